@@ -1,0 +1,1 @@
+"""curvafit: read, make and enforce the shape texture of tubes and membranes in 3D."""

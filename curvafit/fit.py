@@ -1,0 +1,130 @@
+"""What an inference found, and the `fit.json` that carries it to the generator and the prior."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from curvafit.match import Match
+from curvafit.morphometry import Morphometry
+from curvafit.priors.coefficients import NAMES, Coefficients
+from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
+
+FORMAT = "curvafit-fit-1"
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The parameters of a scan, in working and in physical units.
+
+    Attributes
+    ----------
+    coefficients, mass
+        The better supported of match and refinement (`chosen`), in working units: voxel 0.01, ε 0.02, a20 = 1.
+    uncertainty
+        Standard deviation of each refined coefficient; 0 for the one that fixes the scale.
+    scale
+        Working voxel in scan voxels, (z, y, x).
+    working_voxel, length_unit
+        Edge of a working voxel, and the unit that it and every physical number here is in.
+    matches, refined
+        The nearest shapes of the atlas, and what refinement made of them with its own account (`Refinement`).
+    distances
+        Curvature-diagram distances from the scan to the regenerated `match` and `fit` (None where the shape could not
+        be made) and between two seeds of the chosen one (`seed_noise`).
+    status
+        Which of the two is better supported, and what failed.
+    """
+
+    kind: str
+    family: str
+    coefficients: Coefficients
+    mass: float
+    chosen: str
+    uncertainty: dict[str, float]
+    scale: tuple[float, float, float]
+    working_voxel: float
+    length_unit: str
+    matches: tuple[Match, ...]
+    refined: dict[str, Any]
+    distances: dict[str, float | None]
+    status: str
+    morphometry: Morphometry
+    notes: tuple[str, ...]
+    provenance: dict[str, Any]
+
+    @property
+    def length(self) -> float:
+        """λ: a working length of 1 in physical units."""
+        return self.working_voxel / WORKING_SPACING
+
+    @property
+    def coefficients_physical(self) -> Coefficients:
+        """The same energy in `length_unit`: quadratic part unchanged, linear / λ, constant / λ²."""
+        return self.coefficients.in_unit(1 / self.length)
+
+    @property
+    def epsilon_physical(self) -> float:
+        return WORKING_EPSILON * self.length
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain numbers, strings, lists and dicts, as `fit.json` holds them."""
+        return {
+            "format": FORMAT,
+            "kind": self.kind,
+            "family": self.family,
+            "coefficients": self.coefficients.as_dict(),
+            "mass": self.mass,
+            "chosen": self.chosen,
+            "uncertainty": self.uncertainty,
+            "scale": list(self.scale),
+            "working_voxel": self.working_voxel,
+            "length_unit": self.length_unit,
+            "coefficients_physical": self.coefficients_physical.as_dict(),
+            "epsilon_physical": self.epsilon_physical,
+            "matches": [_match_dict(match) for match in self.matches],
+            "refined": self.refined,
+            "distances": self.distances,
+            "status": self.status,
+            "morphometry": dataclasses.asdict(self.morphometry),
+            "notes": list(self.notes),
+            "provenance": self.provenance,
+        }
+
+    def to_json(self) -> str:
+        return json.dumps(self.as_dict(), indent=2, allow_nan=False)
+
+
+def read_prior(path: str | Path) -> tuple[Coefficients, float]:
+    """The working coefficients and mass of a `fit.json`, to generate with.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        If there is no such file, or it is not a `fit.json` of this format.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"expected a fit.json, found no file {path}")
+    try:
+        content = json.loads(path.read_text())
+        found = content["format"]
+        if found != FORMAT:
+            raise ValueError(f"expected a fit.json of format {FORMAT}, got {found!r} in {path}: run `curvafit infer` again")
+        values = [content["coefficients"][name] for name in NAMES]
+        return Coefficients(*values), float(content["mass"])
+    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
+        raise ValueError(f"expected a fit.json written by `curvafit infer`, got {path} ({error!r})") from error
+
+
+def _match_dict(match: Match) -> dict[str, Any]:
+    return {
+        "id": match.id,
+        "distance": match.distance,
+        "coefficients": match.coefficients.as_dict(),
+        "mass": match.mass,
+        "seed": match.seed,
+    }

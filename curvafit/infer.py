@@ -1,0 +1,277 @@
+"""The main job: a scan in, its parameters out. Each step is another module's; the order is here."""
+
+from __future__ import annotations
+
+import datetime
+import platform
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from curvafit.diagram import Diagram, diagram
+from curvafit.family import family_of
+from curvafit.fit import Fit
+from curvafit.generation.flow import Flow, generate
+from curvafit.index import Atlas, load_atlas
+from curvafit.match import Match, nearest
+from curvafit.morphometry import morphometry
+from curvafit.prepare import Prepared, prepare
+from curvafit.priors.coefficients import Coefficients
+from curvafit.priors.grid import WORKING_EPSILON, Grid
+from curvafit.priors.profile import phase_field
+from curvafit.refine import Refinement, refine
+from curvafit.scan import Field, load
+from curvafit.transport import wasserstein
+
+#: Longest edge, in working voxels, of the boxes in which shapes are regenerated for comparison.
+REGENERATED_EDGE = 100
+#: How many of the nearest shapes are kept, and how many of them refinement starts from.
+MATCHES, STARTS = 5, 3
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Inference:
+    """An inference with all that its report shows.
+
+    `scan` as read and `prepared` for measurement; curvature diagrams of the scan, the regenerated match and the
+    regenerated fit; the phase fields of the last two, `(Z, Y, X)` (None where the shape could not be made).
+    """
+
+    scan: Field
+    prepared: Prepared
+    diagram: Diagram
+    match_diagram: Diagram | None
+    fit_diagram: Diagram | None
+    matched: np.ndarray | None
+    regenerated: np.ndarray | None
+    fit: Fit
+
+    @property
+    def best(self) -> np.ndarray | None:
+        """The regenerated shape of the better supported parameters."""
+        return self.regenerated if self.fit.chosen == "fit" else self.matched
+
+
+def infer(
+    scan: str | Path | Field,
+    *,
+    kind: str = "auto",
+    periodic: bool = False,
+    atlas: str | Path | Atlas | None = None,
+    threshold: float | str = "otsu",
+    dark: bool = False,
+    roi: str | Path | np.ndarray | None = None,
+    label: int | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+    **reading: Any,
+) -> Inference:
+    """Infer the generation parameters (a, m₀) of a scanned volume.
+
+    Parameters
+    ----------
+    scan
+        A volume file (see `curvafit.scan.load`, which takes the remaining keywords: spacing, unit, key, raw_shape,
+        dtype), or a `Field`.
+    kind
+        `"field"`, `"mask"`, `"image"`, or `"auto"`: two values are a mask, plateaus near ±1 a phase field.
+    periodic
+        Whether the box repeats; true of generated fields, of scans hardly ever.
+    atlas
+        The shapes to match against; the packaged ones by default.
+    threshold, dark, roi, label
+        What is inside: see `curvafit.prepare.prepare`.
+    progress
+        Called with a sentence and the share done.
+
+    Raises
+    ------
+    ValueError, FileNotFoundError
+        One sentence on a volume that cannot be measured.
+    """
+    say = progress or (lambda text, share: None)
+    say("reading the scan", 0.0)
+    atlas = atlas if isinstance(atlas, Atlas) else load_atlas(atlas)
+    volume = scan if isinstance(scan, Field) else load(scan, **reading)
+    mask_of_interest = load(roi).values if isinstance(roi, (str, Path)) else roi
+    prepared = prepare(
+        volume, kind=kind, periodic=periodic, threshold=threshold, dark=dark, roi=mask_of_interest, label=label
+    )
+    say("measuring curvature", 0.05)
+    seen = scan_diagram(prepared)
+    seen_as = "field" if prepared.kind == "field" else "mask"
+    say("searching the atlas", 0.1)
+    matches = nearest(seen, atlas, seen_as=seen_as, count=MATCHES)
+    say("refining the parameters", 0.2)
+    refined = _refined(prepared, matches, seed, say)
+    say("regenerating", 0.6)
+    twins = _regenerate(prepared, matches[0], refined, seed, say)
+    fit = _fit(prepared, seen, matches, refined, twins, _provenance(volume, atlas, seed))
+    match_twin, fit_twin = twins["match"][0], twins["fit"][0]
+    say("done", 1.0)
+    return Inference(
+        volume,
+        prepared,
+        seen,
+        match_twin.diagram,
+        fit_twin.diagram,
+        match_twin.phase,
+        fit_twin.phase,
+        fit,
+    )
+
+
+def scan_diagram(prepared: Prepared) -> Diagram:
+    """The geometric curvature diagram of a prepared scan, over all its windows."""
+    parts = []
+    for window in prepared.windows:
+        phase = prepared.phase[window]
+        grid = Grid(phase.shape, prepared.grid.spacing, prepared.grid.boundary)
+        parts.append(diagram(torch.from_numpy(phase), grid, WORKING_EPSILON))
+    return Diagram(np.concatenate([part.points for part in parts]), np.concatenate([part.weights for part in parts]))
+
+
+@dataclass(frozen=True)
+class _Twin:
+    """A regenerated shape as the query would be seen, or the reason why there is none."""
+
+    flow: Flow
+    phase: np.ndarray | None
+    diagram: Diagram | None
+
+
+def _refined(prepared: Prepared, matches: tuple[Match, ...], seed: int, say: Progress) -> Refinement:
+    window = prepared.windows[0]
+    phase = torch.from_numpy(np.ascontiguousarray(prepared.phase[window]))
+    grid = Grid(tuple(phase.shape), prepared.grid.spacing, prepared.grid.boundary)
+    starts = [match.coefficients for match in matches[:STARTS]]
+    return refine(
+        phase,
+        grid,
+        WORKING_EPSILON,
+        kind=prepared.kind,
+        starts=starts,
+        seed=seed,
+        progress=lambda text, share: say(text, 0.2 + 0.4 * share),
+    )
+
+
+def _regenerate(
+    prepared: Prepared, match: Match, refined: Refinement, seed: int, say: Progress
+) -> dict[str, tuple[_Twin, _Twin]]:
+    """Two seeds each of the nearest match and of the refined parameters, in a periodic box of the window's size."""
+    shape = tuple(min(edge.stop - edge.start, REGENERATED_EDGE) for edge in prepared.windows[0])
+    grid = Grid(shape, prepared.grid.spacing, "periodic")
+    twins = {}
+    for step, (name, source) in enumerate((("match", match), ("fit", refined))):
+        pair = []
+        for k in range(2):
+            say(f"regenerating the {name}, seed {seed + k}", 0.6 + 0.2 * step + 0.1 * k)
+            pair.append(_twin(source.coefficients, source.mass, grid, seed + k, prepared.kind))
+        twins[name] = (pair[0], pair[1])
+    return twins
+
+
+def _twin(coefficients: Coefficients, mass: float, grid: Grid, seed: int, kind: str) -> _Twin:
+    flow = generate(coefficients, mass, grid, seed=seed, reject_early=True)
+    if not flow.viability.viable:
+        return _Twin(flow, None, None)
+    field = flow.field if kind == "field" else phase_field(flow.field > 0, grid, WORKING_EPSILON)
+    return _Twin(flow, flow.field.numpy(), diagram(field, grid, WORKING_EPSILON))
+
+
+def _fit(
+    prepared: Prepared,
+    seen: Diagram,
+    matches: tuple[Match, ...],
+    refined: Refinement,
+    twins: dict[str, tuple[_Twin, _Twin]],
+    provenance: dict[str, Any],
+) -> Fit:
+    distances = {name: _distance(seen, pair) for name, pair in twins.items()}
+    noises = {name: _noise(pair) for name, pair in twins.items()}
+    chosen, status = _verdict(distances, noises, refined, twins)
+    distances["seed_noise"] = noises[chosen]
+    better = refined if chosen == "fit" else matches[0]
+    return Fit(
+        kind=prepared.kind,
+        family=family_of(seen),
+        coefficients=better.coefficients,
+        mass=float(better.mass),
+        chosen=chosen,
+        uncertainty={name: float(value) for name, value in refined.uncertainty.items()},
+        scale=prepared.scale,
+        working_voxel=prepared.working_voxel,
+        length_unit=prepared.unit,
+        matches=matches,
+        refined=_refinement_dict(refined),
+        distances=distances,
+        status=status,
+        morphometry=morphometry(prepared.mask, prepared.working_voxel, prepared.unit, periodic=prepared.grid.periodic),
+        notes=prepared.notes,
+        provenance=provenance,
+    )
+
+
+def _distance(seen: Diagram, pair: tuple[_Twin, _Twin]) -> float | None:
+    found = [wasserstein(seen, twin.diagram) for twin in pair if twin.diagram is not None]
+    return float(np.mean(found)) if found else None
+
+
+def _noise(pair: tuple[_Twin, _Twin]) -> float | None:
+    first, second = pair[0].diagram, pair[1].diagram
+    return wasserstein(first, second) if first is not None and second is not None else None
+
+
+def _verdict(
+    distances: dict[str, float | None], noises: dict[str, float | None], refined: Refinement, twins: dict
+) -> tuple[str, str]:
+    """Which of match and fit is better supported, in a word and in a sentence."""
+    match, fit = distances["match"], distances["fit"]
+    if fit is None:
+        reason = twins["fit"][0].flow.viability.reason
+        return "match", f"The nearest match is better supported: the refined parameters make no shape ({reason})."
+    if match is None:
+        return "fit", "The refined parameters are better supported: the nearest match could not be regenerated."
+    noise = noises["fit"] or noises["match"] or 0.0
+    both = f"regenerated, the fit lies {fit:.1f} from the scan, the match {match:.1f}, two seeds {noise:.1f} apart"
+    if fit <= match + noise:
+        how = "clearly" if fit < match - noise else "within seed noise"
+        return "fit", f"The refined parameters are supported ({how}): {both}. {refined.status}"
+    return "match", f"The nearest match is better supported: {both}. {refined.status}"
+
+
+def _refinement_dict(refined: Refinement) -> dict[str, Any]:
+    return {
+        "method": refined.method,
+        "coefficients": refined.coefficients.as_dict(),
+        "mass": float(refined.mass),
+        "singular_values": [float(value) for value in refined.singular_values],
+        "residual": float(refined.residual),
+        "evaluations": int(refined.evaluations),
+        "status": refined.status,
+    }
+
+
+def _provenance(volume: Field, atlas: Atlas, seed: int) -> dict[str, Any]:
+    return {
+        "curvafit": version("curvafit"),
+        "scan": str(volume.source),
+        "scan_shape": list(volume.values.shape),
+        "scan_spacing": list(volume.spacing),
+        "seed": seed,
+        "schedule": "fast",
+        "epsilon": WORKING_EPSILON,
+        "atlas": {"format": atlas.format_version, "shapes": len(atlas.ids)},
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "python": platform.python_version(),
+        "torch": version("torch"),
+        "numpy": version("numpy"),
+    }

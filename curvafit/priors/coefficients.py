@@ -1,0 +1,158 @@
+"""The six coefficients of the curvature polynomial, the ways to state them, and the published ones by name."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+#: Names in the paper's order: κ1², κ1κ2, κ2², κ1, κ2, 1.
+NAMES = ("a20", "a11", "a02", "a10", "a01", "a00")
+
+
+@dataclass(frozen=True)
+class Coefficients:
+    """p(κ1, κ2) = a20 κ1² + a11 κ1κ2 + a02 κ2² + a10 κ1 + a01 κ2 + a00 with κ1 ≥ κ2 (eq. `F`).
+
+    Numbers, or tensors that broadcast with the voxels (coefficients that vary in space or over a batch). Lengths are
+    in whatever unit the grid's spacing is in; the published values are in working units (spacing 0.01).
+
+    Warns
+    -----
+    UserWarning
+        Outside a20 > 0, a02 > 0, where the quadratic part of F_ε is not bounded below.
+    """
+
+    a20: float | Tensor
+    a11: float | Tensor
+    a02: float | Tensor
+    a10: float | Tensor = 0.0
+    a01: float | Tensor = 0.0
+    a00: float | Tensor = 0.0
+
+    def __post_init__(self) -> None:
+        for name in NAMES:
+            value = getattr(self, name)
+            if not isinstance(value, Tensor):
+                object.__setattr__(self, name, float(value))
+            if not bool(torch.isfinite(torch.as_tensor(value)).all()):
+                raise ValueError(f"expected finite coefficients, got {name} = {value}")
+        if not bool((torch.as_tensor(self.a20) > 0).all()) or not bool((torch.as_tensor(self.a02) > 0).all()):
+            warnings.warn(
+                f"a20 > 0 and a02 > 0 keep the energy bounded below, got a20 = {self.a20}, a02 = {self.a02}",
+                stacklevel=3,
+            )
+
+    def __iter__(self):
+        return (getattr(self, name) for name in NAMES)
+
+    def tensor(self, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None) -> Tensor:
+        """The six values stacked along a first axis, `(6,)` or `(6, *their shape)`; keeps their gradients."""
+        parts = [torch.as_tensor(value, dtype=dtype, device=device) for value in self]
+        return torch.stack(torch.broadcast_tensors(*parts))
+
+    def polynomial(self, kappa1, kappa2):
+        """p(κ1, κ2), elementwise."""
+        quadratic = self.a20 * kappa1**2 + self.a11 * kappa1 * kappa2 + self.a02 * kappa2**2
+        return quadratic + self.a10 * kappa1 + self.a01 * kappa2 + self.a00
+
+    def scaled(self, factor: float) -> Coefficients:
+        """All six times a positive factor: the same minimisers."""
+        return Coefficients(*(factor * value for value in self))
+
+    def in_unit(self, unit: float) -> Coefficients:
+        """The same energy with lengths measured in multiples of `unit` (old lengths): quadratic part kept,
+        linear × unit, constant × unit². Working units to physical ones is `in_unit(0.01 / working voxel)`."""
+        if not unit > 0:
+            raise ValueError(f"expected a positive length unit, got {unit}")
+        a20, a11, a02, a10, a01, a00 = self
+        return Coefficients(a20, a11, a02, a10 * unit, a01 * unit, a00 * unit**2)
+
+    def mirrored(self) -> Coefficients:
+        """a' with F_ε[-u; a] = F_ε[u; a']: inside and outside exchange, (κ1, κ2) becomes (-κ2, -κ1)."""
+        a20, a11, a02, a10, a01, a00 = self
+        return Coefficients(a02, a11, a20, -a01, -a10, a00)
+
+    @classmethod
+    def from_b(cls, h2, H0, k1, alpha, kappa1, beta, kappa2) -> Coefficients:  # noqa: N803
+        """h2 (H - H0)² + k1 K + α (κ1 - κ1⁰)² + β (κ2 - κ2⁰)², expanded (eq. `redundant`)."""
+        return cls(
+            h2 + alpha,
+            2 * h2 + k1,
+            h2 + beta,
+            -2 * h2 * H0 - 2 * alpha * kappa1,
+            -2 * h2 * H0 - 2 * beta * kappa2,
+            h2 * H0**2 + alpha * kappa1**2 + beta * kappa2**2,
+        )
+
+    @classmethod
+    def helfrich(cls, bending: float, gaussian: float = 0.0, spontaneous: float = 0.0) -> Coefficients:
+        """χ_b/2 (H - H0)² + χ_G K (eq. `Helfrich`), H = κ1 + κ2."""
+        return cls.from_b(bending / 2, spontaneous, gaussian, 0, 0, 0, 0)
+
+    @classmethod
+    def willmore(cls) -> Coefficients:
+        """H² (eq. `Willmore`)."""
+        return cls(1, 2, 1)
+
+    def as_dict(self) -> dict[str, float]:
+        """Names to numbers; for coefficients that do not vary."""
+        return {name: float(value) for name, value in dataclasses.asdict(self).items()}
+
+
+class Preset(NamedTuple):
+    """Coefficients (working units) and mass m₀ of a published shape, with where they were published."""
+
+    coefficients: Coefficients
+    mass: float
+    source: str
+
+
+_GALLERY = "curvatubes results/gallery"
+_TABLE_3, _TABLE_4 = "paper, Table 'four shapes'", "paper, Table 'spatialized'"
+_PUBLISHED: dict[str, tuple[tuple[float, ...], float, str]] = {
+    "bilayers": ((1, 1, 1, 0, 0, 0), -0.4, _GALLERY),
+    "exp-0366": ((1, -0.238, 11.988, -175.909, -27.167, 2117.037), -0.648, _GALLERY),
+    "exp-0556": ((1, 3.225, 10.87, -146.309, 143.487, -2920.302), -0.499, _GALLERY),
+    "exp-0625": ((1, 2.869, 9.711, -116.933, 61.261, 577.676), -0.657, _GALLERY),
+    "exp-0830": ((1, 3.725, 0.649, -39.994, 64.093, 2758.058), -0.568, _GALLERY),
+    "metatubes": ((0.924, 1.352, 2.932, 8.29, 61.066, 297.722), -0.53, _GALLERY),
+    "pearls": ((1, 3.55, 1, -56, -56, 784), -0.77, _GALLERY),
+    "sieve": ((0.946, 3.959, 1.942, 18.329, 28.008, 113.771), -0.534, _GALLERY),
+    "sponge": ((1, 2.8, 2, -10, -10, 25), -0.25, _GALLERY),
+    "trabec": ((2, 1.823, 12, -166, -14, 3548), -0.512, _GALLERY),
+    "tubes": ((1, 2, 6, -40, -40, 400), -0.6, _GALLERY),
+    "weird": ((1, 0.396, 1.095, -28.64, 190.906, 2062.082), -0.598, _GALLERY),
+    "flow": ((1, 2.4, 9, 30, 170, -195), -0.66, "paper, Fig. 'cvg_1'"),
+    "seeds": ((1, -0.35, 1.02, -40, 100, 1600), -0.69, "paper, Fig. 'var_1'"),
+    "bilinear-layers": ((2, 2, 2, 0, 0, 0), -0.3, _TABLE_3),
+    "bilinear-spheres": ((2, 2, 2, -75, -75, 937.5), -0.6, _TABLE_3),
+    "bilinear-tubes": ((2, 2, 11, -100, -50, 1250), -0.7, _TABLE_3),
+    "bilinear-sponges": ((1, 2.8, 2, -10, -10, 25), -0.25, _TABLE_3),
+    "spatial-1": ((2, 2, 2, 0, 0, 0), -0.4, _TABLE_4),
+    "spatial-2": ((1, 2, 6, -40, -40, 400), -0.6, _TABLE_4),
+    "spatial-3": ((2, 2, 2, -75, -75, 937.5), -0.7, _TABLE_4),
+    "spatial-4": ((2, 2, 11, -180, -90, 4050), -0.7, _TABLE_4),
+}
+
+#: Every published parameter by name.
+PRESETS: dict[str, Preset] = {
+    name: Preset(Coefficients(*values), mass, source) for name, (values, mass, source) in _PUBLISHED.items()
+}
+
+
+def preset(name: str) -> Preset:
+    """A published shape's parameters.
+
+    Raises
+    ------
+    ValueError
+        If the name is not one of `PRESETS`.
+    """
+    if name not in PRESETS:
+        raise ValueError(f"expected a preset among {', '.join(PRESETS)}, got {name!r}")
+    return PRESETS[name]

@@ -1,0 +1,110 @@
+"""Curvatures of a field's level sets: the paper's diffuse ones, from M_ε, and the geometric ones, from Hess u.
+
+Both take a field with its gradient and Hessian (as `stencils` stores them), so that they serve any discretisation and
+exact derivatives alike. Signs: κ1 ≥ κ2, positive where the phase u > 0 is convex.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from curvafit.priors.grid import Grid
+from curvafit.priors.profile import double_well_derivative
+from curvafit.priors.stencils import gradient, hessian
+
+#: Offset ξ of the gradient's norm and width of the smooth positive part (paper, "Implementation details").
+XI = 1e-6
+#: Least value under the square root.
+ROOT_FLOOR = 1e-6
+
+
+class Jet(NamedTuple):
+    """A field `(..., Z, Y, X)` with its gradient `(..., 3, Z, Y, X)` and Hessian `(..., 6, Z, Y, X)`."""
+
+    value: Tensor
+    gradient: Tensor
+    hessian: Tensor
+
+
+class SecondForm(NamedTuple):
+    """What F_ε needs of M_ε: Tr M, |M|², √(2|M|² - (Tr M)²)⁺, and |∇u|."""
+
+    trace: Tensor
+    norm2: Tensor
+    root: Tensor
+    slope: Tensor
+
+
+class Curvatures(NamedTuple):
+    """Principal curvatures κ1 ≥ κ2, their sum H, and K (equal to κ1κ2 but for the diffuse one, where κ1κ2 ≤ K)."""
+
+    kappa1: Tensor
+    kappa2: Tensor
+    mean: Tensor
+    gauss: Tensor
+
+
+def jet(u: Tensor, grid: Grid) -> Jet:
+    """The field with its central differences."""
+    return Jet(u, gradient(u, grid), hessian(u, grid))
+
+
+def second_form(field: Jet, epsilon: float, xi: float = XI) -> SecondForm:
+    """M_ε = -ε Hess u + W'(u)/ε n⊗n (eq. `Meps`), with n⊗n = ∇u⊗∇u / (|∇u|² + ξ²)."""
+    ε = epsilon
+    slope2, laplacian, hess2, normal = _invariants(field)
+    W_ = double_well_derivative(field.value)
+    length2 = slope2 + xi**2
+    unit = slope2 / length2
+    trace = -ε * laplacian + W_ / ε * unit
+    norm2 = ε**2 * hess2 - 2 * W_ * normal / length2 + (W_ / ε * unit) ** 2
+    root = smooth_positive(2 * norm2 - trace**2, xi).clamp_min(ROOT_FLOOR).sqrt()
+    return SecondForm(trace, norm2, root, length2.sqrt())
+
+
+def smooth_positive(x: Tensor, xi: float = XI) -> Tensor:
+    """x⁺ ≃ ξ log(1 + exp(x / ξ))."""
+    return torch.nn.functional.softplus(x, beta=1 / xi, threshold=30)
+
+
+def diffuse_curvatures(field: Jet, epsilon: float) -> Curvatures:
+    """κ1, κ2 = (Tr M ± √(2|M|² - (Tr M)²)⁺) / 2ε|∇u|, H and K (eqs. `Heps`, `Keps`, `kepsa`, `kepsb`)."""
+    trace, norm2, root, slope = second_form(field, epsilon)
+    width = 2 * epsilon * slope
+    gauss = (trace**2 - norm2) / (2 * (epsilon * slope) ** 2)
+    return Curvatures((trace + root) / width, (trace - root) / width, 2 * trace / width, gauss)
+
+
+def geometric_curvatures(field: Jet, xi: float = XI) -> Curvatures:
+    """Eigenvalues of -P (Hess u) P / |∇u|, P = I - n⊗n: the level sets' shape operator, whatever the profile.
+
+    H = -(Δu - nᵀHess u n) / |∇u| and K = ∇uᵀ adj(Hess u) ∇u / |∇u|⁴ (Goldman 2005).
+    """
+    slope2, laplacian, _, normal = _invariants(field)
+    length2 = slope2 + xi**2
+    mean = -(laplacian - normal / length2) / length2.sqrt()
+    gauss = _adjugate_form(field) / length2**2
+    root = (mean**2 - 4 * gauss).clamp_min(0).sqrt()
+    return Curvatures((mean + root) / 2, (mean - root) / 2, mean, gauss)
+
+
+def _invariants(field: Jet) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """|∇u|², Δu, |Hess u|², ∇uᵀ Hess u ∇u."""
+    gz, gy, gx = field.gradient.unbind(-4)
+    zz, yy, xx, zy, zx, yx = field.hessian.unbind(-4)
+    slope2 = gz**2 + gy**2 + gx**2
+    hess2 = zz**2 + yy**2 + xx**2 + 2 * (zy**2 + zx**2 + yx**2)
+    normal = gz * (gz * zz + 2 * (gy * zy + gx * zx)) + gy * (gy * yy + 2 * gx * yx) + gx**2 * xx
+    return slope2, zz + yy + xx, hess2, normal
+
+
+def _adjugate_form(field: Jet) -> Tensor:
+    """∇uᵀ adj(Hess u) ∇u."""
+    gz, gy, gx = field.gradient.unbind(-4)
+    zz, yy, xx, zy, zx, yx = field.hessian.unbind(-4)
+    diagonal = gz**2 * (yy * xx - yx**2) + gy**2 * (zz * xx - zx**2) + gx**2 * (zz * yy - zy**2)
+    cross = gz * gy * (zx * yx - zy * xx) + gz * gx * (zy * yx - zx * yy) + gy * gx * (zy * zx - zz * yx)
+    return diagonal + 2 * cross

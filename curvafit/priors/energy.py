@@ -1,0 +1,100 @@
+"""F_ε and its relatives in plain torch: the definition that the fused kernels are tested against.
+
+Every energy is a sum over voxels times the voxel's volume. Fields are `(..., Z, Y, X)`; results drop the space axes.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from curvafit.priors.coefficients import Coefficients
+from curvafit.priors.curvature import Jet, diffuse_curvatures, jet, second_form
+from curvafit.priors.grid import Grid
+from curvafit.priors.profile import double_well
+from curvafit.priors.shapes import Float
+from curvafit.priors.stencils import gradient
+
+
+def energy(
+    u: Float[Tensor, "*batch z y x"], coefficients: Coefficients, grid: Grid, epsilon: float
+) -> Float[Tensor, "*batch"]:
+    """F_ε(u) (eq. `Feps`), differentiable in the field and in the coefficients.
+
+    Parameters
+    ----------
+    u
+        Phase field, about +1 inside and -1 outside.
+    coefficients
+        Numbers, or tensors that broadcast with `u` (`(batch, 1, 1, 1)` for one set a field).
+    grid, epsilon
+        The sampling, and the interface parameter in spacing's unit.
+    """
+    density = energy_terms(jet(u, grid), epsilon)
+    a = coefficients.tensor(u.dtype, u.device)
+    per_voxel = sum(weight * term for weight, term in zip(a, density.unbind(-4), strict=True))
+    return per_voxel.sum((-3, -2, -1)) * grid.voxel_volume  # type: ignore[union-attr]
+
+
+def energy_terms(field: Jet, epsilon: float) -> Float[Tensor, "*batch 6 z y x"]:
+    """Densities of the six terms that a20, a11, a02, a10, a01, a00 multiply in F_ε, which is linear in them."""
+    ε = epsilon
+    trace, norm2, root, slope = second_form(field, ε)
+    slope2 = field.gradient.square().sum(-4)
+    even, odd = norm2 / (2 * ε), trace * root / (2 * ε)
+    terms = (
+        even + odd,
+        (trace**2 - norm2) / (2 * ε),
+        even - odd,
+        slope * (trace + root) / 2,
+        slope * (trace - root) / 2,
+        ε * slope2,
+    )
+    return torch.stack(terms, -4)
+
+
+def unsimplified_energy(u: Tensor, coefficients: Coefficients, grid: Grid, epsilon: float) -> Tensor:
+    """𝓔̃_ε: F_ε before the positive part of |M|² outside the square root was dropped (eq. `tildeEeps`)."""
+    density = unsimplified_density(jet(u, grid), coefficients, epsilon)
+    return density.sum((-3, -2, -1)) * grid.voxel_volume
+
+
+def unsimplified_density(field: Jet, coefficients: Coefficients, epsilon: float) -> Tensor:
+    """The integrand of 𝓔̃_ε."""
+    trace, _, root, slope = second_form(field, epsilon)
+    a20, a11, a02, a10, a01, a00 = coefficients
+    slope2 = field.gradient.square().sum(-4)
+    quadratic = (a20 + a02 - a11) * root**2 + (a20 + a02 + a11) * trace**2 + 2 * (a20 - a02) * trace * root
+    linear = (a10 + a01) * trace + (a10 - a01) * root
+    return quadratic / (4 * epsilon) + slope * linear / 2 + a00 * epsilon * slope2
+
+
+def curvature_integral(u: Tensor, coefficients: Coefficients, grid: Grid, epsilon: float) -> Tensor:
+    """𝓔_ε(u) = ∫ p(κ1_ε, κ2_ε) ε|∇u|² dx: the form that the other two expand (eq. `Eeps`)."""
+    density = curvature_density(jet(u, grid), coefficients, epsilon)
+    return density.sum((-3, -2, -1)) * grid.voxel_volume
+
+
+def curvature_density(field: Jet, coefficients: Coefficients, epsilon: float) -> Tensor:
+    """The integrand of 𝓔_ε; zero where ∇u is."""
+    curvatures = diffuse_curvatures(field, epsilon)
+    slope2 = field.gradient.square().sum(-4)
+    return coefficients.polynomial(curvatures.kappa1, curvatures.kappa2) * epsilon * slope2
+
+
+def cahn_hilliard_area(u: Tensor, grid: Grid, epsilon: float) -> Tensor:
+    """𝓐_ε(u) = ∫ ε/2 |∇u|² + W(u)/ε, about σ × area (eq. `CH_eps`)."""
+    gradient_part, well_part = _cahn_hilliard_parts(u, grid, epsilon)
+    return (gradient_part + well_part).sum((-3, -2, -1)) * grid.voxel_volume
+
+
+def discrepancy_ratio(u: Tensor, grid: Grid, epsilon: float) -> Tensor:
+    """∫|ε/2 |∇u|² - W(u)/ε| over 𝓐_ε, in [0, 1]: zero for the optimal profile (paper, Experiment 4)."""
+    gradient_part, well_part = _cahn_hilliard_parts(u, grid, epsilon)
+    space = (-3, -2, -1)
+    return (gradient_part - well_part).abs().sum(space) / (gradient_part + well_part).sum(space)
+
+
+def _cahn_hilliard_parts(u: Tensor, grid: Grid, epsilon: float) -> tuple[Tensor, Tensor]:
+    slope2 = gradient(u, grid).square().sum(-4)
+    return epsilon / 2 * slope2, double_well(u) / epsilon

@@ -1,0 +1,140 @@
+"""Finite differences and the Gaussian blur, each linear map beside its exact adjoint.
+
+Fields are `(..., Z, Y, X)` tensors of any floating type on any device. Vectors add an axis of 3 (z, y, x) before
+the space axes, Hessians an axis of 6 (zz, yy, xx, zy, zx, yx).
+
+Beyond the box a field continues periodically or as its mirror image. The transpose of a difference is then the same
+difference gathered from a continuation too: periodic, or mirrored with a sign along the axes that are differenced once.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+from curvafit.priors.grid import Grid
+from curvafit.priors.shapes import Float
+
+#: Axis pairs of the six Hessian components, in storage order.
+HESSIAN_AXES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+
+
+def pad(u: Float[Tensor, "*batch z y x"], grid: Grid, width: int = 1, odd: tuple[int, ...] = ()) -> Tensor:
+    """Continue `u` by `width` voxels on every side: periodic, or mirrored (with a sign along the axes in `odd`)."""
+    for axis in range(3):
+        dim = axis - 3
+        n = u.shape[dim]
+        if width > n:
+            raise ValueError(f"expected at least {width} voxels along axis {axis} for this stencil, got {n}")
+        head, tail = u.narrow(dim, 0, width), u.narrow(dim, n - width, width)
+        if grid.periodic:
+            head, tail = tail, head
+        else:
+            sign = -1 if axis in odd else 1
+            head, tail = sign * head.flip(dim), sign * tail.flip(dim)
+        u = torch.cat((head, u, tail), dim)
+    return u
+
+
+def gradient(u: Float[Tensor, "*batch z y x"], grid: Grid) -> Float[Tensor, "*batch 3 z y x"]:
+    """Central differences [-1, 0, 1] / 2Δx."""
+    v = pad(_checked(u, grid), grid)
+    return torch.stack([_central(v, axis) / (2 * h) for axis, h in enumerate(grid.spacing)], -4)
+
+
+def gradient_adjoint(p: Float[Tensor, "*batch 3 z y x"], grid: Grid) -> Float[Tensor, "*batch z y x"]:
+    """Transpose of `gradient`: ⟨∇u, p⟩ = ⟨u, ∇ᵀp⟩ as plain sums over voxels."""
+    _checked(p, grid)
+    return sum(
+        -_central(pad(p.select(-4, axis), grid, odd=(axis,)), axis) / (2 * h) for axis, h in enumerate(grid.spacing)
+    )  # type: ignore[return-value]
+
+
+def divergence(vector: Float[Tensor, "*batch 3 z y x"], grid: Grid) -> Float[Tensor, "*batch z y x"]:
+    """div = -∇ᵀ under either boundary, so that ∫ div A = 0 exactly (no flux through the box)."""
+    return -gradient_adjoint(vector, grid)
+
+
+def hessian(u: Float[Tensor, "*batch z y x"], grid: Grid) -> Float[Tensor, "*batch 6 z y x"]:
+    """Second differences: [1, -2, 1] on the diagonal, the 4-point cross off it (19 points in all)."""
+    v = pad(_checked(u, grid), grid)
+    return torch.stack([_second(v, i, j) / _area(grid, i, j) for i, j in HESSIAN_AXES], -4)
+
+
+def hessian_adjoint(p: Float[Tensor, "*batch 6 z y x"], grid: Grid) -> Float[Tensor, "*batch z y x"]:
+    """Transpose of `hessian`: ⟨Hess u, p⟩ = ⟨u, Hessᵀp⟩ over the six stored components."""
+    _checked(p, grid)
+    return sum(
+        _second(pad(p.select(-4, c), grid, odd=() if i == j else (i, j)), i, j) / _area(grid, i, j)
+        for c, (i, j) in enumerate(HESSIAN_AXES)
+    )  # type: ignore[return-value]
+
+
+def gaussian_blur(u: Float[Tensor, "*batch z y x"], grid: Grid, width: float) -> Float[Tensor, "*batch z y x"]:
+    """k ∗ u with a separable Gaussian of standard deviation `width` (in spacing's unit), cut at four deviations.
+
+    The continuation beyond the box is a reflection group's, so the blur is its own adjoint under both boundaries.
+    """
+    _checked(u, grid)
+    if width == 0:
+        return u
+    batch = u.shape[:-3]
+    v = u.reshape(-1, 1, *grid.shape)
+    for axis, h in enumerate(grid.spacing):
+        taps = gaussian_taps(width / h)
+        one_axis = [1, 1, 1]
+        one_axis[axis] = len(taps)
+        kernel = torch.tensor(taps, dtype=u.dtype, device=u.device).reshape(1, 1, *one_axis)
+        v = torch.nn.functional.conv3d(_pad_axis(v, grid, axis, len(taps) // 2), kernel)
+    return v.reshape(*batch, *grid.shape)
+
+
+@lru_cache(maxsize=64)
+def gaussian_taps(deviation: float) -> tuple[float, ...]:
+    """Weights of the one-dimensional blur, 2⌈4σ⌉ + 1 of them, summing to one; `deviation` in voxels."""
+    if not deviation > 0:
+        raise ValueError(f"expected a blur width above 0, got {deviation} voxels")
+    radius = math.ceil(4 * deviation)
+    taps = [math.exp(-0.5 * (k / deviation) ** 2) for k in range(-radius, radius + 1)]
+    return tuple(w / math.fsum(taps) for w in taps)
+
+
+def _pad_axis(v: Tensor, grid: Grid, axis: int, width: int) -> Tensor:
+    dim, n = axis - 3, grid.shape[axis]
+    index = torch.arange(-width, n + width, device=v.device)
+    if grid.periodic:
+        index = index % n
+    else:
+        index = index % (2 * n)
+        index = torch.where(index < n, index, 2 * n - 1 - index)
+    return v.index_select(dim, index)
+
+
+def _central(v: Tensor, axis: int) -> Tensor:
+    return _shift(v, {axis: 1}) - _shift(v, {axis: -1})
+
+
+def _second(v: Tensor, i: int, j: int) -> Tensor:
+    if i == j:
+        return _shift(v, {i: 1}) - 2 * _shift(v, {}) + _shift(v, {i: -1})
+    same = _shift(v, {i: 1, j: 1}) + _shift(v, {i: -1, j: -1})
+    return (same - _shift(v, {i: 1, j: -1}) - _shift(v, {i: -1, j: 1})) / 4
+
+
+def _shift(v: Tensor, offset: dict[int, int]) -> Tensor:
+    for axis in range(3):
+        v = v.narrow(axis - 3, 1 + offset.get(axis, 0), v.shape[axis - 3] - 2)
+    return v
+
+
+def _area(grid: Grid, i: int, j: int) -> float:
+    return grid.spacing[i] * grid.spacing[j]
+
+
+def _checked(u: Tensor, grid: Grid) -> Tensor:
+    if tuple(u.shape[-3:]) != grid.shape:
+        raise ValueError(f"expected a field whose last axes are {grid.shape}, got {tuple(u.shape)}")
+    return u
