@@ -8,32 +8,30 @@ from curvafit.diagram import Diagram
 
 #: Angles of the ideal points in the (κ1, κ2) plane: sphere (1, 1), tube (1, 0), sponge (1, -1); cavities mirror them.
 _ANGLES = {"spheres": 45.0, "tubes": 0.0, "sponge": -45.0, "tubular cavities": -90.0, "bubbles": -135.0}
-#: A point belongs to a flat piece where its curvedness is under this share of the diagram's root mean square ...
-_FLAT = 0.35
-#: ... and the shape is made of layers where such pieces carry at least this share of the area.
+#: A point is flat where its radii of curvature exceed the structure's half-thickness this many times over.
+_FLAT_RADII = 2.5
+#: Share of flat area from which a shape is made of layers.
 _LAYERS = 0.5
 
 
-def family_shares(diagram: Diagram) -> dict[str, float]:
-    """The share of the area nearest in direction to each family's ideal point, and the flat share (`layers`).
+def family_shares(diagram: Diagram, radius: float) -> dict[str, float]:
+    """The share of area nearest in direction to each family's ideal point, and the flat share (`layers`).
 
-    Directions after Koenderink's shape index; flatness is relative to the diagram's own root-mean-square curvedness.
+    Directions after Koenderink's shape index; `radius` is the structure's half-thickness in the diagram's unit.
     """
     kappa1, kappa2 = diagram.points.T
     weights = diagram.weights / diagram.weights.sum()
-    curvedness = np.hypot(kappa1, kappa2)
-    flat = curvedness < _FLAT * np.sqrt((weights * curvedness**2).sum())
+    flat = np.hypot(kappa1, kappa2) * radius * _FLAT_RADII < 1
     angle = np.degrees(np.arctan2(kappa2, kappa1))
     angle = np.where(angle > 45 + 1e-9, angle - 360, angle)
-    names = list(_ANGLES)
     nearest = np.abs(angle[:, None] - np.array(list(_ANGLES.values()))).argmin(1)
-    shares = {name: float(weights[(nearest == k) & ~flat].sum()) for k, name in enumerate(names)}
+    shares = {name: float(weights[(nearest == k) & ~flat].sum()) for k, name in enumerate(_ANGLES)}
     return {"layers": float(weights[flat].sum())} | shares
 
 
-def family_of(diagram: Diagram) -> str:
+def family_of(diagram: Diagram, radius: float) -> str:
     """The family's name: the largest share, or layers where at least half the area is flat."""
-    shares = family_shares(diagram)
+    shares = family_shares(diagram, radius)
     if shares["layers"] >= _LAYERS:
         return "layers"
-    return max((name for name in shares if name != "layers"), key=lambda name: shares[name])
+    return max(_ANGLES, key=lambda name: shares[name])

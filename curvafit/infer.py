@@ -202,7 +202,7 @@ def _fit(
     better = refined if chosen == "fit" else matches[0]
     return Fit(
         kind=prepared.kind,
-        family=family_of(seen),
+        family=family_of(seen, prepared.thickness / 2 * prepared.grid.spacing[0]),
         coefficients=better.coefficients,
         mass=float(better.mass),
         chosen=chosen,

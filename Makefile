@@ -1,0 +1,40 @@
+# Needs Python 3.11 or newer, and make.
+#   make demo   install; take a real CT volume of bone to its parameters and a report
+#   make test   install with the test tools; run all tests
+#   make lint   ruff and the type checker
+# A CPU-only torch, several GB smaller on Linux: make demo TORCH_INDEX=https://download.pytorch.org/whl/cpu
+
+PYTHON ?= python3
+TORCH_INDEX ?=
+
+BIN := .venv/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
+
+.PHONY: demo test lint clean
+
+demo: .venv/installed
+	@scan=$$($(BIN)/curvafit samples get bone) || scan=$$($(BIN)/curvafit samples get synthetic) \
+	&& $(BIN)/curvafit infer "$$scan" -o demo_out
+
+test: .venv/installed-dev
+	$(BIN)/python -m pytest -q
+
+lint: .venv/installed-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright --pythonpath $(BIN)/python
+
+clean:
+	rm -rf .venv demo_out build dist
+
+.venv/installed: EXTRAS :=
+.venv/installed-dev: EXTRAS := [dev]
+.venv/installed .venv/installed-dev: pyproject.toml constraints.txt | $(BIN)/python
+	@echo "installing curvafit$(EXTRAS) into .venv (some minutes the first time)"
+	@$(PIP) $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) torch
+	@$(PIP) --editable ".$(EXTRAS)"
+	@touch $@
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; v = sys.version.split()[0]; sys.exit(None if sys.version_info >= (3, 11) else "expected Python 3.11 or newer, got " + v + "; name another with make PYTHON=...")'
+	@$(PYTHON) -m venv .venv || { rm -rf .venv; exit 1; }

@@ -1,0 +1,254 @@
+"""A store of generated shapes: Zarr groups, one a draw, each visible whole or not at all.
+
+Layout, version 1 (every attribute is JSON in a group's `zarr.json`)::
+
+    STORE/                 format, version, settings (shape, spacing, epsilon, blur, law, seed, schedule, steps)
+    STORE/draws/000012/    the record of draw 12: parameters, mass, seed, steps, viability, energy, software versions
+    STORE/draws/000012/field   the phase field, float32 (Z, Y, X), one checksummed chunk; absent where not viable
+
+A draw is written beside its place, flushed to disk and renamed into it, so a killed process loses the draw it was
+at and nothing else. Draws that were not viable keep their record: a resumed build does not make them again.
+
+Fields are float32, not float16: the stationarity fit reads Hess u where |u| is near 1 and ∇u near 0, and there
+float16's half step of 2.4e-4 is a second difference of up to 1e-3 / Δx² = 10 in working units.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import os
+import shutil
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from zarr.codecs import BloscCodec, Crc32cCodec
+
+from curvafit.generation.viability import Viability
+from curvafit.priors.coefficients import NAMES, Coefficients
+
+FORMAT = "curvafit shapes"
+VERSION = 1
+#: A draw's folder is written in less than this; an older one was left by a killed process.
+_STALE_SECONDS = 600.0
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What all draws of a store share: sampling (z, y, x), ε and blur in spacing's unit, the law and its seed, and the
+    schedule's fields (name, steps, rates)."""
+
+    shape: tuple[int, int, int]
+    spacing: tuple[float, float, float]
+    epsilon: float
+    blur: float
+    law: str
+    seed: int
+    schedule: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Record:
+    """One draw: its index, parameters, noise seed, the steps made (fewer where rejected early), viability figures,
+    final energy F_ε, the flow's status sentence, the software versions and the seconds it took."""
+
+    index: int
+    coefficients: Coefficients
+    mass: float
+    seed: int
+    steps: int
+    viability: Viability
+    energy: float
+    status: str
+    versions: dict[str, str]
+    seconds: float
+
+
+class Store:
+    """The draws in a folder; one process writes at a time, any number may read. Open with `open_store`."""
+
+    def __init__(self, path: Path, settings: Settings) -> None:
+        self.path, self.settings = path, settings
+
+    def indices(self) -> list[int]:
+        """Draws with a complete record, in increasing order."""
+        names = (entry.name for entry in (self.path / "draws").iterdir())
+        return sorted(int(name) for name in names if name.isdigit() and self._attributes(int(name)) is not None)
+
+    def record(self, index: int) -> Record:
+        """The record of a draw.
+
+        Raises
+        ------
+        KeyError
+            If the draw is missing or incomplete.
+        """
+        attributes = self._attributes(index)
+        if attributes is None:
+            raise KeyError(f"expected a complete draw {index} in {self.path}, got none")
+        return Record(
+            **{name: attributes[name] for name in ("index", "seed", "status", "versions", "steps")},
+            **{name: _number(attributes[name]) for name in ("mass", "energy", "seconds")},
+            coefficients=Coefficients(*(attributes["coefficients"][name] for name in NAMES)),
+            viability=Viability(**{name: _number(value) for name, value in attributes["viability"].items()}),
+        )
+
+    def field(self, index: int) -> np.ndarray:
+        """The phase field of a viable draw, float32 (Z, Y, X).
+
+        Raises
+        ------
+        KeyError
+            If the draw is missing, incomplete or was not viable.
+        """
+        folder = self._place(index) / "field"
+        if self._attributes(index) is None or not folder.is_dir():
+            raise KeyError(f"expected a viable draw {index} in {self.path}, got none")
+        return np.asarray(zarr.open_array(store=str(folder), mode="r")[...])
+
+    def write(self, record: Record, field: np.ndarray | None) -> bool:
+        """Add a draw, whole or not at all; False where it was there already (nothing is then changed).
+
+        Raises
+        ------
+        ValueError
+            If the field is missing for a viable record, present for another, or not float32 of the store's shape.
+        """
+        if record.viability.viable != (field is not None):
+            raise ValueError(f"expected a field exactly for viable draws, got viable = {record.viability.viable}")
+        if field is not None and (field.dtype != np.float32 or field.shape != self.settings.shape):
+            raise ValueError(f"expected a float32 field {self.settings.shape}, got {field.dtype} {field.shape}")
+        place = self._place(record.index)
+        if self._attributes(record.index) is not None:
+            return False
+        shutil.rmtree(place, ignore_errors=True)
+        self._clear_stale()
+        partial = Path(tempfile.mkdtemp(dir=self.path / "draws", prefix=".partial-"))
+        try:
+            _write_draw(partial / place.name, record, field)
+            return _publish(partial / place.name, place)
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+
+    def _place(self, index: int) -> Path:
+        return self.path / "draws" / f"{index:06d}"
+
+    def _attributes(self, index: int) -> dict | None:
+        """A draw's attributes, None where anything of it is missing; a field's bytes are checked when it is read."""
+        place = self._place(index)
+        attributes = _group_attributes(place)
+        if attributes is None or attributes.get("index") != index:
+            return None
+        complete = not attributes["viability"]["viable"] or (place / "field" / "c" / "0" / "0" / "0").is_file()
+        return attributes if complete else None
+
+    def _clear_stale(self) -> None:
+        for left in (self.path / "draws").glob(".partial-*"):
+            if time.time() - left.stat().st_mtime > _STALE_SECONDS:
+                shutil.rmtree(left, ignore_errors=True)
+
+
+def open_store(path: str | Path, settings: Settings | None = None) -> Store:
+    """Open a store; with `settings`, create it where there is none.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is nothing at `path` and no settings were given.
+    ValueError
+        If `path` holds something else, a store of another format version, or a store made with other settings.
+    """
+    path = Path(path)
+    if not path.exists():
+        if settings is None:
+            raise FileNotFoundError(f"expected a store of shapes at {path}, got nothing there")
+        _create(path, settings)
+    attributes = _group_attributes(path)
+    if attributes is None or attributes.get("format") != FORMAT:
+        raise ValueError(f"expected a store of shapes at {path}, got something else")
+    if attributes.get("version") != VERSION:
+        raise ValueError(f"expected a store of version {VERSION} at {path}, got version {attributes.get('version')}")
+    stored: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in attributes["settings"].items()}
+    found = Settings(**stored)
+    if settings is not None and settings != found:
+        raise ValueError(f"expected the settings of {path}, got another {_difference(found, settings)}")
+    return Store(path, found)
+
+
+def _create(path: Path, settings: Settings) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}-"))
+    try:
+        header = {"format": FORMAT, "version": VERSION, "settings": dataclasses.asdict(settings)}
+        zarr.create_group(store=str(partial / "store"), attributes=header)
+        zarr.create_group(store=str(partial / "store" / "draws"))
+        _publish(partial / "store", path)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _write_draw(folder: Path, record: Record, field: np.ndarray | None) -> None:
+    attributes = dataclasses.asdict(record) | {"coefficients": record.coefficients.as_dict()}
+    attributes["viability"] = {name: _plain(value) for name, value in attributes["viability"].items()}
+    zarr.create_group(store=str(folder), attributes={name: _plain(value) for name, value in attributes.items()})
+    if field is None:
+        return
+    array = zarr.create_array(
+        store=str(folder / "field"),
+        shape=field.shape,
+        dtype=field.dtype,
+        chunks=field.shape,
+        compressors=[BloscCodec(cname="zstd", clevel=5, shuffle="shuffle"), Crc32cCodec()],
+        dimension_names=("z", "y", "x"),
+    )
+    array[...] = field
+
+
+def _publish(partial: Path, place: Path) -> bool:
+    """Flush a folder's files and rename it into its place; False where another process was first."""
+    for file in partial.rglob("*"):
+        if file.is_file():
+            with file.open("rb+") as handle:
+                os.fsync(handle.fileno())
+    try:
+        os.replace(partial, place)
+    except OSError:
+        if not place.is_dir():
+            raise
+        return False
+    return True
+
+
+def _group_attributes(folder: Path) -> dict | None:
+    """The attributes of the Zarr group in a folder, None where there is no readable one."""
+    try:
+        text = json.loads((folder / "zarr.json").read_text())
+    except (OSError, ValueError):
+        return None
+    return text.get("attributes") if isinstance(text, dict) and text.get("node_type") == "group" else None
+
+
+def _plain(value: Any) -> Any:
+    """A JSON value; numbers that are not finite become null."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _number(value: Any) -> Any:
+    return math.nan if value is None else value
+
+
+def _difference(found: Settings, asked: Settings) -> str:
+    """The first setting that differs, with both values."""
+    for name, value in dataclasses.asdict(found).items():
+        other = getattr(asked, name)
+        if other != value:
+            return f"{name}: {other} for {value}"
+    return "one"

@@ -1,0 +1,213 @@
+"""Curvature diagrams: the area-weighted measure that a surface leaves on the (κ1, κ2) plane."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from curvafit.mesh import Surface, areas, surface
+from curvafit.priors.curvature import Curvatures, diffuse_curvatures, geometric_curvatures, jet
+from curvafit.priors.grid import Grid
+from curvafit.priors.profile import profile_distance
+
+Kind = Literal["geometric", "diffuse"]
+
+#: Triangles smaller than this, in squared voxel edges, carry no curvature (paper's program).
+LEAST_TRIANGLE = 1e-4
+#: Voxels that a non-periodic box loses on every side: its stencils and distances see a mirror image there.
+MARGIN = 3
+#: A level set is defined where the slope of the distance, 1 for a perfect profile, exceeds this.
+LEAST_SLOPE = 0.1
+#: How many times bins may double in the tails of a thinned diagram.
+WIDENINGS = 5
+#: Radii of curvature below this many voxels are not resolved.
+LEAST_RADIUS = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Diagram:
+    """A measure on the (κ1, κ2) plane.
+
+    Attributes
+    ----------
+    points
+        (κ1, κ2) with κ1 ≥ κ2, `(N, 2)` float64, in `unit`.
+    weights
+        Areas `(N,)` float64, in the grid's unit squared.
+    spread
+        Root mean square distance of the measured points to the ones that stand for them: 0 unless binned. The
+        transport distance (cost ½|x - y|²) between a diagram and its binned self is at most √½ · spread.
+    excluded
+        Part of the surface's area, in [0, 1], left out because curvature is not resolved there.
+    """
+
+    points: np.ndarray
+    weights: np.ndarray
+    unit: str = "1/working unit"
+    spread: float = 0.0
+    excluded: float = 0.0
+
+    def __post_init__(self) -> None:
+        points, weights = np.asarray(self.points, dtype=np.float64), np.asarray(self.weights, dtype=np.float64)
+        if points.ndim != 2 or points.shape[1] != 2 or weights.shape != points.shape[:1]:
+            raise ValueError(f"expected points (N, 2) and weights (N,), got {points.shape} and {weights.shape}")
+        if not np.isfinite(points).all() or not np.isfinite(weights).all() or (weights < 0).any():
+            raise ValueError("expected finite points and finite weights of at least 0, got others")
+        object.__setattr__(self, "points", points)
+        object.__setattr__(self, "weights", weights)
+
+    @property
+    def area(self) -> float:
+        """Total weight."""
+        return float(self.weights.sum())
+
+    @property
+    def normalised(self) -> Diagram:
+        """The same diagram with total weight 1."""
+        if not self.area > 0:
+            raise ValueError("expected a diagram with area, got an empty one")
+        return dataclasses.replace(self, weights=self.weights / self.area)
+
+    def mean(self) -> np.ndarray:
+        """Area-weighted mean (κ1, κ2)."""
+        return self.normalised.weights @ self.points
+
+    def binned(self, width: float) -> Diagram:
+        """Bins of edge `width`, each replaced by its barycentre: means and total weight are kept exactly."""
+        if not width > 0:
+            raise ValueError(f"expected a bin width above 0, got {width}")
+        cells = np.floor(self.points / width).astype(np.int64)
+        _, index = np.unique(cells, axis=0, return_inverse=True)
+        return self._merged(index.reshape(-1))
+
+    def thinned(self, width: float, share: float) -> Diagram:
+        """Bins of edge `width` where the area is and wider ones, by powers of two, in the tails: a bin is the widest
+        whose part of the area times (edge / width)² is at most `share`."""
+        if not width > 0 or not share > 0:
+            raise ValueError(f"expected a bin width and a share above 0, got {width} and {share}")
+        parts = self.normalised.weights
+        found = np.full(len(parts), -1, dtype=np.int64)
+        count = 0
+        for level in range(WIDENINGS, -1, -1):
+            open_ = np.flatnonzero(found < 0)
+            cells = np.floor(self.points[open_] / (width * 2**level)).astype(np.int64)
+            _, index = np.unique(cells, axis=0, return_inverse=True)
+            index = index.reshape(-1)
+            light = np.bincount(index, parts[open_]) * 4.0**level <= share if level else np.ones(index.max(initial=-1) + 1, bool)
+            taken = light[index]
+            found[open_[taken]] = count + index[taken]
+            count += len(light)
+        _, index = np.unique(found, return_inverse=True)
+        return self._merged(index.reshape(-1))
+
+    def _merged(self, index: np.ndarray) -> Diagram:
+        """Points with the same index (0, 1, …) replaced by their barycentre."""
+        weights = np.bincount(index, self.weights)
+        kept = weights > 0
+        safe = np.where(kept, weights, 1)
+        means = np.stack([np.bincount(index, self.weights * self.points[:, k]) / safe for k in range(2)], axis=1)
+        square = ((self.points - means[index]) ** 2).sum(1)
+        added = float(self.weights @ square) / self.area if self.area > 0 else 0.0
+        spread = math.sqrt(self.spread**2 + added)
+        return dataclasses.replace(self, points=means[kept], weights=weights[kept], spread=spread)
+
+
+def diagram(
+    u: np.ndarray | Tensor, grid: Grid, epsilon: float, curvature: Kind = "geometric", margin: int | None = None
+) -> Diagram:
+    """The curvature diagram of {u = 0}: a point for each triangle, weighted by its area.
+
+    Curvatures of the voxels around a triangle are interpolated linearly at its barycentre. The geometric ones are those
+    of the level sets of √2 ε artanh(u), which are u's own: differences of that near-distance err far less than
+    differences of tanh. The diffuse ones are the paper's, of u itself.
+
+    Parameters
+    ----------
+    u
+        Phase field `(Z, Y, X)`, positive inside.
+    curvature
+        `"geometric"`, or `"diffuse"` to reproduce the paper.
+    margin
+        Voxels left out along every side of a box that is not periodic; `MARGIN` by default. 0 measures up to the
+        outermost centres, right where the mirror image beyond them is real.
+
+    Raises
+    ------
+    ValueError
+        If there is no surface in the box, the field is not finite, or `curvature` has another name.
+    """
+    if curvature not in ("geometric", "diffuse"):
+        raise ValueError(f"expected curvature 'geometric' or 'diffuse', got {curvature!r}")
+    values = torch.as_tensor(u)
+    values = values if values.is_floating_point() else values.to(torch.get_default_dtype())
+    mesh = _inner_surface(values, grid, margin)
+    kappa1, kappa2, resolved = _voxel_curvatures(values, grid, epsilon, curvature)
+    weights, centres = areas(mesh), mesh.barycentres / np.array(grid.spacing)
+    kept = weights >= LEAST_TRIANGLE * grid.voxel_volume ** (2 / 3)
+    weights, centres = weights[kept], centres[kept]
+    points, known = _interpolated((kappa1, kappa2), resolved, centres, grid.periodic)
+    if not known.any():
+        raise ValueError("expected a surface whose curvature the grid resolves, got none")
+    excluded = 1 - float(weights[known].sum() / weights.sum())
+    return Diagram(points[known], weights[known], excluded=excluded)
+
+
+def _inner_surface(values: Tensor, grid: Grid, margin: int | None) -> Surface:
+    """The surface without a margin along the sides of a box that is not periodic, in the whole box's coordinates."""
+    m = 0 if grid.periodic else MARGIN if margin is None else margin
+    if m == 0:
+        return surface(values, grid)
+    shape = tuple(n - 2 * m for n in grid.shape)
+    if min(shape) < 4:
+        raise ValueError(f"expected a box of at least {2 * m + 4} voxels along each axis, got {grid.shape}")
+    inner = surface(values[(slice(m, -m),) * 3], Grid(shape, grid.spacing, grid.boundary))
+    return Surface(inner.vertices + m * np.array(grid.spacing), inner.faces)
+
+
+def _voxel_curvatures(values: Tensor, grid: Grid, epsilon: float, curvature: str) -> tuple[np.ndarray, ...]:
+    """κ1, κ2 of every voxel (0 where not resolved) and whether they are resolved, as 1 or 0."""
+    found: Curvatures
+    distance = jet(profile_distance(values, epsilon), grid)
+    found = geometric_curvatures(distance) if curvature == "geometric" else diffuse_curvatures(jet(values, grid), epsilon)
+    steepest = distance.gradient.square().sum(-4).sqrt()
+    sharpest = 1 / (LEAST_RADIUS * max(grid.spacing))
+    κ1, κ2 = found.kappa1, found.kappa2
+    resolved = (steepest > LEAST_SLOPE) & (κ1.abs() < sharpest) & (κ2.abs() < sharpest)
+    parts = (torch.where(resolved, κ1, 0.0), torch.where(resolved, κ2, 0.0), resolved.to(values.dtype))
+    return tuple(part.detach().cpu().numpy() for part in parts)
+
+
+def _interpolated(
+    fields: tuple[np.ndarray, ...], resolved: np.ndarray, centres: np.ndarray, periodic: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Values at `centres` `(N, 3)` (in voxels) of the resolved voxels around, `(N, 2)`, and where there are any."""
+    corners, weights = _corners(resolved.shape, centres, periodic)
+    weights = weights * resolved.reshape(-1)[corners]
+    total = weights.sum(0)
+    known = total > 0
+    safe = np.where(known, total, 1)
+    points = np.stack([(weights * field.reshape(-1)[corners]).sum(0) / safe for field in fields], axis=1)
+    return points.astype(np.float64), known
+
+
+def _corners(shape: tuple[int, ...], centres: np.ndarray, periodic: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Flat indices and weights `(8, N)` of linear interpolation."""
+    size = np.array(shape)
+    low = np.floor(centres).astype(np.int64)
+    low = low if periodic else np.clip(low, 0, size - 2)
+    part = centres - low
+    index = np.zeros((8, len(centres)), dtype=np.int64)
+    weight = np.ones((8, len(centres)))
+    for corner in range(8):
+        for axis in range(3):
+            step = corner >> axis & 1
+            at = low[:, axis] + step
+            index[corner] = index[corner] * size[axis] + (at % size[axis] if periodic else at)
+            weight[corner] *= part[:, axis] if step else 1 - part[:, axis]
+    return index, weight

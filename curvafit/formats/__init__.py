@@ -1,0 +1,70 @@
+"""One module a file format; `curvafit.scan` chooses among them by suffix."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from curvafit.formats.arrays import read_hdf5, read_npy, read_npz, read_raw, read_zarr, write_npy, write_zarr
+from curvafit.formats.base import Raw, ScanError, normalise_unit
+from curvafit.formats.medical import is_dicom, read_dicom, read_itk, read_mrc, read_nrrd
+from curvafit.formats.nifti import read_nifti, write_nifti
+from curvafit.formats.tiff import SLICES, read_slices, read_tiff, write_tiff
+
+__all__ = ["READERS", "WRITERS", "Raw", "ScanError", "normalise_unit", "pick_reader"]
+
+#: Suffix -> reader(path, key=, raw_shape=, dtype=).
+READERS: dict[str, Callable[..., Raw]] = {
+    **dict.fromkeys((".nii", ".nii.gz"), read_nifti),
+    **dict.fromkeys((".tif", ".tiff"), read_tiff),
+    ".npy": read_npy,
+    ".npz": read_npz,
+    **dict.fromkeys((".h5", ".hdf5"), read_hdf5),
+    **dict.fromkeys((".raw", ".bin", ".vol"), read_raw),
+    ".zarr": read_zarr,
+    ".nrrd": read_nrrd,
+    ".nhdr": read_nrrd,
+    ".mha": read_itk,
+    ".mhd": read_itk,
+    **dict.fromkeys((".mrc", ".map", ".rec"), read_mrc),
+}
+
+#: Suffix -> writer(field, path).
+WRITERS: dict[str, Callable[[Any, Path], None]] = {
+    ".nii": write_nifti,
+    ".nii.gz": write_nifti,
+    ".tif": write_tiff,
+    ".tiff": write_tiff,
+    ".npy": write_npy,
+    ".zarr": write_zarr,
+}
+
+
+def pick_reader(path: Path, shape_given: bool = False) -> Callable[..., Raw]:
+    """The reader of a file by its suffix, of a folder by what lies in it.
+
+    Raises
+    ------
+    ScanError
+        If the suffix is unknown (and no shape makes it a RAW file) or the folder holds no slices.
+    """
+    if path.is_dir():
+        return _pick_folder(path)
+    for suffix in sorted(READERS, key=len, reverse=True):
+        if path.name.lower().endswith(suffix):
+            return READERS[suffix]
+    if shape_given:
+        return read_raw
+    raise ScanError(f"expected a file ending in one of {', '.join(READERS)}, got {path.name!r}")
+
+
+def _pick_folder(path: Path) -> Callable[..., Raw]:
+    inside = [p for p in path.iterdir() if not p.name.startswith(".")]
+    if any(p.name in ("zarr.json", ".zarray", ".zgroup") for p in path.iterdir()) or path.suffix == ".zarr":
+        return read_zarr
+    if any(p.suffix.lower() in SLICES for p in inside):
+        return read_slices
+    if any(p.is_file() and is_dicom(p) for p in inside):
+        return read_dicom
+    raise ScanError(f"expected a folder of TIFF or DICOM slices or a Zarr store, got {path} with none")

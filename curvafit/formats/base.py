@@ -1,0 +1,77 @@
+"""What every reader returns and raises, and the names of length units."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any, NamedTuple
+
+import numpy as np
+
+#: Suffixes of what a name may state as a unit -> (our name, factor to it).
+_UNITS: dict[str, tuple[str, float]] = {
+    **dict.fromkeys(("", "voxel", "voxels", "pixel", "pixels", "px", "unknown", "none", "null"), ("voxel", 1.0)),
+    **dict.fromkeys(("nm", "nanometer", "nanometers", "nanometre", "nanometres"), ("nm", 1.0)),
+    **dict.fromkeys(("a", "å", "angstrom", "angstroms", "ångström"), ("nm", 0.1)),
+    **dict.fromkeys(
+        ("um", "µm", "μm", "\\u00b5m", "micron", "microns", "micrometer", "micrometers", "micrometre", "micrometres"),
+        ("um", 1.0),
+    ),
+    **dict.fromkeys(("mm", "millimeter", "millimeters", "millimetre", "millimetres"), ("mm", 1.0)),
+    **dict.fromkeys(("cm", "centimeter", "centimeters", "centimetre", "centimetres"), ("mm", 10.0)),
+    **dict.fromkeys(("inch", "inches", "in"), ("mm", 25.4)),
+    **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), ("m", 1.0)),
+}
+
+
+class ScanError(ValueError):
+    """A volume that cannot be used, said in one sentence."""
+
+
+class Raw(NamedTuple):
+    """What a file holds: an array with z first, and spacing, unit and affine where it states them.
+
+    `spacing` has one number per axis of `values`, or three for (z, y, x). `guesses` are sentences on a spacing or unit
+    that the file leaves open: void where the caller states it.
+    """
+
+    values: np.ndarray
+    spacing: tuple[float, ...] | None = None
+    unit: str | None = None
+    affine: np.ndarray | None = None
+    notes: tuple[str, ...] = ()
+    guesses: tuple[str, ...] = ()
+
+
+def normalise_unit(unit: str | None) -> tuple[str, float]:
+    """Our name of a length unit and the factor that turns a number in `unit` into it: `"cm"` -> `("mm", 10.0)`.
+
+    Raises
+    ------
+    ScanError
+        If the name is of no known unit.
+    """
+    name = (unit or "").strip().casefold()
+    if name not in _UNITS:
+        raise ScanError(f"expected a unit of voxel, nm, um, mm or m, got {unit!r}")
+    return _UNITS[name]
+
+
+def pick_key(keys: list[str], key: str | None, path: object) -> str:
+    """The key asked for, or the only one; else a sentence that lists what there is."""
+    listed = ", ".join(keys[:20]) + (", …" if len(keys) > 20 else "")
+    if key is None:
+        if len(keys) == 1:
+            return keys[0]
+        raise ScanError(f"expected a key as in {path}::KEY, got none, and {path} has {listed or 'no arrays'}")
+    found = key if key in keys else key.strip("/")
+    if found not in keys:
+        raise ScanError(f"expected a key of {path}, got {key!r}, and it has {listed or 'no arrays'}")
+    return found
+
+
+def extra(module: str, what: str) -> Any:
+    """A library of the extra `[io]`, or the line that installs it."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as reason:
+        raise ScanError(f'expected {module} for {what}, got none: pip install "curvafit[io]"') from reason

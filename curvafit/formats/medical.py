@@ -1,0 +1,98 @@
+"""NRRD, MHA/MHD, MRC and DICOM folders, through the libraries of the extra `[io]`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from curvafit.formats.base import Raw, ScanError, extra, pick_key
+
+#: Axes flipped between DICOM's and ITK's patient frame (left, posterior, superior) and NIfTI's (right, anterior, superior).
+_LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
+
+
+def read_nrrd(path: Path, **_: object) -> Raw:
+    nrrd = extra("nrrd", "NRRD files")
+    values, header = nrrd.read(str(path), index_order="C")
+    units = header.get("space units") or header.get("units")
+    unit = next((u for u in units if u), None) if units is not None else None
+    if "space directions" in header:
+        directions = np.asarray(header["space directions"], dtype=np.float64)
+        directions = directions[~np.isnan(directions).any(axis=1)]
+        affine = np.eye(4)
+        affine[:3, :3] = directions.T
+        affine[:3, 3] = header.get("space origin", np.zeros(3))
+        if str(header.get("space", "")).startswith("left-posterior"):
+            affine = _LPS_TO_RAS @ affine
+        return Raw(values, tuple(np.linalg.norm(directions, axis=1)[::-1]), unit or "mm", affine)
+    if "spacings" in header:
+        return Raw(values, tuple(float(h) for h in header["spacings"])[::-1], unit)
+    return Raw(values)
+
+
+def read_itk(path: Path, **_: object) -> Raw:
+    """MetaImage; ITK's unit is the millimetre."""
+    itk = extra("SimpleITK", "MHA and MHD files")
+    image = itk.ReadImage(str(path))
+    spacing = np.array(image.GetSpacing())
+    values = itk.GetArrayFromImage(image)
+    affine = None
+    if len(spacing) == 3:
+        affine = np.eye(4)
+        affine[:3, :3] = np.array(image.GetDirection()).reshape(3, 3) * spacing
+        affine[:3, 3] = image.GetOrigin()
+        affine = _LPS_TO_RAS @ affine
+    return Raw(values, tuple(float(h) for h in spacing[::-1]), "mm", affine)
+
+
+def read_mrc(path: Path, **_: object) -> Raw:
+    """MRC and CCP4 maps; voxel sizes in Å."""
+    mrcfile = extra("mrcfile", "MRC files")
+    with mrcfile.open(path, mode="r") as file:
+        size = file.voxel_size
+        spacing = (float(size.z), float(size.y), float(size.x))
+        return Raw(np.array(file.data), spacing if min(spacing) > 0 else None, "angstrom")
+
+
+def read_dicom(path: Path, *, key: str | None = None, **_: object) -> Raw:
+    """A folder of one series' slices, in the order of their positions; `key` picks a series by its UID."""
+    pydicom = extra("pydicom", "DICOM folders")
+    files = sorted(p for p in path.iterdir() if p.is_file() and is_dicom(p))
+    images = [image for image in map(pydicom.dcmread, files) if "PixelData" in image]
+    series = sorted({str(image.get("SeriesInstanceUID", "")) for image in images})
+    chosen = pick_key(series, key, path)
+    slices = [image for image in images if str(image.get("SeriesInstanceUID", "")) == chosen]
+    rows, columns = (np.array(slices[0].ImageOrientationPatient, dtype=float).reshape(2, 3))
+    normal = np.cross(rows, columns)
+    slices.sort(key=lambda image: float(np.dot(normal, np.array(image.ImagePositionPatient, dtype=float))))
+    values = np.stack([_rescaled(image) for image in slices])
+    z, origin = _slice_distance(slices, normal, path)
+    y, x = (float(h) for h in slices[0].PixelSpacing)
+    affine = np.eye(4)
+    affine[:3, :3] = np.column_stack([rows * x, columns * y, normal * z])
+    affine[:3, 3] = origin
+    return Raw(values, (z, y, x), "mm", _LPS_TO_RAS @ affine)
+
+
+def is_dicom(path: Path) -> bool:
+    """Whether a file bears DICOM's mark at byte 128."""
+    with path.open("rb") as stream:
+        return stream.read(132)[128:] == b"DICM"
+
+
+def _rescaled(image: Any) -> np.ndarray:
+    slope, intercept = float(image.get("RescaleSlope", 1)), float(image.get("RescaleIntercept", 0))
+    values = image.pixel_array
+    return values if (slope, intercept) == (1, 0) else (values * slope + intercept).astype(np.float32)
+
+
+def _slice_distance(slices: list[Any], normal: np.ndarray, path: Path) -> tuple[float, np.ndarray]:
+    positions = np.array([image.ImagePositionPatient for image in slices], dtype=float)
+    if len(slices) < 2:
+        raise ScanError(f"expected a DICOM series of several slices, got {len(slices)} in {path}")
+    steps = np.diff(positions @ normal)
+    if steps.min() <= 0 or np.ptp(steps) > 0.05 * steps.mean():
+        raise ScanError(f"expected evenly spaced DICOM slices, got steps of {steps.min():.4g} to {steps.max():.4g} mm in {path}")
+    return float(steps.mean()), positions[0]

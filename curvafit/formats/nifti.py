@@ -1,0 +1,65 @@
+"""NIfTI: x,y,z in the file, z,y,x here; zooms, units and affine both ways."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import nibabel
+import numpy as np
+
+from curvafit.formats.base import Raw, ScanError, normalise_unit
+
+_TO_FILE = {"voxel": ("unknown", 1.0), "nm": ("micron", 1e-3), "um": ("micron", 1.0), "mm": ("mm", 1.0), "m": ("meter", 1.0)}
+
+
+def read_nifti(path: Path, **_: object) -> Raw:
+    """Values, zooms, unit and affine. Without a unit, zooms other than 1 are taken for mm, as NIfTI's readers do."""
+    image: Any = nibabel.load(path)
+    values = np.asanyarray(image.dataobj).T
+    zooms = tuple(float(f"{h:.7g}") for h in image.header.get_zooms())[:3]  # stored as float32
+    if len(zooms) < 3:
+        raise ScanError(f"expected a 3D volume, got {values.ndim}D of shape {values.shape} in {path}")
+    unit = image.header.get_xyzt_units()[0]
+    affine = np.array(image.affine, dtype=np.float64)
+    spacing: tuple[float, ...] | None = (1.0,) * (values.ndim - 3) + zooms[::-1]
+    guesses: list[str] = []
+    wrote = re.match(r"curvafit unit=(\w+)", bytes(image.header["descrip"]).decode("latin-1"))
+    if wrote:
+        unit, factor = _own_unit(wrote[1])
+        affine[:3] *= factor
+        spacing = tuple(h * factor for h in spacing)
+    elif unit == "unknown" and all(h == 1 for h in zooms):
+        spacing = None
+    elif unit == "unknown":
+        unit = "mm"
+        guesses.append("The file names no unit of length: mm is assumed.")
+    lengths = np.linalg.norm(affine[:3, :3], axis=0)[::-1]
+    if spacing is not None and not np.allclose(lengths, spacing[-3:], rtol=0.01):
+        guesses.append("The file's affine and voxel sizes disagree: the voxel sizes are used.")
+    return Raw(values, spacing, unit, affine, guesses=tuple(guesses))
+
+
+def write_nifti(field: Any, path: Path) -> None:
+    """`field` with qform and sform set to its affine (or to its spacing) and the unit named."""
+    values = field.values.view(np.uint8) if field.values.dtype == bool else field.values
+    if values.dtype == np.float16:
+        values = values.astype(np.float32)
+    unit, factor = _TO_FILE[field.unit]
+    affine = np.diag([*field.spacing[::-1], 1.0]) if field.affine is None else field.affine.copy()
+    affine[:3] *= factor
+    image = nibabel.Nifti1Image(values.T, affine, dtype=values.dtype)
+    image.header.set_xyzt_units(unit)
+    image.header.set_zooms([h * factor for h in field.spacing[::-1]])
+    image.set_qform(affine, code="aligned")
+    image.set_sform(affine, code="aligned")
+    if field.unit in ("voxel", "nm"):
+        image.header["descrip"] = f"curvafit unit={field.unit}".encode()
+    nibabel.save(image, path)
+
+
+def _own_unit(name: str) -> tuple[str, float]:
+    """The unit that `write_nifti` left in the description because NIfTI has no code for it."""
+    unit, _ = normalise_unit(name)
+    return unit, 1 / _TO_FILE[unit][1]

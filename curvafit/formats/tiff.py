@@ -1,0 +1,141 @@
+"""TIFF: a file or a folder of slices; spacing from ImageJ's, OME's or tifffile's description, or from the tags."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import tifffile
+
+from curvafit.formats.base import Raw, ScanError, normalise_unit
+
+#: Suffixes of a folder's slices.
+SLICES = (".tif", ".tiff")
+_TAG_UNITS = {2: "inch", 3: "cm"}
+#: Resolutions that programs write when they know none (dots an inch).
+_SCREEN = (1, 72, 96, 100, 150, 200, 300, 600)
+
+
+def read_tiff(path: Path, **_: object) -> Raw:
+    """The first series of a file."""
+    with tifffile.TiffFile(path) as file:
+        series = file.series[0]
+        _refuse_colour(series.axes, path)
+        spacing, unit, guesses = _spacing(file)
+        count = len(file.series)
+        notes = (f"The file holds {count} images: the first is used.",) if count > 1 else ()
+        return Raw(series.asarray(), spacing, unit, notes=notes, guesses=guesses)
+
+
+def read_slices(path: Path, **_: object) -> Raw:
+    """A folder of 2D slices in the natural order of their names; in-plane size from the first slice's tags."""
+    names = sorted((p for p in path.iterdir() if p.suffix.lower() in SLICES), key=lambda p: natural_key(p.name))
+    first = read_tiff(names[0])
+    slices = [np.squeeze(tifffile.imread(name)) for name in names]
+    for name, plane in zip(names, slices, strict=True):
+        if plane.ndim != 2 or plane.shape != slices[0].shape:
+            raise ScanError(
+                f"expected 2D slices of one shape {slices[0].shape}, got {plane.shape} in {name.name} of {path}"
+            )
+    return first._replace(values=np.stack(slices))
+
+
+def write_tiff(field: Any, path: Path) -> None:
+    """ImageJ's metadata where it knows the type of the values, else OME's."""
+    values = field.values.view(np.uint8) if field.values.dtype == bool else field.values
+    z, y, x = field.spacing
+    if values.dtype in (np.uint8, np.uint16, np.float32):
+        exact = {"curvafit_spacing": f"{z!r},{y!r},{x!r}", "curvafit_unit": field.unit}
+        unit = {"um": "micron", "voxel": "pixel"}.get(field.unit, field.unit)
+        metadata = {"axes": "ZYX", "spacing": z, "unit": unit, **exact}
+        tifffile.imwrite(path, values, imagej=True, resolution=(1 / x, 1 / y), metadata=metadata)
+        return
+    sizes = {f"PhysicalSize{axis}": h for axis, h in zip("ZYX", field.spacing, strict=True)}
+    units = {f"PhysicalSize{axis}Unit": {"um": "µm", "voxel": "pixel"}.get(field.unit, field.unit) for axis in "ZYX"}
+    tifffile.imwrite(path, values, ome=True, metadata={"axes": "ZYX", **sizes, **units})
+
+
+def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
+    """Sorts slice2 before slice10."""
+    return tuple((0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", name.casefold()))
+
+
+def _refuse_colour(axes: str, path: Path) -> None:
+    if "S" in axes:
+        raise ScanError(f"expected a grey volume, got a colour image (axes {axes}) in {path}")
+
+
+def _spacing(file: tifffile.TiffFile) -> tuple[tuple[float, ...] | None, str | None, tuple[str, ...]]:
+    if file.is_ome and file.ome_metadata:
+        return (*_from_ome(file.ome_metadata), ())
+    described: dict[str, Any] = dict(file.imagej_metadata or (file.shaped_metadata or ({},))[0])
+    if "curvafit_spacing" in described:
+        return tuple(float(h) for h in described["curvafit_spacing"].split(",")), described["curvafit_unit"], ()
+    if "PhysicalSizeX" in described:
+        sizes = tuple(float(described.get(f"PhysicalSize{axis}", described["PhysicalSizeX"])) for axis in "ZYX")
+        return sizes, described.get("unit", described.get("PhysicalSizeXUnit", "um")), ()
+    if file.is_imagej:
+        return _from_imagej(file, described)
+    return _from_description(described) if "spacing" in described else _from_tags(file)
+
+
+def _from_description(described: dict[str, Any]) -> tuple[tuple[float, ...] | None, str | None, tuple[str, ...]]:
+    """tifffile's own JSON, which has no rule for `spacing`: three numbers, or one that counts for all axes."""
+    sizes = tuple(float(h) for h in np.atleast_1d(described["spacing"]))
+    unit = described.get("unit")
+    if len(sizes) == 3:
+        return sizes, unit, ()
+    note = f"The file states one voxel size, {sizes[0]:g} {unit or ''}".rstrip() + ": it is taken for all three axes."
+    return sizes[:1] * 3, unit, (note,)
+
+
+def _from_ome(text: str) -> tuple[tuple[float, ...] | None, str | None]:
+    pixels = next((node for node in ElementTree.fromstring(text).iter() if node.tag.endswith("Pixels")), None)
+    if pixels is None or "PhysicalSizeX" not in pixels.attrib:
+        return None, None
+    sizes = []
+    for axis in "ZYX":
+        size = float(pixels.get(f"PhysicalSize{axis}", pixels.attrib["PhysicalSizeX"]))
+        _, factor = normalise_unit(pixels.get(f"PhysicalSize{axis}Unit", "um"))
+        sizes.append(size * factor)
+    return tuple(sizes), normalise_unit(pixels.get("PhysicalSizeXUnit", "um"))[0]
+
+
+def _from_imagej(
+    file: tifffile.TiffFile, described: dict[str, Any]
+) -> tuple[tuple[float, ...] | None, str | None, tuple[str, ...]]:
+    """ImageJ: `spacing` is the distance of slices, the resolution tags count pixels per `unit`."""
+    y, x = _pixels_per_unit(file)
+    unit = described.get("unit")
+    if "spacing" not in described and (unit is None or normalise_unit(unit)[0] == "voxel"):
+        return None, None, ()
+    z = abs(float(described.get("spacing", 1 / x)))
+    notes = () if "spacing" in described else ("The file states no distance of slices: it is taken as the pixel's.",)
+    return (z, 1 / y, 1 / x), unit, notes
+
+
+def _from_tags(file: tifffile.TiffFile) -> tuple[tuple[float, ...] | None, str | None, tuple[str, ...]]:
+    """Resolution tags alone: used where they are no printer's default; the distance of slices is then a guess."""
+    y, x = _pixels_per_unit(file)
+    tag = file.pages[0].tags.get("ResolutionUnit")  # type: ignore[union-attr]
+    unit = _TAG_UNITS.get(int(tag.value)) if tag is not None else None
+    if unit is None or min(x, y) <= 0:
+        return None, None, ()
+    dots = x * (2.54 if unit == "cm" else 1.0)
+    if any(abs(dots - screen) < 0.51 for screen in _SCREEN):
+        return None, None, ()
+    _, factor = normalise_unit(unit)
+    notes = ("The file states no distance of slices: it is taken as the pixel's.",)
+    return (factor / x, factor / y, factor / x), "mm", notes
+
+
+def _pixels_per_unit(file: tifffile.TiffFile) -> tuple[float, float]:
+    values = []
+    for name in ("YResolution", "XResolution"):
+        tag = file.pages[0].tags.get(name)  # type: ignore[union-attr]
+        top, bottom = tag.value if tag is not None else (1, 1)
+        values.append(top / bottom if top and bottom else 1.0)
+    return values[0], values[1]

@@ -1,0 +1,27 @@
+"""Seeded starts of the flow."""
+
+from __future__ import annotations
+
+import torch
+
+from curvafit.priors.grid import Grid
+from curvafit.priors.shapes import Float
+
+#: Width of the published start's interval, 40 Δx at Δx = 0.01.
+AMPLITUDE = 0.4
+
+
+def white_noise(grid: Grid, seed: int, amplitude: float = AMPLITUDE) -> Float[torch.Tensor, "3 z y x"]:
+    """A₀: independent and uniform on [0, amplitude) in every voxel and component, float32, on the processor.
+
+    The same numbers for the same seed and shape, whatever was drawn before.
+
+    Raises
+    ------
+    ValueError
+        If the seed is not a whole number from 0.
+    """
+    if int(seed) != seed or seed < 0:
+        raise ValueError(f"expected a seed that is a whole number from 0, got {seed}")
+    generator = torch.Generator().manual_seed(int(seed))
+    return amplitude * torch.rand((3, *grid.shape), generator=generator, dtype=torch.float32)

@@ -1,0 +1,47 @@
+"""Whether a flow made a shape: the published tests, as one pure predicate."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from curvafit.priors.energy import discrepancy_ratio
+from curvafit.priors.grid import Grid
+from curvafit.priors.shapes import Float
+
+#: Greatest discrepancy ratio, and least extent of either phase, of a viable shape (paper, Experiment 4).
+DISCREPANCY_LIMIT = 0.75
+PHASE_LIMIT = 0.1
+
+
+@dataclass(frozen=True)
+class Viability:
+    """The discrepancy ratio, max u and min u of a field, whether they are a shape's, and the reason where not."""
+
+    discrepancy: float
+    highest: float
+    lowest: float
+    viable: bool
+    reason: str
+
+
+def viability(u: Float[Tensor, "z y x"], grid: Grid, epsilon: float) -> Viability:
+    """Discrepancy ratio < 0.75, max u > 0.1 and min u < -0.1 (paper, Experiment 4)."""
+    highest, lowest = float(u.max()), float(u.min())
+    ratio = float(discrepancy_ratio(u, grid, epsilon))
+    reason = _reason(ratio, highest, lowest)
+    return Viability(ratio, highest, lowest, not reason, reason)
+
+
+def _reason(ratio: float, highest: float, lowest: float) -> str:
+    if not (math.isfinite(highest) and math.isfinite(lowest)):
+        return "the field is not finite"
+    if not highest > PHASE_LIMIT:
+        return f"no inside: the field's maximum is {highest:.3f}, at most {PHASE_LIMIT}"
+    if not lowest < -PHASE_LIMIT:
+        return f"no outside: the field's minimum is {lowest:.3f}, at least {-PHASE_LIMIT}"
+    if not ratio < DISCREPANCY_LIMIT:
+        return f"no interface profile: the discrepancy ratio is {ratio:.3f}, at least {DISCREPANCY_LIMIT}"
+    return ""

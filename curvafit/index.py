@@ -1,0 +1,255 @@
+"""An atlas's diagrams with their parameters, in one file, ready to be searched."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import importlib.resources
+import io
+import json
+import os
+import zipfile
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from curvafit.data_synth.atlas import BIN_WIDTH, diagrams, versions
+from curvafit.data_synth.store import Store, open_store
+from curvafit.diagram import Diagram
+from curvafit.priors.coefficients import Coefficients
+from curvafit.priors.grid import Grid
+from curvafit.transport import TAIL_SHARE, sliced_embedding
+
+FORMAT = "curvafit atlas"
+VERSION = 1
+#: What reading a damaged file or another one can raise.
+_UNREADABLE = (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile, zlib.error)
+#: How a shape can be seen: as its phase field, or as the mask {u > 0} re-profiled.
+VIEWS = ("field", "mask")
+
+
+@dataclass(frozen=True)
+class Atlas:
+    """N generated shapes: parameters in working units, and their geometric diagrams, binned.
+
+    `ids` name the shapes; `coefficients` is float64 (N, 6) in the order of `curvafit.priors.coefficients.NAMES`,
+    `masses` m₀ and `volume_fractions` of {u > 0} float64 (N,), `seeds` int64 (N,) those of the noise each shape grew
+    from. `provenance` says how they were made: grid, schedule, law, versions, command, date.
+    """
+
+    ids: tuple[str, ...]
+    coefficients: np.ndarray
+    masses: np.ndarray
+    seeds: np.ndarray
+    volume_fractions: np.ndarray
+    field_diagrams: tuple[Diagram, ...]
+    mask_diagrams: tuple[Diagram, ...]
+    provenance: dict[str, Any]
+    format_version: int = VERSION
+
+    def __post_init__(self) -> None:
+        n = len(self.ids)
+        expected = {"coefficients": (n, 6), "masses": (n,), "seeds": (n,), "volume_fractions": (n,)}
+        for name, shape in expected.items():
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"expected {name} of shape {shape}, got {getattr(self, name).shape}")
+        if not n or len(self.field_diagrams) != n or len(self.mask_diagrams) != n:
+            counts = f"{len(self.field_diagrams)} and {len(self.mask_diagrams)} for {n} shapes"
+            raise ValueError(f"expected a field and a mask diagram for each of at least one shape, got {counts}")
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def shape_coefficients(self, position: int) -> Coefficients:
+        """The six coefficients of the shape at a position."""
+        return Coefficients(*map(float, self.coefficients[position]))
+
+    def diagrams(self, seen_as: str) -> tuple[Diagram, ...]:
+        """The diagrams of the shapes seen as `"field"` or as `"mask"`.
+
+        Raises
+        ------
+        ValueError
+            If `seen_as` is another word.
+        """
+        if seen_as not in VIEWS:
+            raise ValueError(f"expected shapes seen as 'field' or 'mask', got {seen_as!r}")
+        return self.field_diagrams if seen_as == "field" else self.mask_diagrams
+
+    def embeddings(self, seen_as: str) -> np.ndarray:
+        """Sliced-quantile embeddings (N, 288) of those diagrams; computed once."""
+        self.diagrams(seen_as)
+        return self._field_embeddings if seen_as == "field" else self._mask_embeddings
+
+    @cached_property
+    def _field_embeddings(self) -> np.ndarray:
+        return np.stack([np.asarray(sliced_embedding(d)) for d in self.field_diagrams])
+
+    @cached_property
+    def _mask_embeddings(self) -> np.ndarray:
+        return np.stack([np.asarray(sliced_embedding(d)) for d in self.mask_diagrams])
+
+
+def extract(store: str | Path | Store, command: Sequence[str] = ()) -> Atlas:
+    """Measure every viable shape of a store, as a field and as a mask.
+
+    Parameters
+    ----------
+    store
+        An open store, or its folder.
+    command
+        The command lines that made the atlas, for its provenance.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        If there is no such store, it is of another version, or holds no viable shape.
+    """
+    store = store if isinstance(store, Store) else open_store(store)
+    records = [store.record(index) for index in store.indices()]
+    viable = [record for record in records if record.viability.viable]
+    if not viable:
+        raise ValueError(f"expected at least one viable shape in {store.path}, got none in {len(records)} draws")
+    settings = store.settings
+    grid = Grid(settings.shape, settings.spacing)
+    fractions, of_fields, of_masks = zip(*(_measured(store, record.index, grid) for record in viable), strict=True)
+    return Atlas(
+        ids=tuple(f"{settings.seed}-{record.index:05d}" for record in viable),
+        coefficients=np.array([list(record.coefficients) for record in viable], dtype=np.float64),
+        masses=np.array([record.mass for record in viable]),
+        seeds=np.array([record.seed for record in viable], dtype=np.int64),
+        volume_fractions=np.array(fractions),
+        field_diagrams=of_fields,
+        mask_diagrams=of_masks,
+        provenance=_provenance(store, len(records), command),
+    )
+
+
+def save_atlas(atlas: Atlas, path: str | Path) -> None:
+    """Write an atlas as one compressed `.npz`: arrays, and a JSON header with format, version and provenance.
+
+    Points are stored in float16: κ is rounded by at most 2⁻¹¹ of itself (0.03 at 100), far below the bins' width of 2.
+    Weights, as parts of a diagram's area, are stored in float32.
+    """
+    header = {"format": FORMAT, "version": VERSION, "ids": list(atlas.ids), "provenance": atlas.provenance}
+    arrays = {
+        "header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8),
+        "coefficients": atlas.coefficients,
+        "masses": atlas.masses,
+        "seeds": atlas.seeds,
+        "volume_fractions": atlas.volume_fractions,
+    }
+    for view in VIEWS:
+        arrays |= {f"{view}_{name}": value for name, value in _packed(atlas.diagrams(view)).items()}
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    path = Path(path)
+    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        partial.write_bytes(buffer.getvalue())
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def load_atlas(path: str | Path | None = None) -> Atlas:
+    """Read an atlas file; without a path, the one that comes with the package.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If it is not an atlas, is truncated, or has another format version.
+    """
+    if path is None:
+        data = importlib.resources.files("curvafit").joinpath("data", "atlas.npz").read_bytes()
+        return _parse(data, "the packaged atlas")
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"expected an atlas file, got {path}, where there is none")
+    return _parse(Path(path).read_bytes(), str(path))
+
+
+def _measured(store: Store, index: int, grid: Grid) -> tuple[float, Diagram, Diagram]:
+    """Volume fraction of {u > 0}, and the two diagrams, of one draw."""
+    field = torch.from_numpy(store.field(index))
+    return float((field > 0).double().mean()), *diagrams(field, grid, store.settings.epsilon)
+
+
+def _provenance(store: Store, draws: int, command: Sequence[str]) -> dict[str, Any]:
+    made = sorted({json.dumps(store.record(index).versions, sort_keys=True) for index in store.indices()})
+    return {
+        "command": list(command),
+        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        "draws": draws,
+        "settings": dataclasses.asdict(store.settings),
+        "diagrams": {
+            "curvature": "geometric",
+            "bin_width": BIN_WIDTH,
+            "tail_share": TAIL_SHARE,
+            "unit": "1/working unit",
+        },
+        "generated_with": [json.loads(text) for text in made],
+        "measured_with": versions(),
+    }
+
+
+def _packed(measured: tuple[Diagram, ...]) -> dict[str, np.ndarray]:
+    """Diagrams as flat arrays: the points of number i are rows offsets[i] to offsets[i + 1]."""
+    areas = np.array([d.weights.sum() for d in measured])
+    return {
+        "points": np.concatenate([d.points for d in measured]).astype(np.float16),
+        "weights": np.concatenate([d.weights / a for d, a in zip(measured, areas, strict=True)]).astype(np.float32),
+        "offsets": np.cumsum([0] + [len(d.weights) for d in measured]),
+        "areas": areas,
+        "spreads": np.array([d.spread for d in measured]),
+        "excluded": np.array([d.excluded for d in measured]),
+    }
+
+
+def _parse(data: bytes, name: str) -> Atlas:
+    """The atlas in a file's bytes."""
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+            arrays = {key: archive[key] for key in archive.files}
+        header = json.loads(arrays["header"].tobytes())
+        known = header["format"] == FORMAT
+    except _UNREADABLE as error:
+        raise ValueError(f"expected an atlas file, got {name}, which is truncated or something else") from error
+    if not known:
+        raise ValueError(f"expected an atlas file, got {name}, which is something else")
+    if header.get("version") != VERSION:
+        raise ValueError(f"expected an atlas of version {VERSION}, got version {header.get('version')} in {name}")
+    try:
+        return _assembled(arrays, header)
+    except (KeyError, IndexError, TypeError) as error:
+        raise ValueError(f"expected a whole atlas of version {VERSION}, got {name} without {error}") from error
+
+
+def _assembled(arrays: dict[str, np.ndarray], header: dict[str, Any]) -> Atlas:
+    return Atlas(
+        ids=tuple(header["ids"]),
+        coefficients=arrays["coefficients"],
+        masses=arrays["masses"],
+        seeds=arrays["seeds"],
+        volume_fractions=arrays["volume_fractions"],
+        field_diagrams=_unpacked(arrays, "field"),
+        mask_diagrams=_unpacked(arrays, "mask"),
+        provenance=header["provenance"],
+    )
+
+
+def _unpacked(arrays: dict[str, np.ndarray], view: str) -> tuple[Diagram, ...]:
+    points, weights = (arrays[f"{view}_{name}"].astype(np.float64) for name in ("points", "weights"))
+    bounds = arrays[f"{view}_offsets"]
+    figures = (arrays[f"{view}_{name}"] for name in ("areas", "spreads", "excluded"))
+    return tuple(
+        Diagram(points[first:last], weights[first:last] * area, spread=float(spread), excluded=float(excluded))
+        for first, last, area, spread, excluded in zip(bounds[:-1], bounds[1:], *figures, strict=True)
+    )

@@ -1,0 +1,80 @@
+"""The shapes of an atlas whose diagrams are nearest to a given one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from curvafit.diagram import Diagram
+from curvafit.index import Atlas
+from curvafit.priors.coefficients import Coefficients
+from curvafit.transport import sliced_embedding, wasserstein_many
+
+
+@dataclass(frozen=True)
+class Match:
+    """An atlas shape: its id, the Wasserstein distance of its diagram to the query's (1 / working unit), and the
+    parameters that made it (coefficients in working units, mass m₀, noise seed)."""
+
+    id: str
+    distance: float
+    coefficients: Coefficients
+    mass: float
+    seed: int
+
+
+def nearest(
+    diagram: Diagram, atlas: Atlas, *, seen_as: str = "field", count: int = 5, shortlist: int = 20
+) -> tuple[Match, ...]:
+    """The `count` shapes nearest to a diagram, nearest first.
+
+    Distances are `transport.wasserstein`, taken on the `shortlist` shapes that are nearest in sliced distance.
+
+    Parameters
+    ----------
+    diagram
+        The query's geometric diagram, in 1 / working unit.
+    atlas
+        Where to search; see `curvafit.index.load_atlas`.
+    seen_as
+        What the query was measured on, `"field"` or `"mask"`: it is compared with diagrams of the same kind.
+    count
+        How many; all of them where the atlas has fewer.
+    shortlist
+        How many exact distances to take; at least `count` are.
+
+    Raises
+    ------
+    ValueError
+        If `count` or `shortlist` is not positive, `seen_as` is another word, or the diagram has no area.
+    """
+    if count < 1 or shortlist < 1:
+        raise ValueError(f"expected a count and a shortlist of at least 1, got {count} and {shortlist}")
+    candidates = atlas.diagrams(seen_as)
+    if not float(diagram.weights.sum()) > 0:
+        raise ValueError("expected a diagram with area, got an empty one")
+    near = _shortlist(np.asarray(sliced_embedding(diagram)), atlas.embeddings(seen_as), max(count, shortlist))
+    return _sorted(diagram, atlas, candidates, near)[:count]
+
+
+def _shortlist(query: np.ndarray, embeddings: np.ndarray, length: int) -> list[int]:
+    """Positions of the embeddings nearest to the query's, nearest first."""
+    distances = np.linalg.norm(embeddings - query, axis=1)
+    return np.argsort(distances, kind="stable")[:length].tolist()
+
+
+def _sorted(diagram: Diagram, atlas: Atlas, candidates: tuple[Diagram, ...], near: list[int]) -> tuple[Match, ...]:
+    """Matches at the given positions of the atlas, by increasing distance."""
+    distances = wasserstein_many(diagram, [candidates[i] for i in near])
+    found = (
+        Match(
+            id=atlas.ids[i],
+            distance=distance,
+            coefficients=atlas.shape_coefficients(i),
+            mass=float(atlas.masses[i]),
+            seed=int(atlas.seeds[i]),
+        )
+        for i, distance in zip(near, distances, strict=True)
+    )
+    return tuple(sorted(found, key=lambda match: match.distance))

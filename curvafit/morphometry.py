@@ -1,0 +1,205 @@
+"""The familiar numbers of a porous or branching structure: volume fraction, thickness, spacing, connectivity, surface.
+
+Thickness and spacing are the mean diameters of the largest balls that fit (Hildebrand & Rüegsegger 1997): each voxel of
+the phase takes the largest ball, centred in the phase and inside it, that covers the voxel. Balls come from the exact
+Euclidean distance transform; a ball that sticks out of a larger painted one by less than half a voxel or 5 % of its
+radius is left out.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from numba import njit
+from scipy import ndimage
+from skimage import measure
+
+__all__ = ["Morphometry", "local_thickness", "morphometry"]
+
+#: How far a periodic box is continued before distances are taken, in voxels.
+_WRAPPED = 32
+
+
+@dataclass(frozen=True)
+class Morphometry:
+    """Numbers in powers of `unit`; thickness and spacing are ball diameters, NaN where a phase is missing."""
+
+    volume_fraction: float
+    thickness_mean: float
+    thickness_std: float
+    spacing_mean: float
+    connectivity_density: float
+    euler: int
+    surface_to_volume: float
+    unit: str
+
+    def to_dict(self) -> dict[str, float | int | str]:
+        return asdict(self)
+
+
+def morphometry(
+    mask: np.ndarray,
+    spacing: float | tuple[float, float, float] = 1.0,
+    unit: str = "voxel",
+    *,
+    periodic: bool = False,
+) -> Morphometry:
+    """Volume fraction (BV/TV), thickness (Tb.Th), spacing (Tb.Sp), Euler number, connectivity density, BS/BV.
+
+    Parameters
+    ----------
+    mask
+        Bool array (Z, Y, X), True in the structure.
+    spacing
+        Voxel edges (z, y, x) in `unit`, or one for all.
+    periodic
+        The box repeats. Else nothing is known beyond it: balls may reach out of it, its faces count as no surface,
+        and the Euler number is that of the part inside.
+
+    Returns
+    -------
+    Morphometry
+        `euler` is 26-connected; `surface_to_volume` is the area by marching cubes over the structure's volume, in
+        1/unit; `connectivity_density` is (1 - χ) over the box's volume, in 1/unit³.
+
+    Raises
+    ------
+    ValueError
+        If the mask is not 3D, or empty or full.
+    """
+    mask = np.asarray(mask, dtype=bool)
+    edges = (float(spacing),) * 3 if isinstance(spacing, (int, float)) else spacing
+    if mask.ndim != 3:
+        raise ValueError(f"expected a 3D mask, got an array of shape {mask.shape}")
+    filled = int(mask.sum())
+    if filled in (0, mask.size):
+        raise ValueError(f"expected a mask with voxels inside and outside, got {filled} of {mask.size} inside")
+    voxel = math.prod(edges)
+    thickness = local_thickness(mask, edges, periodic=periodic)[mask]
+    gap = local_thickness(~mask, edges, periodic=periodic)[~mask]
+    euler = _periodic_euler(mask) if periodic else int(measure.euler_number(mask, connectivity=3))
+    return Morphometry(
+        volume_fraction=filled / mask.size,
+        thickness_mean=float(thickness.mean(dtype=np.float64)),
+        thickness_std=float(thickness.std(dtype=np.float64)),
+        spacing_mean=float(gap.mean(dtype=np.float64)),
+        connectivity_density=(1 - euler) / (mask.size * voxel),
+        euler=euler,
+        surface_to_volume=_surface(mask, edges, periodic) / (filled * voxel),
+        unit=unit,
+    )
+
+
+def local_thickness(
+    mask: np.ndarray,
+    spacing: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    *,
+    periodic: bool = False,
+    largest: float = 24.0,
+) -> np.ndarray:
+    """Diameter of the largest ball inside `mask` that covers each voxel; 0 outside, infinite where there is no outside.
+
+    Diameters are 2·EDT, EDT being the distance to the nearest outer voxel's centre: half a voxel too much on plates
+    (on average over their positions), up to a voxel too little on tubes and balls, whose axes miss the grid; for the
+    same reason a ball covers voxels up to half a voxel beyond its rim. Where balls are wider than `largest` voxels in
+    radius they are painted on a grid coarser by a whole factor, at a cost of under 1/`largest` of their size.
+
+    Parameters
+    ----------
+    mask
+        Bool array (Z, Y, X).
+    spacing
+        Voxel edges (z, y, x).
+    periodic
+        The box repeats (seen to a depth of `_WRAPPED` voxels); else balls may reach out of it.
+
+    Returns
+    -------
+    np.ndarray
+        float32 (Z, Y, X), in spacing's unit.
+    """
+    mask = np.asarray(mask, dtype=bool)
+    if not mask.any() or mask.all():
+        return np.where(mask, np.float32(np.inf), np.float32(0))
+    if periodic:
+        margin = [min(n // 2, _WRAPPED) for n in mask.shape]
+        padded = np.pad(mask, [(m, m) for m in margin], mode="wrap")
+        inner = tuple(slice(m, m + n) for m, n in zip(margin, mask.shape, strict=True))
+        return local_thickness(padded, spacing, largest=largest)[inner]
+    edge = float(min(spacing))
+    radius = ndimage.distance_transform_edt(mask, sampling=spacing).astype(np.float32)  # type: ignore[union-attr]
+    factor = math.ceil(float(radius.max()) / edge / largest)
+    if factor == 1:
+        return 2 * _largest_balls(radius, np.asarray(spacing, dtype=np.float32), edge)
+    painted = _largest_balls(_coarsened(radius, factor), np.asarray(spacing, dtype=np.float32) * factor, edge)
+    fine = painted.repeat(factor, 0).repeat(factor, 1).repeat(factor, 2)[tuple(slice(n) for n in mask.shape)]
+    return np.where(mask, 2 * np.maximum(fine, radius), np.float32(0))
+
+
+def _coarsened(radius: np.ndarray, factor: int) -> np.ndarray:
+    """Largest radius of each block of factor³ voxels."""
+    padded = np.pad(radius, [(0, -n % factor) for n in radius.shape])
+    z, y, x = (n // factor for n in padded.shape)
+    return padded.reshape(z, factor, y, factor, x, factor).max(axis=(1, 3, 5))
+
+
+def _largest_balls(radius: np.ndarray, spacing: np.ndarray, edge: float) -> np.ndarray:
+    centres = np.flatnonzero(radius > 0)
+    order = centres[np.argsort(-radius.ravel()[centres], kind="stable")]
+    painted = np.zeros(radius.size, dtype=np.float32)
+    owner = np.full(radius.size, -1, dtype=np.int64)
+    _paint(order, radius.ravel(), painted, owner, np.array(radius.shape), spacing, np.float32(edge))
+    return np.where(radius > 0, painted.reshape(radius.shape), np.float32(0))
+
+
+@njit(cache=True)
+def _paint(order, radius, painted, owner, shape, spacing, edge):  # pragma: no cover
+    """Balls in descending size; each voxel keeps the first, hence largest, that covers it (and which it was)."""
+    ny, nx = shape[1], shape[2]
+    hz, hy, hx = spacing
+    for centre in order:
+        r = radius[centre]
+        z, y, x = centre // (ny * nx), centre // nx % ny, centre % nx
+        if owner[centre] >= 0:
+            o = owner[centre]
+            dz, dy, dx = (z - o // (ny * nx)) * hz, (y - o // nx % ny) * hy, (x - o % nx) * hx
+            out = np.sqrt(dz * dz + dy * dy + dx * dx) + r - radius[o]
+            if out <= max(0.5 * edge, 0.05 * radius[o]):
+                continue
+        reach = r + 0.5 * edge
+        kz, ky = int(reach / hz), int(reach / hy)
+        for k in range(max(0, z - kz), min(shape[0], z + kz + 1)):
+            for j in range(max(0, y - ky), min(ny, y + ky + 1)):
+                rest = reach * reach - ((k - z) * hz) ** 2 - ((j - y) * hy) ** 2
+                if rest < 0:
+                    continue
+                kx = int(np.sqrt(rest) / hx)
+                row = (k * ny + j) * nx
+                for i in range(max(0, x - kx), min(nx, x + kx + 1)):
+                    if painted[row + i] < r:
+                        painted[row + i] = r
+                        owner[row + i] = centre
+
+
+def _surface(mask: np.ndarray, spacing: tuple[float, float, float], periodic: bool) -> float:
+    """Marching-cubes area of the mask, smoothed by a voxel so that its stairs do not count."""
+    soft = ndimage.gaussian_filter(mask.astype(np.float32), 1.0, mode="wrap" if periodic else "nearest")
+    if not soft.min() < 0.5 < soft.max():
+        soft = mask.astype(np.float32)
+    if periodic:
+        soft = np.pad(soft, [(0, 1)] * 3, mode="wrap")
+    vertices, faces, _, _ = measure.marching_cubes(soft, 0.5, spacing=spacing)
+    return float(measure.mesh_surface_area(vertices, faces))
+
+
+def _periodic_euler(mask: np.ndarray) -> int:
+    """χ of the union of closed voxels on the torus: vertices - edges + faces - voxels."""
+    total = 0
+    for axes in ((), (0,), (1,), (2,), (0, 1), (0, 2), (1, 2), (0, 1, 2)):
+        cells = mask
+        for axis in axes:
+            cells = cells | np.roll(cells, 1, axis)
+        total += (-1) ** (3 - len(axes)) * int(np.count_nonzero(cells))
+    return total

@@ -1,0 +1,127 @@
+"""What in a scan is structure: the kind of the scan, its threshold, its sign."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy import ndimage
+from skimage.filters import threshold_otsu
+
+from curvafit.scan import Field, ScanError
+
+__all__ = ["Kind", "Level", "find_level"]
+
+Kind = Literal["field", "mask", "image"]
+
+
+@dataclass(frozen=True)
+class Level:
+    """A scan whose structure is where `values` (float32) > 0, and the grey level that was subtracted."""
+
+    kind: Kind
+    values: np.ndarray
+    threshold: float | None
+    note: str
+
+    @property
+    def mask(self) -> np.ndarray:
+        return self.values > 0
+
+
+def find_level(
+    field: Field,
+    *,
+    kind: Literal["auto", "field", "mask", "image"] = "auto",
+    threshold: Literal["otsu"] | float = "otsu",
+    dark: bool = False,
+    label: int | None = None,
+    region: np.ndarray | None = None,
+    periodic: bool = False,
+) -> Level:
+    """The structure of a scan; parameters as in `prepare.prepare`.
+
+    Raises
+    ------
+    ScanError
+        If the kind, label or threshold fits nothing in the scan, or a phase is empty.
+    """
+    if kind not in ("auto", "field", "mask", "image"):
+        raise ScanError(f"expected kind auto, field, mask or image, got {kind!r}")
+    values = field.values
+    if label is not None:
+        level = _signed(_label_mask(values, label), dark, f"The structure is label {label}.")
+    else:
+        kind = _guess_kind(values, threshold) if kind == "auto" else kind
+        if kind == "field":
+            level = _field_level(values, dark)
+        elif kind == "mask":
+            level = _mask_level(values, dark)
+        else:
+            level = _image_level(field, threshold, dark, region, periodic)
+    counted = level.mask if region is None else level.mask[region]
+    if not counted.any():
+        raise ScanError("expected a structure in the scan, got none: every voxel is background")
+    if counted.all():
+        raise ScanError("expected background in the scan, got none: every voxel is structure")
+    return level
+
+
+def _guess_kind(values: np.ndarray, threshold: Literal["otsu"] | float) -> Kind:
+    """Two values: a mask. Smooth floats from about -1 to about 1 that mostly lie far from 0: a phase field."""
+    lowest, highest = values.min(), values.max()
+    if np.all((values == lowest) | (values == highest)):
+        return "mask"
+    if values.dtype.kind == "f" and threshold == "otsu" and -2 <= lowest <= -0.7 and 0.3 <= highest <= 2:
+        steepest = max(float(np.abs(np.diff(values, axis=axis)).max()) for axis in range(3))
+        if steepest < 1 and np.count_nonzero(np.abs(values) > 0.35) > 0.6 * values.size:
+            return "field"
+    return "image"
+
+
+def _field_level(values: np.ndarray, dark: bool) -> Level:
+    note = f"Taken for a phase field: values {values.min():.3g} to {values.max():.3g}."
+    return Level("field", (-values if dark else values).astype(np.float32), None, note)
+
+
+def _mask_level(values: np.ndarray, dark: bool) -> Level:
+    lowest, highest = values.min(), values.max()
+    if np.all((values == lowest) | (values == highest)):
+        return _signed(values == highest, dark, f"Taken for a mask of the values {float(lowest):g} and {float(highest):g}.")
+    return _signed(values != 0, dark, "Taken for a mask: the structure is where it is not zero.")
+
+
+def _label_mask(values: np.ndarray, label: int) -> np.ndarray:
+    mask = values == label
+    if not mask.any():
+        found = np.unique(values)
+        listed = ", ".join(f"{float(value):g}" for value in found[:12]) + (", …" if len(found) > 12 else "")
+        raise ScanError(f"expected a label of the scan ({listed}), got {label}")
+    return mask
+
+
+def _signed(mask: np.ndarray, dark: bool, note: str) -> Level:
+    return Level("mask", np.where(mask != dark, np.float32(1), np.float32(-1)), None, note)
+
+
+def _image_level(
+    field: Field, threshold: Literal["otsu"] | float, dark: bool, region: np.ndarray | None, periodic: bool
+) -> Level:
+    """Grey levels smoothed by one voxel of the finest axis, minus the threshold."""
+    finest = min(field.spacing)
+    width = [finest / h for h in field.spacing]
+    mode = "wrap" if periodic else "nearest"
+    smooth = ndimage.gaussian_filter(field.values.astype(np.float32), width, mode=mode, truncate=3.0)
+    counted = smooth if region is None else smooth[region]
+    try:
+        level = float(threshold_otsu(counted)) if threshold == "otsu" else float(threshold)
+    except ValueError:
+        raise ScanError(f"expected a threshold that is a number or 'otsu', got {threshold!r}") from None
+    lowest, highest = float(counted.min()), float(counted.max())
+    if not lowest < level < highest:
+        raise ScanError(f"expected a threshold within the smoothed scan's {lowest:.4g} to {highest:.4g}, got {level:.4g}")
+    how = "Otsu's" if threshold == "otsu" else "the given"
+    side = "dark" if dark else "bright"
+    note = f"Smoothed by one voxel and split at {how} threshold, {level:.4g}: the {side} phase is the structure."
+    return Level("image", (level - smooth) if dark else (smooth - level), level, note)

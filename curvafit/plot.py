@@ -1,0 +1,286 @@
+"""Pictures: surfaces, slices with the structure's contour, curvature diagrams.
+
+Each kind has a function that draws on matplotlib axes and one that makes a `Figure` of its own; neither touches
+pyplot's global state. Arrays are z,y,x.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.colors import LinearSegmentedColormap, LogNorm
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon, Rectangle
+from matplotlib.patheffects import withStroke
+from scipy.ndimage import gaussian_filter
+
+from curvafit.diagram import Diagram
+from curvafit.render import View, render
+from curvafit.scan import write_atomically
+from curvafit.wording import unit_name
+
+#: Colours that stay apart for the colour-blind (Okabe & Ito 2008), and a quiet grey for frames and notes.
+CONTOUR, DIAGONAL, QUIET, INK = "#E69F00", "#C8372D", "#8A8F98", "#22262B"
+#: Area density in a diagram: light where little, dark where much.
+DENSITY = LinearSegmentedColormap.from_list(
+    "density", ["#E3ECF5", "#A9CBE3", "#5AA2CB", "#2B6FA8", "#1B3F7A", "#16193F"]
+)
+#: Bins along each axis of a drawn diagram, and decades that its colours span.
+BINS, DECADES = 72, 3.0
+#: Pixels per inch of every picture.
+DPI = 160
+
+Spacing = tuple[float, float, float]
+Limits = tuple[float, float]
+
+
+# ---- surfaces --------------------------------------------------------------------------------------------------------
+
+
+def surface_picture(u: np.ndarray, path: str | Path, *, width: int = 900, title: str = "", **options) -> Path:
+    """Write a picture of the surface of `u` `(Z, Y, X)`; `options` are those of `surface_on`.
+
+    Raises
+    ------
+    ValueError
+        If the volume cannot be drawn (see `render.render`).
+    """
+    return write_picture(surface_figure(u, width=width, title=title, **options), path)
+
+
+def surface_figure(u: np.ndarray, *, width: int = 720, title: str = "", **options) -> Figure:
+    """A figure `width` pixels wide of one surface."""
+    figure = _figure(width / DPI, width / DPI)
+    axes = figure.add_axes((0, 0, 1, 0.93 if title else 1))
+    surface_on(axes, u, width=width, **options)
+    if title:
+        axes.set_title(title, fontsize=12)
+    return figure
+
+
+def surface_on(
+    axes: Axes,
+    u: np.ndarray,
+    *,
+    spacing: Spacing = (1.0, 1.0, 1.0),
+    level: float = 0.0,
+    width: int = 720,
+    azimuth: float = 32.0,
+    elevation: float = 24.0,
+) -> None:
+    """Draw the level set of a field (or the outline of a bool mask) in its box, cut faces capped."""
+    values = np.asarray(u)
+    if values.dtype == np.bool_:
+        values, level = gaussian_filter(values.astype(np.float32), 0.7), level + 0.5
+    picture, camera = render(values, spacing=spacing, level=level, width=width, azimuth=azimuth, elevation=elevation)
+    height = picture.shape[0]
+    axes.set_axis_off()
+    axes.add_collection(_edges(camera, (width, height), front=False))
+    axes.imshow(picture, extent=(0, width, height, 0), interpolation="antialiased", zorder=2)
+    axes.add_collection(_edges(camera, (width, height), front=True))
+
+
+def gallery_picture(
+    fields: Mapping[str, np.ndarray], path: str | Path, *, columns: int = 4, width: int = 1600, **options
+) -> Path:
+    """Write a table of surfaces, each above its name."""
+    if not fields:
+        raise ValueError("expected at least one field to draw, got none")
+    columns = min(columns, len(fields))
+    rows = math.ceil(len(fields) / columns)
+    cell = width / columns / DPI
+    figure = _figure(cell * columns, 1.13 * cell * rows)
+    for k, (name, u) in enumerate(fields.items()):
+        row, column = divmod(k, columns)
+        bottom = 1 - (row + 1) / rows
+        axes = figure.add_axes((column / columns + 0.004, bottom + 0.11 / rows, 1 / columns - 0.008, 0.88 / rows))
+        surface_on(axes, u, width=round(width / columns), **options)
+        figure.text((column + 0.5) / columns, bottom + 0.05 / rows, name, ha="center", va="center", fontsize=12)
+    return write_picture(figure, path)
+
+
+def _edges(camera: View, size: tuple[int, int], *, front: bool) -> LineCollection:
+    """The box's edges in picture pixels: the nine in front of the shape, or the three behind it."""
+    corners = np.array(list(np.ndindex(2, 2, 2)), dtype=float)
+    towards = camera.frame[2]
+    hidden = (corners == (towards < 0)).all(axis=1).argmax()
+    pairs = [(a, b) for a in range(8) for b in range(a + 1, 8) if np.abs(corners[a] - corners[b]).sum() == 1]
+    places = camera.project(corners) * np.array(size)
+    lines = [places[[a, b]] for a, b in pairs if (hidden in (a, b)) != front]
+    return LineCollection(lines, colors=QUIET, linewidths=0.6, alpha=0.55 if front else 0.4, zorder=3 if front else 1)
+
+
+# ---- slices ----------------------------------------------------------------------------------------------------------
+
+
+def slice_figure(
+    image: np.ndarray,
+    structure: np.ndarray,
+    *,
+    image_extent: tuple[float, float, float, float],
+    extent: tuple[float, float, float, float],
+    limits: Limits,
+    unit: str,
+    axes_names: tuple[str, str],
+    window: tuple[float, float, float, float] | None = None,
+) -> Figure:
+    """A grey slice with the zero contour of `structure` over it.
+
+    Parameters
+    ----------
+    image, structure
+        Two-dimensional, rows first, over the rectangles `image_extent` and `extent` (left, right, bottom, top) in
+        `unit`.
+    limits
+        Grey values shown as black and white.
+    axes_names
+        Names of the vertical and the horizontal axis.
+    window
+        A rectangle to frame, likewise.
+    """
+    left, right, bottom, top = extent
+    ratio = abs(top - bottom) / abs(right - left)
+    figure = _figure(4.2, 4.2 * min(max(ratio, 0.25), 2.0) + 0.45)
+    axes = figure.add_axes((0.075, 0.01, 0.915, 1 - 0.45 / figure.get_figheight()))
+    axes.imshow(image, cmap="gray", vmin=limits[0], vmax=limits[1], extent=image_extent, interpolation="nearest")
+    rows, columns = structure.shape
+    x = left + (np.arange(columns) + 0.5) / columns * (right - left)
+    y = top + (np.arange(rows) + 0.5) / rows * (bottom - top)
+    if structure.min() < 0 < structure.max():
+        axes.contour(x, y, structure, levels=[0.0], colors=CONTOUR, linewidths=1.3)
+    if window is not None:
+        corner = (min(window[:2]), min(window[2:]))
+        box = Rectangle(corner, abs(window[1] - window[0]), abs(window[3] - window[2]), fill=False)
+        box.set(edgecolor="white", linestyle=(0, (4, 3)), linewidth=1.2)
+        axes.add_patch(box)
+    axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xticks=[], yticks=[])
+    axes.set_ylabel(axes_names[0], rotation=0, labelpad=8)
+    _scale_bar(figure, axes, right - left, unit, axes_names[1])
+    return figure
+
+
+def _scale_bar(figure: Figure, axes: Axes, length: float, unit: str, name: str) -> None:
+    """A bar of a round length above the slice, with the horizontal axis's name."""
+    bar = round_length(0.3 * abs(length))
+    share = bar / abs(length)
+    axes.plot([1 - share, 1], [1.035, 1.035], transform=axes.transAxes, color=INK, linewidth=2.5, clip_on=False)
+    label = f"{bar:g} {unit_name(unit, bar)}"
+    axes.text(1 - share - 0.02, 1.035, label, transform=axes.transAxes, ha="right", va="center")
+    axes.text(0.0, 1.035, f"{name} →", transform=axes.transAxes, ha="left", va="center")
+
+
+def round_length(length: float) -> float:
+    """The largest of 1, 2, 5 × 10ⁿ that is not above `length`."""
+    if not length > 0:
+        raise ValueError(f"expected a positive length, got {length}")
+    power = 10.0 ** math.floor(math.log10(length))
+    return max((step * power for step in (1, 2, 5) if step * power <= length), default=power)
+
+
+# ---- curvature diagrams ----------------------------------------------------------------------------------------------
+
+
+def diagram_figure(
+    diagram: Diagram, *, limits: Limits | None = None, unit: str = "working unit", length: float = 1.0, title: str = ""
+) -> Figure:
+    """A figure of one diagram; see `diagram_on`."""
+    figure = _figure(4.2, 4.2)
+    axes = figure.add_axes((0.16, 0.13, 0.82, 0.79 if title else 0.85))
+    diagram_on(axes, diagram, limits=limits or shared_limits([diagram], length), unit=unit, length=length)
+    if title:
+        axes.set_title(title, fontsize=11)
+    return figure
+
+
+def diagram_on(
+    axes: Axes, diagram: Diagram, *, limits: Limits, unit: str = "working unit", length: float = 1.0
+) -> None:
+    """Draw the share of area over (κ1, κ2): κ1 to the right, κ2 up, colours by the logarithm.
+
+    `length` is the diagram's unit in `unit`: curvatures are divided by it. `limits` (in 1 / `unit`) hold for both axes.
+    """
+    low, high = limits
+    edges = np.linspace(low, high, BINS + 1)
+    points = np.asarray(diagram.points) / length
+    weights = np.asarray(diagram.weights) / float(np.sum(diagram.weights))
+    shares, _, _ = np.histogram2d(points[:, 0], points[:, 1], bins=[edges, edges], weights=weights)
+    shares = gaussian_filter(shares, 0.8).T
+    highest = max(float(shares.max()), 1e-9)
+    shown = np.ma.masked_less(shares, highest * 10**-DECADES)
+    axes.add_patch(Polygon([(low, low), (low, high), (high, high)], color="#F3F4F6", zorder=0))
+    axes.axhline(0, color=QUIET, linewidth=0.7, zorder=1)
+    axes.axvline(0, color=QUIET, linewidth=0.7, zorder=1)
+    norm = LogNorm(highest * 10**-DECADES, highest)
+    axes.pcolormesh(edges, edges, shown, cmap=DENSITY, norm=norm, rasterized=True, zorder=2)
+    axes.plot([low, high], [low, high], color=DIAGONAL, linewidth=1.4, zorder=3)
+    axes.set(xlim=limits, ylim=limits, aspect="equal")
+    name = unit_name(unit)
+    axes.set_xlabel(f"κ₁ (1/{name})", labelpad=2)
+    axes.set_ylabel(f"κ₂ (1/{name})", labelpad=2)
+    axes.locator_params(nbins=5)
+    axes.tick_params(length=3, labelsize=9)
+    _name_families(axes, limits)
+
+
+def shared_limits(diagrams: Sequence[Diagram], length: float = 1.0, tail: float = 0.004) -> Limits:
+    """The interval that holds both curvatures of every diagram but for the outermost `tail` of area at either end."""
+    bounds = [0.0, 0.0]
+    for diagram in diagrams:
+        for kappa in np.asarray(diagram.points).T / length:
+            order = np.argsort(kappa)
+            cumulated = np.cumsum(np.asarray(diagram.weights)[order])
+            cuts = np.searchsorted(cumulated, [tail * cumulated[-1], (1 - tail) * cumulated[-1]])
+            low, high = kappa[order][np.minimum(cuts, len(kappa) - 1)]
+            bounds = [min(bounds[0], float(low)), max(bounds[1], float(high))]
+    width = max(bounds[1] - bounds[0], 1e-9)
+    return bounds[0] - 0.08 * width, bounds[1] + 0.08 * width
+
+
+def _name_families(axes: Axes, limits: Limits) -> None:
+    """Small words where spheres, tubes and saddles lie, in the corners that hold no mass."""
+    low, high = limits
+    pad = 0.02 * (high - low)
+    style = {"fontsize": 8.5, "color": "#5B616B", "style": "italic", "zorder": 4}
+    style["path_effects"] = [withStroke(linewidth=2, foreground="white")]
+    at = high - 5 * pad
+    axes.text(at, at + pad, "spheres", rotation=45, rotation_mode="anchor", ha="right", va="bottom", **style)
+    axes.text(high - pad, 0.4 * pad, "tubes", ha="right", va="bottom", **style)
+    if low < -0.15 * high:
+        end = min(high, -low) - 4 * pad
+        axes.plot(
+            [0, min(high, -low)], [0, -min(high, -low)], color=QUIET, linewidth=0.7, linestyle=(0, (2, 3)), zorder=1
+        )
+        axes.text(end, -end + pad, "saddles", rotation=-45, rotation_mode="anchor", ha="right", va="bottom", **style)
+
+
+# ---- files -----------------------------------------------------------------------------------------------------------
+
+
+def png(figure: Figure) -> bytes:
+    """The figure as a PNG."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=DPI)
+    return buffer.getvalue()
+
+
+def write_picture(figure: Figure, path: str | Path) -> Path:
+    """Write a PNG under a temporary name, then move it to `path`."""
+    content = png(figure)
+    return write_atomically(Path(path), lambda temporary: _write(temporary, content))
+
+
+def _write(path: Path, content: bytes) -> None:
+    path.write_bytes(content)
+
+
+def _figure(width: float, height: float) -> Figure:
+    figure = Figure(figsize=(width, height), facecolor="white")
+    FigureCanvasAgg(figure)
+    return figure

@@ -1,0 +1,301 @@
+"""From a scan to the working grid: what is structure, on which voxels, seen through which windows."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import torch
+from scipy import ndimage
+
+from curvafit.phases import Kind, Level, find_level
+from curvafit.priors import WORKING_EPSILON, WORKING_SPACING, Grid, phase_field
+from curvafit.regrid import Window, median_thickness, resample, rich_boxes, signed_distance, surface_voxels, without_specks
+from curvafit.scan import Field, ScanError, load
+
+__all__ = ["KEPT_THICKNESS", "LARGEST_BOX", "LARGEST_WINDOW", "WORKING_THICKNESS", "Prepared", "prepare"]
+
+#: Median thickness, in voxels, of an isotropic scan whose grid is kept; and the one a scan is resampled to.
+KEPT_THICKNESS = (5.0, 16.0)
+WORKING_THICKNESS = 8.0
+#: A structure is refused when it is nowhere thicker than this many scan voxels.
+THINNEST = 3.0
+#: Longest sides: of a window and of the whole working grid, in working voxels; of what is read, in scan voxels.
+LARGEST_WINDOW = 128
+LARGEST_BOX = 256
+LARGEST_SCAN = 512
+#: Coarsening stops where a side would have fewer working voxels than this.
+FEWEST = 32
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A scan on the working grid.
+
+    Attributes
+    ----------
+    kind
+        `"field"`, `"mask"` or `"image"`: what the scan was taken for.
+    phase
+        float32 (Z, Y, X): the scan's own phase field, or the optimal profile of `mask`.
+    mask
+        bool, same shape: the structure.
+    grid
+        Working units: spacing 0.01, the boundary periodic or replicate.
+    scale
+        Working voxel in scan voxels (z, y, x).
+    working_voxel
+        Edge of a working voxel in `unit`.
+    threshold
+        Grey level that separates the phases, None for fields and masks.
+    thickness
+        Median thickness of the structure, by volume, in working voxels.
+    windows
+        Boxes of at most 128 voxels a side that together cover the grid's surface; the first is the main one. They
+        overlap, so sums belong on the whole grid; one smaller than the grid is no periodic box.
+    origin
+        Scan voxel coordinates (z, y, x) of the corner of the first working voxel.
+    roi
+        bool, same shape: the region of interest, None where all counts.
+    notes
+        Sentences on what was decided.
+    """
+
+    kind: Kind
+    phase: np.ndarray
+    mask: np.ndarray
+    grid: Grid
+    scale: tuple[float, float, float]
+    working_voxel: float
+    unit: str
+    threshold: float | None
+    thickness: float
+    windows: tuple[Window, ...]
+    notes: tuple[str, ...]
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    roi: np.ndarray | None = None
+
+
+def prepare(
+    field: Field,
+    *,
+    kind: Literal["auto", "field", "mask", "image"] = "auto",
+    periodic: bool = False,
+    threshold: Literal["otsu"] | float = "otsu",
+    dark: bool = False,
+    roi: Field | np.ndarray | str | os.PathLike[str] | None = None,
+    label: int | None = None,
+) -> Prepared:
+    """Find the structure and put it on the working grid, where its median thickness is a known number of voxels.
+
+    A mask is a volume of two values, a phase field a float volume with plateaus near ±1, anything else an image: it is
+    smoothed (Gaussian, one voxel of the finest axis) and thresholded. The grid is kept where it is a phase field's, or
+    isotropic with a median thickness of 5 to 16 voxels; else it is resampled to a thickness of 8: images as smoothed
+    grey levels, masks as signed distances. Thickness is the local thickness (`morphometry.local_thickness`), its
+    median over the structure's volume. Specks and pinholes smaller than a ball of half that diameter are dropped.
+
+    Parameters
+    ----------
+    field
+        The scan.
+    kind
+        Overrides the guess; a `"mask"` of several values is the structure where it is not zero.
+    periodic
+        The box repeats.
+    threshold
+        Grey level, or `"otsu"`.
+    dark
+        The structure is the dark phase (of a mask: its lower value; of a field: where it is negative).
+    roi
+        Nonzero where the scan counts (array, field or file of the scan's shape).
+    label
+        The structure is where the scan has this value.
+
+    Raises
+    ------
+    ScanError
+        If there is no structure, nothing else, no surface, or nothing at least 3 voxels thick; or if `roi`, `label` or
+        `threshold` do not fit the scan.
+    """
+    region = _region_of_interest(roi, field)
+    where, notes = _cropped(field, region)
+    region = None if region is None else region[where]
+    part = replace(field, values=field.values[where], affine=None)
+    periodic = periodic and part.shape == field.shape
+    options = {"kind": kind, "threshold": threshold, "dark": dark, "label": label}
+    level = find_level(part, region=region, periodic=periodic, **options)  # type: ignore[arg-type]
+    scan = _Scan(level, part.shape, part.spacing, periodic, region, field.notes + notes + (level.note,))
+    prepared = _on_working_grid(scan)
+    corner = tuple(s.start + o for s, o in zip(where, prepared.origin, strict=True))
+    return replace(prepared, unit=field.unit, origin=corner)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class _Scan:
+    """What is left of a scan once its structure is known."""
+
+    level: Level
+    shape: tuple[int, int, int]
+    spacing: tuple[float, float, float]
+    periodic: bool
+    region: np.ndarray | None
+    notes: tuple[str, ...]
+
+    @property
+    def counted(self) -> np.ndarray:
+        """The structure within the region of interest."""
+        return self.level.mask if self.region is None else self.level.mask & self.region
+
+
+def _region_of_interest(roi: Field | np.ndarray | str | os.PathLike[str] | None, field: Field) -> np.ndarray | None:
+    if roi is None:
+        return None
+    loaded = roi if isinstance(roi, Field | np.ndarray) else load(roi)
+    region = np.asarray(loaded.values if isinstance(loaded, Field) else loaded) != 0
+    if region.shape != field.shape:
+        raise ScanError(f"expected a region of interest of the scan's shape {field.shape}, got {region.shape}")
+    if not region.any():
+        raise ScanError("expected a region of interest with voxels in it, got an empty one")
+    return region
+
+
+def _cropped(field: Field, region: np.ndarray | None) -> tuple[Window, tuple[str, ...]]:
+    """The region's bounding box, and of a very large scan the middle."""
+    notes: tuple[str, ...] = ()
+    box = [slice(0, n) for n in field.shape]
+    if region is not None:
+        box = list(ndimage.find_objects(region.astype(np.uint8))[0])
+        notes += (f"The region of interest holds {region.mean():.1%} of the scan.",)
+    if any(s.stop - s.start > LARGEST_SCAN for s in box):
+        box = [_middle(s, LARGEST_SCAN) for s in box]
+        notes += (f"Of this large scan the middle {_times(s.stop - s.start for s in box)} voxels are used.",)
+    return (box[0], box[1], box[2]), notes
+
+
+def _middle(whole: slice, length: int) -> slice:
+    extent = whole.stop - whole.start
+    length = min(length, extent)
+    first = whole.start + (extent - length) // 2
+    return slice(first, first + length)
+
+
+def _on_working_grid(scan: _Scan) -> Prepared:
+    """Choose the working voxel, move the scan to it, drop specks, profile the mask, choose windows."""
+    thickness, notes = _thickness(scan)
+    scale, why = _scale(scan, thickness)
+    start, shape, cut = _working_box(scan, scale)
+    edges = [s * h for s, h in zip(scale, scan.spacing, strict=True)]
+    edge = edges[0] if max(edges) <= (1 + 1e-9) * min(edges) else math.prod(edges) ** (1 / 3)
+    values, region = _moved(scan, scale, start, shape)
+    grid = Grid(shape, (WORKING_SPACING,) * 3, "periodic" if scan.periodic and not cut else "replicate")
+    mask, dropped = _structure(scan.level.kind, values, region, thickness / edge, grid.periodic)
+    windows = rich_boxes(surface_voxels(mask), LARGEST_WINDOW)
+    if not windows:
+        raise ScanError("expected a surface between structure and background, got none on the working grid")
+    phase = values if scan.level.kind == "field" else phase_field(torch.from_numpy(mask), grid, WORKING_EPSILON).numpy()
+    return Prepared(
+        kind=scan.level.kind,
+        phase=np.ascontiguousarray(phase, dtype=np.float32),
+        mask=mask,
+        grid=grid,
+        scale=scale,
+        working_voxel=edge,
+        unit="voxel",
+        threshold=scan.level.threshold,
+        thickness=thickness / edge,
+        windows=tuple(windows),
+        notes=scan.notes + notes + why + cut + dropped,
+        origin=tuple(a * s for a, s in zip(start, scale, strict=True)),  # type: ignore[arg-type]
+        roi=region,
+    )
+
+
+def _thickness(scan: _Scan) -> tuple[float, tuple[str, ...]]:
+    """Median thickness in the scan's unit; refused where next to nothing is thick enough to have a shape."""
+    median, thick = median_thickness(scan.counted, scan.spacing, scan.periodic)
+    voxel = math.prod(scan.spacing) ** (1 / 3)
+    if scan.level.kind != "field" and thick < THINNEST * voxel:
+        raise ScanError(
+            f"expected a structure at least {THINNEST:g} voxels thick, got 95 % of it thinner than {thick / voxel:.2g}"
+        )
+    note = f"Median thickness {median / voxel:.3g} scan voxels."
+    if median < THINNEST * voxel:
+        note = f"Half of the structure is thinner than {median / voxel:.2g} scan voxels: its curvature is uncertain."
+    return median, (note,)
+
+
+def _scale(scan: _Scan, thickness: float) -> tuple[tuple[float, float, float], tuple[str, ...]]:
+    """Working voxel in scan voxels, per axis; all ones where the scan's grid is kept."""
+    spacing, finest = scan.spacing, min(scan.spacing)
+    isotropic = max(spacing) <= 1.01 * finest
+    if isotropic and (scan.level.kind == "field" or KEPT_THICKNESS[0] <= thickness / finest <= KEPT_THICKNESS[1]):
+        return (1.0, 1.0, 1.0), ("The scan's grid is kept.",)
+    edge = finest if scan.level.kind == "field" else thickness / WORKING_THICKNESS
+    extent = min(n * h for n, h in zip(scan.shape, spacing, strict=True))
+    note = "Resampled to cubic voxels" if scan.level.kind == "field" else f"Resampled to {WORKING_THICKNESS:g} voxels a thickness"
+    if extent < FEWEST * edge and edge > finest:
+        edge = max(extent / FEWEST, finest)
+        note = f"Resampled, as far as leaves {FEWEST} voxels a side"
+    scale = [edge / h for h in spacing]
+    if scan.periodic:
+        scale = [n / max(4, round(n / s)) for n, s in zip(scan.shape, scale, strict=True)]
+    said = " x ".join(f"{s:.3g}" for s in scale)
+    return (scale[0], scale[1], scale[2]), (f"{note}: a working voxel is {said} scan voxels (z, y, x).",)
+
+
+def _working_box(
+    scan: _Scan, scale: tuple[float, float, float]
+) -> tuple[tuple[int, int, int], tuple[int, int, int], tuple[str, ...]]:
+    """First working voxel, number of voxels, and a note where that is not all of the scan."""
+    full = [math.floor(n / s + 1e-6) for n, s in zip(scan.shape, scale, strict=True)]
+    if min(full) < 4:
+        raise ScanError(f"expected at least 4 working voxels along each axis, got {_times(full)}")
+    if max(full) <= LARGEST_BOX:
+        return (0, 0, 0), (full[0], full[1], full[2]), ()
+    sides = [min(n, LARGEST_BOX) for n in full]
+    size = [math.ceil(n * s) for n, s in zip(sides, scale, strict=True)]
+    boxes = rich_boxes(surface_voxels(scan.counted), size)
+    corner = boxes[0] if boxes else tuple(slice(0, n) for n in size)
+    start = [min(int(c.start / s), n - m) for c, s, n, m in zip(corner, scale, full, sides, strict=True)]
+    note = f"Of {_times(full)} working voxels, {_times(sides)} from {tuple(start)} on are used."
+    return (start[0], start[1], start[2]), (sides[0], sides[1], sides[2]), (note,)
+
+
+def _moved(
+    scan: _Scan, scale: tuple[float, float, float], start: tuple[int, int, int], shape: tuple[int, int, int]
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Level values and region of interest on the working grid."""
+    values, region = scan.level.values, scan.region
+    if scale == (1.0, 1.0, 1.0):
+        box = tuple(slice(a, a + n) for a, n in zip(start, shape, strict=True))
+        return values[box], None if region is None else region[box]
+    if scan.level.kind == "mask":
+        reach = 4 * max(max(s * h, h) for s, h in zip(scale, scan.spacing, strict=True))
+        values = signed_distance(scan.level.mask, scan.spacing, reach)
+    moved = resample(values, scale, start, shape, periodic=scan.periodic)
+    if region is None:
+        return moved, None
+    return moved, resample(region.astype(np.uint8), scale, start, shape, periodic=scan.periodic, nearest=True) > 0
+
+
+def _structure(
+    kind: Kind, values: np.ndarray, region: np.ndarray | None, thickness: float, periodic: bool
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """The mask on the working grid, without what is too small to be structure."""
+    mask = values > 0 if region is None else (values > 0) & region
+    if kind == "field":
+        return mask, ()
+    smallest = math.pi / 6 * (thickness / 2) ** 3
+    cleaned, specks, pinholes = without_specks(mask, smallest, periodic)
+    if not specks and not pinholes:
+        return mask, ()
+    counts = f"specks: {specks}, pinholes: {pinholes}, {(cleaned != mask).mean():.2g} of the volume"
+    return cleaned, (f"Dropped what is smaller than a ball of half the median thickness ({counts}).",)
+
+
+def _times(shape: Iterable[int]) -> str:
+    return " x ".join(str(n) for n in shape)

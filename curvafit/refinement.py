@@ -1,0 +1,85 @@
+"""What a refinement reports, and the bounded parameters and least-squares solver that its methods share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+
+from curvafit.priors.coefficients import NAMES, Coefficients
+
+#: A share of a20 + a02 that a start is kept away from the domain's edges, a20 = 0 and a02 = 0.
+_EDGE = 0.01
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """Refined parameters (a, m₀) in working units, with what supports them.
+
+    Attributes
+    ----------
+    method
+        `"stationarity"` or `"fixed point"`.
+    coefficients, mass
+        In the gauge a20 = 1 (a02 = 1 where a20 is too small to divide by: `status` says so).
+    uncertainty
+        Standard deviation of each of the six coefficients; 0 for the one that fixes the scale.
+    singular_values
+        Of the least-squares problem at the solution, largest first: how firmly each direction of a is held.
+    residual
+        What is left of the misfit, in the method's own unit (each method's function says which).
+    starts
+        Each start's coefficients with the residual it ended at, best first.
+    status
+        A sentence on how well the answer is supported.
+    evaluations
+        Times that the costly part was evaluated.
+    """
+
+    method: str
+    coefficients: Coefficients
+    mass: float
+    uncertainty: dict[str, float]
+    singular_values: tuple[float, ...]
+    residual: float
+    starts: tuple[tuple[Coefficients, float], ...]
+    status: str
+    evaluations: int
+
+
+def units(epsilon: float) -> np.ndarray:
+    """`(6,)` factors from dimensionless coefficients (lengths in ε) to those in spacing's unit."""
+    return np.array([1, 1, 1, 1 / epsilon, 1 / epsilon, 1 / epsilon**2])
+
+
+def in_gauge(values: np.ndarray) -> tuple[Coefficients, int]:
+    """Coefficients with a20 = 1, or with a02 = 1 where a20 is under a thousandth of it; and which of the two (0, 2)."""
+    fixed = 0 if values[0] > 1e-3 * values[2] else 2
+    return Coefficients(*(float(value) for value in values / values[fixed])), fixed
+
+
+def admissible(values: np.ndarray) -> np.ndarray:
+    """The nearest six with a20 + a02 = 2 and both positive, away from the edge."""
+    share = np.clip(values[0] / max(values[0] + values[2], 1e-12), _EDGE, 1 - _EDGE)
+    scaled = 2 * values / max(values[0] + values[2], 1e-12)
+    return np.concatenate(([2 * share, scaled[1], 2 - 2 * share], scaled[3:]))
+
+
+def named(deviations: Sequence[float]) -> dict[str, float]:
+    """Names to numbers."""
+    return {name: float(value) for name, value in zip(NAMES, deviations, strict=True)}
+
+
+@contextmanager
+def double_precision_on_cpu():
+    """JAX in float64 on the CPU while inside; the caller's settings are untouched."""
+    import jax
+
+    with ExitStack() as stack:
+        stack.enter_context(jax.enable_x64(True))
+        stack.enter_context(jax.default_device(jax.devices("cpu")[0]))
+        yield

@@ -1,0 +1,156 @@
+"""Between grids: median thickness, resampling with exact bookkeeping, specks, windows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import ndimage
+
+from curvafit.morphometry import local_thickness
+
+__all__ = [
+    "Window",
+    "median_thickness",
+    "resample",
+    "rich_boxes",
+    "signed_distance",
+    "surface_voxels",
+    "without_specks",
+]
+
+Window = tuple[slice, slice, slice]
+
+#: Thickness is measured in a box of at most this many voxels a side.
+_MEASURED = 160
+_CONNECTED_26 = np.ones((3, 3, 3), dtype=bool)
+
+
+def median_thickness(mask: np.ndarray, spacing: tuple[float, float, float], periodic: bool) -> tuple[float, float]:
+    """Median and 95th percentile, over the structure's volume, of the local thickness.
+
+    Measured in the box of at most 160 voxels a side that `rich_boxes` puts first.
+
+    Returns
+    -------
+    tuple[float, float]
+        In spacing's unit.
+    """
+    boxes = rich_boxes(surface_voxels(mask), _MEASURED)
+    part = mask[boxes[0]] if boxes else mask
+    found = local_thickness(part, spacing, periodic=periodic and part.shape == mask.shape)[part]
+    return float(np.median(found)), float(np.percentile(found, 95))
+
+
+def surface_voxels(mask: np.ndarray) -> np.ndarray:
+    """Voxels of the structure with a face on the background, inside the box."""
+    return mask & ~ndimage.binary_erosion(mask, border_value=1)
+
+
+def rich_boxes(content: np.ndarray, size: int | Sequence[int]) -> list[Window]:
+    """Boxes of at most `size` voxels a side that cover the volume and hold content; the first is the one to look at.
+
+    That is the middle one, unless it holds less than half of what the others hold on average: then the fullest.
+    """
+    sides = [size] * 3 if isinstance(size, int) else list(size)
+    middle = tuple(_centred(n, side) for n, side in zip(content.shape, sides, strict=True))
+    tiles = [_tiles(n, side) for n, side in zip(content.shape, sides, strict=True)]
+    candidates = [middle] + [(z, y, x) for z in tiles[0] for y in tiles[1] for x in tiles[2] if (z, y, x) != middle]
+    counts = [int(np.count_nonzero(content[box])) for box in candidates]
+    filled = [(count, box) for count, box in zip(counts, candidates, strict=True) if count]
+    ordered = [box for _, box in sorted(filled, key=lambda pair: -pair[0])]
+    if ordered and counts[0] >= 0.5 * sum(counts) / len(counts):
+        ordered.remove(middle)
+        ordered.insert(0, middle)
+    return ordered  # type: ignore[return-value]
+
+
+def signed_distance(mask: np.ndarray, spacing: Sequence[float], limit: float) -> np.ndarray:
+    """Distance to the mask's faces, positive inside, up to ±`limit`; float32.
+
+    Centre to centre, less half the finest edge: within half a voxel of the exact one, and its sign is the mask's.
+    """
+    half = 0.5 * min(spacing)
+    inner = ndimage.distance_transform_edt(mask, sampling=spacing)
+    outer = ndimage.distance_transform_edt(~mask, sampling=spacing)
+    return np.clip(np.where(mask, inner - half, half - outer), -limit, limit).astype(np.float32)  # type: ignore[operator]
+
+
+def resample(
+    values: np.ndarray,
+    scale: Sequence[float],
+    start: Sequence[int],
+    shape: Sequence[int],
+    *,
+    periodic: bool = False,
+    nearest: bool = False,
+) -> np.ndarray:
+    """Values on a grid whose voxels are `scale` old voxels long; the corners of both grids' first voxels coincide.
+
+    New voxel i covers the old voxels from i·scale to (i + 1)·scale. Linear, after a Gaussian of (scale - 1)/2 old
+    voxels along axes that become coarser.
+
+    Parameters
+    ----------
+    values
+        (Z, Y, X).
+    scale
+        New voxel in old voxels, along (z, y, x).
+    start, shape
+        First voxel and number of voxels of the part that is wanted, in new voxels.
+    nearest
+        Take the nearest value instead (labels).
+    """
+    width = [0.0 if nearest else max(0.0, (s - 1) / 2) for s in scale]
+    cut, first = values, [0, 0, 0]
+    if not periodic:
+        margin = [math.ceil(4 * w) + 2 for w in width]
+        first = [max(0, math.floor(a * s) - m) for a, s, m in zip(start, scale, margin, strict=True)]
+        last = [math.ceil((a + n) * s) + m for a, n, s, m in zip(start, shape, scale, margin, strict=True)]
+        cut = values[tuple(slice(a, b) for a, b in zip(first, last, strict=True))]
+    smooth = ndimage.gaussian_filter(cut, width, mode="wrap" if periodic else "nearest") if any(width) else cut
+    offset = [(a + 0.5) * s - 0.5 - f for a, s, f in zip(start, scale, first, strict=True)]
+    mode = "grid-wrap" if periodic else "nearest"
+    return ndimage.affine_transform(smooth, scale, offset, tuple(shape), order=0 if nearest else 1, mode=mode)
+
+
+def without_specks(mask: np.ndarray, smallest: float, periodic: bool) -> tuple[np.ndarray, int, int]:
+    """The mask less its components (26-connected) and pinholes (6-connected) of under `smallest` voxels.
+
+    Pieces that touch the faces of a periodic box may go on beyond, and stay.
+
+    Returns
+    -------
+    tuple[np.ndarray, int, int]
+        The mask, and how many specks and pinholes were dropped.
+    """
+    specks, count = _small_pieces(mask, smallest, periodic, _CONNECTED_26)
+    cleaned = mask & ~specks
+    pinholes, holes = _small_pieces(~cleaned, smallest, periodic, None)
+    return cleaned | pinholes, count, holes
+
+
+def _small_pieces(
+    mask: np.ndarray, smallest: float, periodic: bool, structure: np.ndarray | None
+) -> tuple[np.ndarray, int]:
+    labels, _ = ndimage.label(mask, structure)  # type: ignore[misc]
+    small = np.bincount(labels.ravel()) < smallest
+    small[0] = False
+    if periodic:
+        for axis in range(3):
+            small[np.unique(np.take(labels, [0, -1], axis=axis))] = False
+    return small[labels], int(small.sum())
+
+
+def _centred(n: int, size: int) -> slice:
+    length = min(n, size)
+    first = (n - length) // 2
+    return slice(first, first + length)
+
+
+def _tiles(n: int, size: int) -> list[slice]:
+    """The fewest intervals of `size` that cover 0..n, evenly spread."""
+    length = min(n, size)
+    count = math.ceil(n / length)
+    return [slice(first, first + length) for first in (round(i * (n - length) / max(count - 1, 1)) for i in range(count))]

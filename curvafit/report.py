@@ -1,0 +1,251 @@
+"""What an inference leaves behind: one self-contained page, `fit.json`, the regenerated volume."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import TYPE_CHECKING
+
+from curvafit.priors.coefficients import NAMES
+from curvafit.report_pictures import diagram_figures, slice_figures, surface_figures, window_framed
+from curvafit.scan import Field, save, write_atomically
+from curvafit.wording import density, describe, length, number, per_unit, percent, unit_name
+
+if TYPE_CHECKING:
+    from curvafit.infer import Inference
+
+#: Each coefficient as it is written, what it multiplies, and the power of 1/length that it carries in physical units.
+_TERMS = {
+    "a20": ("a₂₀", "κ₁²", 0),
+    "a11": ("a₁₁", "κ₁κ₂", 0),
+    "a02": ("a₀₂", "κ₂²", 0),
+    "a10": ("a₁₀", "κ₁", 1),
+    "a01": ("a₀₁", "κ₂", 1),
+    "a00": ("a₀₀", "1", 2),
+}
+_NAMES = {"match": "nearest match", "fit": "refined parameters"}
+
+
+def write_inference(inference: Inference, directory: str | Path) -> Path:
+    """Write `fit.json`, `report.html` and `regenerated.nii.gz` into a folder; returns the report's path.
+
+    All three are made in a temporary folder beside it and moved once they are whole. Without a regenerated shape there
+    is no `regenerated.nii.gz`.
+
+    Raises
+    ------
+    NotADirectoryError
+        If there is a file of that name.
+    """
+    target = Path(directory)
+    if target.exists() and not target.is_dir():
+        raise NotADirectoryError(f"expected a folder to write to, got the file {target}")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    work = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
+    try:
+        (work / "fit.json").write_text(inference.fit.to_json(), encoding="utf-8")
+        write_report(inference, work / "report.html")
+        if inference.best is not None:
+            voxel = (inference.fit.working_voxel,) * 3
+            save(Field(inference.best, voxel, inference.fit.length_unit), work / "regenerated.nii.gz")
+        target.mkdir(exist_ok=True)
+        (target / "regenerated.nii.gz").unlink(missing_ok=True)
+        for made in sorted(work.iterdir()):
+            os.replace(made, target / made.name)
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+    return target / "report.html"
+
+
+def write_report(inference: Inference, path: str | Path) -> Path:
+    """Write the report of an inference as one HTML page without outside parts; returns its path."""
+    page = report_html(inference)
+    return write_atomically(Path(path), lambda temporary: _write(temporary, page))
+
+
+def report_html(inference: Inference) -> str:
+    """The page itself."""
+    template = Template(files("curvafit").joinpath("templates", "report.html").read_text(encoding="utf-8"))
+    fit = inference.fit
+    sentence = escape(describe(inference))
+    return template.substitute(
+        version=escape(str(fit.provenance.get("curvafit", ""))),
+        title=f"{sentence} · curvafit",
+        sentence=sentence + ".",
+        scan=_scan_line(inference),
+        verdict=escape(fit.status),
+        slices=slice_figures(inference),
+        frame=" The dashed frame is the main window." if window_framed(inference) else "",
+        notes=_list(fit.notes),
+        surfaces=surface_figures(inference),
+        diagrams=diagram_figures(inference),
+        distance_unit=escape(_distance_unit(inference)),
+        distances_say=_distances_say(inference),
+        bars=_bars(inference),
+        scale_say=_scale_say(inference),
+        physical_head=f"{_NAMES[fit.chosen].split()[0]}, physical",
+        parameters=_parameter_rows(inference),
+        parameters_say=_parameters_say(inference),
+        numbers=_number_rows(inference),
+        euler=f"Euler number {number(fit.morphometry.euler, 7)} in the box",
+        matches=_match_rows(inference),
+        command=escape("curvafit generate --prior fit.json --shape 100 --seed 1 -o more.nii.gz"),
+        python=_PYTHON,
+        provenance=_provenance(inference),
+    )
+
+
+_PYTHON = escape(
+    """import curvafit
+from curvafit.fit import read_prior
+
+coefficients, mass = read_prior("fit.json")
+flow = curvafit.generate(coefficients, mass, curvafit.Grid((100, 100, 100)), seed=1)"""
+)
+
+
+def _write(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8")
+
+
+def _scan_line(inference: Inference) -> str:
+    scan, fit = inference.scan, inference.fit
+    shape = " × ".join(str(n) for n in scan.values.shape)
+    kind = {"field": "phase field", "mask": "mask", "image": "image"}.get(fit.kind, fit.kind)
+    same = len({round(h / scan.spacing[0], 6) for h in scan.spacing}) == 1
+    spacing = (scan.spacing[0],) if same else scan.spacing
+    voxel = " × ".join(number(h, 4) for h in spacing) + f" {unit_name(scan.unit, spacing[0])}"
+    name = Path(scan.source).name or "a volume"
+    line = f"{name}: {kind} of {shape} voxels (z, y, x), voxel edge {voxel}."
+    return escape(line) + f" Measured on voxels of {escape(length(fit.working_voxel, fit.length_unit, 3))}."
+
+
+def _list(notes: tuple[str, ...]) -> str:
+    return "<ul class=\"small\">" + "".join(f"<li>{escape(note)}</li>" for note in notes) + "</ul>" if notes else ""
+
+
+def _distance_unit(inference: Inference) -> str:
+    voxel = length(inference.fit.length, inference.fit.length_unit, 3)
+    return f"curvature per working unit (1 working unit = 100 working voxels = {voxel})"
+
+
+def _distances_say(inference: Inference) -> str:
+    noise = inference.fit.distances.get("seed_noise")
+    if noise is None:
+        return "The same parameters could not be grown twice, so how much two seeds differ is not known."
+    return f"Two seeds of the same parameters lie {number(noise, 2)} apart: smaller differences mean nothing."
+
+
+def _bars(inference: Inference) -> str:
+    fit = inference.fit
+    rows = (("nearest match", "match"), ("refined", "fit"), ("two seeds", "seed_noise"))
+    longest = max([value for value in fit.distances.values() if value is not None], default=1.0) or 1.0
+    parts = []
+    for name, key in rows:
+        value = fit.distances.get(key)
+        style = "noise" if key == "seed_noise" else "best" if key == fit.chosen else ""
+        bar = f'<span class="bar {style}" style="width:{100 * value / longest:.1f}%"></span>' if value is not None else ""
+        bold = " class=\"chosen\"" if key == fit.chosen else ""
+        said = number(value, 2) if value is not None else "could not be made" if key != "seed_noise" else "not known"
+        parts.append(f"<span{bold}>{name}</span><span>{bar}</span><span{bold}>{said}</span>")
+    return "\n".join(parts)
+
+
+def _scale_say(inference: Inference) -> str:
+    return "here a₂₀ = 1" if abs(float(inference.fit.coefficients.a20) - 1) < 1e-9 else "any common factor may be put on them"
+
+
+def _parameter_rows(inference: Inference) -> str:
+    fit = inference.fit
+    match, refined = fit.matches[0].coefficients.as_dict(), fit.refined["coefficients"]
+    physical = fit.coefficients_physical.as_dict()
+    rows = [_coefficient_row(inference, name, match[name], refined[name], physical[name]) for name in NAMES]
+    marks = {name: " chosen" if name == fit.chosen else "" for name in _NAMES}
+    rows.append(
+        "<tr><th scope=\"row\">m₀</th><td>mass</td>"
+        f'<td class="n{marks["match"]}">{number(fit.matches[0].mass)}</td>'
+        f'<td class="n{marks["fit"]}">{number(fit.refined["mass"])}</td><td></td>'
+        f'<td class="n chosen">{number(fit.mass)}</td><td></td><td></td></tr>'
+    )
+    rows.append(
+        '<tr><th scope="row">ε</th><td>half width of the interface</td><td class="n">0.02</td><td class="n">0.02</td><td></td>'
+        f'<td class="n chosen">{number(fit.epsilon_physical)}</td><td></td><td>{unit_name(fit.length_unit, 2)}</td></tr>'
+    )
+    return "\n".join(rows)
+
+
+def _coefficient_row(inference: Inference, name: str, match: float, refined: float, physical: float) -> str:
+    fit = inference.fit
+    symbol, factor, power = _TERMS[name]
+    deviation = fit.uncertainty.get(name)
+    working_sd = _deviation(deviation, 1.0)
+    physical_sd = _deviation(deviation, fit.length**-power) if fit.chosen == "fit" else ""
+    best = {key: " chosen" if key == fit.chosen else "" for key in _NAMES}
+    unit = per_unit(fit.length_unit, power) if power else ""
+    return (
+        f'<tr><th scope="row">{symbol}</th><td>{factor}</td><td class="n{best["match"]}">{number(match)}</td>'
+        f'<td class="n{best["fit"]}">{number(refined)}</td><td class="sd">{working_sd}</td>'
+        f'<td class="n chosen">{number(physical)}</td><td class="sd">{physical_sd}</td><td>{unit}</td></tr>'
+    )
+
+
+def _deviation(value: float | None, factor: float) -> str:
+    if value is None:
+        return ""
+    return f"± {number(value * factor, 2)}" if value > 0 else "fixed"
+
+
+def _parameters_say(inference: Inference) -> str:
+    fit = inference.fit
+    voxel = length(fit.working_voxel, fit.length_unit, 3)
+    method = escape(str(fit.refined.get("method", "refinement")))
+    return (
+        f"Columns two and three are in working units (voxel 0.01, ε 0.02); a working voxel is {escape(voxel)}. "
+        f"Bold: the {_NAMES[fit.chosen]}, which are better supported and which fit.json holds. "
+        f"± is one standard deviation of the refinement ({method}); it does not hold what the model leaves out."
+    )
+
+
+def _number_rows(inference: Inference) -> str:
+    numbers = inference.fit.morphometry
+    unit = numbers.unit
+    thickness = f"{length(numbers.thickness_mean, unit)} ± {length(numbers.thickness_std, unit)}"
+    rows = (
+        ("Volume fraction", "BV/TV", percent(numbers.volume_fraction)),
+        ("Mean thickness", "Tb.Th", thickness),
+        ("Mean spacing", "Tb.Sp", length(numbers.spacing_mean, unit)),
+        ("Connectivity density", "Conn.D", density(numbers.connectivity_density, unit, 3)),
+        ("Surface to volume", "BS/BV", density(numbers.surface_to_volume, unit, 1)),
+    )
+    return "\n".join(
+        f'<tr><th scope="row">{name}</th><td class="small">{short}</td><td class="n">{escape(value)}</td></tr>'
+        for name, short, value in rows
+    )
+
+
+def _match_rows(inference: Inference) -> str:
+    return "\n".join(
+        f'<tr><th scope="row">{escape(str(match.id))}</th><td class="n">{number(match.distance, 2)}</td>'
+        f'<td class="n">{number(match.mass)}</td><td class="n">{match.seed}</td></tr>'
+        for match in inference.fit.matches
+    )
+
+
+def _provenance(inference: Inference) -> str:
+    return "\n".join(
+        f"<dt>{escape(str(name).replace('_', ' '))}</dt><dd>{escape(_plain(value))}</dd>"
+        for name, value in inference.fit.provenance.items()
+    )
+
+
+def _plain(value: object) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_plain(part)}" for name, part in value.items())
+    if isinstance(value, (list, tuple)):
+        return ", ".join(_plain(part) for part in value)
+    return str(value)

@@ -1,0 +1,232 @@
+"""Volume files to `Field` and back: values in z,y,x, with spacing, unit and affine."""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+import uuid
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from curvafit.formats import READERS, WRITERS, Raw, ScanError, normalise_unit, pick_reader
+
+__all__ = ["READABLE", "WRITABLE", "Field", "ScanError", "load", "save", "write_atomically"]
+
+#: Suffixes that `load` and `save` know.
+READABLE = tuple(READERS)
+WRITABLE = tuple(WRITERS)
+
+
+@dataclass(frozen=True)
+class Field:
+    """A volume and its place in the world.
+
+    Parameters
+    ----------
+    values
+        Array (Z, Y, X), in the file's own type.
+    spacing
+        Voxel edges along (z, y, x), in `unit`.
+    unit
+        `"voxel"` (unknown), `"nm"`, `"um"`, `"mm"` or `"m"`.
+    affine
+        4x4 map from voxel index (x, y, z, 1) to position in `unit`, NIfTI's convention; its columns are as long as
+        the spacing. None where the file has none.
+    source
+        Where it came from.
+    notes
+        Sentences on what was assumed while reading.
+
+    Raises
+    ------
+    ValueError
+        If values are not a 3D array, spacing is not 3 positive numbers or the unit has no known name.
+    """
+
+    values: np.ndarray
+    spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    unit: str = "voxel"
+    affine: np.ndarray | None = None
+    source: str = ""
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if np.ndim(self.values) != 3:
+            raise ScanError(f"expected a 3D volume, got an array of shape {np.shape(self.values)}")
+        spacing = _positive_triple(self.spacing)
+        unit, factor = normalise_unit(self.unit)
+        object.__setattr__(self, "values", np.asarray(self.values))
+        object.__setattr__(self, "spacing", tuple(h * factor for h in spacing))
+        object.__setattr__(self, "unit", unit)
+        if self.affine is not None:
+            affine = np.array(self.affine, dtype=np.float64)
+            if affine.shape != (4, 4):
+                raise ScanError(f"expected an affine of shape (4, 4), got {affine.shape}")
+            affine[:3] *= factor
+            object.__setattr__(self, "affine", affine)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        return self.values.shape  # type: ignore[return-value]
+
+
+def load(
+    path: str | os.PathLike[str],
+    *,
+    key: str | None = None,
+    spacing: Sequence[float] | float | None = None,
+    unit: str | None = None,
+    raw_shape: Sequence[int] | None = None,
+    dtype: str | None = None,
+) -> Field:
+    """Read a volume from a file, or from a folder of slices.
+
+    Parameters
+    ----------
+    path
+        NIfTI, TIFF, NPY, NPZ, HDF5, RAW, Zarr; with `curvafit[io]` also NRRD, MHA/MHD, MRC and DICOM folders.
+        `file.h5::key` names an array within a file; `key` does the same.
+    spacing, unit
+        Override what the file says: voxel edges (z, y, x), or one for all; nm, um, mm or m. A `unit` alone renames
+        the file's numbers, it does not convert them.
+    raw_shape, dtype
+        Voxels (z, y, x) and numpy type of a RAW file, which cannot tell them.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ScanError
+        A `ValueError`: unknown suffix, a damaged or truncated file, a missing key, a volume that is not 3D,
+        not finite or constant, a spacing that is not positive.
+    """
+    location, key = _split_key(os.fspath(path), key)
+    if not location.exists():
+        raise FileNotFoundError(f"expected a volume file, got no such file: {location}")
+    reader = pick_reader(location, raw_shape is not None)
+    raw = _guarded(reader, location, key=key, raw_shape=raw_shape, dtype=dtype)
+    raw = _squeezed(raw, location)
+    _check_values(raw.values, location)
+    return _placed(raw, f"{location}::{key}" if key else str(location), spacing, unit)
+
+
+def save(field: Field, path: str | os.PathLike[str]) -> Path:
+    """Write a field as NIfTI, TIFF, NPY or Zarr, by suffix; a file of that name is replaced once the new one is whole.
+
+    NIfTI keeps the affine (qform and sform) and the unit, TIFF (ImageJ's or OME's metadata) and Zarr (attributes)
+    spacing and unit, NPY the values only.
+
+    Raises
+    ------
+    ScanError
+        If the suffix is unknown or the format cannot hold the values' type.
+    """
+    target = Path(path)
+    writer = next((write for suffix, write in WRITERS.items() if target.name.lower().endswith(suffix)), None)
+    if writer is None:
+        raise ScanError(f"expected a name ending in one of {', '.join(WRITABLE)}, got {target.name!r}")
+    return write_atomically(target, lambda temporary: writer(field, temporary))
+
+
+def write_atomically(target: Path, write: Callable[[Path], None]) -> Path:
+    """Call `write` with a temporary name beside `target` (same suffix), then move what it made to `target`."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    mark = uuid.uuid4().hex[:8]
+    temporary = target.with_name(f".{mark}.{target.name}")
+    aside = target.with_name(f".{mark}.old.{target.name}")
+    try:
+        write(temporary)
+        if target.is_dir():
+            os.replace(target, aside)
+        os.replace(temporary, target)
+    finally:
+        _remove(temporary)
+        _remove(aside)
+    return target
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def _split_key(path: str, key: str | None) -> tuple[Path, str | None]:
+    name, separator, inner = path.rpartition("::")
+    return (Path(name), key or inner or None) if separator else (Path(path), key)
+
+
+def _guarded(reader: Callable[..., Raw], path: Path, **options: object) -> Raw:
+    """A library's own exceptions become one sentence; ours pass."""
+    try:
+        return reader(path, **options)
+    except (ScanError, FileNotFoundError, MemoryError):
+        raise
+    except Exception as reason:  # every library has its own way to say that a file is damaged
+        said = " ".join(f"{type(reason).__name__}: {reason}".split())[:200]
+        raise ScanError(f"expected a whole, readable file, got {path} that cannot be read ({said})") from reason
+
+
+def _squeezed(raw: Raw, path: Path) -> Raw:
+    """Drop axes of length 1 beyond three, with their spacing."""
+    values = raw.values
+    if values.dtype.kind not in "biuf":
+        raise ScanError(f"expected numbers, got values of type {values.dtype} in {path}")
+    kept = [axis for axis, n in enumerate(values.shape) if n != 1]
+    if len(kept) != 3:
+        got = "no values" if values.size == 0 else f"{len(kept)}D of shape {tuple(values.shape)}"
+        raise ScanError(f"expected a 3D volume, got {got} in {path}")
+    spacing = raw.spacing
+    if spacing is not None and len(spacing) == values.ndim:
+        spacing = tuple(spacing[axis] for axis in kept)
+    return raw._replace(values=values.reshape([values.shape[axis] for axis in kept]), spacing=spacing)
+
+
+def _check_values(values: np.ndarray, path: Path) -> None:
+    if values.size == 0:
+        raise ScanError(f"expected a 3D volume, got no values (shape {values.shape}) in {path}")
+    lowest, highest = values.min(), values.max()
+    if values.dtype.kind == "f" and not (math.isfinite(lowest) and math.isfinite(highest)):
+        what = "NaN" if math.isnan(lowest) else "infinite"
+        count = np.count_nonzero(np.isnan(values) if what == "NaN" else np.isinf(values))
+        raise ScanError(f"expected finite values, got {count} that are {what} in {path}")
+    if lowest == highest:
+        raise ScanError(f"expected a volume that varies, got {lowest} everywhere in {path}")
+
+
+def _placed(raw: Raw, source: str, spacing: Sequence[float] | float | None, unit: str | None) -> Field:
+    """Native values with the file's spacing and unit, or the caller's."""
+    notes = list(raw.notes if spacing is not None or unit is not None else raw.notes + raw.guesses)
+    file_unit, factor = normalise_unit(raw.unit)
+    stated = None if raw.spacing is None else _positive_triple(tuple(h * factor for h in raw.spacing))
+    affine = None if raw.affine is None else np.diag([factor, factor, factor, 1.0]) @ raw.affine
+    chosen_unit, chosen_factor = (file_unit, 1.0) if unit is None else normalise_unit(unit)
+    chosen = stated
+    if spacing is not None:
+        chosen = _positive_triple(spacing)
+    if chosen is None:
+        chosen = (1.0, 1.0, 1.0)
+        assumed = "lengths are counted in voxels" if chosen_unit == "voxel" else f"voxels of 1 {chosen_unit} are assumed"
+        notes.append(f"The file states no spacing: {assumed}.")
+    if affine is not None and stated is not None:
+        affine[:3, :3] *= np.array(chosen)[::-1] / np.array(stated)[::-1]
+    if unit is not None:
+        chosen = tuple(h * chosen_factor for h in chosen)
+        affine = None if affine is None else np.diag([chosen_factor] * 3 + [1.0]) @ affine
+    values = np.ascontiguousarray(raw.values, dtype=raw.values.dtype.newbyteorder("="))
+    return Field(values, chosen, chosen_unit, affine, source, tuple(notes))
+
+
+def _positive_triple(spacing: object) -> tuple[float, float, float]:
+    try:
+        triple = (float(spacing),) * 3 if isinstance(spacing, (int, float)) else tuple(float(h) for h in spacing)  # type: ignore[union-attr]
+    except (TypeError, ValueError):
+        triple = ()
+    if len(triple) != 3 or any(not math.isfinite(h) or h <= 0 for h in triple):
+        raise ScanError(f"expected a spacing of 3 positive numbers (z, y, x), got {spacing!r}")
+    return triple  # type: ignore[return-value]

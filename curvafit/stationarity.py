@@ -1,0 +1,267 @@
+"""Parameters of a phase field from its stationarity: the weak form of Σ a_α ∂F_α/∂u = λ, which is linear in (a, λ).
+
+Each Gaussian test function gives one equation. The columns carry the error of the field itself, amplified by second
+differences, so ordinary least squares is biased; here the misfit is measured in units of the misfit that such an error
+causes (total least squares with the noise propagated through the columns), and the error's size is the one at which
+the two agree.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from curvafit.priors.coefficients import NAMES, Coefficients
+from curvafit.priors.curvature import jet
+from curvafit.priors.energy import energy_terms
+from curvafit.priors.grid import Grid
+from curvafit.priors.shapes import Float
+from curvafit.priors.stencils import gaussian_blur, pad
+from curvafit.refinement import Progress, Refinement, admissible, double_precision_on_cpu, in_gauge, named, units
+
+#: Standard deviation of the test functions, in voxels.
+TEST_WIDTH = 4.0
+#: Reach in voxels of a density's gradient: one of the stencil, one of its adjoint.
+_REACH = 2
+#: Planes treated at once, which bounds the memory.
+_SLAB = 24
+#: Test functions are centred on every second voxel.
+_STRIDE = 2
+#: The field's error is modelled as white noise of this width (voxels); its amplitude is searched from the first value.
+_ERROR_WIDTH, _ERROR_START, _ERROR_LIMITS, _ERROR_STEPS = 1.0, 1e-3, (1e-6, 3e-2), 4
+#: A field of a few thousand values was rounded.
+_ROUNDED_VALUES = 4096
+#: A field error above which stationarity says little.
+_LARGE_ERROR = 0.005
+
+
+class _Problem(NamedTuple):
+    """Triangles `(6, 6)` with the multiplier eliminated, of the equations and of what the field's error adds to them."""
+
+    columns: np.ndarray
+    error: np.ndarray
+
+
+def is_rounded(u: np.ndarray | Tensor) -> bool:
+    """Whether a field holds so few values that it was quantised: second differences of it are then noise."""
+    return len(np.unique(np.asarray(u))) <= min(_ROUNDED_VALUES, math.prod(u.shape) // 16)
+
+
+def energy_gradients(u: Float[Tensor, "z y x"], grid: Grid, epsilon: float) -> Float[Tensor, "6 z y x"]:
+    """∂F_α/∂u per volume for the six terms, in u's precision; within a voxel of a border that is not periodic the
+    field is taken to continue as its mirror image."""
+    padded = pad(u, grid, _REACH)
+    slabs = []
+    for start in range(0, grid.shape[0], _SLAB):
+        slab = padded[start : start + _SLAB + 2 * _REACH].clone().requires_grad_()
+        part = Grid(tuple(slab.shape), grid.spacing, "replicate")  # type: ignore[arg-type]
+        terms = energy_terms(jet(slab, part), epsilon).sum((-3, -2, -1))
+        each = [torch.autograd.grad(term, slab, retain_graph=True)[0] for term in terms]
+        inside = slice(_REACH, -_REACH)
+        slabs.append(torch.stack(each)[:, inside, inside, inside])
+    return torch.cat(slabs, 1)
+
+
+def stationarity(
+    u: Float[Tensor, "z y x"],
+    grid: Grid,
+    epsilon: float,
+    *,
+    starts: Sequence[Coefficients] = (),
+    width: float | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Refinement:
+    """Coefficients up to scale under which a phase field is stationary at fixed mass: Σ a_α k ∗ ∂F_α/∂u = λ.
+
+    Minimises |R a| / |N a| over a20, a02 > 0: R the QR-compressed columns, λ eliminated, N those that an error of the
+    field alone would cause. Its unconstrained minimiser, one of the starts, is the whitened columns' smallest singular
+    vector. Posed with optimistix (Levenberg–Marquardt) in float64. m₀ is the field's mean.
+
+    The deviations are a jackknife over octants; they hold what varies over the box, not a bias common to all of it.
+
+    Parameters
+    ----------
+    u
+        Phase field, periodic or a crop of a larger one (the test functions then stay off the border).
+    starts
+        Coefficients to start from besides the total least squares solution.
+    width
+        Standard deviation of the test functions in voxels; `TEST_WIDTH`, less in a small crop.
+    seed
+        Of the noise that is propagated.
+
+    Returns
+    -------
+    Refinement
+        `residual` is the root mean square error of the field that would explain the misfit.
+
+    Raises
+    ------
+    ValueError
+        If the field is not finite, has another shape than the grid, or is a crop under 24 voxels along an axis.
+    """
+    values = torch.as_tensor(u).detach().to("cpu", torch.float64)
+    if tuple(values.shape) != grid.shape or not bool(torch.isfinite(values).all()):
+        raise ValueError(f"expected a finite field of shape {grid.shape}, got shape {tuple(values.shape)}")
+    say = progress or (lambda text, share: None)
+    width = _width(grid) if width is None else width
+    say("differentiating the energy", 0.0)
+    octants = _equations(values, grid, epsilon, width)
+    problem, size, trials = _with_error(values, octants, grid, epsilon, width, seed)
+    say("solving", 0.8)
+    tls, singular = _total_least_squares(problem)
+    given = [np.array([float(value) for value in start]) / units(epsilon) for start in starts]
+    begun = np.stack([admissible(start) for start in (tls, *given)])
+    solutions, residuals = _solve([problem] * len(begun), begun)
+    order = np.argsort(residuals)
+    best = solutions[order[0]]
+    replicas = [_Problem(_triangle(np.delete(octants, k, 0)), problem.error) for k in range(len(octants))]
+    coefficients, fixed = in_gauge(best * units(epsilon))
+    jackknife = _solve(replicas, np.stack([best] * len(replicas)))[0] * units(epsilon)
+    deviations = _jackknife_deviation(jackknife / jackknife[:, fixed : fixed + 1])
+    residual = float(size * residuals[order[0]])
+    say("solved", 1.0)
+    return Refinement(
+        method="stationarity",
+        coefficients=coefficients,
+        mass=float(values.mean()),
+        uncertainty=named(deviations),
+        singular_values=tuple(float(value) for value in singular),
+        residual=residual,
+        starts=tuple((in_gauge(begun[k] * units(epsilon))[0], float(size * residuals[k])) for k in order),
+        status=_status(coefficients, deviations, fixed, residual, is_rounded(values)),
+        evaluations=1 + trials,
+    )
+
+
+def _width(grid: Grid) -> float:
+    """The default test width, or in a small crop the one that leaves a core of eight voxels."""
+    if grid.periodic:
+        return TEST_WIDTH
+    if min(grid.shape) < 24:
+        raise ValueError(f"expected a crop of at least 24 voxels along each axis, got {grid.shape}")
+    return min(TEST_WIDTH, (min(grid.shape) - 8 - 2 * _REACH) // 2 / 4)
+
+
+def _equations(u: Tensor, grid: Grid, epsilon: float, width: float) -> np.ndarray:
+    """`(8, 7, 7)`: each octant's equations [1 | columns], dimensionless, QR-compressed."""
+    tested = _tested(energy_gradients(u, grid, epsilon), grid, epsilon, width)
+    halves = [np.array_split(np.arange(n), 2) for n in tested.shape[1:]]
+    parts = [tested[:, z][:, :, y][..., x] for z in halves[0] for y in halves[1] for x in halves[2]]
+    scale = math.sqrt(tested[0].size)
+    return np.stack([_compressed(part.reshape(6, -1)) / scale for part in parts])
+
+
+def _tested(columns: Tensor, grid: Grid, epsilon: float, width: float) -> np.ndarray:
+    """`(6, …)` columns against Gaussian test functions whose support stays in the box (or goes round it)."""
+    deviation = width * max(grid.spacing)
+    scaled = columns * torch.as_tensor(units(epsilon), dtype=columns.dtype).reshape(6, 1, 1, 1)
+    blurred = gaussian_blur(scaled, grid, deviation)
+    core = [slice(None)]
+    for n, h in zip(grid.shape, grid.spacing, strict=True):
+        margin = 0 if grid.periodic else math.ceil(4 * deviation / h) + _REACH
+        if n - 2 * margin < 2 * _STRIDE:
+            raise ValueError(f"expected a test width under {n / 8 - 1:.1f} voxels in a crop of {n}, got {width}")
+        core.append(slice(margin, n - margin, _STRIDE))
+    return blurred[tuple(core)].numpy()
+
+
+def _compressed(columns: np.ndarray) -> np.ndarray:
+    """Triangle `(7, 7)` of the QR factorisation of [1 | columns]."""
+    rows = np.concatenate((np.ones((1, columns.shape[1])), columns)).T
+    triangle = np.linalg.qr(rows, mode="r")
+    return np.pad(triangle, ((0, 7 - len(triangle)), (0, 0)))
+
+
+def _triangle(stack: np.ndarray) -> np.ndarray:
+    """`(6, 6)`: stacked triangles `(n, 7, 7)` as one, the multiplier's column eliminated."""
+    return np.linalg.qr(stack.reshape(-1, 7), mode="r")[1:, 1:]
+
+
+def _with_error(
+    u: Tensor, octants: np.ndarray, grid: Grid, epsilon: float, width: float, seed: int
+) -> tuple[_Problem, float, int]:
+    """The problem whitened by a field error, the error's root mean square and the number of trials.
+
+    A finite error, not its linearisation: the columns are singular where ∇u = 0 and at umbilics. Its size is searched
+    until the misfit is what it causes (smallest singular value 1).
+    """
+    columns = _triangle(octants)
+    clean = energy_gradients(u, grid, epsilon)
+    error = torch.randn(u.shape, generator=torch.Generator().manual_seed(seed), dtype=u.dtype)
+    error = gaussian_blur(error, grid, _ERROR_WIDTH * max(grid.spacing))
+    error /= error.square().mean().sqrt()
+    size = _ERROR_START
+    for trial in range(1, _ERROR_STEPS + 1):
+        change = _tested(energy_gradients(u + size * error, grid, epsilon) - clean, grid, epsilon, width)
+        triangle = _compressed(change.reshape(6, -1))[1:, 1:] / math.sqrt(change[0].size)
+        problem = _Problem(columns, triangle)
+        least = _total_least_squares(problem)[1][-1]
+        wanted = float(np.clip(size * least, *_ERROR_LIMITS))
+        if trial == _ERROR_STEPS or abs(math.log(wanted / size)) < 0.1:
+            break
+        size = wanted
+    return problem, size, trial
+
+
+def _total_least_squares(problem: _Problem) -> tuple[np.ndarray, np.ndarray]:
+    """Smallest singular vector of the columns whitened by the error, with a20 + a02 > 0, and the singular values."""
+    whitened = np.linalg.solve(problem.error.T, problem.columns.T).T
+    _, singular, rows = np.linalg.svd(whitened)
+    a = np.linalg.solve(problem.error, rows[-1])
+    return a * np.sign(a[0] + a[2]), singular
+
+
+def _solve(problems: Sequence[_Problem], begun: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Minimisers `(n, 6)` of |R a| / |N a| with a20 + a02 = 2, both positive, from `(n, 6)` starts; their values."""
+    with double_precision_on_cpu():
+        import jax
+        import jax.numpy as jnp
+        import optimistix
+
+        def coefficients(free):
+            share = jax.nn.sigmoid(free[0])
+            return jnp.stack([2 * share, free[1], 2 - 2 * share, free[2], free[3], free[4]])
+
+        def residual(free, args):
+            columns, error = args
+            a = coefficients(free)
+            return columns @ a / jnp.linalg.norm(error @ a)
+
+        def minimise(columns, error, start):
+            begin = jnp.concatenate([jnp.log(start[:1] / start[2:3]), start[1:2], start[3:]])
+            solver = optimistix.LevenbergMarquardt(rtol=1e-8, atol=1e-10)
+            found = optimistix.least_squares(
+                residual, solver, begin, args=(columns, error), max_steps=500, throw=False
+            ).value
+            return coefficients(found), jnp.linalg.norm(residual(found, (columns, error)))
+
+        columns, errors = (jnp.asarray(np.stack(part)) for part in zip(*problems, strict=True))
+        found = jax.jit(jax.vmap(minimise))(columns, errors, jnp.asarray(begun))
+        return np.asarray(found[0]), np.asarray(found[1])
+
+
+def _jackknife_deviation(replicas: np.ndarray) -> np.ndarray:
+    """Standard deviation over delete-one replicas `(n, …)`."""
+    n = len(replicas)
+    return np.sqrt((n - 1) / n * ((replicas - replicas.mean(0)) ** 2).sum(0))
+
+
+def _status(coefficients: Coefficients, deviations: np.ndarray, fixed: int, residual: float, rounded: bool) -> str:
+    """How well stationarity supports the coefficients, in a sentence."""
+    if rounded:
+        return "Stationarity is not supported: the field was rounded to few values, which its second differences amplify."
+    weak = [name for name, value, d in zip(NAMES, coefficients, deviations, strict=True) if d > max(abs(value) / 2, 0)]
+    gauge = "" if fixed == 0 else " a20 is at the edge of the domain, so a02 = 1 fixes the scale."
+    if residual > _LARGE_ERROR:
+        verdict = "Stationarity is weakly supported"
+    else:
+        verdict = "Stationarity is supported"
+    held = f"; weakly held: {', '.join(weak)}" if weak else ""
+    return f"{verdict}: a field error of {residual:.1e} would explain the misfit{held}.{gauge}"

@@ -1,0 +1,89 @@
+"""Distances between curvature diagrams: Sinkhorn divergences, and a sliced embedding to search with."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from geomloss import SamplesLoss
+from torch import Tensor
+
+from curvafit.diagram import Diagram
+
+#: Part of the area, times (edge / bin width)², that a widened bin may hold.
+TAIL_SHARE = 1e-3
+
+
+def wasserstein(
+    a: Diagram, b: Diagram, *, blur: float = 1.0, reach: float | None = 20.0, bin_width: float = 2.0
+) -> float:
+    """√ of the debiased unbalanced Sinkhorn divergence of two normalised diagrams, cost ½|x - y|².
+
+    The paper's distance (blur 1, reach 20: all in 1 / grid's unit), by geomloss, on binned diagrams instead of random
+    triangles. Two diagrams that differ by a small shift s are |s| / √2 apart; far apart, the distance levels off.
+
+    Parameters
+    ----------
+    a, b
+        Diagrams in the same unit.
+    reach
+        How far area is moved before it is cheaper to destroy it; None moves all.
+    bin_width
+        Edge of the bins, widened in the tails (`Diagram.thinned`); 0 compares the points as they are.
+
+    Raises
+    ------
+    ValueError
+        If a diagram is empty, the units differ, or a parameter is out of range.
+    """
+    return wasserstein_many(a, [b], blur=blur, reach=reach, bin_width=bin_width)[0]
+
+
+def wasserstein_many(
+    query: Diagram,
+    diagrams: Sequence[Diagram],
+    *,
+    blur: float = 1.0,
+    reach: float | None = 20.0,
+    bin_width: float = 2.0,
+) -> list[float]:
+    """`wasserstein` of one diagram to each of several; the query is binned once."""
+    if not blur > 0 or not (reach is None or reach > 0) or bin_width < 0:
+        raise ValueError(f"expected positive blur and reach, got blur {blur}, reach {reach}, bin width {bin_width}")
+    loss = SamplesLoss("sinkhorn", p=2, blur=blur, reach=reach, debias=True, backend="tensorized")
+    first = _measure(query, bin_width)
+    found = []
+    for other in diagrams:
+        if other.unit != query.unit:
+            raise ValueError(f"expected diagrams in one unit, got {query.unit} and {other.unit}")
+        with torch.no_grad():
+            value = float(loss(*first, *_measure(other, bin_width)))
+        found.append(math.sqrt(max(0.0, value)))
+    return found
+
+
+def sliced_embedding(diagram: Diagram, directions: int = 12, quantiles: int = 24) -> np.ndarray:
+    """Quantiles of the diagram's projections on `directions` lines through the origin, `(directions · quantiles,)`.
+
+    Scaled so that the Euclidean distance of two embeddings is their sliced W₂, the mean over directions of the squared
+    one-dimensional distances: |s| / √2 for a shift by s, as in `wasserstein`.
+    """
+    whole = diagram.normalised
+    angles = np.pi * np.arange(directions) / directions
+    levels = (np.arange(quantiles) + 0.5) / quantiles
+    lines = whole.points @ np.stack([np.cos(angles), np.sin(angles)])
+    rows = []
+    for values in lines.T:
+        order = np.argsort(values, kind="stable")
+        reached = np.cumsum(whole.weights[order]) - whole.weights[order] / 2
+        rows.append(np.interp(levels, reached, values[order]))
+    return np.concatenate(rows) / math.sqrt(directions * quantiles)
+
+
+def _measure(diagram: Diagram, bin_width: float) -> tuple[Tensor, Tensor]:
+    whole = diagram.normalised
+    if bin_width:
+        whole = whole.thinned(bin_width, TAIL_SHARE)
+    return torch.from_numpy(whole.weights).float(), torch.from_numpy(whole.points).float()

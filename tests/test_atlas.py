@@ -1,0 +1,228 @@
+"""Building resumes to the same draws; atlas files come back within their stated rounding, damaged ones are refused."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import types
+
+import numpy as np
+import pytest
+import torch
+
+from curvafit.data_synth import __main__ as command
+from curvafit.data_synth import atlas as building
+from curvafit.data_synth.design import INTERVALS, random_law, start_seed
+from curvafit.data_synth.store import open_store
+from curvafit.generation.schedule import schedule
+from curvafit.generation.viability import Viability
+from curvafit.index import VERSION, Atlas, extract, load_atlas, save_atlas
+from curvafit.priors.grid import Grid
+from curvafit.priors.profile import optimal_profile
+
+SHAPE = 20
+
+
+def ball(radius: float) -> torch.Tensor:
+    """The phase field of a ball (radius in working units) in the middle of a box of `SHAPE` voxels."""
+    axes = (torch.arange(SHAPE) - SHAPE / 2 + 0.25) * 0.01
+    z, y, x = torch.meshgrid(axes, axes, axes, indexing="ij")
+    return optimal_profile(radius - (z**2 + y**2 + x**2).sqrt(), 0.02).float()
+
+
+class Balls:
+    """Stands for `generate`: a ball sized by the mass, viable where a11 > 0; remembers its calls, may be stopped."""
+
+    def __init__(self, stop_after: int | None = None) -> None:
+        self.seeds: list[int] = []
+        self.stop_after = stop_after
+
+    def __call__(self, coefficients, mass, grid, *, seed, reject_early, **options):
+        if len(self.seeds) == self.stop_after:
+            raise KeyboardInterrupt
+        assert reject_early
+        self.seeds.append(seed)
+        viable = coefficients.a11 > 0
+        history = types.SimpleNamespace(step=np.array([1, 9]), energy=np.array([2.0, 1.0]))
+        viability = Viability(0.1, 1.0, -1.0, viable, "" if viable else "a11 is negative")
+        field = ball(0.05 + 0.03 * mass)
+        return types.SimpleNamespace(field=field, history=history, viability=viability, status="converged")
+
+
+@pytest.fixture
+def balls(monkeypatch):
+    stand_in = Balls()
+    monkeypatch.setattr(building, "generate", stand_in)
+    return stand_in
+
+
+@pytest.fixture
+def atlas(tmp_path, balls) -> Atlas:
+    return extract(building.build(tmp_path / "s.zarr", 6, SHAPE, seed=2), command=["first", "second"])
+
+
+def test_building_draws_in_order_until_enough_are_viable(tmp_path, balls):
+    said = []
+    store = building.build(tmp_path / "s.zarr", 5, SHAPE, seed=1, progress=lambda *news: said.append(news))
+    records = [store.record(index) for index in store.indices()]
+    assert store.indices() == list(range(len(records)))
+    assert sum(record.viability.viable for record in records) == 5 and records[-1].viability.viable
+    assert any(not record.viability.viable for record in records)
+    assert [(record.coefficients, record.mass) for record in records] == [random_law(1, i) for i in store.indices()]
+    assert balls.seeds == [record.seed for record in records] == [start_seed(1, i) for i in store.indices()]
+    assert [(record.index, draws) for record, _, draws in said] == [(i, i + 1) for i in store.indices()]
+    assert (records[0].steps, records[0].energy) == (9, 1.0)
+    assert store.settings.schedule == dataclasses.asdict(schedule("fast"))
+
+
+def test_an_interrupted_build_resumes_to_the_same_store_and_makes_no_draw_twice(tmp_path, monkeypatch):
+    whole, first, second = Balls(), Balls(stop_after=4), Balls()
+    monkeypatch.setattr(building, "generate", whole)
+    straight = building.build(tmp_path / "straight.zarr", 5, SHAPE)
+    monkeypatch.setattr(building, "generate", first)
+    with pytest.raises(KeyboardInterrupt):
+        building.build(tmp_path / "s.zarr", 5, SHAPE)
+    monkeypatch.setattr(building, "generate", second)
+    resumed = building.build(tmp_path / "s.zarr", 5, SHAPE)
+    assert len(first.seeds) == 4 and first.seeds + second.seeds == whole.seeds
+    assert resumed.indices() == straight.indices()
+    for index in straight.indices():
+        one, other = (dataclasses.replace(s.record(index), seconds=0) for s in (straight, resumed))
+        assert one == other
+    building.build(tmp_path / "s.zarr", 5, SHAPE)
+    assert first.seeds + second.seeds == whole.seeds  # a finished store asks for nothing
+
+
+def test_a_real_draw_is_what_its_record_says(tmp_path):
+    quick = dataclasses.replace(schedule("fast"), name="quick", steps=30)
+    grid = Grid((16,) * 3)
+    building._draw(open_store(tmp_path / "s.zarr", _settings(grid, quick)), 0, grid, quick)
+    store = open_store(tmp_path / "s.zarr")
+    record = store.record(0)
+    assert record.versions["torch"] == building.versions()["torch"]
+    assert 0 < record.steps <= 30 and np.isfinite(record.energy)
+    if record.viability.viable:
+        assert float(store.field(0).mean()) == pytest.approx(record.mass, abs=1e-6)
+
+
+def test_wrong_counts_and_other_settings_are_refused(tmp_path, balls):
+    with pytest.raises(ValueError, match="expected a count of at least 1 shape, got 0"):
+        building.build(tmp_path / "s.zarr", 0, SHAPE)
+    building.build(tmp_path / "s.zarr", 1, SHAPE)
+    with pytest.raises(ValueError, match="expected the settings of .*, got another seed: 3 for 0"):
+        building.build(tmp_path / "s.zarr", 1, SHAPE, seed=3)
+
+
+def test_the_command_builds_and_says_what_was_wrong(tmp_path, balls, capsys):
+    assert command.main([str(tmp_path / "s.zarr"), "--count", "2", "--shape", str(SHAPE)]) == 0
+    assert "viable (2 of " in capsys.readouterr().err
+    assert command.main([str(tmp_path / "s.zarr"), "--count", "0"]) == 2
+    assert capsys.readouterr().err == "expected a count of at least 1 shape, got 0\n"
+
+
+def test_an_atlas_holds_what_the_store_does(tmp_path, atlas):
+    store = open_store(tmp_path / "s.zarr")
+    viable = [r for r in map(store.record, store.indices()) if r.viability.viable]
+    assert atlas.ids == tuple(f"2-{r.index:05d}" for r in viable)
+    assert [atlas.shape_coefficients(i) for i in range(6)] == [r.coefficients for r in viable]
+    np.testing.assert_array_equal(atlas.masses, [r.mass for r in viable])
+    np.testing.assert_array_equal(atlas.seeds, [r.seed for r in viable])
+    np.testing.assert_allclose(atlas.volume_fractions[0], np.mean(store.field(viable[0].index) > 0))
+    for measured in atlas.diagrams("field"):  # balls: κ1 and κ2 are 1/R all over, the area 4πR²
+        κ = np.average(measured.points, axis=0, weights=measured.weights)
+        assert measured.weights.sum() * κ[0] * κ[1] == pytest.approx(4 * np.pi, rel=0.12)
+    assert atlas.provenance["command"] == ["first", "second"]
+    assert atlas.provenance["settings"]["seed"] == 2
+    assert atlas.provenance["draws"] == len(store.indices())
+
+
+def test_an_atlas_file_comes_back_within_its_stated_rounding(tmp_path, atlas):
+    save_atlas(atlas, tmp_path / "a.npz")
+    back = load_atlas(tmp_path / "a.npz")
+    assert (back.ids, back.format_version) == (atlas.ids, VERSION)
+    assert back.provenance == json.loads(json.dumps(atlas.provenance))
+    for name in ("coefficients", "masses", "seeds", "volume_fractions"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(atlas, name))
+    for view in ("field", "mask"):
+        for one, other in zip(atlas.diagrams(view), back.diagrams(view), strict=True):
+            assert np.all(np.abs(one.points - other.points) <= 2**-11 * np.abs(one.points) + 2**-24)
+            np.testing.assert_allclose(other.weights, one.weights, rtol=2**-23)
+            assert other.spread == pytest.approx(one.spread)
+    assert [path.name for path in tmp_path.glob("*.npz*")] == ["a.npz"]
+
+
+def test_an_atlas_of_another_version_is_refused(tmp_path, atlas):
+    save_atlas(atlas, tmp_path / "a.npz")
+    with np.load(tmp_path / "a.npz") as archive:
+        arrays = dict(archive)
+    header = json.loads(arrays["header"].tobytes()) | {"version": VERSION + 1}
+    arrays["header"] = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
+    np.savez(tmp_path / "b.npz", **arrays)
+    sentence = f"expected an atlas of version {VERSION}, got version {VERSION + 1} in .*b.npz"
+    with pytest.raises(ValueError, match=sentence):
+        load_atlas(tmp_path / "b.npz")
+
+
+def test_a_damaged_atlas_is_refused_wherever_it_is_cut(tmp_path, atlas):
+    save_atlas(atlas, tmp_path / "a.npz")
+    whole = (tmp_path / "a.npz").read_bytes()
+    for length in (0, 1, 50, len(whole) // 2, len(whole) - 1):
+        (tmp_path / "cut.npz").write_bytes(whole[:length])
+        with pytest.raises(ValueError, match=r"expected an atlas file, got .*cut.npz, which is truncated"):
+            load_atlas(tmp_path / "cut.npz")
+    for start in range(100, len(whole) - 100, len(whole) // 20):
+        (tmp_path / "cut.npz").write_bytes(whole[:start] + bytes(64) + whole[start + 64 :])
+        with pytest.raises(ValueError, match=r"expected an atlas file|expected a whole atlas"):
+            load_atlas(tmp_path / "cut.npz")
+
+
+def test_other_files_are_no_atlas(tmp_path):
+    with pytest.raises(FileNotFoundError, match="expected an atlas file, got .*none.npz, where there is none"):
+        load_atlas(tmp_path / "none.npz")
+    buffer = io.BytesIO()
+    np.savez(buffer, a=np.zeros(3))
+    header = np.frombuffer(b'{"format": "another"}', dtype=np.uint8)
+    np.savez(tmp_path / "other.npz", header=header)
+    (tmp_path / "array.npz").write_bytes(buffer.getvalue())
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    for name in ("other.npz", "array.npz", "array.npy"):
+        with pytest.raises(ValueError, match="expected an atlas file, got .* something else"):
+            load_atlas(tmp_path / name)
+
+
+def test_arrays_that_do_not_fit_together_are_refused(atlas):
+    with pytest.raises(ValueError, match=r"expected masses of shape \(6,\), got \(5,\)"):
+        dataclasses.replace(atlas, masses=atlas.masses[1:])
+    with pytest.raises(ValueError, match="expected a field and a mask diagram for each of at least one shape"):
+        dataclasses.replace(atlas, mask_diagrams=atlas.mask_diagrams[1:])
+    with pytest.raises(ValueError, match="expected shapes seen as 'field' or 'mask', got 'image'"):
+        atlas.diagrams("image")
+
+
+def test_a_store_without_viable_shapes_gives_no_atlas(tmp_path):
+    store = open_store(tmp_path / "s.zarr", _settings(Grid((16,) * 3), schedule("fast")))
+    with pytest.raises(ValueError, match="expected at least one viable shape in .*, got none in 0 draws"):
+        extract(store)
+
+
+def test_the_packaged_atlas_is_of_the_random_law_and_small():
+    atlas = load_atlas()
+    file = building.Path(__file__).parent.parent / "curvafit" / "data" / "atlas.npz"
+    assert file.stat().st_size < 5e6
+    assert len(atlas) >= 200 and len(set(atlas.ids)) == len(set(atlas.seeds.tolist())) == len(atlas)
+    settings = atlas.provenance["settings"]
+    assert settings["schedule"]["name"] == "fast" and min(settings["shape"]) >= 48
+    for position, name in enumerate(atlas.ids):
+        seed, index = map(int, name.split("-"))
+        assert random_law(seed, index) == (atlas.shape_coefficients(position), atlas.masses[position])
+        assert start_seed(seed, index) == atlas.seeds[position]
+    low, high = INTERVALS["mass"]
+    assert low < atlas.masses.min() and atlas.masses.max() < high
+    assert all(np.isfinite(d.points).all() and d.weights.min() > 0 for d in atlas.diagrams("mask"))
+    assert any("curvafit" in line for line in atlas.provenance["command"])
+
+
+def _settings(grid: Grid, plan) -> building.Settings:
+    epsilon, blur = building.WORKING_EPSILON, building.BLUR
+    return building.Settings(grid.shape, grid.spacing, epsilon, blur, building.LAW, 0, dataclasses.asdict(plan))

@@ -1,0 +1,87 @@
+"""Matching: a shape finds itself, the short list keeps the true nearest, order and errors."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from curvafit.diagram import Diagram
+from curvafit.index import Atlas, load_atlas
+from curvafit.match import nearest
+from curvafit.transport import wasserstein
+
+
+def blob(centre: tuple[float, float], count: int = 60) -> Diagram:
+    """A cloud of width 5 about a centre, with κ1 ≥ κ2."""
+    points = np.random.default_rng(0).normal(centre, 5, (count, 2))
+    return Diagram(np.sort(points, axis=1)[:, ::-1].copy(), np.full(count, 0.1)).binned(2.0)
+
+
+def atlas_of(fields: tuple[Diagram, ...], masks: tuple[Diagram, ...]) -> Atlas:
+    n = len(fields)
+    coefficients = np.arange(6.0 * n).reshape(n, 6) + 1
+    ids = tuple(f"0-{i:05d}" for i in range(n))
+    return Atlas(ids, coefficients, -0.1 * np.arange(n), np.arange(n) + 100, np.full(n, 0.3), fields, masks, {})
+
+
+@pytest.fixture(scope="module")
+def packaged() -> Atlas:
+    return load_atlas()
+
+
+def test_matches_come_by_distance_with_the_parameters_of_their_shape():
+    fields = tuple(blob((30.0 + 10 * k, 0.0)) for k in (3, 0, 2, 1))
+    atlas = atlas_of(fields, fields)
+    found = nearest(blob((30.0, 0.0)), atlas, count=3)
+    assert [match.id for match in found] == ["0-00001", "0-00003", "0-00002"]
+    assert found[0].distance == pytest.approx(0, abs=1e-3)
+    assert found[1].distance == pytest.approx(10 / np.sqrt(2), rel=0.05)  # cost ½|x - y|²
+    assert list(found[1].coefficients) == list(atlas.coefficients[3])
+    assert (found[1].mass, found[1].seed) == (atlas.masses[3], 103)
+
+
+def test_a_query_meets_shapes_seen_as_it_is():
+    near, far = blob((30.0, 0.0)), blob((60.0, 0.0))
+    atlas = atlas_of((near, far), (far, near))
+    assert nearest(near, atlas, seen_as="field")[0].id == "0-00000"
+    assert nearest(near, atlas, seen_as="mask")[0].id == "0-00001"
+
+
+def test_no_more_matches_than_shapes_and_a_short_list_is_never_shorter_than_the_count():
+    atlas = atlas_of(*[tuple(blob((30.0 + k, 0.0)) for k in range(4))] * 2)
+    assert len(nearest(blob((30.0, 0.0)), atlas, count=9)) == 4
+    assert len(nearest(blob((30.0, 0.0)), atlas, count=3, shortlist=1)) == 3
+
+
+@pytest.mark.parametrize("seen_as", ["field", "mask"])
+def test_every_shape_looked_up_in_the_packaged_atlas_is_itself(packaged, seen_as):
+    for position in range(0, len(packaged), len(packaged) // 12):
+        first, second = nearest(packaged.diagrams(seen_as)[position], packaged, seen_as=seen_as, count=2, shortlist=4)
+        assert first.id == packaged.ids[position]
+        assert first.distance < 0.05 and second.distance > first.distance
+
+
+def test_the_short_list_keeps_the_true_nearest(packaged):
+    """Leave-one-out over the packaged atlas: recall of the 5 nearest of all distances within the default short list."""
+    queries = range(5, len(packaged), len(packaged) // 5)
+    kept, best = 0, 0
+    for position in queries:
+        query = packaged.mask_diagrams[position]
+        distances = [wasserstein(query, other) for other in packaged.mask_diagrams]
+        truth = [packaged.ids[i] for i in np.argsort(distances) if i != position][:5]
+        found = [m.id for m in nearest(query, packaged, seen_as="mask", count=6) if m.id != packaged.ids[position]]
+        kept += len(set(truth) & set(found))
+        best += found[0] == truth[0]
+    assert best == len(queries)
+    assert kept >= 0.9 * 5 * len(queries)
+
+
+def test_wrong_requests_are_refused_in_one_sentence():
+    fields = (blob((30.0, 0.0)),)
+    atlas = atlas_of(fields, fields)
+    with pytest.raises(ValueError, match="expected a count and a shortlist of at least 1, got 0 and 20"):
+        nearest(fields[0], atlas, count=0)
+    with pytest.raises(ValueError, match="expected shapes seen as 'field' or 'mask', got 'image'"):
+        nearest(fields[0], atlas, seen_as="image")
+    with pytest.raises(ValueError, match="expected a diagram with area, got an empty one"):
+        nearest(Diagram(np.zeros((0, 2)), np.zeros(0)), atlas)

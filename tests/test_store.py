@@ -1,0 +1,163 @@
+"""The store: whole draws or none, what goes in comes out, versions and settings are checked."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from curvafit.data_synth.store import Record, Settings, open_store
+from curvafit.generation.viability import Viability
+from curvafit.priors.coefficients import Coefficients
+
+SHAPE = (6, 5, 4)
+SETTINGS = Settings(SHAPE, (0.01,) * 3, 0.02, 0.02, "experiment-4", 7, {"name": "fast", "steps": 10})
+finite = st.floats(-1e4, 1e4)
+seeds = st.integers(0, 2**63 - 1)
+
+
+def record(index: int, viable: bool = True, energy: float = 1.5) -> Record:
+    viability = Viability(0.2 if viable else math.nan, 1.0, -1.0, viable, "" if viable else "no second phase")
+    coefficients = Coefficients(1, 2, 6, -40, -40, 400.125)
+    return Record(index, coefficients, -0.6, 12345 + index, 10, viability, energy, "done", {"torch": "2.13"}, 0.5)
+
+
+def field(index: int) -> np.ndarray:
+    return np.random.default_rng(index).uniform(-1, 1, SHAPE).astype(np.float32)
+
+
+def test_a_draw_comes_back_as_it_went_in(tmp_path):
+    store = open_store(tmp_path / "s.zarr", SETTINGS)
+    assert store.write(record(3), field(3))
+    again = open_store(tmp_path / "s.zarr")
+    assert again.settings == SETTINGS
+    assert again.indices() == [3]
+    assert again.record(3) == record(3)
+    assert again.field(3).dtype == np.float32
+    np.testing.assert_array_equal(again.field(3), field(3))
+
+
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(index=st.integers(0, 10**7), values=st.tuples(*[finite] * 4), mass=st.floats(-1, 1), seed=seeds)
+def test_any_record_survives_the_store_exactly(tmp_path, index, values, mass, seed):
+    viability = Viability(0.8, 0.05, -1.0, False, "κ too high: “odd” text\n")
+    coefficients = Coefficients(1, values[0], 0.1, *values[1:])
+    put = Record(index, coefficients, mass, seed, 5, viability, -1e300, "stopped", {}, 1e-9)
+    store = open_store(tmp_path / f"{time.monotonic_ns()}.zarr", SETTINGS)
+    store.write(put, None)
+    assert open_store(store.path).record(index) == put
+
+
+def test_figures_that_are_not_finite_are_kept_as_such(tmp_path):
+    store = open_store(tmp_path / "s.zarr", SETTINGS)
+    store.write(record(0, viable=False, energy=math.nan), None)
+    assert "NaN" not in (store.path / "draws" / "000000" / "zarr.json").read_text()
+    back = store.record(0)
+    assert math.isnan(back.energy) and math.isnan(back.viability.discrepancy) and not back.viability.viable
+
+
+def test_no_draw_is_written_twice(tmp_path):
+    store = open_store(tmp_path / "s.zarr", SETTINGS)
+    assert store.write(record(0), field(0))
+    assert not store.write(record(0), field(1))
+    np.testing.assert_array_equal(store.field(0), field(0))
+
+
+def test_a_rejected_draw_is_remembered_without_a_field(tmp_path):
+    store = open_store(tmp_path / "s.zarr", SETTINGS)
+    store.write(record(0, viable=False), None)
+    assert store.indices() == [0]
+    with pytest.raises(KeyError, match="expected a viable draw 0"):
+        store.field(0)
+
+
+def test_a_process_killed_while_writing_loses_only_its_own_draw(tmp_path):
+    open_store(tmp_path / "s.zarr", SETTINGS).write(record(0), field(0))
+    script = """
+        import os, signal, sys
+        sys.path.insert(0, sys.argv[2])
+        import test_store
+        from curvafit.data_synth import store as module
+        store = module.open_store(sys.argv[1])
+        store.write(test_store.record(1), test_store.field(1))
+        module._publish = lambda partial, place: os.kill(os.getpid(), signal.SIGKILL)
+        store.write(test_store.record(2), test_store.field(2))
+    """
+    here = os.path.dirname(__file__)
+    arguments = [sys.executable, "-c", textwrap.dedent(script), str(tmp_path / "s.zarr"), here]
+    ended = subprocess.run(arguments, check=False, cwd=os.path.dirname(here))
+    assert ended.returncode == -signal.SIGKILL
+    store = open_store(tmp_path / "s.zarr")
+    assert len(list((store.path / "draws").glob(".partial-*/000002/field"))) == 1  # it was torn mid-way
+    assert store.indices() == [0, 1]
+    np.testing.assert_array_equal(store.field(1), field(1))
+    assert store.write(record(2), field(2))
+    assert store.indices() == [0, 1, 2]
+
+
+def test_what_a_killed_process_left_is_cleared_once_it_is_old(tmp_path):
+    store = open_store(tmp_path / "s.zarr", SETTINGS)
+    old, new = store.path / "draws" / ".partial-old", store.path / "draws" / ".partial-new"
+    old.mkdir()
+    new.mkdir()
+    os.utime(old, (0, 0))
+    store.write(record(0), field(0))
+    assert not old.exists() and new.exists()
+
+
+@pytest.mark.parametrize("torn", ["zarr.json", "field/c/0/0/0"])
+def test_an_incomplete_draw_does_not_count_and_is_made_again(tmp_path, torn):
+    store = open_store(tmp_path / "s.zarr", SETTINGS)
+    store.write(record(0), field(0))
+    (store.path / "draws" / "000000" / torn).unlink()
+    assert store.indices() == []
+    with pytest.raises(KeyError, match="expected a complete draw 0"):
+        store.record(0)
+    assert store.write(record(0), field(0))
+    np.testing.assert_array_equal(store.field(0), field(0))
+
+
+def test_damaged_bytes_of_a_field_are_noticed(tmp_path):
+    store = open_store(tmp_path / "s.zarr", SETTINGS)
+    store.write(record(0), field(0))
+    chunk = store.path / "draws" / "000000" / "field" / "c" / "0" / "0" / "0"
+    data = bytearray(chunk.read_bytes())
+    data[len(data) // 2] ^= 1
+    chunk.write_bytes(bytes(data))
+    with pytest.raises(ValueError, match="checksum"):
+        store.field(0)
+
+
+def test_another_version_or_other_settings_are_refused_in_one_sentence(tmp_path):
+    path = tmp_path / "s.zarr"
+    open_store(path, SETTINGS)
+    other = Settings(SHAPE, (0.01,) * 3, 0.02, 0.02, "experiment-4", 8, {"name": "fast", "steps": 10})
+    with pytest.raises(ValueError, match=r"expected the settings of .*s.zarr, got another seed: 8 for 7"):
+        open_store(path, other)
+    header = json.loads((path / "zarr.json").read_text())
+    header["attributes"]["version"] = 99
+    (path / "zarr.json").write_text(json.dumps(header))
+    with pytest.raises(ValueError, match="expected a store of version 1 at .*, got version 99"):
+        open_store(path)
+
+
+def test_what_is_no_store_is_refused(tmp_path):
+    with pytest.raises(FileNotFoundError, match="expected a store of shapes at .*, got nothing there"):
+        open_store(tmp_path / "none")
+    with pytest.raises(ValueError, match="expected a store of shapes at .*, got something else"):
+        open_store(tmp_path)
+    store = open_store(tmp_path / "s.zarr", SETTINGS)
+    for wrong in (None, field(0).astype(np.float64), field(0)[1:]):
+        with pytest.raises(ValueError, match="expected a f(ield exactly|loat32 field)"):
+            store.write(record(0), wrong)
+    assert store.indices() == []
