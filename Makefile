@@ -13,7 +13,8 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constr
 .PHONY: demo test lint clean
 
 demo: .venv/installed
-	@scan=$$($(BIN)/curvafit samples get bone) || scan=$$($(BIN)/curvafit samples get synthetic) \
+	@scan=$$($(BIN)/curvafit samples get bone) \
+	|| { echo "bone can't be had: taking the synthetic scan"; scan=$$($(BIN)/curvafit samples get synthetic); } \
 	&& $(BIN)/curvafit infer "$$scan" -o demo_out
 
 test: .venv/installed-dev

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from curvafit.mesh import Surface, areas, surface
-from curvafit.priors.curvature import Curvatures, diffuse_curvatures, geometric_curvatures, jet
+from curvafit.priors.curvature import diffuse_curvatures, geometric_curvatures, jet
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import profile_distance
 
@@ -82,29 +82,29 @@ class Diagram:
         """Bins of edge `width`, each replaced by its barycentre: means and total weight are kept exactly."""
         if not width > 0:
             raise ValueError(f"expected a bin width above 0, got {width}")
-        cells = np.floor(self.points / width).astype(np.int64)
-        _, index = np.unique(cells, axis=0, return_inverse=True)
-        return self._merged(index.reshape(-1))
+        return self._merged(self._cells(width))
 
     def thinned(self, width: float, share: float) -> Diagram:
         """Bins of edge `width` where the area is and wider ones, by powers of two, in the tails: a bin is the widest
         whose part of the area times (edge / width)² is at most `share`."""
-        if not width > 0 or not share > 0:
-            raise ValueError(f"expected a bin width and a share above 0, got {width} and {share}")
-        parts = self.normalised.weights
-        found = np.full(len(parts), -1, dtype=np.int64)
-        count = 0
-        for level in range(WIDENINGS, -1, -1):
-            open_ = np.flatnonzero(found < 0)
-            cells = np.floor(self.points[open_] / (width * 2**level)).astype(np.int64)
-            _, index = np.unique(cells, axis=0, return_inverse=True)
-            index = index.reshape(-1)
-            light = np.bincount(index, parts[open_]) * 4.0**level <= share if level else np.ones(index.max(initial=-1) + 1, bool)
-            taken = light[index]
-            found[open_[taken]] = count + index[taken]
-            count += len(light)
-        _, index = np.unique(found, return_inverse=True)
-        return self._merged(index.reshape(-1))
+        if not share > 0:
+            raise ValueError(f"expected a share above 0, got {share}")
+        fine = self.binned(width)
+        parts = fine.normalised.weights
+        chosen = fine._cells(width)
+        taken = np.zeros(len(parts), dtype=bool)
+        for level in range(WIDENINGS, 0, -1):
+            cells = fine._cells(width * 2**level)
+            light = (np.bincount(cells, parts * ~taken) * 4.0**level <= share)[cells] & ~taken
+            chosen[light] = level * len(parts) + cells[light]
+            taken |= light
+        return fine._merged(np.unique(chosen, return_inverse=True)[1])
+
+    def _cells(self, width: float) -> np.ndarray:
+        """Number of the square of edge `width` that each point is in: 0, 1, … over the occupied ones."""
+        cells = np.floor(self.points / width).astype(np.int64)
+        cells -= cells.min(0, initial=0)
+        return np.unique(cells @ np.array([cells[:, 1].max(initial=0) + 1, 1]), return_inverse=True)[1]
 
     def _merged(self, index: np.ndarray) -> Diagram:
         """Points with the same index (0, 1, …) replaced by their barycentre."""
@@ -163,22 +163,23 @@ def _inner_surface(values: Tensor, grid: Grid, margin: int | None) -> Surface:
     m = 0 if grid.periodic else MARGIN if margin is None else margin
     if m == 0:
         return surface(values, grid)
-    shape = tuple(n - 2 * m for n in grid.shape)
-    if min(shape) < 4:
+    nz, ny, nx = (n - 2 * m for n in grid.shape)
+    if min(nz, ny, nx) < 4:
         raise ValueError(f"expected a box of at least {2 * m + 4} voxels along each axis, got {grid.shape}")
-    inner = surface(values[(slice(m, -m),) * 3], Grid(shape, grid.spacing, grid.boundary))
+    inner = surface(values[(slice(m, -m),) * 3], Grid((nz, ny, nx), grid.spacing, grid.boundary))
     return Surface(inner.vertices + m * np.array(grid.spacing), inner.faces)
 
 
 def _voxel_curvatures(values: Tensor, grid: Grid, epsilon: float, curvature: str) -> tuple[np.ndarray, ...]:
     """κ1, κ2 of every voxel (0 where not resolved) and whether they are resolved, as 1 or 0."""
-    found: Curvatures
     distance = jet(profile_distance(values, epsilon), grid)
-    found = geometric_curvatures(distance) if curvature == "geometric" else diffuse_curvatures(jet(values, grid), epsilon)
-    steepest = distance.gradient.square().sum(-4).sqrt()
+    if curvature == "geometric":
+        κ1, κ2, _, _ = geometric_curvatures(distance)
+    else:
+        κ1, κ2, _, _ = diffuse_curvatures(jet(values, grid), epsilon)
+    slope = distance.gradient.square().sum(-4).sqrt()
     sharpest = 1 / (LEAST_RADIUS * max(grid.spacing))
-    κ1, κ2 = found.kappa1, found.kappa2
-    resolved = (steepest > LEAST_SLOPE) & (κ1.abs() < sharpest) & (κ2.abs() < sharpest)
+    resolved = (slope > LEAST_SLOPE) & (κ1.abs() < sharpest) & (κ2.abs() < sharpest)
     parts = (torch.where(resolved, κ1, 0.0), torch.where(resolved, κ2, 0.0), resolved.to(values.dtype))
     return tuple(part.detach().cpu().numpy() for part in parts)
 

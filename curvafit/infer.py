@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import math
 import platform
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,18 +14,19 @@ from typing import Any
 import numpy as np
 import torch
 
-from curvafit.diagram import Diagram, diagram
+from curvafit.diagram import MARGIN, Diagram, diagram
 from curvafit.family import family_of
 from curvafit.fit import Fit
 from curvafit.generation.flow import Flow, generate
 from curvafit.index import Atlas, load_atlas
 from curvafit.match import Match, nearest
 from curvafit.morphometry import morphometry
-from curvafit.prepare import Prepared, prepare
+from curvafit.prepare import LARGEST_WINDOW, Prepared, prepare
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.profile import phase_field
-from curvafit.refine import Refinement, refine
+from curvafit.refine import refine
+from curvafit.refinement import Refinement
 from curvafit.scan import Field, load
 from curvafit.transport import wasserstein
 
@@ -100,10 +102,7 @@ def infer(
     say("reading the scan", 0.0)
     atlas = atlas if isinstance(atlas, Atlas) else load_atlas(atlas)
     volume = scan if isinstance(scan, Field) else load(scan, **reading)
-    mask_of_interest = load(roi).values if isinstance(roi, (str, Path)) else roi
-    prepared = prepare(
-        volume, kind=kind, periodic=periodic, threshold=threshold, dark=dark, roi=mask_of_interest, label=label
-    )
+    prepared = prepare(volume, kind=kind, periodic=periodic, threshold=threshold, dark=dark, roi=roi, label=label)
     say("measuring curvature", 0.05)
     seen = scan_diagram(prepared)
     seen_as = "field" if prepared.kind == "field" else "mask"
@@ -129,13 +128,37 @@ def infer(
 
 
 def scan_diagram(prepared: Prepared) -> Diagram:
-    """The geometric curvature diagram of a prepared scan, over all its windows."""
-    parts = []
-    for window in prepared.windows:
-        phase = prepared.phase[window]
-        grid = Grid(phase.shape, prepared.grid.spacing, prepared.grid.boundary)
-        parts.append(diagram(torch.from_numpy(phase), grid, WORKING_EPSILON))
-    return Diagram(np.concatenate([part.points for part in parts]), np.concatenate([part.weights for part in parts]))
+    """The geometric curvature diagram of a prepared scan; of a large one tile by tile, each cell in one tile."""
+    grid = prepared.grid
+    if max(grid.shape) <= LARGEST_WINDOW or grid.periodic:
+        return _tile_diagram(prepared, (slice(None),) * 3)
+    cuts = [_tiles(n) for n in grid.shape]
+    parts = [_tile_diagram(prepared, (z, y, x)) for z in cuts[0] for y in cuts[1] for x in cuts[2]]
+    found = [part for part in parts if part is not None]
+    if not found:
+        raise ValueError("expected a surface inside the scan, got none away from its borders")
+    points, weights = (np.concatenate([getattr(part, name) for part in found]) for name in ("points", "weights"))
+    lost = sum(part.excluded * part.area for part in found) / weights.sum()
+    return Diagram(points, weights, excluded=float(lost))
+
+
+def _tiles(n: int) -> list[slice]:
+    """Stretches of at most a window's length whose interiors (`MARGIN` voxels in) share their end planes only."""
+    count = math.ceil((n - 2 * MARGIN) / (LARGEST_WINDOW - 2 * MARGIN))
+    ends = np.linspace(MARGIN, n - 1 - MARGIN, count + 1).astype(int)
+    return [slice(a - MARGIN, b + MARGIN + 1) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+
+
+def _tile_diagram(prepared: Prepared, tile: tuple[slice, slice, slice]) -> Diagram | None:
+    phase = np.ascontiguousarray(prepared.phase[tile])
+    grid = Grid(phase.shape, prepared.grid.spacing, prepared.grid.boundary)
+    inner = phase if grid.periodic else phase[(slice(MARGIN, -MARGIN),) * 3]
+    if not inner.min() < 0 < inner.max():
+        if phase.shape == prepared.grid.shape:
+            raise ValueError("expected a surface inside the scan, got none away from its borders")
+        return None
+    where = None if prepared.roi is None else prepared.roi[tile]
+    return diagram(phase, grid, WORKING_EPSILON, where=where)
 
 
 @dataclass(frozen=True)
@@ -148,9 +171,9 @@ class _Twin:
 
 
 def _refined(prepared: Prepared, matches: tuple[Match, ...], seed: int, say: Progress) -> Refinement:
-    window = prepared.windows[0]
-    phase = torch.from_numpy(np.ascontiguousarray(prepared.phase[window]))
-    grid = Grid(tuple(phase.shape), prepared.grid.spacing, prepared.grid.boundary)
+    phase = torch.from_numpy(np.ascontiguousarray(prepared.phase[prepared.windows[0]]))
+    whole = phase.shape == prepared.grid.shape
+    grid = Grid(phase.shape, prepared.grid.spacing, prepared.grid.boundary if whole else "replicate")
     starts = [match.coefficients for match in matches[:STARTS]]
     return refine(
         phase,
@@ -200,9 +223,10 @@ def _fit(
     chosen, status = _verdict(distances, noises, refined, twins)
     distances["seed_noise"] = noises[chosen]
     better = refined if chosen == "fit" else matches[0]
+    grid = prepared.grid
     return Fit(
         kind=prepared.kind,
-        family=family_of(seen, prepared.thickness / 2 * prepared.grid.spacing[0]),
+        family=family_of(seen, prepared.thickness / 2 * grid.spacing[0]),
         coefficients=better.coefficients,
         mass=float(better.mass),
         chosen=chosen,
@@ -214,7 +238,7 @@ def _fit(
         refined=_refinement_dict(refined),
         distances=distances,
         status=status,
-        morphometry=morphometry(prepared.mask, prepared.working_voxel, prepared.unit, periodic=prepared.grid.periodic),
+        morphometry=morphometry(prepared.mask, prepared.working_voxel, prepared.unit, periodic=grid.periodic),
         notes=prepared.notes,
         provenance=provenance,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from typing import Literal
 
@@ -9,9 +10,9 @@ import numpy as np
 from scipy import ndimage
 from skimage.filters import threshold_otsu
 
-from curvafit.scan import Field, ScanError
+from curvafit.scan import Field, ScanError, load
 
-__all__ = ["Kind", "Level", "find_level"]
+__all__ = ["Kind", "Level", "find_level", "region_of_interest"]
 
 Kind = Literal["field", "mask", "image"]
 
@@ -68,6 +69,25 @@ def find_level(
     return level
 
 
+def region_of_interest(roi: Field | np.ndarray | str | os.PathLike[str] | None, field: Field) -> np.ndarray | None:
+    """Where the scan counts: a mask of its shape, or None for everywhere.
+
+    Raises
+    ------
+    ScanError
+        If the mask is empty or of another shape.
+    """
+    if roi is None:
+        return None
+    loaded = roi if isinstance(roi, Field | np.ndarray) else load(roi)
+    region = np.asarray(loaded.values if isinstance(loaded, Field) else loaded) != 0
+    if region.shape != field.shape:
+        raise ScanError(f"expected a region of interest of the scan's shape {field.shape}, got {region.shape}")
+    if not region.any():
+        raise ScanError("expected a region of interest with voxels in it, got an empty one")
+    return region
+
+
 def _guess_kind(values: np.ndarray, threshold: Literal["otsu"] | float) -> Kind:
     """Two values: a mask. Smooth floats from about -1 to about 1 that mostly lie far from 0: a phase field."""
     lowest, highest = values.min(), values.max()
@@ -88,7 +108,8 @@ def _field_level(values: np.ndarray, dark: bool) -> Level:
 def _mask_level(values: np.ndarray, dark: bool) -> Level:
     lowest, highest = values.min(), values.max()
     if np.all((values == lowest) | (values == highest)):
-        return _signed(values == highest, dark, f"Taken for a mask of the values {float(lowest):g} and {float(highest):g}.")
+        note = f"Taken for a mask of the values {float(lowest):g} and {float(highest):g}."
+        return _signed(values == highest, dark, note)
     return _signed(values != 0, dark, "Taken for a mask: the structure is where it is not zero.")
 
 
@@ -120,7 +141,8 @@ def _image_level(
         raise ScanError(f"expected a threshold that is a number or 'otsu', got {threshold!r}") from None
     lowest, highest = float(counted.min()), float(counted.max())
     if not lowest < level < highest:
-        raise ScanError(f"expected a threshold within the smoothed scan's {lowest:.4g} to {highest:.4g}, got {level:.4g}")
+        levels = f"{lowest:.4g} to {highest:.4g}"
+        raise ScanError(f"expected a threshold within the smoothed scan's {levels}, got {level:.4g}")
     how = "Otsu's" if threshold == "otsu" else "the given"
     side = "dark" if dark else "bright"
     note = f"Smoothed by one voxel and split at {how} threshold, {level:.4g}: the {side} phase is the structure."

@@ -146,9 +146,12 @@ def slice_figure(
         A rectangle to frame, likewise.
     """
     left, right, bottom, top = extent
-    ratio = abs(top - bottom) / abs(right - left)
-    figure = _figure(4.2, 4.2 * min(max(ratio, 0.25), 2.0) + 0.45)
-    axes = figure.add_axes((0.075, 0.01, 0.915, 1 - 0.45 / figure.get_figheight()))
+    ratio = min(max(abs(top - bottom) / abs(right - left), 0.25), 2.0)
+    inner, strip = 3.9, 0.36
+    figure = _figure(4.2, inner * ratio + strip + 0.04)
+    height = figure.get_figheight()
+    axes = figure.add_axes((1 - (inner + 0.02) / 4.2, 0.03 / height, inner / 4.2, inner * ratio / height))
+    axes.spines[:].set_color(QUIET)
     axes.imshow(image, cmap="gray", vmin=limits[0], vmax=limits[1], extent=image_extent, interpolation="nearest")
     rows, columns = structure.shape
     x = left + (np.arange(columns) + 0.5) / columns * (right - left)
@@ -161,7 +164,7 @@ def slice_figure(
         box.set(edgecolor="white", linestyle=(0, (4, 3)), linewidth=1.2)
         axes.add_patch(box)
     axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xticks=[], yticks=[])
-    axes.set_ylabel(axes_names[0], rotation=0, labelpad=8)
+    axes.set_ylabel(axes_names[0], rotation=0, labelpad=6)
     _scale_bar(figure, axes, right - left, unit, axes_names[1])
     return figure
 
@@ -170,10 +173,11 @@ def _scale_bar(figure: Figure, axes: Axes, length: float, unit: str, name: str) 
     """A bar of a round length above the slice, with the horizontal axis's name."""
     bar = round_length(0.3 * abs(length))
     share = bar / abs(length)
-    axes.plot([1 - share, 1], [1.035, 1.035], transform=axes.transAxes, color=INK, linewidth=2.5, clip_on=False)
+    above = 1 + 0.19 / (axes.get_position().height * figure.get_figheight())
+    axes.plot([1 - share, 1], [above, above], transform=axes.transAxes, color=INK, linewidth=2.5, clip_on=False)
     label = f"{bar:g} {unit_name(unit, bar)}"
-    axes.text(1 - share - 0.02, 1.035, label, transform=axes.transAxes, ha="right", va="center")
-    axes.text(0.0, 1.035, f"{name} →", transform=axes.transAxes, ha="left", va="center")
+    axes.text(1 - share - 0.02, above, label, transform=axes.transAxes, ha="right", va="center")
+    axes.text(0.0, above, f"{name} →", transform=axes.transAxes, ha="left", va="center")
 
 
 def round_length(length: float) -> float:
@@ -221,6 +225,7 @@ def diagram_on(
     axes.pcolormesh(edges, edges, shown, cmap=DENSITY, norm=norm, rasterized=True, zorder=2)
     axes.plot([low, high], [low, high], color=DIAGONAL, linewidth=1.4, zorder=3)
     axes.set(xlim=limits, ylim=limits, aspect="equal")
+    axes.spines[:].set_color(QUIET)
     name = unit_name(unit)
     axes.set_xlabel(f"κ₁ (1/{name})", labelpad=2)
     axes.set_ylabel(f"κ₂ (1/{name})", labelpad=2)
@@ -229,7 +234,7 @@ def diagram_on(
     _name_families(axes, limits)
 
 
-def shared_limits(diagrams: Sequence[Diagram], length: float = 1.0, tail: float = 0.004) -> Limits:
+def shared_limits(diagrams: Sequence[Diagram], length: float = 1.0, tail: float = 0.006) -> Limits:
     """The interval that holds both curvatures of every diagram but for the outermost `tail` of area at either end."""
     bounds = [0.0, 0.0]
     for diagram in diagrams:

@@ -10,12 +10,20 @@ from typing import Literal
 
 import numpy as np
 import torch
-from scipy import ndimage
 
-from curvafit.phases import Kind, Level, find_level
+from curvafit.phases import Kind, Level, find_level, region_of_interest
 from curvafit.priors import WORKING_EPSILON, WORKING_SPACING, Grid, phase_field
-from curvafit.regrid import Window, median_thickness, resample, rich_boxes, signed_distance, surface_voxels, without_specks
-from curvafit.scan import Field, ScanError, load
+from curvafit.regrid import (
+    Window,
+    bounding_box,
+    median_thickness,
+    resample,
+    rich_boxes,
+    signed_distance,
+    surface_voxels,
+    without_specks,
+)
+from curvafit.scan import Field, ScanError
 
 __all__ = ["KEPT_THICKNESS", "LARGEST_BOX", "LARGEST_WINDOW", "WORKING_THICKNESS", "Prepared", "prepare"]
 
@@ -53,14 +61,15 @@ class Prepared:
     threshold
         Grey level that separates the phases, None for fields and masks.
     thickness
-        Median thickness of the structure, by volume, in working voxels.
+        Median thickness of the structure beneath its surface, in working voxels.
     windows
         Boxes of at most 128 voxels a side that together cover the grid's surface; the first is the main one. They
         overlap, so sums belong on the whole grid; one smaller than the grid is no periodic box.
     origin
         Scan voxel coordinates (z, y, x) of the corner of the first working voxel.
     roi
-        bool, same shape: the region of interest, None where all counts.
+        bool, same shape: the region of interest, None where all counts. Structure ends at its faces, so surface within
+        a voxel of them is none of the scan's.
     notes
         Sentences on what was decided.
     """
@@ -96,7 +105,7 @@ def prepare(
     smoothed (Gaussian, one voxel of the finest axis) and thresholded. The grid is kept where it is a phase field's, or
     isotropic with a median thickness of 5 to 16 voxels; else it is resampled to a thickness of 8: images as smoothed
     grey levels, masks as signed distances. Thickness is the local thickness (`morphometry.local_thickness`), its
-    median over the structure's volume. Specks and pinholes smaller than a ball of half that diameter are dropped.
+    median over the structure's surface. Specks and pinholes smaller than a ball of half that diameter are dropped.
 
     Parameters
     ----------
@@ -121,8 +130,8 @@ def prepare(
         If there is no structure, nothing else, no surface, or nothing at least 3 voxels thick; or if `roi`, `label` or
         `threshold` do not fit the scan.
     """
-    region = _region_of_interest(roi, field)
-    where, notes = _cropped(field, region)
+    region = region_of_interest(roi, field)
+    where, notes = bounding_box(field.shape, region, LARGEST_SCAN)
     region = None if region is None else region[where]
     part = replace(field, values=field.values[where], affine=None)
     periodic = periodic and part.shape == field.shape
@@ -151,38 +160,6 @@ class _Scan:
         return self.level.mask if self.region is None else self.level.mask & self.region
 
 
-def _region_of_interest(roi: Field | np.ndarray | str | os.PathLike[str] | None, field: Field) -> np.ndarray | None:
-    if roi is None:
-        return None
-    loaded = roi if isinstance(roi, Field | np.ndarray) else load(roi)
-    region = np.asarray(loaded.values if isinstance(loaded, Field) else loaded) != 0
-    if region.shape != field.shape:
-        raise ScanError(f"expected a region of interest of the scan's shape {field.shape}, got {region.shape}")
-    if not region.any():
-        raise ScanError("expected a region of interest with voxels in it, got an empty one")
-    return region
-
-
-def _cropped(field: Field, region: np.ndarray | None) -> tuple[Window, tuple[str, ...]]:
-    """The region's bounding box, and of a very large scan the middle."""
-    notes: tuple[str, ...] = ()
-    box = [slice(0, n) for n in field.shape]
-    if region is not None:
-        box = list(ndimage.find_objects(region.astype(np.uint8))[0])
-        notes += (f"The region of interest holds {region.mean():.1%} of the scan.",)
-    if any(s.stop - s.start > LARGEST_SCAN for s in box):
-        box = [_middle(s, LARGEST_SCAN) for s in box]
-        notes += (f"Of this large scan the middle {_times(s.stop - s.start for s in box)} voxels are used.",)
-    return (box[0], box[1], box[2]), notes
-
-
-def _middle(whole: slice, length: int) -> slice:
-    extent = whole.stop - whole.start
-    length = min(length, extent)
-    first = whole.start + (extent - length) // 2
-    return slice(first, first + length)
-
-
 def _on_working_grid(scan: _Scan) -> Prepared:
     """Choose the working voxel, move the scan to it, drop specks, profile the mask, choose windows."""
     thickness, notes = _thickness(scan)
@@ -191,12 +168,19 @@ def _on_working_grid(scan: _Scan) -> Prepared:
     edges = [s * h for s, h in zip(scale, scan.spacing, strict=True)]
     edge = edges[0] if max(edges) <= (1 + 1e-9) * min(edges) else math.prod(edges) ** (1 / 3)
     values, region = _moved(scan, scale, start, shape)
-    grid = Grid(shape, (WORKING_SPACING,) * 3, "periodic" if scan.periodic and not cut else "replicate")
+    grid = Grid(
+        shape,
+        (WORKING_SPACING, WORKING_SPACING, WORKING_SPACING),
+        "periodic" if scan.periodic and not cut else "replicate",
+    )
     mask, dropped = _structure(scan.level.kind, values, region, thickness / edge, grid.periodic)
     windows = rich_boxes(surface_voxels(mask), LARGEST_WINDOW)
     if not windows:
         raise ScanError("expected a surface between structure and background, got none on the working grid")
-    phase = values if scan.level.kind == "field" else phase_field(torch.from_numpy(mask), grid, WORKING_EPSILON).numpy()
+    if scan.level.kind != "field":
+        phase = _profiled(mask, grid)
+    else:
+        phase = values if region is None or region.all() else np.minimum(values, _profiled(region, grid))
     return Prepared(
         kind=scan.level.kind,
         phase=np.ascontiguousarray(phase, dtype=np.float32),
@@ -236,10 +220,10 @@ def _scale(scan: _Scan, thickness: float) -> tuple[tuple[float, float, float], t
         return (1.0, 1.0, 1.0), ("The scan's grid is kept.",)
     edge = finest if scan.level.kind == "field" else thickness / WORKING_THICKNESS
     extent = min(n * h for n, h in zip(scan.shape, spacing, strict=True))
-    note = "Resampled to cubic voxels" if scan.level.kind == "field" else f"Resampled to {WORKING_THICKNESS:g} voxels a thickness"
+    note = f"Resampled to {thickness / edge:.3g} voxels a thickness"
     if extent < FEWEST * edge and edge > finest:
         edge = max(extent / FEWEST, finest)
-        note = f"Resampled, as far as leaves {FEWEST} voxels a side"
+        note = f"Resampled as far as leaves {FEWEST} voxels a side"
     scale = [edge / h for h in spacing]
     if scan.periodic:
         scale = [n / max(4, round(n / s)) for n, s in zip(scan.shape, scale, strict=True)]
@@ -275,7 +259,7 @@ def _moved(
         return values[box], None if region is None else region[box]
     if scan.level.kind == "mask":
         reach = 4 * max(max(s * h, h) for s, h in zip(scale, scan.spacing, strict=True))
-        values = signed_distance(scan.level.mask, scan.spacing, reach)
+        values = signed_distance(scan.level.mask, scan.spacing, reach, scan.periodic)
     moved = resample(values, scale, start, shape, periodic=scan.periodic)
     if region is None:
         return moved, None
@@ -294,7 +278,12 @@ def _structure(
     if not specks and not pinholes:
         return mask, ()
     counts = f"specks: {specks}, pinholes: {pinholes}, {(cleaned != mask).mean():.2g} of the volume"
+    cleaned = cleaned if region is None else cleaned & region
     return cleaned, (f"Dropped what is smaller than a ball of half the median thickness ({counts}).",)
+
+
+def _profiled(mask: np.ndarray, grid: Grid) -> np.ndarray:
+    return phase_field(torch.from_numpy(mask), grid, WORKING_EPSILON).numpy()
 
 
 def _times(shape: Iterable[int]) -> str:

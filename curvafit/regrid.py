@@ -12,6 +12,7 @@ from curvafit.morphometry import local_thickness
 
 __all__ = [
     "Window",
+    "bounding_box",
     "median_thickness",
     "resample",
     "rich_boxes",
@@ -27,19 +28,37 @@ _MEASURED = 160
 _CONNECTED_26 = np.ones((3, 3, 3), dtype=bool)
 
 
-def median_thickness(mask: np.ndarray, spacing: tuple[float, float, float], periodic: bool) -> tuple[float, float]:
-    """Median and 95th percentile, over the structure's volume, of the local thickness.
+def bounding_box(
+    shape: tuple[int, int, int], region: np.ndarray | None, longest: int
+) -> tuple[Window, tuple[str, ...]]:
+    """The box around a region (else all), its middle where a side is over `longest` voxels, and notes on both."""
+    box, notes = [slice(0, n) for n in shape], []
+    if region is not None:
+        box = list(ndimage.find_objects(region.astype(np.uint8))[0])
+        notes.append(f"The region of interest holds {region.mean():.1%} of the scan.")
+    if any(s.stop - s.start > longest for s in box):
+        box = [_middle(s, longest) for s in box]
+        sides = " x ".join(str(s.stop - s.start) for s in box)
+        notes.append(f"Of this large scan the middle {sides} voxels are used.")
+    return (box[0], box[1], box[2]), tuple(notes)
 
-    Measured in the box of at most 160 voxels a side that `rich_boxes` puts first.
+
+def median_thickness(mask: np.ndarray, spacing: tuple[float, float, float], periodic: bool) -> tuple[float, float]:
+    """Median and 95th percentile, over the structure's surface, of the local thickness beneath it.
+
+    By surface and not by volume, since that is what a curvature diagram weighs by: a solid rind beside thin struts
+    would else set the scale. Measured in the box of at most 160 voxels a side that `rich_boxes` puts first.
 
     Returns
     -------
     tuple[float, float]
         In spacing's unit.
     """
-    boxes = rich_boxes(surface_voxels(mask), _MEASURED)
+    surface = surface_voxels(mask)
+    boxes = rich_boxes(surface, _MEASURED)
     part = mask[boxes[0]] if boxes else mask
-    found = local_thickness(part, spacing, periodic=periodic and part.shape == mask.shape)[part]
+    thickness = local_thickness(part, spacing, periodic=periodic and part.shape == mask.shape)
+    found = thickness[surface[boxes[0]]] if boxes else thickness[part]
     return float(np.median(found)), float(np.percentile(found, 95))
 
 
@@ -54,7 +73,7 @@ def rich_boxes(content: np.ndarray, size: int | Sequence[int]) -> list[Window]:
     That is the middle one, unless it holds less than half of what the others hold on average: then the fullest.
     """
     sides = [size] * 3 if isinstance(size, int) else list(size)
-    middle = tuple(_centred(n, side) for n, side in zip(content.shape, sides, strict=True))
+    middle = tuple(_middle(slice(0, n), side) for n, side in zip(content.shape, sides, strict=True))
     tiles = [_tiles(n, side) for n, side in zip(content.shape, sides, strict=True)]
     candidates = [middle] + [(z, y, x) for z in tiles[0] for y in tiles[1] for x in tiles[2] if (z, y, x) != middle]
     counts = [int(np.count_nonzero(content[box])) for box in candidates]
@@ -66,11 +85,16 @@ def rich_boxes(content: np.ndarray, size: int | Sequence[int]) -> list[Window]:
     return ordered  # type: ignore[return-value]
 
 
-def signed_distance(mask: np.ndarray, spacing: Sequence[float], limit: float) -> np.ndarray:
+def signed_distance(mask: np.ndarray, spacing: Sequence[float], limit: float, periodic: bool = False) -> np.ndarray:
     """Distance to the mask's faces, positive inside, up to ±`limit`; float32.
 
     Centre to centre, less half the finest edge: within half a voxel of the exact one, and its sign is the mask's.
     """
+    if periodic:
+        margin = [min(n, math.ceil(limit / h) + 1) for n, h in zip(mask.shape, spacing, strict=True)]
+        padded = np.pad(mask, [(m, m) for m in margin], mode="wrap")
+        inner = tuple(slice(m, m + n) for m, n in zip(margin, mask.shape, strict=True))
+        return signed_distance(padded, spacing, limit)[inner]
     half = 0.5 * min(spacing)
     inner = ndimage.distance_transform_edt(mask, sampling=spacing)
     outer = ndimage.distance_transform_edt(~mask, sampling=spacing)
@@ -112,7 +136,8 @@ def resample(
     smooth = ndimage.gaussian_filter(cut, width, mode="wrap" if periodic else "nearest") if any(width) else cut
     offset = [(a + 0.5) * s - 0.5 - f for a, s, f in zip(start, scale, first, strict=True)]
     mode = "grid-wrap" if periodic else "nearest"
-    return ndimage.affine_transform(smooth, scale, offset, tuple(shape), order=0 if nearest else 1, mode=mode)
+    order = 0 if nearest else 1
+    return ndimage.affine_transform(smooth, np.asarray(scale), np.asarray(offset), tuple(shape), order=order, mode=mode)  # type: ignore[arg-type]
 
 
 def without_specks(mask: np.ndarray, smallest: float, periodic: bool) -> tuple[np.ndarray, int, int]:
@@ -134,8 +159,8 @@ def without_specks(mask: np.ndarray, smallest: float, periodic: bool) -> tuple[n
 def _small_pieces(
     mask: np.ndarray, smallest: float, periodic: bool, structure: np.ndarray | None
 ) -> tuple[np.ndarray, int]:
-    labels, _ = ndimage.label(mask, structure)  # type: ignore[misc]
-    small = np.bincount(labels.ravel()) < smallest
+    labels: np.ndarray = ndimage.label(mask, structure)[0]  # type: ignore[index]
+    small: np.ndarray = np.bincount(labels.ravel()) < smallest
     small[0] = False
     if periodic:
         for axis in range(3):
@@ -143,9 +168,10 @@ def _small_pieces(
     return small[labels], int(small.sum())
 
 
-def _centred(n: int, size: int) -> slice:
-    length = min(n, size)
-    first = (n - length) // 2
+def _middle(whole: slice, length: int) -> slice:
+    extent = whole.stop - whole.start
+    length = min(length, extent)
+    first = whole.start + (extent - length) // 2
     return slice(first, first + length)
 
 
@@ -153,4 +179,5 @@ def _tiles(n: int, size: int) -> list[slice]:
     """The fewest intervals of `size` that cover 0..n, evenly spread."""
     length = min(n, size)
     count = math.ceil(n / length)
-    return [slice(first, first + length) for first in (round(i * (n - length) / max(count - 1, 1)) for i in range(count))]
+    starts = [round(i * (n - length) / max(count - 1, 1)) for i in range(count)]
+    return [slice(start, start + length) for start in starts]

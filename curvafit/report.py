@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import shutil
 import tempfile
@@ -51,8 +52,8 @@ def write_inference(inference: Inference, directory: str | Path) -> Path:
         (work / "fit.json").write_text(inference.fit.to_json(), encoding="utf-8")
         write_report(inference, work / "report.html")
         if inference.best is not None:
-            voxel = (inference.fit.working_voxel,) * 3
-            save(Field(inference.best, voxel, inference.fit.length_unit), work / "regenerated.nii.gz")
+            edge = inference.fit.working_voxel
+            save(Field(inference.best, (edge, edge, edge), inference.fit.length_unit), work / "regenerated.nii.gz")
         target.mkdir(exist_ok=True)
         (target / "regenerated.nii.gz").unlink(missing_ok=True)
         for made in sorted(work.iterdir()):
@@ -60,6 +61,25 @@ def write_inference(inference: Inference, directory: str | Path) -> Path:
     finally:
         shutil.rmtree(work, ignore_errors=True)
     return target / "report.html"
+
+
+def with_command(inference: Inference, command: str) -> Inference:
+    """The inference with the command line that made it in its provenance."""
+    provenance = {**inference.fit.provenance, "command": command}
+    return dataclasses.replace(inference, fit=dataclasses.replace(inference.fit, provenance=provenance))
+
+
+def parameter_table(inference: Inference) -> list[tuple[str, str, str, str]]:
+    """Rows of name, working value, deviation and physical value with its unit, for the better supported parameters."""
+    fit = inference.fit
+    physical = fit.coefficients_physical.as_dict()
+    rows = []
+    for name, value in fit.coefficients.as_dict().items():
+        _, _, power = _TERMS[name]
+        unit = f" {per_unit(fit.length_unit, power)}" if power else ""
+        deviation = _deviation(fit.uncertainty.get(name), 1.0) if fit.chosen == "fit" else ""
+        rows.append((name, number(value), deviation.removeprefix("± "), number(physical[name]) + unit))
+    return [*rows, ("mass", number(fit.mass), "", "")]
 
 
 def write_report(inference: Inference, path: str | Path) -> Path:
@@ -92,7 +112,7 @@ def report_html(inference: Inference) -> str:
         parameters=_parameter_rows(inference),
         parameters_say=_parameters_say(inference),
         numbers=_number_rows(inference),
-        euler=f"Euler number {number(fit.morphometry.euler, 7)} in the box",
+        euler=f"Euler number {fit.morphometry.euler} in the box",
         matches=_match_rows(inference),
         command=escape("curvafit generate --prior fit.json --shape 100 --seed 1 -o more.nii.gz"),
         python=_PYTHON,
@@ -119,19 +139,19 @@ def _scan_line(inference: Inference) -> str:
     kind = {"field": "phase field", "mask": "mask", "image": "image"}.get(fit.kind, fit.kind)
     same = len({round(h / scan.spacing[0], 6) for h in scan.spacing}) == 1
     spacing = (scan.spacing[0],) if same else scan.spacing
-    voxel = " × ".join(number(h, 4) for h in spacing) + f" {unit_name(scan.unit, spacing[0])}"
+    voxel = " × ".join(f"{h:.4g}" for h in spacing) + f" {unit_name(scan.unit, spacing[0])}"
     name = Path(scan.source).name or "a volume"
     line = f"{name}: {kind} of {shape} voxels (z, y, x), voxel edge {voxel}."
     return escape(line) + f" Measured on voxels of {escape(length(fit.working_voxel, fit.length_unit, 3))}."
 
 
 def _list(notes: tuple[str, ...]) -> str:
-    return "<ul class=\"small\">" + "".join(f"<li>{escape(note)}</li>" for note in notes) + "</ul>" if notes else ""
+    return '<ul class="small">' + "".join(f"<li>{escape(note)}</li>" for note in notes) + "</ul>" if notes else ""
 
 
 def _distance_unit(inference: Inference) -> str:
     voxel = length(inference.fit.length, inference.fit.length_unit, 3)
-    return f"curvature per working unit (1 working unit = 100 working voxels = {voxel})"
+    return f"1/working unit (100 working voxels, {voxel})"
 
 
 def _distances_say(inference: Inference) -> str:
@@ -149,15 +169,18 @@ def _bars(inference: Inference) -> str:
     for name, key in rows:
         value = fit.distances.get(key)
         style = "noise" if key == "seed_noise" else "best" if key == fit.chosen else ""
-        bar = f'<span class="bar {style}" style="width:{100 * value / longest:.1f}%"></span>' if value is not None else ""
-        bold = " class=\"chosen\"" if key == fit.chosen else ""
+        bar = (
+            f'<span class="bar {style}" style="width:{100 * value / longest:.1f}%"></span>' if value is not None else ""
+        )
+        bold = ' class="chosen"' if key == fit.chosen else ""
         said = number(value, 2) if value is not None else "could not be made" if key != "seed_noise" else "not known"
         parts.append(f"<span{bold}>{name}</span><span>{bar}</span><span{bold}>{said}</span>")
     return "\n".join(parts)
 
 
 def _scale_say(inference: Inference) -> str:
-    return "here a₂₀ = 1" if abs(float(inference.fit.coefficients.a20) - 1) < 1e-9 else "any common factor may be put on them"
+    held = [name for name in ("a20", "a02") if abs(inference.fit.coefficients.as_dict()[name] - 1) < 1e-9]
+    return f"here {_TERMS[held[0]][0]} = 1" if held else "any common factor may be put on them"
 
 
 def _parameter_rows(inference: Inference) -> str:
@@ -167,14 +190,15 @@ def _parameter_rows(inference: Inference) -> str:
     rows = [_coefficient_row(inference, name, match[name], refined[name], physical[name]) for name in NAMES]
     marks = {name: " chosen" if name == fit.chosen else "" for name in _NAMES}
     rows.append(
-        "<tr><th scope=\"row\">m₀</th><td>mass</td>"
+        '<tr><th scope="row">m₀</th><td>mass</td>'
         f'<td class="n{marks["match"]}">{number(fit.matches[0].mass)}</td>'
         f'<td class="n{marks["fit"]}">{number(fit.refined["mass"])}</td><td></td>'
         f'<td class="n chosen">{number(fit.mass)}</td><td></td><td></td></tr>'
     )
+    ε = f"{number(fit.epsilon_physical)}</td><td></td><td>{unit_name(fit.length_unit, 2)}"
     rows.append(
-        '<tr><th scope="row">ε</th><td>half width of the interface</td><td class="n">0.02</td><td class="n">0.02</td><td></td>'
-        f'<td class="n chosen">{number(fit.epsilon_physical)}</td><td></td><td>{unit_name(fit.length_unit, 2)}</td></tr>'
+        '<tr><th scope="row">ε</th><td>interface</td>'
+        f'<td class="n">0.02</td><td class="n">0.02</td><td></td><td class="n">{ε}</td></tr>'
     )
     return "\n".join(rows)
 
@@ -205,8 +229,8 @@ def _parameters_say(inference: Inference) -> str:
     voxel = length(fit.working_voxel, fit.length_unit, 3)
     method = escape(str(fit.refined.get("method", "refinement")))
     return (
-        f"Columns two and three are in working units (voxel 0.01, ε 0.02); a working voxel is {escape(voxel)}. "
-        f"Bold: the {_NAMES[fit.chosen]}, which are better supported and which fit.json holds. "
+        f"Match and refined are in working units (voxel 0.01, ε 0.02); a working voxel is {escape(voxel)}. "
+        f"Bold: the {_NAMES[fit.chosen]}, the better supported, kept in fit.json. "
         f"± is one standard deviation of the refinement ({method}); it does not hold what the model leaves out."
     )
 
@@ -229,11 +253,12 @@ def _number_rows(inference: Inference) -> str:
 
 
 def _match_rows(inference: Inference) -> str:
-    return "\n".join(
-        f'<tr><th scope="row">{escape(str(match.id))}</th><td class="n">{number(match.distance, 2)}</td>'
-        f'<td class="n">{number(match.mass)}</td><td class="n">{match.seed}</td></tr>'
-        for match in inference.fit.matches
-    )
+    rows = []
+    for match in inference.fit.matches:
+        cells = [number(match.distance, 2), *map(number, match.coefficients.as_dict().values()), number(match.mass)]
+        columns = "".join(f'<td class="n">{cell}</td>' for cell in (*cells, str(match.seed)))
+        rows.append(f'<tr><th scope="row">{escape(str(match.id))}</th>{columns}</tr>')
+    return "\n".join(rows)
 
 
 def _provenance(inference: Inference) -> str:

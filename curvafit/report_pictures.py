@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 _AXES = "zyx"
 #: The three shapes of a report: which parameters made it, its title.
-_SHAPES = ((None, "The scan"), ("match", "Nearest match, regenerated"), ("fit", "Refined, regenerated"))
+_SHAPES = ((None, "The scan"), ("match", "Nearest match, regrown"), ("fit", "Refined, regrown"))
 
 
 def slice_figures(inference: Inference) -> str:
@@ -33,9 +33,7 @@ def slice_figures(inference: Inference) -> str:
 def surface_figures(inference: Inference) -> str:
     """The scan's surface, the matched and the regenerated shape, in boxes of one size."""
     shapes = (scan_box(inference), inference.matched, inference.regenerated)
-    return "".join(
-        _shape(inference, name, title, u) for (name, title), u in zip(_SHAPES, shapes, strict=True)
-    )
+    return "".join(_shape(inference, name, title, u) for (name, title), u in zip(_SHAPES, shapes, strict=True))
 
 
 def diagram_figures(inference: Inference) -> str:
@@ -93,7 +91,7 @@ def _slice(inference: Inference, axis: int, index: int, limits: tuple[float, flo
         window=framed,
     )
     depth = length((row + 0.5) * scan.spacing[axis], scan.unit)
-    caption = f"<b>Across {_AXES[axis]}</b>, slice {row} of {scan.values.shape[axis]} ({escape(depth)})"
+    caption = f"<b>Across {_AXES[axis]}</b>, slice {row} of {scan.values.shape[axis]}, at {escape(depth)}"
     return _figure(figure, f"Slice across {_AXES[axis]} with the surface's outline", caption)
 
 
@@ -102,7 +100,7 @@ def _shape(inference: Inference, name: str | None, title: str, u: np.ndarray | N
     if u is None:
         return _missing(caption)
     fit = inference.fit
-    edges = [length(n * fit.working_voxel, fit.length_unit) for n in u.shape]
+    edges = [length(n * fit.working_voxel, fit.length_unit, 3) for n in u.shape]
     box = f"edge {edges[0]}" if len(set(edges)) == 1 else " × ".join(edges)
     distance = "" if name is None else f"; distance {fit.distances[name]:.1f}"
     return _figure(surface_figure(u), f"Surface: {title}", f"{caption}<br>{escape(box + distance)}")
@@ -119,4 +117,5 @@ def _figure(figure: Figure, alt: str, caption: str) -> str:
 
 
 def _missing(caption: str) -> str:
-    return f'<figure><div class="none">no shape grew from these parameters</div><figcaption>{caption}</figcaption></figure>\n'
+    box = '<div class="none">no shape grew from these parameters</div>'
+    return f"<figure>{box}<figcaption>{caption}</figcaption></figure>\n"

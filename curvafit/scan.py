@@ -165,7 +165,7 @@ def _guarded(reader: Callable[..., Raw], path: Path, **options: object) -> Raw:
     """A library's own exceptions become one sentence; ours pass."""
     try:
         return reader(path, **options)
-    except (ScanError, FileNotFoundError, MemoryError):
+    except (ScanError, MemoryError):
         raise
     except Exception as reason:  # every library has its own way to say that a file is damaged
         said = " ".join(f"{type(reason).__name__}: {reason}".split())[:200]
@@ -203,20 +203,18 @@ def _placed(raw: Raw, source: str, spacing: Sequence[float] | float | None, unit
     """Native values with the file's spacing and unit, or the caller's."""
     notes = list(raw.notes if spacing is not None or unit is not None else raw.notes + raw.guesses)
     file_unit, factor = normalise_unit(raw.unit)
-    stated = None if raw.spacing is None else _positive_triple(tuple(h * factor for h in raw.spacing))
+    stated = None if raw.spacing is None else tuple(h * factor for h in raw.spacing)
     affine = None if raw.affine is None else np.diag([factor, factor, factor, 1.0]) @ raw.affine
     chosen_unit, chosen_factor = (file_unit, 1.0) if unit is None else normalise_unit(unit)
-    chosen = stated
-    if spacing is not None:
-        chosen = _positive_triple(spacing)
-    if chosen is None:
-        chosen = (1.0, 1.0, 1.0)
-        assumed = "lengths are counted in voxels" if chosen_unit == "voxel" else f"voxels of 1 {chosen_unit} are assumed"
-        notes.append(f"The file states no spacing: {assumed}.")
-    if affine is not None and stated is not None:
-        affine[:3, :3] *= np.array(chosen)[::-1] / np.array(stated)[::-1]
+    chosen = _positive_triple(1.0 if stated is None and spacing is None else stated if spacing is None else spacing)
+    if stated is None and spacing is None:
+        counted = "counted in voxels" if chosen_unit == "voxel" else f"those of voxels of 1 {chosen_unit}"
+        notes.append(f"The file states no spacing: lengths are {counted}.")
+    if affine is not None and stated != chosen:
+        lengths = np.linalg.norm(affine[:3, :3], axis=0)
+        affine[:3, :3] *= np.array(chosen)[::-1] / np.where(lengths > 0, lengths, 1)
     if unit is not None:
-        chosen = tuple(h * chosen_factor for h in chosen)
+        chosen = (chosen[0] * chosen_factor, chosen[1] * chosen_factor, chosen[2] * chosen_factor)
         affine = None if affine is None else np.diag([chosen_factor] * 3 + [1.0]) @ affine
     values = np.ascontiguousarray(raw.values, dtype=raw.values.dtype.newbyteorder("="))
     return Field(values, chosen, chosen_unit, affine, source, tuple(notes))

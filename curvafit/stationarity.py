@@ -112,8 +112,10 @@ def stationarity(
     say = progress or (lambda text, share: None)
     width = _width(grid) if width is None else width
     say("differentiating the energy", 0.0)
-    octants = _equations(values, grid, epsilon, width)
-    problem, size, trials = _with_error(values, octants, grid, epsilon, width, seed)
+    gradients = energy_gradients(values, grid, epsilon)
+    octants = _equations(gradients, grid, epsilon, width)
+    say("propagating the field's error", 0.2)
+    problem, size, trials = _with_error(values, gradients, _triangle(octants), grid, epsilon, width, seed)
     say("solving", 0.8)
     tls, singular = _total_least_squares(problem)
     given = [np.array([float(value) for value in start]) / units(epsilon) for start in starts]
@@ -149,9 +151,9 @@ def _width(grid: Grid) -> float:
     return min(TEST_WIDTH, (min(grid.shape) - 8 - 2 * _REACH) // 2 / 4)
 
 
-def _equations(u: Tensor, grid: Grid, epsilon: float, width: float) -> np.ndarray:
+def _equations(gradients: Tensor, grid: Grid, epsilon: float, width: float) -> np.ndarray:
     """`(8, 7, 7)`: each octant's equations [1 | columns], dimensionless, QR-compressed."""
-    tested = _tested(energy_gradients(u, grid, epsilon), grid, epsilon, width)
+    tested = _tested(gradients, grid, epsilon, width)
     halves = [np.array_split(np.arange(n), 2) for n in tested.shape[1:]]
     parts = [tested[:, z][:, :, y][..., x] for z in halves[0] for y in halves[1] for x in halves[2]]
     scale = math.sqrt(tested[0].size)
@@ -161,15 +163,14 @@ def _equations(u: Tensor, grid: Grid, epsilon: float, width: float) -> np.ndarra
 def _tested(columns: Tensor, grid: Grid, epsilon: float, width: float) -> np.ndarray:
     """`(6, …)` columns against Gaussian test functions whose support stays in the box (or goes round it)."""
     deviation = width * max(grid.spacing)
-    scaled = columns * torch.as_tensor(units(epsilon), dtype=columns.dtype).reshape(6, 1, 1, 1)
-    blurred = gaussian_blur(scaled, grid, deviation)
-    core = [slice(None)]
+    core = []
     for n, h in zip(grid.shape, grid.spacing, strict=True):
         margin = 0 if grid.periodic else math.ceil(4 * deviation / h) + _REACH
         if n - 2 * margin < 2 * _STRIDE:
             raise ValueError(f"expected a test width under {n / 8 - 1:.1f} voxels in a crop of {n}, got {width}")
         core.append(slice(margin, n - margin, _STRIDE))
-    return blurred[tuple(core)].numpy()
+    tested = [gaussian_blur(column, grid, deviation)[tuple(core)].numpy() for column in columns]
+    return np.stack(tested) * units(epsilon).reshape(6, 1, 1, 1)
 
 
 def _compressed(columns: np.ndarray) -> np.ndarray:
@@ -185,15 +186,13 @@ def _triangle(stack: np.ndarray) -> np.ndarray:
 
 
 def _with_error(
-    u: Tensor, octants: np.ndarray, grid: Grid, epsilon: float, width: float, seed: int
+    u: Tensor, clean: Tensor, columns: np.ndarray, grid: Grid, epsilon: float, width: float, seed: int
 ) -> tuple[_Problem, float, int]:
     """The problem whitened by a field error, the error's root mean square and the number of trials.
 
     A finite error, not its linearisation: the columns are singular where ∇u = 0 and at umbilics. Its size is searched
     until the misfit is what it causes (smallest singular value 1).
     """
-    columns = _triangle(octants)
-    clean = energy_gradients(u, grid, epsilon)
     error = torch.randn(u.shape, generator=torch.Generator().manual_seed(seed), dtype=u.dtype)
     error = gaussian_blur(error, grid, _ERROR_WIDTH * max(grid.spacing))
     error /= error.square().mean().sqrt()

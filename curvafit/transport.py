@@ -13,7 +13,7 @@ from torch import Tensor
 from curvafit.diagram import Diagram
 
 #: Part of the area, times (edge / bin width)², that a widened bin may hold.
-TAIL_SHARE = 1e-3
+TAIL_SHARE = 3e-3
 
 
 def wasserstein(

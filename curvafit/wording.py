@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 METRES = {"nm": 1e-9, "um": 1e-6, "mm": 1e-3, "m": 1.0}
 #: tan 22.5°: how far in direction a point may lie from a family's ideal one.
 _NARROW = math.tan(math.pi / 8)
+#: A space that no line breaks at.
+_GLUE = "\u00a0"
 
 _Radii = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 #: For each round family: which points (κ1, κ2) are its own, and the curvature that its radius is one over.
@@ -70,25 +72,25 @@ def number(value: float | None, digits: int = 3) -> str:
         return "–"
     if value == 0 or math.isinf(value):
         return f"{value:g}"
-    power = math.floor(math.log10(abs(value)))
-    if not -4 <= power <= 6:
-        return f"{value:.{digits - 1}e}".replace("-", "−")
-    rounded = f"{round(value, digits - 1 - power):,.{max(0, digits - 1 - power)}f}"
-    return rounded.replace(",", "\u202f").replace("-", "−")
+    rounded = f"{value:.{digits - 1}e}"
+    power = int(rounded.partition("e")[2])
+    if -4 <= power <= 6:
+        rounded = f"{float(rounded):,.{max(0, digits - 1 - power)}f}".replace(",", "\u202f")
+    return rounded.replace("-", "−")
 
 
 def percent(share: float) -> str:
-    return f"{number(100 * share, 2)} %"
+    return f"{number(100 * share, 2)}{_GLUE}%"
 
 
 def length(value: float, unit: str, digits: int = 2) -> str:
     """A length in the unit in which it is 1 to 1000."""
     if unit not in METRES or not math.isfinite(value) or value <= 0:
-        return f"{number(value, digits)} {unit_name(unit, value)}"
+        return f"{number(value, digits)}{_GLUE}{unit_name(unit, value)}"
     metres = value * METRES[unit]
     fitting = [name for name, size in METRES.items() if metres / size >= 0.9995]
     best = fitting[-1] if fitting else "nm"
-    return f"{number(metres / METRES[best], digits)} {unit_name(best)}"
+    return f"{number(metres / METRES[best], digits)}{_GLUE}{unit_name(best)}"
 
 
 def density(value: float, unit: str, power: int, digits: int = 3) -> str:
@@ -96,7 +98,7 @@ def density(value: float, unit: str, power: int, digits: int = 3) -> str:
     names = [unit, *(name for name in ("mm", "um", "nm", "m") if unit in METRES and name != unit)]
     scaled = {name: value * (METRES[name] / METRES[unit]) ** power if name != unit else value for name in names}
     best = next((name for name in names if 0.1 <= abs(scaled[name]) < 1e4), unit)
-    return f"{number(scaled[best], digits)} {per_unit(best, power)}"
+    return f"{number(scaled[best], digits)}{_GLUE}{per_unit(best, power)[1:]}"
 
 
 def per_unit(unit: str, power: int) -> str:

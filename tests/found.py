@@ -1,9 +1,13 @@
-"""A finished inference made by hand from exact shapes: a lattice of tubes as the scan, two more as its regenerations."""
+"""A finished inference made by hand from exact shapes: a lattice of tubes as the scan, two more beside it."""
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
+import pytest
 import torch
+from matplotlib.figure import Figure
 
 from curvafit.diagram import Diagram, diagram
 from curvafit.fit import Fit
@@ -32,7 +36,10 @@ def measured(phase: np.ndarray) -> Diagram:
     return diagram(torch.from_numpy(phase), Grid(phase.shape, 0.01, "replicate"), EPSILON)
 
 
-def made_inference(n: int = 48, *, chosen: str = "fit", lost: bool = False, source: str = "tubes <b>&.tif") -> Inference:
+@lru_cache
+def made_inference(
+    n: int = 48, *, chosen: str = "fit", lost: bool = False, source: str = "tubes <b>&.tif"
+) -> Inference:
     """The inference; with `lost`, nothing grew from the refined parameters."""
     phase, matched, regenerated = lattice(n, 24, RADIUS), lattice(n, 16, 4.5), lattice(n, 24, 5.5)
     noise = np.random.default_rng(0).normal(0, 12, phase.shape)
@@ -77,3 +84,16 @@ def made_fit(chosen: str = "fit", lost: bool = False) -> Fit:
         notes=("Smoothed by one voxel, split at Otsu's threshold 110.", "Specks < 5 voxels were dropped."),
         provenance={"curvafit": "0.1.0", "scan": "tubes <b>&.tif", "seed": 0, "date": "2025-01-01T00:00:00+00:00"},
     )
+
+
+def without_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports with empty pictures, where their text is what matters. What cannot be drawn is still refused."""
+    import curvafit.report_pictures as pictures
+
+    def blank(u: np.ndarray) -> Figure:
+        if not np.isfinite(u).all():
+            raise ValueError("expected a finite volume to draw, got NaN or infinite values")
+        return Figure()
+
+    monkeypatch.setattr(pictures, "surface_figure", blank)
+    monkeypatch.setattr(pictures, "png", lambda figure: b"\x89PNG")

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-from curvafit.data_synth import __main__ as command
 from curvafit.data_synth import atlas as building
 from curvafit.data_synth.design import INTERVALS, random_law, start_seed
 from curvafit.data_synth.store import open_store
@@ -37,6 +36,7 @@ class Balls:
     def __init__(self, stop_after: int | None = None) -> None:
         self.seeds: list[int] = []
         self.stop_after = stop_after
+        self.highest = 1.0
 
     def __call__(self, coefficients, mass, grid, *, seed, reject_early, **options):
         if len(self.seeds) == self.stop_after:
@@ -45,7 +45,7 @@ class Balls:
         self.seeds.append(seed)
         viable = coefficients.a11 > 0
         history = types.SimpleNamespace(step=np.array([1, 9]), energy=np.array([2.0, 1.0]))
-        viability = Viability(0.1, 1.0, -1.0, viable, "" if viable else "a11 is negative")
+        viability = Viability(0.1, self.highest, -1.0, viable, "" if viable else "a11 is negative")
         field = ball(0.05 + 0.03 * mass)
         return types.SimpleNamespace(field=field, history=history, viability=viability, status="converged")
 
@@ -59,7 +59,7 @@ def balls(monkeypatch):
 
 @pytest.fixture
 def atlas(tmp_path, balls) -> Atlas:
-    return extract(building.build(tmp_path / "s.zarr", 6, SHAPE, seed=2), command=["first", "second"])
+    return extract(building.build(tmp_path / "s.zarr", 6, SHAPE, seed=2), command=["then this"])
 
 
 def test_building_draws_in_order_until_enough_are_viable(tmp_path, balls):
@@ -114,13 +114,6 @@ def test_wrong_counts_and_other_settings_are_refused(tmp_path, balls):
         building.build(tmp_path / "s.zarr", 1, SHAPE, seed=3)
 
 
-def test_the_command_builds_and_says_what_was_wrong(tmp_path, balls, capsys):
-    assert command.main([str(tmp_path / "s.zarr"), "--count", "2", "--shape", str(SHAPE)]) == 0
-    assert "viable (2 of " in capsys.readouterr().err
-    assert command.main([str(tmp_path / "s.zarr"), "--count", "0"]) == 2
-    assert capsys.readouterr().err == "expected a count of at least 1 shape, got 0\n"
-
-
 def test_an_atlas_holds_what_the_store_does(tmp_path, atlas):
     store = open_store(tmp_path / "s.zarr")
     viable = [r for r in map(store.record, store.indices()) if r.viability.viable]
@@ -132,9 +125,19 @@ def test_an_atlas_holds_what_the_store_does(tmp_path, atlas):
     for measured in atlas.diagrams("field"):  # balls: κ1 and κ2 are 1/R all over, the area 4πR²
         κ = np.average(measured.points, axis=0, weights=measured.weights)
         assert measured.weights.sum() * κ[0] * κ[1] == pytest.approx(4 * np.pi, rel=0.12)
-    assert atlas.provenance["command"] == ["first", "second"]
+    build = f"curvafit atlas build s.zarr --count {len(viable)} --shape 20,20,20 --seed 2 --schedule fast"
+    assert atlas.provenance["command"] == [build, "then this"]
     assert atlas.provenance["settings"]["seed"] == 2
     assert atlas.provenance["draws"] == len(store.indices())
+
+
+def test_faint_and_over_sharp_shapes_stay_in_the_store_and_out_of_the_atlas(tmp_path, balls):
+    for count, highest in enumerate((1.0, 0.4, 4.0, 1.5), 1):
+        balls.highest = highest
+        store = building.build(tmp_path / "s.zarr", count, SHAPE)
+    whole = extract(store)
+    assert len(whole) == 2
+    assert whole.provenance["viable"] == 4
 
 
 def test_an_atlas_file_comes_back_within_its_stated_rounding(tmp_path, atlas):
@@ -200,9 +203,9 @@ def test_arrays_that_do_not_fit_together_are_refused(atlas):
         atlas.diagrams("image")
 
 
-def test_a_store_without_viable_shapes_gives_no_atlas(tmp_path):
+def test_a_store_without_well_formed_shapes_gives_no_atlas(tmp_path):
     store = open_store(tmp_path / "s.zarr", _settings(Grid((16,) * 3), schedule("fast")))
-    with pytest.raises(ValueError, match="expected at least one viable shape in .*, got none in 0 draws"):
+    with pytest.raises(ValueError, match="expected at least one well-formed shape in .*, got none in 0 draws"):
         extract(store)
 
 
@@ -220,9 +223,9 @@ def test_the_packaged_atlas_is_of_the_random_law_and_small():
     low, high = INTERVALS["mass"]
     assert low < atlas.masses.min() and atlas.masses.max() < high
     assert all(np.isfinite(d.points).all() and d.weights.min() > 0 for d in atlas.diagrams("mask"))
-    assert any("curvafit" in line for line in atlas.provenance["command"])
+    assert all(line.startswith("curvafit atlas ") for line in atlas.provenance["command"])
 
 
 def _settings(grid: Grid, plan) -> building.Settings:
-    epsilon, blur = building.WORKING_EPSILON, building.BLUR
+    epsilon, blur = building.WORKING_EPSILON, building.WORKING_BLUR
     return building.Settings(grid.shape, grid.spacing, epsilon, blur, building.LAW, 0, dataclasses.asdict(plan))

@@ -15,7 +15,7 @@ import torch
 from curvafit.data_synth.design import LAW, random_law, start_seed
 from curvafit.data_synth.store import Record, Settings, Store, open_store
 from curvafit.diagram import Diagram, diagram
-from curvafit.generation.flow import generate
+from curvafit.generation.flow import WORKING_BLUR, generate
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.schedule import schedule as named_schedule
 from curvafit.priors.grid import WORKING_EPSILON, Grid
@@ -24,8 +24,6 @@ from curvafit.transport import TAIL_SHARE
 
 #: Progress(record, viable so far, draws so far), called after every new draw.
 Progress = Callable[[Record, int, int], None]
-#: Standard deviation of the flow's blur, in working units.
-BLUR = 0.02
 #: Edge of the bins in the (κ1, κ2) plane, in 1 / working unit: the one that distances are taken with.
 BIN_WIDTH = 2.0
 
@@ -63,7 +61,9 @@ def build(
     z, y, x = (shape,) * 3 if isinstance(shape, int) else shape
     grid = Grid((z, y, x))
     plan = named_schedule(schedule)
-    settings = Settings(grid.shape, grid.spacing, WORKING_EPSILON, BLUR, LAW, int(seed), dataclasses.asdict(plan))
+    settings = Settings(
+        grid.shape, grid.spacing, WORKING_EPSILON, WORKING_BLUR, LAW, int(seed), dataclasses.asdict(plan)
+    )
     store = open_store(store_path, settings)
     done = {index: store.record(index).viability.viable for index in store.indices()}
     index = 0

@@ -26,7 +26,7 @@ def write_npy(field: Any, path: Path) -> None:
 
 
 def read_npz(path: Path, *, key: str | None = None, **_: object) -> Raw:
-    with np.load(path, allow_pickle=False) as file:
+    with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
         return Raw(file[pick_key(list(file.files), key, path)])
 
 
@@ -40,9 +40,7 @@ def read_hdf5(path: Path, *, key: str | None = None, **_: object) -> Raw:
         return Raw(dataset[()], spacing, unit)
 
 
-def read_raw(
-    path: Path, *, raw_shape: Sequence[int] | None = None, dtype: str | None = None, **_: object
-) -> Raw:
+def read_raw(path: Path, *, raw_shape: Sequence[int] | None = None, dtype: str | None = None, **_: object) -> Raw:
     """Bare numbers, x fastest: shape and type come from the caller (a byte a voxel needs no type)."""
     if raw_shape is None:
         raise ScanError(f"expected --raw-shape Z,Y,X for the bare numbers in {path}, got none")

@@ -23,6 +23,9 @@ _UNITS: dict[str, tuple[str, float]] = {
 }
 
 
+_METRES = {"nm": 1e-9, "um": 1e-6, "mm": 1e-3, "m": 1.0}
+
+
 class ScanError(ValueError):
     """A volume that cannot be used, said in one sentence."""
 
@@ -54,6 +57,14 @@ def normalise_unit(unit: str | None) -> tuple[str, float]:
     if name not in _UNITS:
         raise ScanError(f"expected a unit of voxel, nm, um, mm or m, got {unit!r}")
     return _UNITS[name]
+
+
+def convert_length(length: float, unit: str | None, to: str | None) -> float:
+    """A length in `unit`, in `to`; a unit on either side that is no physical one counts as the other."""
+    (name, factor), (target, target_factor) = normalise_unit(unit), normalise_unit(to)
+    if "voxel" in (name, target):
+        return length * factor
+    return length * factor * _METRES[name] / (_METRES[target] * target_factor)
 
 
 def pick_key(keys: list[str], key: str | None, path: object) -> str:

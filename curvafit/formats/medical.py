@@ -9,7 +9,7 @@ import numpy as np
 
 from curvafit.formats.base import Raw, ScanError, extra, pick_key
 
-#: Axes flipped between DICOM's and ITK's patient frame (left, posterior, superior) and NIfTI's (right, anterior, superior).
+#: From DICOM's and ITK's patient frame (left, posterior, superior) to NIfTI's (right, anterior, superior).
 _LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
@@ -64,7 +64,7 @@ def read_dicom(path: Path, *, key: str | None = None, **_: object) -> Raw:
     series = sorted({str(image.get("SeriesInstanceUID", "")) for image in images})
     chosen = pick_key(series, key, path)
     slices = [image for image in images if str(image.get("SeriesInstanceUID", "")) == chosen]
-    rows, columns = (np.array(slices[0].ImageOrientationPatient, dtype=float).reshape(2, 3))
+    rows, columns = np.array(slices[0].ImageOrientationPatient, dtype=float).reshape(2, 3)
     normal = np.cross(rows, columns)
     slices.sort(key=lambda image: float(np.dot(normal, np.array(image.ImagePositionPatient, dtype=float))))
     values = np.stack([_rescaled(image) for image in slices])
@@ -94,5 +94,6 @@ def _slice_distance(slices: list[Any], normal: np.ndarray, path: Path) -> tuple[
         raise ScanError(f"expected a DICOM series of several slices, got {len(slices)} in {path}")
     steps = np.diff(positions @ normal)
     if steps.min() <= 0 or np.ptp(steps) > 0.05 * steps.mean():
-        raise ScanError(f"expected evenly spaced DICOM slices, got steps of {steps.min():.4g} to {steps.max():.4g} mm in {path}")
+        steps_said = f"steps of {steps.min():.4g} to {steps.max():.4g} mm"
+        raise ScanError(f"expected evenly spaced DICOM slices, got {steps_said} in {path}")
     return float(steps.mean()), positions[0]

@@ -11,7 +11,14 @@ import numpy as np
 
 from curvafit.formats.base import Raw, ScanError, normalise_unit
 
-_TO_FILE = {"voxel": ("unknown", 1.0), "nm": ("micron", 1e-3), "um": ("micron", 1.0), "mm": ("mm", 1.0), "m": ("meter", 1.0)}
+#: Our unit -> (NIfTI's, factor to it).
+_TO_FILE = {
+    "voxel": ("unknown", 1.0),
+    "nm": ("micron", 1e-3),
+    "um": ("micron", 1.0),
+    "mm": ("mm", 1.0),
+    "m": ("meter", 1.0),
+}
 
 
 def read_nifti(path: Path, **_: object) -> Raw:
@@ -29,7 +36,7 @@ def read_nifti(path: Path, **_: object) -> Raw:
     if wrote:
         unit, factor = _own_unit(wrote[1])
         affine[:3] *= factor
-        spacing = tuple(h * factor for h in spacing)
+        spacing = (1.0,) * (values.ndim - 3) + tuple(h * factor for h in zooms[::-1])
     elif unit == "unknown" and all(h == 1 for h in zooms):
         spacing = None
     elif unit == "unknown":

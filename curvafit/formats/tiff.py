@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -10,24 +13,29 @@ from xml.etree import ElementTree
 import numpy as np
 import tifffile
 
-from curvafit.formats.base import Raw, ScanError, normalise_unit
+from curvafit.formats.base import Raw, ScanError, convert_length, normalise_unit
 
 #: Suffixes of a folder's slices.
 SLICES = (".tif", ".tiff")
 _TAG_UNITS = {2: "inch", 3: "cm"}
-#: Resolutions that programs write when they know none (dots an inch).
-_SCREEN = (1, 72, 96, 100, 150, 200, 300, 600)
+#: Resolutions that programs write when they know none (dots an inch; 25.4 is a dot a millimetre).
+_SCREEN = (1, 25.4, 72, 96, 100, 150, 200, 300, 600)
 
 
 def read_tiff(path: Path, **_: object) -> Raw:
     """The first series of a file."""
-    with tifffile.TiffFile(path) as file:
+    with _complaints() as said, tifffile.TiffFile(path) as file:
         series = file.series[0]
-        _refuse_colour(series.axes, path)
+        if "S" in series.axes:
+            raise ScanError(f"expected a grey volume, got a colour image (axes {series.axes}) in {path}")
+        values = series.asarray()
         spacing, unit, guesses = _spacing(file)
         count = len(file.series)
-        notes = (f"The file holds {count} images: the first is used.",) if count > 1 else ()
-        return Raw(series.asarray(), spacing, unit, notes=notes, guesses=guesses)
+    lost = next((text for text in said if "invalid page offset" in text), None)
+    if lost:
+        raise ScanError(f"expected a whole, readable file, got {path} that cannot be read ({lost})")
+    notes = (f"The file holds {count} images: the first is used.",) if count > 1 else ()
+    return Raw(values, spacing, unit, notes=notes, guesses=guesses)
 
 
 def read_slices(path: Path, **_: object) -> Raw:
@@ -51,11 +59,13 @@ def write_tiff(field: Any, path: Path) -> None:
         exact = {"curvafit_spacing": f"{z!r},{y!r},{x!r}", "curvafit_unit": field.unit}
         unit = {"um": "micron", "voxel": "pixel"}.get(field.unit, field.unit)
         metadata = {"axes": "ZYX", "spacing": z, "unit": unit, **exact}
-        tifffile.imwrite(path, values, imagej=True, resolution=(1 / x, 1 / y), metadata=metadata)
+        tifffile.imwrite(
+            path, values, photometric="minisblack", imagej=True, resolution=(1 / x, 1 / y), metadata=metadata
+        )
         return
     sizes = {f"PhysicalSize{axis}": h for axis, h in zip("ZYX", field.spacing, strict=True)}
     units = {f"PhysicalSize{axis}Unit": {"um": "µm", "voxel": "pixel"}.get(field.unit, field.unit) for axis in "ZYX"}
-    tifffile.imwrite(path, values, ome=True, metadata={"axes": "ZYX", **sizes, **units})
+    tifffile.imwrite(path, values, photometric="minisblack", ome=True, metadata={"axes": "ZYX", **sizes, **units})
 
 
 def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
@@ -63,9 +73,20 @@ def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
     return tuple((0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", name.casefold()))
 
 
-def _refuse_colour(axes: str, path: Path) -> None:
-    if "S" in axes:
-        raise ScanError(f"expected a grey volume, got a colour image (axes {axes}) in {path}")
+@contextmanager
+def _complaints() -> Iterator[list[str]]:
+    """What tifffile logs meanwhile: it reads what is left of a damaged file and raises nothing."""
+    said: list[str] = []
+    handler = logging.Handler(logging.WARNING)
+    handler.emit = lambda record: said.append(record.getMessage())  # type: ignore[method-assign]
+    logger = logging.getLogger("tifffile")
+    propagate, logger.propagate = logger.propagate, False
+    logger.addHandler(handler)
+    try:
+        yield said
+    finally:
+        logger.removeHandler(handler)
+        logger.propagate = propagate
 
 
 def _spacing(file: tifffile.TiffFile) -> tuple[tuple[float, ...] | None, str | None, tuple[str, ...]]:
@@ -96,22 +117,27 @@ def _from_ome(text: str) -> tuple[tuple[float, ...] | None, str | None]:
     pixels = next((node for node in ElementTree.fromstring(text).iter() if node.tag.endswith("Pixels")), None)
     if pixels is None or "PhysicalSizeX" not in pixels.attrib:
         return None, None
+    unit = pixels.get("PhysicalSizeXUnit", "um")
     sizes = []
     for axis in "ZYX":
-        size = float(pixels.get(f"PhysicalSize{axis}", pixels.attrib["PhysicalSizeX"]))
-        _, factor = normalise_unit(pixels.get(f"PhysicalSize{axis}Unit", "um"))
-        sizes.append(size * factor)
-    return tuple(sizes), normalise_unit(pixels.get("PhysicalSizeXUnit", "um"))[0]
+        source = axis if f"PhysicalSize{axis}" in pixels.attrib else "X"
+        size = float(pixels.attrib[f"PhysicalSize{source}"])
+        sizes.append(convert_length(size, pixels.get(f"PhysicalSize{source}Unit", "um"), unit))
+    return tuple(sizes), unit
 
 
 def _from_imagej(
     file: tifffile.TiffFile, described: dict[str, Any]
 ) -> tuple[tuple[float, ...] | None, str | None, tuple[str, ...]]:
-    """ImageJ: `spacing` is the distance of slices, the resolution tags count pixels per `unit`."""
+    """ImageJ: `spacing` is the distance of slices, the resolution tags count pixels per `unit`.
+
+    Without a unit only the proportions mean anything: lengths are then in pixels along x.
+    """
     y, x = _pixels_per_unit(file)
     unit = described.get("unit")
-    if "spacing" not in described and (unit is None or normalise_unit(unit)[0] == "voxel"):
-        return None, None, ()
+    if normalise_unit(unit)[0] == "voxel":
+        sizes = (abs(float(described.get("spacing", 1 / x))) * x, x / y, 1.0)
+        return (None if np.allclose(sizes, 1) else sizes), None, ()
     z = abs(float(described.get("spacing", 1 / x)))
     notes = () if "spacing" in described else ("The file states no distance of slices: it is taken as the pixel's.",)
     return (z, 1 / y, 1 / x), unit, notes

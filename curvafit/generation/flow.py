@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
@@ -58,6 +58,7 @@ class State:
 class Callback(Protocol):
     def __call__(self, step: int, total: int, state: State, /) -> bool | None:
         """Called every `RECORD_EVERY` steps with the number made, and at the end; returning True stops the flow."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -121,13 +122,15 @@ def generate(
     Raises
     ------
     ValueError
-        If the mass is outside (-1, 1), a name is unknown, or there is no fused step for the coefficients or device.
+        If the mass is outside (-1, 1), ε is not positive or the blur negative, a name is unknown, or there is no fused
+        step for the coefficients or device.
     """
     if not -1 < mass < 1:
         raise ValueError(f"expected a mass in (-1, 1), got {mass}")
+    _check_lengths(epsilon, blur)
     plan = named_schedule(schedule)
     form = DivergenceForm.of(grid, blur, mass)
-    moved = stepper(white_noise(grid, seed), form, coefficients, epsilon, None, backend, device)
+    moved = stepper(white_noise(grid, seed), form, coefficients, epsilon, plan.betas, None, backend, device)
     return _run(moved, grid, epsilon, plan, callbacks, reject_early, seed)
 
 
@@ -160,11 +163,17 @@ def relax(
             raise ValueError(f"expected a {name} of shape {grid.shape}, got {tuple(values.shape)}")
     if not bool(torch.isfinite(field).all()):
         raise ValueError("expected a finite field, got NaN or infinity in it")
+    _check_lengths(epsilon, blur)
     plan = named_schedule(schedule)
     form = DivergenceForm.of(grid, blur, field)
     start = torch.zeros((3, *grid.shape))
-    moved = stepper(start, form, coefficients, epsilon, frozen, backend, device)
+    moved = stepper(start, form, coefficients, epsilon, plan.betas, frozen, backend, device)
     return _run(moved, grid, epsilon, plan, callbacks, False, None)
+
+
+def _check_lengths(epsilon: float, blur: float) -> None:
+    if not (0 < epsilon < math.inf and 0 <= blur < math.inf):
+        raise ValueError(f"expected epsilon > 0 and blur >= 0 in the spacing's unit, got {epsilon} and {blur}")
 
 
 def _run(
@@ -181,10 +190,9 @@ def _run(
     stop = ""
     for made in range(plan.steps + 1):
         looking = made % RECORD_EVERY == 0 or made == plan.steps
-        rate = plan.rate(made) if made < plan.steps else None
-        seen = moved.step(rate, looking)
+        moved.step(plan.rate(made) if made < plan.steps else None)
         if looking:
-            rows.append((made, *seen, moved.mass()))
+            rows.append((made, *moved.statistics(), moved.mass()))
             stop = _look(moved, made, plan, rows[-1], callbacks)
         if not stop and reject_early and made in plan.checks:
             failed = viability(moved.field(), grid, epsilon)

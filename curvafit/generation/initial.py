@@ -14,7 +14,8 @@ AMPLITUDE = 0.4
 def white_noise(grid: Grid, seed: int, amplitude: float = AMPLITUDE) -> Float[torch.Tensor, "3 z y x"]:
     """A₀: independent and uniform on [0, amplitude) in every voxel and component, float32, on the processor.
 
-    The same numbers for the same seed and shape, whatever was drawn before.
+    The same numbers for the same seed and shape, whatever was drawn before. In a box with walls the mean is taken off:
+    a constant A has no divergence in a periodic box, but pours through walls.
 
     Raises
     ------
@@ -24,4 +25,5 @@ def white_noise(grid: Grid, seed: int, amplitude: float = AMPLITUDE) -> Float[to
     if int(seed) != seed or seed < 0:
         raise ValueError(f"expected a seed that is a whole number from 0, got {seed}")
     generator = torch.Generator().manual_seed(int(seed))
-    return amplitude * torch.rand((3, *grid.shape), generator=generator, dtype=torch.float32)
+    noise = amplitude * torch.rand((3, *grid.shape), generator=generator, dtype=torch.float32)
+    return noise if grid.periodic else noise - amplitude / 2

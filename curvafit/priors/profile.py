@@ -9,9 +9,15 @@ from torch import Tensor
 
 from curvafit.priors.grid import Grid
 from curvafit.priors.shapes import Bool, Float
+from curvafit.priors.stencils import gaussian_blur
 
 #: σ = ∫ √(2W) over [-1, 1] = 4 / (3√2): what a unit of area costs in the limit ε → 0.
 SIGMA = 4 / (3 * math.sqrt(2))
+
+#: Deviation, in voxels, of the Gaussian that takes a mask's stairs away.
+STAIRS = 2.0
+#: Voxels that this made cross the surface are pulled back: how often, how strongly, how widely (voxels).
+SWEEPS, PULL, PULL_WIDTH = 8, 8.0, 1.5
 
 
 def double_well(u: Tensor) -> Tensor:
@@ -56,8 +62,37 @@ def signed_distance(
 
 
 def phase_field(mask: Bool[Tensor, "*batch z y x"], grid: Grid, epsilon: float) -> Float[Tensor, "*batch z y x"]:
-    """A mask's phase field: the optimal profile of its signed distance, saturated beyond 6 ε."""
-    return optimal_profile(signed_distance(mask, grid, limit=6 * epsilon), epsilon)
+    """A mask's phase field: the optimal profile of its signed distance, rid of the voxels' stairs.
+
+    The stairs are smoothed away by 1 - (1 - G)² = 2G - G∗G, G a Gaussian of `STAIRS` voxels along each axis. Its second
+    moments vanish, so that planes stay exact and a sphere or cylinder of radius R moves by O(σ⁴/R³), not by σ²/R.
+    Voxels whose sign that changed (thin places) are then pulled back, a few times, by a smooth amount.
+
+    Raises
+    ------
+    ValueError
+        As `signed_distance` does.
+    """
+    reach = 6 * epsilon + math.ceil(4 * STAIRS) * max(grid.spacing)
+    distance = _without_stairs(signed_distance(mask, grid, limit=reach), grid)
+    return optimal_profile(_with_signs(distance, mask.bool(), grid), epsilon)
+
+
+def _without_stairs(distance: Tensor, grid: Grid) -> Tensor:
+    voxels = Grid(grid.shape, (1.0, 1.0, 1.0), grid.boundary)
+    once = gaussian_blur(distance, voxels, STAIRS)
+    return 2 * once - gaussian_blur(once, voxels, STAIRS)
+
+
+def _with_signs(distance: Tensor, mask: Tensor, grid: Grid) -> Tensor:
+    """Add Gaussians where the sign is not the mask's; a lone voxel's wrong value is lowered by a seventh a sweep."""
+    voxels = Grid(grid.shape, (1.0, 1.0, 1.0), grid.boundary)
+    for _ in range(SWEEPS):
+        wrong = torch.where(mask, distance.clamp_max(0), distance.clamp_min(0))
+        if not bool(wrong.any()):
+            break
+        distance = distance - PULL * gaussian_blur(wrong, voxels, PULL_WIDTH)
+    return distance
 
 
 def _distance_to(target: Tensor, grid: Grid, reach: float) -> Tensor:

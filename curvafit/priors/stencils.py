@@ -81,15 +81,14 @@ def gaussian_blur(u: Float[Tensor, "*batch z y x"], grid: Grid, width: float) ->
     _checked(u, grid)
     if width == 0:
         return u
-    batch = u.shape[:-3]
-    v = u.reshape(-1, 1, *grid.shape)
     for axis, h in enumerate(grid.spacing):
         taps = gaussian_taps(width / h)
-        one_axis = [1, 1, 1]
-        one_axis[axis] = len(taps)
-        kernel = torch.tensor(taps, dtype=u.dtype, device=u.device).reshape(1, 1, *one_axis)
-        v = torch.nn.functional.conv3d(_pad_axis(v, grid, axis, len(taps) // 2), kernel)
-    return v.reshape(*batch, *grid.shape)
+        radius, dim, n = len(taps) // 2, axis - 3, grid.shape[axis]
+        v = _pad_axis(u, grid, axis, radius)
+        u = taps[radius] * v.narrow(dim, radius, n)
+        for k in range(radius):
+            u = u.add_(v.narrow(dim, k, n) + v.narrow(dim, 2 * radius - k, n), alpha=taps[k])
+    return u
 
 
 @lru_cache(maxsize=64)

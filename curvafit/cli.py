@@ -1,0 +1,226 @@
+"""The command line: parse, call, print. Wrong input is one sentence on the error stream and exit code 2.
+
+What a command needs is imported when it runs, so that help is quick.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from curvafit.cli_data import atlas_app, samples_app
+from curvafit.cli_support import (
+    command_line,
+    error_console,
+    flow_progress,
+    numbers,
+    output,
+    plainly,
+    say,
+    stages,
+    threshold_of,
+    triple,
+    whole_triple,
+)
+
+if TYPE_CHECKING:
+    from curvafit.infer import Inference
+    from curvafit.priors.coefficients import Coefficients
+
+app = typer.Typer(
+    help="Shape texture of tubes and membranes in 3D: a scan in, its parameters out; parameters in, shapes out.",
+    epilog="Start with `curvafit infer SCAN -o DIR` or `curvafit generate --preset tubes -o tubes.nii.gz`. "
+    "CURVAFIT_DEBUG=1 shows where an error came from.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+app.add_typer(samples_app, name="samples")
+app.add_typer(atlas_app, name="atlas")
+
+
+def main() -> None:
+    """The entry point."""
+    app(prog_name="curvafit")
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        say(f"curvafit {version('curvafit')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and leave.")
+    ] = False,
+) -> None:
+    pass
+
+
+# ---- generate --------------------------------------------------------------------------------------------------------
+
+
+@app.command(
+    epilog="[bold]Examples[/bold]\n\n"
+    "curvafit generate --preset tubes -o tubes.nii.gz\n\n"
+    "curvafit generate --coefficients 1,2,6,-40,-40,400 --mass -0.6 --shape 64,64,128 -o tubes.stl\n\n"
+    "curvafit generate --prior bone/fit.json --seed 3 -o more_bone.tif"
+)
+def generate(
+    out: Annotated[
+        Path,
+        typer.Option("-o", "--output", help="Volume (.nii.gz .nii .tif .npy .zarr) or surface (.stl .ply) to write."),
+    ],
+    preset: Annotated[str | None, typer.Option(help="A published shape; see `curvafit presets`.")] = None,
+    coefficients: Annotated[
+        str | None, typer.Option(help="a20,a11,a02,a10,a01,a00 in working units; needs --mass.")
+    ] = None,
+    prior: Annotated[Path | None, typer.Option(help="fit.json of `curvafit infer`.")] = None,
+    mass: Annotated[float | None, typer.Option(help="Mean of the field, in (-1, 1).")] = None,
+    shape: Annotated[str, typer.Option(help="Voxels: N or Z,Y,X.")] = "100",
+    schedule: Annotated[str, typer.Option(help="fast (1000 steps) or paper (8000).")] = "fast",
+    steps: Annotated[int | None, typer.Option(help="Another number of steps.")] = None,
+    seed: Annotated[int, typer.Option(help="Of the noise that the shape grows from.")] = 0,
+) -> None:
+    """Make a shape from parameters, with a picture (.png) and a record (.json) beside it."""
+    with plainly():
+        box = whole_triple(shape, "--shape")
+        law, m0, voxel, unit, origin = _law(preset, coefficients, prior, mass)
+        from curvafit.generation.flow import generate as make
+        from curvafit.generation.schedule import schedule as named
+        from curvafit.priors.grid import Grid
+        from curvafit.shape_files import check_target, shape_record, write_shape
+
+        check_target(out)
+        plan, grid = named(schedule, steps), Grid(box)
+        with flow_progress(plan.steps) as watch:
+            flow = make(law, m0, grid, schedule=plan, seed=seed, callbacks=[watch])
+        if not flow.viability.lowest < 0 < flow.viability.highest:
+            say(f"{flow.status}; nothing was written", to=error_console())
+            raise typer.Exit(1)
+        if not flow.viability.viable:
+            say(f"note: {flow.status}", to=error_console())
+        record = shape_record(flow, law, m0, origin=origin, voxel=voxel, unit=unit, command=command_line())
+        files = write_shape(flow, out, voxel=voxel, unit=unit, record=record)
+        say(f"{flow.status}; {100 * record['volume_fraction']:.1f} % of the volume")
+        for path in files:
+            say(str(path))
+
+
+def _law(
+    preset: str | None, coefficients: str | None, prior: Path | None, mass: float | None
+) -> tuple[Coefficients, float, float, str, str]:
+    """Coefficients, mass, voxel, unit and where they came from: exactly one source is asked for."""
+    given = [value for value in (preset, coefficients, prior) if value is not None]
+    if len(given) != 1:
+        raise ValueError(f"expected one of --preset, --coefficients and --prior, got {len(given)} of them")
+    from curvafit.priors.coefficients import Coefficients
+    from curvafit.priors.coefficients import preset as named
+
+    if preset is not None:
+        found = named(preset)
+        return found.coefficients, found.mass if mass is None else mass, 1.0, "voxel", f"preset {preset}"
+    if prior is not None:
+        from curvafit.fit import read_prior
+        from curvafit.shape_files import prior_voxel
+
+        law, m0 = read_prior(prior)
+        voxel, unit = prior_voxel(prior)
+        return law, m0 if mass is None else mass, voxel, unit, f"prior {prior}"
+    if mass is None:
+        raise ValueError("expected --mass beside --coefficients, got none")
+    return Coefficients(*numbers(coefficients or "", "--coefficients", 6)), mass, 1.0, "voxel", "coefficients"
+
+
+@app.command()
+def presets() -> None:
+    """List the published shapes: coefficients in working units, mass, source."""
+    with plainly():
+        from curvafit.priors.coefficients import NAMES, PRESETS
+
+        rows = [
+            (name, *(f"{value:g}" for value in entry.coefficients.as_dict().values()), f"{entry.mass:g}", entry.source)
+            for name, entry in PRESETS.items()
+        ]
+        output(("name", *NAMES, "mass", "source"), rows, right=range(1, 8))
+
+
+# ---- infer -----------------------------------------------------------------------------------------------------------
+
+
+@app.command(
+    epilog="[bold]Examples[/bold]\n\n"
+    "curvafit infer bone.tif --spacing 0.0195 --unit mm -o bone\n\n"
+    "curvafit infer vessels.nii.gz --kind mask -o vessels\n\n"
+    "curvafit infer cells.h5 --key raw --dark --threshold 90 -o cells\n\n"
+    "curvafit infer fibres.raw --raw-shape 128,128,128 --dtype u1 -o fibres"
+)
+def infer(
+    scan: Annotated[
+        str, typer.Argument(help="NIfTI, TIFF (or folder of slices), NPY, NPZ, HDF5 (file.h5::key), RAW, Zarr …")
+    ],
+    out: Annotated[Path, typer.Option("-o", "--output", help="Folder for fit.json, report.html, regenerated.nii.gz.")],
+    kind: Annotated[str, typer.Option(help="auto, field, mask or image.")] = "auto",
+    periodic: Annotated[bool, typer.Option("--periodic", help="The box repeats (generated fields).")] = False,
+    atlas: Annotated[Path | None, typer.Option(help="Another atlas (.npz) than the packaged one.")] = None,
+    threshold: Annotated[str, typer.Option(help="Grey level, or otsu.")] = "otsu",
+    dark: Annotated[bool, typer.Option("--dark", help="The structure is the dark phase.")] = False,
+    roi: Annotated[Path | None, typer.Option(help="Mask of what counts, of the scan's shape.")] = None,
+    label: Annotated[int | None, typer.Option(help="The structure is where the scan has this value.")] = None,
+    spacing: Annotated[str | None, typer.Option(help="Voxel edges z,y,x, or one for all; overrides the file.")] = None,
+    unit: Annotated[str | None, typer.Option(help="nm, um, mm or m; overrides the file.")] = None,
+    raw_shape: Annotated[str | None, typer.Option(help="Z,Y,X of a RAW file.")] = None,
+    dtype: Annotated[str | None, typer.Option(help="Type of a RAW file: u1, u2, f4 …")] = None,
+    key: Annotated[str | None, typer.Option(help="Array within an NPZ, HDF5 or Zarr file.")] = None,
+    seed: Annotated[int, typer.Option(help="Of the shapes that are regrown for comparison.")] = 0,
+) -> None:
+    """Infer the parameters of a scanned volume, and write a report."""
+    with plainly():
+        reading = {
+            "spacing": None if spacing is None else triple(spacing, "--spacing"),
+            "raw_shape": None if raw_shape is None else whole_triple(raw_shape, "--raw-shape"),
+            "unit": unit,
+            "dtype": dtype,
+            "key": key,
+        }
+        level = threshold_of(threshold)
+        what = {"kind": kind, "periodic": periodic, "threshold": level, "dark": dark, "roi": roi, "label": label}
+        found, report = _inferred(scan, out, {**what, "atlas": atlas, "seed": seed, **reading})
+        _show(found)
+        say(str(report))
+
+
+def _inferred(scan: str, out: Path, options: dict[str, Any]) -> tuple[Inference, Path]:
+    """The inference and the path of its report, with progress."""
+    from curvafit.shape_files import check_folder
+
+    check_folder(out)
+    with stages() as progress:
+        from curvafit.infer import infer as find
+        from curvafit.report import with_command, write_inference
+
+        found = find(scan, progress=progress, **options)
+        progress("drawing the report", 1.0)
+        return found, write_inference(with_command(found, command_line()), out)
+
+
+def _show(found: Inference) -> None:
+    """The sentence, the verdict, a small table."""
+    from curvafit.report import parameter_table
+    from curvafit.wording import describe, length, number
+
+    fit = found.fit
+    say(f"{describe(found)}.", style="bold")
+    say(fit.status)
+    output(("", "working units", "±", f"with lengths in {fit.length_unit}"), parameter_table(found), right=range(1, 4))
+    names = {"match": "nearest match", "fit": "refined", "seed_noise": "two seeds"}
+    apart = ", ".join(f"{names[name]} {number(value, 2)}" for name, value in fit.distances.items())
+    say(f"Distances in 1/working unit ({length(fit.length, fit.length_unit, 3)}): {apart}.")

@@ -1,0 +1,157 @@
+"""Parsing, progress and plain errors for the command line."""
+
+from __future__ import annotations
+
+import math
+import os
+import shlex
+import sys
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+#: Set to anything, an error keeps its traceback.
+DEBUG = "CURVAFIT_DEBUG"
+
+
+@contextmanager
+def plainly() -> Iterator[None]:
+    """Turn an expected exception into its sentence and exit code 2, Ctrl-C into 130, warnings into notes."""
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = _note
+            yield
+    except KeyboardInterrupt:
+        say("interrupted: nothing was written", to=error_console())
+        raise typer.Exit(130) from None
+    except (ValueError, OSError, ImportError, MemoryError, RuntimeError) as error:
+        if os.environ.get(DEBUG) or not _expected(error):
+            raise
+        say(_sentence(error), to=error_console())
+        raise typer.Exit(2) from None
+
+
+def _expected(error: Exception) -> bool:
+    """Whether an exception tells of the input or the machine rather than of a mistake of ours."""
+    if isinstance(error, ImportError):
+        return not (error.name or "").startswith("curvafit")
+    return not isinstance(error, RuntimeError) or "memory" in str(error).lower()
+
+
+def _sentence(error: Exception) -> str:
+    if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "memory" in str(error).lower()):
+        return "error: expected a volume that fits into memory, got a larger one"
+    if isinstance(error, OSError) and error.strerror:
+        return f"error: {error.strerror.lower()}: {error.filename or ''}"
+    text = " ".join(str(error).split())
+    return f"error: {text or type(error).__name__}"
+
+
+def _note(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
+    if issubclass(category, UserWarning):
+        say(f"note: {message}", to=error_console())
+
+
+def command_line() -> str:
+    """The command as it was given."""
+    return shlex.join(["curvafit", *sys.argv[1:]])
+
+
+# ---- parsing ---------------------------------------------------------------------------------------------------------
+
+
+def numbers(text: str, option: str, count: int) -> tuple[float, ...]:
+    """So many finite numbers between commas."""
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != count or not all(math.isfinite(value) for value in values):
+        raise ValueError(f"expected {option} as {count} numbers between commas, got {text!r}")
+    return values
+
+
+def triple(text: str, option: str) -> tuple[float, float, float]:
+    """One positive number for all axes, or three."""
+    values = numbers(text, option, 1) * 3 if "," not in text else numbers(text, option, 3)
+    if min(values) <= 0:
+        raise ValueError(f"expected {option} as positive numbers, got {text!r}")
+    return values  # type: ignore[return-value]
+
+
+def whole_triple(text: str, option: str) -> tuple[int, int, int]:
+    """One positive whole number for all axes, or three."""
+    values = triple(text, option)
+    if any(value != int(value) for value in values):
+        raise ValueError(f"expected {option} as whole numbers, got {text!r}")
+    return tuple(int(value) for value in values)  # type: ignore[return-value]
+
+
+def threshold_of(text: str) -> float | str:
+    """A grey level, or `"otsu"`."""
+    return text.lower() if text.lower() == "otsu" else numbers(text, "--threshold", 1)[0]
+
+
+# ---- printing --------------------------------------------------------------------------------------------------------
+
+
+def error_console() -> Console:
+    """The error stream."""
+    return Console(stderr=True, highlight=False)
+
+
+def say(text: str, *, to: Console | None = None, style: str | None = None) -> None:
+    """One line as it is: no markup, no wrapping, so that paths can be copied."""
+    (to or Console(highlight=False)).print(text, style=style, markup=False, soft_wrap=True)
+
+
+def output(heads: Sequence[str], rows: Iterable[Sequence[str]], right: Iterable[int] = ()) -> None:
+    """A table without a frame; the columns in `right` are aligned to the right."""
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    rights = set(right)
+    for k, head in enumerate(heads):
+        table.add_column(head, justify="right" if k in rights else "left", no_wrap=k in rights or k == 0)
+    for row in rows:
+        table.add_row(*row)
+    console = Console(highlight=False)
+    console.print(table, markup=False) if console.is_terminal else Console(highlight=False, width=160).print(table)
+
+
+@contextmanager
+def stages() -> Iterator[Callable[[str, float], None]]:
+    """A progress bar for a job that names its stages: call it with a sentence and the share done.
+
+    Where the error stream is no terminal, each new sentence is a line.
+    """
+    console = error_console()
+    if not console.is_terminal:
+        said: list[str] = []
+
+        def write(text: str, share: float) -> None:
+            if said[-1:] != [text]:
+                said.append(text)
+                say(f"[{100 * share:3.0f} %] {text}", to=console)
+
+        yield write
+        return
+    with Progress(
+        TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=console, transient=True
+    ) as bar:
+        task = bar.add_task("starting", total=1.0)
+        yield lambda text, share: bar.update(task, description=text, completed=share)
+
+
+@contextmanager
+def flow_progress(steps: int) -> Iterator[Callable[..., None]]:
+    """A progress bar that is a flow's callback."""
+    columns = TextColumn("growing"), BarColumn(), TextColumn("{task.completed:.0f} of {task.total:.0f} steps")
+    console = error_console()
+    quiet = not console.is_terminal
+    with Progress(*columns, TimeRemainingColumn(), console=console, transient=True, disable=quiet) as bar:
+        task = bar.add_task("growing", total=steps)
+        yield lambda step, total, state: bar.update(task, completed=step)

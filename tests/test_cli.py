@@ -1,0 +1,293 @@
+"""The command line: what parses, what is written, and one sentence with exit code 2 for everything else."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from found import made_fit, made_inference, without_drawing
+from typer.testing import CliRunner, Result
+
+from curvafit.cli import app
+from curvafit.scan import Field, load, save
+
+LAW = ["--coefficients", "1,2,6,-40,-40,400", "--mass", "-0.6"]
+QUICK = [*LAW, "--shape", "24", "--steps", "30"]
+
+
+def call(*arguments: object) -> Result:
+    return CliRunner().invoke(app, [str(part) for part in arguments])
+
+
+def refused(result: Result, said: str) -> None:
+    """One sentence on the error stream, nothing on the other, exit code 2."""
+    assert result.exit_code == 2, (result.output, result.exception)
+    assert result.stdout == ""
+    lines = result.stderr.strip().splitlines()
+    assert len(lines) == 1 and lines[0].startswith("error: ") and said in lines[0], lines
+
+
+# ---- help ------------------------------------------------------------------------------------------------------------
+
+
+def test_help_and_version_load_nothing_heavy() -> None:
+    script = """
+import sys
+from curvafit.cli import app
+try:
+    app(["--help"])
+except SystemExit as leave:
+    assert leave.code == 0
+print(sorted({"torch", "numpy", "scipy", "matplotlib", "numba", "jax"} & set(sys.modules)))
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.rstrip().endswith("[]")
+    assert "generate" in done.stdout and "infer" in done.stdout
+    assert re.fullmatch(r"curvafit \d+\.\d+\.\d+\S*\n", call("--version").stdout)
+
+
+@pytest.mark.parametrize("command", ["generate", "infer", "atlas build", "atlas extract", "samples get"])
+def test_help_of_a_command_has_an_example(command: str) -> None:
+    result = call(*command.split(), "--help")
+    assert result.exit_code == 0
+    assert f"curvafit {command}" in result.stdout and "xample" in result.stdout
+
+
+def test_presets_are_listed_with_their_numbers() -> None:
+    lines = {line.split()[0]: line.split() for line in call("presets").stdout.splitlines()}
+    assert lines["name"] == ["name", "a20", "a11", "a02", "a10", "a01", "a00", "mass", "source"]
+    assert lines["tubes"][1:8] == ["1", "2", "6", "-40", "-40", "400", "-0.6"]
+
+
+def test_samples_are_listed_with_their_licences() -> None:
+    result = call("samples")
+    assert result.exit_code == 0 and re.search(r"^bone .* MIT ", result.stdout, re.MULTILINE)
+    refused(call("samples", "get", "nothing"), "expected a sample named bone")
+
+
+# ---- generate --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
+def test_generate_writes_a_field_a_picture_and_a_record(tmp_path: Path) -> None:
+    target = tmp_path / "new" / "tubes.nii.gz"
+    result = call("generate", *QUICK, "--seed", 7, "-o", target)
+    assert result.exit_code == 0, (result.output, result.exception)
+    assert sorted(path.name for path in target.parent.iterdir()) == ["tubes.json", "tubes.nii.gz", "tubes.png"]
+    record = json.loads((target.parent / "tubes.json").read_text())
+    assert list(record["coefficients"].values()) == [1, 2, 6, -40, -40, 400]
+    assert (record["mass"], record["seed"], record["schedule"]) == (-0.6, 7, {"name": "fast", "steps": 30})
+    field = load(target)
+    assert field.shape == (24, 24, 24) and field.unit == "voxel"
+    assert field.values.mean() == pytest.approx(-0.6, abs=1e-5)
+    assert str(target) in result.stdout
+
+
+@pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
+def test_generate_writes_a_surface_in_the_prior_s_unit(tmp_path: Path) -> None:
+    prior = tmp_path / "fit.json"
+    prior.write_text(made_fit().to_json())
+    target = tmp_path / "more.ply"
+    result = call("generate", "--prior", prior, "--mass", "-0.4", "--shape", "16,20,24", "--steps", 30, "-o", target)
+    assert result.exit_code == 0, (result.output, result.exception)
+    record = json.loads((tmp_path / "more.json").read_text())
+    assert record["coefficients"] == made_fit().coefficients.as_dict()
+    assert (record["mass"], record["shape"], record["voxel"], record["unit"]) == (-0.4, [16, 20, 24], 0.0195, "mm")
+    assert target.read_bytes().startswith(b"ply\nformat binary_little_endian")
+    again = call("generate", "--prior", prior, "--shape", "16", "--steps", 30, "-o", tmp_path / "fit.npy")
+    refused(again, "record fit.json is not another file's")
+    assert prior.read_text() == made_fit().to_json()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ([], "expected one of --preset, --coefficients and --prior, got 0"),
+        (["--preset", "tubes", *LAW], "got 2"),
+        (["--preset", "tube"], "expected a preset among bilayers"),
+        (["--coefficients", "1,2,6,-40,-40,400"], "expected --mass"),
+        (["--coefficients", "1,2,6", "--mass", "-0.6"], "expected --coefficients as 6 numbers"),
+        (["--coefficients", "1,2,6,-40,nan,400", "--mass", "0"], "expected --coefficients as 6 numbers"),
+        ([*LAW, "--mass", "-1.5"], "expected a mass in (-1, 1)"),
+        ([*LAW, "--shape", "10,10"], "expected --shape as 3 numbers"),
+        ([*LAW, "--shape", "10.5"], "expected --shape as whole numbers"),
+        ([*LAW, "--shape", "2"], "at least 4"),
+        ([*LAW, "--shape", "-8"], "expected --shape as positive numbers"),
+        ([*LAW, "--schedule", "slow"], "expected a schedule among paper, fast"),
+        ([*LAW, "--steps", "0"], "expected a whole number of steps"),
+        (["--prior", "nowhere.json"], "expected a fit.json, found no file"),
+    ],
+)
+def test_generate_refuses_in_one_sentence(tmp_path: Path, arguments: list[str], said: str) -> None:
+    refused(call("generate", *arguments, "-o", tmp_path / "out.npy"), said)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_generate_refuses_a_place_before_it_works(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    refused(call("generate", *QUICK, "-o", tmp_path / "out.xyz"), "expected a name ending in one of")
+    refused(call("generate", *QUICK, "-o", tmp_path / "file" / "out.npy"), "is a file")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_generate_refuses_a_prior_of_another_kind(tmp_path: Path) -> None:
+    prior = tmp_path / "other.json"
+    for content, said in (("{}", "expected a fit.json"), ("[1", "expected a fit.json"), ('{"format": "x"}', "format")):
+        prior.write_text(content)
+        refused(call("generate", "--prior", prior, "-o", tmp_path / "out.npy"), said)
+
+
+def test_an_option_that_does_not_parse_exits_with_2(tmp_path: Path) -> None:
+    assert call("generate", "--preset", "tubes", "--seed", "x", "-o", tmp_path / "a.npy").exit_code == 2
+    assert call("infer", tmp_path / "a.npy").exit_code == 2
+
+
+# ---- infer -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    without_drawing(monkeypatch)
+
+
+@pytest.fixture
+def finding(monkeypatch: pytest.MonkeyPatch, undrawn: None) -> dict[str, Any]:
+    """Puts a made inference in the place of the real one, and keeps what it was called with."""
+    calls: dict[str, Any] = {}
+
+    def find(scan: str, *, progress: Any, **given: Any) -> Any:
+        progress("reading the scan", 0.0)
+        calls.update(scan=scan, **given)
+        return made_inference()
+
+    monkeypatch.setattr(importlib.import_module("curvafit.infer"), "infer", find)
+    return calls
+
+
+def test_infer_writes_three_files_and_says_what_it_found(tmp_path: Path, finding: dict[str, Any]) -> None:
+    result = call("infer", "scan.h5::raw", "-o", tmp_path / "out", "--spacing", "2,1,1", "--unit", "um", "--dark")
+    assert result.exit_code == 0, (result.output, result.exception)
+    names = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert names == ["fit.json", "regenerated.nii.gz", "report.html"]
+    lines = result.stdout.splitlines()
+    assert lines[0].startswith("Tubes, radius") and lines[-1] == str(tmp_path / "out" / "report.html")
+    assert re.search(r"a11 +1\.80 +0\.40 +1\.80", result.stdout)
+    assert "[  0 %] reading the scan" in result.stderr
+    assert finding["scan"] == "scan.h5::raw" and finding["spacing"] == (2.0, 1.0, 1.0)
+    assert finding["unit"] == "um" and finding["dark"] is True and finding["threshold"] == "otsu"
+
+
+def test_infer_hands_every_option_on(tmp_path: Path, finding: dict[str, Any]) -> None:
+    options = "--kind mask --periodic --threshold -12.5 --label 3 --raw-shape 4,5,6 --dtype u1 --key k --seed 9"
+    result = call("infer", "a.raw", "-o", tmp_path, *options.split(), "--spacing", "0.5", "--roi", "r.npy")
+    assert result.exit_code == 0, (result.output, result.exception)
+    wanted = {"kind": "mask", "periodic": True, "threshold": -12.5, "label": 3, "raw_shape": (4, 5, 6), "dtype": "u1"}
+    wanted |= {"key": "k", "seed": 9, "spacing": (0.5, 0.5, 0.5), "roi": Path("r.npy"), "atlas": None}
+    assert {name: finding[name] for name in wanted} == wanted
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--spacing", "1,0,1"], "expected --spacing as positive numbers"),
+        (["--spacing", "1,1"], "expected --spacing as 3 numbers"),
+        (["--spacing", "a"], "expected --spacing as 1 numbers"),
+        (["--threshold", "high"], "expected --threshold"),
+        (["--raw-shape", "4,5"], "expected --raw-shape"),
+        (["--unit", "furlong"], "furlong"),
+        (["--kind", "drawing"], "expected kind auto, field, mask or image"),
+        (["--atlas", "nowhere.npz"], "expected an atlas file"),
+        (["--roi", "nowhere.npy"], "no such file"),
+        (["--label", "77"], "expected a label of the scan"),
+        (["--threshold", "5"], "expected a threshold within"),
+    ],
+)
+def test_infer_refuses_options_in_one_sentence(tmp_path: Path, arguments: list[str], said: str) -> None:
+    scan = tmp_path / "scan.npy"
+    values = np.random.default_rng(0).normal(size=(20, 20, 20)).astype(np.float32)
+    save(Field(values), scan)
+    result = call("infer", scan, "-o", tmp_path / "out", *arguments)
+    refused_after_stages(result, said)
+    assert not (tmp_path / "out").exists()
+
+
+BAD_VOLUMES: dict[str, Any] = {
+    "flat": np.zeros((20, 20)),
+    "four": np.zeros((5, 5, 5, 5)),
+    "nan": np.full((20, 20, 20), np.nan),
+    "constant": np.ones((20, 20, 20)),
+    "thin": np.indices((30, 30, 30)).sum(0) % 8 == 0,
+}
+
+
+@pytest.mark.parametrize("name", BAD_VOLUMES)
+def test_infer_refuses_volumes_in_one_sentence(tmp_path: Path, name: str) -> None:
+    np.save(tmp_path / f"{name}.npy", BAD_VOLUMES[name])
+    refused_after_stages(call("infer", tmp_path / f"{name}.npy", "-o", tmp_path / "out"), "expected")
+    assert [path.name for path in tmp_path.iterdir()] == [f"{name}.npy"]
+
+
+def test_infer_refuses_missing_unknown_and_truncated_files(tmp_path: Path) -> None:
+    (tmp_path / "scan.xyz").write_bytes(b"12345")
+    np.save(tmp_path / "cut.npy", np.random.default_rng(0).normal(size=(9, 9, 9)))
+    (tmp_path / "cut.npy").write_bytes((tmp_path / "cut.npy").read_bytes()[:900])
+    for name, said in (("none.tif", "no such file"), ("scan.xyz", "expected"), ("cut.npy", "expected")):
+        refused_after_stages(call("infer", tmp_path / name, "-o", tmp_path / "out"), said)
+    refused(call("infer", tmp_path / "none.tif", "-o", tmp_path / "scan.xyz"), "is a file")
+    assert not (tmp_path / "out").exists()
+
+
+def refused_after_stages(result: Result, said: str) -> None:
+    """As `refused`, after lines that name the stages."""
+    assert result.exit_code == 2, (result.output, result.exception)
+    assert result.stdout == ""
+    *before, last = result.stderr.strip().splitlines()
+    assert all(re.match(r"\[ *\d+ %\] ", line) for line in before), before
+    assert last.startswith("error: ") and said in last
+
+
+# ---- interruptions and mistakes --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (KeyboardInterrupt(), 130, "interrupted: nothing was written"),
+        (MemoryError(), 2, "fits into memory"),
+        (RuntimeError("not enough memory: you tried to allocate"), 2, "fits into memory"),
+        (ModuleNotFoundError("expected pynrrd, got none: pip install curvafit[io]", name="nrrd"), 2, "pip install"),
+        (PermissionError(13, "Permission denied", "out"), 2, "permission denied: out"),
+    ],
+)
+def test_an_interruption_or_a_limit_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException, code: int, said: str
+) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise error
+
+    monkeypatch.setattr(importlib.import_module("curvafit.generation.flow"), "generate", fail)
+    result = call("generate", *QUICK, "-o", tmp_path / "out.npy")
+    assert result.exit_code == code
+    assert said in result.stderr and "Traceback" not in result.output
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_our_own_mistakes_keep_their_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise RuntimeError("a tensor of another shape")
+
+    monkeypatch.setattr(importlib.import_module("curvafit.generation.flow"), "generate", fail)
+    assert isinstance(call("generate", *QUICK, "-o", tmp_path / "out.npy").exception, RuntimeError)
+
+
+@pytest.mark.filterwarnings("default::UserWarning")
+def test_a_warning_becomes_a_note(tmp_path: Path) -> None:
+    result = call("generate", "--coefficients", "-1,2,6,-40,-40,400", "--mass", "7", "-o", tmp_path / "out.npy")
+    assert result.exit_code == 2 and "a20 > 0 and a02 > 0" in result.stderr

@@ -1,0 +1,246 @@
+"""The flow: what it keeps, what it lowers, when it stops, and that its two ways of stepping are one."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from curvafit.generation.flow import RECORD_EVERY, generate, relax
+from curvafit.generation.initial import white_noise
+from curvafit.generation.schedule import SCHEDULES, Schedule, schedule
+from curvafit.generation.viability import viability
+from curvafit.priors.coefficients import Coefficients, preset
+from curvafit.priors.energy import energy
+from curvafit.priors.grid import Grid
+from curvafit.priors.profile import optimal_profile
+from curvafit.priors.stencils import gaussian_blur
+
+TUBES, MASS = preset("tubes").coefficients, preset("tubes").mass
+BACKENDS = ("torch", "fused")
+EPSILON = BLUR = 0.02
+
+
+@pytest.fixture(autouse=True)
+def _fused_where_asked(request):
+    names = getattr(request.node, "callspec", None)
+    if names is not None and names.params.get("backend") == "fused":
+        pytest.importorskip("numba")
+
+
+def short(steps: int, rate: float = 1e-2) -> Schedule:
+    return Schedule("test", steps, rate, rate / 10, "cosine")
+
+
+def gyroid(grid: Grid) -> torch.Tensor:
+    """A smooth field that has no flat phase, where rounding would decide the gradient's direction."""
+    z, y, x = torch.meshgrid(
+        *(2 * math.pi * (torch.arange(n, dtype=torch.float64) + 0.5) / n for n in grid.shape), indexing="ij"
+    )
+    return (torch.sin(z) * torch.cos(y) + torch.sin(y) * torch.cos(x) + torch.sin(x) * torch.cos(z)).float()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("boundary", ["periodic", "replicate"])
+def test_mass_is_exact(boundary, backend):
+    grid = Grid((16, 18, 20), 0.01, boundary)
+    flow = generate(TUBES, MASS, grid, schedule=short(30), backend=backend)
+    assert len(flow.history.mass) == 30 / RECORD_EVERY + 1
+    assert np.abs(flow.history.mass - MASS).max() < 1e-6
+    assert float(flow.field.double().mean()) == pytest.approx(MASS, abs=1e-6)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_energy_falls_and_history_tells_it(backend):
+    grid = Grid((20, 20, 20))
+    flow = generate(TUBES, MASS, grid, schedule=short(75), backend=backend)
+    history = flow.history
+    assert history.step.tolist() == [*range(0, 80, 10), 75]
+    assert history.energy[-1] < 0.2 * history.energy[0]
+    assert history.gradient_mean[-1] < 0.5 * history.gradient_mean[0]
+    assert (history.gradient_max >= history.gradient_mean).all()
+    assert history.energy[-1] == pytest.approx(float(energy(flow.field.double(), TUBES, grid, EPSILON)), rel=1e-4)
+
+
+def test_backends_agree_step_by_step():
+    """From a field without flat phases the two stay together over twenty steps to some 1e-5 of what moves. (Later, and
+    at once from noise, rounding decides the direction where X is near zero, and any two float32 programs part.)"""
+    pytest.importorskip("numba")
+    grid = Grid((20, 22, 24))
+    plan = Schedule("test", 20, 1e-3, 1e-3, "constant")
+    plain, fused = (relax(gyroid(grid), TUBES, grid, schedule=plan, backend=backend) for backend in BACKENDS)
+    moved = float((plain.field - gaussian_blur(gyroid(grid), grid, BLUR)).abs().max())
+    assert moved > 0.1
+    assert float((plain.field - fused.field).abs().max()) < 1e-4 * moved
+    assert np.allclose(plain.history.energy, fused.history.energy, rtol=1e-5)
+    assert np.allclose(plain.history.gradient_mean, fused.history.gradient_mean, rtol=1e-3)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_seed_is_a_shape(backend):
+    grid = Grid((12, 13, 14))
+    torch.manual_seed(0)
+    first = generate(TUBES, MASS, grid, schedule=short(20), seed=3, backend=backend)
+    torch.rand(7)
+    state = torch.get_rng_state()
+    again = generate(TUBES, MASS, grid, schedule=short(20), seed=3, backend=backend)
+    assert torch.equal(torch.get_rng_state(), state)
+    assert torch.equal(first.field, again.field)
+    assert first.seed == 3
+    other = generate(TUBES, MASS, grid, schedule=short(20), seed=4, backend=backend)
+    assert float((first.field - other.field).abs().max()) > 0.1
+
+
+def test_start_is_the_published_one():
+    noise = white_noise(Grid((30, 31, 32)), 0)
+    assert noise.dtype == torch.float32
+    assert noise.shape == (3, 30, 31, 32)
+    assert 0 <= float(noise.min()) < 1e-3 < 0.399 < float(noise.max()) < 0.4
+    assert float(noise.mean()) == pytest.approx(0.2, abs=1e-3)
+    assert abs(float(white_noise(Grid((30, 31, 32), 0.01, "replicate"), 0).mean())) < 1e-3
+    with pytest.raises(ValueError, match="expected a seed"):
+        white_noise(Grid((8, 8, 8)), -1)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_runaway_stops_with_a_sentence(backend):
+    """A step of 1e30 overflows float32; the flow says so instead of returning a shape."""
+    plan = Schedule("test", 100, 1e30, 1e30, "constant")
+    flow = generate(TUBES, MASS, Grid((12, 12, 12)), schedule=plan, backend=backend)
+    assert "not finite" in flow.status
+    assert not flow.viability.viable
+    assert flow.history.step[-1] < 100
+
+
+def test_callbacks_see_and_stop():
+    grid = Grid((12, 12, 12))
+    seen = []
+
+    def watch(step, total, state):
+        seen.append((step, total, state.energy, float(state.field.mean())))
+        return step >= 20
+
+    flow = generate(TUBES, MASS, grid, schedule=short(50), callbacks=[watch, lambda *_: None])
+    assert [row[:2] for row in seen] == [(0, 50), (10, 50), (20, 50)]
+    assert [row[2] for row in seen] == flow.history.energy.tolist()
+    assert all(row[3] == pytest.approx(MASS, abs=1e-6) for row in seen)
+    assert flow.status == "stopped by a callback after 20 of 50 steps"
+
+
+def test_early_rejection_saves_the_rest():
+    """A cost on area alone, from little mass, leaves no shape."""
+    area = Coefficients(1, 2, 1, 0, 0, 5000)
+    grid = Grid((16, 16, 16))
+    asked = generate(area, -0.75, grid, schedule=short(200, 3e-3), reject_early=True)
+    assert asked.history.step[-1] == 100
+    assert not asked.viability.viable
+    assert asked.status.startswith("stopped after 100 of 200 steps: no inside")
+    whole = generate(area, -0.75, grid, schedule=short(200, 3e-3))
+    assert whole.history.step[-1] == 200
+    assert whole.status.startswith("no shape after 200 steps")
+
+
+def test_viability_is_the_published_predicate():
+    grid = Grid((32, 32, 32))
+    axis = 0.01 * (torch.arange(32) - 15.5)
+    z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
+    ball = optimal_profile(0.09 - (z**2 + y**2 + x**2).sqrt(), EPSILON)
+    assert viability(ball, grid, EPSILON).viable
+    assert viability(ball, grid, EPSILON).reason == ""
+    for field, reason in (
+        (torch.full(grid.shape, -0.5), "no inside"),
+        (torch.full(grid.shape, 0.5), "no outside"),
+        (0.2 * torch.sin(2 * math.pi * z / 0.32), "no interface profile"),
+        (ball * math.nan, "not finite"),
+    ):
+        found = viability(field, grid, EPSILON)
+        assert not found.viable
+        assert reason in found.reason
+
+
+def test_schedules():
+    paper, fast = SCHEDULES["paper"], SCHEDULES["fast"]
+    assert (paper.steps, paper.rate(0), paper.rate(7999), paper.checks) == (8000, 1e-3, 1e-3, (500, 1000, 5000))
+    assert fast.rate(0) == pytest.approx(1e-2)
+    assert fast.rate(fast.steps - 1) == pytest.approx(1e-4)
+    rates = [fast.rate(step) for step in range(fast.steps)]
+    assert rates == sorted(rates, reverse=True)
+    assert fast.checks == (fast.steps // 2,)
+    assert schedule("paper", steps=700).checks == (500,)
+    assert schedule(fast) is fast
+    with pytest.raises(ValueError, match="expected a schedule among paper, fast, got 'slow'"):
+        schedule("slow")
+    for wrong in ((0, 1e-3, "constant"), (10, 0.0, "constant"), (10, 1e-3, "linear")):
+        with pytest.raises(ValueError, match="expected"):
+            Schedule("x", wrong[0], wrong[1], 1e-3, wrong[2])
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("boundary", ["periodic", "replicate"])
+def test_relax_starts_at_the_field(boundary, backend):
+    grid = Grid((16, 17, 18), 0.01, boundary)
+    fields = []
+    flow = relax(
+        gyroid(grid),
+        TUBES,
+        grid,
+        schedule=short(20, 1e-3),
+        backend=backend,
+        callbacks=[lambda step, total, state: fields.append(state.field.clone())],
+    )
+    assert float((fields[0] - gaussian_blur(gyroid(grid), grid, BLUR)).abs().max()) < 1e-5
+    assert float((flow.field - fields[0]).abs().max()) > 0.01
+    assert flow.history.energy[-1] < flow.history.energy[0]
+    assert np.abs(flow.history.mass - float(gyroid(grid).double().mean())).max() < 1e-6
+    assert flow.seed is None
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_relax_leaves_what_is_frozen(backend):
+    """u moves only within the blur's and the divergence's reach (9 voxels) of voxels that are free."""
+    grid = Grid((40, 12, 12))
+    frozen = torch.ones(grid.shape, dtype=torch.bool)
+    frozen[18:22] = False
+    flow = relax(gyroid(grid), TUBES, grid, schedule=short(20, 1e-3), frozen=frozen, backend=backend)
+    change = (flow.field - gaussian_blur(gyroid(grid), grid, BLUR)).abs().amax((1, 2))
+    assert float(change[:9].max()) < 1e-5
+    assert float(change[31:].max()) < 1e-5
+    assert float(change[18:22].min()) > 1e-3
+
+
+def test_coefficients_may_vary_in_space():
+    grid = Grid((12, 13, 14))
+    varying = Coefficients(1, 2, torch.full(grid.shape, 6.0), -40, -40, 400)
+    plan = short(10)
+    same = generate(varying, MASS, grid, schedule=plan).field
+    assert torch.equal(same, generate(TUBES, MASS, grid, schedule=plan, backend="torch").field)
+    with pytest.raises(ValueError, match="expected numbers as coefficients"):
+        generate(varying, MASS, grid, schedule=plan, backend="fused")
+
+
+def test_wrong_input_is_refused():
+    grid = Grid((12, 12, 12))
+    for mass in (1.0, -1.5, math.nan):
+        with pytest.raises(ValueError, match="expected a mass in"):
+            generate(TUBES, mass, grid)
+    for epsilon, blur in ((0.0, 0.02), (0.02, -0.01), (math.nan, 0.02)):
+        with pytest.raises(ValueError, match="expected epsilon > 0 and blur >= 0"):
+            generate(TUBES, MASS, grid, epsilon=epsilon, blur=blur)
+    with pytest.raises(ValueError, match="expected a backend"):
+        generate(TUBES, MASS, grid, backend="cuda")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="expected a field of shape"):
+        relax(torch.zeros(12, 12, 11), TUBES, grid, schedule="fast")
+    with pytest.raises(ValueError, match="expected a frozen mask of shape"):
+        relax(torch.zeros(grid.shape), TUBES, grid, schedule="fast", frozen=torch.zeros(3, 3, 3, dtype=torch.bool))
+    with pytest.raises(ValueError, match="expected a finite field"):
+        relax(torch.full(grid.shape, math.inf), TUBES, grid, schedule="fast")
+
+
+def test_fast_makes_a_shape():
+    flow = generate(TUBES, MASS, Grid((32, 32, 32)), schedule=schedule("fast", steps=400))
+    assert flow.viability.viable
+    assert flow.viability.discrepancy < 0.3
+    assert "after 400 steps" in flow.status
+    assert float(flow.field.max()) > 0.5

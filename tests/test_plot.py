@@ -1,0 +1,164 @@
+"""Pictures: the renderer against exact silhouettes and shades, limits of diagrams, files."""
+
+from __future__ import annotations
+
+import io
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pytest
+
+from curvafit.diagram import Diagram
+from curvafit.plot import (
+    DIAGONAL,
+    diagram_figure,
+    gallery_picture,
+    png,
+    round_length,
+    shared_limits,
+    slice_figure,
+    surface_picture,
+)
+from curvafit.render import render, view
+
+
+def ball(shape: tuple[int, int, int], radius: float, spacing: tuple[float, float, float] = (1, 1, 1)) -> np.ndarray:
+    """radius - distance from the box's centre, in units of `spacing`."""
+    axes = [(np.arange(n) - (n - 1) / 2) * h for n, h in zip(shape, spacing, strict=True)]
+    z, y, x = np.meshgrid(*axes, indexing="ij")
+    return (radius - np.sqrt(z**2 + y**2 + x**2)).astype(np.float32)
+
+
+def cover(picture: np.ndarray) -> float:
+    """Pixels covered."""
+    return picture[..., 3].sum() / 255
+
+
+def test_a_ball_covers_its_disc_and_is_lit_from_the_upper_left() -> None:
+    picture, camera = render(ball((40, 40, 40), 12), width=200)
+    pixel = 2 * camera.half[0] / 200
+    assert cover(picture) * pixel**2 == pytest.approx(math.pi * 12**2, rel=0.01)
+    rows, columns = np.nonzero(picture[..., 3])
+    assert rows.mean() == pytest.approx((picture.shape[0] - 1) / 2, abs=0.5)
+    assert columns.mean() == pytest.approx(99.5, abs=0.5)
+    brightness = picture[..., :3].mean(axis=-1)
+    middle, reach = picture.shape[0] // 2, round(7 / pixel)
+    assert brightness[middle - reach, 100 - reach] > brightness[middle + reach, 100 + reach] + 40
+
+
+def test_spacing_makes_a_ball_of_a_flat_box() -> None:
+    spacing = (2.0, 1.0, 1.0)
+    picture, camera = render(ball((20, 40, 40), 12, spacing), spacing=spacing, width=160)
+    assert camera.box == pytest.approx((38, 39, 39))
+    assert cover(picture) * (2 * camera.half[0] / 160) ** 2 == pytest.approx(math.pi * 12**2, rel=0.02)
+
+
+def test_cut_faces_are_capped_in_another_colour() -> None:
+    solid, _ = render(np.ones((16, 16, 16)), width=120)
+    camera = view((16, 16, 16))
+    areas = np.abs(camera.frame[2]) * 15**2
+    pixel = 2 * camera.half[0] / 120
+    assert cover(solid) * pixel**2 == pytest.approx(areas.sum(), rel=0.01)
+    rounded, _ = render(ball((16, 16, 16), 6), width=120)
+    warmth = [p[p[..., 3] == 255][:, 0].mean() / p[p[..., 3] == 255][:, 2].mean() for p in (solid, rounded)]
+    assert warmth[0] > warmth[1] + 0.15
+
+
+def test_nothing_inside_is_transparent() -> None:
+    picture, _ = render(-np.ones((8, 8, 8)), width=60)
+    assert not picture[..., 3].any()
+
+
+def test_the_nearer_of_two_balls_hides_the_other() -> None:
+    camera = view((48, 48, 48))
+    towards = camera.frame[2]
+    index = np.stack(np.meshgrid(*(np.arange(48) - 23.5,) * 3, indexing="ij"), axis=-1)
+    near, far = (np.linalg.norm(index - sign * 14 * towards, axis=-1) for sign in (1, -1))
+    both, _ = render(np.maximum(5 - near, 5 - far), width=120)
+    one, _ = render(5 - near, width=120)
+    assert cover(both) == pytest.approx(cover(one), rel=0.01)
+
+
+def test_corners_of_the_box_fall_inside_the_picture() -> None:
+    camera = view((10, 30, 20), (3.0, 1.0, 1.0))
+    places = camera.project(np.array(list(np.ndindex(2, 2, 2)), dtype=float))
+    assert places.min() >= 0 and places.max() <= 1
+    assert np.ptp(places, axis=0) == pytest.approx((1 / 1.02, 1 / 1.02))
+    assert np.linalg.det(camera.frame[:, ::-1]) == pytest.approx(1)  # right, up, towards in x, y, z: not mirrored
+
+
+@pytest.mark.parametrize(
+    ("volume", "said"),
+    [(np.zeros((8, 8)), "3 axes"), (np.zeros((8, 3, 8)), "at least 4"), (np.full((8, 8, 8), np.nan), "finite")],
+)
+def test_what_cannot_be_drawn_is_refused(volume: np.ndarray, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        render(volume)
+
+
+def test_shared_limits_hold_both_curvatures_and_leave_out_a_thin_tail() -> None:
+    first = Diagram(np.array([[1.0, -2.0], [3.0, 0.0], [900.0, -900.0]]), np.array([1.0, 1.0, 1e-6]))
+    second = Diagram(np.array([[5.0, 5.0]]), np.array([1.0]))
+    low, high = shared_limits([first, second])
+    assert low < -2 and high > 5 and high - low < 10
+    assert shared_limits([first, second], length=2.0) == pytest.approx((low / 2, high / 2))
+
+
+def test_a_diagram_puts_its_mass_where_the_curvatures_are() -> None:
+    point = Diagram(np.array([[20.0, -10.0]]), np.array([3.0]))
+    figure = diagram_figure(point, limits=(-40.0, 40.0))
+    axes = figure.axes[0]
+    mesh = axes.collections[0]
+    shares = np.ma.filled(mesh.get_array(), 0.0).reshape(72, 72)
+    row, column = np.unravel_index(shares.argmax(), shares.shape)
+    centre = np.linspace(-40, 40, 73)[:-1] + 40 / 72
+    assert centre[column] == pytest.approx(20, abs=1) and centre[row] == pytest.approx(-10, abs=1)
+    diagonal = [line for line in axes.lines if line.get_color() == DIAGONAL]
+    assert len(diagonal) == 1 and np.array_equal(*diagonal[0].get_data())
+
+
+def test_a_slice_shows_its_contour_in_physical_places() -> None:
+    structure = ball((32, 32, 32), 8)[16]
+    figure = slice_figure(
+        structure,
+        structure,
+        image_extent=(0, 3.2, 3.2, 0),
+        extent=(0, 3.2, 3.2, 0),
+        limits=(-1, 1),
+        unit="mm",
+        axes_names=("y", "x"),
+    )
+    outline = np.concatenate([path.vertices for path in figure.axes[0].collections[0].get_paths()])
+    radii = np.hypot(*(outline - 1.6).T)
+    assert radii == pytest.approx(0.8, abs=0.02)
+    assert "0.5 mm" in {text.get_text() for text in figure.axes[0].texts}
+
+
+@pytest.mark.parametrize(("length", "rounded"), [(0.73, 0.5), (1.0, 1.0), (2.4e-4, 2e-4), (999, 500)])
+def test_bars_have_round_lengths(length: float, rounded: float) -> None:
+    assert round_length(length) == pytest.approx(rounded)
+
+
+def test_pictures_are_written_whole_or_not_at_all(tmp_path: Path) -> None:
+    made = surface_picture(ball((12, 12, 12), 4) > 0, tmp_path / "ball.png", width=160, title="a ball")
+    assert matplotlib.image.imread(made).shape[:2] == (160, 160)
+    gallery_picture({"one": ball((12, 12, 12), 4), "two": ball((12, 12, 12), 3)}, tmp_path / "two.png", width=320)
+    assert matplotlib.image.imread(tmp_path / "two.png").shape[1] == 320
+    with pytest.raises(ValueError, match="finite"):
+        surface_picture(np.full((8, 8, 8), np.inf), tmp_path / "no.png")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["ball.png", "two.png"]
+
+
+def test_png_bytes_are_a_picture() -> None:
+    content = png(diagram_figure(Diagram(np.array([[2.0, 1.0]]), np.array([1.0])), title="one point"))
+    assert matplotlib.image.imread(io.BytesIO(content)).shape[2] == 4
+
+
+def test_drawing_leaves_pyplot_alone() -> None:
+    script = "import sys, curvafit.plot; print('matplotlib.pyplot' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"

@@ -1,0 +1,284 @@
+"""From scan to working grid: the right phase, at the right size, in the right place."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import ndimage
+
+from curvafit.phases import find_level
+from curvafit.prepare import LARGEST_WINDOW, WORKING_THICKNESS, Prepared, prepare
+from curvafit.priors import Grid, phase_field
+from curvafit.regrid import resample, rich_boxes, without_specks
+from curvafit.scan import Field, ScanError, load, save
+
+
+def tube_mask(shape: tuple[int, int, int], spacing: tuple[float, float, float], radius: float) -> np.ndarray:
+    """A tube along x through the middle, in physical lengths."""
+    z, y, _ = (((np.arange(n) + 0.5) * h - n * h / 2) for n, h in zip(shape, spacing, strict=True))
+    return np.broadcast_to((z[:, None] ** 2 + y[None, :] ** 2 < radius**2)[:, :, None], shape)
+
+
+def image_of(mask: np.ndarray, noise: float = 8.0, seed: int = 0) -> np.ndarray:
+    grey = 50 + 100 * ndimage.gaussian_filter(mask.astype(np.float32), 0.7)
+    return np.clip(grey + np.random.default_rng(seed).normal(0, noise, mask.shape), 0, 255).astype(np.uint8)
+
+
+# ---- kinds -----------------------------------------------------------------------------------------------------------
+
+
+def test_kinds_are_told_apart() -> None:
+    mask = tube_mask((32, 32, 32), (1, 1, 1), 6)
+    field = phase_field(_tensor(mask), Grid(mask.shape), 0.02).numpy()
+    assert prepare(Field(mask)).kind == "mask"
+    assert prepare(Field(np.where(mask, np.float32(1), np.float32(-1)))).kind == "mask"
+    assert prepare(Field(field)).kind == "field"
+    assert prepare(Field(image_of(mask))).kind == "image"
+    scaled = 2 * image_of(mask).astype(np.float32) / 255 - 1
+    assert prepare(Field(scaled)).kind == "image"
+    assert prepare(Field(field), threshold=0.5).kind == "image"
+    for kind in ("field", "mask", "image"):
+        assert prepare(Field(field), kind=kind).kind == kind
+
+
+def test_a_phase_field_stays_as_it_is() -> None:
+    mask = tube_mask((24, 28, 32), (1, 1, 1), 6)
+    field = phase_field(_tensor(mask), Grid(mask.shape), 0.02).numpy()
+    prepared = prepare(Field(field, 0.5, "um"), periodic=True)
+    assert np.array_equal(prepared.phase, field)
+    assert prepared.grid == Grid(mask.shape, boundary="periodic")
+    assert (prepared.scale, prepared.working_voxel, prepared.unit) == ((1, 1, 1), 0.5, "um")
+    assert prepared.threshold is None
+    assert np.array_equal(prepare(Field(field), dark=True).mask, ~(field >= 0))
+
+
+def test_a_mask_is_profiled_as_the_atlas_profiles_its_masks() -> None:
+    mask = tube_mask((24, 24, 24), (1, 1, 1), 5)
+    prepared = prepare(Field(mask))
+    assert prepared.grid.boundary == "replicate"
+    assert np.array_equal(prepared.mask, mask)
+    assert np.array_equal(prepared.phase, phase_field(_tensor(mask), prepared.grid, 0.02).numpy())
+    assert prepared.phase.dtype == np.float32
+
+
+def test_the_image_of_a_mask_gives_the_mask_back() -> None:
+    mask = tube_mask((40, 40, 40), (1, 1, 1), 6)
+    bright, dark = prepare(Field(image_of(mask))), prepare(Field(255 - image_of(mask)), dark=True)
+    for prepared in (bright, dark):
+        overlap = (prepared.mask & mask).sum() / (prepared.mask | mask).sum()
+        assert overlap > 0.9
+        assert prepared.threshold is not None and 0 < prepared.threshold < 255
+    assert bright.threshold == pytest.approx(100, abs=12)
+    given = prepare(Field(image_of(mask)), threshold=100.0)
+    assert given.threshold == 100
+    assert "the given threshold, 100" in " ".join(given.notes)
+
+
+def test_labels() -> None:
+    labels = np.zeros((32, 32, 32), np.uint16)
+    labels[tube_mask(labels.shape, (1, 1, 1), 4)] = 7
+    labels[:6] = 3
+    assert np.array_equal(prepare(Field(labels), label=7).mask, labels == 7)
+    assert np.array_equal(prepare(Field(labels), kind="mask").mask, labels != 0)
+    with pytest.raises(ScanError, match=r"expected a label of the scan \(0, 3, 7\), got 5"):
+        prepare(Field(labels), label=5)
+
+
+# ---- size and place --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("shape", "spacing", "radius"),
+    [((40, 40, 40), (1, 1, 1), 2.1), ((96, 96, 64), (0.5, 0.5, 0.5), 12), ((20, 60, 60), (3, 1, 1), 9)],
+)
+@pytest.mark.parametrize("grey", [False, True])
+def test_resampled_to_a_known_thickness_at_the_right_place(shape, spacing, radius: float, grey: bool) -> None:
+    mask = tube_mask(shape, spacing, radius)
+    prepared = prepare(Field(image_of(mask, 3.0) if grey else mask, spacing, "um"))
+    assert prepared.scale != (1, 1, 1)
+    edge = prepared.working_voxel
+    assert tuple(s * h for s, h in zip(prepared.scale, spacing, strict=True)) == pytest.approx((edge,) * 3)
+    assert prepared.mask.shape == tuple(int(n / s + 1e-6) for n, s in zip(shape, prepared.scale, strict=True))
+    if min(prepared.mask.shape) > 32:
+        assert prepared.thickness == pytest.approx(WORKING_THICKNESS)
+    centre = np.array(ndimage.center_of_mass(prepared.mask)[:2]) + 0.5
+    middle = np.array(shape[:2]) * spacing[:2] / 2
+    assert centre * edge == pytest.approx(middle, abs=0.3 * max(spacing))
+    area = prepared.mask.mean(axis=2).sum() * edge**2
+    assert area == pytest.approx(np.pi * radius**2, rel=0.25 if radius < 3 * min(spacing) else 0.12)
+
+
+@pytest.mark.parametrize(("radius", "kept"), [(1.8, False), (4, True), (7, True), (12, False)])
+def test_the_grid_is_kept_from_5_to_16_voxels(radius: float, kept: bool) -> None:
+    prepared = prepare(Field(tube_mask((64, 64, 40), (1, 1, 1), radius)))
+    assert (prepared.scale == (1, 1, 1)) is kept
+    assert any("grid is kept" in note for note in prepared.notes) is kept
+
+
+@given(st.tuples(*[st.floats(0.4, 3)] * 3), st.tuples(*[st.integers(0, 3)] * 3), st.tuples(*[st.floats(-2, 2)] * 3))
+@settings(max_examples=30, deadline=None)
+def test_resampling_keeps_linear_functions_of_position(scale, start, slope) -> None:
+    old = np.indices((24, 24, 24)) + 0.5  # positions of voxel centres, in old voxels
+    shape = [max(1, int(24 / s) - a) for s, a in zip(scale, start, strict=True)]
+    values = np.tensordot(slope, old, 1)
+    found = resample(values, scale, start, shape)
+    new = (np.indices(shape) + np.array(start)[:, None, None, None] + 0.5) * np.array(scale)[:, None, None, None]
+    inner = np.all((new > 6) & (new < 18), axis=0)  # the Gaussian bends values near the faces
+    assert found[inner] == pytest.approx(np.tensordot(slope, new, 1)[inner], abs=1e-6)
+
+
+def test_periodic_boxes_stay_periodic_when_resampled() -> None:
+    shape = (48, 48, 36)
+    mask = np.roll(tube_mask(shape, (1, 1, 1), 9.6), 24, axis=0)  # the tube crosses the seam
+    rolled, plain = prepare(Field(mask), periodic=True), prepare(Field(np.roll(mask, 24, axis=0)), periodic=True)
+    assert rolled.grid.boundary == plain.grid.boundary == "periodic"
+    assert tuple(n * s for n, s in zip(rolled.mask.shape, rolled.scale, strict=True)) == pytest.approx(shape)
+    assert rolled.mask.mean() == pytest.approx(plain.mask.mean(), rel=0.03)
+    assert rolled.mask[0, rolled.mask.shape[1] // 2].all() and rolled.mask[-1, rolled.mask.shape[1] // 2].all()
+
+
+def test_specks_and_pinholes_are_dropped() -> None:
+    mask = tube_mask((40, 40, 40), (1, 1, 1), 6).copy()
+    clean = mask.copy()
+    mask[3, 3, 3] = mask[36, 5:7, 30] = True
+    mask[20, 20, 10] = False
+    prepared = prepare(Field(mask))
+    assert np.array_equal(prepared.mask, clean)
+    assert any("specks: 2, pinholes: 1" in note for note in prepared.notes)
+    seam = np.zeros((12, 12, 12), bool)
+    seam[0, 5, 5] = seam[6, 6, 6] = True
+    assert without_specks(seam, 4, periodic=True)[0].nonzero()[0].tolist() == [0]
+    assert without_specks(seam, 4, periodic=False)[0].sum() == 0
+
+
+def test_only_the_region_of_interest_counts(tmp_path) -> None:
+    mask = tube_mask((40, 40, 40), (1, 1, 1), 5)
+    region = np.zeros(mask.shape, np.uint8)
+    region[4:36, 4:36, 10:30] = 1
+    path = save(Field(region), tmp_path / "roi.nii")
+    for roi in (region, Field(region), path):
+        prepared = prepare(Field(mask), roi=roi)
+        assert prepared.mask.shape == (32, 32, 20)
+        assert prepared.origin == (4, 4, 10)
+        assert np.array_equal(prepared.mask, mask[4:36, 4:36, 10:30])
+    holed = region.copy()
+    holed[:, :20] = 0
+    holed[4, 4, 10] = 1
+    assert not prepare(Field(mask), roi=holed).mask[:, :16].any()
+    assert any("holds 40.0% of the scan" in note for note in prepare(Field(mask), roi=np.repeat(region[:, :, :1] * 0 + (np.arange(40) < 16)[:, None, None], 40, 2)).notes)  # fmt: skip  # noqa: E501
+    with pytest.raises(
+        ScanError, match=r"expected a region of interest of the scan's shape \(40, 40, 40\), got \(40, 40, 39\)"
+    ):
+        prepare(Field(mask), roi=region[:, :, 1:])
+    with pytest.raises(ScanError, match="expected a region of interest with voxels in it"):
+        prepare(Field(mask), roi=np.zeros_like(region))
+
+
+# ---- windows ---------------------------------------------------------------------------------------------------------
+
+
+@given(st.tuples(*[st.integers(4, 60)] * 3), st.integers(4, 30), st.integers(0, 10**6))
+@settings(max_examples=40, deadline=None)
+def test_boxes_cover_what_there_is(shape, size: int, seed: int) -> None:
+    content = np.random.default_rng(seed).random(shape) < 0.01
+    boxes = rich_boxes(content, size)
+    seen = np.zeros(shape, bool)
+    for box in boxes:
+        assert all(s.stop - s.start == min(n, size) for s, n in zip(box, shape, strict=True))
+        assert content[box].any()
+        seen[box] = True
+    assert not np.any(content & ~seen)
+
+
+def test_the_middle_comes_first_unless_it_is_poor() -> None:
+    content = np.ones((40, 40, 40), bool)
+    assert rich_boxes(content, 20)[0] == (slice(10, 30),) * 3
+    content[8:32, 8:32, 8:32] = False
+    content[:20, :20, :20] = True
+    assert rich_boxes(content, 20)[0] == (slice(0, 20),) * 3
+    assert rich_boxes(np.zeros((9, 9, 9), bool), 20) == []
+
+
+# ---- refusals --------------------------------------------------------------------------------------------------------
+
+
+def test_what_has_no_shape_is_refused() -> None:
+    thin = np.zeros((32, 32, 32), np.uint8)
+    thin[16, 10:12] = 1
+    full = np.ones((32, 32, 32), np.uint8)
+    image = image_of(tube_mask((32, 32, 32), (1, 1, 1), 5))
+    with pytest.raises(ScanError, match="expected a structure at least 3 voxels thick, got 95 % of it thinner than 2"):
+        prepare(Field(thin))
+    with pytest.raises(ScanError, match="expected a structure in the scan, got none: every voxel is background"):
+        prepare(Field(full * 0 + np.eye(32, dtype=np.uint8)), roi=np.eye(32)[None] + np.zeros((32, 1, 1)) < 0.5)
+    with pytest.raises(ScanError, match="expected background in the scan, got none: every voxel is structure"):
+        prepare(Field(full), kind="mask", dark=False)
+    with pytest.raises(ScanError, match=r"expected a threshold within the smoothed scan's .* to .*, got 400"):
+        prepare(Field(image), threshold=400.0)
+    with pytest.raises(ScanError, match="expected a threshold that is a number or 'otsu', got 'li'"):
+        prepare(Field(image), threshold="li")  # type: ignore[arg-type]
+    with pytest.raises(ScanError, match="expected kind auto, field, mask or image, got 'tube'"):
+        prepare(Field(image), kind="tube")  # type: ignore[arg-type]
+    with pytest.raises(ScanError, match="expected at least 4 working voxels along each axis, got 3 x 32 x 32"):
+        prepare(Field(image[15:18]))
+
+
+def test_a_field_without_surface_is_refused() -> None:
+    values = np.full((16, 16, 16), -0.9, np.float32)
+    values[3, 3, 3] = -0.8
+    with pytest.raises(ScanError, match="every voxel is background"):
+        find_level(Field(values), kind="field")
+
+
+# ---- real scans ------------------------------------------------------------------------------------------------------
+
+
+def check(prepared: Prepared) -> None:
+    assert prepared.phase.shape == prepared.mask.shape == prepared.grid.shape
+    assert np.array_equal(prepared.phase > 0, prepared.mask)
+    assert len(prepared.notes) >= 2 and all(note.endswith(".") for note in prepared.notes)
+    for window in prepared.windows:
+        assert all(s.stop - s.start <= LARGEST_WINDOW for s in window)
+        assert 0 < prepared.mask[window].mean() < 1
+
+
+def test_bone_is_kept_on_its_grid(data) -> None:
+    scan = load(data / "scans" / "lhdl_trabecular_200.tif")
+    truth = load(data / "scans" / "lhdl_trabecular_200_otsu_mask.tif").values > 0
+    inner = (slice(40, 160),) * 3
+    prepared = prepare(Field(scan.values[inner], scan.spacing, scan.unit))
+    check(prepared)
+    assert (prepared.kind, prepared.scale, prepared.working_voxel, prepared.unit) == ("image", (1, 1, 1), 19.5, "um")
+    dice = 2 * (prepared.mask & truth[inner]).sum() / (prepared.mask.sum() + truth[inner].sum())
+    assert dice > 0.97
+
+
+def test_anisotropic_membranes_become_cubic(data) -> None:
+    prepared = prepare(load(data / "scans" / "plantseg_sample_ovule.h5::raw"))
+    check(prepared)
+    assert prepared.scale[0] * 0.235 == pytest.approx(prepared.scale[1] * 0.15)
+    assert prepared.scale[1] == prepared.scale[2]
+
+
+def test_thin_fibres_are_magnified(data) -> None:
+    scan = load(data / "scans" / "quanfima_polymer3d_8bit_128x128x128.raw", raw_shape=(128, 128, 128))
+    prepared = prepare(Field(scan.values[:64, :64, :64]))
+    check(prepared)
+    assert prepared.thickness == pytest.approx(WORKING_THICKNESS)
+    assert max(prepared.scale) < 0.7
+
+
+@pytest.mark.parametrize("name", ["sponge", "trabec", "weird", "pearls"])
+def test_gallery_fields_are_known_as_such(data, name: str) -> None:
+    path = next((data / "gallery").glob(f"{name} *"))
+    prepared = prepare(load(path), periodic=True)
+    check(prepared)
+    assert (prepared.kind, prepared.scale, prepared.grid.boundary) == ("field", (1, 1, 1), "periodic")
+
+
+def _tensor(mask: np.ndarray):
+    import torch
+
+    return torch.from_numpy(np.ascontiguousarray(mask))

@@ -1,0 +1,213 @@
+"""The report: one self-contained page, readable numbers, files written whole or not at all."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from found import EPSILON, RADIUS, SCALE, made_inference, without_drawing
+
+from curvafit.diagram import diagram
+from curvafit.priors import Grid
+from curvafit.report import parameter_table, report_html, with_command, write_inference
+from curvafit.report_pictures import scan_box
+from curvafit.scan import load
+from curvafit.wording import density, describe, family_radius, length, number
+
+VOID = {"meta", "img", "br", "hr", "link", "input"}
+
+
+class Page(HTMLParser):
+    """Reads a page: complains of unbalanced tags, keeps text, attributes and tables."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.attributes: list[tuple[str, str | None]] = []
+        self.text = ""
+        self.feed(page)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.attributes += attrs
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if "style" not in self.open:
+            self.text += data + " "
+
+
+@pytest.fixture(scope="module")
+def html() -> str:
+    return report_html(made_inference())
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    without_drawing(monkeypatch)
+
+
+def test_the_page_stands_alone_and_is_well_formed(html: str) -> None:
+    page = Page(html)
+    links = [value or "" for name, value in page.attributes if name in ("src", "href", "action", "srcset")]
+    assert len(links) == 9 and all(link.startswith("data:image/png;base64,") for link in links)
+    assert "url(" not in html and "<script" not in html and not re.search(r"https?:", html)
+    assert all(base64.b64decode(link.partition(",")[2])[:4] == b"\x89PNG" for link in links)
+    alts = [value for name, value in page.attributes if name == "alt"]
+    assert len(alts) == 9 and all(alts)
+    assert len(html) < 4_000_000
+
+
+def test_what_the_user_named_is_escaped(html: str) -> None:
+    assert "tubes <b>" not in html and "tubes &lt;b&gt;&amp;.tif" in html
+    assert "1.6 &lt; 2.2 &amp; so on" in html
+
+
+def test_the_page_says_what_was_found(html: str) -> None:
+    text = " ".join(Page(html).text.split())
+    opening = re.search(r"Tubes, radius (\d+) µm, 19 % of the volume\.", text)
+    assert opening is not None
+    assert float(opening[1]) == pytest.approx(1000 * RADIUS * SCALE, rel=0.05)
+    for said in ("nearest match 2.2", "refined 1.6", "two seeds 1.1", "Two seeds of the same parameters lie 1.1 apart"):
+        assert said in text, said
+    for name in ("BV/TV", "Tb.Th", "Tb.Sp", "Conn.D 4.90 /mm³", "BS/BV 21.4 /mm", "0-00004", "Specks < 5 voxels"):
+        assert name in text, name
+    assert "curvafit generate --prior fit.json" in text
+    assert text.count("better supported") >= 3
+
+
+def test_physical_coefficients_carry_their_power_of_length(html: str) -> None:
+    rows = dict(re.findall(r'<tr><th scope="row">(a.{2})</th>(.*?)</tr>', html))
+    assert set(rows) == {"a₂₀", "a₁₁", "a₀₂", "a₁₀", "a₀₁", "a₀₀"}
+    λ = SCALE / 0.01
+    assert number(-38.5 / λ) in rows["a₁₀"] and number(6 / λ, 2) in rows["a₁₀"] and "1/mm<" in rows["a₁₀"]
+    assert number(433 / λ**2) in rows["a₀₀"] and number(51 / λ**2, 2) in rows["a₀₀"] and "1/mm²" in rows["a₀₀"]
+    assert "fixed" in rows["a₂₀"] and "1/mm" not in rows["a₁₁"]
+
+
+def test_what_could_not_be_made_is_said(undrawn: None) -> None:
+    text = " ".join(Page(report_html(made_inference(lost=True))).text.split())
+    assert text.count("no shape grew from these parameters") == 2
+    assert "refined could not be made" in text
+    assert "Bold: the nearest match" in text
+
+
+def test_without_a_match_the_scan_alone_is_drawn(undrawn: None) -> None:
+    alone = dataclasses.replace(made_inference(), matched=None, match_diagram=None)
+    assert report_html(alone).count("no shape grew") == 2
+
+
+def test_the_scan_is_cut_to_the_regenerated_box() -> None:
+    found = made_inference()
+    smaller = dataclasses.replace(found, regenerated=found.regenerated[:32, :40, :])
+    assert np.array_equal(scan_box(smaller), found.prepared.phase[8:40, 4:44, :])
+
+
+def test_an_inference_is_written_whole(tmp_path: Path, undrawn: None) -> None:
+    found = with_command(made_inference(), "curvafit infer 'a b.tif' -o out")
+    report = write_inference(found, tmp_path / "deep" / "out")
+    assert report == tmp_path / "deep" / "out" / "report.html"
+    names = sorted(path.name for path in report.parent.iterdir())
+    assert names == ["fit.json", "regenerated.nii.gz", "report.html"]
+    assert sorted(path.name for path in report.parent.parent.iterdir()) == ["out"]
+    assert json.loads((report.parent / "fit.json").read_text())["provenance"]["command"].endswith("-o out")
+    volume = load(report.parent / "regenerated.nii.gz")
+    assert volume.unit == "mm" and volume.spacing == pytest.approx((SCALE,) * 3)
+    assert np.array_equal(volume.values, found.regenerated)
+    assert "curvafit infer &#x27;a b.tif&#x27; -o out" in report.read_text(encoding="utf-8")
+
+
+def test_a_failure_leaves_what_was_there(tmp_path: Path, undrawn: None) -> None:
+    target = tmp_path / "out"
+    target.mkdir()
+    (target / "fit.json").write_text("mine")
+    broken = dataclasses.replace(made_inference(), regenerated=np.full((48, 48, 48), np.nan))
+    with pytest.raises(ValueError, match="expected a finite volume"):
+        write_inference(broken, target)
+    assert [path.name for path in tmp_path.rglob("*")] == ["out", "fit.json"]
+    assert (target / "fit.json").read_text() == "mine"
+    with pytest.raises(NotADirectoryError, match="expected a folder"):
+        write_inference(made_inference(), target / "fit.json")
+
+
+def test_a_shape_that_cannot_be_made_leaves_no_older_volume(tmp_path: Path, undrawn: None) -> None:
+    (tmp_path / "regenerated.nii.gz").write_text("older")
+    nothing = dataclasses.replace(made_inference(lost=True), matched=None, match_diagram=None)
+    write_inference(nothing, tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["fit.json", "report.html"]
+
+
+def test_the_table_follows_the_better_supported() -> None:
+    refined, match = parameter_table(made_inference()), parameter_table(made_inference(chosen="match"))
+    assert [row[0] for row in refined] == ["a20", "a11", "a02", "a10", "a01", "a00", "mass"]
+    assert refined[1][1:3] == ("1.80", "0.40") and match[1][1:3] == ("2.00", "")
+
+
+@pytest.mark.parametrize(("family", "curvatures"), [("spheres", (0.1, 0.1)), ("tubes", (0.1, 0.0))])
+def test_radii_come_from_the_family_s_own_area(family: str, curvatures: tuple[float, float]) -> None:
+    z, y, x = np.meshgrid(*(np.arange(48) - 23.5,) * 3, indexing="ij")
+    radius = np.sqrt(y**2 + x**2 + (z**2 if family == "spheres" else 0))
+    u = np.tanh(0.01 * (10 - radius) / (np.sqrt(2) * EPSILON))
+    measured = diagram(torch.from_numpy(u), Grid(u.shape, 0.01, "replicate"), EPSILON)
+    assert family_radius(measured, family) == pytest.approx(0.1, rel=0.05)
+    assert family_radius(measured, "sponge") is None
+    assert measured.mean() * 0.01 == pytest.approx(curvatures, abs=0.006)
+
+
+@pytest.mark.parametrize(
+    ("family", "said"),
+    [
+        ("tubes", "Tubes, radius 9"),
+        ("layers", "Layers, 200 µm thick, 19 % of the volume"),
+        ("sponge", "Sponge, struts 200 µm thick, 19 % of the volume"),
+        ("bubbles", "Bubbles, radius 98 µm, in a phase that is 19 % of the volume"),
+        ("something else", "Something else, 200 µm thick"),
+    ],
+)
+def test_the_first_sentence(family: str, said: str) -> None:
+    found = made_inference()
+    named = dataclasses.replace(found, fit=dataclasses.replace(found.fit, family=family))
+    assert describe(named).replace("\u00a0", " ").startswith(said)
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "said"),
+    [
+        (0.0390, 3, "0.0390"),
+        (-40.0, 3, "−40.0"),
+        (12345.6, 3, "12\u202f300"),
+        (0.99996, 3, "1.00"),
+        (0.0, 3, "0"),
+        (2.5e-7, 2, "2.5e−07"),
+        (None, 2, "–"),
+        (float("nan"), 2, "–"),
+    ],
+)
+def test_numbers_are_rounded_to_significant_digits(value: float | None, digits: int, said: str) -> None:
+    assert number(value, digits) == said
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "said"),
+    [(0.0412, "mm", "41 µm"), (1500.0, "um", "1.5 mm"), (5.13, "voxel", "5.1 voxels"), (0.2, "nm", "0.20 nm")],
+)
+def test_lengths_are_said_in_a_fitting_unit(value: float, unit: str, said: str) -> None:
+    assert length(value, unit).replace("\u00a0", " ") == said
+
+
+def test_densities_change_their_unit_only_where_they_must() -> None:
+    assert density(4.9, "mm", 3).replace("\u00a0", " ") == "4.90 /mm³"
+    assert density(4.9e-9, "um", 3).replace("\u00a0", " ") == "4.90 /mm³"
+    assert density(0.02, "voxel", 1).replace("\u00a0", " ") == "0.0200 /voxel"
