@@ -30,7 +30,7 @@ FORMAT = "curvafit atlas"
 VERSION = 1
 #: What an atlas asks of a viable shape besides: |u| in both phases reaches a value in this interval. The published
 #: tests let through plateaus near 0, whose level set is no interface, and fragments of a few voxels with |u| up to 7.
-FORMED = (0.6, 2.0)
+FORMED = (0.5, 2.0)
 #: What reading a damaged file or another one can raise.
 _UNREADABLE = (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile, zlib.error)
 #: How a shape can be seen: as its phase field, or as the mask {u > 0} re-profiled.

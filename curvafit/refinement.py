@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,10 +76,13 @@ def named(deviations: Sequence[float]) -> dict[str, float]:
 
 @contextmanager
 def double_precision_on_cpu():
-    """JAX in float64 on the CPU while inside; the caller's settings are untouched."""
+    """JAX in float64 on the CPU while inside, in every thread: callbacks run in another one. Restored at the end."""
     import jax
 
-    with ExitStack() as stack:
-        stack.enter_context(jax.enable_x64(True))
-        stack.enter_context(jax.default_device(jax.devices("cpu")[0]))
-        yield
+    before = jax.config.read("jax_enable_x64")
+    jax.config.update("jax_enable_x64", True)
+    try:
+        with jax.default_device(jax.devices("cpu")[0]):
+            yield
+    finally:
+        jax.config.update("jax_enable_x64", before)

@@ -73,7 +73,7 @@ def test_the_image_of_a_mask_gives_the_mask_back() -> None:
     assert bright.threshold == pytest.approx(100, abs=12)
     given = prepare(Field(image_of(mask)), threshold=100.0)
     assert given.threshold == 100
-    assert "the given threshold, 100" in " ".join(given.notes)
+    assert "the given threshold of 100" in " ".join(given.notes)
 
 
 def test_labels() -> None:

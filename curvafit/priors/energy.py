@@ -61,10 +61,11 @@ def unsimplified_energy(u: Tensor, coefficients: Coefficients, grid: Grid, epsil
 
 def unsimplified_density(field: Jet, coefficients: Coefficients, epsilon: float) -> Tensor:
     """The integrand of 𝓔̃_ε."""
-    trace, _, root, slope = second_form(field, epsilon)
+    trace, norm2, root, slope = second_form(field, epsilon)
     a20, a11, a02, a10, a01, a00 = coefficients
     slope2 = field.gradient.square().sum(-4)
-    quadratic = (a20 + a02 - a11) * root**2 + (a20 + a02 + a11) * trace**2 + 2 * (a20 - a02) * trace * root
+    positive = (2 * norm2 - trace**2).clamp_min(0)
+    quadratic = (a20 + a02 - a11) * positive + (a20 + a02 + a11) * trace**2 + 2 * (a20 - a02) * trace * root
     linear = (a10 + a01) * trace + (a10 - a01) * root
     return quadratic / (4 * epsilon) + slope * linear / 2 + a00 * epsilon * slope2
 
