@@ -17,6 +17,8 @@ from rich.table import Table
 
 #: Set to anything, an error keeps its traceback.
 DEBUG = "CURVAFIT_DEBUG"
+#: Signs that look better on a page than in a terminal, where they are copied and some encodings lack them.
+_PLAIN = str.maketrans({"\u2212": "-", "\u2013": "-", "\u202f": " ", "\u00a0": " "})
 
 
 @contextmanager
@@ -107,7 +109,7 @@ def error_console() -> Console:
 
 def say(text: str, *, to: Console | None = None, style: str | None = None) -> None:
     """One line as it is: no markup, no wrapping, so that paths can be copied."""
-    (to or Console(highlight=False)).print(text, style=style, markup=False, soft_wrap=True)
+    (to or Console(highlight=False)).print(text.translate(_PLAIN), style=style, markup=False, soft_wrap=True)
 
 
 def output(heads: Sequence[str], rows: Iterable[Sequence[str]], right: Iterable[int] = ()) -> None:
@@ -117,7 +119,7 @@ def output(heads: Sequence[str], rows: Iterable[Sequence[str]], right: Iterable[
     for k, head in enumerate(heads):
         table.add_column(head, justify="right" if k in rights else "left", no_wrap=k in rights or k == 0)
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*(cell.translate(_PLAIN) for cell in row))
     console = Console(highlight=False)
     console.print(table, markup=False) if console.is_terminal else Console(highlight=False, width=160).print(table)
 

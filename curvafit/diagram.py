@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from curvafit.mesh import Surface, areas, surface
+from curvafit.mesh import NoSurface, Surface, areas, surface
 from curvafit.priors.curvature import diffuse_curvatures, geometric_curvatures, jet
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import profile_distance
@@ -119,7 +119,12 @@ class Diagram:
 
 
 def diagram(
-    u: np.ndarray | Tensor, grid: Grid, epsilon: float, curvature: Kind = "geometric", margin: int | None = None
+    u: np.ndarray | Tensor,
+    grid: Grid,
+    epsilon: float,
+    curvature: Kind = "geometric",
+    margin: int | None = None,
+    where: np.ndarray | None = None,
 ) -> Diagram:
     """The curvature diagram of {u = 0}: a point for each triangle, weighted by its area.
 
@@ -136,11 +141,13 @@ def diagram(
     margin
         Voxels left out along every side of a box that is not periodic; `MARGIN` by default. 0 measures up to the
         outermost centres, right where the mirror image beyond them is real.
+    where
+        bool `(Z, Y, X)`: only triangles whose nearest voxel is True count.
 
     Raises
     ------
     ValueError
-        If there is no surface in the box, the field is not finite, or `curvature` has another name.
+        If there is no surface in the box or in `where`, the field is not finite, or `curvature` has another name.
     """
     if curvature not in ("geometric", "diffuse"):
         raise ValueError(f"expected curvature 'geometric' or 'diffuse', got {curvature!r}")
@@ -150,10 +157,14 @@ def diagram(
     kappa1, kappa2, resolved = _voxel_curvatures(values, grid, epsilon, curvature)
     weights, centres = areas(mesh), mesh.barycentres / np.array(grid.spacing)
     kept = weights >= LEAST_TRIANGLE * grid.voxel_volume ** (2 / 3)
+    if where is not None:
+        kept &= np.asarray(where, dtype=bool)[tuple((np.rint(centres).astype(int) % grid.shape).T)]
+    if not kept.any():
+        raise NoSurface("expected a surface in the part that counts, got none")
     weights, centres = weights[kept], centres[kept]
     points, known = _interpolated((kappa1, kappa2), resolved, centres, grid.periodic)
     if not known.any():
-        raise ValueError("expected a surface whose curvature the grid resolves, got none")
+        raise NoSurface("expected a surface whose curvature the grid resolves, got none")
     excluded = 1 - float(weights[known].sum() / weights.sum())
     return Diagram(points[known], weights[known], excluded=excluded)
 

@@ -113,7 +113,9 @@ def read_prior(path: str | Path) -> tuple[Coefficients, float]:
         content = json.loads(path.read_text())
         found = content["format"]
         if found != FORMAT:
-            raise ValueError(f"expected a fit.json of format {FORMAT}, got {found!r} in {path}: run `curvafit infer` again")
+            raise ValueError(
+                f"expected a fit.json of format {FORMAT}, got {found!r} in {path}: run `curvafit infer` again"
+            )
         values = [content["coefficients"][name] for name in NAMES]
         return Coefficients(*values), float(content["mass"])
     except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:

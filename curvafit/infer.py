@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 import datetime
-import math
 import platform
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 
-from curvafit.diagram import MARGIN, Diagram, diagram
+from curvafit.diagram import Diagram, diagram
 from curvafit.family import family_of
 from curvafit.fit import Fit
 from curvafit.generation.flow import Flow, generate
 from curvafit.index import Atlas, load_atlas
 from curvafit.match import Match, nearest
+from curvafit.measure import scan_diagram
 from curvafit.morphometry import morphometry
-from curvafit.prepare import LARGEST_WINDOW, Prepared, prepare
+from curvafit.prepare import Prepared, prepare
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.profile import phase_field
@@ -64,10 +64,10 @@ class Inference:
 def infer(
     scan: str | Path | Field,
     *,
-    kind: str = "auto",
+    kind: Literal["auto", "field", "mask", "image"] = "auto",
     periodic: bool = False,
     atlas: str | Path | Atlas | None = None,
-    threshold: float | str = "otsu",
+    threshold: float | Literal["otsu"] = "otsu",
     dark: bool = False,
     roi: str | Path | np.ndarray | None = None,
     label: int | None = None,
@@ -113,52 +113,9 @@ def infer(
     say("regenerating", 0.6)
     twins = _regenerate(prepared, matches[0], refined, seed, say)
     fit = _fit(prepared, seen, matches, refined, twins, _provenance(volume, atlas, seed))
-    match_twin, fit_twin = twins["match"][0], twins["fit"][0]
     say("done", 1.0)
-    return Inference(
-        volume,
-        prepared,
-        seen,
-        match_twin.diagram,
-        fit_twin.diagram,
-        match_twin.phase,
-        fit_twin.phase,
-        fit,
-    )
-
-
-def scan_diagram(prepared: Prepared) -> Diagram:
-    """The geometric curvature diagram of a prepared scan; of a large one tile by tile, each cell in one tile."""
-    grid = prepared.grid
-    if max(grid.shape) <= LARGEST_WINDOW or grid.periodic:
-        return _tile_diagram(prepared, (slice(None),) * 3)
-    cuts = [_tiles(n) for n in grid.shape]
-    parts = [_tile_diagram(prepared, (z, y, x)) for z in cuts[0] for y in cuts[1] for x in cuts[2]]
-    found = [part for part in parts if part is not None]
-    if not found:
-        raise ValueError("expected a surface inside the scan, got none away from its borders")
-    points, weights = (np.concatenate([getattr(part, name) for part in found]) for name in ("points", "weights"))
-    lost = sum(part.excluded * part.area for part in found) / weights.sum()
-    return Diagram(points, weights, excluded=float(lost))
-
-
-def _tiles(n: int) -> list[slice]:
-    """Stretches of at most a window's length whose interiors (`MARGIN` voxels in) share their end planes only."""
-    count = math.ceil((n - 2 * MARGIN) / (LARGEST_WINDOW - 2 * MARGIN))
-    ends = np.linspace(MARGIN, n - 1 - MARGIN, count + 1).astype(int)
-    return [slice(a - MARGIN, b + MARGIN + 1) for a, b in zip(ends[:-1], ends[1:], strict=True)]
-
-
-def _tile_diagram(prepared: Prepared, tile: tuple[slice, slice, slice]) -> Diagram | None:
-    phase = np.ascontiguousarray(prepared.phase[tile])
-    grid = Grid(phase.shape, prepared.grid.spacing, prepared.grid.boundary)
-    inner = phase if grid.periodic else phase[(slice(MARGIN, -MARGIN),) * 3]
-    if not inner.min() < 0 < inner.max():
-        if phase.shape == prepared.grid.shape:
-            raise ValueError("expected a surface inside the scan, got none away from its borders")
-        return None
-    where = None if prepared.roi is None else prepared.roi[tile]
-    return diagram(phase, grid, WORKING_EPSILON, where=where)
+    of_match, of_fit = twins["match"][0], twins["fit"][0]
+    return Inference(volume, prepared, seen, of_match.diagram, of_fit.diagram, of_match.phase, of_fit.phase, fit)
 
 
 @dataclass(frozen=True)
@@ -173,7 +130,8 @@ class _Twin:
 def _refined(prepared: Prepared, matches: tuple[Match, ...], seed: int, say: Progress) -> Refinement:
     phase = torch.from_numpy(np.ascontiguousarray(prepared.phase[prepared.windows[0]]))
     whole = phase.shape == prepared.grid.shape
-    grid = Grid(phase.shape, prepared.grid.spacing, prepared.grid.boundary if whole else "replicate")
+    z, y, x = phase.shape
+    grid = Grid((z, y, x), prepared.grid.spacing, prepared.grid.boundary if whole else "replicate")
     starts = [match.coefficients for match in matches[:STARTS]]
     return refine(
         phase,
@@ -190,8 +148,8 @@ def _regenerate(
     prepared: Prepared, match: Match, refined: Refinement, seed: int, say: Progress
 ) -> dict[str, tuple[_Twin, _Twin]]:
     """Two seeds each of the nearest match and of the refined parameters, in a periodic box of the window's size."""
-    shape = tuple(min(edge.stop - edge.start, REGENERATED_EDGE) for edge in prepared.windows[0])
-    grid = Grid(shape, prepared.grid.spacing, "periodic")
+    z, y, x = (min(edge.stop - edge.start, REGENERATED_EDGE) for edge in prepared.windows[0])
+    grid = Grid((z, y, x), prepared.grid.spacing, "periodic")
     twins = {}
     for step, (name, source) in enumerate((("match", match), ("fit", refined))):
         pair = []

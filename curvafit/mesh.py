@@ -17,6 +17,10 @@ from curvafit.priors.grid import Grid
 SUFFIXES = (".stl", ".ply")
 
 
+class NoSurface(ValueError):
+    """There is no level set where one was asked for."""
+
+
 @dataclass(frozen=True, eq=False)
 class Surface:
     """A triangle mesh.
@@ -129,7 +133,7 @@ def _checked(u: np.ndarray | Tensor, grid: Grid) -> np.ndarray:
 def _march(values: np.ndarray, grid: Grid, level: float) -> Surface:
     low, high = float(values.min()), float(values.max())
     if not low < level < high:
-        raise ValueError(f"expected a field that crosses {level:g}, got values from {low:g} to {high:g}")
+        raise NoSurface(f"expected a field that crosses {level:g}, got values from {low:g} to {high:g}")
     vertices, faces, _, _ = marching_cubes(values, level, spacing=grid.spacing, gradient_direction="descent")
     return Surface(vertices.astype(np.float64), faces.astype(np.int64))
 

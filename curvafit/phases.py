@@ -113,7 +113,7 @@ def _mask_level(values: np.ndarray, dark: bool) -> Level:
     if np.all((values == lowest) | (values == highest)):
         note = f"Taken for a mask of the values {float(lowest):g} and {float(highest):g}."
         return _signed(values == highest, dark, note)
-    return _signed(values != 0, dark, "Taken for a mask: the structure is where it is not zero.")
+    return _signed(values > 0, dark, "Taken for a mask: the structure is where it is positive.")
 
 
 def _label_mask(values: np.ndarray, label: int) -> np.ndarray:

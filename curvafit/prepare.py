@@ -112,7 +112,7 @@ def prepare(
     field
         The scan.
     kind
-        Overrides the guess; a `"mask"` of several values is the structure where it is not zero.
+        Overrides the guess; a `"mask"` of several values is the structure where it is positive.
     periodic
         The box repeats.
     threshold

@@ -69,7 +69,7 @@ def admissible(values: np.ndarray) -> np.ndarray:
     return np.concatenate(([2 * share, scaled[1], 2 - 2 * share], scaled[3:]))
 
 
-def named(deviations: Sequence[float]) -> dict[str, float]:
+def named(deviations: Sequence[float] | np.ndarray) -> dict[str, float]:
     """Names to numbers."""
     return {name: float(value) for name, value in zip(NAMES, deviations, strict=True)}
 

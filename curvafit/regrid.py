@@ -64,7 +64,7 @@ def median_thickness(mask: np.ndarray, spacing: tuple[float, float, float], peri
 
 def surface_voxels(mask: np.ndarray) -> np.ndarray:
     """Voxels of the structure with a face on the background, inside the box."""
-    return mask & ~ndimage.binary_erosion(mask, border_value=1)
+    return mask & ~ndimage.binary_erosion(mask, border_value=1)  # pyright: ignore[reportOperatorIssue]
 
 
 def rich_boxes(content: np.ndarray, size: int | Sequence[int]) -> list[Window]:

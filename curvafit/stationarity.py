@@ -41,7 +41,7 @@ _LARGE_ERROR = 0.005
 
 
 class _Problem(NamedTuple):
-    """Triangles `(6, 6)` with the multiplier eliminated, of the equations and of what the field's error adds to them."""
+    """Triangles `(6, 6)`, multiplier eliminated: of the equations, and of what the field's error adds to them."""
 
     columns: np.ndarray
     error: np.ndarray
@@ -182,7 +182,8 @@ def _compressed(columns: np.ndarray) -> np.ndarray:
 
 def _triangle(stack: np.ndarray) -> np.ndarray:
     """`(6, 6)`: stacked triangles `(n, 7, 7)` as one, the multiplier's column eliminated."""
-    return np.linalg.qr(stack.reshape(-1, 7), mode="r")[1:, 1:]
+    triangle = np.asarray(np.linalg.qr(stack.reshape(-1, 7), mode="r"))
+    return triangle[1:, 1:]
 
 
 def _with_error(
@@ -255,12 +256,11 @@ def _jackknife_deviation(replicas: np.ndarray) -> np.ndarray:
 def _status(coefficients: Coefficients, deviations: np.ndarray, fixed: int, residual: float, rounded: bool) -> str:
     """How well stationarity supports the coefficients, in a sentence."""
     if rounded:
-        return "Stationarity is not supported: the field was rounded to few values, which its second differences amplify."
+        return (
+            "Stationarity is not supported: the field was rounded to few values, which its second differences amplify."
+        )
     weak = [name for name, value, d in zip(NAMES, coefficients, deviations, strict=True) if d > max(abs(value) / 2, 0)]
     gauge = "" if fixed == 0 else " a20 is at the edge of the domain, so a02 = 1 fixes the scale."
-    if residual > _LARGE_ERROR:
-        verdict = "Stationarity is weakly supported"
-    else:
-        verdict = "Stationarity is supported"
+    verdict = "Stationarity is weakly supported" if residual > _LARGE_ERROR else "Stationarity is supported"
     held = f"; weakly held: {', '.join(weak)}" if weak else ""
     return f"{verdict}: a field error of {residual:.1e} would explain the misfit{held}.{gauge}"

@@ -58,7 +58,7 @@ def test_blur_is_its_own_adjoint_and_keeps_the_mean(grid: Grid, seed: int, width
     """Also where it is wider than the box, and where the edges differ."""
     u, p = noise(seed, *grid.shape), noise(seed + 1, *grid.shape)
     left, right = stencils.gaussian_blur(u, grid, width) * p, u * stencils.gaussian_blur(p, grid, width)
-    assert abs(float(left.sum() - right.sum())) <= 1e-12 * float((u.abs().sum() * p.abs().max()))
+    assert abs(float(left.sum() - right.sum())) <= 1e-12 * float(u.abs().sum() * p.abs().max())
     torch.testing.assert_close(stencils.gaussian_blur(u, grid, width).mean(), u.mean(), rtol=0, atol=1e-12)
 
 

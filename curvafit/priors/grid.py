@@ -35,7 +35,7 @@ class Grid:
     """
 
     shape: tuple[int, int, int]
-    spacing: tuple[float, float, float] = (WORKING_SPACING,) * 3
+    spacing: tuple[float, float, float] = (WORKING_SPACING, WORKING_SPACING, WORKING_SPACING)
     boundary: Boundary = "periodic"
 
     def __post_init__(self) -> None:
