@@ -14,6 +14,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
 
 #: Set to anything, an error keeps its traceback.
 DEBUG = "CURVAFIT_DEBUG"
@@ -119,9 +120,9 @@ def output(heads: Sequence[str], rows: Iterable[Sequence[str]], right: Iterable[
     for k, head in enumerate(heads):
         table.add_column(head, justify="right" if k in rights else "left", no_wrap=k in rights or k == 0)
     for row in rows:
-        table.add_row(*(cell.translate(_PLAIN) for cell in row))
+        table.add_row(*(Text(cell.translate(_PLAIN)) for cell in row))
     console = Console(highlight=False)
-    console.print(table, markup=False) if console.is_terminal else Console(highlight=False, width=160).print(table)
+    (console if console.is_terminal else Console(highlight=False, width=160)).print(table)
 
 
 @contextmanager

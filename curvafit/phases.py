@@ -43,8 +43,11 @@ def find_level(
     label: int | None = None,
     region: np.ndarray | None = None,
     periodic: bool = False,
+    extremes: tuple[float, float] | None = None,
 ) -> Level:
     """The structure of a scan; parameters as in `prepare.prepare`.
+
+    `extremes` are the lowest and highest value of the whole that `field` is a part of: they tell a mask's two values.
 
     Raises
     ------
@@ -54,14 +57,16 @@ def find_level(
     if kind not in ("auto", "field", "mask", "image"):
         raise ScanError(f"expected kind auto, field, mask or image, got {kind!r}")
     values = field.values
+    lowest, highest = (values.min(), values.max()) if extremes is None else extremes
+    two = bool(np.all((values == lowest) | (values == highest)))
     if label is not None:
         level = _signed(_label_mask(values, label), dark, f"The structure is label {label}.")
     else:
-        kind = _guess_kind(values, threshold) if kind == "auto" else kind
+        kind = _guess_kind(values, threshold, two) if kind == "auto" else kind
         if kind == "field":
             level = _field_level(values, dark)
         elif kind == "mask":
-            level = _mask_level(values, dark)
+            level = _mask_level(values, dark, lowest, highest, two)
         else:
             level = _image_level(field, threshold, dark, region, periodic)
     counted = level.mask if region is None else level.mask[region]
@@ -91,11 +96,11 @@ def region_of_interest(roi: Field | np.ndarray | str | os.PathLike[str] | None, 
     return region
 
 
-def _guess_kind(values: np.ndarray, threshold: Literal["otsu"] | float) -> Kind:
+def _guess_kind(values: np.ndarray, threshold: Literal["otsu"] | float, two: bool) -> Kind:
     """Two values: a mask. Floats from about -1 to about 1, without noise, mostly far from 0: a phase field."""
-    lowest, highest = values.min(), values.max()
-    if np.all((values == lowest) | (values == highest)):
+    if two:
         return "mask"
+    lowest, highest = values.min(), values.max()
     if values.dtype.kind == "f" and threshold == "otsu" and -2 <= lowest <= -0.7 and 0.3 <= highest <= 2:
         jitter = float(np.median(np.abs(np.diff(values, 3, axis=2)))) if values.shape[2] > 3 else 0.0
         if jitter < _NOISE and np.count_nonzero(np.abs(values) > 0.35) > 0.6 * values.size:
@@ -108,9 +113,8 @@ def _field_level(values: np.ndarray, dark: bool) -> Level:
     return Level("field", (-values if dark else values).astype(np.float32), None, note)
 
 
-def _mask_level(values: np.ndarray, dark: bool) -> Level:
-    lowest, highest = values.min(), values.max()
-    if np.all((values == lowest) | (values == highest)):
+def _mask_level(values: np.ndarray, dark: bool, lowest: float, highest: float, two: bool) -> Level:
+    if two:
         note = f"Taken for a mask of the values {float(lowest):g} and {float(highest):g}."
         return _signed(values == highest, dark, note)
     return _signed(values > 0, dark, "Taken for a mask: the structure is where it is positive.")

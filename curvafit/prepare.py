@@ -136,7 +136,8 @@ def prepare(
     part = replace(field, values=field.values[where], affine=None)
     periodic = periodic and part.shape == field.shape
     options = {"kind": kind, "threshold": threshold, "dark": dark, "label": label}
-    level = find_level(part, region=region, periodic=periodic, **options)  # type: ignore[arg-type]
+    extremes = (field.values.min(), field.values.max())
+    level = find_level(part, region=region, periodic=periodic, extremes=extremes, **options)  # type: ignore[arg-type]
     scan = _Scan(level, part.shape, part.spacing, periodic, region, field.notes + notes + (level.note,))
     prepared = _on_working_grid(scan)
     corner = tuple(s.start + o for s, o in zip(where, prepared.origin, strict=True))
