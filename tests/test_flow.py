@@ -163,8 +163,10 @@ def test_viability_is_the_published_predicate():
 def test_schedules():
     paper, fast = SCHEDULES["paper"], SCHEDULES["fast"]
     assert (paper.steps, paper.rate(0), paper.rate(7999), paper.checks) == (8000, 1e-3, 1e-3, (500, 1000, 5000))
-    assert fast.rate(0) == pytest.approx(1e-2)
-    assert fast.rate(fast.steps - 1) == pytest.approx(1e-4)
+    assert fast.rate(0) == pytest.approx(fast.start)
+    assert fast.rate(fast.steps - 1) == pytest.approx(fast.stop)
+    assert fast.stop < fast.start / 10
+    assert paper.betas == (0.9, 0.999)
     rates = [fast.rate(step) for step in range(fast.steps)]
     assert rates == sorted(rates, reverse=True)
     assert fast.checks == (fast.steps // 2,)
