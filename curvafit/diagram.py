@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -118,6 +118,16 @@ class Diagram:
         return dataclasses.replace(self, points=means[kept], weights=weights[kept], spread=spread)
 
 
+class SurfaceCurvatures(NamedTuple):
+    """Barycentres of triangles `(N, 3)` (z, y, x) with their (κ1, κ2) `(N, 2)` and areas `(N,)`, in the grid's unit;
+    and the part of the area where curvature is not resolved, which is left out."""
+
+    centres: np.ndarray
+    points: np.ndarray
+    areas: np.ndarray
+    excluded: float
+
+
 def diagram(
     u: np.ndarray | Tensor,
     grid: Grid,
@@ -126,7 +136,20 @@ def diagram(
     margin: int | None = None,
     where: np.ndarray | None = None,
 ) -> Diagram:
-    """The curvature diagram of {u = 0}: a point for each triangle, weighted by its area.
+    """The curvature diagram of {u = 0}: what `surface_curvatures` finds, without the places; takes what that takes."""
+    found = surface_curvatures(u, grid, epsilon, curvature, margin, where)
+    return Diagram(found.points, found.areas, excluded=found.excluded)
+
+
+def surface_curvatures(
+    u: np.ndarray | Tensor,
+    grid: Grid,
+    epsilon: float,
+    curvature: Kind = "geometric",
+    margin: int | None = None,
+    where: np.ndarray | None = None,
+) -> SurfaceCurvatures:
+    """κ1, κ2 of {u = 0} on every triangle of its mesh.
 
     Curvatures of the voxels around a triangle are interpolated linearly at its barycentre. The geometric ones are those
     of the level sets of √2 ε artanh(u), which are u's own: differences of that near-distance err far less than
@@ -166,7 +189,7 @@ def diagram(
     if not known.any():
         raise NoSurface("expected a surface whose curvature the grid resolves, got none")
     excluded = 1 - float(weights[known].sum() / weights.sum())
-    return Diagram(points[known], weights[known], excluded=excluded)
+    return SurfaceCurvatures(centres[known] * np.array(grid.spacing), points[known], weights[known], excluded)
 
 
 def _inner_surface(values: Tensor, grid: Grid, margin: int | None) -> Surface:

@@ -2,7 +2,8 @@
 
 A mask's profile is made up, so that stationarity, which reads the profile's deviation from tanh, says nothing of it.
 A short flow started at the scan mends the profile first and then moves the interface, the less the better the
-parameters are.
+parameters are. A weak energy moves nothing either, so all flows get the same budget of force: a is scaled until the
+norm of (a_α × the force of term α alone) is that of the first start, and only its direction counts.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from curvafit.priors.shapes import Float
 from curvafit.priors.stencils import gaussian_blur, gradient
 from curvafit.refinement import Progress, Refinement, double_precision_on_cpu, named
 from curvafit.regrid import rich_boxes, surface_voxels
+from curvafit.stationarity import energy_gradients
 
 #: The short flow: Adam steps of 1e-3 as published.
 SHORT_FLOW = Schedule("short", 150, 1e-3, 1e-3, "constant")
@@ -54,8 +56,9 @@ def fixed_point(
     """Coefficients (a20 = 1, a02 > 0) under which a short flow started at `phase` moves its interface least.
 
     Least squares in the low-passed displacement of the interface, by optimistix (Levenberg-Marquardt, float64), from
-    each start. The mass is the phase field's mean, which the flow keeps. Deviations take one independent sample of the
-    residual for each patch 4π (low-pass)² of the interface; they hold what the residual says, not the valley's shape.
+    each start. The mass is the phase field's mean, which the flow keeps. Deviations add up two parts: the residual's
+    covariance, with one independent sample for each patch 4π (low-pass)² of the interface, and the spread of the ends
+    that other starts reached with less than twice the best residual (valleys are flat, and a fit stalls in them).
 
     Parameters
     ----------
@@ -80,13 +83,13 @@ def fixed_point(
         raise ValueError("expected at least one start for the fixed-point fit, got none")
     if not bool(torch.isfinite(phase).all()):
         raise ValueError("expected a finite phase field, got NaN or infinity in it")
-    flow = ShortFlow(phase, grid, epsilon)
+    flow = ShortFlow(phase, grid, epsilon, starts[0])
     total = len(starts) * (STEPS + 1) * (1 + len(_SIZES))
     flow.after = lambda count: progress("flowing from the scan", min(1.0, count / total)) if progress else None
     ends = [_minimise(flow, _parameters(start)) for start in starts]
     order = np.argsort([end.residual for end in ends])
     best = ends[order[0]]
-    deviations = _deviations(best, flow.patches)
+    deviations = np.hypot(_deviations(best, flow.patches), _spread(ends, best))
     singular = np.linalg.svd(best.jacobian, compute_uv=False)
     return Refinement(
         method="fixed point",
@@ -104,7 +107,7 @@ def fixed_point(
 class ShortFlow:
     """The residual as a function of the five free parameters, with its Jacobian; the last values are remembered."""
 
-    def __init__(self, phase: Tensor, grid: Grid, epsilon: float) -> None:
+    def __init__(self, phase: Tensor, grid: Grid, epsilon: float, reference: Coefficients) -> None:
         values, self.grid = _box(phase.detach().to("cpu", torch.float32), grid)
         self.epsilon, self.evaluations, self._known = epsilon, 0, {}
         self.after: Callable[[int], object] = lambda count: None
@@ -122,6 +125,8 @@ class ShortFlow:
         share = gaussian_blur(slope, self.grid, LOW_PASS * self._voxel)[self._read]
         self._kept = share > _FAINT * share.max()
         self._norm = (share * share[self._kept].sum()).sqrt()[self._kept]
+        self._forces = self._force_of_each_term()
+        self._budget = self._force(reference.scaled(1 / float(reference.a20)))
         area = float(slope[inside].sum()) * self.grid.voxel_volume / 2
         self.patches = area / (4 * np.pi * (LOW_PASS * self._voxel) ** 2)
 
@@ -142,10 +147,19 @@ class ShortFlow:
         ahead = [self.residual(free + DIFFERENCE * unit) for unit in np.eye(len(free))]
         return (np.stack(ahead, 1) - here[:, None]) / DIFFERENCE
 
+    def _force_of_each_term(self) -> np.ndarray:
+        """Root mean square of the six low-passed ∂F_α/∂u where the residual is read."""
+        terms = energy_gradients(self._before.double(), self.grid, self.epsilon)
+        low = gaussian_blur(terms, self.grid, LOW_PASS * self._voxel)[(slice(None), *self._read)][:, self._kept]
+        return low.square().mean(1).sqrt().numpy()
+
+    def _force(self, coefficients: Coefficients) -> float:
+        return float(np.linalg.norm(self._forces * coefficients.tensor().numpy()))
+
     def _flowed(self, free: np.ndarray) -> np.ndarray:
-        flow = relax(
-            self.start, _coefficients(free), self.grid, schedule=SHORT_FLOW, epsilon=self.epsilon, frozen=self._frozen
-        )
+        a = _coefficients(free)
+        scaled = a.scaled(self._budget / self._force(a))
+        flow = relax(self.start, scaled, self.grid, schedule=SHORT_FLOW, epsilon=self.epsilon, frozen=self._frozen)
         self.evaluations += 1
         self.after(self.evaluations)
         moved = (flow.field - self._before).double()
@@ -231,6 +245,14 @@ def _deviations(end: _End, patches: float) -> np.ndarray:
     free = np.sqrt(np.diag(covariance)) * _SIZES
     a02 = _coefficients(end.free).a02
     return np.array([0.0, free[0], a02 * free[1], *free[2:]])
+
+
+def _spread(ends: Sequence[_End], best: _End) -> np.ndarray:
+    """Root mean square distance from the best end to the others that are nearly as good, in coefficients."""
+    near = [end for end in ends if end.residual < 2 * best.residual and end is not best]
+    values = [_coefficients(end.free).tensor().numpy() for end in near]
+    centre = _coefficients(best.free).tensor().numpy()
+    return np.sqrt(np.mean([(value - centre) ** 2 for value in values], axis=0)) if values else np.zeros(6)
 
 
 def _status(end: _End, deviations: np.ndarray) -> str:

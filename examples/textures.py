@@ -1,6 +1,6 @@
 """Eight textures from published parameters, as one picture (the README's).
 
-    python examples/textures.py [--edge 80] [-o docs/textures.png]
+python examples/textures.py [--edge 80] [-o docs/textures.png]
 """
 
 from __future__ import annotations

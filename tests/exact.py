@@ -155,6 +155,7 @@ def exact_jet(function: Callable[[Tensor], Tensor], points: Tensor) -> Jet:
     p = points.detach().clone().requires_grad_(True)
     value = function(p)
     (slope,) = torch.autograd.grad(value.sum(), p, create_graph=True)
+    slope = slope + 0 * p  # a plane's slope does not depend on p, and has to say so
     rows = [torch.autograd.grad(slope[..., k].sum(), p, retain_graph=True)[0] for k in range(3)]
     hessian = torch.stack([rows[i][..., j] for i, j in HESSIAN_AXES])
     return Jet(value.detach(), slope.detach().movedim(-1, 0), hessian)

@@ -100,7 +100,9 @@ def test_tiles_measure_what_the_whole_box_measures(tubes: np.ndarray) -> None:
     np.testing.assert_allclose(tiled.mean(), whole.mean(), rtol=1e-6, atol=1e-6)
     direction = rng.normal(size=2)
     for share in (0.1, 0.5, 0.9):
-        assert _quantile(tiled, direction, share) == pytest.approx(_quantile(whole, direction, share), rel=1e-3, abs=0.05)
+        assert _quantile(tiled, direction, share) == pytest.approx(
+            _quantile(whole, direction, share), rel=1e-3, abs=0.05
+        )
 
 
 def test_a_region_of_interest_hides_the_surface_that_it_cuts(tubes: np.ndarray) -> None:

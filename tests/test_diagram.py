@@ -1,0 +1,214 @@
+"""Curvature diagrams: right on exact shapes, blind to the seam, and honest about what they leave out."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from exact import Cylinder, Gyroid, Shape, Sphere, Torus, centres, profile
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from curvafit.diagram import Diagram, diagram, surface_curvatures
+from curvafit.priors.grid import Grid
+from curvafit.priors.profile import phase_field
+from curvafit.transport import wasserstein
+
+#: On one octant (the rest is its mirror image), tube radius 8 ε; ε is 1 and the spacing 1 over voxels an ε.
+OCTANTS: dict[str, tuple[Shape, tuple[float, float, float]]] = {
+    "sphere": (Sphere(8.0), (12, 12, 12)),
+    "cylinder": (Cylinder(8.0), (4, 12, 12)),
+    "torus": (Torus(16.0, 8.0), (12, 28, 28)),
+}
+
+
+def octant(name: str, voxels: int) -> tuple[torch.Tensor, Grid]:
+    """The exact profile and its mirrored box."""
+    shape, size = OCTANTS[name]
+    nz, ny, nx = (round(edge * voxels) for edge in size)
+    grid = Grid((nz, ny, nx), (1 / voxels,) * 3, "replicate")
+    return profile(shape, centres(grid), 1.0), grid
+
+
+def errors(name: str, voxels: int, kind: str) -> np.ndarray:
+    """|κ - exact κ| at every triangle's barycentre, over max(|κ1|, |κ2|) there: `(N, 2)`."""
+    u, grid = octant(name, voxels)
+    found = surface_curvatures(u, grid, 1.0, kind, margin=0)  # type: ignore[arg-type]
+    assert found.excluded == 0
+    places = torch.from_numpy(found.centres) + 0.5 / voxels
+    truth = torch.stack(OCTANTS[name][0].curvatures(places), -1).numpy()
+    return np.abs(found.points - truth) / np.abs(truth).max(1, keepdims=True)
+
+
+@pytest.mark.parametrize("name", OCTANTS)
+@pytest.mark.parametrize(("voxels", "tolerance"), [(4, 0.02), (2, 0.05)])
+def test_geometric_curvatures_on_exact_shapes(name: str, voxels: int, tolerance: float) -> None:
+    """Every triangle, not only their mean."""
+    assert errors(name, voxels, "geometric").max() < tolerance
+
+
+@pytest.mark.parametrize("name", ["sphere", "torus"])
+def test_diffuse_curvatures_are_far_more_biased(name: str) -> None:
+    """The grid's normal-normal residue parts κ1 from κ2; hence the geometric ones for scans."""
+    diffuse, geometric = (errors(name, 2, kind).mean() for kind in ("diffuse", "geometric"))
+    assert diffuse > 10 * geometric
+    assert diffuse > 0.04
+
+
+def test_diffuse_sphere_opens_up() -> None:
+    """The direction: κ1 too large, κ2 too small, as measured on the published program's fields."""
+    mean = diagram(*octant("sphere", 2), 1.0, "diffuse", margin=0).mean() * 8
+    assert mean[0] == pytest.approx(1.21, abs=0.05)
+    assert mean[1] == pytest.approx(0.79, abs=0.05)
+
+
+def test_gauss_bonnet() -> None:
+    """∫K dA = 2πχ: 4π for a sphere, 0 for a torus, -16π for a gyroid's cell."""
+    ball = diagram(*octant("sphere", 2), 1.0, margin=0)
+    # The octant's outermost half voxel along each mirror lies beyond the outermost centres.
+    assert 8 * ball.weights @ ball.points.prod(1) == pytest.approx(4 * math.pi, rel=0.06)
+    grid = Grid((32, 32, 32), (1.0,) * 3)
+    u = profile(Sphere(9.0, (16.3, 15.9, 16.1)), centres(grid), 2.0)
+    whole = diagram(u, grid, 2.0)
+    assert whole.weights @ whole.points.prod(1) == pytest.approx(4 * math.pi, rel=0.01)
+    assert whole.area == pytest.approx(4 * math.pi * 81, rel=0.01)
+    grid = Grid((24, 52, 52), (1.0,) * 3)
+    ring = diagram(profile(Torus(15.0, 7.0, (12.2, 26.1, 25.8)), centres(grid), 2.0), grid, 2.0)
+    curved = ring.weights @ np.abs(ring.points.prod(1))
+    assert abs(ring.weights @ ring.points.prod(1)) < 0.01 * curved
+    grid = Grid((40, 40, 40), (0.5,) * 3)
+    cell = diagram(Gyroid(20.0).level(centres(grid)) * 0.5, grid, 2.0)
+    assert cell.weights @ cell.points.prod(1) == pytest.approx(Gyroid(20.0).total_curvature, rel=0.01)
+    assert abs(cell.mean().sum()) < 0.01 * np.abs(cell.points).max()
+
+
+@settings(deadline=None, max_examples=6)
+@given(shift=st.tuples(*[st.integers(0, 23)] * 3))
+def test_periodic_diagrams_do_not_see_the_seam(shift: tuple[int, int, int]) -> None:
+    grid = Grid((24, 24, 24), (1.0, 1.0, 1.0))
+    u = profile(Sphere(7.0, (12.3, 11.9, 12.1)), centres(grid), 2.0)
+    still, moved = diagram(u, grid, 2.0), diagram(u.roll(shift, (0, 1, 2)), grid, 2.0)
+    assert moved.area == pytest.approx(still.area, rel=1e-5)
+    np.testing.assert_allclose(moved.mean(), still.mean(), rtol=1e-4)
+
+
+def test_exchanging_inside_and_outside_mirrors_the_diagram() -> None:
+    u, grid = octant("torus", 2)
+    there, back = diagram(u, grid, 1.0), diagram(-u, grid, 1.0)
+    np.testing.assert_allclose(back.mean(), -there.mean()[::-1], rtol=1e-3, atol=1e-4)
+
+
+def test_margins_keep_borders_out() -> None:
+    """A tilted rod leaves the box: at its ends the mirror image bends it, and a margin leaves the ends out."""
+    grid = Grid((28, 28, 28), (1.0, 1.0, 1.0), "replicate")
+    u = profile(Cylinder(6.0, (1.0, 0.8, 0.1), (14.0, 14.0, 14.0)), centres(grid), 2.0)
+    spoilt, clean = diagram(u, grid, 2.0, margin=0), diagram(u, grid, 2.0)
+    assert np.abs(clean.points * 6 - (1, 0)).max() < 0.05
+    assert np.abs(spoilt.points * 6 - (1, 0)).max() > 0.2
+    with pytest.raises(ValueError, match="expected a box of at least 30 voxels along each axis"):
+        diagram(u, grid, 2.0, margin=13)
+
+
+def test_anisotropic_voxels() -> None:
+    grid = Grid((16, 32, 24), (2.0, 1.0, 1.4), "replicate")
+    u = profile(Sphere(11.0, (16.1, 16.2, 16.9)), centres(grid), 2.8)
+    found = diagram(u, grid, 2.8, margin=0)
+    np.testing.assert_allclose(found.points * 11, 1, atol=0.06)
+    assert found.area == pytest.approx(4 * math.pi * 121, rel=0.015)
+
+
+def test_only_where_asked() -> None:
+    u, grid = octant("sphere", 2)
+    lower = np.zeros(grid.shape, dtype=bool)
+    lower[:8] = True
+    parts = [diagram(u, grid, 1.0, margin=0, where=where).area for where in (lower, ~lower)]
+    assert sum(parts) == pytest.approx(diagram(u, grid, 1.0, margin=0).area, rel=1e-12)
+    assert min(parts) > 0
+    with pytest.raises(ValueError, match="expected a surface in the part that counts"):
+        diagram(u, grid, 1.0, margin=0, where=np.zeros(grid.shape, dtype=bool))
+
+
+def test_what_is_not_resolved_is_left_out_and_counted() -> None:
+    """A ball of one voxel's radius beside one of seven."""
+    grid = Grid((24, 24, 32), (1.0, 1.0, 1.0))
+    points = centres(grid)
+    d = torch.maximum(
+        Sphere(7.0, (12.2, 12.1, 10.0)).distance(points), Sphere(0.8, (12.5, 12.5, 26.5)).distance(points)
+    )
+    found = diagram(torch.tanh(d / (2 * math.sqrt(2))), grid, 2.0)
+    assert 0 < found.excluded < 0.02
+    assert np.isfinite(found.points).all()
+    assert np.abs(found.points).max() < 1
+
+
+def test_flat_noise_never_gives_nan() -> None:
+    grid = Grid((10, 10, 10), (0.01, 0.01, 0.01))
+    u = 1e-7 * torch.randn(10, 10, 10, generator=torch.Generator().manual_seed(0))
+    with pytest.raises(ValueError, match="expected a surface whose curvature the grid resolves, got none"):
+        diagram(u, grid, 0.02)
+
+
+def test_bad_input_is_one_sentence() -> None:
+    u, grid = octant("sphere", 2)
+    with pytest.raises(ValueError, match="expected curvature 'geometric' or 'diffuse', got 'mean'"):
+        diagram(u, grid, 1.0, "mean")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="expected a field that crosses 0"):
+        diagram(u.abs() + 0.1, grid, 1.0)
+    with pytest.raises(ValueError, match=r"expected points \(N, 2\) and weights \(N,\), got \(3, 2\) and \(2,\)"):
+        Diagram(np.zeros((3, 2)), np.ones(2))
+    with pytest.raises(ValueError, match="expected finite points"):
+        Diagram(np.full((1, 2), np.nan), np.ones(1))
+    with pytest.raises(ValueError, match="got an empty one"):
+        Diagram(np.zeros((0, 2)), np.zeros(0)).mean()
+    for bad in (0.0, -1.0):
+        with pytest.raises(ValueError, match="expected a bin width above 0"):
+            Diagram(np.zeros((1, 2)), np.ones(1)).binned(bad)
+
+
+def cloud(seed: int, count: int = 500) -> Diagram:
+    generator = np.random.default_rng(seed)
+    return Diagram(20 * generator.standard_t(3, (count, 2)), generator.random(count))
+
+
+@settings(deadline=None, max_examples=25)
+@given(seed=st.integers(0, 10**6), width=st.floats(0.5, 30))
+def test_bins_keep_area_and_mean_and_state_their_spread(seed: int, width: float) -> None:
+    """The variance that binning takes away is its spread's square."""
+    whole = cloud(seed)
+    for binned in (whole.binned(width), whole.thinned(width, 0.01)):
+        assert binned.area == pytest.approx(whole.area, rel=1e-12)
+        np.testing.assert_allclose(binned.mean(), whole.mean(), rtol=0, atol=1e-9)
+        lost = moment(whole) - moment(binned)
+        assert binned.spread**2 == pytest.approx(lost, rel=1e-9, abs=1e-9)
+    assert whole.binned(width).spread <= width * math.sqrt(0.5)
+    twice = whole.binned(width).binned(3 * width)
+    assert twice.spread**2 == pytest.approx(moment(whole) - moment(twice), rel=1e-9, abs=1e-9)
+
+
+def moment(d: Diagram) -> float:
+    return float(d.normalised.weights @ (d.points**2).sum(1))
+
+
+def test_thinning_widens_only_the_tails() -> None:
+    whole = cloud(0, 20000)
+    fine, thin = whole.binned(2.0), whole.thinned(2.0, 3e-3)
+    assert len(thin.weights) < 0.75 * len(fine.weights)
+    assert thin.spread < 1.2 * fine.spread
+
+
+@pytest.mark.parametrize("name", ["tubes", "sponge"])
+def test_masks_stay_near_their_fields(data, name: str) -> None:
+    """The published shapes, known only as {u > 0}: within 2 of themselves, in 1 / working unit. Their area is kept."""
+    import nibabel
+
+    found = sorted((data / "gallery").glob(f"{name} *.nii.gz"))
+    if not found:
+        pytest.skip(f"needs the gallery in {data}")
+    u = torch.from_numpy(nibabel.load(found[0]).get_fdata(dtype=np.float32))
+    grid = Grid(tuple(u.shape), (0.01,) * 3)  # type: ignore[arg-type]
+    of_field, of_mask = diagram(u, grid, 0.02), diagram(phase_field(u > 0, grid, 0.02), grid, 0.02)
+    assert wasserstein(of_field, of_mask) < 1.0
+    assert of_mask.area == pytest.approx(of_field.area, rel=0.01)
+    assert of_field.excluded == of_mask.excluded == 0

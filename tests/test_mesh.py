@@ -1,0 +1,146 @@
+"""Surfaces: seams, orientation, caps, topology, files."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from exact import Gyroid, Sphere, Torus, centres
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from curvafit.mesh import (
+    NoSurface,
+    Surface,
+    areas,
+    capped_surface,
+    euler_characteristic,
+    surface,
+    volume,
+    write_surface,
+)
+from curvafit.priors.grid import Grid
+
+SPACING = (0.1, 0.08, 0.12)
+
+
+def field(shape, grid: Grid) -> torch.Tensor:
+    return shape.distance(centres(grid))
+
+
+def ball(radius: float = 1.0) -> tuple[torch.Tensor, Grid]:
+    grid = Grid((28, 34, 24), SPACING, "replicate")
+    return field(Sphere(radius, (1.4, 1.36, 1.44)), grid), grid
+
+
+def test_a_balls_area_and_volume_from_below() -> None:
+    """Vertices lie on a sphere (nearly), triangles inside it."""
+    mesh = surface(*ball())
+    assert 0.98 * 4 * math.pi < areas(mesh).sum() < 4 * math.pi
+    assert 0.98 * 4 / 3 * math.pi < volume(mesh) < 4 / 3 * math.pi
+
+
+def test_vertices_lie_on_the_level_set_in_the_grids_unit() -> None:
+    u, grid = ball()
+    corner = torch.tensor(grid.spacing, dtype=torch.float64) / 2
+    for level in (0.0, 0.2):
+        mesh = surface(u, grid, level)
+        found = Sphere(1.0, (1.4, 1.36, 1.44)).distance(torch.from_numpy(mesh.vertices) + corner)
+        assert float((found - level).abs().max()) < 0.002
+
+
+def test_triangles_face_outwards() -> None:
+    mesh = surface(*ball())
+    corners = mesh.vertices[mesh.faces][:, :, ::-1]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    out = corners.mean(1) - corners.mean((0, 1))
+    large = areas(mesh) > 1e-6
+    assert ((normals * out).sum(1)[large] > 0).all()
+    assert volume(surface(-ball()[0], ball()[1])) < 0
+
+
+@settings(deadline=None, max_examples=8)
+@given(shift=st.tuples(*[st.integers(0, 15)] * 3))
+def test_a_periodic_surface_does_not_see_the_seam(shift: tuple[int, int, int]) -> None:
+    """Each cell once, wherever the box is cut: the area and Euler characteristic stay."""
+    grid = Grid((16, 16, 16), SPACING)
+    u = field(Sphere(0.5, (0.8, 0.64, 0.96)), grid)
+    whole, moved = surface(u, grid), surface(u.roll(shift, (0, 1, 2)), grid)
+    assert areas(moved).sum() == pytest.approx(areas(whole).sum(), rel=1e-5)
+    assert euler_characteristic(moved, grid) == euler_characteristic(whole, grid) == 2
+
+
+def test_a_mirrored_box_ends_at_its_outermost_centres() -> None:
+    """A slab's two faces, 7 centres' gaps on a side instead of 8."""
+    u = torch.where(torch.arange(8).view(8, 1, 1).expand(8, 8, 8) < 4, 1.0, -1.0)
+    open_box, torus = Grid((8, 8, 8), (1.0, 1.0, 1.0), "replicate"), Grid((8, 8, 8), (1.0, 1.0, 1.0))
+    assert areas(surface(u, open_box)).sum() == pytest.approx(49)
+    assert areas(surface(u, torus)).sum() == pytest.approx(2 * 64)
+
+
+def test_euler_characteristics() -> None:
+    grid = Grid((20, 44, 44), (0.1, 0.1, 0.1), "replicate")
+    assert euler_characteristic(surface(*ball()), ball()[1]) == 2
+    assert euler_characteristic(surface(field(Torus(1.3, 0.6, (1.0, 2.2, 2.2)), grid), grid), grid) == 0
+    box = Grid((24, 24, 24), (1 / 24,) * 3)
+    gyroid = surface(Gyroid(1.0).level(centres(box)), box)
+    assert euler_characteristic(gyroid, box) == -8
+    assert areas(gyroid).sum() == pytest.approx(3.0915, rel=0.01)  # the minimal surface's, which it approximates
+
+
+def test_caps_close_the_box_on_its_faces() -> None:
+    """A solid that leaves the box is cut where the voxels end."""
+    grid = Grid((10, 12, 8), SPACING, "replicate")
+    u = torch.ones(grid.shape)
+    u[:, 3:9] = -1.0
+    mesh = capped_surface(u, grid)
+    assert trimesh.Trimesh(mesh.vertices, mesh.faces).is_watertight
+    half = np.array(grid.spacing) / 2
+    np.testing.assert_allclose(mesh.vertices.min(0), -half, atol=1e-6)
+    np.testing.assert_allclose(mesh.vertices.max(0), np.array(grid.shape) * SPACING - half, atol=1e-6)
+    assert volume(mesh) == pytest.approx(0.5 * grid.volume, rel=0.02)
+
+
+def test_capped_gyroid_is_watertight_and_holds_half_the_box() -> None:
+    box = Grid((20, 20, 20), (1 / 20,) * 3)
+    mesh = capped_surface(Gyroid(1.0).level(centres(box)), box)
+    assert trimesh.Trimesh(mesh.vertices, mesh.faces).is_watertight
+    assert volume(mesh) == pytest.approx(0.5, abs=0.01)
+
+
+@pytest.mark.parametrize("suffix", [".stl", ".ply", ".PLY"])
+def test_files_are_read_back_by_another_program(tmp_path: Path, suffix: str) -> None:
+    """In x, y, z order, closed, with the volume's sign kept."""
+    u, grid = ball()
+    path = write_surface(surface(u, grid), tmp_path / f"ball{suffix}")
+    found = trimesh.load_mesh(path)
+    assert isinstance(found, trimesh.Trimesh)
+    assert found.is_watertight
+    assert found.volume == pytest.approx(volume(surface(u, grid)), rel=1e-5)
+    centre = np.array([1.44, 1.36, 1.4]) - np.array(SPACING[::-1]) / 2
+    np.testing.assert_allclose(found.bounds.mean(0), centre, atol=0.01)
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_bad_input_is_one_sentence(tmp_path: Path) -> None:
+    u, grid = ball()
+    with pytest.raises(ValueError, match=r"expected a surface file ending in \.stl or \.ply, got 'ball\.obj'"):
+        write_surface(surface(u, grid), tmp_path / "ball.obj")
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(NoSurface, match="expected a field that crosses 0, got values from"):
+        surface(u - 5, grid)
+    with pytest.raises(ValueError, match=r"expected a field of shape \(28, 34, 24\), got \(4, 4, 4\)"):
+        surface(torch.zeros(4, 4, 4), grid)
+    u[3, 3, 3] = math.nan
+    with pytest.raises(ValueError, match="finite numbers"):
+        surface(u, grid)
+
+
+def test_areas_of_a_known_triangle() -> None:
+    mesh = Surface(np.array([[0.0, 0, 0], [0, 3, 0], [0, 0, 4]]), np.array([[0, 1, 2]]))
+    np.testing.assert_allclose(areas(mesh), [6.0])
+    np.testing.assert_allclose(mesh.barycentres, [[0, 1, 4 / 3]])

@@ -1,0 +1,101 @@
+"""What pins the parameters down, what does not, and why the paper's literal loss cannot."""
+
+from __future__ import annotations
+
+import nibabel
+import numpy as np
+import pytest
+import torch
+
+from curvafit.fixed_point import ShortFlow, _parameters, fixed_point, sharpened
+from curvafit.generation.flow import generate
+from curvafit.priors.coefficients import Coefficients, preset
+from curvafit.priors.grid import WORKING_EPSILON, Grid
+from curvafit.priors.profile import phase_field
+from curvafit.priors.stencils import gaussian_blur
+from curvafit.refine import literal_loss_descent, refine
+
+GRID = Grid((48, 48, 48))
+
+
+@pytest.fixture(scope="module")
+def tubes() -> torch.Tensor:
+    shape = preset("tubes")
+    return generate(shape.coefficients, shape.mass, GRID, seed=1).field
+
+
+@pytest.fixture(scope="module")
+def mask_phase(tubes: torch.Tensor) -> torch.Tensor:
+    return phase_field(tubes > 0, GRID, WORKING_EPSILON)
+
+
+def test_the_authors_sponge_gives_its_coefficients_back(data) -> None:
+    (path,) = (data / "gallery").glob("sponge coeffs*.nii.gz")
+    field = torch.from_numpy(np.asarray(nibabel.load(path).dataobj, dtype=np.float32))
+    found = refine(field, Grid((100, 100, 100)), WORKING_EPSILON, kind="field", starts=[Coefficients(1, 0, 1)])
+    truth = preset("sponge")
+    for name in ("a11", "a02", "a10", "a01"):
+        assert getattr(found.coefficients, name) == pytest.approx(getattr(truth.coefficients, name), rel=0.05)
+    assert found.mass == pytest.approx(truth.mass, abs=1e-4)
+    assert found.method == "stationarity" and found.coefficients.a20 == 1
+
+
+def test_the_right_parameters_leave_a_mask_where_it_is(mask_phase: torch.Tensor) -> None:
+    flow = ShortFlow(mask_phase, GRID, WORKING_EPSILON, preset("tubes").coefficients)
+    truth = np.linalg.norm(flow.residual(_parameters(preset("tubes").coefficients)))
+    wrong = np.linalg.norm(flow.residual(_parameters(preset("sponge").coefficients)))
+    assert truth < 1
+    assert truth < 0.7 * wrong
+
+
+def test_only_the_direction_of_a_counts(mask_phase: torch.Tensor) -> None:
+    shape = preset("tubes").coefficients
+    weak, strong = (ShortFlow(mask_phase, GRID, WORKING_EPSILON, shape.scaled(c)) for c in (0.5, 2))
+    np.testing.assert_allclose(weak.residual(_parameters(shape)), strong.residual(_parameters(shape)), atol=1e-6)
+
+
+@pytest.mark.slow
+def test_the_fixed_point_fit_improves_on_its_start(mask_phase: torch.Tensor) -> None:
+    start = Coefficients(1, 1, 3, -60, 20, 800)
+    flow = ShortFlow(mask_phase, GRID, WORKING_EPSILON, start)
+    before = np.linalg.norm(flow.residual(_parameters(start)))
+    told: list[float] = []
+    found = fixed_point(
+        mask_phase, GRID, WORKING_EPSILON, starts=[start], progress=lambda text, share: told.append(share)
+    )
+    assert found.residual < before
+    assert found.coefficients.a20 == 1 and found.coefficients.a02 > 0
+    assert len(told) == found.evaluations and told == sorted(told)
+    assert found.mass == pytest.approx(float(mask_phase.mean()), abs=1e-6)
+    assert all(value >= 0 for value in found.uncertainty.values())
+
+
+def test_sharpening_undoes_most_of_the_blur(mask_phase: torch.Tensor) -> None:
+    blurred = gaussian_blur(mask_phase, GRID, WORKING_EPSILON)
+    kept = gaussian_blur(sharpened(mask_phase, GRID, WORKING_EPSILON), GRID, WORKING_EPSILON)
+    assert (kept - mask_phase).abs().mean() < 0.35 * (blurred - mask_phase).abs().mean()
+    assert float(kept.double().mean()) == pytest.approx(float(mask_phase.double().mean()), abs=1e-5)
+
+
+def test_the_halo_of_a_crop_is_held(mask_phase: torch.Tensor) -> None:
+    crop = mask_phase[:32, :32, :32].contiguous()
+    flow = ShortFlow(crop, Grid((32, 32, 32), boundary="replicate"), WORKING_EPSILON, preset("tubes").coefficients)
+    assert flow._frozen is not None
+    assert bool(flow._frozen[0].all()) and not bool(flow._frozen[16, 16, 16])
+
+
+def test_the_literal_loss_falls_for_ever(tubes: torch.Tensor) -> None:
+    losses, path = literal_loss_descent(tubes, GRID, WORKING_EPSILON, preset("tubes").coefficients, 1000, 1e-3)
+    falls = losses.diff()
+    assert bool((falls < 0).all())
+    torch.testing.assert_close(falls, falls[:1].expand_as(falls), rtol=1e-6, atol=0)
+    assert losses[-1] < 0 < losses[0]
+    turned = torch.nn.functional.cosine_similarity(path[-1] - path[0], path[1] - path[0], dim=0)
+    assert float(turned) == pytest.approx(1)
+
+
+def test_an_unknown_kind_and_no_start_are_refused(mask_phase: torch.Tensor) -> None:
+    with pytest.raises(ValueError, match="expected kind"):
+        refine(mask_phase, GRID, WORKING_EPSILON, kind="mesh", starts=[Coefficients(1, 2, 1)])
+    with pytest.raises(ValueError, match="expected at least one start"):
+        refine(mask_phase, GRID, WORKING_EPSILON, kind="mask", starts=[])
