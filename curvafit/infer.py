@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
 import platform
 from collections.abc import Callable
@@ -111,6 +112,7 @@ def infer(
     say("refining the parameters", 0.2)
     refined = _refined(prepared, matches, seed, say)
     say("regenerating", 0.6)
+    refined = _with_mass(refined, prepared, seed)
     twins = _regenerate(prepared, matches[0], refined, seed, say)
     fit = _fit(prepared, seen, matches, refined, twins, _provenance(volume, atlas, seed))
     say("done", 1.0)
@@ -144,12 +146,32 @@ def _refined(prepared: Prepared, matches: tuple[Match, ...], seed: int, say: Pro
     )
 
 
+def _with_mass(refined: Refinement, prepared: Prepared, seed: int) -> Refinement:
+    """The mass that gives a regenerated shape the scan's volume fraction, to first order; a field's own is its mean.
+
+    A mask does not tell its mass: the phases of a minimiser stop short of ±1 by an amount that curvature decides.
+    """
+    if prepared.kind == "field":
+        return refined
+    flow = generate(refined.coefficients, refined.mass, _twin_grid(prepared), seed=seed, reject_early=True)
+    if not flow.viability.viable:
+        return refined
+    region = np.ones_like(prepared.mask) if prepared.roi is None else prepared.roi
+    missing = float(prepared.mask[region].mean()) - float((flow.field > 0).double().mean())
+    return dataclasses.replace(refined, mass=float(np.clip(refined.mass + 2 * missing, -0.95, 0.95)))
+
+
+def _twin_grid(prepared: Prepared) -> Grid:
+    """A periodic box of the main window's size, for shapes to compare with."""
+    z, y, x = (min(edge.stop - edge.start, REGENERATED_EDGE) for edge in prepared.windows[0])
+    return Grid((z, y, x), prepared.grid.spacing, "periodic")
+
+
 def _regenerate(
     prepared: Prepared, match: Match, refined: Refinement, seed: int, say: Progress
 ) -> dict[str, tuple[_Twin, _Twin]]:
-    """Two seeds each of the nearest match and of the refined parameters, in a periodic box of the window's size."""
-    z, y, x = (min(edge.stop - edge.start, REGENERATED_EDGE) for edge in prepared.windows[0])
-    grid = Grid((z, y, x), prepared.grid.spacing, "periodic")
+    """Two seeds each of the nearest match and of the refined parameters."""
+    grid = _twin_grid(prepared)
     twins = {}
     for step, (name, source) in enumerate((("match", match), ("fit", refined))):
         pair = []

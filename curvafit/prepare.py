@@ -34,7 +34,7 @@ WORKING_THICKNESS = 8.0
 THINNEST = 3.0
 #: Longest sides: of a window and of the whole working grid, in working voxels; of what is read, in scan voxels.
 LARGEST_WINDOW = 128
-LARGEST_BOX = 256
+LARGEST_BOX = 200
 LARGEST_SCAN = 512
 #: Coarsening stops where a side would have fewer working voxels than this.
 FEWEST = 32
