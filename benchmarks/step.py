@@ -65,30 +65,19 @@ class Comparison(NamedTuple):
     bandwidth: float
 
 
+def programs(size: int) -> tuple[TorchStepper, FusedFlow]:
+    """The same flow twice, on a cube: in plain torch and fused."""
+    grid, shape, betas = Grid((size, size, size)), preset("tubes"), SCHEDULES["fast"].betas
+    start, form = white_noise(grid, 0), DivergenceForm(grid, BLUR, shape.mass)
+    plain = TorchStepper(start, form, shape.coefficients, WORKING_EPSILON, betas, None, "cpu")
+    a = [float(value) for value in shape.coefficients]
+    fused = FusedFlow(start.numpy(), shape.mass, a, grid, WORKING_EPSILON, BLUR, betas=betas, adam_eps=ADAM_EPS)
+    return plain, fused
+
+
 def compare(size: int, rounds: int) -> Comparison:
-    """The two programs in turn, on a cube."""
-    grid = Grid((size, size, size))
-    shape = preset("tubes")
-    start = white_noise(grid, 0)
-    plain = TorchStepper(
-        start,
-        DivergenceForm(grid, BLUR, shape.mass),
-        shape.coefficients,
-        WORKING_EPSILON,
-        SCHEDULES["fast"].betas,
-        None,
-        "cpu",
-    )
-    fused = FusedFlow(
-        start.numpy(),
-        shape.mass,
-        list(shape.coefficients),
-        grid,
-        WORKING_EPSILON,
-        BLUR,
-        betas=SCHEDULES["fast"].betas,
-        adam_eps=ADAM_EPS,
-    )
+    """The two programs in turn."""
+    plain, fused = programs(size)
     passes = (
         fused.blur_divergence,
         fused.blur_along_z,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from collections.abc import Sequence
 
 import torch
@@ -9,14 +11,14 @@ from torch import Tensor
 
 from curvafit.fixed_point import fixed_point
 from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.curvature import jet
+from curvafit.priors.curvature import geometric_curvatures, jet
 from curvafit.priors.energy import energy_terms
 from curvafit.priors.grid import Grid
 from curvafit.priors.shapes import Float
 from curvafit.refinement import Progress, Refinement
-from curvafit.stationarity import stationarity
+from curvafit.stationarity import is_rounded, stationarity
 
-__all__ = ["Refinement", "literal_loss_descent", "refine"]
+__all__ = ["Refinement", "literal_loss_descent", "mass_of_mask", "refine"]
 
 
 def refine(
@@ -30,6 +32,8 @@ def refine(
     progress: Progress | None = None,
 ) -> Refinement:
     """Refine the nearest matches: stationarity for a phase field, the fixed point of a short flow for a mask or image.
+
+    A field that was rounded to few values is treated like a mask: second differences of it are noise.
 
     Parameters
     ----------
@@ -45,11 +49,29 @@ def refine(
     ValueError
         If the kind has another name, or as the method does.
     """
-    if kind == "field":
-        return stationarity(phase, grid, epsilon, starts=starts, seed=seed, progress=progress)
-    if kind not in ("mask", "image"):
+    if kind not in ("field", "mask", "image"):
         raise ValueError(f"expected kind 'field', 'mask' or 'image', got {kind!r}")
-    return fixed_point(phase, grid, epsilon, starts=starts, progress=progress)
+    rounded = kind == "field" and is_rounded(phase)
+    if kind == "field" and not rounded:
+        return stationarity(phase, grid, epsilon, starts=starts, seed=seed, progress=progress)
+    found = fixed_point(phase, grid, epsilon, starts=starts, progress=progress)
+    if not rounded:
+        return found
+    why = "Stationarity is not supported by a field rounded to few values."
+    return dataclasses.replace(found, status=f"{why} {found.status}")
+
+
+def mass_of_mask(phase: Float[Tensor, "z y x"], grid: Grid, epsilon: float) -> float:
+    """m₀ of the shape {u > 0} to leading order in ε, from its volume fraction and its total mean curvature:
+    m₀ = 2·fraction - 1 + (π²/6) ε² ∫H dA / |Ω|, which is the mean of the optimal profile about its surface.
+
+    `phase` is the mask's phase field; ∫H dA is its level sets' H = κ1 + κ2 averaged with weight |∇u| / 2.
+    """
+    field = jet(phase.double(), grid)
+    slope = field.gradient.square().sum(-4).sqrt()
+    total = float((geometric_curvatures(field).mean * slope).sum()) / 2 * grid.voxel_volume
+    fraction = float((phase > 0).double().mean())
+    return 2 * fraction - 1 + math.pi**2 / 6 * epsilon**2 * total / grid.volume
 
 
 def literal_loss_descent(

@@ -122,11 +122,9 @@ def stationarity(
     begun = np.stack([admissible(start) for start in (tls, *given)])
     solutions, residuals = _solve([problem] * len(begun), begun)
     order = np.argsort(residuals)
-    best = solutions[order[0]]
-    replicas = [_Problem(_triangle(np.delete(octants, k, 0)), problem.error) for k in range(len(octants))]
-    coefficients, fixed = in_gauge(best * units(epsilon))
-    jackknife = _solve(replicas, np.stack([best] * len(replicas)))[0] * units(epsilon)
-    deviations = _jackknife_deviation(jackknife / jackknife[:, fixed : fixed + 1])
+    coefficients, fixed = in_gauge(solutions[order[0]] * units(epsilon))
+    replicas = _replicas(octants, problem.error, solutions[order[0]]) * units(epsilon)
+    deviations = _jackknife_deviation(replicas / replicas[:, fixed : fixed + 1])
     residual = float(size * residuals[order[0]])
     say("solved", 1.0)
     return Refinement(
@@ -245,6 +243,12 @@ def _solve(problems: Sequence[_Problem], begun: np.ndarray) -> tuple[np.ndarray,
         columns, errors = (jnp.asarray(np.stack(part)) for part in zip(*problems, strict=True))
         found = jax.jit(jax.vmap(minimise))(columns, errors, jnp.asarray(begun))
         return np.asarray(found[0]), np.asarray(found[1])
+
+
+def _replicas(octants: np.ndarray, error: np.ndarray, best: np.ndarray) -> np.ndarray:
+    """Solutions `(n, 6)` with one octant left out each."""
+    problems = [_Problem(_triangle(np.delete(octants, k, 0)), error) for k in range(len(octants))]
+    return _solve(problems, np.stack([best] * len(problems)))[0]
 
 
 def _jackknife_deviation(replicas: np.ndarray) -> np.ndarray:

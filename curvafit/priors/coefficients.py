@@ -39,9 +39,9 @@ class Coefficients:
             value = getattr(self, name)
             if not isinstance(value, Tensor):
                 object.__setattr__(self, name, float(value))
-            if not bool(torch.isfinite(torch.as_tensor(value)).all()):
+            if not bool(torch.isfinite(torch.as_tensor(value, dtype=torch.float64)).all()):
                 raise ValueError(f"expected finite coefficients, got {name} = {value}")
-        if not bool((torch.as_tensor(self.a20) > 0).all()) or not bool((torch.as_tensor(self.a02) > 0).all()):
+        if any(not bool((torch.as_tensor(a, dtype=torch.float64) > 0).all()) for a in (self.a20, self.a02)):
             warnings.warn(
                 f"a20 > 0 and a02 > 0 keep the energy bounded below, got a20 = {self.a20}, a02 = {self.a02}",
                 stacklevel=3,
@@ -78,7 +78,7 @@ class Coefficients:
         return Coefficients(a02, a11, a20, -a01, -a10, a00)
 
     @classmethod
-    def from_b(cls, h2, H0, k1, alpha, kappa1, beta, kappa2) -> Coefficients:  # noqa: N803
+    def from_b(cls, h2, H0, k1, alpha, kappa1, beta, kappa2) -> Coefficients:
         """h2 (H - H0)² + k1 K + α (κ1 - κ1⁰)² + β (κ2 - κ2⁰)², expanded (eq. `redundant`)."""
         return cls(
             h2 + alpha,
