@@ -106,9 +106,7 @@ def stationarity(
     ValueError
         If the field is not finite, has another shape than the grid, or is a crop under 24 voxels along an axis.
     """
-    values = torch.as_tensor(u).detach().to("cpu", torch.float64)
-    if tuple(values.shape) != grid.shape or not bool(torch.isfinite(values).all()):
-        raise ValueError(f"expected a finite field of shape {grid.shape}, got shape {tuple(values.shape)}")
+    values = _checked(u, grid)
     say = progress or (lambda text, share: None)
     width = _width(grid) if width is None else width
     say("differentiating the energy", 0.0)
@@ -138,6 +136,15 @@ def stationarity(
         status=_status(coefficients, deviations, fixed, residual, is_rounded(values)),
         evaluations=1 + trials,
     )
+
+
+def _checked(u: Tensor, grid: Grid) -> Tensor:
+    values = torch.as_tensor(u).detach().to("cpu", torch.float64)
+    if tuple(values.shape) != grid.shape:
+        raise ValueError(f"expected a field of shape {grid.shape}, got {tuple(values.shape)}")
+    if not bool(torch.isfinite(values).all()):
+        raise ValueError("expected a finite field, got NaN or infinity in it")
+    return values
 
 
 def _width(grid: Grid) -> float:
