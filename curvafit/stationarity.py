@@ -24,8 +24,8 @@ from curvafit.priors.shapes import Float
 from curvafit.priors.stencils import gaussian_blur, pad
 from curvafit.refinement import Progress, Refinement, admissible, double_precision_on_cpu, in_gauge, named, units
 
-#: Standard deviation of the test functions, in voxels.
-TEST_WIDTH = 4.0
+#: Standard deviation of the test functions, in voxels; in a crop less, for what their support takes from each side.
+TEST_WIDTH, CROP_WIDTH = 4.0, 3.0
 #: Reach in voxels of a density's gradient: one of the stencil, one of its adjoint.
 _REACH = 2
 #: Planes treated at once, which bounds the memory.
@@ -92,7 +92,7 @@ def stationarity(
     starts
         Coefficients to start from besides the total least squares solution.
     width
-        Standard deviation of the test functions in voxels; `TEST_WIDTH`, less in a small crop.
+        Standard deviation of the test functions in voxels; `TEST_WIDTH`, in a crop `CROP_WIDTH` or less.
     seed
         Of the noise that is propagated.
 
@@ -148,12 +148,12 @@ def _checked(u: Tensor, grid: Grid) -> Tensor:
 
 
 def _width(grid: Grid) -> float:
-    """The default test width, or in a small crop the one that leaves a core of eight voxels."""
+    """The default test width; in a small crop the one that leaves a core of eight voxels."""
     if grid.periodic:
         return TEST_WIDTH
     if min(grid.shape) < 24:
         raise ValueError(f"expected a crop of at least 24 voxels along each axis, got {grid.shape}")
-    return min(TEST_WIDTH, (min(grid.shape) - 8 - 2 * _REACH) // 2 / 4)
+    return min(CROP_WIDTH, (min(grid.shape) - 8 - 2 * _REACH) // 2 / 4)
 
 
 def _equations(gradients: Tensor, grid: Grid, epsilon: float, width: float) -> np.ndarray:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from curvafit.priors.coefficients import PRESETS, Coefficients, preset
 
-finite = st.floats(-50, 50)
+finite = st.floats(-50, 50, allow_subnormal=False)
 positive = st.floats(0.1, 50)
 coefficients = st.builds(Coefficients, positive, finite, positive, finite, finite, finite)
 #: Rows of the paper's two tables: (h2, H0, k1, α, κ1⁰, β, κ2⁰).

@@ -89,7 +89,7 @@ def test_diffuse_product_falls_short_where_the_root_is_cut() -> None:
     field = random_jet(0, 2000)
     trace, norm2, root, _ = second_form(field, 0.1)
     cut = 2 * norm2 < trace**2
-    assert 0.02 < float(cut.double().mean()) < 0.98
+    assert 20 < int(cut.sum()) < 1980
     found = diffuse_curvatures(field, 0.1)
     gap = found.gauss - found.kappa1 * found.kappa2
     assert float(gap[cut].min()) > 0

@@ -54,7 +54,7 @@ def test_diffuse_curvatures_are_far_more_biased(name: str) -> None:
     """The grid's normal-normal residue parts κ1 from κ2; hence the geometric ones for scans."""
     diffuse, geometric = (errors(name, 2, kind).mean() for kind in ("diffuse", "geometric"))
     assert diffuse > 10 * geometric
-    assert diffuse > 0.04
+    assert diffuse > (0.15 if name == "sphere" else 0.01)
 
 
 def test_diffuse_sphere_opens_up() -> None:
@@ -67,8 +67,8 @@ def test_diffuse_sphere_opens_up() -> None:
 def test_gauss_bonnet() -> None:
     """∫K dA = 2πχ: 4π for a sphere, 0 for a torus, -16π for a gyroid's cell."""
     ball = diagram(*octant("sphere", 2), 1.0, margin=0)
-    # The octant's outermost half voxel along each mirror lies beyond the outermost centres.
-    assert 8 * ball.weights @ ball.points.prod(1) == pytest.approx(4 * math.pi, rel=0.06)
+    # Half a voxel along each mirror lies beyond the octant's outermost centres: compare with the area that is left.
+    assert ball.weights @ ball.points.prod(1) == pytest.approx(ball.area / 8**2, rel=0.005)
     grid = Grid((32, 32, 32), (1.0,) * 3)
     u = profile(Sphere(9.0, (16.3, 15.9, 16.1)), centres(grid), 2.0)
     whole = diagram(u, grid, 2.0)
@@ -131,16 +131,16 @@ def test_only_where_asked() -> None:
 
 
 def test_what_is_not_resolved_is_left_out_and_counted() -> None:
-    """A ball of one voxel's radius beside one of seven."""
+    """A spot so faint that its level set has no slope, beside a ball of seven voxels."""
     grid = Grid((24, 24, 32), (1.0, 1.0, 1.0))
     points = centres(grid)
-    d = torch.maximum(
-        Sphere(7.0, (12.2, 12.1, 10.0)).distance(points), Sphere(0.8, (12.5, 12.5, 26.5)).distance(points)
-    )
-    found = diagram(torch.tanh(d / (2 * math.sqrt(2))), grid, 2.0)
-    assert 0 < found.excluded < 0.02
+    ball = torch.tanh(Sphere(7.0, (12.2, 12.1, 10.0)).distance(points) / (2 * math.sqrt(2)))
+    away = points - torch.tensor([12.0, 12.0, 26.0], dtype=points.dtype)
+    spot = 0.06 * torch.exp(-away.square().sum(-1) / 18) - 0.05
+    found = diagram(torch.where(points[..., 2] < 20, ball, spot), grid, 2.0)
+    assert 0 < found.excluded < 0.2
     assert np.isfinite(found.points).all()
-    assert np.abs(found.points).max() < 1
+    np.testing.assert_allclose(found.mean() * 7, 1, atol=0.02)
 
 
 def test_flat_noise_never_gives_nan() -> None:
@@ -195,7 +195,7 @@ def test_thinning_widens_only_the_tails() -> None:
     whole = cloud(0, 20000)
     fine, thin = whole.binned(2.0), whole.thinned(2.0, 3e-3)
     assert len(thin.weights) < 0.75 * len(fine.weights)
-    assert thin.spread < 1.2 * fine.spread
+    assert fine.spread < thin.spread < 1.5 * fine.spread
 
 
 @pytest.mark.parametrize("name", ["tubes", "sponge"])

