@@ -31,8 +31,10 @@ SHORT_FLOW = Schedule("short", 150, 1e-3, 1e-3, "constant")
 LARGEST_BOX, HALO = 64, 8
 #: Standard deviation in voxels of the low-pass on the displacement, and every how many voxels it is read.
 LOW_PASS, STRIDE = 2.0, 2
-#: Levenberg-Marquardt steps from each start.
-STEPS = 5
+#: Levenberg-Marquardt steps from each start, and more from the best end.
+FIRST_STEPS, LAST_STEPS = 3, 7
+#: Displacement in voxels that the solver is told is 1: its damping starts at 1.
+_UNIT = 0.1
 #: Step of the Jacobian's finite differences, in scaled parameters.
 DIFFERENCE = 0.05
 #: Voxels whose share of interface is under this part of the largest are not read.
@@ -41,6 +43,8 @@ _FAINT = 0.02
 _LOST = 10.0
 #: Sizes of (a11, log a02, a10, a01, a00) in working units that make a change of one a similar change of the flow.
 _SIZES = np.array([2.0, 1.0, 50.0, 50.0, 800.0])
+#: Flows that leave at most this many times the least residual are as good: the truth itself may leave that.
+_AS_GOOD = 1.2
 #: A coefficient whose deviation is above this part of its size is weakly held.
 _WEAK = 0.5
 
@@ -55,10 +59,11 @@ def fixed_point(
 ) -> Refinement:
     """Coefficients (a20 = 1, a02 > 0) under which a short flow started at `phase` moves its interface least.
 
-    Least squares in the low-passed displacement of the interface, by optimistix (Levenberg-Marquardt, float64), from
-    each start. The mass is the phase field's mean, which the flow keeps. Deviations add up two parts: the residual's
-    covariance, with one independent sample for each patch 4π (low-pass)² of the interface, and the spread of the ends
-    that other starts reached with less than twice the best residual (valleys are flat, and a fit stalls in them).
+    Least squares in the low-passed displacement of the interface, by optimistix (Levenberg-Marquardt, float64): some
+    steps from each start, then more from the best end. The mass is the phase field's mean, which the flow keeps.
+
+    Deviations add up two parts: the residual's covariance, with one independent sample for each patch 4π (low-pass)² of
+    the interface, and the reach of the valley: how far from the best the fit met parameters that are nearly as good.
 
     Parameters
     ----------
@@ -84,12 +89,12 @@ def fixed_point(
     if not bool(torch.isfinite(phase).all()):
         raise ValueError("expected a finite phase field, got NaN or infinity in it")
     flow = ShortFlow(phase, grid, epsilon, starts[0])
-    total = len(starts) * (STEPS + 1) * (1 + len(_SIZES))
+    total = (1 + len(_SIZES)) * (len(starts) * (FIRST_STEPS + 1) + LAST_STEPS)
     flow.after = lambda count: progress("flowing from the scan", min(1.0, count / total)) if progress else None
-    ends = [_minimise(flow, _parameters(start)) for start in starts]
+    ends = [_minimise(flow, _parameters(start), FIRST_STEPS) for start in starts]
     order = np.argsort([end.residual for end in ends])
-    best = ends[order[0]]
-    deviations = np.hypot(_deviations(best, flow.patches), _spread(ends, best))
+    best = _minimise(flow, ends[order[0]].free, LAST_STEPS)
+    deviations = np.hypot(_deviations(best, flow.patches), _valley(flow, best))
     singular = np.linalg.svd(best.jacobian, compute_uv=False)
     return Refinement(
         method="fixed point",
@@ -140,6 +145,11 @@ class ShortFlow:
         if key not in self._known:
             self._known[key] = self._flowed(free)
         return self._known[key]
+
+    def nearly(self, residual: float) -> np.ndarray:
+        """Parameters `(n, 5)` of the flows made so far that left at most this residual."""
+        good = [np.frombuffer(key) for key, left in self._known.items() if np.linalg.norm(left) <= residual]
+        return np.array(good).reshape(-1, len(_SIZES))
 
     def jacobian(self, free: np.ndarray) -> np.ndarray:
         """One-sided differences, `(size, 5)`."""
@@ -202,23 +212,23 @@ def _parameters(start: Coefficients) -> np.ndarray:
     return np.array([a11, np.log(a02), a10, a01, a00]) / _SIZES
 
 
-def _minimise(flow: ShortFlow, begin: np.ndarray) -> _End:
+def _minimise(flow: ShortFlow, begin: np.ndarray, steps: int) -> _End:
     """The best of the points that Levenberg-Marquardt visits from a start."""
     with double_precision_on_cpu():
         import jax
         import jax.numpy as jnp
         import optimistix
 
-        visited: list[np.ndarray] = []
+        visited = [np.array(begin, dtype=np.float64)]
         shape = jax.ShapeDtypeStruct((flow.size,), jnp.float64)
         wide = jax.ShapeDtypeStruct((flow.size, len(_SIZES)), jnp.float64)
 
         def value(free):
             visited.append(np.array(free, dtype=np.float64))
-            return flow.residual(visited[-1])
+            return flow.residual(visited[-1]) / _UNIT
 
         def slope_of(free):
-            return flow.jacobian(np.array(free, dtype=np.float64))
+            return flow.jacobian(np.array(free, dtype=np.float64)) / _UNIT
 
         @jax.custom_jvp
         def residual(free):
@@ -232,7 +242,7 @@ def _minimise(flow: ShortFlow, begin: np.ndarray) -> _End:
 
         solver = optimistix.LevenbergMarquardt(rtol=1e-3, atol=1e-3)
         optimistix.least_squares(
-            lambda free, args: residual(free), solver, jnp.asarray(begin), max_steps=STEPS, throw=False
+            lambda free, args: residual(free), solver, jnp.asarray(begin), max_steps=steps, throw=False
         )
     best = min(visited, key=lambda free: float(np.linalg.norm(flow.residual(free))))
     return _End(best, float(np.linalg.norm(flow.residual(best))), flow.jacobian(best))
@@ -247,12 +257,11 @@ def _deviations(end: _End, patches: float) -> np.ndarray:
     return np.array([0.0, free[0], a02 * free[1], *free[2:]])
 
 
-def _spread(ends: Sequence[_End], best: _End) -> np.ndarray:
-    """Root mean square distance from the best end to the others that are nearly as good, in coefficients."""
-    near = [end for end in ends if end.residual < 2 * best.residual and end is not best]
-    values = [_coefficients(end.free).tensor().numpy() for end in near]
+def _valley(flow: ShortFlow, best: _End) -> np.ndarray:
+    """Largest distance `(6,)` of a nearly as good flow's coefficients from the best."""
     centre = _coefficients(best.free).tensor().numpy()
-    return np.sqrt(np.mean([(value - centre) ** 2 for value in values], axis=0)) if values else np.zeros(6)
+    near = [_coefficients(free).tensor().numpy() for free in flow.nearly(_AS_GOOD * best.residual)]
+    return np.abs(np.array(near) - centre).max(0)
 
 
 def _status(end: _End, deviations: np.ndarray) -> str:

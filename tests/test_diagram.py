@@ -49,12 +49,12 @@ def test_geometric_curvatures_on_exact_shapes(name: str, voxels: int, tolerance:
     assert errors(name, voxels, "geometric").max() < tolerance
 
 
-@pytest.mark.parametrize("name", ["sphere", "torus"])
-def test_diffuse_curvatures_are_far_more_biased(name: str) -> None:
-    """The grid's normal-normal residue parts κ1 from κ2; hence the geometric ones for scans."""
+@pytest.mark.parametrize(("name", "least"), [("sphere", 0.15), ("torus", 0.01)])
+def test_diffuse_curvatures_are_far_more_biased(name: str, least: float) -> None:
+    """The grid's normal-normal residue parts κ1 from κ2, most where they are equal; hence geometric ones for scans."""
     diffuse, geometric = (errors(name, 2, kind).mean() for kind in ("diffuse", "geometric"))
     assert diffuse > 10 * geometric
-    assert diffuse > (0.15 if name == "sphere" else 0.01)
+    assert diffuse > least
 
 
 def test_diffuse_sphere_opens_up() -> None:

@@ -15,6 +15,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.ndimage import distance_transform_edt
 
 from curvafit.diagram import diagram
+from curvafit.mesh import surface
 from curvafit.priors import profile
 from curvafit.priors.grid import Grid
 
@@ -113,31 +114,36 @@ def test_signed_distance_takes_batches() -> None:
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (1.0, 0.5, 2.0)])
 def test_planes_between_voxels_are_exact(axis: int, spacing: tuple[float, float, float]) -> None:
-    """Also in a periodic box, where the slab's other face is 24 voxels away: its middle, a crease, is out of reach."""
-    n, h = 48, spacing[axis]
-    at = torch.arange(n, dtype=torch.float32).sub(11.5).mul(h)
-    along = [1, 1, 1]
-    along[axis] = n
-    d = torch.minimum(at, 24 * h - at).view(along).expand(n, n, n)
-    found = profile.phase_field(d > 0, box(n, "periodic", spacing), 2 * h)
+    """Also in a periodic box, where the slab's other face is 32 voxels away."""
+    n, h, shape, along = 64, spacing[axis], [4, 4, 4], [1, 1, 1]
+    shape[axis] = along[axis] = n
+    at = torch.arange(n, dtype=torch.float32).sub(15.5).mul(h)
+    d = torch.minimum(at, 32 * h - at).view(along).expand(shape)
+    found = profile.phase_field(d > 0, Grid(tuple(shape), spacing), 2 * h)  # type: ignore[arg-type]
     error = (profile.profile_distance(found, 2 * h) - d).abs()
-    assert float(error[d.abs() < 3 * h].max()) < 2e-3 * h
+    assert float(error[d.abs() < 4 * h].max()) < 2e-3 * h
 
 
-def test_tilted_planes_stay_where_they_are() -> None:
-    """Voxels cut a tilted plane into stairs. Their level set keeps its place; distances to the tips of the stairs are
-    shorter than to the plane, which flattens the profile by about a fifth."""
+@pytest.mark.parametrize("normal", [(1.0, 0.62, -0.35), (1.0, 0.27, 0.11), (-0.4, 1.0, 0.9)])
+def test_tilted_planes_are_unbiased(normal: tuple[float, float, float]) -> None:
+    """Voxels cut a tilted plane into stairs; a tenth of a voxel is left of them, and none on average."""
+    plane, grid = Plane(normal, (24.3, 23.8, 24.1)), box(48)
+    u = profile.phase_field(plane.distance(centres(grid)) > 0, grid, EPSILON)
+    inner = slice(10, -10)
+    mesh = surface(u[inner, inner, inner], box(28))
+    error = plane.distance(torch.from_numpy(mesh.vertices) + 10.5)
+    assert abs(float(error.mean())) < 0.03
+    assert float(error.square().mean().sqrt()) < 0.1
+
+
+def test_distances_across_tilted_faces_are_short_not_long() -> None:
+    """The direction of what smoothing cannot mend: overhanging voxels are nearer than the plane, by up to a fifth."""
     plane, grid = Plane((1.0, 0.62, -0.35), (16.3, 15.8, 16.1)), box(32)
+    d = plane.distance(centres(grid))
+    found = profile.profile_distance(profile.phase_field(d > 0, grid, EPSILON), EPSILON)
     inner = (slice(8, -8),) * 3
-    d = plane.distance(centres(grid))[inner]
-    found = profile.profile_distance(profile.phase_field(plane.distance(centres(grid)) > 0, grid, EPSILON), EPSILON)[
-        inner
-    ]
-    near = d.abs() < 0.25
-    assert abs(float((found - d)[near].mean())) < 0.02
-    assert float((found - d)[near].square().mean().sqrt()) < 0.06
-    slope = float((found * d)[d.abs() < 2].sum() / d[d.abs() < 2].square().sum())
-    assert 0.75 < slope < 1
+    slope = (found * d)[inner][d[inner].abs() < 3].sum() / d[inner][d[inner].abs() < 3].square().sum()
+    assert 0.78 < float(slope) < 1.0
 
 
 @pytest.mark.parametrize("radius", [4, 6, 8, 10])
@@ -161,13 +167,13 @@ def test_balls_and_rods_keep_their_mean_curvature(radius: int) -> None:
         assert np.mean(scatter) < 0.25
 
 
-def test_smoothing_moves_a_ball_little() -> None:
-    """Without second moments the blur moves a ball of six voxels by under a tenth of one."""
-    grid, R = box(28), 6.0
-    d = Sphere(R, (14.2, 13.9, 14.1)).distance(centres(grid))
-    u = profile.phase_field(d > 0, grid, EPSILON)
-    moved = (profile.profile_distance(u, EPSILON) - d)[d.abs() < 0.5].mean()
-    assert abs(float(moved)) < 0.1
+def test_balls_keep_their_size() -> None:
+    """The zero level of a ball of 6 voxels' radius moves by less than a tenth of a voxel."""
+    grid, ball = box(28), Sphere(6.0, (14.2, 13.9, 14.1))
+    mesh = surface(profile.phase_field(ball.distance(centres(grid)) > 0, grid, EPSILON), grid)
+    error = ball.distance(torch.from_numpy(mesh.vertices) + 0.5)
+    assert abs(float(error.mean())) < 0.05
+    assert float(error.abs().max()) < 0.3
 
 
 def test_inside_and_outside_are_treated_alike() -> None:

@@ -128,7 +128,8 @@ def test_a_rounded_field_is_told_and_treated_like_a_mask(sponge: torch.Tensor, m
     assert "not supported" in stationarity(rounded, GRID, WORKING_EPSILON).status
     import curvafit.fixed_point as method
 
-    monkeypatch.setattr(method, "STEPS", 1)
+    monkeypatch.setattr(method, "FIRST_STEPS", 1)
+    monkeypatch.setattr(method, "LAST_STEPS", 1)
     other = refine(rounded, GRID, WORKING_EPSILON, kind="field", starts=[TRUTH.coefficients])
     assert other.method == "fixed point"
     assert other.status.startswith("Stationarity is not supported by a field rounded to few values.")

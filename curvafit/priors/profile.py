@@ -66,7 +66,9 @@ def phase_field(mask: Bool[Tensor, "*batch z y x"], grid: Grid, epsilon: float) 
 
     The stairs are smoothed away by 1 - (1 - G)² = 2G - G∗G, G a Gaussian of `STAIRS` voxels along each axis. Its second
     moments vanish, so that planes stay exact and a sphere or cylinder of radius R moves by O(σ⁴/R³), not by σ²/R.
-    Voxels whose sign that changed (thin places) are then pulled back, a few times, by a smooth amount.
+    Voxels whose sign that changed (thin places) are then pulled back, a few times, by a smooth amount. What is right is
+    the zero level: across tilted faces, whose voxels overhang, distances are up to a fifth short, about as much as the
+    profiles of generated shapes are wider than tanh.
 
     Raises
     ------
