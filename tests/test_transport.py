@@ -70,7 +70,7 @@ def test_triangle_inequality_on_some() -> None:
 
 
 def test_binning_costs_less_than_stated() -> None:
-    """At most 0.05 at width 2, about what the docstring states; and the bound √½ · spread on the distance to one's binned self."""
+    """At most 0.05 at width 2, and √½ · spread is a bound on the distance to one's binned self."""
     a, b = blob(3, count=2500), blob(4, (24.0, -6.0), 6.0, count=2500)
     fine, coarse = (wasserstein(a, b, bin_width=width) for width in (0.5, 2.0))
     assert abs(fine - coarse) < 0.05
