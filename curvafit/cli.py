@@ -11,11 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from curvafit.cli_data import atlas_app, samples_app
+from curvafit.cli_generate import EXAMPLES, generate, presets
 from curvafit.cli_support import (
     command_line,
-    error_console,
-    flow_progress,
-    numbers,
     output,
     plainly,
     say,
@@ -27,7 +25,6 @@ from curvafit.cli_support import (
 
 if TYPE_CHECKING:
     from curvafit.infer import Inference
-    from curvafit.priors.coefficients import Coefficients
 
 app = typer.Typer(
     help="Shape texture of tubes and membranes in 3D: a scan in, its parameters out; parameters in, shapes out.",
@@ -39,6 +36,8 @@ app = typer.Typer(
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+app.command(epilog=EXAMPLES)(generate)
+app.command()(presets)
 app.add_typer(samples_app, name="samples")
 app.add_typer(atlas_app, name="atlas")
 
@@ -63,94 +62,6 @@ def _options(
     ] = False,
 ) -> None:
     pass
-
-
-# ---- generate --------------------------------------------------------------------------------------------------------
-
-
-@app.command(
-    epilog="[bold]Examples[/bold]\n\n"
-    "curvafit generate --preset tubes -o tubes.nii.gz\n\n"
-    "curvafit generate --coefficients 1,2,6,-40,-40,400 --mass -0.6 --shape 64,64,128 -o tubes.stl\n\n"
-    "curvafit generate --prior bone/fit.json --seed 3 -o more_bone.tif"
-)
-def generate(
-    out: Annotated[
-        Path,
-        typer.Option("-o", "--output", help="Volume (.nii.gz .nii .tif .npy .zarr) or surface (.stl .ply) to write."),
-    ],
-    preset: Annotated[str | None, typer.Option(help="A published shape; see `curvafit presets`.")] = None,
-    coefficients: Annotated[
-        str | None, typer.Option(help="a20,a11,a02,a10,a01,a00 in working units; needs --mass.")
-    ] = None,
-    prior: Annotated[Path | None, typer.Option(help="fit.json of `curvafit infer`.")] = None,
-    mass: Annotated[float | None, typer.Option(help="Mean of the field, in (-1, 1).")] = None,
-    shape: Annotated[str, typer.Option(help="Voxels: N or Z,Y,X.")] = "100",
-    schedule: Annotated[str, typer.Option(help="fast (1000 steps) or paper (8000).")] = "fast",
-    steps: Annotated[int | None, typer.Option(help="Another number of steps.")] = None,
-    seed: Annotated[int, typer.Option(help="Of the noise that the shape grows from.")] = 0,
-) -> None:
-    """Make a shape from parameters, with a picture (.png) and a record (.json) beside it."""
-    with plainly():
-        box = whole_triple(shape, "--shape")
-        law, m0, voxel, unit, origin = _law(preset, coefficients, prior, mass)
-        from curvafit.generation.flow import generate as make
-        from curvafit.generation.schedule import schedule as named
-        from curvafit.priors.grid import Grid
-        from curvafit.shape_files import check_target, shape_record, write_shape
-
-        check_target(out)
-        plan, grid = named(schedule, steps), Grid(box)
-        with flow_progress(plan.steps) as watch:
-            flow = make(law, m0, grid, schedule=plan, seed=seed, callbacks=[watch])
-        if not flow.viability.lowest < 0 < flow.viability.highest:
-            say(f"{flow.status}; nothing was written", to=error_console())
-            raise typer.Exit(1)
-        if not flow.viability.viable:
-            say(f"note: {flow.status}", to=error_console())
-        record = shape_record(flow, law, m0, origin=origin, voxel=voxel, unit=unit, command=command_line())
-        files = write_shape(flow, out, voxel=voxel, unit=unit, record=record)
-        say(f"{flow.status}; {100 * record['volume_fraction']:.1f} % of the volume")
-        for path in files:
-            say(str(path))
-
-
-def _law(
-    preset: str | None, coefficients: str | None, prior: Path | None, mass: float | None
-) -> tuple[Coefficients, float, float, str, str]:
-    """Coefficients, mass, voxel, unit and where they came from: exactly one source is asked for."""
-    given = [value for value in (preset, coefficients, prior) if value is not None]
-    if len(given) != 1:
-        raise ValueError(f"expected one of --preset, --coefficients and --prior, got {len(given)} of them")
-    from curvafit.priors.coefficients import Coefficients
-    from curvafit.priors.coefficients import preset as named
-
-    if preset is not None:
-        found = named(preset)
-        return found.coefficients, found.mass if mass is None else mass, 1.0, "voxel", f"preset {preset}"
-    if prior is not None:
-        from curvafit.fit import read_prior
-        from curvafit.shape_files import prior_voxel
-
-        law, m0 = read_prior(prior)
-        voxel, unit = prior_voxel(prior)
-        return law, m0 if mass is None else mass, voxel, unit, f"prior {prior}"
-    if mass is None:
-        raise ValueError("expected --mass beside --coefficients, got none")
-    return Coefficients(*numbers(coefficients or "", "--coefficients", 6)), mass, 1.0, "voxel", "coefficients"
-
-
-@app.command()
-def presets() -> None:
-    """List the published shapes: coefficients in working units, mass, source."""
-    with plainly():
-        from curvafit.priors.coefficients import NAMES, PRESETS
-
-        rows = [
-            (name, *(f"{value:g}" for value in entry.coefficients.as_dict().values()), f"{entry.mass:g}", entry.source)
-            for name, entry in PRESETS.items()
-        ]
-        output(("name", *NAMES, "mass", "source"), rows, right=range(1, 8))
 
 
 # ---- infer -----------------------------------------------------------------------------------------------------------

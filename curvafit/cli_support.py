@@ -95,6 +95,29 @@ def whole_triple(text: str, option: str) -> tuple[int, int, int]:
     return tuple(int(value) for value in values)  # type: ignore[return-value]
 
 
+def whole_numbers(text: str, option: str) -> tuple[int, ...]:
+    """Some whole numbers from 0."""
+    values = numbers(text, option, text.count(",") + 1)
+    if min(values) < 0 or any(value != int(value) for value in values):
+        raise ValueError(f"expected {option} as whole numbers from 0, got {text!r}")
+    return tuple(int(value) for value in values)
+
+
+def device_of(text: str) -> str:
+    """A device of this machine, as torch names it."""
+    import torch
+
+    try:
+        kind = torch.device(text).type
+    except RuntimeError:
+        kind = ""
+    there = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
+    if not there.get(kind):
+        names = ", ".join(name for name, able in there.items() if able)
+        raise ValueError(f"expected --device to be one of this machine's ({names}), got {text!r}")
+    return text
+
+
 def threshold_of(text: str) -> float | str:
     """A grey level, or `"otsu"`."""
     return text.lower() if text.lower() == "otsu" else numbers(text, "--threshold", 1)[0]

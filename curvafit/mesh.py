@@ -1,11 +1,9 @@
-"""Surfaces of phase fields: extracted by marching cubes, measured, capped, written as STL or PLY."""
+"""Surfaces of phase fields: extracted by marching cubes, capped, measured."""
 
 from __future__ import annotations
 
-import os
-import tempfile
+import math
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from skimage.measure import marching_cubes
@@ -13,8 +11,10 @@ from torch import Tensor
 
 from curvafit.priors.grid import Grid
 
-#: Suffixes that `write_surface` knows.
-SUFFIXES = (".stl", ".ply")
+#: Part of the greatest value by which a capped surface's voxels are moved away from the level.
+LEAST_PART = 5e-4
+#: Greatest relative change that makes voxels of equal values differ: marching cubes leaves holes where a face ties.
+TIE = np.float32(1e-4)
 
 
 class NoSurface(ValueError):
@@ -58,29 +58,68 @@ def surface(u: np.ndarray | Tensor, grid: Grid, level: float = 0.0) -> Surface:
 def capped_surface(u: np.ndarray | Tensor, grid: Grid, level: float = 0.0) -> Surface:
     """The boundary of {u > level} within the box, closed by flat caps on the box's faces; for printing and export.
 
+    It is watertight, and stays so in float32: no vertex comes closer to a voxel's centre than some ten-thousandths of
+    an edge, and none stands twice. The caps of opposite faces of a periodic box are the same, so that copies tile.
+
+    Raises
+    ------
+    ValueError
+        As `surface` does.
+    """
+    values = _checked(u, grid).astype(np.float32) - np.float32(level)
+    if not values.max() > 0:
+        raise NoSurface(f"expected a field that exceeds {level:g}, got none over {float(np.max(u)):g}")
+    values *= 1 + TIE * np.random.default_rng(0).random(values.shape, dtype=np.float32)
+    for axis in range(3):
+        values = _with_walls(values, axis, grid.periodic)
+    values += np.copysign(LEAST_PART * np.abs(values).max(), values)
+    vertices, faces, _, _ = marching_cubes(values, 0.0, gradient_direction="descent")
+    places = [_unpadded(vertices[:, k], n) * h for k, (n, h) in enumerate(zip(grid.shape, grid.spacing, strict=True))]
+    return _welded(Surface(np.stack(places, axis=1), faces.astype(np.int64)))
+
+
+def solid_surface(u: np.ndarray | Tensor, grid: Grid) -> Surface:
+    """The boundary of {u > 0}, closed as `capped_surface` closes it, around the volume of the voxels in {u > 0}.
+
+    Flat triangles cut a curved surface short, by 1 % of the volume of tubes 10 voxels thick. The level is moved by as
+    little as makes up for it, some hundredths of a voxel.
+
     Raises
     ------
     ValueError
         As `surface` does.
     """
     values = _checked(u, grid)
-    padded = np.pad(values, 1, mode="edge")
-    outer = np.ones(padded.shape, dtype=bool)
-    outer[1:-1, 1:-1, 1:-1] = False
-    # The mirrored value puts the crossing half a voxel beyond the last centre: on the box's face.
-    padded[outer] = level - np.abs(padded[outer] - level)
-    found = _march(padded, grid, level)
-    return Surface(found.vertices - np.array(grid.spacing), found.faces)
+    wanted = np.count_nonzero(values > 0) * grid.voxel_volume
+
+    def attempt(level: float) -> tuple[float, Surface]:
+        mesh = capped_surface(values, grid, level)
+        return volume(mesh) - wanted, mesh
+
+    tried = [attempt(0.0)]
+    error, highest = tried[0][0], float(values.max())
+    step = math.copysign(0.01 * highest, error)
+    tried.append(attempt(step))
+    if tried[1][0] != error:
+        level = step * error / (error - tried[1][0])  # where the line through both has its zero
+        tried.append(attempt(min(max(level, -0.1 * highest), 0.1 * highest)))
+    return min(tried, key=lambda each: abs(each[0]))[1]
 
 
 def areas(mesh: Surface) -> np.ndarray:
     """Area of each triangle, `(F,)`, in the grid's unit squared."""
-    return np.linalg.norm(_area_vectors(mesh), axis=1)
+    return np.linalg.norm(area_vectors(mesh), axis=1)
+
+
+def area_vectors(mesh: Surface) -> np.ndarray:
+    """Half the cross product of each triangle's edges, `(F, 3)` in (x, y, z)."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]][:, ::-1] for k in range(3))
+    return np.cross(b - a, c - a) / 2
 
 
 def volume(mesh: Surface) -> float:
     """Volume enclosed by a closed surface, by the divergence theorem, in the grid's unit cubed."""
-    return float((mesh.barycentres[:, ::-1] * _area_vectors(mesh)).sum() / 3)
+    return float((mesh.barycentres[:, ::-1] * area_vectors(mesh)).sum() / 3)
 
 
 def euler_characteristic(mesh: Surface, grid: Grid) -> int:
@@ -95,30 +134,6 @@ def euler_characteristic(mesh: Surface, grid: Grid) -> int:
     faces = faces[(a != b) & (b != c) & (c != a)]
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     return len(np.unique(faces)) - len(np.unique(edges, axis=0)) + len(faces)
-
-
-def write_surface(mesh: Surface, path: str | Path) -> Path:
-    """Write a binary STL or PLY file by suffix, in (x, y, z) order and the grid's unit; whole or not at all.
-
-    Raises
-    ------
-    ValueError
-        If the suffix is neither `.stl` nor `.ply`.
-    """
-    path = Path(path)
-    suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise ValueError(f"expected a surface file ending in {' or '.join(SUFFIXES)}, got {path.name!r}")
-    content = _stl(mesh) if suffix == ".stl" else _ply(mesh)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise
-    return path
 
 
 def _checked(u: np.ndarray | Tensor, grid: Grid) -> np.ndarray:
@@ -138,29 +153,25 @@ def _march(values: np.ndarray, grid: Grid, level: float) -> Surface:
     return Surface(vertices.astype(np.float64), faces.astype(np.int64))
 
 
-def _area_vectors(mesh: Surface) -> np.ndarray:
-    """Half the cross product of each triangle's edges, `(F, 3)` in (x, y, z)."""
-    a, b, c = (mesh.vertices[mesh.faces[:, k]][:, ::-1] for k in range(3))
-    return np.cross(b - a, c - a) / 2
+def _with_walls(values: np.ndarray, axis: int, periodic: bool) -> np.ndarray:
+    """Two layers more on both sides of an axis: the field on the box's face, and the outside right beyond it."""
+    first, last = np.take(values, [0], axis), np.take(values, [-1], axis)
+    if periodic:
+        first = last = (first + last) / 2
+    outside = np.full_like(first, -np.abs(values).max())
+    return np.concatenate([outside, first, values, last, outside], axis)
 
 
-def _stl(mesh: Surface) -> bytes:
-    vectors = _area_vectors(mesh)
-    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
-    record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-    triangles = np.zeros(len(mesh.faces), dtype=record)
-    triangles["normal"] = vectors / np.where(lengths > 0, lengths, 1)
-    triangles["corners"] = mesh.vertices[mesh.faces][:, :, ::-1]
-    header = b"curvafit surface, x y z".ljust(80)
-    return header + np.uint32(len(triangles)).astype("<u4").tobytes() + triangles.tobytes()
+def _unpadded(index: np.ndarray, count: int) -> np.ndarray:
+    """Positions in a padded axis in voxels of the unpadded one: both layers of a side are on the box's face."""
+    inner = np.arange(count, dtype=np.float64)
+    knots = np.concatenate([[-0.5, -0.5], inner, [count - 0.5, count - 0.5]])
+    return np.interp(index, np.arange(count + 4), knots)
 
 
-def _ply(mesh: Surface) -> bytes:
-    header = (
-        "ply\nformat binary_little_endian 1.0\ncomment curvafit surface\n"
-        f"element vertex {len(mesh.vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
-        f"element face {len(mesh.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    faces = np.zeros(len(mesh.faces), dtype=[("count", "u1"), ("corners", "<i4", 3)])
-    faces["count"], faces["corners"] = 3, mesh.faces
-    return header.encode() + mesh.vertices[:, ::-1].astype("<f4").tobytes() + faces.tobytes()
+def _welded(mesh: Surface) -> Surface:
+    """Vertices of one place as one, without the triangles that this closes."""
+    vertices, index = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    faces = index.reshape(-1)[mesh.faces]
+    a, b, c = faces.T
+    return Surface(vertices, faces[(a != b) & (b != c) & (c != a)])

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from curvafit.formats import READERS, WRITERS, Raw, ScanError, normalise_unit, pick_reader
+from curvafit.formats import READERS, WRITERS, Raw, ScanError, normalise_unit, pick_reader, pick_writer
 
-__all__ = ["READABLE", "WRITABLE", "Field", "ScanError", "load", "save", "write_atomically"]
+__all__ = ["READABLE", "WRITABLE", "Field", "ScanError", "load", "move_into_place", "save", "write_atomically"]
 
 #: Suffixes that `load` and `save` know.
 READABLE = tuple(READERS)
@@ -115,37 +115,45 @@ def load(
 
 
 def save(field: Field, path: str | os.PathLike[str]) -> Path:
-    """Write a field as NIfTI, TIFF, NPY or Zarr, by suffix; a file of that name is replaced once the new one is whole.
+    """Write a field as NIfTI, TIFF, NPY, MRC or Zarr, by suffix; a file of that name is replaced once the new one is
+    whole.
 
-    NIfTI keeps the affine (qform and sform) and the unit, TIFF (ImageJ's or OME's metadata) and Zarr (attributes)
-    spacing and unit, NPY the values only.
+    NIfTI keeps the affine (qform and sform) and the unit; TIFF (ImageJ's or OME's metadata), MRC (in Å) and Zarr
+    (OME-NGFF 0.5, with halved copies of a large volume) spacing and unit; NPY the values only.
 
     Raises
     ------
     ScanError
-        If the suffix is unknown or the format cannot hold the values' type.
+        If the suffix is unknown, the format cannot hold the values' type, or it needs a unit and there is none.
     """
     target = Path(path)
-    writer = next((write for suffix, write in WRITERS.items() if target.name.lower().endswith(suffix)), None)
-    if writer is None:
-        raise ScanError(f"expected a name ending in one of {', '.join(WRITABLE)}, got {target.name!r}")
+    writer = pick_writer(target, field.unit)
     return write_atomically(target, lambda temporary: writer(field, temporary))
 
 
 def write_atomically(target: Path, write: Callable[[Path], None]) -> Path:
     """Call `write` with a temporary name beside `target` (same suffix), then move what it made to `target`."""
     target.parent.mkdir(parents=True, exist_ok=True)
-    mark = uuid.uuid4().hex[:8]
-    temporary = target.with_name(f".{mark}.{target.name}")
-    aside = target.with_name(f".{mark}.old.{target.name}")
+    temporary = target.with_name(f".{uuid.uuid4().hex[:8]}.{target.name}")
     try:
         write(temporary)
-        if target.is_dir():
-            os.replace(target, aside)
-        os.replace(temporary, target)
+        return move_into_place(temporary, target)
     finally:
         _remove(temporary)
-        _remove(aside)
+
+
+def move_into_place(made: Path, target: Path) -> Path:
+    """Rename a finished file or folder to `target`, on the same disk; what stood there goes once the new one is in."""
+    aside = target.with_name(f".{uuid.uuid4().hex[:8]}.old.{target.name}")
+    if target.is_dir():
+        os.replace(target, aside)
+    try:
+        os.replace(made, target)
+    except OSError:
+        if aside.exists():
+            os.replace(aside, target)
+        raise
+    _remove(aside)
     return target
 
 

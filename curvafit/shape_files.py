@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
 import json
 import os
@@ -12,35 +13,78 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from scipy.ndimage import map_coordinates
+from torch import Tensor
 
+from curvafit.formats import normalise_unit, pick_writer
 from curvafit.generation.flow import Flow
-from curvafit.mesh import SUFFIXES, capped_surface, write_surface
+from curvafit.mesh import Surface, solid_surface, surface
+from curvafit.mesh_files import SUFFIXES, write_surface
 from curvafit.plot import surface_picture
-from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.grid import WORKING_EPSILON, Grid
-from curvafit.scan import WRITABLE, Field, save
+from curvafit.priors.coefficients import NAMES, Coefficients
+from curvafit.priors.curvature import geometric_curvatures, jet
+from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
+from curvafit.priors.profile import profile_distance
+from curvafit.scan import WRITABLE, Field, move_into_place, save
 
 #: What a record beside a shape says that it is.
 FORMAT = "curvafit-shape-1"
 
 
-def check_target(path: str | Path) -> Path:
+@dataclasses.dataclass(frozen=True)
+class Output:
+    """How a field becomes a file.
+
+    Parameters
+    ----------
+    voxel, unit
+        Edge of a voxel, for spacing or vertices.
+    tile
+        How often the box is repeated along z, y, x; for periodic boxes.
+    cap
+        Whether a surface is closed on the box's faces (then watertight, around the volume of {u > 0}) or open there.
+
+    Raises
+    ------
+    ValueError
+        If the unit has no known name, the voxel is not positive or a repeat is under 1.
+    """
+
+    voxel: float = 1.0
+    unit: str = "voxel"
+    tile: tuple[int, int, int] = (1, 1, 1)
+    cap: bool = True
+
+    def __post_init__(self) -> None:
+        unit, factor = normalise_unit(self.unit)
+        object.__setattr__(self, "unit", unit)
+        object.__setattr__(self, "voxel", float(self.voxel) * factor)
+        if not 0 < self.voxel < float("inf"):
+            raise ValueError(f"expected a positive voxel edge, got {self.voxel}")
+        if len(self.tile) != 3 or any(int(n) != n or n < 1 for n in self.tile):
+            raise ValueError(f"expected 3 whole repeats of at least 1 (z, y, x), got {self.tile}")
+
+
+def check_target(path: str | Path, output: Output | None = None) -> Path:
     """The path, if a shape can be written there by its suffix; asked before the work is done.
 
     Raises
     ------
     ValueError
-        If the suffix is neither a volume's nor a surface's, the place cannot be written to, or another file
-        stands where the record goes.
+        If the suffix is neither a volume's nor a surface's, its format cannot hold the output's unit, the place cannot
+        be written to, or another file stands where the record goes.
     """
     target = Path(path)
     known = (*WRITABLE, *SUFFIXES)
     if not target.name.lower().endswith(known):
         raise ValueError(f"expected a name ending in one of {', '.join(known)}, got {target.name!r}")
+    if not target.name.lower().endswith(SUFFIXES):
+        pick_writer(target, (output or Output()).unit)
     if target.is_dir() and not target.name.lower().endswith(".zarr"):
         raise ValueError(f"expected the name of a file, got the folder {target}")
     check_folder(target.parent)
-    note = _beside(target, ".json")
+    note = beside(target, ".json")
     if note.exists() and FORMAT not in note.read_text(encoding="utf-8", errors="replace")[:200]:
         raise ValueError(f"expected a name whose record {note.name} is not another file's, got {target.name!r}")
     return target
@@ -63,13 +107,17 @@ def check_folder(path: str | Path) -> Path:
     return folder
 
 
-def stem(path: str | Path) -> Path:
-    """The path without its suffix, `.nii.gz` included."""
+def beside(path: str | Path, ending: str) -> Path:
+    """The path with another ending than its suffix; `.nii.gz` counts as one."""
     target = Path(path)
-    suffix = max(
-        (known for known in (*WRITABLE, *SUFFIXES) if target.name.lower().endswith(known)), key=len, default=""
-    )
-    return target.with_name(target.name[: len(target.name) - len(suffix)])
+    known = [each for each in (*WRITABLE, *SUFFIXES) if target.name.lower().endswith(each)]
+    return target.with_name(target.name[: len(target.name) - max(map(len, known), default=0)] + ending)
+
+
+def step_path(path: str | Path, step: int) -> Path:
+    """Where a snapshot goes: `tubes_step00100.nii.gz` beside `tubes.nii.gz`."""
+    suffix = Path(path).name.removeprefix(beside(path, "").name)
+    return beside(path, f"_step{step:05d}{suffix}")
 
 
 def prior_voxel(path: str | Path) -> tuple[float, str]:
@@ -82,19 +130,14 @@ def prior_voxel(path: str | Path) -> tuple[float, str]:
 
 
 def write_shape(
-    flow: Flow,
-    path: str | Path,
-    *,
-    voxel: float = 1.0,
-    unit: str = "voxel",
-    record: dict[str, Any] | None = None,
+    flow: Flow, path: str | Path, *, output: Output | None = None, record: dict[str, Any] | None = None
 ) -> tuple[Path, Path, Path]:
-    """Write a flow's field (a volume) or its closed surface (STL, PLY), by suffix, with a picture and a record.
+    """Write a flow's field as a volume or a surface, by suffix, with a picture of one box and a record.
 
     Parameters
     ----------
-    voxel, unit
-        Edge of a voxel, for spacing or vertices.
+    output
+        See `Output`.
     record
         What to write into the JSON beside it; see `shape_record`.
 
@@ -105,41 +148,75 @@ def write_shape(
     Raises
     ------
     ValueError
-        If the suffix is unknown, or the field has no surface.
+        If the suffix is unknown, the field has no surface, or a box that is not periodic is to be repeated.
     """
-    target = check_target(path)
-    u, spacing = flow.field.numpy(), (voxel, voxel, voxel)
+    target = check_target(path, output)
     target.parent.mkdir(parents=True, exist_ok=True)
     work = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
     try:
-        made = work / target.name
-        if target.name.lower().endswith(SUFFIXES):
-            write_surface(capped_surface(u, Grid(u.shape, spacing, "periodic")), made)
-        else:
-            save(Field(u, spacing, unit), made)
-        picture, note = _beside(made, ".png"), _beside(made, ".json")
-        surface_picture(u, picture)
+        made = write_field(flow.field, flow.grid, work / target.name, output)
+        picture, note = beside(made, ".png"), beside(made, ".json")
+        surface_picture(flow.field.numpy(), picture)
         note.write_text(json.dumps(record or {}, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-        return tuple(_moved(part, target.parent) for part in (made, picture, note))  # type: ignore[return-value]
+        parts = (made, picture, note)
+        return tuple(move_into_place(part, target.parent / part.name) for part in parts)  # type: ignore[return-value]
     finally:
         shutil.rmtree(work, ignore_errors=True)
 
 
-def shape_record(flow: Flow, coefficients: Coefficients, mass: float, **more: Any) -> dict[str, Any]:
-    """What is needed to make the shape again: parameters, sampling, seed, schedule, versions; and how it ended."""
+def write_field(field: Tensor, grid: Grid, path: str | Path, output: Output | None = None) -> Path:
+    """Write a field `(Z, Y, X)` as a volume or a surface, by suffix, without picture and record.
+
+    A VTP surface bears its level set's principal curvatures `kappa1` and `kappa2` at the vertices, 0 on caps.
+
+    Raises
+    ------
+    ValueError
+        As `write_shape` does.
+    """
+    target, how = Path(path), output or Output()
+    if not grid.periodic and how.tile != (1, 1, 1):
+        raise ValueError(f"expected a periodic box to repeat, got boundary {grid.boundary!r}")
+    values, edges = np.tile(field.numpy(), how.tile), (how.voxel, how.voxel, how.voxel)
+    if not target.name.lower().endswith(SUFFIXES):
+        return save(Field(values, edges, how.unit), target)
+    box = Grid(values.shape, edges, grid.boundary)
+    mesh = solid_surface(values, box) if how.cap else surface(values, box)
+    data = None
+    if target.suffix.lower() == ".vtp":
+        data = _vertex_curvatures(mesh, field, Grid(grid.shape, edges, grid.boundary))
+        on_caps = how.cap & _on_faces(mesh, box)
+        data = {name: np.where(on_caps, 0, κ) for name, κ in data.items()}
+    return write_surface(mesh, target, unit=how.unit, data=data)
+
+
+def shape_record(
+    flow: Flow,
+    coefficients: Coefficients,
+    mass: float | Tensor,
+    *,
+    epsilon: float | Tensor = WORKING_EPSILON,
+    output: Output | None = None,
+    **more: Any,
+) -> dict[str, Any]:
+    """What is needed to make the shape again: parameters, sampling, seed, schedule, versions; and how it ended.
+
+    A parameter that varies in space is stated by its least and greatest value.
+    """
     return {
         "format": FORMAT,
-        "coefficients": coefficients.as_dict(),
-        "mass": mass,
+        "coefficients": dict(zip(NAMES, map(_stated, coefficients), strict=True)),
+        "mass": _stated(mass),
         "shape": list(flow.grid.shape),
         "spacing": list(flow.grid.spacing),
-        "epsilon": WORKING_EPSILON,
+        "epsilon": _stated(epsilon),
         "boundary": flow.grid.boundary,
         "seed": flow.seed,
         "schedule": {"name": flow.schedule.name, "steps": flow.schedule.steps},
         "status": flow.status,
         "viable": flow.viability.viable,
         "volume_fraction": float(np.mean(flow.field.numpy() > 0)),
+        **dataclasses.asdict(output or Output()),
         **more,
         "curvafit": version("curvafit"),
         "torch": version("torch"),
@@ -147,16 +224,26 @@ def shape_record(flow: Flow, coefficients: Coefficients, mass: float, **more: An
     }
 
 
-def _beside(target: Path, suffix: str) -> Path:
-    """The path with another suffix; `.nii.gz` counts as one."""
-    known = [each for each in (*WRITABLE, *SUFFIXES) if target.name.lower().endswith(each)]
-    return target.with_name(target.name[: -max(map(len, known))] + suffix)
+def _stated(value: float | Tensor) -> float | dict[str, float]:
+    """A number, or the range of a map."""
+    if not isinstance(value, Tensor) or value.numel() == 1:
+        return float(value)
+    return {"least": float(value.min()), "greatest": float(value.max())}
 
 
-def _moved(part: Path, folder: Path) -> Path:
-    """Put a finished file (or Zarr folder) in its place."""
-    target = folder / part.name
-    if target.is_dir():
-        shutil.rmtree(target)
-    os.replace(part, target)
-    return target
+def _vertex_curvatures(mesh: Surface, field: Tensor, grid: Grid) -> dict[str, np.ndarray]:
+    """κ1, κ2 `(V,)` of the level sets of a field, linearly between its voxels; a periodic one repeats."""
+    ε = WORKING_EPSILON / WORKING_SPACING * grid.spacing[0]
+    κ1, κ2, _, _ = geometric_curvatures(jet(profile_distance(field, ε), grid))
+    places = (mesh.vertices / np.array(grid.spacing)).T
+    beyond, sharpest = "grid-wrap" if grid.periodic else "nearest", 1 / grid.spacing[0]
+    known = {"kappa1": κ1, "kappa2": κ2}
+    known = {name: torch.nan_to_num(κ).clamp(-sharpest, sharpest).numpy() for name, κ in known.items()}
+    return {name: map_coordinates(κ, places, order=1, mode=beyond) for name, κ in known.items()}
+
+
+def _on_faces(mesh: Surface, box: Grid) -> np.ndarray:
+    """Which vertices are on the box's faces, half a voxel beyond the outermost centres, `(V,)`."""
+    middle = (np.array(box.shape) - 1) / 2
+    reach = np.abs(mesh.vertices / np.array(box.spacing) - middle)
+    return np.any(reach > middle + 0.5 - 1e-6, axis=1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import json
 import re
 import subprocess
 import sys
@@ -12,27 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from found import made_fit, made_inference, without_drawing
-from typer.testing import CliRunner, Result
+from calling import QUICK, call, refused
+from found import made_inference, without_drawing
+from typer.testing import Result
 
-from curvafit.cli import app
-from curvafit.scan import Field, load, save
-
-LAW = ["--coefficients", "1,2,6,-40,-40,400", "--mass", "-0.6"]
-QUICK = [*LAW, "--shape", "24", "--steps", "30"]
-
-
-def call(*arguments: object) -> Result:
-    return CliRunner().invoke(app, [str(part) for part in arguments])
-
-
-def refused(result: Result, said: str) -> None:
-    """One sentence on the error stream, nothing on the other, exit code 2."""
-    assert result.exit_code == 2, (result.output, result.exception)
-    assert result.stdout == ""
-    lines = result.stderr.strip().splitlines()
-    assert len(lines) == 1 and lines[0].startswith("error: ") and said in lines[0], lines
-
+from curvafit.scan import Field, save
 
 # ---- help ------------------------------------------------------------------------------------------------------------
 
@@ -70,78 +53,6 @@ def test_samples_are_listed_with_their_licences() -> None:
     result = call("samples")
     assert result.exit_code == 0 and re.search(r"^bone .* MIT ", result.stdout, re.MULTILINE)
     refused(call("samples", "get", "nothing"), "expected a sample named bone")
-
-
-# ---- generate --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
-def test_generate_writes_a_field_a_picture_and_a_record(tmp_path: Path) -> None:
-    target = tmp_path / "new" / "tubes.nii.gz"
-    result = call("generate", *QUICK, "--seed", 7, "-o", target)
-    assert result.exit_code == 0, (result.output, result.exception)
-    assert sorted(path.name for path in target.parent.iterdir()) == ["tubes.json", "tubes.nii.gz", "tubes.png"]
-    record = json.loads((target.parent / "tubes.json").read_text())
-    assert list(record["coefficients"].values()) == [1, 2, 6, -40, -40, 400]
-    assert (record["mass"], record["seed"], record["schedule"]) == (-0.6, 7, {"name": "fast", "steps": 30})
-    field = load(target)
-    assert field.shape == (24, 24, 24) and field.unit == "voxel"
-    assert field.values.mean() == pytest.approx(-0.6, abs=1e-5)
-    assert str(target) in result.stdout
-
-
-@pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
-def test_generate_writes_a_surface_in_the_prior_s_unit(tmp_path: Path) -> None:
-    prior = tmp_path / "fit.json"
-    prior.write_text(made_fit().to_json())
-    target = tmp_path / "more.ply"
-    result = call("generate", "--prior", prior, "--mass", "-0.4", "--shape", "16,20,24", "--steps", 30, "-o", target)
-    assert result.exit_code == 0, (result.output, result.exception)
-    record = json.loads((tmp_path / "more.json").read_text())
-    assert record["coefficients"] == made_fit().coefficients.as_dict()
-    assert (record["mass"], record["shape"], record["voxel"], record["unit"]) == (-0.4, [16, 20, 24], 0.0195, "mm")
-    assert target.read_bytes().startswith(b"ply\nformat binary_little_endian")
-    again = call("generate", "--prior", prior, "--shape", "16", "--steps", 30, "-o", tmp_path / "fit.npy")
-    refused(again, "record fit.json is not another file's")
-    assert prior.read_text() == made_fit().to_json()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        ([], "expected one of --preset, --coefficients and --prior, got 0"),
-        (["--preset", "tubes", *LAW], "got 2"),
-        (["--preset", "tube"], "expected a preset among bilayers"),
-        (["--coefficients", "1,2,6,-40,-40,400"], "expected --mass"),
-        (["--coefficients", "1,2,6", "--mass", "-0.6"], "expected --coefficients as 6 numbers"),
-        (["--coefficients", "1,2,6,-40,nan,400", "--mass", "0"], "expected --coefficients as 6 numbers"),
-        ([*LAW, "--mass", "-1.5"], "expected a mass in (-1, 1)"),
-        ([*LAW, "--shape", "10,10"], "expected --shape as 3 numbers"),
-        ([*LAW, "--shape", "10.5"], "expected --shape as whole numbers"),
-        ([*LAW, "--shape", "2"], "at least 4"),
-        ([*LAW, "--shape", "-8"], "expected --shape as positive numbers"),
-        ([*LAW, "--schedule", "slow"], "expected a schedule among paper, fast"),
-        ([*LAW, "--steps", "0"], "expected a whole number of steps"),
-        (["--prior", "nowhere.json"], "expected a fit.json, found no file"),
-    ],
-)
-def test_generate_refuses_in_one_sentence(tmp_path: Path, arguments: list[str], said: str) -> None:
-    refused(call("generate", *arguments, "-o", tmp_path / "out.npy"), said)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_generate_refuses_a_place_before_it_works(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("mine")
-    refused(call("generate", *QUICK, "-o", tmp_path / "out.xyz"), "expected a name ending in one of")
-    refused(call("generate", *QUICK, "-o", tmp_path / "file" / "out.npy"), "is a file")
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]
-
-
-def test_generate_refuses_a_prior_of_another_kind(tmp_path: Path) -> None:
-    prior = tmp_path / "other.json"
-    for content, said in (("{}", "expected a fit.json"), ("[1", "expected a fit.json"), ('{"format": "x"}', "format")):
-        prior.write_text(content)
-        refused(call("generate", "--prior", prior, "-o", tmp_path / "out.npy"), said)
 
 
 def test_an_option_that_does_not_parse_exits_with_2(tmp_path: Path) -> None:

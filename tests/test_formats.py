@@ -225,6 +225,27 @@ def test_mrc_is_in_nanometres(tmp_path: Path) -> None:
     assert field.spacing == pytest.approx((3, 2, 1))
 
 
+@pytest.mark.parametrize("dtype", ["bool", "uint8", "int16", "uint16", "float32", "float64"])
+def test_mrc_is_written_in_angstrom(tmp_path: Path, dtype: str) -> None:
+    mrcfile = pytest.importorskip("mrcfile")
+    path = save(Field(ramp(dtype=dtype), (0.03, 0.02, 0.01), "um"), tmp_path / "scan.mrc")
+    assert mrcfile.validate(path)
+    with mrcfile.open(path) as file:
+        assert file.is_volume() or file.header.nz == 4
+        assert (file.voxel_size.x, file.voxel_size.y, file.voxel_size.z) == pytest.approx((100, 200, 300))
+    back = load(path)
+    assert np.array_equal(back.values, ramp(dtype=dtype))
+    assert back.unit == "nm" and back.spacing == pytest.approx((30, 20, 10))
+
+
+def test_mrc_needs_a_unit_and_a_type_it_has(tmp_path: Path) -> None:
+    with pytest.raises(ScanError, match="expected a unit of nm, um, mm or m for an MRC file"):
+        save(Field(ramp()), tmp_path / "scan.mrc")
+    with pytest.raises(ScanError, match="expected whole numbers of at most 16 bits or floats .*, got int32"):
+        save(Field(ramp(dtype="int32"), 1.0, "nm"), tmp_path / "scan.mrc")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_dicom_slices_are_ordered_by_position(tmp_path: Path) -> None:
     pydicom = pytest.importorskip("pydicom")
     for number in (0, 1, 2, 3):

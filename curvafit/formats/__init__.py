@@ -6,13 +6,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from curvafit.formats.arrays import read_hdf5, read_npy, read_npz, read_raw, read_zarr, write_npy, write_zarr
+from curvafit.formats.arrays import read_hdf5, read_npy, read_npz, read_raw, write_npy
 from curvafit.formats.base import Raw, ScanError, normalise_unit
-from curvafit.formats.medical import is_dicom, read_dicom, read_itk, read_mrc, read_nrrd
+from curvafit.formats.medical import check_mrc, is_dicom, read_dicom, read_itk, read_mrc, read_nrrd, write_mrc
+from curvafit.formats.ngff import read_zarr, write_zarr
 from curvafit.formats.nifti import read_nifti, write_nifti
 from curvafit.formats.tiff import SLICES, read_slices, read_tiff, write_tiff
 
-__all__ = ["READERS", "WRITERS", "Raw", "ScanError", "normalise_unit", "pick_reader"]
+__all__ = ["READERS", "WRITERS", "Raw", "ScanError", "normalise_unit", "pick_reader", "pick_writer"]
 
 #: Suffix -> reader(path, key=, raw_shape=, dtype=).
 READERS: dict[str, Callable[..., Raw]] = {
@@ -37,6 +38,7 @@ WRITERS: dict[str, Callable[[Any, Path], None]] = {
     ".tif": write_tiff,
     ".tiff": write_tiff,
     ".npy": write_npy,
+    ".mrc": write_mrc,
     ".zarr": write_zarr,
 }
 
@@ -57,6 +59,22 @@ def pick_reader(path: Path, shape_given: bool = False) -> Callable[..., Raw]:
     if shape_given:
         return read_raw
     raise ScanError(f"expected a file ending in one of {', '.join(READERS)}, got {path.name!r}")
+
+
+def pick_writer(path: Path, unit: str) -> Callable[[Any, Path], None]:
+    """The writer of a file by its suffix, if it can hold lengths in `unit`.
+
+    Raises
+    ------
+    ScanError
+        If the suffix is unknown, the format needs a unit and there is none, or its library is not installed.
+    """
+    suffix = next((known for known in WRITERS if path.name.lower().endswith(known)), None)
+    if suffix is None:
+        raise ScanError(f"expected a name ending in one of {', '.join(WRITERS)}, got {path.name!r}")
+    if suffix == ".mrc":
+        check_mrc(unit)
+    return WRITERS[suffix]
 
 
 def _pick_folder(path: Path) -> Callable[..., Raw]:

@@ -1,17 +1,16 @@
-"""NPY, NPZ, HDF5, RAW and Zarr."""
+"""NPY, NPZ, HDF5 and RAW."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
-import zarr
 
-from curvafit.formats.base import Raw, ScanError, pick_key
+from curvafit.formats.base import Raw, ScanError, pick_key, stated
 
 _RAW_TYPES = "uint8, int8, uint16, int16, uint32, int32, float32, float64 (or with > for big-endian, as in >u2)"
 
@@ -36,7 +35,7 @@ def read_hdf5(path: Path, *, key: str | None = None, **_: object) -> Raw:
         keys: list[str] = []
         file.visititems(lambda name, item: keys.append(name) if isinstance(item, h5py.Dataset) else None)
         dataset: Any = file[pick_key(keys, key, path)]
-        spacing, unit = _stated(dict(dataset.attrs), dataset.ndim)
+        spacing, unit = stated(dict(dataset.attrs), dataset.ndim)
         return Raw(dataset[()], spacing, unit)
 
 
@@ -58,58 +57,3 @@ def read_raw(path: Path, *, raw_shape: Sequence[int] | None = None, dtype: str |
         wanted = math.prod(shape) * kind.itemsize
         raise ScanError(f"expected {wanted} bytes for shape {shape} of {kind}, got {size} in {path}")
     return Raw(np.fromfile(path, dtype=kind).reshape(shape))
-
-
-def read_zarr(path: Path, *, key: str | None = None, **_: object) -> Raw:
-    """An array, or one of a group; spacing and unit from its attributes or from OME-Zarr's multiscales."""
-    node: Any = zarr.open(path, mode="r")
-    if isinstance(node, zarr.Array):
-        spacing, unit = _stated(node.attrs.asdict(), node.ndim)
-        return Raw(np.asarray(node[...]), spacing, unit)
-    arrays = _zarr_arrays(node)
-    attributes = node.attrs.asdict()
-    scales = _multiscales(attributes)
-    if key is None and scales:
-        key = next(iter(scales))
-    name = pick_key(sorted(arrays), key, path)
-    array = arrays[name]
-    spacing, unit = scales.get(name) or _stated({**attributes, **array.attrs.asdict()}, array.ndim)
-    return Raw(np.asarray(array[...]), spacing, unit)
-
-
-def write_zarr(field: Any, path: Path) -> None:
-    chunks = tuple(min(64, n) for n in field.values.shape)
-    array = zarr.create_array(path, shape=field.values.shape, chunks=chunks, dtype=field.values.dtype)
-    array[...] = field.values
-    array.attrs.update({"spacing": list(field.spacing), "unit": field.unit, "axes": "zyx"})
-
-
-def _zarr_arrays(group: Any, prefix: str = "") -> dict[str, Any]:
-    found = {prefix + name: array for name, array in group.arrays()}
-    for name, inner in group.groups():
-        found.update(_zarr_arrays(inner, f"{prefix}{name}/"))
-    return found
-
-
-def _stated(attributes: Mapping[str, Any], ndim: int) -> tuple[tuple[float, ...] | None, str | None]:
-    """Spacing and unit of an array's attributes; one number counts for all axes."""
-    for name, known in (("element_size_um", "um"), ("spacing", None), ("voxel_size", None)):
-        if name in attributes:
-            sizes = np.atleast_1d(np.asarray(attributes[name], dtype=np.float64))
-            unit = known or attributes.get("unit", attributes.get("units"))
-            unit = unit.decode() if isinstance(unit, bytes) else unit
-            return tuple(float(h) for h in (np.repeat(sizes, ndim) if sizes.size == 1 else sizes)), unit
-    return None, None
-
-
-def _multiscales(attributes: Mapping[str, Any]) -> dict[str, tuple[tuple[float, ...] | None, str | None]]:
-    """OME-Zarr: path of each level -> (scale of its axes, unit of the last one)."""
-    described = attributes.get("ome", attributes).get("multiscales") or []
-    found: dict[str, tuple[tuple[float, ...] | None, str | None]] = {}
-    for image in described[:1]:
-        axes = [axis if isinstance(axis, dict) else {"name": axis} for axis in image.get("axes", [])]
-        unit = axes[-1].get("unit") if axes else None
-        for level in image.get("datasets", []):
-            scales = [t["scale"] for t in level.get("coordinateTransformations", []) if t.get("type") == "scale"]
-            found[level["path"]] = (tuple(float(h) for h in scales[0]) if scales else None, unit)
-    return found

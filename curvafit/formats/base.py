@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -78,6 +79,17 @@ def pick_key(keys: list[str], key: str | None, path: object) -> str:
     if found not in keys:
         raise ScanError(f"expected a key of {path}, got {key!r}, and it has {listed or 'no arrays'}")
     return found
+
+
+def stated(attributes: Mapping[str, Any], ndim: int) -> tuple[tuple[float, ...] | None, str | None]:
+    """Spacing and unit of an array's attributes; one number counts for all axes."""
+    for name, known in (("element_size_um", "um"), ("spacing", None), ("voxel_size", None)):
+        if name in attributes:
+            sizes = np.atleast_1d(np.asarray(attributes[name], dtype=np.float64))
+            unit = known or attributes.get("unit", attributes.get("units"))
+            unit = unit.decode() if isinstance(unit, bytes) else unit
+            return tuple(float(h) for h in (np.repeat(sizes, ndim) if sizes.size == 1 else sizes)), unit
+    return None, None
 
 
 def extra(module: str, what: str) -> Any:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.formats.base import Raw, ScanError, extra, pick_key
+from curvafit.formats.base import Raw, ScanError, convert_length, extra, pick_key
 
 #: From DICOM's and ITK's patient frame (left, posterior, superior) to NIfTI's (right, anterior, superior).
 _LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -54,6 +54,24 @@ def read_mrc(path: Path, **_: object) -> Raw:
         size = file.voxel_size
         spacing = (float(size.z), float(size.y), float(size.x))
         return Raw(np.array(file.data), spacing if min(spacing) > 0 else None, "angstrom")
+
+
+def check_mrc(unit: str) -> None:
+    """Refuse what `write_mrc` cannot write: lengths without a unit, or anything where its library is missing."""
+    extra("mrcfile", "MRC files")
+    if unit == "voxel":
+        raise ScanError("expected a unit of nm, um, mm or m for an MRC file, which holds voxel sizes in Å, got none")
+
+
+def write_mrc(field: Any, path: Path) -> None:
+    """The volume with its voxel sizes in Å; float64 becomes float32, bool int8 and uint8 uint16."""
+    check_mrc(field.unit)
+    kept = {"bool": "int8", "float64": "float32", "uint8": "uint16"}.get(field.values.dtype.name)
+    values = field.values if kept is None else field.values.astype(kept)
+    if values.dtype.name not in ("int8", "int16", "uint16", "float16", "float32"):
+        raise ScanError(f"expected whole numbers of at most 16 bits or floats for an MRC file, got {values.dtype}")
+    with extra("mrcfile", "MRC files").new(path, values, overwrite=True) as file:
+        file.voxel_size = tuple(convert_length(h, field.unit, "angstrom") for h in field.spacing[::-1])
 
 
 def read_dicom(path: Path, *, key: str | None = None, **_: object) -> Raw:

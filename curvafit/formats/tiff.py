@@ -17,6 +17,8 @@ from curvafit.formats.base import Raw, ScanError, convert_length, normalise_unit
 
 #: Suffixes of a folder's slices.
 SLICES = (".tif", ".tiff")
+#: Bytes beyond which ImageJ's TIFF cannot point.
+_IMAGEJ_LIMIT = 2**32 - 2**25
 _TAG_UNITS = {2: "inch", 3: "cm"}
 #: Resolutions that programs write when they know none (dots an inch; 25.4 is a dot a millimetre).
 _SCREEN = (1, 25.4, 72, 96, 100, 150, 200, 300, 600)
@@ -52,10 +54,10 @@ def read_slices(path: Path, **_: object) -> Raw:
 
 
 def write_tiff(field: Any, path: Path) -> None:
-    """ImageJ's metadata where it knows the type of the values, else OME's."""
+    """ImageJ's metadata where it knows the type of the values and can hold as many, else OME's."""
     values = field.values.view(np.uint8) if field.values.dtype == bool else field.values
     z, y, x = field.spacing
-    if values.dtype in (np.uint8, np.uint16, np.float32):
+    if values.dtype in (np.uint8, np.uint16, np.float32) and values.nbytes < _IMAGEJ_LIMIT:
         exact = {"curvafit_spacing": f"{z!r},{y!r},{x!r}", "curvafit_unit": field.unit}
         unit = {"um": "micron", "voxel": "pixel"}.get(field.unit, field.unit)
         metadata = {"axes": "ZYX", "spacing": z, "unit": unit, **exact}

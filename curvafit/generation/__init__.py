@@ -9,16 +9,20 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from curvafit.generation.flow import Flow, History, State, generate, relax
+    from curvafit.generation.batch import generate_batch
+    from curvafit.generation.flow import descend, generate, relax
     from curvafit.generation.initial import white_noise
+    from curvafit.generation.result import Flow, History, State
     from curvafit.generation.schedule import SCHEDULES, Schedule
     from curvafit.generation.viability import Viability
 
 _HOMES = {
-    "Flow": "flow",
-    "History": "flow",
-    "State": "flow",
+    "Flow": "result",
+    "History": "result",
+    "State": "result",
+    "descend": "flow",
     "generate": "flow",
+    "generate_batch": "batch",
     "relax": "flow",
     "white_noise": "initial",
     "SCHEDULES": "schedule",
@@ -26,7 +30,19 @@ _HOMES = {
     "Viability": "viability",
 }
 
-__all__ = ["SCHEDULES", "Flow", "History", "Schedule", "State", "Viability", "generate", "relax", "white_noise"]
+__all__ = [
+    "SCHEDULES",
+    "Flow",
+    "History",
+    "Schedule",
+    "State",
+    "Viability",
+    "descend",
+    "generate",
+    "generate_batch",
+    "relax",
+    "white_noise",
+]
 
 
 def __getattr__(name: str) -> Any:

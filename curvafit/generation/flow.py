@@ -1,93 +1,52 @@
-"""The H⁻¹ flow of Algorithm 1: Adam on A, u = k ∗ (div A + base). One loop, two ways to make a step."""
+"""The flows of the paper: from noise at constant mass (Algorithm 1), and from a field (Algorithm 2 and others)."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal, Protocol
+from pathlib import Path
+from typing import Literal
 
-import numpy as np
 import torch
 from torch import Tensor
 
+from curvafit.generation.cost import Cost
 from curvafit.generation.initial import white_noise
-from curvafit.generation.parametrization import DivergenceForm
+from curvafit.generation.loop import Orders, run
+from curvafit.generation.parametrization import FORMS, DivergenceForm
+from curvafit.generation.result import RECORD_EVERY, Callback, Flow, History, State
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.schedule import schedule as named_schedule
-from curvafit.generation.stepper import Stepper, stepper
-from curvafit.generation.viability import Viability, viability
+from curvafit.generation.setup import Place, base_of
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.shapes import Bool, Float
 
+__all__ = ["RECORD_EVERY", "WORKING_BLUR", "Flow", "History", "State", "descend", "generate", "relax"]
+
 #: Standard deviation of the published blur, in working units (two voxels).
 WORKING_BLUR = 0.02
-#: Steps between two entries of the history (and two calls of the callbacks).
-RECORD_EVERY = 10
-#: A flow whose energy falls by less than this share over its last tenth is called converged.
-SETTLED = 0.01
+#: Seconds between two checkpoints, if not said otherwise.
+CHECKPOINT_EVERY = 60.0
 
 Backend = Literal["auto", "torch", "fused"]
 
 
-@dataclass(frozen=True)
-class History:
-    """Figures every `RECORD_EVERY` steps and at the end, arrays `(N,)`: the number of steps made, F_ε, max and mean of
-    |∂F_ε/∂A| over free voxels, the mean of u."""
-
-    step: np.ndarray
-    energy: np.ndarray
-    gradient_max: np.ndarray
-    gradient_mean: np.ndarray
-    mass: np.ndarray
-
-
-@dataclass(frozen=True)
-class State:
-    """What a callback sees: the figures of the history's newest entry, and the field, `(Z, Y, X)`, which the next step
-    overwrites (clone it to keep it)."""
-
-    field: Tensor
-    energy: float
-    gradient_max: float
-    gradient_mean: float
-    mass: float
-
-
-class Callback(Protocol):
-    def __call__(self, step: int, total: int, state: State, /) -> bool | None:
-        """Called every `RECORD_EVERY` steps with the number made, and at the end; returning True stops the flow."""
-        ...
-
-
-@dataclass(frozen=True)
-class Flow:
-    """The end of a flow: the field, float32 `(Z, Y, X)`, how it came there, and whether it is a shape.
-
-    `status` is a sentence; `seed` is None where the flow started from a given field.
-    """
-
-    field: Tensor
-    history: History
-    status: str
-    grid: Grid
-    viability: Viability
-    schedule: Schedule
-    seed: int | None
-
-
 def generate(
     coefficients: Coefficients,
-    mass: float,
+    mass: float | Tensor | None,
     grid: Grid,
     *,
+    volume_fraction: float | None = None,
     schedule: str | Schedule = "fast",
     seed: int = 0,
-    epsilon: float = WORKING_EPSILON,
+    epsilon: float | Tensor = WORKING_EPSILON,
     blur: float = WORKING_BLUR,
+    orientation: Float[Tensor, "3 3"] | None = None,
+    snapshots: Sequence[int] = (),
     callbacks: Sequence[Callback] = (),
     reject_early: bool = False,
+    checkpoint: str | Path | None = None,
+    checkpoint_every: float = CHECKPOINT_EVERY,
     backend: Backend = "auto",
     device: torch.device | str = "cpu",
 ) -> Flow:
@@ -96,23 +55,36 @@ def generate(
     Parameters
     ----------
     coefficients
-        The six numbers, or tensors that broadcast with the voxels (then in plain torch).
+        The six numbers, or tensors that broadcast with the voxels `(Z, Y, X)`: they vary in space.
     mass
-        m₀, the mean of u, in (-1, 1); exact to 1e-6 at every step.
+        m₀, the mean of u, in (-1, 1); exact to 1e-6 at every step. A tensor is m(x): u = k ∗ (div A + m). None where
+        the volume fraction is given.
     grid, epsilon, blur
-        The sampling; ε and the blur's standard deviation in spacing's unit.
+        The sampling; ε, a number or a tensor that broadcasts with the voxels, and the blur's standard deviation, in
+        spacing's unit.
+    volume_fraction
+        Instead of a mass: the share of voxels with u > 0. The mass is steered there while the flow runs, and a last
+        small constant makes the share exact; where that fails, `status` says so. The mass is then `Flow.mass`.
     schedule
         `"fast"`, `"paper"`, or a `Schedule`.
     seed
         Of the start. The same seed, grid and number of threads make the same field, bit for bit.
+    orientation
+        Q of a further term ε ∫ ∇uᵀQ∇u, symmetric, axes z, y, x; see `priors.energy.orientation`.
+    snapshots
+        Numbers of steps after which the field is kept in `Flow.snapshots`.
     callbacks
         See `Callback`.
     reject_early
         Stop as soon as a viability check fails (see `Schedule.checks`) instead of after the last step.
+    checkpoint, checkpoint_every
+        A file that the run is saved to every so many seconds, and resumed from if it is there: the end is then the
+        same, bit for bit on one machine and number of threads. It is removed at the end, but kept where a callback
+        stopped the flow.
     backend
-        `"auto"` takes the fused step where there is one; `"torch"` and `"fused"` insist.
+        `"auto"` takes a fused step where there is one; `"torch"` and `"fused"` insist.
     device
-        Where plain torch runs.
+        Where torch runs.
 
     Returns
     -------
@@ -122,16 +94,16 @@ def generate(
     Raises
     ------
     ValueError
-        If the mass is outside (-1, 1), ε is not positive or the blur negative, a name is unknown, or there is no fused
-        step for the coefficients or device.
+        If the mass is outside (-1, 1), ε is not positive or the blur negative, a tensor does not broadcast with the
+        voxels, a name is unknown, a file is not this run's checkpoint, or there is no fused step for the device.
     """
-    if not -1 < mass < 1:
-        raise ValueError(f"expected a mass in (-1, 1), got {mass}")
-    _check_lengths(epsilon, blur)
-    plan = named_schedule(schedule)
-    form = DivergenceForm.of(grid, blur, mass)
-    moved = stepper(white_noise(grid, seed), form, coefficients, epsilon, plan.betas, None, backend, device)
-    return _run(moved, grid, epsilon, plan, callbacks, reject_early, seed)
+    base, cost = base_of(mass, volume_fraction, grid), Cost(coefficients, grid, epsilon, orientation, blur)
+    place, plan = Place(backend, device, checkpoint, checkpoint_every), named_schedule(schedule)
+    form = DivergenceForm.of(grid, blur, base, place.blur)
+    moved = place.stepper(white_noise(grid, seed), form, cost, plan, "adam", None)
+    orders = Orders(grid, epsilon, plan, callbacks, snapshots, reject_early, volume_fraction)
+    saved = place.saved(moved, cost, orders, seed=seed, mass=base)
+    return run(moved, [orders], [seed], saved)[0]
 
 
 def relax(
@@ -140,10 +112,14 @@ def relax(
     grid: Grid,
     *,
     schedule: str | Schedule,
-    epsilon: float = WORKING_EPSILON,
+    epsilon: float | Tensor = WORKING_EPSILON,
     blur: float = WORKING_BLUR,
+    orientation: Float[Tensor, "3 3"] | None = None,
     frozen: Bool[Tensor, "z y x"] | None = None,
+    snapshots: Sequence[int] = (),
     callbacks: Sequence[Callback] = (),
+    checkpoint: str | Path | None = None,
+    checkpoint_every: float = CHECKPOINT_EVERY,
     backend: Backend = "auto",
     device: torch.device | str = "cpu",
 ) -> Flow:
@@ -155,72 +131,79 @@ def relax(
     Raises
     ------
     ValueError
-        If the field or the mask does not have the grid's shape, or is not finite.
+        If the field or the mask does not have the grid's shape, or is not finite; or as `generate`.
     """
-    field = torch.as_tensor(field).detach().to("cpu", torch.float32)
+    cost = Cost(coefficients, grid, epsilon, orientation, blur)
+    place = Place(backend, device, checkpoint, checkpoint_every)
+    orders = Orders(grid, epsilon, named_schedule(schedule), callbacks, snapshots)
+    return _from_field(field, cost, place, "h-1", "adam", frozen, orders)
+
+
+def descend(
+    field: Float[Tensor, "z y x"],
+    coefficients: Coefficients,
+    grid: Grid,
+    *,
+    flow: Literal["l2", "mass", "h-1"] = "l2",
+    optimiser: Literal["lbfgs", "adam"] = "lbfgs",
+    steps: int = 200,
+    schedule: str | Schedule = "fast",
+    epsilon: float | Tensor = WORKING_EPSILON,
+    blur: float | None = None,
+    orientation: Float[Tensor, "3 3"] | None = None,
+    snapshots: Sequence[int] = (),
+    callbacks: Sequence[Callback] = (),
+    checkpoint: str | Path | None = None,
+    checkpoint_every: float = CHECKPOINT_EVERY,
+    backend: Backend = "auto",
+    device: torch.device | str = "cpu",
+) -> Flow:
+    """Lower F_ε from a field v₀, to a minimum near it (paper, Algorithm 2: the L² flow under L-BFGS).
+
+    The other arguments are `generate`'s. u starts at k ∗ v₀.
+
+    Parameters
+    ----------
+    field
+        v₀, `(Z, Y, X)`.
+    flow
+        `"l2"`: u = k ∗ v, v free. Algorithm 2 blurs u at each iteration; we read it as this map, whose energy is one
+        function of v. `"mass"`: u = k ∗ (v - mean v) + m₀, the L² flow at constant mass. `"h-1"`: as `relax`.
+    optimiser
+        `"lbfgs"` (history 10, lengths from 1 by a strong Wolfe line search) or `"adam"`.
+    steps
+        How many; one of L-BFGS is one iteration with its line search. It stops before where that finds nothing lower.
+    schedule
+        Step lengths of Adam; its number of steps is replaced.
+    blur
+        Standard deviation of k; None is a voxel's shortest edge, as published.
+
+    Raises
+    ------
+    ValueError
+        As `relax`, or if the flow or the optimiser has another name.
+    """
+    if flow not in FORMS:
+        raise ValueError(f"expected a flow among {', '.join(FORMS)}, got {flow!r}")
+    plan = named_schedule(schedule, steps)
+    if optimiser == "lbfgs":
+        plan = Schedule("lbfgs", steps, 1.0, 1.0, "constant")
+    cost = Cost(coefficients, grid, epsilon, orientation, min(grid.spacing) if blur is None else blur)
+    place = Place(backend, device, checkpoint, checkpoint_every)
+    orders = Orders(grid, epsilon, plan, callbacks, snapshots)
+    return _from_field(field, cost, place, flow, optimiser, None, orders)
+
+
+def _from_field(
+    field: Tensor, cost: Cost, place: Place, flow: str, optimiser: str, frozen: Tensor | None, orders: Orders
+) -> Flow:
+    field, grid, plan = torch.as_tensor(field).detach().to("cpu", torch.float32).contiguous(), cost.grid, orders.plan
     for name, values in (("field", field), ("frozen mask", frozen)):
         if values is not None and tuple(values.shape) != grid.shape:
             raise ValueError(f"expected a {name} of shape {grid.shape}, got {tuple(values.shape)}")
     if not bool(torch.isfinite(field).all()):
         raise ValueError("expected a finite field, got NaN or infinity in it")
-    _check_lengths(epsilon, blur)
-    plan = named_schedule(schedule)
-    form = DivergenceForm.of(grid, blur, field)
-    start = torch.zeros((3, *grid.shape))
-    moved = stepper(start, form, coefficients, epsilon, plan.betas, frozen, backend, device)
-    return _run(moved, grid, epsilon, plan, callbacks, False, None)
-
-
-def _check_lengths(epsilon: float, blur: float) -> None:
-    if not (0 < epsilon < math.inf and 0 <= blur < math.inf):
-        raise ValueError(f"expected epsilon > 0 and blur >= 0 in the spacing's unit, got {epsilon} and {blur}")
-
-
-def _run(
-    moved: Stepper,
-    grid: Grid,
-    epsilon: float,
-    plan: Schedule,
-    callbacks: Sequence[Callback],
-    reject_early: bool,
-    seed: int | None,
-) -> Flow:
-    """The loop: look, then step, until a reason to stop."""
-    rows: list[tuple[float, ...]] = []
-    stop = ""
-    for made in range(plan.steps + 1):
-        looking = made % RECORD_EVERY == 0 or made == plan.steps
-        moved.step(plan.rate(made) if made < plan.steps else None)
-        if looking:
-            rows.append((made, *moved.statistics(), moved.mass()))
-            stop = _look(moved, made, plan, rows[-1], callbacks)
-        if not stop and reject_early and made in plan.checks:
-            failed = viability(moved.field(), grid, epsilon)
-            stop = "" if failed.viable else f"stopped after {made} of {plan.steps} steps: {failed.reason}"
-        if stop:
-            break
-    field = moved.field().clone()
-    end = viability(field, grid, epsilon)
-    history = History(*np.array(rows, dtype=np.float64).T)
-    return Flow(field, history, _status(stop, end, history), grid, end, plan, seed)
-
-
-def _look(moved: Stepper, made: int, plan: Schedule, row: tuple[float, ...], callbacks: Sequence[Callback]) -> str:
-    """The NaN guard and the callbacks; a sentence where the flow is to stop."""
-    if not math.isfinite(row[1]):
-        return f"stopped after {made} of {plan.steps} steps: the energy is not finite"
-    state = State(moved.field(), *row[1:])
-    asked = [bool(callback(made, plan.steps, state)) for callback in callbacks]
-    return f"stopped by a callback after {made} of {plan.steps} steps" if any(asked) else ""
-
-
-def _status(stop: str, end: Viability, history: History) -> str:
-    if stop:
-        return stop
-    made = int(history.step[-1])
-    if not end.viable:
-        return f"no shape after {made} steps: {end.reason}"
-    before = history.energy[np.searchsorted(history.step, 0.9 * made, side="right") - 1]
-    fall = (before - history.energy[-1]) / max(abs(before), 1e-30)
-    word = "converged" if abs(fall) < SETTLED else "still moving"
-    return f"{word} after {made} steps: the energy fell by {100 * fall:.2f} % over the last tenth"
+    form, start = FORMS[flow].at(field, grid, cost.blur, place.blur)
+    moved = place.stepper(start, form, cost, plan, optimiser, frozen)
+    saved = place.saved(moved, cost, orders, flow=flow, field=field, frozen=frozen)
+    return run(moved, [orders], [None], saved)[0]

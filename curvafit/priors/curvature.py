@@ -52,8 +52,8 @@ def jet(u: Tensor, grid: Grid) -> Jet:
     return Jet(u, gradient(u, grid), hessian(u, grid))
 
 
-def second_form(field: Jet, epsilon: float, xi: float = XI) -> SecondForm:
-    """M_ε = -ε Hess u + W'(u)/ε n⊗n (eq. `Meps`), with n⊗n = ∇u⊗∇u / (|∇u|² + ξ²)."""
+def second_form(field: Jet, epsilon: float | Tensor, xi: float = XI) -> SecondForm:
+    """M_ε = -ε Hess u + W'(u)/ε n⊗n (eq. `Meps`), with n⊗n = ∇u⊗∇u / (|∇u|² + ξ²); ε broadcasts with the field."""
     ε = epsilon
     slope2, laplacian, hess2, normal = _invariants(field)
     W_ = double_well_derivative(field.value)
@@ -70,7 +70,7 @@ def smooth_positive(x: Tensor, xi: float = XI) -> Tensor:
     return torch.nn.functional.softplus(x, beta=1 / xi, threshold=30)
 
 
-def diffuse_curvatures(field: Jet, epsilon: float) -> Curvatures:
+def diffuse_curvatures(field: Jet, epsilon: float | Tensor) -> Curvatures:
     """κ1, κ2 = (Tr M ± √(2|M|² - (Tr M)²)⁺) / 2ε|∇u|, H and K (eqs. `Heps`, `Keps`, `kepsa`, `kepsb`)."""
     trace, norm2, root, slope = second_form(field, epsilon)
     width = 2 * epsilon * slope

@@ -5,6 +5,9 @@ Every energy is a sum over voxels times the voxel's volume. Fields are `(..., Z,
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -17,7 +20,11 @@ from curvafit.priors.stencils import gradient
 
 
 def energy(
-    u: Float[Tensor, "*batch z y x"], coefficients: Coefficients, grid: Grid, epsilon: float
+    u: Float[Tensor, "*batch z y x"],
+    coefficients: Coefficients,
+    grid: Grid,
+    epsilon: float | Tensor,
+    orientation: Float[Tensor, "3 3"] | None = None,
 ) -> Float[Tensor, "*batch"]:
     """F_ε(u) (eq. `Feps`), differentiable in the field and in the coefficients.
 
@@ -28,15 +35,62 @@ def energy(
     coefficients
         Numbers, or tensors that broadcast with `u` (`(batch, 1, 1, 1)` for one set a field).
     grid, epsilon
-        The sampling, and the interface parameter in spacing's unit.
+        The sampling, and the interface parameter in spacing's unit: a number, or a tensor that broadcasts with `u`.
+    orientation
+        Q of a further term ε ∫ ∇uᵀQ∇u, symmetric, axes z, y, x; see `orientation`.
+
+    Raises
+    ------
+    ValueError
+        If the orientation is not symmetric.
     """
-    density = energy_terms(jet(u, grid), epsilon)
-    a = coefficients.tensor(u.dtype, u.device)
-    per_voxel = sum(weight * term for weight, term in zip(a, density.unbind(-4), strict=True))
-    return per_voxel.sum((-3, -2, -1)) * grid.voxel_volume  # type: ignore[union-attr]
+    field, ε = jet(u, grid), _like(epsilon, u)
+    terms = energy_terms(field, ε).unbind(-4)
+    weighted = (_like(a, u) * term for a, term in zip(coefficients, terms, strict=True))
+    per_voxel = sum(weighted, start=torch.zeros_like(u))
+    if orientation is not None:
+        per_voxel = per_voxel + ε * orientation_form(field.gradient, orientation)
+    return per_voxel.sum((-3, -2, -1)) * grid.voxel_volume
 
 
-def energy_terms(field: Jet, epsilon: float) -> Float[Tensor, "*batch 6 z y x"]:
+def orientation(direction: Sequence[int | float] | Tensor, strength: int | float) -> Float[Tensor, "3 3"]:
+    """Q = μ θθᵀ, which holds normals off the direction θ: tubes lie along θ, layers contain it (paper, "Extensions").
+
+    Parameters
+    ----------
+    direction
+        θ along (z, y, x), of any length above 0.
+    strength
+        μ; a negative one draws the normals towards θ.
+
+    Returns
+    -------
+    Tensor
+        Symmetric `(3, 3)`, float64. Sums of such are orientations too.
+
+    Raises
+    ------
+    ValueError
+        If the direction is not three finite numbers that are not all 0, or the strength is not finite.
+    """
+    θ = torch.as_tensor(direction, dtype=torch.float64)
+    if tuple(θ.shape) != (3,) or not bool(torch.isfinite(θ).all()) or not bool(θ.any()):
+        raise ValueError(f"expected a direction of 3 finite numbers (z, y, x), not all 0, got {direction}")
+    if not math.isfinite(strength):
+        raise ValueError(f"expected a finite strength, got {strength}")
+    θ = θ / θ.norm()
+    return strength * torch.outer(θ, θ)
+
+
+def orientation_form(slope: Float[Tensor, "*batch 3 z y x"], orientation: Float[Tensor, "3 3"]) -> Tensor:
+    """∇uᵀQ∇u in every voxel: (θ·∇u)² μ for Q = μ θθᵀ (paper, "Extensions")."""
+    Q = orientation.to(slope)
+    if tuple(Q.shape) != (3, 3) or not torch.equal(Q, Q.T):
+        raise ValueError(f"expected a symmetric orientation of shape (3, 3) (z, y, x), got {orientation.tolist()}")
+    return torch.einsum("ij,...izyx,...jzyx->...zyx", Q, slope, slope)
+
+
+def energy_terms(field: Jet, epsilon: float | Tensor) -> Float[Tensor, "*batch 6 z y x"]:
     """Densities of the six terms that a20, a11, a02, a10, a01, a00 multiply in F_ε, which is linear in them."""
     ε = epsilon
     trace, norm2, root, slope = second_form(field, ε)
@@ -83,19 +137,25 @@ def curvature_density(field: Jet, coefficients: Coefficients, epsilon: float) ->
     return coefficients.polynomial(curvatures.kappa1, curvatures.kappa2) * epsilon * slope2
 
 
-def cahn_hilliard_area(u: Tensor, grid: Grid, epsilon: float) -> Tensor:
+def cahn_hilliard_area(u: Tensor, grid: Grid, epsilon: float | Tensor) -> Tensor:
     """𝓐_ε(u) = ∫ ε/2 |∇u|² + W(u)/ε, about σ × area (eq. `CH_eps`)."""
-    gradient_part, well_part = _cahn_hilliard_parts(u, grid, epsilon)
+    gradient_part, well_part = cahn_hilliard_parts(u, grid, epsilon)
     return (gradient_part + well_part).sum((-3, -2, -1)) * grid.voxel_volume
 
 
-def discrepancy_ratio(u: Tensor, grid: Grid, epsilon: float) -> Tensor:
+def discrepancy_ratio(u: Tensor, grid: Grid, epsilon: float | Tensor) -> Tensor:
     """∫|ε/2 |∇u|² - W(u)/ε| over 𝓐_ε, in [0, 1]: zero for the optimal profile (paper, Experiment 4)."""
-    gradient_part, well_part = _cahn_hilliard_parts(u, grid, epsilon)
+    gradient_part, well_part = cahn_hilliard_parts(u, grid, epsilon)
     space = (-3, -2, -1)
     return (gradient_part - well_part).abs().sum(space) / (gradient_part + well_part).sum(space)
 
 
-def _cahn_hilliard_parts(u: Tensor, grid: Grid, epsilon: float) -> tuple[Tensor, Tensor]:
-    slope2 = gradient(u, grid).square().sum(-4)
-    return epsilon / 2 * slope2, double_well(u) / epsilon
+def cahn_hilliard_parts(u: Tensor, grid: Grid, epsilon: float | Tensor) -> tuple[Tensor, Tensor]:
+    """ε/2 |∇u|² and W(u)/ε in every voxel."""
+    ε, slope2 = _like(epsilon, u), gradient(u, grid).square().sum(-4)
+    return ε / 2 * slope2, double_well(u) / ε
+
+
+def _like(value: float | Tensor, u: Tensor) -> float | Tensor:
+    """A number as it is, a tensor in the field's type and on its device."""
+    return value.to(u) if isinstance(value, Tensor) else value

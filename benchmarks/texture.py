@@ -1,0 +1,161 @@
+"""Time to texture: the `fast` schedule against the published one, in steps, seconds, energy and curvature diagram.
+
+    python -m benchmarks.texture [--presets tubes,seeds,…] [--seeds 3] [--edge 100] [-o texture] [--start]
+
+For each preset and schedule: the mean energy, and the seconds of one shape. Distances are those of geometric diagrams:
+`noise` between two seeds of `paper`, `cross` from a seed of `fast` to one of `paper`, `bias` between the two pooled
+diagrams (all seeds' surfaces together), which is what a schedule changes on top of a seed's noise. Shapes are kept in
+the folder with the commit that made them: a killed run goes on, and a second one only prints.
+
+`--start` times the command line, start-up included, against 8000 steps of plain torch (timed over a few).
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import tempfile
+import time
+from itertools import combinations, product
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from rich.progress import Progress
+
+from benchmarks.step import programs
+from curvafit.diagram import Diagram, diagram
+from curvafit.generation.flow import generate
+from curvafit.generation.schedule import SCHEDULES
+from curvafit.priors.coefficients import preset
+from curvafit.priors.grid import WORKING_EPSILON, Grid
+from curvafit.scan import write_atomically
+from curvafit.transport import wasserstein
+
+#: Tubes, tubes of two kinds, layers, spheres, sponges of two kinds, trabeculae, and the paper's flow.
+PRESETS = ("tubes", "seeds", "bilayers", "bilinear-spheres", "sponge", "sieve", "trabec", "flow")
+
+
+class Shape(NamedTuple):
+    """What is kept of a generated shape: F_ε, seconds, whether it is viable, diagram, commit."""
+
+    energy: float
+    seconds: float
+    viable: bool
+    diagram: Diagram
+    commit: str
+
+
+class Row(NamedTuple):
+    """A preset's comparison."""
+
+    energies: tuple[float, float]
+    seconds: tuple[float, float]
+    noise: float
+    cross: float
+    bias: float
+
+
+def shape_of(name: str, schedule: str, seed: int, edge: int, folder: Path) -> Shape:
+    """Generate and measure, or read what an earlier run kept."""
+    path = folder / f"{name}-{schedule}-{edge}-{seed}.npz"
+    if not path.exists():
+        parameters, grid = preset(name), Grid((edge,) * 3)
+        begun = time.perf_counter()
+        checkpoint = folder / f"{path.stem}.checkpoint"
+        with Progress(transient=True) as progress:
+            task = progress.add_task(path.stem)
+            flow = generate(
+                parameters.coefficients,
+                parameters.mass,
+                grid,
+                schedule=schedule,
+                seed=seed,
+                checkpoint=checkpoint,
+                callbacks=[lambda made, total, state: progress.update(task, completed=made, total=total)],
+            )
+        seconds = time.perf_counter() - begun
+        found = diagram(flow.field, grid, WORKING_EPSILON)
+        figures = np.array([flow.history.energy[-1], seconds, flow.viability.viable])
+        kept = {"figures": figures, "points": found.points, "weights": found.weights, "commit": _commit()}
+        write_atomically(path, lambda temporary: np.savez_compressed(temporary, **kept))
+    with np.load(path) as kept:
+        energy, seconds, viable = kept["figures"]
+        found = Diagram(kept["points"], kept["weights"])
+        return Shape(float(energy), float(seconds), bool(viable), found, str(kept["commit"]))
+
+
+def _commit() -> str:
+    asked = subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True, check=False)
+    return asked.stdout.strip() or "unknown"
+
+
+def compare(paper: list[Shape], fast: list[Shape]) -> Row:
+    """Distances within and between two schedules' shapes."""
+    noise = np.mean([wasserstein(a.diagram, b.diagram) for a, b in combinations(paper, 2)])
+    cross = np.mean([wasserstein(a.diagram, b.diagram) for a, b in product(fast, paper)])
+    bias = wasserstein(_pooled(fast), _pooled(paper))
+    energies = tuple(float(np.mean([shape.energy for shape in shapes])) for shapes in (paper, fast))
+    seconds = tuple(float(np.median([shape.seconds for shape in shapes])) for shapes in (paper, fast))
+    return Row(energies, seconds, float(noise), float(cross), float(bias))
+
+
+def _pooled(shapes: list[Shape]) -> Diagram:
+    parts = [shape.diagram.normalised for shape in shapes]
+    return Diagram(np.concatenate([d.points for d in parts]), np.concatenate([d.weights for d in parts]))
+
+
+def start_up(edge: int) -> tuple[float, float]:
+    """Seconds of `curvafit generate`, from the shell and back, and of 8000 steps in plain torch."""
+    plain, _ = programs(edge)
+    plain.step(1e-3)
+    begun = time.perf_counter()
+    for _ in range(3):
+        plain.step(1e-3)
+    slow = (time.perf_counter() - begun) / 3 * SCHEDULES["paper"].steps
+    with tempfile.TemporaryDirectory() as folder:
+        begun = time.perf_counter()
+        out = f"{folder}/tubes.nii.gz"
+        command = [sys.executable, "-m", "curvafit", "generate", "--preset", "tubes", "--shape", str(edge), "-o", out]
+        subprocess.run(command, check=True, capture_output=True)
+        return time.perf_counter() - begun, slow
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--presets", default=",".join(PRESETS))
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--edge", type=int, default=100)
+    parser.add_argument("--start", action="store_true", help="only time a start from the shell")
+    parser.add_argument("-o", "--output", type=Path, default=Path("texture"))
+    options = parser.parse_args()
+    if options.start:
+        ours, plain = start_up(options.edge)
+        print(
+            f"{options.edge}³: curvafit generate {ours:.1f} s, 8000 plain steps {plain:.0f} s, {plain / ours:.0f} times"
+        )
+        return
+    options.output.mkdir(parents=True, exist_ok=True)
+    plans = ", ".join(f"{plan.name} {plan.steps}" for plan in SCHEDULES.values())
+    print(f"{options.edge}³, {options.seeds} seeds; steps: {plans}; {_commit()}")
+    names = ("E paper", "E fast", "noise", "cross", "bias", "/noise", "s paper", "s fast")
+    print(f"{'preset':17}" + "".join(f"{name:>9}" for name in names))
+    for name in options.presets.split(","):
+        paper, fast = (
+            [shape_of(name, schedule, seed, options.edge, options.output) for seed in range(options.seeds)]
+            for schedule in ("paper", "fast")
+        )
+        row = compare(paper, fast)
+        distances = (row.noise, row.cross, row.bias, row.bias / row.noise)
+        print(
+            f"{name:17}"
+            + "".join(f"{energy:9.1f}" for energy in row.energies)
+            + "".join(f"{distance:9.2f}" for distance in distances)
+            + "".join(f"{seconds:9.1f}" for seconds in row.seconds),
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,272 @@
+"""The commands that make shapes: generate and presets."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+
+import typer
+
+from curvafit.cli_support import (
+    command_line,
+    device_of,
+    error_console,
+    flow_progress,
+    numbers,
+    output,
+    plainly,
+    say,
+    triple,
+    whole_numbers,
+    whole_triple,
+)
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from curvafit.generation.flow import Flow
+    from curvafit.priors.coefficients import Coefficients
+    from curvafit.shape_files import Output
+
+#: Voxels along an edge, if nothing says otherwise.
+EDGE = 100
+
+EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
+    (
+        "curvafit generate --preset tubes -o tubes.nii.gz",
+        "curvafit generate --preset tubes --spacing 0.0195 --unit mm -o tubes.stl",
+        "curvafit generate --preset sponge --volume-fraction 0.3 --shape 64,64,128 --tile 1,2,2 -o sponge.zarr",
+        "curvafit generate --coefficients 1,2,6,-40,-40,400 --mass -0.6 --orientation 0,0,1,50 -o lying.vtp",
+        "curvafit generate --prior bone/fit.json --shape 128 --seed 3 -o more_bone.tif",
+        "curvafit generate --preset tubes --maps maps.npz -o graded.nii.gz",
+        "curvafit generate --preset tubes --shape 300 --checkpoint run.pt --snapshots 10,100,1000 -o large.nii.gz",
+    )
+)
+
+_what = partial(typer.Option, rich_help_panel="What to make")
+_how = partial(typer.Option, rich_help_panel="How")
+_out = partial(typer.Option, rich_help_panel="What to write")
+
+Target = Annotated[
+    Path,
+    _out("-o", "--output", help="Volume (.nii.gz .nii .tif .npy .mrc .zarr) or surface (.stl .ply .vtp) to write."),
+]
+Preset = Annotated[str | None, _what(help="A published shape; see `curvafit presets`.")]
+Six = Annotated[str | None, _what(help="a20,a11,a02,a10,a01,a00 in working units; needs a mass.")]
+Prior = Annotated[Path | None, _what(help="fit.json of `curvafit infer`.")]
+Mass = Annotated[float | None, _what(help="Mean of the field, in (-1, 1).")]
+Share = Annotated[float | None, _what(help="Share of the volume inside, in (0, 1), instead of a mass.")]
+Orientation = Annotated[str | None, _what(help="θz,θy,θx,μ: tubes and layers lie along θ, the more the larger μ.")]
+Maps = Annotated[
+    Path | None,
+    _what(help="Parameters that vary in space: an .npz of volumes a20 … a00, mass, epsilon, or a folder of them."),
+]
+Shape = Annotated[str | None, _what(help=f"Voxels: N or Z,Y,X; {EDGE} or the maps' by default.")]
+Boundary = Annotated[str, _what(help="periodic, or replicate (walls that the shape meets squarely).")]
+Epsilon = Annotated[float | None, _what(help="Interface width in working units; 0.02 (two voxels) by default.")]
+Seed = Annotated[int, _what(help="Of the noise that the shape grows from.")]
+Plan = Annotated[str, _how(help="fast (1000 steps) or paper (8000).")]
+Steps = Annotated[int | None, _how(help="Another number of steps.")]
+Device = Annotated[str, _how(help="cpu, cuda, cuda:1 …")]
+Checkpoint = Annotated[Path | None, _how(help="File to save the run to, and to go on from if it is there.")]
+Every = Annotated[float, _how(help="Seconds between two checkpoints.")]
+Spacing = Annotated[str | None, _out(help="Edge of a voxel (a cube), in --unit; 1 by default.")]
+Unit = Annotated[str | None, _out(help="nm, um, mm or m; needs --spacing.")]
+Tile = Annotated[str | None, _out(help="Repeat a periodic box N or Z,Y,X times.")]
+Cap = Annotated[bool, _out("--cap/--no-cap", help="Close a surface on the box's faces, or leave it open there.")]
+Snapshots = Annotated[str | None, _out(help="Also write the field after these numbers of steps: 10,100,1000.")]
+
+
+def generate(
+    out: Target,
+    preset: Preset = None,
+    coefficients: Six = None,
+    prior: Prior = None,
+    mass: Mass = None,
+    volume_fraction: Share = None,
+    orientation: Orientation = None,
+    maps: Maps = None,
+    shape: Shape = None,
+    boundary: Boundary = "periodic",
+    epsilon: Epsilon = None,
+    seed: Seed = 0,
+    schedule: Plan = "fast",
+    steps: Steps = None,
+    device: Device = "cpu",
+    checkpoint: Checkpoint = None,
+    checkpoint_every: Every = 60.0,
+    spacing: Spacing = None,
+    unit: Unit = None,
+    tile: Tile = None,
+    cap: Cap = True,
+    snapshots: Snapshots = None,
+) -> None:
+    """Make a shape from parameters, with a picture (.png) and a record (.json) beside it."""
+    with plainly():
+        law = _law(preset, coefficients, prior, mass, volume_fraction, epsilon, maps, shape)
+        how = _output(law, spacing, unit, tile, cap, boundary)
+        options: dict[str, Any] = {"seed": seed, "checkpoint_every": checkpoint_every, "checkpoint": checkpoint}
+        options["snapshots"] = () if snapshots is None else whole_numbers(snapshots, "--snapshots")
+        options["orientation"] = Q = None if orientation is None else _orientation(orientation)
+        _check(out, how, checkpoint)
+        flow = _grown(law, boundary, schedule, steps, {**options, "device": device_of(device)})
+        told = {"orientation": Q if Q is None else Q.tolist(), "maps": maps if maps is None else str(maps)}
+        _write(flow, law, out, how, told)
+
+
+def presets() -> None:
+    """List the published shapes: coefficients in working units, mass, source."""
+    with plainly():
+        from curvafit.priors.coefficients import NAMES, PRESETS
+
+        rows = [
+            (name, *(f"{value:g}" for value in entry.coefficients.as_dict().values()), f"{entry.mass:g}", entry.source)
+            for name, entry in PRESETS.items()
+        ]
+        output(("name", *NAMES, "mass", "source"), rows, right=range(1, 8))
+
+
+class _Law(NamedTuple):
+    """Parameters of a shape, its voxels, and where the parameters came from. `mass` is None for a volume fraction."""
+
+    coefficients: Coefficients
+    mass: float | Tensor | None
+    share: float | None
+    epsilon: float | Tensor
+    box: tuple[int, int, int]
+    origin: str
+    voxel: float = 1.0
+    unit: str = "voxel"
+
+
+def _law(
+    preset: str | None,
+    six: str | None,
+    prior: Path | None,
+    mass: float | None,
+    share: float | None,
+    epsilon: float | None,
+    maps: Path | None,
+    shape: str | None,
+) -> _Law:
+    """One source of coefficients, one of the mass; maps take the place of single ones."""
+    box = None if shape is None else whole_triple(shape, "--shape")
+    from curvafit.parameter_maps import map_shape, read_maps
+    from curvafit.priors.coefficients import NAMES, Coefficients
+    from curvafit.priors.grid import WORKING_EPSILON
+
+    drawn = {} if maps is None else read_maps(maps, box)
+    for option, value, name in (("--mass", mass, "mass"), ("--epsilon", epsilon, "epsilon")):
+        if value is not None and name in drawn:
+            raise ValueError(f"expected either {option} or a map of {name}, got both")
+    given = [value for value in (preset, six, prior) if value is not None]
+    if len(given) > 1 or (not given and not set(NAMES) <= drawn.keys()):
+        raise ValueError(f"expected one of --preset, --coefficients and --prior, got {len(given)} of them")
+    values, own_mass, origin, voxel, unit = _source(preset, six, prior)
+    told = drawn.get("mass", mass)
+    if told is not None and share is not None:
+        raise ValueError("expected either a mass or --volume-fraction, got both")
+    m0 = None if share is not None else own_mass if told is None else told
+    if m0 is None and share is None:
+        raise ValueError("expected --mass or --volume-fraction beside the coefficients, got none")
+    law = Coefficients(*(drawn.get(name, value) for name, value in zip(NAMES, values, strict=True)))
+    ε = drawn.get("epsilon", WORKING_EPSILON if epsilon is None else epsilon)
+    return _Law(law, m0, share, ε, box or map_shape(drawn) or (EDGE, EDGE, EDGE), origin, voxel, unit)
+
+
+def _source(
+    preset: str | None, six: str | None, prior: Path | None
+) -> tuple[tuple[float, ...], float | None, str, float, str]:
+    """Six coefficients, the mass that goes with them, what they are, and the voxel's edge and unit."""
+    if preset is not None:
+        from curvafit.priors.coefficients import preset as named
+
+        found = named(preset)
+        return tuple(found.coefficients), found.mass, f"preset {preset}", 1.0, "voxel"  # type: ignore[arg-type]
+    if prior is not None:
+        from curvafit.fit import read_prior
+        from curvafit.shape_files import prior_voxel
+
+        law, m0 = read_prior(prior)
+        return tuple(law), m0, f"prior {prior}", *prior_voxel(prior)  # type: ignore[arg-type]
+    if six is not None:
+        return numbers(six, "--coefficients", 6), None, "coefficients", 1.0, "voxel"
+    return (1.0, 0.0, 1.0, 0.0, 0.0, 0.0), None, "maps", 1.0, "voxel"
+
+
+def _output(law: _Law, spacing: str | None, unit: str | None, tile: str | None, cap: bool, boundary: str) -> Output:
+    """How to write: the voxel of the options, else the prior's."""
+    if unit is not None and spacing is None:
+        raise ValueError("expected --spacing beside --unit, got none")
+    edges = (law.voxel,) * 3 if spacing is None else triple(spacing, "--spacing")
+    if len(set(edges)) > 1:
+        raise ValueError(f"expected --spacing of cubic voxels, one number, got {spacing!r}")
+    if tile is not None and boundary != "periodic":
+        raise ValueError(f"expected --tile with a periodic boundary, got {boundary!r}")
+    from curvafit.shape_files import Output
+
+    repeats = (1, 1, 1) if tile is None else whole_triple(tile, "--tile")
+    return Output(edges[0], (law.unit if spacing is None else "voxel") if unit is None else unit, repeats, cap)
+
+
+def _orientation(text: str) -> Tensor:
+    from curvafit.priors.energy import orientation
+
+    *direction, strength = numbers(text, "--orientation", 4)
+    return orientation(direction, strength)
+
+
+def _check(out: Path, how: Output, checkpoint: Path | None) -> None:
+    """Refuse places that cannot be written to, before the work."""
+    from curvafit.shape_files import check_folder, check_target
+
+    check_target(out, how)
+    if checkpoint is not None:
+        check_folder(checkpoint.parent)
+        if checkpoint.is_dir() or checkpoint.absolute() == out.absolute():
+            raise ValueError(f"expected a file of its own for the checkpoint, got {checkpoint}")
+
+
+def _grown(law: _Law, boundary: str, schedule: str, steps: int | None, options: dict[str, Any]) -> Flow:
+    """The flow, with progress; leaves with exit code 1 where it has no surface."""
+    from curvafit.generation.flow import generate as make
+    from curvafit.generation.schedule import schedule as named
+    from curvafit.priors.grid import Grid
+
+    plan, grid = named(schedule, steps), Grid(law.box, boundary=boundary)  # type: ignore[arg-type]
+    options |= {"volume_fraction": law.share, "epsilon": law.epsilon, "schedule": plan}
+    with flow_progress(plan.steps) as watch:
+        try:
+            flow = make(law.coefficients, law.mass, grid, callbacks=[watch], **options)
+        except KeyboardInterrupt:
+            if options["checkpoint"] is None or not options["checkpoint"].exists():
+                raise
+            said = f"interrupted: the same command goes on from {options['checkpoint']}"
+            say(said, to=error_console())
+            raise typer.Exit(130) from None
+    if not flow.viability.lowest < 0 < flow.viability.highest:
+        say(f"{flow.status}; nothing was written", to=error_console())
+        raise typer.Exit(1)
+    return flow
+
+
+def _write(flow: Flow, law: _Law, out: Path, how: Output, told: dict[str, Any]) -> None:
+    """Write everything, and print what and where."""
+    from curvafit.mesh import NoSurface
+    from curvafit.shape_files import shape_record, step_path, write_field, write_shape
+
+    if not flow.viability.viable:
+        say(f"note: {flow.status}", to=error_console())
+    mass = flow.mass if law.mass is None else law.mass
+    told |= {"origin": law.origin, "wanted_volume_fraction": law.share, "snapshots": list(flow.snapshots)}
+    record = shape_record(flow, law.coefficients, mass, epsilon=law.epsilon, output=how, **told, command=command_line())
+    files = list(write_shape(flow, out, output=how, record=record))
+    for step, field in flow.snapshots.items():
+        try:
+            files.append(write_field(field, flow.grid, step_path(out, step), how))
+        except NoSurface:
+            say(f"note: no surface after {step} steps", to=error_console())
+    say(f"{flow.status}; {100 * record['volume_fraction']:.2f} % of the volume")
+    for path in files:
+        say(str(path))

@@ -1,0 +1,102 @@
+"""Zarr: bare arrays and groups are read; OME-NGFF 0.5 (OME-Zarr) is read and written."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+
+from curvafit.formats.base import Raw, pick_key, stated
+
+#: Edge of a chunk, and of the largest volume that is not halved any more, in voxels.
+CHUNK = 64
+#: Our unit -> OME-NGFF's; a voxel has none.
+_UNITS = {"nm": "nanometer", "um": "micrometer", "mm": "millimeter", "m": "meter"}
+
+
+def read_zarr(path: Path, *, key: str | None = None, **_: object) -> Raw:
+    """An array, or one of a group; spacing and unit from its attributes or from OME-Zarr's multiscales."""
+    node: Any = zarr.open(path, mode="r")
+    if isinstance(node, zarr.Array):
+        spacing, unit = stated(node.attrs.asdict(), node.ndim)
+        return Raw(np.asarray(node[...]), spacing, unit)
+    arrays = _arrays(node)
+    attributes = node.attrs.asdict()
+    scales = _multiscales(attributes)
+    if key is None and scales:
+        key = next(iter(scales))
+    name = pick_key(sorted(arrays), key, path)
+    array = arrays[name]
+    spacing, unit = scales.get(name) or stated({**attributes, **array.attrs.asdict()}, array.ndim)
+    return Raw(np.asarray(array[...]), spacing, unit)
+
+
+def write_zarr(field: Any, path: Path) -> None:
+    """A group of one image, OME-NGFF 0.5: the volume as `0`, halved copies as `1`, `2` … until one chunk holds it."""
+    levels = list(_halvings(np.asarray(field.values)))
+    kind = {"type": "space", **({"unit": _UNITS[field.unit]} if field.unit in _UNITS else {})}
+    image = {
+        "name": "volume",
+        "axes": [{"name": name, **kind} for name in "zyx"],
+        "datasets": [
+            {"path": str(k), "coordinateTransformations": _placed(field.spacing, 2**k, first)}
+            for k, (_, first) in enumerate(levels)
+        ],
+    }
+    group = zarr.create_group(path, attributes={"ome": {"version": "0.5", "multiscales": [image]}})
+    for k, (values, _) in enumerate(levels):
+        chunks = tuple(min(CHUNK, n) for n in values.shape)
+        array = group.create_array(
+            str(k), shape=values.shape, chunks=chunks, dtype=values.dtype, dimension_names=("z", "y", "x")
+        )
+        array[...] = values
+
+
+def _halvings(values: np.ndarray) -> Iterator[tuple[np.ndarray, float]]:
+    """The volume and its halved copies, each with its first voxel's centre in voxels of the whole one.
+
+    Numbers with a fraction are averaged over 2³ voxels (the last ones again where the count is odd); of others, which
+    may be labels, every second is taken.
+    """
+    first = 0.0
+    yield values, first
+    while max(values.shape) > CHUNK:
+        if values.dtype.kind == "f":
+            even = np.pad(values, [(0, n % 2) for n in values.shape], mode="edge")
+            nz, ny, nx = (n // 2 for n in even.shape)
+            values = even.reshape(nz, 2, ny, 2, nx, 2).mean((1, 3, 5), dtype=np.float32).astype(values.dtype)
+            first = 2 * first + 0.5
+        else:
+            values = values[::2, ::2, ::2]
+        yield values, first
+
+
+def _placed(spacing: tuple[float, float, float], factor: int, first: float) -> list[dict[str, Any]]:
+    """Scale, and where the first centre is not at the origin a translation, in the axes' unit."""
+    transforms: list[dict[str, Any]] = [{"type": "scale", "scale": [factor * h for h in spacing]}]
+    if first:
+        transforms.append({"type": "translation", "translation": [first * h for h in spacing]})
+    return transforms
+
+
+def _arrays(group: Any, prefix: str = "") -> dict[str, Any]:
+    found = {prefix + name: array for name, array in group.arrays()}
+    for name, inner in group.groups():
+        found.update(_arrays(inner, f"{prefix}{name}/"))
+    return found
+
+
+def _multiscales(attributes: Mapping[str, Any]) -> dict[str, tuple[tuple[float, ...] | None, str | None]]:
+    """OME-Zarr: path of each level -> (scale of its axes, unit of the last one)."""
+    described = attributes.get("ome", attributes).get("multiscales") or []
+    found: dict[str, tuple[tuple[float, ...] | None, str | None]] = {}
+    for image in described[:1]:
+        axes = [axis if isinstance(axis, dict) else {"name": axis} for axis in image.get("axes", [])]
+        unit = axes[-1].get("unit") if axes else None
+        for level in image.get("datasets", []):
+            scales = [t["scale"] for t in level.get("coordinateTransformations", []) if t.get("type") == "scale"]
+            found[level["path"]] = (tuple(float(h) for h in scales[0]) if scales else None, unit)
+    return found

@@ -1,0 +1,109 @@
+"""Many shapes: over parameters and seeds, one after another or, on an NVIDIA device, together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from numbers import Real
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from curvafit.generation.cost import Cost
+from curvafit.generation.flow import WORKING_BLUR, Backend, generate
+from curvafit.generation.fused import CudaStepper
+from curvafit.generation.initial import white_noise
+from curvafit.generation.loop import Orders, run
+from curvafit.generation.parametrization import DivergenceForm
+from curvafit.generation.result import Flow
+from curvafit.generation.schedule import Schedule
+from curvafit.generation.schedule import schedule as named_schedule
+from curvafit.generation.setup import base_of
+from curvafit.priors import kernels
+from curvafit.priors.coefficients import Coefficients
+from curvafit.priors.grid import WORKING_EPSILON, Grid
+from curvafit.priors.shapes import Float
+
+#: Shapes that a device makes together, if not said otherwise.
+TOGETHER = 64
+
+
+def generate_batch(
+    coefficients: Coefficients | Sequence[Coefficients],
+    masses: float | Tensor | Sequence[float | Tensor],
+    grid: Grid,
+    *,
+    seeds: int | Sequence[int] = 0,
+    schedule: str | Schedule = "fast",
+    epsilon: float | Tensor = WORKING_EPSILON,
+    blur: float = WORKING_BLUR,
+    orientation: Float[Tensor, "3 3"] | None = None,
+    snapshots: Sequence[int] = (),
+    reject_early: bool = False,
+    together: int = TOGETHER,
+    backend: Backend = "auto",
+    device: torch.device | str = "cpu",
+) -> Iterator[Flow]:
+    """Make shapes, as `generate` makes each, and give them out as they are done, in order.
+
+    Parameters
+    ----------
+    coefficients, masses, seeds
+        One for all shapes, or a sequence of one a shape; all sequences have one length. (A mass that is a tensor varies
+        in space, for all shapes.)
+    together
+        How many shapes an NVIDIA device makes at once, each some 70 bytes a voxel. A processor makes one at a time.
+
+    The other arguments are `generate`'s, for all shapes.
+
+    Raises
+    ------
+    ValueError
+        If the sequences differ in length, at once; or as `generate`, where a shape's turn comes.
+    """
+    if together < 1:
+        raise ValueError(f"expected at least one shape at a time, got {together}")
+    jobs, plan = _jobs(coefficients, masses, seeds), named_schedule(schedule)
+    told = {
+        "schedule": plan, "epsilon": epsilon, "blur": blur, "orientation": orientation,
+        "snapshots": snapshots, "reject_early": reject_early, "backend": backend, "device": device,
+    }  # fmt: skip
+    if torch.device(device).type == "cuda" and backend != "torch" and kernels.fused(device):
+        groups = [jobs[first : first + together] for first in range(0, len(jobs), together)]
+        return (flow for group in groups for flow in _together(group, grid, told))
+    return (generate(job.coefficients, job.mass, grid, seed=job.seed, **told) for job in jobs)
+
+
+class _Job(NamedTuple):
+    coefficients: Coefficients
+    mass: float | Tensor
+    seed: int
+
+
+def _jobs(coefficients, masses, seeds) -> list[_Job]:
+    """One a shape."""
+    columns = [
+        [coefficients] if isinstance(coefficients, Coefficients) else list(coefficients),
+        [masses] if isinstance(masses, (Real, Tensor)) else list(masses),
+        [seeds] if isinstance(seeds, Real) else list(seeds),
+    ]
+    lengths = {len(column) for column in columns} - {1}
+    if len(lengths) > 1 or 0 in lengths:
+        found = ", ".join(str(len(column)) for column in columns)
+        raise ValueError(f"expected coefficients, masses and seeds of one length, or one for all, got {found}")
+    count = max(lengths, default=1)
+    return [_Job(*row) for row in zip(*(column * (count // len(column)) for column in columns), strict=True)]
+
+
+def _together(jobs: list[_Job], grid: Grid, told: dict[str, Any]) -> list[Flow]:
+    """Shapes that share a device's steps."""
+    plan = told["schedule"]
+    costs = [Cost(job.coefficients, grid, told["epsilon"], told["orientation"], told["blur"]) for job in jobs]
+    forms = [
+        DivergenceForm.of(grid, told["blur"], base_of(job.mass, None, grid), kernels.gaussian_blur) for job in jobs
+    ]
+    starts = [white_noise(grid, job.seed) for job in jobs]
+    each = [job.coefficients for job in jobs]
+    moved = CudaStepper(starts, [form.base for form in forms], costs[0], each, plan.betas, None, told["device"])
+    orders = Orders(grid, told["epsilon"], plan, snapshots=told["snapshots"], reject_early=told["reject_early"])
+    return run(moved, [orders] * len(jobs), [job.seed for job in jobs])

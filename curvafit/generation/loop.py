@@ -1,0 +1,187 @@
+"""The one loop of all flows: step, look, until a reason to stop. Shapes that share a stepper share the loop."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from curvafit.generation import fraction
+from curvafit.generation.checkpoint import Checkpoint
+from curvafit.generation.result import RECORD_EVERY, Callback, Flow, History, State
+from curvafit.generation.schedule import Schedule
+from curvafit.generation.stepper import Shape, Stepper
+from curvafit.generation.viability import Viability, viability
+from curvafit.priors.grid import Grid
+
+#: A flow whose energy falls by less than this share over its last tenth is called converged.
+SETTLED = 0.01
+
+
+@dataclass(frozen=True)
+class Orders:
+    """What a flow is asked to do, beside lowering the energy.
+
+    Parameters
+    ----------
+    grid, epsilon, plan
+        The sampling, ε for the viability checks, and the steps.
+    callbacks, reject_early, snapshots, volume_fraction
+        As in `generate`.
+
+    Raises
+    ------
+    ValueError
+        If a snapshot is not among the plan's steps.
+    """
+
+    grid: Grid
+    epsilon: float | Tensor
+    plan: Schedule
+    callbacks: Sequence[Callback] = ()
+    snapshots: Sequence[int] = ()
+    reject_early: bool = False
+    volume_fraction: float | None = None
+
+    def __post_init__(self) -> None:
+        wrong = [step for step in self.snapshots if step not in range(self.plan.steps + 1)]
+        if wrong:
+            raise ValueError(f"expected snapshots at 0 to {self.plan.steps} steps, got {wrong}")
+
+    def next_mark(self, made: int) -> int:
+        """The number of steps after which to look again."""
+        regular = made + RECORD_EVERY - made % RECORD_EVERY
+        checks = self.plan.checks if self.reject_early else ()
+        return min(mark for mark in (regular, self.plan.steps, *self.snapshots, *checks) if mark > made)
+
+
+def run(
+    moved: Stepper, orders: Sequence[Orders], seeds: Sequence[int | None], checkpoint: Checkpoint | None = None
+) -> list[Flow]:
+    """Step shapes that share a stepper until the plan, which they share too, is done, or none is left.
+
+    A shape stops earlier where its energy is not finite, or a callback or a check says so; all of them, where the
+    optimiser stalls. The checkpoint is removed at the end, but kept where a callback stopped the flow.
+    """
+    lanes = [_Lane(*each) for each in zip(moved.shapes, orders, seeds, strict=True)]
+    plan, made = orders[0].plan, _resumed(moved, lanes, checkpoint)
+    while True:
+        last = made == plan.steps or moved.stalled
+        moved.step(None if last else plan.rate(made))
+        settled = [lane.settle() for lane in lanes] if last else []
+        if any(settled):
+            moved.step(None)
+        for lane in lanes:
+            lane.look(made, last, moved.stalled)
+        if last or all(lane.stop for lane in lanes):
+            break
+        mark = min(each.next_mark(made) for each in orders)
+        made += 1 + moved.run([plan.rate(step) for step in range(made + 1, mark)])
+        if checkpoint is not None and checkpoint.due():
+            checkpoint.save(_content(moved, lanes, made))
+    if checkpoint is not None:
+        if any(lane.asked for lane in lanes) and not last:
+            checkpoint.save(_content(moved, lanes, made + 1))
+        else:
+            checkpoint.remove()
+    return [lane.end() for lane in lanes]
+
+
+def _resumed(moved: Stepper, lanes: list[_Lane], checkpoint: Checkpoint | None) -> int:
+    """The number of steps made: none, or those of the checkpoint's state, from which all goes on."""
+    found = checkpoint.load() if checkpoint else None
+    if found is None:
+        return 0
+    moved.restore(found["stepper"])
+    for lane, (rows, kept) in zip(lanes, found["lanes"], strict=True):
+        lane.rows, lane.kept = rows, kept
+    return found["made"]
+
+
+def _content(moved: Stepper, lanes: list[_Lane], made: int) -> dict[str, Any]:
+    return {"made": made, "lanes": [(lane.rows, lane.kept) for lane in lanes], "stepper": moved.state()}
+
+
+class _Lane:
+    """One shape on its way."""
+
+    def __init__(self, shape: Shape, orders: Orders, seed: int | None) -> None:
+        self._shape, self._orders, self._seed = shape, orders, seed
+        self.rows: list[list[float]] = []
+        self.kept: dict[int, Tensor] = {}
+        #: Why it stopped before the plan's end, and whether a callback asked for it.
+        self.stop, self.asked = "", False
+        self._missed, self._stalled, self._field, self._mass = "", False, None, math.nan
+
+    def settle(self) -> bool:
+        """Make the share of volume exact at the end, where a small constant does it; whether one was added."""
+        share = self._orders.volume_fraction
+        if share is None or self.stop:
+            return False
+        u = self._shape.field()
+        shift, end = fraction.last_shift(u, share), self._viability(u)
+        if end.viable and abs(shift) <= fraction.LAST:
+            self._shape.shift(shift)
+            return True
+        self._missed = f"; volume fraction {float((u > 0).double().mean()):.4f} instead of {share:.4f}"
+        return False
+
+    def look(self, made: int, last: bool, stalled: bool) -> None:
+        """Do what is to be done after so many steps."""
+        if self.stop:
+            return
+        orders, shape, total = self._orders, self._shape, self._orders.plan.steps
+        if made in orders.snapshots:
+            self.kept[made] = shape.field()
+        if last or made % RECORD_EVERY == 0:
+            self._record(made, last)
+        if not self.stop and orders.reject_early and made in orders.plan.checks:
+            failed = self._viability(shape.field())
+            self.stop = "" if failed.viable else f"stopped after {made} of {total} steps: {failed.reason}"
+        if last or self.stop:
+            self._field, self._mass, self._stalled = shape.field(), shape.mass(), stalled
+
+    def end(self) -> Flow:
+        """What came out."""
+        assert self._field is not None
+        orders, end = self._orders, self._viability(self._field)
+        history = History(*np.array(self.rows, dtype=np.float64).T)
+        status = self._status(end, history)
+        return Flow(self._field, history, status, orders.grid, end, orders.plan, self._seed, self._mass, self.kept)
+
+    def _record(self, made: int, last: bool) -> None:
+        """The history's newest row, the guard against NaN, the callbacks, and the next mass."""
+        orders, shape, total = self._orders, self._shape, self._orders.plan.steps
+        statistics, mass = shape.statistics(), shape.mass()
+        self.rows.append([made, *statistics, mass])
+        if not math.isfinite(statistics.energy):
+            self.stop = f"stopped after {made} of {total} steps: the energy is not finite"
+            return
+        if orders.callbacks:
+            state = State(shape.field(), *statistics, mass)
+            answers = [bool(callback(made, total, state)) for callback in orders.callbacks]
+            if any(answers):
+                self.stop, self.asked = f"stopped by a callback after {made} of {total} steps", True
+        share = orders.volume_fraction
+        if share is not None and not last and made >= fraction.BEGIN * total:
+            shape.shift(fraction.correction(shape.field(), share, mass, total))
+
+    def _viability(self, u: Tensor) -> Viability:
+        return viability(u, self._orders.grid, self._orders.epsilon)
+
+    def _status(self, end: Viability, history: History) -> str:
+        if self.stop:
+            return self.stop
+        made = int(history.step[-1])
+        if not end.viable:
+            return f"no shape after {made} steps: {end.reason}{self._missed}"
+        if self._stalled:
+            return f"stopped after {made} steps: the line search finds no lower energy{self._missed}"
+        before = history.energy[np.searchsorted(history.step, 0.9 * made, side="right") - 1]
+        fall = (before - history.energy[-1]) / max(abs(before), 1e-30)
+        word = "converged" if abs(fall) < SETTLED else "still moving"
+        return f"{word} after {made} steps: the energy fell by {100 * fall:.2f} % over the last tenth{self._missed}"

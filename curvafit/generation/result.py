@@ -1,0 +1,65 @@
+"""What a flow gives back, and what it shows on its way."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from torch import Tensor
+
+from curvafit.generation.schedule import Schedule
+from curvafit.generation.viability import Viability
+from curvafit.priors.grid import Grid
+
+#: Steps between two entries of the history (and two calls of the callbacks).
+RECORD_EVERY = 10
+
+
+@dataclass(frozen=True)
+class History:
+    """Figures every `RECORD_EVERY` steps and at the end, arrays `(N,)`: the number of steps made, F_ε, max and mean of
+    |∂F_ε/∂A| over free voxels, the mean of u. (For the L² flows the gradient is that of v.)"""
+
+    step: np.ndarray
+    energy: np.ndarray
+    gradient_max: np.ndarray
+    gradient_mean: np.ndarray
+    mass: np.ndarray
+
+
+@dataclass(frozen=True)
+class State:
+    """What a callback sees: the figures of the history's newest entry, and the field, `(Z, Y, X)`."""
+
+    field: Tensor
+    energy: float
+    gradient_max: float
+    gradient_mean: float
+    mass: float
+
+
+class Callback(Protocol):
+    def __call__(self, step: int, total: int, state: State, /) -> bool | None:
+        """Called every `RECORD_EVERY` steps with the number made, and at the end; returning True stops the flow."""
+        ...
+
+
+@dataclass(frozen=True)
+class Flow:
+    """The end of a flow: the field, float32 `(Z, Y, X)`, how it came there, and whether it is a shape.
+
+    `status` is a sentence; `seed` is None where the flow started from a given field; `mass` is the mean of the field,
+    and `snapshots` the fields that were asked for, by the number of steps made.
+    """
+
+    field: Tensor
+    history: History
+    status: str
+    grid: Grid
+    viability: Viability
+    schedule: Schedule
+    seed: int | None
+    mass: float
+    snapshots: Mapping[int, Tensor]

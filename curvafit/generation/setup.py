@@ -1,0 +1,97 @@
+"""From what a flow is told to what steps it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from curvafit.generation import fraction
+from curvafit.generation.checkpoint import Checkpoint, identity
+from curvafit.generation.cost import Cost, check_shape
+from curvafit.generation.fused import CudaStepper, FusedStepper
+from curvafit.generation.loop import Orders
+from curvafit.generation.parametrization import Blur, DivergenceForm, Form
+from curvafit.generation.schedule import Schedule
+from curvafit.generation.stepper import LbfgsStepper, Stepper, TorchStepper
+from curvafit.priors import kernels, stencils
+from curvafit.priors.grid import Grid
+
+
+@dataclass(frozen=True)
+class Place:
+    """How and where the steps are made, and where they are saved.
+
+    Raises
+    ------
+    ValueError
+        If the backend is unknown.
+    """
+
+    backend: str
+    device: torch.device | str
+    checkpoint: str | Path | None
+    every: float
+
+    def __post_init__(self) -> None:
+        if self.backend not in ("auto", "torch", "fused"):
+            raise ValueError(f"expected a backend 'auto', 'torch' or 'fused', got {self.backend!r}")
+
+    @property
+    def blur(self) -> Blur:
+        """The blur of forms."""
+        return stencils.gaussian_blur if self.backend == "torch" else kernels.gaussian_blur
+
+    def stepper(
+        self, start: Tensor, form: Form, cost: Cost, plan: Schedule, optimiser: str, frozen: Tensor | None
+    ) -> Stepper:
+        """The stepper of one shape: fused where there is a kernel, unless plain torch is asked for.
+
+        Raises
+        ------
+        ValueError
+            If the optimiser is unknown, or a fused kernel is asked for and there is none.
+        """
+        if optimiser not in ("adam", "lbfgs"):
+            raise ValueError(f"expected an optimiser 'adam' or 'lbfgs', got {optimiser!r}")
+        able, betas = kernels.fused(self.device), plan.betas
+        if self.backend == "fused" and not able:
+            raise ValueError(f"expected a device with fused kernels (and numba or triton), got {self.device}")
+        if able and self.backend != "torch" and optimiser == "adam" and isinstance(form, DivergenceForm):
+            if torch.device(self.device).type == "cuda":
+                return CudaStepper([start], [form.base], cost, [cost.coefficients], betas, frozen, self.device)
+            return FusedStepper(start, form, cost, betas, frozen)
+        kind = LbfgsStepper if optimiser == "lbfgs" else TorchStepper
+        lowered, plain = (cost.coefficients, cost.epsilon), self.backend == "torch"
+        return kind(start, form, *lowered, betas, frozen, self.device, cost.orientation, fused=not plain)
+
+    def saved(self, moved: Stepper, cost: Cost, orders: Orders, **more: object) -> Checkpoint | None:
+        """The checkpoint of a run, where one is asked for."""
+        if self.checkpoint is None:
+            return None
+        mine = {"schedule": orders.plan, "volume_fraction": orders.volume_fraction, "snapshots": [*orders.snapshots]}
+        told = {**vars(cost), **mine, "stepper": type(moved).__name__, **more}
+        return Checkpoint(self.checkpoint, self.every, identity(**told))
+
+
+def base_of(mass: float | Tensor | None, share: float | None, grid: Grid) -> float | Tensor:
+    """The base of div A: the mass, a field of it `(Z, Y, X)`, or a first estimate for a share of volume.
+
+    Raises
+    ------
+    ValueError
+        If not exactly one of the two is given, or it is out of range or shape.
+    """
+    if (mass is None) == (share is None):
+        raise ValueError(f"expected either a mass or a volume fraction, got {mass} and {share}")
+    if share is not None:
+        return fraction.first_mass(share)
+    values = torch.as_tensor(mass)
+    if not bool((values.abs() < 1).all()):
+        raise ValueError(f"expected a mass in (-1, 1), got {float(values.min())} to {float(values.max())}")
+    if values.dim() == 0:
+        return float(mass)  # type: ignore[arg-type]
+    check_shape("mass", values, grid)
+    return values.detach().to("cpu", torch.float32).expand(grid.shape).contiguous()

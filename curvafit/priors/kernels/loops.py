@@ -1,0 +1,856 @@
+"""The loops of the fused kernels for processors (numba, float32), written in vectors.
+
+All of numba's code is in this one file, so that a change to any of it renews the compiled cache.
+
+Vectors. A loop over x takes `NARROW` or `WIDE` floats at a time; a wide vector is two of the processor's, whose
+independent arithmetic hides the other's latency. Square roots and quotients come from the processor's estimates and a
+Newton step where it has them (14 bits, so full float32 after one step), else from exact division.
+
+Volumes that one pass hands to the next are flat: `SLACK` floats, then planes of (Y + 4) × (X + 4), the field with two
+samples of its continuation on every side, then `SLACK` floats. So a stencil reads its neighbours at fixed distances
+wherever it stands, and a loop runs over several rows in one go; what it computes on the continuation is right for one
+sample beyond the box and finite and unused for the second. A and Adam's moments are `(3, Z, Y, X)` without that.
+The last vector of a run overshoots its end, into what is computed later or never read.
+
+The order of every sum does not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+import operator
+from typing import Any
+
+import llvmlite.binding as llvm
+import numpy as np
+from llvmlite import ir
+from numba import config, njit, prange, types
+from numba.core.imputils import lower_builtin
+from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
+from numba.extending import intrinsic, models, register_model
+
+#: All of fast-math but the leave to assume that no value is NaN or infinite: a diverged flow must show.
+_FLAGS = {"reassoc", "contract", "arcp", "nsz", "afn"}
+_SERIAL = {"cache": True, "fastmath": _FLAGS, "error_model": "numpy", "nogil": True}
+_PARALLEL = {**_SERIAL, "parallel": True}
+
+
+def _features() -> str:
+    """Of the processor that numba compiles for."""
+    name, features = getattr(config, "CPU_NAME", None), getattr(config, "CPU_FEATURES", None)
+    if features is None and name is None:
+        return llvm.get_host_cpu_features().flatten()
+    return features or ""
+
+
+_AVX512 = "+avx512f" in _features().split(",")
+#: Floats of the two kinds of vector.
+NARROW, WIDE = (16, 32) if _AVX512 else (8, 8)
+#: Floats before and after a flat volume.
+SLACK = 64
+#: Samples of the continuation on every side of a plane.
+EDGE = 2
+#: Rows that a blur computes at once, and taps that are unrolled (weights are padded with zeros to a multiple).
+TOGETHER, TAPS = 4, 17
+#: Rows that Adam takes at a time: whole vectors whatever X.
+ROWS = 16
+#: Partial derivatives kept for a row: what goes to the six neighbours, to the centre, and along the diagonals.
+PARTIALS = 10
+_YM, _C, _ZM, _ZP, _XM, _XP, _ZX, _YP, _ZY, _YX = range(PARTIALS)
+#: Floats of a strip in the blur along z: the twenty rows that four outputs need stay in the second-level cache.
+_STRIP = 2048
+
+
+_ZERO, _HALF, _ONE, _LEAST = np.float32(0), np.float32(0.5), np.float32(1), np.float32(1e-37)
+
+
+class _Vector(types.Type):
+    def __init__(self, width: int) -> None:
+        self.width = width
+        super().__init__(f"float32x{width}")
+
+
+_register: Any = register_model(_Vector)
+_infer: Any = infer_global
+
+
+@_register
+class _VectorModel(models.PrimitiveModel):
+    def __init__(self, manager, vector) -> None:
+        super().__init__(manager, vector, _ir(vector.width))
+
+
+def _ir(width: int) -> ir.VectorType:
+    return ir.VectorType(ir.FloatType(), width)
+
+
+def _constant(width: int, value: float) -> ir.Constant:
+    return ir.Constant(_ir(width), [value] * width)
+
+
+def _lanes(builder, first, second, indices):
+    return builder.shuffle_vector(first, second, ir.Constant(ir.VectorType(ir.IntType(32), len(indices)), indices))
+
+
+def _splat(builder, number, width: int):
+    nothing = ir.Constant(_ir(width), ir.Undefined)
+    return _lanes(builder, builder.insert_element(nothing, number, ir.IntType(32)(0)), nothing, [0] * width)
+
+
+def _function(builder, name: str, result, arguments):
+    known = builder.module.globals.get(name)
+    return known or ir.Function(builder.module, ir.FunctionType(result, arguments), name)
+
+
+def _define_operators(vector: _Vector) -> None:
+    """v + v, v - v, v · v, v / v, and with a number on either side."""
+    kinds = ((vector, vector), (vector, types.float32), (types.float32, vector))
+    cases = [signature(vector, *kind) for kind in kinds]
+    names = {operator.add: "fadd", operator.sub: "fsub", operator.mul: "fmul", operator.truediv: "fdiv"}
+    for symbol, name in names.items():
+        _infer(symbol)(type(f"{name}_{vector}", (ConcreteTemplate,), {"cases": cases}))
+
+        def lower(context, builder, sig, values, name=name):
+            first, second = (
+                value if kind == vector else _splat(builder, value, vector.width)
+                for value, kind in zip(values, sig.args, strict=True)
+            )
+            return getattr(builder, name)(first, second)
+
+        for kind in kinds:
+            lower_builtin(symbol, *kind)(lower)
+
+
+_VECTORS = {width: _Vector(width) for width in {NARROW, WIDE}}
+for _kind in _VECTORS.values():
+    _define_operators(_kind)
+
+
+def _address(context, builder, kind, values, width: int):
+    """Of a vector in an array, the first two values being the array and an index from 0."""
+    data = context.make_array(kind)(context, builder, values[0]).data
+    return builder.bitcast(builder.gep(data, [values[1]]), _ir(width).as_pointer())
+
+
+def _loader(width: int):
+    def load(typingctx, array, index):
+        """Floats `index` … of a flat float32 array."""
+
+        def generate(context, builder, sig, values):
+            return builder.load(_address(context, builder, sig.args[0], values, width), align=4)
+
+        return _VECTORS[width](array, types.intp), generate
+
+    return load
+
+
+def _filler(width: int):
+    def full(typingctx, number):
+        """A vector of equal floats."""
+
+        def generate(context, builder, sig, values):
+            return _splat(builder, values[0], width)
+
+        return _VECTORS[width](types.float32), generate
+
+    return full
+
+
+def _type_store(typingctx, array, index, value):
+    """`array[index …] = value`."""
+
+    def generate(context, builder, sig, values):
+        builder.store(values[2], _address(context, builder, sig.args[0], values, sig.args[2].width), align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, value), generate
+
+
+def _type_store_first(typingctx, array, index, value, count):
+    """The same for the first `count` floats of it."""
+
+    def generate(context, builder, sig, values):
+        width = value.width
+        numbers = ir.VectorType(ir.IntType(64), width)
+        nothing = ir.Constant(numbers, ir.Undefined)
+        limit = _lanes(builder, builder.insert_element(nothing, values[3], ir.IntType(32)(0)), nothing, [0] * width)
+        within = builder.icmp_signed("<", ir.Constant(numbers, list(range(width))), limit)
+        address = _address(context, builder, sig.args[0], values, width)
+        kinds = [_ir(width), address.type, ir.IntType(32), within.type]
+        masked = _function(builder, f"llvm.masked.store.v{width}f32.p0", ir.VoidType(), kinds)
+        builder.call(masked, [values[2], address, ir.IntType(32)(4), within])
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, value, types.intp), generate
+
+
+def _estimate(builder, name: str, value, width: int):
+    """The processor's 14-bit estimate, vector by vector of its own width."""
+    kinds = [_ir(16), _ir(16), ir.IntType(16)]
+    function = _function(builder, f"llvm.x86.avx512.{name}.ps.512", _ir(16), kinds)
+    everywhere = ir.IntType(16)(-1)
+    parts = []
+    for first in range(0, width, 16):
+        part = _lanes(builder, value, value, list(range(first, first + 16)))
+        parts.append(builder.call(function, [part, _constant(16, 0.0), everywhere]))
+    return parts[0] if width == 16 else _lanes(builder, parts[0], parts[-1], list(range(width)))
+
+
+def _type_inverse_root(typingctx, value, one, half):
+    """1/√value of normal positive floats. `one` and `half` are vectors of these."""
+
+    def generate(context, builder, sig, values):
+        x, one, half = values
+        width = value.width
+        if not _AVX512:
+            root = _function(builder, f"llvm.sqrt.v{width}f32", _ir(width), [_ir(width)])
+            return builder.fdiv(one, builder.call(root, [x]))
+        y = _estimate(builder, "rsqrt14", x, width)
+        error = builder.fsub(one, builder.fmul(builder.fmul(x, y), y))
+        return builder.fadd(y, builder.fmul(builder.fmul(y, half), error))
+
+    return value(value, value, value), generate
+
+
+def _type_inverse(typingctx, value, one):
+    """1/value of normal floats."""
+
+    def generate(context, builder, sig, values):
+        x, one = values
+        if not _AVX512:
+            return builder.fdiv(one, x)
+        y = _estimate(builder, "rcp14", x, value.width)
+        return builder.fadd(y, builder.fmul(y, builder.fsub(one, builder.fmul(x, y))))
+
+    return value(value, value), generate
+
+
+def _type_where_above(typingctx, value, bound, yes, no):
+    """`yes` where value > bound, else `no`."""
+
+    def generate(context, builder, sig, values):
+        x, bound, yes, no = values
+        return builder.select(builder.fcmp_ordered(">", x, bound), yes, no)
+
+    return value(value, value, value, value), generate
+
+
+def _type_weights(typingctx, taps, first, like):
+    """Weights `first` … of a blur, each a vector like `like`."""
+    kind = types.UniTuple(like, TAPS)
+
+    def generate(context, builder, sig, values):
+        data = builder.gep(context.make_array(taps)(context, builder, values[0]).data, [values[1]])
+        numbers = [builder.load(builder.gep(data, [ir.IntType(64)(j)])) for j in range(TAPS)]
+        return context.make_tuple(builder, kind, [_splat(builder, number, like.width) for number in numbers])
+
+    return kind(taps, types.intp, like), generate
+
+
+def _type_blur_across(typingctx, source, origin, size, index, first, weights, total):
+    """Four neighbouring sums of weighted rows, added to `total`: row j of the source, from `origin + index[j]·size`
+    on, j from `first` on."""
+
+    def generate(context, builder, sig, values):
+        source_, origin_, size_, index_, first_, weights_, total_ = values
+        width = total.dtype.width
+        places = builder.gep(context.make_array(index)(context, builder, index_).data, [first_])
+        weights_ = [builder.extract_value(weights_, j) for j in range(TAPS)]
+        sums = [builder.extract_value(total_, k) for k in range(TOGETHER)]
+        for j in range(TAPS + TOGETHER - 1):
+            place = builder.load(builder.gep(places, [ir.IntType(64)(j)]))
+            offset = builder.add(origin_, builder.mul(place, size_))
+            row = builder.load(_address(context, builder, source, [source_, offset], width), align=4)
+            for k in range(max(0, j - TAPS + 1), min(TOGETHER, j + 1)):
+                sums[k] = builder.fadd(sums[k], builder.fmul(row, weights_[j - k]))
+        return context.make_tuple(builder, total, sums)
+
+    return total(source, types.intp, types.intp, index, types.intp, weights, total), generate
+
+
+def _type_blur_along(typingctx, row, first, weights, total):
+    """The sum of a row's weighted samples from `first` on, for as many neighbours as a vector has, added to `total`."""
+
+    def generate(context, builder, sig, values):
+        row_, first_, weights_, sum_ = values
+        for j in range(TAPS):
+            place = builder.add(first_, ir.IntType(64)(j))
+            samples = builder.load(_address(context, builder, row, [row_, place], total.width), align=4)
+            sum_ = builder.fadd(sum_, builder.fmul(samples, builder.extract_value(weights_, j)))
+        return sum_
+
+    return total(row, types.intp, weights, total), generate
+
+
+def _reduction(name: str):
+    def reduce(typingctx, value):
+        """Sum, or greatest, of a vector's floats."""
+
+        def generate(context, builder, sig, values):
+            whole = f"llvm.vector.reduce.{name}.v{value.width}f32"
+            if name == "fmax":
+                return builder.call(_function(builder, whole, ir.FloatType(), [_ir(value.width)]), values)
+            function = _function(builder, whole, ir.FloatType(), [ir.FloatType(), _ir(value.width)])
+            return builder.call(function, [ir.FloatType()(0.0), *values], fastmath=("reassoc",))
+
+        return types.float32(value), generate
+
+    return reduce
+
+
+_narrow: Any = intrinsic(_loader(NARROW))
+_wide: Any = intrinsic(_loader(WIDE))
+_full_narrow: Any = intrinsic(_filler(NARROW))
+_full: Any = intrinsic(_filler(WIDE))
+_store: Any = intrinsic(_type_store)
+_store_first: Any = intrinsic(_type_store_first)
+_inverse_root: Any = intrinsic(_type_inverse_root)
+_inverse: Any = intrinsic(_type_inverse)
+_where_above: Any = intrinsic(_type_where_above)
+_weights: Any = intrinsic(_type_weights)
+_blur_across: Any = intrinsic(_type_blur_across)
+_blur_along: Any = intrinsic(_type_blur_along)
+_sum: Any = intrinsic(_reduction("fadd"))
+_greatest: Any = intrinsic(_reduction("fmax"))
+
+
+@njit(**_SERIAL)
+def _scaled(value, ratios, which):
+    """Times one of the spacings' ratios, where they differ."""
+    if ratios is None:
+        return value
+    return value * ratios[which]
+
+
+@njit(**_SERIAL)
+def _weight(local, places, which, cell):
+    return _wide(local, places[which, 0] + places[which, 1] * cell)
+
+
+@njit(**_SERIAL)
+def _cost(k, local, places, cell):
+    """The density's weights: (h/ε)², the floor of X, then those of X, T², TS, GT, GS and s, and twice the weights of X,
+    T² and s; where they vary, from `cell` on."""
+    if local is None:
+        return (
+            _full(k[7]), _full(k[8]), _full(k[9]), _full(k[10]), _full(k[11]), _full(k[12]), _full(k[13]), _full(k[14]),
+            _full(k[15]), _full(k[16]), _full(k[17]),
+        )  # fmt: skip
+    well, X, T2 = _weight(local, places, 0, cell), _weight(local, places, 1, cell), _weight(local, places, 2, cell)
+    TS, GT = _weight(local, places, 3, cell), _weight(local, places, 4, cell)
+    GS, s = _weight(local, places, 5, cell), _weight(local, places, 6, cell)
+    return well, well * k[8], X, T2, TS, GT, GS, s, X + X, T2 + T2, s + s
+
+
+@njit(**_SERIAL)
+def _mirrored(orient, across_z, across_y):
+    """Q as it stands in the box's mirror image: what has one axis that is mirrored is negative."""
+    if orient is None:
+        return None
+    return orient[2 * across_z + across_y]
+
+
+@njit(**_SERIAL)
+def _tilt(gz, gy, gx, orient, local, places, cell, i):
+    """Q∇u, times the weight of ∇uᵀQ∇u; a row of signs says where x is mirrored."""
+    weight, sign = _weight(local, places, 7, cell), _wide(local, places[8, 0] + i)
+    gz, gy, gx = weight * gz, weight * gy, weight * gx
+    across = sign * gx
+    tz = gz * orient[0] + gy * orient[3] + across * orient[4]
+    ty = gz * orient[3] + gy * orient[1] + across * orient[5]
+    return tz, ty, sign * (gz * orient[4] + gy * orient[5]) + gx * orient[2]
+
+
+@njit(**_SERIAL)
+def _partials(u, m, c, p, stride, n, ring, size, at, inside, from_, k, ratios, orient, local, places):
+    """Energy of n cells, and their partial derivatives from `at` on into the ten arrays of the ring, `size` apart.
+
+    `m`, `c`, `p` are the cells' offsets in the planes z-1, z, z+1 of u; `inside` is one in the box from `from_` on.
+    Differences are in units of the spacing, the constants `k` scaled accordingly. They are read where they are used:
+    kept in registers, they would push the variables out. `local` and `places` are None, or the weights where they vary
+    (from row 0 of `places` on: of each its offset in `local`, and one, or zero for a vector that serves everywhere);
+    then `orient` holds Q's zz, yy, xx, zy, zx, yx.
+    """
+    energy = _full(k[1])
+    for i in range(0, n, WIDE):
+        ξ2, zero, half, quarter = _full(k[0]), _full(k[1]), _full(k[2]), _full(k[3])
+        one, two, three = _full(k[4]), _full(k[5]), _full(k[6])
+        well, low, of_X, of_T2, of_TS, of_GT, of_GS, of_s, twice_X, twice_T2, twice_s = _cost(k, local, places, c + i)
+        u_ = _wide(u, c + i)
+        zm, zp = _wide(u, m + i), _wide(u, p + i)
+        ym, yp = _wide(u, c + i - stride), _wide(u, c + i + stride)
+        xm, xp = _wide(u, c + i - 1), _wide(u, c + i + 1)
+        gz, gy, gx = _scaled(zp - zm, ratios, 0), _scaled(yp - ym, ratios, 1), _scaled(xp - xm, ratios, 2)
+        twice = u_ + u_
+        zz, yy = _scaled((zp + zm) - twice, ratios, 3), _scaled((yp + ym) - twice, ratios, 4)
+        xx = _scaled((xp + xm) - twice, ratios, 5)
+        zy = (_wide(u, p + i + stride) + _wide(u, m + i - stride)) - (
+            _wide(u, p + i - stride) + _wide(u, m + i + stride)
+        )
+        zx = (_wide(u, p + i + 1) + _wide(u, m + i - 1)) - (_wide(u, p + i - 1) + _wide(u, m + i + 1))
+        yx = (_wide(u, c + i + stride + 1) + _wide(u, c + i - stride - 1)) - (
+            _wide(u, c + i + stride - 1) + _wide(u, c + i - stride + 1)
+        )
+        zy, zx = _scaled(quarter * zy, ratios, 6), _scaled(quarter * zx, ratios, 7)
+        yx = _scaled(quarter * yx, ratios, 8)
+        # The density.
+        gzz, gyy, gxx = gz * gz, gy * gy, gx * gx
+        s = gzz + gyy + gxx
+        d = s + ξ2
+        i_G = _inverse_root(d, one, half)
+        i_d, G = i_G * i_G, d * i_G
+        beyond = ξ2 * i_d
+        r = one - beyond
+        u2 = u_ * u_
+        w = u_ * (well * u2 - well)
+        N = (zz * zz + yy * yy + xx * xx) + two * (zy * zy + zx * zx + yx * yx)
+        hz = gz * zz + gy * zy + gx * zx
+        hy = gz * zy + gy * yy + gx * yx
+        hx = gz * zx + gy * yx + gx * xx
+        q = (gz * hz + gy * hy + gx * hx) * i_d
+        wr = w * r
+        T = wr - (zz + yy + xx)
+        T2 = T * T
+        X = two * (N + wr * wr - (w + w) * q) - T2
+        inner = _where_above(X, low, X, low)
+        i_S = _inverse_root(inner, one, half)
+        S = inner * i_S
+        TS = of_TS * T
+        e_S = TS + of_GS * G
+        e_G = of_GT * T + of_GS * S
+        e = of_X * X + of_T2 * T2 + TS * S + G * e_G + of_s * s
+        tz = ty = tx = zero
+        if orient is not None:
+            tz, ty, tx = _tilt(gz, gy, gx, orient, local, places, c + i, i)
+            e = e + (gz * tz + gy * ty + gx * tx)
+        energy = energy + e * _wide(inside, from_ + i)
+        # Its derivatives, from the outside in: by P twice that by X, which is zero in e's root below the floor.
+        e_P = twice_X + e_S * _where_above(X, low, i_S, zero)
+        e_T = T * (twice_T2 - e_P) + (of_TS * S + of_GT * G)
+        P2 = e_P + e_P
+        e_wr = e_T + P2 * wr
+        half_Q = w * e_P * i_d
+        Q = half_Q + half_Q
+        e_q = Q + Q
+        e_w = r * e_wr - P2 * q
+        e_s = twice_s + e_G * i_G + e_q * q + two * beyond * i_d * (w * e_wr)
+        dz, dy, dx = e_s * gz - e_q * hz, e_s * gy - e_q * hy, e_s * gx - e_q * hx
+        if orient is not None:
+            dz, dy, dx = dz + (tz + tz), dy + (ty + ty), dx + (tx + tx)
+        dz, dy, dx = _scaled(dz, ratios, 0), _scaled(dy, ratios, 1), _scaled(dx, ratios, 2)
+        dzz, dyy = _scaled(P2 * zz - e_T - Q * gzz, ratios, 3), _scaled(P2 * yy - e_T - Q * gyy, ratios, 4)
+        dxx = _scaled(P2 * xx - e_T - Q * gxx, ratios, 5)
+        o = at + i
+        _store(ring, o + _C * size, e_w * (well * (three * u2) - well) - two * (dzz + dyy + dxx))
+        _store(ring, o + _ZM * size, dzz - dz)
+        _store(ring, o + _ZP * size, dzz + dz)
+        _store(ring, o + _YM * size, dyy - dy)
+        _store(ring, o + _YP * size, dyy + dy)
+        _store(ring, o + _XM * size, dxx - dx)
+        _store(ring, o + _XP * size, dxx + dx)
+        Qz, Qy = half_Q * gz, half_Q * gy
+        _store(ring, o + _ZY * size, _scaled(e_P * zy - Qz * gy, ratios, 6))
+        _store(ring, o + _ZX * size, _scaled(e_P * zx - Qz * gx, ratios, 7))
+        _store(ring, o + _YX * size, _scaled(e_P * yx - Qy * gx, ratios, 8))
+    return _sum(energy)
+
+
+@njit(**_SERIAL)
+def _gather(ring, size, at, stride, n, sums, below, centre, above, out, target):
+    """Apply the transposed stencils to n cells from `at` of the ring on: finish the plane below, add to this one,
+    begin the one above (`below`, `centre`, `above` are offsets into `sums`)."""
+    c, zm, zp, xm, xp, zx = (
+        at + _C * size,
+        at + _ZM * size,
+        at + _ZP * size,
+        at + _XM * size,
+        at + _XP * size,
+        at + _ZX * size,
+    )
+    yp, ym = at + _YP * size - stride, at + _YM * size + stride
+    zy_m, zy_p, yx_m, yx_p = (
+        at + _ZY * size - stride,
+        at + _ZY * size + stride,
+        at + _YX * size - stride,
+        at + _YX * size + stride,
+    )
+    for i in range(0, n, WIDE):
+        within = _wide(ring, c + i) + _wide(ring, yp + i) + (_wide(ring, ym + i) + _wide(ring, xp + i - 1))
+        within = within + _wide(ring, xm + i + 1) + (_wide(ring, yx_p + i + 1) - _wide(ring, yx_p + i - 1))
+        within = within + (_wide(ring, yx_m + i - 1) - _wide(ring, yx_m + i + 1))
+        across = (_wide(ring, zy_p + i) - _wide(ring, zy_m + i)) + (_wide(ring, zx + i + 1) - _wide(ring, zx + i - 1))
+        _store(out, target + i, _wide(sums, below + i) + _wide(ring, zm + i) + across)
+        _store(sums, above + i, _wide(ring, zp + i) - across)
+        if i + WIDE <= n:
+            _store(sums, centre + i, _wide(sums, centre + i) + within)
+        else:
+            _store_first(sums, centre + i, _wide(sums, centre + i) + within, n - i)
+
+
+@njit(**_SERIAL)
+def _carry(ring, size, stride, count):
+    """Of a block of `count` rows (in places 2 … of the ring), what the next needs of its last two, to places 0, 1."""
+    far = count * stride
+    for array in range(_C, _YP):
+        first = SLACK + array * size + stride
+        for i in range(first, first + stride, WIDE):
+            _store(ring, i, _wide(ring, i + far))
+    for array in range(_YP, PARTIALS):
+        first = SLACK + array * size
+        for i in range(first, first + 2 * stride, WIDE):
+            _store(ring, i, _wide(ring, i + far))
+
+
+@njit(**_SERIAL)
+def _energy_gradient_chunk(
+    u, out, energies, ring, sums, inside, k, ratios, orient, local, places, index,
+    first, last, y0, y1, block, Z, Y, stride,
+):  # fmt: skip
+    """Planes first … last - 1, rows y0 … y1 - 1 of the gradient, with a halo of one cell computed on every side."""
+    plane, size = (Y + 2 * EDGE) * stride, (ring.size - 2 * SLACK) // PARTIALS
+    share = (sums.size - 2 * SLACK) // 4
+    for z in range(first - 1, last + 1):
+        m, c, p = SLACK + index[z + 1] * plane, SLACK + index[z + 2] * plane, SLACK + index[z + 3] * plane
+        below, centre, above = SLACK + (z + 2) % 3 * share, SLACK + (z + 3) % 3 * share, SLACK + (z + 4) % 3 * share
+        energy = 0.0
+        y = y0 - 1
+        while y <= y1:
+            within = y0 <= y < y1
+            count = min(block, y1 - y) if within else 1
+            o = (y + EDGE) * stride
+            from_ = (block - count if within else block) * stride
+            place = SLACK + 2 * stride
+            energy += _partials(
+                u, m + o, c + o, p + o, stride, count * stride, ring, size, place, inside, from_, k, ratios,
+                _mirrored(orient, z < 0 or z >= Z, y < 0 or y >= Y), local, places,
+            )  # fmt: skip
+            begin = max(y - 1, y0)
+            n = (y + count - 1 - begin) * stride
+            place += (begin - y) * stride
+            row = (begin - y0) * stride
+            if z > first:
+                target = SLACK + (z - 1) * plane + (begin + EDGE) * stride
+                _gather(ring, size, place, stride, n, sums, below + row, centre + row, above + row, out, target)
+            else:
+                discard = SLACK + 3 * share
+                _gather(ring, size, place, stride, n, sums, below + row, centre + row, above + row, sums, discard)
+            _carry(ring, size, stride, count)
+            y += count
+        if first <= z < last:
+            energies[z] = energy
+
+
+@njit(**_PARALLEL)
+def energy_gradient(
+    u, out, energies, rings, sums, inside, k, ratios, orient, local, places, index, block, tile, Z, Y, X
+):
+    """Energies of the planes, tile of rows by tile, and the gradient."""
+    chunks = rings.shape[0]
+    for chunk in prange(chunks):
+        first, last = chunk * Z // chunks, (chunk + 1) * Z // chunks
+        if first < last:
+            for y0 in range(0, Y, tile):
+                _energy_gradient_chunk(
+                    u, out, energies[y0 // tile], rings[chunk], sums[chunk], inside, k, ratios, orient,
+                    local, places, index, first, last, y0, min(Y, y0 + tile), block, Z, Y, X + 2 * EDGE,
+                )  # fmt: skip
+
+
+@njit(**_SERIAL)
+def _store_rows(out, target, apart, count, rows):
+    """The first of four rows' vectors."""
+    first, second, third, fourth = rows
+    _store(out, target, first)
+    if count > 1:
+        _store(out, target + apart, second)
+    if count > 2:
+        _store(out, target + 2 * apart, third)
+    if count > 3:
+        _store(out, target + 3 * apart, fourth)
+
+
+@njit(**_SERIAL)
+def _blur_rows(source, origin, size, index, first, out, target, apart, count, n, taps, shift):
+    """Up to four rows of n, `apart` in `out`, of a blur across rows: `index` says which of those that stand `size`
+    apart in the source is where, from the first one's first tap at `first` on."""
+    whole = -(-n // NARROW) * NARROW // WIDE * WIDE
+    for j in range(0, taps.size, TAPS):
+        wide, narrow = _weights(taps, j, _full(shift)), _weights(taps, j, _full_narrow(shift))
+        for i in range(0, whole, WIDE):
+            o = target + i
+            if j == 0:
+                begun = (_full(shift), _full(shift), _full(shift), _full(shift))
+            else:
+                begun = (_wide(out, o), _wide(out, o + apart), _wide(out, o + 2 * apart), _wide(out, o + 3 * apart))
+            rows = _blur_across(source, origin + i, size, index, first + j, wide, begun)
+            _store_rows(out, o, apart, count, rows)
+        for i in range(whole, n, NARROW):
+            o = target + i
+            if j == 0:
+                rest = (_full_narrow(shift), _full_narrow(shift), _full_narrow(shift), _full_narrow(shift))
+            else:
+                rest = (
+                    _narrow(out, o),
+                    _narrow(out, o + apart),
+                    _narrow(out, o + 2 * apart),
+                    _narrow(out, o + 3 * apart),
+                )
+            _store_rows(out, o, apart, count, _blur_across(source, origin + i, size, index, first + j, narrow, rest))
+
+
+@njit(**_SERIAL)
+def _blur_planes(source, origin, plane, index, first, out, target, count, n, taps, shift):
+    """As `_blur_rows` across planes, n in whole wide vectors, `taps` between three zeros.
+
+    Its rows come from the second-level cache at best, where one row at a time for all taps is faster than all at once.
+    """
+    for i in range(0, n, WIDE):
+        a = b = c = d = _full(shift)
+        for j in range(taps.size - TOGETHER + 1):
+            row = _wide(source, origin + index[first + j] * plane + i)
+            a, b = a + row * taps[j + 3], b + row * taps[j + 2]
+            c, d = c + row * taps[j + 1], d + row * taps[j]
+        _store_rows(out, target + i, plane, count, (a, b, c, d))
+
+
+@njit(**_PARALLEL)
+def blur_z(source, out, base, chunks, Z, plane, index, taps, shift):
+    """Blur along z, plus a number and, where there is one, a field; strip by strip, four planes at a time."""
+    for chunk in prange(chunks):
+        first, last = chunk * Z // chunks, (chunk + 1) * Z // chunks
+        strips = -(-plane // _STRIP)
+        for strip in range(strips + 1):
+            # Whole vectors; what remains of the plane is the end of one more.
+            n = min(_STRIP, plane // WIDE * WIDE - strip * _STRIP) if strip < strips else WIDE
+            begin = SLACK + (strip * _STRIP if strip < strips else plane - WIDE)
+            for z in range(first, last, TOGETHER):
+                target, count = begin + z * plane, min(TOGETHER, last - z)
+                _blur_planes(source, begin, plane, index, z, out, target, count, n, taps, shift)
+                if base.size > 0:
+                    for row in range(target, target + count * plane, plane):
+                        for i in range(row, row + n):
+                            out[i] += base[i]
+
+
+@njit(**_SERIAL)
+def _continue_rows(rows, start, length, X, r, index):
+    """The continuation of four rows, `length` apart, whose samples stand from start + r on."""
+    end = start + TOGETHER * length
+    if index[0] == X - r and r <= NARROW:
+        for row in range(start, end, length):
+            _store_first(rows, row, _narrow(rows, row + X), r)
+            _store_first(rows, row + r + X, _narrow(rows, row + r), r)
+    else:
+        for j in range(r):
+            left, right = r + index[j], r + index[r + X + j]
+            for row in range(start, end, length):
+                rows[row + j], rows[row + r + X + j] = rows[row + left], rows[row + right]
+
+
+@njit(**_SERIAL)
+def _blur_x(rows, start, length, count, out, target, X, taps, ends):
+    """Blur along `count` rows, `length` apart, from their continuation at `start` on, into rows X + 2·EDGE apart, with
+    two samples of their own continuation at either end."""
+    stride = X + 2 * EDGE
+    for j in range(0, taps.size, TAPS):
+        weights = _weights(taps, j, _full_narrow(_ZERO))
+        for i in range(0, X, NARROW):
+            for k in range(count):
+                o = target + k * stride + i
+                begun = _full_narrow(_ZERO) if j == 0 else _narrow(out, o)
+                blurred = _blur_along(rows, start + k * length + i + j, weights, begun)
+                if i + NARROW <= X:
+                    _store(out, o, blurred)
+                else:
+                    _store_first(out, o, blurred, X - i)
+    for o in range(target, target + count * stride, stride):
+        out[o - 2], out[o - 1] = out[o + ends[0]], out[o + ends[1]]
+        out[o + X], out[o + X + 1] = out[o + ends[2]], out[o + ends[3]]
+
+
+@njit(**_SERIAL)
+def _blur_plane(source, origin, size, work, out, target, edge, Y, X, r, blur):
+    """Blur a plane along y and x: rows `size` apart in the source, to rows -edge … Y + edge - 1 of `out`, whose row 0
+    begins at `target`; r is the radius along x.
+
+    Four rows are blurred along y before the four before them are along x: by then what was written has arrived.
+    """
+    index_y, taps_y, index_x, taps_x, ends = blur
+    stride, length = X + 2 * EDGE, X + taps_x.size + WIDE + NARROW
+    now, before = 0, TOGETHER * length
+    for y in range(-edge, Y + edge + TOGETHER, TOGETHER):
+        if y < Y + edge:
+            _blur_rows(source, origin, size, index_y, y + EDGE, work, now + r, length, TOGETHER, X, taps_y, _ZERO)
+            _continue_rows(work, now, length, X, r, index_x)
+        if y > -edge:
+            done = y - TOGETHER
+            count = min(TOGETHER, Y + edge - done)
+            _blur_x(work, before, length, count, out, target + done * stride, X, taps_x, ends)
+        now, before = before, now
+
+
+@njit(**_PARALLEL)
+def blur_in_planes(source, out, works, Z, Y, X, index_y, taps_y, index_x, taps_x, ends, r):
+    """Blur along y and x."""
+    chunks = works.shape[0]
+    stride = X + 2 * EDGE
+    plane = (Y + 2 * EDGE) * stride
+    for chunk in prange(chunks):
+        blur = (index_y, taps_y, index_x, taps_x, ends)
+        for z in range(chunk * Z // chunks, (chunk + 1) * Z // chunks):
+            o = SLACK + z * plane + EDGE * stride + EDGE
+            _blur_plane(source, o, stride, works[chunk], out, o, 0, Y, X, r, blur)
+
+
+@njit(**_SERIAL)
+def _within(i, n, periodic):
+    """Index i, at most one beyond either end, brought back: to the other end, or to the nearest."""
+    if i < 0:
+        return n - 1 if periodic else 0
+    if i >= n:
+        return 0 if periodic else n - 1
+    return i
+
+
+@njit(**_SERIAL)
+def _divergence_rows(A, out, target, n, zm, zp, ym, yp, o, fz_m, fz_p, fy_m, fy_p, fx):
+    """div A of n samples, which are neighbours in memory."""
+    for i in range(0, n, WIDE):
+        total = _wide(A, zp + i) * fz_p - _wide(A, zm + i) * fz_m
+        total = total + (_wide(A, yp + i) * fy_p - _wide(A, ym + i) * fy_m)
+        _store(out, target + i, total + (_wide(A, o + i + 1) - _wide(A, o + i - 1)) * fx)
+
+
+@njit(**_SERIAL)
+def _divergence_plane(A, out, start, half, z, Z, Y, X, periodic):
+    """div A on a plane: central differences of an odd continuation (no flux through mirrors)."""
+    size = Y * X
+    Az, Ay, Ax = SLACK, SLACK + (Z + z) * size, SLACK + (2 * Z + z) * size
+    odd = _ONE if periodic else -_ONE
+    zm, zp = Az + _within(z - 1, Z, periodic) * size, Az + _within(z + 1, Z, periodic) * size
+    fz_m, fz_p = (half[0] * (odd if z == 0 else _ONE), half[0] * (odd if z == Z - 1 else _ONE))
+    fy, fx = half[1], half[2]
+    first, final, end = _within(-1, Y, periodic) * X, _within(Y, Y, periodic) * X, (Y - 1) * X
+    _divergence_rows(A, out, start, X, zm, zp, Ay + first, Ay + X, Ax, fz_m, fz_p, odd * fy, fy, fx)
+    _divergence_rows(A, out, start + X, end - X, zm + X, zp + X, Ay, Ay + 2 * X, Ax + X, fz_m, fz_p, fy, fy, fx)
+    _divergence_rows(
+        A, out, start + end, X, zm + end, zp + end, Ay + end - X, Ay + final, Ax + end, fz_m, fz_p, fy, odd * fy, fx
+    )
+    left, right = _within(-1, X, periodic), _within(X, X, periodic)
+    for y in range(Y):
+        o, row = Ax + y * X, start + y * X
+        out[row] += fx * (A[o - 1] - odd * A[o + left])
+        out[row + X - 1] += fx * (odd * A[o + right] - A[o + X])
+
+
+@njit(**_SERIAL)
+def _blurred_divergence(A, out, work, start, half, z, Z, Y, X, periodic, r, blur):
+    """div A of a plane, blurred along y and x, with its continuation; `start` is its place in `work`."""
+    stride = X + 2 * EDGE
+    _divergence_plane(A, work, start, half, z, Z, Y, X, periodic)
+    o = SLACK + z * (Y + 2 * EDGE) * stride + EDGE * stride + EDGE
+    _blur_plane(work, start, X, work, out, o, EDGE, Y, X, r, blur)
+
+
+@njit(**_SERIAL)
+def _slopes(work, target, before, after, factor, X):
+    """factor·(before - after) of a row."""
+    for i in range(0, X, NARROW):
+        _store(work, target + i, (_narrow(work, before + i) - _narrow(work, after + i)) * factor)
+
+
+@njit(**_SERIAL)
+def _adam_rows(A, m, v, o, keep, free, work, slopes, most, n, adam):
+    """Adam on n samples of a component, from `o` on; returns the sum of the slopes' moduli, and keeps their maxima in
+    `work`, from `most` on."""
+    total, top = _full_narrow(_ZERO), _narrow(work, most)
+    one, half, least = _full_narrow(_ONE), _full_narrow(_HALF), _full_narrow(_LEAST)
+    for i in range(n, -(-n // NARROW) * NARROW):
+        work[slopes + i] = _ZERO
+    for i in range(0, n, NARROW):
+        slope = _narrow(work, slopes + i)
+        if keep.size > 0:
+            slope = slope * _narrow(keep, free + i)
+        first = _narrow(m, o + i)
+        first = first + (slope - first) * adam[0]
+        second = _narrow(v, o + i) * adam[1] + slope * slope * adam[2]
+        # Below the least number whose root the processor estimates, the root is lost beside eps.
+        root = second * _inverse_root(_where_above(second, least, second, least), one, half)
+        moved = _narrow(A, o + i) - first * adam[3] * _inverse(root * adam[4] + _full_narrow(adam[5]), one)
+        size = _where_above(slope, _full_narrow(_ZERO), slope, _full_narrow(_ZERO) - slope)
+        top = _where_above(size, top, size, top)
+        total = total + size
+        if i + NARROW <= n:
+            _store(m, o + i, first)
+            _store(v, o + i, second)
+            _store(A, o + i, moved)
+        else:
+            _store_first(m, o + i, first, n - i)
+            _store_first(v, o + i, second, n - i)
+            _store_first(A, o + i, moved, n - i)
+    _store(work, most, top)
+    return _sum(total)
+
+
+@njit(**_SERIAL)
+def _adam_plane(A, m, v, keep, work, below, here, above, slopes, half, adam, z, Z, Y, X):
+    """-∇ of a plane and Adam, some rows at a time; returns sum and maximum of the slopes' moduli. `below`, `here`,
+    `above` are the first samples' offsets in `work`."""
+    stride = X + 2 * EDGE
+    most = slopes + ROWS * X + SLACK
+    _store(work, most, _full_narrow(_ZERO))
+    total = 0.0
+    for y in range(0, Y, ROWS):
+        count = min(ROWS, Y - y)
+        free = SLACK + (z * Y + y) * X
+        for component in range(3):
+            for k in range(count):
+                row = (y + k) * stride
+                if component == 0:
+                    before, after = below + row, above + row
+                elif component == 1:
+                    before, after = here + row - stride, here + row + stride
+                else:
+                    before, after = here + row - 1, here + row + 1
+                _slopes(work, slopes + k * X, before, after, half[component], X)
+            o = component * Z * Y * X + free
+            total += _adam_rows(A, m, v, o, keep, free, work, slopes, most, count * X, adam)
+    return total, _greatest(_narrow(work, most))
+
+
+@njit(**_PARALLEL)
+def adam_step(
+    moves, g, A, m, v, keep, out, works, sums, highest, half, adam, Z, Y, X, periodic,
+    index_z, index_y, taps_y, index_x, taps_x, ends, r,
+):  # fmt: skip
+    """Blur along y and x, three planes at a time; -∇, the transpose of div; Adam; and as soon as A's neighbouring
+    planes have moved, div A for the next step, blurred along y and x, while A is in the cache. If it `moves`: else the
+    last alone (one function, for it takes seconds to compile)."""
+    chunks = works.shape[0]
+    stride = X + 2 * EDGE
+    plane = (Y + 2 * EDGE) * stride
+    for chunk in prange(chunks):
+        work = works[chunk]
+        blur = (index_y, taps_y, index_x, taps_x, ends)
+        first, last = chunk * Z // chunks, (chunk + 1) * Z // chunks
+        start = work.size - Y * X - SLACK
+        slopes = start - ROWS * X - 3 * SLACK
+        ring = slopes - 3 * plane - SLACK
+        origin = EDGE * stride + EDGE
+        for z in range(first - 1, last + 1) if moves and first < last else range(0):
+            above = ring + (z + 3) % 3 * plane + origin
+            _blur_plane(g, SLACK + index_z[z + 2] * plane + origin, stride, work, work, above, 1, Y, X, r, blur)
+            if z > first:
+                below, here = ring + (z + 1) % 3 * plane + origin, ring + (z + 2) % 3 * plane + origin
+                sums[z - 1], highest[z - 1] = _adam_plane(
+                    A, m, v, keep, work, below, here, above, slopes, half, adam, z - 1, Z, Y, X
+                )
+                if z - 2 > first:
+                    _blurred_divergence(A, out, work, start, half, z - 2, Z, Y, X, periodic, r, blur)
+    # The planes whose neighbours another thread moved, or all.
+    for chunk in prange(chunks):
+        work = works[chunk]
+        blur = (index_y, taps_y, index_x, taps_x, ends)
+        first, last = chunk * Z // chunks, (chunk + 1) * Z // chunks
+        start = work.size - Y * X - SLACK
+        for z in range(first, last, max(1, last - 1 - first) if moves else 1):
+            _blurred_divergence(A, out, work, start, half, z, Z, Y, X, periodic, r, blur)

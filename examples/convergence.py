@@ -1,0 +1,90 @@
+"""A shape on its way: surfaces, diagrams, energy and gradient over 8000 steps (paper, Figs. 2 and 3).
+
+python examples/convergence.py [--small] [--edge 100] [--schedule paper] [-o convergence]
+
+Preset `flow`: a = (1, 2.4, 9, 30, 170, -195), m₀ = -0.66. A killed run goes on where it was.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from common import CELL, DIAGRAM, SURFACE, draw, parser, plan_of, program, write_table
+from matplotlib.figure import Figure
+
+from curvafit.diagram import Diagram, diagram
+from curvafit.generation.flow import Flow, generate
+from curvafit.generation.viability import viability
+from curvafit.mesh import NoSurface
+from curvafit.plot import write_picture
+from curvafit.priors.coefficients import preset
+from curvafit.priors.grid import WORKING_EPSILON, Grid
+from curvafit.transport import wasserstein
+
+#: Numbers of steps in the table, and those that the paper shows.
+MARKS = (10, 30, 100, 300, 1000, 2000, 4000, 8000)
+SHOWN = (10, 300, 1000, 4000, 8000)
+
+
+def main() -> None:
+    options = parser(__doc__, "convergence", plan="paper").parse_args()
+    options.output.mkdir(parents=True, exist_ok=True)
+    grid, plan, shape = Grid((options.edge,) * 3), plan_of(options), preset("flow")
+    marks = sorted({mark for mark in MARKS if mark < plan.steps} | {plan.steps})
+    flow = generate(
+        shape.coefficients,
+        shape.mass,
+        grid,
+        schedule=plan,
+        seed=options.seed,
+        snapshots=marks,
+        checkpoint=options.output / "convergence.checkpoint",
+        device=options.device,
+    )
+    diagrams = {step: diagram_of(u.numpy(), grid, options.curvature) for step, u in flow.snapshots.items()}
+    write_table(options, "convergence", [*table(flow, diagrams), flow.status], [program()])
+    shown = [step for step in marks if step in (*SHOWN, plan.steps)]
+    print(write_picture(picture(flow, diagrams, shown), options.output / "convergence.png"))
+
+
+def diagram_of(u: np.ndarray, grid: Grid, kind) -> Diagram | None:
+    """The diagram, if there is a surface: early fields are noise."""
+    try:
+        return diagram(u, grid, WORKING_EPSILON, curvature=kind)
+    except NoSurface:
+        return None
+
+
+def table(flow: Flow, diagrams: dict[int, Diagram | None]) -> list[str]:
+    """A line a mark; the distance is the one to the last diagram."""
+    history, last = flow.history, diagrams[max(diagrams)]
+    lines = [
+        f"{'step':>5} {'energy':>12} {'max |∂G|':>10} {'mean |∂G|':>10} {'discrep.':>9} {'u > 0':>7} {'distance':>9}"
+    ]
+    for step, u in flow.snapshots.items():
+        at = int(np.flatnonzero(history.step == step)[0])
+        seen = diagrams[step]
+        away = wasserstein(seen, last) if seen and last else float("nan")
+        ratio = viability(u, flow.grid, WORKING_EPSILON).discrepancy
+        line = (
+            f"{step:5d} {history.energy[at]:12.4f} {history.gradient_max[at]:10.3e} {history.gradient_mean[at]:10.3e}"
+        )
+        lines.append(f"{line} {ratio:9.3f} {float((u > 0).double().mean()):7.4f} {away:9.3f}")
+    return lines
+
+
+def picture(flow: Flow, diagrams: dict[int, Diagram | None], shown: list[int]) -> Figure:
+    """Surfaces and diagrams at some steps, above the curves."""
+    figure = Figure(figsize=(CELL * len(shown), SURFACE + DIAGRAM + 3), layout="constrained")
+    above, below = figure.subfigures(2, 1, height_ratios=[SURFACE + DIAGRAM, 3], squeeze=False).flat
+    draw(above, {f"{step} steps": (flow.snapshots[step].numpy(), diagrams[step]) for step in shown}, len(shown))
+    history, axes = flow.history, below.subplots(1, 3)
+    curves = {"energy": history.energy, "max |∂G|": history.gradient_max, "mean |∂G|": history.gradient_mean}
+    for each, (name, values) in zip(axes, curves.items(), strict=True):
+        each.plot(history.step[1:], values[1:], color="#2B6FA8", linewidth=1)
+        each.set_yscale("log" if (values[1:] > 0).all() else "symlog")
+        each.set(title=name, xlabel="steps")
+    return figure
+
+
+if __name__ == "__main__":
+    main()

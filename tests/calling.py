@@ -1,0 +1,22 @@
+"""The command line called from tests."""
+
+from __future__ import annotations
+
+from typer.testing import CliRunner, Result
+
+from curvafit.cli import app
+
+LAW = ["--coefficients", "1,2,6,-40,-40,400", "--mass", "-0.6"]
+QUICK = [*LAW, "--shape", "24", "--steps", "30"]
+
+
+def call(*arguments: object) -> Result:
+    return CliRunner().invoke(app, [str(part) for part in arguments])
+
+
+def refused(result: Result, said: str) -> None:
+    """One sentence on the error stream, nothing on the other, exit code 2."""
+    assert result.exit_code == 2, (result.output, result.exception)
+    assert result.stdout == ""
+    lines = result.stderr.strip().splitlines()
+    assert len(lines) == 1 and lines[0].startswith("error: ") and said in lines[0], lines

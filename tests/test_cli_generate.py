@@ -1,0 +1,288 @@
+"""`curvafit generate`: what it hands on, what it writes, and one sentence with exit code 2 for everything else."""
+
+from __future__ import annotations
+
+import importlib
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import nibabel
+import numpy as np
+import pytest
+import torch
+import trimesh
+from calling import LAW, QUICK, call, refused
+from found import made_fit
+
+from curvafit.generation.flow import generate
+from curvafit.priors.coefficients import preset
+from curvafit.priors.energy import orientation
+from curvafit.priors.grid import Grid
+from curvafit.scan import load
+
+pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
+
+
+@pytest.fixture(autouse=True)
+def undrawn(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
+    """Empty pictures, but where a test is named after its own."""
+    if "picture" not in request.node.name:
+        monkeypatch.setattr("curvafit.shape_files.surface_picture", lambda u, path: path.write_bytes(b""))
+
+
+def made(*arguments: object) -> dict[str, Any]:
+    """The record that a command which succeeds leaves."""
+    result = call("generate", *arguments)
+    assert result.exit_code == 0, (result.output, result.exception)
+    record = next(Path(line) for line in result.stdout.splitlines() if line.endswith(".json"))
+    return json.loads(record.read_text())
+
+
+def test_generate_writes_a_field_a_picture_and_a_record(tmp_path: Path) -> None:
+    target = tmp_path / "new" / "tubes.nii.gz"
+    result = call("generate", *QUICK, "--seed", 7, "-o", target)
+    assert result.exit_code == 0, (result.output, result.exception)
+    assert sorted(path.name for path in target.parent.iterdir()) == ["tubes.json", "tubes.nii.gz", "tubes.png"]
+    record = json.loads((target.parent / "tubes.json").read_text())
+    assert list(record["coefficients"].values()) == [1, 2, 6, -40, -40, 400]
+    assert (record["mass"], record["seed"], record["schedule"]) == (-0.6, 7, {"name": "fast", "steps": 30})
+    field = load(target)
+    assert field.shape == (24, 24, 24) and field.unit == "voxel"
+    assert field.values.mean() == pytest.approx(-0.6, abs=1e-5)
+    assert str(target) in result.stdout
+
+
+def test_generate_writes_a_surface_in_the_prior_s_unit(tmp_path: Path) -> None:
+    prior = tmp_path / "fit.json"
+    prior.write_text(made_fit().to_json())
+    target = tmp_path / "more.ply"
+    result = call("generate", "--prior", prior, "--mass", "-0.4", "--shape", "16,20,24", "--steps", 30, "-o", target)
+    assert result.exit_code == 0, (result.output, result.exception)
+    record = json.loads((tmp_path / "more.json").read_text())
+    assert record["coefficients"] == made_fit().coefficients.as_dict()
+    assert (record["mass"], record["shape"], record["voxel"], record["unit"]) == (-0.4, [16, 20, 24], 0.0195, "mm")
+    assert target.read_bytes().startswith(b"ply\nformat binary_little_endian")
+    again = call("generate", "--prior", prior, "--shape", "16", "--steps", 30, "-o", tmp_path / "fit.npy")
+    refused(again, "record fit.json is not another file's")
+    assert prior.read_text() == made_fit().to_json()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ([], "expected one of --preset, --coefficients and --prior, got 0"),
+        (["--preset", "tubes", *LAW], "got 2"),
+        (["--preset", "tube"], "expected a preset among bilayers"),
+        (["--coefficients", "1,2,6,-40,-40,400"], "expected --mass"),
+        (["--coefficients", "1,2,6", "--mass", "-0.6"], "expected --coefficients as 6 numbers"),
+        (["--coefficients", "1,2,6,-40,nan,400", "--mass", "0"], "expected --coefficients as 6 numbers"),
+        ([*LAW, "--mass", "-1.5"], "expected a mass in (-1, 1)"),
+        ([*LAW, "--shape", "10,10"], "expected --shape as 3 numbers"),
+        ([*LAW, "--shape", "10.5"], "expected --shape as whole numbers"),
+        ([*LAW, "--shape", "2"], "at least 4"),
+        ([*LAW, "--shape", "-8"], "expected --shape as positive numbers"),
+        ([*LAW, "--schedule", "slow"], "expected a schedule among paper, fast"),
+        ([*LAW, "--steps", "0"], "expected a whole number of steps"),
+        ([*LAW, "--volume-fraction", "0.3"], "expected either a mass or --volume-fraction"),
+        ([*LAW[:2], "--volume-fraction", "1.3"], "expected a volume fraction in (0, 1)"),
+        ([*LAW, "--unit", "mm"], "expected --spacing beside --unit"),
+        ([*LAW, "--spacing", "1", "--unit", "furlong"], "furlong"),
+        ([*LAW, "--spacing", "1,2,2"], "expected --spacing of cubic voxels"),
+        ([*LAW, "--spacing", "0"], "expected --spacing as positive numbers"),
+        ([*LAW, "--tile", "0,1,1"], "expected --tile as positive numbers"),
+        ([*LAW, "--tile", "2", "--boundary", "replicate"], "expected --tile with a periodic boundary"),
+        ([*LAW, "--boundary", "open"], "expected boundary 'periodic' or 'replicate'"),
+        ([*LAW, "--epsilon", "0"], "expected epsilon > 0"),
+        ([*LAW, "--orientation", "1,0,0"], "expected --orientation as 4 numbers"),
+        ([*LAW, "--orientation", "0,0,0,5"], "expected a direction of 3 finite numbers"),
+        ([*LAW, "--snapshots", "5,x"], "expected --snapshots as 2 numbers"),
+        ([*LAW, "--snapshots", "2.5"], "expected --snapshots as whole numbers"),
+        ([*LAW, "--steps", "20", "--shape", "16", "--snapshots", "21"], "expected snapshots at 0 to 20 steps"),
+        ([*LAW, "--device", "abacus"], "expected --device to be one of this machine's"),
+        ([*LAW, "--maps", "nowhere.npz"], "got no such file: nowhere.npz"),
+        (["--prior", "nowhere.json"], "expected a fit.json, found no file"),
+    ],
+)
+def test_generate_refuses_in_one_sentence(tmp_path: Path, arguments: list[str], said: str) -> None:
+    refused(call("generate", *arguments, "-o", tmp_path / "out.npy"), said)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_generate_refuses_a_place_before_it_works(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    refused(call("generate", *QUICK, "-o", tmp_path / "out.xyz"), "expected a name ending in one of")
+    refused(call("generate", *QUICK, "-o", tmp_path / "file" / "out.npy"), "is a file")
+    refused(call("generate", *QUICK, "-o", tmp_path / "out.mrc"), "expected a unit of nm, um, mm or m for an MRC file")
+    refused(call("generate", *QUICK, "--checkpoint", tmp_path, "-o", tmp_path / "out.npy"), "a file of its own")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_generate_refuses_a_prior_of_another_kind(tmp_path: Path) -> None:
+    prior = tmp_path / "other.json"
+    for content, said in (("{}", "expected a fit.json"), ("[1", "expected a fit.json"), ('{"format": "x"}', "format")):
+        prior.write_text(content)
+        refused(call("generate", "--prior", prior, "-o", tmp_path / "out.npy"), said)
+
+
+# ---- what is handed on -----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def handed(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """What the generator is called with; it then stops."""
+    calls: dict[str, Any] = {}
+
+    def keep(coefficients: Any, mass: Any, grid: Grid, **more: Any) -> None:
+        calls.update(more, coefficients=coefficients, mass=mass, grid=grid)
+        raise ValueError("expected no flow")
+
+    monkeypatch.setattr(importlib.import_module("curvafit.generation.flow"), "generate", keep)
+    return calls
+
+
+def test_every_option_reaches_the_generator(tmp_path: Path, handed: dict[str, Any]) -> None:
+    options = "--preset tubes --shape 8,10,12 --boundary replicate --epsilon 0.03 --orientation 0,3,4,25 --seed 5 "
+    options += "--schedule paper --steps 77 --snapshots 10,70 --checkpoint-every 5 --volume-fraction 0.3"
+    call("generate", *options.split(), "--checkpoint", tmp_path / "run.pt", "-o", tmp_path / "out.npy")
+    assert handed["coefficients"] == preset("tubes").coefficients
+    assert (handed["mass"], handed["volume_fraction"], handed["seed"]) == (None, 0.3, 5)
+    assert handed["grid"] == Grid((8, 10, 12), boundary="replicate")
+    assert (handed["schedule"].name, handed["schedule"].steps, handed["snapshots"]) == ("paper", 77, (10, 70))
+    assert torch.equal(handed["orientation"], orientation((0, 0.6, 0.8), 25))
+    assert (handed["checkpoint"], handed["checkpoint_every"]) == (tmp_path / "run.pt", 5)
+    assert (handed["epsilon"], handed["device"]) == (0.03, "cpu")
+
+
+def test_maps_take_the_place_of_numbers(tmp_path: Path, handed: dict[str, Any]) -> None:
+    slope = np.linspace(0.1, 0.9, 5 * 6 * 7, dtype=np.float32).reshape(5, 6, 7)
+    np.savez(tmp_path / "maps.npz", a00=900 * slope, mass=-slope, a11=1.5)
+    call("generate", "--preset", "tubes", "--maps", tmp_path / "maps.npz", "-o", tmp_path / "out.npy")
+    law = handed["coefficients"]
+    assert (law.a20, law.a11, law.a02, law.a10, law.a01) == (1, 1.5, 6, -40, -40)
+    np.testing.assert_array_equal(law.a00, 900 * slope)
+    np.testing.assert_array_equal(handed["mass"], -slope)
+    assert handed["grid"].shape == (5, 6, 7)
+    refused(
+        call("generate", *LAW, "--maps", tmp_path / "maps.npz", "-o", tmp_path / "out.npy"),
+        "expected either --mass or a map of mass",
+    )
+    wrong = call("generate", *LAW, "--shape", "8", "--maps", tmp_path / "maps.npz", "-o", tmp_path / "out.npy")
+    refused(wrong, "expected the map a00 of shape (8, 8, 8), got (5, 6, 7)")
+
+
+def test_a_map_s_shape_is_made_and_its_range_recorded(tmp_path: Path) -> None:
+    np.savez(tmp_path / "maps.npz", a00=np.linspace(300, 500, 16)[:, None, None] * np.ones((16, 16, 16)))
+    maps = ["--maps", tmp_path / "maps.npz", "--steps", 30]
+    record = made("--preset", "tubes", *maps, "-o", tmp_path / "out.npy")
+    assert record["shape"] == [16, 16, 16] and record["maps"].endswith("maps.npz")
+    assert record["coefficients"]["a00"] == {"least": 300, "greatest": 500}
+
+
+# ---- what is written -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("suffix", "spacing", "unit"), [(".tif", 0.02, "um"), (".mrc", 20, "nm"), (".zarr", 0.02, "um")]
+)
+def test_voxels_have_their_size_in_the_file(tmp_path: Path, suffix: str, spacing: float, unit: str) -> None:
+    made(*QUICK, "--spacing", "0.02", "--unit", "um", "-o", tmp_path / f"out{suffix}")
+    field = load(tmp_path / f"out{suffix}")
+    assert field.spacing == pytest.approx((spacing,) * 3) and field.unit == unit
+    assert field.values.mean() == pytest.approx(-0.6, abs=1e-5)
+
+
+def test_nifti_is_whole_and_tiled(tmp_path: Path) -> None:
+    """Zooms, qform, sform and unit as nibabel reads them; the repeats are copies of the box."""
+    size = ["--spacing", "0.02", "--unit", "mm"]
+    made(*QUICK, *size, "-o", tmp_path / "one.nii.gz")
+    record = made(*QUICK, *size, "--tile", "1,2,3", "-o", tmp_path / "more.nii.gz")
+    one, more = nibabel.load(tmp_path / "one.nii.gz"), nibabel.load(tmp_path / "more.nii.gz")
+    for affine in (more.get_qform(), more.get_sform(), more.affine):
+        np.testing.assert_allclose(affine, np.diag([0.02, 0.02, 0.02, 1]), atol=1e-7)
+    assert more.header.get_xyzt_units()[0] == "mm"
+    np.testing.assert_allclose(more.header.get_zooms(), 0.02, rtol=1e-6)
+    np.testing.assert_array_equal(more.dataobj, np.tile(one.dataobj, (3, 2, 1)))
+    assert (record["tile"], record["voxel"], record["unit"]) == ([1, 2, 3], 0.02, "mm")
+
+
+def solid(tmp_path: Path, edge: int, *more: object) -> None:
+    """Tubes as STL: closed for another program, with the volume of {u > 0}."""
+    size = ["--shape", edge, "--spacing", "0.02", "--unit", "mm"]
+    record = made("--preset", "tubes", *size, *more, "-o", tmp_path / "tubes.stl")
+    mesh = trimesh.load_mesh(tmp_path / "tubes.stl")
+    assert mesh.is_watertight and mesh.is_winding_consistent
+    assert mesh.volume == pytest.approx(record["volume_fraction"] * (0.02 * edge) ** 3, rel=0.002)
+    np.testing.assert_allclose(mesh.bounds, [[-0.01] * 3, [0.02 * (edge - 0.5)] * 3], atol=1e-6)
+
+
+def test_tubes_are_watertight_with_the_volume_of_the_phase(tmp_path: Path) -> None:
+    solid(tmp_path, 48, "--steps", 150)
+
+
+@pytest.mark.slow
+def test_tubes_of_the_published_size_are_watertight(tmp_path: Path) -> None:
+    solid(tmp_path, 100)
+
+
+def test_an_open_surface_ends_at_the_box(tmp_path: Path) -> None:
+    made(*QUICK, "--no-cap", "-o", tmp_path / "out.ply")
+    mesh = trimesh.load_mesh(tmp_path / "out.ply")
+    assert not mesh.is_watertight
+    np.testing.assert_allclose(mesh.bounds, [[0] * 3, [24] * 3], atol=1e-6)
+
+
+def test_a_volume_fraction_is_reached_and_its_mass_recorded(tmp_path: Path) -> None:
+    options = ["--volume-fraction", "0.25", "--shape", "32", "--steps", 200]
+    record = made("--preset", "sponge", *options, "-o", tmp_path / "out.npy")
+    values = load(tmp_path / "out.npy").values
+    assert (values > 0).mean() == pytest.approx(0.25, abs=0.002)
+    assert record["mass"] == pytest.approx(values.mean(), abs=1e-6) and record["wanted_volume_fraction"] == 0.25
+
+
+def test_snapshots_are_the_field_on_its_way(tmp_path: Path) -> None:
+    record = made(*QUICK, "--snapshots", "7,30", "-o", tmp_path / "out.npy")
+    assert record["snapshots"] == [7, 30]
+    law = preset("tubes")
+    flow = generate(law.coefficients, law.mass, Grid((24, 24, 24)), schedule=plan(30), snapshots=(7, 30))
+    for step in (7, 30):
+        np.testing.assert_array_equal(np.load(tmp_path / f"out_step{step:05d}.npy"), flow.snapshots[step])
+    assert len(list(tmp_path.iterdir())) == 5
+
+
+def plan(steps: int) -> Any:
+    return importlib.import_module("curvafit.generation.schedule").schedule("fast", steps)
+
+
+def test_an_interrupted_run_goes_on_from_its_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    @contextmanager
+    def interrupting(steps: int) -> Iterator[Any]:
+        def watch(step: int, total: int, state: object) -> None:
+            if step == 20:
+                raise KeyboardInterrupt
+
+        yield watch
+
+    saving = [*QUICK, "--checkpoint", tmp_path / "run.pt", "--checkpoint-every", 0]
+    with monkeypatch.context() as patch:
+        patch.setattr("curvafit.cli_generate.flow_progress", interrupting)
+        result = call("generate", *saving, "-o", tmp_path / "out.npy")
+    assert result.exit_code == 130 and "the same command goes on from" in result.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["run.pt"]
+    refused(call("generate", *saving, "--seed", 9, "-o", tmp_path / "out.npy"), "expected a checkpoint of this run")
+    made(*saving, "-o", tmp_path / "out.npy")
+    made(*QUICK, "-o", tmp_path / "whole.npy")
+    np.testing.assert_array_equal(np.load(tmp_path / "out.npy"), np.load(tmp_path / "whole.npy"))
+    assert not (tmp_path / "run.pt").exists()
+
+
+def test_a_failure_while_writing_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any, **__: Any) -> None:
+        raise OSError(28, "No space left on device", "out")
+
+    monkeypatch.setattr("curvafit.shape_files.surface_picture", full)
+    result = call("generate", *QUICK, "-o", tmp_path / "out.zarr")
+    assert result.exit_code == 2 and result.stderr.endswith("error: no space left on device: out\n")
+    assert list(tmp_path.iterdir()) == []

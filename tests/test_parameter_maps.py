@@ -1,0 +1,68 @@
+"""Parameters that vary in space, from files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from curvafit.parameter_maps import map_shape, read_maps
+from curvafit.scan import Field, save
+
+RAMP = np.linspace(1, 2, 4 * 5 * 6).reshape(4, 5, 6)
+
+
+def test_an_npz_and_a_folder_say_the_same(tmp_path: Path) -> None:
+    np.savez(tmp_path / "maps.npz", a20=RAMP, mass=-RAMP / 4)
+    folder = tmp_path / "maps"
+    save(Field(RAMP, (1, 2, 3), "mm"), folder / "a20.nii.gz")
+    save(Field(-RAMP / 4), folder / "mass.zarr")
+    (folder / "README.md").write_text("what these are")
+    for path in (tmp_path / "maps.npz", folder):
+        maps = read_maps(path)
+        assert sorted(maps) == ["a20", "mass"] and map_shape(maps) == (4, 5, 6)
+        assert torch.equal(maps["a20"], torch.from_numpy(RAMP.astype(np.float32)))
+        assert torch.equal(maps["mass"], torch.from_numpy((-RAMP / 4).astype(np.float32)))
+
+
+def test_one_number_holds_everywhere(tmp_path: Path) -> None:
+    np.savez(tmp_path / "maps.npz", a11=-3, epsilon=np.array([0.02]))
+    maps = read_maps(tmp_path / "maps.npz", (9, 9, 9))
+    assert maps == {"a11": -3.0, "epsilon": 0.02} and map_shape(maps) is None
+
+
+@pytest.mark.parametrize(
+    ("arrays", "said"),
+    [
+        ({}, "expected maps named a20, a11, a02, a10, a01, a00, mass, epsilon, got none"),
+        ({"a21": RAMP, "a20": RAMP}, "got a21 in"),
+        ({"a20": RAMP, "a02": RAMP[:3]}, r"expected the map a02 of shape \(4, 5, 6\), got \(3, 5, 6\)"),
+        ({"a20": RAMP[0]}, r"expected the map a20 of shape \(5, 6\), got \(5, 6\)"),
+        ({"a20": np.where(RAMP > 1.5, np.nan, RAMP)}, "expected finite numbers in the map a20"),
+        ({"a20": RAMP * 1j}, "expected finite numbers in the map a20"),
+    ],
+)
+def test_maps_that_do_not_fit_are_refused(tmp_path: Path, arrays: dict[str, np.ndarray], said: str) -> None:
+    np.savez(tmp_path / "maps.npz", **arrays)
+    with pytest.raises(ValueError, match=said):
+        read_maps(tmp_path / "maps.npz")
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="expected a file or folder of maps"):
+        read_maps(tmp_path / "maps.npz")
+    (tmp_path / "text.npz").write_text("a20 = 1")
+    np.save(tmp_path / "one.npy", RAMP)
+    for name in ("text.npz", "one.npy"):
+        with pytest.raises(ValueError, match="expected an NPZ file or a folder of maps, got .* that is neither"):
+            read_maps(tmp_path / name)
+    folder = tmp_path / "maps"
+    save(Field(RAMP), folder / "a20.npy")
+    save(Field(RAMP), folder / "other.npy")
+    with pytest.raises(ValueError, match="expected maps named .*, got other in"):
+        read_maps(folder)
+    (folder / "other.npy").rename(folder / "a20.NPY")
+    with pytest.raises(ValueError, match="expected one map a20, got two in"):
+        read_maps(folder)
