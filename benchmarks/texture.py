@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from rich.progress import Progress
 
-from benchmarks.step import programs
+from benchmarks.step import plain_stepper
 from curvafit.diagram import Diagram, diagram
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import SCHEDULES
@@ -108,7 +108,7 @@ def _pooled(shapes: list[Shape]) -> Diagram:
 
 def start_up(edge: int) -> tuple[float, float]:
     """Seconds of `curvafit generate`, from the shell and back, and of 8000 steps in plain torch."""
-    plain, _ = programs(edge)
+    plain = plain_stepper(edge)
     plain.step(1e-3)
     begun = time.perf_counter()
     for _ in range(3):

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from curvafit.diagram import Diagram, diagram
-    from curvafit.generation.flow import generate
+    from curvafit.generation.batch import generate_batch
+    from curvafit.generation.flow import descend, generate
     from curvafit.infer import infer
     from curvafit.priors.coefficients import Coefficients, preset
     from curvafit.priors.grid import Grid
@@ -26,8 +27,10 @@ __all__ = [
     "Field",
     "Grid",
     "__version__",
+    "descend",
     "diagram",
     "generate",
+    "generate_batch",
     "infer",
     "load",
     "preset",
@@ -40,8 +43,10 @@ _SOURCES = {
     "Diagram": "curvafit.diagram",
     "Field": "curvafit.scan",
     "Grid": "curvafit.priors.grid",
+    "descend": "curvafit.generation.flow",
     "diagram": "curvafit.diagram",
     "generate": "curvafit.generation.flow",
+    "generate_batch": "curvafit.generation.batch",
     "infer": "curvafit.infer",
     "load": "curvafit.scan",
     "preset": "curvafit.priors.coefficients",

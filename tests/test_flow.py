@@ -238,3 +238,13 @@ def test_fast_makes_a_shape():
     assert flow.viability.discrepancy < 0.3
     assert "after 400 steps" in flow.status
     assert float(flow.field.max()) > 0.5
+
+
+def test_a_preset_by_name_has_its_own_mass_unless_told_otherwise() -> None:
+    tubes, brief = preset("tubes"), Schedule("brief", 3, 1e-3, 1e-3, "constant")
+    by_name = generate("tubes", grid=12, schedule=brief)
+    by_number = generate(tubes.coefficients, tubes.mass, Grid((12, 12, 12)), schedule=brief)
+    assert torch.equal(by_name.field, by_number.field)
+    assert generate("tubes", -0.3, (12, 10, 8), schedule=brief).mass == pytest.approx(-0.3, abs=1e-6)
+    with pytest.raises(ValueError, match="preset"):
+        generate("tube")

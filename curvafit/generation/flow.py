@@ -17,7 +17,7 @@ from curvafit.generation.result import RECORD_EVERY, Callback, Flow, History, St
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.schedule import schedule as named_schedule
 from curvafit.generation.setup import Place, base_of
-from curvafit.priors.coefficients import Coefficients
+from curvafit.priors.coefficients import Coefficients, preset
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.shapes import Bool, Float
 
@@ -32,9 +32,9 @@ Backend = Literal["auto", "torch", "fused"]
 
 
 def generate(
-    coefficients: Coefficients,
-    mass: float | Tensor | None,
-    grid: Grid,
+    coefficients: Coefficients | str,
+    mass: float | Tensor | None = None,
+    grid: Grid | int | tuple[int, int, int] = 100,
     *,
     volume_fraction: float | None = None,
     schedule: str | Schedule = "fast",
@@ -55,13 +55,13 @@ def generate(
     Parameters
     ----------
     coefficients
-        The six numbers, or tensors that broadcast with the voxels `(Z, Y, X)`: they vary in space.
+        The six numbers, or tensors that broadcast with the voxels `(Z, Y, X)`: they vary in space. Or a preset's name.
     mass
         m₀, the mean of u, in (-1, 1); exact to 1e-6 at every step. A tensor is m(x): u = k ∗ (div A + m). None where
-        the volume fraction is given.
+        the volume fraction is given, or for the preset's own.
     grid, epsilon, blur
-        The sampling; ε, a number or a tensor that broadcasts with the voxels, and the blur's standard deviation, in
-        spacing's unit.
+        The sampling, or voxels along (z, y, x), or along each, of a periodic box in working units; ε, a number or a
+        tensor that broadcasts with the voxels, and the blur's standard deviation, in spacing's unit.
     volume_fraction
         Instead of a mass: the share of voxels with u > 0. The mass is steered there while the flow runs, and a last
         small constant makes the share exact; where that fails, `status` says so. The mass is then `Flow.mass`.
@@ -97,6 +97,10 @@ def generate(
         If the mass is outside (-1, 1), ε is not positive or the blur negative, a tensor does not broadcast with the
         voxels, a name is unknown, a file is not this run's checkpoint, or there is no fused step for the device.
     """
+    if isinstance(coefficients, str):
+        named = preset(coefficients)
+        coefficients, mass = named.coefficients, named.mass if mass is None and volume_fraction is None else mass
+    grid = grid if isinstance(grid, Grid) else Grid(grid)  # type: ignore[arg-type]
     base, cost = base_of(mass, volume_fraction, grid), Cost(coefficients, grid, epsilon, orientation, blur)
     place, plan = Place(backend, device, checkpoint, checkpoint_every), named_schedule(schedule)
     form = DivergenceForm.of(grid, blur, base, place.blur)

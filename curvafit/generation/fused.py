@@ -134,7 +134,7 @@ class CudaStepper(Stepper):
 
     def shift(self, k: int, amount: float) -> None:
         """Add a constant to the field of one shape from the next step on."""
-        self._flow.shift(k, amount)  # type: ignore[attr-defined]
+        self._flow.shift(k, amount)
 
     def state(self) -> dict[str, Any]:
         return self._flow.state()._asdict()

@@ -5,7 +5,7 @@ if __name__ != "curvafit.priors":
 
 from curvafit.priors.coefficients import PRESETS, Coefficients, Preset, preset
 from curvafit.priors.curvature import diffuse_curvatures, geometric_curvatures, jet
-from curvafit.priors.energy import cahn_hilliard_area, discrepancy_ratio, energy, energy_terms
+from curvafit.priors.energy import cahn_hilliard_area, discrepancy_ratio, energy, energy_terms, orientation
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.priors.profile import SIGMA, optimal_profile, phase_field, profile_distance, signed_distance
 
@@ -25,6 +25,7 @@ __all__ = [
     "geometric_curvatures",
     "jet",
     "optimal_profile",
+    "orientation",
     "phase_field",
     "preset",
     "profile_distance",

@@ -9,8 +9,12 @@ Newton step where it has them (14 bits, so full float32 after one step), else fr
 Volumes that one pass hands to the next are flat: `SLACK` floats, then planes of (Y + 4) × (X + 4), the field with two
 samples of its continuation on every side, then `SLACK` floats. So a stencil reads its neighbours at fixed distances
 wherever it stands, and a loop runs over several rows in one go; what it computes on the continuation is right for one
-sample beyond the box and finite and unused for the second. A and Adam's moments are `(3, Z, Y, X)` without that.
-The last vector of a run overshoots its end, into what is computed later or never read.
+sample beyond the box and finite and unused for the second. A and Adam's moments are `(3, Z, Y, X)` between the same
+slack. The last vector of a run overshoots its end, into what is computed later or never read.
+
+Notation follows the plain-torch definition: s = |∇u|², d = s + ξ², G = √d, r = s/d, w = W'(u) = u³ - u, N = |Hess u|²,
+q = ∇uᵀ Hess u ∇u / d, T = Tr M, P = |M|², X = 2P - T², S = √(X⁺), all in the units of `_density_constants`. In float32
+the smooth positive part is 0 or X outside |X| < 2e-5, and under the root's floor of 1e-6: X⁺ = max(X, 1e-6).
 
 The order of every sum does not depend on the number of threads.
 """
@@ -59,8 +63,7 @@ _YM, _C, _ZM, _ZP, _XM, _XP, _ZX, _YP, _ZY, _YX = range(PARTIALS)
 #: Floats of a strip in the blur along z: the twenty rows that four outputs need stay in the second-level cache.
 _STRIP = 2048
 
-
-_ZERO, _HALF, _ONE, _LEAST = np.float32(0), np.float32(0.5), np.float32(1), np.float32(1e-37)
+_ZERO, _HALF, _ONE, _LEAST = (np.float32(value) for value in (0, 0.5, 1, 1e-37))
 
 
 class _Vector(types.Type):
