@@ -161,7 +161,7 @@ def test_constraints_hold_every_requirement() -> None:
     assert pins["torch"] == "2.13.0"
     groups = [project()["dependencies"], *project()["optional-dependencies"].values()]
     for requirement in (Requirement(text) for group in groups for text in group):
-        if requirement.name != "curvafit":
+        if requirement.name not in ("curvafit", "triton"):  # a torch for CUDA brings the triton that it wants
             assert requirement.specifier.contains(pins[canonicalize_name(requirement.name)]), requirement
 
 
