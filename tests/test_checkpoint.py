@@ -28,7 +28,7 @@ import sys
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import Schedule
 from curvafit.priors import Grid, preset
-plan = Schedule("test", 150, 1e-2, 1e-3, "cosine")
+plan = Schedule("test", 200, 1e-2, 1e-3, "cosine")
 tubes = preset("tubes")
 flow = generate(
     tubes.coefficients, None, Grid((14, 15, 16)), volume_fraction=0.2, schedule=plan, seed=5, backend=sys.argv[1],
@@ -69,10 +69,10 @@ def same(one, other) -> None:
 
 @pytest.mark.parametrize("backend", ["torch", "fused"])
 def test_a_killed_program_goes_on(backend, tmp_path):
-    """SIGKILL at a random step, anywhere in it; then the same end as of a run in one go."""
+    """SIGKILL at a random step after the first save, anywhere in it; then the same end as of a run in one go."""
     if backend == "fused":
         pytest.importorskip("numba")
-    path, steps = tmp_path / "run.ckpt", random.SystemRandom().randrange(1, 12)
+    path, steps = tmp_path / "run.ckpt", random.SystemRandom().randrange(2, 9)
     command = [sys.executable, "-c", SCRIPT, backend, str(path)]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
@@ -81,9 +81,9 @@ def test_a_killed_program_goes_on(backend, tmp_path):
         process.send_signal(signal.SIGKILL)
         assert process.wait() == -signal.SIGKILL
     saved = torch.load(path, weights_only=True)["content"]["made"]
-    assert 10 * (steps - 1) <= saved < 150
+    assert 10 * (steps - 1) <= saved < 200
     seen = []
-    plan = Schedule("test", 150, 1e-2, 1e-3, "cosine")
+    plan = Schedule("test", 200, 1e-2, 1e-3, "cosine")
     told = {"volume_fraction": 0.2, "schedule": plan, "seed": 5, "backend": backend, "snapshots": (10, 100)}
     resumed = generate(
         TUBES, None, GRID, **told, checkpoint=path, callbacks=[lambda step, *rest: seen.append(step) or None]
