@@ -13,6 +13,7 @@ the folder with the commit that made them: a killed run goes on, and a second on
 from __future__ import annotations
 
 import argparse
+import os
 import subprocess
 import sys
 import tempfile
@@ -138,7 +139,8 @@ def main() -> None:
         return
     options.output.mkdir(parents=True, exist_ok=True)
     plans = ", ".join(f"{plan.name} {plan.steps}" for plan in SCHEDULES.values())
-    print(f"{options.edge}³, {options.seeds} seeds; steps: {plans}; {_commit()}")
+    threads = os.environ.get("NUMBA_NUM_THREADS", os.cpu_count())
+    print(f"{options.edge}³, {options.seeds} seeds; steps: {plans}; {threads} threads; {_commit()}")
     names = ("E paper", "E fast", "noise", "cross", "bias", "/noise", "s paper", "s fast")
     print(f"{'preset':17}" + "".join(f"{name:>9}" for name in names))
     for name in options.presets.split(","):

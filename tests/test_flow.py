@@ -167,11 +167,15 @@ def test_schedules():
     assert fast.rate(fast.steps - 1) == pytest.approx(fast.stop)
     assert fast.stop < fast.start / 10
     assert paper.betas == (0.9, 0.999)
+    assert 8 * fast.steps <= paper.steps
     rates = [fast.rate(step) for step in range(fast.steps)]
     assert rates == sorted(rates, reverse=True)
     assert fast.checks == (fast.steps // 2,)
     assert schedule("paper", steps=700).checks == (500,)
     assert schedule(fast) is fast
+    for name in ("momentum", "memory"):
+        with pytest.raises(ValueError, match=f"expected {name} in \\[0, 1\\), got 1"):
+            Schedule("x", 10, 1e-3, 1e-3, "cosine", **{name: 1})
     with pytest.raises(ValueError, match="expected a schedule among paper, fast, got 'slow'"):
         schedule("slow")
     for wrong in ((0, 1e-3, "constant"), (10, 0.0, "constant"), (10, 1e-3, "linear")):

@@ -12,7 +12,7 @@ from curvafit.generation.schedule import Schedule, schedule
 from curvafit.priors.coefficients import Coefficients, preset
 from curvafit.priors.grid import Grid
 
-PLAN = schedule("fast", steps=250)
+PLAN = Schedule("short", 250, 5e-3, 1e-4, "cosine", memory=0.95)
 
 
 def share(u: torch.Tensor) -> float:
