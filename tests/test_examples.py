@@ -7,12 +7,14 @@ import sys
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import nibabel
 import numpy as np
 import pytest
+import trimesh
 
+from curvafit.mesh import surface
 from curvafit.priors.coefficients import preset
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
@@ -152,3 +154,32 @@ def test_spatialised_maps(script) -> None:
         assert float(mass[0, 0, 21 * k + 10]) == pytest.approx(stated.mass)
     ends = mass[0, 0, 0] + mass[0, 0, -1], mass[0, 0, 20] + mass[0, 0, 21], mass[0, 0, 41] + mass[0, 0, 42]
     assert [float(end) / 2 for end in ends] == pytest.approx([-0.55, -0.4, -0.5])
+
+
+@pytest.mark.parametrize(("name", "genus"), [("sphere", 0), ("torus", 1), ("genus-2", 2)])
+def test_willmore_starts_have_their_genus(script, name: str, genus: int) -> None:
+    field, grid = script("willmore").start(name, 48, 4)
+    shape = surface(field, grid)
+    assert trimesh.Trimesh(shape.vertices, shape.faces).euler_number == 2 - 2 * genus
+
+
+def test_willmore_energy_is_extrapolated(script) -> None:
+    """Energies with errors of ε² and (Δx/ε)² give what there is without."""
+    willmore = script("willmore")
+    rows = []
+    for edge, width in ((15, 4), (15, 5), (20, 4), (20, 5)):
+        field, grid = willmore.start("sphere", edge, width)
+        ε = width * grid.spacing[0]
+        flow = SimpleNamespace(grid=grid, field=field)
+        rows.append(willmore.Row(ε, 50 + 3 * ε**2 - 7 / width**2, 0.0, 0.0, flow))
+    assert willmore.extrapolated(rows) == pytest.approx(50, abs=1e-9)
+
+
+def test_willmore(script, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    options = ("--cases", "sphere", "--scale", 0.3, "--steps", 3, "-o", tmp_path)
+    monkeypatch.setattr(sys, "argv", ["willmore", *map(str, options)])
+    script("willmore").main()
+    _, *rows, _, area = (tmp_path / "willmore.txt").read_text(encoding="utf-8").splitlines()
+    assert [numbers(row.split(")")[1])[1] for row in rows] == pytest.approx([16 * np.pi] * 4, rel=0.09)
+    assert numbers(area)[0] == pytest.approx(4 * np.pi * 0.66**2, rel=0.1)
+    assert (tmp_path / "sphere.png").read_bytes().startswith(b"\x89PNG")
