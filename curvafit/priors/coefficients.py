@@ -41,9 +41,10 @@ class Coefficients:
                 object.__setattr__(self, name, float(value))
             if not bool(torch.isfinite(torch.as_tensor(value, dtype=torch.float64)).all()):
                 raise ValueError(f"expected finite coefficients, got {name} = {value}")
-        if any(not bool((torch.as_tensor(a, dtype=torch.float64) > 0).all()) for a in (self.a20, self.a02)):
+        least = [float(torch.as_tensor(a, dtype=torch.float64).detach().min()) for a in (self.a20, self.a02)]
+        if min(least) <= 0:
             warnings.warn(
-                f"a20 > 0 and a02 > 0 keep the energy bounded below, got a20 = {self.a20}, a02 = {self.a02}",
+                f"a20 > 0 and a02 > 0 keep the energy bounded below, got a20 >= {least[0]:g}, a02 >= {least[1]:g}",
                 stacklevel=3,
             )
 
