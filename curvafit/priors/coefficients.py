@@ -44,7 +44,7 @@ class Coefficients:
         least = [float(torch.as_tensor(a, dtype=torch.float64).detach().min()) for a in (self.a20, self.a02)]
         if min(least) <= 0:
             warnings.warn(
-                f"a20 > 0 and a02 > 0 keep the energy bounded below, got a20 >= {least[0]:g}, a02 >= {least[1]:g}",
+                f"a20 > 0 and a02 > 0 keep the energy bounded below, got least a20 = {least[0]:g}, a02 = {least[1]:g}",
                 stacklevel=3,
             )
 
