@@ -167,7 +167,7 @@ def test_willmore_energy_is_extrapolated(script) -> None:
     """Energies with errors of ε² and (Δx/ε)² give what there is without."""
     willmore = script("willmore")
     rows = []
-    for edge, width in ((15, 4), (15, 5), (20, 4), (20, 5)):
+    for edge, width in ((15, 4), (20, 5), (20, 4)):
         field, grid = willmore.start("sphere", edge, width)
         ε = width * grid.spacing[0]
         flow = SimpleNamespace(grid=grid, field=field)
@@ -180,6 +180,6 @@ def test_willmore(script, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> No
     monkeypatch.setattr(sys, "argv", ["willmore", *map(str, options)])
     script("willmore").main()
     _, *rows, _, area = (tmp_path / "willmore.txt").read_text(encoding="utf-8").splitlines()
-    assert [numbers(row.split(")")[1])[1] for row in rows] == pytest.approx([16 * np.pi] * 4, rel=0.09)
+    assert [numbers(row.split(")")[1])[1] for row in rows] == pytest.approx([16 * np.pi] * 3, rel=0.09)
     assert numbers(area)[0] == pytest.approx(4 * np.pi * 0.66**2, rel=0.1)
     assert (tmp_path / "sphere.png").read_bytes().startswith(b"\x89PNG")

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 from torch import Tensor
 
-#: Mass is corrected from this part of the steps on: the first steps only smooth the noise.
-BEGIN = 0.02
+#: Mass is corrected from this part of the steps on: before, u's sign tells little of a shape's volume.
+BEGIN = 0.2
 #: Part of what is missing that one correction makes good, in a flow of so many steps or fewer: the longer a flow, the
 #: slower its shape answers, and the more corrections there are.
-GAIN, GAIN_STEPS = 0.3, 1000
-#: The most that is taken to be missing, as a mass.
-LARGEST = 0.1
+GAIN, GAIN_STEPS = 0.1, 1000
+#: How far the mass may go from that of a sharp shape: thin shapes are some 0.15 off; beyond, a phase is lost.
+REACH = 0.2
 #: Masses that no correction leaves.
 BOUND = 0.95
 #: The largest constant that is added at the end to make the share exact: beyond, it was not reached.
@@ -34,9 +34,9 @@ def first_mass(share: float) -> float:
 def correction(u: Tensor, share: float, mass: float, steps: int) -> float:
     """What to add to the mass of a flow of so many steps, on its way: a sharp shape gains half of it in volume."""
     missing = share - float(np.count_nonzero(u.numpy() > 0)) / u.numel()
-    gain = min(GAIN, GAIN * GAIN_STEPS / steps)
-    change = gain * min(max(2 * missing, -LARGEST), LARGEST)
-    return min(max(mass + change, -BOUND), BOUND) - mass
+    gain, sharp = min(GAIN, GAIN * GAIN_STEPS / steps), first_mass(share)
+    wanted = min(max(mass + gain * 2 * missing, sharp - REACH), sharp + REACH)
+    return min(max(wanted, -BOUND), BOUND) - mass
 
 
 def last_shift(u: Tensor, share: float) -> float:
