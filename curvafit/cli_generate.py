@@ -71,7 +71,7 @@ Steps = Annotated[int | None, _how(help="Another number of steps.")]
 Device = Annotated[str, _how(help="cpu, cuda, cuda:1 …")]
 Checkpoint = Annotated[Path | None, _how(help="File to save the run to, and to go on from if it is there.")]
 Every = Annotated[float, _how(help="Seconds between two checkpoints.")]
-Spacing = Annotated[str | None, _out(help="Edge of a voxel (a cube), in --unit; 1 by default.")]
+Spacing = Annotated[str | None, _out(help="Edge of a voxel (a cube), in --unit; by default 1, or the prior's.")]
 Unit = Annotated[str | None, _out(help="nm, um, mm or m; needs --spacing.")]
 Tile = Annotated[str | None, _out(help="Repeat a periodic box N or Z,Y,X times.")]
 Cap = Annotated[bool, _out("--cap/--no-cap", help="Close a surface on the box's faces, or leave it open there.")]
@@ -113,6 +113,8 @@ def generate(
         flow = _grown(law, boundary, schedule, steps, {**options, "device": device_of(device)})
         told = {"orientation": Q if Q is None else Q.tolist(), "maps": maps if maps is None else str(maps)}
         _write(flow, law, out, how, told)
+        if checkpoint is not None:
+            checkpoint.unlink(missing_ok=True)
 
 
 def presets() -> None:
@@ -207,7 +209,7 @@ def _output(law: _Law, spacing: str | None, unit: str | None, tile: str | None, 
     from curvafit.shape_files import Output
 
     repeats = (1, 1, 1) if tile is None else whole_triple(tile, "--tile")
-    return Output(edges[0], (law.unit if spacing is None else "voxel") if unit is None else unit, repeats, cap)
+    return Output(edges[0], unit or law.unit, repeats, cap)
 
 
 def _orientation(text: str) -> Tensor:
@@ -219,12 +221,13 @@ def _orientation(text: str) -> Tensor:
 
 def _check(out: Path, how: Output, checkpoint: Path | None) -> None:
     """Refuse places that cannot be written to, before the work."""
-    from curvafit.shape_files import check_folder, check_target
+    from curvafit.shape_files import beside, check_folder, check_target
 
     check_target(out, how)
     if checkpoint is not None:
         check_folder(checkpoint.parent)
-        if checkpoint.is_dir() or checkpoint.absolute() == out.absolute():
+        taken = (out, beside(out, ".json"), beside(out, ".png"))
+        if checkpoint.is_dir() or checkpoint.absolute() in [path.absolute() for path in taken]:
             raise ValueError(f"expected a file of its own for the checkpoint, got {checkpoint}")
 
 
@@ -238,7 +241,7 @@ def _grown(law: _Law, boundary: str, schedule: str, steps: int | None, options: 
     options |= {"volume_fraction": law.share, "epsilon": law.epsilon, "schedule": plan}
     with flow_progress(plan.steps) as watch:
         try:
-            flow = make(law.coefficients, law.mass, grid, callbacks=[watch], **options)
+            flow = make(law.coefficients, law.mass, grid, callbacks=[watch], keep_checkpoint=True, **options)
         except KeyboardInterrupt:
             if options["checkpoint"] is None or not options["checkpoint"].exists():
                 raise

@@ -111,7 +111,7 @@ def device_of(text: str) -> str:
         kind = torch.device(text).type
     except RuntimeError:
         kind = ""
-    there = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
+    there = {"cpu": True, "cuda": torch.cuda.is_available()}
     if not there.get(kind):
         names = ", ".join(name for name, able in there.items() if able)
         raise ValueError(f"expected --device to be one of this machine's ({names}), got {text!r}")

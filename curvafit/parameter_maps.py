@@ -12,7 +12,7 @@ from torch import Tensor
 
 from curvafit.formats import READERS, ScanError
 from curvafit.priors.coefficients import NAMES
-from curvafit.scan import load
+from curvafit.scan import read_values
 
 #: What may vary: the six coefficients, the mass and ε, all in working units.
 PARAMETERS = (*NAMES, "mass", "epsilon")
@@ -45,7 +45,8 @@ def read_maps(path: str | Path, shape: tuple[int, int, int] | None = None) -> di
         listed = ", ".join(unknown) or "none"
         raise ValueError(f"expected maps named {', '.join(PARAMETERS)}, got {listed} in {place}")
     for name, values in found.items():
-        if values.dtype.kind not in "iuf" or not np.isfinite(values).all():
+        numbers = values.dtype.kind in "iuf"
+        if not numbers or not np.isfinite(values).all() or np.abs(values).max(initial=0) > np.finfo(np.float32).max:
             raise ValueError(f"expected finite numbers in the map {name}, got others in {place}")
         if values.size > 1:
             shape = shape or values.shape  # type: ignore[assignment]
@@ -79,5 +80,5 @@ def _from_folder(path: Path) -> dict[str, np.ndarray]:
         name = file.name.split(".")[0]
         if name in found:
             raise ScanError(f"expected one map {name}, got two in {path}")
-        found[name] = load(file).values if name in PARAMETERS else np.empty(0)
+        found[name] = read_values(file) if name in PARAMETERS else np.empty(0)
     return found

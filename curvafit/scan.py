@@ -114,6 +114,25 @@ def load(
     return _placed(raw, f"{location}::{key}" if key else str(location), spacing, unit)
 
 
+def read_values(path: str | os.PathLike[str]) -> np.ndarray:
+    """The array in a volume file, z first, whatever it holds; axes of one before the last three are left out.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ScanError
+        If the suffix is unknown or the file damaged.
+    """
+    location = Path(path)
+    if not location.exists():
+        raise FileNotFoundError(f"expected a volume file, got no such file: {location}")
+    values = _guarded(pick_reader(location), location, key=None, raw_shape=None, dtype=None).values
+    while values.ndim > 3 and values.shape[0] == 1:
+        values = values[0]
+    return values
+
+
 def save(field: Field, path: str | os.PathLike[str]) -> Path:
     """Write a field as NIfTI, TIFF, NPY, MRC or Zarr, by suffix; a file of that name is replaced once the new one is
     whole.

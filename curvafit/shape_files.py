@@ -73,7 +73,7 @@ def check_target(path: str | Path, output: Output | None = None) -> Path:
     ------
     ValueError
         If the suffix is neither a volume's nor a surface's, its format cannot hold the output's unit, the place cannot
-        be written to, or another file stands where the record goes.
+        be written to, or another file stands where the record or the picture goes.
     """
     target = Path(path)
     known = (*WRITABLE, *SUFFIXES)
@@ -84,7 +84,9 @@ def check_target(path: str | Path, output: Output | None = None) -> Path:
     if target.is_dir() and not target.name.lower().endswith(".zarr"):
         raise ValueError(f"expected the name of a file, got the folder {target}")
     check_folder(target.parent)
-    note = beside(target, ".json")
+    note, picture = beside(target, ".json"), beside(target, ".png")
+    if picture.exists() and not note.exists():
+        raise ValueError(f"expected a name whose picture {picture.name} is not another file's, got {target.name!r}")
     if note.exists() and FORMAT not in note.read_text(encoding="utf-8", errors="replace")[:200]:
         raise ValueError(f"expected a name whose record {note.name} is not another file's, got {target.name!r}")
     return target
@@ -108,9 +110,13 @@ def check_folder(path: str | Path) -> Path:
 
 
 def beside(path: str | Path, ending: str) -> Path:
-    """The path with another ending than its suffix; `.nii.gz` counts as one."""
+    """The path with another ending than its suffix; `.nii.gz` and `.ome.zarr` count as one."""
     target = Path(path)
-    known = [each for each in (*WRITABLE, *SUFFIXES) if target.name.lower().endswith(each)]
+    known = [
+        each
+        for each in (*WRITABLE, *SUFFIXES, ".ome.zarr", ".ome.tif", ".ome.tiff")
+        if target.name.lower().endswith(each)
+    ]
     return target.with_name(target.name[: len(target.name) - max(map(len, known), default=0)] + ending)
 
 
@@ -208,11 +214,11 @@ def shape_record(
         "coefficients": dict(zip(NAMES, map(_stated, coefficients), strict=True)),
         "mass": _stated(mass),
         "shape": list(flow.grid.shape),
-        "spacing": list(flow.grid.spacing),
+        "working_spacing": list(flow.grid.spacing),
         "epsilon": _stated(epsilon),
         "boundary": flow.grid.boundary,
         "seed": flow.seed,
-        "schedule": {"name": flow.schedule.name, "steps": flow.schedule.steps},
+        "schedule": dataclasses.asdict(flow.schedule),
         "status": flow.status,
         "viable": flow.viability.viable,
         "volume_fraction": float(np.mean(flow.field.numpy() > 0)),

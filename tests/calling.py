@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+from typing import Any
+
 from typer.testing import CliRunner, Result
 
 from curvafit.cli import app
@@ -20,3 +24,11 @@ def refused(result: Result, said: str) -> None:
     assert result.stdout == ""
     lines = result.stderr.strip().splitlines()
     assert len(lines) == 1 and lines[0].startswith("error: ") and said in lines[0], lines
+
+
+def made(*arguments: object) -> dict[str, Any]:
+    """The record that a `generate` which succeeds leaves."""
+    result = call("generate", *arguments)
+    assert result.exit_code == 0, (result.output, result.exception)
+    record = next(Path(line) for line in result.stdout.splitlines() if line.endswith(".json"))
+    return json.loads(record.read_text())

@@ -10,6 +10,7 @@ import torch
 
 from curvafit.generation.batch import generate_batch
 from curvafit.generation.flow import generate
+from curvafit.generation.fused import together
 from curvafit.generation.schedule import Schedule
 from curvafit.priors.coefficients import Coefficients, preset
 from curvafit.priors.grid import Grid
@@ -25,6 +26,17 @@ def same(one, other) -> None:
         np.testing.assert_allclose(getattr(one.history, name), getattr(other.history, name), rtol=1e-12)
     assert (one.seed, one.status, one.schedule, one.grid) == (other.seed, other.status, other.schedule, other.grid)
     assert one.snapshots.keys() == other.snapshots.keys()
+
+
+def test_parameters_that_vary_stand_beside_some_that_do_not():
+    """Also where a box has six voxels along x, as many as there are coefficients."""
+    a = SPONGE.coefficients
+    varying = Coefficients(torch.full((4, 5, 6), 7.0), *list(a)[1:])
+    both = together((TUBES.coefficients, varying), Grid((4, 5, 6)))
+    assert both.shape == (2, 6, 4, 5, 6)
+    for one, stated in zip(both, ([*TUBES.coefficients], [7.0, *list(a)[1:]]), strict=True):
+        assert torch.equal(one, torch.tensor(stated, dtype=one.dtype).reshape(6, 1, 1, 1).expand(6, 4, 5, 6))
+    assert together((a, a), Grid((4, 5, 6))).shape == (2, 6)
 
 
 def test_one_after_another():

@@ -139,9 +139,31 @@ def test_another_runs_checkpoint_is_refused(tmp_path):
         with pytest.raises(ValueError, match=rf"expected a checkpoint of this run, got one with .*\b{name} .* instead"):
             make(checkpoint=path, **changed)
         assert path.read_bytes() == kept
-    path.write_bytes(kept[:500])
-    with pytest.raises(ValueError, match="got a file that cannot be read"):
-        make(checkpoint=path)
+    for content in (kept[:500], b".....\n", b"", b"\x80\x02c"):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match="got a file that cannot be read"):
+            make(checkpoint=path)
+
+
+def test_a_checkpoint_is_its_backends(tmp_path):
+    """The same flow by other operations ends in other bits."""
+    path, start = tmp_path / "run", generate(TUBES, MASS, GRID, schedule=PLAN).field
+    told = {"flow": "mass", "optimiser": "adam", "steps": 40, "checkpoint": path}
+    descend(start, TUBES, GRID, **told, callbacks=[lambda step, *rest: step == 20], backend="torch")
+    with pytest.raises(ValueError, match="backend torch instead of auto"):
+        descend(start, TUBES, GRID, **told)
+
+
+def test_a_checkpoint_may_be_kept(tmp_path):
+    path = tmp_path / "run"
+
+    def make():
+        told = {"checkpoint": path, "checkpoint_every": 0, "keep_checkpoint": True}
+        return generate(TUBES, MASS, GRID, schedule=PLAN, **told)
+
+    first = make()
+    assert path.exists()
+    same(first, make())
 
 
 def test_a_callback_pauses_a_run(tmp_path):

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +13,11 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from calling import LAW, QUICK, call, refused
+from calling import LAW, QUICK, call, made, refused
 from found import made_fit
 
 from curvafit.generation.flow import generate
+from curvafit.generation.schedule import schedule
 from curvafit.priors.coefficients import preset
 from curvafit.priors.energy import orientation
 from curvafit.priors.grid import Grid
@@ -33,14 +33,6 @@ def undrawn(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> 
         monkeypatch.setattr("curvafit.shape_files.surface_picture", lambda u, path: path.write_bytes(b""))
 
 
-def made(*arguments: object) -> dict[str, Any]:
-    """The record that a command which succeeds leaves."""
-    result = call("generate", *arguments)
-    assert result.exit_code == 0, (result.output, result.exception)
-    record = next(Path(line) for line in result.stdout.splitlines() if line.endswith(".json"))
-    return json.loads(record.read_text())
-
-
 def test_generate_writes_a_field_a_picture_and_a_record(tmp_path: Path) -> None:
     target = tmp_path / "new" / "tubes.nii.gz"
     result = call("generate", *QUICK, "--seed", 7, "-o", target)
@@ -48,7 +40,7 @@ def test_generate_writes_a_field_a_picture_and_a_record(tmp_path: Path) -> None:
     assert sorted(path.name for path in target.parent.iterdir()) == ["tubes.json", "tubes.nii.gz", "tubes.png"]
     record = json.loads((target.parent / "tubes.json").read_text())
     assert list(record["coefficients"].values()) == [1, 2, 6, -40, -40, 400]
-    assert (record["mass"], record["seed"], record["schedule"]) == (-0.6, 7, {"name": "fast", "steps": 30})
+    assert (record["mass"], record["seed"], record["schedule"]) == (-0.6, 7, dataclasses.asdict(schedule("fast", 30)))
     field = load(target)
     assert field.shape == (24, 24, 24) and field.unit == "voxel"
     assert field.values.mean() == pytest.approx(-0.6, abs=1e-5)
@@ -246,43 +238,7 @@ def test_snapshots_are_the_field_on_its_way(tmp_path: Path) -> None:
     record = made(*QUICK, "--snapshots", "7,30", "-o", tmp_path / "out.npy")
     assert record["snapshots"] == [7, 30]
     law = preset("tubes")
-    flow = generate(law.coefficients, law.mass, Grid((24, 24, 24)), schedule=plan(30), snapshots=(7, 30))
+    flow = generate(law.coefficients, law.mass, Grid((24, 24, 24)), schedule=schedule("fast", 30), snapshots=(7, 30))
     for step in (7, 30):
         np.testing.assert_array_equal(np.load(tmp_path / f"out_step{step:05d}.npy"), flow.snapshots[step])
     assert len(list(tmp_path.iterdir())) == 5
-
-
-def plan(steps: int) -> Any:
-    return importlib.import_module("curvafit.generation.schedule").schedule("fast", steps)
-
-
-def test_an_interrupted_run_goes_on_from_its_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    @contextmanager
-    def interrupting(steps: int) -> Iterator[Any]:
-        def watch(step: int, total: int, state: object) -> None:
-            if step == 20:
-                raise KeyboardInterrupt
-
-        yield watch
-
-    saving = [*QUICK, "--checkpoint", tmp_path / "run.pt", "--checkpoint-every", 0]
-    with monkeypatch.context() as patch:
-        patch.setattr("curvafit.cli_generate.flow_progress", interrupting)
-        result = call("generate", *saving, "-o", tmp_path / "out.npy")
-    assert result.exit_code == 130 and "the same command goes on from" in result.stderr
-    assert [path.name for path in tmp_path.iterdir()] == ["run.pt"]
-    refused(call("generate", *saving, "--seed", 9, "-o", tmp_path / "out.npy"), "expected a checkpoint of this run")
-    made(*saving, "-o", tmp_path / "out.npy")
-    made(*QUICK, "-o", tmp_path / "whole.npy")
-    np.testing.assert_array_equal(np.load(tmp_path / "out.npy"), np.load(tmp_path / "whole.npy"))
-    assert not (tmp_path / "run.pt").exists()
-
-
-def test_a_failure_while_writing_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: Any, **__: Any) -> None:
-        raise OSError(28, "No space left on device", "out")
-
-    monkeypatch.setattr("curvafit.shape_files.surface_picture", full)
-    result = call("generate", *QUICK, "-o", tmp_path / "out.zarr")
-    assert result.exit_code == 2 and result.stderr.endswith("error: no space left on device: out\n")
-    assert list(tmp_path.iterdir()) == []

@@ -33,6 +33,14 @@ def test_one_number_holds_everywhere(tmp_path: Path) -> None:
     assert maps == {"a11": -3.0, "epsilon": 0.02} and map_shape(maps) is None
 
 
+def test_a_folder_may_hold_constants_and_single_numbers(tmp_path: Path) -> None:
+    np.save(tmp_path / "a20.npy", np.full((4, 5, 6), 2.0))
+    np.save(tmp_path / "mass.npy", np.full((1, 1, 1), -0.5))
+    maps = read_maps(tmp_path)
+    assert map_shape(maps) == (4, 5, 6) and bool((maps["a20"] == 2).all())
+    assert maps["mass"] == -0.5
+
+
 @pytest.mark.parametrize(
     ("arrays", "said"),
     [
@@ -41,6 +49,7 @@ def test_one_number_holds_everywhere(tmp_path: Path) -> None:
         ({"a20": RAMP, "a02": RAMP[:3]}, r"expected the map a02 of shape \(4, 5, 6\), got \(3, 5, 6\)"),
         ({"a20": RAMP[0]}, r"expected the map a20 of shape \(5, 6\), got \(5, 6\)"),
         ({"a20": np.where(RAMP > 1.5, np.nan, RAMP)}, "expected finite numbers in the map a20"),
+        ({"a20": RAMP * 1e39}, "expected finite numbers in the map a20"),
         ({"a20": RAMP * 1j}, "expected finite numbers in the map a20"),
     ],
 )

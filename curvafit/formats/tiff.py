@@ -19,6 +19,8 @@ from curvafit.formats.base import Raw, ScanError, convert_length, normalise_unit
 SLICES = (".tif", ".tiff")
 #: Bytes beyond which ImageJ's TIFF cannot point.
 _IMAGEJ_LIMIT = 2**32 - 2**25
+#: Voxels a unit that TIFF's resolution can state.
+_RESOLUTION_LIMIT = 2**31
 _TAG_UNITS = {2: "inch", 3: "cm"}
 #: Resolutions that programs write when they know none (dots an inch; 25.4 is a dot a millimetre).
 _SCREEN = (1, 25.4, 72, 96, 100, 150, 200, 300, 600)
@@ -54,10 +56,12 @@ def read_slices(path: Path, **_: object) -> Raw:
 
 
 def write_tiff(field: Any, path: Path) -> None:
-    """ImageJ's metadata where it knows the type of the values and can hold as many, else OME's."""
+    """ImageJ's metadata where it knows the type of the values and can hold as many, else, or by name, OME's."""
     values = field.values.view(np.uint8) if field.values.dtype == bool else field.values
     z, y, x = field.spacing
-    if values.dtype in (np.uint8, np.uint16, np.float32) and values.nbytes < _IMAGEJ_LIMIT:
+    named = path.name.lower().endswith((".ome.tif", ".ome.tiff"))
+    fits = values.nbytes < _IMAGEJ_LIMIT and max(1 / x, 1 / y) < _RESOLUTION_LIMIT
+    if values.dtype in (np.uint8, np.uint16, np.float32) and fits and not named:
         exact = {"curvafit_spacing": f"{z!r},{y!r},{x!r}", "curvafit_unit": field.unit}
         unit = {"um": "micron", "voxel": "pixel"}.get(field.unit, field.unit)
         metadata = {"axes": "ZYX", "spacing": z, "unit": unit, **exact}

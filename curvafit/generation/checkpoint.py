@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import pickle
 import time
 from importlib.metadata import version
 from pathlib import Path
@@ -27,6 +26,8 @@ class Checkpoint:
         Seconds between two saves, at least; 0 saves after every step.
     run
         What identifies the run, by name; see `identity`.
+    keep
+        Whether the file stays when the run is done.
 
     Raises
     ------
@@ -34,10 +35,10 @@ class Checkpoint:
         If the seconds are negative.
     """
 
-    def __init__(self, path: str | Path, every: float, run: dict[str, str]) -> None:
+    def __init__(self, path: str | Path, every: float, run: dict[str, str], keep: bool = False) -> None:
         if not every >= 0:
             raise ValueError(f"expected seconds between checkpoints, at least 0, got {every}")
-        self.path, self._every, self._run = Path(path), every, run
+        self.path, self._every, self._run, self._keep = Path(path), every, run, keep
         self._saved = time.monotonic()
 
     def load(self) -> dict[str, Any] | None:
@@ -53,7 +54,9 @@ class Checkpoint:
         try:
             found = torch.load(self.path, weights_only=True)
             theirs, content = found["run"], found["content"]
-        except (pickle.UnpicklingError, RuntimeError, EOFError, KeyError, TypeError) as error:
+        except OSError:
+            raise
+        except Exception as error:  # torch.load raises many, by what the bytes happen to be
             raise ValueError(f"expected a checkpoint of a flow, got a file that cannot be read: {self.path}") from error
         names = [name for name in {**theirs, **self._run} if theirs.get(name) != self._run.get(name)]
         if names:
@@ -75,8 +78,10 @@ class Checkpoint:
         os.replace(self._part, self.path)
         self._saved = time.monotonic()
 
-    def remove(self) -> None:
-        """Remove the file: the run is done."""
+    def close(self) -> None:
+        """The run is done: remove the file, unless it is to be kept."""
+        if self._keep:
+            return
         self._part.unlink(missing_ok=True)
         self.path.unlink(missing_ok=True)
 

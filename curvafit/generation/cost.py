@@ -31,7 +31,8 @@ class Cost:
     def __post_init__(self) -> None:
         lengths = torch.as_tensor(self.epsilon)
         if not (bool(((lengths > 0) & (lengths < math.inf)).all()) and 0 <= self.blur < math.inf):
-            got = f"{self.epsilon} and {self.blur}"
+            got = f"{float(lengths.min())} to {float(lengths.max())}" if lengths.dim() else f"{self.epsilon}"
+            got = f"{got} and {self.blur}"
             raise ValueError(f"expected epsilon > 0 and blur >= 0 in the spacing's unit, got {got}")
         for name, value in zip(("epsilon", *NAMES), (self.epsilon, *self.coefficients), strict=True):
             if isinstance(value, Tensor):

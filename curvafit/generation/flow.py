@@ -47,6 +47,7 @@ def generate(
     reject_early: bool = False,
     checkpoint: str | Path | None = None,
     checkpoint_every: float = CHECKPOINT_EVERY,
+    keep_checkpoint: bool = False,
     backend: Backend = "auto",
     device: torch.device | str = "cpu",
 ) -> Flow:
@@ -81,6 +82,8 @@ def generate(
         A file that the run is saved to every so many seconds, and resumed from if it is there: the end is then the
         same, bit for bit on one machine and number of threads. It is removed at the end, but kept where a callback
         stopped the flow.
+    keep_checkpoint
+        Leave the file at the end too, for the caller to remove once the result is safe.
     backend
         `"auto"` takes a fused step where there is one; `"torch"` and `"fused"` insist.
     device
@@ -102,7 +105,7 @@ def generate(
         coefficients, mass = named.coefficients, named.mass if mass is None and volume_fraction is None else mass
     grid = grid if isinstance(grid, Grid) else Grid(grid)  # type: ignore[arg-type]
     base, cost = base_of(mass, volume_fraction, grid), Cost(coefficients, grid, epsilon, orientation, blur)
-    place, plan = Place(backend, device, checkpoint, checkpoint_every), named_schedule(schedule)
+    place, plan = Place(backend, device, checkpoint, checkpoint_every, keep_checkpoint), named_schedule(schedule)
     form = DivergenceForm.of(grid, blur, base, place.blur)
     moved = place.stepper(white_noise(grid, seed), form, cost, plan, "adam", None)
     orders = Orders(grid, epsilon, plan, callbacks, snapshots, reject_early, volume_fraction)

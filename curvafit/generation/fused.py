@@ -14,6 +14,7 @@ from curvafit.generation.parametrization import DivergenceForm
 from curvafit.generation.stepper import ADAM_EPS, Shape, Statistics, Stepper
 from curvafit.priors import kernels
 from curvafit.priors.coefficients import Coefficients
+from curvafit.priors.grid import Grid
 
 
 class FusedStepper(Stepper):
@@ -91,9 +92,9 @@ class CudaStepper(Stepper):
         from curvafit.priors.kernels.cuda import CudaFlow
 
         base = torch.stack(torch.broadcast_tensors(*(torch.as_tensor(each, dtype=torch.float32) for each in bases)))
-        a = torch.stack(torch.broadcast_tensors(*(kernels.stacked(each, cost.grid) for each in coefficients)))
         self._flow = CudaFlow(
-            torch.stack(list(starts)), base, a, cost.grid, cost.epsilon, cost.blur, frozen,
+            torch.stack(list(starts)), base, together(coefficients, cost.grid), cost.grid, cost.epsilon, cost.blur,
+            frozen,
             orientation=cost.orientation, betas=betas, adam_eps=ADAM_EPS, device=device,
         )  # fmt: skip
         self._shapes = tuple(_CudaShape(self, k) for k in range(len(starts)))
@@ -143,6 +144,14 @@ class CudaStepper(Stepper):
         from curvafit.priors.kernels.cuda import State
 
         self._flow.restore(State(**state))
+
+
+def together(coefficients: Sequence[Coefficients], grid: Grid) -> Tensor:
+    """One set a shape: `(B, 6)`, or `(B, 6, Z, Y, X)` where any of them varies."""
+    a = [kernels.stacked(each, grid) for each in coefficients]
+    if any(each.dim() > 1 for each in a):
+        a = [each.reshape(6, 1, 1, 1) if each.dim() == 1 else each for each in a]
+    return torch.stack(torch.broadcast_tensors(*a))
 
 
 class _CudaShape:

@@ -65,7 +65,7 @@ def run(
     """Step shapes that share a stepper until the plan, which they share too, is done, or none is left.
 
     A shape stops earlier where its energy is not finite, or a callback or a check says so; all of them, where the
-    optimiser stalls. The checkpoint is removed at the end, but kept where a callback stopped the flow.
+    optimiser stalls. The checkpoint is closed at the end, but saved where a callback stopped the flow.
     """
     lanes = [_Lane(*each) for each in zip(moved.shapes, orders, seeds, strict=True)]
     plan, made = orders[0].plan, _resumed(moved, lanes, checkpoint)
@@ -87,7 +87,7 @@ def run(
         if any(lane.asked for lane in lanes) and not last:
             checkpoint.save(_content(moved, lanes, made + 1))
         else:
-            checkpoint.remove()
+            checkpoint.close()
     return [lane.end() for lane in lanes]
 
 
@@ -183,5 +183,7 @@ class _Lane:
             return f"stopped after {made} steps: the line search finds no lower energy{self._missed}"
         before = history.energy[np.searchsorted(history.step, 0.9 * made, side="right") - 1]
         fall = (before - history.energy[-1]) / max(abs(before), 1e-30)
-        word = "converged" if abs(fall) < SETTLED else "still moving"
-        return f"{word} after {made} steps: the energy fell by {100 * fall:.2f} % over the last tenth{self._missed}"
+        word, way = "converged" if abs(fall) < SETTLED else "still moving", "rose" if fall < 0 else "fell"
+        return (
+            f"{word} after {made} steps: the energy {way} by {100 * abs(fall):.2f} % over the last tenth{self._missed}"
+        )

@@ -34,6 +34,7 @@ class Place:
     device: torch.device | str
     checkpoint: str | Path | None
     every: float
+    keep: bool = False
 
     def __post_init__(self) -> None:
         if self.backend not in ("auto", "torch", "fused"):
@@ -72,8 +73,8 @@ class Place:
         if self.checkpoint is None:
             return None
         mine = {"schedule": orders.plan, "volume_fraction": orders.volume_fraction, "snapshots": [*orders.snapshots]}
-        told = {**vars(cost), **mine, "stepper": type(moved).__name__, **more}
-        return Checkpoint(self.checkpoint, self.every, identity(**told))
+        where = {"stepper": type(moved).__name__, "backend": self.backend, "device": self.device}
+        return Checkpoint(self.checkpoint, self.every, identity(**vars(cost), **mine, **where, **more), self.keep)
 
 
 def base_of(mass: float | Tensor | None, share: float | None, grid: Grid) -> float | Tensor:

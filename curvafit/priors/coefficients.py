@@ -40,7 +40,8 @@ class Coefficients:
             if not isinstance(value, Tensor):
                 object.__setattr__(self, name, float(value))
             if not bool(torch.isfinite(torch.as_tensor(value, dtype=torch.float64)).all()):
-                raise ValueError(f"expected finite coefficients, got {name} = {value}")
+                got = "numbers that are not" if isinstance(value, Tensor) and value.dim() > 0 else value
+                raise ValueError(f"expected finite coefficients, got {name} = {got}")
         least = [float(torch.as_tensor(a, dtype=torch.float64).detach().min()) for a in (self.a20, self.a02)]
         if min(least) <= 0:
             warnings.warn(
