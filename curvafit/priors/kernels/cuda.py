@@ -349,7 +349,9 @@ class _Layout:
     def __init__(self, grid: Grid, batch: int, device: torch.device, tuning: Tuning) -> None:
         Z, Y, X = grid.shape
         if math.prod(grid.shape) > _LARGEST:
-            raise ValueError(f"expected at most {_LARGEST} voxels a shape, got {grid.shape}")
+            raise ValueError(
+                f"expected at most {_LARGEST} voxels a shape (more with backend 'torch'), got {grid.shape}"
+            )
         self.grid, self.batch, self.device, self.tuning = grid, batch, device, tuning
         self.lanes, self.width = tuning.lanes, tuning.width or _width(X)
         if X % self.width:
@@ -477,7 +479,8 @@ class _Taps:
         self.taps = tuple(gaussian_taps(width / h) if width > 0 else (1.0,) for h in grid.spacing)
         self.radius = tuple(len(taps) // 2 for taps in self.taps)
         if max(self.radius) > _WIDEST:
-            raise ValueError(f"expected a blur of at most {_WIDEST // 4} voxels, got {width} at {grid.spacing}")
+            most = f"{_WIDEST // 4} voxels (more with backend 'torch')"
+            raise ValueError(f"expected a blur of at most {most}, got {width} at {grid.spacing}")
         self.inner = (0.0, *self.taps[0], 0.0)
         half, wide = 0.5 / grid.spacing[0], (0.0, 0.0, *self.taps[0], 0.0, 0.0)
         self.slopes = tuple(half * (before - after) for before, after in zip(wide, wide[2:], strict=False))
