@@ -21,6 +21,7 @@ from matplotlib.figure import Figure, FigureBase
 
 from curvafit.diagram import Diagram, diagram
 from curvafit.generation.flow import Flow, generate
+from curvafit.mesh import NoSurface
 from curvafit.plot import INK, diagram_on, shared_limits, surface_on, write_picture
 from curvafit.priors.coefficients import Coefficients, preset
 from curvafit.priors.grid import WORKING_EPSILON, Grid
@@ -71,20 +72,25 @@ def maps(edge: int) -> tuple[Coefficients, torch.Tensor]:
     return Coefficients(*a), mass
 
 
-def middle(whole: Shape, cube: int, options: Namespace) -> tuple[Diagram, float]:
-    """The diagram of the middle half of a cube, and the part of it that is inside."""
+def middle(whole: Shape, cube: int, options: Namespace) -> tuple[Diagram | None, float]:
+    """The diagram of the middle half of a cube, None where it has no surface, and the part of it that is inside."""
     first, last = round((cube + 0.25) * options.edge), round((cube + 0.75) * options.edge)
     where = np.zeros(whole.field.shape, dtype=bool)
     where[..., first:last] = True
-    seen = diagram(whole.field, Grid(whole.field.shape), WORKING_EPSILON, options.curvature, where=where)
-    return seen, float((whole.field[..., first:last] > 0).mean())
+    inside = float((whole.field[..., first:last] > 0).mean())
+    try:
+        return diagram(whole.field, Grid(whole.field.shape), WORKING_EPSILON, options.curvature, where=where), inside
+    except NoSurface:
+        return None, inside
 
 
 HEAD = f"{'middle of':10} {'κ1':>7} {'κ2':>7} {'u > 0':>6} | {'pure: κ1':>8} {'κ2':>7} {'u > 0':>6} | {'distance':>8}"
 
 
-def row(number: int, seen: Diagram, inside: float, pure: Shape, kind: str) -> str:
+def row(number: int, seen: Diagram | None, inside: float, pure: Shape, kind: str) -> str:
     """Figures of the middle of a cube beside those of the pure preset's."""
+    if seen is None:
+        return f"p{number:<9} no surface, {inside:.3f} inside"
     line = "p{:<9} {:7.1f} {:7.1f} {:6.3f}".format(number, *seen.mean(), inside)
     if not pure.diagrams:
         return f"{line} | {pure.facts['status']}"

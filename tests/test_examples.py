@@ -138,9 +138,9 @@ def test_lean_of_plane_surfaces(script) -> None:
 
 
 def test_spatialised(run: Run) -> None:
-    _, *rows, status = run("spatialised", "--edge", 20, "--steps", 80)
+    _, *rows, status = run("spatialised", "--edge", 20, "--schedule", "paper", "--steps", 300)
     assert [row.split()[0] for row in rows] == ["p1", "p2", "p3", "p4"]
-    assert "after 80 steps" in status
+    assert "after 300 steps" in status
     inside = [numbers(row)[2] for row in rows]
     assert inside[0] == max(inside) and 0.05 < inside[0] < 0.5
 
