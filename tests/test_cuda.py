@@ -54,6 +54,7 @@ def test_interpreted_kernels_are_the_definition(name: str, interpreted: dict[str
 
 
 @needs_triton
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("boundary", "observe", "held", "width"), [("periodic", False, False, 4), ("replicate", True, True, 1)]
 )

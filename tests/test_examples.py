@@ -17,6 +17,8 @@ import trimesh
 from curvafit.mesh import surface
 from curvafit.priors.coefficients import preset
 
+pytestmark = pytest.mark.slow
+
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 
 Run = Callable[..., list[str]]

@@ -17,6 +17,7 @@ def share(u: torch.Tensor) -> float:
     return float((u > 0).double().mean())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("boundary", ["periodic", "replicate"])
 @pytest.mark.parametrize(("name", "wanted"), [("tubes", 0.12), ("sponge", 0.4)])
 def test_a_volume_fraction_is_reached(name, wanted, boundary):
