@@ -113,8 +113,7 @@ def generate(
         flow = _grown(law, boundary, schedule, steps, {**options, "device": device_of(device)})
         told = {"orientation": Q if Q is None else Q.tolist(), "maps": maps if maps is None else str(maps)}
         _write(flow, law, out, how, told)
-        if checkpoint is not None:
-            checkpoint.unlink(missing_ok=True)
+        _discard(checkpoint)
 
 
 def presets() -> None:
@@ -249,9 +248,16 @@ def _grown(law: _Law, boundary: str, schedule: str, steps: int | None, options: 
             say(said, to=error_console())
             raise typer.Exit(130) from None
     if not flow.viability.lowest < 0 < flow.viability.highest:
+        _discard(options["checkpoint"])
         say(f"{flow.status}; nothing was written", to=error_console())
         raise typer.Exit(1)
     return flow
+
+
+def _discard(checkpoint: Path | None) -> None:
+    """Once nothing is left to be saved: the flow kept the file until then."""
+    if checkpoint is not None:
+        checkpoint.unlink(missing_ok=True)
 
 
 def _write(flow: Flow, law: _Law, out: Path, how: Output, told: dict[str, Any]) -> None:

@@ -80,10 +80,9 @@ class Checkpoint:
 
     def close(self) -> None:
         """The run is done: remove the file, unless it is to be kept."""
-        if self._keep:
-            return
         self._part.unlink(missing_ok=True)
-        self.path.unlink(missing_ok=True)
+        if not self._keep:
+            self.path.unlink(missing_ok=True)
 
     @property
     def _part(self) -> Path:
