@@ -14,7 +14,17 @@ import numpy as np
 
 from curvafit.formats import READERS, WRITERS, Raw, ScanError, normalise_unit, pick_reader, pick_writer
 
-__all__ = ["READABLE", "WRITABLE", "Field", "ScanError", "load", "move_into_place", "save", "write_atomically"]
+__all__ = [
+    "READABLE",
+    "WRITABLE",
+    "Field",
+    "ScanError",
+    "load",
+    "move_into_place",
+    "read_values",
+    "save",
+    "write_atomically",
+]
 
 #: Suffixes that `load` and `save` know.
 READABLE = tuple(READERS)
@@ -105,11 +115,7 @@ def load(
         not finite or constant, a spacing that is not positive.
     """
     location, key = _split_key(os.fspath(path), key)
-    if not location.exists():
-        raise FileNotFoundError(f"expected a volume file, got no such file: {location}")
-    reader = pick_reader(location, raw_shape is not None)
-    raw = _guarded(reader, location, key=key, raw_shape=raw_shape, dtype=dtype)
-    raw = _squeezed(raw, location)
+    raw = _squeezed(_read(location, key=key, raw_shape=raw_shape, dtype=dtype), location)
     _check_values(raw.values, location)
     return _placed(raw, f"{location}::{key}" if key else str(location), spacing, unit)
 
@@ -124,10 +130,7 @@ def read_values(path: str | os.PathLike[str]) -> np.ndarray:
     ScanError
         If the suffix is unknown or the file damaged.
     """
-    location = Path(path)
-    if not location.exists():
-        raise FileNotFoundError(f"expected a volume file, got no such file: {location}")
-    values = _guarded(pick_reader(location), location, key=None, raw_shape=None, dtype=None).values
+    values = _read(Path(path)).values
     while values.ndim > 3 and values.shape[0] == 1:
         values = values[0]
     return values
@@ -197,6 +200,14 @@ def _guarded(reader: Callable[..., Raw], path: Path, **options: object) -> Raw:
     except Exception as reason:  # every library has its own way to say that a file is damaged
         said = " ".join(f"{type(reason).__name__}: {reason}".split())[:200]
         raise ScanError(f"expected a whole, readable file, got {path} that cannot be read ({said})") from reason
+
+
+def _read(path: Path, key: str | None = None, raw_shape: Sequence[int] | None = None, dtype: str | None = None) -> Raw:
+    """What the reader of that file gives."""
+    if not path.exists():
+        raise FileNotFoundError(f"expected a volume file, got no such file: {path}")
+    reader = pick_reader(path, raw_shape is not None)
+    return _guarded(reader, path, key=key, raw_shape=raw_shape, dtype=dtype)
 
 
 def _squeezed(raw: Raw, path: Path) -> Raw:

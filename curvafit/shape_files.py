@@ -112,11 +112,7 @@ def check_folder(path: str | Path) -> Path:
 def beside(path: str | Path, ending: str) -> Path:
     """The path with another ending than its suffix; `.nii.gz` and `.ome.zarr` count as one."""
     target = Path(path)
-    known = [
-        each
-        for each in (*WRITABLE, *SUFFIXES, ".ome.zarr", ".ome.tif", ".ome.tiff")
-        if target.name.lower().endswith(each)
-    ]
+    known = [each for each in (*WRITABLE, *SUFFIXES) if target.name.lower().endswith(each)]
     return target.with_name(target.name[: len(target.name) - max(map(len, known), default=0)] + ending)
 
 

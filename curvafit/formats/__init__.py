@@ -11,7 +11,7 @@ from curvafit.formats.base import Raw, ScanError, normalise_unit
 from curvafit.formats.medical import check_mrc, is_dicom, read_dicom, read_itk, read_mrc, read_nrrd, write_mrc
 from curvafit.formats.ngff import read_zarr, write_zarr
 from curvafit.formats.nifti import read_nifti, write_nifti
-from curvafit.formats.tiff import SLICES, read_slices, read_tiff, write_tiff
+from curvafit.formats.tiff import SLICES, read_slices, read_tiff, write_ome_tiff, write_tiff
 
 __all__ = ["READERS", "WRITERS", "Raw", "ScanError", "normalise_unit", "pick_reader", "pick_writer"]
 
@@ -35,11 +35,12 @@ READERS: dict[str, Callable[..., Raw]] = {
 WRITERS: dict[str, Callable[[Any, Path], None]] = {
     ".nii": write_nifti,
     ".nii.gz": write_nifti,
+    **dict.fromkeys((".ome.tif", ".ome.tiff"), write_ome_tiff),
     ".tif": write_tiff,
     ".tiff": write_tiff,
     ".npy": write_npy,
     ".mrc": write_mrc,
-    ".zarr": write_zarr,
+    **dict.fromkeys((".zarr", ".ome.zarr"), write_zarr),
 }
 
 

@@ -56,22 +56,31 @@ def read_slices(path: Path, **_: object) -> Raw:
 
 
 def write_tiff(field: Any, path: Path) -> None:
-    """ImageJ's metadata where it knows the type of the values and can hold as many, else, or by name, OME's."""
-    values = field.values.view(np.uint8) if field.values.dtype == bool else field.values
-    z, y, x = field.spacing
-    named = path.name.lower().endswith((".ome.tif", ".ome.tiff"))
+    """ImageJ's metadata where it knows the type of the values and can hold as many, else OME's."""
+    values, (z, y, x) = _stored(field), field.spacing
     fits = values.nbytes < _IMAGEJ_LIMIT and max(1 / x, 1 / y) < _RESOLUTION_LIMIT
-    if values.dtype in (np.uint8, np.uint16, np.float32) and fits and not named:
+    if values.dtype in (np.uint8, np.uint16, np.float32) and fits:
         exact = {"curvafit_spacing": f"{z!r},{y!r},{x!r}", "curvafit_unit": field.unit}
         unit = {"um": "micron", "voxel": "pixel"}.get(field.unit, field.unit)
         metadata = {"axes": "ZYX", "spacing": z, "unit": unit, **exact}
         tifffile.imwrite(
             path, values, photometric="minisblack", imagej=True, resolution=(1 / x, 1 / y), metadata=metadata
         )
-        return
+    else:
+        write_ome_tiff(field, path)
+
+
+def write_ome_tiff(field: Any, path: Path) -> None:
+    """OME's metadata."""
     sizes = {f"PhysicalSize{axis}": h for axis, h in zip("ZYX", field.spacing, strict=True)}
     units = {f"PhysicalSize{axis}Unit": {"um": "µm", "voxel": "pixel"}.get(field.unit, field.unit) for axis in "ZYX"}
-    tifffile.imwrite(path, values, photometric="minisblack", ome=True, metadata={"axes": "ZYX", **sizes, **units})
+    metadata = {"axes": "ZYX", **sizes, **units}
+    tifffile.imwrite(path, _stored(field), photometric="minisblack", ome=True, metadata=metadata)
+
+
+def _stored(field: Any) -> np.ndarray:
+    """The values as a TIFF holds them: bytes for a mask."""
+    return field.values.view(np.uint8) if field.values.dtype == bool else field.values
 
 
 def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
