@@ -14,7 +14,6 @@ made them: a killed run begins with the shape it was at, and a second one only p
 from __future__ import annotations
 
 import argparse
-import os
 import subprocess
 import sys
 import tempfile
@@ -23,6 +22,7 @@ from itertools import combinations, product
 from pathlib import Path
 from typing import NamedTuple
 
+import numba
 import numpy as np
 from rich.progress import Progress
 
@@ -35,8 +35,11 @@ from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.scan import write_atomically
 from curvafit.transport import wasserstein
 
-#: Tubes, tubes of two kinds, layers, spheres, sponges of two kinds, trabeculae, and the paper's flow.
-PRESETS = ("tubes", "seeds", "bilayers", "bilinear-spheres", "sponge", "sieve", "trabec", "flow")
+#: Tubes of three kinds, layers, spheres of two kinds, sponges of two kinds, trabeculae, metatubes, the paper's flow.
+PRESETS = (
+    "tubes", "seeds", "bilinear-tubes", "bilayers", "bilinear-spheres", "pearls", "sponge", "sieve", "trabec",
+    "metatubes", "flow",
+)  # fmt: skip
 
 
 class Shape(NamedTuple):
@@ -62,7 +65,7 @@ class Row(NamedTuple):
 def shape_of(name: str, schedule: str, seed: int, edge: int, folder: Path) -> Shape:
     """Generate and measure, or read what an earlier run kept."""
     path, plan = folder / f"{name}-{schedule}-{edge}-{seed}.npz", repr(SCHEDULES[schedule])
-    if not (path.exists() and str(np.load(path)["plan"]) == plan):
+    if not path.exists() or _plan(path) != plan:
         parameters, grid = preset(name), Grid((edge,) * 3)
         begun = time.perf_counter()
         with Progress(transient=True) as progress:
@@ -84,6 +87,12 @@ def shape_of(name: str, schedule: str, seed: int, edge: int, folder: Path) -> Sh
         energy, seconds, viable = kept["figures"]
         found = Diagram(kept["points"], kept["weights"])
         return Shape(float(energy), float(seconds), bool(viable), found, str(kept["commit"]))
+
+
+def _plan(path: Path) -> str:
+    """The schedule that made a kept shape; nothing in files that do not say."""
+    with np.load(path) as kept:
+        return str(kept.get("plan", ""))
 
 
 def _commit() -> str:
@@ -138,7 +147,7 @@ def main() -> None:
         return
     options.output.mkdir(parents=True, exist_ok=True)
     plans = ", ".join(f"{plan.name} {plan.steps}" for plan in SCHEDULES.values())
-    threads = os.environ.get("NUMBA_NUM_THREADS", os.cpu_count())
+    threads = numba.get_num_threads()
     print(f"{options.edge}³, {options.seeds} seeds; steps: {plans}; {threads} threads; {_commit()}")
     names = ("E paper", "E fast", "noise", "cross", "bias", "/noise", "s paper", "s fast")
     print(f"{'preset':17}" + "".join(f"{name:>9}" for name in names))

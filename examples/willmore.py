@@ -135,8 +135,9 @@ def main() -> None:
         runs = [(2 * round(100 * options.scale * part), width) for part, width in RUNS]
         runs = runs[-1:] if name == "genus-2" else runs
         rows = [flow_of(name, *run, options.steps or STEPS[name], options.output) for run in runs]
-        lines += report(name, rows)
-        print("\n".join(report(name, rows)), flush=True)
+        found = report(name, rows)
+        lines += found
+        print("\n".join(found), flush=True)
         begun, _ = start(name, *runs[-1])
         pictures = {f"{name}: start": begun.numpy(), f"{name}: end": rows[-1].flow.field.numpy()}
         gallery_picture(pictures, options.output / f"{name}.png", columns=2, width=1400)

@@ -20,7 +20,7 @@ GRID, PLAN = Grid((12, 13, 14)), Schedule("test", 45, 1e-2, 1e-3, "cosine")
 TUBES, SPONGE = preset("tubes"), preset("sponge")
 
 
-def same(one, other) -> None:
+def assert_same(one, other) -> None:
     assert torch.equal(one.field, other.field)
     for name in ("step", "energy", "gradient_max", "gradient_mean", "mass"):
         np.testing.assert_allclose(getattr(one.history, name), getattr(other.history, name), rtol=1e-12)
@@ -43,7 +43,7 @@ def test_one_after_another():
     pairs = [(TUBES.coefficients, TUBES.mass), (SPONGE.coefficients, SPONGE.mass)]
     flows = generate_batch(*zip(*pairs, strict=True), GRID, seeds=(3, 4), schedule=PLAN, snapshots=(7,))
     for flow, (a, mass), seed in zip(flows, pairs, (3, 4), strict=True):
-        same(flow, generate(a, mass, GRID, seed=seed, schedule=PLAN, snapshots=(7,)))
+        assert_same(flow, generate(a, mass, GRID, seed=seed, schedule=PLAN, snapshots=(7,)))
 
 
 def test_one_for_all():
@@ -114,4 +114,4 @@ def test_shapes_that_share_steps_are_the_same(monkeypatch):
     assert _Imitation.batches == [3, 2]
     assert len({flow.status for flow in flows}) > 1
     for flow, a, mass in zip(flows, each, masses, strict=True):
-        same(flow, generate(a, mass, GRID, seed=flow.seed, **told))
+        assert_same(flow, generate(a, mass, GRID, seed=flow.seed, **told))

@@ -57,7 +57,7 @@ def interrupted(make, path: Path, after: int):
     return flow
 
 
-def same(one, other) -> None:
+def assert_same(one, other) -> None:
     assert torch.equal(one.field, other.field)
     for name in ("step", "energy", "gradient_max", "gradient_mean", "mass"):
         np.testing.assert_array_equal(getattr(one.history, name), getattr(other.history, name))
@@ -90,7 +90,7 @@ def test_a_killed_program_goes_on(backend, tmp_path):
     )
     assert seen[0] == -(-saved // 10) * 10
     assert not path.exists()
-    same(resumed, generate(TUBES, None, GRID, **told))
+    assert_same(resumed, generate(TUBES, None, GRID, **told))
 
 
 @pytest.mark.parametrize("optimiser", ["adam", "lbfgs"])
@@ -101,7 +101,7 @@ def test_flows_from_a_field_go_on(flow, optimiser, tmp_path):
     def make(**more):
         return descend(start, TUBES, GRID, flow=flow, optimiser=optimiser, steps=40, **more)
 
-    same(interrupted(make, tmp_path / "run", 20), make())
+    assert_same(interrupted(make, tmp_path / "run", 20), make())
 
 
 def test_relaxing_with_frozen_voxels_goes_on(tmp_path):
@@ -112,7 +112,7 @@ def test_relaxing_with_frozen_voxels_goes_on(tmp_path):
     def make(**more):
         return relax(start, TUBES, GRID, schedule=PLAN, frozen=frozen, **more)
 
-    same(interrupted(make, tmp_path / "run", 30), make())
+    assert_same(interrupted(make, tmp_path / "run", 30), make())
 
 
 def test_another_runs_checkpoint_is_refused(tmp_path):
@@ -163,7 +163,7 @@ def test_a_checkpoint_may_be_kept(tmp_path):
 
     first = make()
     assert path.exists()
-    same(first, make())
+    assert_same(first, make())
 
 
 def test_a_callback_pauses_a_run(tmp_path):
@@ -178,7 +178,7 @@ def test_a_callback_pauses_a_run(tmp_path):
     assert torch.load(path, weights_only=True)["content"]["made"] == 31
     resumed = make(checkpoint=path)
     assert not path.exists()
-    same(resumed, make())
+    assert_same(resumed, make())
 
 
 def test_a_file_is_whole_or_old(tmp_path, monkeypatch):

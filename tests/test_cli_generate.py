@@ -200,7 +200,7 @@ def test_nifti_is_whole_and_tiled(tmp_path: Path) -> None:
     assert (record["tile"], record["voxel"], record["unit"]) == ([1, 2, 3], 0.02, "mm")
 
 
-def solid(tmp_path: Path, edge: int, *more: object) -> None:
+def assert_solid(tmp_path: Path, edge: int, *more: object) -> None:
     """Tubes as STL: closed for another program, with the volume of {u > 0}."""
     size = ["--shape", edge, "--spacing", "0.02", "--unit", "mm"]
     record = made("--preset", "tubes", *size, *more, "-o", tmp_path / "tubes.stl")
@@ -211,12 +211,12 @@ def solid(tmp_path: Path, edge: int, *more: object) -> None:
 
 
 def test_tubes_are_watertight_with_the_volume_of_the_phase(tmp_path: Path) -> None:
-    solid(tmp_path, 48, "--steps", 150)
+    assert_solid(tmp_path, 48, "--steps", 150)
 
 
 @pytest.mark.slow
 def test_tubes_of_the_published_size_are_watertight(tmp_path: Path) -> None:
-    solid(tmp_path, 100)
+    assert_solid(tmp_path, 100)
 
 
 def test_an_open_surface_ends_at_the_box(tmp_path: Path) -> None:
