@@ -28,14 +28,14 @@ from curvafit.priors.grid import Grid
 from curvafit.priors.profile import SIGMA, optimal_profile
 
 #: Grids as multiples of the full one, and ε in voxels. The last is the published one: 200 voxels, spacing 0.01, ε 0.04.
-RUNS = ((0.75, 4), (1, 16 / 3), (1, 4))
+RUNS = ((0.8, 4), (1, 5), (1, 4))
 #: Radius of the sphere, and half edges of a cube and of its hole, in units of half the box's shortest edge. Larger
-#: shapes have smaller errors, by the square of ε over their size; they must leave the walls some seven ε.
-RADIUS, CUBES = 0.66, {"torus": (0.64, 0.24), "genus-2": (0.8, 0.3)}
+#: shapes have smaller errors, by the square of ε over their size; they must leave the walls some six ε.
+RADIUS, CUBES = 0.66, {"torus": (0.67, 0.25), "genus-2": (0.8, 0.3)}
 #: Least known Willmore energies, ∫ H² dA with H the sum of the curvatures (genus 2: Hsu, Kusner and Sullivan).
 MINIMA = {"sphere": 16 * math.pi, "torus": 8 * math.pi**2, "genus-2": 4 * 21.89}
 #: Most iterations of L-BFGS.
-STEPS = {"sphere": 100, "torus": 600, "genus-2": 1200}
+STEPS = {"sphere": 100, "torus": 800, "genus-2": 1200}
 
 
 class Row(NamedTuple):
