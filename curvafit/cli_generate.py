@@ -186,11 +186,10 @@ def _source(
         found = named(preset)
         return tuple(found.coefficients), found.mass, f"preset {preset}", 1.0, "voxel"  # type: ignore[arg-type]
     if prior is not None:
-        from curvafit.fit import read_prior
-        from curvafit.shape_files import prior_voxel
+        from curvafit.priors import read_fit
 
-        law, m0 = read_prior(prior)
-        return tuple(law), m0, f"prior {prior}", *prior_voxel(prior)  # type: ignore[arg-type]
+        fit = read_fit(prior)
+        return tuple(fit.coefficients), fit.mass, f"prior {prior}", fit.working_voxel, fit.unit
     if six is not None:
         return numbers(six, "--coefficients", 6), None, "coefficients", 1.0, "voxel"
     return (1.0, 0.0, 1.0, 0.0, 0.0, 0.0), None, "maps", 1.0, "voxel"

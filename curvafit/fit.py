@@ -5,15 +5,13 @@ from __future__ import annotations
 import dataclasses
 import json
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from curvafit.match import Match
 from curvafit.morphometry import Morphometry
-from curvafit.priors.coefficients import NAMES, Coefficients
+from curvafit.priors.coefficients import Coefficients
+from curvafit.priors.fit_file import FORMAT
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
-
-FORMAT = "curvafit-fit-1"
 
 
 @dataclass(frozen=True)
@@ -96,30 +94,6 @@ class Fit:
 
     def to_json(self) -> str:
         return json.dumps(self.as_dict(), indent=2, allow_nan=False)
-
-
-def read_prior(path: str | Path) -> tuple[Coefficients, float]:
-    """The working coefficients and mass of a `fit.json`, to generate with.
-
-    Raises
-    ------
-    FileNotFoundError, ValueError
-        If there is no such file, or it is not a `fit.json` of this format.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"expected a fit.json, found no file {path}")
-    try:
-        content = json.loads(path.read_text())
-        found = content["format"]
-        if found != FORMAT:
-            raise ValueError(
-                f"expected a fit.json of format {FORMAT}, got {found!r} in {path}: run `curvafit infer` again"
-            )
-        values = [content["coefficients"][name] for name in NAMES]
-        return Coefficients(*values), float(content["mass"])
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
-        raise ValueError(f"expected a fit.json written by `curvafit infer`, got {path} ({error!r})") from error
 
 
 def _match_dict(match: Match) -> dict[str, Any]:

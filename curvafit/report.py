@@ -122,10 +122,10 @@ def report_html(inference: Inference) -> str:
 
 _PYTHON = escape(
     """import curvafit
-from curvafit.fit import read_prior
+from curvafit.priors import read_fit
 
-coefficients, mass = read_prior("fit.json")
-flow = curvafit.generate(coefficients, mass, curvafit.Grid((100, 100, 100)), seed=1)"""
+fit = read_fit("fit.json")
+flow = curvafit.generate(fit.coefficients, fit.mass, 100, seed=1)"""
 )
 
 

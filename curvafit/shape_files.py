@@ -122,15 +122,6 @@ def step_path(path: str | Path, step: int) -> Path:
     return beside(path, f"_step{step:05d}{suffix}")
 
 
-def prior_voxel(path: str | Path) -> tuple[float, str]:
-    """Edge of a working voxel and its unit, from a `fit.json`; a voxel where it does not say."""
-    content = json.loads(Path(path).read_text(encoding="utf-8"))
-    voxel, unit = content.get("working_voxel", 1.0), content.get("length_unit", "voxel")
-    if not isinstance(voxel, (int, float)) or not voxel > 0 or not isinstance(unit, str):
-        raise ValueError(f"expected a positive working_voxel and a length_unit in {path}, got {voxel!r} and {unit!r}")
-    return float(voxel), unit
-
-
 def write_shape(
     flow: Flow, path: str | Path, *, output: Output | None = None, record: dict[str, Any] | None = None
 ) -> tuple[Path, Path, Path]:

@@ -10,12 +10,12 @@ import pytest
 import torch
 
 from curvafit.diagram import diagram
-from curvafit.fit import FORMAT, read_prior
 from curvafit.generation.flow import generate
 from curvafit.infer import Inference, infer
 from curvafit.measure import scan_diagram
 from curvafit.prepare import prepare
 from curvafit.priors.coefficients import preset
+from curvafit.priors.fit_file import FORMAT, read_fit
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.scan import Field
 from curvafit.transport import wasserstein
@@ -71,22 +71,24 @@ def test_fit_json_holds_what_the_generator_needs(found: Inference, tmp_path) -> 
     }  # fmt: skip
     assert set(content["distances"]) == {"match", "fit", "seed_noise"}
     assert content["provenance"]["seed"] == 3 and content["length_unit"] == "um"
-    coefficients, mass = read_prior(path)
-    assert tuple(coefficients) == pytest.approx(tuple(found.fit.coefficients))
-    assert mass == pytest.approx(found.fit.mass)
+    prior, fit = read_fit(path), found.fit
+    assert tuple(prior.coefficients) == pytest.approx(tuple(fit.coefficients))
+    assert tuple(prior.physical) == pytest.approx(tuple(fit.coefficients_physical))
+    assert (prior.mass, prior.epsilon) == pytest.approx((fit.mass, fit.epsilon_physical))
+    assert (prior.working_voxel, prior.unit) == (fit.working_voxel, fit.length_unit)
 
 
-def test_read_prior_refuses_what_is_no_fit(tmp_path) -> None:
+def test_read_fit_refuses_what_is_no_fit(tmp_path) -> None:
     with pytest.raises(FileNotFoundError, match=r"expected a fit\.json, found no file"):
-        read_prior(tmp_path / "none.json")
+        read_fit(tmp_path / "none.json")
     path = tmp_path / "fit.json"
     for text in ("{", "[]", "{}", '{"format": "curvafit-fit-1"}'):
         path.write_text(text)
         with pytest.raises(ValueError, match="expected a fit.json written by"):
-            read_prior(path)
+            read_fit(path)
     path.write_text('{"format": "curvafit-fit-0"}')
     with pytest.raises(ValueError, match="expected a fit.json of format"):
-        read_prior(path)
+        read_fit(path)
 
 
 def test_tiles_measure_what_the_whole_box_measures(tubes: np.ndarray) -> None:

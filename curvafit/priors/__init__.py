@@ -4,10 +4,14 @@ if __name__ != "curvafit.priors":
     raise ImportError("import curvafit.priors, not priors: the folder at the project's root is a link into the package")
 
 from curvafit.priors.coefficients import PRESETS, Coefficients, Preset, preset
+from curvafit.priors.combined import CombinedLoss
 from curvafit.priors.curvature import diffuse_curvatures, geometric_curvatures, jet
 from curvafit.priors.energy import cahn_hilliard_area, discrepancy_ratio, energy, energy_terms, orientation
+from curvafit.priors.fit_file import Prior, read_fit
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
+from curvafit.priors.loss import curvature_prior
 from curvafit.priors.profile import SIGMA, optimal_profile, phase_field, profile_distance, signed_distance
+from curvafit.priors.segmentation import CurvaturePrior
 
 __all__ = [
     "PRESETS",
@@ -15,9 +19,13 @@ __all__ = [
     "WORKING_EPSILON",
     "WORKING_SPACING",
     "Coefficients",
+    "CombinedLoss",
+    "CurvaturePrior",
     "Grid",
     "Preset",
+    "Prior",
     "cahn_hilliard_area",
+    "curvature_prior",
     "diffuse_curvatures",
     "discrepancy_ratio",
     "energy",
@@ -29,5 +37,6 @@ __all__ = [
     "phase_field",
     "preset",
     "profile_distance",
+    "read_fit",
     "signed_distance",
 ]

@@ -25,6 +25,7 @@ def energy(
     grid: Grid,
     epsilon: float | Tensor,
     orientation: Float[Tensor, "3 3"] | None = None,
+    mask: Tensor | None = None,
 ) -> Float[Tensor, "*batch"]:
     """F_ε(u) (eq. `Feps`), differentiable in the field and in the coefficients.
 
@@ -38,6 +39,8 @@ def energy(
         The sampling, and the interface parameter in spacing's unit: a number, or a tensor that broadcasts with `u`.
     orientation
         Q of a further term ε ∫ ∇uᵀQ∇u, symmetric, axes z, y, x; see `orientation`.
+    mask
+        What the energy's density is multiplied by before it is summed; broadcasts with `u`.
 
     Raises
     ------
@@ -50,6 +53,8 @@ def energy(
     per_voxel = sum(weighted, start=torch.zeros_like(u))
     if orientation is not None:
         per_voxel = per_voxel + ε * orientation_form(field.gradient, orientation)
+    if mask is not None:
+        per_voxel = per_voxel * mask.to(u)
     return per_voxel.sum((-3, -2, -1)) * grid.voxel_volume
 
 

@@ -45,7 +45,12 @@ def stacked(coefficients: Coefficients, grid: Grid) -> Tensor:
 
 
 def energy_gradient(
-    u: Tensor, coefficients: Coefficients, grid: Grid, epsilon: float | Tensor, orientation: Tensor | None = None
+    u: Tensor,
+    coefficients: Coefficients,
+    grid: Grid,
+    epsilon: float | Tensor,
+    orientation: Tensor | None = None,
+    mask: Tensor | None = None,
 ) -> tuple[float, Tensor]:
     """`energy` of a field `(Z, Y, X)` and its gradient with respect to every voxel, on the field's device, in its type.
 
@@ -55,26 +60,32 @@ def energy_gradient(
         If the field's shape is not the grid's.
     """
     if u.dtype != torch.float32 or not fused(u.device):
-        return plain_energy_gradient(u, coefficients, grid, epsilon, orientation)
+        return plain_energy_gradient(u, coefficients, grid, epsilon, orientation, mask)
     if u.device.type == "cuda":
         from curvafit.priors.kernels import cuda
 
-        energies, gradient = cuda.energy_gradient(u, stacked(coefficients, grid), grid, epsilon, orientation)
+        energies, gradient = cuda.energy_gradient(u, stacked(coefficients, grid), grid, epsilon, orientation, mask)
         return float(energies), gradient
     from curvafit.priors.kernels import cpu
 
     a, ε, Q = on_processor(coefficients, grid, epsilon, orientation)
-    value, slope = cpu.energy_gradient(u.detach().numpy(), a, grid, ε, Q)
+    kept = None if mask is None else mask.detach().numpy()
+    value, slope = cpu.energy_gradient(u.detach().numpy(), a, grid, ε, Q, kept)
     return value, torch.from_numpy(slope)
 
 
 def plain_energy_gradient(
-    u: Tensor, coefficients: Coefficients, grid: Grid, epsilon: float | Tensor, orientation: Tensor | None = None
+    u: Tensor,
+    coefficients: Coefficients,
+    grid: Grid,
+    epsilon: float | Tensor,
+    orientation: Tensor | None = None,
+    mask: Tensor | None = None,
 ) -> tuple[float, Tensor]:
     """The same by autograd: the definition."""
     free = u.detach().requires_grad_()
     with torch.enable_grad():
-        value = energy(free, coefficients, grid, epsilon, orientation)
+        value = energy(free, coefficients, grid, epsilon, orientation, mask)
         (gradient,) = torch.autograd.grad(value, free)
     return float(value.detach()), gradient
 

@@ -29,7 +29,7 @@ _BLOCK, _TILE = 432, 43_000
 _LINE = 16
 
 
-def energy_gradient(u: np.ndarray, a, grid: Grid, epsilon, orientation=None) -> tuple[float, np.ndarray]:
+def energy_gradient(u: np.ndarray, a, grid: Grid, epsilon, orientation=None, mask=None) -> tuple[float, np.ndarray]:
     """F_ε(u) and its gradient with respect to every voxel (the voxel's volume included).
 
     Parameters
@@ -42,13 +42,15 @@ def energy_gradient(u: np.ndarray, a, grid: Grid, epsilon, orientation=None) -> 
         The sampling, either boundary, and the interface parameter in spacing's unit, a number or an array `(Z, Y, X)`.
     orientation
         Q of a further term ε ∫ ∇uᵀQ∇u, symmetric, axes z, y, x, or None.
+    mask
+        What the energy's density is multiplied by, `(Z, Y, X)`, or None.
 
     Raises
     ------
     ValueError
         If an array's shape is not the grid's, or the orientation is not symmetric.
     """
-    density = _Density(a, grid, epsilon, _threads(grid), orientation)
+    density = _Density(a, grid, epsilon, _threads(grid), orientation, mask)
     gradient = _volume(grid)
     value = density(_padded(u, grid), gradient)
     return value, _inner(gradient, grid).copy()
@@ -237,17 +239,21 @@ class _Blur:
 class _Density:
     """F_ε's constants and scratch on a grid."""
 
-    def __init__(self, a, grid: Grid, epsilon, threads: int, orientation) -> None:
+    def __init__(self, a, grid: Grid, epsilon, threads: int, orientation, mask=None) -> None:
         Z, Y, X = grid.shape
         stride = X + 2 * EDGE
         self._grid, self._threads = grid, threads
         self._block, self._tile = max(1, min(8, _BLOCK // stride)), min(Y, max(8, _TILE // stride))
-        weights = _weights(a, grid, epsilon)
-        self._constants, self._general = _density_constants(weights, grid), (_ratios(grid), None, None, None)
+        weights, ratios = _weights(a, grid, epsilon), _ratios(grid)
+        self._constants, self._general = _density_constants(weights, grid), (ratios, None, None, None)
+        ratios = _RATIOS if ratios is None else ratios
         if orientation is not None or any(np.ndim(value) > 0 for value in weights):
-            ratios = _RATIOS if self._general[0] is None else self._general[0]
             weights.append(_voxelwise(epsilon, grid) * grid.voxel_volume / (2 * grid.spacing[2]) ** 2)
+            if mask is not None:
+                weights[1:] = [value * _voxelwise(mask, grid) for value in weights[1:]]
             self._general = (ratios, _orientations(orientation, grid), *_local(weights, self._block, grid))
+        elif mask is not None:
+            self._general = (ratios, None, _padded(np.asarray(mask), grid), None)
         self._index = _continuation(Z, EDGE, EDGE, grid.periodic)
         row = np.zeros(stride, np.float32)
         row[EDGE:-EDGE] = 1
@@ -335,9 +341,12 @@ def _padded(u: np.ndarray, grid: Grid) -> np.ndarray:
     volume = _volume(grid)
     Z, Y, X = grid.shape
     whole = volume[SLACK:-SLACK].reshape(Z, Y + 2 * EDGE, X + 2 * EDGE)
-    y, x = (_continuation(n, EDGE, EDGE, grid.periodic) for n in (Y, X))
-    for plane, values in zip(whole, u, strict=True):
-        plane[...] = values[np.ix_(y, x)]
+    y, x = (EDGE + _continuation(n, EDGE, EDGE, grid.periodic) for n in (Y, X))
+    whole[:, EDGE:-EDGE, EDGE:-EDGE] = u
+    for k in (0, 1, -2, -1):
+        whole[:, :, k] = whole[:, :, x[k]]
+    for k in (0, 1, -2, -1):
+        whole[:, k] = whole[:, y[k]]
     return volume
 
 

@@ -109,6 +109,7 @@ def energy_gradient(
     grid: Grid,
     epsilon: float | Tensor,
     orientation: Tensor | None = None,
+    mask: Tensor | None = None,
     *,
     tuning: Tuning | None = None,
 ) -> tuple[Tensor, Tensor]:
@@ -120,6 +121,8 @@ def energy_gradient(
         `(Z, Y, X)` or `(B, Z, Y, X)`, float32, on the device.
     a, epsilon, orientation
         As for `CudaFlow`.
+    mask
+        What the energy's density is multiplied by, `(Z, Y, X)` or `(B, Z, Y, X)`, or None.
 
     Returns
     -------
@@ -136,7 +139,7 @@ def energy_gradient(
     fields = u.detach().reshape(-1, *grid.shape).contiguous()
     layout = _Layout(grid, len(fields), u.device, tuning or Tuning())
     scratch = _Scratch(layout, 0)
-    cost = _Density(layout, a, epsilon, orientation)
+    cost = _Density(layout, a, epsilon, orientation, mask)
     gradient = torch.empty_like(fields)
     with layout.selected():
         cost.launch(fields, scratch, True)()
@@ -438,7 +441,9 @@ class _Scratch:
 class _Density:
     """F_ε's numbers on the device."""
 
-    def __init__(self, layout: _Layout, a, epsilon: float | Tensor, orientation: Tensor | None) -> None:
+    def __init__(
+        self, layout: _Layout, a, epsilon: float | Tensor, orientation: Tensor | None, mask: Tensor | None = None
+    ) -> None:
         hz, hy, hx = layout.grid.spacing
         self._layout = layout
         self._weights, self._varies = _weights(a, epsilon, layout)
@@ -449,7 +454,9 @@ class _Density:
             **dict(zip(("fzy", "fzx", "fyx"), (0.25 / (hz * hy), 0.25 / (hz * hx), 0.25 / (hy * hx)), strict=True)),
             **_orientation(orientation, layout.grid),
         }
-        self._oriented = orientation is not None
+        self._oriented, self._mask = orientation is not None, None
+        if mask is not None:
+            self._mask = _fitting(mask.float(), (layout.batch, *layout.grid.shape), "mask", layout).contiguous()
         self._energies = layout.figures(layout.chunks)
 
     def launch(self, u: Tensor, scratch: _Scratch, energy: bool) -> Launch:
@@ -459,12 +466,14 @@ class _Density:
             "parts": scratch.parts,
             "energies": self._energies,
             "weights": self._weights,
+            "mask": self._weights if self._mask is None else self._mask,
             **layout.sizes,
             "apart": scratch.apart,
             "planes": layout.planes,
             **self._numbers,
         }
-        constants = {"ENERGY": energy, "ORIENTED": self._oriented, "VARIES": self._varies, **layout.constants}
+        constants = {"ENERGY": energy, "ORIENTED": self._oriented, "VARIES": self._varies}
+        constants |= {"MASKED": self._mask is not None, **layout.constants}
         return Launch("density", (layout.chunks, layout.batch), arguments, constants, layout.lanes)
 
     def energy(self) -> Tensor:

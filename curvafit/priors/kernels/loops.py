@@ -332,11 +332,17 @@ def _weight(local, places, which, cell):
 @njit(**_SERIAL)
 def _cost(k, local, places, cell):
     """The density's weights: (h/ε)², the floor of X, then those of X, T², TS, GT, GS and s, and twice the weights of X,
-    T² and s; where they vary, from `cell` on."""
+    T² and s; where they vary, from `cell` on; where `places` is None, `local` is a mask of them."""
     if local is None:
         return (
             _full(k[7]), _full(k[8]), _full(k[9]), _full(k[10]), _full(k[11]), _full(k[12]), _full(k[13]), _full(k[14]),
             _full(k[15]), _full(k[16]), _full(k[17]),
+        )  # fmt: skip
+    if places is None:
+        mask = _wide(local, cell)
+        return (
+            _full(k[7]), _full(k[8]), mask * k[9], mask * k[10], mask * k[11], mask * k[12], mask * k[13], mask * k[14],
+            mask * k[15], mask * k[16], mask * k[17],
         )  # fmt: skip
     well, X, T2 = _weight(local, places, 0, cell), _weight(local, places, 1, cell), _weight(local, places, 2, cell)
     TS, GT = _weight(local, places, 3, cell), _weight(local, places, 4, cell)
@@ -371,7 +377,7 @@ def _partials(u, m, c, p, stride, n, ring, size, at, inside, from_, k, ratios, o
     Differences are in units of the spacing, the constants `k` scaled accordingly. They are read where they are used:
     kept in registers, they would push the variables out. `local` and `places` are None, or the weights where they vary
     (from row 0 of `places` on: of each its offset in `local`, and one, or zero for a vector that serves everywhere);
-    then `orient` holds Q's zz, yy, xx, zy, zx, yx.
+    then `orient` holds Q's zz, yy, xx, zy, zx, yx. Or `local` alone is a volume that all weights are multiplied by.
     """
     energy = _full(k[1])
     for i in range(0, n, WIDE):

@@ -144,16 +144,18 @@ def blur_plane(
             tl.store(out + (y * X + cell), values[k], mask=_below(place, G, y < Y))
 
 
-@triton.jit(do_not_specialize=["u", "parts", "energies", "weights", "Z", "Y", "X", "apart", "planes"])
+@triton.jit(do_not_specialize=["u", "parts", "energies", "weights", "mask", "Z", "Y", "X", "apart", "planes"])
 def density(
-    u, parts, energies, weights, Z, Y, X, apart, planes, eps,
+    u, parts, energies, weights, mask, Z, Y, X, apart, planes, eps,
     fz, fy, fx, fzz, fyy, fxx, fzy, fzx, fyx, Qzz, Qyy, Qxx, Qzy, Qzx, Qyx,
-    PERIODIC: tl.constexpr, ENERGY: tl.constexpr, ORIENTED: tl.constexpr, VARIES: tl.constexpr, LANES: tl.constexpr,
+    PERIODIC: tl.constexpr, ENERGY: tl.constexpr, ORIENTED: tl.constexpr, VARIES: tl.constexpr, MASKED: tl.constexpr,
+    LANES: tl.constexpr,
 ):  # fmt: skip
     """Partial derivatives of F_ε's density, summed along z as far as the transposed stencils allow: `VOLUMES` of them.
 
     A program takes `planes` planes of a column of cells, and those on either side once more. `weights` are the
-    density's six, a shape or (VARIES) a voxel, the latter with ε; Q is the orientation, times the voxel's volume.
+    density's six, a shape or (VARIES) a voxel, the latter with ε; Q is the orientation, times the voxel's volume. What
+    comes of a voxel is multiplied by its `mask` (MASKED).
     """
     plane = Y * X
     chunks = tl.cdiv(Z, planes)
@@ -169,6 +171,7 @@ def density(
     yb, ya, xb, xa = _before(y, Y, PERIODIC), _after(y, Y, PERIODIC), _before(x, X, PERIODIC), _after(x, X, PERIODIC)
     rows, columns = (yb * X, y * X, ya * X), (xb, x, xa)
     weights += shape * (7 * volume if VARIES else 6)
+    mask += shape * volume
     if not VARIES:
         wP, wT2, wTS = tl.load(weights), tl.load(weights + 1), tl.load(weights + 2)
         wGT, wGS, ws = tl.load(weights + 3), tl.load(weights + 4), tl.load(weights + 5)
@@ -191,6 +194,9 @@ def density(
             ε = tl.load(weights + 6 * volume + here)
         else:
             ε = eps
+        kept = 1.0
+        if MASKED:
+            kept = tl.load(mask + _reflect(z, Z, PERIODIC) * plane + cell)
         # Differences.
         gz, gy, gx = fz * (n_c - b_c), fy * (ya_ - yb_), fx * (xa_ - xb_)
         twice = c + c
@@ -245,7 +251,10 @@ def density(
             e = wP * P + wT2 * T * T + wTS * T * S + G * (wGT * T + wGS * S) + ws * s
             if ORIENTED:
                 e += qz * gz + qy * gy + qx * gx
-            energy += tl.where(_below(place, plane, (z >= first) & (z < last)), e, 0.0)
+            energy += tl.where(_below(place, plane, (z >= first) & (z < last)), kept * e, 0.0)
+        if MASKED:
+            dz, dy, dx, e_L, e_N, e_Q = kept * dz, kept * dy, kept * dx, kept * e_L, kept * e_N, kept * e_Q
+            e_n, e_q, e_w = kept * e_n, kept * e_q, kept * e_w
         dz, dy, dx = fz * dz, fy * dy, fx * dx
         dzz = fzz * (e_L + e_N * zz + e_Q * gz * gz)
         dyy = fyy * (e_L + e_N * yy + e_Q * gy * gy)

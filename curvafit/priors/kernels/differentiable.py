@@ -1,0 +1,75 @@
+"""F_ε of a batch of fields, differentiable: the fused kernels as an operator that is opaque to compilers."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from curvafit.priors import kernels
+from curvafit.priors.coefficients import Coefficients
+from curvafit.priors.energy import energy
+from curvafit.priors.grid import Grid
+from curvafit.priors.shapes import Float
+
+
+def energies(
+    u: Float[Tensor, "batch z y x"],
+    coefficients: Coefficients,
+    grid: Grid,
+    epsilon: float,
+    mask: Float[Tensor, "#batch z y x"],
+) -> Float[Tensor, " batch"]:
+    """`energy` of every field, its density multiplied by a mask.
+
+    Float32 takes the fused kernel where there is one: its gradient comes with its value, so that the backward pass is
+    a multiplication, once. Other fields take the definition.
+
+    Parameters
+    ----------
+    coefficients
+        Numbers.
+    grid, epsilon
+        A grid with mirrors; ε in its spacing's unit.
+    mask
+        Gets no gradient.
+    """
+    if u.dtype != torch.float32 or not kernels.fused(u.device):
+        return energy(u, coefficients, grid, epsilon, mask=mask)
+    a = [float(value) for value in coefficients]
+    return _energies(u, mask.to(u).expand(u.shape), a, list(grid.spacing), epsilon)[0]
+
+
+_SCHEMA = "(Tensor u, Tensor mask, float[] a, float[] spacing, float epsilon) -> (Tensor, Tensor)"
+
+
+@torch.library.custom_op("curvafit::energies", mutates_args=(), schema=_SCHEMA)
+def _energies(u, mask, a, spacing, epsilon):
+    """The energies, and their gradient."""
+    grid, cost = Grid(tuple(u.shape[1:]), tuple(spacing), "replicate"), Coefficients(*a)
+    if u.device.type == "cuda":
+        from curvafit.priors.kernels import cuda
+
+        values, gradient = cuda.energy_gradient(u, kernels.stacked(cost, grid), grid, epsilon, mask=mask)
+        return values.to(u), gradient
+    values, gradient = u.new_empty(u.shape[0]), torch.empty_like(u, memory_format=torch.contiguous_format)
+    for k in range(len(u)):
+        values[k], gradient[k] = kernels.energy_gradient(u[k], cost, grid, epsilon, mask=mask[k])
+    return values, gradient
+
+
+@_energies.register_fake
+def _(u, mask, a, spacing, epsilon):
+    return u.new_empty(u.shape[0]), torch.empty_like(u, memory_format=torch.contiguous_format)
+
+
+def _keep(ctx, inputs, output) -> None:
+    ctx.save_for_backward(output[1])
+    ctx.mark_non_differentiable(output[1])
+
+
+def _backward(ctx, by_energies, _):
+    (gradient,) = ctx.saved_tensors
+    return gradient * by_energies[:, None, None, None], None, None, None, None
+
+
+_energies.register_autograd(_backward, setup_context=_keep)

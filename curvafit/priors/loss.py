@@ -1,0 +1,92 @@
+"""F_ε of predicted probabilities in a window of a larger volume: the function behind the training loss."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from curvafit.priors.coefficients import Coefficients
+from curvafit.priors.energy import cahn_hilliard_parts
+from curvafit.priors.grid import WORKING_EPSILON, Grid
+from curvafit.priors.kernels.differentiable import energies
+from curvafit.priors.profile import SIGMA
+from curvafit.priors.refined import refined
+from curvafit.priors.shapes import Float
+from curvafit.priors.stencils import gaussian_blur
+
+#: Voxels that ε spans at least: an axis with fewer is interpolated.
+RESOLVED = 2
+
+
+def curvature_prior(
+    probability: Float[Tensor, "batch z y x"],
+    coefficients: Coefficients,
+    spacing: tuple[float, float, float],
+    epsilon: float,
+    *,
+    mask: Float[Tensor, "#batch z y x"] | None = None,
+    normalize: Literal["voxel", "area"] | None = "voxel",
+    border: int = 1,
+    blur: float = 0.0,
+) -> Float[Tensor, " batch"]:
+    """F_ε(2p - 1) of probabilities in a window of a larger volume (eq. `Feps`), by fused kernels in float32.
+
+    Parameters
+    ----------
+    probability
+        In [0, 1], float32 or float64 (the definition, for tests).
+    coefficients, epsilon, blur
+        Numbers, ε, and the standard deviation of a Gaussian that is applied first, in spacing's unit.
+    spacing
+        Voxel edges (z, y, x). An axis with fewer than two voxels to ε is interpolated (cubic) until it has two.
+    mask
+        Weights of the energy's density.
+    normalize
+        `"voxel"`: the mean density over the mask, in units of ε (F_ε ε³ / volume). `"area"`: per interface area
+        (F_ε ε² / (area + ε²)). None: F_ε itself.
+    border
+        Voxels at each side of the window, whose density is left out.
+
+    Raises
+    ------
+    ValueError
+        If the window is too small for its border.
+    """
+    shape = tuple(probability.shape[1:])
+    if min(shape) < max(4, 2 * border + 1):
+        least = max(4, 2 * border + 1)
+        raise ValueError(f"expected a volume of at least {least} voxels along each axis, got {shape}: it has no inside")
+    times = upsampling(spacing, epsilon)
+    unit = epsilon / WORKING_EPSILON
+    u, kept = 2 * probability - 1, _window(probability, mask, border)
+    for axis, n in enumerate(times):
+        u, kept = refined(u, axis, n), kept.repeat_interleave(n, axis - 3) if n > 1 else kept
+    grid = Grid(tuple(u.shape[1:]), tuple(h / n / unit for h, n in zip(spacing, times, strict=True)), "replicate")  # type: ignore[arg-type]
+    if blur:
+        u = gaussian_blur(u, grid, blur / unit)
+    total = energies(u, coefficients.in_unit(unit), grid, WORKING_EPSILON, kept)
+    if normalize == "voxel":
+        volume = kept.sum((-3, -2, -1)) * (grid.voxel_volume / WORKING_EPSILON**3)
+        return total / volume.clamp_min(torch.finfo(volume.dtype).tiny)
+    if normalize == "area":
+        parts = cahn_hilliard_parts(u, grid, WORKING_EPSILON)
+        area = (sum(parts) * kept).sum((-3, -2, -1)) * (grid.voxel_volume / SIGMA / WORKING_EPSILON**2)
+        return total / (area + 1)
+    return total
+
+
+def upsampling(spacing: Sequence[float], epsilon: float) -> tuple[int, int, int]:
+    """How many times each axis is refined for ε to span two voxels."""
+    return tuple(max(1, math.ceil(RESOLVED * h / epsilon - 1e-3)) for h in spacing)  # type: ignore[return-value]
+
+
+def _window(probability: Tensor, mask: Tensor | None, border: int) -> Tensor:
+    """The mask, zero at the border; `(1 or batch, z, y, x)`."""
+    inside = probability.new_zeros(probability.shape[1:])
+    z, y, x = (slice(border, n - border) for n in inside.shape)
+    inside[z, y, x] = 1
+    return inside[None] if mask is None else inside * mask.to(inside)

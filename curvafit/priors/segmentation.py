@@ -1,0 +1,253 @@
+"""F_ε as a training loss: what a predicted segmentation's surfaces cost."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from os import PathLike
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from curvafit.priors.coefficients import PRESETS, Coefficients
+from curvafit.priors.fit_file import read_fit
+from curvafit.priors.grid import WORKING_SPACING, Grid
+from curvafit.priors.loss import RESOLVED, curvature_prior, upsampling
+
+Law = Coefficients | str | PathLike[str]
+
+_REDUCTIONS, _NORMALIZATIONS = ("mean", "sum", "none"), ("voxel", "area")
+
+
+class CurvaturePrior(nn.Module):
+    """The energy F_ε of a segmentation, as a loss with the keywords of MONAI's.
+
+    `forward(input, target=None, mask=None)`: `input` is `(B, N, D, H, W)`, N classes or one; a scalar comes back, or
+    `(B, N, 1, 1, 1)` with `reduction="none"`. Everything is computed in float32 whatever autocast says (float64 input
+    stays). The target says only which voxels to ignore. Deterministic; a constant or saturated input has a finite
+    value and gradient.
+
+    Parameters
+    ----------
+    coefficients
+        `Coefficients` with lengths in spacing's unit; or a preset's name, in working units of which the smallest
+        voxel edge is 0.01; or the path of a `fit.json`, in the unit it names, which must be spacing's. Or a sequence
+        of such, one a class.
+    sigmoid, softmax
+        The input is logits: apply this first.
+    include_background
+        False leaves channel 0 out.
+    to_onehot_y
+        The target is class numbers `(B, 1, D, H, W)`.
+    reduction
+        `"mean"` over batch and classes; `"sum"` of the energies F_ε themselves, not normalised, so that windows which
+        overlap by 2·border voxels add up to the interior of the whole (border 2 where an axis is interpolated);
+        `"none"`.
+    ignore_index
+        Voxels where the target has this value count nothing.
+    spacing
+        Voxel edges (z, y, x) in any unit, or one for all.
+    epsilon
+        ε in that unit; twice the smallest edge if not given. Structures thinner than two smallest edges do not
+        survive it. An axis on which ε spans fewer than two voxels is interpolated: a warning says so.
+    weight
+        A factor, or one a class; classes of weight 0 are not computed.
+    normalize
+        `"voxel"`: mean density in units of ε; patches of all sizes compare. `"area"`: per area of interface.
+    border
+        Voxels at each face of the input that do not count, since their neighbours are unknown.
+    blur
+        Standard deviation, in spacing's unit, of a Gaussian applied to the probabilities; none by default.
+    shape
+        Voxels (D, H, W) of a whole patch. An input of another shape is then the same patch on a coarser grid, as in
+        deep supervision: the spacing follows.
+
+    Raises
+    ------
+    ValueError
+        If an argument is out of range, or in `forward` a shape does not fit.
+    """
+
+    def __init__(
+        self,
+        coefficients: Law | Sequence[Law],
+        *,
+        sigmoid: bool = False,
+        softmax: bool = False,
+        include_background: bool = True,
+        to_onehot_y: bool = False,
+        reduction: str = "mean",
+        ignore_index: int | None = None,
+        spacing: float | Sequence[float] = 1.0,
+        epsilon: float | None = None,
+        weight: float | Sequence[float] = 1.0,
+        normalize: Literal["voxel", "area"] = "voxel",
+        border: int = 1,
+        blur: float = 0.0,
+        shape: Sequence[int] | None = None,
+    ) -> None:
+        super().__init__()
+        if sigmoid and softmax:
+            raise ValueError("expected sigmoid or softmax, got both")
+        if reduction not in _REDUCTIONS or normalize not in _NORMALIZATIONS:
+            known = f"a reduction among {_REDUCTIONS} and normalize among {_NORMALIZATIONS}"
+            raise ValueError(f"expected {known}, got {reduction!r} and {normalize!r}")
+        self.sigmoid, self.softmax, self.reduction = sigmoid, softmax, reduction
+        self.normalize: Literal["voxel", "area"] = normalize
+        self.include_background, self.to_onehot_y, self.ignore_index = include_background, to_onehot_y, ignore_index
+        self.spacing = _edges(spacing)
+        self.epsilon = RESOLVED * min(self.spacing) if epsilon is None else float(epsilon)
+        if not 0 < self.epsilon < math.inf or not 0 <= blur < math.inf:
+            raise ValueError(f"expected epsilon > 0 and blur >= 0 in spacing's unit, got {epsilon} and {blur}")
+        if border != int(border) or border < 0:
+            raise ValueError(f"expected a border of whole voxels from 0, got {border}")
+        self.border, self.blur = int(border), float(blur)
+        self.shape = None if shape is None else Grid(tuple(shape), self.spacing).shape  # type: ignore[arg-type]
+        self.weight = _weights(weight)
+        laws = [coefficients] if isinstance(coefficients, (Coefficients, str, PathLike)) else list(coefficients)
+        self.coefficients = tuple(_numbers(law, min(self.spacing)) for law in laws)
+        _tell(self.spacing, self.epsilon)
+
+    def extra_repr(self) -> str:
+        return f"spacing={self.spacing}, epsilon={self.epsilon:g}, weight={self.weight}, border={self.border}"
+
+    def forward(self, input: Tensor, target: Tensor | None = None, mask: Tensor | None = None) -> Tensor:
+        with torch.autocast(input.device.type, enabled=False):
+            probability, kept = self._probability(input), self._kept(input, target, mask)
+            classes = probability.shape[1]
+            laws, weights = _each(self.coefficients, classes, "coefficients"), _each(self.weight, classes, "weight")
+            spacing = self._spacing(input)
+            columns = []
+            for channel, (law, weight) in enumerate(zip(laws, weights, strict=True)):
+                field = probability[:, channel]
+                if weight == 0:
+                    columns.append(field.sum((-3, -2, -1)) * 0)
+                    continue
+                value = curvature_prior(
+                    field,
+                    law,
+                    spacing,
+                    self.epsilon,
+                    mask=None if kept is None else kept[:, min(channel, kept.shape[1] - 1)],
+                    normalize=None if self.reduction == "sum" else self.normalize,
+                    border=self.border,
+                    blur=self.blur,
+                )
+                columns.append(weight * value)
+            values = torch.stack(columns, 1)
+            if self.reduction == "none":
+                return values[..., None, None, None]
+            return values.sum() if self.reduction == "sum" else values.mean()
+
+    def suggest_weight(
+        self, loss_fn: Callable[[Tensor, Tensor], Tensor], batch: tuple[Tensor, Tensor], share: float = 1.0
+    ) -> float:
+        """The factor that gives this loss `share` times the gradient of another, as norms over the input.
+
+        Parameters
+        ----------
+        loss_fn
+            Called with the batch; its value is summed.
+        batch
+            A network's output and its target, as in training.
+
+        Raises
+        ------
+        ValueError
+            If either gradient is zero or not finite: take a batch whose prediction has a surface.
+        """
+        output, target = batch
+        leaf = output.detach().float().requires_grad_()
+        sizes = []
+        for loss in (loss_fn, self):
+            with torch.enable_grad():
+                (slope,) = torch.autograd.grad(loss(leaf, target).sum(), leaf)
+            sizes.append(float(slope.double().norm()))
+        if not all(0 < size < math.inf for size in sizes):
+            raise ValueError(f"expected a batch on which both losses have a gradient, got norms {sizes[0]}, {sizes[1]}")
+        return share * sizes[0] / sizes[1]
+
+    def _probability(self, input: Tensor) -> Tensor:
+        """(B, classes that count, D, H, W) in float32 or float64."""
+        if input.dim() != 5 or not input.is_floating_point():
+            raise ValueError(f"expected an input of floats (B, N, D, H, W), got {input.dtype} {tuple(input.shape)}")
+        values = input if input.dtype == torch.float64 else input.float()
+        many = input.shape[1] > 1
+        if self.sigmoid:
+            values = values.sigmoid()
+        elif self.softmax and many:
+            values = values.softmax(1)
+        elif self.softmax:
+            raise ValueError("expected two classes or more for softmax, got one: use sigmoid")
+        return values if self.include_background or not many else values[:, 1:]
+
+    def _kept(self, input: Tensor, target: Tensor | None, mask: Tensor | None) -> Tensor | None:
+        """(B or 1, classes that count or 1, D, H, W): the mask, without what is ignored."""
+        batch, classes = input.shape[:2]
+        space = tuple(input.shape[2:])
+        if mask is not None:
+            if mask.dim() != 5 or tuple(mask.shape[2:]) != space or mask.shape[1] not in (1, classes):
+                expected = f"({batch} or 1, {classes} or 1, {', '.join(map(str, space))})"
+                raise ValueError(f"expected a mask of shape {expected}, got {tuple(mask.shape)}")
+            if mask.shape[1] > 1 and not self.include_background:
+                mask = mask[:, 1:]
+        if target is not None and (target.dim() != 5 or target.shape[0] != batch or tuple(target.shape[2:]) != space):
+            raise ValueError(f"expected a target of shape {(batch, 1, *space)}, got {tuple(target.shape)}")
+        if target is not None and self.to_onehot_y and target.shape[1] != 1:
+            raise ValueError(f"expected a target of class numbers (B, 1, D, H, W), got {tuple(target.shape)}")
+        if self.ignore_index is None:
+            return mask
+        if target is None or target.shape[1] != 1:
+            got = "none" if target is None else f"shape {tuple(target.shape)}"
+            raise ValueError(
+                f"expected a target of labels (B, 1, D, H, W) to find label {self.ignore_index}, got {got}"
+            )
+        known = target != self.ignore_index
+        return known if mask is None else mask * known
+
+    def _spacing(self, input: Tensor) -> tuple[float, float, float]:
+        """The voxel edges of this input: coarser than the patch's where it has fewer voxels."""
+        if self.shape is None:
+            return self.spacing
+        pairs = zip(self.spacing, self.shape, input.shape[2:], strict=True)
+        return tuple(h * whole / n for h, whole, n in pairs)  # type: ignore[return-value]
+
+
+def _edges(spacing: float | Sequence[float]) -> tuple[float, float, float]:
+    return Grid((4, 4, 4), spacing).spacing  # type: ignore[arg-type]
+
+
+def _weights(weight: float | Sequence[float]) -> tuple[float, ...]:
+    values = (float(weight),) if isinstance(weight, (int, float)) else tuple(float(value) for value in weight)
+    if not values or not all(0 <= value < math.inf for value in values):
+        raise ValueError(f"expected a weight from 0, or one a class, got {weight}")
+    return values
+
+
+def _numbers(law: Law, edge: float) -> Coefficients:
+    """Coefficients with lengths in spacing's unit."""
+    if isinstance(law, Coefficients):
+        if any(isinstance(value, Tensor) and value.dim() > 0 for value in law):
+            raise ValueError("expected coefficients that are numbers, got some that vary")
+        return law
+    if isinstance(law, str) and law in PRESETS:
+        return PRESETS[law].coefficients.in_unit(WORKING_SPACING / edge)
+    if isinstance(law, str) and not law.endswith(".json"):
+        raise ValueError(f"expected a preset among {', '.join(PRESETS)}, or a fit.json, got {law!r}")
+    return read_fit(law).physical
+
+
+def _each(values: tuple, classes: int, name: str) -> tuple:
+    if len(values) not in (1, classes):
+        raise ValueError(f"expected one {name} or {classes}, one a class that counts, got {len(values)}")
+    return values * classes if len(values) == 1 else values
+
+
+def _tell(spacing: tuple[float, float, float], epsilon: float) -> None:
+    """Say once which axes are interpolated."""
+    times = upsampling(spacing, epsilon)
+    if max(times) > 1:
+        axes = ", ".join(f"{axis} {n}-fold" for axis, n in zip("zyx", times, strict=True) if n > 1)
+        warnings.warn(f"ε = {epsilon:g} spans fewer than 2 voxels: interpolating {axes}", stacklevel=3)
