@@ -158,7 +158,7 @@ def test_spatialised_maps(script) -> None:
     assert [float(end) / 2 for end in ends] == pytest.approx([-0.55, -0.4, -0.5])
 
 
-@pytest.mark.parametrize(("name", "genus"), [("sphere", 0), ("torus", 1), ("genus-2", 2)])
+@pytest.mark.parametrize(("name", "genus"), [("sphere", 0), ("torus", 1), ("smaller-torus", 1), ("genus-2", 2)])
 def test_willmore_starts_have_their_genus(script, name: str, genus: int) -> None:
     field, grid = script("willmore").start(name, 48, 4)
     shape = surface(field, grid)

@@ -8,6 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from curvafit.priors.grid import METRES
+
 #: Suffixes of what a name may state as a unit -> (our name, factor to it).
 _UNITS: dict[str, tuple[str, float]] = {
     **dict.fromkeys(("", "voxel", "voxels", "pixel", "pixels", "px", "unknown", "none", "null"), ("voxel", 1.0)),
@@ -22,9 +24,6 @@ _UNITS: dict[str, tuple[str, float]] = {
     **dict.fromkeys(("inch", "inches", "in"), ("mm", 25.4)),
     **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), ("m", 1.0)),
 }
-
-
-_METRES = {"nm": 1e-9, "um": 1e-6, "mm": 1e-3, "m": 1.0}
 
 
 class ScanError(ValueError):
@@ -65,7 +64,7 @@ def convert_length(length: float, unit: str | None, to: str | None) -> float:
     (name, factor), (target, target_factor) = normalise_unit(unit), normalise_unit(to)
     if "voxel" in (name, target):
         return length * factor
-    return length * factor * _METRES[name] / (_METRES[target] * target_factor)
+    return length * factor * METRES[name] / (METRES[target] * target_factor)
 
 
 def pick_key(keys: list[str], key: str | None, path: object) -> str:

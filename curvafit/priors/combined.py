@@ -20,8 +20,8 @@ class CombinedLoss(nn.Module):
     weight
         See `CurvaturePrior.suggest_weight`.
     warmup
-        Calls in training mode over which the weight grows linearly to its full value; they are counted in a buffer, so
-        that a resumed training goes on.
+        Calls over which the weight grows linearly to its full value; those without a gradient or in evaluation mode do
+        not count. The count is a buffer, so that a resumed training goes on.
 
     Raises
     ------
@@ -42,7 +42,7 @@ class CombinedLoss(nn.Module):
 
     def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
         """The sum; `mask` goes to the prior."""
-        if self.training:
+        if self.training and torch.is_grad_enabled():
             self.calls += 1
         strength = self.weight
         if self.warmup:

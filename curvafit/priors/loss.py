@@ -13,7 +13,6 @@ from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.energy import cahn_hilliard_parts
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.kernels.differentiable import energies
-from curvafit.priors.profile import SIGMA
 from curvafit.priors.refined import refined
 from curvafit.priors.shapes import Float
 from curvafit.priors.stencils import gaussian_blur
@@ -46,8 +45,8 @@ def curvature_prior(
     mask
         Weights of the energy's density.
     normalize
-        `"voxel"`: the mean density over the mask, in units of ε (F_ε ε³ / volume). `"area"`: per interface area
-        (F_ε ε² / (area + ε²)). None: F_ε itself.
+        `"voxel"`: the mean density over the mask, in units of ε (F_ε ε³ / volume). `"area"`: per interface
+        area in units of ε (F_ε ε² / (𝓐_ε + ε²)), that is the mean of p(κ1, κ2) ε². None: F_ε itself.
     border
         Voxels at each side of the window, whose density is left out.
 
@@ -73,9 +72,8 @@ def curvature_prior(
         volume = kept.sum((-3, -2, -1)) * (grid.voxel_volume / WORKING_EPSILON**3)
         return total / volume.clamp_min(torch.finfo(volume.dtype).tiny)
     if normalize == "area":
-        parts = cahn_hilliard_parts(u, grid, WORKING_EPSILON)
-        area = (sum(parts) * kept).sum((-3, -2, -1)) * (grid.voxel_volume / SIGMA / WORKING_EPSILON**2)
-        return total / (area + 1)
+        area = sum(cahn_hilliard_parts(u, grid, WORKING_EPSILON)) * kept
+        return total / (area.sum((-3, -2, -1)) * (grid.voxel_volume / WORKING_EPSILON**2) + 1)
     return total
 
 

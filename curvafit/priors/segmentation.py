@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from curvafit.priors.coefficients import PRESETS, Coefficients
 from curvafit.priors.fit_file import read_fit
-from curvafit.priors.grid import WORKING_SPACING, Grid
+from curvafit.priors.grid import METRES, WORKING_SPACING, Grid
 from curvafit.priors.loss import RESOLVED, curvature_prior, upsampling
 
 Law = Coefficients | str | PathLike[str]
@@ -33,8 +33,7 @@ class CurvaturePrior(nn.Module):
     ----------
     coefficients
         `Coefficients` with lengths in spacing's unit; or a preset's name, in working units of which the smallest
-        voxel edge is 0.01; or the path of a `fit.json`, in the unit it names, which must be spacing's. Or a sequence
-        of such, one a class.
+        voxel edge is 0.01; or the path of a `fit.json`. Or a sequence of such, one a class.
     sigmoid, softmax
         The input is logits: apply this first.
     include_background
@@ -48,7 +47,9 @@ class CurvaturePrior(nn.Module):
     ignore_index
         Voxels where the target has this value count nothing.
     spacing
-        Voxel edges (z, y, x) in any unit, or one for all.
+        Voxel edges (z, y, x), or one for all.
+    unit
+        Spacing's unit (nm, um, mm or m) where it is not that of the `fit.json`, which is then converted.
     epsilon
         ε in that unit; twice the smallest edge if not given. Structures thinner than two smallest edges do not
         survive it. An axis on which ε spans fewer than two voxels is interpolated: a warning says so.
@@ -81,6 +82,7 @@ class CurvaturePrior(nn.Module):
         reduction: str = "mean",
         ignore_index: int | None = None,
         spacing: float | Sequence[float] = 1.0,
+        unit: str | None = None,
         epsilon: float | None = None,
         weight: float | Sequence[float] = 1.0,
         normalize: Literal["voxel", "area"] = "voxel",
@@ -107,7 +109,7 @@ class CurvaturePrior(nn.Module):
         self.shape = None if shape is None else Grid(tuple(shape), self.spacing).shape  # type: ignore[arg-type]
         self.weight = _weights(weight)
         laws = [coefficients] if isinstance(coefficients, (Coefficients, str, PathLike)) else list(coefficients)
-        self.coefficients = tuple(_numbers(law, min(self.spacing)) for law in laws)
+        self.coefficients = tuple(_numbers(law, min(self.spacing), unit) for law in laws)
         _tell(self.spacing, self.epsilon)
 
     def extra_repr(self) -> str:
@@ -174,14 +176,19 @@ class CurvaturePrior(nn.Module):
         if input.dim() != 5 or not input.is_floating_point():
             raise ValueError(f"expected an input of floats (B, N, D, H, W), got {input.dtype} {tuple(input.shape)}")
         values = input if input.dtype == torch.float64 else input.float()
-        many = input.shape[1] > 1
         if self.sigmoid:
             values = values.sigmoid()
-        elif self.softmax and many:
+        if input.shape[1] == 1:
+            for name, unfit in (
+                ("softmax=True", self.softmax),
+                ("include_background=False", not self.include_background),
+            ):
+                if unfit:
+                    warnings.warn(f"single channel prediction, `{name}` ignored.", stacklevel=3)
+            return values
+        if self.softmax:
             values = values.softmax(1)
-        elif self.softmax:
-            raise ValueError("expected two classes or more for softmax, got one: use sigmoid")
-        return values if self.include_background or not many else values[:, 1:]
+        return values if self.include_background else values[:, 1:]
 
     def _kept(self, input: Tensor, target: Tensor | None, mask: Tensor | None) -> Tensor | None:
         """(B or 1, classes that count or 1, D, H, W): the mask, without what is ignored."""
@@ -201,9 +208,7 @@ class CurvaturePrior(nn.Module):
             return mask
         if target is None or target.shape[1] != 1:
             got = "none" if target is None else f"shape {tuple(target.shape)}"
-            raise ValueError(
-                f"expected a target of labels (B, 1, D, H, W) to find label {self.ignore_index}, got {got}"
-            )
+            raise ValueError(f"expected a target (B, 1, D, H, W) with labels {self.ignore_index} to ignore, got {got}")
         known = target != self.ignore_index
         return known if mask is None else mask * known
 
@@ -226,7 +231,7 @@ def _weights(weight: float | Sequence[float]) -> tuple[float, ...]:
     return values
 
 
-def _numbers(law: Law, edge: float) -> Coefficients:
+def _numbers(law: Law, edge: float, unit: str | None) -> Coefficients:
     """Coefficients with lengths in spacing's unit."""
     if isinstance(law, Coefficients):
         if any(isinstance(value, Tensor) and value.dim() > 0 for value in law):
@@ -236,7 +241,12 @@ def _numbers(law: Law, edge: float) -> Coefficients:
         return PRESETS[law].coefficients.in_unit(WORKING_SPACING / edge)
     if isinstance(law, str) and not law.endswith(".json"):
         raise ValueError(f"expected a preset among {', '.join(PRESETS)}, or a fit.json, got {law!r}")
-    return read_fit(law).physical
+    fit = read_fit(law)
+    if unit is None or unit == fit.unit:
+        return fit.physical
+    if unit not in METRES or fit.unit not in METRES:
+        raise ValueError(f"expected two units among {', '.join(METRES)}, got {unit} and the fit's {fit.unit}")
+    return fit.physical.in_unit(METRES[unit] / METRES[fit.unit])
 
 
 def _each(values: tuple, classes: int, name: str) -> tuple:
