@@ -12,6 +12,8 @@ import typer
 
 from curvafit.cli_data import atlas_app, samples_app
 from curvafit.cli_generate import EXAMPLES, generate, presets
+from curvafit.cli_hosts import EXAMPLE as NNUNET_EXAMPLE
+from curvafit.cli_hosts import nnunet
 from curvafit.cli_support import (
     command_line,
     output,
@@ -38,6 +40,7 @@ app = typer.Typer(
 )
 app.command(epilog=EXAMPLES)(generate)
 app.command()(presets)
+app.command(epilog=NNUNET_EXAMPLE)(nnunet)
 app.add_typer(samples_app, name="samples")
 app.add_typer(atlas_app, name="atlas")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import json
 import math
 
@@ -193,7 +192,7 @@ def test_cubic_convolution_keeps_parabolas():
 def test_gradcheck(normalize, options):
     prior = CurvaturePrior("tubes", softmax=True, normalize=normalize, **options)
     logits = noise(1, 2, 6, 5, 7).requires_grad_()
-    assert torch.autograd.gradcheck(prior, (logits,))
+    assert torch.autograd.gradcheck(prior, (logits,), fast_mode=True)
 
 
 def test_the_fused_kernels_have_the_gradient_of_the_definition():
@@ -235,161 +234,3 @@ def test_it_is_deterministic():
     prior, logits = CurvaturePrior("tubes", sigmoid=True), noise(2, 1, 20, 20, 20, dtype=torch.float32)
     assert torch.equal(prior(logits), prior(logits))
     assert torch.equal(slope_of(prior, logits), slope_of(prior, logits))
-
-
-# ---- what counts -----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_ignored_labels_count_nothing(dtype):
-    prior, masked = CurvaturePrior("tubes", ignore_index=255), CurvaturePrior("tubes")
-    p = probabilities(2, 1, 10, 10, 16).to(dtype)
-    labels = torch.zeros(2, 1, 10, 10, 16, dtype=torch.uint8)
-    labels[..., 9:] = 255
-    labels[1] = 255
-    expected = masked(p[:1, ..., :10]) / 2
-    torch.testing.assert_close(prior(p, labels), expected, rtol=1e-5, atol=0)
-    torch.testing.assert_close(prior(p, labels), masked(p, mask=labels != 255))
-    slope = slope_of(lambda x: prior(x, labels), p)
-    assert not bool(slope[..., 10:].any()) and not bool(slope[1].any()) and bool(slope[0, ..., 8].any())
-
-
-def test_masks_weigh_the_density_and_not_the_field():
-    prior, p = CurvaturePrior("tubes", reduction="sum"), probabilities(1, 1, 10, 10, 16)
-    left = (torch.arange(16) < 7).double().expand(1, 1, 10, 10, 16)
-    torch.testing.assert_close(prior(p, mask=left) + prior(p, mask=1 - left), prior(p), rtol=1e-12, atol=0)
-    torch.testing.assert_close(prior(p, mask=0.25 * left), 0.25 * prior(p, mask=left), rtol=1e-12, atol=0)
-    flat = torch.ones_like(p)  # no surface, and a masked field would have one
-    assert float(prior(flat, mask=left)) == 0
-
-
-@pytest.mark.parametrize("normalize", ["voxel", "area"])
-def test_an_empty_mask_is_zero(normalize):
-    prior, p = CurvaturePrior("tubes", normalize=normalize), probabilities(1, 1, 8, 8, 8).float()
-    nothing = torch.zeros(1, 1, 8, 8, 8)
-    assert float(prior(p, mask=nothing)) == 0 and not bool(slope_of(lambda x: prior(x, mask=nothing), p).any())
-
-
-def test_each_class_has_its_law_and_weight():
-    p = torch.cat([probabilities(2, 1, 8, 9, 10, seed=k) for k in range(3)], 1)
-    laws, weights = ("tubes", LAW, "sponge"), (1.0, 0.0, 3.0)
-    prior = CurvaturePrior(laws, weight=weights, reduction="none")
-    found = prior(p)
-    assert found.shape == (2, 3, 1, 1, 1)
-    for k, (law, weight) in enumerate(zip(laws, weights, strict=True)):
-        alone = CurvaturePrior(law, reduction="none")(p[:, k : k + 1])
-        torch.testing.assert_close(found[:, k : k + 1], weight * alone)
-    torch.testing.assert_close(CurvaturePrior(laws, weight=weights)(p), found.mean())
-    without = CurvaturePrior(laws[1:], include_background=False, reduction="none")
-    torch.testing.assert_close(without(p)[:, 1], found[:, 2] / 3)
-
-
-def test_two_class_softmax_is_the_sigmoid_of_the_difference():
-    logits = noise(2, 2, 8, 8, 8)
-    two = CurvaturePrior("tubes", softmax=True, include_background=False)
-    one = CurvaturePrior("tubes", sigmoid=True)
-    torch.testing.assert_close(two(logits), one(logits[:, 1:] - logits[:, :1]))
-
-
-def test_a_structure_two_voxels_thick_survives():
-    """A tube of 2 × 2 voxels and a sheet of 2, learnt by cross-entropy with the prior at equal gradient, default ε."""
-    target = torch.zeros(2, 1, 16, 16, 16)
-    target[0, 0, 7:9, 7:9] = target[1, 0, 7:9] = 1
-    base, prior = torch.nn.BCEWithLogitsLoss(), CurvaturePrior("trabec", sigmoid=True)
-    logits = noise(*target.shape, dtype=torch.float32)
-    weight = prior.suggest_weight(base, (logits, target))
-    logits.requires_grad_()
-    adam = torch.optim.Adam([logits], lr=0.1)
-    for _ in range(100):
-        adam.zero_grad()
-        (base(logits, target) + weight * prior(logits, target)).backward()
-        adam.step()
-    assert torch.equal(logits > 0, target > 0)
-
-
-# ---- beside other losses ---------------------------------------------------------------------------------------------
-
-
-def test_the_suggested_weight_balances_gradients():
-    base = torch.nn.BCEWithLogitsLoss()
-    prior, logits = CurvaturePrior("tubes", sigmoid=True), noise(1, 1, 8, 8, 8, dtype=torch.float32)
-    target = (noise(1, 1, 8, 8, 8, seed=1) > 0).float()
-    weight = prior.suggest_weight(base, (logits, target), share=0.3)
-    ours, theirs = slope_of(prior, logits).norm(), slope_of(lambda x: base(x, target), logits).norm()
-    assert float(weight * ours) == pytest.approx(0.3 * float(theirs), rel=1e-5)
-    with pytest.raises(ValueError, match="expected a batch on which both losses have a gradient"):
-        prior.suggest_weight(base, (torch.full_like(logits, 1e4), target))
-
-
-def test_it_can_be_copied():
-    prior = CurvaturePrior(("tubes", "sponge"), weight=(1, 2), spacing=(1, 1, 2), epsilon=4.0)
-    p = probabilities(1, 2, 8, 8, 8)
-    assert torch.equal(copy.deepcopy(prior)(p), prior(p))
-    assert "epsilon=4" in repr(prior)
-
-
-# ---- wrong input -----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"sigmoid": True, "softmax": True}, "expected sigmoid or softmax, got both"),
-        ({"reduction": "max"}, "expected a reduction among"),
-        ({"normalize": "volume"}, "normalize among"),
-        ({"spacing": (1, 0, 1)}, "expected a spacing of 3 positive numbers"),
-        ({"epsilon": -1.0}, "expected epsilon > 0"),
-        ({"border": 0.5}, "expected a border of whole voxels"),
-        ({"weight": -1}, "expected a weight from 0"),
-        ({"shape": (8, 8)}, "expected shape as 3 numbers"),
-    ],
-)
-def test_wrong_arguments_are_said(options, message):
-    with pytest.raises(ValueError, match=message):
-        CurvaturePrior("tubes", **options)
-
-
-def test_wrong_laws_are_said(tmp_path):
-    with pytest.raises(ValueError, match=r"expected a preset among .* got 'tubs'"):
-        CurvaturePrior("tubs")
-    with pytest.raises(FileNotFoundError, match=r"expected a fit\.json, found no file"):
-        CurvaturePrior(tmp_path / "fit.json")
-    with pytest.raises(ValueError, match="expected coefficients that are numbers"):
-        CurvaturePrior(Coefficients(torch.ones(2), 1, 1))
-    with pytest.raises(ValueError, match="expected one coefficients or 1, one a class that counts, got 2"):
-        CurvaturePrior(("tubes", "sponge"))(torch.rand(1, 1, 8, 8, 8))
-
-
-@pytest.mark.parametrize(
-    ("shape", "message"),
-    [
-        ((1, 1, 1, 16, 16), "expected a volume of at least 4 voxels along each axis, got .1, 16, 16."),
-        ((1, 16, 16, 16), "expected an input of floats .B, N, D, H, W."),
-    ],
-)
-def test_flat_input_is_refused(shape, message):
-    with pytest.raises(ValueError, match=message):
-        CurvaturePrior("tubes")(torch.rand(shape))
-    with pytest.raises(ValueError, match="expected an input of floats"):
-        CurvaturePrior("tubes")(torch.ones((1, 1, 8, 8, 8), dtype=torch.int64))
-
-
-def test_wrong_targets_and_masks_are_said():
-    p, prior = torch.rand(2, 2, 8, 8, 8), CurvaturePrior("tubes", ignore_index=2)
-    for target in (None, torch.ones(2, 2, 8, 8, 8)):
-        with pytest.raises(ValueError, match="expected a target .* with labels 2 to ignore"):
-            prior(p, target)
-    with pytest.raises(ValueError, match="expected a target of shape"):
-        prior(p, torch.ones(2, 1, 8, 8, 4))
-    with pytest.raises(ValueError, match="expected a mask of shape"):
-        prior(p, torch.ones(2, 1, 8, 8, 8), mask=torch.ones(2, 3, 8, 8, 8))
-    with pytest.raises(ValueError, match="expected a target of class numbers"):
-        CurvaturePrior("tubes", to_onehot_y=True)(p, torch.ones(2, 2, 8, 8, 8))
-
-
-@pytest.mark.parametrize("option", [{"softmax": True}, {"include_background": False}])
-def test_what_a_single_channel_ignores_is_said(option):
-    p = probabilities(1, 1, 8, 8, 8)
-    with pytest.warns(UserWarning, match="single channel prediction"):
-        found = CurvaturePrior("tubes", **option)(p)
-    assert torch.equal(found, CurvaturePrior("tubes")(p))

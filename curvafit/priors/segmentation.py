@@ -116,6 +116,7 @@ class CurvaturePrior(nn.Module):
         return f"spacing={self.spacing}, epsilon={self.epsilon:g}, weight={self.weight}, border={self.border}"
 
     def forward(self, input: Tensor, target: Tensor | None = None, mask: Tensor | None = None) -> Tensor:
+        input, target, mask = _plain(input), _plain(target), _plain(mask)
         with torch.autocast(input.device.type, enabled=False):
             probability, kept = self._probability(input), self._kept(input, target, mask)
             classes = probability.shape[1]
@@ -218,6 +219,11 @@ class CurvaturePrior(nn.Module):
             return self.spacing
         pairs = zip(self.spacing, self.shape, input.shape[2:], strict=True)
         return tuple(h * whole / n for h, whole, n in pairs)  # type: ignore[return-value]
+
+
+def _plain(values):
+    """Without what subclasses (MONAI's `MetaTensor`) add."""
+    return values if values is None or type(values) is Tensor else values.as_subclass(Tensor)
 
 
 def _edges(spacing: float | Sequence[float]) -> tuple[float, float, float]:

@@ -51,7 +51,7 @@ def _energies(u, mask, a, spacing, epsilon):
 
         values, gradient = cuda.energy_gradient(u, kernels.stacked(cost, grid), grid, epsilon, mask=mask)
         return values.to(u), gradient
-    values, gradient = u.new_empty(u.shape[0]), torch.empty_like(u, memory_format=torch.contiguous_format)
+    values, gradient = u.new_empty((u.shape[0],)), torch.empty_like(u, memory_format=torch.contiguous_format)
     for k in range(len(u)):
         values[k], gradient[k] = kernels.energy_gradient(u[k], cost, grid, epsilon, mask=mask[k])
     return values, gradient
@@ -59,7 +59,7 @@ def _energies(u, mask, a, spacing, epsilon):
 
 @_energies.register_fake
 def _(u, mask, a, spacing, epsilon):
-    return u.new_empty(u.shape[0]), torch.empty_like(u, memory_format=torch.contiguous_format)
+    return u.new_empty((u.shape[0],)), torch.empty_like(u, memory_format=torch.contiguous_format)
 
 
 def _keep(ctx, inputs, output) -> None:
