@@ -93,7 +93,8 @@ before = [p.detach().clone() for p in trainer.network.parameters()]
 step = trainer.train_step({"data": image, "target": target})
 assert step["loss"] == step["loss"] and any(bool((a != b).any()) for a, b in zip(before, trainer.network.parameters()))
 made = int(combined.calls)
-trainer.validation_step({"data": image, "target": [t.clone() for t in target]})
+with torch.no_grad():
+    trainer.validation_step({"data": image, "target": [t.clone() for t in target]})
 assert int(combined.calls) == made
 trainer.current_epoch = 3
 trainer.on_train_epoch_start()
@@ -111,6 +112,8 @@ def test_the_trainer_in_the_real_package(tmp_path):
     for name in ("raw", "preprocessed", "results"):
         (tmp_path / name).mkdir()
         env[f"nnUNet_{name}"] = str(tmp_path / name)
+    (tmp_path / "preprocessed" / "Dataset001_X" / "x").mkdir(parents=True)
+    (tmp_path / "preprocessed" / "Dataset001_X" / "x" / "case.npz").touch()  # tells how data are stored
     command = [sys.executable, "-c", textwrap.dedent(PROGRAM)]
     done = subprocess.run(command, env=os.environ | env, capture_output=True, text=True, check=False)
     assert done.returncode == 0 and done.stdout.rstrip().endswith("done"), done.stderr
