@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.energy import cahn_hilliard_parts
 from curvafit.priors.grid import WORKING_EPSILON, Grid
-from curvafit.priors.kernels.differentiable import energies
+from curvafit.priors.kernels.differentiable import areas, energies
 from curvafit.priors.refined import refined
 from curvafit.priors.shapes import Float
 from curvafit.priors.stencils import gaussian_blur
@@ -46,7 +45,7 @@ def curvature_prior(
         Weights of the energy's density.
     normalize
         `"voxel"`: the mean density over the mask, in units of ε (F_ε ε³ / volume). `"area"`: per interface
-        area in units of ε (F_ε ε² / (𝓐_ε + ε²)), that is the mean of p(κ1, κ2) ε². None: F_ε itself.
+        area in units of ε (F_ε ε² / (∫ ε|∇u|² + ε²)), that is the mean of p(κ1, κ2) ε². None: F_ε itself.
     border
         Voxels at each side of the window, whose density is left out.
 
@@ -72,8 +71,7 @@ def curvature_prior(
         volume = kept.sum((-3, -2, -1)) * (grid.voxel_volume / WORKING_EPSILON**3)
         return total / volume.clamp_min(torch.finfo(volume.dtype).tiny)
     if normalize == "area":
-        area = sum(cahn_hilliard_parts(u, grid, WORKING_EPSILON)) * kept
-        return total / (area.sum((-3, -2, -1)) * (grid.voxel_volume / WORKING_EPSILON**2) + 1)
+        return total / (areas(u, grid, WORKING_EPSILON, kept) / WORKING_EPSILON**2 + 1)
     return total
 
 

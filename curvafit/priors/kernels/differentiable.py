@@ -10,6 +10,7 @@ from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.energy import energy
 from curvafit.priors.grid import Grid
 from curvafit.priors.shapes import Float
+from curvafit.priors.stencils import gradient
 
 
 def energies(
@@ -39,22 +40,35 @@ def energies(
     return _energies(u, mask.to(u).expand(u.shape), a, list(grid.spacing), epsilon)[0]
 
 
+def areas(
+    u: Float[Tensor, "batch z y x"], grid: Grid, epsilon: float, mask: Float[Tensor, "#batch z y x"]
+) -> Float[Tensor, " batch"]:
+    """∫ ε|∇u|², about σ × area, of every field, likewise: the term of F_ε that a00 multiplies."""
+    if u.dtype != torch.float32 or not kernels.fused(u.device):
+        slope2 = gradient(u, grid).square().sum(-4)
+        return epsilon * (slope2 * mask.to(u)).sum((-3, -2, -1)) * grid.voxel_volume
+    return _energies(u, mask.to(u).expand(u.shape), [0.0] * 5 + [1.0], list(grid.spacing), epsilon)[0]
+
+
 _SCHEMA = "(Tensor u, Tensor mask, float[] a, float[] spacing, float epsilon) -> (Tensor, Tensor)"
 
 
 @torch.library.custom_op("curvafit::energies", mutates_args=(), schema=_SCHEMA)
 def _energies(u, mask, a, spacing, epsilon):
     """The energies, and their gradient."""
-    grid, cost = Grid(tuple(u.shape[1:]), tuple(spacing), "replicate"), Coefficients(*a)
+    grid = Grid(tuple(u.shape[1:]), tuple(spacing), "replicate")
     if u.device.type == "cuda":
         from curvafit.priors.kernels import cuda
 
-        values, gradient = cuda.energy_gradient(u, kernels.stacked(cost, grid), grid, epsilon, mask=mask)
-        return values.to(u), gradient
-    values, gradient = u.new_empty((u.shape[0],)), torch.empty_like(u, memory_format=torch.contiguous_format)
+        values, slopes = cuda.energy_gradient(u, torch.tensor(a), grid, epsilon, mask=mask)
+        return values.to(u), slopes
+    from curvafit.priors.kernels import cpu
+
+    values, slopes = u.new_empty((u.shape[0],)), torch.empty_like(u, memory_format=torch.contiguous_format)
     for k in range(len(u)):
-        values[k], gradient[k] = kernels.energy_gradient(u[k], cost, grid, epsilon, mask=mask[k])
-    return values, gradient
+        value, slope = cpu.energy_gradient(u[k].numpy(), a, grid, epsilon, mask=mask[k].numpy())
+        values[k], slopes[k] = value, torch.from_numpy(slope)
+    return values, slopes
 
 
 @_energies.register_fake
@@ -68,8 +82,8 @@ def _keep(ctx, inputs, output) -> None:
 
 
 def _backward(ctx, by_energies, _):
-    (gradient,) = ctx.saved_tensors
-    return gradient * by_energies[:, None, None, None], None, None, None, None
+    (slopes,) = ctx.saved_tensors
+    return slopes * by_energies[:, None, None, None], None, None, None, None
 
 
 _energies.register_autograd(_backward, setup_context=_keep)
