@@ -131,17 +131,24 @@ def check_wide_blur(device: str, tuning: cuda.Tuning) -> None:
 
 
 def check_energy(device: str, tuning: cuda.Tuning) -> None:
-    """F_ε and its gradient: numbers a shape; then numbers and ε that vary over voxels, and an orientation. No farther
-    from float64 than a few times what the definition itself loses in float32."""
+    """F_ε and its gradient: numbers a shape; then numbers and ε that vary over voxels, and an orientation; both under a
+    mask. No farther from float64 than a few times what the definition itself loses in float32."""
     for boundary in ("periodic", "replicate"):
         grid = Grid((5, 4, 7), SPACING, boundary)
         u = (gaussian_blur(noise(2, *grid.shape), grid, 0.01) - 0.3).float()
         maps = NUMBERS[:, :, None, None, None] * (1 + 0.2 * noise(2, 6, *grid.shape).tanh())
         ε = EPSILON * (1 + 0.2 * noise(*grid.shape, seed=1).tanh())
-        cases = ((NUMBERS, a_shape(NUMBERS), EPSILON, None), (maps, Coefficients(*maps.unbind(1)), ε, Q))
-        for a, coefficients, epsilon, turned in cases:
-            exact, rough = (gradient(u.to(kind), coefficients, grid, epsilon, turned) for kind in FLOATS)
-            value, slope = cuda.energy_gradient(u.to(device), a, grid, epsilon, turned, tuning=tuning)
+        mask = (1 + noise(2, *grid.shape, seed=2)).clamp_min(0)
+        numbers, varying = a_shape(NUMBERS), Coefficients(*maps.unbind(1))
+        cases = (
+            (NUMBERS, numbers, EPSILON, None, None),
+            (maps, varying, ε, Q, None),
+            (NUMBERS, numbers, EPSILON, None, mask),
+            (maps, varying, ε, Q, mask),
+        )
+        for a, coefficients, epsilon, turned, kept in cases:
+            exact, rough = (gradient(u.to(kind), coefficients, grid, epsilon, turned, kept) for kind in FLOATS)
+            value, slope = cuda.energy_gradient(u.to(device), a, grid, epsilon, turned, kept, tuning=tuning)
             torch.testing.assert_close(value.cpu(), exact[0], rtol=1e-6, atol=0)
             lost, error = (
                 (found.double().cpu() - exact[1]).abs() / exact[1].abs().max() for found in (rough[1], slope)
@@ -152,9 +159,9 @@ def check_energy(device: str, tuning: cuda.Tuning) -> None:
             assert error.max() < 1e-3, error.max()  # where X in √X⁺ crosses zero, 1/√X magnifies what is rounded off
 
 
-def gradient(u: Tensor, a: Coefficients, grid: Grid, epsilon, turned) -> tuple[Tensor, Tensor]:
+def gradient(u: Tensor, a: Coefficients, grid: Grid, epsilon, turned, mask=None) -> tuple[Tensor, Tensor]:
     free = u.detach().requires_grad_()
-    value = energy(free, a, grid, epsilon, turned)
+    value = energy(free, a, grid, epsilon, turned, mask)
     return value.detach(), torch.autograd.grad(value.sum(), free)[0]
 
 

@@ -82,6 +82,28 @@ def test_orientation_and_what_varies_in_space_are_the_definitions(kinds, spacing
     assert_is_the_definition(smooth_field(grid), Coefficients(*a), grid, ε, Q)
 
 
+@pytest.mark.parametrize("boundary", BOUNDARIES)
+@pytest.mark.parametrize("spacing", SPACINGS)
+@pytest.mark.parametrize("varies", [False, True])
+def test_a_mask_weighs_the_density(varies, spacing, boundary):
+    """By the kernel made for it, and where what varies takes the mask with it."""
+    grid = Grid((9, 8, 35), spacing, boundary)
+    u, a = smooth_field(grid), list(TUBES)
+    mask = (smooth_field(grid, 5) > -0.3) * (1 + smooth_field(grid, 6).abs())
+    Q = ORIENTATION if varies else None
+    if varies:
+        a[5] = a[5] * (1 + 0.3 * smooth_field(grid, 5))
+    free = u.clone().requires_grad_()
+    value = energy(free, Coefficients(*a), grid, EPSILON, Q, mask)
+    (slope,) = torch.autograd.grad(value, free)
+    given = [v.numpy() if isinstance(v, torch.Tensor) else v for v in a]
+    turned = None if Q is None else Q.numpy()
+    found, gradient_found = cpu.energy_gradient(u.numpy(), given, grid, EPSILON, turned, mask.numpy())
+    error = np.abs(gradient_found - slope.numpy()) / float(slope.abs().max())
+    assert found == pytest.approx(float(value.detach()), rel=1e-5)
+    assert np.quantile(error, 0.9) < 1e-5 and error.max() < 1e-2
+
+
 def test_arrays_of_equal_numbers_are_numbers():
     grid = Grid((6, 7, 20))
     u = smooth_field(grid).numpy()
