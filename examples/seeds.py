@@ -16,6 +16,7 @@ import numpy as np
 from common import CELL, DIAGRAM, KINDS, SURFACE, Shape, draw, grown, parser, write_table
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from rich.progress import track
 
 from curvafit.data_synth.design import random_law, start_seed
 from curvafit.plot import CONTOUR, DIAGONAL, write_picture
@@ -70,7 +71,8 @@ def random_shapes(options: Namespace) -> tuple[list[Shape], int]:
 def distances(shapes: list[Shape], kind: str) -> np.ndarray:
     """The distance of every pair."""
     binned = [shape.diagrams[kind].thinned(BIN_WIDTH, TAIL_SHARE) for shape in shapes]
-    return np.concatenate([wasserstein_many(one, binned[k + 1 :], bin_width=0) for k, one in enumerate(binned[:-1])])
+    firsts = track(enumerate(binned[:-1]), f"{kind} distances", total=len(binned) - 1)
+    return np.concatenate([wasserstein_many(one, binned[k + 1 :], bin_width=0) for k, one in firsts])
 
 
 def histogram(axes: Axes, kind: str, near: np.ndarray, far: np.ndarray) -> None:
