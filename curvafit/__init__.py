@@ -79,7 +79,7 @@ def __dir__() -> list[str]:
 
 
 class _Package(ModuleType):
-    """`curvafit.diagram`, `curvafit.infer` and `curvafit.segment` are functions, in modules of the same names: the functions win.
+    """`curvafit.diagram`, `infer` and `segment` are functions, in modules of the same names: the functions win.
 
     Importing such a module would otherwise bind it here in the function's place.
     """
