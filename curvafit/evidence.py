@@ -111,9 +111,9 @@ def interpolated_distance(
 def _plane_distance(mask: np.ndarray, spacing: Sequence[float], gap: float) -> np.ndarray:
     if not mask.any() or mask.all():
         return np.full(mask.shape, gap if mask.any() else -gap)
-    inner, outer = (ndimage.distance_transform_edt(side, sampling=spacing) for side in (mask, ~mask))
+    inner, outer = (np.asarray(ndimage.distance_transform_edt(side, sampling=spacing)) for side in (mask, ~mask))
     half = min(spacing) / 2
-    return np.where(mask, np.subtract(inner, half), np.subtract(half, outer))
+    return np.where(mask, inner - half, half - outer)
 
 
 def _smoothed(values: np.ndarray, scan: Field, width: float) -> np.ndarray:
