@@ -24,7 +24,7 @@ __all__ = ["STEPS", "Segmentation", "reconstruct", "segment"]
 
 #: Steps of Adam, if not said otherwise.
 STEPS = 150
-#: Nats that a unit of the Willmore energy costs; other energies are brought to its force first.
+#: Nats that a unit of the Willmore energy costs: best, or nearly, from little noise to much on bone and tubes.
 NATS = 1.0
 #: The spring that holds known slices, in working units; ten times less lets go of them, ten times more stalls.
 STIFFNESS = 1e6
@@ -86,8 +86,9 @@ def segment(
     probability
         Instead of grey levels: the probability of the inside, in [0, 1], of the scan's shape.
     weight
-        λ, in nats per unit of F_ε. The default counts the data in nats, so by their noise, and gives F_ε on the start
-        the force (root mean square) that the Willmore energy has there at λ = 1.
+        λ, in nats per unit of F_ε; 2 / (a20 + a02) if not given. The data count in nats, so by their noise; the
+        Willmore energy counts as it is; and others as what small bumps on a plane cost, which is (a20 + a02) / 2 times
+        their Willmore energy (linear terms aside, since ∫κ1κ2 = 0).
     threshold, dark
         The grey level between the phases, or `"otsu"`; whether the structure is the dark one.
     epsilon
@@ -114,10 +115,12 @@ def segment(
         values = probability.values if isinstance(probability, Field) else probability
         found = of_probability(values, scan)
     start = _started(found.level, place)
-    force = _force(law, place, start)
-    λ = NATS / force if weight is None else float(weight)
-    ratio = place.spread(found.ratio) / (λ * force * place.grid.voxel_volume)
-    flow = _lowered(start, law.scaled(1 / force), data.Evidence(ratio), place, steps, progress)
+    stiffness = float(law.a20 + law.a02) / 2
+    if stiffness <= 0:
+        raise ScanError(f"expected coefficients with a20 + a02 > 0, got {2 * stiffness:g}: surfaces would crumple")
+    λ = NATS / stiffness if weight is None else float(weight)
+    ratio = place.spread(found.ratio) / (λ * stiffness * place.grid.voxel_volume)
+    flow = _lowered(start, law.scaled(1 / stiffness), data.Evidence(ratio), place, steps, progress)
     notes = (*notes, f"{found.note[0].upper()}{found.note[1:]}.", *place.notes)
     u = place.back(flow.field)
     return _result(scan, u > 0, u, law, place, λ, notes, flow)
@@ -204,7 +207,7 @@ def _started(level: np.ndarray, place: Place) -> Tensor:
 
 
 def _force(law: Coefficients, place: Place, u: Tensor) -> float:
-    """Root mean square of ∂F_ε/∂u, over that of the Willmore energy: what makes all coefficients comparable."""
+    """Root mean square of ∂F_ε/∂u, over that of the Willmore energy: what makes Adam's steps and springs comparable."""
     sizes = []
     for each in (law.in_unit(place.unit), Coefficients.willmore()):
         _, slope = kernels.energy_gradient(u, each, place.grid, WORKING_EPSILON)

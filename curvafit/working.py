@@ -34,6 +34,8 @@ def law_of(prior: Law, scan: Field) -> tuple[Coefficients, tuple[str, ...]]:
         If there is no such file.
     """
     if isinstance(prior, Coefficients):
+        if any(isinstance(value, Tensor) and value.dim() > 0 for value in prior):
+            raise ScanError("expected coefficients that are numbers, got some that vary")
         return prior, ()
     if isinstance(prior, str) and prior in PRESETS:
         unit = WORKING_SPACING / min(scan.spacing)

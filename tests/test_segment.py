@@ -261,11 +261,12 @@ def test_an_axis_and_numbers_of_slices() -> None:
         ({"every": 8, "axis": 3}, "axis 0, 1 or 2"),
         ({"every": 31}, "voxels inside and outside"),
         ({"every": 8, "epsilon": -1.0}, "positive epsilon"),
+        ({"every": 8, "prior": Coefficients(1e-30, 0, 1e-30).scaled(1e-30)}, "with a force"),
     ],
 )
 def test_bad_slices_are_refused(options, said) -> None:
     with pytest.raises(ValueError, match=said):
-        reconstruct(Field(tubes()), WILLMORE, **options)
+        reconstruct(Field(tubes()), **{"prior": WILLMORE, **options})
 
 
 @pytest.mark.parametrize(
@@ -275,12 +276,28 @@ def test_bad_slices_are_refused(options, said) -> None:
         ({"threshold": 500.0}, "within the smoothed scan's"),
         ({"threshold": "li"}, "a number or 'otsu'"),
         ({"epsilon": math.inf}, "positive epsilon"),
-        ({"prior": Coefficients(1e-30, 0, 1e-30).scaled(1e-30)}, "with a force"),
+        ({"prior": Coefficients(torch.ones(32, 32, 32), 0, 1)}, "coefficients that are numbers"),
     ],
 )
 def test_bad_options_are_refused(options, said) -> None:
     with pytest.raises(ValueError, match=said):
         segment(noisy(tubes(), 30), **{"prior": WILLMORE, **options})
+
+
+@pytest.mark.filterwarnings("ignore:a20 > 0:UserWarning")
+def test_a_prior_without_stiffness_is_refused() -> None:
+    with pytest.raises(ValueError, match="a20 . a02 > 0"):
+        segment(noisy(tubes(), 30), Coefficients(1, 0, -2))
+
+
+def test_a_prior_s_scale_does_not_matter_but_its_weight_does() -> None:
+    scan = noisy(tubes(), 60)
+    one, thrice = (segment(scan, WILLMORE.scaled(by), steps=30) for by in (1, 3))
+    assert thrice.weight == pytest.approx(1 / 3) and np.array_equal(one.mask.values, thrice.mask.values)
+    rough = segment(scan, WILLMORE, weight=0.01, steps=30)
+    assert (
+        np.abs(np.diff(rough.mask.values.astype(int))).sum() > 1.1 * np.abs(np.diff(one.mask.values.astype(int))).sum()
+    )
 
 
 def test_a_prior_that_is_too_strong_says_so() -> None:
