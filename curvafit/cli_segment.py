@@ -40,7 +40,7 @@ Weight = Annotated[float | None, _what(help="Nats that a unit of the energy cost
 Threshold = Annotated[str, _what(help="Grey level between the phases, or otsu.")]
 Dark = Annotated[bool, _what("--dark", help="The structure is the dark phase.")]
 Epsilon = Annotated[float | None, _what(help="ε in the scan's unit; twice the smallest voxel edge by default.")]
-Steps = Annotated[int, _what(help="How many.", min=1)]
+Steps = Annotated[int, _what(help="Steps of the flow.", min=1)]
 Every = Annotated[int | None, _what(help="Every so many slices are known.")]
 First = Annotated[int, _what(help="The first of them.")]
 Axis = Annotated[str, _what(help="What slices are counted along: z, y or x (first, second, last axis of an array).")]

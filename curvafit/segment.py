@@ -17,7 +17,6 @@ from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON
 from curvafit.priors.profile import optimal_profile, phase_field
 from curvafit.scan import Field, ScanError
-from curvafit.wording import percent
 from curvafit.working import Law, Place, law_of
 
 __all__ = ["STEPS", "Segmentation", "reconstruct", "segment"]
@@ -249,7 +248,7 @@ def _result(
     share, energy = float(mask.mean()), flow.history.energy
     fall = (energy[-2] - energy[-1]) / max(abs(energy[-1]), 1e-30) if len(energy) > 1 else 1.0
     made, word = int(flow.history.step[-1]), "settled" if abs(fall) < SETTLED else "still moving"
-    status = f"{word} after {made} steps: {percent(share)} of the volume is inside"
+    status = f"{word} after {made} steps: {100 * share:.2f} % of the volume is inside"
     if not np.isfinite(energy[-1]):
         status = f"stopped after {made} steps: the energy is not finite, lower the weight"
     elif share in (0.0, 1.0):
