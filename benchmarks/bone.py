@@ -43,7 +43,7 @@ KEPT = (4, 8, 12)
 NOISE = (20, 40, 60)
 #: TV's weights, as shares of the grey levels' contrast; the random walker's β.
 WEIGHTS = (0.05, 0.1, 0.2, 0.3, 0.4, 0.6, 0.8, 1.0, 1.5)
-BETAS = (1, 10, 130)
+BETAS = (1, 130)
 FIGURES = ("dice", "distance", "betti")
 Corner = tuple[int, int, int]
 
