@@ -19,7 +19,7 @@ from curvafit.formats.nifti import write_nifti_like
 from curvafit.plot import CONTOUR, DPI
 from curvafit.scan import Field, move_into_place, save
 from curvafit.segment import Segmentation
-from curvafit.shape_files import beside, check_folder
+from curvafit.shape_files import beside, check_beside
 
 __all__ = ["FORMAT", "check_mask_target", "write_mask"]
 
@@ -42,12 +42,7 @@ def check_mask_target(path: str | Path, unit: str | None = None) -> Path:
     pick_writer(target, unit or "mm")
     if target.is_dir() and not target.name.lower().endswith(".zarr"):
         raise ValueError(f"expected the name of a file, got the folder {target}")
-    check_folder(target.parent)
-    note, picture = beside(target, ".json"), beside(target, ".png")
-    if picture.exists() and not note.exists():
-        raise ValueError(f"expected a name whose picture {picture.name} is not another file's, got {target.name!r}")
-    if note.exists() and FORMAT not in note.read_text(encoding="utf-8", errors="replace")[:200]:
-        raise ValueError(f"expected a name whose record {note.name} is not another file's, got {target.name!r}")
+    check_beside(target, FORMAT)
     return target
 
 
