@@ -188,7 +188,9 @@ def draw(cases: dict[int, list[dict]], sections: Path, path: Path, label: str) -
             rows = [_mean([found[name][key] for found in cases[level]]) for level in sorted(cases)]
             axes.errorbar(sorted(cases), *zip(*rows, strict=True), label=name, marker="o", capsize=3)
         axes.set(xlabel=label, ylabel="Dice" if key == "dice" else "Betti error", xticks=sorted(cases))
+    figure.axes[-2].set_ylim(bottom=0.8)
     figure.axes[-1].set_yscale("symlog", linthresh=10)
+    figure.axes[-1].set_ylim(bottom=0)
     figure.axes[-1].legend(fontsize=8)
     write_atomically(path, lambda temporary: figure.savefig(temporary, dpi=130))
 
