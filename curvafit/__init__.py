@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from curvafit.priors.coefficients import Coefficients, preset
     from curvafit.priors.grid import Grid
     from curvafit.scan import Field, load, save
+    from curvafit.segment import reconstruct, segment
     from curvafit.transport import wasserstein
 
     __version__: str
@@ -34,7 +35,9 @@ __all__ = [
     "infer",
     "load",
     "preset",
+    "reconstruct",
     "save",
+    "segment",
     "wasserstein",
 ]
 
@@ -50,7 +53,9 @@ _SOURCES = {
     "infer": "curvafit.infer",
     "load": "curvafit.scan",
     "preset": "curvafit.priors.coefficients",
+    "reconstruct": "curvafit.segment",
     "save": "curvafit.scan",
+    "segment": "curvafit.segment",
     "wasserstein": "curvafit.transport",
 }
 
@@ -74,7 +79,7 @@ def __dir__() -> list[str]:
 
 
 class _Package(ModuleType):
-    """`curvafit.diagram` and `curvafit.infer` are functions, in modules of the same names: the functions win.
+    """`curvafit.diagram`, `infer` and `segment` are functions, in modules of the same names: the functions win.
 
     Importing such a module would otherwise bind it here in the function's place.
     """

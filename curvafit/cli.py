@@ -14,6 +14,7 @@ from curvafit.cli_data import atlas_app, samples_app
 from curvafit.cli_generate import EXAMPLES, generate, presets
 from curvafit.cli_hosts import EXAMPLE as NNUNET_EXAMPLE
 from curvafit.cli_hosts import nnunet
+from curvafit.cli_segment import RECONSTRUCT_EXAMPLES, SEGMENT_EXAMPLES, reconstruct, segment
 from curvafit.cli_support import (
     command_line,
     output,
@@ -41,6 +42,8 @@ app = typer.Typer(
 app.command(epilog=EXAMPLES)(generate)
 app.command()(presets)
 app.command(epilog=NNUNET_EXAMPLE)(nnunet)
+app.command(epilog=SEGMENT_EXAMPLES)(segment)
+app.command(epilog=RECONSTRUCT_EXAMPLES)(reconstruct)
 app.add_typer(samples_app, name="samples")
 app.add_typer(atlas_app, name="atlas")
 

@@ -83,13 +83,21 @@ def check_target(path: str | Path, output: Output | None = None) -> Path:
         pick_writer(target, (output or Output()).unit)
     if target.is_dir() and not target.name.lower().endswith(".zarr"):
         raise ValueError(f"expected the name of a file, got the folder {target}")
+    check_beside(target, FORMAT)
+    return target
+
+
+def check_beside(target: Path, kind: str) -> None:
+    """Raise ValueError if a folder cannot take a file with its picture and record, or would lose another file's.
+
+    `kind` is what such a record says that it is.
+    """
     check_folder(target.parent)
     note, picture = beside(target, ".json"), beside(target, ".png")
     if picture.exists() and not note.exists():
         raise ValueError(f"expected a name whose picture {picture.name} is not another file's, got {target.name!r}")
-    if note.exists() and FORMAT not in note.read_text(encoding="utf-8", errors="replace")[:200]:
+    if note.exists() and kind not in note.read_text(encoding="utf-8", errors="replace")[:200]:
         raise ValueError(f"expected a name whose record {note.name} is not another file's, got {target.name!r}")
-    return target
 
 
 def check_folder(path: str | Path) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -64,6 +65,27 @@ def write_nifti(field: Any, path: Path) -> None:
     if field.unit in ("voxel", "nm"):
         image.header["descrip"] = f"curvafit unit={field.unit}".encode()
     nibabel.save(image, path)
+
+
+def write_nifti_like(values: np.ndarray, like: Path, path: Path) -> None:
+    """`values` (Z, Y, X) with the header of another NIfTI file of that shape: its affines, codes and zooms to the bit.
+
+    Only what tells of its values (type, scale, range, intent) is set anew.
+
+    Raises
+    ------
+    ScanError
+        If the other file has another number of voxels.
+    """
+    image: Any = nibabel.load(like)
+    header = image.header.copy()
+    if math.prod(image.shape) != values.size:
+        raise ScanError(f"expected values of the file's shape {image.shape[::-1]}, got {values.shape}")
+    header.set_data_dtype(values.dtype)
+    header.set_slope_inter(1, 0)
+    header.set_intent("none")
+    header["cal_min"] = header["cal_max"] = 0
+    nibabel.save(type(image)(values.T.reshape(image.shape), None, header), path)
 
 
 def _own_unit(name: str) -> tuple[str, float]:

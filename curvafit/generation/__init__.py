@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from curvafit.generation.batch import generate_batch
+    from curvafit.generation.data import Data, Evidence, Hinge
     from curvafit.generation.flow import descend, generate, relax
     from curvafit.generation.initial import white_noise
     from curvafit.generation.result import Flow, History, State
@@ -17,7 +18,10 @@ if TYPE_CHECKING:
     from curvafit.generation.viability import Viability
 
 _HOMES = {
+    "Data": "data",
+    "Evidence": "data",
     "Flow": "result",
+    "Hinge": "data",
     "History": "result",
     "State": "result",
     "descend": "flow",
@@ -32,7 +36,10 @@ _HOMES = {
 
 __all__ = [
     "SCHEDULES",
+    "Data",
+    "Evidence",
     "Flow",
+    "Hinge",
     "History",
     "Schedule",
     "State",

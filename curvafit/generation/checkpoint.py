@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import os
 import time
@@ -101,4 +102,6 @@ def _text(value: object) -> str:
     if isinstance(value, Tensor):
         values = value.detach().cpu().contiguous().numpy()
         return f"{values.dtype} {values.shape} {hashlib.sha256(values.tobytes()).hexdigest()[:16]}"
+    if dataclasses.is_dataclass(value) and any(isinstance(each, Tensor) for each in vars(value).values()):
+        return f"{type(value).__name__}({', '.join(map(_text, vars(value).values()))})"
     return str(value)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from curvafit.generation.data import Data
 from curvafit.priors.coefficients import NAMES, Coefficients
 from curvafit.priors.grid import Grid
 
@@ -27,6 +28,7 @@ class Cost:
     epsilon: float | Tensor
     orientation: Tensor | None
     blur: float
+    data: Data | None = None
 
     def __post_init__(self) -> None:
         lengths = torch.as_tensor(self.epsilon)
@@ -37,6 +39,9 @@ class Cost:
         for name, value in zip(("epsilon", *NAMES), (self.epsilon, *self.coefficients), strict=True):
             if isinstance(value, Tensor):
                 check_shape(name, value, self.grid)
+        for name, value in vars(self.data).items() if self.data is not None else ():
+            if isinstance(value, Tensor):
+                check_shape(f"the data's {name}", value, self.grid)
 
 
 def check_shape(name: str, value: Tensor, grid: Grid) -> None:

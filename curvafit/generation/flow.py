@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from curvafit.generation.cost import Cost
+from curvafit.generation.data import Data
 from curvafit.generation.initial import white_noise
 from curvafit.generation.loop import Orders, run
 from curvafit.generation.parametrization import FORMS, DivergenceForm
@@ -158,6 +159,7 @@ def descend(
     epsilon: float | Tensor = WORKING_EPSILON,
     blur: float | None = None,
     orientation: Float[Tensor, "3 3"] | None = None,
+    data: Data | None = None,
     snapshots: Sequence[int] = (),
     callbacks: Sequence[Callback] = (),
     checkpoint: str | Path | None = None,
@@ -165,7 +167,7 @@ def descend(
     backend: Backend = "auto",
     device: torch.device | str = "cpu",
 ) -> Flow:
-    """Lower F_ε from a field v₀, to a minimum near it (paper, Algorithm 2: the L² flow under L-BFGS).
+    """Lower F_ε, or F_ε + D, from a field v₀ to a minimum near it (paper, Algorithm 2: the L² flow under L-BFGS).
 
     The other arguments are `generate`'s. u starts at k ∗ v₀.
 
@@ -184,6 +186,8 @@ def descend(
         Step lengths of Adam; its number of steps is replaced.
     blur
         Standard deviation of k; None is a voxel's shortest edge, as published.
+    data
+        A term D(u) that is lowered too, as `generation.data.Evidence`; the history's energies include it.
 
     Raises
     ------
@@ -195,7 +199,7 @@ def descend(
     plan = named_schedule(schedule, steps)
     if optimiser == "lbfgs":
         plan = Schedule("lbfgs", steps, 1.0, 1.0, "constant")
-    cost = Cost(coefficients, grid, epsilon, orientation, min(grid.spacing) if blur is None else blur)
+    cost = Cost(coefficients, grid, epsilon, orientation, min(grid.spacing) if blur is None else blur, data)
     place = Place(backend, device, checkpoint, checkpoint_every)
     orders = Orders(grid, epsilon, plan, callbacks, snapshots)
     return _from_field(field, cost, place, flow, optimiser, None, orders)

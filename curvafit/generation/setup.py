@@ -60,13 +60,14 @@ class Place:
         able, betas = kernels.fused(self.device), plan.betas
         if self.backend == "fused" and not able:
             raise ValueError(f"expected a device with fused kernels (and numba or triton), got {self.device}")
-        if able and self.backend != "torch" and optimiser == "adam" and isinstance(form, DivergenceForm):
+        plain = self.backend == "torch"
+        if able and not plain and cost.data is None and optimiser == "adam" and isinstance(form, DivergenceForm):
             if torch.device(self.device).type == "cuda":
                 return CudaStepper([start], [form.base], cost, [cost.coefficients], betas, frozen, self.device)
             return FusedStepper(start, form, cost, betas, frozen)
         kind = LbfgsStepper if optimiser == "lbfgs" else TorchStepper
-        lowered, plain = (cost.coefficients, cost.epsilon), self.backend == "torch"
-        return kind(start, form, *lowered, betas, frozen, self.device, cost.orientation, fused=not plain)
+        lowered, more = (cost.coefficients, cost.epsilon), {"fused": not plain, "data": cost.data}
+        return kind(start, form, *lowered, betas, frozen, self.device, cost.orientation, **more)
 
     def saved(self, moved: Stepper, cost: Cost, orders: Orders, **more: object) -> Checkpoint | None:
         """The checkpoint of a run, where one is asked for."""

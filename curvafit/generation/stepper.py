@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from curvafit.generation.data import Data
 from curvafit.generation.parametrization import Form
 from curvafit.priors import kernels
 from curvafit.priors.coefficients import Coefficients
@@ -99,11 +100,13 @@ class TorchStepper(Stepper):
         device: torch.device | str,
         orientation: Tensor | None = None,
         fused: bool = False,
+        data: Data | None = None,
     ) -> None:
         def here(value):
             return value.to(device, torch.float32) if isinstance(value, Tensor) and value.dim() > 0 else value
 
         self._form, self._offset = form.to(device), 0.0
+        self._data = None if data is None else data.to(device)
         self._cost = (Coefficients(*map(here, coefficients)), form.grid, here(epsilon), here(orientation))
         self._slope_of = kernels.energy_gradient if fused else kernels.plain_energy_gradient
         self._free = None if frozen is None else ~torch.as_tensor(frozen, dtype=torch.bool, device=device)
@@ -119,9 +122,12 @@ class TorchStepper(Stepper):
         return torch.optim.Adam([self._parameters], betas=betas, eps=ADAM_EPS)
 
     def _evaluate(self) -> tuple[float, Tensor, Tensor]:
-        """F_ε, u, and the gradient with respect to the parameters, where they are now."""
+        """What is lowered, u, and the gradient with respect to the parameters, where they are now."""
         u = self._form.field(self._parameters) + self._offset
         value, slope = self._slope_of(u, *self._cost)
+        if self._data is not None:
+            more, pull = self._data.slope(u, self._form.grid)
+            value, slope = value + more, slope + pull
         slope = self._form.pullback(slope)
         return value, u, slope if self._free is None else slope * self._free
 

@@ -1,0 +1,161 @@
+"""The commands that segment without a network: segment and reconstruct."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from curvafit.cli_support import command_line, plainly, say, stages, threshold_of, triple, whole_numbers, whole_triple
+
+if TYPE_CHECKING:
+    from curvafit.scan import Field
+    from curvafit.segment import Segmentation
+
+SEGMENT_EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
+    (
+        "curvafit segment bone.nii.gz --prior bone/fit.json -o mask.nii.gz",
+        "curvafit segment cells.h5 --key raw --dark --prior sponge --spacing 0.2 --unit um -o mask.tif",
+        "curvafit segment vessels.nii.gz --probability network.nii.gz --prior vessels/fit.json -o mask.nii.gz",
+    )
+)
+RECONSTRUCT_EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
+    (
+        "curvafit reconstruct labels.nii.gz --every 8 --prior bone/fit.json -o volume.nii.gz",
+        "curvafit reconstruct labels.tif --slices 0,7,15 --axis x --prior tubes -o volume.tif",
+    )
+)
+
+_what = partial(typer.Option, rich_help_panel="What to do")
+_how = partial(typer.Option, rich_help_panel="How to read the file")
+
+Volume = Annotated[str, typer.Argument(help="NIfTI, TIFF (or folder of slices), NPY, NPZ, HDF5 (file.h5::key), Zarr …")]
+Target = Annotated[Path, typer.Option("-o", "--output", help="Mask to write: .nii.gz .nii .tif .npy .mrc .zarr.")]
+Prior = Annotated[str, _what(help="fit.json of `curvafit infer`, or a preset's name (see `curvafit presets`).")]
+Probability = Annotated[Path | None, _what(help="Volume of probabilities of the inside, instead of grey levels.")]
+Weight = Annotated[float | None, _what(help="Nats that a unit of the energy costs; from the noise by default.")]
+Threshold = Annotated[str, _what(help="Grey level between the phases, or otsu.")]
+Dark = Annotated[bool, _what("--dark", help="The structure is the dark phase.")]
+Epsilon = Annotated[float | None, _what(help="ε in the scan's unit; twice the smallest voxel edge by default.")]
+Steps = Annotated[int, _what(help="Steps of the flow.", min=1)]
+Every = Annotated[int | None, _what(help="Every so many slices are known.")]
+First = Annotated[int, _what(help="The first of them.")]
+Axis = Annotated[str, _what(help="What slices are counted along: z, y or x (first, second, last axis of an array).")]
+Spacing = Annotated[str | None, _how(help="Voxel edges z,y,x, or one for all; overrides the file.")]
+Unit = Annotated[str | None, _how(help="nm, um, mm or m; overrides the file.")]
+RawShape = Annotated[str | None, _how(help="Z,Y,X of a RAW file.")]
+Dtype = Annotated[str | None, _how(help="Type of a RAW file: u1, u2, f4 …")]
+Key = Annotated[str | None, _how(help="Array within an NPZ, HDF5 or Zarr file.")]
+
+#: Steps of the flow; `segment.STEPS`, which help must not import.
+STEPS = 150
+
+
+def segment(
+    scan: Volume,
+    out: Target,
+    prior: Prior,
+    probability: Probability = None,
+    weight: Weight = None,
+    threshold: Threshold = "otsu",
+    dark: Dark = False,
+    epsilon: Epsilon = None,
+    steps: Steps = STEPS,
+    spacing: Spacing = None,
+    unit: Unit = None,
+    raw_shape: RawShape = None,
+    dtype: Dtype = None,
+    key: Key = None,
+) -> None:
+    """Find the structure of a noisy scan under a curvature prior, with a picture (.png) and a record (.json)."""
+    with plainly():
+        reading = _reading(spacing, unit, raw_shape, dtype, key)
+        options = {"weight": weight, "threshold": threshold_of(threshold), "dark": dark, "epsilon": epsilon}
+
+        def made(volume: Field, progress: Callable[[str, float], None]) -> Segmentation:
+            from curvafit.scan import load
+            from curvafit.segment import segment as find
+
+            likely = None if probability is None else load(probability)
+            return find(volume, prior, probability=likely, steps=steps, progress=progress, **options)  # type: ignore[arg-type]
+
+        more = {"probability": None if probability is None else str(probability), **options}
+        _run(scan, out, prior, reading, made, {"job": "segment", "steps": steps, **more})
+
+
+def reconstruct(
+    slices: Volume,
+    out: Target,
+    prior: Prior,
+    every: Every = None,
+    first: First = 0,
+    known: Annotated[str | None, _what("--slices", help="Or: the numbers of the known slices, 0,7,15.")] = None,
+    axis: Axis = "z",
+    epsilon: Epsilon = None,
+    steps: Steps = STEPS,
+    spacing: Spacing = None,
+    unit: Unit = None,
+    raw_shape: RawShape = None,
+    dtype: Dtype = None,
+    key: Key = None,
+) -> None:
+    """Fill a mask of which only some slices are known, with a picture (.png) and a record (.json)."""
+    with plainly():
+        reading = _reading(spacing, unit, raw_shape, dtype, key)
+        if axis.lower() not in ("z", "y", "x"):
+            raise ValueError(f"expected --axis z, y or x, got {axis!r}")
+        if (every is None) == (known is None):
+            raise ValueError(f"expected either --every or --slices, got {'neither' if every is None else 'both'}")
+        numbers = None if known is None else list(whole_numbers(known, "--slices"))
+        options = {"every": every, "first": first, "known": numbers, "axis": "zyx".index(axis.lower())}
+
+        def made(volume: Field, progress: Callable[[str, float], None]) -> Segmentation:
+            from curvafit.segment import reconstruct as fill
+
+            return fill(volume, prior, epsilon=epsilon, steps=steps, progress=progress, **options)  # type: ignore[arg-type]
+
+        _run(slices, out, prior, reading, made, {"job": "reconstruct", "steps": steps, **options})
+
+
+def _reading(
+    spacing: str | None, unit: str | None, raw_shape: str | None, dtype: str | None, key: str | None
+) -> dict[str, Any]:
+    return {
+        "spacing": None if spacing is None else triple(spacing, "--spacing"),
+        "raw_shape": None if raw_shape is None else whole_triple(raw_shape, "--raw-shape"),
+        "unit": unit,
+        "dtype": dtype,
+        "key": key,
+    }
+
+
+def _run(
+    source: str,
+    out: Path,
+    prior: str,
+    reading: dict[str, Any],
+    make: Callable[[Field, Callable[[str, float], None]], Segmentation],
+    told: dict[str, Any],
+) -> None:
+    """Refuse, read, compute, write, say."""
+    from curvafit.mask_files import check_mask_target, write_mask
+    from curvafit.scan import load
+
+    check_mask_target(out)
+    with stages() as progress:
+        progress("reading", 0.0)
+        volume = load(source, **reading)
+        check_mask_target(out, volume.unit)
+        found = make(volume, progress)
+        progress("writing", 1.0)
+        asked = {"command": command_line(), "prior": prior, **told}
+        own = reading["spacing"] is None and reading["unit"] is None
+        files = write_mask(found, volume, out, like=source if own else None, record=asked)
+    for note in found.notes:
+        say(note)
+    say(f"{found.status[0].upper()}{found.status[1:]}.", style="bold")
+    for path in files:
+        say(str(path))

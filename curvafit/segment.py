@@ -1,0 +1,265 @@
+"""Segmentation without a network: a scan's evidence, or a few known slices, and the energy F_ε of the surface."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from torch import Tensor
+
+from curvafit.evidence import interpolated_distance, of_intensities, of_probability
+from curvafit.generation import data
+from curvafit.generation.flow import Flow, descend
+from curvafit.priors import kernels
+from curvafit.priors.coefficients import Coefficients
+from curvafit.priors.grid import WORKING_EPSILON
+from curvafit.priors.profile import optimal_profile, phase_field
+from curvafit.scan import Field, ScanError
+from curvafit.working import Law, Place, law_of
+
+__all__ = ["STEPS", "Segmentation", "reconstruct", "segment"]
+
+#: Steps of Adam, if not said otherwise.
+STEPS = 150
+#: Nats that a unit of the Willmore energy costs: best, or nearly, from little noise to much on bone and tubes.
+NATS = 1.0
+#: The spring that holds known slices, in working units; ten times less lets go of them, ten times more stalls.
+STIFFNESS = 1e6
+
+#: A flow whose last ten steps lower the energy by less than this share has settled.
+SETTLED = 0.001
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Segmentation:
+    """A mask, and how it came about.
+
+    Attributes
+    ----------
+    mask, phase
+        On the scan's own grid, with its spacing, unit and affine: bool, and the phase field u, float32.
+    weight
+        λ, in nats per unit of F_ε; None where the data were known slices.
+    coefficients, epsilon
+        Of F_ε, with lengths in the scan's unit.
+    status
+        A sentence: whether the flow settled, and what is inside.
+    notes
+        Sentences on what was found and assumed.
+    """
+
+    mask: Field
+    phase: Field
+    weight: float | None
+    coefficients: Coefficients
+    epsilon: float
+    status: str
+    notes: tuple[str, ...]
+
+
+def segment(
+    scan: Field,
+    prior: Law,
+    *,
+    probability: Field | np.ndarray | None = None,
+    weight: float | None = None,
+    threshold: float | str = "otsu",
+    dark: bool = False,
+    epsilon: float | None = None,
+    steps: int = STEPS,
+    progress: Progress | None = None,
+) -> Segmentation:
+    """Find the structure of a scan: lower -log p(scan | mask) + λ F_ε from a smoothed, thresholded start.
+
+    Parameters
+    ----------
+    scan
+        Grey levels of two phases with noise.
+    prior
+        `Coefficients` with lengths in the scan's unit; or a preset's name, in working units of which the smallest voxel
+        edge is 0.01; or the path of a `fit.json`, whose unit is converted.
+    probability
+        Instead of grey levels: the probability of the inside, in [0, 1], of the scan's shape.
+    weight
+        λ, in nats per unit of F_ε; 2 / (a20 + a02) if not given. The data count in nats, so by their noise; the
+        Willmore energy counts as it is; and others as what small bumps on a plane cost, which is (a20 + a02) / 2 times
+        their Willmore energy (linear terms aside, since ∫κ1κ2 = 0).
+    threshold, dark
+        The grey level between the phases, or `"otsu"`; whether the structure is the dark one.
+    epsilon
+        ε in the scan's unit; twice the smallest voxel edge if not given. What is thinner does not survive.
+    steps
+        Of Adam.
+    progress
+        Called with a sentence and the share done.
+
+    Raises
+    ------
+    ValueError
+        If an argument is out of range or does not fit the scan, or the prior's unit cannot be converted.
+    FileNotFoundError
+        If there is no such `fit.json`.
+    """
+    law, notes = law_of(prior, scan)
+    place = Place.of(scan, epsilon)
+    if weight is not None and not 0 < weight < math.inf:
+        raise ScanError(f"expected a positive weight, got {weight}")
+    if probability is None:
+        found = of_intensities(scan, threshold, dark)
+    else:
+        values = probability.values if isinstance(probability, Field) else probability
+        found = of_probability(values, scan)
+    start = _started(found.level, place)
+    stiffness = float(law.a20 + law.a02) / 2
+    if stiffness <= 0:
+        raise ScanError(f"expected coefficients with a20 + a02 > 0, got {2 * stiffness:g}: surfaces would crumple")
+    λ = NATS / stiffness if weight is None else float(weight)
+    ratio = place.spread(found.ratio) / (λ * stiffness * place.grid.voxel_volume)
+    flow = _lowered(start, law.scaled(1 / stiffness), data.Evidence(ratio), place, steps, progress)
+    notes = (*notes, f"{found.note[0].upper()}{found.note[1:]}.", *place.notes)
+    u = place.back(flow.field)
+    return _result(scan, u > 0, u, law, place, λ, notes, flow)
+
+
+def reconstruct(
+    slices: Field,
+    prior: Law,
+    *,
+    every: int | None = None,
+    first: int = 0,
+    known: Sequence[int] | None = None,
+    axis: int = 0,
+    epsilon: float | None = None,
+    steps: int = STEPS,
+    progress: Progress | None = None,
+) -> Segmentation:
+    """Fill a volume of which some slices are known: lower F_ε while these hold, from interpolated signed distances.
+
+    Parameters
+    ----------
+    slices
+        A mask of the whole volume's shape, positive inside; only its known slices are read, and kept as they are.
+    prior, epsilon, steps, progress
+        As in `segment`.
+    every, first
+        Known are `first`, `first + every`, … along `axis`.
+    known
+        Instead: their numbers, two or more.
+    axis
+        0, 1 or 2 of the array: z, y or x.
+
+    Raises
+    ------
+    ValueError
+        As `segment`, or if fewer than two slices are known, or they are all empty or all full.
+    FileNotFoundError
+        If there is no such `fit.json`.
+    """
+    law, notes = law_of(prior, slices)
+    place = Place.of(slices, epsilon)
+    if axis not in (0, 1, 2):
+        raise ScanError(f"expected an axis 0, 1 or 2 (z, y, x), got {axis}")
+    places = _places(slices.shape[axis], every, first, known)
+    there = np.moveaxis(slices.values, axis, 0)[places] > 0
+    if there.all() or not there.any():
+        raise ScanError(
+            f"expected known slices with voxels inside and outside, got {'full' if there.all() else 'empty'} ones"
+        )
+    order = (axis, *(k for k in range(3) if k != axis))
+    edges = [slices.spacing[k] for k in order]
+    distance = np.moveaxis(interpolated_distance(there, places, slices.shape[axis], edges), 0, axis)
+    start = optimal_profile(place.finer(distance), place.epsilon)
+    held = np.zeros(slices.shape, dtype=np.float32)
+    np.moveaxis(held, axis, 0)[places] = np.where(there, STIFFNESS, -STIFFNESS)
+    spring = data.Hinge(place.spread(held, centre=axis))
+    flow = _lowered(start, law.scaled(1 / _force(law, place, start)), spring, place, steps, progress)
+    u = place.back(flow.field)
+    mask = u > 0
+    np.moveaxis(mask, axis, 0)[places] = there
+    notes = (*notes, f"{len(places)} of {slices.shape[axis]} slices are known.", *place.notes)
+    return _result(slices, mask, u, law, place, None, notes, flow)
+
+
+def _places(length: int, every: int | None, first: int, known: Sequence[int] | None) -> list[int]:
+    if (every is None) == (known is None):
+        raise ScanError("expected either every how many slices are known, or their numbers")
+    if every is not None and (every < 1 or first < 0):
+        raise ScanError(f"expected every from 1 and first from 0, got {every} and {first}")
+    places = sorted(set(known)) if known is not None else list(range(first, length, every or 1))
+    if len(places) < 2 or places[0] < 0 or places[-1] >= length:
+        raise ScanError(f"expected two or more known slices within 0 to {length - 1}, got {places}")
+    return places
+
+
+def _started(level: np.ndarray, place: Place) -> Tensor:
+    """The phase field of where a smooth volume is positive."""
+    inside = place.finer(level) > 0
+    if not inside.any() or inside.all():
+        raise ScanError(
+            f"expected a structure and background in the scan, got {'none' if inside.all() else 'one phase'}"
+        )
+    return phase_field(inside, place.grid, WORKING_EPSILON)
+
+
+def _force(law: Coefficients, place: Place, u: Tensor) -> float:
+    """Root mean square of ∂F_ε/∂u, over that of the Willmore energy: what makes Adam's steps and springs comparable."""
+    sizes = []
+    for each in (law.in_unit(place.unit), Coefficients.willmore()):
+        _, slope = kernels.energy_gradient(u, each, place.grid, WORKING_EPSILON)
+        sizes.append(float(slope.double().norm()))
+    if not all(0 < size < math.inf for size in sizes):
+        raise ScanError("expected coefficients with a force on the start, got none: they are 0, or there is no surface")
+    return sizes[0] / sizes[1]
+
+
+def _lowered(
+    start: Tensor, law: Coefficients, term: data.Data, place: Place, steps: int, progress: Progress | None
+) -> Flow:
+    def watch(made: int, total: int, state: object) -> None:
+        if progress is not None:
+            progress("lowering the energy", made / total)
+
+    return descend(
+        start,
+        law.in_unit(place.unit),
+        place.grid,
+        data=term,
+        optimiser="adam",
+        steps=steps,
+        blur=0.0,
+        callbacks=[watch],
+    )
+
+
+def _result(
+    scan: Field,
+    mask: np.ndarray,
+    u: np.ndarray,
+    law: Coefficients,
+    place: Place,
+    weight: float | None,
+    notes: tuple[str, ...],
+    flow: Flow,
+) -> Segmentation:
+    share, energy = float(mask.mean()), flow.history.energy
+    fall = (energy[-2] - energy[-1]) / max(abs(energy[-1]), 1e-30) if len(energy) > 1 else 1.0
+    made, word = int(flow.history.step[-1]), "settled" if abs(fall) < SETTLED else "still moving"
+    status = f"{word} after {made} steps: {100 * share:.2f} % of the volume is inside"
+    if not np.isfinite(energy[-1]):
+        status = f"stopped after {made} steps: the energy is not finite, lower the weight"
+    elif share in (0.0, 1.0):
+        status = f"no surface is left after {made} steps: the prior is too strong for the data, lower its weight"
+    whole = {"notes": (), "source": scan.source}
+    return Segmentation(
+        replace(scan, values=mask, **whole),
+        replace(scan, values=u, **whole),
+        weight,
+        law,
+        place.epsilon,
+        status,
+        (*scan.notes, *notes),
+    )

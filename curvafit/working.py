@@ -1,0 +1,124 @@
+"""From a scan's grid and unit to those a flow runs in, and back; and a prior in the scan's unit."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from os import PathLike
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from curvafit.priors.coefficients import PRESETS, Coefficients
+from curvafit.priors.fit_file import read_fit
+from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
+from curvafit.priors.loss import RESOLVED, upsampling
+from curvafit.priors.refined import refined
+from curvafit.scan import Field, ScanError
+from curvafit.wording import METRES
+
+__all__ = ["Law", "Place", "law_of"]
+
+Law = Coefficients | str | PathLike[str]
+
+
+def law_of(prior: Law, scan: Field) -> tuple[Coefficients, tuple[str, ...]]:
+    """Coefficients with lengths in the scan's unit, and sentences on where they are from.
+
+    Raises
+    ------
+    ValueError
+        If there is no preset of that name, or the units of a `fit.json` and the scan cannot be compared.
+    FileNotFoundError
+        If there is no such file.
+    """
+    if isinstance(prior, Coefficients):
+        if any(isinstance(value, Tensor) and value.dim() > 0 for value in prior):
+            raise ScanError("expected coefficients that are numbers, got some that vary")
+        return prior, ()
+    if isinstance(prior, str) and prior in PRESETS:
+        unit = WORKING_SPACING / min(scan.spacing)
+        return PRESETS[prior].coefficients.in_unit(unit), (
+            f"The preset {prior}, at a working voxel of one scan voxel.",
+        )
+    if isinstance(prior, str) and not prior.endswith(".json"):
+        raise ScanError(f"expected a preset among {', '.join(PRESETS)}, or a fit.json, got {prior!r}")
+    fit = read_fit(prior)
+    if fit.unit == scan.unit:
+        return fit.physical, ()
+    if not {fit.unit, scan.unit} <= METRES.keys():
+        raise ScanError(f"expected a scan whose unit of length compares with the prior's {fit.unit}, got {scan.unit}")
+    said = f"The prior's lengths, in {fit.unit}, are taken to {scan.unit}."
+    return fit.physical.in_unit(METRES[scan.unit] / METRES[fit.unit]), (said,)
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a flow runs: working units, and axes refined until ε spans two voxels.
+
+    Attributes
+    ----------
+    grid
+        Working units; the boundary replicates.
+    times
+        How many parts a scan voxel has along each axis.
+    unit, epsilon
+        A working length of 1, and ε, in the scan's unit.
+    """
+
+    grid: Grid
+    times: tuple[int, int, int]
+    unit: float
+    epsilon: float
+
+    @classmethod
+    def of(cls, scan: Field, epsilon: float | None) -> Place:
+        """The place for a scan; ε is twice the smallest voxel edge if not given.
+
+        Raises
+        ------
+        ScanError
+            If ε is not positive or the scan is too small.
+        """
+        ε = RESOLVED * min(scan.spacing) if epsilon is None else float(epsilon)
+        if not 0 < ε < math.inf:
+            raise ScanError(f"expected a positive epsilon in {scan.unit}, got {epsilon}")
+        if min(scan.shape) < 4:
+            raise ScanError(f"expected at least 4 voxels along each axis, got {scan.shape}")
+        times, unit = upsampling(scan.spacing, ε), ε / WORKING_EPSILON
+        shape = tuple(n * t for n, t in zip(scan.shape, times, strict=True))
+        spacing = tuple(h / t / unit for h, t in zip(scan.spacing, times, strict=True))
+        return cls(Grid(shape, spacing, "replicate"), times, unit, ε)  # type: ignore[arg-type]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Which axes are refined, in a sentence."""
+        if max(self.times) == 1:
+            return ()
+        axes = ", ".join(f"{axis} {n}-fold" for axis, n in zip("zyx", self.times, strict=True) if n > 1)
+        return (f"ε spans fewer than 2 voxels on some axes: the flow ran on a grid refined {axes}.",)
+
+    def finer(self, values: np.ndarray) -> Tensor:
+        """A smooth volume on the flow's grid."""
+        u = torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
+        for axis, n in enumerate(self.times):
+            u = refined(u, axis, n)
+        return u
+
+    def spread(self, values: np.ndarray, centre: int | None = None) -> Tensor:
+        """What voxels say, shared among their parts; along the axis `centre` by the middle one or two alone."""
+        u = torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
+        for axis, n in enumerate(self.times):
+            share = torch.full((n,), 1 / n)
+            if axis == centre:
+                share = (torch.arange(n) - (n - 1) / 2).abs().lt(1).float()
+            u = u.unsqueeze(axis + 1) * share.reshape(-1, *(1,) * (2 - axis))
+            u = u.flatten(axis, axis + 1)
+        return u
+
+    def back(self, u: Tensor) -> np.ndarray:
+        """The mean of each scan voxel's parts."""
+        for axis, n in enumerate(self.times):
+            u = u.unflatten(axis, (-1, n)).mean(axis + 1)
+        return u.numpy()

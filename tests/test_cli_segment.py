@@ -1,0 +1,182 @@
+"""`curvafit segment` and `reconstruct`: what they write, to the bit, and one sentence with exit code 2 for the rest."""
+
+from __future__ import annotations
+
+import importlib
+import json
+from pathlib import Path
+
+import nibabel
+import numpy as np
+import pytest
+from calling import call, refused
+from found import made_fit
+
+from curvafit.scan import Field, load, save
+
+pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
+
+#: Turned about z and sheared a little, with a shift that no float32 holds: what is not kept to the bit shows.
+OBLIQUE = np.array(
+    [[0.0613, -0.011, 0.0031, -17.1234567], [0.0097, 0.0622, -0.001, 3.3], [-0.003, 0.002, 0.09, 0.1], [0, 0, 0, 1]]
+)
+
+
+def ball(shape: tuple[int, int, int] = (20, 18, 16)) -> np.ndarray:
+    z, y, x = (np.arange(n) - n / 2 + 0.4 for n in shape)
+    return z[:, None, None] ** 2 + y[:, None] ** 2 + x**2 < 36
+
+
+def grey(noise: float = 40) -> np.ndarray:
+    mask = ball()
+    values = 100 + 100 * mask + noise * np.random.default_rng(0).standard_normal(mask.shape)
+    return values.clip(0, 255).astype(np.uint8)
+
+
+@pytest.fixture
+def oblique(tmp_path: Path) -> Path:
+    """A NIfTI scan with an oblique sform, another qform, scaled values and a note."""
+    image = nibabel.Nifti1Image(grey().T, OBLIQUE)
+    image.header.set_xyzt_units("mm")
+    image.set_sform(OBLIQUE, code="scanner")
+    turned = OBLIQUE.copy()
+    turned[:3, 3] += 1
+    image.set_qform(turned, code="aligned")
+    image.header.set_slope_inter(2.0, -7.0)
+    image.header["descrip"] = b"a scan"
+    image.header["cal_max"] = 300
+    path = tmp_path / "scan.nii.gz"
+    nibabel.save(image, path)
+    return path
+
+
+def test_segment_keeps_the_header_to_the_bit(oblique: Path, tmp_path: Path) -> None:
+    target = tmp_path / "new" / "mask.nii.gz"
+    result = call("segment", oblique, "--prior", "tubes", "--steps", 20, "-o", target)
+    assert result.exit_code == 0, (result.output, result.exception)
+    assert sorted(path.name for path in target.parent.iterdir()) == ["mask.json", "mask.nii.gz", "mask.png"]
+    one, other = nibabel.load(oblique), nibabel.load(target)
+    kept = [*(f"srow_{k}" for k in "xyz"), *(f"quatern_{k}" for k in "bcd"), *(f"qoffset_{k}" for k in "xyz")]
+    for name in (*kept, "pixdim", "qform_code", "sform_code", "xyzt_units", "descrip", "dim"):
+        assert one.header[name].tobytes() == other.header[name].tobytes(), name  # type: ignore[index]
+    assert other.affine.tobytes() == one.affine.tobytes()  # type: ignore[attr-defined]
+    values = np.asanyarray(other.dataobj)  # type: ignore[attr-defined]
+    assert values.dtype == np.uint8 and np.unique(values).tolist() == [0, 1]
+    overlap = (values.T > 0) & ball()
+    assert 2 * overlap.sum() / ((values > 0).sum() + ball().sum()) > 0.9
+    record = json.loads(target.with_name("mask.json").read_text())
+    assert record["format"] == "curvafit-mask-1" and record["job"] == "segment" and record["prior"] == "tubes"
+    assert record["steps"] == 20 and record["weight"] > 0 and record["command"].startswith("curvafit ")
+    assert record["unit"] == "mm" and record["epsilon"] == pytest.approx(2 * min(record["spacing"]))
+    assert str(target) in result.stdout and "of the volume is inside" in result.stdout
+    again = call("segment", oblique, "--prior", "tubes", "--steps", 1, "-o", target)
+    assert again.exit_code == 0 and json.loads(target.with_name("mask.json").read_text())["steps"] == 1
+
+
+def test_an_axis_of_one_and_another_spacing(tmp_path: Path) -> None:
+    path, target = tmp_path / "scan.nii", tmp_path / "mask.nii"
+    image = nibabel.Nifti2Image(grey().T[..., None], np.diag([0.2, 0.2, 0.4, 1]))
+    nibabel.save(image, path)
+    assert call("segment", path, "--prior", "sponge", "--steps", 2, "-o", target).exit_code == 0
+    made = nibabel.load(target)
+    assert isinstance(made, nibabel.Nifti2Image) and made.shape == (16, 18, 20, 1)
+    other = tmp_path / "other.nii"
+    told = call("segment", path, "--prior", "sponge", "--steps", 2, "--spacing", "3,2,2", "--unit", "um", "-o", other)
+    assert told.exit_code == 0 and "z" in told.stdout
+    assert load(other).spacing == (3, 2, 2) and load(other).unit == "um"
+
+
+def test_other_formats_and_a_fit_in_another_unit(tmp_path: Path) -> None:
+    path, prior, target = tmp_path / "scan.tif", tmp_path / "fit.json", tmp_path / "mask.ome.tif"
+    save(Field(grey(), (19.5,) * 3, "um"), path)
+    prior.write_text(made_fit().to_json())
+    result = call("segment", path, "--prior", prior, "--dark", "--threshold", 150, "--steps", 2, "-o", target)
+    assert result.exit_code == 0, (result.output, result.exception)
+    assert "in mm, are taken to um" in result.stdout
+    made = load(target)
+    assert made.unit == "um" and made.spacing == pytest.approx((19.5,) * 3)
+    assert made.values.mean() > 0.5
+    record = json.loads((tmp_path / "mask.json").read_text())
+    assert record["dark"] is True and record["threshold"] == 150
+    assert record["coefficients"] == pytest.approx(made_fit().coefficients_physical.in_unit(1e-3).as_dict())
+
+
+def test_a_probability_map(tmp_path: Path) -> None:
+    path, likely, target = tmp_path / "scan.npy", tmp_path / "p.npy", tmp_path / "mask.npy"
+    np.save(path, grey())
+    np.save(likely, np.where(ball(), 0.9, 0.2).astype(np.float32))
+    options = ("--prior", "sponge", "--weight", 0.5, "--steps", 10)
+    result = call("segment", path, "--probability", likely, *options, "-o", target)
+    assert result.exit_code == 0, (result.output, result.exception)
+    assert (np.load(target).astype(bool) != ball()).mean() < 0.02
+    assert json.loads((tmp_path / "mask.json").read_text())["weight"] == 0.5
+
+
+def test_reconstruct_fills_what_it_is_not_told(tmp_path: Path) -> None:
+    truth, path, target = ball((20, 18, 17)), tmp_path / "slices.nii.gz", tmp_path / "volume.nii.gz"
+    given = np.zeros_like(truth)
+    given[..., ::4] = truth[..., ::4]
+    save(Field(given, (0.1, 0.1, 0.1), "mm"), path)
+    result = call("reconstruct", path, "--every", 4, "--axis", "x", "--prior", "sponge", "--steps", 20, "-o", target)
+    assert result.exit_code == 0, (result.output, result.exception)
+    made = load(target).values.astype(bool)
+    assert np.array_equal(made[..., ::4], truth[..., ::4]) and (made != truth).mean() < 0.02
+    record = json.loads((tmp_path / "volume.json").read_text())
+    assert (record["every"], record["axis"], record["weight"]) == (4, 2, None)
+    named = tmp_path / "named.nii.gz"
+    options = ("--slices", "0,4,8,12,16", "--axis", "x", "--prior", "sponge", "--steps", 20)
+    assert call("reconstruct", path, *options, "-o", named).exit_code == 0
+    assert np.array_equal(load(named).values, load(target).values)
+
+
+def test_a_picture_shows_the_slices(oblique: Path, tmp_path: Path) -> None:
+    from matplotlib.image import imread
+
+    assert call("segment", oblique, "--prior", "sponge", "--steps", 1, "-o", tmp_path / "m.npy").exit_code == 0
+    picture = imread(tmp_path / "m.png")
+    assert picture.shape[1] > 1000 and np.ptp(picture[..., 0] - picture[..., 2]) > 0.4  # grey, and an orange line
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("segment", "SCAN", "--prior", "tube", "-o", "m.nii.gz"), "expected a preset among"),
+        (("segment", "SCAN", "--prior", "none.json", "-o", "m.nii.gz"), "expected a fit.json"),
+        (("segment", "SCAN", "--prior", "FIT", "--unit", "voxel", "-o", "m.nii.gz"), "compares with the prior's mm"),
+        (("segment", "SCAN", "--prior", "tubes", "--weight", "-1", "-o", "m.nii.gz"), "positive weight"),
+        (("segment", "SCAN", "--prior", "tubes", "--threshold", "low", "-o", "m.nii.gz"), "--threshold"),
+        (("segment", "SCAN", "--prior", "tubes", "--spacing", "0", "-o", "m.nii.gz"), "--spacing"),
+        (("segment", "SCAN", "--prior", "tubes", "--probability", "SMALL", "-o", "m.nii.gz"), "of the scan's shape"),
+        (("segment", "none.tif", "--prior", "tubes", "-o", "m.nii.gz"), "no such file"),
+        (("reconstruct", "SCAN", "--prior", "tubes", "-o", "m.nii.gz"), "--every or --slices"),
+        (("reconstruct", "SCAN", "--prior", "tubes", "--every", "4", "--axis", "w", "-o", "m.nii.gz"), "--axis"),
+        (("reconstruct", "SCAN", "--prior", "tubes", "--slices", "1,a", "-o", "m.nii.gz"), "--slices"),
+        (("reconstruct", "SCAN", "--prior", "tubes", "--slices", "3,77", "-o", "m.nii.gz"), "within 0 to 19"),
+    ],
+)
+def test_wrong_input_is_a_sentence(arguments, said, oblique, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "fit.json").write_text(made_fit().to_json())
+    np.save(tmp_path / "small.npy", np.linspace(0, 1, 125, dtype=np.float32).reshape(5, 5, 5))
+    places = {"SCAN": oblique, "FIT": "fit.json", "SMALL": "small.npy"}
+    result = call(*(places.get(part, part) for part in arguments))
+    assert result.exit_code == 2, (result.output, result.exception)
+    lines = result.stderr.strip().splitlines()
+    assert lines[-1].startswith("error: ") and said in lines[-1], lines
+    assert not (tmp_path / "m.nii.gz").exists() and not list(tmp_path.glob(".m*"))
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("mask.xyz", "ending in one of"), ("taken/mask.tif", "is a file"), ("other.nii.gz", "not another file's")],
+)
+def test_places_that_cannot_be_written_are_refused_first(name, said, oblique, tmp_path, monkeypatch) -> None:
+    (tmp_path / "taken").write_text("")
+    (tmp_path / "other.json").write_text("{}")
+    monkeypatch.setattr("curvafit.scan.load", lambda *_, **__: pytest.fail("read all the same"))
+    refused(call("segment", oblique, "--prior", "tubes", "-o", tmp_path / name), said)
+
+
+def test_steps_are_those_of_the_library() -> None:
+    library = importlib.import_module("curvafit.segment")
+    assert importlib.import_module("curvafit.cli_segment").STEPS == library.STEPS

@@ -1,0 +1,87 @@
+"""The data term of a flow: its gradient, what it means, and runs that it belongs to."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from curvafit.generation.checkpoint import identity
+from curvafit.generation.data import Evidence, Hinge
+from curvafit.generation.flow import descend
+from curvafit.priors.coefficients import Coefficients
+from curvafit.priors.grid import Grid
+from curvafit.priors.profile import optimal_profile
+
+pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
+
+WILLMORE = Coefficients.willmore()
+GRID = Grid((8, 9, 10), (0.01, 0.012, 0.02), "replicate")
+
+
+def drawn(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("kind", [Evidence, Hinge])
+def test_a_data_term_s_gradient(kind) -> None:
+    term, u, way = kind(drawn(8, 9, 10)), 1.2 * drawn(8, 9, 10, seed=1), drawn(8, 9, 10, seed=2)
+    step = 1e-5
+    ahead, behind = (term.slope(u + sign * step * way, GRID)[0] for sign in (1, -1))
+    _, slope = term.slope(u, GRID)
+    assert (ahead - behind) / (2 * step) == pytest.approx(float((slope * way).sum()), rel=1e-7)
+
+
+def test_evidence_of_a_mask_is_its_log_likelihood() -> None:
+    r, inside = drawn(8, 9, 10), drawn(8, 9, 10, seed=1) > 0
+    values = [Evidence(r).slope(torch.where(m, 1.0, -1.0).double(), GRID)[0] for m in (inside, ~inside)]
+    gained = float((r * torch.where(inside, 1.0, -1.0)).sum()) * GRID.voxel_volume
+    assert values[1] - values[0] == pytest.approx(gained, rel=1e-12)
+
+
+def test_a_hinge_lets_go_where_it_is_right() -> None:
+    value, slope = Hinge(torch.full((8, 9, 10), -3.0)).slope(torch.full((8, 9, 10), -1.1), GRID)
+    assert value == 0 and not slope.any()
+
+
+@pytest.mark.parametrize("bad", [torch.full((4, 4, 4), math.nan), torch.zeros(4, 4)])
+def test_bad_evidence_is_refused(bad) -> None:
+    for kind in (Evidence, Hinge):
+        with pytest.raises(ValueError, match="expected finite evidence"):
+            kind(bad)
+
+
+def test_evidence_of_another_shape_is_refused() -> None:
+    with pytest.raises(ValueError, match="expected the data's ratio to broadcast"):
+        descend(torch.zeros(8, 8, 8), WILLMORE, Grid(8), data=Evidence(torch.ones(7, 8, 8)), steps=1)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("flow", "optimiser"), [("l2", "lbfgs"), ("l2", "adam"), ("mass", "adam"), ("h-1", "adam")])
+def test_every_flow_lowers_energy_and_data_as_plain_torch_does(flow, optimiser) -> None:
+    grid = Grid((12, 12, 12), boundary="replicate")
+    start = optimal_profile(0.04 - torch.from_numpy(np.linalg.norm(np.mgrid[:12, :12, :12] - 5.5, axis=0)) * 0.01, 0.02)
+    term = Evidence(1e6 * drawn(12, 12, 12))
+    options = {"flow": flow, "optimiser": optimiser, "steps": 10, "schedule": "paper", "data": term}
+    fast, plain = (descend(start, WILLMORE, grid, backend=each, **options) for each in ("auto", "torch"))
+    torch.testing.assert_close(fast.field, plain.field, atol=2e-3, rtol=0)
+    assert fast.history.energy[-1] < fast.history.energy[0]
+    without = descend(start, WILLMORE, grid, **{**options, "data": None})
+    assert not torch.allclose(without.field, fast.field, atol=1e-3)
+
+
+def test_a_checkpoint_is_its_data_s(tmp_path: Path) -> None:
+    one, same, other = (identity(data=Evidence(drawn(4, 4, 4, seed=k))) for k in (0, 0, 1))
+    assert one == same != other
+    assert one != identity(data=Hinge(drawn(4, 4, 4))) and one != identity(data=None)
+    path = tmp_path / "run.pt"
+    options = {"steps": 20, "checkpoint": path, "checkpoint_every": 0.0, "optimiser": "adam"}
+    start, stop = 0.5 * drawn(8, 8, 8), [lambda made, total, state: made >= 10]
+    descend(start, WILLMORE, Grid(8), data=Evidence(drawn(8, 8, 8)), callbacks=stop, **options)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="expected a checkpoint of this run"):
+        descend(start, WILLMORE, Grid(8), data=Evidence(2 * drawn(8, 8, 8)), **options)
+    resumed = descend(start, WILLMORE, Grid(8), data=Evidence(drawn(8, 8, 8)), **options)
+    whole = descend(start, WILLMORE, Grid(8), data=Evidence(drawn(8, 8, 8)), **{**options, "checkpoint": None})
+    assert torch.equal(resumed.field, whole.field)

@@ -1,0 +1,232 @@
+"""Segmentation without a network: evidence, units, grids, and shapes that come out better."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from found import made_fit
+from scipy import ndimage
+from skimage.filters import threshold_otsu
+
+from curvafit.evidence import interpolated_distance, of_intensities, of_probability
+from curvafit.priors.coefficients import Coefficients, preset
+from curvafit.scan import Field
+from curvafit.segment import reconstruct, segment
+from curvafit.working import Place, law_of
+
+pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
+
+WILLMORE = Coefficients.willmore()
+
+
+def tubes(n: int = 32) -> np.ndarray:
+    """Two crossing tubes and a ball, none thinner than six voxels."""
+    z, y, x = np.mgrid[:n, :n, :n] - n / 2 + 0.5
+    first, second = np.hypot(z + 8, y) < 4, np.hypot(z - 0.3 * y - 3, x - 4) < 3.5
+    return first | second | (z**2 + (y + 9) ** 2 + (x + 9) ** 2 < 25)
+
+
+def noisy(mask: np.ndarray, noise: float, **place) -> Field:
+    values = 30 + 100 * mask + noise * np.random.default_rng(1).standard_normal(mask.shape)
+    return Field(values.astype(np.float32), **place)
+
+
+def dice(a: np.ndarray, b: np.ndarray) -> float:
+    return 2 * float((a & b).sum()) / float(a.sum() + b.sum())
+
+
+# ---- evidence --------------------------------------------------------------------------------------------------------
+
+
+def test_intensities_find_the_classes_and_the_noise() -> None:
+    truth = tubes()
+    found = of_intensities(noisy(truth, 25))
+    ideal = (noisy(truth, 25).values - 80) * 100 / 25**2
+    inner = ndimage.binary_erosion(truth, iterations=2) | ndimage.binary_erosion(~truth, iterations=2, border_value=1)
+    slope = np.polyfit(ideal[inner], found.ratio[inner], 1)
+    assert slope == pytest.approx([1, 0], abs=0.15)
+    dark = of_intensities(dataclasses.replace(noisy(truth, 25), values=200 - noisy(truth, 25).values), dark=True)
+    np.testing.assert_allclose(dark.ratio, found.ratio, rtol=0.02, atol=0.1)
+
+
+def test_a_probability_is_its_own_evidence() -> None:
+    p = np.random.default_rng(0).random((6, 7, 8)).astype(np.float32)
+    found = of_probability(p, Field(p))
+    np.testing.assert_allclose(1 / (1 + np.exp(-found.ratio.astype(float))), p.clip(1e-4, 1 - 1e-4), atol=1e-6)
+    for bad, said in ((p[1:], "shape"), (2 * p, r"\[0, 1\]")):
+        with pytest.raises(ValueError, match=said):
+            of_probability(bad, Field(p))
+
+
+def test_distances_between_slices() -> None:
+    disc = np.hypot(*(np.mgrid[:32, :32] - 15.5)) < 10
+    distance = interpolated_distance(np.stack([disc, np.zeros_like(disc)]), [2, 6], 9, (2.0, 1.0, 1.0))
+    assert np.array_equal(distance[2] > 0, disc) and np.array_equal(distance[0], distance[2])
+    assert distance[6:].max() == -8  # as far outside as the slices are apart
+    np.testing.assert_allclose(distance[4], (distance[2] + distance[6]) / 2, atol=1e-6)
+
+
+# ---- units and grids -------------------------------------------------------------------------------------------------
+
+
+def test_a_prior_comes_in_the_scan_s_unit(tmp_path: Path) -> None:
+    fit = made_fit()
+    path = tmp_path / "fit.json"
+    path.write_text(fit.to_json())
+    mm, um = (Field(np.zeros((4, 4, 4)), (h,) * 3, unit) for h, unit in ((0.0195, "mm"), (19.5, "um")))
+    assert law_of(path, mm)[0] == fit.coefficients_physical
+    law, notes = law_of(str(path), um)
+    assert law.as_dict() == pytest.approx(fit.coefficients_physical.in_unit(1e-3).as_dict())
+    assert "mm" in notes[0] and "um" in notes[0]
+    with pytest.raises(ValueError, match="expected a scan whose unit of length compares with the prior's mm"):
+        law_of(path, Field(np.zeros((4, 4, 4))))
+    with pytest.raises(ValueError, match="expected a preset among"):
+        law_of("tube", mm)
+    with pytest.raises(FileNotFoundError):
+        law_of(tmp_path / "none.json", mm)
+    working = law_of("tubes", um)[0].in_unit(19.5 / 0.01)
+    assert working.as_dict() == pytest.approx(preset("tubes").coefficients.as_dict())
+
+
+def test_axes_are_refined_and_brought_back() -> None:
+    place = Place.of(Field(np.zeros((6, 7, 8)), (2.5, 1.0, 1.0)), None)
+    assert place.times == (3, 1, 1) and place.grid.shape == (18, 7, 8) and place.epsilon == 2
+    assert min(place.grid.spacing) * 100 == pytest.approx(2.5 / 3)
+    values = np.random.default_rng(0).random((6, 7, 8)).astype(np.float32)
+    shared = place.spread(values)
+    assert float(shared.sum()) == pytest.approx(float(values.sum()), rel=1e-5)
+    np.testing.assert_allclose(place.back(3 * shared), values, rtol=1e-6)
+    held = place.spread(values, centre=0)
+    np.testing.assert_array_equal(held[1::3].numpy(), values)
+    assert not held[0::3].any() and not held[2::3].any()
+
+
+@pytest.mark.parametrize("scale", [1e-3, 40.0])
+def test_a_segmentation_does_not_depend_on_the_unit_of_length(scale: float) -> None:
+    truth = tubes(24)
+    law = preset("tubes").coefficients.in_unit(0.01)
+    one = segment(noisy(truth, 60), law, steps=30)
+    other = segment(noisy(truth, 60, spacing=(scale,) * 3), law.in_unit(1 / scale), steps=30)
+    assert one.weight == pytest.approx(other.weight, rel=1e-4)
+    assert (one.mask.values != other.mask.values).mean() < 1e-3
+
+
+# ---- what comes out --------------------------------------------------------------------------------------------------
+
+
+def test_noisy_tubes_come_out_better_than_from_a_threshold_at_any_smoothing() -> None:
+    truth = tubes()
+    scan = noisy(truth, 90, spacing=(0.02,) * 3, unit="mm", affine=np.diag([-0.02, 0.02, 0.02, 1]))
+    found = segment(scan, WILLMORE)
+    others = []
+    for width in (0, 0.7, 1, 1.5, 2, 3):
+        smooth = ndimage.gaussian_filter(scan.values, width)
+        others.append(dice(smooth > threshold_otsu(smooth), truth))
+    assert dice(found.mask.values, truth) > max(others) + 0.01
+    assert found.mask.spacing == scan.spacing and found.mask.unit == "mm"
+    assert np.array_equal(found.mask.affine, scan.affine)  # type: ignore[arg-type]
+    assert found.mask.values.dtype == bool and np.array_equal(found.mask.values, found.phase.values > 0)
+    assert "settled" in found.status and found.weight == pytest.approx(1, rel=1e-6)
+
+
+def test_a_probability_map_is_regularised() -> None:
+    truth = tubes()
+    ratio = 4 * (2 * truth - 1) + 4 * np.random.default_rng(2).standard_normal(truth.shape)
+    map_ = (1 / (1 + np.exp(-ratio))).astype(np.float32)
+    found = segment(noisy(truth, 90), WILLMORE, probability=map_)
+    assert dice(found.mask.values, truth) > dice(map_ > 0.5, truth) + 0.05
+
+
+def test_anisotropic_scans_keep_their_grid() -> None:
+    truth = tubes(36)[1::3]
+    scan = noisy(truth, 40, spacing=(3.0, 1.0, 1.0))
+    found = segment(scan, WILLMORE)
+    assert found.mask.shape == truth.shape and found.mask.spacing == (3.0, 1.0, 1.0)
+    assert any("z 3-fold" in note for note in found.notes)
+    assert dice(found.mask.values, truth) > 0.93
+
+
+def test_known_slices_are_kept_and_the_rest_beats_interpolation() -> None:
+    """A ball: lines between its sections cut it short, their spline less, its curvature least."""
+    n, every = 41, 8
+    truth = np.linalg.norm(np.mgrid[:n, :n, :n] - 20.0, axis=0) < 15.2
+    places = np.arange(0, n, every)
+    found = reconstruct(Field(truth.astype(np.uint8)), WILLMORE, every=every)
+    lines = interpolated_distance(truth[places], list(places), n, (1.0, 1.0, 1.0))
+    share = np.arange(n) / every
+    low = np.minimum(share.astype(int), len(places) - 2)
+    w = (share - low)[:, None, None]
+    lines = (1 - w) * lines[places][low] + w * lines[places][low + 1] > 0
+    assert np.array_equal(found.mask.values[places], truth[places])
+    assert dice(found.mask.values, truth) > dice(lines, truth) + 0.01
+    assert found.weight is None
+
+
+def test_an_axis_and_numbers_of_slices() -> None:
+    truth = tubes()
+    known = [1, 8, 15, 22, 30]
+    along = reconstruct(Field(truth), WILLMORE, known=known, steps=20)
+    turned = reconstruct(Field(np.ascontiguousarray(truth.transpose(1, 2, 0))), WILLMORE, known=known, axis=2, steps=20)
+    assert (along.mask.values != turned.mask.values.transpose(2, 0, 1)).mean() < 2e-3
+    assert np.array_equal(turned.mask.values[..., known], truth.transpose(1, 2, 0)[..., known])
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({}, "either every"),
+        ({"every": 8, "known": [1, 2]}, "either every"),
+        ({"every": 0}, "every from 1"),
+        ({"known": [3]}, "two or more"),
+        ({"known": [3, 99]}, "within 0 to 31"),
+        ({"every": 8, "axis": 3}, "axis 0, 1 or 2"),
+        ({"every": 31}, "voxels inside and outside"),
+        ({"every": 8, "epsilon": -1.0}, "positive epsilon"),
+        ({"every": 8, "prior": Coefficients(1e-30, 0, 1e-30).scaled(1e-30)}, "with a force"),
+    ],
+)
+def test_bad_slices_are_refused(options, said) -> None:
+    with pytest.raises(ValueError, match=said):
+        reconstruct(Field(tubes()), **{"prior": WILLMORE, **options})
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"weight": 0.0}, "positive weight"),
+        ({"threshold": 500.0}, "within the smoothed scan's"),
+        ({"threshold": "li"}, "a number or 'otsu'"),
+        ({"epsilon": math.inf}, "positive epsilon"),
+        ({"prior": Coefficients(torch.ones(32, 32, 32), 0, 1)}, "coefficients that are numbers"),
+    ],
+)
+def test_bad_options_are_refused(options, said) -> None:
+    with pytest.raises(ValueError, match=said):
+        segment(noisy(tubes(), 30), **{"prior": WILLMORE, **options})
+
+
+@pytest.mark.filterwarnings("ignore:a20 > 0:UserWarning")
+def test_a_prior_without_stiffness_is_refused() -> None:
+    with pytest.raises(ValueError, match="a20 . a02 > 0"):
+        segment(noisy(tubes(), 30), Coefficients(1, 0, -2))
+
+
+def test_a_prior_s_scale_does_not_matter_but_its_weight_does() -> None:
+    scan = noisy(tubes(), 60)
+    one, thrice = (segment(scan, WILLMORE.scaled(by), steps=30) for by in (1, 3))
+    assert thrice.weight == pytest.approx(1 / 3) and np.array_equal(one.mask.values, thrice.mask.values)
+    rough = segment(scan, WILLMORE, weight=0.01, steps=30)
+    assert (
+        np.abs(np.diff(rough.mask.values.astype(int))).sum() > 1.1 * np.abs(np.diff(one.mask.values.astype(int))).sum()
+    )
+
+
+def test_a_prior_that_is_too_strong_says_so() -> None:
+    ball = np.linalg.norm(np.mgrid[:20, :20, :20] - 9.5, axis=0) < 4
+    found = segment(noisy(ball, 30), Coefficients(1, 2, 1, 0, 0, 1.0), weight=1e4, steps=400)
+    assert found.status.startswith("no surface is left") and not found.mask.values.any()
