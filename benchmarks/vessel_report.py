@@ -6,6 +6,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
 
 from benchmarks.vessel_data import STACKS, part
 from benchmarks.vessel_scores import SCORES, block_counts, bootstrap, scores
@@ -89,7 +90,7 @@ def picture(folder: Path, runs: dict[str, list[list[dict]]]) -> None:
     plt.close(figure)
 
 
-def _bars(axis: plt.Axes, found: dict[str, np.ndarray], columns: tuple[int, ...]) -> None:
+def _bars(axis: Axes, found: dict[str, np.ndarray], columns: tuple[int, ...]) -> None:
     losses = [loss for loss in found if loss != "dice+ce"]
     for shift, column in enumerate(columns):
         middle, low, high = np.array([found[loss][1][:, column] for loss in losses]).T

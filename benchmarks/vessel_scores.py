@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import ndimage
 from skimage.morphology import skeletonize
 
@@ -45,7 +48,8 @@ def blocks(volume: np.ndarray) -> list[np.ndarray]:
 
 
 def components(mask: np.ndarray) -> tuple[np.ndarray, int]:
-    return ndimage.label(mask, np.ones((3, 3, 3)))
+    labels, count = ndimage.label(mask, np.ones((3, 3, 3)))  # type: ignore[misc]
+    return labels, count
 
 
 def without_specks(mask: np.ndarray) -> np.ndarray:
@@ -55,7 +59,7 @@ def without_specks(mask: np.ndarray) -> np.ndarray:
     return large[labels]
 
 
-def scores(counts: dict[str, np.ndarray]) -> np.ndarray:
+def scores(counts: Mapping[str, ArrayLike]) -> np.ndarray:
     """`SCORES` of blocks taken together, from counts `(…, blocks)`: `(…, 4)`.
 
     Dice; clDice (Shit et al. 2021); the Betti-0 error, mean over blocks of the difference in components, without

@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from monai.inferers import sliding_window_inference
-from monai.losses import SoftclDiceLoss
-from monai.networks.nets import DynUNet
+from monai.inferers.utils import sliding_window_inference
+from monai.losses.cldice import SoftclDiceLoss
+from monai.networks.nets.dynunet import DynUNet
 from skimage.morphology import dilation, skeletonize
 from torch import Tensor, nn
 from torch.nn import functional
@@ -50,7 +50,7 @@ def network() -> nn.Module:
     """A U-Net of four levels; slices are five times thicker than pixels, so the first stays in the plane."""
     kernels, strides = [(1, 3, 3), 3, 3, 3], [1, (1, 2, 2), 2, 2]
     model = DynUNet(3, 1, 1, kernels, strides, strides[1:], filters=FILTERS, norm_name="instance")
-    return model.to(memory_format=torch.channels_last_3d)
+    return model.to(memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
 
 
 def dice_ce(logits: Tensor, target: Tensor) -> Tensor:

@@ -88,7 +88,7 @@ class Study:
                 "seed": seed,
                 "stack": stack,
             } | provenance()
-            write_atomically(path, lambda temporary: temporary.write_text(json.dumps(kept)))
+            write(path, json.dumps(kept))
             found = " ".join(f"{value:.4f}" for value in scores(kept["validation"]))
             print(f"{time.strftime('%H:%M')} {name}: validation {found}, {kept['seconds']:.0f} s", flush=True)
         return json.loads(path.read_text())
@@ -147,7 +147,7 @@ class Study:
             with np.load(self.folder / f"dice+ce-0-0-{rate:g}-{TUNING}-{stack}-fit.npz") as kept:
                 example = Field(kept["mask"].astype(np.uint8), SPACING, "um")
             found = infer(example, kind="mask").fit
-            write_atomically(path, lambda temporary: temporary.write_text(found.to_json()))
+            write(path, found.to_json())
             print(f"{time.strftime('%H:%M')} {path.name}: {found.chosen}, {found.coefficients}", flush=True)
         return str(path)
 
@@ -161,6 +161,15 @@ def tuning(study: Study, rate: float) -> list[tuple[float, list[dict]]]:
 
 def other(stack: str) -> str:
     return STACKS[1 - STACKS.index(stack)]
+
+
+def write(path: Path, text: str) -> None:
+    """A text file, whole or not at all."""
+
+    def to(temporary: Path) -> None:
+        temporary.write_text(text)
+
+    write_atomically(path, to)
 
 
 def provenance() -> dict[str, str]:
@@ -185,7 +194,7 @@ def main() -> None:
         for loss, setting in chosen.items():
             runs[loss].append(study.pair(loss, *setting, rate, seed))
         text = table(runs, tuning(study, rate))
-        write_atomically(options.output / "vessels.txt", lambda temporary, text=text: temporary.write_text(text))
+        write(options.output / "vessels.txt", text)
     print(text)
     picture(options.output, runs)
 
