@@ -25,7 +25,7 @@ PARTS = {
 }
 SLICES, UNKNOWN = 3, 2
 #: Voxels of a training patch: its depth always holds an annotated slice.
-PATCH = (12, 96, 96)
+PATCH = (12, 80, 80)
 
 
 class Part(NamedTuple):

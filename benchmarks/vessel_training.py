@@ -24,6 +24,8 @@ from curvafit.scan import write_atomically
 
 LOSSES = ("dice+ce", "cldice", "skeleton", "curvature")
 FILTERS = (8, 16, 32, 48)
+#: Patches of a batch: a batch of one takes PyTorch's slow convolutions on one thread.
+BATCH = 2
 #: Batches over whose median the curvature prior's weight is balanced.
 BATCHES = 9
 
@@ -127,7 +129,9 @@ class Training:
         return float(np.median([prior.suggest_weight(dice_ce, batch) for batch in batches]))
 
     def batch(self, step: int) -> tuple[Tensor, Tensor]:
-        return patch(self.image, self.target, (self.seed, step % 2**32))
+        pairs = [patch(self.image, self.target, (self.seed, step % 2**32, k)) for k in range(BATCH)]
+        x, y = (torch.cat(tensors) for tensors in zip(*pairs, strict=True))
+        return x, y
 
     def save(self, path: Path) -> None:
         state = {"model": self.model.state_dict(), "optimiser": self.optimiser.state_dict(), "step": self.step}

@@ -48,7 +48,7 @@ class Budget(NamedTuple):
 BUDGETS = {
     "small": Budget(12, (4e-3,), (1.0,), ((0.3, 2.0),), False),
     "full": Budget(
-        450,
+        400,
         (1e-3, 2e-3, 4e-3, 8e-3),
         (0.1, 0.3, 1.0, 3.0),
         ((0.1, 2.0), (0.3, 2.0), (1.0, 2.0), (0.3, 1.0)),
@@ -186,6 +186,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     torch.use_deterministic_algorithms(True)
+    torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
     study = Study(options.output, BUDGETS[options.budget])
     rate = study.rate()
     chosen = {loss: study.chosen(loss, rate) for loss in LOSSES}
