@@ -65,5 +65,5 @@ def patch(image: np.ndarray, target: np.ndarray, seed: tuple[int, ...]) -> tuple
     window = tuple(slice(start, start + edge) for start, edge in zip(corner, PATCH, strict=True))
     turns, mirrors = int(random.integers(4)), tuple(axis for axis, value in enumerate(random.random(3)) if value < 0.5)
     x, y = (np.flip(np.rot90(values[window], turns, (1, 2)), mirrors) for values in (image, target))
-    x = random.uniform(0.8, 1.25) * x + random.uniform(-0.3, 0.3) + random.normal(0, random.uniform(0, 0.15), x.shape)
+    x = random.uniform(0.9, 1.1) * x + random.uniform(-0.1, 0.1) + random.normal(0, random.uniform(0, 0.1), x.shape)
     return torch.from_numpy(x.astype(np.float32))[None, None], torch.from_numpy(y.astype(np.float32))[None, None]

@@ -49,9 +49,12 @@ class Plan(NamedTuple):
 
 
 def network() -> nn.Module:
-    """A U-Net of four levels; slices are five times thicker than pixels, so the first stays in the plane."""
+    """A U-Net of four levels; slices are five times thicker than pixels, so the first stays in the plane.
+
+    Batch normalisation: instance normalisation would forget how bright a patch is.
+    """
     kernels, strides = [(1, 3, 3), 3, 3, 3], [1, (1, 2, 2), 2, 2]
-    model = DynUNet(3, 1, 1, kernels, strides, strides[1:], filters=FILTERS, norm_name="instance")
+    model = DynUNet(3, 1, 1, kernels, strides, strides[1:], filters=FILTERS, norm_name="batch")
     return model.to(memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
 
 
