@@ -11,7 +11,7 @@ pytest.importorskip("monai")
 from benchmarks.vessel_data import UNKNOWN, Part, annotated, sparse
 from benchmarks.vessel_report import stacked, table, verdict
 from benchmarks.vessel_scores import COUNTS, SCORES, block_counts, bootstrap, scores
-from benchmarks.vessel_training import LOSSES, Plan, Setting, Training, dice_ce, predict
+from benchmarks.vessel_training import LOSSES, Plan, Setting, Training, dice_ce, network, predict
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,8 @@ def test_dice_ce_sees_labelled_voxels_only(tubes):
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-def test_a_training_resumes_to_the_same_network(tubes, loss, tmp_path):
+def test_a_training_resumes_to_the_same_network(tubes, loss, tmp_path, monkeypatch):
+    monkeypatch.setattr("benchmarks.vessel_training.BATCHES", 1)
     plan, setting = Plan(2, 1, 1e-3), Setting(loss, 0.5, 4.0, "tubes")
     whole, again = Training(tubes, plan, 7), Training(tubes, plan, 8)
     whole.run(dice_ce, plan.alone)
@@ -45,8 +46,13 @@ def test_a_training_resumes_to_the_same_network(tubes, loss, tmp_path):
     again.load(tmp_path / "begun.pt")
     again.seed = 7
     assert whole.finish(setting) == again.finish(setting)
-    probability, twin = (predict(training.model, tubes.image) for training in (whole, again))
-    assert probability.shape == tubes.label.shape and (probability == twin).all()
+    pairs = zip(whole.model.state_dict().values(), again.model.state_dict().values(), strict=True)
+    assert all(torch.equal(one, other) for one, other in pairs)
+
+
+def test_a_prediction_covers_the_volume(tubes):
+    probability = predict(network(), tubes.image)
+    assert probability.shape == tubes.label.shape and 0 < probability.min() and probability.max() < 1
 
 
 def test_scores_of_a_perfect_and_of_a_broken_prediction(tubes):
