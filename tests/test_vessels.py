@@ -52,7 +52,7 @@ def test_a_training_resumes_to_the_same_network(tubes, loss, tmp_path, monkeypat
 
 def test_a_prediction_covers_the_volume(tubes):
     probability = predict(network(), tubes.image)
-    assert probability.shape == tubes.label.shape and 0 < probability.min() and probability.max() < 1
+    assert probability.shape == tubes.label.shape and 0 < probability.min() < probability.max() < 1
 
 
 def test_scores_of_a_perfect_and_of_a_broken_prediction(tubes):
