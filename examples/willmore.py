@@ -116,6 +116,12 @@ def _radius_ratio(flow: Flow) -> float:
     return float((radii.max() - radii.min()) / (radii.max() + radii.min()))
 
 
+def genus(flow: Flow) -> int:
+    """Of the surface where it ends, by its Euler number: vertices less half the triangles, for a closed mesh."""
+    shape = surface(flow.field, flow.grid)
+    return round(1 - (len(shape.vertices) - len(shape.faces) / 2) / 2)
+
+
 def extrapolated(rows: list[Row]) -> float:
     """The energy at ε = 0 and Δx/ε = 0, by terms in 1, ε² and (Δx/ε)²."""
     terms = [(1, row.epsilon**2, (row.flow.grid.spacing[0] / row.epsilon) ** 2) for row in rows]
@@ -127,7 +133,7 @@ def report(name: str, rows: list[Row]) -> list[str]:
     least, lines = MINIMA[name], []
     for row in rows:
         line = f"{name:13} {row.flow.grid.shape!s:16} {row.epsilon:6.3f} {row.energy:9.3f} {least:9.3f} "
-        line += f"{row.energy / least - 1:+8.2%}  {row.flow.status}"
+        line += f"{row.energy / least - 1:+8.2%}  genus {genus(row.flow)}, {row.flow.status}"
         lines.append(line)
     last = rows[-1]
     if len(rows) > 1:

@@ -163,6 +163,7 @@ def test_willmore_starts_have_their_genus(script, name: str, genus: int) -> None
     field, grid = script("willmore").start(name, 48, 4)
     shape = surface(field, grid)
     assert trimesh.Trimesh(shape.vertices, shape.faces).euler_number == 2 - 2 * genus
+    assert script("willmore").genus(SimpleNamespace(grid=grid, field=field)) == genus
 
 
 def test_willmore_energy_is_extrapolated(script) -> None:
