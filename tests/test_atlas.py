@@ -94,6 +94,7 @@ def test_an_interrupted_build_resumes_to_the_same_store_and_makes_no_draw_twice(
     assert first.seeds + second.seeds == whole.seeds  # a finished store asks for nothing
 
 
+@pytest.mark.slow
 def test_a_real_draw_is_what_its_record_says(tmp_path):
     quick = dataclasses.replace(schedule("fast"), name="quick", steps=30)
     grid = Grid((16,) * 3)

@@ -44,6 +44,7 @@ def interpreted() -> dict[str, str]:
 
 @needs_triton
 @pytest.mark.parametrize("name", CHECKS)
+@pytest.mark.slow
 def test_interpreted_kernels_are_the_definition(name: str, interpreted: dict[str, str]) -> None:
     if "only 0-dimensional arrays can be converted" in interpreted[name]:
         pytest.skip("needs a triton whose interpreter knows this NumPy")

@@ -68,6 +68,7 @@ def test_every_shape_looked_up_in_the_packaged_atlas_is_itself(packaged, seen_as
         assert first.distance < 0.05 < second.distance
 
 
+@pytest.mark.slow
 def test_the_short_list_keeps_the_true_nearest(packaged):
     """Against the distances to every third shape, with a short list in proportion: the nearest found, and 4 of 5."""
     part = every_third(packaged)

@@ -29,6 +29,7 @@ def mask_phase(tubes: torch.Tensor) -> torch.Tensor:
     return phase_field(tubes > 0, GRID, WORKING_EPSILON)
 
 
+@pytest.mark.slow
 def test_the_authors_sponge_gives_its_coefficients_back(data) -> None:
     (path,) = (data / "gallery").glob("sponge coeffs*.nii.gz")
     field = torch.from_numpy(np.asarray(nibabel.load(path).dataobj, dtype=np.float32))
