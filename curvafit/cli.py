@@ -19,11 +19,10 @@ from curvafit.cli_support import (
     command_line,
     output,
     plainly,
+    reading_of,
     say,
     stages,
     threshold_of,
-    triple,
-    whole_triple,
 )
 
 if TYPE_CHECKING:
@@ -101,13 +100,7 @@ def infer(
 ) -> None:
     """Infer the parameters of a scanned volume, and write a report."""
     with plainly():
-        reading = {
-            "spacing": None if spacing is None else triple(spacing, "--spacing"),
-            "raw_shape": None if raw_shape is None else whole_triple(raw_shape, "--raw-shape"),
-            "unit": unit,
-            "dtype": dtype,
-            "key": key,
-        }
+        reading = reading_of(spacing, unit, raw_shape, dtype, key)
         level = threshold_of(threshold)
         what = {"kind": kind, "periodic": periodic, "threshold": level, "dark": dark, "roi": roi, "label": label}
         found, report = _inferred(scan, out, {**what, "atlas": atlas, "seed": seed, **reading})

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli_support import command_line, plainly, say, stages, threshold_of, triple, whole_numbers, whole_triple
+from curvafit.cli_support import command_line, plainly, reading_of, say, stages, threshold_of, whole_numbers
 
 if TYPE_CHECKING:
     from curvafit.scan import Field
@@ -72,7 +72,7 @@ def segment(
 ) -> None:
     """Find the structure of a noisy scan under a curvature prior, with a picture (.png) and a record (.json)."""
     with plainly():
-        reading = _reading(spacing, unit, raw_shape, dtype, key)
+        reading = reading_of(spacing, unit, raw_shape, dtype, key)
         options = {"weight": weight, "threshold": threshold_of(threshold), "dark": dark, "epsilon": epsilon}
 
         def made(volume: Field, progress: Callable[[str, float], None]) -> Segmentation:
@@ -104,7 +104,7 @@ def reconstruct(
 ) -> None:
     """Fill a mask of which only some slices are known, with a picture (.png) and a record (.json)."""
     with plainly():
-        reading = _reading(spacing, unit, raw_shape, dtype, key)
+        reading = reading_of(spacing, unit, raw_shape, dtype, key)
         if axis.lower() not in ("z", "y", "x"):
             raise ValueError(f"expected --axis z, y or x, got {axis!r}")
         if (every is None) == (known is None):
@@ -118,18 +118,6 @@ def reconstruct(
             return fill(volume, prior, epsilon=epsilon, steps=steps, progress=progress, **options)  # type: ignore[arg-type]
 
         _run(slices, out, prior, reading, made, {"job": "reconstruct", "steps": steps, **options})
-
-
-def _reading(
-    spacing: str | None, unit: str | None, raw_shape: str | None, dtype: str | None, key: str | None
-) -> dict[str, Any]:
-    return {
-        "spacing": None if spacing is None else triple(spacing, "--spacing"),
-        "raw_shape": None if raw_shape is None else whole_triple(raw_shape, "--raw-shape"),
-        "unit": unit,
-        "dtype": dtype,
-        "key": key,
-    }
 
 
 def _run(

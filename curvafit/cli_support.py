@@ -9,6 +9,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 import typer
 from rich.console import Console
@@ -121,6 +122,19 @@ def device_of(text: str) -> str:
 def threshold_of(text: str) -> float | str:
     """A grey level, or `"otsu"`."""
     return text.lower() if text.lower() == "otsu" else numbers(text, "--threshold", 1)[0]
+
+
+def reading_of(
+    spacing: str | None, unit: str | None, raw_shape: str | None, dtype: str | None, key: str | None
+) -> dict[str, Any]:
+    """The options that say how to read a file, as `scan.load` takes them."""
+    return {
+        "spacing": None if spacing is None else triple(spacing, "--spacing"),
+        "raw_shape": None if raw_shape is None else whole_triple(raw_shape, "--raw-shape"),
+        "unit": unit,
+        "dtype": dtype,
+        "key": key,
+    }
 
 
 # ---- printing --------------------------------------------------------------------------------------------------------

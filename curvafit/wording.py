@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from curvafit.priors.grid import METRES
+
 if TYPE_CHECKING:
     from curvafit.diagram import Diagram
     from curvafit.infer import Inference
 
-#: Metres in each unit of length, small to large.
-METRES = {"nm": 1e-9, "um": 1e-6, "mm": 1e-3, "m": 1.0}
 #: tan 22.5°: how far in direction a point may lie from a family's ideal one.
 _NARROW = math.tan(math.pi / 8)
 #: A space that no line breaks at.

@@ -4,23 +4,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from os import PathLike
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from curvafit.priors.coefficients import PRESETS, Coefficients
-from curvafit.priors.fit_file import read_fit
-from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
+from curvafit.priors.coefficients import Coefficients
+from curvafit.priors.fit_file import Law, find_law
+from curvafit.priors.grid import METRES, WORKING_EPSILON, Grid
 from curvafit.priors.loss import RESOLVED, upsampling
 from curvafit.priors.refined import refined
 from curvafit.scan import Field, ScanError
-from curvafit.wording import METRES
 
 __all__ = ["Law", "Place", "law_of"]
-
-Law = Coefficients | str | PathLike[str]
 
 
 def law_of(prior: Law, scan: Field) -> tuple[Coefficients, tuple[str, ...]]:
@@ -33,24 +29,16 @@ def law_of(prior: Law, scan: Field) -> tuple[Coefficients, tuple[str, ...]]:
     FileNotFoundError
         If there is no such file.
     """
-    if isinstance(prior, Coefficients):
-        if any(isinstance(value, Tensor) and value.dim() > 0 for value in prior):
-            raise ScanError("expected coefficients that are numbers, got some that vary")
-        return prior, ()
-    if isinstance(prior, str) and prior in PRESETS:
-        unit = WORKING_SPACING / min(scan.spacing)
-        return PRESETS[prior].coefficients.in_unit(unit), (
-            f"The preset {prior}, at a working voxel of one scan voxel.",
-        )
-    if isinstance(prior, str) and not prior.endswith(".json"):
-        raise ScanError(f"expected a preset among {', '.join(PRESETS)}, or a fit.json, got {prior!r}")
-    fit = read_fit(prior)
-    if fit.unit == scan.unit:
-        return fit.physical, ()
-    if not {fit.unit, scan.unit} <= METRES.keys():
-        raise ScanError(f"expected a scan whose unit of length compares with the prior's {fit.unit}, got {scan.unit}")
-    said = f"The prior's lengths, in {fit.unit}, are taken to {scan.unit}."
-    return fit.physical.in_unit(METRES[scan.unit] / METRES[fit.unit]), (said,)
+    found = find_law(prior, min(scan.spacing))
+    if isinstance(found, Coefficients):
+        named = f"The preset {prior}, at a working voxel of one scan voxel."
+        return found, () if isinstance(prior, Coefficients) else (named,)
+    if found.unit == scan.unit:
+        return found.physical, ()
+    if not {found.unit, scan.unit} <= METRES.keys():
+        raise ScanError(f"expected a scan whose unit of length compares with the prior's {found.unit}, got {scan.unit}")
+    said = f"The prior's lengths, in {found.unit}, are taken to {scan.unit}."
+    return found.in_unit(scan.unit), (said,)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, Self
 
 import torch
 from torch import Tensor
@@ -26,7 +26,23 @@ class Data(Protocol):
 
 
 @dataclass(frozen=True)
-class Evidence:
+class _OfVoxels:
+    """What has a number r a voxel."""
+
+    ratio: Float[Tensor, "z y x"]
+
+    def __post_init__(self) -> None:
+        if self.ratio.dim() != 3 or not math.isfinite(float(self.ratio.abs().max())):
+            got = f"one of shape {tuple(self.ratio.shape)} or not finite"
+            raise ValueError(f"expected finite evidence (Z, Y, X), got {got}")
+
+    def to(self, device: torch.device | str, /) -> Self:
+        """The same on a device."""
+        return type(self)(self.ratio.to(device))
+
+
+@dataclass(frozen=True)
+class Evidence(_OfVoxels):
     """D(u) = V Σ r (½ - q(u)), q(u) = (3u - u³) / 4 on [-1, 1] and ±½ beyond.
 
     r is what a voxel says for the inside (positive) or the outside, V the voxel's volume. Where u is ±1 this is the
@@ -44,11 +60,6 @@ class Evidence:
         If it is not a finite 3D tensor.
     """
 
-    ratio: Float[Tensor, "z y x"]
-
-    def __post_init__(self) -> None:
-        _check(self.ratio)
-
     def slope(self, u: Float[Tensor, "z y x"], grid: Grid, /) -> tuple[float, Float[Tensor, "z y x"]]:
         """D(u) and its gradient."""
         r, v = self.ratio.to(u.dtype), u.clamp(-1, 1)
@@ -56,13 +67,9 @@ class Evidence:
         value = float((r * (0.5 - v * (3 - v2) / 4)).sum(dtype=torch.float64)) * grid.voxel_volume
         return value, r * (v2 - 1) * (0.75 * grid.voxel_volume)
 
-    def to(self, device: torch.device | str, /) -> Evidence:
-        """The same on a device."""
-        return Evidence(self.ratio.to(device))
-
 
 @dataclass(frozen=True)
-class Hinge:
+class Hinge(_OfVoxels):
     """D(u) = V Σ |r| (1 - sign(r) u)₊² / 4: holds u at ±1 or beyond on the side that r says.
 
     For voxels that are known: no force where they are right, a spring where they are not; wrong by 2 costs |r|.
@@ -78,23 +85,9 @@ class Hinge:
         If it is not a finite 3D tensor.
     """
 
-    ratio: Float[Tensor, "z y x"]
-
-    def __post_init__(self) -> None:
-        _check(self.ratio)
-
     def slope(self, u: Float[Tensor, "z y x"], grid: Grid, /) -> tuple[float, Float[Tensor, "z y x"]]:
         """D(u) and its gradient."""
         r = self.ratio.to(u.dtype)
         short, size = (1 - r.sign() * u).clamp_min(0), r.abs()
         value = float((size * short * short).sum(dtype=torch.float64)) * grid.voxel_volume / 4
         return value, r * short * (-0.5 * grid.voxel_volume)
-
-    def to(self, device: torch.device | str, /) -> Hinge:
-        """The same on a device."""
-        return Hinge(self.ratio.to(device))
-
-
-def _check(ratio: Tensor) -> None:
-    if ratio.dim() != 3 or not math.isfinite(float(ratio.abs().max())):
-        raise ValueError(f"expected finite evidence (Z, Y, X), got one of shape {tuple(ratio.shape)} or not finite")

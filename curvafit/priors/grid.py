@@ -8,7 +8,7 @@ from typing import Literal
 
 Boundary = Literal["periodic", "replicate"]
 
-#: Units of length that files name, in metres.
+#: Metres in each unit of length that files name, small to large.
 METRES = {"nm": 1e-9, "um": 1e-6, "mm": 1e-3, "m": 1.0}
 #: Length of a voxel's edge in working units; the published parameters are all stated at this sampling.
 WORKING_SPACING = 0.01

@@ -11,12 +11,10 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from curvafit.priors.coefficients import PRESETS, Coefficients
-from curvafit.priors.fit_file import read_fit
-from curvafit.priors.grid import METRES, WORKING_SPACING, Grid
+from curvafit.priors.coefficients import Coefficients
+from curvafit.priors.fit_file import Law, find_law
+from curvafit.priors.grid import Grid
 from curvafit.priors.loss import RESOLVED, curvature_prior, upsampling
-
-Law = Coefficients | str | PathLike[str]
 
 _REDUCTIONS, _NORMALIZATIONS = ("mean", "sum", "none"), ("voxel", "area")
 
@@ -239,20 +237,8 @@ def _weights(weight: float | Sequence[float]) -> tuple[float, ...]:
 
 def _numbers(law: Law, edge: float, unit: str | None) -> Coefficients:
     """Coefficients with lengths in spacing's unit."""
-    if isinstance(law, Coefficients):
-        if any(isinstance(value, Tensor) and value.dim() > 0 for value in law):
-            raise ValueError("expected coefficients that are numbers, got some that vary")
-        return law
-    if isinstance(law, str) and law in PRESETS:
-        return PRESETS[law].coefficients.in_unit(WORKING_SPACING / edge)
-    if isinstance(law, str) and not law.endswith(".json"):
-        raise ValueError(f"expected a preset among {', '.join(PRESETS)}, or a fit.json, got {law!r}")
-    fit = read_fit(law)
-    if unit is None or unit == fit.unit:
-        return fit.physical
-    if unit not in METRES or fit.unit not in METRES:
-        raise ValueError(f"expected two units among {', '.join(METRES)}, got {unit} and the fit's {fit.unit}")
-    return fit.physical.in_unit(METRES[unit] / METRES[fit.unit])
+    found = find_law(law, edge)
+    return found if isinstance(found, Coefficients) else found.in_unit(unit)
 
 
 def _each(values: tuple, classes: int, name: str) -> tuple:
