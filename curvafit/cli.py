@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli_data import atlas_app, samples_app
+from curvafit.cli_atlas import atlas_app
 from curvafit.cli_generate import EXAMPLES, generate, presets
 from curvafit.cli_hosts import EXAMPLE as NNUNET_EXAMPLE
 from curvafit.cli_hosts import nnunet
+from curvafit.cli_samples import samples_app
 from curvafit.cli_segment import RECONSTRUCT_EXAMPLES, SEGMENT_EXAMPLES, reconstruct, segment
 from curvafit.cli_support import (
     command_line,

@@ -1,4 +1,4 @@
-"""The commands about data: sample volumes and atlases."""
+"""The command about sample volumes."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ from typing import Annotated
 
 import typer
 
-from curvafit.cli_support import command_line, error_console, output, plainly, say, stages, whole_triple
+from curvafit.cli_support import error_console, output, plainly, say
 
 #: The sample that needs no network, and what the list says of it.
 SYNTHETIC = "synthetic"
 _SYNTHETIC_SAYS = ("a generated trabecular shape, imaged with blur and noise", "MIT", "made on the spot")
 
 samples_app = typer.Typer(help="Volumes to try things on, with their licences.", invoke_without_command=True)
-atlas_app = typer.Typer(help="Collections of generated shapes to match scans against.", no_args_is_help=True)
 
 
 @samples_app.callback()
@@ -71,48 +70,3 @@ def _copied(path: Path, target: Path) -> Path:
 
 def _copy(source: Path, target: Path) -> None:
     shutil.copyfile(source, target)
-
-
-@atlas_app.command("build", epilog="[bold]Example[/bold]\n\ncurvafit atlas build store.zarr --count 240 --shape 56")
-def build_atlas(
-    store: Annotated[Path, typer.Argument(help="Folder of the Zarr store; resumed where it exists.")],
-    count: Annotated[int, typer.Option(help="Viable shapes to end with.")] = 240,
-    shape: Annotated[str, typer.Option(help="Voxels: N or Z,Y,X.")] = "56",
-    seed: Annotated[int, typer.Option(help="Of the random law.")] = 0,
-    schedule: Annotated[str, typer.Option(help="fast or paper.")] = "fast",
-) -> None:
-    """Generate shapes of the random law into a store, until enough are viable."""
-    with plainly():
-        box = whole_triple(shape, "--shape")
-        from curvafit.data_synth.atlas import build
-
-        with stages() as progress:
-            build(
-                store,
-                count,
-                box,
-                seed,
-                schedule,
-                lambda record, viable, draws: progress(f"{viable} viable of {draws} draws", viable / count),
-            )
-        say(str(store))
-
-
-@atlas_app.command("extract", epilog="[bold]Example[/bold]\n\ncurvafit atlas extract store.zarr -o atlas.npz")
-def extract_atlas(
-    store: Annotated[Path, typer.Argument(help="A store made by `curvafit atlas build`.")],
-    out: Annotated[Path, typer.Option("-o", "--output", help="The atlas (.npz) to write.")],
-) -> None:
-    """Measure a store's shapes, and write the atlas that `infer --atlas` reads."""
-    with plainly():
-        if out.suffix.lower() != ".npz":
-            raise ValueError(f"expected a name ending in .npz, got {out.name!r}")
-        from curvafit.index import extract, save_atlas
-        from curvafit.shape_files import check_folder
-
-        check_folder(out.parent)
-        atlas = extract(store, [command_line()])
-        out.parent.mkdir(parents=True, exist_ok=True)
-        save_atlas(atlas, out)
-        say(f"{len(atlas.ids)} shapes", to=error_console())
-        say(str(out))
