@@ -2,39 +2,107 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from curvafit.cli_support import command_line, error_console, plainly, say, stages, whole_triple
 
+if TYPE_CHECKING:
+    from curvafit.data_synth.atlas import Progress
+    from curvafit.data_synth.design import Design
+    from curvafit.data_synth.workers import Workers
+
 atlas_app = typer.Typer(help="Collections of generated shapes to match scans against.", no_args_is_help=True)
 
 
-@atlas_app.command("build", epilog="[bold]Example[/bold]\n\ncurvafit atlas build store.zarr --count 240 --shape 56")
+_Workers = Annotated[
+    int | None, typer.Option(help="Processes on this machine; as many as cores by default, 0 for none but this.")
+]
+_Scheduler = Annotated[str | None, typer.Option(help="A running dask scheduler, tcp://HOST:PORT, instead.")]
+_Store = Annotated[Path, typer.Argument(help="Folder of the Zarr store.")]
+
+
+@atlas_app.command(
+    "build",
+    epilog="[bold]Examples[/bold]\n\n"
+    "curvafit atlas build store.zarr --count 1000 --shape 64\n\n"
+    "curvafit atlas build tubes.zarr --around tubes --spread 0.2 --count 100\n\n"
+    "curvafit atlas build box.zarr --design box.yaml --scheduler tcp://node1:8786",
+)
 def build_atlas(
     store: Annotated[Path, typer.Argument(help="Folder of the Zarr store; resumed where it exists.")],
-    count: Annotated[int, typer.Option(help="Viable shapes to end with.")] = 240,
-    shape: Annotated[str, typer.Option(help="Voxels: N or Z,Y,X.")] = "56",
-    seed: Annotated[int, typer.Option(help="Of the random law.")] = 0,
+    count: Annotated[int, typer.Option(help="Viable shapes to end with.")] = 1000,
+    shape: Annotated[str, typer.Option(help="Voxels: N or Z,Y,X.")] = "64",
+    seed: Annotated[int, typer.Option(help="Of the design.")] = 0,
+    design: Annotated[str, typer.Option(help="random, sobol, or a YAML file (docs/atlas.md).")] = "random",
+    around: Annotated[str | None, typer.Option(help="A preset or fit.json to draw around, instead.")] = None,
+    spread: Annotated[float | None, typer.Option(help="With --around: share of the random law's intervals.")] = None,
     schedule: Annotated[str, typer.Option(help="fast or paper.")] = "fast",
+    workers: _Workers = None,
+    scheduler: _Scheduler = None,
 ) -> None:
-    """Generate shapes of the random law into a store, until enough are viable."""
+    """Generate shapes into a store, until enough are viable. A killed build goes on where it was."""
     with plainly():
         box = whole_triple(shape, "--shape")
+        law = _design(design, around, spread)
         from curvafit.data_synth.atlas import build
 
-        with stages() as progress:
-            build(
-                store,
-                count,
-                box,
-                seed,
-                schedule,
-                lambda record, viable, draws: progress(f"{viable} viable of {draws} draws", viable / count),
-            )
+        with _made(count, workers, scheduler) as (crew, progress):
+            build(store, count, box, seed, schedule, progress, design=law, workers=crew)
         say(str(store))
+
+
+@atlas_app.command("extend", epilog="[bold]Example[/bold]\n\ncurvafit atlas extend store.zarr --count 500")
+def extend_atlas(
+    store: _Store,
+    count: Annotated[int, typer.Option(help="Viable shapes to add.")] = 100,
+    workers: _Workers = None,
+    scheduler: _Scheduler = None,
+) -> None:
+    """Add shapes to a store, of its own design and settings."""
+    with plainly():
+        from curvafit.data_synth.atlas import extend
+        from curvafit.data_synth.store import open_store
+
+        with _made(open_store(store).wanted + count, workers, scheduler) as (crew, progress):
+            extend(store, count, progress, workers=crew)
+        say(str(store))
+
+
+@atlas_app.command("info", epilog="[bold]Example[/bold]\n\ncurvafit atlas info store.zarr")
+def atlas_info(store: _Store) -> None:
+    """What a store holds, and how it was made."""
+    with plainly():
+        from curvafit.data_synth.census import census
+        from curvafit.data_synth.store import open_store
+
+        for name, value in census(open_store(store)).items():
+            say(f"{name}: {value}")
+
+
+@atlas_app.command("verify", epilog="[bold]Example[/bold]\n\ncurvafit atlas verify store.zarr --regenerate 5")
+def verify_atlas(
+    store: _Store,
+    regenerate: Annotated[int, typer.Option(help="Draws to make again and compare.")] = 3,
+    seed: Annotated[int, typer.Option(help="Of the choice of these.")] = 0,
+) -> None:
+    """Check every draw of a store. Exit code 1 where something is lost, torn, doubled or not what it says."""
+    with plainly():
+        from curvafit.data_synth.census import verify
+
+        with stages() as progress:
+            found = verify(store, regenerate, seed, progress)
+        for note in found.notes:
+            say(f"note: {note}")
+        for problem in found.problems:
+            say(f"error: {problem}", to=error_console())
+        say(found.status)
+    if found.problems:
+        raise typer.Exit(1)
 
 
 @atlas_app.command("extract", epilog="[bold]Example[/bold]\n\ncurvafit atlas extract store.zarr -o atlas.npz")
@@ -55,3 +123,34 @@ def extract_atlas(
         save_atlas(atlas, out)
         say(f"{len(atlas.ids)} shapes", to=error_console())
         say(str(out))
+
+
+def _design(name: str, around: str | None, spread: float | None) -> Design:
+    """The design that the options name."""
+    from curvafit.data_synth import design, design_file
+
+    if around is not None:
+        if name not in ("random", "sobol"):
+            raise ValueError(f"expected either --around or a design's file, got {around} and {name}")
+        share = design_file.SPREAD if spread is None else spread
+        return design.around(design_file.point_of(around), share, name)  # type: ignore[arg-type]
+    if spread is not None:
+        raise ValueError("expected --around beside --spread, got none")
+    if name in ("random", "sobol"):
+        return design.boxed(name)  # type: ignore[arg-type]
+    return design_file.read_design(name)
+
+
+@contextmanager
+def _made(count: int, workers: int | None, scheduler: str | None) -> Iterator[tuple[Workers, Progress]]:
+    """Workers, and a progress bar for them; Ctrl-C says that nothing is lost."""
+    from curvafit.data_synth.workers import cluster
+
+    try:
+        with stages() as progress:
+            progress("starting workers", 0.0)
+            with cluster(workers, scheduler) as crew:
+                yield crew, lambda _, viable, draws: progress(f"{viable} viable of {draws} draws", viable / count)
+    except KeyboardInterrupt:
+        say("interrupted: what is made is kept, and the same command goes on with it", to=error_console())
+        raise typer.Exit(130) from None

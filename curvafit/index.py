@@ -19,7 +19,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from curvafit.data_synth.atlas import BIN_WIDTH, diagrams, versions
+from curvafit.data_synth.atlas import BIN_WIDTH, diagrams
+from curvafit.data_synth.design import boxed
+from curvafit.data_synth.draws import versions
 from curvafit.data_synth.store import Record, Store, open_store
 from curvafit.diagram import Diagram
 from curvafit.priors.coefficients import Coefficients
@@ -215,7 +217,9 @@ def _build_command(store: Store, viable: int) -> str:
     """The command that makes the same store: building stops at its last viable draw."""
     settings = store.settings
     shape, name = ",".join(map(str, settings.shape)), settings.schedule["name"]
-    options = f"--count {viable} --shape {shape} --seed {settings.seed} --schedule {name}"
+    known = {json.dumps(boxed(law).as_dict()): law for law in ("random", "sobol")}
+    design = known.get(json.dumps(settings.design), "design.yaml")
+    options = f"--count {viable} --shape {shape} --seed {settings.seed} --design {design} --schedule {name}"
     return f"curvafit atlas build {store.path.name} {options}"
 
 

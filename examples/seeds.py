@@ -18,7 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.progress import track
 
-from curvafit.data_synth.design import random_law, start_seed
+from curvafit.data_synth.design import boxed
 from curvafit.plot import CONTOUR, DIAGONAL, write_picture
 from curvafit.priors.coefficients import preset
 from curvafit.transport import TAIL_SHARE, wasserstein_many
@@ -60,7 +60,7 @@ def random_shapes(options: Namespace) -> tuple[list[Shape], int]:
     found: list[Shape] = []
     index = 0
     while len(found) < options.count:
-        (a, mass), seed = random_law(options.seed, index), start_seed(options.seed, index)
+        a, mass, seed = boxed().draw(options.seed, index)
         path = options.output / f"random-{index:04d}.npz"
         shape = grown(path, a, mass, options, keep=False, seed=seed, reject_early=True)
         found += [shape] if shape.facts["viable"] else []

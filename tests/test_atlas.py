@@ -12,7 +12,8 @@ import pytest
 import torch
 
 from curvafit.data_synth import atlas as building
-from curvafit.data_synth.design import INTERVALS, random_law, start_seed
+from curvafit.data_synth import draws
+from curvafit.data_synth.design import INTERVALS, boxed
 from curvafit.data_synth.store import open_store
 from curvafit.generation.schedule import schedule
 from curvafit.generation.viability import Viability
@@ -31,17 +32,20 @@ def ball(radius: float) -> torch.Tensor:
 
 
 class Balls:
-    """Stands for `generate`: a ball sized by the mass, viable where a11 > 0; remembers its calls, may be stopped."""
+    """Stands for `generate_batch`: a ball sized by the mass, viable where a11 > 0; remembers, may be stopped."""
 
     def __init__(self, stop_after: int | None = None) -> None:
         self.seeds: list[int] = []
         self.stop_after = stop_after
         self.highest = 1.0
 
-    def __call__(self, coefficients, mass, grid, *, seed, reject_early, **options):
+    def __call__(self, coefficients, masses, grid, *, seeds, reject_early, **options):
+        assert reject_early
+        return (self._made(*job) for job in zip(coefficients, masses, seeds, strict=True))
+
+    def _made(self, coefficients, mass, seed):
         if len(self.seeds) == self.stop_after:
             raise KeyboardInterrupt
-        assert reject_early
         self.seeds.append(seed)
         viable = coefficients.a11 > 0
         history = types.SimpleNamespace(step=np.array([1, 9]), energy=np.array([2.0, 1.0]))
@@ -53,7 +57,7 @@ class Balls:
 @pytest.fixture
 def balls(monkeypatch):
     stand_in = Balls()
-    monkeypatch.setattr(building, "generate", stand_in)
+    monkeypatch.setattr(draws, "generate_batch", stand_in)
     return stand_in
 
 
@@ -69,8 +73,8 @@ def test_building_draws_in_order_until_enough_are_viable(tmp_path, balls):
     assert store.indices() == list(range(len(records)))
     assert sum(record.viability.viable for record in records) == 5 and records[-1].viability.viable
     assert any(not record.viability.viable for record in records)
-    assert [(record.coefficients, record.mass) for record in records] == [random_law(1, i) for i in store.indices()]
-    assert balls.seeds == [record.seed for record in records] == [start_seed(1, i) for i in store.indices()]
+    assert [(r.coefficients, r.mass, r.seed) for r in records] == [boxed().draw(1, i) for i in store.indices()]
+    assert balls.seeds == [record.seed for record in records]
     assert [(record.index, draws) for record, _, draws in said] == [(i, i + 1) for i in store.indices()]
     assert (records[0].steps, records[0].energy) == (9, 1.0)
     assert store.settings.schedule == dataclasses.asdict(schedule("fast"))
@@ -78,12 +82,12 @@ def test_building_draws_in_order_until_enough_are_viable(tmp_path, balls):
 
 def test_an_interrupted_build_resumes_to_the_same_store_and_makes_no_draw_twice(tmp_path, monkeypatch):
     whole, first, second = Balls(), Balls(stop_after=4), Balls()
-    monkeypatch.setattr(building, "generate", whole)
+    monkeypatch.setattr(draws, "generate_batch", whole)
     straight = building.build(tmp_path / "straight.zarr", 5, SHAPE)
-    monkeypatch.setattr(building, "generate", first)
+    monkeypatch.setattr(draws, "generate_batch", first)
     with pytest.raises(KeyboardInterrupt):
         building.build(tmp_path / "s.zarr", 5, SHAPE)
-    monkeypatch.setattr(building, "generate", second)
+    monkeypatch.setattr(draws, "generate_batch", second)
     resumed = building.build(tmp_path / "s.zarr", 5, SHAPE)
     assert len(first.seeds) == 4 and first.seeds + second.seeds == whole.seeds
     assert resumed.indices() == straight.indices()
@@ -98,10 +102,9 @@ def test_an_interrupted_build_resumes_to_the_same_store_and_makes_no_draw_twice(
 def test_a_real_draw_is_what_its_record_says(tmp_path):
     quick = dataclasses.replace(schedule("fast"), name="quick", steps=30)
     grid = Grid((16,) * 3)
-    building._draw(open_store(tmp_path / "s.zarr", _settings(grid, quick)), 0, grid, quick)
-    store = open_store(tmp_path / "s.zarr")
-    record = store.record(0)
-    assert record.versions["torch"] == building.versions()["torch"]
+    store = open_store(tmp_path / "s.zarr", _settings(grid, quick))
+    (record,) = draws.make(store.path, [0])
+    assert store.record(0) == record and record.versions == draws.versions()
     assert 0 < record.steps <= 30 and np.isfinite(record.energy)
     if record.viability.viable:
         assert float(store.field(0).mean()) == pytest.approx(record.mass, abs=1e-6)
@@ -126,7 +129,7 @@ def test_an_atlas_holds_what_the_store_does(tmp_path, atlas):
     for measured in atlas.diagrams("field"):  # balls: κ1 and κ2 are 1/R all over, the area 4πR²
         κ = np.average(measured.points, axis=0, weights=measured.weights)
         assert measured.weights.sum() * κ[0] * κ[1] == pytest.approx(4 * np.pi, rel=0.12)
-    build = f"curvafit atlas build s.zarr --count {len(viable)} --shape 20,20,20 --seed 2 --schedule fast"
+    build = f"curvafit atlas build s.zarr --count {len(viable)} --shape 20,20,20 --seed 2 --design random --schedule fast"
     assert atlas.provenance["command"] == [build, "then this"]
     assert atlas.provenance["settings"]["seed"] == 2
     assert atlas.provenance["draws"] == len(store.indices())
@@ -219,8 +222,8 @@ def test_the_packaged_atlas_is_of_the_random_law_and_small():
     assert settings["schedule"]["name"] == "fast" and min(settings["shape"]) >= 48
     for position, name in enumerate(atlas.ids):
         seed, index = map(int, name.split("-"))
-        assert random_law(seed, index) == (atlas.shape_coefficients(position), atlas.masses[position])
-        assert start_seed(seed, index) == atlas.seeds[position]
+        made = (atlas.shape_coefficients(position), atlas.masses[position], atlas.seeds[position])
+        assert boxed().draw(seed, index) == made
     low, high = INTERVALS["mass"]
     assert low < atlas.masses.min() and atlas.masses.max() < high
     assert all(np.isfinite(d.points).all() and d.weights.min() > 0 for d in atlas.diagrams("mask"))
@@ -229,4 +232,4 @@ def test_the_packaged_atlas_is_of_the_random_law_and_small():
 
 def _settings(grid: Grid, plan) -> building.Settings:
     epsilon, blur = building.WORKING_EPSILON, building.WORKING_BLUR
-    return building.Settings(grid.shape, grid.spacing, epsilon, blur, building.LAW, 0, dataclasses.asdict(plan))
+    return building.Settings(grid.shape, grid.spacing, epsilon, blur, boxed().as_dict(), 0, dataclasses.asdict(plan))

@@ -147,7 +147,7 @@ def test_another_version_or_other_settings_are_refused_in_one_sentence(tmp_path)
     header = json.loads((path / "zarr.json").read_text())
     header["attributes"]["version"] = 99
     (path / "zarr.json").write_text(json.dumps(header))
-    with pytest.raises(ValueError, match="expected a store of version 1 at .*, got version 99"):
+    with pytest.raises(ValueError, match="expected a store of version 2 at .*, got version 99"):
         open_store(path)
 
 

@@ -5,18 +5,25 @@ if __name__ != "curvafit.data_synth":
         "import curvafit.data_synth, not data_synth: the folder at the project's root is a link into the package"
     )
 
-from curvafit.data_synth.atlas import build, diagrams
-from curvafit.data_synth.design import INTERVALS, random_law, start_seed
+from curvafit.data_synth.atlas import build, diagrams, extend
+from curvafit.data_synth.design import INTERVALS, Design, Draw, around, boxed
+from curvafit.data_synth.design_file import read_design
 from curvafit.data_synth.store import Record, Settings, Store, open_store
+from curvafit.data_synth.workers import cluster
 
 __all__ = [
     "INTERVALS",
+    "Design",
+    "Draw",
     "Record",
     "Settings",
     "Store",
+    "around",
+    "boxed",
     "build",
+    "cluster",
     "diagrams",
+    "extend",
     "open_store",
-    "random_law",
-    "start_seed",
+    "read_design",
 ]

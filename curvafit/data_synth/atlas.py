@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.metadata
-import math
-import platform
-import time
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import torch
 
-from curvafit.data_synth.design import LAW, random_law, start_seed
+from curvafit.data_synth.design import Design, boxed
 from curvafit.data_synth.store import Record, Settings, Store, open_store
+from curvafit.data_synth.workers import Here, Workers
 from curvafit.diagram import Diagram, diagram
-from curvafit.generation.flow import WORKING_BLUR, generate
+from curvafit.generation.flow import WORKING_BLUR
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.schedule import schedule as named_schedule
 from curvafit.priors.grid import WORKING_EPSILON, Grid
@@ -26,6 +24,8 @@ from curvafit.transport import TAIL_SHARE
 Progress = Callable[[Record, int, int], None]
 #: Edge of the bins in the (κ1, κ2) plane, in 1 / working unit: the one that distances are taken with.
 BIN_WIDTH = 2.0
+#: A design is given up when none of its first so many draws was viable, or fewer than one in so many.
+BARREN = 200
 
 
 def build(
@@ -35,10 +35,14 @@ def build(
     seed: int = 0,
     schedule: str | Schedule = "fast",
     progress: Progress | None = None,
+    *,
+    design: Design | None = None,
+    workers: Workers | None = None,
 ) -> Store:
-    """Generate draws 0, 1, 2 … of the random law until `count` are viable; resumes a store that has some already.
+    """Generate draws 0, 1, 2 … of a design until `count` are viable; resumes a store that has some already.
 
-    Draw i depends on (seed, i) alone, so however often it is stopped and resumed, the store ends with the same draws.
+    Draw i depends on (design, seed, i) alone, so however often it is stopped and resumed, and by however many workers
+    it is made, the store ends with the same draws: the last of them is the `count`-th viable one.
 
     Parameters
     ----------
@@ -50,31 +54,42 @@ def build(
         Voxels (z, y, x), or one number for a cube; the box is periodic, in working units.
     progress
         Called after every new draw with its record, the number of viable draws and of all draws.
+    design
+        Experiment 4's random law by default.
+    workers
+        Whoever makes the draws (`cluster`); this process by default.
 
     Raises
     ------
     ValueError
-        If `count` is not positive, or the store was made with other settings or by another format version.
+        If `count` is not positive, the store was made with other settings or by another format version, or hardly any
+        draw of the design is viable.
+    OSError
+        If the store can't be written, or the workers are gone. What was made is kept.
     """
     if count < 1:
         raise ValueError(f"expected a count of at least 1 shape, got {count}")
     z, y, x = (shape,) * 3 if isinstance(shape, int) else shape
     grid = Grid((z, y, x))
-    plan = named_schedule(schedule)
-    settings = Settings(
-        grid.shape, grid.spacing, WORKING_EPSILON, WORKING_BLUR, LAW, int(seed), dataclasses.asdict(plan)
-    )
-    store = open_store(store_path, settings)
-    done = {index: store.record(index).viability.viable for index in store.indices()}
-    index = 0
-    while sum(done.values()) < count:
-        if index not in done:
-            record = _draw(store, index, grid, plan)
-            done[index] = record.viability.viable
-            if progress is not None:
-                progress(record, sum(done.values()), len(done))
-        index += 1
-    return store
+    plan, law = dataclasses.asdict(named_schedule(schedule)), (design or boxed()).as_dict()
+    settings = Settings(grid.shape, grid.spacing, WORKING_EPSILON, WORKING_BLUR, law, int(seed), plan)
+    return _filled(open_store(store_path, settings), count, workers or Here(), progress)
+
+
+def extend(
+    store_path: str | Path, count: int, progress: Progress | None = None, *, workers: Workers | None = None
+) -> Store:
+    """Go on with a store, by its own settings, until it has `count` more viable shapes than were asked of it so far.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError, OSError
+        If there is no store, or as `build`.
+    """
+    if count < 1:
+        raise ValueError(f"expected a count of at least 1 more shape, got {count}")
+    store = open_store(store_path)
+    return _filled(store, store.wanted + count, workers or Here(), progress)
 
 
 def diagrams(field: torch.Tensor, grid: Grid, epsilon: float) -> tuple[Diagram, Diagram]:
@@ -88,46 +103,29 @@ def diagrams(field: torch.Tensor, grid: Grid, epsilon: float) -> tuple[Diagram, 
     return of_field, of_mask
 
 
-def versions() -> dict[str, str]:
-    """Versions of Python and of the libraries that a generated field depends on."""
-    names = ("curvafit", "torch", "numpy", "numba")
-    return {"python": platform.python_version()} | {name: _version(name) for name in names}
+def _filled(store: Store, count: int, workers: Workers, progress: Progress | None) -> Store:
+    """Ask for draws in order, never for more than may still be wanted: nothing is made beyond the last viable one."""
+    store.want(count)
+    viable = {index: store.record(index).viability.viable for index in store.indices()}
+    asked = 0
+    todo = (index for index in itertools.count() if index not in viable)
+    while (found := sum(viable.values())) < count:
+        while chunk := _chunk(todo, min(workers.chunk, count - found - asked), asked, workers):
+            workers.submit(store.path, chunk)
+            asked += len(chunk)
+        for record in workers.done():
+            asked -= 1
+            viable[record.index] = record.viability.viable
+            if progress is not None:
+                progress(record, sum(viable.values()), len(viable))
+        if len(viable) > BARREN * (1 + sum(viable.values())):
+            raise ValueError(
+                f"expected a design with viable shapes, got {sum(viable.values())} of {len(viable)} draws: "
+                f"the last was not, as {record.status}"
+            )
+    return store
 
 
-def _draw(store: Store, index: int, grid: Grid, plan: Schedule) -> Record:
-    """Generate one draw and store it."""
-    settings = store.settings
-    coefficients, mass = random_law(settings.seed, index)
-    seed = start_seed(settings.seed, index)
-    began = time.perf_counter()
-    flow = generate(
-        coefficients,
-        mass,
-        grid,
-        schedule=plan,
-        seed=seed,
-        epsilon=settings.epsilon,
-        blur=settings.blur,
-        reject_early=True,
-    )
-    record = Record(
-        index=index,
-        coefficients=coefficients,
-        mass=mass,
-        seed=seed,
-        steps=int(flow.history.step[-1]) if len(flow.history.step) else 0,
-        viability=flow.viability,
-        energy=float(flow.history.energy[-1]) if len(flow.history.energy) else math.nan,
-        status=flow.status,
-        versions=versions(),
-        seconds=time.perf_counter() - began,
-    )
-    store.write(record, flow.field.cpu().numpy().astype("float32") if record.viability.viable else None)
-    return record
-
-
-def _version(name: str) -> str:
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return "not installed"
+def _chunk(todo: Iterator[int], most: int, asked: int, workers: Workers) -> list[int]:
+    """The next indices to ask for; none where the workers have enough."""
+    return list(itertools.islice(todo, most)) if most > 0 and asked < workers.places * workers.chunk else []

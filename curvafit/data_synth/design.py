@@ -1,13 +1,17 @@
-"""Which parameters to draw: the random law of the paper's Experiment 4, one independent stream a draw."""
+"""Which parameters to draw: Experiment 4's random law, other boxes, Sobol's sequence, lists; one stream a draw."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, get_args
+
 import numpy as np
+from scipy.stats import qmc
 
 from curvafit.priors.coefficients import NAMES, Coefficients
 
-#: Name of the law, as stores record it.
-LAW = "experiment-4"
 #: Open intervals of the uniform law, in working units; a20 = 1 is the gauge (paper, "Experiment 4").
 INTERVALS: dict[str, tuple[float, float]] = {
     "a11": (-4.0, 4.0),
@@ -17,43 +21,145 @@ INTERVALS: dict[str, tuple[float, float]] = {
     "a00": (-3000.0, 3000.0),
     "mass": (-0.75, -0.15),
 }
+#: Parameters of a draw, in the order of a point.
+PARAMETERS: tuple[str, ...] = (*NAMES, "mass")
+Law = Literal["random", "sobol", "list"]
 
 
-def random_law(seed: int, index: int) -> tuple[Coefficients, float]:
-    """The parameters (a, m₀) of draw `index`: a20 = 1, the others uniform and independent (paper, Experiment 4).
+class Draw(NamedTuple):
+    """Parameters in working units, and the seed of the white noise, a number below 2³²."""
 
-    Every (seed, index) has its own random stream, so a draw never depends on which others were made before it.
+    coefficients: Coefficients
+    mass: float
+    seed: int
+
+
+@dataclass(frozen=True)
+class Design:
+    """A sequence of parameters, the same for ever for a seed: draw i depends on (seed, i) alone.
 
     Parameters
     ----------
-    seed, index
-        Whole numbers from 0.
-
-    Returns
-    -------
-    Coefficients in working units (spacing 0.01), and the mass m₀.
-
-    Raises
-    ------
-    ValueError
-        If the seed or the index is not a whole number from 0.
-    """
-    generator = np.random.default_rng(_stream(seed, index, "parameters"))
-    drawn = {name: float(generator.uniform(low, high)) for name, (low, high) in INTERVALS.items()}
-    mass = drawn.pop("mass")
-    values = {"a20": 1.0} | drawn
-    return Coefficients(*(values[name] for name in NAMES)), mass
-
-
-def start_seed(seed: int, index: int) -> int:
-    """The seed of draw `index`'s white noise, a number below 2³²; independent of its parameters.
+    law
+        `"random"`: uniform and independent in a box. `"sobol"`: the same box, filled evenly by a scrambled Sobol
+        sequence. `"list"`: the points in turn, again and again with other noise.
+    box
+        Intervals of (a20, a11, a02, a10, a01, a00, m₀) in working units; of no width where a parameter is fixed.
+    points
+        Points of seven numbers, for `"list"`.
 
     Raises
     ------
     ValueError
-        If the seed or the index is not a whole number from 0.
+        If the law has another name, there is no box or no point, an interval is not one, or m₀ leaves (-1, 1).
     """
-    return int(_stream(seed, index, "start").generate_state(1)[0])
+
+    law: Law
+    box: tuple[tuple[float, float], ...] = ()
+    points: tuple[tuple[float, ...], ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.law not in get_args(Law):
+            raise ValueError(f"expected a law among {', '.join(get_args(Law))}, got {self.law!r}")
+        rows = self.points if self.law == "list" else tuple(zip(*self.box, strict=True))
+        if not rows or any(len(row) != len(PARAMETERS) for row in rows):
+            raise ValueError(f"expected {len(PARAMETERS)} parameters ({', '.join(PARAMETERS)}) for a {self.law} design")
+        if not all(math.isfinite(value) for row in rows for value in row):
+            raise ValueError("expected finite parameters in a design, got NaN or infinity")
+        for name, interval in zip(PARAMETERS, self.box, strict=False):
+            if interval[0] > interval[1]:
+                raise ValueError(f"expected an interval of {name} from low to high, got {list(interval)}")
+        for row in rows:
+            if not -1 < row[-1] < 1:
+                raise ValueError(f"expected masses in (-1, 1), got {row[-1]}")
+
+    def draw(self, seed: int, index: int) -> Draw:
+        """Draw `index` of a seed, both whole numbers from 0.
+
+        Raises
+        ------
+        ValueError
+            If the seed or the index is not a whole number from 0.
+        """
+        start = int(_stream(seed, index, "start").generate_state(1)[0])
+        if self.law == "list":
+            values = self.points[index % len(self.points)]
+        else:
+            shares = zip(self.box, self._shares(seed, index), strict=True)
+            values = [low + (high - low) * share for (low, high), share in shares]
+        return Draw(Coefficients(*map(float, values[:-1])), float(values[-1]), start)
+
+    def as_dict(self) -> dict[str, Any]:
+        """What a store records: `Design(**…)` of it, in JSON's types."""
+        rows = {"points": self.points} if self.law == "list" else {"box": self.box}
+        return {"law": self.law} | {name: [list(row) for row in value] for name, value in rows.items()}
+
+    @staticmethod
+    def from_dict(kept: Mapping[str, Any]) -> Design:
+        """The inverse of `as_dict`."""
+        return Design(kept["law"], *(tuple(tuple(row) for row in kept.get(name, ())) for name in ("box", "points")))
+
+    def _shares(self, seed: int, index: int) -> list[float]:
+        """How far into each interval the draw lies, 0 to 1. A fixed parameter takes no random number."""
+        free = [low < high for low, high in self.box]
+        if self.law == "random":
+            values = np.random.default_rng(_stream(seed, index, "parameters")).random(sum(free))
+        else:
+            engine = qmc.Sobol(sum(free), scramble=True, rng=np.random.default_rng(_stream(seed, 0, "parameters")))
+            values = (engine.fast_forward(index) if index else engine).random(1)[0]
+        shares = iter(values.tolist())
+        return [next(shares) if moves else 0.0 for moves in free]
+
+
+def boxed(law: Law = "random", **intervals: float | Sequence[float]) -> Design:
+    """A box: Experiment 4's, but for the intervals or fixed values that are given by name.
+
+    Raises
+    ------
+    ValueError
+        If a name is not a parameter's, or a value is neither a number nor two of them.
+    """
+    unknown = set(intervals) - set(PARAMETERS)
+    if unknown:
+        raise ValueError(f"expected parameters among {', '.join(PARAMETERS)}, got {', '.join(sorted(unknown))}")
+    asked = {name: _interval(name, value) for name, value in intervals.items()}
+    whole: dict[str, tuple[float, float]] = {"a20": (1.0, 1.0), **INTERVALS, **asked}
+    return Design(law, tuple(whole[name] for name in PARAMETERS))
+
+
+def around(point: Sequence[float], spread: float, law: Law = "random") -> Design:
+    """A box around seven numbers, brought to a20 = 1: `spread` times as wide as Experiment 4's; a02 and m₀ in range.
+
+    Raises
+    ------
+    ValueError
+        If the spread is not positive, or a20 of the point is not.
+    """
+    if not spread > 0:
+        raise ValueError(f"expected a positive spread, got {spread}")
+    if not point[0] > 0:
+        raise ValueError(f"expected a point with a20 > 0, got {point[0]}")
+    centre = dict(zip(PARAMETERS, (*(value / point[0] for value in point[:-1]), point[-1]), strict=True))
+    box = {name: _near(centre[name], spread * (high - low) / 2) for name, (low, high) in INTERVALS.items()}
+    least = INTERVALS["a02"][0]
+    box["a02"] = (max(box["a02"][0], least), max(box["a02"][1], least))
+    box["mass"] = (max(box["mass"][0], -0.99), min(box["mass"][1], 0.99))
+    return boxed(law, **box)
+
+
+def _near(centre: float, half: float) -> tuple[float, float]:
+    return centre - half, centre + half
+
+
+def _interval(name: str, value: Any) -> tuple[float, float]:
+    pair = [value, value] if isinstance(value, (int, float)) else value
+    if not isinstance(pair, (list, tuple)) or len(pair) != 2 or not all(_is_number(end) for end in pair):
+        raise ValueError(f"expected {name} as a number or two of them, got {value!r}")
+    return float(pair[0]), float(pair[1])
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 def _stream(seed: int, index: int, purpose: str) -> np.random.SeedSequence:

@@ -1,9 +1,11 @@
 """A store of generated shapes: Zarr groups, one a draw, each visible whole or not at all.
 
-Layout, version 1 (every attribute is JSON in a group's `zarr.json`)::
+Layout, version 2 (every attribute is JSON in a group's `zarr.json`)::
 
-    STORE/                 format, version, settings (shape, spacing, epsilon, blur, law, seed, schedule, steps)
-    STORE/draws/000012/    the record of draw 12: parameters, mass, seed, steps, viability, energy, software versions
+    STORE/                 format, version, settings (shape, spacing, epsilon, blur, design, seed, schedule), and how
+                           many viable shapes are wanted
+    STORE/draws/000012/    the record of draw 12: parameters, mass, seed, steps, viability, energy, software versions;
+                           and the SHA-256 of all that and the field
     STORE/draws/000012/field   the phase field, float32 (Z, Y, X), one checksummed chunk; absent where not viable
 
 A draw is written beside its place, flushed to disk and renamed into it, so a killed process loses the draw it was
@@ -17,12 +19,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 import os
 import shutil
 import tempfile
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,56 +30,39 @@ import numpy as np
 import zarr
 from zarr.codecs import BloscCodec, Crc32cCodec
 
-from curvafit.generation.viability import Viability
-from curvafit.priors.coefficients import NAMES, Coefficients
+from curvafit.data_synth.record import Record, Settings, attributes_of, digest, record_of
 
 FORMAT = "curvafit shapes"
-VERSION = 1
+VERSION = 2
 #: A draw's folder is written in less than this; an older one was left by a killed process.
 _STALE_SECONDS = 600.0
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What all draws of a store share: sampling (z, y, x), ε and blur in spacing's unit, the law and its seed, and the
-    schedule's fields (name, steps, rates)."""
-
-    shape: tuple[int, int, int]
-    spacing: tuple[float, float, float]
-    epsilon: float
-    blur: float
-    law: str
-    seed: int
-    schedule: dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Record:
-    """One draw: its index, parameters, noise seed, the steps made (fewer where rejected early), viability figures,
-    final energy F_ε, the flow's status sentence, the software versions and the seconds it took."""
-
-    index: int
-    coefficients: Coefficients
-    mass: float
-    seed: int
-    steps: int
-    viability: Viability
-    energy: float
-    status: str
-    versions: dict[str, str]
-    seconds: float
-
-
 class Store:
-    """The draws in a folder; one process writes at a time, any number may read. Open with `open_store`."""
+    """The draws in a folder; any number of processes may write draws and read them. Open with `open_store`."""
 
     def __init__(self, path: Path, settings: Settings) -> None:
         self.path, self.settings = path, settings
 
+    @property
+    def wanted(self) -> int:
+        """How many viable shapes the store is to have."""
+        attributes = _group_attributes(self.path)
+        return 0 if attributes is None else int(attributes["wanted"])
+
+    def want(self, count: int) -> None:
+        """Set how many are wanted, where it is more than before; one process at a time."""
+        if count > self.wanted:
+            _rewrite(self.path, {"wanted": count})
+
     def indices(self) -> list[int]:
         """Draws with a complete record, in increasing order."""
         names = (entry.name for entry in (self.path / "draws").iterdir())
-        return sorted(int(name) for name in names if name.isdigit() and self._attributes(int(name)) is not None)
+        return sorted(int(name) for name in names if name.isdigit() and self.has(int(name)))
+
+    def has(self, index: int) -> bool:
+        """Whether a draw is there, complete."""
+        return self._attributes(index) is not None
 
     def record(self, index: int) -> Record:
         """The record of a draw.
@@ -92,12 +75,7 @@ class Store:
         attributes = self._attributes(index)
         if attributes is None:
             raise KeyError(f"expected a complete draw {index} in {self.path}, got none")
-        return Record(
-            **{name: attributes[name] for name in ("index", "seed", "status", "versions", "steps")},
-            **{name: _number(attributes[name]) for name in ("mass", "energy", "seconds")},
-            coefficients=Coefficients(*(attributes["coefficients"][name] for name in NAMES)),
-            viability=Viability(**{name: _number(value) for name, value in attributes["viability"].items()}),
-        )
+        return record_of(attributes)
 
     def field(self, index: int) -> np.ndarray:
         """The phase field of a viable draw, float32 (Z, Y, X).
@@ -108,9 +86,26 @@ class Store:
             If the draw is missing, incomplete or was not viable.
         """
         folder = self._place(index) / "field"
-        if self._attributes(index) is None or not folder.is_dir():
+        if not self.has(index) or not folder.is_dir():
             raise KeyError(f"expected a viable draw {index} in {self.path}, got none")
         return np.asarray(zarr.open_array(store=str(folder), mode="r")[...])
+
+    def intact(self, index: int) -> bool:
+        """Whether a draw's record and field are, bit for bit, what was written.
+
+        Raises
+        ------
+        KeyError
+            If the draw is missing or incomplete.
+        """
+        attributes = self._attributes(index)
+        if attributes is None:
+            raise KeyError(f"expected a complete draw {index} in {self.path}, got none")
+        try:
+            field = self.field(index) if attributes["viability"]["viable"] else None
+        except (RuntimeError, ValueError, OSError):  # a chunk that is truncated, or whose own checksum is wrong
+            return False
+        return digest(attributes, field) == attributes["sha256"]
 
     def write(self, record: Record, field: np.ndarray | None) -> bool:
         """Add a draw, whole or not at all; False where it was there already (nothing is then changed).
@@ -125,7 +120,7 @@ class Store:
         if field is not None and (field.dtype != np.float32 or field.shape != self.settings.shape):
             raise ValueError(f"expected a float32 field {self.settings.shape}, got {field.dtype} {field.shape}")
         place = self._place(record.index)
-        if self._attributes(record.index) is not None:
+        if self.has(record.index):
             return False
         shutil.rmtree(place, ignore_errors=True)
         self._clear_stale()
@@ -185,7 +180,7 @@ def _create(path: Path, settings: Settings) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}-"))
     try:
-        header = {"format": FORMAT, "version": VERSION, "settings": dataclasses.asdict(settings)}
+        header = {"format": FORMAT, "version": VERSION, "settings": dataclasses.asdict(settings), "wanted": 0}
         zarr.create_group(store=str(partial / "store"), attributes=header)
         zarr.create_group(store=str(partial / "store" / "draws"))
         _publish(partial / "store", path)
@@ -194,9 +189,8 @@ def _create(path: Path, settings: Settings) -> None:
 
 
 def _write_draw(folder: Path, record: Record, field: np.ndarray | None) -> None:
-    attributes = dataclasses.asdict(record) | {"coefficients": record.coefficients.as_dict()}
-    attributes["viability"] = {name: _plain(value) for name, value in attributes["viability"].items()}
-    zarr.create_group(store=str(folder), attributes={name: _plain(value) for name, value in attributes.items()})
+    attributes = attributes_of(record)
+    zarr.create_group(store=str(folder), attributes=attributes | {"sha256": digest(attributes, field)})
     if field is None:
         return
     array = zarr.create_array(
@@ -208,6 +202,20 @@ def _write_draw(folder: Path, record: Record, field: np.ndarray | None) -> None:
         dimension_names=("z", "y", "x"),
     )
     array[...] = field
+
+
+def _rewrite(folder: Path, attributes: dict[str, Any]) -> None:
+    """Change attributes of the Zarr group in a folder, all at once."""
+    text = json.loads((folder / "zarr.json").read_text())
+    text["attributes"] |= attributes
+    partial = folder / f".partial-{os.getpid()}.json"
+    try:
+        partial.write_text(json.dumps(text, indent=2))
+        with partial.open("rb+") as handle:
+            os.fsync(handle.fileno())
+        os.replace(partial, folder / "zarr.json")
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def _publish(partial: Path, place: Path) -> bool:
@@ -232,17 +240,6 @@ def _group_attributes(folder: Path) -> dict | None:
     except (OSError, ValueError):
         return None
     return text.get("attributes") if isinstance(text, dict) and text.get("node_type") == "group" else None
-
-
-def _plain(value: Any) -> Any:
-    """A JSON value; numbers that are not finite become null."""
-    if isinstance(value, np.generic):
-        value = value.item()
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _number(value: Any) -> Any:
-    return math.nan if value is None else value
 
 
 def _difference(found: Settings, asked: Settings) -> str:

@@ -1,0 +1,134 @@
+"""What a store holds, and whether it is whole."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from curvafit.data_synth.design import Design
+from curvafit.data_synth.draws import flows, versions
+from curvafit.data_synth.record import Record
+from curvafit.data_synth.store import Store, open_store
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What is wrong with a store, a sentence each; what is only remarkable; and a sentence in all."""
+
+    problems: tuple[str, ...]
+    notes: tuple[str, ...]
+    status: str
+
+
+def census(store: Store) -> dict[str, str]:
+    """What there is to say of a store, by name."""
+    records = [store.record(index) for index in store.indices()]
+    settings, viable = store.settings, sum(record.viability.viable for record in records)
+    size = sum(file.stat().st_size for file in store.path.rglob("*") if file.is_file())
+    schedule = settings.schedule
+    return {
+        "shapes": str(viable),
+        "wanted": str(store.wanted),
+        "draws": str(len(records)),
+        "voxels": " x ".join(map(str, settings.shape)),
+        "epsilon": f"{settings.epsilon:g} (voxel edges {', '.join(f'{edge:g}' for edge in settings.spacing)})",
+        "design": _named(settings.design),
+        "seed": str(settings.seed),
+        "schedule": f"{schedule['name']}, {schedule['steps']} steps",
+        "made with": "; ".join(f"{text} ({count})" for text, count in Counter(map(_made_with, records)).items()),
+        "seconds a draw": f"{np.mean([record.seconds for record in records]):.2f}" if records else "none",
+        "size": f"{size / 1e6:.1f} MB",
+    }
+
+
+def verify(
+    path: str | Path,
+    regenerate: int = 3,
+    seed: int = 0,
+    progress: Callable[[str, float], None] = lambda text, share: None,
+) -> Verdict:
+    """Check every draw: that it is there, whole, itself and single; and that some come out again as they are.
+
+    Parameters
+    ----------
+    regenerate, seed
+        How many draws are made again, by this process, and the seed of their choice. Where Python, libraries and
+        processor are those of the record, a field must come out bit for bit; elsewhere a difference is a note.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        If there is no store, or it is of another version.
+    """
+    store = open_store(path)
+    indices, problems, notes = store.indices(), [], []
+    viable = 0
+    for k, index in enumerate(indices):
+        progress(f"{k} of {len(indices)} draws checked", k / (len(indices) + regenerate))
+        problems += _wrong(store, index)
+        viable += store.record(index).viability.viable
+    missing = sorted(set(range(max(indices, default=-1) + 1)) - set(indices))
+    lost = f"{len(missing)} draws are not there: {', '.join(map(str, missing[:9]))}"
+    if missing or viable < store.wanted:
+        (problems if missing and viable >= store.wanted else notes).append(
+            f"{viable} of {store.wanted} shapes are made" + f"; {lost}" * bool(missing)
+        )
+    problems += _strangers(store)
+    sound = [index for index in indices if store.intact(index)] if problems else indices
+    chosen = np.random.default_rng(seed).permutation(sound)[:regenerate].tolist()
+    for k, index in enumerate(chosen):
+        progress(f"making draw {index} again", (len(indices) + k) / (len(indices) + regenerate))
+        _compare(store, index, problems, notes)
+    made = f"{len(chosen)} made again"
+    said = "nothing is wrong" if not problems else f"{len(problems)} things are wrong"
+    return Verdict(tuple(problems), tuple(notes), f"{len(indices)} draws, {viable} shapes checked, {made}: {said}")
+
+
+def _wrong(store: Store, index: int) -> list[str]:
+    """What is wrong with one draw, but for its flow."""
+    if not store.intact(index):
+        return [f"draw {index} is not what was written: its checksum differs"]
+    record, draw = store.record(index), Design.from_dict(store.settings.design).draw(store.settings.seed, index)
+    if (record.coefficients, record.mass, record.seed) != draw:
+        return [f"draw {index} has other parameters than the design's"]
+    if record.viability.viable:
+        field = store.field(index)
+        if not np.isfinite(field).all() or not field.min() < 0 < field.max():
+            return [f"draw {index} is recorded as a shape, but has no surface"]
+    return []
+
+
+def _strangers(store: Store) -> list[str]:
+    """Entries of the folder that are neither draws nor what a killed worker leaves."""
+    draws = store.path / "draws"
+    expected = {f"{index:06d}" for index in store.indices()} | {"zarr.json"}
+    others = [each.name for each in draws.iterdir() if each.name not in expected and not each.name.startswith(".")]
+    return [f"draws/{name} is torn, or no draw" for name in sorted(others)]
+
+
+def _compare(store: Store, index: int, problems: list[str], notes: list[str]) -> None:
+    """Make a draw again, and say where it differs."""
+    record = store.record(index)
+    ((_, flow),) = flows(store.settings, [index])
+    same = flow.viability.viable == record.viability.viable
+    if same and record.viability.viable:
+        same = np.array_equal(flow.field.cpu().numpy().astype(np.float32), store.field(index))
+    if same:
+        return
+    if record.versions == versions():
+        problems.append(f"draw {index} came out otherwise when it was made again")
+    else:
+        notes.append(f"draw {index} came out otherwise, made with {_made_with(record)}")
+
+
+def _named(design: dict) -> str:
+    points = len(design.get("points", ()))
+    return f"{design['law']} of {points} points" if points else f"{design['law']} in {design['box']}"
+
+
+def _made_with(record: Record) -> str:
+    return ", ".join(f"{name} {version}" for name, version in record.versions.items())

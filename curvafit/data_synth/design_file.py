@@ -1,0 +1,99 @@
+"""A design written down: a YAML file with a box, the surroundings of a point, or a list of points."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from curvafit.data_synth.design import PARAMETERS, Design, around, boxed
+from curvafit.priors.coefficients import preset
+from curvafit.priors.fit_file import read_fit
+
+#: The kinds of design, and the keys that may stand beside each.
+KEYS = {"box": {"law"}, "around": {"law", "spread"}, "list": set()}
+#: Share of Experiment 4's intervals that the surroundings of a point span.
+SPREAD = 0.1
+
+
+def read_design(path: str | PathLike[str]) -> Design:
+    """Read a design; see docs/atlas.md for its keys.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        If there is no such file, or it is not YAML, has unknown keys, or is no design (`Design`).
+    """
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"expected a design in YAML, found no file {path}")
+    try:
+        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"expected a design in YAML, got {path}: {error}") from error
+    try:
+        return _design(content, Path(path).parent)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def point_of(source: Any, folder: Path = Path()) -> tuple[float, ...]:
+    """Seven numbers: of a preset's name, of a `fit.json` (beside `folder` where its path is relative), or by name.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        If it is none of these, or a number is missing.
+    """
+    if isinstance(source, str) and source.endswith(".json"):
+        fit = read_fit(folder / source)
+        return (*map(float, fit.coefficients), fit.mass)
+    if isinstance(source, str):
+        named = preset(source)
+        return (*map(float, named.coefficients), float(named.mass))
+    if not isinstance(source, Mapping) or set(source) != set(PARAMETERS):
+        raise ValueError(f"expected a preset, a fit.json or {', '.join(PARAMETERS)}, got {source!r}")
+    try:
+        return tuple(float(source[name]) for name in PARAMETERS)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"expected numbers for {', '.join(PARAMETERS)}, got {source!r}") from error
+
+
+def _design(content: Any, folder: Path) -> Design:
+    kind = _kind(content)
+    if kind == "list":
+        if not isinstance(content["list"], list):
+            raise ValueError(f"expected a list of points, got {content['list']!r}")
+        return Design("list", points=tuple(point_of(each, folder) for each in content["list"]))
+    law = content.get("law", "random")
+    if law not in ("random", "sobol"):
+        raise ValueError(f"expected a law random or sobol, got {law!r}")
+    if kind == "around":
+        return around(point_of(content["around"], folder), _spread(content.get("spread", SPREAD)), law)
+    if not isinstance(content["box"], Mapping):
+        raise ValueError(f"expected a box of names and intervals, got {content['box']!r}")
+    return boxed(law, **{str(name): value for name, value in content["box"].items()})
+
+
+def _kind(content: Any) -> str:
+    """Which of the three a file is; every key must be known."""
+    if not isinstance(content, Mapping):
+        raise ValueError(f"expected the keys of a design ({', '.join(KEYS)}), got {content!r}")
+    kinds = [key for key in KEYS if key in content]
+    known = set(KEYS) | set().union(*KEYS.values())
+    for key in content:
+        if key not in known:
+            raise ValueError(f"expected keys among {', '.join(sorted(known))}, got {key!r}")
+    if len(kinds) != 1:
+        raise ValueError(f"expected one of the keys {', '.join(KEYS)}, got {' and '.join(kinds) or 'none'}")
+    for key in set(content) - KEYS[kinds[0]] - {kinds[0]}:
+        raise ValueError(f"expected no key {key!r} beside {kinds[0]!r}")
+    return kinds[0]
+
+
+def _spread(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ValueError(f"expected a spread that is a number, got {value!r}")
+    return float(value)

@@ -1,0 +1,141 @@
+"""Where draws are made: in this process, or by the workers of a dask cluster."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+from curvafit.data_synth.draws import device, make
+from curvafit.data_synth.store import Record
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+#: Draws that a worker with an NVIDIA device makes together.
+TOGETHER = 32
+#: Seconds that a scheduler has to answer.
+PATIENCE = 10
+
+
+class Workers(Protocol):
+    """Whoever makes draws."""
+
+    #: Draws that are made together.
+    chunk: int
+
+    @property
+    def places(self) -> int:
+        """How many chunks may be asked for at once."""
+        ...
+
+    def submit(self, path: Path, indices: Sequence[int]) -> None:
+        """Ask for some draws of a store."""
+        ...
+
+    def done(self) -> list[Record]:
+        """Wait for some of what was asked for."""
+        ...
+
+
+class Here:
+    """This process."""
+
+    places: int = 1
+
+    def __init__(self) -> None:
+        self.chunk = TOGETHER if device() == "cuda" else 1
+        self._asked: list[tuple[Path, Sequence[int]]] = []
+
+    def submit(self, path: Path, indices: Sequence[int]) -> None:
+        self._asked.append((path, indices))
+
+    def done(self) -> list[Record]:
+        return make(*self._asked.pop(0))
+
+
+class Cluster:
+    """The workers of a dask cluster, which must see the store's folder under the same name.
+
+    Each always has a chunk to go on with. A chunk whose worker dies is given to another.
+    """
+
+    def __init__(self, client: Client) -> None:
+        from distributed import as_completed
+
+        devices = set(client.run(device).values())  # type: ignore
+        if not devices:
+            raise OSError(f"expected a scheduler with workers, got none at {client.scheduler.address}")  # type: ignore
+        self._client = client
+        self._futures = as_completed()
+        self.chunk = TOGETHER if "cuda" in devices else 1
+
+    @property
+    def places(self) -> int:
+        """Two chunks a thread, as many threads as there are now."""
+        return 2 * sum(self._client.nthreads().values())  # type: ignore
+
+    def submit(self, path: Path, indices: Sequence[int]) -> None:
+        self._futures.add(self._client.submit(make, str(path.resolve()), list(indices), pure=False))
+
+    def done(self) -> list[Record]:
+        from distributed import KilledWorker
+
+        first = next(self._futures)
+        try:
+            return first.result()
+        except KilledWorker as error:
+            raise OSError(f"expected workers to survive their draws, got one that killed several: {error}") from error
+
+
+@contextmanager
+def cluster(count: int | None = None, scheduler: str | None = None) -> Iterator[Workers]:
+    """Workers: of the scheduler at an address, or so many on this machine (as many as cores); 0 is this process.
+
+    Raises
+    ------
+    ImportError
+        If dask.distributed is not installed and more than this process is wanted.
+    OSError
+        If there is no scheduler at the address, or it has no workers.
+    """
+    if count is not None and count < 0:
+        raise ValueError(f"expected a number of workers from 0, got {count}")
+    if count == 0 and scheduler is None:
+        yield Here()
+        return
+    try:
+        import distributed
+    except ImportError as error:
+        raise ImportError('expected dask.distributed: pip install "curvafit[atlas]"', name="distributed") from error
+    if scheduler is not None:
+        with _connected(distributed, scheduler) as client:
+            yield Cluster(client)
+        return
+    here = distributed.LocalCluster(
+        n_workers=count or _cores(),
+        threads_per_worker=1,
+        processes=True,
+        dashboard_address="",
+        memory_limit=0,
+        silence_logs=logging.ERROR,
+    )
+    with here, distributed.Client(here) as client:
+        yield Cluster(client)
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextmanager
+def _connected(distributed, address: str) -> Iterator[Client]:
+    try:
+        client = distributed.Client(address, timeout=PATIENCE)
+    except (OSError, ValueError) as error:
+        raise OSError(f"expected a dask scheduler at {address}, got none within {PATIENCE} s") from error
+    with client:
+        yield client
