@@ -129,7 +129,9 @@ def test_an_atlas_holds_what_the_store_does(tmp_path, atlas):
     for measured in atlas.diagrams("field"):  # balls: κ1 and κ2 are 1/R all over, the area 4πR²
         κ = np.average(measured.points, axis=0, weights=measured.weights)
         assert measured.weights.sum() * κ[0] * κ[1] == pytest.approx(4 * np.pi, rel=0.12)
-    build = f"curvafit atlas build s.zarr --count {len(viable)} --shape 20,20,20 --seed 2 --design random --schedule fast"
+    build = (
+        f"curvafit atlas build s.zarr --count {len(viable)} --shape 20,20,20 --seed 2 --design random --schedule fast"
+    )
     assert atlas.provenance["command"] == [build, "then this"]
     assert atlas.provenance["settings"]["seed"] == 2
     assert atlas.provenance["draws"] == len(store.indices())

@@ -119,7 +119,7 @@ def cluster(count: int | None = None, scheduler: str | None = None) -> Iterator[
         n_workers=count or _cores(),
         threads_per_worker=1,
         processes=True,
-        dashboard_address="",
+        dashboard_address=":0",
         memory_limit=0,
         silence_logs=logging.ERROR,
     )

@@ -1,0 +1,114 @@
+"""`verify` finds what is lost, torn, changed, foreign or unlike its design; and nothing in a sound store."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+
+from curvafit.data_synth import build, extend
+from curvafit.data_synth.census import census, verify
+from curvafit.data_synth.store import open_store
+from curvafit.generation.schedule import schedule
+
+QUICK = schedule("fast", steps=40)
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory):
+    """A store of four shapes, and of draws that were none."""
+    return build(tmp_path_factory.mktemp("sound") / "s.zarr", 4, 16, seed=1, schedule=QUICK).path
+
+
+@pytest.fixture
+def path(sound, tmp_path):
+    return shutil.copytree(sound, tmp_path / "s.zarr")
+
+
+def viable(path) -> list[int]:
+    store = open_store(path)
+    return [index for index in store.indices() if store.record(index).viability.viable]
+
+
+def changed(path, index: int, **attributes) -> None:
+    file = path / "draws" / f"{index:06d}" / "zarr.json"
+    content = json.loads(file.read_text())
+    content["attributes"] |= attributes
+    file.write_text(json.dumps(content))
+
+
+def test_nothing_is_wrong_with_a_sound_store(path):
+    found = verify(path, regenerate=2)
+    assert (found.problems, found.notes) == ((), ())
+    assert found.status.endswith("2 made again: nothing is wrong")
+    told = census(open_store(path))
+    assert (told["shapes"], told["wanted"], told["voxels"]) == ("4", "4", "16 x 16 x 16")
+
+
+def test_an_extended_store_is_as_if_built_at_once(path, tmp_path):
+    longer = extend(path, 2)
+    whole = build(tmp_path / "whole.zarr", 6, 16, seed=1, schedule=QUICK)
+    assert longer.indices() == whole.indices() and longer.wanted == whole.wanted == 6
+    assert all((longer.field(i) == whole.field(i)).all() for i in viable(path))
+    assert verify(path, 0).problems == ()
+
+
+def test_a_lost_draw_is_found_and_made_again(path):
+    shutil.rmtree(path / "draws" / f"{viable(path)[1]:06d}")
+    found = verify(path, 0)
+    assert found.problems == () and "1 draws are not there" in found.notes[0]  # as if the build had been stopped
+    build(path, 4, 16, seed=1, schedule=QUICK)
+    assert verify(path, 0).notes == ()
+
+
+def test_a_draw_lost_from_a_whole_store_is_a_problem(path):
+    store = open_store(path)
+    barren = next(index for index in store.indices() if not store.record(index).viability.viable)
+    shutil.rmtree(path / "draws" / f"{barren:06d}")
+    assert "1 draws are not there" in verify(path, 0).problems[0]
+
+
+def test_torn_and_foreign_folders_are_found(path):
+    (path / "draws" / f"{viable(path)[0]:06d}" / "field" / "c" / "0" / "0" / "0").unlink()
+    (path / "draws" / "notes").mkdir()
+    (path / "draws" / ".partial-killed").mkdir()
+    problems = verify(path, 0).problems
+    assert any("000000 is torn" in each or "is torn, or no draw" in each for each in problems)
+    assert any("draws/notes is torn, or no draw" in each for each in problems)
+    assert not any("partial" in each for each in problems)
+
+
+def test_changed_bytes_and_numbers_are_found(path):
+    first, second = viable(path)[:2]
+    chunk = path / "draws" / f"{first:06d}" / "field" / "c" / "0" / "0" / "0"
+    content = bytearray(chunk.read_bytes())
+    content[len(content) // 2] ^= 1
+    chunk.write_bytes(content)
+    changed(path, second, mass=-0.1)
+    problems = verify(path, 0).problems
+    assert [
+        f"draw {index} is not what was written" in each for index, each in zip((first, second), problems, strict=True)
+    ]
+
+
+def test_a_draw_in_another_place_is_found(path):
+    one, other = (path / "draws" / f"{index:06d}" for index in viable(path)[:2])
+    shutil.rmtree(other)
+    shutil.copytree(one, other)
+    assert any(f"draws/{other.name} is torn, or no draw" in each for each in verify(path, 0).problems)
+
+
+def test_a_field_that_does_not_come_out_again_is_found(path, monkeypatch):
+    monkeypatch.setattr("curvafit.data_synth.census.flows", wrong_flows)
+    found = verify(path, 20)
+    assert any("came out otherwise when it was made again" in each for each in found.problems)
+    for index in open_store(path).indices():
+        assert found.problems.count(f"draw {index} came out otherwise when it was made again") <= 1
+
+
+def wrong_flows(settings, indices):
+    """The flows of the draws one further."""
+    from curvafit.data_synth.draws import flows
+
+    return flows(settings, [index + 1 for index in indices])

@@ -1,0 +1,100 @@
+"""Designs: boxes, Sobol's sequence, lists and surroundings; their YAML, and what is wrong with other YAML."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from curvafit.data_synth.design import INTERVALS, PARAMETERS, Design, around, boxed
+from curvafit.data_synth.design_file import read_design
+from curvafit.priors.coefficients import preset
+
+
+def written(tmp_path, text: str):
+    path = tmp_path / "design.yaml"
+    path.write_text(text)
+    return path
+
+
+def table(design: Design, count: int, seed: int = 0) -> np.ndarray:
+    return np.array([[*draw.coefficients, draw.mass] for draw in (design.draw(seed, i) for i in range(count))])
+
+
+def test_a_sobol_sequence_fills_the_box_more_evenly_than_chance():
+    values = (table(boxed("sobol"), 256)[:, 1:] - [low for low, _ in INTERVALS.values()]) / [
+        high - low for low, high in INTERVALS.values()
+    ]
+    for column in values.T:  # one point in every 256th part of every interval: a (0, m, s)-net seen from one side
+        assert sorted(np.floor(256 * column).astype(int)) == list(range(256))
+    assert not np.array_equal(table(boxed("sobol"), 4), table(boxed("sobol"), 4, seed=1))
+
+
+def test_a_draw_of_any_design_depends_on_seed_and_index_alone():
+    for design in (
+        boxed(),
+        boxed("sobol"),
+        around(table(boxed(), 1)[0], 0.1),
+        Design("list", points=((1.0,) * 6 + (0.0,),)),
+    ):
+        assert design.draw(3, 17) == design.draw(3, 17)
+        assert Design.from_dict(design.as_dict()) == design
+        assert len({design.draw(0, index).seed for index in range(20)}) == 20
+
+
+def test_a_box_in_yaml_changes_some_intervals_and_fixes_others(tmp_path):
+    design = read_design(written(tmp_path, "law: sobol\nbox:\n  a11: [1, 2]\n  a02: 6\n"))
+    found = table(design, 50)
+    assert design.law == "sobol"
+    assert (found[:, PARAMETERS.index("a02")] == 6).all() and (found[:, 0] == 1).all()
+    a11, a00 = found[:, 1], found[:, 5]
+    assert a11.min() > 1 and a11.max() < 2 and a00.min() < -2000 and a00.max() > 2000
+
+
+def test_surroundings_hold_their_point_and_have_the_asked_for_width(tmp_path):
+    tubes = preset("tubes")
+    found = table(read_design(written(tmp_path, "around: tubes\nspread: 0.2\n")), 300)
+    for column, centre, (low, high) in zip(
+        found[:, 1:].T, [*tubes.coefficients, tubes.mass][1:], INTERVALS.values(), strict=True
+    ):
+        assert column.min() < centre < column.max()
+        assert np.ptp(column) == pytest.approx(0.2 * (high - low), rel=0.05)
+    scaled = around([2 * value for value in tubes.coefficients] + [tubes.mass], 0.2)
+    np.testing.assert_allclose(table(scaled, 5), table(around([*tubes.coefficients, tubes.mass], 0.2), 5))
+
+
+def test_a_list_comes_in_turn_with_other_noise(tmp_path):
+    text = "list:\n  - sponge\n  - {a20: 1, a11: 2, a02: 3, a10: -4, a01: 5, a00: 6, mass: -0.3}\n"
+    draws = [read_design(written(tmp_path, text)).draw(0, index) for index in range(4)]
+    assert draws[0].coefficients == draws[2].coefficients == preset("sponge").coefficients
+    assert [*draws[1].coefficients, draws[1].mass] == [1, 2, 3, -4, 5, 6, -0.3]
+    assert draws[0].seed != draws[2].seed
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("box: {a11: [1, 2]", "expected a design in YAML, got"),
+        ("- 1", "expected the keys of a design"),
+        ("bxo: {a11: 3}", "expected keys among around, box, law, list, spread, got 'bxo'"),
+        ("law: sobol", "expected one of the keys box, around, list, got none"),
+        ("box: {}\nlist: []", "got box and list"),
+        ("list: []\nlaw: sobol", "expected no key 'law' beside 'list'"),
+        ("list: []", "expected 7 parameters"),
+        ("box: {a12: [1, 2]}", "expected parameters among a20, a11, a02, a10, a01, a00, mass, got a12"),
+        ("box: {a11: [2, 1]}", "expected an interval of a11 from low to high"),
+        ("box: {a11: [1, two]}", "expected a11 as a number or two of them"),
+        ("box: {a11: .nan}", "expected finite parameters"),
+        ("box: {mass: [-2, 0]}", r"expected masses in \(-1, 1\), got -2"),
+        ("law: even\nbox: {}", "expected a law random or sobol, got 'even'"),
+        ("around: tubs", "expected a preset among"),
+        ("around: nowhere/fit.json", "found no file"),
+        ("around: tubes\nspread: wide", "expected a spread that is a number"),
+        ("around: tubes\nspread: 0", "expected a positive spread"),
+        ("list:\n - {a20: 1}", "expected a preset, a fit.json or a20"),
+    ],
+)
+def test_wrong_yaml_is_one_sentence(tmp_path, text, sentence):
+    with pytest.raises((ValueError, FileNotFoundError), match=sentence):
+        read_design(written(tmp_path, text))
+    with pytest.raises(FileNotFoundError, match="expected a design in YAML, found no file"):
+        read_design(tmp_path / "none.yaml")

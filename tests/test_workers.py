@@ -1,0 +1,97 @@
+"""Draws by workers: the same store whoever makes it; killed workers and builds lose their own draw at most."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from curvafit.data_synth import build, cluster, open_store
+from curvafit.data_synth.census import verify
+from curvafit.generation.schedule import schedule
+
+distributed = pytest.importorskip("distributed", reason="needs dask.distributed")
+
+COUNT, EDGE, PLAN = 8, 16, schedule("fast", steps=60)
+#: As a script: builds with two workers, and says where it is.
+SCRIPT = f"""
+import sys
+from curvafit.data_synth import build, cluster
+from curvafit.generation.schedule import schedule
+if __name__ == "__main__":
+    with cluster(2) as crew:
+        plan = schedule("fast", steps={PLAN.steps})
+        build(sys.argv[1], {COUNT}, {EDGE}, 1, plan, lambda r, v, n: print(r.index, flush=True), workers=crew)
+"""
+
+
+@pytest.fixture(scope="module")
+def serial(tmp_path_factory):
+    return build(tmp_path_factory.mktemp("serial") / "s.zarr", COUNT, EDGE, 1, PLAN)
+
+
+def same(one, other) -> bool:
+    whole = one.indices() == other.indices()
+    kept = (i for i in one.indices() if one.record(i).viability.viable)
+    return whole and all((one.field(i) == other.field(i)).all() for i in kept)
+
+
+def test_two_workers_make_the_store_that_one_process_makes_though_one_is_killed(tmp_path, serial):
+    with cluster(2) as crew:
+        pids = list(crew._client.run(os.getpid).values())
+        killed = []
+
+        def kill_once(record, viable, draws):
+            if not killed:
+                killed.append(os.kill(pids[0], signal.SIGKILL))
+
+        store = build(tmp_path / "s.zarr", COUNT, EDGE, 1, PLAN, kill_once, workers=crew)
+    assert killed and same(store, serial)
+    assert verify(store.path, 0).problems == verify(store.path, 0).notes == ()
+
+
+@pytest.mark.slow
+def test_a_build_killed_at_random_goes_on_to_the_same_store(tmp_path, serial):
+    script, path = tmp_path / "build.py", tmp_path / "s.zarr"
+    script.write_text(SCRIPT)
+    begun = subprocess.Popen([sys.executable, str(script), str(path)], stdout=subprocess.PIPE, text=True)
+    assert begun.stdout is not None and begun.stdout.readline()
+    time.sleep(random.Random(0).uniform(0, 0.3))
+    begun.kill()
+    begun.wait()
+    begun.stdout.close()
+    if path.exists():
+        assert verify(path, 0).problems == ()
+    store = build(path, COUNT, EDGE, 1, PLAN)
+    assert same(store, serial)
+    assert verify(path, 0).problems == verify(path, 0).notes == ()
+
+
+def test_a_scheduler_that_is_not_there_and_too_few_workers_are_one_sentence(monkeypatch):
+    monkeypatch.setattr("curvafit.data_synth.workers.PATIENCE", 1)
+    nowhere = "tcp://127.0.0.1:9"
+    with pytest.raises(OSError, match=f"expected a dask scheduler at {nowhere}, got none within 1 s"):
+        cluster(scheduler=nowhere).__enter__()
+    with pytest.raises(ValueError, match="expected a number of workers from 0, got -1"):
+        cluster(-1).__enter__()
+
+
+def test_without_dask_the_line_to_type_is_said(monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(ImportError, match=r'pip install "curvafit\[atlas\]"'), cluster(2):
+        pass
+
+
+def test_a_barren_design_ends(tmp_path, monkeypatch):
+    monkeypatch.setattr("curvafit.data_synth.atlas.BARREN", 3)
+    from curvafit.data_synth import Design
+
+    empty = Design("list", points=((1.0, 0.0, 1.0, 0.0, 0.0, 9e9, -0.9),))
+    with pytest.raises(ValueError, match="expected a design with viable shapes, got 0 of 4 draws"):
+        build(tmp_path / "s.zarr", 1, 8, schedule=PLAN, design=empty)
+    assert len(open_store(tmp_path / "s.zarr").indices()) == 4
