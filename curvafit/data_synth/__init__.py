@@ -9,10 +9,11 @@ from curvafit.data_synth.atlas import build, diagrams, extend
 from curvafit.data_synth.design import INTERVALS, Design, Draw, around, boxed
 from curvafit.data_synth.design_file import read_design
 from curvafit.data_synth.store import Record, Settings, Store, open_store
-from curvafit.data_synth.workers import cluster
+from curvafit.data_synth.workers import Cluster, cluster
 
 __all__ = [
     "INTERVALS",
+    "Cluster",
     "Design",
     "Draw",
     "Record",
