@@ -18,7 +18,7 @@ demo: .venv/installed
 	&& $(BIN)/curvafit infer "$$scan" -o demo_out
 
 test: .venv/installed-dev
-	$(BIN)/python -m pytest -q
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile
 
 lint: .venv/installed-dev
 	$(BIN)/ruff check .
