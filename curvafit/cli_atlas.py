@@ -49,8 +49,11 @@ def build_atlas(
     with plainly():
         box = whole_triple(shape, "--shape")
         law = _design(design, around, spread)
-        from curvafit.data_synth.atlas import build
+        from curvafit.data_synth.atlas import build, settings_of
+        from curvafit.data_synth.store import open_store
 
+        if store.exists():
+            open_store(store, settings_of(box, seed, schedule, law))
         with _made(count, workers, scheduler) as (crew, progress):
             build(store, count, box, seed, schedule, progress, design=law, workers=crew)
         say(str(store))

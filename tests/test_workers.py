@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import random
 import signal
@@ -95,3 +96,19 @@ def test_a_barren_design_ends(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="expected a design with viable shapes, got 0 of 4 draws"):
         build(tmp_path / "s.zarr", 1, 8, schedule=PLAN, design=empty)
     assert len(open_store(tmp_path / "s.zarr").indices()) == 4
+
+
+def test_a_full_disk_is_named_and_what_is_made_is_kept(tmp_path, serial, monkeypatch):
+    from curvafit.data_synth import store as storing
+
+    store = build(tmp_path / "s.zarr", 2, EDGE, 1, PLAN)
+    monkeypatch.setattr(storing, "_publish", full)
+    with pytest.raises(OSError, match="No space left on device.*s.zarr"):
+        build(store.path, COUNT, EDGE, 1, PLAN)
+    monkeypatch.undo()
+    assert verify(store.path, 0).problems == () and not list((store.path / "draws").glob(".*"))
+    assert same(build(store.path, COUNT, EDGE, 1, PLAN), serial)
+
+
+def full(partial, place):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

@@ -69,10 +69,7 @@ def build(
     """
     if count < 1:
         raise ValueError(f"expected a count of at least 1 shape, got {count}")
-    z, y, x = (shape,) * 3 if isinstance(shape, int) else shape
-    grid = Grid((z, y, x))
-    plan, law = dataclasses.asdict(named_schedule(schedule)), (design or boxed()).as_dict()
-    settings = Settings(grid.shape, grid.spacing, WORKING_EPSILON, WORKING_BLUR, law, int(seed), plan)
+    settings = settings_of(shape, seed, schedule, design)
     return _filled(open_store(store_path, settings), count, workers or Here(), progress)
 
 
@@ -90,6 +87,16 @@ def extend(
         raise ValueError(f"expected a count of at least 1 more shape, got {count}")
     store = open_store(store_path)
     return _filled(store, store.wanted + count, workers or Here(), progress)
+
+
+def settings_of(
+    shape: int | Sequence[int], seed: int = 0, schedule: str | Schedule = "fast", design: Design | None = None
+) -> Settings:
+    """The settings of the store that `build` makes of these."""
+    z, y, x = (shape,) * 3 if isinstance(shape, int) else shape
+    grid = Grid((z, y, x))
+    plan, law = dataclasses.asdict(named_schedule(schedule)), (design or boxed()).as_dict()
+    return Settings(grid.shape, grid.spacing, WORKING_EPSILON, WORKING_BLUR, law, int(seed), plan)
 
 
 def diagrams(field: torch.Tensor, grid: Grid, epsilon: float) -> tuple[Diagram, Diagram]:

@@ -15,7 +15,7 @@ import torch
 from llvmlite import binding
 
 from curvafit.data_synth.design import Design, Draw
-from curvafit.data_synth.store import Record, Settings, open_store
+from curvafit.data_synth.store import Record, Settings, Store, open_store
 from curvafit.generation.batch import generate_batch
 from curvafit.generation.result import Flow
 from curvafit.generation.schedule import Schedule
@@ -34,6 +34,13 @@ def make(path: str | Path, indices: Sequence[int]) -> list[Record]:
         If the store can't be read or written.
     """
     store = open_store(path)
+    try:
+        return _made(store, indices)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror or str(error), error.filename or str(store.path)) from error
+
+
+def _made(store: Store, indices: Sequence[int]) -> list[Record]:
     missing = [index for index in indices if not store.has(index)]
     began = time.perf_counter()
     for index, (draw, flow) in zip(missing, flows(store.settings, missing), strict=True):

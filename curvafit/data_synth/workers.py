@@ -108,6 +108,7 @@ def cluster(count: int | None = None, scheduler: str | None = None) -> Iterator[
         yield Here()
         return
     try:
+        import dask.config
         import distributed
     except ImportError as error:
         raise ImportError('expected dask.distributed: pip install "curvafit[atlas]"', name="distributed") from error
@@ -115,8 +116,15 @@ def cluster(count: int | None = None, scheduler: str | None = None) -> Iterator[
         with _connected(distributed, scheduler) as client:
             yield Cluster(client)
         return
+    quiet = {"distributed.nanny.pre-spawn-environ.DASK_LOGGING__DISTRIBUTED": "critical"}
+    with dask.config.set(quiet), _local(distributed, count or _cores()) as client:
+        yield Cluster(client)
+
+
+@contextmanager
+def _local(distributed, count: int) -> Iterator[Client]:
     here = distributed.LocalCluster(
-        n_workers=count or _cores(),
+        n_workers=count,
         threads_per_worker=1,
         processes=True,
         dashboard_address=":0",
@@ -124,7 +132,7 @@ def cluster(count: int | None = None, scheduler: str | None = None) -> Iterator[
         silence_logs=logging.ERROR,
     )
     with here, distributed.Client(here) as client:
-        yield Cluster(client)
+        yield client
 
 
 def _cores() -> int:
