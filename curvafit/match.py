@@ -8,8 +8,9 @@ import numpy as np
 
 from curvafit.diagram import Diagram
 from curvafit.index import Atlas
+from curvafit.pairwise import one_to_many
 from curvafit.priors.coefficients import Coefficients
-from curvafit.transport import sliced_embedding, wasserstein_many
+from curvafit.transport import sliced_embedding
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ def nearest(
 ) -> tuple[Match, ...]:
     """The `count` shapes nearest to a diagram, nearest first.
 
-    Distances are `transport.wasserstein`, taken on the `shortlist` shapes that are nearest in sliced distance.
+    Distances are those of `curvafit.pairwise`, taken on the `shortlist` shapes that are nearest in sliced distance.
 
     Parameters
     ----------
@@ -66,7 +67,7 @@ def _shortlist(query: np.ndarray, embeddings: np.ndarray, length: int) -> list[i
 
 def _sorted(diagram: Diagram, atlas: Atlas, candidates: tuple[Diagram, ...], near: list[int]) -> tuple[Match, ...]:
     """Matches at the given positions of the atlas, by increasing distance."""
-    distances = wasserstein_many(diagram, [candidates[i] for i in near])
+    distances = one_to_many(diagram, [candidates[i] for i in near]).tolist()
     found = (
         Match(
             id=atlas.ids[i],
