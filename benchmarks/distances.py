@@ -36,7 +36,7 @@ from curvafit.priors.profile import phase_field
 from curvafit.transport import comparable, wasserstein
 
 #: Diagrams and rounds of the timing, and the pairs of them that geomloss takes.
-TIMED, ROUNDS, SLOW = 64, 5, 12
+TIMED, ROUNDS, SLOW = 64, 5, 8
 #: Viable shapes, edge and seed of the store that is made; points that a diagram of the truth has at most; pairs of
 #: whole diagrams; edges of bins.
 SHAPES, EDGE, SEED, POINTS, WHOLE, WIDTHS = 40, 56, 77, 2500, 3, (1.0, 1.5, 2.0, 3.0)
@@ -44,10 +44,11 @@ SHAPES, EDGE, SEED, POINTS, WHOLE, WIDTHS = 40, 56, 77, 2500, 3, (1.0, 1.5, 2.0,
 HELD, LENGTHS = 50, (5, 10, 20, 40, 80)
 
 
-def seconds(action: Callable[[], object]) -> float:
-    begun = time.perf_counter()
+def seconds(action: Callable[[], object]) -> np.ndarray:
+    """Passed, and used by all of the process's threads, `(2,)`."""
+    begun = np.array([time.perf_counter(), time.process_time()])
     action()
-    return time.perf_counter() - begun
+    return np.array([time.perf_counter(), time.process_time()]) - begun
 
 
 def time_table(atlas: Atlas) -> None:
@@ -55,7 +56,7 @@ def time_table(atlas: Atlas) -> None:
     bins = comparable([atlas.mask_diagrams[k] for k in chosen], 1.0, 20.0, 2.0)
     pairs, slow = len(bins) * (len(bins) - 1) // 2, np.random.default_rng(1).integers(0, len(bins), (SLOW, 2))
     counts = sorted({1, numba.get_num_threads()})
-    times: dict[str, list[float]] = {f"threads: {n}": [] for n in counts} | {"geomloss": []}
+    times: dict[str, list[np.ndarray]] = {f"threads: {n}": [] for n in counts} | {"geomloss": []}
     for turn in range(ROUNDS + 1):
         for n in counts:
             numba.set_num_threads(n)
@@ -65,18 +66,21 @@ def time_table(atlas: Atlas) -> None:
             times = {name: [] for name in times}
     sizes = np.array([len(d.weights) for d in bins])
     print(f"1. {len(bins)} diagrams of masks, {sizes.mean():.0f} bins ({sizes.min()} to {sizes.max()}), {pairs} pairs")
-    print(f"{'':10} {'least ms a pair':>16} {'median':>8} {'geomloss is':>12} {'atlas':>12} {'1000 shapes':>12}")
+    print(f"{'':10} {'least ms a pair':>16} {'median':>8} {'processor':>10} {'geomloss':>9} {'atlas':>12} {'1000':>12}")
+    reference = np.min(times["geomloss"], axis=0)[0]
     for name, taken in times.items():
-        least, ratio = min(taken), min(times["geomloss"]) / min(taken)
+        least, used = np.min(taken, axis=0)
         minutes = (f"{least * n * (n - 1) / 120:8.1f} min" for n in (len(atlas), 1000))
-        print(f"{name:10} {1e3 * least:16.3f} {1e3 * np.median(taken):8.3f} {ratio:11.0f}× {' '.join(minutes)}")
+        row = f"{name:10} {1e3 * least:16.3f} {1e3 * np.median(taken, axis=0)[0]:8.3f} {1e3 * used:10.3f}"
+        print(f"{row} {reference / least:8.0f}× {' '.join(minutes)}")
 
 
 def all_pairs(atlas: Atlas, folder: Path) -> None:
     for view in VIEWS:
         diagrams, path = atlas.diagrams(view), folder / f"{view}.npz"
         took = seconds(lambda d=diagrams, p=path: pairwise(d, checkpoint=p))
-        print(f"all pairs of {len(diagrams)} diagrams seen as {view}: {took / 60:.2f} min")
+        passed, used = took / 60
+        print(f"all pairs of {len(diagrams)} diagrams seen as {view}: {passed:.2f} min, of the processor {used:.2f}")
 
 
 def whole_diagrams(store: Path) -> list[Diagram]:
@@ -158,7 +162,7 @@ def match_table(atlas: Atlas) -> None:
     queries = [(view, atlas.diagrams(view)[k]) for view in VIEWS for k in held]
     first = seconds(lambda: [nearest(queries[k][1], rest, seen_as=view) for k, view in ((0, "field"), (-1, "mask"))])
     best = [one_to_many(query, rest.diagrams(view)).min() for view, query in track(queries, "all distances")]
-    print(f"3. {len(queries)} queries against {len(rest)} shapes; the first two took {first / 2:.2f} s each")
+    print(f"3. {len(queries)} queries against {len(rest)} shapes; the first two took {first[0] / 2:.2f} s each")
     print(f"{'short list':>10} {'recall@1':>9} {'median s':>9} {'most':>6}")
     for length in LENGTHS:
         hits, times = 0, []
@@ -166,7 +170,7 @@ def match_table(atlas: Atlas) -> None:
             begun = time.perf_counter()
             match = nearest(query, rest, seen_as=view, count=1, shortlist=length)[0]
             times.append(time.perf_counter() - begun)
-            hits += match.distance <= least * (1 + 1e-5)
+            hits += match.distance <= least + 1e-3
         print(f"{length:10} {hits / len(queries):9.2f} {np.median(times):9.3f} {max(times):6.2f}")
 
 

@@ -26,7 +26,7 @@ class Match:
 
 
 def nearest(
-    diagram: Diagram, atlas: Atlas, *, seen_as: str = "field", count: int = 5, shortlist: int = 20
+    diagram: Diagram, atlas: Atlas, *, seen_as: str = "field", count: int = 5, shortlist: int = 40
 ) -> tuple[Match, ...]:
     """The `count` shapes nearest to a diagram, nearest first.
 
@@ -43,7 +43,8 @@ def nearest(
     count
         How many; all of them where the atlas has fewer.
     shortlist
-        How many exact distances to take; at least `count` are.
+        How many exact distances to take; at least `count` are. Among 430 diagrams, 10 held the nearest in 99 % and 20
+        always; all of the nearest five were among 20 in 99 %, among 40 in 99.95 % (`benchmarks.distances --match`).
 
     Raises
     ------

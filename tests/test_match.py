@@ -85,7 +85,7 @@ def test_the_short_list_keeps_the_true_nearest(packaged):
 def test_wrong_requests_are_refused_in_one_sentence():
     fields = (blob((30.0, 0.0)),)
     atlas = atlas_of(fields, fields)
-    with pytest.raises(ValueError, match="expected a count and a shortlist of at least 1, got 0 and 20"):
+    with pytest.raises(ValueError, match="expected a count and a shortlist of at least 1, got 0 and 40"):
         nearest(fields[0], atlas, count=0)
     with pytest.raises(ValueError, match="expected shapes seen as 'field' or 'mask', got 'image'"):
         nearest(fields[0], atlas, seen_as="image")
