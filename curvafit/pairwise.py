@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import os
 import time
 import zipfile
 from collections.abc import Callable, Sequence
@@ -163,6 +164,8 @@ class _File:
         header = np.frombuffer(json.dumps(self._header).encode(), dtype=np.uint8)
         with open(path, "wb") as file:
             np.savez(file, header=header, keys=np.array(self._keys, dtype="S64"), distances=distances)
+            file.flush()
+            os.fsync(file.fileno())
 
     def _content(self, path: Path) -> tuple[list[str], np.ndarray]:
         """Digests and distances of a file that was made with the same settings."""

@@ -2,10 +2,13 @@
 
 The steps are those of geomloss's `SamplesLoss("sinkhorn", p=2)` with its default scaling: ε falls from the pair's
 diameter squared to blur², by 4 a step; both potentials move half way to their soft transforms; a last whole step is
-made at blur². That is not convergence: converged distances between diagrams are about 9 % larger. As every ε depends on
-the pair's diameter, kernels exp(-C/ε) are not shared between pairs, and as bins are replaced by their barycentres, they
-are not products over rows and columns. What is exploited instead: both transforms of a step take the same plan
-exp((f + g - C)/ε), so one exponential a pair of points gives a row's sum and a column's.
+made at blur². That is not convergence: converged distances between diagrams are 9 % larger in the median, up to 20 %.
+
+On a grid exp(-C/ε) is a product over rows and columns. In plain sums that leaves float32's range at small ε (e⁻²⁴⁵⁰
+over a distance of 70 at ε = 1); in sums of exponentials it takes more of them, over the rows and columns of both
+diagrams' box, than there are pairs of the few hundred occupied bins. As every ε depends on the pair's diameter, kernels
+are not shared between pairs either. What is exploited: both transforms of a step take the same plan exp((f + g - C)/ε),
+so one exponential a pair of points gives a part of a row's sum and of a column's, where both stay within float32.
 
 Notation: potentials f and g; in units of log2, F = f/(ε ln 2) + log2 a, G = g/(ε ln 2) + log2 b, and the plan is
 2^(F + G - h d²) with h = 1/(2 ε ln 2).
@@ -70,7 +73,7 @@ def costs(
 ) -> np.ndarray:
     """The entropic, unbalanced cost OT_ε of each pair of measures, ½|x - y|² a unit moved, `(K,)` float64.
 
-    The debiased divergence is that of the pair less half of each measure's with itself (Séjourné et al. 2019, eq. 24).
+    The debiased divergence is the pair's cost less half of each measure's with itself (Séjourné et al. 2019).
 
     Parameters
     ----------
@@ -82,19 +85,21 @@ def costs(
         `"cpu"` takes numba's loops on its threads, any other one batches of tensors there.
     """
     first, second = (np.asarray(numbers, dtype=np.int64) for numbers in (first, second))
+    if torch.device(device).type != "cpu":
+        return batched(measures, first, second, blur, reach, device)
     ε, kept = _schedule(measures, first, second, blur)
     ρ = math.inf if reach is None else reach**2
-    if torch.device(device).type != "cpu":
-        return batched(measures, first, second, ε, kept, ρ, device)
     found = np.empty(len(first))
     _costs(measures.x, measures.y, measures.log2, measures.bounds, first, second, ε, kept, ρ, found)
     return found
 
 
 def batched(
-    measures: Measures, first: np.ndarray, second: np.ndarray, ε: np.ndarray, kept: np.ndarray, ρ: float, device
+    measures: Measures, first: np.ndarray, second: np.ndarray, blur: float, reach: float | None, device
 ) -> np.ndarray:
     """`costs` in torch, several pairs at a time, each padded to the batch's largest by points without weight."""
+    ε, kept = _schedule(measures, first, second, blur)
+    ρ = math.inf if reach is None else reach**2
     found = np.empty(len(first))
     for pairs, size in _batches(np.diff(measures.bounds), first, second):
         (x, log_a), (y, log_b) = (_padded(measures, numbers[pairs], size, device) for numbers in (first, second))
