@@ -8,8 +8,9 @@ import numpy as np
 
 from curvafit.diagram import Diagram
 from curvafit.index import Atlas
+from curvafit.pairwise import one_to_many
 from curvafit.priors.coefficients import Coefficients
-from curvafit.transport import sliced_embedding, wasserstein_many
+from curvafit.transport import sliced_embedding
 
 
 @dataclass(frozen=True)
@@ -25,11 +26,11 @@ class Match:
 
 
 def nearest(
-    diagram: Diagram, atlas: Atlas, *, seen_as: str = "field", count: int = 5, shortlist: int = 20
+    diagram: Diagram, atlas: Atlas, *, seen_as: str = "field", count: int = 5, shortlist: int = 40
 ) -> tuple[Match, ...]:
     """The `count` shapes nearest to a diagram, nearest first.
 
-    Distances are `transport.wasserstein`, taken on the `shortlist` shapes that are nearest in sliced distance.
+    Distances are those of `curvafit.pairwise`, taken on the `shortlist` shapes that are nearest in sliced distance.
 
     Parameters
     ----------
@@ -42,7 +43,8 @@ def nearest(
     count
         How many; all of them where the atlas has fewer.
     shortlist
-        How many exact distances to take; at least `count` are.
+        How many exact distances to take; at least `count` are. Among 430 diagrams, 10 held the nearest in 99 % and 20
+        always; all of the nearest five were among 20 in 99 %, among 40 in 99.95 % (`benchmarks.distances --match`).
 
     Raises
     ------
@@ -66,7 +68,7 @@ def _shortlist(query: np.ndarray, embeddings: np.ndarray, length: int) -> list[i
 
 def _sorted(diagram: Diagram, atlas: Atlas, candidates: tuple[Diagram, ...], near: list[int]) -> tuple[Match, ...]:
     """Matches at the given positions of the atlas, by increasing distance."""
-    distances = wasserstein_many(diagram, [candidates[i] for i in near])
+    distances = one_to_many(diagram, [candidates[i] for i in near]).tolist()
     found = (
         Match(
             id=atlas.ids[i],

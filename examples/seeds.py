@@ -4,8 +4,8 @@ python examples/seeds.py [--small] [--edge 100] [--count 100] [--schedule fast] 
 
 Five seeds of preset `seeds`, a = (1, -0.35, 1.02, -40, 100, 1600), m₀ = -0.69; viable shapes of the random law, each
 from its own noise; and the mean distance between the former over the mean distance between the latter, all pairs of
-each. The distance is the paper's, `transport.wasserstein` as it is: the square root of geomloss's Sinkhorn divergence
-with p = 2, blur 1 and reach 20. Finished shapes are kept: a killed run goes on where it was.
+each. The distance is the paper's, by `curvafit.pairwise`: the square root of geomloss's Sinkhorn divergence with p = 2,
+blur 1 and reach 20. Finished shapes are kept: a killed run goes on where it was.
 """
 
 from __future__ import annotations
@@ -16,16 +16,13 @@ import numpy as np
 from common import CELL, DIAGRAM, KINDS, SURFACE, Shape, draw, grown, parser, write_table
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from rich.progress import track
 
 from curvafit.data_synth.design import boxed
+from curvafit.pairwise import pairwise
 from curvafit.plot import CONTOUR, DIAGONAL, write_picture
 from curvafit.priors.coefficients import preset
-from curvafit.transport import TAIL_SHARE, wasserstein_many
 
 SEEDS = 5
-#: The bins that `wasserstein` takes, taken once for all pairs; and the published ratio.
-BIN_WIDTH, PUBLISHED = 2.0, 0.107
 
 
 def main() -> None:
@@ -70,9 +67,7 @@ def random_shapes(options: Namespace) -> tuple[list[Shape], int]:
 
 def distances(shapes: list[Shape], kind: str) -> np.ndarray:
     """The distance of every pair."""
-    binned = [shape.diagrams[kind].thinned(BIN_WIDTH, TAIL_SHARE) for shape in shapes]
-    firsts = track(enumerate(binned[:-1]), f"{kind} distances", total=len(binned) - 1)
-    return np.concatenate([wasserstein_many(one, binned[k + 1 :], bin_width=0) for k, one in firsts])
+    return pairwise([shape.diagrams[kind] for shape in shapes])[np.triu_indices(len(shapes), 1)]
 
 
 def histogram(axes: Axes, kind: str, near: np.ndarray, far: np.ndarray) -> None:

@@ -19,6 +19,8 @@ ALLOWED = {
     "mesh": {"priors"},
     "diagram": {"priors", "mesh"},
     "transport": {"priors", "diagram"},
+    "sinkhorn": {"priors"},
+    "pairwise": {"priors", "scan", "diagram", "transport", "sinkhorn"},
     "data_synth": {"generation", "priors", "scan", "mesh", "diagram", "transport"},
 }
 #: The command line imports everything; of the package, only `__main__` imports it.

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from curvafit.diagram import Diagram
-from curvafit.transport import sliced_embedding, wasserstein, wasserstein_many
+from curvafit.transport import sliced_embedding, wasserstein
 
 
 def blob(seed: int = 0, centre: tuple[float, float] = (20.0, -5.0), width: float = 4.0, count: int = 300) -> Diagram:
@@ -78,15 +78,17 @@ def test_binning_costs_less_than_stated() -> None:
     assert wasserstein(a, binned, reach=None, bin_width=0) <= math.sqrt(0.5) * binned.spread + 0.01
 
 
-def test_one_against_many_is_each() -> None:
-    ds = [blob(k, (10.0 + k, 0.0)) for k in range(3)]
-    assert wasserstein_many(ds[0], ds) == [wasserstein(ds[0], d) for d in ds]
+def test_points_that_are_one_have_a_distance() -> None:
+    """No diameter to begin with: ε is blur² from the start."""
+    one = Diagram(np.array([[3.0, -1.0]]), np.array([2.0]))
+    assert wasserstein(one, one) == pytest.approx(0, abs=1e-6)
+    assert wasserstein(one, moved(one, (0.5, 0.0)), reach=None) == pytest.approx(0.5 / math.sqrt(2), rel=1e-3)
 
 
 def test_sliced_distance_ranks_as_the_full_one() -> None:
     query = blob(0)
     others = [blob(k, (20.0 + 3 * k, -5.0 - k)) for k in range(1, 6)]
-    full = wasserstein_many(query, others, reach=None)
+    full = [wasserstein(query, other, reach=None) for other in others]
     sliced = [float(np.linalg.norm(sliced_embedding(query) - sliced_embedding(d))) for d in others]
     assert np.argsort(full).tolist() == np.argsort(sliced).tolist()
     assert sliced_embedding(query).shape == (288,)

@@ -1,0 +1,141 @@
+"""Many distances at once: geomloss's values, on both backends; and a file that saves work and never lies."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from geomloss import SamplesLoss
+
+from curvafit import pairwise as module
+from curvafit import sinkhorn
+from curvafit.diagram import Diagram
+from curvafit.index import load_atlas
+from curvafit.pairwise import one_to_many, pairwise
+from curvafit.transport import wasserstein
+
+
+def cloud(seed: int, count: int, centre: tuple[float, float] = (0.0, 0.0), width: float = 10.0) -> Diagram:
+    """Points with weights over six orders of magnitude."""
+    generator = np.random.default_rng(seed)
+    return Diagram(generator.normal(centre, width, (count, 2)), 10 ** generator.uniform(-6, 0, count))
+
+
+#: Near, far enough for exp(-C / blur²) to leave float32's range many times over, narrow, and a single point.
+CLOUDS = [
+    cloud(0, 60),
+    cloud(1, 45, (15, -4), 6.0),
+    cloud(2, 70, (-150, 200), 30.0),
+    cloud(3, 30, (1, 1), 0.2),
+    cloud(4, 1, (5, 5)),
+]
+
+
+def cost(a: Diagram, b: Diagram, blur: float, reach: float | None) -> float:
+    """OT_ε by geomloss in float64."""
+    loss = SamplesLoss("sinkhorn", p=2, blur=blur, reach=reach, debias=False, backend="tensorized")
+    with torch.no_grad():
+        return float(loss(*(torch.from_numpy(v) for d in (a, b) for v in (d.normalised.weights, d.points))))
+
+
+def measures(diagrams: list[Diagram]) -> sinkhorn.Measures:
+    return sinkhorn.packed([d.points for d in diagrams], [d.normalised.weights for d in diagrams])
+
+
+@pytest.mark.parametrize(("blur", "reach"), [(1.0, 20.0), (0.3, 5.0), (1.0, None)])
+def test_costs_are_geomloss_s(blur: float, reach: float | None) -> None:
+    """On processors and in torch, whose small batches hold sets of unlike sizes. Float32 keeps 1e-6 of a potential."""
+    first, second = np.triu_indices(len(CLOUDS), 1)
+    truth = [cost(CLOUDS[i], CLOUDS[j], blur, reach) for i, j in zip(first, second, strict=True)]
+    found = sinkhorn.costs(measures(CLOUDS), first, second, blur, reach)
+    np.testing.assert_allclose(found, truth, rtol=2e-5, atol=1e-4)
+
+
+@pytest.mark.parametrize("reach", [20.0, None])
+def test_batches_cost_what_single_pairs_do(reach: float | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    packed = measures(CLOUDS)
+    first, second = np.triu_indices(len(CLOUDS))
+    for entries in (1, 3 * 70**2, 1 << 26):
+        monkeypatch.setattr(sinkhorn, "_ENTRIES", entries)
+        found = sinkhorn.batched(packed, first, second, 1.0, reach, "cpu")
+        np.testing.assert_allclose(found, sinkhorn.costs(packed, first, second, 1.0, reach), rtol=2e-5, atol=1e-4)
+
+
+def test_distances_are_wasserstein_s_on_the_packaged_atlas() -> None:
+    """But for the terms of the diagrams themselves, with steps from their own diameters: 3e-3 at most."""
+    atlas = load_atlas()
+    diagrams = sorted(atlas.mask_diagrams, key=lambda d: len(d.points))[:: len(atlas) // 7][:7]
+    found = pairwise(diagrams)
+    for i, j in zip(*np.triu_indices(len(diagrams), 1), strict=True):
+        assert found[i, j] == pytest.approx(wasserstein(diagrams[i], diagrams[j]), rel=3e-3, abs=5e-3)
+    assert (found == found.T).all()
+    assert (np.diag(found) == 0).all()
+
+
+def test_one_to_many_is_a_row_and_weights_are_shares() -> None:
+    others = [dataclasses.replace(d, weights=7 * d.weights) for d in CLOUDS]
+    np.testing.assert_allclose(one_to_many(CLOUDS[1], others), pairwise(CLOUDS)[1], rtol=1e-5, atol=0.01)
+    assert one_to_many(CLOUDS[0], []).shape == (0,)
+    assert pairwise([]).shape == (0, 0)
+
+
+def test_points_without_weight_do_not_count() -> None:
+    a = CLOUDS[0]
+    more = Diagram(np.concatenate([a.points, [[500.0, 0.0]]]), np.append(a.weights, 0.0))
+    assert one_to_many(a, [more], bin_width=0)[0] == 0
+
+
+def interrupt(done: int, total: int) -> None:
+    raise KeyboardInterrupt
+
+
+def test_an_interrupted_run_goes_on_and_a_longer_list_costs_its_new_rows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "BLOCK", 2)
+    path, truth = tmp_path / "distances.npz", pairwise(CLOUDS)
+    with pytest.raises(KeyboardInterrupt):
+        pairwise(CLOUDS[:4], checkpoint=path, progress=interrupt)
+    reports: list[tuple[int, int]] = []
+    found = pairwise(CLOUDS[:4], checkpoint=path, progress=lambda *report: reports.append(report))
+    assert reports == [(4, 6), (6, 6)]
+    np.testing.assert_array_equal(found, truth[:4, :4])
+    reports.clear()
+    np.testing.assert_array_equal(pairwise(CLOUDS, checkpoint=path, progress=lambda *r: reports.append(r)), truth)
+    assert reports == [(8, 10), (10, 10)]
+    np.testing.assert_array_equal(pairwise(CLOUDS, checkpoint=path, progress=interrupt), truth)
+    assert [each.name for each in tmp_path.iterdir()] == ["distances.npz"]
+
+
+def test_rows_follow_their_diagrams(tmp_path: Path) -> None:
+    """In another order, without some, and with one changed by a single weight or point."""
+    path = tmp_path / "distances.npz"
+    truth = pairwise(CLOUDS, checkpoint=path)
+    order = [3, 1, 4]
+    np.testing.assert_array_equal(
+        pairwise([CLOUDS[k] for k in order], checkpoint=path, progress=interrupt), truth[np.ix_(order, order)]
+    )
+    for change in ({"points": CLOUDS[3].points + 1}, {"weights": CLOUDS[3].weights[::-1].copy()}):
+        changed = [CLOUDS[1], dataclasses.replace(CLOUDS[3], **change), CLOUDS[4]]
+        np.testing.assert_allclose(pairwise(changed, checkpoint=path), pairwise(changed), rtol=1e-5, atol=0.01)
+
+
+def test_bad_input_is_one_sentence(tmp_path: Path) -> None:
+    path = tmp_path / "distances.npz"
+    pairwise(CLOUDS[:2], checkpoint=path)
+    with pytest.raises(ValueError, match=r"expected distances of this kind, got .* with blur 1.0 instead of 2.0$"):
+        pairwise(CLOUDS[:2], blur=2.0, checkpoint=path)
+    path.write_bytes(path.read_bytes()[:300])
+    with pytest.raises(ValueError, match="expected a file of distances, got .*, which is something else"):
+        pairwise(CLOUDS[:2], checkpoint=path)
+    with pytest.raises(OSError):
+        pairwise(CLOUDS[:2], checkpoint=path / "below" / "distances.npz", progress=interrupt)
+    with pytest.raises(ValueError, match="expected positive blur and reach"):
+        pairwise(CLOUDS[:2], reach=0.0)
+    with pytest.raises(ValueError, match="expected diagrams in one unit, got 1/working unit and 1/um"):
+        one_to_many(CLOUDS[0], [dataclasses.replace(CLOUDS[1], unit="1/um")])
+    with pytest.raises(ValueError, match="got an empty one"):
+        one_to_many(CLOUDS[0], [Diagram(np.zeros((0, 2)), np.zeros(0))])
