@@ -134,7 +134,7 @@ def error_table(whole: list[Diagram], count: int, path: Path) -> None:
     exact = {name: truth(fine, pairs, path) for name, pairs in sets.items()}
     sizes, spread = [len(d.weights) for d in fine], max(d.spread for d in fine)
     print(f"2. {len(whole)} whole diagrams; truth on {min(sizes)} to {max(sizes)} points", end=", ")
-    print(f"each at most {spread / math.sqrt(2):.2f} from its whole diagram; what that changes in a distance:")
+    print(f"each at most {spread / math.sqrt(2):.2f} from its whole; what that changes:")
     for i, j in sets["random"][:: max(1, count // WHOLE)]:
         before, after = (float(one_to_many(ds[i], [ds[j]], bin_width=0)[0]) for ds in (whole, fine))
         print(f"   {len(whole[i].weights)} and {len(whole[j].weights)} triangles: {before:.4f} to {after:.4f}")

@@ -65,12 +65,12 @@ def test_batches_cost_what_single_pairs_do(reach: float | None, monkeypatch: pyt
 
 
 def test_distances_are_wasserstein_s_on_the_packaged_atlas() -> None:
-    """But for the terms of the diagrams themselves, with steps from their own diameters: 3e-3 at most."""
+    """But for the terms of the diagrams themselves, with steps from their own diameters: 5e-3 at most."""
     atlas = load_atlas()
     diagrams = sorted(atlas.mask_diagrams, key=lambda d: len(d.points))[:: len(atlas) // 7][:7]
     found = pairwise(diagrams)
     for i, j in zip(*np.triu_indices(len(diagrams), 1), strict=True):
-        assert found[i, j] == pytest.approx(wasserstein(diagrams[i], diagrams[j]), rel=3e-3, abs=5e-3)
+        assert found[i, j] == pytest.approx(wasserstein(diagrams[i], diagrams[j]), rel=5e-3)
     assert (found == found.T).all()
     assert (np.diag(found) == 0).all()
 
