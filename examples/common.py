@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import FigureBase
 
-from curvafit.data_synth.atlas import versions
+from curvafit.data_synth.draws import versions
 from curvafit.diagram import Diagram, diagram
 from curvafit.generation.flow import Flow, generate
 from curvafit.generation.schedule import Schedule, schedule
