@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 from pathlib import Path
 from typing import Annotated
@@ -12,7 +13,7 @@ from curvafit.cli_support import plainly, say
 
 EXAMPLE = """[bold]Example[/bold]
 
-eval "$(curvafit nnunet --prior bone/fit.json --weight 0.01)"
+eval "$(curvafit nnunet --prior bone/fit.json)"
 
 nnUNetv2_train 4 3d_fullres 0 -tr nnUNetTrainerCurvafit
 """
@@ -20,13 +21,16 @@ nnUNetv2_train 4 3d_fullres 0 -tr nnUNetTrainerCurvafit
 
 def nnunet(
     prior: Annotated[str, typer.Option(help="fit.json of an example, or a preset's name (curvafit presets).")],
-    weight: Annotated[float, typer.Option(help="Of the prior beside Dice and cross-entropy, from 0.")],
+    share: Annotated[
+        float | None, typer.Option(help="Of the gradient of Dice and cross-entropy; 0.1 where no weight is given.")
+    ] = None,
+    weight: Annotated[float | None, typer.Option(help="Of the prior's value, instead of a share.")] = None,
     epsilon: Annotated[float | None, typer.Option(help="ε in mm; twice the finest voxel edge if not given.")] = None,
-    warmup: Annotated[float, typer.Option(help="Epochs over which the weight grows to its full value.")] = 0.0,
+    warmup: Annotated[float, typer.Option(help="Epochs before a share is set, or over which a weight grows.")] = 50,
 ) -> None:
     """Print the lines for a shell that let nnU-Net v2 train with the curvature prior.
 
-    The loss is a mean over voxels; `CurvaturePrior.suggest_weight` tells a weight that balances it with another.
+    nnU-Net takes lengths for mm: a fit in another physical unit is converted.
     """
     with plainly():
         from curvafit.priors import PRESETS, read_fit
@@ -34,13 +38,18 @@ def nnunet(
         if prior not in PRESETS:
             if not prior.endswith(".json"):
                 raise ValueError(f"expected --prior to be a fit.json or a preset ({', '.join(PRESETS)}), got {prior!r}")
-            read_fit(prior)
+            read_fit(prior).in_unit("mm")
             prior = str(Path(prior).resolve())
-        if weight < 0 or warmup < 0 or (epsilon is not None and epsilon <= 0):
-            raise ValueError(f"expected a weight and a warm-up from 0 and ε above, got {weight}, {warmup}, {epsilon}")
+        if share is not None and weight is not None:
+            raise ValueError("expected either --share or --weight, got both")
+        share = 0.1 if share is None and weight is None else share
+        given = {"SHARE": share, "WEIGHT": weight, "WARMUP": warmup, "EPSILON": epsilon}
+        for name, value in given.items():
+            if value is not None and not (0 <= value < math.inf and (value or name in ("WEIGHT", "WARMUP"))):
+                raise ValueError(f"expected --{name.lower()} to be a positive number, got {value}")
         folder = shlex.quote(str(Path(__file__).resolve().parent / "nnunet"))
         say(f"export nnUNet_extTrainer={folder}${{nnUNet_extTrainer:+:$nnUNet_extTrainer}}")
-        told = {"PRIOR": prior, "WEIGHT": f"{weight:g}", "WARMUP": f"{warmup:g}"}
-        for name, value in (told | ({} if epsilon is None else {"EPSILON": f"{epsilon:g}"})).items():
-            say(f"export CURVAFIT_{name}={shlex.quote(value)}")
+        say(f"export CURVAFIT_PRIOR={shlex.quote(prior)}")
+        for name, value in given.items():
+            say(f"unset CURVAFIT_{name}" if value is None else f"export CURVAFIT_{name}={value:g}")
         say("# then: nnUNetv2_train DATASET 3d_fullres FOLD -tr nnUNetTrainerCurvafit")

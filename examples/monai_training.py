@@ -58,7 +58,8 @@ def scan(edge: int, seed: int, steps: int | None) -> dict[str, Tensor]:
     return {"image": image[None], "label": label[None], "truth": truth[None]}
 
 
-def train(loss: nn.Module, scans: list[dict[str, Tensor]], steps: int, patch: int) -> nn.Module:
+def train(loss: CombinedLoss, share: float, scans: list[dict[str, Tensor]], steps: int, patch: int) -> nn.Module:
+    """Half of the steps without the prior, then with its share of the gradient of Dice + CE."""
     set_determinism(0)
     keys = ["image", "label"]
     augment = Compose(
@@ -71,9 +72,13 @@ def train(loss: nn.Module, scans: list[dict[str, Tensor]], steps: int, patch: in
     loader = DataLoader(Dataset([scans[k % len(scans)] for k in range(2 * steps)], augment), batch_size=2)
     net = UNet(spatial_dims=3, in_channels=1, out_channels=1, channels=(8, 16, 32), strides=(2, 2), num_res_units=1)
     adam = torch.optim.Adam(net.parameters(), 3e-3)
-    for data in loader:
+    for step, data in enumerate(loader):
         adam.zero_grad()
-        loss(net(data["image"]), data["label"]).backward()
+        logits = net(data["image"])
+        if share and step == steps // 2:
+            loss.weight = loss.prior.suggest_weight(loss.base, (logits, data["label"]), share)
+            print(f"the prior's weight, for {share:g} of the gradient: {loss.weight:.2g}")
+        loss(logits, data["label"]).backward()
         adam.step()
     return net.eval()
 
@@ -82,7 +87,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--small", action="store_true", help="a few steps on tiny shapes: a smoke test")
     parser.add_argument("--steps", type=int, default=200)
-    parser.add_argument("--weight", type=float, default=3e-3)
+    parser.add_argument("--share", type=float, default=0.1, help="of the gradient of Dice + CE")
     parser.add_argument("-o", "--output", type=Path, default=Path("monai_training"))
     options = parser.parse_args()
     edge, steps, patch, flow = (32, 2, 16, 60) if options.small else (80, options.steps, 48, None)
@@ -90,11 +95,8 @@ def main() -> None:
     base = Annotated(DiceCELoss(sigmoid=True))
     prior = CurvaturePrior(PRESET, sigmoid=True)
     panels = {"image": test["image"], "truth": test["truth"]}
-    for name, loss in (
-        ("Dice + CE", base),
-        ("with the prior", CombinedLoss(base, prior, options.weight, warmup=steps // 4)),
-    ):
-        net = train(loss, scans, steps, patch)
+    for name, share in (("Dice + CE", 0.0), ("with the prior", options.share)):
+        net = train(CombinedLoss(base, prior, 0.0), share, scans, steps, patch)
         with torch.no_grad():
             logits = sliding_window_inference(test["image"][None], (patch,) * 3, 1, net, overlap=0.25)
         found = (logits > 0).float()  # type: ignore[operator]

@@ -29,7 +29,10 @@ def test_the_command_prints_lines_that_a_shell_takes(tmp_path):
         said = subprocess.run(["bash", "-c", script], env=env, capture_output=True, text=True, check=True)
         folder, *rest = said.stdout.strip().split("|")
         assert folder.split(os.pathsep) == [str(FOLDER), *([before] if before else [])]
-        assert rest == ["tubes", "0.01", "0.5", "0"]
+        assert rest == ["tubes", "0.01", "0.5", "50"]
+        assert "unset CURVAFIT_SHARE" in script
+    shared = call("nnunet", "--prior", "tubes").stdout.splitlines()
+    assert "export CURVAFIT_SHARE=0.1" in shared and "unset CURVAFIT_WEIGHT" in shared
 
 
 @pytest.mark.parametrize(
@@ -37,7 +40,11 @@ def test_the_command_prints_lines_that_a_shell_takes(tmp_path):
     [
         (("--prior", "tubs", "--weight", "1"), "expected --prior to be a fit.json or a preset"),
         (("--prior", "none.json", "--weight", "1"), "expected a fit.json, found no file none.json"),
-        (("--prior", "tubes", "--weight", "-1"), "expected a weight and a warm-up from 0"),
+        (("--prior", "tubes", "--weight", "-1"), "expected --weight to be a positive number, got -1"),
+        (("--prior", "tubes", "--share", "nan"), "expected --share to be a positive number, got nan"),
+        (("--prior", "tubes", "--epsilon", "inf"), "expected --epsilon to be a positive number, got inf"),
+        (("--prior", "tubes", "--warmup", "nan"), "expected --warmup to be a positive number, got nan"),
+        (("--prior", "tubes", "--share", "1", "--weight", "1"), "expected either --share or --weight"),
     ],
 )
 def test_wrong_options_are_said(options, message):
@@ -99,6 +106,19 @@ assert int(combined.calls) == made
 trainer.current_epoch = 3
 trainer.on_train_epoch_start()
 assert int(combined.calls) == 3 * 250 * made
+os.environ["CURVAFIT_SHARE"] = "0.2"
+shared = kind(copy.deepcopy(plans), "3d_fullres", 0, dataset, device=torch.device("cpu"))
+shared.initialize()
+shared.dataloader_train = iter([{"data": image, "target": [t.clone() for t in target]}] * 20)
+for epoch in (1, 2):
+    assert shared.loss.loss.weight == 0
+    shared.current_epoch = epoch
+    shared.on_train_epoch_start()
+combined = shared.loss.loss
+leaf = shared.network(image)[0].detach().float().requires_grad_()
+slopes = [torch.autograd.grad(part(leaf, target[0]), leaf)[0].norm() for part in (combined.base, combined.prior)]
+assert abs(float(combined.weight * slopes[1] / slopes[0]) - 0.2) < 1e-3
+assert shared.train_step({"data": image, "target": target})["loss"] < 1e3
 print("done")
 """
 

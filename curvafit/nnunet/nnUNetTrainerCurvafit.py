@@ -1,25 +1,32 @@
 """nnU-Net v2's trainer with the curvature prior beside its loss, found through `nnUNet_extTrainer`.
 
-`curvafit nnunet --prior fit.json --weight 0.01` prints the lines to set; then
+`curvafit nnunet --prior fit.json` prints the lines to set; then
 `nnUNetv2_train DATASET 3d_fullres FOLD -tr nnUNetTrainerCurvafit`.
 """
 
 from __future__ import annotations
 
 import os
+import statistics
 
+import torch
 from nnunetv2.training.loss.deep_supervision import DeepSupervisionWrapper  # pyright: ignore[reportMissingImports]
 from nnunetv2.training.nnUNetTrainer.nnUNetTrainer import nnUNetTrainer  # pyright: ignore[reportMissingImports]
-from torch import Tensor, nn
 
 from curvafit.priors import CombinedLoss, CurvaturePrior
+
+#: Batches over whose median the prior is balanced.
+BATCHES = 9
 
 
 class nnUNetTrainerCurvafit(nnUNetTrainer):
     """Dice + cross-entropy + weight × F_ε of the predicted foreground classes, at every level of deep supervision.
 
-    Read from the environment: `CURVAFIT_PRIOR` (a preset's name or a `fit.json`), `CURVAFIT_WEIGHT`, and, where they
-    are set, `CURVAFIT_EPSILON` in mm and `CURVAFIT_WARMUP` in epochs. A continued training warms up no second time.
+    Read from the environment: `CURVAFIT_PRIOR` (a preset's name or a `fit.json`); `CURVAFIT_SHARE` or
+    `CURVAFIT_WEIGHT`; and, where they are set, `CURVAFIT_EPSILON` in mm and `CURVAFIT_WARMUP` in epochs. A weight grows
+    to its full value over the warm-up. With a share there is no prior until then; then the weight is set once, to what
+    gives the prior that share of the gradient of Dice + cross-entropy. A training that is continued warms up no second
+    time, and is balanced anew. The prior acts on all of a patch, on what nnU-Net's ignore label hides too.
 
     Raises
     ------
@@ -29,10 +36,12 @@ class nnUNetTrainerCurvafit(nnUNetTrainer):
 
     def _build_loss(self):
         loss, own = super()._build_loss(), self._prior()
-        weight, epochs = _number("CURVAFIT_WEIGHT"), _number("CURVAFIT_WARMUP", 0.0)
+        self._share, epochs = _number("CURVAFIT_SHARE", 0.0), _number("CURVAFIT_WARMUP", 0.0)
+        weight = 0.0 if self._share else _number("CURVAFIT_WEIGHT")
         deep = isinstance(loss, DeepSupervisionWrapper)
         levels = sum(factor != 0 for factor in loss.weight_factors) if deep else 1
-        warmup = int(epochs * self.num_iterations_per_epoch) * levels
+        warmup = 0 if self._share else int(epochs * self.num_iterations_per_epoch) * levels
+        self._balanced_from = epochs
         combined = CombinedLoss(loss.loss if deep else loss, own, weight, warmup)
         self._combined, self._calls_an_epoch = combined, self.num_iterations_per_epoch * levels
         if not deep:
@@ -43,8 +52,31 @@ class nnUNetTrainerCurvafit(nnUNetTrainer):
     def on_train_epoch_start(self):
         super().on_train_epoch_start()
         self._combined.calls.fill_(int(self.current_epoch) * self._calls_an_epoch)
+        if self._share and not self._combined.weight and self.current_epoch >= self._balanced_from:
+            self._combined.weight = self._balance()
+            self.print_to_log_file(f"weight of the curvature prior: {self._combined.weight:.3g}")
 
-    def _prior(self) -> nn.Module:
+    def _balance(self) -> float:
+        """The weight that gives the prior its share of the gradient, the median of some batches; 0 where none has a
+        surface yet: it is then asked again after the next epoch."""
+        found = []
+        for _ in range(BATCHES):
+            batch = next(self.dataloader_train)
+            with torch.no_grad():
+                output = self.network(batch["data"].to(self.device))
+            target = batch["target"]
+            finest = [each[0] if isinstance(each, (list, tuple)) else each for each in (output, target)]
+            try:
+                pair = (finest[0].float(), finest[1].to(self.device))
+                found.append(self._combined.prior.suggest_weight(self._combined.base, pair, self._share))
+            except ValueError:
+                continue
+        weight = torch.tensor(statistics.median(found) if found else 0.0, device=self.device)
+        if self.is_ddp:
+            torch.distributed.all_reduce(weight, torch.distributed.ReduceOp.AVG)
+        return float(weight)
+
+    def _prior(self) -> CurvaturePrior:
         spacing, patch = self.configuration_manager.spacing, self.configuration_manager.patch_size
         if len(patch) != 3:
             raise ValueError(f"expected a 3D configuration, got {self.configuration_name} of patch size {list(patch)}")
@@ -52,30 +84,16 @@ class nnUNetTrainerCurvafit(nnUNetTrainer):
         if not law:
             raise ValueError("expected CURVAFIT_PRIOR to be a preset or a fit.json, got nothing: see `curvafit nnunet`")
         regions = self.label_manager.has_regions
-        prior = CurvaturePrior(
+        return CurvaturePrior(
             law,
             sigmoid=regions,
             softmax=not regions,
             include_background=regions,
-            ignore_index=None if regions else self.label_manager.ignore_label,
             spacing=spacing,
             unit="mm",
             epsilon=epsilon or None,
             shape=patch,
         )
-        return _Regions(prior) if regions and self.label_manager.has_ignore_label else prior
-
-
-class _Regions(nn.Module):
-    """With regions, the target's last channel is one where the label is ignored."""
-
-    def __init__(self, prior: CurvaturePrior) -> None:
-        super().__init__()
-        self.prior = prior
-
-    def forward(self, output: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-        known = 1 - target[:, -1:].float()
-        return self.prior(output, mask=known if mask is None else mask * known)
 
 
 def _number(name: str, missing: float | None = None) -> float:
