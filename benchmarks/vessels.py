@@ -187,7 +187,7 @@ def main() -> None:
     torch.set_num_threads(1)
     torch.use_deterministic_algorithms(True)
     torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
-    study = Study(options.output, BUDGETS[options.budget])
+    study = Study(options.output / options.budget, BUDGETS[options.budget])
     rate = study.rate()
     chosen = {loss: study.chosen(loss, rate) for loss in LOSSES}
     runs: dict[str, list[list[dict]]] = {loss: [] for loss in LOSSES}
@@ -195,9 +195,9 @@ def main() -> None:
         for loss, setting in chosen.items():
             runs[loss].append(study.pair(loss, *setting, rate, seed))
         text = table(runs, tuning(study, rate))
-        write(options.output / "vessels.txt", text)
+        write(study.folder / "vessels.txt", text)
     print(text)
-    picture(options.output, runs)
+    picture(study.folder, runs)
 
 
 if __name__ == "__main__":

@@ -35,14 +35,14 @@ class nnUNetTrainerCurvafit(nnUNetTrainer):
     """
 
     def _build_loss(self):
-        loss, own = super()._build_loss(), self._prior()
+        loss, self._own = super()._build_loss(), self._prior()
         self._share, epochs = _number("CURVAFIT_SHARE", 0.0), _number("CURVAFIT_WARMUP", 0.0)
         weight = 0.0 if self._share else _number("CURVAFIT_WEIGHT")
         deep = isinstance(loss, DeepSupervisionWrapper)
         levels = sum(factor != 0 for factor in loss.weight_factors) if deep else 1
         warmup = 0 if self._share else int(epochs * self.num_iterations_per_epoch) * levels
         self._balanced_from = epochs
-        combined = CombinedLoss(loss.loss if deep else loss, own, weight, warmup)
+        combined = CombinedLoss(loss.loss if deep else loss, self._own, weight, warmup)
         self._combined, self._calls_an_epoch = combined, self.num_iterations_per_epoch * levels
         if not deep:
             return combined
@@ -68,7 +68,7 @@ class nnUNetTrainerCurvafit(nnUNetTrainer):
             finest = [each[0] if isinstance(each, (list, tuple)) else each for each in (output, target)]
             try:
                 pair = (finest[0].float(), finest[1].to(self.device))
-                found.append(self._combined.prior.suggest_weight(self._combined.base, pair, self._share))
+                found.append(self._own.suggest_weight(self._combined.base, pair, self._share))
             except ValueError:
                 continue
         weight = torch.tensor(statistics.median(found) if found else 0.0, device=self.device)
