@@ -16,8 +16,10 @@ from curvafit.priors.refined import refined
 from curvafit.priors.shapes import Float
 from curvafit.priors.stencils import gaussian_blur
 
-#: Voxels that ε spans at least: an axis with fewer is interpolated.
+#: Voxels that ε spans: an axis with fewer, by more than a tenth, is interpolated.
 RESOLVED = 2
+#: How many times an axis is refined at most.
+MOST = 16
 
 
 def curvature_prior(
@@ -40,7 +42,8 @@ def curvature_prior(
     coefficients, epsilon, blur
         Numbers, ε, and the standard deviation of a Gaussian that is applied first, in spacing's unit.
     spacing
-        Voxel edges (z, y, x). An axis with fewer than two voxels to ε is interpolated (cubic) until it has two.
+        Voxel edges (z, y, x). An axis with fewer than two voxels to ε is interpolated (cubic) until it has two;
+        up to a tenth less is left as it is.
     mask
         Weights of the energy's density.
     normalize
@@ -52,7 +55,7 @@ def curvature_prior(
     Raises
     ------
     ValueError
-        If the window is too small for its border.
+        If the window is too small for its border, or as `upsampling`.
     """
     shape = tuple(probability.shape[1:])
     if min(shape) < max(4, 2 * border + 1):
@@ -76,8 +79,22 @@ def curvature_prior(
 
 
 def upsampling(spacing: Sequence[float], epsilon: float) -> tuple[int, int, int]:
-    """How many times each axis is refined for ε to span two voxels."""
-    return tuple(max(1, math.ceil(RESOLVED * h / epsilon - 1e-3)) for h in spacing)  # type: ignore[return-value]
+    """How many times each axis is refined for ε to span two voxels; not at all where it lacks a tenth of that.
+
+    Raises
+    ------
+    ValueError
+        If an axis would be refined more than 16-fold.
+    """
+    ratios = [RESOLVED * h / epsilon for h in spacing]
+    times = tuple(1 if ratio <= 1.1 else math.ceil(ratio - 1e-3) for ratio in ratios)
+    if max(times) > MOST:
+        least = RESOLVED * max(spacing) / MOST
+        raise ValueError(
+            f"expected an ε of at least {least:g} for voxels of {tuple(spacing)}, got {epsilon:g}, for which an axis "
+            f"is refined {max(times)}-fold: give ε in spacing's unit, or coarser"
+        )
+    return times  # type: ignore[return-value]
 
 
 def _window(probability: Tensor, mask: Tensor | None, border: int) -> Tensor:

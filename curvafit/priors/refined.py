@@ -22,6 +22,7 @@ def refined(u: Tensor, axis: int, times: int) -> Tensor:
 
 
 @lru_cache(maxsize=32)
+@torch.inference_mode(False)  # what is kept must serve a later backward pass
 def _weights(n: int, times: int) -> Tensor:
     """`(n, n · times)`: a column for each new sample."""
     place = (torch.arange(n * times, dtype=torch.float64) + 0.5) / times - 0.5

@@ -50,7 +50,8 @@ class CurvaturePrior(nn.Module):
         Spacing's unit (nm, um, mm or m) where it is not that of the `fit.json`, which is then converted.
     epsilon
         ε in that unit; twice the smallest edge if not given. Structures thinner than two smallest edges do not
-        survive it. An axis on which ε spans fewer than two voxels is interpolated: a warning says so.
+        survive it. An axis on which ε spans fewer than two voxels, by more than a tenth, is interpolated: a warning
+        says so. More than 16-fold is refused.
     weight
         A factor, or one a class; classes of weight 0 are not computed.
     normalize

@@ -23,7 +23,7 @@ def energies(
     """`energy` of every field, its density multiplied by a mask.
 
     Float32 takes the fused kernel where there is one: its gradient comes with its value, so that the backward pass is
-    a multiplication, once. Other fields take the definition.
+    a multiplication, once; a second derivative raises a RuntimeError. Other fields take the definition.
 
     Parameters
     ----------
@@ -77,13 +77,28 @@ def _(u, mask, a, spacing, epsilon):
 
 
 def _keep(ctx, inputs, output) -> None:
-    ctx.save_for_backward(output[1])
+    ctx.save_for_backward(output[1], inputs[0])
     ctx.mark_non_differentiable(output[1])
 
 
 def _backward(ctx, by_energies, _):
-    (slopes,) = ctx.saved_tensors
-    return slopes * by_energies[:, None, None, None], None, None, None, None
+    slopes, u = ctx.saved_tensors
+    return _Once.apply(slopes, by_energies, u), None, None, None, None
+
+
+class _Once(torch.autograd.Function):
+    """The gradient by u, which says that it depends on u but not how."""
+
+    @staticmethod
+    def forward(slopes, by_energies, u):
+        return slopes * by_energies[:, None, None, None]
+
+    @staticmethod
+    def setup_context(ctx, inputs, output) -> None: ...
+
+    @staticmethod
+    def backward(ctx, *_):
+        raise RuntimeError("expected first derivatives of F_ε in float32, got a second one: take float64 for it")
 
 
 _energies.register_autograd(_backward, setup_context=_keep)
