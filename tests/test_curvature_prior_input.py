@@ -114,6 +114,7 @@ def test_it_can_be_copied():
         ({"epsilon": -1.0}, "expected epsilon > 0"),
         ({"border": 0.5}, "expected a border of whole voxels"),
         ({"weight": -1}, "expected a weight from 0"),
+        ({"weight": None}, "expected a weight from 0, or one a class, got None"),
         ({"shape": (8, 8)}, "expected shape as 3 numbers"),
     ],
 )
@@ -138,6 +139,7 @@ def test_wrong_laws_are_said(tmp_path):
     [
         ((1, 1, 1, 16, 16), "expected a volume of at least 4 voxels along each axis, got .1, 16, 16."),
         ((1, 16, 16, 16), "expected an input of floats .B, N, D, H, W."),
+        ((0, 1, 8, 8, 8), "expected an input of floats .B, N, D, H, W., got torch.float32 .0, 1, 8, 8, 8."),
     ],
 )
 def test_flat_input_is_refused(shape, message):
@@ -154,8 +156,9 @@ def test_wrong_targets_and_masks_are_said():
             prior(p, target)
     with pytest.raises(ValueError, match="expected a target of shape"):
         prior(p, torch.ones(2, 1, 8, 8, 4))
-    with pytest.raises(ValueError, match="expected a mask of shape"):
-        prior(p, torch.ones(2, 1, 8, 8, 8), mask=torch.ones(2, 3, 8, 8, 8))
+    for shape in ((2, 3, 8, 8, 8), (3, 1, 8, 8, 8), (0, 1, 8, 8, 8), (2, 1, 8, 8, 1), (2, 8, 8, 8)):
+        with pytest.raises(ValueError, match=r"expected a mask of shape \(2 or 1, 2 or 1, 8, 8, 8\), got"):
+            prior(p, torch.ones(2, 1, 8, 8, 8), mask=torch.ones(shape))
     with pytest.raises(ValueError, match="expected a target of class numbers"):
         CurvaturePrior("tubes", to_onehot_y=True)(p, torch.ones(2, 2, 8, 8, 8))
 

@@ -66,7 +66,7 @@ def test_the_warm_up_counts_training_steps_and_survives_a_restart():
 
 
 def test_combined_loss_refuses_negative_numbers():
-    for options in ({"weight": -1.0}, {"warmup": -1}):
+    for options in ({"weight": -1.0}, {"weight": None}, {"warmup": -1}):
         with pytest.raises(ValueError, match="expected a weight and a warm-up from 0"):
             CombinedLoss(nn.BCEWithLogitsLoss(), CurvaturePrior("tubes"), **options)
 

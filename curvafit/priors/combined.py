@@ -35,7 +35,7 @@ class CombinedLoss(nn.Module):
         self, base: Callable[[Tensor, Tensor], Tensor], prior: nn.Module, weight: float = 1.0, warmup: int = 0
     ) -> None:
         super().__init__()
-        if not weight >= 0 or warmup < 0:
+        if weight is None or not weight >= 0 or warmup < 0:
             raise ValueError(f"expected a weight and a warm-up from 0, got {weight} and {warmup}")
         self.base, self.prior, self.weight, self.warmup = base, prior, float(weight), int(warmup)
         self.register_buffer("calls", torch.zeros((), dtype=torch.int64))

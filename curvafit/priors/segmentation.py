@@ -13,8 +13,8 @@ from torch import Tensor, nn
 
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.fit_file import Law, find_law
-from curvafit.priors.grid import Grid
-from curvafit.priors.loss import RESOLVED, curvature_prior, upsampling
+from curvafit.priors.grid import METRES, Grid
+from curvafit.priors.loss import MOST, RESOLVED, curvature_prior, upsampling
 
 _REDUCTIONS, _NORMALIZATIONS = ("mean", "sum", "none"), ("voxel", "area")
 
@@ -24,8 +24,9 @@ class CurvaturePrior(nn.Module):
 
     `forward(input, target=None, mask=None)`: `input` is `(B, N, D, H, W)`, N classes or one; a scalar comes back, or
     `(B, N, 1, 1, 1)` with `reduction="none"`. Everything is computed in float32 whatever autocast says (float64 input
-    stays). The target says only which voxels to ignore. Deterministic; a constant or saturated input has a finite
-    value and gradient.
+    stays). The target says only which voxels to ignore, the mask (from 0, of that shape or with one for B or N) how
+    much each counts. Deterministic; a constant or saturated input has a finite value and gradient. Second derivatives
+    are for float64 alone; in float32 they raise a RuntimeError.
 
     Parameters
     ----------
@@ -33,7 +34,7 @@ class CurvaturePrior(nn.Module):
         `Coefficients` with lengths in spacing's unit; or a preset's name, in working units of which the smallest
         voxel edge is 0.01; or the path of a `fit.json`. Or a sequence of such, one a class.
     sigmoid, softmax
-        The input is logits: apply this first.
+        The input is logits: apply this first. Without either it is probabilities; others are warned of.
     include_background
         False leaves channel 0 out.
     to_onehot_y
@@ -47,7 +48,8 @@ class CurvaturePrior(nn.Module):
     spacing
         Voxel edges (z, y, x), or one for all.
     unit
-        Spacing's unit (nm, um, mm or m) where it is not that of the `fit.json`, which is then converted.
+        Spacing's unit (nm, um, mm or m) where it is not that of the `fit.json`, which is then converted. An ε four
+        times off the fit's is warned of.
     epsilon
         ε in that unit; twice the smallest edge if not given. Structures thinner than two smallest edges do not
         survive it. An axis on which ε spans fewer than two voxels, by more than a tenth, is interpolated: a warning
@@ -62,7 +64,7 @@ class CurvaturePrior(nn.Module):
         Standard deviation, in spacing's unit, of a Gaussian applied to the probabilities; none by default.
     shape
         Voxels (D, H, W) of a whole patch. An input of another shape is then the same patch on a coarser grid, as in
-        deep supervision: the spacing follows.
+        deep supervision: the spacing follows. A level under 4 voxels, or 16 times too coarse for ε, is zero.
 
     Raises
     ------
@@ -108,7 +110,8 @@ class CurvaturePrior(nn.Module):
         self.shape = None if shape is None else Grid(tuple(shape), self.spacing).shape  # type: ignore[arg-type]
         self.weight = _weights(weight)
         laws = [coefficients] if isinstance(coefficients, (Coefficients, str, PathLike)) else list(coefficients)
-        self.coefficients = tuple(_numbers(law, min(self.spacing), unit) for law in laws)
+        self.coefficients = tuple(_numbers(law, min(self.spacing), unit, self.epsilon) for law in laws)
+        self._said: set[str] = set()
         _tell(self.spacing, self.epsilon)
 
     def extra_repr(self) -> str:
@@ -121,10 +124,10 @@ class CurvaturePrior(nn.Module):
             classes = probability.shape[1]
             laws, weights = _each(self.coefficients, classes, "coefficients"), _each(self.weight, classes, "weight")
             spacing = self._spacing(input)
-            columns = []
+            skipped, columns = self._skips(input), []
             for channel, (law, weight) in enumerate(zip(laws, weights, strict=True)):
                 field = probability[:, channel]
-                if weight == 0:
+                if weight == 0 or skipped:
                     columns.append(field.sum((-3, -2, -1)) * 0)
                     continue
                 value = curvature_prior(
@@ -173,11 +176,13 @@ class CurvaturePrior(nn.Module):
 
     def _probability(self, input: Tensor) -> Tensor:
         """(B, classes that count, D, H, W) in float32 or float64."""
-        if input.dim() != 5 or not input.is_floating_point():
+        if input.dim() != 5 or not input.is_floating_point() or 0 in input.shape:
             raise ValueError(f"expected an input of floats (B, N, D, H, W), got {input.dtype} {tuple(input.shape)}")
         values = input if input.dtype == torch.float64 else input.float()
         if self.sigmoid:
             values = values.sigmoid()
+        elif not self.softmax or input.shape[1] == 1:
+            self._look(values)
         if input.shape[1] == 1:
             for name, unfit in (
                 ("softmax=True", self.softmax),
@@ -195,9 +200,12 @@ class CurvaturePrior(nn.Module):
         batch, classes = input.shape[:2]
         space = tuple(input.shape[2:])
         if mask is not None:
-            if mask.dim() != 5 or tuple(mask.shape[2:]) != space or mask.shape[1] not in (1, classes):
+            fits = mask.dim() == 5 and mask.shape[0] in (1, batch) and mask.shape[1] in (1, classes)
+            if not fits or tuple(mask.shape[2:]) != space:
                 expected = f"({batch} or 1, {classes} or 1, {', '.join(map(str, space))})"
                 raise ValueError(f"expected a mask of shape {expected}, got {tuple(mask.shape)}")
+            if not torch.compiler.is_compiling() and not bool(((mask >= 0) & (mask < math.inf)).all()):
+                raise ValueError("expected a mask of finite numbers from 0, got others")
             if mask.shape[1] > 1 and not self.include_background:
                 mask = mask[:, 1:]
         if target is not None and (target.dim() != 5 or target.shape[0] != batch or tuple(target.shape[2:]) != space):
@@ -219,6 +227,30 @@ class CurvaturePrior(nn.Module):
         pairs = zip(self.spacing, self.shape, input.shape[2:], strict=True)
         return tuple(h * whole / n for h, whole, n in pairs)  # type: ignore[return-value]
 
+    def _skips(self, input: Tensor) -> bool:
+        """Whether this is a level of deep supervision that has no inside or is too coarse for ε."""
+        space = tuple(input.shape[2:])
+        if self.shape is None or space == self.shape:
+            return False
+        times = RESOLVED * max(self._spacing(input)) / self.epsilon
+        if times <= MOST + 1e-3 and min(space) >= max(4, 2 * self.border + 1):
+            return False
+        self._say(str(space), f"a level of {space} voxels is too coarse for ε = {self.epsilon:g}: it counts nothing")
+        return True
+
+    def _look(self, probability: Tensor) -> None:
+        if torch.compiler.is_compiling() or "range" in self._said:
+            return
+        low, high = (float(value) for value in probability.detach().aminmax())
+        if low < -1e-3 or high > 1 + 1e-3:
+            self._say("range", f"expected probabilities, got {low:g} to {high:g}: is sigmoid or softmax missing?")
+
+    def _say(self, what: str, message: str) -> None:
+        """A warning, once."""
+        if not torch.compiler.is_compiling() and what not in self._said:
+            self._said.add(what)
+            warnings.warn(message, stacklevel=3)
+
 
 def _plain(values):
     """Without what subclasses (MONAI's `MetaTensor`) add."""
@@ -230,16 +262,28 @@ def _edges(spacing: float | Sequence[float]) -> tuple[float, float, float]:
 
 
 def _weights(weight: float | Sequence[float]) -> tuple[float, ...]:
-    values = (float(weight),) if isinstance(weight, (int, float)) else tuple(float(value) for value in weight)
+    try:
+        values = tuple(torch.as_tensor(weight, dtype=torch.float64).flatten().tolist())
+    except (TypeError, ValueError, RuntimeError):
+        values = ()
     if not values or not all(0 <= value < math.inf for value in values):
         raise ValueError(f"expected a weight from 0, or one a class, got {weight}")
     return values
 
 
-def _numbers(law: Law, edge: float, unit: str | None) -> Coefficients:
+def _numbers(law: Law, edge: float, unit: str | None, epsilon: float) -> Coefficients:
     """Coefficients with lengths in spacing's unit."""
     found = find_law(law, edge)
-    return found if isinstance(found, Coefficients) else found.in_unit(unit)
+    if isinstance(found, Coefficients):
+        if unit is not None and unit not in METRES:
+            raise ValueError(f"expected a unit among {', '.join(METRES)}, got {unit!r}")
+        return found
+    numbers, unit = found.in_unit(unit), unit or found.unit
+    fitted = found.epsilon * (1 if unit == found.unit else METRES[found.unit] / METRES[unit])
+    if not 1 / 4 <= epsilon / fitted <= 4:
+        both = f"ε is {epsilon:g} {unit} here and was {fitted:g} {unit} in the fit"
+        warnings.warn(f"{both}: give spacing and its unit, if these are not meant", stacklevel=4)
+    return numbers
 
 
 def _each(values: tuple, classes: int, name: str) -> tuple:
