@@ -105,19 +105,30 @@ def test_distributed_training_sees_the_same_gradients(tmp_path):
 # ---- MONAI -----------------------------------------------------------------------------------------------------------
 
 
-def test_keywords_mean_what_they_mean_in_monai():
-    """Every keyword and reduction that MONAI's Dice loss has gives a result of the same shape."""
+@pytest.mark.parametrize("name", ["prior", "dice"])
+def test_keywords_mean_what_they_mean_in_monai(name):
+    """Every keyword and reduction that MONAI's Dice loss has relates the same values in both."""
     losses = pytest.importorskip("monai.losses", reason="monai is not installed: pip install monai")
     logits = noise(2, 3, 8, 8, 8)
     target = torch.randint(0, 3, (2, 1, 8, 8, 8), generator=torch.Generator().manual_seed(0))
-    for reduction in ("mean", "sum", "none"):
-        for include in (True, False):
-            options = {"to_onehot_y": True, "softmax": True, "reduction": reduction, "include_background": include}
-            dice, prior = losses.DiceLoss(**options), CurvaturePrior("tubes", **options)
-            assert prior(logits, target).shape == dice(logits, target).shape
-    sigmoid = {"sigmoid": True, "reduction": "none"}
-    dice = losses.DiceLoss(**sigmoid)(logits, (logits > 0).float())
-    assert CurvaturePrior("tubes", **sigmoid)(logits).shape == dice.shape
+    onehot = nn.functional.one_hot(target[:, 0], 3).movedim(-1, 1)
+    p = logits.softmax(1)
+
+    def value(input: Tensor, target: Tensor, **options) -> Tensor:
+        loss = CurvaturePrior("tubes", **options) if name == "prior" else losses.DiceLoss(**options)
+        return loss(input, target)
+
+    each = value(p, onehot, reduction="none")
+    assert each.shape == (2, 3, 1, 1, 1) and len(set(each.flatten().tolist())) == 6
+    for include, expected in ((True, each), (False, each[:, 1:])):
+        options = {"to_onehot_y": True, "softmax": True, "include_background": include}
+        torch.testing.assert_close(value(logits, target, reduction="none", **options), expected)
+        torch.testing.assert_close(value(logits, target, **options), expected.mean())
+        if name == "prior":  # of the energies themselves: 6³ voxels inside, ε of two voxels
+            expected = expected * 6**3 / 2**3
+        torch.testing.assert_close(value(logits, target, reduction="sum", **options), expected.sum())
+    found = value(logits, onehot, sigmoid=True, reduction="none")
+    torch.testing.assert_close(found, value(logits.sigmoid(), onehot, reduction="none"))
 
 
 def test_tensors_with_metadata_are_tensors():
