@@ -106,12 +106,11 @@ class CurvaturePrior(nn.Module):
             raise ValueError(f"expected epsilon > 0 and blur >= 0 in spacing's unit, got {epsilon} and {blur}")
         if border != int(border) or border < 0:
             raise ValueError(f"expected a border of whole voxels from 0, got {border}")
-        self.border, self.blur = int(border), float(blur)
+        self.border, self.blur, self._said = int(border), float(blur), set()
         self.shape = None if shape is None else Grid(tuple(shape), self.spacing).shape  # type: ignore[arg-type]
         self.weight = _weights(weight)
         laws = [coefficients] if isinstance(coefficients, (Coefficients, str, PathLike)) else list(coefficients)
         self.coefficients = tuple(_numbers(law, min(self.spacing), unit, self.epsilon) for law in laws)
-        self._said: set[str] = set()
         _tell(self.spacing, self.epsilon)
 
     def extra_repr(self) -> str:
