@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 from typer.testing import CliRunner, Result
 
@@ -15,7 +16,10 @@ QUICK = [*LAW, "--shape", "24", "--steps", "30"]
 
 
 def call(*arguments: object) -> Result:
-    return CliRunner().invoke(app, [str(part) for part in arguments])
+    """As from a shell: `sys.argv`, which records repeat, is the command's."""
+    told = [str(part) for part in arguments]
+    with patch("sys.argv", ["curvafit", *told]):
+        return CliRunner().invoke(app, told)
 
 
 def refused(result: Result, said: str) -> None:
