@@ -132,7 +132,9 @@ def _run(
     from curvafit.mask_files import check_mask_target, write_mask
     from curvafit.scan import load
 
-    check_mask_target(out)
+    law = prior if prior.endswith(".json") else None  # or a preset's name
+    inputs = [each for each in (source, law, told.get("probability")) if each is not None]
+    check_mask_target(out, inputs=inputs)
     with stages() as progress:
         progress("reading", 0.0)
         volume = load(source, **reading)

@@ -6,6 +6,7 @@ import datetime
 import json
 import shutil
 import tempfile
+from collections.abc import Iterable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -29,21 +30,36 @@ FORMAT = "curvafit-mask-1"
 _NIFTI = (".nii", ".nii.gz")
 
 
-def check_mask_target(path: str | Path, unit: str | None = None) -> Path:
+def check_mask_target(path: str | Path, unit: str | None = None, inputs: Iterable[str | Path] = ()) -> Path:
     """The path, if a mask in `unit` can be written there; asked before the work is done.
+
+    `inputs` are the files, or folders, that are read: none may be written over.
 
     Raises
     ------
     ValueError
-        If the suffix is no volume's, its format needs a unit, the place cannot be written to, or another file stands
-        where the record or the picture goes.
+        If the suffix is no volume's, its format needs a unit, the place cannot be written to, or an input or another
+        file stands where the mask, the record or the picture goes.
     """
     target = Path(path)
     pick_writer(target, unit or "mm")
     if target.is_dir() and not target.name.lower().endswith(".zarr"):
         raise ValueError(f"expected the name of a file, got the folder {target}")
+    for each in inputs:
+        _check_apart(target, Path(str(each).partition("::")[0]))
     check_beside(target, FORMAT)
     return target
+
+
+def _check_apart(target: Path, source: Path) -> None:
+    if not source.exists():
+        return
+    read = source.resolve()
+    for made in (target, beside(target, ".png"), beside(target, ".json")):
+        place = made.resolve()
+        same = made.exists() and made.samefile(source)
+        if same or place.is_relative_to(read) or read.is_relative_to(place):
+            raise ValueError(f"expected an output that writes over no input, got {made}, where {source} is read")
 
 
 def write_mask(
@@ -69,7 +85,7 @@ def write_mask(
     -------
     The paths of mask, picture (`.png`) and record (`.json`). All three are made in a temporary folder, then moved.
     """
-    target = check_mask_target(path, scan.unit)
+    target = check_mask_target(path, scan.unit, () if like is None else (like,))
     target.parent.mkdir(parents=True, exist_ok=True)
     mask = found.mask.values.astype(np.uint8)
     work = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))

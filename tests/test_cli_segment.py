@@ -178,6 +178,33 @@ def test_places_that_cannot_be_written_are_refused_first(name, said, oblique, tm
     refused(call("segment", oblique, "--prior", "tubes", "-o", tmp_path / name), said)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "target"),
+    [
+        (("segment", "g.npy", "--prior", "tubes"), "g.npy"),
+        (("segment", "g.npy", "--prior", "tubes"), "link.npy"),
+        (("segment", "g.npy", "--prior", "tubes", "--probability", "p.npy"), "p.npy"),
+        (("segment", "g.npy", "--prior", "mine.json"), "mine.npy"),
+        (("segment", "slices", "--prior", "tubes"), "slices/1.tif"),
+        (("reconstruct", "g.npy", "--every", "4", "--prior", "tubes"), "sub/../g.npy"),
+        (("reconstruct", "h.h5::g.npy", "--every", "4", "--prior", "tubes"), "hard.npy"),
+    ],
+)
+def test_no_input_is_written_over(arguments, target, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for folder in ("sub", "slices"):
+        (tmp_path / folder).mkdir()
+    for name in ("g.npy", "p.npy", "h.h5", "slices/1.tif"):
+        (tmp_path / name).write_text(name)
+    (tmp_path / "mine.json").write_text('{"format": "curvafit-mask-1"}')
+    (tmp_path / "link.npy").symlink_to("g.npy")
+    (tmp_path / "hard.npy").hardlink_to("h.h5")
+    monkeypatch.setattr("curvafit.scan.load", lambda *_, **__: pytest.fail("read all the same"))
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    refused(call(*arguments, "-o", target), "writes over no input")
+    assert before == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+
+
 def test_steps_are_those_of_the_library() -> None:
     library = importlib.import_module("curvafit.segment")
     assert importlib.import_module("curvafit.cli_segment").STEPS == library.STEPS
