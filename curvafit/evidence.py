@@ -15,12 +15,14 @@ from curvafit.scan import Field, ScanError
 
 __all__ = ["Evidence", "interpolated_distance", "of_intensities", "of_probability"]
 
-#: Grey levels beyond these percentiles count as these.
+#: Where Otsu's threshold is to be found, grey levels beyond these percentiles count as these.
 TAILS = (0.1, 99.9)
 #: Contrast between the classes that a smoothed scan's noise may have, as a share; its deviation in voxels, from and to.
 QUIET, WIDTHS = 1 / 16, (0.7, 3.0)
 #: The least noise that is believed, as a share of the contrast, and the most that a probability is.
 LEAST_NOISE, CERTAIN = 0.05, 1e-4
+#: Classes that Otsu's threshold found with less contrast than so many times the noise may be the noise's own.
+FAINT = 1.0
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,8 @@ def of_intensities(scan: Field, threshold: float | str = "otsu", dark: bool = Fa
     """Two classes of grey levels with one Gaussian noise: r = (g - t) (c₁ - c₀) / σ².
 
     The scan is smoothed and split by Otsu's threshold; c₀, c₁ and σ are the raw levels' means and pooled deviation on
-    either side, t is half way between the means. It is then smoothed anew, as far as the noise asks for.
+    either side, t is half way between the means. It is then smoothed anew, as far as the noise asks for. A structure of
+    less than 0.1 % of the volume asks for a threshold: Otsu's takes it for a tail of the noise.
 
     Parameters
     ----------
@@ -63,16 +66,19 @@ def of_intensities(scan: Field, threshold: float | str = "otsu", dark: bool = Fa
     values = scan.values.astype(np.float32)
     if isinstance(threshold, str) and threshold != "otsu":
         raise ScanError(f"expected a threshold that is a number or 'otsu', got {threshold!r}")
-    if not np.all((values == values.min()) | (values == values.max())):  # a mask's rarer value is no tail
+    found = threshold == "otsu"
+    if found and not np.all((values == values.min()) | (values == values.max())):  # a mask's rarer value is no tail
         values = np.clip(values, *np.percentile(values, TAILS))
     smooth = _smoothed(values, scan, WIDTHS[0] + 0.3)
     means, noise = _classes(values, smooth, threshold)
     smooth = _smoothed(values, scan, _width(noise / (means[1] - means[0])))
     means, noise = _classes(values, smooth, threshold)
     contrast = means[1] - means[0]
-    middle, sign = sum(means) / 2 if threshold == "otsu" else float(threshold), -1 if dark else 1
+    middle, sign = sum(means) / 2 if found else float(threshold), -1 if dark else 1
     noise = max(noise, LEAST_NOISE * contrast)
     said = f"classes at {means[0]:.4g} and {means[1]:.4g}, noise {noise:.3g}, split at {middle:.4g}"
+    if found and contrast < FAINT * noise:
+        said += "; they differ by less than the noise, as where the structure is rare: better give a threshold"
     return Evidence(sign * (values - middle) * np.float32(contrast / noise**2), sign * (smooth - middle), said)
 
 

@@ -54,6 +54,17 @@ def test_intensities_find_the_classes_and_the_noise() -> None:
     np.testing.assert_allclose(dark.ratio, found.ratio, rtol=0.02, atol=0.1)
 
 
+def test_a_rare_structure_needs_a_threshold_and_is_told_so() -> None:
+    ball = np.linalg.norm(np.mgrid[:48, :48, :48] - 23.5, axis=0) < 2.9
+    scan = noisy(ball, 10)
+    assert "better give a threshold" in of_intensities(scan).note
+    assert "better give" not in of_intensities(noisy(tubes(), 60)).note
+    found = of_intensities(scan, 80.0)
+    assert "better give" not in found.note and dice(found.level > 0, ball) > 0.9
+    assert np.median(found.ratio[ball]) > 40 > -40 > np.median(found.ratio[~ball])
+    assert dice(segment(scan, WILLMORE, threshold=80.0, steps=10).mask.values, ball) > 0.9
+
+
 def test_a_probability_is_its_own_evidence() -> None:
     p = np.random.default_rng(0).random((6, 7, 8)).astype(np.float32)
     found = of_probability(p, Field(p))
