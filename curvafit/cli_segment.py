@@ -73,14 +73,19 @@ def segment(
     """Find the structure of a noisy scan under a curvature prior, with a picture (.png) and a record (.json)."""
     with plainly():
         reading = reading_of(spacing, unit, raw_shape, dtype, key)
-        options = {"weight": weight, "threshold": threshold_of(threshold), "dark": dark, "epsilon": epsilon}
+        options: dict[str, Any] = {"weight": weight, "epsilon": epsilon}
+        if probability is None:
+            options |= {"threshold": threshold_of(threshold), "dark": dark}
+        elif dark or threshold.lower() != "otsu":
+            given = "--dark" if dark else f"--threshold {threshold}"
+            raise ValueError(f"expected neither --threshold nor --dark with --probability, got {given}")
 
         def made(volume: Field, progress: Callable[[str, float], None]) -> Segmentation:
             from curvafit.scan import load
             from curvafit.segment import segment as find
 
-            likely = None if probability is None else load(probability)
-            return find(volume, prior, probability=likely, steps=steps, progress=progress, **options)  # type: ignore[arg-type]
+            likely = None if probability is None else load(probability, spacing=reading["spacing"], unit=unit)
+            return find(volume, prior, probability=likely, steps=steps, progress=progress, **options)
 
         more = {"probability": None if probability is None else str(probability), **options}
         _run(scan, out, prior, reading, made, {"job": "segment", "steps": steps, **more})

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from scipy import ndimage
 from scipy.interpolate import CubicSpline
 from skimage.filters import threshold_otsu
 
+from curvafit.priors.grid import METRES
 from curvafit.scan import Field, ScanError
 
 __all__ = ["Evidence", "interpolated_distance", "of_intensities", "of_probability"]
@@ -21,6 +23,8 @@ TAILS = (0.1, 99.9)
 QUIET, WIDTHS = 1 / 16, (0.7, 3.0)
 #: The least noise that is believed, as a share of the contrast, and the most that a probability is.
 LEAST_NOISE, CERTAIN = 0.05, 1e-4
+#: Voxels between what is the same place in two files.
+ASTRAY = 0.1
 #: Classes that Otsu's threshold found with less contrast than so many times the noise may be the noise's own.
 FAINT = 1.0
 
@@ -82,15 +86,17 @@ def of_intensities(scan: Field, threshold: float | str = "otsu", dark: bool = Fa
     return Evidence(sign * (values - middle) * np.float32(contrast / noise**2), sign * (smooth - middle), said)
 
 
-def of_probability(probability: np.ndarray, scan: Field) -> Evidence:
+def of_probability(probability: Field | np.ndarray, scan: Field) -> Evidence:
     """r = log p / (1 - p) of a map (Z, Y, X) in [0, 1].
 
     Raises
     ------
     ScanError
-        If its shape is not the scan's or it leaves [0, 1].
+        If its shape or place is not the scan's or it leaves [0, 1].
     """
-    values = np.asarray(probability, dtype=np.float32)
+    if isinstance(probability, Field) and probability.shape == scan.shape:
+        _check_place(probability, scan)
+    values = np.asarray(probability.values if isinstance(probability, Field) else probability, dtype=np.float32)
     if values.shape != scan.shape:
         raise ScanError(f"expected a probability map of the scan's shape {scan.shape}, got {values.shape}")
     lowest, highest = float(values.min()), float(values.max())
@@ -99,6 +105,18 @@ def of_probability(probability: np.ndarray, scan: Field) -> Evidence:
     p = values.clip(CERTAIN, 1 - CERTAIN)
     said = f"probabilities from {lowest:.3g} to {highest:.3g}"
     return Evidence(np.log(p / (1 - p)), _smoothed(values, scan, WIDTHS[0]) - 0.5, said)
+
+
+def _check_place(other: Field, scan: Field) -> None:
+    """Raise if the affines, where both have one, part by more than `ASTRAY` at a corner."""
+    if scan.affine is None or other.affine is None:
+        return
+    factor = METRES[other.unit] / METRES[scan.unit] if {other.unit, scan.unit} <= METRES.keys() else 1.0
+    corners = np.array(list(product(*((0, n - 1) for n in scan.shape[::-1]))))
+    one, two = (corners @ affine[:3, :3].T + affine[:3, 3] for affine in (scan.affine, other.affine))
+    far = float(np.linalg.norm(factor * two - one, axis=1).max()) / min(scan.spacing)
+    if not far < ASTRAY:
+        raise ScanError(f"expected a probability map with the scan's affine, got one {far:.3g} voxels away")
 
 
 def interpolated_distance(

@@ -83,7 +83,8 @@ def segment(
         `Coefficients` with lengths in the scan's unit; or a preset's name, in working units of which the smallest voxel
         edge is 0.01; or the path of a `fit.json`, whose unit is converted.
     probability
-        Instead of grey levels: the probability of the inside, in [0, 1], of the scan's shape.
+        Instead of grey levels, and of `threshold` and `dark`: the probability of the inside, in [0, 1], of the scan's
+        shape, and at its place where both files tell one.
     weight
         λ, in nats per unit of F_ε; 2 / (a20 + a02) if not given. The data count in nats, so by their noise; the
         Willmore energy counts as it is; and others as what small bumps on a plane cost, which is (a20 + a02) / 2 times
@@ -110,9 +111,10 @@ def segment(
         raise ScanError(f"expected a positive weight, got {weight}")
     if probability is None:
         found = of_intensities(scan, threshold, dark)
+    elif dark or threshold != "otsu":
+        raise ScanError("expected neither a threshold nor dark with a probability map, which says what is inside")
     else:
-        values = probability.values if isinstance(probability, Field) else probability
-        found = of_probability(values, scan)
+        found = of_probability(probability, scan)
     start = _started(found.level, place)
     stiffness = float(law.a20 + law.a02) / 2
     if stiffness <= 0:

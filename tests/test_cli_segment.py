@@ -110,7 +110,14 @@ def test_a_probability_map(tmp_path: Path) -> None:
     result = call("segment", path, "--probability", likely, *options, "-o", target)
     assert result.exit_code == 0, (result.output, result.exception)
     assert (np.load(target).astype(bool) != ball()).mean() < 0.02
-    assert json.loads((tmp_path / "mask.json").read_text())["weight"] == 0.5
+    record = json.loads((tmp_path / "mask.json").read_text())
+    assert record["weight"] == 0.5 and record["probability"] == str(likely)
+    assert "threshold" not in record and "dark" not in record
+    placed = call("segment", path, "--probability", likely, *options, "--spacing", 3, "--unit", "um", "-o", target)
+    assert placed.exit_code == 0 and json.loads((tmp_path / "mask.json").read_text())["unit"] == "um"
+    for more in (("--dark",), ("--threshold", 128)):
+        other = call("segment", path, "--probability", likely, *options, *more, "-o", tmp_path / "other.npy")
+        refused(other, f"with --probability, got {' '.join(map(str, more))}")
 
 
 def test_reconstruct_fills_what_it_is_not_told(tmp_path: Path) -> None:

@@ -74,6 +74,22 @@ def test_a_probability_is_its_own_evidence() -> None:
             of_probability(bad, Field(p))
 
 
+def test_a_probability_map_is_at_the_scan_s_place() -> None:
+    p = np.random.default_rng(0).random((6, 7, 8)).astype(np.float32)
+    affine = np.array([[-0.02, 0.001, 0, 5], [0.001, 0.02, 0, -17], [0, 0, 0.03, 3], [0, 0, 0, 1]])
+    scan = Field(p, (0.03, 0.02, 0.02), "mm", affine)
+    for unit, factor in (("mm", 1), ("um", 1e3), ("voxel", 1)):
+        spacing = (0.03 * factor, 0.02 * factor, 0.02 * factor)
+        other = np.diag([factor] * 3 + [1]) @ affine
+        same = of_probability(Field(p, spacing, unit, other.astype(np.float32)), scan)
+        np.testing.assert_array_equal(same.ratio, of_probability(p, scan).ratio)
+        for column in (0, 3):  # mirrored, or a voxel away
+            moved = other.copy()
+            moved[0, column] += (0.04, None, None, 0.02)[column] * factor  # type: ignore[operator]
+            with pytest.raises(ValueError, match="with the scan's affine, got one .* voxels away"):
+                segment(scan, WILLMORE, probability=Field(p, spacing, unit, moved))
+
+
 def test_distances_between_slices() -> None:
     disc = np.hypot(*(np.mgrid[:32, :32] - 15.5)) < 10
     distance = interpolated_distance(np.stack([disc, np.zeros_like(disc)]), [2, 6], 9, (2.0, 1.0, 1.0))
@@ -212,6 +228,8 @@ def test_bad_slices_are_refused(options, said) -> None:
         ({"weight": 0.0}, "positive weight"),
         ({"threshold": 500.0}, "within the smoothed scan's"),
         ({"threshold": "li"}, "a number or 'otsu'"),
+        ({"threshold": 80.0, "probability": tubes()}, "neither a threshold nor dark"),
+        ({"dark": True, "probability": tubes()}, "neither a threshold nor dark"),
         ({"epsilon": math.inf}, "positive epsilon"),
         ({"prior": Coefficients(torch.ones(32, 32, 32), 0, 1)}, "coefficients that are numbers"),
     ],
