@@ -65,9 +65,11 @@ def of_intensities(scan: Field, threshold: float | str = "otsu", dark: bool = Fa
     Raises
     ------
     ScanError
-        If a threshold leaves nothing on one side.
+        If a value is not finite, or a threshold leaves nothing on one side.
     """
     values = scan.values.astype(np.float32)
+    if not np.isfinite(values).all():
+        raise ScanError(f"expected finite values, got {np.count_nonzero(~np.isfinite(values))} that are not")
     if isinstance(threshold, str) and threshold != "otsu":
         raise ScanError(f"expected a threshold that is a number or 'otsu', got {threshold!r}")
     found = threshold == "otsu"

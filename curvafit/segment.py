@@ -28,6 +28,8 @@ NATS = 1.0
 #: The spring that holds known slices, in working units; ten times less lets go of them, ten times more stalls.
 STIFFNESS = 1e6
 
+#: Values that known slices may have; more are grey levels.
+LABELS = 256
 #: A flow whose last ten steps lower the energy by less than this share has settled.
 SETTLED = 0.001
 
@@ -144,11 +146,13 @@ def reconstruct(
     Parameters
     ----------
     slices
-        A mask of the whole volume's shape, positive inside; only its known slices are read, and kept as they are.
+        A mask, or labels, of the whole volume's shape, positive inside; only its known slices are read, and kept as
+        they are.
     prior, epsilon, steps, progress
         As in `segment`.
     every, first
-        Known are `first`, `first + every`, … along `axis`.
+        Known are `first`, `first + every`, … along `axis`. Before the first and beyond the last known slice these are
+        continued.
     known
         Instead: their numbers, two or more.
     axis
@@ -157,7 +161,7 @@ def reconstruct(
     Raises
     ------
     ValueError
-        As `segment`, or if fewer than two slices are known, or they are all empty or all full.
+        As `segment`, or if fewer than two slices are known, they are all empty or all full, or no labels.
     FileNotFoundError
         If there is no such `fit.json`.
     """
@@ -166,7 +170,7 @@ def reconstruct(
     if axis not in (0, 1, 2):
         raise ScanError(f"expected an axis 0, 1 or 2 (z, y, x), got {axis}")
     places = _places(slices.shape[axis], every, first, known)
-    there = np.moveaxis(slices.values, axis, 0)[places] > 0
+    there = _labels(np.moveaxis(slices.values, axis, 0)[places]) > 0
     if there.all() or not there.any():
         raise ScanError(
             f"expected known slices with voxels inside and outside, got {'full' if there.all() else 'empty'} ones"
@@ -182,19 +186,38 @@ def reconstruct(
     u = place.back(flow.field)
     mask = u > 0
     np.moveaxis(mask, axis, 0)[places] = there
-    notes = (*notes, f"{len(places)} of {slices.shape[axis]} slices are known.", *place.notes)
+    notes = (*notes, *_known(places, slices.shape[axis]), *place.notes)
     return _result(slices, mask, u, law, place, None, notes, flow)
 
 
 def _places(length: int, every: int | None, first: int, known: Sequence[int] | None) -> list[int]:
     if (every is None) == (known is None):
         raise ScanError("expected either every how many slices are known, or their numbers")
+    given = (every, first) if known is None else known
+    if not all(math.isfinite(number) and number == int(number) for number in given):  # type: ignore[arg-type, operator]
+        raise ScanError(f"expected whole numbers of slices, got {', '.join(map(str, given))}")
     if every is not None and (every < 1 or first < 0):
         raise ScanError(f"expected every from 1 and first from 0, got {every} and {first}")
-    places = sorted(set(known)) if known is not None else list(range(first, length, every or 1))
+    places = sorted({int(n) for n in (known if known is not None else range(int(first), length, int(every or 1)))})
     if len(places) < 2 or places[0] < 0 or places[-1] >= length:
         raise ScanError(f"expected two or more known slices within 0 to {length - 1}, got {places}")
     return places
+
+
+def _known(places: list[int], length: int) -> tuple[str, ...]:
+    """What is known and what is not even between, in sentences."""
+    before, beyond = places[0], length - 1 - places[-1]
+    outer = f"The {before} before the first and {beyond} beyond the last are extrapolated."
+    return f"{len(places)} of {length} slices are known.", *((outer,) if before or beyond else ())
+
+
+def _labels(values: np.ndarray) -> np.ndarray:
+    """The values, if they are not grey levels."""
+    if values.dtype.kind == "f" and not np.array_equal(values, np.round(values)):
+        raise ScanError("expected known slices with a mask or labels, got values that are not whole numbers")
+    if values.dtype.itemsize > 1 and (count := len(np.unique(values))) > LABELS:
+        raise ScanError(f"expected known slices with a mask or at most {LABELS} labels, got {count} values")
+    return values
 
 
 def _started(level: np.ndarray, place: Place) -> Tensor:
@@ -249,12 +272,13 @@ def _result(
 ) -> Segmentation:
     share, energy = float(mask.mean()), flow.history.energy
     fall = (energy[-2] - energy[-1]) / max(abs(energy[-1]), 1e-30) if len(energy) > 1 else 1.0
-    made, word = int(flow.history.step[-1]), "settled" if abs(fall) < SETTLED else "still moving"
-    status = f"{word} after {made} steps: {100 * share:.2f} % of the volume is inside"
+    count, word = int(flow.history.step[-1]), "settled" if abs(fall) < SETTLED else "still moving"
+    made = f"{count} step" if count == 1 else f"{count} steps"
+    status = f"{word} after {made}: {100 * share:.2f} % of the volume is inside"
     if not np.isfinite(energy[-1]):
-        status = f"stopped after {made} steps: the energy is not finite, lower the weight"
+        status = f"stopped after {made}: the energy is not finite, lower the weight"
     elif share in (0.0, 1.0):
-        status = f"no surface is left after {made} steps: the prior is too strong for the data, lower its weight"
+        status = f"no surface is left after {made}: the prior is too strong for the data, lower its weight"
     whole = {"notes": (), "source": scan.source}
     return Segmentation(
         replace(scan, values=mask, **whole),

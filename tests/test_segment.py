@@ -211,6 +211,9 @@ def test_an_axis_and_numbers_of_slices() -> None:
         ({"every": 0}, "every from 1"),
         ({"known": [3]}, "two or more"),
         ({"known": [3, 99]}, "within 0 to 31"),
+        ({"known": [0.0, 12.5]}, "whole numbers of slices, got 0.0, 12.5"),
+        ({"every": math.nan}, "whole numbers of slices"),
+        ({"every": 8, "first": 0.5}, "whole numbers of slices"),
         ({"every": 8, "axis": 3}, "axis 0, 1 or 2"),
         ({"every": 31}, "voxels inside and outside"),
         ({"every": 8, "epsilon": -1.0}, "positive epsilon"),
@@ -220,6 +223,32 @@ def test_an_axis_and_numbers_of_slices() -> None:
 def test_bad_slices_are_refused(options, said) -> None:
     with pytest.raises(ValueError, match=said):
         reconstruct(Field(tubes()), **{"prior": WILLMORE, **options})
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        (noisy(tubes(), 10).values, "not whole numbers"),
+        (noisy(tubes(), 1000).values.astype(np.int16), "at most 256 labels, got [34]"),
+        (np.where(tubes(), np.nan, 0), "not whole numbers"),
+    ],
+)
+def test_grey_slices_are_refused(values, said) -> None:
+    with pytest.raises(ValueError, match=said):
+        reconstruct(Field(values), WILLMORE, every=8)
+
+
+def test_labels_count_as_inside_and_what_is_extrapolated_is_said() -> None:
+    truth = tubes()
+    labels = np.where(truth, np.random.default_rng(0).integers(1, 200, truth.shape), 0).astype(np.float32)
+    labels[1::2] += 0.5  # these are not read
+    found = reconstruct(Field(labels), WILLMORE, every=8.0, first=2, steps=1)  # type: ignore[arg-type]
+    plain = reconstruct(Field(truth), WILLMORE, known=[2, 10, 18, 26], steps=1)
+    assert np.array_equal(found.mask.values, plain.mask.values) and found.notes == plain.notes
+    assert "The 2 before the first and 5 beyond the last are extrapolated." in found.notes
+    assert "after 1 step:" in found.status
+    whole = reconstruct(Field(truth), WILLMORE, known=[0, 15, 31], steps=1)
+    assert not any("extrapolated" in note for note in whole.notes)
 
 
 @pytest.mark.parametrize(
@@ -237,6 +266,13 @@ def test_bad_slices_are_refused(options, said) -> None:
 def test_bad_options_are_refused(options, said) -> None:
     with pytest.raises(ValueError, match=said):
         segment(noisy(tubes(), 30), **{"prior": WILLMORE, **options})
+
+
+def test_a_scan_with_holes_is_refused() -> None:
+    scan = noisy(tubes(), 30)
+    scan.values[3, 4, 5:7] = math.nan, math.inf
+    with pytest.raises(ValueError, match="expected finite values, got 2 that are not"):
+        segment(scan, WILLMORE)
 
 
 @pytest.mark.filterwarnings("ignore:a20 > 0:UserWarning")
