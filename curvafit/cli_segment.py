@@ -147,8 +147,8 @@ def _run(
         found = make(volume, progress)
         progress("writing", 1.0)
         asked = {"command": command_line(), "prior": prior, **told}
-        own = reading["spacing"] is None and reading["unit"] is None
-        files = write_mask(found, volume, out, like=source if own else None, record=asked)
+        own = source if reading["spacing"] is None else None
+        files = write_mask(found, volume, out, like=own, unit=reading["unit"], record=asked)
     for note in found.notes:
         say(note)
     say(f"{found.status[0].upper()}{found.status[1:]}.", style="bold")

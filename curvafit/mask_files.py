@@ -68,6 +68,7 @@ def write_mask(
     path: str | Path,
     *,
     like: str | Path | None = None,
+    unit: str | None = None,
     record: dict[str, Any] | None = None,
 ) -> tuple[Path, Path, Path]:
     """Write the mask (0 and 1, uint8), a picture of the middle slices, and a record.
@@ -78,6 +79,8 @@ def write_mask(
         What was segmented: the picture's grey levels.
     like
         The scan's own file: where it and the target are NIfTI, the header is kept, all but the values' type and range.
+    unit
+        What the lengths in `like` are said to be in, if not what its header says.
     record
         What to add to the record.
 
@@ -92,7 +95,7 @@ def write_mask(
     try:
         made = work / target.name
         if like is not None and all(str(each).lower().endswith(_NIFTI) for each in (like, target)):
-            write_nifti_like(mask, Path(like), made)
+            write_nifti_like(mask, Path(like), made, unit)
         else:
             save(Field(mask, scan.spacing, scan.unit, scan.affine), made)
         picture, note = beside(made, ".png"), beside(made, ".json")

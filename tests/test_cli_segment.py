@@ -33,6 +33,11 @@ def grey(noise: float = 40) -> np.ndarray:
     return values.clip(0, 255).astype(np.uint8)
 
 
+#: What a header says of the place, whatever its unit is called.
+KEPT = [*(f"srow_{k}" for k in "xyz"), *(f"quatern_{k}" for k in "bcd"), *(f"qoffset_{k}" for k in "xyz")]
+KEPT += ["pixdim", "qform_code", "sform_code", "dim"]
+
+
 @pytest.fixture
 def oblique(tmp_path: Path) -> Path:
     """A NIfTI scan with an oblique sform, another qform, scaled values and a note."""
@@ -56,8 +61,7 @@ def test_segment_keeps_the_header_to_the_bit(oblique: Path, tmp_path: Path) -> N
     assert result.exit_code == 0, (result.output, result.exception)
     assert sorted(path.name for path in target.parent.iterdir()) == ["mask.json", "mask.nii.gz", "mask.png"]
     one, other = nibabel.load(oblique), nibabel.load(target)
-    kept = [*(f"srow_{k}" for k in "xyz"), *(f"quatern_{k}" for k in "bcd"), *(f"qoffset_{k}" for k in "xyz")]
-    for name in (*kept, "pixdim", "qform_code", "sform_code", "xyzt_units", "descrip", "dim"):
+    for name in (*KEPT, "xyzt_units", "descrip"):
         assert one.header[name].tobytes() == other.header[name].tobytes(), name  # type: ignore[index]
     assert other.affine.tobytes() == one.affine.tobytes()  # type: ignore[attr-defined]
     values = np.asanyarray(other.dataobj)  # type: ignore[attr-defined]
@@ -72,6 +76,24 @@ def test_segment_keeps_the_header_to_the_bit(oblique: Path, tmp_path: Path) -> N
     assert str(target) in result.stdout and "of the volume is inside" in result.stdout
     again = call("segment", oblique, "--prior", "tubes", "--steps", 1, "-o", target)
     assert again.exit_code == 0 and json.loads(target.with_name("mask.json").read_text())["steps"] == 1
+
+
+@pytest.mark.parametrize(("unit", "written"), [("um", "um"), ("voxel", "voxel"), ("nm", "nm"), ("cm", "mm")])
+def test_another_unit_renames_and_keeps_the_rest_of_the_header(unit, written, oblique, tmp_path) -> None:
+    target, again = tmp_path / "mask.nii.gz", tmp_path / "again.nii"
+    one = nibabel.load(oblique)
+    one.header.set_xyzt_units("mm", "sec")  # type: ignore[attr-defined]
+    nibabel.save(one, oblique)
+    assert call("segment", oblique, "--unit", unit, "--prior", "tubes", "--steps", 1, "-o", target).exit_code == 0
+    other, made, told = nibabel.load(target), load(target), load(oblique, unit=unit)
+    assert made.unit == written and made.spacing == pytest.approx(told.spacing, rel=1e-6)
+    np.testing.assert_allclose(made.affine, told.affine, rtol=1e-6)  # type: ignore[arg-type]
+    for name in KEPT if unit in ("um", "voxel") else ["qform_code", "sform_code", "quatern_b"]:
+        assert one.header[name].tobytes() == other.header[name].tobytes(), name  # type: ignore[index]
+    assert other.header.get_xyzt_units()[1] == "sec"  # type: ignore[attr-defined]
+    # a file that bears our own note on its unit loses it
+    assert call("segment", target, "--unit", "um", "--prior", "tubes", "--steps", 1, "-o", again).exit_code == 0
+    assert load(again).unit == "um" and load(again).spacing == pytest.approx(made.spacing, rel=1e-6)
 
 
 def test_an_axis_of_one_and_another_spacing(tmp_path: Path) -> None:

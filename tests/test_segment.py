@@ -229,7 +229,7 @@ def test_bad_slices_are_refused(options, said) -> None:
     ("values", "said"),
     [
         (noisy(tubes(), 10).values, "not whole numbers"),
-        (noisy(tubes(), 1000).values.astype(np.int16), "at most 256 labels, got [34]"),
+        (noisy(tubes(), 1000).values.astype(np.int16), "at most 256 labels"),
         (np.where(tubes(), np.nan, 0), "not whole numbers"),
     ],
 )

@@ -33,9 +33,9 @@ def read_nifti(path: Path, **_: object) -> Raw:
     affine = np.array(image.affine, dtype=np.float64)
     spacing: tuple[float, ...] | None = (1.0,) * (values.ndim - 3) + zooms[::-1]
     guesses: list[str] = []
-    wrote = re.match(r"curvafit unit=(\w+)", bytes(image.header["descrip"]).decode("latin-1"))
+    wrote = _own_unit(image.header)
     if wrote:
-        unit, factor = _own_unit(wrote[1])
+        unit, factor = wrote
         affine[:3] *= factor
         spacing = (1.0,) * (values.ndim - 3) + tuple(h * factor for h in zooms[::-1])
     elif unit == "unknown" and all(h == 1 for h in zooms):
@@ -67,10 +67,11 @@ def write_nifti(field: Any, path: Path) -> None:
     nibabel.save(image, path)
 
 
-def write_nifti_like(values: np.ndarray, like: Path, path: Path) -> None:
+def write_nifti_like(values: np.ndarray, like: Path, path: Path, unit: str | None = None) -> None:
     """`values` (Z, Y, X) with the header of another NIfTI file of that shape: its affines, codes and zooms to the bit.
 
-    Only what tells of its values (type, scale, range, intent) is set anew.
+    Only what tells of its values (type, scale, range, intent) is set anew, and the unit, if one is named: what the
+    numbers of that file then are. NIfTI has neither nm nor cm, which alone are converted.
 
     Raises
     ------
@@ -85,10 +86,30 @@ def write_nifti_like(values: np.ndarray, like: Path, path: Path) -> None:
     header.set_slope_inter(1, 0)
     header.set_intent("none")
     header["cal_min"] = header["cal_max"] = 0
+    if unit is not None:
+        _rename(header, unit)
     nibabel.save(type(image)(values.T.reshape(image.shape), None, header), path)
 
 
-def _own_unit(name: str) -> tuple[str, float]:
-    """The unit that `write_nifti` left in the description because NIfTI has no code for it."""
-    unit, _ = normalise_unit(name)
+def _own_unit(header: Any) -> tuple[str, float] | None:
+    """The unit that `write_nifti` left in the description because NIfTI has no code for it, and the factor to it."""
+    wrote = re.match(r"curvafit unit=(\w+)", bytes(header["descrip"]).decode("latin-1"))
+    if wrote is None:
+        return None
+    unit, _ = normalise_unit(wrote[1])
     return unit, 1 / _TO_FILE[unit][1]
+
+
+def _rename(header: Any, unit: str) -> None:
+    """Name the unit of lengths that `read_nifti` would give."""
+    name, factor = normalise_unit(unit)
+    code, into = _TO_FILE[name]
+    own = _own_unit(header)
+    scale = factor * into * (own[1] if own else 1.0)
+    header.set_xyzt_units(code, header.get_xyzt_units()[1])
+    if scale != 1:
+        header["pixdim"][1:4] *= scale
+        for key in ("srow_x", "srow_y", "srow_z", "qoffset_x", "qoffset_y", "qoffset_z"):
+            header[key] = header[key] * scale
+    if own or name in ("voxel", "nm"):
+        header["descrip"] = f"curvafit unit={name}".encode() if name in ("voxel", "nm") else b""
