@@ -36,7 +36,7 @@ Volume = Annotated[str, typer.Argument(help="NIfTI, TIFF (or folder of slices), 
 Target = Annotated[Path, typer.Option("-o", "--output", help="Mask to write: .nii.gz .nii .tif .npy .mrc .zarr.")]
 Prior = Annotated[str, _what(help="fit.json of `curvafit infer`, or a preset's name (see `curvafit presets`).")]
 Probability = Annotated[Path | None, _what(help="Volume of probabilities of the inside, instead of grey levels.")]
-Weight = Annotated[float | None, _what(help="Nats that a unit of the energy costs; from the noise by default.")]
+Weight = Annotated[float | None, _what(help="Nats that a unit of the energy costs; 2 / (a20 + a02) by default.")]
 Threshold = Annotated[str, _what(help="Grey level between the phases, or otsu.")]
 Dark = Annotated[bool, _what("--dark", help="The structure is the dark phase.")]
 Epsilon = Annotated[float | None, _what(help="ε in the scan's unit; twice the smallest voxel edge by default.")]

@@ -76,7 +76,8 @@ def numbers(text: str, option: str, count: int) -> tuple[float, ...]:
     except ValueError:
         values = ()
     if len(values) != count or not all(math.isfinite(value) for value in values):
-        raise ValueError(f"expected {option} as {count} numbers between commas, got {text!r}")
+        what = "a number" if count == 1 else f"{count} numbers between commas"
+        raise ValueError(f"expected {option} as {what}, got {text!r}")
     return values
 
 

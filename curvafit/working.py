@@ -11,7 +11,7 @@ from torch import Tensor
 
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.fit_file import Law, find_law
-from curvafit.priors.grid import METRES, WORKING_EPSILON, Grid
+from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.loss import RESOLVED, upsampling
 from curvafit.priors.refined import refined
 from curvafit.scan import Field, ScanError
@@ -35,10 +35,11 @@ def law_of(prior: Law, scan: Field) -> tuple[Coefficients, tuple[str, ...]]:
         return found, () if isinstance(prior, Coefficients) else (named,)
     if found.unit == scan.unit:
         return found.physical, ()
-    if not {found.unit, scan.unit} <= METRES.keys():
-        raise ScanError(f"expected a scan whose unit of length compares with the prior's {found.unit}, got {scan.unit}")
-    said = f"The prior's lengths, in {found.unit}, are taken to {scan.unit}."
-    return found.in_unit(scan.unit), (said,)
+    try:
+        law = found.in_unit(scan.unit)
+    except ValueError as reason:
+        raise ScanError(f"{reason}: give --spacing and --unit") from None
+    return law, (f"The prior's lengths, in {found.unit}, are taken to {scan.unit}.",)
 
 
 @dataclass(frozen=True)

@@ -172,9 +172,12 @@ def test_a_picture_shows_the_slices(oblique: Path, tmp_path: Path) -> None:
     [
         (("segment", "SCAN", "--prior", "tube", "-o", "m.nii.gz"), "expected a preset among"),
         (("segment", "SCAN", "--prior", "none.json", "-o", "m.nii.gz"), "expected a fit.json"),
-        (("segment", "SCAN", "--prior", "FIT", "--unit", "voxel", "-o", "m.nii.gz"), "compares with the prior's mm"),
+        (
+            ("segment", "SCAN", "--prior", "FIT", "--unit", "voxel", "-o", "m.nii.gz"),
+            "got voxel and the fit's mm: give --spacing and --unit",
+        ),
         (("segment", "SCAN", "--prior", "tubes", "--weight", "-1", "-o", "m.nii.gz"), "positive weight"),
-        (("segment", "SCAN", "--prior", "tubes", "--threshold", "low", "-o", "m.nii.gz"), "--threshold"),
+        (("segment", "SCAN", "--prior", "tubes", "--threshold", "low", "-o", "m.nii.gz"), "--threshold as a number,"),
         (("segment", "SCAN", "--prior", "tubes", "--spacing", "0", "-o", "m.nii.gz"), "--spacing"),
         (("segment", "SCAN", "--prior", "tubes", "--probability", "SMALL", "-o", "m.nii.gz"), "of the scan's shape"),
         (("segment", "none.tif", "--prior", "tubes", "-o", "m.nii.gz"), "no such file"),

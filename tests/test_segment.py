@@ -110,7 +110,7 @@ def test_a_prior_comes_in_the_scan_s_unit(tmp_path: Path) -> None:
     law, notes = law_of(str(path), um)
     assert law.as_dict() == pytest.approx(fit.coefficients_physical.in_unit(1e-3).as_dict())
     assert "mm" in notes[0] and "um" in notes[0]
-    with pytest.raises(ValueError, match="expected a scan whose unit of length compares with the prior's mm"):
+    with pytest.raises(ValueError, match="got voxel and the fit's mm: give --spacing and --unit"):
         law_of(path, Field(np.zeros((4, 4, 4))))
     with pytest.raises(ValueError, match="expected a preset among"):
         law_of("tube", mm)
