@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import math
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from curvafit.evidence import of_probability
 from curvafit.generation.checkpoint import identity
 from curvafit.generation.data import Evidence, Hinge
 from curvafit.generation.flow import descend
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
+from curvafit.scan import Field
+from curvafit.segment import reconstruct, segment
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 
@@ -85,3 +89,45 @@ def test_a_checkpoint_is_its_data_s(tmp_path: Path) -> None:
     resumed = descend(start, WILLMORE, Grid(8), data=Evidence(drawn(8, 8, 8)), **options)
     whole = descend(start, WILLMORE, Grid(8), data=Evidence(drawn(8, 8, 8)), **{**options, "checkpoint": None})
     assert torch.equal(resumed.field, whole.field)
+
+
+# ---- terms on grids that are not the scan's --------------------------------------------------------------------------
+
+
+#: A grid whose axes all differ, and a ball of radius 7 in it: its signed distance, positive inside.
+SHAPE, EDGES = (9, 21, 13), (3.0, 1.0, 1.5)
+PLACES = np.meshgrid(*((np.arange(n) - (n - 1) / 2) * h for n, h in zip(SHAPE, EDGES, strict=True)), indexing="ij")
+DISTANCE = 7 - np.linalg.norm(PLACES, axis=0)
+
+
+@pytest.mark.parametrize("along", [0, 1, 2])
+def test_known_slices_hold_whatever_the_axis_and_the_spacing(along: int) -> None:
+    """The array turned, its spacing with it: the same field, and at an ε of our own near the profile of that ε."""
+    known, ε, fields = list(range(0, SHAPE[along], (2, 4, 3)[along])), 3.0, []
+    for turn in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        truth = Field((DISTANCE > 0).transpose(turn), tuple(EDGES[k] for k in turn))  # type: ignore[arg-type]
+        found = reconstruct(truth, WILLMORE, known=known, axis=turn.index(along), epsilon=ε, steps=8)
+        assert found.epsilon == ε and any("2-fold" in note for note in found.notes)
+        fields.append(found.phase.values.transpose(np.argsort(turn)))
+    for other in fields[1:]:
+        np.testing.assert_allclose(other, fields[0], atol=1e-3)
+    assert np.abs(fields[0] - np.tanh(DISTANCE / (math.sqrt(2) * ε))).mean() < 0.1  # 0.15 at the ε of two voxels
+
+
+@pytest.mark.parametrize("epsilon", [1.0, 2.0, 5.0])
+def test_evidence_counts_its_nats_once_whatever_the_volume_of_a_part(epsilon: float, monkeypatch) -> None:
+    gained = []
+
+    def watched(start, law, grid, *, data, **options):
+        ends = [data.slope(torch.full(grid.shape, side), grid)[0] for side in (1.0, -1.0)]
+        gained.append(ends[1] - ends[0])
+        return descend(start, law, grid, data=data, **options)
+
+    monkeypatch.setattr(import_module("curvafit.segment"), "descend", watched)
+    noise = np.random.default_rng(0).standard_normal(SHAPE)
+    likely = Field((1 / (1 + np.exp(-DISTANCE - noise))).astype(np.float32), EDGES)
+    law = Coefficients(1.5, 0.5, 2.5)
+    found = segment(likely, law, probability=likely, weight=0.3, epsilon=epsilon, steps=1)
+    assert found.epsilon == epsilon
+    nats = float(of_probability(likely, likely).ratio.sum(dtype=np.float64))
+    assert 0.3 * 2 * gained[0] == pytest.approx(nats, rel=1e-4)  # λ times the stiffness, 0.3 (1.5 + 2.5) / 2
