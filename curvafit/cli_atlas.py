@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from curvafit.cli_support import command_line, error_console, plainly, say, stages, whole_triple
+from curvafit.cli_support import command_line, device_of, error_console, plainly, say, stages, whole_triple
 
 if TYPE_CHECKING:
     from curvafit.data_synth.atlas import Progress
@@ -128,6 +128,25 @@ def extract_atlas(
         say(str(out))
 
 
+@atlas_app.command("map", epilog="[bold]Example[/bold]\n\ncurvafit atlas map store.zarr -o map")
+def map_atlas(
+    store: Annotated[Path, typer.Argument(help="A store made by `curvafit atlas build`.")],
+    out: Annotated[Path, typer.Option("-o", "--output", help="Folder for atlas.html, atlas.png and a cache.")],
+    device: Annotated[str, typer.Option(help="For the distances: cpu, cuda, cuda:1 …")] = "cpu",
+) -> None:
+    """Lay a store's shapes out on a map: a picture, and a page to explore them in and to place scans on."""
+    with plainly():
+        from curvafit.shape_files import check_folder
+
+        check_folder(out)
+        with _kept(), stages() as progress:
+            from curvafit.atlas_files import write_map
+
+            files = write_map(store, out, device=device_of(device), command=command_line(), progress=progress)
+        for path in files:
+            say(str(path))
+
+
 def _design(name: str, around: str | None, spread: float | None) -> Design:
     """The design that the options name."""
     from curvafit.data_synth import design, design_file
@@ -146,14 +165,20 @@ def _design(name: str, around: str | None, spread: float | None) -> Design:
 
 @contextmanager
 def _made(count: int, workers: int | None, scheduler: str | None) -> Iterator[tuple[Workers, Progress]]:
-    """Workers, and a progress bar for them; Ctrl-C says that nothing is lost."""
+    """Workers, and a progress bar for them."""
     from curvafit.data_synth.workers import cluster
 
+    with _kept(), stages() as progress:
+        progress("starting workers", 0.0)
+        with cluster(workers, scheduler) as crew:
+            yield crew, lambda _, viable, draws: progress(f"{viable} viable of {draws} draws", viable / count)
+
+
+@contextmanager
+def _kept() -> Iterator[None]:
+    """Ctrl-C says that nothing is lost."""
     try:
-        with stages() as progress:
-            progress("starting workers", 0.0)
-            with cluster(workers, scheduler) as crew:
-                yield crew, lambda _, viable, draws: progress(f"{viable} viable of {draws} draws", viable / count)
+        yield
     except KeyboardInterrupt:
         say("interrupted: what is made is kept, and the same command goes on with it", to=error_console())
         raise typer.Exit(130) from None

@@ -12,6 +12,10 @@ _ANGLES = {"spheres": 45.0, "tubes": 0.0, "sponge": -45.0, "tubular cavities": -
 _FLAT_RADII = 2.5
 #: Share of flat area from which a shape is made of layers.
 _LAYERS = 0.5
+#: Half-thickness of each family's ideal, times its area over its volume: a plate's is 1, a cylinder's 2, a ball's 3.
+_SLENDER = {"layers": 1, "spheres": 3, "tubes": 2, "sponge": 2, "tubular cavities": 2, "bubbles": 3}
+#: All families, in the order in which they are listed.
+FAMILIES = ("spheres", "layers", "tubes", "sponge", "tubular cavities", "bubbles")
 
 
 def family_shares(diagram: Diagram, radius: float) -> dict[str, float]:
@@ -31,7 +35,24 @@ def family_shares(diagram: Diagram, radius: float) -> dict[str, float]:
 
 def family_of(diagram: Diagram, radius: float) -> str:
     """The family's name: the largest share, or layers where at least half the area is flat."""
-    shares = family_shares(diagram, radius)
+    return leading_family(family_shares(diagram, radius))
+
+
+def leading_family(shares: dict[str, float]) -> str:
+    """The family that shares of area speak for: the largest, or layers where they hold at least half."""
     if shares["layers"] >= _LAYERS:
         return "layers"
     return max(_ANGLES, key=lambda name: shares[name])
+
+
+def half_thickness(diagram: Diagram, volume: float) -> float:
+    """Half-thickness of what a surface bounds, from its volume and its diagram alone, in the diagram's unit.
+
+    Volume over area, times 1, 2 or 3 as the area is that of plates, cylinders or balls. Found from below: the more area
+    counts as curved, the thicker the structure, and the more area counts as curved.
+    """
+    thin = volume / diagram.area
+    radius = thin
+    for _ in range(4):
+        radius = thin * sum(_SLENDER[name] * share for name, share in family_shares(diagram, radius).items())
+    return radius

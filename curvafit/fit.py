@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 from dataclasses import dataclass
 from typing import Any
 
+from curvafit.diagram import Diagram
 from curvafit.match import Match
 from curvafit.morphometry import Morphometry
 from curvafit.priors.coefficients import Coefficients
@@ -35,6 +37,9 @@ class Fit:
         be made) and between two seeds of the chosen one (`seed_noise`).
     status
         Which of the two is better supported, and what failed.
+    diagram
+        The scan's curvature diagram, binned as an atlas's are, in 1 / working unit: with it the scan finds its place on
+        an atlas's map.
     """
 
     kind: str
@@ -53,6 +58,7 @@ class Fit:
     morphometry: Morphometry
     notes: tuple[str, ...]
     provenance: dict[str, Any]
+    diagram: Diagram | None = None
 
     @property
     def length(self) -> float:
@@ -90,10 +96,24 @@ class Fit:
             "morphometry": dataclasses.asdict(self.morphometry),
             "notes": list(self.notes),
             "provenance": self.provenance,
+            "diagram": None if self.diagram is None else _diagram_dict(self.diagram, self.kind),
         }
 
     def to_json(self) -> str:
-        return json.dumps(self.as_dict(), indent=2, allow_nan=False)
+        """The text of a `fit.json`: indented, but lists of numbers in one line."""
+        text = json.dumps(self.as_dict(), indent=2, allow_nan=False)
+        return re.sub(r"\[\s+([-+.\de,\s]+?)\s+\]", lambda found: f"[{' '.join(found[1].split())}]", text)
+
+
+def _diagram_dict(diagram: Diagram, kind: str) -> dict[str, Any]:
+    """Curvatures to 2 decimals (bins are 2 wide), shares of area, and which diagrams of an atlas it compares with."""
+    return {
+        "seen_as": "field" if kind == "field" else "mask",
+        "unit": diagram.unit,
+        "kappa1": diagram.points[:, 0].round(2).tolist(),
+        "kappa2": diagram.points[:, 1].round(2).tolist(),
+        "share": diagram.normalised.weights.round(7).tolist(),
+    }
 
 
 def _match_dict(match: Match) -> dict[str, Any]:

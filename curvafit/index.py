@@ -10,7 +10,7 @@ import json
 import os
 import zipfile
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -101,7 +101,13 @@ class Atlas:
         return np.stack([np.asarray(sliced_embedding(d)) for d in self.mask_diagrams])
 
 
-def extract(store: str | Path | Store, command: Sequence[str] = ()) -> Atlas:
+#: What is measured of a draw: volume fraction of {u > 0}, diagram of the field, diagram of its mask.
+Measured = tuple[float, Diagram, Diagram]
+
+
+def extract(
+    store: str | Path | Store, command: Sequence[str] = (), measure: Callable[[Store, Record], Measured] | None = None
+) -> Atlas:
     """Measure every well-formed viable shape of a store (see `FORMED`), as a field and as a mask.
 
     Parameters
@@ -110,6 +116,8 @@ def extract(store: str | Path | Store, command: Sequence[str] = ()) -> Atlas:
         An open store, or its folder.
     command
         Command lines for the provenance, after the one that makes the store.
+    measure
+        What to call in place of `measured`: one that remembers, or that tells how far it is.
 
     Raises
     ------
@@ -118,14 +126,13 @@ def extract(store: str | Path | Store, command: Sequence[str] = ()) -> Atlas:
     """
     store = store if isinstance(store, Store) else open_store(store)
     records = [store.record(index) for index in store.indices()]
-    kept = [record for record in records if _formed(record)]
+    kept = [record for record in records if formed(record)]
     if not kept:
         raise ValueError(f"expected at least one well-formed shape in {store.path}, got none in {len(records)} draws")
-    settings = store.settings
-    grid = Grid(settings.shape, settings.spacing)
-    fractions, of_fields, of_masks = zip(*(_measured(store, record.index, grid) for record in kept), strict=True)
+    measure = measure or measured
+    fractions, of_fields, of_masks = zip(*(measure(store, record) for record in kept), strict=True)
     return Atlas(
-        ids=tuple(f"{settings.seed}-{record.index:05d}" for record in kept),
+        ids=tuple(shape_id(store, record) for record in kept),
         coefficients=np.array([list(record.coefficients) for record in kept], dtype=np.float64),
         masses=np.array([record.mass for record in kept]),
         seeds=np.array([record.seed for record in kept], dtype=np.int64),
@@ -134,6 +141,24 @@ def extract(store: str | Path | Store, command: Sequence[str] = ()) -> Atlas:
         mask_diagrams=of_masks,
         provenance=_provenance(store, records, command),
     )
+
+
+def formed(record: Record) -> bool:
+    """Whether a draw is viable and well-formed: see `FORMED`."""
+    seen = record.viability
+    return seen.viable and all(FORMED[0] < extent < FORMED[1] for extent in (seen.highest, -seen.lowest))
+
+
+def shape_id(store: Store, record: Record) -> str:
+    """What a draw is called in an atlas: the law's seed and the draw's index."""
+    return f"{store.settings.seed}-{record.index:05d}"
+
+
+def measured(store: Store, record: Record) -> Measured:
+    """Volume fraction of {u > 0}, and the diagrams of field and mask, of one viable draw."""
+    field = torch.from_numpy(store.field(record.index))
+    grid = Grid(store.settings.shape, store.settings.spacing)
+    return float((field > 0).double().mean()), *diagrams(field, grid, store.settings.epsilon)
 
 
 def save_atlas(atlas: Atlas, path: str | Path) -> None:
@@ -179,17 +204,6 @@ def load_atlas(path: str | Path | None = None) -> Atlas:
     if not Path(path).is_file():
         raise FileNotFoundError(f"expected an atlas file, got {path}, where there is none")
     return _parse(Path(path).read_bytes(), str(path))
-
-
-def _formed(record: Record) -> bool:
-    seen = record.viability
-    return seen.viable and all(FORMED[0] < extent < FORMED[1] for extent in (seen.highest, -seen.lowest))
-
-
-def _measured(store: Store, index: int, grid: Grid) -> tuple[float, Diagram, Diagram]:
-    """Volume fraction of {u > 0}, and the two diagrams, of one draw."""
-    field = torch.from_numpy(store.field(index))
-    return float((field > 0).double().mean()), *diagrams(field, grid, store.settings.epsilon)
 
 
 def _provenance(store: Store, records: list[Record], command: Sequence[str]) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
+from curvafit.data_synth.atlas import BIN_WIDTH
 from curvafit.diagram import Diagram, diagram
 from curvafit.family import family_of
 from curvafit.fit import Fit
@@ -29,7 +30,7 @@ from curvafit.priors.profile import phase_field
 from curvafit.refine import refine
 from curvafit.refinement import Refinement
 from curvafit.scan import Field, load
-from curvafit.transport import wasserstein
+from curvafit.transport import TAIL_SHARE, wasserstein
 
 #: Longest edge, in working voxels, of the boxes in which shapes are regenerated for comparison.
 REGENERATED_EDGE = 100
@@ -221,6 +222,7 @@ def _fit(
         morphometry=morphometry(prepared.mask, prepared.working_voxel, prepared.unit, periodic=grid.periodic),
         notes=prepared.notes,
         provenance=provenance,
+        diagram=seen.thinned(BIN_WIDTH, TAIL_SHARE),
     )
 
 

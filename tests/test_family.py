@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from curvafit.diagram import Diagram
-from curvafit.family import family_of, family_shares
+from curvafit.family import family_of, family_shares, half_thickness
 
 RADIUS = 0.04
 
@@ -43,3 +43,19 @@ def test_shares_are_a_partition_of_the_area() -> None:
 def test_a_flat_half_makes_layers() -> None:
     assert family_of(at((1, 0), (0.01, 0), (0.01, 0)), RADIUS) == "layers"
     assert family_of(at((1, 0), (1, 0), (0.01, 0)), RADIUS) == "tubes"
+
+
+@pytest.mark.parametrize(
+    ("point", "area", "volume"),
+    [
+        ((0.0, 0.0), 2.0, 2 * RADIUS),
+        ((1 / RADIUS, 0.0), 2 * np.pi * RADIUS, np.pi * RADIUS**2),
+        ((1 / RADIUS, 1 / RADIUS), 4 * np.pi * RADIUS**2, 4 / 3 * np.pi * RADIUS**3),
+    ],
+)
+def test_volume_and_area_tell_how_thick_plates_cylinders_and_balls_are(
+    point: tuple[float, float], area: float, volume: float
+) -> None:
+    several = 3.0
+    measured = Diagram(np.array([point]), np.array([several * area]))
+    assert half_thickness(measured, several * volume) == pytest.approx(RADIUS)

@@ -1,0 +1,153 @@
+"""`atlas.png` and `atlas.html` of a store, made in steps that are not made twice."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import io
+import json
+import zipfile
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from curvafit.atlas_map import AtlasMap, Progress, check_extra, check_size, diagram_distances, embed, map_atlas
+from curvafit.atlas_page import page_html
+from curvafit.atlas_picture import map_picture
+from curvafit.atlas_shapes import Shown, regrow_command, shown
+from curvafit.data_synth.census import census
+from curvafit.data_synth.record import Record
+from curvafit.data_synth.store import Store, open_store
+from curvafit.diagram import Diagram
+from curvafit.index import Atlas, Measured, extract, formed, measured, shape_id
+from curvafit.scan import write_atomically
+
+#: Folder beside the two files for what took long: measured shapes, distances, places.
+CACHE = "cache"
+#: Goes up when what is kept changes.
+_CACHE_VERSION = 1
+
+_Arrays = dict[str, np.ndarray]
+
+
+def write_map(
+    store: str | Path | Store, directory: str | Path, *, device: str = "cpu", command: str = "", progress: Progress
+) -> tuple[Path, Path]:
+    """Write `atlas.png` and `atlas.html` of a store's well-formed shapes into a folder; returns their paths.
+
+    What takes long is kept in the folder's `cache`, shape by shape: a run that was stopped goes on where it was, one
+    on a larger store measures the new shapes only. The cache may be deleted at any time.
+
+    Raises
+    ------
+    ImportError
+        If the extra `[atlas]` is not installed.
+    FileNotFoundError, ValueError
+        If there is no such store, or it has too few well-formed shapes.
+    """
+    check_extra()
+    store = store if isinstance(store, Store) else open_store(store)
+    records = [record for record in map(store.record, store.indices()) if formed(record)]
+    check_size(len(records))
+    folder = Path(directory)
+    (folder / CACHE).mkdir(parents=True, exist_ok=True)
+    atlas, shapes = _looked_at(store, records, folder / CACHE, progress)
+    mapped = _mapped(atlas, folder / CACHE, device, progress)
+    progress("drawing", 0.95)
+    picture = map_picture(mapped, lambda k: store.field(records[k].index), folder / "atlas.png")
+    commands = [regrow_command(r, store.settings, f"shape_{shape_id(store, r)}.nii.gz") for r in records]
+    text = page_html(mapped, shapes, commands, _account(mapped, store, command))
+    page = write_atomically(folder / "atlas.html", lambda place: _write(place, text))
+    progress("done", 1.0)
+    return picture, page
+
+
+def _looked_at(store: Store, records: list[Record], cache: Path, progress: Progress) -> tuple[Atlas, list[Shown]]:
+    """Every shape's measures and pictures."""
+    shapes: list[Shown] = []
+
+    def look(store: Store, record: Record) -> Measured:
+        progress(f"measuring {len(records)} shapes", 0.6 * len(shapes) / len(records))
+        kept = _kept(cache / f"shape-{_key(store, record)}.npz", lambda: _look(store, record))
+        shapes.append(Shown(kept["thumbnail"].tobytes(), kept["volume"].tobytes()))
+        return float(kept["fraction"]), _diagram(kept, "field"), _diagram(kept, "mask")
+
+    return extract(store, measure=look), shapes
+
+
+def _look(store: Store, record: Record) -> _Arrays:
+    fraction, *diagrams = measured(store, record)
+    seen = shown(store.field(record.index))
+    found = {"fraction": np.float64(fraction)} | {
+        name: np.frombuffer(part, dtype=np.uint8) for name, part in seen._asdict().items()
+    }
+    for view, diagram in zip(("field", "mask"), diagrams, strict=True):
+        figures = np.array([diagram.spread, diagram.excluded])
+        found |= {f"{view}_points": diagram.points, f"{view}_weights": diagram.weights, f"{view}_figures": figures}
+    return found
+
+
+def _diagram(kept: _Arrays, view: str) -> Diagram:
+    spread, excluded = map(float, kept[f"{view}_figures"])
+    return Diagram(kept[f"{view}_points"], kept[f"{view}_weights"], spread=spread, excluded=excluded)
+
+
+def _mapped(atlas: Atlas, cache: Path, device: str, progress: Progress) -> AtlasMap:
+    """Distances, places, clusters, families."""
+    distances = diagram_distances(
+        atlas.field_diagrams,
+        device=device,
+        progress=lambda done, pairs: progress(f"comparing {pairs} pairs", 0.6 + 0.25 * done / max(pairs, 1)),
+        saved=cache / "distances.npz",
+    )
+    progress("laying out the map", 0.86)
+    key = hashlib.sha256(distances.tobytes()).hexdigest()[:12]
+    places = _kept(cache / f"places-{key}-{version('umap-learn')}.npz", lambda: {"positions": embed(distances)})
+    return map_atlas(atlas, distances, places["positions"])
+
+
+def _kept(path: Path, make: Callable[[], _Arrays]) -> _Arrays:
+    """The arrays in a file; made, and kept there, where there is no sound one."""
+    try:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as archive:
+            return dict(archive)
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile):
+        made = make()
+    buffer = io.BytesIO()
+    np.savez(buffer, **made)
+    write_atomically(path, lambda place: _write(place, buffer.getvalue()))
+    return made
+
+
+def _key(store: Store, record: Record) -> str:
+    """A name that changes with anything a shape's measures and pictures depend on."""
+    settings, told = dataclasses.asdict(store.settings), dataclasses.asdict(record)
+    content = json.dumps([_CACHE_VERSION, version("curvafit"), settings, told], sort_keys=True, default=str)
+    return f"{shape_id(store, record)}-{hashlib.sha256(content.encode()).hexdigest()[:12]}"
+
+
+def _account(mapped: AtlasMap, store: Store, command: str) -> list[tuple[str, str]]:
+    """How the map was made, in rows for the page."""
+    chosen = mapped.settings
+    rows = {
+        "command": command,
+        "well-formed": f"{len(mapped)} of the store's shapes",
+        **census(store),
+        "distances": _listed(chosen["distances"]),
+        "UMAP": _listed(chosen["umap"]),
+        "HDBSCAN": _listed(chosen["hdbscan"]) + f": {max(mapped.clusters) + 1} clusters",
+        "measured with": _listed(chosen["versions"]),
+        "measured on": mapped.atlas.provenance["date"],
+    }
+    return [(name, said) for name, said in rows.items() if said]
+
+
+def _listed(values: dict[str, Any]) -> str:
+    return ", ".join(f"{name} {value}" for name, value in values.items())
+
+
+def _write(path: Path, content: str | bytes) -> None:
+    path.write_bytes(content.encode() if isinstance(content, str) else content)

@@ -1,0 +1,170 @@
+"""An atlas on the plane: where each shape lies, which cluster it is in, and of which family it is."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from curvafit.data_synth.atlas import BIN_WIDTH
+from curvafit.diagram import Diagram
+from curvafit.family import FAMILIES, family_of, family_shares, half_thickness, leading_family
+from curvafit.index import Atlas
+
+#: The paper's settings (Experiment 4): of UMAP, of HDBSCAN on the embedded points, of the distances.
+UMAP: dict[str, Any] = {"n_neighbors": 25, "min_dist": 0.05, "spread": 1.0, "random_state": 1}
+HDBSCAN: dict[str, Any] = {"min_cluster_size": 10, "min_samples": 10}
+DISTANCE: dict[str, Any] = {"blur": 1.0, "reach": 20.0, "bin_width": BIN_WIDTH}
+#: Below this, there is nothing to lay out.
+LEAST_SHAPES = 5
+#: What HDBSCAN calls a point of no cluster.
+NOISE = -1
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True, eq=False)
+class AtlasMap:
+    """The map of an atlas of N shapes.
+
+    Attributes
+    ----------
+    distances
+        Between the diagrams of the fields, `(N, N)`, in 1 / working unit.
+    positions
+        Places on the map, `(N, 2)`; only who is near whom has a meaning.
+    clusters
+        Cluster of each shape `(N,)`, from 0, or `NOISE`.
+    cluster_families
+        What each cluster is called: where the normalised diagrams of its shapes, taken together, have their mass.
+    families
+        What each shape is called: where its own diagram has its mass.
+    settings
+        How the map was made: parameters of every step, versions.
+    """
+
+    atlas: Atlas
+    distances: np.ndarray
+    positions: np.ndarray
+    clusters: np.ndarray
+    cluster_families: tuple[str, ...]
+    families: tuple[str, ...]
+    settings: dict[str, Any]
+
+    def __len__(self) -> int:
+        return len(self.atlas)
+
+    def neighbours(self, count: int) -> np.ndarray:
+        """The other shapes nearest to each one, nearest first: `(N, count)`, or `(N, N - 1)` where that is less."""
+        others = self.distances + np.diag(np.full(len(self), np.inf))
+        return np.argsort(others, axis=1, kind="stable")[:, : min(count, len(self) - 1)]
+
+
+def map_atlas(atlas: Atlas, distances: np.ndarray, positions: np.ndarray | None = None) -> AtlasMap:
+    """Lay an atlas out by its distances, find clusters, and name them (paper, Experiment 4 and Figure 10).
+
+    Parameters
+    ----------
+    distances
+        `(N, N)`, symmetric: see `diagram_distances`.
+    positions
+        Where the shapes lie, `(N, 2)`, if that is known already; else `embed` tells.
+
+    Raises
+    ------
+    ImportError
+        If umap-learn or scikit-learn is not installed.
+    ValueError
+        If there are fewer than `LEAST_SHAPES` shapes, or the distances are not finite, symmetric and of that size.
+    """
+    check_extra()
+    check_size(n := len(atlas))
+    if distances.shape != (n, n) or not np.isfinite(distances).all() or not np.allclose(distances, distances.T):
+        raise ValueError(f"expected finite symmetric distances ({n}, {n}), got {distances.shape} or others")
+    positions = embed(distances) if positions is None else positions
+    clusters = find_clusters(positions)
+    families, shares = _families(atlas)
+    pooled = [shares[clusters == cluster].mean(0) for cluster in range(max(clusters) + 1)]
+    names = tuple(leading_family(dict(zip(FAMILIES, pool, strict=True))) for pool in pooled)
+    return AtlasMap(atlas, distances, positions, clusters, names, families, _settings(n))
+
+
+def diagram_distances(
+    diagrams: Sequence[Diagram],
+    *,
+    device: str = "cpu",
+    progress: Callable[[int, int], None] | None = None,
+    saved: Path | None = None,
+) -> np.ndarray:
+    """Wasserstein distances of all pairs `(N, N)`, with the paper's settings: `pairwise`, with its progress and its
+    checkpoint `saved`."""
+    from curvafit.pairwise import pairwise
+
+    return pairwise(diagrams, **DISTANCE, device=device, progress=progress, checkpoint=saved)
+
+
+def embed(distances: np.ndarray) -> np.ndarray:
+    """UMAP's places `(N, 2)` of shapes with distances `(N, N)`; with fewer than 26 shapes, all are neighbours."""
+    chosen = UMAP | {"n_neighbors": min(UMAP["n_neighbors"], len(distances) - 1)}
+    with warnings.catch_warnings():
+        # It tells that a neural kin of it is not installed, that precomputed distances cannot be inverted, and that
+        # far families are not connected.
+        warnings.simplefilter("ignore")
+        from umap import UMAP as Umap
+
+        found = Umap(metric="precomputed", n_jobs=1, **chosen).fit_transform(distances.astype(np.float32))
+    return np.asarray(found, dtype=np.float64)
+
+
+def find_clusters(positions: np.ndarray) -> np.ndarray:
+    """HDBSCAN's clusters `(N,)` of places `(N, 2)`, the largest first, `NOISE` for none."""
+    if len(positions) < HDBSCAN["min_cluster_size"]:
+        return np.full(len(positions), NOISE)
+    from sklearn.cluster import HDBSCAN as Hdbscan
+
+    options = HDBSCAN | {"copy": True}
+    found = Hdbscan(**options).fit_predict(positions)
+    sizes = np.bincount(found[found >= 0], minlength=1)
+    rank = np.argsort(np.argsort(-sizes, kind="stable"))
+    return np.where(found >= 0, rank[found], NOISE)
+
+
+def check_size(count: int) -> None:
+    """Raise ValueError if there are too few shapes for a map."""
+    if count < LEAST_SHAPES:
+        raise ValueError(f"expected an atlas of at least {LEAST_SHAPES} shapes to map, got {count}")
+
+
+def check_extra() -> None:
+    """Raise ImportError with the line to type if the extra `[atlas]` is not installed."""
+    for module in ("umap", "sklearn"):
+        if find_spec(module) is None:
+            raise ImportError(f'expected {module} for a map, got none: pip install "curvafit[atlas]"')
+
+
+def _families(atlas: Atlas) -> tuple[tuple[str, ...], np.ndarray]:
+    """The family of each shape, and its shares of area in the order of `FAMILIES`, `(N, 6)`."""
+    sampling = atlas.provenance["settings"]
+    box = float(np.prod(sampling["shape"]) * np.prod(sampling["spacing"]))
+    names, shares = [], []
+    for diagram, fraction in zip(atlas.field_diagrams, atlas.volume_fractions, strict=True):
+        radius = half_thickness(diagram, float(fraction) * box)
+        names.append(family_of(diagram, radius))
+        found = family_shares(diagram, radius)
+        shares.append([found[name] for name in FAMILIES])
+    return tuple(names), np.array(shares)
+
+
+def _settings(count: int) -> dict[str, Any]:
+    return {
+        "distances": {"of": "fields", **DISTANCE},
+        "umap": UMAP | {"n_neighbors": min(UMAP["n_neighbors"], count - 1), "metric": "precomputed"},
+        "hdbscan": HDBSCAN,
+        "versions": {name: version(name) for name in ("curvafit", "umap-learn", "scikit-learn", "numpy", "torch")},
+    }

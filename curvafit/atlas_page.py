@@ -1,0 +1,165 @@
+"""A map as one page: everything in it, nothing from elsewhere.
+
+Small things (places, parameters, neighbours) are one JSON text. Thumbnails, small volumes, diagrams and embeddings are
+pieces of base64 in four more texts, found by their offsets and decoded when they are looked at.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Iterable, Sequence
+from html import escape
+from importlib.resources import files
+from string import Template
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.colors import to_hex
+from scipy.spatial.distance import cdist
+
+from curvafit.atlas_map import NOISE, AtlasMap
+from curvafit.atlas_picture import CLUSTER_COLOURS, FAMILY_COLOURS
+from curvafit.atlas_shapes import CUT, LEVELS, Shown, small_shape
+from curvafit.diagram import Diagram
+from curvafit.family import FAMILIES
+from curvafit.index import VIEWS
+from curvafit.plot import DENSITY, shared_limits
+from curvafit.priors.coefficients import NAMES
+
+#: How many nearest shapes are shown beside one, and how many a scan is placed by.
+NEIGHBOURS, PLACED_BY = 8, 5
+#: Columns that points can be coloured by: key, symbol, what it is. a20 is the gauge in most designs.
+_COLUMNS = {
+    "a20": ("a₂₀", "coefficient of κ₁²"),
+    "a11": ("a₁₁", "coefficient of κ₁κ₂"),
+    "a02": ("a₀₂", "coefficient of κ₂²"),
+    "a10": ("a₁₀", "coefficient of κ₁"),
+    "a01": ("a₀₁", "coefficient of κ₂"),
+    "a00": ("a₀₀", "constant coefficient"),
+    "m0": ("m₀", "mass: mean of the field"),
+    "volume": ("volume", "share of the box inside"),
+}
+_SCRIPTS = ("data", "chart", "moves", "diagram", "solid", "hands", "panel", "scan", "start")
+
+
+def page_html(
+    mapped: AtlasMap, shapes: Sequence[Shown], commands: Sequence[str], made: Sequence[tuple[str, str]]
+) -> str:
+    """The page.
+
+    Parameters
+    ----------
+    shapes, commands
+        What is shown of each shape, and the line that grows it again, in the atlas's order.
+    made
+        Rows of the account of how the map was made.
+    """
+    blobs = {
+        "thumbnails": _joined(one.thumbnail for one in shapes),
+        "volumes": _joined(one.volume for one in shapes),
+    }
+    data = _small(mapped, commands)
+    scale, pieces = _diagrams(mapped.atlas.field_diagrams)
+    data["diagram"]["scale"], blobs["diagrams"] = scale, _joined(pieces)
+    scale, pieces = _embeddings(mapped)
+    data["embedding"]["scale"], blobs["embeddings"] = scale, _joined(pieces)
+    data["offsets"] = {name: offsets for name, (_, offsets) in blobs.items()}
+    return Template(_template("atlas.html")).substitute(
+        version=escape(str(mapped.settings["versions"]["curvafit"])),
+        title=f"Atlas of {len(mapped)} shapes",
+        style=_template("atlas.css"),
+        script="\n".join(_template(f"atlas_{name}.js") for name in _SCRIPTS),
+        made="\n".join(f"<dt>{escape(name)}</dt><dd>{escape(value)}</dd>" for name, value in made),
+        data=json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
+        blobs="\n".join(f'<script type="text/plain" id="{name}">{text}</script>' for name, (text, _) in blobs.items()),
+    )
+
+
+def _small(mapped: AtlasMap, commands: Sequence[str]) -> dict[str, Any]:
+    """What the page has at hand at once."""
+    near = mapped.neighbours(NEIGHBOURS)
+    sampling = mapped.atlas.provenance["settings"]
+    box = np.array(sampling["shape"]) * sampling["spacing"]
+    limits = np.array([shared_limits([diagram]) for diagram in mapped.atlas.field_diagrams])
+    return {
+        "ids": mapped.atlas.ids,
+        "places": _unit_square(mapped.positions).round(5).tolist(),
+        "family": [FAMILIES.index(name) for name in mapped.families],
+        "families": [[name, FAMILY_COLOURS[name]] for name in FAMILIES],
+        "cluster": mapped.clusters.tolist(),
+        "clusters": [
+            [f"{name} ({number + 1})", CLUSTER_COLOURS[number % len(CLUSTER_COLOURS)]]
+            for number, name in enumerate(mapped.cluster_families)
+        ],
+        "noise": NOISE,
+        "columns": _columns(mapped),
+        "commands": list(commands),
+        "neighbours": near.tolist(),
+        "distances": np.take_along_axis(mapped.distances, near, axis=1).round(3).tolist(),
+        "volume": {
+            "shape": small_shape(sampling["shape"]),
+            "box": (box / box.max()).tolist(),
+            "levels": LEVELS,
+            "cut": CUT,
+            "slope": float(np.sqrt(2) * sampling["epsilon"] / box.max()),
+        },
+        "diagram": {"limits": [float(np.quantile(limits[:, 0], 0.05)), float(np.quantile(limits[:, 1], 0.95))]},
+        "embedding": {"usual": {view: _usual(mapped.atlas.embeddings(view)) for view in VIEWS}, "nearest": PLACED_BY},
+        "ramps": {
+            "values": [to_hex(colour) for colour in colormaps["viridis"](np.linspace(0, 1, 17))],
+            "density": [to_hex(colour) for colour in DENSITY(np.linspace(0, 1, 17))],
+        },
+    }
+
+
+def _columns(mapped: AtlasMap) -> list[dict[str, Any]]:
+    atlas = mapped.atlas
+    values = dict(zip(NAMES, atlas.coefficients.T, strict=True))
+    values |= {"m0": atlas.masses, "volume": atlas.volume_fractions}
+    return [
+        {"key": key, "symbol": symbol, "says": says, "values": values[key].tolist()}
+        for key, (symbol, says) in _COLUMNS.items()
+        if key != "a20" or np.ptp(values[key]) > 0
+    ]
+
+
+def _unit_square(positions: np.ndarray) -> np.ndarray:
+    """Places moved and scaled (both axes alike) so that they are in the middle of [0, 1]²."""
+    low, high = positions.min(0), positions.max(0)
+    return (positions - (low + high) / 2) / max(float((high - low).max()), 1e-9) + 0.5
+
+
+def _usual(embeddings: np.ndarray) -> list[float]:
+    """The distance to the nearest other shape, that half of the shapes and that 95 % of them stay below."""
+    apart = cdist(embeddings, embeddings)
+    np.fill_diagonal(apart, np.inf)
+    return np.quantile(apart.min(1), [0.5, 0.95]).round(4).tolist()
+
+
+def _diagrams(diagrams: Sequence[Diagram]) -> tuple[float, list[bytes]]:
+    """The step of κ, and of each diagram κ1, κ2 (int16) and shares of area (uint16, of 65535), one after another."""
+    step = max(float(np.abs(diagram.points).max()) for diagram in diagrams) / 32767
+    return step, [
+        np.rint(diagram.points.T / step).astype("<i2").tobytes()
+        + np.rint(diagram.normalised.weights * 65535).astype("<u2").tobytes()
+        for diagram in diagrams
+    ]
+
+
+def _embeddings(mapped: AtlasMap) -> tuple[float, list[bytes]]:
+    """The step, and the sliced embeddings of fields and of masks `(N, 288)`, int16."""
+    found = [mapped.atlas.embeddings(view) for view in VIEWS]
+    step = max(float(np.abs(each).max()) for each in found) / 32767
+    return step, [np.rint(each / step).astype("<i2").tobytes() for each in found]
+
+
+def _joined(pieces: Iterable[bytes]) -> tuple[str, list[int]]:
+    """Pieces in base64, joined, and where each begins and the last ends."""
+    texts = [base64.b64encode(piece).decode("ascii") for piece in pieces]
+    return "".join(texts), np.cumsum([0, *map(len, texts)]).tolist()
+
+
+def _template(name: str) -> str:
+    return files("curvafit").joinpath("templates", name).read_text(encoding="utf-8")

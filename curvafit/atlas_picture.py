@@ -1,0 +1,154 @@
+"""The picture of a map: its points coloured by family, some of its shapes around them (paper, Figure 10)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import ConnectionPatch
+from matplotlib.patheffects import withStroke
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.distance import cdist
+
+from curvafit.atlas_map import NOISE, AtlasMap
+from curvafit.plot import DPI, INK, QUIET
+from curvafit.render import render
+from curvafit.scan import write_atomically
+
+#: Colours that stay apart for the colour-blind: of families (Okabe & Ito 2008), and of clusters (Tol's muted ones).
+FAMILY_COLOURS = {
+    "spheres": "#0072B2",
+    "layers": "#E69F00",
+    "tubes": "#009E73",
+    "sponge": "#CC79A7",
+    "tubular cavities": "#56B4E9",
+    "bubbles": "#D55E00",
+}
+CLUSTER_COLOURS = ["#44AA99", "#882255", "#DDCC77", "#332288", "#CC6677", "#88CCEE", "#117733", "#999933", "#AA4499"]
+#: Points of no cluster.
+NOISE_COLOUR = "#000000"
+#: Inches: the page, and the edge of a thumbnail's cell.
+_WIDTH, _HEIGHT, _CELL = 14.0, 10.6, 1.92
+#: Thumbnails along the top and the bottom, and along either side between them.
+_ACROSS, _DOWN = 7, 3
+
+
+def map_picture(mapped: AtlasMap, field: Callable[[int], np.ndarray], path: str | Path) -> Path:
+    """Write the map as a PNG, its settings among the PNG's texts.
+
+    Parameters
+    ----------
+    field
+        The phase field `(Z, Y, X)` of the shape at a position of the atlas; asked for the twenty that are shown.
+    """
+    figure = map_figure(mapped, field)
+    settings = json.dumps({"map": mapped.settings, "atlas": mapped.atlas.provenance})
+    texts = {"Title": f"Atlas of {len(mapped)} shapes", "Description": settings}
+    return write_atomically(Path(path), lambda place: figure.savefig(place, format="png", dpi=DPI, metadata=texts))
+
+
+def map_figure(mapped: AtlasMap, field: Callable[[int], np.ndarray]) -> Figure:
+    """The figure itself."""
+    figure = Figure(figsize=(_WIDTH, _HEIGHT), facecolor="white")
+    FigureCanvasAgg(figure)
+    margin = _CELL + 0.28
+    axes = figure.add_axes(
+        (margin / _WIDTH, (margin + 0.62) / _HEIGHT, 1 - 2 * margin / _WIDTH, 1 - (2 * margin + 0.62) / _HEIGHT)
+    )
+    colours = [
+        NOISE_COLOUR if cluster == NOISE else FAMILY_COLOURS[name]
+        for cluster, name in zip(mapped.clusters, mapped.families, strict=True)
+    ]
+    size = float(np.clip(9000 / len(mapped), 14, 60))
+    axes.scatter(*mapped.positions.T, c=colours, s=size, linewidths=0.5, edgecolors="white", zorder=2)
+    axes.set(xticks=[], yticks=[])
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(0.05)
+    axes.spines[:].set_visible(False)
+    _name_clusters(axes, mapped)
+    figure.draw_without_rendering()
+    slots = _slots()
+    chosen = spread_out(mapped.positions, len(slots))
+    places = axes.transData.transform(mapped.positions[chosen]) / (figure.dpi * np.array([_WIDTH, _HEIGHT]))
+    for position, slot in zip(chosen, slots[_assigned(places, slots)], strict=True):
+        _thumbnail(figure, axes, field(position), slot, mapped.positions[position], colours[position])
+    _legend(figure, mapped)
+    return figure
+
+
+def spread_out(positions: np.ndarray, count: int) -> np.ndarray:
+    """Numbers of up to `count` points, each the farthest from those before it; the first is nearest to the middle."""
+    chosen = [int(np.linalg.norm(positions - np.median(positions, axis=0), axis=1).argmin())]
+    apart = np.linalg.norm(positions - positions[chosen[0]], axis=1)
+    while len(chosen) < min(count, len(positions)):
+        chosen.append(int(apart.argmax()))
+        apart = np.minimum(apart, np.linalg.norm(positions - positions[chosen[-1]], axis=1))
+    return np.array(chosen)
+
+
+def _slots() -> np.ndarray:
+    """Middles of the thumbnails' cells around the page, `(20, 2)` in figure coordinates."""
+    low, high = (_CELL / 2 + 0.75) / _HEIGHT, 1 - (_CELL / 2 + 0.1) / _HEIGHT
+    left, right = (_CELL / 2 + 0.1) / _WIDTH, 1 - (_CELL / 2 + 0.1) / _WIDTH
+    across = [(x, y) for y in (low, high) for x in np.linspace(left, right, _ACROSS)]
+    down = [(x, y) for x in (left, right) for y in np.linspace(low, high, _DOWN + 2)[1:-1]]
+    return np.array(across + down)
+
+
+def _assigned(places: np.ndarray, slots: np.ndarray) -> np.ndarray:
+    """A slot for each place, so that the lines are shortest in all: then no two of them cross."""
+    inches = np.array([_WIDTH, _HEIGHT])
+    return linear_sum_assignment(cdist(places * inches, slots * inches))[1]
+
+
+def _thumbnail(
+    figure: Figure, axes: Axes, u: np.ndarray, slot: np.ndarray, place: np.ndarray, colour: str | tuple
+) -> None:
+    """A shape in its cell, a dot in its colour beneath, a line to its point."""
+    width, height = _CELL / _WIDTH, _CELL / _HEIGHT
+    cell = figure.add_axes((slot[0] - width / 2, slot[1] - height / 2, width, height), zorder=3)
+    cell.imshow(render(u, width=round(_CELL * DPI))[0], interpolation="antialiased")
+    cell.set_axis_off()
+    size = np.array([_WIDTH, _HEIGHT])
+    away = axes.transData.transform(place) / figure.dpi - slot * size
+    edge = slot + away / np.abs(away).max() * 0.47 * _CELL / size
+    line = ConnectionPatch(tuple(edge), tuple(place), "figure fraction", axes.transData, color=colour)
+    line.set(linewidth=1.1, alpha=0.75, zorder=1)
+    figure.add_artist(line)
+    axes.scatter(*place, s=95, facecolors="none", edgecolors=[colour], linewidths=1.8, zorder=4)
+
+
+def _name_clusters(axes: Axes, mapped: AtlasMap) -> None:
+    """Each cluster's name at its middle."""
+    for number, name in enumerate(mapped.cluster_families):
+        x, y = np.median(mapped.positions[mapped.clusters == number], axis=0)
+        text = axes.text(x, y, name, ha="center", va="center", fontsize=15, color=INK, zorder=5, style="italic")
+        text.set_path_effects([withStroke(linewidth=4, foreground="white", alpha=0.85)])
+
+
+def _legend(figure: Figure, mapped: AtlasMap) -> None:
+    named = mapped.clusters != NOISE
+    rows = [(name, colour, sum(np.array(mapped.families)[named] == name)) for name, colour in FAMILY_COLOURS.items()]
+    rows.append(("no cluster", NOISE_COLOUR, int((~named).sum())))
+    marks = [
+        Line2D([], [], marker="o", linestyle="", color=colour, markersize=7, label=f"{name}  {count}")
+        for name, colour, count in rows
+        if count
+    ]
+    figure.legend(
+        handles=marks, loc="lower left", ncols=len(marks), frameon=False, fontsize=11, handletextpad=0.2,
+        bbox_to_anchor=(0.005, 0.026),
+    )  # fmt: skip
+    chosen = mapped.settings
+    said = (
+        f"{len(mapped)} shapes · Wasserstein distances of curvature diagrams · UMAP of {chosen['umap']['n_neighbors']} "
+        f"neighbours, seed {chosen['umap']['random_state']} · colour: where a shape's own area lies · curvafit "
+        f"{chosen['versions']['curvafit']}"
+    )
+    figure.text(0.014, 0.012, said, va="bottom", fontsize=9, color=QUIET)
