@@ -117,7 +117,7 @@ def _kept(path: Path, make: Callable[[], _Arrays]) -> _Arrays:
     except (OSError, ValueError, EOFError, zipfile.BadZipFile):
         made = make()
     buffer = io.BytesIO()
-    np.savez(buffer, **made)
+    np.savez(buffer, allow_pickle=False, **made)
     write_atomically(path, lambda place: _write(place, buffer.getvalue()))
     return made
 

@@ -128,7 +128,7 @@ def find_clusters(positions: np.ndarray) -> np.ndarray:
         return np.full(len(positions), NOISE)
     from sklearn.cluster import HDBSCAN as Hdbscan
 
-    options = HDBSCAN | {"copy": True}
+    options: dict[str, Any] = HDBSCAN | {"copy": True}
     found = Hdbscan(**options).fit_predict(positions)
     sizes = np.bincount(found[found >= 0], minlength=1)
     rank = np.argsort(np.argsort(-sizes, kind="stable"))
