@@ -81,7 +81,7 @@ def _looked_at(store: Store, records: list[Record], cache: Path, progress: Progr
 def _look(store: Store, record: Record) -> _Arrays:
     fraction, *diagrams = measured(store, record)
     seen = shown(store.field(record.index))
-    found = {"fraction": np.float64(fraction)} | {
+    found = {"fraction": np.array(fraction)} | {
         name: np.frombuffer(part, dtype=np.uint8) for name, part in seen._asdict().items()
     }
     for view, diagram in zip(("field", "mask"), diagrams, strict=True):

@@ -54,7 +54,8 @@ def small_volume(u: np.ndarray) -> np.ndarray:
 
 
 def regrow_command(record: Record, settings: Settings, name: str) -> str:
-    """The `curvafit generate` line that makes a draw's field again, bit for bit where the versions are the same.
+    """The `curvafit generate` line that makes a draw's field again: with the same versions, processor and number of
+    threads (stores are made on one) bit for bit.
 
     Raises
     ------

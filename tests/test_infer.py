@@ -71,6 +71,9 @@ def test_fit_json_holds_what_the_generator_needs(found: Inference, tmp_path) -> 
     }  # fmt: skip
     assert set(content["distances"]) == {"match", "fit", "seed_noise"}
     assert content["provenance"]["seed"] == 3 and content["length_unit"] == "um"
+    kept = content["diagram"]
+    assert kept["seen_as"] == "mask" and sum(kept["share"]) == pytest.approx(1, abs=1e-4)
+    assert len(kept["kappa1"]) == len(kept["share"]) and path.read_text().count("\n") < 200
     prior, fit = read_fit(path), found.fit
     assert tuple(prior.coefficients) == pytest.approx(tuple(fit.coefficients))
     assert tuple(prior.physical) == pytest.approx(tuple(fit.coefficients_physical))

@@ -35,7 +35,7 @@ function axes(context, x, y, low, high) {
   for (let tick = Math.ceil(low / step) * step; tick <= high; tick += step) {
     const text = String(Math.round(tick)).replace("-", "−");
     context.textAlign = "center";
-    context.fillText(text, x(tick), y(low) + 13);
+    if (x(tick) > x(low) + 12) context.fillText(text, x(tick), y(low) + 13);
     context.textAlign = "right";
     context.fillText(text, x(low) - 4, y(tick) + 4);
   }

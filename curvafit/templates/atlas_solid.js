@@ -56,7 +56,7 @@ float march(vec3 o, vec3 d, float start, float stop, float unit) {
 }
 
 vec3 outward(vec3 p) {
-  vec3 e = 1.2 * voxel;
+  vec3 e = 2.0 * voxel;
   return -normalize(vec3(
     at(p + vec3(e.x, 0, 0)) - at(p - vec3(e.x, 0, 0)),
     at(p + vec3(0, e.y, 0)) - at(p - vec3(0, e.y, 0)),
