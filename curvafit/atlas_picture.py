@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -37,6 +38,8 @@ NOISE_COLOUR = "#000000"
 _WIDTH, _HEIGHT, _CELL = 14.0, 10.6, 1.92
 #: Thumbnails along the top and the bottom, and along either side between them.
 _ACROSS, _DOWN = 7, 3
+#: Share of the shapes from which a family is named on the map.
+_NAMED = 0.05
 
 
 def map_picture(mapped: AtlasMap, field: Callable[[int], np.ndarray], path: str | Path) -> Path:
@@ -71,7 +74,7 @@ def map_figure(mapped: AtlasMap, field: Callable[[int], np.ndarray]) -> Figure:
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.05)
     axes.spines[:].set_visible(False)
-    _name_clusters(axes, mapped)
+    _name_families(axes, mapped)
     figure.draw_without_rendering()
     slots = _slots()
     chosen = spread_out(mapped.positions, len(slots))
@@ -124,10 +127,16 @@ def _thumbnail(
     axes.scatter(*place, s=95, facecolors="none", edgecolors=[colour], linewidths=1.8, zorder=4)
 
 
-def _name_clusters(axes: Axes, mapped: AtlasMap) -> None:
-    """Each cluster's name at its middle."""
-    for number, name in enumerate(mapped.cluster_families):
-        x, y = np.median(mapped.positions[mapped.clusters == number], axis=0)
+def _name_families(axes: Axes, mapped: AtlasMap) -> None:
+    """The name of each larger family, where its shapes lie densest."""
+    for name in FAMILY_COLOURS:
+        own = mapped.positions[np.array(mapped.families) == name]
+        if len(own) < _NAMED * len(mapped):
+            continue
+        apart = cdist(own, own)
+        near = np.argsort(apart, axis=1)[:, : math.ceil(len(own) / 4)]
+        densest = np.take_along_axis(apart, near, axis=1).mean(1).argmin()
+        x, y = own[near[densest]].mean(0)
         text = axes.text(x, y, name, ha="center", va="center", fontsize=15, color=INK, zorder=5, style="italic")
         text.set_path_effects([withStroke(linewidth=4, foreground="white", alpha=0.85)])
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
 from curvafit.diagram import Diagram
 
@@ -12,10 +13,10 @@ _ANGLES = {"spheres": 45.0, "tubes": 0.0, "sponge": -45.0, "tubular cavities": -
 _FLAT_RADII = 2.5
 #: Share of flat area from which a shape is made of layers.
 _LAYERS = 0.5
-#: Half-thickness of each family's ideal, times its area over its volume: a plate's is 1, a cylinder's 2, a ball's 3.
-_SLENDER = {"layers": 1, "spheres": 3, "tubes": 2, "sponge": 2, "tubular cavities": 2, "bubbles": 3}
 #: All families, in the order in which they are listed.
 FAMILIES = ("spheres", "layers", "tubes", "sponge", "tubular cavities", "bubbles")
+#: Where the search for a half-thickness ends.
+_DEEPEST = 6.0
 
 
 def family_shares(diagram: Diagram, radius: float) -> dict[str, float]:
@@ -48,11 +49,11 @@ def leading_family(shares: dict[str, float]) -> str:
 def half_thickness(diagram: Diagram, volume: float) -> float:
     """Half-thickness of what a surface bounds, from its volume and its diagram alone, in the diagram's unit.
 
-    Volume over area, times 1, 2 or 3 as the area is that of plates, cylinders or balls. Found from below: the more area
-    counts as curved, the thicker the structure, and the more area counts as curved.
+    The depth h at which the inner parallel surfaces have swept the volume: an element of area dA has
+    (1 - κ1 t)(1 - κ2 t) dA at depth t, nothing beyond its centres of curvature (Steiner's formula). Exact for plates,
+    cylinders and balls; at most `_DEEPEST` times volume / area, where a ball's is 3.
     """
-    thin = volume / diagram.area
-    radius = thin
-    for _ in range(4):
-        radius = thin * sum(_SLENDER[name] * share for name, share in family_shares(diagram, radius).items())
-    return radius
+    depths = np.linspace(0, _DEEPEST * volume / diagram.area, 601)
+    left = np.clip(1 - diagram.points[:, :, None] * depths, 0, None).prod(axis=1)
+    swept = cumulative_trapezoid(diagram.weights @ left, depths, initial=0)
+    return float(depths[np.searchsorted(swept, min(volume, swept[-1]) * (1 - 1e-9))])

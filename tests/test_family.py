@@ -51,11 +51,20 @@ def test_a_flat_half_makes_layers() -> None:
         ((0.0, 0.0), 2.0, 2 * RADIUS),
         ((1 / RADIUS, 0.0), 2 * np.pi * RADIUS, np.pi * RADIUS**2),
         ((1 / RADIUS, 1 / RADIUS), 4 * np.pi * RADIUS**2, 4 / 3 * np.pi * RADIUS**3),
+        ((1 / RADIUS, -1 / RADIUS), 1.0, 2 / 3 * RADIUS),
     ],
 )
-def test_volume_and_area_tell_how_thick_plates_cylinders_and_balls_are(
+def test_volume_and_curvatures_tell_how_thick_plates_cylinders_and_balls_are(
     point: tuple[float, float], area: float, volume: float
 ) -> None:
     several = 3.0
     measured = Diagram(np.array([point]), np.array([several * area]))
-    assert half_thickness(measured, several * volume) == pytest.approx(RADIUS)
+    assert half_thickness(measured, several * volume) == pytest.approx(RADIUS, rel=0.02)
+
+
+def test_a_thick_shell_is_as_thick_as_its_wall() -> None:
+    outer, inner = 0.11, 0.05
+    areas = 4 * np.pi * np.array([outer, inner]) ** 2
+    shell = Diagram(np.array([[1 / outer] * 2, [-1 / inner] * 2]), areas)
+    thickness = half_thickness(shell, 4 / 3 * np.pi * (outer**3 - inner**3))
+    assert thickness == pytest.approx((outer - inner) / 2, rel=0.02)
