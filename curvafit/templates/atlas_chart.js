@@ -32,7 +32,7 @@ function pixel([x, y], width = points.clientWidth, height = points.clientHeight)
 function draw() {
   const { context, width, height } = fitted(points);
   const colours = colouring();
-  const radius = Math.min(9, 3.6 * Math.sqrt(Math.sqrt(view.zoom)) * (COUNT > 400 ? 1 : 1.35));
+  const radius = Math.min(9, 3.6 * Math.sqrt(Math.sqrt(view.zoom)) * (COUNT > 400 ? 1 : 1.35) * (width < 500 ? 0.75 : 1));
   context.lineWidth = 1;
   context.strokeStyle = themed("rim");
   const dots = atlas.places.map((place) => pixel(place, width, height));
