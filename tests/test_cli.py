@@ -110,7 +110,7 @@ def test_infer_hands_every_option_on(tmp_path: Path, finding: dict[str, Any]) ->
     [
         (["--spacing", "1,0,1"], "expected --spacing as positive numbers"),
         (["--spacing", "1,1"], "expected --spacing as 3 numbers"),
-        (["--spacing", "a"], "expected --spacing as 1 numbers"),
+        (["--spacing", "a"], "expected --spacing as a number"),
         (["--threshold", "high"], "expected --threshold"),
         (["--raw-shape", "4,5"], "expected --raw-shape"),
         (["--unit", "furlong"], "furlong"),
