@@ -65,20 +65,24 @@ def verify(
         If there is no store, or it is of another version.
     """
     store = open_store(path)
-    indices, problems, notes = store.indices(), [], []
-    viable = 0
+    indices, problems, notes, sound = store.indices(), [], [], []
+    design, viable = Design.from_dict(store.settings.design), 0
     for k, index in enumerate(indices):
         progress(f"{k} of {len(indices)} draws checked", k / (len(indices) + regenerate))
-        problems += _wrong(store, index)
-        viable += store.record(index).viability.viable
+        record, intact = store.record(index), store.intact(index)
+        viable += record.viability.viable
+        if intact:
+            sound.append(index)
+            problems += _wrong(store, record, design)
+        else:
+            problems.append(f"draw {index} is not what was written: its checksum differs")
     missing = sorted(set(range(max(indices, default=-1) + 1)) - set(indices))
     lost = f"{len(missing)} draws are not there: {', '.join(map(str, missing[:9]))}"
     if missing or viable < store.wanted:
         (problems if missing and viable >= store.wanted else notes).append(
             f"{viable} of {store.wanted} shapes are made" + f"; {lost}" * bool(missing)
         )
-    problems += _strangers(store)
-    sound = [index for index in indices if store.intact(index)] if problems else indices
+    problems += _strangers(store, indices)
     chosen = np.random.default_rng(seed).permutation(sound)[:regenerate].tolist()
     for k, index in enumerate(chosen):
         progress(f"making draw {index} again", (len(indices) + k) / (len(indices) + regenerate))
@@ -88,24 +92,21 @@ def verify(
     return Verdict(tuple(problems), tuple(notes), f"{len(indices)} draws, {viable} shapes checked, {made}: {said}")
 
 
-def _wrong(store: Store, index: int) -> list[str]:
-    """What is wrong with one draw, but for its flow."""
-    if not store.intact(index):
-        return [f"draw {index} is not what was written: its checksum differs"]
-    record, draw = store.record(index), Design.from_dict(store.settings.design).draw(store.settings.seed, index)
-    if (record.coefficients, record.mass, record.seed) != draw:
-        return [f"draw {index} has other parameters than the design's"]
+def _wrong(store: Store, record: Record, design: Design) -> list[str]:
+    """What is wrong with one intact draw, but for its flow."""
+    if (record.coefficients, record.mass, record.seed) != design.draw(store.settings.seed, record.index):
+        return [f"draw {record.index} has other parameters than the design's"]
     if record.viability.viable:
-        field = store.field(index)
+        field = store.field(record.index)
         if not np.isfinite(field).all() or not field.min() < 0 < field.max():
-            return [f"draw {index} is recorded as a shape, but has no surface"]
+            return [f"draw {record.index} is recorded as a shape, but has no surface"]
     return []
 
 
-def _strangers(store: Store) -> list[str]:
+def _strangers(store: Store, indices: list[int]) -> list[str]:
     """Entries of the folder that are neither draws nor what a killed worker leaves."""
     draws = store.path / "draws"
-    expected = {f"{index:06d}" for index in store.indices()} | {"zarr.json"}
+    expected = {f"{index:06d}" for index in indices} | {"zarr.json"}
     others = [each.name for each in draws.iterdir() if each.name not in expected and not each.name.startswith(".")]
     return [f"draws/{name} is torn, or no draw" for name in sorted(others)]
 

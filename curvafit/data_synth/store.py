@@ -72,10 +72,7 @@ class Store:
         KeyError
             If the draw is missing or incomplete.
         """
-        attributes = self._attributes(index)
-        if attributes is None:
-            raise KeyError(f"expected a complete draw {index} in {self.path}, got none")
-        return record_of(attributes)
+        return record_of(self._complete(index))
 
     def field(self, index: int) -> np.ndarray:
         """The phase field of a viable draw, float32 (Z, Y, X).
@@ -98,9 +95,7 @@ class Store:
         KeyError
             If the draw is missing or incomplete.
         """
-        attributes = self._attributes(index)
-        if attributes is None:
-            raise KeyError(f"expected a complete draw {index} in {self.path}, got none")
+        attributes = self._complete(index)
         try:
             field = self.field(index) if attributes["viability"]["viable"] else None
         except (RuntimeError, ValueError, OSError):  # a chunk that is truncated, or whose own checksum is wrong
@@ -130,6 +125,12 @@ class Store:
             return _publish(partial / place.name, place)
         finally:
             shutil.rmtree(partial, ignore_errors=True)
+
+    def _complete(self, index: int) -> dict:
+        attributes = self._attributes(index)
+        if attributes is None:
+            raise KeyError(f"expected a complete draw {index} in {self.path}, got none")
+        return attributes
 
     def _place(self, index: int) -> Path:
         return self.path / "draws" / f"{index:06d}"
