@@ -32,7 +32,7 @@ clean:
 .venv/installed-dev: EXTRAS := [dev]
 .venv/installed .venv/installed-dev: pyproject.toml constraints.txt | $(BIN)/python
 	@echo "installing curvafit$(EXTRAS) into .venv (some minutes the first time)"
-	@$(PIP) $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) torch
+	@$(if $(TORCH_INDEX),$(PIP) --index-url $(TORCH_INDEX) --no-deps torch)
 	@$(PIP) --editable ".$(EXTRAS)"
 	@touch $@
 
