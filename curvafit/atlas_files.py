@@ -54,7 +54,7 @@ def write_map(
     check_size(len(records))
     folder = Path(directory)
     (folder / CACHE).mkdir(parents=True, exist_ok=True)
-    atlas, shapes = _looked_at(store, records, folder / CACHE, progress)
+    atlas, shapes = _looked_at(store, folder / CACHE, progress)
     mapped = _mapped(atlas, folder / CACHE, device, progress)
     progress("drawing", 0.95)
     picture = map_picture(mapped, lambda k: store.field(records[k].index), folder / "atlas.png")
@@ -65,17 +65,19 @@ def write_map(
     return picture, page
 
 
-def _looked_at(store: Store, records: list[Record], cache: Path, progress: Progress) -> tuple[Atlas, list[Shown]]:
+def _looked_at(store: Store, cache: Path, progress: Progress) -> tuple[Atlas, list[Shown]]:
     """Every shape's measures and pictures."""
     shapes: list[Shown] = []
 
     def look(store: Store, record: Record) -> Measured:
-        progress(f"measuring {len(records)} shapes", 0.6 * len(shapes) / len(records))
         kept = _kept(cache / f"shape-{_key(store, record)}.npz", lambda: _look(store, record))
         shapes.append(Shown(kept["thumbnail"].tobytes(), kept["volume"].tobytes()))
         return float(kept["fraction"]), _diagram(kept, "field"), _diagram(kept, "mask")
 
-    return extract(store, measure=look), shapes
+    def told(done: int, count: int) -> None:
+        progress(f"measuring {count} shapes", 0.6 * done / count)
+
+    return extract(store, measure=look, progress=told), shapes
 
 
 def _look(store: Store, record: Record) -> _Arrays:

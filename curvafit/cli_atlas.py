@@ -121,7 +121,12 @@ def extract_atlas(
         from curvafit.shape_files import check_folder
 
         check_folder(out.parent)
-        atlas = extract(store, [command_line()])
+        with stages() as progress:
+            atlas = extract(
+                store,
+                [command_line()],
+                progress=lambda done, count: progress(f"measuring {count} shapes", done / count),
+            )
         out.parent.mkdir(parents=True, exist_ok=True)
         save_atlas(atlas, out)
         say(f"{len(atlas.ids)} shapes", to=error_console())

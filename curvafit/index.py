@@ -10,7 +10,7 @@ import json
 import os
 import zipfile
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -103,10 +103,15 @@ class Atlas:
 
 #: What is measured of a draw: volume fraction of {u > 0}, diagram of the field, diagram of its mask.
 Measured = tuple[float, Diagram, Diagram]
+#: Progress(shapes measured, shapes), called before each.
+Progress = Callable[[int, int], None]
 
 
 def extract(
-    store: str | Path | Store, command: Sequence[str] = (), measure: Callable[[Store, Record], Measured] | None = None
+    store: str | Path | Store,
+    command: Sequence[str] = (),
+    measure: Callable[[Store, Record], Measured] | None = None,
+    progress: Progress | None = None,
 ) -> Atlas:
     """Measure every well-formed viable shape of a store (see `FORMED`), as a field and as a mask.
 
@@ -117,7 +122,9 @@ def extract(
     command
         Command lines for the provenance, after the one that makes the store.
     measure
-        What to call in place of `measured`: one that remembers, or that tells how far it is.
+        What to call in place of `measured`: one that remembers.
+    progress
+        Called before each shape with the number of those measured, and of all.
 
     Raises
     ------
@@ -129,8 +136,7 @@ def extract(
     kept = [record for record in records if formed(record)]
     if not kept:
         raise ValueError(f"expected at least one well-formed shape in {store.path}, got none in {len(records)} draws")
-    measure = measure or measured
-    fractions, of_fields, of_masks = zip(*(measure(store, record) for record in kept), strict=True)
+    fractions, of_fields, of_masks = zip(*_measures(store, kept, measure or measured, progress), strict=True)
     return Atlas(
         ids=tuple(shape_id(store, record) for record in kept),
         coefficients=np.array([list(record.coefficients) for record in kept], dtype=np.float64),
@@ -141,6 +147,15 @@ def extract(
         mask_diagrams=of_masks,
         provenance=_provenance(store, records, command),
     )
+
+
+def _measures(
+    store: Store, kept: list[Record], measure: Callable[[Store, Record], Measured], progress: Progress | None
+) -> Iterator[Measured]:
+    for done, record in enumerate(kept):
+        if progress is not None:
+            progress(done, len(kept))
+        yield measure(store, record)
 
 
 def formed(record: Record) -> bool:
