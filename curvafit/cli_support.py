@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import shlex
 import sys
 import warnings
@@ -167,15 +168,17 @@ def output(heads: Sequence[str], rows: Iterable[Sequence[str]], right: Iterable[
 def stages() -> Iterator[Callable[[str, float], None]]:
     """A progress bar for a job that names its stages: call it with a sentence and the share done.
 
-    Where the error stream is no terminal, each new sentence is a line.
+    Where the error stream is no terminal, each new sentence is a line; one that only counts on, a line every 5 %.
     """
     console = error_console()
     if not console.is_terminal:
-        said: list[str] = []
+        kind, last = "", 0.0
 
         def write(text: str, share: float) -> None:
-            if said[-1:] != [text]:
-                said.append(text)
+            nonlocal kind, last
+            now = re.sub(r"\d+", "", text)
+            if now != kind or share >= last + 0.05:
+                kind, last = now, share
                 say(f"[{100 * share:3.0f} %] {text}", to=console)
 
         yield write
