@@ -28,6 +28,7 @@ from rich.progress import track
 from curvafit.data_synth.atlas import build
 from curvafit.data_synth.store import open_store
 from curvafit.diagram import Diagram, diagram
+from curvafit.generation.viability import well_formed
 from curvafit.index import VIEWS, Atlas, load_atlas
 from curvafit.match import nearest
 from curvafit.pairwise import one_to_many, pairwise
@@ -37,8 +38,8 @@ from curvafit.transport import comparable, wasserstein
 
 #: Diagrams and rounds of the timing, and the pairs of them that geomloss takes.
 TIMED, ROUNDS, SLOW = 64, 5, 8
-#: Viable shapes, edge and seed of the store that is made; points that a diagram of the truth has at most; pairs of
-#: whole diagrams; edges of bins.
+#: Shapes that are measured; edge and seed of the store that is made where none is named; points that a diagram of the
+#: truth has at most; pairs of whole diagrams; edges of bins.
 SHAPES, EDGE, SEED, POINTS, WHOLE, WIDTHS = 40, 56, 77, 2500, 3, (1.0, 1.5, 2.0, 3.0)
 #: Shapes held out of the atlas, and lengths of the short list.
 HELD, LENGTHS = 50, (5, 10, 20, 40, 80)
@@ -84,14 +85,15 @@ def all_pairs(atlas: Atlas, folder: Path) -> None:
 
 
 def whole_diagrams(store: Path) -> list[Diagram]:
-    """Of the viable shapes of a store: all fields', then all masks'."""
+    """Of the first well-formed shapes of a store: all fields', then all masks'."""
     if not store.exists():
         print(f"making {SHAPES} shapes of {EDGE}³ in {store}")
         build(store, SHAPES, EDGE, SEED)
     opened = open_store(store)
     grid, epsilon = Grid(opened.settings.shape, opened.settings.spacing), opened.settings.epsilon
     fields, masks = [], []
-    for index in track([i for i in opened.indices() if opened.record(i).viability.viable], "diagrams"):
+    viable = [index for index in opened.indices() if well_formed(opened.record(index).viability)]
+    for index in track(viable[:SHAPES], "diagrams"):
         u = torch.from_numpy(opened.field(index))
         fields.append(diagram(u, grid, epsilon))
         masks.append(diagram(phase_field(u > 0, grid, epsilon), grid, epsilon))

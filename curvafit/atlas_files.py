@@ -22,7 +22,8 @@ from curvafit.data_synth.census import census
 from curvafit.data_synth.record import Record
 from curvafit.data_synth.store import Store, open_store
 from curvafit.diagram import Diagram
-from curvafit.index import Atlas, Measured, extract, formed, measured, shape_id
+from curvafit.generation.viability import well_formed
+from curvafit.index import Atlas, Measured, extract, measured, shape_id
 from curvafit.scan import write_atomically
 
 #: Folder beside the two files for what took long: measured shapes, distances, places.
@@ -50,7 +51,7 @@ def write_map(
     """
     check_extra()
     store = store if isinstance(store, Store) else open_store(store)
-    records = [record for record in map(store.record, store.indices()) if formed(record)]
+    records = [record for record in map(store.record, store.indices()) if well_formed(record.viability)]
     check_size(len(records))
     folder = Path(directory)
     (folder / CACHE).mkdir(parents=True, exist_ok=True)

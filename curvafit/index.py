@@ -24,15 +24,13 @@ from curvafit.data_synth.design import boxed
 from curvafit.data_synth.draws import versions
 from curvafit.data_synth.store import Record, Store, open_store
 from curvafit.diagram import Diagram
+from curvafit.generation.viability import FORMED, well_formed
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
 from curvafit.transport import TAIL_SHARE, sliced_embedding
 
 FORMAT = "curvafit atlas"
 VERSION = 1
-#: What an atlas asks of a viable shape besides: |u| in both phases reaches a value in this interval. The published
-#: tests let through plateaus near 0, whose level set is no interface, and fragments of a few voxels with |u| up to 7.
-FORMED = (0.5, 2.0)
 #: What reading a damaged file or another one can raise.
 _UNREADABLE = (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile, zlib.error)
 #: How a shape can be seen: as its phase field, or as the mask {u > 0} re-profiled.
@@ -113,7 +111,7 @@ def extract(
     measure: Callable[[Store, Record], Measured] | None = None,
     progress: Progress | None = None,
 ) -> Atlas:
-    """Measure every well-formed viable shape of a store (see `FORMED`), as a field and as a mask.
+    """Measure every well-formed shape of a store (`generation.viability.well_formed`), as field and as mask.
 
     Parameters
     ----------
@@ -133,7 +131,7 @@ def extract(
     """
     store = store if isinstance(store, Store) else open_store(store)
     records = [store.record(index) for index in store.indices()]
-    kept = [record for record in records if formed(record)]
+    kept = [record for record in records if well_formed(record.viability)]
     if not kept:
         raise ValueError(f"expected at least one well-formed shape in {store.path}, got none in {len(records)} draws")
     fractions, of_fields, of_masks = zip(*_measures(store, kept, measure or measured, progress), strict=True)
@@ -156,12 +154,6 @@ def _measures(
         if progress is not None:
             progress(done, len(kept))
         yield measure(store, record)
-
-
-def formed(record: Record) -> bool:
-    """Whether a draw is viable and well-formed: see `FORMED`."""
-    seen = record.viability
-    return seen.viable and all(FORMED[0] < extent < FORMED[1] for extent in (seen.highest, -seen.lowest))
 
 
 def shape_id(store: Store, record: Record) -> str:

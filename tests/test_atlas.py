@@ -219,9 +219,9 @@ def test_the_packaged_atlas_is_of_the_random_law_and_small():
     atlas = load_atlas()
     file = building.Path(__file__).parent.parent / "curvafit" / "data" / "atlas.npz"
     assert file.stat().st_size < 5e6
-    assert len(atlas) >= 200 and len(set(atlas.ids)) == len(set(atlas.seeds.tolist())) == len(atlas)
+    assert len(atlas) >= 1000 and len(set(atlas.ids)) == len(set(atlas.seeds.tolist())) == len(atlas)
     settings = atlas.provenance["settings"]
-    assert settings["schedule"]["name"] == "fast" and min(settings["shape"]) >= 48
+    assert settings["schedule"]["name"] == "fast" and min(settings["shape"]) >= 64
     for position, name in enumerate(atlas.ids):
         seed, index = map(int, name.split("-"))
         made = (atlas.shape_coefficients(position), atlas.masses[position], atlas.seeds[position])

@@ -67,7 +67,7 @@ def flows(settings: Settings, indices: Sequence[int]) -> Iterator[tuple[Draw, Fl
         reject_early=True,
         device=device(),
     )
-    with _one_thread():
+    with one_thread():
         yield from zip(draws, made, strict=True)
 
 
@@ -99,7 +99,7 @@ def _record(index: int, draw: Draw, flow: Flow, seconds: float) -> Record:
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
+def one_thread() -> Iterator[None]:
     before = torch.get_num_threads(), numba.get_num_threads()
     torch.set_num_threads(1)
     numba.set_num_threads(1)

@@ -1,4 +1,4 @@
-"""Whether a flow made a shape: the published tests, as one pure predicate."""
+"""Whether a flow made a shape: the published tests, and stricter ones, as pure predicates."""
 
 from __future__ import annotations
 
@@ -15,6 +15,9 @@ from curvafit.priors.shapes import Float
 #: Greatest discrepancy ratio, and least extent of either phase, of a viable shape (paper, Experiment 4).
 DISCREPANCY_LIMIT = 0.75
 PHASE_LIMIT = 0.1
+#: What `well_formed` asks besides: |u| in both phases reaches a value in this interval. The published tests let through
+#: plateaus near 0, whose level set is no interface, and fragments of a few voxels with |u| up to 7.
+FORMED = (0.5, 2.0)
 #: Planes that are looked at together.
 PLANES = 16
 
@@ -28,6 +31,11 @@ class Viability:
     lowest: float
     viable: bool
     reason: str
+
+
+def well_formed(seen: Viability) -> bool:
+    """Whether a shape is viable and |u| reaches a value within `FORMED` in both phases."""
+    return seen.viable and all(FORMED[0] < extent < FORMED[1] for extent in (seen.highest, -seen.lowest))
 
 
 def viability(u: Float[Tensor, "z y x"], grid: Grid, epsilon: float | Tensor) -> Viability:
