@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 
 from curvafit.data_synth.design import Design, boxed
+from curvafit.data_synth.draws import make
 from curvafit.data_synth.store import Record, Settings, Store, open_store
 from curvafit.data_synth.workers import Here, Workers
 from curvafit.diagram import Diagram, diagram
@@ -118,7 +119,7 @@ def _filled(store: Store, count: int, workers: Workers, progress: Progress | Non
     todo = (index for index in itertools.count() if index not in viable)
     while (found := sum(viable.values())) < count:
         while chunk := _chunk(todo, min(workers.chunk, count - found - asked), asked, workers):
-            workers.submit(store.path, chunk)
+            workers.submit(make, store.path, chunk)
             asked += len(chunk)
         for record in workers.done():
             asked -= 1

@@ -1,16 +1,15 @@
-"""Where draws are made: in this process, or by the workers of a dask cluster."""
+"""Where draws and cases are made: in this process, or by the workers of a dask cluster."""
 
 from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
-from curvafit.data_synth.draws import device, make
-from curvafit.data_synth.store import Record
+from curvafit.data_synth.draws import device
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -21,10 +20,14 @@ TOGETHER = 32
 PATIENCE = 10
 
 
-class Workers(Protocol):
-    """Whoever makes draws."""
+#: Makes some things of a folder, by their indices, and returns one result each; a function that has a module's name.
+Make = Callable[[Path, Sequence[int]], list[Any]]
 
-    #: Draws that are made together.
+
+class Workers(Protocol):
+    """Whoever makes draws, or cases of a set."""
+
+    #: How many are made together.
     chunk: int
 
     @property
@@ -32,12 +35,12 @@ class Workers(Protocol):
         """How many chunks may be asked for at once."""
         ...
 
-    def submit(self, path: Path, indices: Sequence[int]) -> None:
-        """Ask for some draws of a store."""
+    def submit(self, make: Make, path: Path, indices: Sequence[int]) -> None:
+        """Ask for some of a folder."""
         ...
 
-    def done(self) -> list[Record]:
-        """Wait for some of what was asked for."""
+    def done(self) -> list[Any]:
+        """Wait for some of what was asked for, and return what was made of it."""
         ...
 
 
@@ -48,17 +51,18 @@ class Here:
 
     def __init__(self) -> None:
         self.chunk = TOGETHER if device() == "cuda" else 1
-        self._asked: list[tuple[Path, Sequence[int]]] = []
+        self._asked: list[tuple[Make, Path, Sequence[int]]] = []
 
-    def submit(self, path: Path, indices: Sequence[int]) -> None:
-        self._asked.append((path, indices))
+    def submit(self, make: Make, path: Path, indices: Sequence[int]) -> None:
+        self._asked.append((make, path, indices))
 
-    def done(self) -> list[Record]:
-        return make(*self._asked.pop(0))
+    def done(self) -> list[Any]:
+        make, path, indices = self._asked.pop(0)
+        return make(path, indices)
 
 
 class Cluster:
-    """The workers of a dask cluster, which must see the store's folder under the same name.
+    """The workers of a dask cluster, which must see the folder under the same name.
 
     Each always has a chunk to go on with. A chunk whose worker dies is given to another.
     """
@@ -78,17 +82,17 @@ class Cluster:
         """Two chunks a thread, as many threads as there are now."""
         return 2 * sum(self._client.nthreads().values())  # type: ignore
 
-    def submit(self, path: Path, indices: Sequence[int]) -> None:
-        self._futures.add(self._client.submit(make, str(path.resolve()), list(indices), pure=False))
+    def submit(self, make: Make, path: Path, indices: Sequence[int]) -> None:
+        self._futures.add(self._client.submit(make, path.resolve(), list(indices), pure=False))
 
-    def done(self) -> list[Record]:
+    def done(self) -> list[Any]:
         from distributed import KilledWorker
 
         first = next(self._futures)
         try:
             return first.result()
         except KilledWorker as error:
-            raise OSError(f"expected workers to survive their draws, got one that killed several: {error}") from error
+            raise OSError(f"expected workers to survive their work, got one that killed several: {error}") from error
 
 
 @contextmanager

@@ -1,0 +1,157 @@
+"""Where the shapes of a training set come from: parameters, from which each is generated, or a store of fields."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from curvafit.data_synth.design import PARAMETERS
+from curvafit.data_synth.draws import one_thread
+from curvafit.data_synth.moves import any_crop
+from curvafit.data_synth.store import Store, open_store
+from curvafit.generation.flow import generate
+from curvafit.generation.schedule import schedule as named_schedule
+from curvafit.generation.viability import well_formed
+from curvafit.priors.coefficients import Coefficients
+from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
+
+#: Seeds that a shape gets to become well-formed.
+TRIES = 8
+
+
+class Shape(NamedTuple):
+    """A phase field, float32 (Z, Y, X); its ε in voxels; and what it was made of, in JSON's types."""
+
+    field: np.ndarray
+    epsilon: float
+    origin: dict[str, Any]
+
+
+class Source(Protocol):
+    """Shapes without end, each of the random numbers it is given."""
+
+    def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> Shape:
+        """Shape number `index` of so many voxels (z, y, x)."""
+        ...
+
+    def as_dict(self) -> dict[str, Any]:
+        """What a set records; `source_of` reads it back."""
+        ...
+
+
+@dataclass(frozen=True)
+class Generated:
+    """Shapes generated at points of seven numbers (`PARAMETERS`, working units), in turn.
+
+    Parameters
+    ----------
+    names
+        What the points are called, one each.
+    schedule
+        Of the flow.
+
+    Raises
+    ------
+    ValueError
+        If there is no point, one has another length, or the names are not as many.
+    """
+
+    points: tuple[tuple[float, ...], ...]
+    names: tuple[str, ...]
+    schedule: str = "fast"
+
+    def __post_init__(self) -> None:
+        if not self.points or any(len(point) != len(PARAMETERS) for point in self.points):
+            raise ValueError(f"expected points of {len(PARAMETERS)} numbers ({', '.join(PARAMETERS)})")
+        if len(self.names) != len(self.points):
+            raise ValueError(f"expected a name for each of {len(self.points)} points, got {len(self.names)}")
+
+    def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> Shape:
+        """A well-formed shape, of the first of some seeds that gives one.
+
+        Raises
+        ------
+        ValueError
+            If no seed gives one.
+        """
+        turn = index % len(self.points)
+        *six, mass = self.points[turn]
+        grid, status = Grid(tuple(voxels)), ""  # type: ignore[arg-type]
+        for _ in range(TRIES):
+            seed = int(rng.integers(2**32))
+            with one_thread():
+                flow = generate(
+                    Coefficients(*six), mass, grid, seed=seed, schedule=named_schedule(self.schedule), reject_early=True
+                )
+            if well_formed(flow.viability):
+                point = dict(zip(PARAMETERS, (*six, mass), strict=True))
+                origin = {"name": self.names[turn], "parameters": point, "seed": seed, "schedule": self.schedule}
+                return Shape(flow.field.numpy(), WORKING_EPSILON / WORKING_SPACING, origin)
+            status = flow.status
+        raise ValueError(f"expected {self.names[turn]} to grow from one of {TRIES} seeds, got none: {status}")
+
+    def as_dict(self) -> dict[str, Any]:
+        return {
+            "kind": "generated",
+            "names": list(self.names),
+            "points": [list(point) for point in self.points],
+            "schedule": self.schedule,
+        }
+
+
+@dataclass(frozen=True)
+class Stored:
+    """Random crops of a store's well-formed shapes, turned at random."""
+
+    path: Path
+
+    def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> Shape:
+        """A crop of any of the store's shapes.
+
+        Raises
+        ------
+        ValueError
+            If it is larger than these, or the store has none.
+        """
+        store, draws = _opened(str(self.path))
+        draw = int(draws[int(rng.integers(len(draws)))])
+        field, moved = any_crop(store.field(draw), voxels, rng)
+        record, settings = store.record(draw), store.settings
+        point = dict(zip(PARAMETERS, (*map(float, record.coefficients), record.mass), strict=True))
+        origin = {"name": f"draw {draw}", "parameters": point, "seed": record.seed, "draw": draw, **moved}
+        return Shape(field, settings.epsilon / settings.spacing[0], origin)
+
+    def as_dict(self) -> dict[str, Any]:
+        return {"kind": "stored", "path": str(self.path)}
+
+
+def source_of(kept: dict[str, Any]) -> Source:
+    """The inverse of `Source.as_dict`."""
+    if kept["kind"] == "stored":
+        return Stored(Path(kept["path"]))
+    return Generated(tuple(map(tuple, kept["points"])), tuple(kept["names"]), kept["schedule"])
+
+
+def formed_draws(store: Store) -> list[int]:
+    """The store's well-formed draws.
+
+    Raises
+    ------
+    ValueError
+        If there is none.
+    """
+    found = [index for index in store.indices() if well_formed(store.record(index).viability)]
+    if not found:
+        raise ValueError(f"expected a store with well-formed shapes, got none in {store.path}")
+    return found
+
+
+@lru_cache(maxsize=4)
+def _opened(path: str) -> tuple[Store, list[int]]:
+    store = open_store(path)
+    return store, formed_draws(store)
