@@ -28,7 +28,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from scipy import ndimage
 from skimage.filters import threshold_otsu
-from skimage.measure import euler_number
 from skimage.restoration import denoise_tv_chambolle
 from skimage.segmentation import random_walker
 
@@ -37,6 +36,7 @@ from curvafit.infer import infer
 from curvafit.priors.coefficients import Coefficients
 from curvafit.scan import Field, write_atomically
 from curvafit.segment import reconstruct, segment
+from curvafit.topology import betti_numbers
 
 EDGE, SPACING = 96, 0.0195
 KEPT = (4, 8, 12)
@@ -48,19 +48,11 @@ FIGURES = ("dice", "distance", "betti")
 Corner = tuple[int, int, int]
 
 
-def betti(mask: np.ndarray) -> tuple[int, int, int]:
-    """Pieces (26-connected), tunnels and cavities."""
-    pieces = ndimage.label(mask, np.ones((3, 3, 3)))[1]
-    outer = ndimage.label(~np.pad(mask, 1))[1] if mask.any() else 1
-    cavities = outer - 1
-    return pieces, pieces + cavities - int(euler_number(mask, connectivity=3)), cavities
-
-
 def scores(mask: np.ndarray, truth: np.ndarray) -> dict[str, float]:
     """Dice, mean distance between the surfaces, sum of the Betti numbers' errors."""
     shells = [each & ~ndimage.binary_erosion(each, border_value=1) for each in (mask, truth)]
     apart = [ndimage.distance_transform_edt(~a)[b] for a, b in (shells, shells[::-1])]
-    found, right = betti(mask), betti(truth)
+    found, right = betti_numbers(mask), betti_numbers(truth)
     return {
         "dice": 2 * float((mask & truth).sum()) / float(mask.sum() + truth.sum()),
         "distance": float(np.concatenate(apart).mean()),

@@ -16,6 +16,8 @@ from numba import njit
 from scipy import ndimage
 from skimage import measure
 
+from curvafit.topology import euler_number
+
 __all__ = ["Morphometry", "local_thickness", "morphometry"]
 
 #: How far a periodic box is continued before distances are taken, in voxels.
@@ -79,7 +81,7 @@ def morphometry(
     voxel = math.prod(edges)
     thickness = local_thickness(mask, edges, periodic=periodic)[mask]
     gap = local_thickness(~mask, edges, periodic=periodic)[~mask]
-    euler = _periodic_euler(mask) if periodic else int(measure.euler_number(mask, connectivity=3))
+    euler = euler_number(mask, periodic=periodic)
     return Morphometry(
         volume_fraction=filled / mask.size,
         thickness_mean=float(thickness.mean(dtype=np.float64)),
@@ -196,14 +198,3 @@ def _surface(mask: np.ndarray, spacing: tuple[float, float, float], periodic: bo
         soft = np.pad(soft, [(0, 1)] * 3, mode="wrap")
     vertices, faces, _, _ = measure.marching_cubes(soft, 0.5, spacing=spacing)
     return float(measure.mesh_surface_area(vertices, faces))
-
-
-def _periodic_euler(mask: np.ndarray) -> int:
-    """χ of the union of closed voxels on the torus: vertices - edges + faces - voxels."""
-    total = 0
-    for axes in ((), (0,), (1,), (2,), (0, 1), (0, 2), (1, 2), (0, 1, 2)):
-        cells = mask
-        for axis in axes:
-            cells = cells | np.roll(cells, 1, axis)
-        total += (-1) ** (3 - len(axes)) * int(np.count_nonzero(cells))
-    return total

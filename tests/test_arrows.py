@@ -19,9 +19,11 @@ ALLOWED = {
     "mesh": {"priors"},
     "diagram": {"priors", "mesh"},
     "transport": {"priors", "diagram"},
+    "topology": {"priors"},
+    "morphometry": {"priors", "topology"},
     "sinkhorn": {"priors"},
     "pairwise": {"priors", "scan", "diagram", "transport", "sinkhorn"},
-    "data_synth": {"generation", "priors", "scan", "mesh", "diagram", "transport"},
+    "data_synth": {"generation", "priors", "scan", "mesh", "diagram", "transport", "topology", "morphometry"},
 }
 #: The command line imports everything; of the package, only `__main__` imports it.
 TOP = "cli"

@@ -1,0 +1,218 @@
+"""A skeleton as a graph: nodes where lines end or meet, edges with their polylines, lengths and radii."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from itertools import product
+
+import networkx as nx
+import numpy as np
+from scipy import ndimage
+
+from curvafit.priors.grid import Grid
+
+#: Weights by which voxels' places are averaged along a line, twice, so that their steps do not count.
+SMOOTH = (1 / 9, 2 / 9, 3 / 9, 2 / 9, 1 / 9)
+
+
+def centreline(skeleton: np.ndarray, distance: np.ndarray, grid: Grid, prune: float = 1.0) -> nx.MultiGraph:
+    """The graph of a skeleton of one-voxel wide lines (26 neighbours), with radii.
+
+    Voxels of three or more neighbours are junctions, touching ones a single one at their mean; voxels of one neighbour
+    are ends. Lines are smoothed over some voxels, so that lengths are not those of the voxels' steps; those from
+    voxel to voxel of a tilted line would be up to a tenth too long. A free line that does not leave the ball around its
+    other node by more than a voxel is a spur and is left out, shortest first; where two lines remain at a junction they
+    become one. A piece that is so left with nothing is a node without edges. Neither changes the cycles.
+
+    Parameters
+    ----------
+    skeleton
+        bool (Z, Y, X), as `skeleton_of` gives it.
+    distance
+        Signed distance (Z, Y, X), positive inside: the radii are its values on the lines.
+    prune
+        Spurs are shorter than so many radii of their other node and a voxel; 0 keeps all.
+
+    Returns
+    -------
+    networkx.MultiGraph
+        Nodes 0, 1, … have `position` (z, y, x), `radius` and `kind` ("end", "junction", "point" without edges, "loop"
+        of a line that closes on itself); edges have `points` (N, 3) from the lesser node to the greater and `radii`
+        (N,), both with the nodes' own, `length` and mean `radius`. All is in spacing's unit, the first voxel's centre
+        at the origin. In a periodic box nodes are in the box and `points` run on beyond it.
+
+    Raises
+    ------
+    ValueError
+        If the arrays do not have the grid's shape or the share is negative.
+    """
+    if skeleton.shape != grid.shape or distance.shape != grid.shape:
+        raise ValueError(f"expected arrays of shape {grid.shape}, got {skeleton.shape} and {distance.shape}")
+    if not prune >= 0:
+        raise ValueError(f"expected a share of the radius of at least 0, got {prune}")
+    graph = _traced(np.asarray(skeleton, dtype=bool), distance, grid)
+    if prune > 0:
+        _prune(graph, prune, np.array(grid.spacing))
+    return _finished(graph, distance, grid)
+
+
+def cycle_rank(graph: nx.MultiGraph) -> int:
+    """How many edges can go before a piece falls apart or is a tree."""
+    return graph.number_of_edges() - graph.number_of_nodes() + nx.number_connected_components(graph)
+
+
+def _traced(skeleton: np.ndarray, distance: np.ndarray, grid: Grid) -> nx.MultiGraph:
+    """Nodes with `place` (voxels) and `radius`; edges with `line` (N, 3) in voxels from `start`, unwrapped."""
+    places = np.argwhere(skeleton)
+    number = np.full(skeleton.shape, -1, dtype=np.int64)
+    number[skeleton] = np.arange(len(places))
+    beside = _neighbours(places, number, grid)
+    groups = list(_junctions(beside)) + [[i] for i, near in enumerate(beside) if len(near) < 2]
+    node = {i: k for k, members in enumerate(groups) for i in members}
+    graph = nx.MultiGraph()
+    for k, members in enumerate(groups):
+        cloud = np.stack(_unwrapped([places[i] for i in members], grid))
+        radius = max(float(distance[tuple(places[i])]) for i in members)
+        graph.add_node(k, place=cloud.mean(0), radius=radius)
+    seen: set[int] = set()
+    for i, k in list(node.items()):
+        for first in beside[i]:
+            if first in node and (node[first] > k):
+                _join(graph, k, node[first], [places[i], places[first]], grid)
+            elif first not in node and first not in seen:
+                path = _walk(i, first, beside, node)
+                seen.update(path[1:-1])
+                _join(graph, k, node[path[-1]], [places[j] for j in path], grid)
+    for i in range(len(places)):
+        if i not in node and i not in seen:  # a line that closes on itself
+            node[i] = len(graph)
+            path = _walk(i, beside[i][0], beside, node)
+            seen.update(path)
+            graph.add_node(node[i], place=places[i].astype(float), radius=float(distance[tuple(places[i])]))
+            _join(graph, node[i], node[i], [places[j] for j in path], grid)
+    return graph
+
+
+def _neighbours(places: np.ndarray, number: np.ndarray, grid: Grid) -> list[list[int]]:
+    """The numbers of the voxels around each."""
+    beside: list[list[int]] = [[] for _ in places]
+    for step in product((-1, 0, 1), repeat=3):
+        if step == (0, 0, 0):
+            continue
+        there = places + step
+        valid = np.ones(len(there), dtype=bool) if grid.periodic else ((there >= 0) & (there < grid.shape)).all(1)
+        found = number[tuple((there[valid] % grid.shape).T)]
+        for i, j in zip(np.flatnonzero(valid)[found >= 0], found[found >= 0], strict=True):
+            beside[int(i)].append(int(j))
+    return beside
+
+
+def _junctions(beside: list[list[int]]) -> Iterable[list[int]]:
+    meeting = nx.Graph()
+    crossing = [i for i, near in enumerate(beside) if len(near) > 2]
+    meeting.add_nodes_from(crossing)
+    meeting.add_edges_from((i, j) for i in crossing for j in beside[i] if len(beside[j]) > 2)
+    return (sorted(each) for each in nx.connected_components(meeting))
+
+
+def _walk(start: int, first: int, beside: list[list[int]], node: dict[int, int]) -> list[int]:
+    """From a node's voxel along voxels of two neighbours to the next node's."""
+    path = [start, first]
+    while path[-1] not in node:
+        one, other = beside[path[-1]]
+        path.append(other if one == path[-2] else one)
+    return path
+
+
+def _join(graph: nx.MultiGraph, one: int, other: int, voxels: list[np.ndarray], grid: Grid) -> None:
+    """Add an edge through voxels, the first and the last of which belong to the nodes."""
+    start, end = graph.nodes[one]["place"], graph.nodes[other]["place"]
+    line = np.stack(_unwrapped([start, *voxels[1:-1], end], grid))
+    if one > other:
+        one, other, line = other, one, line[::-1]
+    graph.add_edge(one, other, line=line)
+
+
+def _unwrapped(points: list[np.ndarray], grid: Grid) -> list[np.ndarray]:
+    """The points with whole boxes added so that each is nearest to the one before."""
+    if not grid.periodic:
+        return [np.asarray(point, dtype=float) for point in points]
+    size, out = np.array(grid.shape), [np.asarray(points[0], dtype=float)]
+    for point in points[1:]:
+        out.append(point - size * np.round((point - out[-1]) / size))
+    return out
+
+
+def _prune(graph: nx.MultiGraph, share: float, spacing: np.ndarray) -> None:
+    """Leave out spurs, shortest first, until there are none."""
+    changed = True
+    while changed:
+        spurs = sorted(_spurs(graph, share, spacing))
+        changed = bool(spurs)
+        for _, tip, root in spurs:
+            if tip in graph and root in graph and graph.degree(tip) == 1 and graph.has_edge(tip, root):
+                graph.remove_node(tip)
+                _dissolve(graph, root)
+
+
+def _spurs(graph: nx.MultiGraph, share: float, spacing: np.ndarray) -> Iterable[tuple[float, int, int]]:
+    for one, other, line in graph.edges(data="line"):
+        for tip, root in ((one, other), (other, one)):
+            if graph.degree(tip) == 1 and tip != root:
+                radii = graph.nodes[root]["radius"], graph.nodes[tip]["radius"]
+                length = _length(_smoothed(line) * spacing)
+                if length < share * radii[0] + spacing.max() and (graph.degree(root) > 1 or radii[0] >= radii[1]):
+                    yield length, tip, root
+
+
+def _dissolve(graph: nx.MultiGraph, node: int) -> None:
+    """Make the two edges of a node one."""
+    edges = list(graph.edges(node, keys=True, data="line"))
+    if graph.degree(node) != 2 or len(edges) != 2:
+        return
+    (_, one, _, first), (_, other, _, second) = edges
+    first = first if node > one else first[::-1]  # towards the node
+    second = second if node < other else second[::-1]  # away from it
+    line = np.concatenate([first[:-1], second + (first[-1] - second[0])])
+    graph.remove_node(node)
+    if one > other:
+        one, other, line = other, one, line[::-1]
+    graph.add_edge(one, other, line=line)
+
+
+def _finished(traced: nx.MultiGraph, distance: np.ndarray, grid: Grid) -> nx.MultiGraph:
+    """Numbered anew, in spacing's unit."""
+    spacing, graph = np.array(grid.spacing), nx.MultiGraph()
+    number = {node: k for k, node in enumerate(sorted(traced))}
+    for node, k in number.items():
+        place, degree = traced.nodes[node]["place"], traced.degree(node)
+        kind = ("point", "end", "loop")[degree] if degree < 3 else "junction"
+        home = (place % grid.shape if grid.periodic else place) * spacing
+        graph.add_node(k, position=home, radius=traced.nodes[node]["radius"], kind=kind)
+    for one, other, line in traced.edges(data="line"):
+        if one > other:
+            one, other = other, one
+        smooth = _smoothed(line)
+        points = smooth * spacing
+        points = points - points[0] + graph.nodes[number[one]]["position"]
+        mode = "grid-wrap" if grid.periodic else "nearest"
+        radii = ndimage.map_coordinates(distance, smooth.T, order=1, mode=mode)
+        steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+        mean = float(np.average((radii[1:] + radii[:-1]) / 2, weights=steps)) if steps.sum() else float(radii.mean())
+        graph.add_edge(number[one], number[other], points=points, radii=radii, length=float(steps.sum()), radius=mean)
+    return graph
+
+
+def _smoothed(line: np.ndarray) -> np.ndarray:
+    """Averaged twice along itself; it is continued through its ends, which stay."""
+    for _ in range(2):
+        before, after = 2 * line[0] - line[2:0:-1], 2 * line[-1] - line[-2:-4:-1]
+        if len(before) < 2 or len(after) < 2:
+            break
+        longer = np.concatenate([before, line, after])
+        line = sum(w * longer[k : k + len(line)] for k, w in enumerate(SMOOTH))  # type: ignore[assignment]
+    return line
+
+
+def _length(points: np.ndarray) -> float:
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())

@@ -1,0 +1,206 @@
+"""What is exactly known of a generated shape, as training labels."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from skimage.segmentation import watershed
+from torch import Tensor
+
+from curvafit.data_synth.distance import field_distance
+from curvafit.data_synth.skeleton import skeleton_of
+from curvafit.diagram import LEAST_RADIUS, LEAST_SLOPE, MARGIN
+from curvafit.mesh import NoSurface
+from curvafit.morphometry import local_thickness
+from curvafit.priors.curvature import geometric_curvatures, jet
+from curvafit.priors.grid import Grid
+from curvafit.priors.profile import profile_distance
+from curvafit.topology import betti_numbers, components
+
+#: Pieces that touch are two where the neck between them is thinner than this part of the thinner one.
+NECK = 0.7
+
+
+@dataclass(frozen=True, eq=False)
+class Labels:
+    """Labels of a shape {u > 0}, each `(Z, Y, X)`; None where it was not asked for.
+
+    Attributes
+    ----------
+    grid
+        Voxels, spacing and what lies beyond the box.
+    mask
+        bool: u > 0.
+    distance
+        float32, to the surface, positive inside, in spacing's unit; see `field_distance`.
+    skeleton
+        bool: curves with the mask's topology; see `skeleton_of`. `centreline` makes a graph of it.
+    instances
+        int32: 0 outside, 1, 2, … in the pieces; see `instances_of`.
+    kappa1, kappa2
+        float32: the surface's principal curvatures κ1 ≥ κ2 in 1/spacing's unit, positive where the shape is convex, in
+        the voxels on both sides of the surface (those with one of their six neighbours on the other side); NaN in all
+        others, where the grid does not resolve the curvature, and within `diagram.MARGIN` voxels of the faces of a box
+        that is not periodic.
+    radius
+        float32: half the local thickness, the radius of the largest ball inside that covers the voxel, in spacing's
+        unit; 0 outside. Up to half a voxel too little on tubes and balls; see `morphometry.local_thickness`.
+    betti
+        b0 pieces, b1 tunnels, b2 cavities; see `topology.betti_numbers`.
+    """
+
+    grid: Grid
+    mask: np.ndarray | None = None
+    distance: np.ndarray | None = None
+    skeleton: np.ndarray | None = None
+    instances: np.ndarray | None = None
+    kappa1: np.ndarray | None = None
+    kappa2: np.ndarray | None = None
+    radius: np.ndarray | None = None
+    betti: tuple[int, int, int] | None = None
+
+
+#: What `labels_of` knows.
+NAMES = tuple(field.name for field in fields(Labels) if field.name != "grid")
+
+
+def labels_of(
+    field: Tensor | np.ndarray, grid: Grid, epsilon: float, which: Collection[str] | str = NAMES
+) -> Labels:
+    """The labels of a phase field `(Z, Y, X)`, positive inside; only those in `which` cost time.
+
+    A periodic grid's box repeats: distances, curvatures, radii, pieces and lines go on across its faces, and the Betti
+    numbers are those on the torus. Of a crop (replicate) nothing is known beyond: a tube that is cut ends there.
+
+    Raises
+    ------
+    ValueError
+        If the field is not a finite volume of the grid's shape or does not cross 0, ε is not positive, or a name is
+        unknown.
+    """
+    wanted = {which} if isinstance(which, str) else set(which)
+    if unknown := sorted(wanted - set(NAMES)):
+        raise ValueError(f"expected labels of {', '.join(NAMES)}, got {', '.join(unknown)}")
+    u = _checked(field, grid, epsilon)
+    found: dict[str, np.ndarray | tuple[int, int, int]] = {}
+    mask = (u > 0).cpu().numpy()
+    if wanted & {"distance", "skeleton", "instances"}:
+        found["distance"] = distance = field_distance(u, grid, epsilon)
+        if "skeleton" in wanted:
+            found["skeleton"] = skeleton_of(distance, grid)
+        if "instances" in wanted:
+            found["instances"] = instances_of(distance, grid)
+    if wanted & {"kappa1", "kappa2"}:
+        found["kappa1"], found["kappa2"] = _curvatures(u, mask, grid, epsilon)
+    if "radius" in wanted:
+        found["radius"] = local_thickness(mask, grid.spacing, periodic=grid.periodic) / 2
+    if "betti" in wanted:
+        found["betti"] = betti_numbers(mask, periodic=grid.periodic)
+    return Labels(grid, **{name: value for name, value in ({"mask": mask} | found).items() if name in wanted})  # type: ignore[arg-type]
+
+
+def instances_of(distance: np.ndarray, grid: Grid, neck: float = NECK) -> np.ndarray:
+    """The pieces of {distance > 0}: int32 `(Z, Y, X)`, 0 outside and 1, 2, … in the order of their first voxels.
+
+    Pieces are 26-connected, in a periodic box across its faces too. A piece is divided at necks: the watershed of the
+    distance gives each of its maxima a basin, and basins are one again, widest neck first, unless the neck between them
+    is thinner than `neck` times the thinner one's greatest radius. So balls that touch or are strung on a thinner tube
+    are several, a tube of even width is one; 0 divides nothing.
+
+    Raises
+    ------
+    ValueError
+        If the neck's part is not in [0, 1].
+    """
+    if not 0 <= neck <= 1:
+        raise ValueError(f"expected a neck's part in [0, 1], got {neck}")
+    mask = distance > 0
+    if neck == 0:
+        return components(mask, periodic=grid.periodic)[0]
+    basins = watershed(-distance, mask=mask, connectivity=3).astype(np.int64)
+    tops = np.zeros(basins.max() + 1, dtype=np.float32)
+    np.maximum.at(tops, basins.ravel(), distance.ravel())
+    tops[0] = 0
+    owner = np.arange(len(tops))
+    for width, one, other in _necks(basins, distance, grid):
+        a, b = _root(owner, one), _root(owner, other)
+        if a != b and width >= neck * min(tops[a], tops[b]):
+            owner[b] = a
+            tops[a] = max(tops[a], tops[b])
+    return _renumbered(np.array([_root(owner, k) for k in range(len(owner))])[basins])
+
+
+def _necks(basins: np.ndarray, distance: np.ndarray, grid: Grid) -> list[tuple[float, int, int]]:
+    """Greatest distance at which two basins touch (by faces), widest first."""
+    pairs, widths = [], []
+    for axis in range(3):
+        next_basins, next_distance = np.roll(basins, -1, axis), np.roll(distance, -1, axis)
+        touch = (basins > 0) & (next_basins > 0) & (basins != next_basins)
+        if not grid.periodic:
+            np.moveaxis(touch, axis, 0)[-1] = False
+        pairs.append(np.sort(np.stack([basins[touch], next_basins[touch]], 1), axis=1))
+        widths.append(np.minimum(distance[touch], next_distance[touch]))
+    found, index = np.unique(np.concatenate(pairs), axis=0, return_inverse=True)
+    widest = np.zeros(len(found), dtype=np.float32)
+    np.maximum.at(widest, index.reshape(-1), np.concatenate(widths))
+    order = np.argsort(-widest, kind="stable")
+    return [(float(widest[k]), int(found[k, 0]), int(found[k, 1])) for k in order]
+
+
+def _root(owner: np.ndarray, k: int) -> int:
+    while owner[k] != k:
+        k = owner[k]
+    return int(k)
+
+
+def _renumbered(labels: np.ndarray) -> np.ndarray:
+    """0 and 1, 2, … in the order of their first voxels."""
+    values, first, index = np.unique(labels, return_index=True, return_inverse=True)
+    rank = np.zeros(len(values), dtype=np.int32)
+    named = np.flatnonzero(values > 0)
+    rank[named[np.argsort(first[named])]] = np.arange(1, len(named) + 1)
+    return rank[index].reshape(labels.shape)
+
+
+def _curvatures(u: Tensor, mask: np.ndarray, grid: Grid, epsilon: float) -> tuple[np.ndarray, np.ndarray]:
+    """κ1, κ2 of {u = 0} next to it: those of the level set through the voxel's centre, at distance d from the surface,
+    carried along the normal: κ / (1 + κ d)."""
+    near = jet(profile_distance(u, epsilon), grid)
+    slope = near.gradient.square().sum(-4).sqrt()
+    d = near.value / slope.clamp_min(LEAST_SLOPE)
+    κ1, κ2 = (κ / (1 + κ * d) for κ in geometric_curvatures(near)[:2])
+    sharpest = 1 / (LEAST_RADIUS * max(grid.spacing))
+    known = (slope > LEAST_SLOPE) & (κ1.abs() < sharpest) & (κ2.abs() < sharpest) & torch.from_numpy(_shell(mask, grid))
+    return torch.where(known, κ1, torch.nan).float().numpy(), torch.where(known, κ2, torch.nan).float().numpy()
+
+
+def _shell(mask: np.ndarray, grid: Grid) -> np.ndarray:
+    """Voxels with one of their six neighbours on the other side; those in the margin of a crop left out."""
+    shell = np.zeros(mask.shape, dtype=bool)
+    for axis in range(3):
+        for step in (-1, 1):
+            differ = np.roll(mask, step, axis) != mask
+            if not grid.periodic:
+                np.moveaxis(differ, axis, 0)[0 if step > 0 else -1] = False
+            shell |= differ
+    if not grid.periodic:
+        inner = np.zeros_like(shell)
+        inner[(slice(MARGIN, -MARGIN),) * 3] = True
+        shell &= inner
+    return shell
+
+
+def _checked(field: Tensor | np.ndarray, grid: Grid, epsilon: float) -> Tensor:
+    u = torch.as_tensor(field).detach().cpu()
+    if tuple(u.shape) != grid.shape:
+        raise ValueError(f"expected a field of shape {grid.shape}, got {tuple(u.shape)}")
+    if not u.is_floating_point() or not bool(torch.isfinite(u).all()):
+        raise ValueError(f"expected a field of finite floating-point numbers, got {u.dtype} or numbers that are not")
+    if not epsilon > 0:
+        raise ValueError(f"expected a positive epsilon, got {epsilon}")
+    if not float(u.min()) <= 0 < float(u.max()):
+        raise NoSurface(f"expected a field that crosses 0, got values from {float(u.min()):g} to {float(u.max()):g}")
+    return u.float()

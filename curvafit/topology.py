@@ -1,0 +1,98 @@
+"""Pieces, tunnels and cavities of a mask, in a box that ends or one that repeats."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+from scipy import ndimage
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import breadth_first_order, connected_components
+from skimage import measure
+
+
+def components(mask: np.ndarray, *, periodic: bool = False, connectivity: int = 26) -> tuple[np.ndarray, int]:
+    """Connected pieces: int32 (Z, Y, X) of 0 outside and 1, 2, … in the pieces, and how many there are.
+
+    Voxels touch by corners (`connectivity` 26) or by faces (6); in a periodic box also across its faces.
+    """
+    labels, count = ndimage.label(mask, ndimage.generate_binary_structure(3, 3 if connectivity == 26 else 1))  # type: ignore[misc]
+    if periodic and count:
+        pairs = _seams(labels, connectivity == 26)[:, :2] - 1
+        merged = connected_components(_graph(pairs, count), directed=False)[1]
+        _, first = np.unique(merged, return_index=True)  # numbered in the order of their first voxels
+        rank = np.empty(len(first), dtype=np.int32)
+        rank[np.argsort(first)] = np.arange(1, len(first) + 1)
+        labels, count = np.concatenate([[0], rank[merged]])[labels], len(first)
+    return labels.astype(np.int32), int(count)
+
+
+def euler_number(mask: np.ndarray, *, periodic: bool = False) -> int:
+    """χ of the union of the closed voxels (26-connected); a periodic box's is that on the torus."""
+    if not periodic:
+        return int(measure.euler_number(mask, connectivity=3))
+    total = 0
+    for axes in ((), (0,), (1,), (2,), (0, 1), (0, 2), (1, 2), (0, 1, 2)):
+        cells = mask
+        for axis in axes:
+            cells = cells | np.roll(cells, 1, axis)
+        total += (-1) ** (3 - len(axes)) * int(np.count_nonzero(cells))
+    return total
+
+
+def betti_numbers(mask: np.ndarray, *, periodic: bool = False) -> tuple[int, int, int]:
+    """b0 pieces (26-connected), b1 tunnels, b2 cavities (6-connected).
+
+    A box that is not periodic is all there is: what opens to its faces is no cavity. A periodic one is a torus: a tube
+    that goes around it is a tunnel, and b2 = (pieces of the outside) - 1 + 3 - (directions in which the outside goes
+    around), by Alexander duality. b1 = b0 + b2 - χ.
+    """
+    inside = np.asarray(mask, dtype=bool)
+    if not inside.any():
+        return 0, 0, 0
+    if periodic and inside.all():
+        return 1, 3, 3
+    pieces = components(inside, periodic=periodic)[1]
+    if periodic:
+        cavities = components(~inside, periodic=True, connectivity=6)[1] - 1 + 3 - _directions(~inside)
+    else:
+        cavities = components(~np.pad(inside, 1), connectivity=6)[1] - 1
+    return pieces, pieces + cavities - euler_number(inside, periodic=periodic), cavities
+
+
+def _seams(labels: np.ndarray, corners: bool) -> np.ndarray:
+    """Which labels touch across the faces of a periodic box: unique rows (last layer's, first layer's, axis)."""
+    found = [np.empty((0, 3), dtype=np.int64)]
+    for axis in range(3):
+        last, first = np.take(labels, -1, axis), np.take(labels, 0, axis)
+        for shift in product((-1, 0, 1), repeat=2) if corners else [(0, 0)]:
+            moved = np.roll(first, shift, (0, 1))
+            touch = (last > 0) & (moved > 0)
+            pairs = np.unique(np.stack([last[touch], moved[touch]], axis=1), axis=0)
+            found.append(np.insert(pairs, 2, axis, axis=1))
+    return np.unique(np.concatenate(found), axis=0).astype(np.int64)
+
+
+def _graph(pairs: np.ndarray, count: int) -> coo_array:
+    return coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+
+
+def _directions(mask: np.ndarray) -> int:
+    """Rank of the loops of a 6-connected phase around the torus: of what is left over when its pieces within the box
+    are laid out along a spanning tree."""
+    labels, count = ndimage.label(mask)  # type: ignore[misc]
+    seams = _seams(labels, False)
+    one, other, steps = seams[:, 0] - 1, seams[:, 1] - 1, np.eye(3, dtype=np.int64)[seams[:, 2]]
+    graph = _graph(seams[:, :2] - 1, count).tocsr()
+    step = {}
+    for i, j, by in zip(one, other, steps, strict=True):
+        step[i, j], step[j, i] = by, -by
+    place, seen = np.zeros((count, 3), dtype=np.int64), np.zeros(count, dtype=bool)
+    for root in range(count):
+        if not seen[root]:
+            order, before = breadth_first_order(graph, root, directed=False)
+            seen[order] = True
+            for node in order[1:]:
+                place[node] = place[before[node]] + step[before[node], node]
+    around = place[one] + steps - place[other]
+    return int(np.linalg.matrix_rank(around)) if len(around) else 0
