@@ -6,7 +6,7 @@ python -m benchmarks.distances [--atlas PATH] [--store STORE] [--pairs 200] [--a
    for all pairs of the atlas. The floor: a step takes one exponential a pair of bins, some 20 operations in float32.
    With --all these are computed and timed; where that was stopped, it goes on.
 2. Error of bins on random pairs of whole diagrams, half of them fields', half masks', and on every diagram with its
-   nearest. Truth: geomloss on diagrams binned to at most 2500 points. What that changes in turn is measured on a few
+   nearest. Truth: geomloss on diagrams binned to at most 5000 points. What that changes in turn is measured on a few
    pairs of whole diagrams. The store is made where there is none (an hour on two cores), and the truth is kept.
 3. With --match: `nearest` against all distances, on fields and masks of 50 shapes held out of the atlas.
 """
@@ -40,7 +40,7 @@ from curvafit.transport import comparable, wasserstein
 TIMED, ROUNDS, SLOW = 64, 5, 8
 #: Shapes that are measured; edge and seed of the store that is made where none is named; points that a diagram of the
 #: truth has at most; pairs of whole diagrams; edges of bins.
-SHAPES, EDGE, SEED, POINTS, WHOLE, WIDTHS = 40, 56, 77, 2500, 3, (1.0, 1.5, 2.0, 3.0)
+SHAPES, EDGE, SEED, POINTS, WHOLE, WIDTHS = 40, 56, 77, 5000, 3, (1.0, 1.5, 2.0, 3.0)
 #: Shapes held out of the atlas, and lengths of the short list.
 HELD, LENGTHS = 50, (5, 10, 20, 40, 80)
 
