@@ -34,7 +34,7 @@ from skimage.segmentation import random_walker
 from curvafit.evidence import interpolated_distance
 from curvafit.infer import infer
 from curvafit.priors.coefficients import Coefficients
-from curvafit.scan import Field, write_atomically
+from curvafit.scan import Field, write_atomically, write_content
 from curvafit.segment import reconstruct, segment
 from curvafit.topology import betti_numbers
 
@@ -118,7 +118,7 @@ def inferred(half: str, truth: np.ndarray, folder: Path) -> Path:
     if not path.exists():
         part = truth[:EDGE] if half == "lower" else truth[-EDGE:]
         fit = infer(Field(part.astype(np.uint8), (SPACING,) * 3, "mm"), kind="mask").fit
-        write_atomically(path, lambda temporary: _text(temporary, fit.to_json()))
+        write_content(path, fit.to_json())
     return path
 
 
@@ -131,12 +131,8 @@ def case(path: Path, make: Callable[[], dict[str, np.ndarray]]) -> dict[str, dic
         sections = {name: mask[:, mask.shape[1] // 2] for name, mask in masks.items()}
         write_atomically(path.with_suffix(".npz"), lambda temporary: np.savez_compressed(temporary, **sections))
         found["truth"]["seconds"] = time.perf_counter() - begun
-        write_atomically(path, lambda temporary: _text(temporary, json.dumps(found)))
+        write_content(path, json.dumps(found))
     return json.loads(path.read_text())
-
-
-def _text(path: Path, text: str) -> None:
-    path.write_text(text)
 
 
 def table(title: str, cases: dict[int, list[dict]]) -> None:

@@ -22,6 +22,7 @@ PARTS = {
     "fit": np.s_[:, :368, :240],
     "validation": np.s_[:, 384:, :240],
     "test": np.s_[:, :, 272:],
+    "side": np.s_[:, :, :240],
 }
 SLICES, UNKNOWN = 3, 2
 #: Voxels of a training patch: its depth always holds an annotated slice.
@@ -37,12 +38,14 @@ class Part(NamedTuple):
 
 def part(stack: str, name: str) -> Part:
     """A part of a stack."""
+    values = np.log1p(raw(stack, name).astype(np.float32))
+    return Part((values - values.mean()) / values.std(), raw(stack, name, "label") > 0)
+
+
+def raw(stack: str, name: str, kind: str = "img") -> np.ndarray:
+    """A part's grey values (`"img"`) or `"label"`, as they are in the file."""
     folder = Path(os.environ.get("CURVAFIT_DATA", "")) / "scans" / "vesselNN"
-    image, label = (
-        tifffile.imread(folder / f"poon2015_BBB_{stack}_{kind}.tif")[PARTS[name]] for kind in ("img", "label")
-    )
-    values = np.log1p(image.astype(np.float32))
-    return Part((values - values.mean()) / values.std(), label > 0)
+    return tifffile.imread(folder / f"poon2015_BBB_{stack}_{kind}.tif")[PARTS[name]]
 
 
 def annotated(depth: int) -> list[int]:

@@ -37,11 +37,11 @@ def table(runs: dict[str, list[list[dict]]], tuning: list[tuple[float, list[dict
         "",
         f"{'':24}" + "".join(f"{name:>27}" for name in SCORES),
     ]
-    lines += [f"{label(those[0][0]):24}" + _cells(found[loss][0], "") for loss, those in runs.items()]
-    lines += [f"{'best threshold':24}" + "".join(f"{value:>27.4f}" for value in _threshold())]
+    lines += [f"{label(those[0][0]):24}" + cells(found[loss][0], "") for loss, those in runs.items()]
+    lines += [f"{'best threshold':24}" + "".join(f"{value:>27.4f}" for value in best_threshold())]
     lines += ["", "Differences to Dice + CE"]
     others = [loss for loss in runs if loss != "dice+ce"]
-    lines += [f"{loss:24}" + _cells(found[loss][1], "+") for loss in others]
+    lines += [f"{loss:24}" + cells(found[loss][1], "+") for loss in others]
     lines += ["", *(verdict(loss, found[loss][1]) for loss in others), "", *_sweep(tuning)]
     return "\n".join(lines) + "\n"
 
@@ -101,11 +101,11 @@ def _bars(axis: Axes, found: dict[str, np.ndarray], columns: tuple[int, ...]) ->
     axis.legend()
 
 
-def _cells(values: np.ndarray, sign: str) -> str:
+def cells(values: np.ndarray, sign: str) -> str:
     return "".join(f"{f'{middle:{sign}.4f} [{low:{sign}.4f}, {high:{sign}.4f}]':>27}" for middle, low, high in values.T)
 
 
-def _threshold() -> np.ndarray:
+def best_threshold() -> np.ndarray:
     """Scores of the one threshold a stack that is best in hindsight, mean of both test parts."""
     found = []
     for stack in STACKS:

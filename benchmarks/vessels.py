@@ -28,7 +28,7 @@ from benchmarks.vessel_report import picture, table
 from benchmarks.vessel_scores import block_counts, scores
 from benchmarks.vessel_training import LOSSES, Plan, Setting, Training, dice_ce, predict
 from curvafit.infer import infer
-from curvafit.scan import Field, write_atomically
+from curvafit.scan import Field, write_content
 
 #: The seed of the tuning runs; those reported count from 0.
 TUNING = 100
@@ -88,7 +88,7 @@ class Study:
                 "seed": seed,
                 "stack": stack,
             } | provenance()
-            write(path, json.dumps(kept))
+            write_content(path, json.dumps(kept))
             found = " ".join(f"{value:.4f}" for value in scores(kept["validation"]))
             print(f"{time.strftime('%H:%M')} {name}: validation {found}, {kept['seconds']:.0f} s", flush=True)
         return json.loads(path.read_text())
@@ -147,7 +147,7 @@ class Study:
             with np.load(self.folder / f"dice+ce-0-0-{rate:g}-{TUNING}-{stack}-fit.npz") as kept:
                 example = Field(kept["mask"].astype(np.uint8), SPACING, "um")
             found = infer(example, kind="mask").fit
-            write(path, found.to_json())
+            write_content(path, found.to_json())
             print(f"{time.strftime('%H:%M')} {path.name}: {found.chosen}, {found.coefficients}", flush=True)
         return str(path)
 
@@ -161,15 +161,6 @@ def tuning(study: Study, rate: float) -> list[tuple[float, list[dict]]]:
 
 def other(stack: str) -> str:
     return STACKS[1 - STACKS.index(stack)]
-
-
-def write(path: Path, text: str) -> None:
-    """A text file, whole or not at all."""
-
-    def to(temporary: Path) -> None:
-        temporary.write_text(text)
-
-    write_atomically(path, to)
 
 
 def provenance() -> dict[str, str]:
@@ -195,7 +186,7 @@ def main() -> None:
         for loss, setting in chosen.items():
             runs[loss].append(study.pair(loss, *setting, rate, seed))
         text = table(runs, tuning(study, rate))
-        write(study.folder / "vessels.txt", text)
+        write_content(study.folder / "vessels.txt", text)
     print(text)
     picture(study.folder, runs)
 

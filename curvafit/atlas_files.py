@@ -24,7 +24,7 @@ from curvafit.data_synth.store import Store, open_store
 from curvafit.diagram import Diagram
 from curvafit.generation.viability import well_formed
 from curvafit.index import Atlas, Measured, extract, measured, shape_id
-from curvafit.scan import write_atomically
+from curvafit.scan import write_content
 
 #: Folder beside the two files for what took long: measured shapes, distances, places.
 CACHE = "cache"
@@ -61,7 +61,7 @@ def write_map(
     picture = map_picture(mapped, lambda k: store.field(records[k].index), folder / "atlas.png")
     commands = [regrow_command(r, store.settings, f"shape_{shape_id(store, r)}.nii.gz") for r in records]
     text = page_html(mapped, shapes, commands, _account(mapped, store, command))
-    page = write_atomically(folder / "atlas.html", lambda place: _write(place, text))
+    page = write_content(folder / "atlas.html", text)
     progress("done", 1.0)
     return picture, page
 
@@ -121,7 +121,7 @@ def _kept(path: Path, make: Callable[[], _Arrays]) -> _Arrays:
         made = make()
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **made)
-    write_atomically(path, lambda place: _write(place, buffer.getvalue()))
+    write_content(path, buffer.getvalue())
     return made
 
 
@@ -150,7 +150,3 @@ def _account(mapped: AtlasMap, store: Store, command: str) -> list[tuple[str, st
 
 def _listed(values: dict[str, Any]) -> str:
     return ", ".join(f"{name} {value}" for name, value in values.items())
-
-
-def _write(path: Path, content: str | bytes) -> None:
-    path.write_bytes(content.encode() if isinstance(content, str) else content)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from curvafit.cli_support import command_line, device_of, error_console, plainly, say, stages, whole_triple
+from curvafit.cli_support import command_line, device_of, error_console, kept, plainly, say, stages, whole_triple
 
 if TYPE_CHECKING:
     from curvafit.data_synth.atlas import Progress
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 atlas_app = typer.Typer(help="Collections of generated shapes to match scans against.", no_args_is_help=True)
 
 
-_Workers = Annotated[
+WorkersOption = Annotated[
     int | None, typer.Option(help="Processes on this machine; as many as cores by default, 0 for none but this.")
 ]
-_Scheduler = Annotated[str | None, typer.Option(help="A running dask scheduler, tcp://HOST:PORT, instead.")]
+SchedulerOption = Annotated[str | None, typer.Option(help="A running dask scheduler, tcp://HOST:PORT, instead.")]
 _Store = Annotated[Path, typer.Argument(help="Folder of the Zarr store.")]
 
 
@@ -42,8 +42,8 @@ def build_atlas(
     around: Annotated[str | None, typer.Option(help="A preset or fit.json to draw around, instead.")] = None,
     spread: Annotated[float | None, typer.Option(help="With --around: share of the random law's intervals.")] = None,
     schedule: Annotated[str, typer.Option(help="fast or paper.")] = "fast",
-    workers: _Workers = None,
-    scheduler: _Scheduler = None,
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = None,
 ) -> None:
     """Generate shapes into a store, until enough are viable. A killed build goes on where it was."""
     with plainly():
@@ -63,8 +63,8 @@ def build_atlas(
 def extend_atlas(
     store: _Store,
     count: Annotated[int, typer.Option(help="Viable shapes to add.")] = 100,
-    workers: _Workers = None,
-    scheduler: _Scheduler = None,
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = None,
 ) -> None:
     """Add shapes to a store, of its own design and settings."""
     with plainly():
@@ -144,7 +144,7 @@ def map_atlas(
         from curvafit.shape_files import check_folder
 
         check_folder(out)
-        with _kept(), stages() as progress:
+        with kept(), stages() as progress:
             from curvafit.atlas_files import write_map
 
             files = write_map(store, out, device=device_of(device), command=command_line(), progress=progress)
@@ -173,17 +173,7 @@ def _made(count: int, workers: int | None, scheduler: str | None) -> Iterator[tu
     """Workers, and a progress bar for them."""
     from curvafit.data_synth.workers import cluster
 
-    with _kept(), stages() as progress:
+    with kept(), stages() as progress:
         progress("starting workers", 0.0)
         with cluster(workers, scheduler) as crew:
             yield crew, lambda _, viable, draws: progress(f"{viable} viable of {draws} draws", viable / count)
-
-
-@contextmanager
-def _kept() -> Iterator[None]:
-    """Ctrl-C says that nothing is lost."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        say("interrupted: what is made is kept, and the same command goes on with it", to=error_console())
-        raise typer.Exit(130) from None

@@ -41,6 +41,16 @@ def plainly() -> Iterator[None]:
         raise typer.Exit(2) from None
 
 
+@contextmanager
+def kept() -> Iterator[None]:
+    """Ctrl-C says that nothing is lost."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        say("interrupted: what is made is kept, and the same command goes on with it", to=error_console())
+        raise typer.Exit(130) from None
+
+
 def _expected(error: Exception) -> bool:
     """Whether an exception tells of the input or the machine rather than of a mistake of ours."""
     if isinstance(error, ImportError):

@@ -23,7 +23,7 @@ from scipy.ndimage import gaussian_filter
 
 from curvafit.diagram import Diagram
 from curvafit.render import View, render
-from curvafit.scan import write_atomically
+from curvafit.scan import write_content
 from curvafit.wording import unit_name
 
 #: Colours that stay apart for the colour-blind (Okabe & Ito 2008), and a quiet grey for frames and notes.
@@ -277,12 +277,7 @@ def png(figure: Figure) -> bytes:
 
 def write_picture(figure: Figure, path: str | Path) -> Path:
     """Write a PNG under a temporary name, then move it to `path`."""
-    content = png(figure)
-    return write_atomically(Path(path), lambda temporary: _write(temporary, content))
-
-
-def _write(path: Path, content: bytes) -> None:
-    path.write_bytes(content)
+    return write_content(Path(path), png(figure))
 
 
 def _figure(width: float, height: float) -> Figure:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from curvafit.priors.coefficients import NAMES
 from curvafit.report_pictures import diagram_figures, slice_figures, surface_figures, window_framed
-from curvafit.scan import Field, save, write_atomically
+from curvafit.scan import Field, save, write_content
 from curvafit.wording import density, describe, length, number, per_unit, percent, unit_name
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ def parameter_table(inference: Inference) -> list[tuple[str, str, str, str]]:
 def write_report(inference: Inference, path: str | Path) -> Path:
     """Write the report of an inference as one HTML page without outside parts; returns its path."""
     page = report_html(inference)
-    return write_atomically(Path(path), lambda temporary: _write(temporary, page))
+    return write_content(Path(path), page)
 
 
 def report_html(inference: Inference) -> str:
@@ -127,10 +127,6 @@ from curvafit.priors import read_fit
 fit = read_fit("fit.json")
 flow = curvafit.generate(fit.coefficients, fit.mass, 100, seed=1)"""
 )
-
-
-def _write(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8")
 
 
 def _scan_line(inference: Inference) -> str:

@@ -18,7 +18,7 @@ from scipy import ndimage
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import schedule
 from curvafit.priors import Grid, preset
-from curvafit.scan import Field, save, write_atomically
+from curvafit.scan import Field, save, write_content
 
 __all__ = ["Sample", "SampleUnavailable", "cache_folder", "fetch", "samples", "synthetic_scan"]
 
@@ -133,7 +133,7 @@ def fetch(name: str, *, download: Callable[[str, Path], None] | None = None) -> 
     if _digest(content) != sample.sha256:
         raise SampleUnavailable(f"expected sample {name} with SHA-256 {sample.sha256}, got {_digest(content)}")
     try:
-        return write_atomically(target, lambda temporary: _put(temporary, content))
+        return write_content(target, content)
     except OSError as reason:
         raise SampleUnavailable(f"expected to write sample {name} to {target}, got: {reason}") from reason
 
@@ -198,7 +198,3 @@ def _extract(sample: Sample, folder: Path) -> bytes:
 
 def _digest(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
-
-
-def _put(path: Path, content: bytes) -> None:
-    path.write_bytes(content)

@@ -164,6 +164,16 @@ def write_atomically(target: Path, write: Callable[[Path], None]) -> Path:
         _remove(temporary)
 
 
+def write_content(target: Path, content: str | bytes) -> Path:
+    """Write a text, in UTF-8, or bytes to a file, whole or not at all."""
+    coded = content.encode() if isinstance(content, str) else content
+
+    def write(temporary: Path) -> None:
+        temporary.write_bytes(coded)
+
+    return write_atomically(target, write)
+
+
 def move_into_place(made: Path, target: Path) -> Path:
     """Rename a finished file or folder to `target`, on the same disk; what stood there goes once the new one is in."""
     aside = target.with_name(f".{uuid.uuid4().hex[:8]}.old.{target.name}")
