@@ -25,6 +25,8 @@ from curvafit.cli_support import (
     stages,
     threshold_of,
 )
+from curvafit.cli_synth import EXAMPLES as SYNTH_EXAMPLES
+from curvafit.cli_synth import synth
 
 if TYPE_CHECKING:
     from curvafit.infer import Inference
@@ -44,6 +46,7 @@ app.command()(presets)
 app.command(epilog=NNUNET_EXAMPLE)(nnunet)
 app.command(epilog=SEGMENT_EXAMPLES)(segment)
 app.command(epilog=RECONSTRUCT_EXAMPLES)(reconstruct)
+app.command(epilog=SYNTH_EXAMPLES)(synth)
 app.add_typer(samples_app, name="samples")
 app.add_typer(atlas_app, name="atlas")
 

@@ -22,6 +22,8 @@ from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 
 #: Seeds that a shape gets to become well-formed.
 TRIES = 8
+#: Crops that are looked at for one with both structure and background.
+CROPS = 32
 
 
 class Shape(NamedTuple):
@@ -106,52 +108,54 @@ class Generated:
 
 @dataclass(frozen=True)
 class Stored:
-    """Random crops of a store's well-formed shapes, turned at random."""
+    """Random crops of the well-formed shapes of one or more stores, turned at random."""
 
-    path: Path
+    paths: tuple[Path, ...]
 
     def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> Shape:
-        """A crop of any of the store's shapes.
+        """A crop of any of the stores' shapes that shows both structure and background.
 
         Raises
         ------
         ValueError
-            If it is larger than these, or the store has none.
+            If it is larger than these, there are none, or many crops show only one.
         """
-        store, draws = _opened(str(self.path))
-        draw = int(draws[int(rng.integers(len(draws)))])
-        field, moved = any_crop(store.field(draw), voxels, rng)
+        draws = [(path, draw) for path in self.paths for draw in _opened(str(path))[1]]
+        for _ in range(CROPS):
+            path, draw = draws[int(rng.integers(len(draws)))]
+            store = _opened(str(path))[0]
+            field, moved = any_crop(store.field(draw), voxels, rng)
+            if field.min() < 0 < field.max():
+                break
+        else:
+            edges = " x ".join(map(str, voxels))
+            raise ValueError(f"expected structure and background in crops of {edges} voxels, got one {CROPS} times")
         record, settings = store.record(draw), store.settings
         point = dict(zip(PARAMETERS, (*map(float, record.coefficients), record.mass), strict=True))
-        origin = {"name": f"draw {draw}", "parameters": point, "seed": record.seed, "draw": draw, **moved}
+        origin = {"name": f"{path.name} {draw}", "parameters": point, "seed": record.seed, **moved}
         return Shape(field, settings.epsilon / settings.spacing[0], origin)
 
     def as_dict(self) -> dict[str, Any]:
-        return {"kind": "stored", "path": str(self.path)}
+        return {"kind": "stored", "paths": [str(path) for path in self.paths]}
+
+    @property
+    def within(self) -> int:
+        """The least edge of the stores' shapes, in voxels: what a crop must be within."""
+        return min(min(_opened(str(path))[0].settings.shape) for path in self.paths)
 
 
 def source_of(kept: dict[str, Any]) -> Source:
     """The inverse of `Source.as_dict`."""
     if kept["kind"] == "stored":
-        return Stored(Path(kept["path"]))
+        return Stored(tuple(map(Path, kept["paths"])))
     return Generated(tuple(map(tuple, kept["points"])), tuple(kept["names"]), kept["schedule"])
 
 
-def formed_draws(store: Store) -> list[int]:
-    """The store's well-formed draws.
-
-    Raises
-    ------
-    ValueError
-        If there is none.
-    """
+@lru_cache(maxsize=16)
+def _opened(path: str) -> tuple[Store, list[int]]:
+    """A store and its well-formed draws."""
+    store = open_store(path)
     found = [index for index in store.indices() if well_formed(store.record(index).viability)]
     if not found:
         raise ValueError(f"expected a store with well-formed shapes, got none in {store.path}")
-    return found
-
-
-@lru_cache(maxsize=4)
-def _opened(path: str) -> tuple[Store, list[int]]:
-    store = open_store(path)
-    return store, formed_draws(store)
+    return store, found

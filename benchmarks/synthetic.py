@@ -1,0 +1,196 @@
+"""A small U-Net trained on synthetic pairs only, tested on real capillaries.
+
+    python -m benchmarks.synthetic [-o synthetic] [--budget full] [--seeds 3]
+
+Coefficients are inferred, and the images' noise, blur and contrast estimated, from the unlabelled x < 240 of one
+stack; the test is x > 272 of the other; then the two swap. Four kinds of shapes are imaged alike: straight tubes,
+Gaussian level cuts, the packaged atlas, textures with the inferred coefficients. No label is used, and nothing is
+chosen by one: the network's threshold is 0.5, the rate and the steps are those of `benchmarks.vessels`. Beside them
+stand the one threshold that is best in hindsight on the test part itself; and three annotated slices, from scratch and
+after training on the inferred textures. Shapes, fits and runs are kept: a run that was stopped goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+from curvafit.data_synth.estimate import like
+from torch import Tensor
+
+from benchmarks.synthetic_shapes import EDGE, KINDS, fields
+from benchmarks.vessel_data import PATCH, SPACING, STACKS, part, raw
+from benchmarks.vessel_report import best_threshold, cells, stacked
+from benchmarks.vessel_scores import SCORES, block_counts, bootstrap
+from benchmarks.vessel_training import BATCH, Plan, Training, dice_ce, predict
+from benchmarks.vessels import other, provenance
+from curvafit.data_synth.case import imaged
+from curvafit.data_synth.modality import Modality, field_shape
+from curvafit.data_synth.moves import any_crop
+from curvafit.infer import infer
+from curvafit.scan import Field, write_content
+
+SLICES = "three slices"
+TUNED = "inferred, then three slices"
+
+
+class Budget(NamedTuple):
+    """Steps of a training, and of the tuning on slices after it; the rates of both; fields of a kind."""
+
+    steps: int
+    tuning: int
+    rate: float
+    tuning_rate: float
+    count: int
+
+
+BUDGETS = {"small": Budget(6, 4, 8e-3, 2e-3, 2), "full": Budget(400, 400, 8e-3, 4e-3, 16)}
+
+
+class Synthetic(Training):
+    """A network in training on pairs that are made as it goes."""
+
+    def __init__(self, shapes: np.ndarray, modality: Modality, scan: np.ndarray, plan: Plan, seed: int) -> None:
+        super().__init__(part(STACKS[0], "fit"), plan, seed)
+        values = np.log1p(scan.astype(np.float32))
+        self.shapes, self.modality, self.mean, self.spread = shapes, modality, values.mean(), values.std()
+
+    def batch(self, step: int) -> tuple[Tensor, Tensor]:
+        x, y = (torch.stack(each) for each in zip(*(self._pair(step, k) for k in range(BATCH)), strict=True))
+        return x, y
+
+    def _pair(self, step: int, k: int) -> tuple[Tensor, Tensor]:
+        """An image, standardised like the scan, with its grey values changed as a real patch's are; and its label."""
+        words = np.random.SeedSequence((self.seed, step % 2**32, k))
+        rng, (draw, noise) = np.random.default_rng(words), map(int, words.generate_state(2))
+        imaging = self.modality.draw(draw)
+        whole = self.shapes[int(rng.integers(len(self.shapes)))]
+        crop, _ = any_crop(whole, field_shape(PATCH, EDGE, imaging), rng)
+        grey, seen = imaged(torch.from_numpy(crop), 2.0, EDGE, imaging, noise, PATCH)
+        x = (torch.log1p(grey.clamp_min(0)) - self.mean) / self.spread
+        x = float(rng.uniform(0.9, 1.1)) * x + float(rng.uniform(-0.1, 0.1))
+        return x[None].float(), (seen > 0)[None].float()
+
+
+class Study:
+    """The runs of a budget, kept in a folder."""
+
+    def __init__(self, folder: Path, budget: Budget) -> None:
+        self.folder, self.budget = folder, budget
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def scan(self, stack: str) -> Field:
+        """The unlabelled part that all is taken from."""
+        return Field(raw(stack, "side"), SPACING, "um")
+
+    def fit(self, stack: str) -> Path:
+        path = self.folder / f"fit-{stack}.json"
+        if not path.exists():
+            found = infer(self.scan(stack), seed=0).fit
+            write_content(path, found.to_json())
+            print(f"{path.name}: {found.chosen}, {found.coefficients}", flush=True)
+        return path
+
+    def run(self, name: str, stack: str, seed: int) -> dict:
+        """Train as `name` says on a stack's side, test on the other; or read what an earlier run kept."""
+        path = self.folder / f"{name.replace(' ', '-').replace(',', '')}-{seed}-{stack}.json"
+        if not path.exists():
+            begun = time.process_time()
+            training = self._trained(name, stack, seed, path)
+            image, label = part(other(stack), "test")
+            mask = predict(training.model, image) > 0.5
+            kept = {"name": name, "seed": seed, "stack": stack, "seconds": time.process_time() - begun}
+            kept |= {"test": block_counts(mask, label), "steps": self.budget.steps} | provenance()
+            np.savez_compressed(path.with_suffix(".npz"), mask=mask)
+            write_content(path, json.dumps(kept))
+            print(f"{time.strftime('%H:%M')} {path.stem}: {kept['seconds']:.0f} s", flush=True)
+        return json.loads(path.read_text())
+
+    def _trained(self, name: str, stack: str, seed: int, path: Path) -> Training:
+        if name in KINDS:
+            training = self._synthetic(name, stack, seed)
+            training.run(dice_ce, self.budget.steps)
+            training.save(path.with_suffix(".pt"))
+            return training
+        before = self._synthetic("inferred", stack, seed) if name == TUNED else None
+        steps, rate = self.budget.tuning, self.budget.rate if before is None else self.budget.tuning_rate
+        training = Training(part(stack, "fit"), Plan(steps, 0, rate), seed)
+        if before is not None:
+            self.run("inferred", stack, seed)
+            before.load(self.folder / f"inferred-{seed}-{stack}.pt")
+            training.model.load_state_dict(before.model.state_dict())
+        training.run(dice_ce, steps)
+        return training
+
+    def _synthetic(self, kind: str, stack: str, seed: int) -> Synthetic:
+        shapes = fields(kind, self.fit(stack), self.folder, self.budget.count)
+        scan = self.scan(stack)
+        plan = Plan(self.budget.steps, 0, self.budget.rate)
+        return Synthetic(shapes, like(scan), scan.values, plan, seed)
+
+
+def table(runs: dict[str, list[list[dict]]]) -> str:
+    found = bootstrap({name: stacked(those) for name, those in runs.items()}, "inferred")
+    one = runs["inferred"][0][0]
+    lines = [
+        f"Test halves, {len(runs['inferred'])} seeds, both stacks, {one['steps']} steps; commit {one['commit']}, "
+        f"torch {one['torch']}. 95 % intervals: bootstrap over places and seeds.",
+        f"{'':28}" + "".join(f"{name:>27}" for name in SCORES),
+    ]
+    lines += [f"{name:28}" + cells(found[name][0], "") for name in runs]
+    lines += [f"{'best threshold, in hindsight':28}" + "".join(f"{value:>27.4f}" for value in best_threshold())]
+    lines += ["", "Differences to the inferred textures"]
+    lines += [f"{name:28}" + cells(found[name][1], "+") for name in runs if name != "inferred"]
+    return "\n".join(lines) + "\n"
+
+
+def pictures(study: Study, names: list[str]) -> None:
+    """A slice of a synthetic image of every kind beside the real one; and a window of what each network found."""
+    stack, window = STACKS[1], np.s_[8:16, 256:416, 40:200]
+    image, true = part(stack, "test")
+    shown: dict[str, np.ndarray] = {"real image": image[10, :160, :160], "annotation": true[window].sum(0)}
+    for kind in KINDS:
+        x, _ = study._synthetic(kind, stack, 0).batch(0)
+        shown[f"{kind}: a pair's image"] = x[0, 0, 6].numpy()
+    for name in names:
+        path = study.folder / f"{name.replace(' ', '-').replace(',', '')}-0-{other(stack)}.npz"
+        with np.load(path) as kept:
+            shown[name] = kept["mask"][window].sum(0)
+    figure, axes = plt.subplots(3, 4, figsize=(15, 11.5), layout="constrained")
+    for axis in axes.flat:
+        axis.set_axis_off()
+    for axis, (name, values) in zip(axes.flat, shown.items(), strict=False):
+        axis.imshow(values, cmap="gray")
+        axis.set_title(name)
+    figure.savefig(study.folder / "synthetic.png", dpi=100)
+    plt.close(figure)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("-o", "--output", type=Path, default=Path("synthetic"))
+    parser.add_argument("--budget", choices=BUDGETS, default="full")
+    parser.add_argument("--seeds", type=int, default=3)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    torch.use_deterministic_algorithms(True)
+    torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
+    study, names = Study(options.output / options.budget, BUDGETS[options.budget]), [*KINDS, SLICES, TUNED]
+    runs: dict[str, list[list[dict]]] = {name: [] for name in names}
+    for seed in range(options.seeds):
+        for name in names:
+            runs[name].append([study.run(name, stack, seed) for stack in STACKS])
+        text = table(runs)
+        write_content(study.folder / "synthetic.txt", text)
+    print(text)
+    pictures(study, names)
+
+
+if __name__ == "__main__":
+    main()

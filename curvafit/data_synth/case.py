@@ -1,0 +1,126 @@
+"""One case of a training set: an image, the shape that it shows on the image's own voxels, and how both were made."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from curvafit.data_synth.draws import one_thread
+from curvafit.data_synth.modality import Imaging, Modality, field_shape, image, regrid
+from curvafit.data_synth.sources import Source, Stored, source_of
+
+
+class Case(NamedTuple):
+    """An image and the phase field of what it shows, arrays (Z, Y, X) on one grid of `spacing`; ε in spacing's unit;
+    and what a record says of it, in JSON's types."""
+
+    image: np.ndarray
+    field: np.ndarray
+    spacing: tuple[float, float, float]
+    unit: str
+    epsilon: float
+    record: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What all cases of a set are made by: case i depends on the recipe and i alone.
+
+    Parameters
+    ----------
+    shape
+        Voxels (z, y, x) of the images.
+    voxel
+        Edge of a shape's voxels, in the modality's unit: how large the texture is in the images.
+
+    Raises
+    ------
+    ValueError
+        If the shape is not 3 whole numbers above 0, the voxel is not positive or the seed is not a whole number from 0.
+    """
+
+    source: Source
+    modality: Modality
+    shape: tuple[int, int, int]
+    voxel: float
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if len(self.shape) != 3 or any(int(n) != n or n < 1 for n in self.shape):
+            raise ValueError(f"expected 3 whole numbers of voxels above 0 (z, y, x), got {self.shape}")
+        if not 0 < self.voxel < float("inf"):
+            raise ValueError(f"expected a shape's voxel of positive length, got {self.voxel}")
+        if isinstance(self.seed, bool) or int(self.seed) != self.seed or self.seed < 0:
+            raise ValueError(f"expected a seed that is a whole number from 0, got {self.seed!r}")
+        check_crop(self.source, self.shape, self.voxel, self.modality)
+
+    def case(self, index: int) -> Case:
+        """Case number `index`, made on one thread.
+
+        Raises
+        ------
+        ValueError
+            If no shape can be had.
+        """
+        for_shape, for_imaging, for_image = np.random.SeedSequence(self.seed, spawn_key=(index,)).spawn(3)
+        imaging = self.modality.draw(_number(for_imaging))
+        rng = np.random.default_rng(for_shape)
+        voxels = field_shape(self.shape, self.voxel, imaging)
+        with one_thread():
+            made = self.source.shape(voxels, index, rng)
+            seed = _number(for_image)
+            u = torch.from_numpy(made.field)
+            grey, seen = (each.numpy() for each in imaged(u, made.epsilon, self.voxel, imaging, seed, self.shape))
+        record = {"index": index, "source": made.origin, "imaging": imaging.as_dict(), "image_seed": seed}
+        record |= {"voxel": self.voxel, "volume_fraction": float((seen > 0).mean())}
+        return Case(_counts(grey, imaging), seen, imaging.spacing, imaging.unit, made.epsilon * self.voxel, record)
+
+    def as_dict(self) -> dict[str, Any]:
+        """All of it in JSON's types."""
+        parts = {"source": self.source.as_dict(), "modality": self.modality.as_dict()}
+        return parts | {"shape": list(self.shape), "voxel": self.voxel, "seed": self.seed}
+
+    @staticmethod
+    def from_dict(kept: Mapping[str, Any]) -> Recipe:
+        """The inverse of `as_dict`."""
+        source, modality = source_of(kept["source"]), Modality.from_dict(kept["modality"])
+        z, y, x = kept["shape"]
+        return Recipe(source, modality, (z, y, x), kept["voxel"], kept["seed"])
+
+
+def imaged(
+    field: torch.Tensor, epsilon: float, voxel: float, imaging: Imaging, seed: int, shape: Sequence[int]
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """The image of a phase field (Z, Y, X), and the field on the image's voxels, both of `shape`; see `imaging.image`.
+
+    `epsilon` is in the field's voxels, whose edge is `voxel`. A field of whole voxels may hold a few more than an image
+    asks for.
+    """
+    u, (z, y, x) = field[None, None], shape
+    grey, seen = image(u, voxel, [imaging], [seed], epsilon), regrid(u, voxel, [imaging])
+    return grey[0, 0, :z, :y, :x].contiguous(), seen[0, 0, :z, :y, :x].contiguous()
+
+
+def check_crop(source: Source, shape: Sequence[int], voxel: float, modality: Modality) -> None:
+    """Raise ValueError where images of `shape` need crops that are larger than a store's shapes."""
+    need = field_shape(shape, voxel, modality.base)
+    if isinstance(source, Stored) and max(need) > source.within:
+        images, crops = (" x ".join(map(str, each)) for each in (shape, need))
+        raise ValueError(
+            f"expected crops within the {source.within} voxels of the stored shapes, but {images} voxels of "
+            f"{modality.name} need {crops}: take fewer, or build a store with a larger --shape"
+        )
+
+
+def _counts(grey: np.ndarray, imaging: Imaging) -> np.ndarray:
+    """Whole counts as uint16, where they fit in; else float32."""
+    whole = imaging.ceiling is not None and imaging.ceiling <= np.iinfo(np.uint16).max
+    return grey.astype(np.uint16 if whole else np.float32)
+
+
+def _number(words: np.random.SeedSequence) -> int:
+    return int(words.generate_state(1)[0])

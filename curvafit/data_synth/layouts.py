@@ -1,0 +1,62 @@
+"""How a training set lies on disk: where images and labels are, and the list of them that a reader expects."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+
+class About(NamedTuple):
+    """What a list of cases says of all of them: the set's name, the channel's and the label's."""
+
+    name: str
+    channel: str
+    label: str = "structure"
+
+
+class Layout(NamedTuple):
+    """Where the parts of a case are, with `{case}` for its name and `{part}` for a label's; and the list of cases."""
+
+    image: str
+    label: str
+    part: str
+    listing: Callable[[Sequence[str], About], dict[str, Any]]
+
+
+def _nnunet(cases: Sequence[str], about: About) -> dict[str, Any]:
+    return {
+        "channel_names": {"0": about.channel},
+        "labels": {"background": 0, about.label: 1},
+        "numTraining": len(cases),
+        "file_ending": ".nii.gz",
+        "name": about.name,
+        "description": "synthetic; made by curvafit",
+    }
+
+
+def _decathlon(image: str, label: str) -> Callable[[Sequence[str], About], dict[str, Any]]:
+    def listing(cases: Sequence[str], about: About) -> dict[str, Any]:
+        return {
+            "name": about.name,
+            "description": "synthetic; made by curvafit",
+            "tensorImageSize": "3D",
+            "modality": {"0": about.channel},
+            "labels": {"0": "background", "1": about.label},
+            "numTraining": len(cases),
+            "numTest": 0,
+            "training": [{"image": image.format(case=case), "label": label.format(case=case)} for case in cases],
+            "test": [],
+        }
+
+    return listing
+
+
+_DECATHLON = "imagesTr/{case}.nii.gz", "labelsTr/{case}.nii.gz"
+_ZARR = "images/{case}.zarr", "labels/{case}.zarr"
+
+#: nnU-Net v2's raw data sets; the Medical Segmentation Decathlon's, which MONAI reads; OME-Zarr with that list.
+LAYOUTS: dict[str, Layout] = {
+    "nnunet": Layout("imagesTr/{case}_0000.nii.gz", "labelsTr/{case}.nii.gz", "parts/{part}/{case}.nii.gz", _nnunet),
+    "monai": Layout(*_DECATHLON, "parts/{part}/{case}.nii.gz", _decathlon(*_DECATHLON)),
+    "zarr": Layout(*_ZARR, "parts/{part}/{case}.zarr", _decathlon(*_ZARR)),
+}

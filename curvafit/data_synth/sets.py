@@ -1,0 +1,230 @@
+"""Training sets on disk: cases that are made once, whole or not at all, by any number of workers."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from curvafit.data_synth.case import Case, Recipe
+from curvafit.data_synth.centreline import centreline, write_graphml, write_swc
+from curvafit.data_synth.draws import versions
+from curvafit.data_synth.labels import NAMES, labels_of
+from curvafit.data_synth.layouts import LAYOUTS, About
+from curvafit.data_synth.workers import Here, Workers
+from curvafit.priors.grid import Grid
+from curvafit.scan import Field, save, write_content
+
+FORMAT = "curvafit set"
+VERSION = 1
+#: The set's own record, and the folder of the cases'.
+HEADER, RECORDS = "curvafit.json", "cases"
+#: Labels besides the mask that a set can have.
+PARTS = (*(name for name in NAMES if name != "mask"), "centreline")
+#: Seconds between two lists of the cases.
+LISTED_EVERY = 1.0
+
+#: Progress(cases done, of how many).
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Order:
+    """What a set is to be: its recipe, layout (a name of `LAYOUTS`) and labels besides the mask (names of `PARTS`).
+
+    Raises
+    ------
+    ValueError
+        If a name is unknown.
+    """
+
+    recipe: Recipe
+    layout: str = "nnunet"
+    parts: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.layout not in LAYOUTS:
+            raise ValueError(f"expected a layout among {', '.join(LAYOUTS)}, got {self.layout!r}")
+        if unknown := sorted(set(self.parts) - set(PARTS)):
+            raise ValueError(f"expected labels among {', '.join(PARTS)}, got {', '.join(unknown)}")
+
+    def as_dict(self) -> dict[str, Any]:
+        return {"recipe": self.recipe.as_dict(), "layout": self.layout, "parts": list(self.parts)}
+
+
+def build_set(
+    folder: str | Path, order: Order, count: int, progress: Progress | None = None, *, workers: Workers | None = None
+) -> Path:
+    """Make cases 0 to `count` - 1 of a set, those that are not there yet, and the list that its readers want.
+
+    Case i depends on the order and i alone, so that its voxels are the same whenever and by however many workers it is
+    made. What is written is a valid set at any time, but for the list of one that was killed: the next run mends that.
+
+    Parameters
+    ----------
+    folder
+        Of the set; a new or an empty one, or a set of the same order to go on with.
+
+    Raises
+    ------
+    ValueError
+        If `count` is not positive, or the folder holds something else or a set of another order.
+    OSError
+        If the folder can't be written, or the workers are gone. The cases that were made are kept.
+    """
+    if count < 1:
+        raise ValueError(f"expected a count of at least 1 case, got {count}")
+    folder, workers = Path(folder), workers or Here()
+    _begin(folder, order)
+    done = set(_there(folder))
+    todo = iter([index for index in range(count) if index not in done])
+    asked, listed = 0, time.monotonic()
+    try:
+        while True:
+            while asked < workers.places and (chunk := list(itertools.islice(todo, 1))):
+                workers.submit(make_cases, folder, chunk)
+                asked += 1
+            if not asked:
+                return folder
+            done |= set(workers.done())
+            asked -= 1
+            if progress is not None:
+                progress(len(done), count)
+            if time.monotonic() > listed + LISTED_EVERY:
+                _list(folder, order, done)
+                listed = time.monotonic()
+    finally:
+        _list(folder, order, set(_there(folder)))
+
+
+def make_cases(folder: str | Path, indices: Sequence[int]) -> list[int]:
+    """Make some cases of a set that is begun; what a worker does.
+
+    Raises
+    ------
+    OSError
+        If they can't be written; what was written of such a case is removed.
+    """
+    folder = Path(folder)
+    order = read_order(folder)
+    try:
+        for index in indices:
+            _write_case(folder, order, index, order.recipe.case(index))
+    except OSError as error:
+        raise OSError(error.errno, error.strerror or str(error), error.filename or str(folder)) from error
+    return list(indices)
+
+
+def read_order(folder: str | Path) -> Order:
+    """What a set is to be.
+
+    Raises
+    ------
+    ValueError
+        If the folder holds no set of this version.
+    """
+    try:
+        header = json.loads((Path(folder) / HEADER).read_text())
+        known = header["format"] == FORMAT and header["version"] == VERSION
+    except (OSError, ValueError, KeyError, TypeError):
+        known = False
+    if not known:
+        raise ValueError(f"expected a set of version {VERSION} in {folder}, got none")
+    kept = header["order"]
+    return Order(Recipe.from_dict(kept["recipe"]), kept["layout"], tuple(kept["parts"]))
+
+
+def case_name(index: int) -> str:
+    """What a case is called in file names."""
+    return f"case_{index:05d}"
+
+
+def _begin(folder: Path, order: Order) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"expected a folder for the set, got the file {folder}")
+    if not (folder / HEADER).exists():
+        if folder.is_dir() and any(folder.iterdir()):
+            raise ValueError(f"expected a new or empty folder, or a set to go on with, got {folder} with other things")
+        header = {"format": FORMAT, "version": VERSION, "versions": versions(), "order": order.as_dict()}
+        _write_json(folder / HEADER, header)
+    found, asked = read_order(folder).as_dict(), order.as_dict()
+    if found != asked:
+        name, was, now = _difference(found, asked)
+        raise ValueError(f"expected what {folder} was begun with, got another {name}: {now} for {was}")
+    (folder / RECORDS).mkdir(exist_ok=True)
+
+
+def _there(folder: Path) -> list[int]:
+    """The cases that are complete: a record is written last."""
+    names = (path.stem.removeprefix("case_") for path in (folder / RECORDS).glob("case_*.json"))
+    return sorted(int(name) for name in names if name.isdigit())
+
+
+def _list(folder: Path, order: Order, done: set[int]) -> None:
+    """Write what the layout's readers want."""
+    about, cases = About(folder.resolve().name, order.recipe.modality.name), list(map(case_name, sorted(done)))
+    _write_json(folder / "dataset.json", LAYOUTS[order.layout].listing(cases, about))
+
+
+def _write_case(folder: Path, order: Order, index: int, case: Case) -> None:
+    """Labels, image, record, in this order; all or none."""
+    layout, name = LAYOUTS[order.layout], case_name(index)
+    places = [folder / layout.label.format(case=name), folder / layout.image.format(case=name)]
+    parts = folder / layout.part
+    try:
+        known = _write_parts(order, case, lambda part: Path(str(parts).format(part=part, case=name)), places)
+        mask = (case.field > 0).astype(np.uint8)
+        for values, place in zip((mask, case.image), places, strict=False):
+            save(Field(values, case.spacing, case.unit), place)
+        sums = {"image": _digest(case.image), "label": _digest(mask)}
+        _write_json(folder / RECORDS / f"{name}.json", case.record | known | {"sha256": sums, "versions": versions()})
+    except BaseException:
+        for place in places:
+            shutil.rmtree(place) if place.is_dir() else place.unlink(missing_ok=True)
+        raise
+
+
+def _write_parts(order: Order, case: Case, place: Callable[[str], Path], places: list[Path]) -> dict[str, Any]:
+    """The labels besides the mask; what is no volume goes into the record."""
+    grid, known = Grid(case.image.shape, case.spacing, "replicate"), {}  # type: ignore[arg-type]
+    asked = set(order.parts) - {"centreline"} | ({"skeleton", "distance"} if "centreline" in order.parts else set())
+    found = labels_of(case.field, grid, case.epsilon, asked) if asked else None
+    for part in order.parts:
+        if part == "centreline":
+            graph = centreline(found.skeleton, found.distance, grid)  # type: ignore[union-attr,arg-type]
+            for suffix, write in ((".graphml", write_graphml), (".swc", write_swc)):
+                target = place(part)
+                target = target.with_name(target.name.partition(".")[0] + suffix)
+                places.append(target)
+                write(graph, target)
+        elif part == "betti":
+            known[part] = list(found.betti)  # type: ignore[union-attr,arg-type]
+        else:
+            places.append(place(part))
+            save(Field(getattr(found, part), case.spacing, case.unit), place(part))
+    return known
+
+
+def _digest(values: np.ndarray) -> str:
+    return hashlib.sha256(np.ascontiguousarray(values).tobytes()).hexdigest()
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    write_content(path, json.dumps(content, indent=2) + "\n")
+
+
+def _difference(found: Any, asked: Any, name: str = "order") -> tuple[str, Any, Any]:
+    """The name of the first value that differs, and both."""
+    if isinstance(found, dict) and isinstance(asked, dict) and found.keys() == asked.keys():
+        for key in found:
+            if found[key] != asked[key]:
+                return _difference(found[key], asked[key], key)
+    return name, found, asked

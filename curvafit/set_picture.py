@@ -1,0 +1,45 @@
+"""A picture of a training set: middle slices of some of its cases with the labels' outlines."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from curvafit.data_synth.layouts import LAYOUTS
+from curvafit.data_synth.sets import RECORDS, read_order
+from curvafit.plot import CONTOUR, DPI
+from curvafit.scan import read_values, write_atomically
+
+#: Cases in the picture, and in a row of it.
+SHOWN, ROW = 8, 4
+
+
+def write_preview(folder: str | Path) -> Path:
+    """Write `preview.png` of a set into its folder: the first cases' middle slices, each with and without the label's
+    outline."""
+    folder = Path(folder)
+    layout = LAYOUTS[read_order(folder).layout]
+    names = sorted(path.stem for path in (folder / RECORDS).glob("*.json"))[:SHOWN]
+    columns, rows = min(ROW, len(names)), -(-len(names) // ROW)
+    figure = Figure(figsize=(2.4 * columns, 5.0 * rows + 0.3), facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = np.atleast_2d(figure.subplots(2 * rows, columns, squeeze=False))
+    for each in axes.flat:
+        each.set_axis_off()
+    for k, name in enumerate(names):
+        image, label = (read_values(folder / part.format(case=name)) for part in (layout.image, layout.label))
+        record = json.loads((folder / RECORDS / f"{name}.json").read_text())
+        row, column = 2 * (k // ROW), k % ROW
+        middle = len(image) // 2
+        low, high = np.percentile(image, (0.5, 99.8))
+        _, h, w = record["imaging"]["spacing"]
+        for axis in (axes[row, column], axes[row + 1, column]):
+            axis.imshow(image[middle], cmap="gray", vmin=low, vmax=max(high, low + 1e-6), aspect=h / w)
+        if 0 < label[middle].sum() < label[middle].size:
+            axes[row + 1, column].contour(label[middle], [0.5], colors=CONTOUR, linewidths=0.8)
+        axes[row, column].set_title(f"{name}\n{record['source']['name']}"[:60], fontsize=8)
+    return write_atomically(folder / "preview.png", lambda place: figure.savefig(place, dpi=DPI))

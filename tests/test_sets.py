@@ -1,0 +1,206 @@
+"""Training sets: the same cases whoever makes them and whenever, whole or not at all, as their readers want them."""
+
+from __future__ import annotations
+
+import errno
+import json
+from pathlib import Path
+
+import nibabel
+import numpy as np
+import pytest
+from exact_store import exact_store
+
+from curvafit.data_synth import sets
+from curvafit.data_synth.case import Recipe
+from curvafit.data_synth.modality import Imaging, Modality
+from curvafit.data_synth.sets import Order, build_set, make_cases, read_order
+from curvafit.data_synth.sources import Generated, Stored
+from curvafit.scan import load, read_values
+
+FLAT = Modality("flat", "for tests", 0.5, Imaging(spacing=(1.0, 0.5, 0.5), blur=(0.4, 0.2, 0.2), ceiling=255.0), {
+    "foreground": (80.0, 120.0), "read_noise": (1.0, 3.0),
+})  # fmt: skip
+SHAPE = (8, 16, 16)
+
+
+@pytest.fixture(scope="module")
+def order(tmp_path_factory: pytest.TempPathFactory) -> Order:
+    store = exact_store(tmp_path_factory.mktemp("shapes") / "s.zarr", 8)
+    return Order(Recipe(Stored((store.path,)), FLAT, SHAPE, 0.5, seed=4))
+
+
+def sums(folder: Path) -> dict[str, dict[str, str]]:
+    return {path.stem: json.loads(path.read_text())["sha256"] for path in sorted((folder / "cases").glob("*.json"))}
+
+
+def test_a_case_is_the_image_of_its_field(order):
+    case = order.recipe.case(3)
+    assert case.image.shape == case.field.shape == SHAPE and case.image.dtype == np.uint16
+    assert case.spacing == (1.0, 0.5, 0.5) and case.unit == "um" and case.epsilon == pytest.approx(1.0)
+    inside, outside = (case.image[part].mean() for part in (case.field > 0.9, case.field < -0.9))
+    level = case.record["imaging"]["foreground"]
+    assert abs(inside - level) < 0.15 * level and abs(outside - 10) < 6
+    again, other = order.recipe.case(3), order.recipe.case(4)
+    assert (again.image == case.image).all() and again.record == case.record
+    assert (other.image != case.image).any()
+
+
+def test_nnunet_s_layout(tmp_path, order):
+    folder = build_set(tmp_path / "Dataset007_Flat", order, 3)
+    listed = json.loads((folder / "dataset.json").read_text())
+    assert listed["numTraining"] == 3 and listed["labels"] == {"background": 0, "structure": 1}
+    assert listed["channel_names"] == {"0": "flat"} and listed["file_ending"] == ".nii.gz"
+    for index in range(3):
+        image = nibabel.load(folder / "imagesTr" / f"case_{index:05d}_0000.nii.gz")
+        label = nibabel.load(folder / "labelsTr" / f"case_{index:05d}.nii.gz")
+        assert image.shape == label.shape == SHAPE[::-1]
+        assert image.header.get_zooms() == label.header.get_zooms() == (0.5, 0.5, 1.0)
+        assert (image.affine == label.affine).all() and image.header.get_xyzt_units()[0] == "micron"
+        values = np.asanyarray(label.dataobj)
+        assert set(np.unique(values)) == {0, 1}
+        case = order.recipe.case(index)
+        assert ((case.field > 0) == values.T).all() and (case.image == np.asanyarray(image.dataobj).T).all()
+        record = json.loads((folder / "cases" / f"case_{index:05d}.json").read_text())
+        assert Imaging.from_dict(record["imaging"]).foreground == case.record["imaging"]["foreground"]
+        assert set(record["source"]["parameters"]) == {"a20", "a11", "a02", "a10", "a01", "a00", "mass"}
+
+
+@pytest.mark.parametrize("layout", ["monai", "zarr"])
+def test_decathlon_s_list(tmp_path, order, layout):
+    folder = build_set(tmp_path / "set", Order(order.recipe, layout), 2)
+    listed = json.loads((folder / "dataset.json").read_text())
+    assert listed["numTraining"] == len(listed["training"]) == 2
+    for index, pair in enumerate(listed["training"]):
+        image, label = load(folder / pair["image"]), load(folder / pair["label"])
+        case = order.recipe.case(index)
+        assert image.spacing == label.spacing == case.spacing and image.unit == "um"
+        assert (image.values == case.image).all() and (label.values == (case.field > 0)).all()
+
+
+def test_monai_reads_it(tmp_path, order):
+    data = pytest.importorskip("monai.data", reason="needs MONAI")
+    from monai.transforms import LoadImaged
+
+    folder = build_set(tmp_path / "set", Order(order.recipe, "monai"), 2)
+    pairs = data.load_decathlon_datalist(str(folder / "dataset.json"), data_list_key="training")
+    read = LoadImaged(keys=("image", "label"))(pairs[1])
+    assert read["image"].shape == read["label"].shape == SHAPE[::-1]
+    assert np.diag(read["image"].affine.numpy())[:3].tolist() == [-0.5, -0.5, 1.0] or np.abs(
+        np.diag(read["image"].affine.numpy())[:3]
+    ).tolist() == [0.5, 0.5, 1.0]
+
+
+def test_a_set_goes_on_and_ends_the_same(tmp_path, order):
+    whole = build_set(tmp_path / "whole", order, 4)
+    part = build_set(tmp_path / "part", order, 2)
+    untouched = (part / "labelsTr" / "case_00000.nii.gz").stat().st_mtime_ns
+    told = []
+    build_set(part, order, 4, lambda done, count: told.append((done, count)))
+    assert told == [(3, 4), (4, 4)]
+    assert sums(whole) == sums(part) and len(sums(part)) == 4
+    assert (part / "labelsTr" / "case_00000.nii.gz").stat().st_mtime_ns == untouched
+    assert json.loads((part / "dataset.json").read_text())["numTraining"] == 4
+
+
+def test_what_a_killed_run_left_is_made_anew(tmp_path, order):
+    folder = build_set(tmp_path / "set", order, 2)
+    before = sums(folder)
+    (folder / "cases" / "case_00001.json").unlink()  # killed before the record, which comes last
+    (folder / "imagesTr" / "case_00001_0000.nii.gz").write_bytes(b"torn")
+    build_set(folder, order, 2)
+    assert sums(folder) == before
+    assert (read_values(folder / "imagesTr" / "case_00001_0000.nii.gz") == order.recipe.case(1).image).all()
+
+
+def test_workers_make_the_same_set(tmp_path, order):
+    pytest.importorskip("distributed", reason="needs dask.distributed")
+    from curvafit.data_synth import cluster
+
+    with cluster(2) as crew:
+        two = build_set(tmp_path / "two", order, 3, workers=crew)
+    assert sums(two) == sums(build_set(tmp_path / "one", order, 3))
+
+
+def test_a_disk_that_fills_leaves_a_valid_set(tmp_path, order, monkeypatch):
+    save, saved = sets.save, []
+
+    def until_full(field, path):
+        if len(saved) == 5:  # the image of the third case: its label is there already
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        saved.append(path)
+        return save(field, path)
+
+    monkeypatch.setattr(sets, "save", until_full)
+    with pytest.raises(OSError, match="No space left on device"):
+        build_set(tmp_path / "set", order, 4)
+    there = sorted(path.name for path in (tmp_path / "set" / "labelsTr").iterdir())
+    assert there == ["case_00000.nii.gz", "case_00001.nii.gz"]
+    assert len(list((tmp_path / "set" / "imagesTr").iterdir())) == 2
+    assert json.loads((tmp_path / "set" / "dataset.json").read_text())["numTraining"] == 2
+    monkeypatch.setattr(sets, "save", save)
+    assert len(sums(build_set(tmp_path / "set", order, 4))) == 4
+
+
+def test_labels_besides_the_mask(tmp_path, order):
+    asked = Order(order.recipe, parts=("distance", "instances", "kappa1", "betti", "centreline"))
+    folder = build_set(tmp_path / "set", asked, 1)
+    case = asked.recipe.case(0)
+    distance = load(folder / "parts" / "distance" / "case_00000.nii.gz")
+    assert distance.values.dtype == np.float32 and distance.spacing == case.spacing
+    assert ((distance.values > 0) == (case.field > 0)).all()
+    pieces = read_values(folder / "parts" / "instances" / "case_00000.nii.gz")
+    assert ((pieces > 0) == (case.field > 0)).all()
+    record = json.loads((folder / "cases" / "case_00000.json").read_text())
+    assert len(record["betti"]) == 3 and record["betti"][0] >= 1
+    assert {path.suffix for path in (folder / "parts" / "centreline").iterdir()} == {".graphml", ".swc"}
+
+
+def test_generated_shapes_take_turns_and_other_seeds():
+    tubes, sheet = (1.0, 2.0, 6.0, -40.0, -40.0, 400.0, -0.5), (1.0, 0.0, 1.0, 0.0, 0.0, 0.0, -0.2)
+    source = Generated((tubes, sheet), ("tubes", "sheet"))
+    made = [source.shape((16, 16, 16), index, np.random.default_rng(index)) for index in (0, 2)]
+    assert [each.origin["name"] for each in made] == ["tubes", "tubes"]
+    assert made[0].origin["seed"] != made[1].origin["seed"] and (made[0].field != made[1].field).any()
+    assert made[0].epsilon == 2.0 and made[0].field.dtype == np.float32
+    again = source.shape((16, 16, 16), 0, np.random.default_rng(0))
+    assert (again.field == made[0].field).all()
+
+
+def test_what_does_not_grow_is_said():
+    barren = Generated(((1.0, 0.0, 1.0, 0.0, 0.0, 3000.0, -0.9),), ("nothing",))
+    with pytest.raises(ValueError, match="expected nothing to grow from one of 8 seeds, got none: "):
+        barren.shape((12, 12, 12), 0, np.random.default_rng(0))
+
+
+def test_a_recipe_reads_back(order):
+    assert Recipe.from_dict(json.loads(json.dumps(order.recipe.as_dict()))).as_dict() == order.recipe.as_dict()
+
+
+def test_bad_input(tmp_path, order):
+    recipe = order.recipe
+    with pytest.raises(ValueError, match="expected a count of at least 1 case, got 0"):
+        build_set(tmp_path / "none", order, 0)
+    assert not (tmp_path / "none").exists()
+    with pytest.raises(ValueError, match="expected crops within the 24 voxels of the stored shapes, but 32 x 16 x 16"):
+        Recipe(recipe.source, FLAT, (32, 16, 16), 0.5)
+    with pytest.raises(ValueError, match="expected 3 whole numbers of voxels above 0"):
+        Recipe(recipe.source, FLAT, (8, 0, 8), 0.5)
+    with pytest.raises(ValueError, match="expected a shape's voxel of positive length, got 0"):
+        Recipe(recipe.source, FLAT, SHAPE, 0)
+    with pytest.raises(ValueError, match="expected a layout among nnunet, monai, zarr, got 'bids'"):
+        Order(recipe, "bids")
+    with pytest.raises(ValueError, match="expected labels among .*, got depth"):
+        Order(recipe, parts=("depth",))
+    (tmp_path / "taken").mkdir()
+    (tmp_path / "taken" / "notes.txt").write_text("mine")
+    with pytest.raises(ValueError, match="expected a new or empty folder, or a set to go on with, got .*taken with"):
+        build_set(tmp_path / "taken", order, 1)
+    with pytest.raises(ValueError, match="expected a set of version 1 in .*taken, got none"):
+        read_order(tmp_path / "taken")
+    folder = build_set(tmp_path / "set", order, 1)
+    other = Order(Recipe(recipe.source, FLAT, SHAPE, 0.5, seed=5))
+    with pytest.raises(ValueError, match="expected what .*set was begun with, got another seed: 5 for 4"):
+        build_set(folder, other, 1)
+    with pytest.raises(ValueError, match="expected a set of version 1"):
+        make_cases(tmp_path / "nowhere", [0])

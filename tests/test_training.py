@@ -1,0 +1,140 @@
+"""Pairs on the fly: by number alone, shared out among workers and ranks, none twice."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from exact_store import exact_store
+from torch.utils.data import DataLoader
+
+from curvafit.data_synth import training
+from curvafit.data_synth.modality import Imaging, Modality
+from curvafit.data_synth.moves import cropped, turned
+from curvafit.data_synth.store import open_store
+from curvafit.data_synth.training import Sample, TextureDataset, as_dict, as_monai, as_subject
+
+QUIET = Modality("quiet", "for tests", 1.0, Imaging(blur=(0.5, 0.5, 0.5), read_noise=1.0))
+SHAPE = (12, 16, 20)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return exact_store(tmp_path_factory.mktemp("shapes") / "s.zarr", 8).path
+
+
+def told(sample: Sample) -> str:
+    """Its number and the sum of its voxels' bytes."""
+    return f"{sample.record['number']} {hashlib.sha256(sample.image.numpy().tobytes()).hexdigest()}"
+
+
+def numbers(samples: Iterable[str]) -> list[int]:
+    return [int(each.split()[0]) for each in samples]
+
+
+def test_a_pair_is_a_crop_of_a_shape_and_its_image(store):
+    dataset = TextureDataset(store, QUIET, SHAPE, blend=0.0)
+    for number in range(4):
+        image, label, spacing, record = dataset[number]
+        assert image.shape == label.shape == (1, *SHAPE)
+        assert image.dtype == torch.float32 and label.dtype == torch.uint8 and spacing == (1.0, 1.0, 1.0)
+        (origin,) = record["source"]
+        draw = int(origin["name"].split()[-1])
+        field = cropped(turned(open_store(store).field(draw), origin["symmetry"]), origin["corner"], SHAPE)
+        assert (label[0].numpy() == (field > 0)).all()
+        assert np.corrcoef(image.numpy().ravel(), field.ravel())[0, 1] > 0.9
+
+
+def test_samples_depend_on_seed_and_number_alone(store):
+    first = [told(TextureDataset(store, QUIET, SHAPE, seed=1)[k]) for k in (0, 1, 7)]
+    again = TextureDataset(store, QUIET, SHAPE, seed=1, length=3, transform=told)
+    assert [again[k] for k in (0, 1, 7)] == first
+    assert len({each.split()[1] for each in first}) == 3
+    assert told(TextureDataset(store, QUIET, SHAPE, seed=2)[0]) != first[0]
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_workers_share_an_epoch(store, workers):
+    dataset = TextureDataset(store, QUIET, SHAPE, length=5, transform=told)
+    alone = [dataset[k] for k in range(5)]
+    loader = DataLoader(dataset, batch_size=None, num_workers=workers)
+    assert sorted(loader) == sorted(alone)
+    dataset.set_epoch(1)
+    assert sorted(numbers(loader)) == list(range(5, 10))
+
+
+def test_workers_that_stay_see_the_next_epoch(store):
+    dataset = TextureDataset(store, QUIET, SHAPE, length=2, transform=told)
+    loader = DataLoader(dataset, batch_size=None, num_workers=1, persistent_workers=True)
+    assert numbers(loader) == [0, 1]
+    dataset.set_epoch(3)
+    assert numbers(loader) == [6, 7]
+
+
+def test_ranks_share_an_epoch_evenly(store, monkeypatch):
+    dataset, seen = TextureDataset(store, QUIET, SHAPE, length=7, transform=told), []
+    for rank in range(3):
+        monkeypatch.setattr(training, "_rank", lambda rank=rank: (rank, 3))
+        found = numbers(dataset)
+        assert len(found) == len(dataset) == 2
+        seen += found
+    assert sorted(seen) == list(range(6))
+
+
+def test_a_blend_holds_both_textures(store):
+    dataset = TextureDataset(store, QUIET, (16, 16, 16), blend=1.0)
+    sample = dataset[0]
+    assert len(sample.record["source"]) == 2
+    fields = []
+    for origin in sample.record["source"]:
+        whole = turned(open_store(store).field(int(origin["name"].split()[-1])), origin["symmetry"])
+        fields.append(cropped(whole, origin["corner"], (16, 16, 16)) > 0)
+    label = sample.label[0].numpy() > 0
+    assert (label[fields[0] & fields[1]]).all() and not label[~fields[0] & ~fields[1]].any()
+    assert (label != fields[0]).any() and (label != fields[1]).any()
+
+
+def test_modalities_take_turns_at_random(store):
+    loud = Modality("loud", "for tests", 1.0, Imaging(foreground=1000.0))
+    names = {TextureDataset(store, [QUIET, loud], SHAPE)[k].record["modality"] for k in range(12)}
+    assert names == {"quiet", "loud"}
+
+
+def test_batches_for_a_network(store):
+    batch = next(iter(DataLoader(TextureDataset(store, QUIET, SHAPE, transform=as_dict), batch_size=3)))
+    assert batch["image"].shape == batch["label"].shape == (3, 1, *SHAPE)
+
+
+def test_monai_s_form(store):
+    pytest.importorskip("monai", reason="needs MONAI")
+    wide = Modality("wide", "for tests", 1.0, Imaging(spacing=(2.0, 1.0, 1.0)))
+    sample = TextureDataset(store, wide, (8, 12, 12))[0]
+    made = as_monai(sample)
+    assert np.diag(made["image"].affine.numpy()).tolist() == [2.0, 1.0, 1.0, 1.0]
+    assert (made["label"].numpy() == sample.label.numpy()).all()
+
+
+def test_torchio_s_form(store):
+    pytest.importorskip("torchio", reason="needs TorchIO")
+    wide = Modality("wide", "for tests", 1.0, Imaging(spacing=(2.0, 1.0, 1.0)))
+    sample = TextureDataset(store, wide, (8, 12, 10))[0]
+    subject = as_subject(sample)
+    assert subject.spacing == (1.0, 1.0, 2.0) and subject.shape == (1, 10, 12, 8)
+    assert (subject.label.data[0].permute(2, 1, 0) == sample.label[0]).all()
+
+
+def test_bad_input(store, tmp_path):
+    with pytest.raises(ValueError, match="expected crops within the 24 voxels of the stored shapes, but 25 x 8 x 8"):
+        TextureDataset(store, QUIET, (25, 8, 8))
+    with pytest.raises(FileNotFoundError, match="expected a store of shapes at .*missing.zarr"):
+        TextureDataset(tmp_path / "missing.zarr", QUIET, SHAPE)
+    with pytest.raises(ValueError, match="expected at least one store and one modality, got 1 and 0"):
+        TextureDataset(store, [], SHAPE)
+    with pytest.raises(ValueError, match="expected 3 edges and a length above 0, and a blend in"):
+        TextureDataset(store, QUIET, SHAPE, blend=1.5)
+    with pytest.raises(ValueError, match="expected 3 edges and a length above 0"):
+        TextureDataset(store, QUIET, SHAPE, length=0)
