@@ -16,7 +16,7 @@ def components(mask: np.ndarray, *, periodic: bool = False, connectivity: int = 
 
     Voxels touch by corners (`connectivity` 26) or by faces (6); in a periodic box also across its faces.
     """
-    labels, count = ndimage.label(mask, ndimage.generate_binary_structure(3, 3 if connectivity == 26 else 1))  # type: ignore[misc]
+    labels, count = _within(mask, corners=connectivity == 26)
     if periodic and count:
         pairs = _seams(labels, connectivity == 26)[:, :2] - 1
         merged = connected_components(_graph(pairs, count), directed=False)[1]
@@ -60,6 +60,12 @@ def betti_numbers(mask: np.ndarray, *, periodic: bool = False) -> tuple[int, int
     return pieces, pieces + cavities - euler_number(inside, periodic=periodic), cavities
 
 
+def _within(mask: np.ndarray, corners: bool) -> tuple[np.ndarray, int]:
+    """Pieces within the box, and how many."""
+    labels = np.empty(mask.shape, dtype=np.int32)
+    return labels, int(ndimage.label(mask, ndimage.generate_binary_structure(3, 3 if corners else 1), output=labels))
+
+
 def _seams(labels: np.ndarray, corners: bool) -> np.ndarray:
     """Which labels touch across the faces of a periodic box: unique rows (last layer's, first layer's, axis)."""
     found = [np.empty((0, 3), dtype=np.int64)]
@@ -80,7 +86,7 @@ def _graph(pairs: np.ndarray, count: int) -> coo_array:
 def _directions(mask: np.ndarray) -> int:
     """Rank of the loops of a 6-connected phase around the torus: of what is left over when its pieces within the box
     are laid out along a spanning tree."""
-    labels, count = ndimage.label(mask)  # type: ignore[misc]
+    labels, count = _within(mask, corners=False)
     seams = _seams(labels, False)
     one, other, steps = seams[:, 0] - 1, seams[:, 1] - 1, np.eye(3, dtype=np.int64)[seams[:, 2]]
     graph = _graph(seams[:, :2] - 1, count).tocsr()

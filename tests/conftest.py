@@ -27,3 +27,12 @@ def data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"needs outside data: CURVAFIT_DATA names {named}, which is not a folder")
     return folder
+
+
+@pytest.fixture(scope="session")
+def made():
+    """A generated shape of 32³ voxels, tubes that meet, and its periodic grid."""
+    from curvafit.generation import generate
+
+    flow = generate("sponge", grid=32, seed=3)
+    return flow.field, flow.grid

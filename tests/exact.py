@@ -7,6 +7,7 @@ from its skeleton, and the curvatures at a point are those of the parallel surfa
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -121,6 +122,33 @@ class Torus:
         R, r = self.major, self.minor - offset
         bend = R / r * (R / math.sqrt(R**2 - r**2) - 1)
         return 4 * math.pi**2 * np.array([R / r, 0, bend, R, 0, R * r])
+
+
+@dataclass(frozen=True)
+class Tubes:
+    """Balls of `radius` along polylines `(N, 3)` (z, y, x); inside, the distance is exact where one line is near."""
+
+    radius: float
+    lines: tuple[np.ndarray, ...]
+
+    def distance(self, points: Tensor) -> Tensor:
+        nearest = torch.full(points.shape[:-1], math.inf, dtype=torch.float64)
+        for line in self.lines:
+            corners = torch.as_tensor(line, dtype=torch.float64)
+            for a, b in itertools.pairwise(corners):
+                part = ((points - a) @ (b - a) / (b - a).square().sum().clamp_min(1e-30)).clamp(0, 1)
+                nearest = torch.minimum(nearest, (points - a - part[..., None] * (b - a)).norm(dim=-1))
+        return self.radius - nearest
+
+
+def helix(
+    radius: float, pitch: float, turns: float, start: tuple[float, float, float], corners: int = 60
+) -> np.ndarray:
+    """Corners `(corners + 1, 3)` of a helix around the line along z through `start`; a turn is √((2πr)² + p²) long."""
+    t = np.linspace(0, turns, corners + 1)
+    return np.stack(
+        [start[0] + pitch * t, start[1] + radius * np.sin(2 * np.pi * t), start[2] + radius * np.cos(2 * np.pi * t)], 1
+    )
 
 
 @dataclass(frozen=True)

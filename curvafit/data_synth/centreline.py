@@ -196,7 +196,7 @@ def _finished(traced: nx.MultiGraph, distance: np.ndarray, grid: Grid) -> nx.Mul
         points = smooth * spacing
         points = points - points[0] + graph.nodes[number[one]]["position"]
         mode = "grid-wrap" if grid.periodic else "nearest"
-        radii = ndimage.map_coordinates(distance, smooth.T, order=1, mode=mode)
+        radii = np.maximum(ndimage.map_coordinates(distance, smooth.T, order=1, mode=mode), 0)
         steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
         mean = float(np.average((radii[1:] + radii[:-1]) / 2, weights=steps)) if steps.sum() else float(radii.mean())
         graph.add_edge(number[one], number[other], points=points, radii=radii, length=float(steps.sum()), radius=mean)

@@ -21,7 +21,7 @@ from curvafit.priors.profile import profile_distance
 from curvafit.topology import betti_numbers, components
 
 #: Pieces that touch are two where the neck between them is thinner than this part of the thinner one.
-NECK = 0.7
+NECK = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,9 +67,7 @@ class Labels:
 NAMES = tuple(field.name for field in fields(Labels) if field.name != "grid")
 
 
-def labels_of(
-    field: Tensor | np.ndarray, grid: Grid, epsilon: float, which: Collection[str] | str = NAMES
-) -> Labels:
+def labels_of(field: Tensor | np.ndarray, grid: Grid, epsilon: float, which: Collection[str] | str = NAMES) -> Labels:
     """The labels of a phase field `(Z, Y, X)`, positive inside; only those in `which` cost time.
 
     A periodic grid's box repeats: distances, curvatures, radii, pieces and lines go on across its faces, and the Betti

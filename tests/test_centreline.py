@@ -1,0 +1,216 @@
+"""Centreline graphs of shapes whose axes are known, and their files."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from pathlib import Path
+
+import networkx as nx
+import numpy as np
+import pytest
+import torch
+from exact import Sphere, Torus, Tubes, centres, helix, optimal_profile
+from scipy import ndimage
+
+from curvafit.data_synth.centreline import centreline, cycle_rank
+from curvafit.data_synth.centreline_files import write_graphml, write_swc
+from curvafit.data_synth.labels import labels_of
+from curvafit.priors.grid import Grid
+
+CUBES, FLAT = (1.0, 1.0, 1.0), (1.5, 1.0, 0.75)
+MIDDLE = (24.2, 23.8, 24.1)
+Y = [(24.2, 23.8, 24.1), (24.2, 23.8, 6.0), (24.2, 36.0, 38.0), (24.2, 11.0, 38.0)]
+SPIRAL = helix(11.0, 15.0, 2.0, (9.0, 24.2, 23.9))
+
+
+def cube(spacing: tuple[float, float, float], boundary: str = "replicate") -> Grid:
+    """48 units of length along each axis."""
+    z, y, x = (round(48 / h) for h in spacing)
+    return Grid((z, y, x), spacing, boundary)  # type: ignore[arg-type]
+
+
+def graph_of(distance: torch.Tensor, box: Grid, prune: float = 1.0) -> nx.MultiGraph:
+    found = labels_of(optimal_profile(distance, 2.0), box, 2.0, ("skeleton", "distance"))
+    assert found.skeleton is not None and found.distance is not None
+    return centreline(found.skeleton, found.distance, box, prune)
+
+
+def kinds(graph: nx.MultiGraph) -> Counter[str]:
+    return Counter(kind for _, kind in graph.nodes(data="kind"))
+
+
+def total(graph: nx.MultiGraph) -> float:
+    return sum(length for *_, length in graph.edges(data="length"))
+
+
+def half(box: Grid) -> np.ndarray:
+    """From the box's corner, where `centres` counts from, to the first voxel's centre, where graphs do."""
+    return np.array(box.spacing) / 2
+
+
+SHAPES = {
+    "tube": (Tubes(4.0, (np.array([(14.2, 10.0, 8.0), (34.0, 38.0, 40.0)]),)), {"end": 2}, 0, 1),
+    "helix": (Tubes(3.0, (SPIRAL,)), {"end": 2}, 0, 1),
+    "torus": (Torus(14.0, 4.0, MIDDLE), {"loop": 1}, 1, 1),
+    "junction": (Tubes(4.0, tuple(np.array([Y[0], end]) for end in Y[1:])), {"end": 3, "junction": 1}, 0, 1),
+    "ball": (Sphere(9.0, MIDDLE), {"point": 1}, 0, 1),
+}
+LENGTHS = {
+    "tube": math.dist((14.2, 10.0, 8.0), (34.0, 38.0, 40.0)),
+    "helix": 2 * math.hypot(2 * math.pi * 11, 15),
+    "torus": 2 * math.pi * 14,
+    "junction": sum(math.dist(Y[0], end) for end in Y[1:]),
+    "ball": 0.0,
+}
+
+
+@pytest.mark.parametrize("spacing", [CUBES, FLAT])
+@pytest.mark.parametrize("name", SHAPES)
+def test_nodes_lengths_radii_and_places(name: str, spacing: tuple[float, float, float]) -> None:
+    """Lengths to 4 % and what an end may be short or long of its ball's centre; radii to half a voxel."""
+    shape, expected, cycles, pieces = SHAPES[name]
+    box = cube(spacing)
+    graph = graph_of(shape.distance(centres(box)), box)  # type: ignore[attr-defined]
+    assert kinds(graph) == expected and cycle_rank(graph) == cycles
+    assert nx.number_connected_components(graph) == pieces
+    ends = kinds(graph)["end"]
+    assert abs(total(graph) - LENGTHS[name]) < 0.04 * LENGTHS[name] + ends * 2.5
+    for *_, of in graph.edges(data=True):
+        points, radii = of["points"], of["radii"]
+        assert len(points) == len(radii) and of["length"] > 0
+        radius = shape.radius if isinstance(shape, Tubes) else shape.minor  # type: ignore[attr-defined]
+        middle = slice(4, -4) if name != "torus" else slice(None)
+        assert abs(of["radius"] - radius) < 0.5 * max(spacing)
+        assert np.abs(radii[middle] - radius).max() < 0.75 * max(spacing)
+        off = shape.distance(torch.from_numpy(points + half(box))).numpy()  # type: ignore[attr-defined]
+        assert (radius - off)[middle].max() < 0.9 * max(spacing)
+
+
+def test_a_crop_s_tube_goes_from_face_to_face() -> None:
+    box = Grid((32, 32, 40), 1.0, "replicate")  # type: ignore[arg-type]
+    distance = Tubes(5.0, (np.array([(16.2, 15.8, -40.0), (16.2, 15.8, 80.0)]),)).distance(centres(box))
+    graph = graph_of(distance, box)
+    assert kinds(graph) == {"end": 2} and total(graph) == pytest.approx(39, abs=0.5)
+    assert sorted(round(of["position"][2]) for _, of in graph.nodes(data=True)) == [0, 39]
+
+
+def test_a_periodic_tube_closes_on_itself(tmp_path: Path) -> None:
+    box = Grid((32, 32, 40), 1.0)  # type: ignore[arg-type]
+    distance = Tubes(5.0, (np.array([(16.2, 15.8, -40.0), (16.2, 15.8, 80.0)]),)).distance(centres(box))
+    graph = graph_of(torch.roll(distance, (16, 16), (0, 1)), box)  # along the box's edge
+    assert kinds(graph) == {"loop": 1} and cycle_rank(graph) == 1
+    (edge,) = (of for *_, of in graph.edges(data=True))
+    assert edge["length"] == pytest.approx(40, abs=0.5)
+    assert edge["points"][-1] - edge["points"][0] == pytest.approx(np.array([0, 0, 40]) * np.sign(edge["points"][-1][2]))
+    rows, cuts = read_swc(write_swc(graph, tmp_path / "a.swc", "um"))
+    assert len(cuts) == 1 and np.ptp(rows[:, 2]) > 37
+
+
+@pytest.mark.parametrize("boundary", ["periodic", "replicate"])
+@pytest.mark.parametrize("prune", [0.0, 1.0])
+def test_cycles_are_the_tunnels_of_a_generated_shape(made, boundary: str, prune: float) -> None:
+    """Of a mask without cavities, cut or on the torus, whatever is pruned; and the pieces are the pieces."""
+    u, _ = made
+    box = Grid((32, 32, 32), boundary=boundary)  # type: ignore[arg-type]
+    found = labels_of(u, box, 0.02, ("skeleton", "distance", "betti"))
+    assert found.skeleton is not None and found.distance is not None and found.betti is not None
+    graph = centreline(found.skeleton, found.distance, box, prune)
+    assert found.betti[2] == 0
+    assert (nx.number_connected_components(graph), cycle_rank(graph)) == found.betti[:2]
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("boundary", ["periodic", "replicate"])
+def test_cycles_of_random_masks_without_cavities(seed: int, boundary: str) -> None:
+    box = Grid((28, 24, 32), 1.0, boundary)  # type: ignore[arg-type]
+    noise = ndimage.gaussian_filter(np.random.default_rng(seed).standard_normal(box.shape), 1.8, mode="wrap")
+    field = torch.from_numpy(noise / noise.std() - 0.8)
+    found = labels_of(field, box, 1.0, ("skeleton", "distance", "betti"))
+    assert found.skeleton is not None and found.distance is not None and found.betti is not None
+    graph = centreline(found.skeleton, found.distance, box)
+    assert found.betti[2] == 0 and found.betti[1] > 0
+    assert (nx.number_connected_components(graph), cycle_rank(graph)) == found.betti[:2]
+
+
+def test_a_rough_surface_does_not_sprout() -> None:
+    """A rough wall of a tube (deviation a voxel) makes spurs, which pruning takes away; the tube stays in one."""
+    box = Grid((40, 40, 64), 1.0, "replicate")  # type: ignore[arg-type]
+    noise = ndimage.gaussian_filter(np.random.default_rng(0).standard_normal(box.shape), 2)
+    distance = Tubes(6.0, (np.array([(20.2, 19.8, -30.0), (20.2, 19.8, 94.0)]),)).distance(centres(box))
+    rough = distance + torch.from_numpy(noise / noise.std())
+    assert kinds(graph_of(rough, box, prune=0.0))["junction"] > 2
+    graph = graph_of(rough, box)
+    assert kinds(graph) == {"end": 2} and 63 < total(graph) < 75
+
+
+def test_swc_reads_back(tmp_path: Path) -> None:
+    """A ring with a tail: parents come first, lengths in µm, the ring's cut is named and as long as a step."""
+    box = cube(CUBES)
+    ring = Torus(12.0, 4.0, MIDDLE).distance(centres(box))
+    tail = Tubes(4.0, (np.array([(24.2, 23.8, 36.0), (24.2, 23.8, 80.0)]),)).distance(centres(box))
+    graph = graph_of(torch.maximum(ring, tail), box)
+    assert kinds(graph) == {"junction": 1, "end": 1} and cycle_rank(graph) == 1
+    rows, cuts = read_swc(write_swc(graph, tmp_path / "ring.swc", "nm"))
+    assert len(cuts) == 1 and (rows[0, 6] == -1) and (rows[1:, 6] > 0).all()
+    assert (rows[1:, 6] < rows[1:, 0]).all() and (rows[:, 0] == np.arange(1, len(rows) + 1)).all()
+    steps = np.linalg.norm(rows[1:, 2:5] - rows[rows[1:, 6].astype(int) - 1, 2:5], axis=1)
+    end, node = (rows[i - 1, 2:5] for i in cuts[0])
+    gap = np.linalg.norm(end - node)
+    assert 0 < gap < 0.002 and (steps.sum() + gap) * 1000 == pytest.approx(total(graph), rel=1e-4)
+    assert rows[0, 2:5] * 1000 == pytest.approx((47, 23.3, 23.7), abs=1)  # x, y, z: the tail's end is the root
+    assert rows[:, 5] * 1000 == pytest.approx(np.full(len(rows), 4), abs=1.2)
+
+
+def read_swc(path: Path) -> tuple[np.ndarray, list[tuple[int, int]]]:
+    """Rows `(N, 7)`, and the pairs of ids that comments name."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    cuts = [(int(words[5]), int(words[7])) for words in map(str.split, lines) if words[:3] == ["#", "loop", "cut"]]
+    rows = np.array([[float(v) for v in line.split()] for line in lines if not line.startswith("#")])
+    return rows, cuts
+
+
+def test_swc_has_a_tree_for_each_piece_and_a_cut_for_each_cycle(made, tmp_path: Path) -> None:
+    u, box = made
+    found = labels_of(u, box, 0.02, ("skeleton", "distance"))
+    assert found.skeleton is not None and found.distance is not None
+    graph = centreline(found.skeleton, found.distance, box)
+    rows, cuts = read_swc(write_swc(graph, tmp_path / "a.swc", "mm"))
+    assert (rows[:, 6] < 0).sum() == nx.number_connected_components(graph) and len(cuts) == cycle_rank(graph)
+    steps = np.linalg.norm(rows[1:, 2:5] - rows[rows[1:, 6].astype(int) - 1, 2:5], axis=1)[rows[1:, 6] > 0]
+    assert steps.max() < 4 * 10  # four voxels of 10 µm, across the faces too
+
+
+def test_graphml_reads_back(tmp_path: Path) -> None:
+    box = cube(FLAT)
+    graph = graph_of(SHAPES["junction"][0].distance(centres(box)), box)  # type: ignore[attr-defined]
+    path = write_graphml(graph, tmp_path / "y.graphml", "um")
+    read = nx.read_graphml(path, node_type=int, force_multigraph=True)
+    assert read.graph["unit"] == "um" and nx.utils.graphs_equal(nx.Graph(read.edges()), nx.Graph(graph.edges()))
+    for node, of in graph.nodes(data=True):
+        assert [read.nodes[node][k] for k in "zyx"] == pytest.approx(of["position"])
+        assert (read.nodes[node]["kind"], read.nodes[node]["radius"]) == (of["kind"], pytest.approx(of["radius"]))
+    for one, other, of in read.edges(data=True):
+        points = np.array([[float(v) for v in point.split()] for point in of["points"].split(",")])
+        kept = graph.edges[one, other, 0]
+        assert points == pytest.approx(kept["points"], rel=1e-6) and of["length"] == pytest.approx(kept["length"])
+        assert points[0] == pytest.approx(graph.nodes[min(one, other)]["position"], rel=1e-6)
+        assert len(of["radii"].split()) == len(points)
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_bad_input(tmp_path: Path) -> None:
+    box = Grid((6, 6, 6))
+    empty = np.zeros(box.shape)
+    with pytest.raises(ValueError, match=r"expected arrays of shape \(6, 6, 6\), got \(6, 6, 5\) and \(6, 6, 6\)"):
+        centreline(empty[..., 1:], empty, box)
+    with pytest.raises(ValueError, match=r"expected a share of the radius of at least 0, got -1"):
+        centreline(empty, empty, box, -1)
+    graph = centreline(empty, empty, box)
+    assert len(graph) == 0 and cycle_rank(graph) == 0
+    with pytest.raises(ValueError, match=r"expected a unit of nm, um, mm, m, as SWC is in micrometres, got 'voxel'"):
+        write_swc(graph, tmp_path / "a.swc", "voxel")
+    with pytest.raises(ValueError, match=r"expected a name ending in .swc, got 'a.txt'"):
+        write_swc(graph, tmp_path / "a.txt", "um")
+    with pytest.raises(ValueError, match=r"expected a name ending in .graphml, got 'a.xml'"):
+        write_graphml(graph, tmp_path / "a.xml")

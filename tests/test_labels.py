@@ -1,0 +1,225 @@
+"""Labels against shapes that are known exactly, on cubic and anisotropic voxels, in crops and periodic boxes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from exact import Cylinder, Plane, Shape, Sphere, Torus, Tubes, centres, profile
+from scipy.spatial import cKDTree
+
+from curvafit.data_synth.distance import field_distance
+from curvafit.data_synth.labels import NAMES, Labels, instances_of, labels_of
+from curvafit.data_synth.skeleton import skeleton_of
+from curvafit.diagram import MARGIN
+from curvafit.mesh import surface
+from curvafit.priors.grid import Grid
+from curvafit.topology import betti_numbers
+
+CUBES, FLAT = (1.0, 1.0, 1.0), (1.0, 0.7, 0.5)
+MIDDLE = (14.1, 14.3, 13.8)
+
+
+def grid(spacing: tuple[float, float, float], boundary: str = "replicate") -> Grid:
+    z, y, x = (round(28 / h) for h in spacing)
+    return Grid((z, y, x), spacing, boundary)  # type: ignore[arg-type]
+
+
+SHAPES: dict[str, Shape] = {
+    "plane": Plane((1.0, 0.4, 0.3), MIDDLE),
+    "sphere": Sphere(5.0, MIDDLE),
+    "cylinder": Cylinder(5.0, (0.3, 1.0, 0.4), MIDDLE),
+    "torus": Torus(9.0, 4.0, MIDDLE),
+}
+
+
+def away_from_faces(box: Grid, width: int) -> tuple[slice, ...]:
+    return (slice(width, -width),) * 3
+
+
+@pytest.mark.parametrize("spacing", [CUBES, FLAT])
+@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize("width", [1.0, 1.25])
+def test_distance(name: str, spacing: tuple[float, float, float], width: float) -> None:
+    """Whatever the profile's width: as generated fields' are, it may be up to a quarter wider than tanh."""
+    box = grid(spacing)
+    truth = SHAPES[name].distance(centres(box)).numpy()
+    u = profile(SHAPES[name], centres(box), 2.0 * width).float()
+    found = field_distance(u, box, 2.0)
+    inner = away_from_faces(box, 6)
+    error, depth = np.abs(found - truth)[inner], np.abs(truth)[inner]
+    assert np.array_equal(found > 0, (u > 0).numpy())
+    assert error[depth < 1].max() < 0.05
+    assert error.mean() < 0.04 and error.max() < 0.45
+
+
+def test_distance_around_a_periodic_box() -> None:
+    box = Grid((24, 20, 28), FLAT, "periodic")
+    size = np.array(box.shape) * box.spacing
+    here, corner = ((Sphere(4.0, tuple(size * part))) for part in (0.5, 0.0))
+    middle = field_distance(profile(here, centres(box), 1.5), box, 1.5)
+    moved = np.roll(np.asarray(middle), [n // 2 for n in box.shape], (0, 1, 2))
+    images = [Sphere(4.0, tuple(corner.centre + size * k)) for k in np.ndindex(2, 2, 2)]
+    u = torch.stack([profile(each, centres(box), 1.5) for each in images]).amax(0)
+    assert np.abs(field_distance(u, box, 1.5) - moved).max() < 0.2
+    assert np.abs(moved - np.max([each.distance(centres(box)) for each in images], axis=0)).max() < 0.4
+
+
+def test_distance_of_a_hard_field_is_that_of_the_voxels_faces() -> None:
+    box = Grid((16, 16, 16), 1.0, "replicate")  # type: ignore[arg-type]
+    u = torch.where(torch.arange(16) < 7, 1.0, -1.0).expand(16, 16, 16)
+    assert np.allclose(field_distance(u, box, 2.0)[3, 4], 6.5 - np.arange(16), atol=1e-5)
+
+
+def test_distance_agrees_with_the_mesh_of_a_generated_shape(made) -> None:
+    """Half a voxel or less from the surface, whose mesh is a hundredth of a voxel off itself."""
+    u, box = made
+    mesh = surface(u, box)
+    corners = mesh.vertices[mesh.faces]
+    weights = np.random.default_rng(0).dirichlet((1, 1, 1), (len(corners), 24))
+    cloud = np.einsum("nkc,ncd->nkd", weights, corners).reshape(-1, 3)
+    found = field_distance(u, box, 0.02)
+    near = np.argwhere(np.abs(found) < 0.005)
+    near = near[(near > 1).all(1) & (near < 30).all(1)]
+    expected = cKDTree(cloud).query(near * 0.01)[0]
+    error = np.abs(np.abs(found[tuple(near.T)]) - expected) / 0.01
+    assert error.mean() < 0.03 and np.quantile(error, 0.99) < 0.1
+
+
+@pytest.mark.parametrize("spacing", [CUBES, FLAT])
+@pytest.mark.parametrize("name", ["sphere", "cylinder", "torus"])
+def test_curvatures(name: str, spacing: tuple[float, float, float]) -> None:
+    """Within 6 % of the greater one: of the surface itself, though the voxels are beside it."""
+    box = grid(spacing)
+    shape = SHAPES[name]
+    labels = labels_of(profile(shape, centres(box), 2.0), box, 2.0, ("mask", "kappa1", "kappa2"))
+    assert labels.mask is not None and labels.kappa1 is not None and labels.kappa2 is not None
+    known = np.isfinite(labels.kappa1)
+    assert np.array_equal(known, np.isfinite(labels.kappa2)) and known.sum() > 300
+    d, (κ1, κ2) = shape.distance(centres(box)), shape.curvatures(centres(box))
+    truth = [(κ / (1 + κ * d)).numpy()[known] for κ in (κ1, κ2)]
+    for found, right in zip((labels.kappa1[known], labels.kappa2[known]), truth, strict=True):
+        assert np.abs(found - right).max() < 0.06 * np.abs(truth[0]).max()
+    assert np.abs(d.numpy()[known]).max() <= max(spacing)
+    beside = np.zeros_like(known)
+    for axis in range(3):
+        differ = np.diff(labels.mask.astype(int), axis=axis) != 0
+        for part in (slice(1, None), slice(None, -1)):
+            beside[(slice(None),) * axis + (part,)] |= differ
+    inner = away_from_faces(box, MARGIN)
+    assert np.array_equal(known[inner], beside[inner]) and known.sum() == known[inner].sum()
+
+
+@pytest.mark.parametrize("spacing", [CUBES, FLAT])
+@pytest.mark.parametrize("name", ["sphere", "cylinder"])
+def test_radius(name: str, spacing: tuple[float, float, float]) -> None:
+    """The largest ball's, half a voxel too little at most; at the rim of the box as inside it."""
+    box = grid(spacing)
+    labels = labels_of(profile(SHAPES[name], centres(box), 2.0), box, 2.0, ["radius", "mask"])
+    assert labels.radius is not None and labels.mask is not None
+    assert np.all(labels.radius[~labels.mask] == 0)
+    inside = labels.radius[labels.mask]
+    assert 5 - 0.6 * max(spacing) < inside.mean() < 5 + 0.1 and inside.max() < 5 + 0.5 * max(spacing)
+
+
+CASES = {
+    "ball": (Sphere(6.0, MIDDLE), (1, 0, 0)),
+    "cylinder": (SHAPES["cylinder"], (1, 0, 0)),
+    "torus": (SHAPES["torus"], (1, 1, 0)),
+}
+
+
+@pytest.mark.parametrize("spacing", [CUBES, FLAT])
+@pytest.mark.parametrize("name", CASES)
+def test_betti_numbers_and_a_skeleton_that_has_them(name: str, spacing: tuple[float, float, float]) -> None:
+    shape, betti = CASES[name]
+    box = grid(spacing)
+    labels = labels_of(profile(shape, centres(box), 2.0), box, 2.0, ("betti", "skeleton", "distance"))
+    assert labels.betti == betti
+    assert labels.skeleton is not None and betti_numbers(labels.skeleton) == betti
+    depth = labels.distance[labels.skeleton] if labels.distance is not None else None
+    assert depth is not None and depth.min() > {"torus": 3.0, "cylinder": 4.0, "ball": 3.0}[name] - max(spacing)
+
+
+def test_a_shell_keeps_its_cavity() -> None:
+    box = grid(CUBES)
+    d = Sphere(9.0, MIDDLE).distance(centres(box))
+    distance = torch.minimum(d, 5 - d).numpy().astype(np.float32)
+    assert betti_numbers(distance > 0) == betti_numbers(skeleton_of(distance, box)) == (1, 0, 1)
+
+
+@pytest.mark.parametrize("boundary", ["periodic", "replicate"])
+def test_the_skeleton_of_a_generated_shape_has_its_topology(made, boundary: str) -> None:
+    u, _ = made
+    box = Grid((32, 32, 32), boundary=boundary)  # type: ignore[arg-type]
+    labels = labels_of(u, box, 0.02)
+    assert labels.skeleton is not None and labels.mask is not None and labels.betti is not None
+    assert not (labels.skeleton & ~labels.mask).any()
+    assert betti_numbers(labels.skeleton, periodic=box.periodic) == labels.betti
+    assert labels.betti[1] > 3  # or it shows nothing
+
+
+@pytest.mark.parametrize(("gap", "count"), [(3.0, 2), (-0.5, 2), (-6.0, 1)])
+@pytest.mark.parametrize("spacing", [CUBES, FLAT])
+def test_two_balls_are_two_until_they_are_one(gap: float, count: int, spacing: tuple[float, float, float]) -> None:
+    """Apart, touching, and overlapping by half."""
+    box = grid(spacing)
+    balls = [Sphere(5.0, (14.1, 14.2, 14.0 + side * (5 + gap / 2))) for side in (-1, 1)]
+    u = torch.stack([profile(ball, centres(box), 1.0) for ball in balls]).amax(0)
+    labels = labels_of(u, box, 1.0, ("instances", "mask", "betti"))
+    found = labels.instances
+    assert found is not None and labels.mask is not None and labels.betti is not None
+    assert found.max() == count and np.array_equal(found > 0, labels.mask)
+    assert labels.betti[0] == (2 if gap > 0 else 1)
+    if count == 2:
+        sides = centres(box)[..., 2].numpy() > 14.0
+        assert (found[labels.mask] == sides[labels.mask] + found[labels.mask & ~sides][0] * 1.0).mean() > 0.98
+
+
+def test_beads_on_a_string_and_an_even_tube() -> None:
+    box = grid(CUBES)
+    line = np.array([(14.0, 14.2, -20.0), (14.0, 14.2, 50.0)])
+    thin, even = Tubes(1.5, (line,)).distance(centres(box)), Tubes(4.0, (line,)).distance(centres(box))
+    beads = torch.stack([Sphere(5.0, (14.0, 14.2, x)).distance(centres(box)) for x in (7.0, 21.0)]).amax(0)
+    strung = torch.maximum(thin, beads).numpy().astype(np.float32)
+    assert instances_of(strung, box).max() == 2 and instances_of(strung, box, neck=0).max() == 1
+    assert instances_of(even.numpy().astype(np.float32), box).max() == 1
+
+
+def test_an_instance_goes_on_across_the_faces() -> None:
+    box = grid(CUBES, "periodic")
+    whole = profile(Sphere(5.0, MIDDLE), centres(box), 1.0)
+    cut = torch.roll(whole, (14, 14, 14), (0, 1, 2))
+    assert labels_of(cut, box, 1.0, "instances").instances.max() == 1  # type: ignore[union-attr]
+    crop = grid(CUBES)
+    assert labels_of(cut, crop, 1.0, "instances").instances.max() == 8  # type: ignore[union-attr]
+
+
+def test_only_what_is_asked_for() -> None:
+    box = grid(CUBES)
+    u = profile(SHAPES["sphere"], centres(box), 2.0)
+    for name in NAMES:
+        found = labels_of(u, box, 2.0, name)
+        assert [each for each in NAMES if getattr(found, each) is not None] == [name]
+    assert isinstance(labels_of(u.numpy(), box, 2.0), Labels)
+
+
+@pytest.mark.parametrize(
+    ("field", "epsilon", "which", "complaint"),
+    [
+        (torch.zeros(4, 4, 5), 1.0, "mask", "expected a field of shape (28, 28, 28), got (4, 4, 5)"),
+        (torch.ones(28, 28, 28), 1.0, "mask", "expected a field that crosses 0, got values from 1 to 1"),
+        (torch.full((28, 28, 28), torch.nan), 1.0, "mask", "expected a field of finite floating-point numbers"),
+        (torch.ones(28, 28, 28), 0.0, "mask", "expected a positive epsilon, got 0.0"),
+        (torch.ones(28, 28, 28), 1.0, "maks", "expected labels of mask, distance, skeleton"),
+    ],
+)
+def test_bad_input(field: torch.Tensor, epsilon: float, which: str, complaint: str) -> None:
+    with pytest.raises(ValueError) as error:
+        labels_of(field, grid(CUBES), epsilon, which)
+    assert str(error.value).startswith(complaint)
+
+
+def test_a_neck_of_more_than_all_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"expected a neck's part in \[0, 1\], got 2"):
+        instances_of(np.zeros((4, 4, 4)), Grid((4, 4, 4)), neck=2)
