@@ -13,14 +13,16 @@ from curvafit.priors.grid import Grid
 
 #: Weights by which voxels' places are averaged along a line, twice, so that their steps do not count.
 SMOOTH = (1 / 9, 2 / 9, 3 / 9, 2 / 9, 1 / 9)
+#: How often lines are moved towards the middle.
+CENTRING = 2
 
 
 def centreline(skeleton: np.ndarray, distance: np.ndarray, grid: Grid, prune: float = 1.0) -> nx.MultiGraph:
     """The graph of a skeleton of one-voxel wide lines (26 neighbours), with radii.
 
     Voxels of three or more neighbours are junctions, touching ones a single one at their mean; voxels of one neighbour
-    are ends. Lines are smoothed over some voxels, so that lengths are not those of the voxels' steps; those from
-    voxel to voxel of a tilted line would be up to a tenth too long. A free line that does not leave the ball around its
+    are ends. Lines are smoothed over some voxels, as steps from voxel to voxel would make tilted ones up to a tenth too
+    long, and moved across themselves to where the distance is greatest. A free line that does not leave the ball around its
     other node by more than a voxel is a spur and is left out, shortest first; where two lines remain at a junction they
     become one. A piece that is so left with nothing is a node without edges. Neither changes the cycles.
 
@@ -29,7 +31,8 @@ def centreline(skeleton: np.ndarray, distance: np.ndarray, grid: Grid, prune: fl
     skeleton
         bool (Z, Y, X), as `skeleton_of` gives it.
     distance
-        Signed distance (Z, Y, X), positive inside: the radii are its values on the lines.
+        Signed distance (Z, Y, X), positive inside. A radius is the mean over the 8 voxels around a point of their
+        distance and how far they are beside the line: what it is on a round tube, whose axis misses the voxels.
     prune
         Spurs are shorter than so many radii of their other node and a voxel; 0 keeps all.
 
@@ -53,6 +56,8 @@ def centreline(skeleton: np.ndarray, distance: np.ndarray, grid: Grid, prune: fl
     graph = _traced(np.asarray(skeleton, dtype=bool), distance, grid)
     if prune > 0:
         _prune(graph, prune, np.array(grid.spacing))
+    for _ in range(CENTRING):
+        _centre(graph, distance, grid)
     return _finished(graph, distance, grid)
 
 
@@ -180,6 +185,56 @@ def _dissolve(graph: nx.MultiGraph, node: int) -> None:
     graph.add_edge(one, other, line=line)
 
 
+def _centre(graph: nx.MultiGraph, distance: np.ndarray, grid: Grid) -> None:
+    """Move lines across themselves, towards the greatest distance: half of what it gains from a voxel on one side to
+    one on the other is how far off a tube's middle is. Nodes move as their lines' ends do on average."""
+    edges = list(graph.edges(keys=True, data="line"))
+    if not edges:
+        return
+    spacing = np.array(grid.spacing)
+    lines = [_smoothed(line) for *_, line in edges]
+    along = np.concatenate([np.gradient(line, axis=0) for line in lines]) * spacing
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+    points = np.concatenate(lines)
+    push = np.stack([_at(distance, points + e, grid) - _at(distance, points - e, grid) for e in np.eye(3)], axis=1) / 2
+    push -= (push * along).sum(1, keepdims=True) * along
+    moved = np.split(push / spacing, np.cumsum([len(line) for line in lines])[:-1])
+    ends: dict[int, list[np.ndarray]] = {node: [] for node in graph}
+    for (one, other, *_), line, by in zip(edges, lines, moved, strict=True):
+        line[1:-1] += by[1:-1]
+        first, last = (one, other) if one < other else (other, one)
+        ends[first].append(by[0])
+        ends[last].append(by[-1])
+    mean = {node: np.mean(by, axis=0) if by else np.zeros(3) for node, by in ends.items()}
+    for (one, other, key, _), line in zip(edges, lines, strict=True):
+        line[0] += mean[min(one, other)]
+        line[-1] += mean[max(one, other)]
+        graph.edges[one, other, key]["line"] = line
+    for node, of in graph.nodes(data=True):
+        of["place"] = of["place"] + mean[node]
+
+
+def _radii(distance: np.ndarray, line: np.ndarray, grid: Grid) -> np.ndarray:
+    """Radii (N,) at the points of a line (N, 3) in voxels."""
+    spacing, low = np.array(grid.spacing), np.floor(line).astype(int)
+    along = np.gradient(line, axis=0) * spacing
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+    radii = np.zeros(len(line))
+    for corner in product((0, 1), repeat=3):
+        voxel = low + corner
+        weight = np.prod(np.where(corner, line - low, 1 - line + low), axis=1)
+        beside = (voxel - line) * spacing
+        beside -= (beside * along).sum(1, keepdims=True) * along
+        there = voxel % grid.shape if grid.periodic else np.clip(voxel, 0, np.array(grid.shape) - 1)
+        radii += weight * (distance[tuple(there.T)] + np.linalg.norm(beside, axis=1))
+    return np.maximum(radii, 0)
+
+
+def _at(values: np.ndarray, points: np.ndarray, grid: Grid) -> np.ndarray:
+    """Linearly between voxels, points `(N, 3)` in voxels."""
+    return ndimage.map_coordinates(values, points.T, order=1, mode="grid-wrap" if grid.periodic else "nearest")
+
+
 def _finished(traced: nx.MultiGraph, distance: np.ndarray, grid: Grid) -> nx.MultiGraph:
     """Numbered anew, in spacing's unit."""
     spacing, graph = np.array(grid.spacing), nx.MultiGraph()
@@ -195,11 +250,12 @@ def _finished(traced: nx.MultiGraph, distance: np.ndarray, grid: Grid) -> nx.Mul
         smooth = _smoothed(line)
         points = smooth * spacing
         points = points - points[0] + graph.nodes[number[one]]["position"]
-        mode = "grid-wrap" if grid.periodic else "nearest"
-        radii = np.maximum(ndimage.map_coordinates(distance, smooth.T, order=1, mode=mode), 0)
+        radii = _radii(distance, smooth, grid)
         steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
         mean = float(np.average((radii[1:] + radii[:-1]) / 2, weights=steps)) if steps.sum() else float(radii.mean())
         graph.add_edge(number[one], number[other], points=points, radii=radii, length=float(steps.sum()), radius=mean)
+        for node, radius in ((number[one], radii[0]), (number[other], radii[-1])):
+            graph.nodes[node]["radius"] = max(graph.nodes[node]["radius"], float(radius))
     return graph
 
 
