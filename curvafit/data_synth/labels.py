@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 from dataclasses import dataclass, fields
 
@@ -85,16 +86,16 @@ def labels_of(field: Tensor | np.ndarray, grid: Grid, epsilon: float, which: Col
     u = _checked(field, grid, epsilon)
     found: dict[str, np.ndarray | tuple[int, int, int]] = {}
     mask = (u > 0).cpu().numpy()
-    if wanted & {"distance", "skeleton", "instances"}:
+    if wanted & {"distance", "skeleton", "instances", "radius"}:
         found["distance"] = distance = field_distance(u, grid, epsilon)
         if "skeleton" in wanted:
             found["skeleton"] = skeleton_of(distance, grid)
         if "instances" in wanted:
             found["instances"] = instances_of(distance, grid)
+        if "radius" in wanted:
+            found["radius"] = _radius(distance, grid)
     if wanted & {"kappa1", "kappa2"}:
         found["kappa1"], found["kappa2"] = _curvatures(u, mask, grid, epsilon)
-    if "radius" in wanted:
-        found["radius"] = local_thickness(mask, grid.spacing, periodic=grid.periodic) / 2
     if "betti" in wanted:
         found["betti"] = betti_numbers(mask, periodic=grid.periodic)
     return Labels(grid, **{name: value for name, value in ({"mask": mask} | found).items() if name in wanted})  # type: ignore[arg-type]
@@ -189,6 +190,15 @@ def _shell(mask: np.ndarray, grid: Grid) -> np.ndarray:
         inner[(slice(MARGIN, -MARGIN),) * 3] = True
         shell &= inner
     return shell
+
+
+def _radius(distance: np.ndarray, grid: Grid) -> np.ndarray:
+    """Half the local thickness; a periodic box is continued as far as balls that reach into it need."""
+    width = 2 * math.ceil(float(distance.max()) / min(grid.spacing)) + 4 if grid.periodic else 0
+    margin = [min(n // 2, width) for n in grid.shape]
+    padded = np.pad(distance > 0, [(m, m) for m in margin], mode="wrap")
+    inner = tuple(slice(m, m + n) for m, n in zip(margin, grid.shape, strict=True))
+    return local_thickness(padded, grid.spacing)[inner] / 2
 
 
 def _checked(field: Tensor | np.ndarray, grid: Grid, epsilon: float) -> Tensor:

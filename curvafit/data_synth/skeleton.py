@@ -10,6 +10,22 @@ from skimage.morphology import skeletonize
 
 from curvafit.priors.grid import Grid
 
+#: Of 27 voxels, numbered along x, y, z: the middle; as bits the 6 and the 18 nearest to it, and those that touch each,
+#: the middle aside, by a corner at least, or by a side and among the 18.
+MIDDLE = 13
+_PLACES = np.stack(np.unravel_index(np.arange(27), (3, 3, 3)), 1)
+_STEPS = np.abs(_PLACES[:, None] - _PLACES)
+
+
+def _bits(chosen: np.ndarray) -> np.ndarray:
+    return chosen @ (1 << np.arange(27))
+
+
+FACES = int(_bits(_STEPS[MIDDLE].sum(1) == 1))
+EIGHTEEN = int(_bits((_STEPS[MIDDLE].sum(1) > 0) & (_STEPS[MIDDLE].sum(1) < 3)))
+CORNERS = _bits(_STEPS.max(2) == 1) & ~(1 << MIDDLE)
+SIDES = _bits(_STEPS.sum(2) == 1) & EIGHTEEN
+
 
 def skeleton_of(distance: np.ndarray, grid: Grid) -> np.ndarray:
     """One-voxel wide curves in the middle of {distance > 0}, bool (Z, Y, X), with its pieces, tunnels and cavities.
@@ -34,7 +50,7 @@ def skeleton_of(distance: np.ndarray, grid: Grid) -> np.ndarray:
     order = np.flatnonzero(mask)
     order = order[np.argsort(distance.ravel()[order], kind="stable")]
     left = mask.astype(np.uint8)
-    _thin(left, lines & mask, order, grid.periodic)
+    _thin(left, lines & mask, order.copy(), grid.periodic)
     _thin(left, np.zeros_like(mask), order[left.ravel()[order] > 0], grid.periodic)
     return left.astype(bool)
 
@@ -43,62 +59,48 @@ def skeleton_of(distance: np.ndarray, grid: Grid) -> np.ndarray:
 def _thin(left, fixed, order, periodic):  # pragma: no cover
     """Take away simple voxels in the given order, again and again; ends (of one neighbour) and `fixed` ones stay."""
     nz, ny, nx = left.shape
-    around = np.zeros(27, dtype=np.uint8)
     changed = True
     while changed:
-        changed = False
+        changed, kept = False, 0
         for i in order:
             z, y, x = i // (ny * nx), i // nx % ny, i % nx
-            if not left[z, y, x] or fixed[z, y, x]:
+            if fixed[z, y, x]:
                 continue
-            count = 0
+            around, count = 0, 0
             for k in range(27):
                 a, b, c = z + k // 9 - 1, y + k // 3 % 3 - 1, x + k % 3 - 1
-                if periodic:
+                if a < 0 or b < 0 or c < 0 or a >= nz or b >= ny or c >= nx:
+                    if not periodic:
+                        continue
                     a, b, c = a % nz, b % ny, c % nx
-                within = 0 <= a < nz and 0 <= b < ny and 0 <= c < nx
-                around[k] = left[a, b, c] if within else 0
-                count += around[k]
-            if count > 2 and _simple(around):
+                if k != MIDDLE and left[a, b, c]:
+                    around |= 1 << k
+                    count += 1
+            if count > 1 and _simple(around):
                 left[z, y, x] = 0
                 changed = True
+            else:
+                order[kept] = i
+                kept += 1
+        order = order[:kept]
 
 
 @njit(cache=True)
 def _simple(around):  # pragma: no cover
-    """Whether the middle of 27 voxels can go: one 26-connected piece of the mask around it, and one 6-connected piece,
-    within its 18-neighbourhood, of what is outside and next to it (Bertrand and Malandain 1994)."""
-    return _pieces(around, 1) == 1 and _pieces(around, 0) == 1
+    """Whether the middle of 27 voxels can go, given those of the mask around it as bits: they are one 26-connected
+    piece, and what is outside and next to it is one 6-connected piece within its 18-neighbourhood (Bertrand and
+    Malandain 1994)."""
+    outside = ~around & EIGHTEEN
+    return outside & FACES != 0 and _joined(around, around, CORNERS) and _joined(outside, outside & FACES, SIDES)
 
 
 @njit(cache=True)
-def _pieces(around, value):  # pragma: no cover
-    """26-connected pieces of ones, or those 6-connected pieces of zeros in the 18-neighbourhood that touch a face."""
-    seen = np.zeros(27, dtype=np.bool_)
-    stack = np.zeros(27, dtype=np.int64)
-    seen[13] = True
-    pieces = 0
-    for start in range(27):
-        off = abs(start // 9 - 1) + abs(start // 3 % 3 - 1) + abs(start % 3 - 1)
-        if seen[start] or around[start] != value or (value == 0 and off != 1):
-            continue
-        pieces += 1
-        stack[0], top = start, 1
-        seen[start] = True
-        while top:
-            top -= 1
-            here = stack[top]
-            for other in range(27):
-                if seen[other] or around[other] != value:
-                    continue
-                dz, dy, dx = abs(other // 9 - here // 9), abs(other // 3 % 3 - here // 3 % 3), abs(other % 3 - here % 3)
-                if value == 1:
-                    joined = max(dz, dy, dx) == 1
-                else:
-                    corner = abs(other // 9 - 1) + abs(other // 3 % 3 - 1) + abs(other % 3 - 1) == 3
-                    joined = dz + dy + dx == 1 and not corner
-                if joined:
-                    seen[other] = True
-                    stack[top] = other
-                    top += 1
-    return pieces
+def _joined(bits, wanted, touching):  # pragma: no cover
+    """Whether all of the `wanted` ones among the bits are in one piece."""
+    piece, grown = 0, wanted & -wanted
+    while grown != piece:
+        piece = grown
+        for k in range(27):
+            if piece >> k & 1:
+                grown |= touching[k] & bits
+    return wanted & ~piece == 0
