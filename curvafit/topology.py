@@ -63,7 +63,8 @@ def betti_numbers(mask: np.ndarray, *, periodic: bool = False) -> tuple[int, int
 def _within(mask: np.ndarray, corners: bool) -> tuple[np.ndarray, int]:
     """Pieces within the box, and how many."""
     labels = np.empty(mask.shape, dtype=np.int32)
-    return labels, int(ndimage.label(mask, ndimage.generate_binary_structure(3, 3 if corners else 1), output=labels))
+    ndimage.label(mask, ndimage.generate_binary_structure(3, 3 if corners else 1), output=labels)
+    return labels, int(labels.max(initial=0))
 
 
 def _seams(labels: np.ndarray, corners: bool) -> np.ndarray:

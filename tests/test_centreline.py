@@ -17,6 +17,7 @@ from curvafit.data_synth.centreline import centreline, cycle_rank
 from curvafit.data_synth.centreline_files import write_graphml, write_swc
 from curvafit.data_synth.labels import labels_of
 from curvafit.priors.grid import Grid
+from curvafit.topology import betti_numbers
 
 CUBES, FLAT = (1.0, 1.0, 1.0), (1.5, 1.0, 0.75)
 MIDDLE = (24.2, 23.8, 24.1)
@@ -103,7 +104,9 @@ def test_a_periodic_tube_closes_on_itself(tmp_path: Path) -> None:
     assert kinds(graph) == {"loop": 1} and cycle_rank(graph) == 1
     (edge,) = (of for *_, of in graph.edges(data=True))
     assert edge["length"] == pytest.approx(40, abs=0.5)
-    assert edge["points"][-1] - edge["points"][0] == pytest.approx(np.array([0, 0, 40]) * np.sign(edge["points"][-1][2]))
+    assert edge["points"][-1] - edge["points"][0] == pytest.approx(
+        np.array([0, 0, 40]) * np.sign(edge["points"][-1][2])
+    )
     rows, cuts = read_swc(write_swc(graph, tmp_path / "a.swc", "um"))
     assert len(cuts) == 1 and np.ptp(rows[:, 2]) > 37
 
@@ -121,16 +124,18 @@ def test_cycles_are_the_tunnels_of_a_generated_shape(made, boundary: str, prune:
     assert (nx.number_connected_components(graph), cycle_rank(graph)) == found.betti[:2]
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("seed", "width", "level"), [(0, 1.8, 0.8), (1, 1.0, 0.5), (2, 1.2, -0.1), (3, 3.0, 0.0)])
 @pytest.mark.parametrize("boundary", ["periodic", "replicate"])
-def test_cycles_of_random_masks_without_cavities(seed: int, boundary: str) -> None:
-    box = Grid((28, 24, 32), 1.0, boundary)  # type: ignore[arg-type]
-    noise = ndimage.gaussian_filter(np.random.default_rng(seed).standard_normal(box.shape), 1.8, mode="wrap")
-    field = torch.from_numpy(noise / noise.std() - 0.8)
+def test_cycles_are_the_tunnels_of_random_masks(seed: int, width: float, level: float, boundary: str) -> None:
+    """However dense, with the rings within junctions; with cavities too."""
+    box = Grid((21, 24, 29), FLAT, boundary)  # type: ignore[arg-type]
+    noise = ndimage.gaussian_filter(np.random.default_rng(seed).standard_normal(box.shape), width, mode="wrap")
+    field = torch.from_numpy(noise / noise.std() - level)
     found = labels_of(field, box, 1.0, ("skeleton", "distance", "betti"))
     assert found.skeleton is not None and found.distance is not None and found.betti is not None
+    assert betti_numbers(found.skeleton, periodic=box.periodic) == found.betti
     graph = centreline(found.skeleton, found.distance, box)
-    assert found.betti[2] == 0 and found.betti[1] > 0
+    assert found.betti[1] > 0
     assert (nx.number_connected_components(graph), cycle_rank(graph)) == found.betti[:2]
 
 

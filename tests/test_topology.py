@@ -62,7 +62,9 @@ def test_laws_of_random_masks(seed: int) -> None:
 
 
 def test_pieces_are_numbered_in_order_and_joined_across_faces() -> None:
-    mask = solid((slice(0, 2), slice(0, 2), slice(0, 2)), (slice(4, 6),) * 3, (slice(9, 10), slice(10, 11), slice(11, 12)))
+    mask = solid(
+        (slice(0, 2), slice(0, 2), slice(0, 2)), (slice(4, 6),) * 3, (slice(9, 10), slice(10, 11), slice(11, 12))
+    )
     assert components(mask)[1] == 3
     labels, count = components(mask, periodic=True)
     assert count == 2 and labels.dtype == np.int32

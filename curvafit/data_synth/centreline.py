@@ -10,6 +10,7 @@ import numpy as np
 from scipy import ndimage
 
 from curvafit.priors.grid import Grid
+from curvafit.topology import betti_numbers
 
 #: Weights by which voxels' places are averaged along a line, twice, so that their steps do not count.
 SMOOTH = (1 / 9, 2 / 9, 3 / 9, 2 / 9, 1 / 9)
@@ -22,9 +23,9 @@ def centreline(skeleton: np.ndarray, distance: np.ndarray, grid: Grid, prune: fl
 
     Voxels of three or more neighbours are junctions, touching ones a single one at their mean; voxels of one neighbour
     are ends. Lines are smoothed over some voxels, as steps from voxel to voxel would make tilted ones up to a tenth too
-    long, and moved across themselves to where the distance is greatest. A free line that does not leave the ball around its
-    other node by more than a voxel is a spur and is left out, shortest first; where two lines remain at a junction they
-    become one. A piece that is so left with nothing is a node without edges. Neither changes the cycles.
+    long, and moved across themselves to where the distance is greatest. A free line that does not leave the ball around
+    its other node by more than a voxel is a spur and is left out, shortest first; where two lines remain at a junction
+    they become one. A piece that is so left with nothing is a node without edges. Neither changes the cycles.
 
     Parameters
     ----------
@@ -39,8 +40,9 @@ def centreline(skeleton: np.ndarray, distance: np.ndarray, grid: Grid, prune: fl
     Returns
     -------
     networkx.MultiGraph
-        Nodes 0, 1, … have `position` (z, y, x), `radius` and `kind` ("end", "junction", "point" without edges, "loop"
-        of a line that closes on itself); edges have `points` (N, 3) from the lesser node to the greater and `radii`
+        Nodes 0, 1, … have `position` (z, y, x), `radius`, `kind` ("end", "junction", "point" without edges, "loop" of a
+        line that closes on itself) and `rings`, tunnels some voxels wide within a junction, of which no edge is made,
+        nearly always 0; edges have `points` (N, 3) from the lesser node to the greater and `radii`
         (N,), both with the nodes' own, `length` and mean `radius`. All is in spacing's unit, the first voxel's centre
         at the origin. In a periodic box nodes are in the box and `points` run on beyond it.
 
@@ -54,6 +56,8 @@ def centreline(skeleton: np.ndarray, distance: np.ndarray, grid: Grid, prune: fl
     if not prune >= 0:
         raise ValueError(f"expected a share of the radius of at least 0, got {prune}")
     graph = _traced(np.asarray(skeleton, dtype=bool), distance, grid)
+    for node in list(graph):
+        _dissolve(graph, node)
     if prune > 0:
         _prune(graph, prune, np.array(grid.spacing))
     for _ in range(CENTRING):
@@ -62,8 +66,9 @@ def centreline(skeleton: np.ndarray, distance: np.ndarray, grid: Grid, prune: fl
 
 
 def cycle_rank(graph: nx.MultiGraph) -> int:
-    """How many edges can go before a piece falls apart or is a tree."""
-    return graph.number_of_edges() - graph.number_of_nodes() + nx.number_connected_components(graph)
+    """Independent cycles of edges, with the rings within junctions: the b1 of the skeleton, hence of its mask."""
+    edges = graph.number_of_edges() - graph.number_of_nodes() + nx.number_connected_components(graph)
+    return edges + sum(graph.nodes[node]["rings"] for node in graph)
 
 
 def _traced(skeleton: np.ndarray, distance: np.ndarray, grid: Grid) -> nx.MultiGraph:
@@ -78,7 +83,7 @@ def _traced(skeleton: np.ndarray, distance: np.ndarray, grid: Grid) -> nx.MultiG
     for k, members in enumerate(groups):
         cloud = np.stack(_unwrapped([places[i] for i in members], grid))
         radius = max(float(distance[tuple(places[i])]) for i in members)
-        graph.add_node(k, place=cloud.mean(0), radius=radius)
+        graph.add_node(k, place=cloud.mean(0), radius=radius, rings=_rings(cloud, grid))
     seen: set[int] = set()
     for i, k in list(node.items()):
         for first in beside[i]:
@@ -93,9 +98,21 @@ def _traced(skeleton: np.ndarray, distance: np.ndarray, grid: Grid) -> nx.MultiG
             node[i] = len(graph)
             path = _walk(i, beside[i][0], beside, node)
             seen.update(path)
-            graph.add_node(node[i], place=places[i].astype(float), radius=float(distance[tuple(places[i])]))
+            graph.add_node(node[i], place=places[i].astype(float), radius=float(distance[tuple(places[i])]), rings=0)
             _join(graph, node[i], node[i], [places[j] for j in path], grid)
     return graph
+
+
+def _rings(cloud: np.ndarray, grid: Grid) -> int:
+    """Tunnels among the voxels of a junction, places (N, 3)."""
+    if len(cloud) < 4:
+        return 0
+    low = cloud.min(0)
+    size = (cloud.max(0) - low).astype(int) + 1
+    around = grid.periodic and bool((2 * size > grid.shape).any())  # it may close on itself around the box
+    voxels = np.zeros(grid.shape if around else size, dtype=bool)
+    voxels[tuple((cloud - low).astype(int).T % np.array(voxels.shape)[:, None])] = True
+    return betti_numbers(voxels, periodic=around)[1]
 
 
 def _neighbours(places: np.ndarray, number: np.ndarray, grid: Grid) -> list[list[int]]:
@@ -173,7 +190,7 @@ def _spurs(graph: nx.MultiGraph, share: float, spacing: np.ndarray) -> Iterable[
 def _dissolve(graph: nx.MultiGraph, node: int) -> None:
     """Make the two edges of a node one."""
     edges = list(graph.edges(node, keys=True, data="line"))
-    if graph.degree(node) != 2 or len(edges) != 2:
+    if graph.degree(node) != 2 or len(edges) != 2 or graph.nodes[node]["rings"]:
         return
     (_, one, _, first), (_, other, _, second) = edges
     first = first if node > one else first[::-1]  # towards the node
@@ -241,9 +258,9 @@ def _finished(traced: nx.MultiGraph, distance: np.ndarray, grid: Grid) -> nx.Mul
     number = {node: k for k, node in enumerate(sorted(traced))}
     for node, k in number.items():
         place, degree = traced.nodes[node]["place"], traced.degree(node)
-        kind = ("point", "end", "loop")[degree] if degree < 3 else "junction"
+        kind = ("point", "end", "loop" if traced.has_edge(node, node) else "junction", "junction")[min(degree, 3)]
         home = (place % grid.shape if grid.periodic else place) * spacing
-        graph.add_node(k, position=home, radius=traced.nodes[node]["radius"], kind=kind)
+        graph.add_node(k, position=home, kind=kind, **{of: traced.nodes[node][of] for of in ("radius", "rings")})
     for one, other, line in traced.edges(data="line"):
         if one > other:
             one, other = other, one

@@ -18,8 +18,8 @@ UNDEFINED = 0
 def write_graphml(graph: nx.MultiGraph, path: str | Path, unit: str = "voxel") -> Path:
     """Write a `centreline` as GraphML.
 
-    Nodes have `z`, `y`, `x`, `radius` and `kind`; edges `length`, `radius`, and as text `points` ("z y x" separated by
-    commas, from the edge's source to its target) and `radii`; the graph has its `unit` of length.
+    Nodes have `z`, `y`, `x`, `radius`, `kind` and `rings`; edges `length`, `radius`, and as text `points` ("z y x" and
+    a comma between two, from the lesser node to the greater) and `radii`; the graph has its `unit` of length.
 
     Raises
     ------
@@ -30,7 +30,7 @@ def write_graphml(graph: nx.MultiGraph, path: str | Path, unit: str = "voxel") -
     plain = nx.MultiGraph(unit=unit)
     for node, of in graph.nodes(data=True):
         z, y, x = map(float, of["position"])
-        plain.add_node(node, z=z, y=y, x=x, radius=float(of["radius"]), kind=of["kind"])
+        plain.add_node(node, z=z, y=y, x=x, radius=float(of["radius"]), kind=of["kind"], rings=of["rings"])
     for one, other, of in graph.edges(data=True):
         points = ",".join(" ".join(f"{v:.7g}" for v in point) for point in of["points"])
         radii = " ".join(f"{r:.7g}" for r in of["radii"])
