@@ -43,7 +43,7 @@ def write_swc(graph: nx.MultiGraph, path: str | Path, unit: str) -> Path:
 
     Each piece is a tree from its widest end (or widest node); parents come before their children, a root's is -1. SWC
     holds no loops: of each, the thinnest edge is cut off from one of its nodes, and a comment names the two points that
-    the cut parts. Pieces of a periodic box are laid out beyond it.
+    the cut parts. Pieces of a periodic box are laid out beyond it. The origin is the first voxel's centre.
 
     Parameters
     ----------
