@@ -12,7 +12,7 @@ import numpy as np
 from curvafit.data_synth.imaging import TRIPLES, Imaging, field_shape, image, image_shape, known_fields, regrid
 from curvafit.data_synth.randomness import seeds_of
 
-__all__ = ["MODALITIES", "Imaging", "Modality", "field_shape", "image", "image_shape", "regrid"]
+__all__ = ["Imaging", "Modality", "field_shape", "image", "image_shape", "regrid"]
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,3 @@ def _between(low: Any, high: Any, share: float) -> Any:
     positive = bool(np.all(a > 0) and np.all(b > 0))
     value = np.exp(np.log(a) + share * (np.log(b) - np.log(a))) if positive else a + share * (b - a)
     return tuple(value.tolist()) if value.ndim else float(value)
-
-
-#: Six kinds. Numbers are orders of magnitude: what each rests on is said beside it.
-MODALITIES: dict[str, Modality] = {}

@@ -1,0 +1,172 @@
+"""What a real scan tells of how it was made: noise, blur, levels, textures; as a modality to draw images from."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from scipy import ndimage, optimize
+from skimage.filters import threshold_otsu
+
+from curvafit.data_synth.imaging import Imaging
+from curvafit.data_synth.modality import Modality
+from curvafit.data_synth.noise_estimate import Noise, background_of, noise_of
+from curvafit.data_synth.optics import blur
+from curvafit.scan import Field
+
+#: Voxels that are looked at; of a larger scan the middle.
+MOST = 2_000_000
+#: Deviation, in voxels of the finest edge, of the window that the structure's brightness is averaged in.
+WINDOW = 4.0
+#: Deviation, in the same, of the smoothing before voxels are told apart.
+SMOOTH = 0.8
+#: What a drawn parameter is the estimate's, low and high.
+SPREAD: dict[str, tuple[float, float]] = {
+    "background": (0.8, 1.25),
+    "foreground": (0.7, 1.4),
+    "background_texture": (0.7, 1.4),
+    "foreground_texture": (0.7, 1.4),
+    "blur": (0.8, 1.25),
+    "bias": (0.5, 1.5),
+    "gain": (0.7, 1.4),
+    "read_noise": (0.7, 1.4),
+}
+
+
+class Structure(NamedTuple):
+    """What the mask's surroundings tell: blur in lengths (z, y, x), mean contrast, its relative deviation."""
+
+    blur: tuple[float, float, float]
+    contrast: float
+    texture: float
+
+
+def like(scan: Field, mask: np.ndarray | None = None) -> Modality:
+    """A modality whose images look like a scan: its spacing, levels, textures, blur, noise and uneven light.
+
+    Assumed: two classes; a Gaussian blur, one width in the plane and one along z; noise whose variance is a line over
+    the mean (`noise_of`). Not seen: growth with depth, stripes, rings, lost stain and clutter, which stay 0. The blur
+    is the one that makes the mask, times a brightness averaged over some voxels, most like the scan.
+
+    Parameters
+    ----------
+    scan
+        Values of any type; one of whole numbers is taken to saturate at the highest that its type holds.
+    mask
+        The structure's voxels, (Z, Y, X). By default the bright ones: Otsu's, then those above half of the brightness
+        around them.
+
+    Returns
+    -------
+    Modality
+        `base` holds the estimates, `ranges` their surroundings (`SPREAD`); `voxel` is the finest edge of the scan's.
+
+    Raises
+    ------
+    ValueError
+        If the scan is under eight voxels along an axis, not finite or constant, or the mask is of another shape, empty
+        or full.
+    """
+    values, given = _middle(scan, mask)
+    steps = np.array(scan.spacing)
+    inside = _bright(values, steps) if given is None else given
+    if not inside.any() or inside.all():
+        raise ValueError("expected a mask with voxels inside and outside, got an empty or a full one")
+    ground = background_of(values, inside, steps)
+    structure, _ = _structure(values, inside, steps, ground.level)
+    noise = noise_of(values, inside, ground, steps, ground.level + structure.contrast)
+    base = _imaging(scan, structure, noise)
+    ranges = {name: _around(getattr(base, name), *ends) for name, ends in SPREAD.items() if np.any(getattr(base, name))}
+    about = f"estimated from {scan.source or 'a scan'}, {'its mask' if given is not None else 'without a mask'}"
+    return Modality("like", about, float(min(scan.spacing)), base, ranges)
+
+
+def _imaging(scan: Field, structure: Structure, noise: Noise) -> Imaging:
+    """Levels in photons where the variance grows with the mean; textures as they were before the blur."""
+    unit = noise.gain or 1.0
+    low = max(noise.level - noise.offset, 0.0) / unit
+    high = max(noise.level + structure.contrast - noise.offset, 0.0) / unit
+    shrunk = math.prod(1 + 2 * (σ / noise.length) ** 2 for σ in structure.blur) ** 0.25
+    length = math.sqrt(max(noise.length**2 - 2 * min(structure.blur) ** 2, min(scan.spacing) ** 2))
+    whole = scan.values.dtype.kind in "bui"
+    return Imaging(
+        unit=scan.unit,
+        spacing=scan.spacing,
+        background=low,
+        foreground=high,
+        background_texture=min(noise.texture * shrunk / max(low * unit, 1e-9), 2.0),
+        texture_length=length,
+        foreground_texture=min(structure.texture * structure.contrast / max(high * unit, 1e-9), 2.0),
+        foreground_length=WINDOW * min(scan.spacing),
+        blur=structure.blur,
+        bias=min(noise.bias, 0.9),
+        bias_length=max(n * h for n, h in zip(scan.shape, scan.spacing, strict=True)) / 2,
+        gain=noise.gain,
+        read_noise=noise.read_noise,
+        offset=noise.offset,
+        noise_width=noise.width,
+        ceiling=float(np.iinfo(scan.values.dtype).max) if whole and scan.values.dtype.kind != "b" else None,
+    )
+
+
+def _middle(scan: Field, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
+    if min(scan.shape) < 8:
+        raise ValueError(f"expected a scan of at least 8 voxels along each axis, got {scan.shape}")
+    if mask is not None and np.shape(mask) != scan.shape:
+        raise ValueError(f"expected a mask of the scan's shape {scan.shape}, got {np.shape(mask)}")
+    sides = list(scan.shape)
+    while math.prod(sides) > MOST:
+        sides[int(np.argmax(sides))] -= 8
+    box = tuple(slice((n - side) // 2, (n - side) // 2 + side) for n, side in zip(scan.shape, sides, strict=True))
+    values = scan.values[box].astype(np.float32)
+    if not np.isfinite(values).all() or values.min() == values.max():
+        raise ValueError("expected a scan of finite values that vary, got NaN, infinity or one value")
+    return values, None if mask is None else np.asarray(mask)[box].astype(bool)
+
+
+def _bright(values: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Voxels above half of the brightness of Otsu's voxels around them, each weighed by its own: an edge is then where
+    it is whatever a structure's brightness."""
+    finest = steps.min() / steps
+    smooth = ndimage.gaussian_filter(values, SMOOTH * finest)
+    threshold = threshold_otsu(smooth)
+    above: np.ndarray = smooth > threshold
+    contrast = smooth - np.median(smooth[~above])
+    bright = np.where(above, contrast, 0)
+    weight = ndimage.gaussian_filter(bright, WINDOW * finest)
+    local = ndimage.gaussian_filter(bright**2, WINDOW * finest) / np.maximum(weight, 1e-6 * weight.max())
+    return np.logical_and(contrast > local / 2, ndimage.maximum_filter(above, size=3))
+
+
+def _structure(values: np.ndarray, inside: np.ndarray, steps: np.ndarray, level: float) -> tuple[Structure, np.ndarray]:
+    """The blur (z, and y = x) whose image of the mask is nearest to the scan around it; the brightness everywhere."""
+    finest = steps.min() / steps
+    window = tuple(WINDOW * finest)
+    signal, mask = (torch.from_numpy(each)[None, None].float() for each in (values - level, inside))
+    near = blur(mask, 1.0, tuple(2 * finest)) > 0.02
+
+    def brightness(blurred: torch.Tensor) -> torch.Tensor:
+        weight = blur(blurred * blurred, 1.0, window)
+        return blur(signal * blurred, 1.0, window) / weight.clamp_min(1e-6)
+
+    def misfit(logs: np.ndarray) -> float:
+        blurred = blur(mask, 1.0, tuple(np.exp(logs[[0, 1, 1]])))
+        return float((signal - brightness(blurred) * blurred)[near].square().mean())
+
+    corner = np.log([max(finest[0], 0.5), 1.0])
+    simplex = corner + np.array([[0, 0], [0.5, 0], [0, 0.5]])
+    options = {"xatol": 0.02, "fatol": math.inf, "maxfev": 80, "initial_simplex": simplex}
+    widths = np.exp(optimize.minimize(misfit, corner, method="Nelder-Mead", options=options).x[[0, 1, 1]])
+    everywhere = brightness(blur(mask, 1.0, tuple(widths)))
+    bright = everywhere[mask > 0]
+    bright = bright.maximum(0.02 * bright.abs().median())
+    z, y, x = (np.sqrt(np.maximum(widths**2 - 1 / 12, 0)) * steps).tolist()
+    return Structure((z, y, x), float(bright.mean()), float(bright.std() / bright.mean())), everywhere[0, 0].numpy()
+
+
+def _around(value: Any, low: float, high: float) -> tuple[Any, Any]:
+    if isinstance(value, tuple):
+        return tuple(low * each for each in value), tuple(high * each for each in value)
+    return low * value, high * value
