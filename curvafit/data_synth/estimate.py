@@ -128,11 +128,11 @@ def _middle(scan: Field, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarra
 
 def _bright(values: np.ndarray, steps: np.ndarray) -> np.ndarray:
     """Voxels above half of the brightness of Otsu's voxels around them, each weighed by its own: an edge is then where
-    it is whatever a structure's brightness."""
+    it is whatever a structure's brightness. The threshold is sought on square roots, so that dim structures count."""
     finest = steps.min() / steps
     smooth = ndimage.gaussian_filter(values, SMOOTH * finest)
-    threshold = threshold_otsu(smooth)
-    above: np.ndarray = smooth > threshold
+    root = np.sqrt(np.maximum(smooth - np.quantile(smooth, 0.001), 0))
+    above: np.ndarray = root > threshold_otsu(root)
     contrast = smooth - np.median(smooth[~above])
     bright = np.where(above, contrast, 0)
     weight = ndimage.gaussian_filter(bright, WINDOW * finest)

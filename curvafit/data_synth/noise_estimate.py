@@ -75,7 +75,8 @@ def noise_of(values: np.ndarray, inside: np.ndarray, ground: Background, steps: 
     """The line of variance over mean through the residuals' bins and the background, if it rises by the structure.
 
     The line is gain · mean + rest. A negative rest is an offset, -rest / gain, a positive one read noise: of the two
-    that a line cannot tell apart, the smaller. Where it does not rise, noise is the background's everywhere.
+    that a line cannot tell apart, the smaller. The offset is no brighter than the background's darkest voxels: fine
+    structure that passes for noise makes no steeper line. Where it does not rise, noise is the background's everywhere.
     """
     rest = ground.level, ground.texture, ground.length, ground.bias
     lines = _bins(values, inside, ground, steps)
@@ -84,6 +85,8 @@ def noise_of(values: np.ndarray, inside: np.ndarray, ground: Background, steps: 
         mean, variance, count = np.array(lines).T
         rise = count * (mean - ground.level)
         gain = max(float((rise * (variance - ground.noise)).sum() / (rise * (mean - ground.level)).sum()), 0.0)
+    darkest = float(np.quantile(values[ground.where], 0.001))
+    gain = min(gain, ground.noise / max(ground.level - darkest, 1e-12))
     if ground.noise + gain * (high - ground.level) < GROWS * ground.noise:
         floor = 0.0 if ground.level > 2 * ground.texture else ground.level - (high - ground.level)
         return Noise(0.0, math.sqrt(ground.noise), floor, ground.width, *rest)
@@ -130,7 +133,7 @@ def _bins(
     mean = ndimage.gaussian_filter(values, 1.5 * steps.min() / steps)
     top = values.max()
     used = inside & (ndimage.maximum_filter(values, 3) < top) if (values == top).mean() > 1e-5 else inside
-    passed = _passed(ground.width[1])
+    passed = max(_variance(residual[ground.where]), 1e-12) / max(ground.noise, 1e-12)
     found = []
     edges = np.quantile(mean[used], np.linspace(0, 1, BINS + 1)) if used.any() else np.zeros(1)
     for low, high in itertools.pairwise(edges):
@@ -144,10 +147,3 @@ def _variance(residual: np.ndarray) -> float:
     """Of what is within four deviations, these being the median's."""
     square = np.square(residual)
     return float(square[square < 16 * np.median(square) / 0.455].mean())
-
-
-def _passed(width: float) -> float:
-    """Variance of `RESIDUAL`'s answer to noise of variance 1, smoothed in the plane by `width` voxels."""
-    lag = np.arange(-2, 3)
-    correlation = np.exp(-((lag / (2 * width)) ** 2)) if width else (lag == 0).astype(float)
-    return float(correlation @ np.convolve((1, -2, 1), (1, -2, 1))) ** 2
