@@ -84,7 +84,7 @@ def test_monai_reads_it(tmp_path, order):
 
     folder = build_set(tmp_path / "set", Order(order.recipe, "monai"), 2)
     pairs = data.load_decathlon_datalist(str(folder / "dataset.json"), data_list_key="training")
-    read = LoadImaged(keys=("image", "label"))(pairs[1])
+    read = LoadImaged(keys=("image", "label"), reader="NibabelReader")(pairs[1])
     assert read["image"].shape == read["label"].shape == SHAPE[::-1]
     assert np.diag(read["image"].affine.numpy())[:3].tolist() == [-0.5, -0.5, 1.0] or np.abs(
         np.diag(read["image"].affine.numpy())[:3]

@@ -8,23 +8,36 @@ if __name__ != "curvafit.data_synth":
 from curvafit.data_synth.atlas import build, diagrams, extend
 from curvafit.data_synth.design import INTERVALS, Design, Draw, around, boxed
 from curvafit.data_synth.design_file import read_design
+from curvafit.data_synth.labels import Labels, labels_of
+from curvafit.data_synth.modalities import MODALITIES
+from curvafit.data_synth.modality import Imaging, Modality
 from curvafit.data_synth.store import Record, Settings, Store, open_store
+from curvafit.data_synth.training import TextureDataset, as_dict, as_monai, as_subject
 from curvafit.data_synth.workers import Cluster, cluster
 
 __all__ = [
     "INTERVALS",
+    "MODALITIES",
     "Cluster",
     "Design",
     "Draw",
+    "Imaging",
+    "Labels",
+    "Modality",
     "Record",
     "Settings",
     "Store",
+    "TextureDataset",
     "around",
+    "as_dict",
+    "as_monai",
+    "as_subject",
     "boxed",
     "build",
     "cluster",
     "diagrams",
     "extend",
+    "labels_of",
     "open_store",
     "read_design",
 ]

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from curvafit.data_synth.case import Case, Recipe
-from curvafit.data_synth.centreline import centreline, write_graphml, write_swc
+from curvafit.data_synth.centreline import centreline
+from curvafit.data_synth.centreline_files import write_graphml, write_swc
 from curvafit.data_synth.draws import versions
 from curvafit.data_synth.labels import NAMES, labels_of
 from curvafit.data_synth.layouts import LAYOUTS, About
@@ -204,7 +205,7 @@ def _write_parts(order: Order, case: Case, place: Callable[[str], Path], places:
                 target = place(part)
                 target = target.with_name(target.name.partition(".")[0] + suffix)
                 places.append(target)
-                write(graph, target)
+                write(graph, target, case.unit)
         elif part == "betti":
             known[part] = list(found.betti)  # type: ignore[union-attr,arg-type]
         else:
