@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from curvafit.data_synth.randomness import correlated, seeds_of, stream, uniform
-from curvafit.data_synth.separable import bell, checked, triple
+from curvafit.data_synth.separable import bell, checked, edges
 from curvafit.priors.shapes import Float
 
 #: How fast the stain fades at the end of a lost stretch: a part of the random field's deviation.
@@ -34,7 +34,7 @@ def bias(
     """
     if not 0 <= strength <= 1 or not length > 0:
         raise ValueError(f"expected a bias in [0, 1] and a positive length, got {strength} and {length}")
-    field = correlated(like, [length / h for h in triple(spacing, "a spacing")], seeds, "bias")
+    field = correlated(like, [length / h for h in edges(spacing)], seeds, "bias")
     low, high = field.amin((1, 2, 3, 4), keepdim=True), field.amax((1, 2, 3, 4), keepdim=True)
     middle, half = (high + low) / 2, ((high - low) / 2).clamp_min(torch.finfo(field.dtype).tiny)
     return (field - middle).mul_(strength / half).add_(1)
@@ -56,7 +56,7 @@ def stripes(
         raise ValueError(
             f"expected stripes from 0, a width above 0 and an axis 0 to 2, got {strength}, {width}, {axis}"
         )
-    lengths = [width / h for h in triple(spacing, "a spacing")]
+    lengths = [width / h for h in edges(spacing)]
     lengths[axis] = math.inf
     return correlated(like, lengths, seeds, "stripes").mul_(strength).add_(1).clamp_min_(0).expand(like.shape)
 
@@ -82,7 +82,7 @@ def rings(
     """
     if not 0 <= strength < math.inf or not width > 0:
         raise ValueError(f"expected rings from 0 and a width above 0, got {strength} and {width}")
-    steps = triple(spacing, "a spacing")
+    steps = edges(spacing)
     made = [_rings(like[k : k + 1], steps, width, seed, centre) for k, seed in enumerate(seeds_of(seeds, len(like)))]
     return torch.cat(made) * strength
 
@@ -108,7 +108,7 @@ def dropout(
     if not (0 <= share <= 1 and 0 <= loss <= 1 and length > 0):
         raise ValueError(f"expected a share and a loss in [0, 1] and a length above 0, got {share}, {loss}, {length}")
     inside = checked(occupied, "an occupancy") >= 0.5
-    field = correlated(occupied, [length / h for h in triple(spacing, "a spacing")], seeds, "dropout")
+    field = correlated(occupied, [length / h for h in edges(spacing)], seeds, "dropout")
     level = [_upper(each[within], share) for each, within in zip(field, inside, strict=True)]
     threshold = torch.stack(level)[:, None, None, None, None]
     return 1 - loss * torch.sigmoid((field - threshold) / FADING)
@@ -131,7 +131,7 @@ def clutter(
     if not 0 <= density < math.inf or not radius > 0:
         raise ValueError(f"expected a density from 0 and a positive radius, got {density} and {radius}")
     checked(occupied, "an occupancy")
-    steps = triple(spacing, "a spacing")
+    steps = edges(spacing)
     each = [
         _specks(occupied[k : k + 1], steps, density, radius, seed)
         for k, seed in enumerate(seeds_of(seeds, len(occupied)))
@@ -180,7 +180,7 @@ def _specks(occupied: Tensor, steps: Sequence[float], density: float, radius: fl
     height = (0.5 + 0.5 * drawn[:, 0]) * free.any(1)
     width = radius * (0.5 + drawn[:, 1:4])
     z, y, x = (_bells(n, h, place[:, k], width[:, k]) for k, (n, h) in enumerate(zip(shape, steps, strict=True)))
-    planes = (height[:, None, None] * z[:, :, None] * y[:, None, :]).reshape(count, -1)
+    planes = (height[:, None, None] * z[:, :, None] * y[:, None, :]).flatten(1)
     return (planes.mT @ x).reshape(occupied.shape).clamp_max_(1)
 
 

@@ -7,9 +7,10 @@ whatever else is applied. `curvafit.data_synth.modality.image` chains them.
 
 from curvafit.data_synth.artefacts import bias, clutter, dropout, rings, stripes
 from curvafit.data_synth.noise import digitised, gaussian_noise, poisson, poisson_gaussian, rician
-from curvafit.data_synth.optics import blur, blur_with_depth, intensities, occupancy, sample, texture
+from curvafit.data_synth.optics import EPSILON, blur, blur_with_depth, intensities, occupancy, sample, texture
 
 __all__ = [
+    "EPSILON",
     "bias",
     "blur",
     "blur_with_depth",

@@ -98,7 +98,7 @@ def _imaging(scan: Field, structure: Structure, noise: Noise) -> Imaging:
         foreground=high,
         background_texture=min(noise.texture * shrunk / max(low * unit, 1e-9), 2.0),
         texture_length=length,
-        foreground_texture=min(structure.texture * structure.contrast / max(high * unit, 1e-9), 2.0),
+        foreground_texture=min(structure.texture * abs(structure.contrast) / max(high * unit, 1e-9), 2.0),
         foreground_length=WINDOW * min(scan.spacing),
         blur=structure.blur,
         bias=min(noise.bias, 0.9),
@@ -161,9 +161,11 @@ def _structure(values: np.ndarray, inside: np.ndarray, steps: np.ndarray, level:
     widths = np.exp(optimize.minimize(misfit, corner, method="Nelder-Mead", options=options).x[[0, 1, 1]])
     everywhere = brightness(blur(mask, 1.0, tuple(widths)))
     bright = everywhere[mask > 0]
-    bright = bright.maximum(0.02 * bright.abs().median())
+    bright = bright[bright * bright.mean() > 0]
     z, y, x = (np.sqrt(np.maximum(widths**2 - 1 / 12, 0)) * steps).tolist()
-    return Structure((z, y, x), float(bright.mean()), float(bright.std() / bright.mean())), everywhere[0, 0].numpy()
+    return Structure((z, y, x), float(bright.mean()), abs(float(bright.std() / bright.mean()))), everywhere[
+        0, 0
+    ].numpy()
 
 
 def _around(value: Any, low: float, high: float) -> tuple[Any, Any]:

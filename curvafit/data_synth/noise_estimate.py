@@ -87,8 +87,8 @@ def noise_of(values: np.ndarray, inside: np.ndarray, ground: Background, steps: 
         gain = max(float((rise * (variance - ground.noise)).sum() / (rise * (mean - ground.level)).sum()), 0.0)
     darkest = float(np.quantile(values[ground.where], 0.001))
     gain = min(gain, ground.noise / max(ground.level - darkest, 1e-12))
-    if ground.noise + gain * (high - ground.level) < GROWS * ground.noise:
-        floor = 0.0 if ground.level > 2 * ground.texture else ground.level - (high - ground.level)
+    if gain * abs(high - ground.level) < (GROWS - 1) * ground.noise:
+        floor = 0.0 if ground.level > 2 * ground.texture else ground.level - abs(high - ground.level)
         return Noise(0.0, math.sqrt(ground.noise), floor, ground.width, *rest)
     constant = ground.noise - gain * ground.level
     offset = max(-constant / gain, 0.0)

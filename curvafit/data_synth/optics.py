@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from curvafit.data_synth.randomness import correlated
-from curvafit.data_synth.separable import Triple, along, checked, gaussian, sampling, triple
+from curvafit.data_synth.separable import along, checked, edges, gaussian, sampling, triple
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
 from curvafit.priors.profile import profile_distance
 from curvafit.priors.shapes import Float
@@ -69,7 +69,7 @@ def texture(
     if not 0 <= deviation < math.inf or not length > 0:
         raise ValueError(f"expected a deviation from 0 and a positive length, got {deviation} and {length}")
     spread = math.sqrt(math.log1p(deviation**2))
-    lengths = [length / h for h in triple(spacing, "a spacing")]
+    lengths = [length / h for h in edges(spacing)]
     return correlated(like, lengths, seeds, purpose).mul_(spread).sub_(spread**2 / 2).exp_()
 
 
@@ -78,7 +78,7 @@ def blur(
 ) -> Float[Tensor, "b 1 z y x"]:
     """A Gaussian point-spread function of standard deviations `widths` along (z, y, x)."""
     checked(image, "an image")
-    steps, σ = triple(spacing, "a spacing"), triple(widths, "a blur")
+    steps, σ = edges(spacing), triple(widths, "a blur")
     return along(image, *(gaussian(n, s / h, image) for n, s, h in zip(image.shape[2:], σ, steps, strict=True)))
 
 
@@ -103,7 +103,7 @@ def blur_with_depth(
     if not (0 <= growth < math.inf and 0 <= attenuation < math.inf):
         raise ValueError(f"expected a growth and an attenuation from 0, got {growth} and {attenuation}")
     checked(image, "an image")
-    steps, σ = triple(spacing, "a spacing"), triple(widths, "a blur")
+    steps, σ = edges(spacing), triple(widths, "a blur")
     depth = (torch.arange(image.shape[2], device=image.device, dtype=image.dtype) + 0.5) * steps[0]
     wider = 1 + growth * depth[:, None]
     z, y, x = (s / h * wider if s else None for s, h in zip(σ, steps, strict=True))
@@ -128,16 +128,9 @@ def sample(
         If a spacing is not positive, or the image not finite.
     """
     checked(image, "an image")
-    old, new, wide = _edges(spacing), _edges(onto), triple(window, "a window")
+    old, new, wide = edges(spacing), edges(onto), triple(window, "a window")
     every = zip(image.shape[2:], old, new, wide, strict=True)
     return along(image, *(sampling(n, h, to, over, image) for n, h, to, over in every))
-
-
-def _edges(spacing: float | Sequence[float]) -> Triple:
-    steps = triple(spacing, "a spacing")
-    if not all(steps):
-        raise ValueError(f"expected a spacing of 3 positive numbers (z, y, x), got {spacing!r}")
-    return steps
 
 
 def _levels(levels: Sequence[float]) -> tuple[float, float]:

@@ -97,3 +97,11 @@ def triple(value: float | Sequence[float], name: str) -> Triple:
     if len(numbers) != 3 or not all(math.isfinite(h) and h >= 0 for h in numbers):
         raise ValueError(f"expected {name} of 3 numbers (z, y, x) from 0, got {value!r}")
     return float(numbers[0]), float(numbers[1]), float(numbers[2])
+
+
+def edges(spacing: float | Sequence[float]) -> Triple:
+    """A spacing: three lengths above 0, or one for all."""
+    steps = triple(spacing, "a spacing")
+    if not all(steps):
+        raise ValueError(f"expected a spacing of 3 positive numbers (z, y, x), got {spacing!r}")
+    return steps

@@ -1,0 +1,141 @@
+"""Uneven light, stripes, rings, lost stain, clutter: ranges, amplitudes, geometry; and what is no volume."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+from exact import Cylinder, centres
+from scipy import ndimage
+from torch import Tensor
+
+from curvafit.data_synth import degrade
+from curvafit.priors.grid import Grid
+from curvafit.priors.profile import optimal_profile
+
+N = 40
+GRID = Grid((N, N, N), (1.0, 1.0, 1.0))
+EMPTY = torch.zeros((1, 1, N, N, N), dtype=torch.float64)
+TUBE = optimal_profile(Cylinder(4.0, (1, 0.2, 0.1), (20, 20, 20)).distance(centres(GRID)), degrade.EPSILON)[None, None]
+FULL = degrade.occupancy(TUBE)
+
+
+def test_bias_has_its_range_and_is_smooth() -> None:
+    factor = degrade.bias(EMPTY.expand(3, 1, N, N, N), 1.0, 0.3, 25.0, [1, 2, 3])
+    assert factor.amin((1, 2, 3, 4)).tolist() == pytest.approx([0.7] * 3)
+    assert factor.amax((1, 2, 3, 4)).tolist() == pytest.approx([1.3] * 3)
+    assert float(factor.diff(dim=-1).abs().max()) < 0.08
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_stripes(axis: int) -> None:
+    factor = degrade.stripes(EMPTY, (1.0, 1.0, 1.0), 0.1, 1.0, [4], axis)
+    assert float(factor.diff(dim=axis - 3).abs().max()) == 0
+    profile = factor.select(axis - 3, 0)
+    assert float(profile.mean()) == pytest.approx(1, abs=0.02) and float(profile.std()) == pytest.approx(0.1, rel=0.1)
+    off = profile - 1
+    assert float((off[..., 1:] * off[..., :-1]).mean() / 0.01) == pytest.approx(math.exp(-0.5), abs=0.12)
+    assert float(degrade.stripes(EMPTY, 1.0, 3.0, 1.0, [4]).amin()) == 0
+
+
+def test_rings() -> None:
+    spacing, centre = (1.0, 0.5, 0.5), (11.0, 4.0)
+    term = degrade.rings(EMPTY, spacing, 0.2, 1.0, [3], centre)[0, 0]
+    assert float(term.std()) == pytest.approx(0.2, rel=0.15) and float(term.mean()) == pytest.approx(0, abs=0.02)
+    y, x = (0.5 * (torch.arange(N) + 0.5) - at for at in centre)
+    radius = torch.hypot(y[:, None], x)
+    for low in (3.0, 6.0, 9.0):
+        ring = (radius > low) & (radius < low + 0.1)
+        around = term[:, ring]
+        assert around.shape[1] > 5
+        assert float(around.std(1).mean()) < 0.3 * float(term[:, radius < 12].std())
+    neighbours = (term[1:] * term[:-1]).mean() / term.square().mean()
+    assert abs(float(neighbours)) < 0.1
+
+
+def test_dropout_takes_its_share() -> None:
+    for share in (0.0, 0.25, 1.0):
+        left = degrade.dropout(FULL, 1.0, share, 8.0, 0.8, [6])
+        inside = FULL >= 0.5
+        assert float((left[inside] < 0.6).double().mean()) == pytest.approx(share, abs=2 / int(inside.sum()))
+        assert float(left.amin()) >= 0.2 - 1e-6 and float(left.amax()) <= 1
+    assert degrade.dropout(FULL, 1.0, 0.0, 8.0, 0.8, [6]).unique().tolist() == [1]
+
+
+def test_dropout_fades_whole_stretches_of_a_thin_tube() -> None:
+    left = degrade.dropout(FULL, 1.0, 0.3, 10.0, 1.0, [2])[0, 0]
+    core = FULL[0, 0] == 1
+    across = torch.stack([left[z][core[z]].std() for z in range(N)]).mean()
+    along = torch.stack([left[z][core[z]].mean() for z in range(N)]).std()
+    assert float(across) < 0.5 * float(along)
+
+
+def test_clutter_is_outside_and_as_dense() -> None:
+    density = 4e-4
+    terms = [degrade.clutter(FULL, 1.0, density, 1.0, [seed]) for seed in range(12)]
+    assert all(float(term[FULL == 1].abs().max()) == 0 and float(term.amin()) >= 0 for term in terms)
+    assert all(float(term.amax()) <= 1 for term in terms)
+    counts = [ndimage.label(term[0, 0].numpy() > 0.3)[1] for term in terms]
+    expected = 12 * density * N**3
+    assert sum(counts) == pytest.approx(expected, abs=4 * expected**0.5)
+    widths = sum(float(degrade.clutter(EMPTY, 1.0, density, 1.0, [seed]).sum()) for seed in range(12)) / expected
+    assert widths == pytest.approx(0.75 * (2 * math.pi) ** 1.5, rel=0.25)
+
+
+def test_nothing_is_left_of_specks_that_have_no_room() -> None:
+    assert float(degrade.clutter(torch.ones_like(FULL), 1.0, 1e-3, 1.0, [1]).abs().max()) == 0
+
+
+CHECKED: dict[str, Callable[[Tensor], Tensor]] = {
+    "occupancy": degrade.occupancy,
+    "intensities": lambda v: degrade.intensities(v, (1, 2)),
+    "blur": lambda v: degrade.blur(v, 1.0, 1.0),
+    "blur with depth": lambda v: degrade.blur_with_depth(v, 1.0, 1.0, 0.1),
+    "sample": lambda v: degrade.sample(v, 1.0, 2.0),
+    "dropout": lambda v: degrade.dropout(v, 1.0, 0.2, 3.0, 0.5, [1]),
+    "clutter": lambda v: degrade.clutter(v, 1.0, 1e-3, 1.0, [1]),
+    "poisson": lambda v: degrade.poisson(v, [1]),
+    "gaussian noise": lambda v: degrade.gaussian_noise(v, 1.0, [1]),
+    "rician": lambda v: degrade.rician(v, 1.0, [1]),
+    "digitised": lambda v: degrade.digitised(v, 9.0),
+}
+
+
+@pytest.mark.parametrize("name", CHECKED)
+def test_what_is_no_volume_is_refused(name: str) -> None:
+    broken = FULL.clone()
+    broken[0, 0, 1, 2, 3] = math.nan
+    for wrong, said in (
+        (broken, "finite values, got NaN or infinity"),
+        (FULL[0], r"of shape \(B, 1, Z, Y, X\), got \(1, 40, 40, 40\)"),
+        (FULL.long(), "of a floating type, got torch.int64"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            CHECKED[name](wrong)
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda: degrade.occupancy(FULL, 0.0), "expected a positive ε in voxels, got 0.0"),
+        (lambda: degrade.intensities(FULL, (1, -2)), "expected levels of background and structure from 0"),
+        (lambda: degrade.texture(FULL, 1.0, -0.1, 3.0, [1]), "expected a deviation from 0 and a positive length"),
+        (lambda: degrade.blur(FULL, 1.0, (1, 2)), "expected a blur of 3 numbers"),
+        (lambda: degrade.blur_with_depth(FULL, 1.0, 1.0, -1.0), "expected a growth and an attenuation from 0"),
+        (lambda: degrade.sample(FULL, 1.0, (1, 0, 1)), "expected a spacing of 3 positive numbers"),
+        (lambda: degrade.poisson(FULL - 1, [1]), "expected photons from 0, got -1"),
+        (lambda: degrade.poisson_gaussian(FULL, -1, 1, 0, [1]), "expected a gain and a read noise from 0"),
+        (lambda: degrade.rician(FULL, math.nan, [1]), "expected a noise deviation from 0, got nan"),
+        (lambda: degrade.digitised(FULL, 0), "expected a ceiling above 0, got 0"),
+        (lambda: degrade.bias(FULL, 1.0, 1.5, 3.0, [1]), r"expected a bias in \[0, 1\]"),
+        (lambda: degrade.stripes(FULL, 1.0, 0.1, 1.0, [1], 3), "expected stripes from 0, a width above 0 and an axis"),
+        (lambda: degrade.rings(FULL, 1.0, 0.1, 0.0, [1]), "expected rings from 0 and a width above 0"),
+        (lambda: degrade.dropout(FULL, 1.0, 1.2, 3.0, 0.5, [1]), r"expected a share and a loss in \[0, 1\]"),
+        (lambda: degrade.clutter(FULL, 1.0, -1.0, 1.0, [1]), "expected a density from 0 and a positive radius"),
+    ],
+)
+def test_bad_parameters_are_named(call: Callable[[], Tensor], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        call()

@@ -1,0 +1,132 @@
+"""Parameters found again in images that were made from them, with the true mask and without; real scans where there
+are some."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from exact import Cylinder, centres
+
+from curvafit.data_synth.degrade import EPSILON
+from curvafit.data_synth.estimate import like
+from curvafit.data_synth.modality import Imaging, image, regrid
+from curvafit.priors.grid import Grid
+from curvafit.priors.profile import optimal_profile
+from curvafit.scan import Field, load
+
+N = 72
+TUBES = [
+    Cylinder(5.0, (0.2, 1, 0.3), (18, 36, 20)),
+    Cylinder(6.0, (1, 0.1, 0.4), (36, 50, 52)),
+    Cylinder(4.5, (0.5, 0.4, 1), (54, 18, 36)),
+]
+
+PHOTONS = Imaging(background=6, foreground=60, blur=(1.6, 0.9, 0.9), gain=3, read_noise=2, offset=15, ceiling=4095)
+SLICES = Imaging(
+    spacing=(2, 1, 1), background=40, foreground=160, blur=(2, 1.2, 1.2), read_noise=12, noise_width=(0, 0.7, 0.7)
+)
+TEXTURED = Imaging(
+    background=60, foreground=180, background_texture=0.15, texture_length=5, foreground_texture=0.2,
+    foreground_length=8, blur=(1.2, 1.2, 1.2), read_noise=8, ceiling=255,
+)  # fmt: skip
+CASES = {"photons": PHOTONS, "slices": SLICES, "textured": TEXTURED}
+
+
+@pytest.fixture(scope="module")
+def shape() -> torch.Tensor:
+    points = centres(Grid((N, N, N), (1.0, 1.0, 1.0)))
+    distance = torch.stack([tube.distance(points) for tube in TUBES]).amax(0)
+    return optimal_profile(distance, EPSILON).float()[None, None]
+
+
+def scan_of(shape: torch.Tensor, how: Imaging) -> tuple[Field, np.ndarray]:
+    values = image(shape, 1.0, [how], [3])[0, 0].numpy()
+    return Field(values, how.spacing, "um"), regrid(shape, 1.0, [how])[0, 0].numpy() > 0
+
+
+@pytest.mark.parametrize("masked", [True, False])
+@pytest.mark.parametrize("name", CASES)
+def test_parameters_are_found_again(shape: torch.Tensor, name: str, masked: bool) -> None:
+    """With the mask, blur and levels to a tenth; without it they carry the error of the mask's edges."""
+    how = CASES[name]
+    scan, mask = scan_of(shape, how)
+    found = like(scan, mask if masked else None)
+    b, close = found.base, 0.12 if masked else 0.25
+    assert (b.unit, b.spacing, found.voxel) == ("um", how.spacing, 1.0)
+    assert b.blur == pytest.approx(how.blur, rel=close)
+    unit, true = b.gain or 1.0, how.gain or 1.0
+    level = b.background * unit + b.offset
+    assert level == pytest.approx(how.background * true + how.offset, rel=0.06)
+    contrast = (b.foreground - b.background) * unit
+    assert contrast == pytest.approx((how.foreground - how.background) * true, rel=close)
+    assert b.noise_width == pytest.approx(how.noise_width, abs=0.1)
+    assert b.ceiling is None
+
+
+def test_noise_is_found_again(shape: torch.Tensor) -> None:
+    """The line of variance over mean: its slope, and its height at the background."""
+    for how in (PHOTONS, SLICES, TEXTURED):
+        scan, mask = scan_of(shape, how)
+        b = like(scan, mask).base
+        assert (b.gain > 0) == (how.gain > 0)
+        assert b.gain == pytest.approx(how.gain, rel=0.1)
+        height = b.gain**2 * b.background + b.read_noise**2
+        assert height == pytest.approx(how.gain**2 * how.background + how.read_noise**2, rel=0.1)
+
+
+def test_textures_are_found_again(shape: torch.Tensor) -> None:
+    b = like(*scan_of(shape, TEXTURED)).base
+    assert b.background_texture == pytest.approx(0.15, rel=0.3)
+    assert b.texture_length == pytest.approx(5, rel=0.35)
+    assert b.foreground_texture == pytest.approx(0.2, rel=0.6)
+    plain = like(*scan_of(shape, PHOTONS)).base
+    assert plain.background_texture < 0.08 and plain.foreground_texture < 0.1
+
+
+def test_dark_structures_by_their_mask(shape: torch.Tensor) -> None:
+    how = Imaging(background=150, foreground=60, blur=(1.0, 1.0, 1.0), read_noise=5)
+    b = like(*scan_of(shape, how)).base
+    assert b.foreground == pytest.approx(60, rel=0.1) and b.background == pytest.approx(150, rel=0.05)
+
+
+def test_the_same_scan_in_nanometres(shape: torch.Tensor) -> None:
+    scan, mask = scan_of(shape, SLICES)
+    one = like(scan, mask).base
+    other = like(Field(scan.values, (2000.0, 1000.0, 1000.0), "nm"), mask).base
+    assert other.blur == pytest.approx(tuple(1000 * width for width in one.blur))
+    assert other.read_noise == pytest.approx(one.read_noise)
+
+
+def test_integers_saturate_where_their_type_ends(shape: torch.Tensor) -> None:
+    scan, mask = scan_of(shape, PHOTONS)
+    found = like(Field(scan.values.astype(np.uint16), scan.spacing, "um"), mask)
+    assert found.base.ceiling == 65535
+    low, high = found.ranges["gain"]
+    assert low < found.base.gain < high and found.draw(1) != found.draw(2)
+
+
+def test_bad_scans_are_told() -> None:
+    values = np.random.default_rng(0).normal(size=(12, 12, 12)).astype(np.float32)
+    field = Field(values, (1.0, 1.0, 1.0), "um")
+    for call, said in (
+        (lambda: like(Field(values[:4])), "expected a scan of at least 8 voxels along each axis"),
+        (lambda: like(Field(np.zeros((9, 9, 9)))), "expected a scan of finite values that vary"),
+        (lambda: like(Field(values * np.nan)), "expected a scan of finite values that vary"),
+        (lambda: like(field, np.ones((3, 3, 3), bool)), "expected a mask of the scan's shape"),
+        (lambda: like(field, np.ones(values.shape, bool)), "expected a mask with voxels inside and outside"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            call()
+
+
+def test_a_real_bone(data: Path) -> None:
+    """Two classes of grey; the noise as a difference of neighbours sees it; edges of one to two voxels."""
+    scan = load(data / "scans" / "lhdl_trabecular_200.tif", spacing=19.5, unit="um")
+    cut = Field(scan.values[50:130, 50:130, 50:130], scan.spacing, "um")
+    b = like(cut).base
+    assert 10 < b.background * (b.gain or 1) + b.offset < 40
+    assert 120 < b.foreground * (b.gain or 1) + b.offset < 220
+    assert 15 < b.blur[1] < 45 and 0.5 < b.noise_width[1] < 1.1

@@ -1,0 +1,140 @@
+"""Images of modalities: drawn parameters, the chain, one grid for image and labels, presets."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+from exact import Cylinder, Sphere, centres
+
+from curvafit.data_synth import degrade
+from curvafit.data_synth.modalities import MODALITIES
+from curvafit.data_synth.modality import Imaging, Modality, field_shape, image, image_shape, regrid
+from curvafit.priors.grid import Grid
+from curvafit.priors.profile import optimal_profile
+
+N = 32
+POINTS = centres(Grid((N, N, N), (1.0, 1.0, 1.0)))
+SHAPES = [Cylinder(5.0, (0.3, 1, 0.2), (16, 16, 16)), Sphere(9.0, (16, 16, 16))]
+FIELDS = torch.stack([optimal_profile(shape.distance(POINTS), degrade.EPSILON).float()[None] for shape in SHAPES])
+
+PLAIN = Imaging(background=10, foreground=60)
+
+
+@pytest.mark.parametrize("name", MODALITIES)
+def test_presets_make_images(name: str) -> None:
+    modality = MODALITIES[name]
+    drawn = [modality.draw(seed) for seed in (1, 2)]
+    images = image(FIELDS, modality.voxel, drawn, [1, 2])
+    labels = regrid(FIELDS, modality.voxel, drawn) > 0
+    assert images.shape == labels.shape and bool(torch.isfinite(images).all())
+    assert tuple(images.shape[2:]) == image_shape((N, N, N), modality.voxel, drawn[0])
+    assert float(images.amin()) >= 0 and float(images.amax()) <= drawn[0].ceiling
+    assert torch.equal(images, images.round())
+    sign = 1 if drawn[0].foreground > drawn[0].background else -1
+    for seen, inside in zip(images, labels, strict=True):
+        contrast = sign * float(seen[inside].mean() - seen[~inside].mean())
+        assert contrast > 0.5 * float(seen[~inside].std())
+
+
+@pytest.mark.parametrize("name", MODALITIES)
+def test_an_image_is_its_own(name: str) -> None:
+    """The same voxels, bit by bit, in any batch."""
+    modality = MODALITIES[name]
+    first, second = modality.draw(1), modality.draw(2)
+    batch = image(FIELDS, modality.voxel, [first, second], [1, 2])
+    assert torch.equal(batch[1:], image(FIELDS[1:], modality.voxel, [second], [2]))
+    assert torch.equal(batch, image(FIELDS, modality.voxel, [first, second], [1, 2]))
+    assert not torch.equal(batch[1:], image(FIELDS[1:], modality.voxel, [second], [3]))
+
+
+def test_without_effects_an_image_is_its_occupancy() -> None:
+    seen = image(FIELDS, 1.0, [PLAIN, PLAIN], [0, 0])
+    torch.testing.assert_close(seen, 10 + 50 * degrade.occupancy(FIELDS))
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [
+        {"background_texture": 0.3}, {"foreground_texture": 0.3}, {"blur": (2.0, 1.0, 1.0)}, {"attenuation": 0.02},
+        {"bias": 0.2, "bias_length": 20}, {"stripes": 0.1}, {"rings": 0.1}, {"dropout": 0.3, "dropout_length": 5},
+        {"clutter": 1e-3}, {"gain": 2.0}, {"read_noise": 3.0}, {"rician": 3.0}, {"offset": 7.0}, {"ceiling": 40.0},
+    ],
+)  # fmt: skip
+def test_every_effect_counts_and_leaves_the_others_numbers(effect: dict) -> None:
+    noisy = replace(PLAIN, read_noise=2.0)
+    with_it = image(FIELDS[:1], 1.0, [replace(PLAIN, **effect)], [5])
+    assert not torch.equal(with_it, image(FIELDS[:1], 1.0, [PLAIN], [5]))
+    if not {"read_noise", "rician", "gain", "ceiling"} & set(effect):
+        noise = image(FIELDS[:1], 1.0, [noisy], [5]) - image(FIELDS[:1], 1.0, [PLAIN], [5])
+        same = image(FIELDS[:1], 1.0, [replace(noisy, **effect)], [5]) - with_it
+        torch.testing.assert_close(same, noise, rtol=0, atol=1e-4)
+
+
+def test_images_and_labels_share_a_grid() -> None:
+    how = replace(PLAIN, spacing=(2.5, 1.0, 1.5), thickness=2.5)
+    seen, labels = image(FIELDS, 1.0, [how, how], [1, 2]), regrid(FIELDS, 1.0, [how, how])
+    assert tuple(seen.shape[2:]) == tuple(labels.shape[2:]) == image_shape((N, N, N), 1.0, how) == (12, 32, 21)
+    assert field_shape((12, 32, 20), 1.0, how) == (30, 32, 30)
+    agree = (seen > 35) == (labels > 0)
+    assert float(agree.double().mean()) > 0.985
+
+
+def test_parameters_are_drawn_in_range_and_reproducibly() -> None:
+    for modality in MODALITIES.values():
+        draws = [modality.draw(seed) for seed in range(40)]
+        assert draws[3] == modality.draw(3) and draws[3] != draws[4]
+        for name, (low, high) in modality.ranges.items():
+            values = [getattr(each, name) for each in draws]
+            first = [value[0] if isinstance(value, tuple) else value for value in values]
+            ends = [end[0] if isinstance(end, tuple) else end for end in (low, high)]
+            assert ends[0] <= min(first) < max(first) <= ends[1], name
+    one = Modality("one", "", 1.0, PLAIN, {"bias": (0.0, 0.5)})
+    both = replace(one, ranges={"stripes": (0.1, 0.2), **one.ranges})
+    assert one.draw(3).bias == both.draw(3).bias
+
+
+def test_parameters_go_through_json() -> None:
+    for modality in MODALITIES.values():
+        assert Modality.from_dict(json.loads(json.dumps(modality.as_dict()))) == modality
+        drawn = modality.draw(5)
+        assert Imaging.from_dict(json.loads(json.dumps(drawn.as_dict()))) == drawn
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"spacing": (1, 0, 1)}, "expected spacing as 3 numbers (z, y, x), each a number above 0, got (1, 0, 1)"),
+        ({"blur": (1, 1)}, "expected blur as 3 numbers"),
+        ({"dropout": 1.2}, "expected dropout as a share, got 1.2"),
+        ({"gain": -1}, "expected gain as a number from 0, got -1"),
+        ({"foreground": float("nan")}, "expected foreground as a number from 0, got nan"),
+        ({"ceiling": 0}, "expected ceiling as a number above 0, got 0"),
+        ({"unit": "ell"}, "expected a unit among"),
+    ],
+)
+def test_bad_parameters_are_named(wrong: dict, said: str) -> None:
+    with pytest.raises(ValueError) as told:
+        Imaging(**wrong)
+    assert said in str(told.value)
+
+
+def test_bad_input_is_told() -> None:
+    finer = replace(PLAIN, spacing=(2.0, 1.0, 1.0))
+    broken = FIELDS.clone()
+    broken[1, 0, 3, 3, 3] = torch.nan
+    for call, said in (
+        (lambda: image(FIELDS, 1.0, [PLAIN, finer], [1, 2]), "expected images of one spacing in a batch"),
+        (lambda: image(FIELDS, 1.0, [PLAIN], [1, 2]), "expected one imaging a field, 2, got 1"),
+        (lambda: image(FIELDS, 1.0, [PLAIN, PLAIN], [1]), "expected 2 seeds"),
+        (lambda: image(broken, 1.0, [PLAIN, PLAIN], [1, 2]), "expected phase fields of finite values"),
+        (lambda: image(FIELDS, 0.0, [PLAIN, PLAIN], [1, 2]), "expected a spacing of 3 positive numbers"),
+        (lambda: Imaging.from_dict({"blurr": 1}), "expected fields of an image in an image, got blurr"),
+        (lambda: Modality("m", "", 1.0, PLAIN, {"gain": (2.0, 1.0)}), "expected a range of gain from low to high"),
+        (lambda: Modality("m", "", 0.0, PLAIN), "expected a shape's voxel of positive length, got 0.0"),
+        (lambda: Modality("m", "", 1.0, PLAIN).draw(-1), "expected 1 seeds, whole numbers from 0"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            call()
