@@ -113,6 +113,9 @@ def test_a_real_draw_is_what_its_record_says(tmp_path):
 def test_wrong_counts_and_other_settings_are_refused(tmp_path, balls):
     with pytest.raises(ValueError, match="expected a count of at least 1 shape, got 0"):
         building.build(tmp_path / "s.zarr", 0, SHAPE)
+    with pytest.raises(ValueError, match="expected a seed that is a whole number from 0, got -1"):
+        building.build(tmp_path / "s.zarr", 1, SHAPE, seed=-1)
+    assert not list(tmp_path.iterdir())
     building.build(tmp_path / "s.zarr", 1, SHAPE)
     with pytest.raises(ValueError, match="expected the settings of .*, got another seed: 3 for 0"):
         building.build(tmp_path / "s.zarr", 1, SHAPE, seed=3)

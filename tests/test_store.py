@@ -16,7 +16,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from curvafit.data_synth.store import Record, Settings, open_store
+from curvafit.data_synth.store import Record, Settings, Store, open_store
 from curvafit.generation.viability import Viability
 from curvafit.priors.coefficients import Coefficients
 
@@ -69,6 +69,22 @@ def test_figures_that_are_not_finite_are_kept_as_such(tmp_path):
 def test_no_draw_is_written_twice(tmp_path):
     store = open_store(tmp_path / "s.zarr", SETTINGS)
     assert store.write(record(0), field(0))
+    assert not store.write(record(0), field(1))
+    np.testing.assert_array_equal(store.field(0), field(0))
+
+
+def test_a_draw_that_another_process_ends_at_this_moment_stays(tmp_path, monkeypatch):
+    store, other = open_store(tmp_path / "s.zarr", SETTINGS), open_store(tmp_path / "s.zarr", SETTINGS)
+    truth, asked = Store.has, []
+
+    def late(self, index):
+        if asked:
+            return truth(self, index)
+        asked.append(index)
+        assert other.write(record(0), field(0))
+        return False
+
+    monkeypatch.setattr(Store, "has", late)
     assert not store.write(record(0), field(1))
     np.testing.assert_array_equal(store.field(0), field(0))
 

@@ -79,13 +79,15 @@ def extend(
 ) -> Store:
     """Go on with a store, by its own settings, until it has `count` more viable shapes than were asked of it so far.
 
+    With 0, what was stopped is brought to its end.
+
     Raises
     ------
     FileNotFoundError, ValueError, OSError
         If there is no store, or as `build`.
     """
-    if count < 1:
-        raise ValueError(f"expected a count of at least 1 more shape, got {count}")
+    if count < 0:
+        raise ValueError(f"expected a count of shapes from 0, got {count}")
     store = open_store(store_path)
     return _filled(store, store.wanted + count, workers or Here(), progress)
 
@@ -96,8 +98,9 @@ def settings_of(
     """The settings of the store that `build` makes of these."""
     z, y, x = (shape,) * 3 if isinstance(shape, int) else shape
     grid = Grid((z, y, x))
-    plan, law = dataclasses.asdict(named_schedule(schedule)), (design or boxed()).as_dict()
-    return Settings(grid.shape, grid.spacing, WORKING_EPSILON, WORKING_BLUR, law, int(seed), plan)
+    plan, law = dataclasses.asdict(named_schedule(schedule)), design or boxed()
+    law.draw(seed, 0)  # refuses a wrong seed, before a store is made
+    return Settings(grid.shape, grid.spacing, WORKING_EPSILON, WORKING_BLUR, law.as_dict(), int(seed), plan)
 
 
 def diagrams(field: torch.Tensor, grid: Grid, epsilon: float) -> tuple[Diagram, Diagram]:
@@ -114,7 +117,7 @@ def diagrams(field: torch.Tensor, grid: Grid, epsilon: float) -> tuple[Diagram, 
 def _filled(store: Store, count: int, workers: Workers, progress: Progress | None) -> Store:
     """Ask for draws in order, never for more than may still be wanted: nothing is made beyond the last viable one."""
     store.want(count)
-    viable = {index: store.record(index).viability.viable for index in store.indices()}
+    viable = {index: store.viable(index) for index in store.indices()}
     asked = 0
     todo = (index for index in itertools.count() if index not in viable)
     while (found := sum(viable.values())) < count:

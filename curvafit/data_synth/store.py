@@ -74,6 +74,16 @@ class Store:
         """
         return record_of(self._complete(index))
 
+    def viable(self, index: int) -> bool:
+        """Whether a draw is recorded as a shape.
+
+        Raises
+        ------
+        KeyError
+            If the draw is missing or incomplete.
+        """
+        return self._complete(index)["viability"]["viable"]
+
     def field(self, index: int) -> np.ndarray:
         """The phase field of a viable draw, float32 (Z, Y, X).
 
@@ -117,11 +127,15 @@ class Store:
         place = self._place(record.index)
         if self.has(record.index):
             return False
-        shutil.rmtree(place, ignore_errors=True)
         self._clear_stale()
         partial = Path(tempfile.mkdtemp(dir=self.path / "draws", prefix=".partial-"))
         try:
             _write_draw(partial / place.name, record, field)
+            if _publish(partial / place.name, place):
+                return True
+            if self.has(record.index):
+                return False
+            shutil.rmtree(place)  # what is there is torn
             return _publish(partial / place.name, place)
         finally:
             shutil.rmtree(partial, ignore_errors=True)
@@ -139,7 +153,7 @@ class Store:
         """A draw's attributes, None where anything of it is missing; a field's bytes are checked when it is read."""
         place = self._place(index)
         attributes = _group_attributes(place)
-        if attributes is None or attributes.get("index") != index:
+        if attributes is None or attributes.get("index") != index or not {"viability", "sha256"} <= set(attributes):
             return None
         complete = not attributes["viability"]["viable"] or (place / "field" / "c" / "0" / "0" / "0").is_file()
         return attributes if complete else None
