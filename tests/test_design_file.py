@@ -50,6 +50,11 @@ def test_a_box_in_yaml_changes_some_intervals_and_fixes_others(tmp_path):
     assert a11.min() > 1 and a11.max() < 2 and a00.min() < -2000 and a00.max() > 2000
 
 
+def test_numbers_that_yaml_takes_for_text_are_numbers(tmp_path):
+    plain = read_design(written(tmp_path, "box: {a00: [-1000, 1000], a02: 0.06}"))
+    assert read_design(written(tmp_path, "box: {a00: [-1e3, 1e3], a02: 6e-2}")) == plain
+
+
 def test_surroundings_hold_their_point_and_have_the_asked_for_width(tmp_path):
     tubes = preset("tubes")
     found = table(read_design(written(tmp_path, "around: tubes\nspread: 0.2\n")), 300)
@@ -80,6 +85,8 @@ def test_a_list_comes_in_turn_with_other_noise(tmp_path):
         ("box: {}\nlist: []", "got box and list"),
         ("list: []\nlaw: sobol", "expected no key 'law' beside 'list'"),
         ("list: []", "expected 7 parameters"),
+        ("box: {\n", r"expected a design in YAML, got .*yaml: expected the node content.* in line 2"),
+        ("box: {law: sobol}", "expected parameters among a20, a11, a02, a10, a01, a00, mass, got law"),
         ("box: {a12: [1, 2]}", "expected parameters among a20, a11, a02, a10, a01, a00, mass, got a12"),
         ("box: {a11: [2, 1]}", "expected an interval of a11 from low to high"),
         ("box: {a11: [1, two]}", "expected a11 as a number or two of them"),

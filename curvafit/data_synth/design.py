@@ -111,7 +111,7 @@ class Design:
         return [next(shares) if moves else 0.0 for moves in free]
 
 
-def boxed(law: Law = "random", **intervals: float | Sequence[float]) -> Design:
+def boxed(law: Law = "random", /, **intervals: float | Sequence[float]) -> Design:
     """A box: Experiment 4's, but for the intervals or fixed values that are given by name.
 
     Raises

@@ -32,7 +32,7 @@ def read_design(path: str | PathLike[str]) -> Design:
     try:
         content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"expected a design in YAML, got {path}: {error}") from error
+        raise ValueError(f"expected a design in YAML, got {path}: {_trouble(error)}") from error
     try:
         return _design(content, Path(path).parent)
     except ValueError as error:
@@ -74,7 +74,7 @@ def _design(content: Any, folder: Path) -> Design:
         return around(point_of(content["around"], folder), _spread(content.get("spread", SPREAD)), law)
     if not isinstance(content["box"], Mapping):
         raise ValueError(f"expected a box of names and intervals, got {content['box']!r}")
-    return boxed(law, **{str(name): value for name, value in content["box"].items()})
+    return boxed(law, **{str(name): _number(value) for name, value in content["box"].items()})
 
 
 def _kind(content: Any) -> str:
@@ -93,7 +93,24 @@ def _kind(content: Any) -> str:
     return kinds[0]
 
 
+def _trouble(error: Exception) -> str:
+    """What is wrong, and in which line."""
+    mark = getattr(error, "problem_mark", None)
+    return f"{getattr(error, 'problem', error)} in line {mark.line + 1}" if mark else str(error)
+
+
+def _number(value: Any) -> Any:
+    """The value, but for numbers that YAML takes for text, such as 1e3."""
+    if isinstance(value, list):
+        return [_number(each) for each in value]
+    try:
+        return float(value) if isinstance(value, str) else value
+    except ValueError:
+        return value
+
+
 def _spread(value: Any) -> float:
+    value = _number(value)
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise ValueError(f"expected a spread that is a number, got {value!r}")
     return float(value)
