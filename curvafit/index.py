@@ -7,7 +7,6 @@ import datetime
 import importlib.resources
 import io
 import json
-import os
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Sequence
@@ -27,6 +26,7 @@ from curvafit.diagram import Diagram
 from curvafit.generation.viability import FORMED, well_formed
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
+from curvafit.scan import write_atomically
 from curvafit.transport import TAIL_SHARE, sliced_embedding
 
 FORMAT = "curvafit atlas"
@@ -186,13 +186,7 @@ def save_atlas(atlas: Atlas, path: str | Path) -> None:
         arrays |= {f"{view}_{name}": value for name, value in _packed(atlas.diagrams(view)).items()}
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
-    path = Path(path)
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        partial.write_bytes(buffer.getvalue())
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+    write_atomically(Path(path), lambda place: place.write_bytes(buffer.getvalue()))
 
 
 def load_atlas(path: str | Path | None = None) -> Atlas:
