@@ -26,7 +26,7 @@ from curvafit.diagram import Diagram
 from curvafit.generation.viability import FORMED, well_formed
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
-from curvafit.scan import write_atomically
+from curvafit.scan import write_content
 from curvafit.transport import TAIL_SHARE, sliced_embedding
 
 FORMAT = "curvafit atlas"
@@ -186,7 +186,7 @@ def save_atlas(atlas: Atlas, path: str | Path) -> None:
         arrays |= {f"{view}_{name}": value for name, value in _packed(atlas.diagrams(view)).items()}
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
-    write_atomically(Path(path), lambda place: place.write_bytes(buffer.getvalue()))
+    write_content(Path(path), buffer.getvalue())
 
 
 def load_atlas(path: str | Path | None = None) -> Atlas:

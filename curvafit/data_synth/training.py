@@ -171,7 +171,7 @@ def as_subject(sample: Sample) -> Any:
         If TorchIO is not installed.
     """
     try:
-        import torchio
+        import torchio  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise ImportError("expected TorchIO: pip install torchio", name="torchio") from error
     affine = np.diag([*sample.spacing[::-1], 1.0])
