@@ -158,6 +158,12 @@ def test_spatialised_maps(script) -> None:
     assert [float(end) / 2 for end in ends] == pytest.approx([-0.55, -0.4, -0.5])
 
 
+def test_modalities(script, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(sys, "argv", ["modalities", "--edge", "24", "-o", str(tmp_path)])
+    script("modalities").main()
+    assert (tmp_path / "modalities.png").read_bytes().startswith(b"\x89PNG")
+
+
 @pytest.mark.parametrize(("name", "genus"), [("sphere", 0), ("torus", 1), ("smaller-torus", 1), ("genus-2", 2)])
 def test_willmore_starts_have_their_genus(script, name: str, genus: int) -> None:
     field, grid = script("willmore").start(name, 48, 4)

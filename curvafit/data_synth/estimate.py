@@ -163,9 +163,8 @@ def _structure(values: np.ndarray, inside: np.ndarray, steps: np.ndarray, level:
     bright = everywhere[mask > 0]
     bright = bright[bright * bright.mean() > 0]
     z, y, x = (np.sqrt(np.maximum(widths**2 - 1 / 12, 0)) * steps).tolist()
-    return Structure((z, y, x), float(bright.mean()), abs(float(bright.std() / bright.mean()))), everywhere[
-        0, 0
-    ].numpy()
+    mean, deviation = float(bright.mean()), float(bright.std())
+    return Structure((z, y, x), mean, deviation / abs(mean)), everywhere[0, 0].numpy()
 
 
 def _around(value: Any, low: float, high: float) -> tuple[Any, Any]:
