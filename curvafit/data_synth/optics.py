@@ -27,7 +27,7 @@ def occupancy(field: Float[Tensor, "b 1 z y x"], epsilon: float = EPSILON) -> Fl
     """Share of each cubic voxel that is inside: partial volume, from the sub-voxel distance that the profile holds.
 
     (d + ½) clipped to [0, 1], d = √2 ε artanh u in voxels: exact for a plane along an axis. A tilted plane's ramp is
-    longer with softer ends; its second moment is the same 1/12, and the difference nowhere over 0.07.
+    longer with softer ends; its second moment is the same 1/12, and the difference nowhere over 0.05.
 
     Parameters
     ----------
