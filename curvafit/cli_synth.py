@@ -42,7 +42,7 @@ Atlas = Annotated[
     _what(help="Store of `curvafit atlas build`, cropped; or an atlas (.npz), whose shapes are grown anew."),
 ]
 Presets = Annotated[str | None, _what(help="Published shapes, by name: tubes,sponge. See `curvafit presets`.")]
-Kind = Annotated[str | None, _seen("--modality", help="confocal, two-photon, light-sheet, micro-CT, MRA or EM.")]
+Kind = Annotated[str | None, _seen("--modality", help="confocal, two-photon, light-sheet, micro-ct, mra, em-membrane.")]
 Like = Annotated[str | None, _seen(help="A scan to take noise, blur, contrast and spacing from, instead.")]
 Voxel = Annotated[
     float | None, _seen(help="Edge of a shape's voxel, in --unit: how thick the structure is. By default the prior's.")
@@ -136,9 +136,12 @@ def _modality(name: str | None, like: str | None, reading: dict[str, Any]) -> Mo
         raise ValueError("expected --like beside --spacing, got none")
     from curvafit.data_synth.modalities import MODALITIES
 
-    if name not in MODALITIES:
-        raise ValueError(f"expected --modality among {', '.join(MODALITIES)}, got {name!r}")
-    return MODALITIES[name]
+    plain = {key.casefold().replace(" ", "-"): key for key in MODALITIES}
+    assert name is not None
+    found = plain.get(name.strip().casefold().replace(" ", "-"))
+    if found is None:
+        raise ValueError(f"expected --modality among {', '.join(plain)}, got {name!r}")
+    return MODALITIES[found]
 
 
 def _edge(edge: float | None, unit: str | None, seen: Modality) -> float:

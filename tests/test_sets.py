@@ -78,17 +78,16 @@ def test_decathlon_s_list(tmp_path, order, layout):
         assert (image.values == case.image).all() and (label.values == (case.field > 0)).all()
 
 
+@pytest.mark.filterwarnings("ignore:NvImgCodec")
 def test_monai_reads_it(tmp_path, order):
     data = pytest.importorskip("monai.data", reason="needs MONAI")
     from monai.transforms import LoadImaged
 
     folder = build_set(tmp_path / "set", Order(order.recipe, "monai"), 2)
     pairs = data.load_decathlon_datalist(str(folder / "dataset.json"), data_list_key="training")
-    read = LoadImaged(keys=("image", "label"), reader="NibabelReader")(pairs[1])
+    read = LoadImaged(keys=("image", "label"))(pairs[1])
     assert read["image"].shape == read["label"].shape == SHAPE[::-1]
-    assert np.diag(read["image"].affine.numpy())[:3].tolist() == [-0.5, -0.5, 1.0] or np.abs(
-        np.diag(read["image"].affine.numpy())[:3]
-    ).tolist() == [0.5, 0.5, 1.0]
+    assert np.abs(np.diag(read["image"].affine.numpy()))[:3].tolist() == [0.5, 0.5, 1.0]
 
 
 def test_a_set_goes_on_and_ends_the_same(tmp_path, order):

@@ -1,0 +1,88 @@
+"""`curvafit synth`: sets from the command line, and what it says of bad input."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calling import call, refused
+from exact_store import exact_store
+
+from curvafit.priors.fit_file import FORMAT
+from curvafit.scan import Field, load, save
+
+QUICK = ["--count", "2", "--shape", "8,16,16", "--workers", "0", "--voxel", "0.5"]
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return exact_store(tmp_path_factory.mktemp("shapes") / "s.zarr", 8).path
+
+
+def listed(folder: Path) -> dict:
+    return json.loads((folder / "dataset.json").read_text())
+
+
+def test_a_set_from_a_store(tmp_path, store):
+    out = tmp_path / "Dataset001_S"
+    result = call("synth", "-o", out, "--atlas", store, "--modality", "confocal", *QUICK)
+    assert result.exit_code == 0, (result.output, result.exception)
+    assert [Path(line).name for line in result.stdout.splitlines()] == ["dataset.json", "preview.png"]
+    assert listed(out)["numTraining"] == 2 and listed(out)["channel_names"] == {"0": "confocal"}
+    assert (out / "preview.png").read_bytes().startswith(b"\x89PNG")
+    image = load(out / "imagesTr" / "case_00001_0000.nii.gz")
+    assert image.shape == (8, 16, 16) and image.spacing == (1.0, 0.5, 0.5) and image.unit == "um"
+
+
+def test_names_of_modalities_are_forgiving(tmp_path, store):
+    quick = ["--count", "1", "--shape", "8", "--workers", "0"]
+    result = call("synth", "-o", tmp_path / "s", "--atlas", store, "--modality", "em-membrane", *quick)
+    assert result.exit_code == 0 and listed(tmp_path / "s")["channel_names"] == {"0": "EM membrane"}
+
+
+@pytest.mark.slow
+def test_a_set_of_inferred_shapes_like_a_scan(tmp_path, store):
+    rng = np.random.default_rng(0)
+    z, y, x = np.mgrid[:24, :40, :40]
+    inside = (np.hypot(y - 20, x - 20) < 7) | (np.hypot(z - 12, y - 8) < 4)
+    grey = rng.poisson(np.where(inside, 90.0, 12.0)).astype(np.uint8)
+    save(Field(grey, (0.002, 0.001, 0.001), "mm"), tmp_path / "scan.nii.gz")
+    told = {"mass": -0.5, "epsilon_physical": 0.002, "working_voxel": 0.001, "length_unit": "mm"}
+    working = {"a20": 1, "a11": 2, "a02": 6, "a10": -40, "a01": -40, "a00": 400}
+    fit = told | {"format": FORMAT, "coefficients": working, "coefficients_physical": working}
+    (tmp_path / "fit.json").write_text(json.dumps(fit))
+    quick = ["--count", "1", "--shape", "8,16,16", "--workers", "0"]
+    out = tmp_path / "set"
+    result = call("synth", "-o", out, "--prior", tmp_path / "fit.json", "--like", tmp_path / "scan.nii.gz", *quick)
+    assert result.exit_code == 0, (result.output, result.exception)
+    image = load(out / "imagesTr" / "case_00000_0000.nii.gz")
+    assert image.spacing == pytest.approx((0.002, 0.001, 0.001)) and image.unit == "mm"
+    record = json.loads((out / "cases" / "case_00000.json").read_text())
+    assert record["source"]["parameters"]["a02"] == 6 and record["voxel"] == pytest.approx(0.001)
+
+
+def test_a_set_of_presets_and_of_an_atlas_file(tmp_path):
+    quick = ["--count", "1", "--shape", "16", "--workers", "0", "--modality", "micro-CT"]
+    out = tmp_path / "presets"
+    assert call("synth", "-o", out, "--presets", "tubes,sponge", *quick).exit_code == 0
+    assert json.loads((out / "cases" / "case_00000.json").read_text())["source"]["name"] == "tubes"
+
+
+def test_bad_input(tmp_path, store):
+    out, kind = tmp_path / "set", ["--modality", "confocal"]
+    some = ["synth", "-o", out, "--atlas", store]
+    refused(call(*some, *kind, "--count", "0"), "expected --count of at least 1, got 0")
+    refused(call(*some, *kind, "--shape", "64"), "expected crops within the 24 voxels of the stored shapes")
+    missing = ["synth", "-o", out, "--atlas", tmp_path / "none.zarr", *kind]
+    refused(call(*missing), "expected a store of shapes at")
+    refused(call("synth", "-o", out, *kind), "expected one of --prior, --atlas and --presets, got 0 of them")
+    refused(call(*some, *kind, "--presets", "tubes"), "got 2 of them")
+    refused(call(*some), "expected either --modality or --like, got neither")
+    refused(call(*some, "--modality", "x-ray"), "expected --modality among confocal, two-photon")
+    refused(call("synth", "-o", out, "--presets", "tube", *kind), "tube")
+    refused(call(*some, *kind, *QUICK, "--labels", "depth"), "expected labels among")
+    refused(call(*some, *kind, *QUICK, "--layout", "bids"), "expected a layout among nnunet, monai, zarr")
+    refused(call(*some, *kind, *QUICK, "--seed", "-1"), "expected a seed that is a whole number from 0, got -1")
+    assert not out.exists()
