@@ -9,6 +9,9 @@ import signal
 import subprocess
 import sys
 import time
+import types
+from concurrent.futures import CancelledError
+from unittest.mock import MagicMock
 
 import pytest
 
@@ -17,6 +20,7 @@ from curvafit.data_synth.census import verify
 from curvafit.generation.schedule import schedule
 
 distributed = pytest.importorskip("distributed", reason="needs dask.distributed")
+CommClosedError = pytest.importorskip("distributed.comm").CommClosedError
 
 COUNT, EDGE, PLAN = 8, 16, schedule("fast", steps=60)
 #: As a script: builds with two workers, and says where it is.
@@ -80,6 +84,24 @@ def test_a_scheduler_that_is_not_there_and_too_few_workers_are_one_sentence(monk
         cluster(scheduler=nowhere).__enter__()
     with pytest.raises(ValueError, match="expected a number of workers from 0, got -1"):
         cluster(-1).__enter__()
+
+
+@pytest.mark.parametrize("error", [CommClosedError, CancelledError])
+def test_a_scheduler_that_goes_is_one_sentence(monkeypatch, error):
+    client = MagicMock(**{"run.return_value": {1: "cpu"}, "__exit__.return_value": None})
+    monkeypatch.setattr(distributed, "Client", lambda *_, **__: client)
+    monkeypatch.setattr(distributed, "as_completed", list)
+    sentence = "expected the dask scheduler at tcp://there:1 to stay, got none any more"
+    with pytest.raises(OSError, match=sentence), cluster(scheduler="tcp://there:1"):
+        raise error("gone")
+
+
+def test_workers_here_leave_the_interrupt_to_the_build_and_may_be_gone_for_a_while():
+    with cluster(1) as crew:
+        heard = crew._client.run(lambda: signal.getsignal(signal.SIGINT))
+        assert set(heard.values()) == {signal.SIG_IGN}
+        crew._client = types.SimpleNamespace(nthreads=dict)
+        assert crew.places == 1
 
 
 def test_without_dask_the_line_to_type_is_said(monkeypatch):

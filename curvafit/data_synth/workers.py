@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 TOGETHER = 32
 #: Seconds that a scheduler has to answer.
 PATIENCE = 10
+#: What a worker on this machine runs first: Ctrl-C in the terminal is for the build, which ends its workers.
+_DEAF = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
 
 
 #: Makes some things of a folder, by their indices, and returns one result each; a function that has a module's name.
@@ -79,8 +81,8 @@ class Cluster:
 
     @property
     def places(self) -> int:
-        """Two chunks a thread, as many threads as there are now."""
-        return 2 * sum(self._client.nthreads().values())  # type: ignore
+        """Two chunks a thread, as many threads as there are now; one where all workers are gone, for those to come."""
+        return max(1, 2 * sum(self._client.nthreads().values()))  # type: ignore
 
     def submit(self, make: Make, path: Path, indices: Sequence[int]) -> None:
         self._futures.add(self._client.submit(make, path.resolve(), list(indices), pure=False))
@@ -104,7 +106,7 @@ def cluster(count: int | None = None, scheduler: str | None = None) -> Iterator[
     ImportError
         If dask.distributed is not installed and more than this process is wanted.
     OSError
-        If there is no scheduler at the address, or it has no workers.
+        If there is no scheduler at the address, it has no workers, or it goes.
     """
     if count is not None and count < 0:
         raise ValueError(f"expected a number of workers from 0, got {count}")
@@ -114,6 +116,7 @@ def cluster(count: int | None = None, scheduler: str | None = None) -> Iterator[
     try:
         import dask.config
         import distributed
+        from dask.system import CPU_COUNT
     except ImportError as error:
         raise ImportError('expected dask.distributed: pip install "curvafit[atlas]"', name="distributed") from error
     if scheduler is not None:
@@ -121,7 +124,7 @@ def cluster(count: int | None = None, scheduler: str | None = None) -> Iterator[
             yield Cluster(client)
         return
     quiet = {"distributed.nanny.pre-spawn-environ.DASK_LOGGING__DISTRIBUTED": "critical"}
-    with dask.config.set(quiet), _local(distributed, count or _cores()) as client:
+    with dask.config.set(quiet), _local(distributed, count or CPU_COUNT) as client:
         yield Cluster(client)
 
 
@@ -134,20 +137,22 @@ def _local(distributed, count: int) -> Iterator[Client]:
         dashboard_address=":0",
         memory_limit=0,
         silence_logs=logging.ERROR,
+        preload=_DEAF,
     )
     with here, distributed.Client(here) as client:
         yield client
 
 
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 @contextmanager
 def _connected(distributed, address: str) -> Iterator[Client]:
+    from distributed.comm import CommClosedError
+
     try:
         client = distributed.Client(address, timeout=PATIENCE)
     except (OSError, ValueError) as error:
         raise OSError(f"expected a dask scheduler at {address}, got none within {PATIENCE} s") from error
     with client:
-        yield client
+        try:
+            yield client
+        except (CommClosedError, CancelledError) as error:
+            raise OSError(f"expected the dask scheduler at {address} to stay, got none any more: {error}") from error
