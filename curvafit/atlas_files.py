@@ -51,26 +51,28 @@ def write_map(
     """
     check_extra()
     store = store if isinstance(store, Store) else open_store(store)
-    records = [record for record in map(store.record, store.indices()) if well_formed(record.viability)]
-    check_size(len(records))
+    check_size(sum(well_formed(store.record(index).viability) for index in store.indices()))
     folder = Path(directory)
     (folder / CACHE).mkdir(parents=True, exist_ok=True)
-    atlas, shapes = _looked_at(store, folder / CACHE, progress)
+    atlas, records, shapes, commands = _looked_at(store, folder / CACHE, progress)
     mapped = _mapped(atlas, folder / CACHE, device, progress)
     progress("drawing", 0.95)
     picture = map_picture(mapped, lambda k: store.field(records[k].index), folder / "atlas.png")
-    commands = [regrow_command(r, store.settings, f"shape_{shape_id(store, r)}.nii.gz") for r in records]
     text = page_html(mapped, shapes, commands, _account(mapped, store, command))
     page = write_content(folder / "atlas.html", text)
     progress("done", 1.0)
     return picture, page
 
 
-def _looked_at(store: Store, cache: Path, progress: Progress) -> tuple[Atlas, list[Shown]]:
-    """Every shape's measures and pictures."""
+def _looked_at(store: Store, cache: Path, progress: Progress) -> tuple[Atlas, list[Record], list[Shown], list[str]]:
+    """Every shape's measures, and with each its record, its pictures and the command that grows it again."""
+    records: list[Record] = []
     shapes: list[Shown] = []
+    commands: list[str] = []
 
     def look(store: Store, record: Record) -> Measured:
+        records.append(record)
+        commands.append(regrow_command(record, store.settings, f"shape_{shape_id(store, record)}.nii.gz"))
         kept = _kept(cache / f"shape-{_key(store, record)}.npz", lambda: _look(store, record))
         shapes.append(Shown(kept["thumbnail"].tobytes(), kept["volume"].tobytes()))
         return float(kept["fraction"]), _diagram(kept, "field"), _diagram(kept, "mask")
@@ -78,7 +80,7 @@ def _looked_at(store: Store, cache: Path, progress: Progress) -> tuple[Atlas, li
     def told(done: int, count: int) -> None:
         progress(f"measuring {count} shapes", 0.6 * done / count)
 
-    return extract(store, measure=look, progress=told), shapes
+    return extract(store, measure=look, progress=told), records, shapes, commands
 
 
 def _look(store: Store, record: Record) -> _Arrays:

@@ -252,6 +252,31 @@ def test_nothing_is_measured_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert not list((tmp_path / "map").rglob(".*"))
 
 
+def test_shapes_that_a_build_adds_meanwhile_mix_up_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    quick_map(monkeypatch)
+    store = exact_store(tmp_path / "s.zarr", 10, first=3)
+    real, shown_of = atlas_files.extract, {}
+
+    def extract_later(*arguments, **options):
+        exact_store(tmp_path / "s.zarr", 2)
+        return real(*arguments, **options)
+
+    def picture(mapped, field, path):
+        shown_of.update({name: field(k) for k, name in enumerate(mapped.atlas.ids)})
+        return path
+
+    monkeypatch.setattr(atlas_files, "extract", extract_later)
+    monkeypatch.setattr(atlas_files, "map_picture", picture)
+    _, page = write_map(store, tmp_path / "map", progress=no_progress)
+    assert len(shown_of) == 8
+    for name, u in shown_of.items():
+        np.testing.assert_array_equal(u, exact_field(int(name.split("-")[1])))
+    data = json.loads(re.findall(r'id="data">(.*?)</script>', page.read_text())[0])
+    assert [f"shape_{name}.nii.gz" in line for name, line in zip(data["ids"], data["commands"], strict=True)] == [
+        True
+    ] * 8
+
+
 def test_what_cannot_be_mapped_is_refused_in_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     refused(call("atlas", "map", tmp_path / "none", "-o", tmp_path / "m"), "expected a store of shapes at")
     exact_store(tmp_path / "s.zarr", 5)
