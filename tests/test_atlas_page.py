@@ -190,6 +190,7 @@ def test_a_scan_without_a_diagram_is_placed_by_its_matches_or_refused(opened: Op
         (made_fit().to_json(), "run curvafit infer again"),
         ("{}", "expected a fit.json of format curvafit-fit-1, got odd.json"),
         ("κ", "which is no JSON"),
+        (scan_fit(atlas, 1).to_json().replace('"kappa1"', '"kappa"'), "expected a fit.json with a whole diagram"),
     ):
         drop(page, text, "odd.json")
         page.locator(f"#message:has-text('{said}')").wait_for()

@@ -45,10 +45,11 @@ function nearestShapes(diagram, seenAs) {
 /** What a fit.json says of its place; raises a sentence where it says nothing. */
 function placed(fit, file) {
   if (fit?.format !== FIT_FORMAT) throw new Error(`expected a fit.json of format ${FIT_FORMAT}, got ${file}`);
+  if (fit.diagram && !whole(fit.diagram)) throw new Error(`expected a fit.json with a whole diagram, got ${file}`);
   const diagram = fit.diagram && {
     kappa1: fit.diagram.kappa1, kappa2: fit.diagram.kappa2, share: fit.diagram.share,
   };
-  const seenAs = fit.diagram?.seen_as ?? (fit.kind === "field" ? "field" : "mask");
+  const seenAs = (fit.diagram?.seen_as ?? fit.kind) === "field" ? "field" : "mask";
   const near = diagram ? nearestShapes(diagram, seenAs) : ownMatches(fit);
   if (!near.length) {
     throw new Error(`expected the scan's diagram or matches in this atlas, got neither in ${file}: run curvafit infer again`);
@@ -60,13 +61,19 @@ function placed(fit, file) {
   return { fit, file, diagram, seenAs, near, place, spread };
 }
 
+/** Whether a diagram is three columns of numbers, with some area. */
+function whole({ kappa1, kappa2, share }) {
+  return [kappa1, kappa2, share].every((list) => Array.isArray(list) && list.length === share.length && list.every(Number.isFinite))
+    && share.some((part) => part > 0);
+}
+
 /** Matches that `infer` found, where they are shapes of this very atlas: same name, same parameters. */
 function ownMatches(fit) {
   const same = (match, k) => k >= 0 && ["a11", "a02", "a10", "a01", "a00"].every((name) => {
     const [mine, other] = [columns[name].values[k], match.coefficients?.[name]];
     return Math.abs(mine - other) <= 1e-9 * Math.max(1, Math.abs(mine));
   });
-  return (fit.matches ?? []).map((match) => [match, atlas.ids.indexOf(match.id)]).filter(([match, k]) => same(match, k))
+  return (Array.isArray(fit.matches) ? fit.matches : []).map((match) => [match, atlas.ids.indexOf(match.id)]).filter(([match, k]) => same(match, k))
     .map(([match, k]) => [k, match.distance]);
 }
 

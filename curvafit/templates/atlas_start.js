@@ -61,7 +61,7 @@ for (const id of ["diagram", "scan-diagram"]) new ResizeObserver(diagrams).obser
 addEventListener("hashchange", opened);
 
 function opened() {
-  const k = atlas.ids.indexOf(decodeURIComponent(location.hash.slice(1)));
+  const k = atlas.ids.indexOf(location.hash.slice(1));
   if (k >= 0 && k !== state.selected) select(k, false);
 }
 
