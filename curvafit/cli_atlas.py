@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -51,9 +51,12 @@ def build_atlas(
         law = _design(design, around, spread)
         from curvafit.data_synth.atlas import build, settings_of
         from curvafit.data_synth.store import open_store
+        from curvafit.shape_files import check_folder
 
+        settings = settings_of(box, seed, schedule, law)
         if store.exists():
-            open_store(store, settings_of(box, seed, schedule, law))
+            open_store(store, settings)
+        check_folder(store.parent)
         with _made(count, workers, scheduler) as (crew, progress):
             build(store, count, box, seed, schedule, progress, design=law, workers=crew)
         say(str(store))
@@ -62,7 +65,7 @@ def build_atlas(
 @atlas_app.command("extend", epilog="[bold]Example[/bold]\n\ncurvafit atlas extend store.zarr --count 500")
 def extend_atlas(
     store: _Store,
-    count: Annotated[int, typer.Option(help="Viable shapes to add.")] = 100,
+    count: Annotated[int, typer.Option(help="Viable shapes to add; 0 goes on with what was stopped.")] = 100,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
 ) -> None:
@@ -71,7 +74,12 @@ def extend_atlas(
         from curvafit.data_synth.atlas import extend
         from curvafit.data_synth.store import open_store
 
-        with _made(open_store(store).wanted + count, workers, scheduler) as (crew, progress):
+        wanted = open_store(store).wanted + count
+
+        def again() -> str:
+            return "`--count 0`" if open_store(store).wanted == wanted else "the same command"
+
+        with _made(wanted, workers, scheduler, again) as (crew, progress):
             extend(store, count, progress, workers=crew)
         say(str(store))
 
@@ -169,11 +177,13 @@ def _design(name: str, around: str | None, spread: float | None) -> Design:
 
 
 @contextmanager
-def _made(count: int, workers: int | None, scheduler: str | None) -> Iterator[tuple[Workers, Progress]]:
+def _made(
+    count: int, workers: int | None, scheduler: str | None, again: Callable[[], str] = lambda: "the same command"
+) -> Iterator[tuple[Workers, Progress]]:
     """Workers, and a progress bar for them."""
     from curvafit.data_synth.workers import cluster
 
-    with kept(), stages() as progress:
+    with kept(again), stages() as progress:
         progress("starting workers", 0.0)
         with cluster(workers, scheduler) as crew:
             yield crew, lambda _, viable, draws: progress(f"{viable} viable of {draws} draws", viable / count)

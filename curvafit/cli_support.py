@@ -42,12 +42,12 @@ def plainly() -> Iterator[None]:
 
 
 @contextmanager
-def kept() -> Iterator[None]:
-    """Ctrl-C says that nothing is lost."""
+def kept(again: Callable[[], str] = lambda: "the same command") -> Iterator[None]:
+    """Ctrl-C says that nothing is lost, and what goes on."""
     try:
         yield
     except KeyboardInterrupt:
-        say("interrupted: what is made is kept, and the same command goes on with it", to=error_console())
+        say(f"interrupted: what is made is kept, and {again()} goes on with it", to=error_console())
         raise typer.Exit(130) from None
 
 
