@@ -66,12 +66,12 @@ def throughput(folder: Path, count: int, shape: int, workers: int) -> tuple[floa
     return 3600 * count / (time.perf_counter() - first), first - start, peak
 
 
-def kill(process: subprocess.Popen, whole: bool) -> None:
+def kill(process: subprocess.Popen, whole: bool, chance: random.Random) -> None:
     """Kill a build with its workers, or one of its workers."""
     workers = [
         each for each in family(process)[1:] if "forkserver" in (name := " ".join(each.cmdline())) or "spawn" in name
     ]
-    for each in family(process) if whole else random.sample(workers, min(1, len(workers))):
+    for each in family(process) if whole else chance.sample(workers, min(1, len(workers))):
         try:
             each.kill()
         except psutil.NoSuchProcess:
@@ -90,7 +90,7 @@ def kills(folder: Path, rounds: int, count: int, shape: int) -> None:
             while process.poll() is None and not (path.exists() and len(open_store(path).indices()) > there):
                 time.sleep(0.1)
             time.sleep(chance.uniform(0, 3))
-            kill(process, whole)
+            kill(process, whole, chance)
             found = verify(path, 0)
             print(
                 f"round {number + 1}, {'build' if whole else 'worker'} killed: {found.status} {list(found.problems)}",

@@ -202,6 +202,10 @@ def load_atlas(path: str | Path | None = None) -> Atlas:
     if path is None:
         data = importlib.resources.files("curvafit").joinpath("data", "atlas.npz").read_bytes()
         return _parse(data, "the packaged atlas")
+    if Path(path).is_dir():
+        raise FileNotFoundError(
+            f"expected an atlas file, got the folder {path}: `curvafit atlas extract` makes one of it"
+        )
     if not Path(path).is_file():
         raise FileNotFoundError(f"expected an atlas file, got {path}, where there is none")
     return _parse(Path(path).read_bytes(), str(path))

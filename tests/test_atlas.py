@@ -192,6 +192,8 @@ def test_a_damaged_atlas_is_refused_wherever_it_is_cut(tmp_path, atlas):
 def test_other_files_are_no_atlas(tmp_path):
     with pytest.raises(FileNotFoundError, match="expected an atlas file, got .*none.npz, where there is none"):
         load_atlas(tmp_path / "none.npz")
+    with pytest.raises(FileNotFoundError, match="expected an atlas file, got the folder .*: `curvafit atlas extract`"):
+        load_atlas(tmp_path)
     buffer = io.BytesIO()
     np.savez(buffer, a=np.zeros(3))
     header = np.frombuffer(b'{"format": "another"}', dtype=np.uint8)
