@@ -153,7 +153,7 @@ def save(field: Field, path: str | os.PathLike[str]) -> Path:
     return write_atomically(target, lambda temporary: writer(field, temporary))
 
 
-def write_atomically(target: Path, write: Callable[[Path], None]) -> Path:
+def write_atomically(target: Path, write: Callable[[Path], object]) -> Path:
     """Call `write` with a temporary name beside `target` (same suffix), then move what it made to `target`."""
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = target.with_name(f".{uuid.uuid4().hex[:8]}.{target.name}")

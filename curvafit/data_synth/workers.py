@@ -145,7 +145,7 @@ def _local(distributed, count: int) -> Iterator[Client]:
 
 @contextmanager
 def _connected(distributed, address: str) -> Iterator[Client]:
-    from distributed.comm import CommClosedError
+    from distributed.comm.core import CommClosedError
 
     try:
         client = distributed.Client(address, timeout=PATIENCE)
