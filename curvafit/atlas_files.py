@@ -8,6 +8,7 @@ import io
 import json
 import zipfile
 from collections.abc import Callable
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -102,16 +103,20 @@ def _diagram(kept: _Arrays, view: str) -> Diagram:
 
 def _mapped(atlas: Atlas, cache: Path, device: str, progress: Progress) -> AtlasMap:
     """Distances, places, clusters, families."""
-    distances = diagram_distances(
-        atlas.field_diagrams,
-        device=device,
-        progress=lambda done, pairs: progress(f"comparing {pairs} pairs", 0.6 + 0.25 * done / max(pairs, 1)),
-        saved=cache / "distances.npz",
-    )
+    told = partial(_compared, progress)
+    try:
+        distances = diagram_distances(atlas.field_diagrams, device=device, progress=told, saved=cache / "distances.npz")
+    except ValueError:  # a file that is damaged, or of other settings
+        (cache / "distances.npz").unlink(missing_ok=True)
+        distances = diagram_distances(atlas.field_diagrams, device=device, progress=told, saved=cache / "distances.npz")
     progress("laying out the map", 0.86)
     key = hashlib.sha256(distances.tobytes()).hexdigest()[:12]
     places = _kept(cache / f"places-{key}-{version('umap-learn')}.npz", lambda: {"positions": embed(distances)})
     return map_atlas(atlas, distances, places["positions"])
+
+
+def _compared(progress: Progress, done: int, pairs: int) -> None:
+    progress(f"comparing {pairs} pairs", 0.6 + 0.25 * done / max(pairs, 1))
 
 
 def _kept(path: Path, make: Callable[[], _Arrays]) -> _Arrays:

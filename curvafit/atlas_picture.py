@@ -17,7 +17,7 @@ from matplotlib.patheffects import withStroke
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
-from curvafit.atlas_map import NOISE, AtlasMap
+from curvafit.atlas_map import AtlasMap
 from curvafit.plot import DPI, INK, QUIET
 from curvafit.render import render
 from curvafit.scan import write_atomically
@@ -32,8 +32,6 @@ FAMILY_COLOURS = {
     "bubbles": "#D55E00",
 }
 CLUSTER_COLOURS = ["#44AA99", "#882255", "#DDCC77", "#332288", "#CC6677", "#88CCEE", "#117733", "#999933", "#AA4499"]
-#: Points of no cluster.
-NOISE_COLOUR = "#000000"
 #: Inches: the page, and the edge of a thumbnail's cell.
 _WIDTH, _HEIGHT, _CELL = 14.0, 10.6, 1.92
 #: Thumbnails along the top and the bottom, and along either side between them.
@@ -64,10 +62,7 @@ def map_figure(mapped: AtlasMap, field: Callable[[int], np.ndarray]) -> Figure:
     axes = figure.add_axes(
         (margin / _WIDTH, (margin + 0.62) / _HEIGHT, 1 - 2 * margin / _WIDTH, 1 - (2 * margin + 0.62) / _HEIGHT)
     )
-    colours = [
-        NOISE_COLOUR if cluster == NOISE else FAMILY_COLOURS[name]
-        for cluster, name in zip(mapped.clusters, mapped.families, strict=True)
-    ]
+    colours = [FAMILY_COLOURS[name] for name in mapped.families]
     size = float(np.clip(9000 / len(mapped), 14, 60))
     axes.scatter(*mapped.positions.T, c=colours, s=size, linewidths=0.5, edgecolors="white", zorder=2)
     axes.set(xticks=[], yticks=[])
@@ -142,9 +137,7 @@ def _name_families(axes: Axes, mapped: AtlasMap) -> None:
 
 
 def _legend(figure: Figure, mapped: AtlasMap) -> None:
-    named = mapped.clusters != NOISE
-    rows = [(name, colour, sum(np.array(mapped.families)[named] == name)) for name, colour in FAMILY_COLOURS.items()]
-    rows.append(("no cluster", NOISE_COLOUR, int((~named).sum())))
+    rows = [(name, colour, mapped.families.count(name)) for name, colour in FAMILY_COLOURS.items()]
     marks = [
         Line2D([], [], marker="o", linestyle="", color=colour, markersize=7, label=f"{name}  {count}")
         for name, colour, count in rows

@@ -16,13 +16,11 @@ from calling import call, refused
 from exact_store import FAMILIES, SETTINGS, exact_field, exact_record, exact_store, no_progress, quick_map
 from scipy.spatial.distance import cdist
 
-import curvafit.atlas_files as atlas_files
 import curvafit.atlas_map as atlas_map
 from curvafit.atlas_files import write_map
 from curvafit.atlas_map import NOISE, AtlasMap, embed, find_clusters, map_atlas
 from curvafit.atlas_picture import _assigned, _slots, spread_out
 from curvafit.atlas_shapes import CUT, LEVELS, regrow_command, shown, small_volume
-from curvafit.data_synth.record import Record
 from curvafit.generation.flow import generate
 from curvafit.index import extract
 from curvafit.priors import Coefficients, Grid
@@ -227,54 +225,6 @@ def test_the_page_holds_what_was_measured(made: Path) -> None:
     assert zlib.decompress(piece("volumes", 5)) == small_volume(exact_field(number)).tobytes()
     places = np.array(data["places"])
     assert places.min() >= 0 and places.max() <= 1 and np.ptp(places, axis=0).max() == pytest.approx(1, abs=1e-4)
-
-
-def test_nothing_is_measured_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    quick_map(monkeypatch)
-    looked: list[int] = []
-    real = atlas_files._look
-
-    def look(store, record: Record):
-        looked.append(record.index)
-        return real(store, record)
-
-    monkeypatch.setattr(atlas_files, "_look", look)
-    monkeypatch.setattr(atlas_files, "map_picture", lambda mapped, field, path: path)
-    exact_store(tmp_path / "s.zarr", 7)
-    _, page = write_map(tmp_path / "s.zarr", tmp_path / "map", progress=no_progress)
-    assert looked == [0, 1, 3, 4, 5, 6]
-    before = page.read_text()
-    exact_store(tmp_path / "s.zarr", 9, first=7)
-    kept = sorted((tmp_path / "map" / "cache").glob("shape-3-00004-*"))
-    kept[0].write_bytes(kept[0].read_bytes()[:100])
-    write_map(tmp_path / "s.zarr", tmp_path / "map", progress=no_progress)
-    assert looked == [0, 1, 3, 4, 5, 6, 4, 7, 8] and page.read_text() != before
-    assert not list((tmp_path / "map").rglob(".*"))
-
-
-def test_shapes_that_a_build_adds_meanwhile_mix_up_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    quick_map(monkeypatch)
-    store = exact_store(tmp_path / "s.zarr", 10, first=3)
-    real, shown_of = atlas_files.extract, {}
-
-    def extract_later(*arguments, **options):
-        exact_store(tmp_path / "s.zarr", 2)
-        return real(*arguments, **options)
-
-    def picture(mapped, field, path):
-        shown_of.update({name: field(k) for k, name in enumerate(mapped.atlas.ids)})
-        return path
-
-    monkeypatch.setattr(atlas_files, "extract", extract_later)
-    monkeypatch.setattr(atlas_files, "map_picture", picture)
-    _, page = write_map(store, tmp_path / "map", progress=no_progress)
-    assert len(shown_of) == 8
-    for name, u in shown_of.items():
-        np.testing.assert_array_equal(u, exact_field(int(name.split("-")[1])))
-    data = json.loads(re.findall(r'id="data">(.*?)</script>', page.read_text())[0])
-    assert [f"shape_{name}.nii.gz" in line for name, line in zip(data["ids"], data["commands"], strict=True)] == [
-        True
-    ] * 8
 
 
 def test_what_cannot_be_mapped_is_refused_in_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

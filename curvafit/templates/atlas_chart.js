@@ -121,8 +121,8 @@ function colouring() {
     const [low, high] = range(column.values);
     return column.values.map((value) => ramp(atlas.ramps.values, (value - low) / (high - low || 1)));
   }
-  const [kinds, list] = state.colour === "family" ? [atlas.family, atlas.families] : [atlas.cluster, atlas.clusters];
-  return kinds.map((kind, k) => (atlas.cluster[k] === atlas.noise ? themed("noise") : list[kind][1]));
+  if (state.colour === "family") return atlas.family.map((kind) => atlas.families[kind][1]);
+  return atlas.cluster.map((kind) => (kind === atlas.noise ? themed("noise") : atlas.clusters[kind][1]));
 }
 
 const range = (values) => [Math.min(...values), Math.max(...values)];
@@ -156,9 +156,9 @@ function drawLegend() {
   const own = state.colour === "family";
   const kinds = own ? atlas.family : atlas.cluster;
   (own ? atlas.families : atlas.clusters).forEach(([name, colour], kind) => {
-    group(legend, name, colour, (k) => kinds[k] === kind && atlas.cluster[k] !== atlas.noise);
+    group(legend, name, colour, (k) => kinds[k] === kind);
   });
-  group(legend, "no cluster", themed("noise"), (k) => atlas.cluster[k] === atlas.noise);
+  if (!own) group(legend, "no cluster", themed("noise"), (k) => atlas.cluster[k] === atlas.noise);
 }
 
 function group(legend, name, colour, holds) {

@@ -8,7 +8,7 @@ function select(k, follow = true) {
   state.scan = -1;
   reveal("shape", follow);
   $("shape-name").textContent = atlas.ids[k];
-  const group = atlas.cluster[k] === atlas.noise ? themed("noise") : atlas.families[atlas.family[k]][1];
+  const group = atlas.families[atlas.family[k]][1];
   $("shape-kind").replaceChildren(element("span", { className: "swatch", style: `background:${group}` }), `${familyName(k)}, ${clusterName(k)}`);
   table("parameters", atlas.columns.map((column) => [column.symbol, column.says, column.values[k]]));
   command("command", atlas.commands[k]);

@@ -1,0 +1,80 @@
+"""What a map keeps beside it: nothing is measured twice, what is damaged is made anew, what grows meanwhile mixes up
+nothing."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from exact_store import exact_store, no_progress, quick_map
+
+import curvafit.atlas_files as atlas_files
+from curvafit.atlas_files import write_map
+
+
+def test_nothing_is_measured_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    quick_map(monkeypatch)
+    looked: list[int] = []
+    real = atlas_files._look
+
+    def look(store, record: Record):
+        looked.append(record.index)
+        return real(store, record)
+
+    monkeypatch.setattr(atlas_files, "_look", look)
+    monkeypatch.setattr(atlas_files, "map_picture", lambda mapped, field, path: path)
+    exact_store(tmp_path / "s.zarr", 7)
+    _, page = write_map(tmp_path / "s.zarr", tmp_path / "map", progress=no_progress)
+    assert looked == [0, 1, 3, 4, 5, 6]
+    before = page.read_text()
+    exact_store(tmp_path / "s.zarr", 9, first=7)
+    kept = sorted((tmp_path / "map" / "cache").glob("shape-3-00004-*"))
+    kept[0].write_bytes(kept[0].read_bytes()[:100])
+    write_map(tmp_path / "s.zarr", tmp_path / "map", progress=no_progress)
+    assert looked == [0, 1, 3, 4, 5, 6, 4, 7, 8] and page.read_text() != before
+    assert not list((tmp_path / "map").rglob(".*"))
+
+
+def test_a_damaged_file_of_distances_is_made_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    quick_map(monkeypatch)
+    quick = atlas_files.diagram_distances
+
+    def careful(diagrams, saved, **options):
+        if saved.exists():
+            raise ValueError(f"expected a file of distances, got {saved}, which is something else")
+        return quick(diagrams)
+
+    monkeypatch.setattr(atlas_files, "diagram_distances", careful)
+    monkeypatch.setattr(atlas_files, "map_picture", lambda mapped, field, path: path)
+    exact_store(tmp_path / "s.zarr", 7)
+    (tmp_path / "map" / "cache").mkdir(parents=True)
+    (tmp_path / "map" / "cache" / "distances.npz").write_bytes(b"torn")
+    _, page = write_map(tmp_path / "s.zarr", tmp_path / "map", progress=no_progress)
+    assert page.exists() and not (tmp_path / "map" / "cache" / "distances.npz").exists()
+
+
+def test_shapes_that_a_build_adds_meanwhile_mix_up_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    quick_map(monkeypatch)
+    store = exact_store(tmp_path / "s.zarr", 10, first=3)
+    real, shown_of = atlas_files.extract, {}
+
+    def extract_later(*arguments, **options):
+        exact_store(tmp_path / "s.zarr", 2)
+        return real(*arguments, **options)
+
+    def picture(mapped, field, path):
+        shown_of.update({name: field(k) for k, name in enumerate(mapped.atlas.ids)})
+        return path
+
+    monkeypatch.setattr(atlas_files, "extract", extract_later)
+    monkeypatch.setattr(atlas_files, "map_picture", picture)
+    _, page = write_map(store, tmp_path / "map", progress=no_progress)
+    assert len(shown_of) == 8
+    for name, u in shown_of.items():
+        np.testing.assert_array_equal(u, exact_field(int(name.split("-")[1])))
+    data = json.loads(re.findall(r'id="data">(.*?)</script>', page.read_text())[0])
+    assert [f"shape_{name}.nii.gz" in line for name, line in zip(data["ids"], data["commands"], strict=True)] == [
+        True
+    ] * 8
