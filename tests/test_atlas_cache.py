@@ -7,11 +7,13 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
-from exact_store import exact_store, no_progress, quick_map
+from exact_store import exact_field, exact_store, no_progress, quick_map
 
 import curvafit.atlas_files as atlas_files
 from curvafit.atlas_files import write_map
+from curvafit.data_synth.record import Record
 
 
 def test_nothing_is_measured_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
