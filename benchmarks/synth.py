@@ -20,11 +20,11 @@ from typing import Any
 from unittest.mock import patch
 
 import torch
-from curvafit.data_synth.modalities import MODALITIES
 from torch.utils.data import DataLoader
 
 from curvafit.data_synth import build, cluster, degrade
 from curvafit.data_synth import case as case_module
+from curvafit.data_synth.modalities import MODALITIES
 from curvafit.data_synth.modality import Modality
 from curvafit.data_synth.sources import Stored
 from curvafit.data_synth.training import TextureDataset, as_dict
