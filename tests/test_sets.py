@@ -15,7 +15,7 @@ from curvafit.data_synth import sets
 from curvafit.data_synth.case import Recipe
 from curvafit.data_synth.modality import Imaging, Modality
 from curvafit.data_synth.sets import Order, build_set, make_cases, read_order
-from curvafit.data_synth.sources import Generated, Stored
+from curvafit.data_synth.sources import Generated, Shape, Stored
 from curvafit.scan import load, read_values
 
 FLAT = Modality("flat", "for tests", 0.5, Imaging(spacing=(1.0, 0.5, 0.5), blur=(0.4, 0.2, 0.2), ceiling=255.0), {
@@ -170,6 +170,30 @@ def test_what_does_not_grow_is_said():
     barren = Generated(((1.0, 0.0, 1.0, 0.0, 0.0, 3000.0, -0.9),), ("nothing",))
     with pytest.raises(ValueError, match="expected nothing to grow from one of 8 seeds, got none: "):
         barren.shape((12, 12, 12), 0, np.random.default_rng(0))
+
+
+def test_a_shape_that_falls_between_the_slices_is_not_a_case():
+    class Sheets:
+        """Half sheets beside the only slice, the third one on it, if asked for."""
+
+        def __init__(self, third: int) -> None:
+            self.asked, self.places = 0, [0, 0, third]
+
+        def shape(self, voxels, index, rng):
+            field = np.full(voxels, -1.0, np.float32)
+            field[self.places[min(self.asked, 2)], :4] = 1.0
+            self.asked += 1
+            return Shape(field, 2.0, {"name": "sheet"})
+
+        def as_dict(self):
+            return {"kind": "sheets"}
+
+    coarse = Modality("coarse", "for tests", 1.0, Imaging(spacing=(11.0, 1.0, 1.0)))
+    seen = Sheets(third=5)
+    case = Recipe(seen, coarse, (1, 8, 8), 1.0).case(0)
+    assert seen.asked == 3 and (case.field[0, :4] > 0).all() and (case.field[0, 4:] < 0).all()
+    with pytest.raises(ValueError, match="expected structure and background on 1 x 8 x 8 voxels, got one 8 times"):
+        Recipe(Sheets(third=0), coarse, (1, 8, 8), 1.0).case(0)
 
 
 def test_a_recipe_reads_back(order):

@@ -13,6 +13,9 @@ from curvafit.data_synth.draws import one_thread
 from curvafit.data_synth.modality import Imaging, Modality, field_shape, image, regrid
 from curvafit.data_synth.sources import Source, Stored, source_of
 
+#: Shapes that a case gets until one is seen on the image's voxels, which may be coarse.
+TRIES = 8
+
 
 class Case(NamedTuple):
     """An image and the phase field of what it shows, arrays (Z, Y, X) on one grid of `spacing`; ε in spacing's unit;
@@ -64,17 +67,23 @@ class Recipe:
         Raises
         ------
         ValueError
-            If no shape can be had.
+            If no shape can be had, or none is seen on the image's voxels.
         """
         for_shape, for_imaging, for_image = np.random.SeedSequence(self.seed, spawn_key=(index,)).spawn(3)
         imaging = self.modality.draw(_number(for_imaging))
         rng = np.random.default_rng(for_shape)
         voxels = field_shape(self.shape, self.voxel, imaging)
+        seed = _number(for_image)
         with one_thread():
-            made = self.source.shape(voxels, index, rng)
-            seed = _number(for_image)
-            u = torch.from_numpy(made.field)
-            grey, seen = (each.numpy() for each in imaged(u, made.epsilon, self.voxel, imaging, seed, self.shape))
+            for _ in range(TRIES):
+                made = self.source.shape(voxels, index, rng)
+                u = torch.from_numpy(made.field)
+                grey, seen = (each.numpy() for each in imaged(u, made.epsilon, self.voxel, imaging, seed, self.shape))
+                if seen.min() <= 0 < seen.max():
+                    break
+            else:
+                told = " x ".join(map(str, self.shape))
+                raise ValueError(f"expected structure and background on {told} voxels, got one {TRIES} times")
         record = {"index": index, "source": made.origin, "imaging": imaging.as_dict(), "image_seed": seed}
         record |= {"voxel": self.voxel, "volume_fraction": float((seen > 0).mean())}
         return Case(_counts(grey, imaging), seen, imaging.spacing, imaging.unit, made.epsilon * self.voxel, record)
