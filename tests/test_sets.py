@@ -112,6 +112,7 @@ def test_what_a_killed_run_left_is_made_anew(tmp_path, order):
     assert (read_values(folder / "imagesTr" / "case_00001_0000.nii.gz") == order.recipe.case(1).image).all()
 
 
+@pytest.mark.slow
 def test_workers_make_the_same_set(tmp_path, order):
     pytest.importorskip("distributed", reason="needs dask.distributed")
     from curvafit.data_synth import cluster
