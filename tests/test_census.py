@@ -80,6 +80,18 @@ def test_torn_and_foreign_folders_are_found(path):
     assert problems == (f"draws/{torn} is torn, or no draw", "draws/notes is torn, or no draw")
 
 
+def test_a_draw_that_a_build_adds_meanwhile_is_no_stranger(path, tmp_path):
+    last = sorted((path / "draws").glob("0*"))[-1]
+    last.rename(tmp_path / last.name)
+
+    def add(text, share):
+        if (tmp_path / last.name).exists():
+            (tmp_path / last.name).rename(last)
+
+    assert not any("torn" in problem for problem in verify(path, 0, progress=add).problems)
+    assert last.exists() and verify(path, 0).problems == ()
+
+
 def test_changed_bytes_and_numbers_are_found(path):
     first, second = viable(path)[:2]
     chunk = path / "draws" / f"{first:06d}" / "field" / "c" / "0" / "0" / "0"

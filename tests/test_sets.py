@@ -142,6 +142,26 @@ def test_a_disk_that_fills_leaves_a_valid_set(tmp_path, order, monkeypatch):
     assert len(sums(build_set(tmp_path / "set", order, 4))) == 4
 
 
+def test_a_list_that_finds_no_room_gives_up_the_last_case(tmp_path, order, monkeypatch):
+    listed, write = [], sets._list
+
+    def until_full(folder, order, done):
+        if len(done) > 1 and len(list((folder / "labelsTr").iterdir())) > 1:
+            raise OSError(errno.ENOSPC, "No space left on device", str(folder))
+        listed.append(len(done))
+        write(folder, order, done)
+
+    monkeypatch.setattr(sets, "_list", until_full)
+    asked = Order(order.recipe, parts=("skeleton",))
+    with pytest.raises(OSError, match="No space left on device"):
+        monkeypatch.setattr(sets, "LISTED_EVERY", 0.0)
+        build_set(tmp_path / "set", asked, 3)
+    folder = tmp_path / "set"
+    assert json.loads((folder / "dataset.json").read_text())["numTraining"] == 1 and listed[-1] == 1
+    for part in ("labelsTr", "imagesTr", "cases", "parts/skeleton"):
+        assert [path.name.partition(".")[0][:10] for path in (folder / part).iterdir()] == ["case_00000"], part
+
+
 def test_labels_besides_the_mask(tmp_path, order):
     asked = Order(order.recipe, parts=("distance", "instances", "kappa1", "betti", "centreline"))
     folder = build_set(tmp_path / "set", asked, 1)

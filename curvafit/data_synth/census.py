@@ -110,11 +110,13 @@ def _wrong(store: Store, record: Record, design: Design) -> list[str]:
 
 
 def _strangers(store: Store, indices: list[int]) -> list[str]:
-    """Entries of the folder that are neither draws nor what a killed worker leaves."""
-    draws = store.path / "draws"
+    """Entries of the folder that are neither draws, those that a build adds meanwhile among them, nor what a killed
+    worker leaves."""
     expected = {f"{index:06d}" for index in indices} | {"zarr.json"}
-    others = [each.name for each in draws.iterdir() if each.name not in expected and not each.name.startswith(".")]
-    return [f"draws/{name} is torn, or no draw" for name in sorted(others)]
+    entries = (each.name for each in (store.path / "draws").iterdir())
+    others = sorted(name for name in entries if name not in expected and not name.startswith("."))
+    strangers = [name for name in others if not (len(name) == 6 and name.isdigit() and store.has(int(name)))]
+    return [f"draws/{name} is torn, or no draw" for name in strangers]
 
 
 def _compare(store: Store, index: int, problems: list[str], notes: list[str]) -> None:

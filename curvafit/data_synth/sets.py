@@ -87,7 +87,7 @@ def build_set(
     _begin(folder, order)
     done = set(_there(folder))
     todo = iter([index for index in range(count) if index not in done])
-    asked, listed = 0, time.monotonic()
+    asked, listed = 0, -LISTED_EVERY
     try:
         while True:
             while asked < workers.places and (chunk := list(itertools.islice(todo, 1))):
@@ -103,7 +103,7 @@ def build_set(
                 _list(folder, order, done)
                 listed = time.monotonic()
     finally:
-        _list(folder, order, set(_there(folder)))
+        _list_what_is_there(folder, order)
 
 
 def make_cases(folder: str | Path, indices: Sequence[int]) -> list[int]:
@@ -175,6 +175,36 @@ def _list(folder: Path, order: Order, done: set[int]) -> None:
     _write_json(folder / "dataset.json", LAYOUTS[order.layout].listing(cases, about))
 
 
+def _list_what_is_there(folder: Path, order: Order) -> None:
+    """Write the list; where the disk is too full for it, without the last cases, which make room."""
+    done = _there(folder)
+    while True:
+        try:
+            return _list(folder, order, set(done))
+        except OSError:
+            if not done:
+                raise
+            _remove_case(folder, order, case_name(done.pop()))
+
+
+def _remove_case(folder: Path, order: Order, name: str) -> None:
+    """Its record first: what is left without one is no case."""
+    layout = LAYOUTS[order.layout]
+    places = [
+        folder / RECORDS / f"{name}.json",
+        *(folder / part.format(case=name) for part in (layout.label, layout.image)),
+    ]
+    for place in [*places, *(folder / "parts").glob(f"*/{name}.*")]:
+        _remove(place)
+
+
+def _remove(place: Path) -> None:
+    if place.is_dir():
+        shutil.rmtree(place)
+    else:
+        place.unlink(missing_ok=True)
+
+
 def _write_case(folder: Path, order: Order, index: int, case: Case) -> None:
     """Labels, image, record, in this order; all or none."""
     layout, name = LAYOUTS[order.layout], case_name(index)
@@ -189,7 +219,7 @@ def _write_case(folder: Path, order: Order, index: int, case: Case) -> None:
         _write_json(folder / RECORDS / f"{name}.json", case.record | known | {"sha256": sums, "versions": versions()})
     except BaseException:
         for place in places:
-            shutil.rmtree(place) if place.is_dir() else place.unlink(missing_ok=True)
+            _remove(place)
         raise
 
 
