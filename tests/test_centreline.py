@@ -19,6 +19,8 @@ from curvafit.data_synth.labels import labels_of
 from curvafit.priors.grid import Grid
 from curvafit.topology import betti_numbers
 
+pytestmark = pytest.mark.slow
+
 CUBES, FLAT = (1.0, 1.0, 1.0), (1.5, 1.0, 0.75)
 MIDDLE = (24.2, 23.8, 24.1)
 Y = [(24.2, 23.8, 24.1), (24.2, 23.8, 6.0), (24.2, 36.0, 38.0), (24.2, 11.0, 38.0)]

@@ -17,6 +17,8 @@ from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
 from curvafit.scan import Field, load
 
+pytestmark = pytest.mark.slow
+
 N = 72
 TUBES = [
     Cylinder(5.0, (0.2, 1, 0.3), (18, 36, 20)),

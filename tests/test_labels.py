@@ -16,6 +16,8 @@ from curvafit.mesh import surface
 from curvafit.priors.grid import Grid
 from curvafit.topology import betti_numbers
 
+pytestmark = pytest.mark.slow
+
 CUBES, FLAT = (1.0, 1.0, 1.0), (1.0, 0.7, 0.5)
 MIDDLE = (14.1, 14.3, 13.8)
 
