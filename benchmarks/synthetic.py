@@ -13,7 +13,6 @@ after training on the inferred textures. Shapes, fits and runs are kept: a run t
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from pathlib import Path
@@ -30,7 +29,7 @@ from benchmarks.vessel_data import PATCH, SPACING, STACKS, part, raw
 from benchmarks.vessel_report import best_threshold, cells, stacked
 from benchmarks.vessel_scores import SCORES, block_counts, bootstrap
 from benchmarks.vessel_training import BATCH, Plan, Training, dice_ce, predict
-from benchmarks.vessels import other, provenance
+from benchmarks.vessels import begun, other, provenance
 from curvafit.data_synth.case import imaged
 from curvafit.data_synth.estimate import like
 from curvafit.data_synth.modality import Modality, field_shape
@@ -180,14 +179,7 @@ def pictures(study: Study, names: list[str]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-o", "--output", type=Path, default=Path("synthetic"))
-    parser.add_argument("--budget", choices=BUDGETS, default="full")
-    parser.add_argument("--seeds", type=int, default=3)
-    options = parser.parse_args()
-    torch.set_num_threads(1)
-    torch.use_deterministic_algorithms(True)
-    torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
+    options = begun(__doc__, "synthetic", BUDGETS)
     study, names = Study(options.output / options.budget, BUDGETS[options.budget]), [*KINDS, SLICES, TUNED]
     runs: dict[str, list[list[dict]]] = {name: [] for name in names}
     for seed in range(options.seeds):

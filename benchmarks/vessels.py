@@ -16,6 +16,7 @@ import argparse
 import json
 import subprocess
 import time
+from collections.abc import Iterable
 from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
@@ -169,15 +170,20 @@ def provenance() -> dict[str, str]:
     return {"commit": asked.stdout.strip() or "unknown"} | packages
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-o", "--output", type=Path, default=Path("vessels"))
-    parser.add_argument("--budget", choices=BUDGETS, default="full")
+def begun(doc: str | None, folder: str, budgets: Iterable[str]) -> argparse.Namespace:
+    """The options of a study, and torch as it needs it: one thread, the same bits every time."""
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("-o", "--output", type=Path, default=Path(folder))
+    parser.add_argument("--budget", choices=list(budgets), default="full")
     parser.add_argument("--seeds", type=int, default=3)
-    options = parser.parse_args()
     torch.set_num_threads(1)
     torch.use_deterministic_algorithms(True)
     torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
+    return parser.parse_args()
+
+
+def main() -> None:
+    options = begun(__doc__, "vessels", BUDGETS)
     study = Study(options.output / options.budget, BUDGETS[options.budget])
     rate = study.rate()
     chosen = {loss: study.chosen(loss, rate) for loss in LOSSES}

@@ -103,12 +103,13 @@ def _diagram(kept: _Arrays, view: str) -> Diagram:
 
 def _mapped(atlas: Atlas, cache: Path, device: str, progress: Progress) -> AtlasMap:
     """Distances, places, clusters, families."""
-    told = partial(_compared, progress)
+    saved, told = cache / "distances.npz", partial(_compared, progress)
+    compare = partial(diagram_distances, atlas.field_diagrams, device=device, progress=told, saved=saved)
     try:
-        distances = diagram_distances(atlas.field_diagrams, device=device, progress=told, saved=cache / "distances.npz")
+        distances = compare()
     except ValueError:  # a file that is damaged, or of other settings
-        (cache / "distances.npz").unlink(missing_ok=True)
-        distances = diagram_distances(atlas.field_diagrams, device=device, progress=told, saved=cache / "distances.npz")
+        saved.unlink(missing_ok=True)
+        distances = compare()
     progress("laying out the map", 0.86)
     key = hashlib.sha256(distances.tobytes()).hexdigest()[:12]
     places = _kept(cache / f"places-{key}-{version('umap-learn')}.npz", lambda: {"positions": embed(distances)})

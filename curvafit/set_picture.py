@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 
 from curvafit.data_synth.layouts import LAYOUTS
 from curvafit.data_synth.sets import RECORDS, read_order
-from curvafit.plot import CONTOUR, DPI
-from curvafit.scan import read_values, write_atomically
+from curvafit.plot import CONTOUR, write_picture
+from curvafit.scan import read_values
 
 #: Cases in the picture, and in a row of it.
 SHOWN, ROW = 8, 4
@@ -42,4 +42,4 @@ def write_preview(folder: str | Path) -> Path:
         if 0 < label[middle].sum() < label[middle].size:
             axes[row + 1, column].contour(label[middle], [0.5], colors=CONTOUR, linewidths=0.8)
         axes[row, column].set_title(f"{name}\n{record['source']['name']}"[:60], fontsize=8)
-    return write_atomically(folder / "preview.png", lambda place: figure.savefig(place, dpi=DPI))
+    return write_picture(figure, folder / "preview.png")

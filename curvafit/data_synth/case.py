@@ -11,7 +11,7 @@ import torch
 
 from curvafit.data_synth.draws import one_thread
 from curvafit.data_synth.modality import Imaging, Modality, field_shape, image, regrid
-from curvafit.data_synth.sources import Source, Stored, source_of
+from curvafit.data_synth.sources import Source, source_of
 
 #: Shapes that a case gets until one is seen on the image's voxels, which may be coarse.
 TRIES = 8
@@ -117,7 +117,7 @@ def imaged(
 def check_crop(source: Source, shape: Sequence[int], voxel: float, modality: Modality) -> None:
     """Raise ValueError where images of `shape` need crops that are larger than a store's shapes."""
     need = field_shape(shape, voxel, modality.base)
-    if isinstance(source, Stored) and max(need) > source.within:
+    if max(need) > source.within:
         images, crops = (" x ".join(map(str, each)) for each in (shape, need))
         raise ValueError(
             f"expected crops within the {source.within} voxels of the stored shapes, but {images} voxels of "

@@ -9,7 +9,7 @@ import networkx as nx
 import numpy as np
 
 from curvafit.priors.grid import METRES
-from curvafit.scan import write_atomically
+from curvafit.scan import write_atomically, write_content
 
 #: SWC's type of what is neither soma, axon nor dendrite.
 UNDEFINED = 0
@@ -68,7 +68,7 @@ def write_swc(graph: nx.MultiGraph, path: str | Path, unit: str) -> Path:
     for k, (place, radius, parent) in enumerate(rows, start=1):
         numbers = " ".join(f"{v * factor:.7g}" for v in (*place[::-1], radius))
         lines.append(f"{k} {UNDEFINED} {numbers} {parent}")
-    return write_atomically(target, lambda temporary: _write(temporary, lines))
+    return write_content(target, "\n".join(lines) + "\n")
 
 
 def _lay_out(piece: nx.MultiGraph, rows: list[tuple[np.ndarray, float, int]], cuts: list[tuple[int, int]]) -> None:
@@ -112,7 +112,3 @@ def _named(path: str | Path, suffix: str) -> Path:
     if target.suffix.lower() != suffix:
         raise ValueError(f"expected a name ending in {suffix}, got {target.name!r}")
     return target
-
-
-def _write(path: Path, lines: list[str]) -> None:
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")

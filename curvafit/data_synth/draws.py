@@ -100,6 +100,7 @@ def _record(index: int, draw: Draw, flow: Flow, seconds: float) -> Record:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
+    """Within it torch and numba have one thread: sums, and so voxels, do not depend on how many there are."""
     before = torch.get_num_threads(), numba.get_num_threads()
     torch.set_num_threads(1)
     numba.set_num_threads(1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -36,6 +37,11 @@ class Shape(NamedTuple):
 
 class Source(Protocol):
     """Shapes without end, each of the random numbers it is given."""
+
+    @property
+    def within(self) -> float:
+        """The most voxels that a shape can have along an edge."""
+        ...
 
     def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> Shape:
         """Shape number `index` of so many voxels (z, y, x)."""
@@ -72,6 +78,11 @@ class Generated:
             raise ValueError(f"expected points of {len(PARAMETERS)} numbers ({', '.join(PARAMETERS)})")
         if len(self.names) != len(self.points):
             raise ValueError(f"expected a name for each of {len(self.points)} points, got {len(self.names)}")
+
+    @property
+    def within(self) -> float:
+        """A shape is grown as large as it is asked for."""
+        return math.inf
 
     def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> Shape:
         """A well-formed shape, of the first of some seeds that gives one.
@@ -120,10 +131,9 @@ class Stored:
         ValueError
             If it is larger than these, there are none, or many crops show only one.
         """
-        draws = [(path, draw) for path in self.paths for draw in _opened(str(path))[1]]
+        draws = _formed(self.paths)
         for _ in range(CROPS):
-            path, draw = draws[int(rng.integers(len(draws)))]
-            store = _opened(str(path))[0]
+            store, draw = draws[int(rng.integers(len(draws)))]
             field, moved = any_crop(store.field(draw), voxels, rng)
             if field.min() < 0 < field.max():
                 break
@@ -132,7 +142,7 @@ class Stored:
             raise ValueError(f"expected structure and background in crops of {edges} voxels, got one {CROPS} times")
         record, settings = store.record(draw), store.settings
         point = dict(zip(PARAMETERS, (*map(float, record.coefficients), record.mass), strict=True))
-        origin = {"name": f"{path.name} {draw}", "parameters": point, "seed": record.seed, **moved}
+        origin = {"name": f"{store.path.name} {draw}", "parameters": point, "seed": record.seed, **moved}
         return Shape(field, settings.epsilon / settings.spacing[0], origin)
 
     def as_dict(self) -> dict[str, Any]:
@@ -141,7 +151,7 @@ class Stored:
     @property
     def within(self) -> int:
         """The least edge of the stores' shapes, in voxels: what a crop must be within."""
-        return min(min(_opened(str(path))[0].settings.shape) for path in self.paths)
+        return min(min(store.settings.shape) for store, _ in _formed(self.paths))
 
 
 def source_of(kept: dict[str, Any]) -> Source:
@@ -152,10 +162,12 @@ def source_of(kept: dict[str, Any]) -> Source:
 
 
 @lru_cache(maxsize=16)
-def _opened(path: str) -> tuple[Store, list[int]]:
-    """A store and its well-formed draws."""
-    store = open_store(path)
-    found = [index for index in store.indices() if well_formed(store.record(index).viability)]
-    if not found:
-        raise ValueError(f"expected a store with well-formed shapes, got none in {store.path}")
-    return store, found
+def _formed(paths: tuple[Path, ...]) -> list[tuple[Store, int]]:
+    """The well-formed draws of some stores, each with its store."""
+    found = []
+    for store in map(open_store, paths):
+        own = [(store, index) for index in store.indices() if well_formed(store.record(index).viability)]
+        if not own:
+            raise ValueError(f"expected a store with well-formed shapes, got none in {store.path}")
+        found += own
+    return found
