@@ -2,38 +2,37 @@
 
     python -m benchmarks.synthetic [-o synthetic] [--budget full] [--seeds 3]
 
-Coefficients are inferred, and the images' noise, blur and contrast estimated, from the unlabelled x < 240 of one
-stack, split at Otsu's threshold of the grey values' logarithm (vessels differ tenfold in brightness); the test is
-x > 272 of the other; then the two swap. Four kinds of shapes are imaged alike: straight tubes,
-Gaussian level cuts, the packaged atlas, textures with the inferred coefficients. No label is used, and nothing is
-chosen by one: the network's threshold is 0.5, the rate and the steps are those of `benchmarks.vessels`. Beside them
-stand the one threshold that is best in hindsight on the test part itself; and three annotated slices, from scratch and
-after training on the inferred textures. Shapes, fits and runs are kept: a run that was stopped goes on.
+From the unlabelled x < 240 of one stack come the coefficients, the volume fraction and all degradations (`infer` and
+`like` on the mask that `like` itself guesses); the test is x > 272 of the other; then the two swap. Four kinds of
+shapes are imaged alike: straight tubes, Gaussian level cuts, the packaged atlas, inferred textures. A network sees synthetic pairs only, and its threshold is 0.5. Masks hold what the images show (`Imaging.visible`), as an
+annotator's do. Beside them stand the one threshold that is best in hindsight on the test part itself; and three
+annotated slices, from scratch and after training on the inferred textures. Shapes, fits and runs are kept: a run that
+was stopped goes on.
 """
 
 from __future__ import annotations
 
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
-from skimage.filters import threshold_otsu
 from torch import Tensor
 
-from benchmarks.synthetic_shapes import EDGE, KINDS, fields
+from benchmarks.synthetic_shapes import EPSILON, KINDS, fields, law
 from benchmarks.vessel_data import PATCH, SPACING, STACKS, part, raw
 from benchmarks.vessel_report import best_threshold, cells, stacked
 from benchmarks.vessel_scores import SCORES, block_counts, bootstrap
 from benchmarks.vessel_training import BATCH, Plan, Training, dice_ce, predict
 from benchmarks.vessels import begun, other, provenance
 from curvafit.data_synth.case import imaged
-from curvafit.data_synth.estimate import like
+from curvafit.data_synth.estimate import bright, like, visible_share
 from curvafit.data_synth.modality import Modality, field_shape
-from curvafit.data_synth.moves import any_crop
+from curvafit.data_synth.moves import SYMMETRIES, cropped, turned
 from curvafit.infer import infer
 from curvafit.scan import Field, write_content
 
@@ -51,16 +50,19 @@ class Budget(NamedTuple):
     count: int
 
 
-BUDGETS = {"small": Budget(6, 4, 8e-3, 2e-3, 2), "full": Budget(400, 400, 8e-3, 4e-3, 16)}
+BUDGETS = {"small": Budget(6, 4, 8e-3, 4e-3, 2), "full": Budget(200, 400, 8e-3, 4e-3, 12)}
 
 
 class Synthetic(Training):
     """A network in training on pairs that are made as it goes."""
 
-    def __init__(self, shapes: np.ndarray, modality: Modality, scan: np.ndarray, plan: Plan, seed: int) -> None:
+    def __init__(
+        self, shapes: np.ndarray, edge: float, modality: Modality, scan: np.ndarray, plan: Plan, seed: int
+    ) -> None:
         super().__init__(part(STACKS[0], "fit"), plan, seed)
         values = np.log1p(scan.astype(np.float32))
-        self.shapes, self.modality, self.mean, self.spread = shapes, modality, values.mean(), values.std()
+        self.shapes, self.edge, self.modality = shapes, edge, modality
+        self.mean, self.spread = values.mean(), values.std()
 
     def batch(self, step: int) -> tuple[Tensor, Tensor]:
         x, y = (torch.stack(each) for each in zip(*(self._pair(step, k) for k in range(BATCH)), strict=True))
@@ -71,12 +73,14 @@ class Synthetic(Training):
         words = np.random.SeedSequence((self.seed, step % 2**32, k))
         rng, (draw, noise) = np.random.default_rng(words), map(int, words.generate_state(2))
         imaging = self.modality.draw(draw)
-        whole = self.shapes[int(rng.integers(len(self.shapes)))]
-        crop, _ = any_crop(whole, field_shape(PATCH, EDGE, imaging), rng)
-        grey, seen = imaged(torch.from_numpy(crop), 2.0, EDGE, imaging, noise, PATCH)
+        whole = turned(self.shapes[int(rng.integers(len(self.shapes)))], int(rng.integers(SYMMETRIES)))
+        size = field_shape(PATCH, self.edge, imaging)
+        corner = [int(rng.integers(n - m + 1)) for n, m in zip(whole.shape, size, strict=True)]
+        crop = torch.from_numpy(np.ascontiguousarray(cropped(whole, corner, size)))
+        grey, _, mask = imaged(crop, EPSILON, self.edge, imaging, noise, PATCH)
         x = (torch.log1p(grey.clamp_min(0)) - self.mean) / self.spread
         x = float(rng.uniform(0.9, 1.1)) * x + float(rng.uniform(-0.1, 0.1))
-        return x[None].float(), (seen > 0)[None].float()
+        return x[None].float(), mask[None].float()
 
 
 class Study:
@@ -92,8 +96,13 @@ class Study:
 
     def mask(self, stack: str) -> Field:
         """Where that part is bright: a guess without labels."""
-        bright = np.log1p(self.scan(stack).values.astype(np.float32))
-        return Field((bright > threshold_otsu(bright)).astype(np.uint8), SPACING, "um")
+        guess = bright(self.scan(stack).values.astype(np.float32), SPACING)
+        return Field(guess.astype(np.uint8), SPACING, "um")
+
+    def modality(self, stack: str) -> Modality:
+        """Images like that part, with masks of what can be seen."""
+        found = like(self.scan(stack))
+        return replace(found, base=replace(found.base, visible=visible_share(self.scan(stack), found)))
 
     def fit(self, stack: str) -> Path:
         path = self.folder / f"fit-{stack}.json"
@@ -135,10 +144,9 @@ class Study:
         return training
 
     def _synthetic(self, kind: str, stack: str, seed: int) -> Synthetic:
-        shapes = fields(kind, self.fit(stack), self.folder, self.budget.count)
-        scan = self.scan(stack)
-        plan = Plan(self.budget.steps, 0, self.budget.rate)
-        return Synthetic(shapes, like(scan, self.mask(stack).values > 0), scan.values, plan, seed)
+        fit, plan = self.fit(stack), Plan(self.budget.steps, 0, self.budget.rate)
+        shapes = fields(kind, fit, self.folder, self.budget.count)
+        return Synthetic(shapes, law(fit).working_voxel, self.modality(stack), self.scan(stack).values, plan, seed)
 
 
 def table(runs: dict[str, list[list[dict]]]) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from curvafit.data_synth.draws import one_thread
-from curvafit.data_synth.modality import Imaging, Modality, field_shape, image, regrid
+from curvafit.data_synth.modality import Imaging, Modality, field_shape, image, regrid, visible
 from curvafit.data_synth.sources import Source, source_of
 
 #: Shapes that a case gets until one is seen on the image's voxels, which may be coarse.
@@ -18,11 +18,12 @@ TRIES = 8
 
 
 class Case(NamedTuple):
-    """An image and the phase field of what it shows, arrays (Z, Y, X) on one grid of `spacing`; ε in spacing's unit;
-    and what a record says of it, in JSON's types."""
+    """An image, the phase field of what it shows, and its mask, arrays (Z, Y, X) on one grid of `spacing`; ε in
+    spacing's unit; and what a record says of it, in JSON's types."""
 
     image: np.ndarray
     field: np.ndarray
+    mask: np.ndarray
     spacing: tuple[float, float, float]
     unit: str
     epsilon: float
@@ -78,15 +79,18 @@ class Recipe:
             for _ in range(TRIES):
                 made = self.source.shape(voxels, index, rng)
                 u = torch.from_numpy(made.field)
-                grey, seen = (each.numpy() for each in imaged(u, made.epsilon, self.voxel, imaging, seed, self.shape))
-                if seen.min() <= 0 < seen.max():
+                made_of = imaged(u, made.epsilon, self.voxel, imaging, seed, self.shape)
+                grey, seen, mask = (each.numpy() for each in made_of)
+                if seen.min() <= 0 < seen.max() and mask.any() and not mask.all():
                     break
             else:
                 told = " x ".join(map(str, self.shape))
                 raise ValueError(f"expected structure and background on {told} voxels, got one {TRIES} times")
         record = {"index": index, "source": made.origin, "imaging": imaging.as_dict(), "image_seed": seed}
-        record |= {"voxel": self.voxel, "volume_fraction": float((seen > 0).mean())}
-        return Case(_counts(grey, imaging), seen, imaging.spacing, imaging.unit, made.epsilon * self.voxel, record)
+        record |= {"voxel": self.voxel, "volume_fraction": float(mask.mean())}
+        return Case(
+            _counts(grey, imaging), seen, mask, imaging.spacing, imaging.unit, made.epsilon * self.voxel, record
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """All of it in JSON's types."""
@@ -103,15 +107,17 @@ class Recipe:
 
 def imaged(
     field: torch.Tensor, epsilon: float, voxel: float, imaging: Imaging, seed: int, shape: Sequence[int]
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """The image of a phase field (Z, Y, X), and the field on the image's voxels, both of `shape`; see `imaging.image`.
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """The image of a phase field (Z, Y, X), the field on the image's voxels, and its mask there, all of `shape`.
 
     `epsilon` is in the field's voxels, whose edge is `voxel`. A field of whole voxels may hold a few more than an image
-    asks for.
+    asks for. See `imaging.image` and `Imaging.visible`.
     """
     u, (z, y, x) = field[None, None], shape
     grey, seen = image(u, voxel, [imaging], [seed], epsilon), regrid(u, voxel, [imaging])
-    return grey[0, 0, :z, :y, :x].contiguous(), seen[0, 0, :z, :y, :x].contiguous()
+    mask = visible(u, voxel, [imaging], epsilon) if imaging.visible else seen > 0
+    grey, seen, mask = (each[0, 0, :z, :y, :x].contiguous() for each in (grey, seen, mask))
+    return grey, seen, mask
 
 
 def check_crop(source: Source, shape: Sequence[int], voxel: float, modality: Modality) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ from skimage.filters import threshold_otsu
 
 from curvafit.data_synth.imaging import Imaging
 from curvafit.data_synth.modality import Modality
-from curvafit.data_synth.noise_estimate import Noise, background_of, noise_of
+from curvafit.data_synth.noise_estimate import Noise, background_of, covariance, noise_of
 from curvafit.data_synth.optics import blur
 from curvafit.scan import Field
 
@@ -20,6 +21,8 @@ from curvafit.scan import Field
 MOST = 2_000_000
 #: Deviation, in voxels of the finest edge, of the window that the structure's brightness is averaged in.
 WINDOW = 4.0
+#: Correlation lengths of that brightness, in the same, that are looked at.
+LENGTHS = np.geomspace(WINDOW, 10 * WINDOW, 60)
 #: Deviation, in the same, of the smoothing before voxels are told apart.
 SMOOTH = 0.8
 #: What a drawn parameter is the estimate's, low and high.
@@ -36,11 +39,13 @@ SPREAD: dict[str, tuple[float, float]] = {
 
 
 class Structure(NamedTuple):
-    """What the mask's surroundings tell: blur in lengths (z, y, x), mean contrast, its relative deviation."""
+    """What the mask's surroundings tell: blur in lengths (z, y, x), mean contrast, its relative deviation and the
+    length, in voxels of the finest edge, that it is correlated by."""
 
     blur: tuple[float, float, float]
     contrast: float
     texture: float
+    length: float
 
 
 def like(scan: Field, mask: np.ndarray | None = None) -> Modality:
@@ -71,11 +76,11 @@ def like(scan: Field, mask: np.ndarray | None = None) -> Modality:
     """
     values, given = _middle(scan, mask)
     steps = np.array(scan.spacing)
-    inside = _bright(values, steps) if given is None else given
+    inside = bright(values, steps) if given is None else given
     if not inside.any() or inside.all():
         raise ValueError("expected a mask with voxels inside and outside, got an empty or a full one")
     ground = background_of(values, inside, steps)
-    structure, _ = _structure(values, inside, steps, ground.level)
+    structure = _structure(values, inside, steps, ground.level)
     noise = noise_of(values, inside, ground, steps, ground.level + structure.contrast)
     base = _imaging(scan, structure, noise)
     ranges = {name: _around(getattr(base, name), *ends) for name, ends in SPREAD.items() if np.any(getattr(base, name))}
@@ -99,7 +104,7 @@ def _imaging(scan: Field, structure: Structure, noise: Noise) -> Imaging:
         background_texture=min(noise.texture * shrunk / max(low * unit, 1e-9), 2.0),
         texture_length=length,
         foreground_texture=min(structure.texture * abs(structure.contrast) / max(high * unit, 1e-9), 2.0),
-        foreground_length=WINDOW * min(scan.spacing),
+        foreground_length=structure.length * min(scan.spacing),
         blur=structure.blur,
         bias=min(noise.bias, 0.9),
         bias_length=max(n * h for n, h in zip(scan.shape, scan.spacing, strict=True)) / 2,
@@ -126,9 +131,13 @@ def _middle(scan: Field, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarra
     return values, None if mask is None else np.asarray(mask)[box].astype(bool)
 
 
-def _bright(values: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Voxels above half of the brightness of Otsu's voxels around them, each weighed by its own: an edge is then where
-    it is whatever a structure's brightness. The threshold is sought on square roots, so that dim structures count."""
+def bright(values: np.ndarray, steps: np.ndarray | Sequence[float]) -> np.ndarray:
+    """A guess at the structure's voxels in grey values (Z, Y, X) on voxels of edges `steps`.
+
+    Those above half of the brightness of Otsu's voxels around them, each weighed by its own: an edge is then where it
+    is whatever a structure's brightness. The threshold is sought on square roots, so that dim structures count.
+    """
+    steps = np.asarray(steps, dtype=float)
     finest = steps.min() / steps
     smooth = ndimage.gaussian_filter(values, SMOOTH * finest)
     root = np.sqrt(np.maximum(smooth - np.quantile(smooth, 0.001), 0))
@@ -140,8 +149,30 @@ def _bright(values: np.ndarray, steps: np.ndarray) -> np.ndarray:
     return np.logical_and(contrast > local / 2, ndimage.maximum_filter(above, size=3))
 
 
-def _structure(values: np.ndarray, inside: np.ndarray, steps: np.ndarray, level: float) -> tuple[Structure, np.ndarray]:
-    """The blur (z, and y = x) whose image of the mask is nearest to the scan around it; the brightness everywhere."""
+def visible_share(scan: Field, modality: Modality) -> float:
+    """The share of the structure's light (`Imaging.visible`) at which voxels of a scan look bright, at least 0.01.
+
+    Bright is what exceeds Otsu's threshold of the logarithm of the grey values over the background's darkest. In images
+    of the modality, which is one `like` the scan, a structure of mean brightness passes that level at this share.
+
+    Raises
+    ------
+    ValueError
+        If the modality's structure is not brighter than its background.
+    """
+    base = modality.base
+    low, high = (base.offset + (base.gain or 1.0) * level for level in (base.background, base.foreground))
+    if not low < high:
+        raise ValueError(f"expected a structure brighter than its background, got levels {high:.4g} and {low:.4g}")
+    values, _ = _middle(scan, None)
+    darkest = min(float(np.quantile(values, 0.001)), (low + base.offset) / 2)
+    above = np.log1p(np.maximum(values - darkest, 0) / (low - darkest))
+    level = darkest + (low - darkest) * math.expm1(float(threshold_otsu(above)))
+    return min(max((level - low) / (high - low), 0.01), 0.99)
+
+
+def _structure(values: np.ndarray, inside: np.ndarray, steps: np.ndarray, level: float) -> Structure:
+    """The blur (z, and y = x) whose image of the mask is nearest to the scan around it; the brightness inside."""
     finest = steps.min() / steps
     window = tuple(WINDOW * finest)
     signal, mask = (torch.from_numpy(each)[None, None].float() for each in (values - level, inside))
@@ -159,12 +190,27 @@ def _structure(values: np.ndarray, inside: np.ndarray, steps: np.ndarray, level:
     simplex = corner + np.array([[0, 0], [0.5, 0], [0, 0.5]])
     options = {"xatol": 0.02, "fatol": math.inf, "maxfev": 80, "initial_simplex": simplex}
     widths = np.exp(optimize.minimize(misfit, corner, method="Nelder-Mead", options=options).x[[0, 1, 1]])
-    everywhere = brightness(blur(mask, 1.0, tuple(widths)))
-    bright = everywhere[mask > 0]
-    bright = bright[bright * bright.mean() > 0]
+    contrast = brightness(blur(mask, 1.0, tuple(widths)))[0, 0].numpy()
+    mean = float(contrast[inside].mean())
     z, y, x = (np.sqrt(np.maximum(widths**2 - 1 / 12, 0)) * steps).tolist()
-    mean, deviation = float(bright.mean()), float(bright.std())
-    return Structure((z, y, x), mean, deviation / abs(mean)), everywhere[0, 0].numpy()
+    return Structure((z, y, x), mean, *_texture(contrast / mean, inside))
+
+
+def _texture(relative: np.ndarray, inside: np.ndarray) -> tuple[float, float]:
+    """Deviation and length, in voxels of the plane, of a brightness that was averaged over a window of `WINDOW`: by the
+    covariance of its logarithm. The average lengthens the one, and along a tube it lessens the other."""
+    used = inside & (relative > 0)
+    logs = np.log(np.where(used, relative, 1.0))
+    weight = used.astype(np.float32)
+    rest = (logs - logs[used].mean()) * weight
+    first, second = (covariance(rest, weight, axis) for axis in (1, 2))
+    lags = min(len(first), len(second))
+    seen = (first[:lags] + second[:lags]) / 2
+    share = seen / max(seen[0], 1e-12)
+    misfit = [np.square(share - np.exp(-0.5 * (np.arange(lags) / length) ** 2)).sum() for length in LENGTHS]
+    found = float(LENGTHS[int(np.argmin(misfit))])
+    length = math.sqrt(max(found**2 - 2 * WINDOW**2, WINDOW**2))
+    return math.sqrt(math.expm1(float(seen[0]) * max(found / length, 1.0))), length
 
 
 def _around(value: Any, low: float, high: float) -> tuple[Any, Any]:

@@ -15,12 +15,12 @@ from curvafit.data_synth.optics import EPSILON
 from curvafit.data_synth.randomness import seeds_of
 from curvafit.data_synth.separable import Triple, sampled
 from curvafit.priors.grid import METRES
-from curvafit.priors.shapes import Float
+from curvafit.priors.shapes import Bool, Float
 
 #: Fields of an `Imaging` that are three numbers (z, y, x).
 TRIPLES = ("spacing", "blur", "noise_width")
 #: Those that are shares, those that are above zero; all other numbers are from zero.
-SHARES = ("dropout", "dropout_loss", "bias")
+SHARES = ("dropout", "dropout_loss", "bias", "visible")
 POSITIVE = ("spacing", "texture_length", "foreground_length", "bias_length", "stripe_width", "ring_width")
 POSITIVE += ("dropout_length", "clutter_radius")
 
@@ -56,6 +56,9 @@ class Imaging:
         the noise's smoothing (z, y, x) in voxels of the image.
     ceiling
         Counts are whole and end here; not so where it is None.
+    visible
+        What masks hold: voxels that this share of a structure's light reaches, as an annotator sees them, or, at 0, the
+        structure itself.
 
     Raises
     ------
@@ -93,6 +96,7 @@ class Imaging:
     rician: float = 0.0
     noise_width: Triple = (0.0, 0.0, 0.0)
     ceiling: float | None = None
+    visible: float = 0.0
 
     def __post_init__(self) -> None:
         if self.unit not in (*METRES, "voxel"):
@@ -170,6 +174,20 @@ def regrid(
     return degrade.sample(shapes, spacing, imaging[0].spacing)
 
 
+def visible(
+    shapes: Float[torch.Tensor, "b 1 z y x"], spacing: float, imaging: Sequence[Imaging], epsilon: float = EPSILON
+) -> Bool[torch.Tensor, "b 1 Z Y X"]:
+    """The images' voxels that a share of the structure's light reaches (`Imaging.visible`), evenly stained as it is.
+
+    Raises
+    ------
+    ValueError
+        As `image` does.
+    """
+    _alike(shapes, imaging)
+    return torch.cat([_reached(one, spacing, how, epsilon) for one, how in zip(shapes.split(1), imaging, strict=True)])
+
+
 def field_shape(shape: Sequence[int], spacing: float, imaging: Imaging) -> tuple[int, int, int]:
     """The least voxels (z, y, x) of edge `spacing` that an image of a shape is made from."""
     z, y, x = (math.ceil(n * h / spacing - 1e-6) for n, h in zip(shape, imaging.spacing, strict=True))
@@ -192,8 +210,7 @@ def known_fields(names: Mapping[str, Any], whose: str) -> None:
 def _image(shape: torch.Tensor, spacing: float, how: Imaging, seeds: list[int], epsilon: float) -> torch.Tensor:
     occupied = degrade.occupancy(shape, epsilon)
     light = _blurred(_emitted(occupied, spacing, how, seeds), spacing, how)
-    window = (how.thickness, *how.spacing[1:])
-    light = degrade.sample(light, spacing, how.spacing, window)
+    light = degrade.sample(light, spacing, how.spacing, _window(how))
     if how.bias:
         light = light * degrade.bias(light, how.spacing, how.bias, how.bias_length, seeds)
     if how.stripes:
@@ -205,6 +222,15 @@ def _image(shape: torch.Tensor, spacing: float, how: Imaging, seeds: list[int], 
         strength = how.rings * abs(how.foreground - how.background) * (how.gain or 1)
         counts = counts + degrade.rings(counts, how.spacing, strength, how.ring_width, seeds)
     return counts if how.ceiling is None else degrade.digitised(counts, how.ceiling)
+
+
+def _reached(shape: torch.Tensor, spacing: float, how: Imaging, epsilon: float) -> torch.Tensor:
+    light = degrade.blur_with_depth(degrade.occupancy(shape, epsilon), spacing, how.blur, how.blur_growth)
+    return degrade.sample(light, spacing, how.spacing, _window(how)) > how.visible
+
+
+def _window(how: Imaging) -> Triple:
+    return how.thickness, *how.spacing[1:]
 
 
 def _emitted(occupied: torch.Tensor, spacing: float, how: Imaging, seeds: list[int]) -> torch.Tensor:

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.data_synth.imaging import TRIPLES, Imaging, field_shape, image, image_shape, known_fields, regrid
+from curvafit.data_synth.imaging import TRIPLES, Imaging, field_shape, image, image_shape, known_fields, regrid, visible
 from curvafit.data_synth.randomness import seeds_of
 
-__all__ = ["Imaging", "Modality", "field_shape", "image", "image_shape", "regrid"]
+__all__ = ["Imaging", "Modality", "field_shape", "image", "image_shape", "regrid", "visible"]
 
 
 @dataclass(frozen=True)

@@ -61,7 +61,7 @@ def background_of(values: np.ndarray, inside: np.ndarray, steps: np.ndarray) -> 
     level = float(values[where].mean())
     weight = where.astype(np.float32)
     rest = (values - level) * weight
-    covariances = [_covariance(rest, weight, axis) for axis in range(3)]
+    covariances = [covariance(rest, weight, axis) for axis in range(3)]
     plane = (covariances[1] + covariances[2]) / 2
     noise, lateral, texture, length = _split(plane)
     _, axial, _, _ = _split(covariances[0])
@@ -95,7 +95,7 @@ def noise_of(values: np.ndarray, inside: np.ndarray, ground: Background, steps: 
     return Noise(gain, math.sqrt(max(constant, 0.0)), offset, ground.width, *rest)
 
 
-def _covariance(rest: np.ndarray, weight: np.ndarray, axis: int) -> np.ndarray:
+def covariance(rest: np.ndarray, weight: np.ndarray, axis: int) -> np.ndarray:
     """At lags from 0, of pairs of which both are background."""
     a, w = np.moveaxis(rest, axis, 0), np.moveaxis(weight, axis, 0)
     lags = min(LAGS, len(a) // 3)

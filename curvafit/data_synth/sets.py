@@ -212,7 +212,7 @@ def _write_case(folder: Path, order: Order, index: int, case: Case) -> None:
     parts = folder / layout.part
     try:
         known = _write_parts(order, case, lambda part: Path(str(parts).format(part=part, case=name)), places)
-        mask = (case.field > 0).astype(np.uint8)
+        mask = case.mask.astype(np.uint8)
         for values, place in zip((mask, case.image), places, strict=False):
             save(Field(values, case.spacing, case.unit), place)
         sums = {"image": _digest(case.image), "label": _digest(mask)}

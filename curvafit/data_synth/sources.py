@@ -62,22 +62,27 @@ class Generated:
         What the points are called, one each.
     schedule
         Of the flow.
+    fraction
+        Share of the volume that every shape fills; instead of the points' masses.
 
     Raises
     ------
     ValueError
-        If there is no point, one has another length, or the names are not as many.
+        If there is no point, one has another length, the names are not as many, or the fraction is not within (0, 1).
     """
 
     points: tuple[tuple[float, ...], ...]
     names: tuple[str, ...]
     schedule: str = "fast"
+    fraction: float | None = None
 
     def __post_init__(self) -> None:
         if not self.points or any(len(point) != len(PARAMETERS) for point in self.points):
             raise ValueError(f"expected points of {len(PARAMETERS)} numbers ({', '.join(PARAMETERS)})")
         if len(self.names) != len(self.points):
             raise ValueError(f"expected a name for each of {len(self.points)} points, got {len(self.names)}")
+        if self.fraction is not None and not 0 < self.fraction < 1:
+            raise ValueError(f"expected a volume fraction between 0 and 1, got {self.fraction:g}")
 
     @property
     def within(self) -> float:
@@ -99,10 +104,16 @@ class Generated:
             seed = int(rng.integers(2**32))
             with one_thread():
                 flow = generate(
-                    Coefficients(*six), mass, grid, seed=seed, schedule=named_schedule(self.schedule), reject_early=True
+                    Coefficients(*six),
+                    mass if self.fraction is None else None,
+                    grid,
+                    volume_fraction=self.fraction,
+                    seed=seed,
+                    schedule=named_schedule(self.schedule),
+                    reject_early=True,
                 )
             if well_formed(flow.viability):
-                point = dict(zip(PARAMETERS, (*six, mass), strict=True))
+                point = dict(zip(PARAMETERS, (*six, flow.mass), strict=True))
                 origin = {"name": self.names[turn], "parameters": point, "seed": seed, "schedule": self.schedule}
                 return Shape(flow.field.numpy(), WORKING_EPSILON / WORKING_SPACING, origin)
             status = flow.status
@@ -114,6 +125,7 @@ class Generated:
             "names": list(self.names),
             "points": [list(point) for point in self.points],
             "schedule": self.schedule,
+            "fraction": self.fraction,
         }
 
 
@@ -158,7 +170,7 @@ def source_of(kept: dict[str, Any]) -> Source:
     """The inverse of `Source.as_dict`."""
     if kept["kind"] == "stored":
         return Stored(tuple(map(Path, kept["paths"])))
-    return Generated(tuple(map(tuple, kept["points"])), tuple(kept["names"]), kept["schedule"])
+    return Generated(tuple(map(tuple, kept["points"])), tuple(kept["names"]), kept["schedule"], kept.get("fraction"))
 
 
 @lru_cache(maxsize=16)

@@ -112,10 +112,10 @@ class TextureDataset(IterableDataset):
         imaging, voxel = modality.draw(for_imaging), self.voxel or modality.voxel
         voxels = field_shape(self.shape, voxel, imaging)
         u, epsilon, origin = self._shape(voxels, rng, for_blend)
-        grey, seen = imaged(u, epsilon, voxel, imaging, for_image, self.shape)
+        grey, _, mask = imaged(u, epsilon, voxel, imaging, for_image, self.shape)
         record = {"number": number, "source": origin, "modality": modality.name, "imaging": imaging.as_dict()}
         record |= {"image_seed": for_image, "voxel": voxel}
-        return Sample(grey[None].float(), (seen > 0)[None].to(torch.uint8), imaging.spacing, record)
+        return Sample(grey[None].float(), mask[None].to(torch.uint8), imaging.spacing, record)
 
     def _shape(
         self, voxels: Sequence[int], rng: np.random.Generator, seed: int

@@ -24,6 +24,8 @@ class Prior(NamedTuple):
         The same coefficients, and ε, with lengths in `unit`.
     working_voxel
         Edge of a working voxel in `unit`.
+    volume_fraction
+        Of the scan's structure, None where the file does not tell.
     """
 
     coefficients: Coefficients
@@ -32,6 +34,7 @@ class Prior(NamedTuple):
     epsilon: float
     working_voxel: float
     unit: str
+    volume_fraction: float | None = None
 
     def in_unit(self, unit: str | None) -> Coefficients:
         """The coefficients with lengths in another unit, or in their own where none is named.
@@ -95,6 +98,7 @@ def read_fit(path: str | PathLike[str]) -> Prior:
         mass, epsilon, voxel = (float(content[key]) for key in ("mass", "epsilon_physical", "working_voxel"))
         if not (epsilon > 0 and voxel > 0):
             raise ValueError(f"expected a positive ε and working voxel in {path}, got {epsilon} and {voxel}")
-        return Prior(working, mass, physical, epsilon, voxel, str(content["length_unit"]))
+        filled = content.get("morphometry", {}).get("volume_fraction")
+        return Prior(working, mass, physical, epsilon, voxel, str(content["length_unit"]), filled)
     except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
         raise ValueError(f"expected a fit.json written by `curvafit infer`, got {path} ({error!r})") from error
