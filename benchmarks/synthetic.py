@@ -4,14 +4,15 @@
 
 From the unlabelled x < 240 of one stack come the coefficients, the volume fraction and all degradations (`infer` and
 `like` on the mask that `like` itself guesses); the test is x > 272 of the other; then the two swap. Four kinds of
-shapes are imaged alike: straight tubes, Gaussian level cuts, the packaged atlas, inferred textures. A network sees synthetic pairs only, and its threshold is 0.5. Masks hold what the images show (`Imaging.visible`), as an
-annotator's do. Beside them stand the one threshold that is best in hindsight on the test part itself; and three
-annotated slices, from scratch and after training on the inferred textures. Shapes, fits and runs are kept: a run that
-was stopped goes on.
+shapes are imaged alike: straight tubes, Gaussian level cuts, the packaged atlas, inferred textures. A network sees
+synthetic pairs only, and its threshold is 0.5. Masks hold what the images show (`Imaging.visible`), as an annotator's
+do. Beside them stand the one threshold that is best in hindsight on the test part itself; and three annotated slices,
+from scratch and after training on the inferred textures. Shapes, fits and runs are kept: what was stopped goes on.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
 import time
 from dataclasses import replace
@@ -21,7 +22,7 @@ from typing import NamedTuple
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from benchmarks.synthetic_shapes import EPSILON, KINDS, fields, law
 from benchmarks.vessel_data import PATCH, SPACING, STACKS, part, raw
@@ -119,7 +120,7 @@ class Study:
             begun = time.process_time()
             training = self._trained(name, stack, seed, path)
             image, label = part(other(stack), "test")
-            mask = predict(training.model, image) > 0.5
+            mask = mirrored(training.model, image) > 0.5
             kept = {"name": name, "seed": seed, "stack": stack, "seconds": time.process_time() - begun}
             kept |= {"test": block_counts(mask, label), "steps": self.budget.steps} | provenance()
             np.savez_compressed(path.with_suffix(".npz"), mask=mask)
@@ -147,6 +148,13 @@ class Study:
         fit, plan = self.fit(stack), Plan(self.budget.steps, 0, self.budget.rate)
         shapes = fields(kind, fit, self.folder, self.budget.count)
         return Synthetic(shapes, law(fit).working_voxel, self.modality(stack), self.scan(stack).values, plan, seed)
+
+
+def mirrored(model: nn.Module, image: np.ndarray) -> np.ndarray:
+    """Mean prediction of a part and its mirror images in the plane."""
+    turns = [axes for n in range(3) for axes in itertools.combinations((1, 2), n)]
+    found = [np.flip(predict(model, np.ascontiguousarray(np.flip(image, axes))), axes) for axes in turns]
+    return np.mean(found, axis=0)
 
 
 def table(runs: dict[str, list[list[dict]]]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -9,11 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from curvafit.cli_atlas import SchedulerOption, WorkersOption
-from curvafit.cli_support import kept, plainly, reading_of, say, stages, whole_triple
+from curvafit.cli_support import kept, numbers, plainly, reading_of, say, stages, whole_triple
 
 if TYPE_CHECKING:
     from curvafit.data_synth.modality import Modality
     from curvafit.data_synth.sources import Source
+    from curvafit.scan import Field
 
 EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
     (
@@ -42,10 +44,22 @@ Atlas = Annotated[
     _what(help="Store of `curvafit atlas build`, cropped; or an atlas (.npz), whose shapes are grown anew."),
 ]
 Presets = Annotated[str | None, _what(help="Published shapes, by name: tubes,sponge. See `curvafit presets`.")]
+Filled = Annotated[
+    float | None,
+    _what("--volume-fraction", help="Share of the volume that grown shapes fill. By default the scan's, with --prior."),
+]
 Kind = Annotated[str | None, _seen("--modality", help="confocal, two-photon, light-sheet, micro-ct, mra, em-membrane.")]
 Like = Annotated[str | None, _seen(help="A scan to take noise, blur, contrast and spacing from, instead.")]
 Voxel = Annotated[
     float | None, _seen(help="Edge of a shape's voxel, in --unit: how thick the structure is. By default the prior's.")
+]
+Like_mask = Annotated[str | None, _seen(help="Mask of --like's structure, where there is one: nearer estimates.")]
+Visible = Annotated[
+    str | None,
+    _seen(
+        help="Masks of what an image shows, as annotators draw: where this share of the structure's light arrives; "
+        "auto takes the share from --like. By default masks hold the structure itself."
+    ),
 ]
 Spacing = Annotated[str | None, _seen(help="Voxel edges of --like, if its file does not tell: Z,Y,X or one number.")]
 Unit = Annotated[str | None, _seen(help="nm, um, mm or m; of --spacing and --voxel.")]
@@ -58,8 +72,11 @@ def synth(
     prior: Prior = None,
     atlas: Atlas = None,
     presets: Presets = None,
+    volume_fraction: Filled = None,
     modality: Kind = None,
     like: Like = None,
+    like_mask: Like_mask = None,
+    visible: Visible = None,
     voxel: Voxel = None,
     spacing: Spacing = None,
     unit: Unit = None,
@@ -74,8 +91,8 @@ def synth(
         box = whole_triple(shape, "--shape")
         if count < 1:
             raise ValueError(f"expected --count of at least 1, got {count}")
-        source, edge, edge_unit = _source(prior, atlas, presets)
-        seen = _modality(modality, like, reading_of(spacing, unit, None, None, None))
+        source, edge, edge_unit = _source(prior, atlas, presets, volume_fraction)
+        seen = _modality(modality, like, like_mask, visible, reading_of(spacing, unit, None, None, None))
         from curvafit.data_synth.case import Recipe
         from curvafit.data_synth.sets import Order, build_set
         from curvafit.data_synth.workers import cluster
@@ -94,7 +111,9 @@ def synth(
         say(str(write_preview(out)))
 
 
-def _source(prior: Path | None, atlas: Path | None, presets: str | None) -> tuple[Source, float | None, str | None]:
+def _source(
+    prior: Path | None, atlas: Path | None, presets: str | None, filled: float | None
+) -> tuple[Source, float | None, str | None]:
     """Where shapes come from, and the edge and unit of their voxels where that is known."""
     given = [value for value in (prior, atlas, presets) if value is not None]
     if len(given) != 1:
@@ -106,42 +125,66 @@ def _source(prior: Path | None, atlas: Path | None, presets: str | None) -> tupl
 
         names = tuple(presets.split(","))
         found = [preset(name) for name in names]
-        return Generated(tuple((*map(float, each.coefficients), each.mass) for each in found), names), None, None  # type: ignore[arg-type]
+        points = tuple((*map(float, each.coefficients), each.mass) for each in found)  # type: ignore[arg-type]
+        return Generated(points, names, fraction=filled), None, None
     if prior is not None:
         from curvafit.priors import read_fit
 
         fit = read_fit(prior)
         point = (*map(float, fit.coefficients), fit.mass)  # type: ignore[arg-type]
-        return Generated((point,), (str(prior),)), fit.working_voxel, fit.unit
+        filled = fit.volume_fraction if filled is None else filled
+        return Generated((point,), (str(prior),), fraction=filled), fit.working_voxel, fit.unit
     assert atlas is not None
     if atlas.suffix.lower() != ".npz":
+        if filled is not None:
+            raise ValueError("expected --volume-fraction beside shapes that are grown, got a store of shapes")
         return Stored((atlas.resolve(),)), None, None
     from curvafit.index import load_atlas
 
     held = load_atlas(atlas)
     points = tuple((*map(float, row), float(mass)) for row, mass in zip(held.coefficients, held.masses, strict=True))
-    return Generated(points, held.ids), None, None
+    return Generated(points, held.ids, fraction=filled), None, None
 
 
-def _modality(name: str | None, like: str | None, reading: dict[str, Any]) -> Modality:
-    """The named kind of image, or one like a scan."""
+def _modality(
+    name: str | None, like: str | None, mask: str | None, visible: str | None, reading: dict[str, Any]
+) -> Modality:
+    """The named kind of image, or one like a scan; with the share of light that its masks ask for."""
     if (name is None) == (like is None):
         raise ValueError(f"expected either --modality or --like, got {'neither' if name is None else 'both'}")
-    if like is not None:
-        from curvafit.data_synth import estimate
-        from curvafit.scan import load
+    if like is None:
+        lone = [key for key, value in reading.items() if value is not None and key != "unit"]
+        if lone or mask is not None:
+            raise ValueError(f"expected --like beside {'--spacing' if lone else '--like-mask'}, got none")
+        return _visible(_named(str(name)), visible, None)
+    from curvafit.data_synth import estimate
+    from curvafit.scan import load
 
-        return estimate.like(load(like, **reading))
-    if any(value is not None for key, value in reading.items() if key != "unit"):
-        raise ValueError("expected --like beside --spacing, got none")
+    scan = load(like, **reading)
+    found = estimate.like(scan, None if mask is None else load(mask, **reading).values > 0)
+    return _visible(found, visible, scan)
+
+
+def _named(name: str) -> Modality:
     from curvafit.data_synth.modalities import MODALITIES
 
     plain = {key.casefold().replace(" ", "-"): key for key in MODALITIES}
-    assert name is not None
     found = plain.get(name.strip().casefold().replace(" ", "-"))
     if found is None:
         raise ValueError(f"expected --modality among {', '.join(plain)}, got {name!r}")
     return MODALITIES[found]
+
+
+def _visible(seen: Modality, told: str | None, scan: Field | None) -> Modality:
+    if told is None:
+        return seen
+    if told != "auto":
+        return replace(seen, base=replace(seen.base, visible=numbers(told, "--visible", 1)[0]))
+    if scan is None:
+        raise ValueError("expected --like beside --visible auto, got none")
+    from curvafit.data_synth.estimate import visible_share
+
+    return replace(seen, base=replace(seen.base, visible=visible_share(scan, seen)))
 
 
 def _edge(edge: float | None, unit: str | None, seen: Modality) -> float:

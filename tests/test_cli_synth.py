@@ -52,15 +52,21 @@ def test_a_set_of_inferred_shapes_like_a_scan(tmp_path, store):
     told = {"mass": -0.5, "epsilon_physical": 0.002, "working_voxel": 0.001, "length_unit": "mm"}
     working = {"a20": 1, "a11": 2, "a02": 6, "a10": -40, "a01": -40, "a00": 400}
     fit = told | {"format": FORMAT, "coefficients": working, "coefficients_physical": working}
+    fit["morphometry"] = {"volume_fraction": 0.2}
     (tmp_path / "fit.json").write_text(json.dumps(fit))
+    save(Field(inside.astype(np.uint8), (0.002, 0.001, 0.001), "mm"), tmp_path / "mask.nii.gz")
     quick = ["--count", "1", "--shape", "8,16,16", "--workers", "0"]
-    out = tmp_path / "set"
-    result = call("synth", "-o", out, "--prior", tmp_path / "fit.json", "--like", tmp_path / "scan.nii.gz", *quick)
+    out, scan = tmp_path / "set", tmp_path / "scan.nii.gz"
+    told = ["--like", scan, "--like-mask", tmp_path / "mask.nii.gz", "--visible", "auto"]
+    result = call("synth", "-o", out, "--prior", tmp_path / "fit.json", *told, *quick)
     assert result.exit_code == 0, (result.output, result.exception)
     image = load(out / "imagesTr" / "case_00000_0000.nii.gz")
     assert image.spacing == pytest.approx((0.002, 0.001, 0.001)) and image.unit == "mm"
     record = json.loads((out / "cases" / "case_00000.json").read_text())
     assert record["source"]["parameters"]["a02"] == 6 and record["voxel"] == pytest.approx(0.001)
+    assert 0.01 <= record["imaging"]["visible"] < 0.5
+    order = json.loads((out / "curvafit.json").read_text())["order"]
+    assert order["source"]["fraction"] == 0.2
 
 
 def test_a_set_of_presets_and_of_an_atlas_file(tmp_path):
@@ -82,6 +88,12 @@ def test_bad_input(tmp_path, store):
     refused(call(*some), "expected either --modality or --like, got neither")
     refused(call(*some, "--modality", "x-ray"), "expected --modality among confocal, two-photon")
     refused(call("synth", "-o", out, "--presets", "tube", *kind), "tube")
+    refused(call(*some, *kind, "--visible", "auto"), "expected --like beside --visible auto, got none")
+    refused(call(*some, *kind, "--visible", "1.5"), "expected visible as a share, got 1.5")
+    refused(call(*some, *kind, "--like-mask", "m.nii.gz"), "expected --like beside --like-mask, got none")
+    refused(call(*some, *kind, "--volume-fraction", "0.2"), "expected --volume-fraction beside shapes that are grown")
+    presets = ["synth", "-o", out, "--presets", "tubes", *kind]
+    refused(call(*presets, "--volume-fraction", "2"), "expected a volume fraction between 0 and 1, got 2")
     refused(call(*some, *kind, *QUICK, "--labels", "depth"), "expected labels among")
     refused(call(*some, *kind, *QUICK, "--layout", "bids"), "expected a layout among nnunet, monai, zarr")
     refused(call(*some, *kind, *QUICK, "--seed", "-1"), "expected a seed that is a whole number from 0, got -1")
