@@ -14,6 +14,7 @@ from curvafit.cli_support import kept, numbers, plainly, reading_of, say, stages
 
 if TYPE_CHECKING:
     from curvafit.data_synth.modality import Modality
+    from curvafit.data_synth.sets import Order
     from curvafit.data_synth.sources import Source
     from curvafit.scan import Field
 
@@ -94,21 +95,26 @@ def synth(
         source, edge, edge_unit = _source(prior, atlas, presets, volume_fraction)
         seen = _modality(modality, like, like_mask, visible, reading_of(spacing, unit, None, None, None))
         from curvafit.data_synth.case import Recipe
-        from curvafit.data_synth.sets import Order, build_set
-        from curvafit.data_synth.workers import cluster
-        from curvafit.set_picture import write_preview
-        from curvafit.shape_files import check_folder
+        from curvafit.data_synth.sets import Order
 
         told, its = (edge, edge_unit) if voxel is None else (voxel, unit)
         recipe = Recipe(source, seen, box, _edge(told, its, seen), seed)
-        order = Order(recipe, layout, tuple(labels.split(",")) if labels else ())
-        check_folder(out)
-        with kept(), stages() as progress:
-            progress("starting workers", 0.0)
-            with cluster(workers, scheduler) as crew:
-                build_set(out, order, count, lambda n, of: progress(f"{n} of {of} cases", n / of), workers=crew)
-        say(str(out / "dataset.json"))
-        say(str(write_preview(out)))
+        _build(out, Order(recipe, layout, tuple(labels.split(",")) if labels else ()), count, workers, scheduler)
+
+
+def _build(out: Path, order: Order, count: int, workers: int | None, scheduler: str | None) -> None:
+    from curvafit.data_synth.sets import build_set
+    from curvafit.data_synth.workers import cluster
+    from curvafit.set_picture import write_preview
+    from curvafit.shape_files import check_folder
+
+    check_folder(out)
+    with kept(), stages() as progress:
+        progress("starting workers", 0.0)
+        with cluster(workers, scheduler) as crew:
+            build_set(out, order, count, lambda n, of: progress(f"{n} of {of} cases", n / of), workers=crew)
+    say(str(out / "dataset.json"))
+    say(str(write_preview(out)))
 
 
 def _source(

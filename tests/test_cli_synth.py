@@ -65,7 +65,7 @@ def test_a_set_of_inferred_shapes_like_a_scan(tmp_path, store):
     record = json.loads((out / "cases" / "case_00000.json").read_text())
     assert record["source"]["parameters"]["a02"] == 6 and record["voxel"] == pytest.approx(0.001)
     assert 0.01 <= record["imaging"]["visible"] < 0.5
-    order = json.loads((out / "curvafit.json").read_text())["order"]
+    order = json.loads((out / "curvafit.json").read_text())["order"]["recipe"]
     assert order["source"]["fraction"] == 0.2
 
 

@@ -11,7 +11,7 @@ from exact import Cylinder, Sphere, centres
 
 from curvafit.data_synth import degrade
 from curvafit.data_synth.modalities import MODALITIES
-from curvafit.data_synth.modality import Imaging, Modality, field_shape, image, image_shape, regrid
+from curvafit.data_synth.modality import Imaging, Modality, field_shape, image, image_shape, regrid, visible
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
 
@@ -80,6 +80,15 @@ def test_images_and_labels_share_a_grid() -> None:
     assert field_shape((12, 32, 20), 1.0, how) == (30, 32, 30)
     agree = (seen > 35) == (labels > 0)
     assert float(agree.double().mean()) > 0.985
+
+
+def test_masks_of_what_is_seen() -> None:
+    """With even stain and no noise, a share of the light is that share of the contrast."""
+    how = replace(PLAIN, spacing=(2.5, 1.0, 1.0), thickness=2.5, blur=(3.0, 1.0, 1.0), blur_growth=0.02, visible=0.1)
+    found, clean = visible(FIELDS, 1.0, [how, how]), image(FIELDS, 1.0, [how, how], [1, 2])
+    assert found.dtype == torch.bool and torch.equal(found, clean > 10 + 0.1 * 50)
+    inside = regrid(FIELDS, 1.0, [how, how]) > 0
+    assert bool((found | ~inside).all()) and float(found.sum()) > 1.5 * float(inside.sum())
 
 
 def test_parameters_are_drawn_in_range_and_reproducibly() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import nibabel
@@ -15,7 +16,7 @@ from curvafit.data_synth import sets
 from curvafit.data_synth.case import Recipe
 from curvafit.data_synth.modality import Imaging, Modality
 from curvafit.data_synth.sets import Order, build_set, make_cases, read_order
-from curvafit.data_synth.sources import Generated, Shape, Stored
+from curvafit.data_synth.sources import Generated, Shape, Stored, source_of
 from curvafit.scan import load, read_values
 
 FLAT = Modality("flat", "for tests", 0.5, Imaging(spacing=(1.0, 0.5, 0.5), blur=(0.4, 0.2, 0.2), ceiling=255.0), {
@@ -185,6 +186,29 @@ def test_generated_shapes_take_turns_and_other_seeds():
     assert made[0].epsilon == 2.0 and made[0].field.dtype == np.float32
     again = source.shape((16, 16, 16), 0, np.random.default_rng(0))
     assert (again.field == made[0].field).all()
+
+
+def test_shapes_fill_the_share_that_is_asked_for():
+    point = (1.0, 2.0, 6.0, -40.0, -40.0, 400.0, -0.5)
+    source = Generated((point,), ("tubes",), fraction=0.15)
+    made = source.shape((20, 20, 20), 0, np.random.default_rng(0))
+    assert (made.field > 0).mean() == 0.15 and made.origin["parameters"]["mass"] != -0.5
+    assert source_of(source.as_dict()) == source
+    assert source_of({"kind": "generated", "points": [point], "names": ["tubes"], "schedule": "fast"}).fraction is None
+    with pytest.raises(ValueError, match="expected a volume fraction between 0 and 1, got 1.5"):
+        Generated((point,), ("tubes",), fraction=1.5)
+
+
+def test_labels_are_what_an_image_shows_where_asked(tmp_path, order):
+    modality = order.recipe.modality
+    wide = replace(modality, base=replace(modality.base, blur=(1.5, 1.5, 1.5), visible=0.1))
+    asked = Order(replace(order.recipe, modality=wide), parts=("distance",))
+    folder, case = build_set(tmp_path / "set", asked, 1), asked.recipe.case(0)
+    inside = load(folder / "parts" / "distance" / "case_00000.nii.gz").values > 0
+    label = read_values(folder / "labelsTr" / "case_00000.nii.gz") > 0
+    assert (label == case.mask).all() and label[inside].all() and label.sum() > 1.1 * inside.sum()
+    record = json.loads((folder / "cases" / "case_00000.json").read_text())
+    assert record["volume_fraction"] == label.mean() and record["imaging"]["visible"] == 0.1
 
 
 def test_what_does_not_grow_is_said():

@@ -21,8 +21,8 @@ from curvafit.scan import Field
 MOST = 2_000_000
 #: Deviation, in voxels of the finest edge, of the window that the structure's brightness is averaged in.
 WINDOW = 4.0
-#: Correlation lengths of that brightness, in the same, that are looked at.
-LENGTHS = np.geomspace(WINDOW, 10 * WINDOW, 60)
+#: Correlation lengths of that brightness, in the same, that are looked at: what a dozen lags can tell apart.
+LENGTHS = np.geomspace(WINDOW, 6 * WINDOW, 50)
 #: Deviation, in the same, of the smoothing before voxels are told apart.
 SMOOTH = 0.8
 #: What a drawn parameter is the estimate's, low and high.
