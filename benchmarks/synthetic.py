@@ -122,7 +122,7 @@ class Study:
             image, label = part(other(stack), "test")
             mask = mirrored(training.model, image) > 0.5
             kept = {"name": name, "seed": seed, "stack": stack, "seconds": time.process_time() - begun}
-            kept |= {"test": block_counts(mask, label), "steps": self.budget.steps} | provenance()
+            kept |= {"test": block_counts(mask, label), "steps": training.plan.steps} | provenance()
             np.savez_compressed(path.with_suffix(".npz"), mask=mask)
             write_content(path, json.dumps(kept))
             print(f"{time.strftime('%H:%M')} {path.stem}: {kept['seconds']:.0f} s", flush=True)
@@ -135,7 +135,9 @@ class Study:
             training.save(path.with_suffix(".pt"))
             return training
         before = self._synthetic("inferred", stack, seed) if name == TUNED else None
-        steps, rate = self.budget.tuning, self.budget.rate if before is None else self.budget.tuning_rate
+        steps, rate = self.budget.steps + self.budget.tuning, self.budget.rate
+        if before is not None:
+            steps, rate = self.budget.tuning, self.budget.tuning_rate
         training = Training(part(stack, "fit"), Plan(steps, 0, rate), seed)
         if before is not None:
             self.run("inferred", stack, seed)
@@ -159,10 +161,13 @@ def mirrored(model: nn.Module, image: np.ndarray) -> np.ndarray:
 
 def table(runs: dict[str, list[list[dict]]]) -> str:
     found = bootstrap({name: stacked(those) for name, those in runs.items()}, "inferred")
-    one = runs["inferred"][0][0]
+    every = [run for those in runs.values() for pair in those for run in pair]
+    commits, torches = ({run[key] for run in every} for key in ("commit", "torch"))
+    steps = {name: those[0][0]["steps"] for name, those in runs.items()}
     lines = [
-        f"Test halves, {len(runs['inferred'])} seeds, both stacks, {one['steps']} steps; commit {one['commit']}, "
-        f"torch {one['torch']}. 95 % intervals: bootstrap over places and seeds.",
+        f"Test halves, {len(runs['inferred'])} seeds, both stacks; commit {', '.join(sorted(commits))}, "
+        f"torch {', '.join(sorted(torches))}. 95 % intervals: bootstrap over places and seeds.",
+        f"Steps: {steps}, the last after those of the inferred textures.",
         f"{'':28}" + "".join(f"{name:>27}" for name in SCORES),
     ]
     lines += [f"{name:28}" + cells(found[name][0], "") for name in runs]

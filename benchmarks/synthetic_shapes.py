@@ -21,6 +21,7 @@ from curvafit.morphometry import local_thickness
 from curvafit.priors import Prior, read_fit
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile, phase_field
+from curvafit.scan import write_atomically
 
 KINDS = ("tubes", "cuts", "atlas", "inferred")
 #: Edge of the cubes in µm, the profile's ε in voxels.
@@ -40,7 +41,8 @@ def fields(kind: str, fit: Path, folder: Path, count: int) -> np.ndarray:
             "tubes": lambda: drawn(_tubes, found, radius(fields("inferred", fit, folder, count)), count),
             "cuts": lambda: cuts(found, radius(fields("inferred", fit, folder, count)), count),
         }
-        np.save(path, make[kind]())
+        made = make[kind]()
+        write_atomically(path, lambda temporary: np.save(temporary, made))
     return np.load(path)
 
 

@@ -87,7 +87,11 @@ class Recipe:
                 told = " x ".join(map(str, self.shape))
                 raise ValueError(f"expected structure and background on {told} voxels, got one {TRIES} times")
         record = {"index": index, "source": made.origin, "imaging": imaging.as_dict(), "image_seed": seed}
-        record |= {"voxel": self.voxel, "volume_fraction": float(mask.mean())}
+        record |= {
+            "voxel": self.voxel,
+            "volume_fraction": float((seen > 0).mean()),
+            "mask_fraction": float(mask.mean()),
+        }
         return Case(
             _counts(grey, imaging), seen, mask, imaging.spacing, imaging.unit, made.epsilon * self.voxel, record
         )

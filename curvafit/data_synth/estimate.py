@@ -17,6 +17,8 @@ from curvafit.data_synth.noise_estimate import Noise, background_of, covariance,
 from curvafit.data_synth.optics import blur
 from curvafit.scan import Field
 
+#: Share of the mean brightness from which on the structure's brightness counts for its texture.
+DIMMEST = 0.1
 #: Voxels that are looked at; of a larger scan the middle.
 MOST = 2_000_000
 #: Deviation, in voxels of the finest edge, of the window that the structure's brightness is averaged in.
@@ -58,7 +60,7 @@ def like(scan: Field, mask: np.ndarray | None = None) -> Modality:
     Parameters
     ----------
     scan
-        Values of any type; one of whole numbers is taken to saturate at the highest that its type holds.
+        Values of any type; counts, whole numbers from 0, are taken to saturate at the highest that their type holds.
     mask
         The structure's voxels, (Z, Y, X). By default the bright ones: Otsu's, then those above half of the brightness
         around them.
@@ -84,6 +86,8 @@ def like(scan: Field, mask: np.ndarray | None = None) -> Modality:
     noise = noise_of(values, inside, ground, steps, ground.level + structure.contrast)
     base = _imaging(scan, structure, noise)
     ranges = {name: _around(getattr(base, name), *ends) for name, ends in SPREAD.items() if np.any(getattr(base, name))}
+    if "bias" in ranges:
+        ranges["bias"] = ranges["bias"][0], min(ranges["bias"][1], 1.0)
     about = f"estimated from {scan.source or 'a scan'}, {'its mask' if given is not None else 'without a mask'}"
     return Modality("like", about, float(min(scan.spacing)), base, ranges)
 
@@ -95,7 +99,7 @@ def _imaging(scan: Field, structure: Structure, noise: Noise) -> Imaging:
     high = max(noise.level + structure.contrast - noise.offset, 0.0) / unit
     shrunk = math.prod(1 + 2 * (σ / noise.length) ** 2 for σ in structure.blur) ** 0.25
     length = math.sqrt(max(noise.length**2 - 2 * min(structure.blur) ** 2, min(scan.spacing) ** 2))
-    whole = scan.values.dtype.kind in "bui"
+    counts = scan.values.dtype.kind in "ui" and scan.values.min() >= 0
     return Imaging(
         unit=scan.unit,
         spacing=scan.spacing,
@@ -106,13 +110,13 @@ def _imaging(scan: Field, structure: Structure, noise: Noise) -> Imaging:
         foreground_texture=min(structure.texture * abs(structure.contrast) / max(high * unit, 1e-9), 2.0),
         foreground_length=structure.length * min(scan.spacing),
         blur=structure.blur,
-        bias=min(noise.bias, 0.9),
+        bias=min(noise.bias * abs(noise.level) / max(low * unit, 1e-9), 0.9),
         bias_length=max(n * h for n, h in zip(scan.shape, scan.spacing, strict=True)) / 2,
         gain=noise.gain,
         read_noise=noise.read_noise,
         offset=noise.offset,
         noise_width=noise.width,
-        ceiling=float(np.iinfo(scan.values.dtype).max) if whole and scan.values.dtype.kind != "b" else None,
+        ceiling=float(np.iinfo(scan.values.dtype).max) if counts else None,
     )
 
 
@@ -193,21 +197,24 @@ def _structure(values: np.ndarray, inside: np.ndarray, steps: np.ndarray, level:
     contrast = brightness(blur(mask, 1.0, tuple(widths)))[0, 0].numpy()
     mean = float(contrast[inside].mean())
     z, y, x = (np.sqrt(np.maximum(widths**2 - 1 / 12, 0)) * steps).tolist()
-    return Structure((z, y, x), mean, *_texture(contrast / mean, inside))
+    return Structure((z, y, x), mean, *_texture(contrast / mean, inside, steps))
 
 
-def _texture(relative: np.ndarray, inside: np.ndarray) -> tuple[float, float]:
-    """Deviation and length, in voxels of the plane, of a brightness that was averaged over a window of `WINDOW`: by the
-    covariance of its logarithm. The average lengthens the one, and along a tube it lessens the other."""
-    used = inside & (relative > 0)
+def _texture(relative: np.ndarray, inside: np.ndarray, steps: np.ndarray) -> tuple[float, float]:
+    """Deviation and length, in voxels of the finest edge, of a brightness that was averaged over a window of `WINDOW`:
+    by the covariance of its logarithm in the plane. The average lengthens the one, and along a tube it lessens the
+    other. What has lost its light is not looked at: a logarithm would see little else."""
+    used = inside & (relative > DIMMEST)
     logs = np.log(np.where(used, relative, 1.0))
     weight = used.astype(np.float32)
     rest = (logs - logs[used].mean()) * weight
     first, second = (covariance(rest, weight, axis) for axis in (1, 2))
-    lags = min(len(first), len(second))
-    seen = (first[:lags] + second[:lags]) / 2
+    seen = np.concatenate([first, second])
+    lags = np.concatenate(
+        [np.arange(len(each)) * h / steps.min() for each, h in ((first, steps[1]), (second, steps[2]))]
+    )
     share = seen / max(seen[0], 1e-12)
-    misfit = [np.square(share - np.exp(-0.5 * (np.arange(lags) / length) ** 2)).sum() for length in LENGTHS]
+    misfit = [np.square(share - np.exp(-0.5 * (lags / length) ** 2)).sum() for length in LENGTHS]
     found = float(LENGTHS[int(np.argmin(misfit))])
     length = math.sqrt(max(found**2 - 2 * WINDOW**2, WINDOW**2))
     return math.sqrt(math.expm1(float(seen[0]) * max(found / length, 1.0))), length

@@ -280,6 +280,8 @@ def _in_range(name: str, numbers: Any) -> bool:
         low, high = -math.inf if name == "offset" else 0.0, 1.0 if name in SHARES else math.inf
         if not low <= number <= high or (number == 0 and name in (*POSITIVE, "ceiling")):
             return False
+        if name == "visible" and number == 1:
+            return False
     return True
 
 

@@ -23,7 +23,13 @@ class Layout(NamedTuple):
     listing: Callable[[Sequence[str], About], dict[str, Any]]
 
 
+_NNUNET = "imagesTr/{case}_0000.nii.gz", "labelsTr/{case}.nii.gz"
+
+
 def _nnunet(cases: Sequence[str], about: About) -> dict[str, Any]:
+    """With the cases by name: what else lies in the folders, such as a killed run's temporary files, does not count."""
+    image, label = _NNUNET
+    listed = {case: {"images": [image.format(case=case)], "label": label.format(case=case)} for case in cases}
     return {
         "channel_names": {"0": about.channel},
         "labels": {"background": 0, about.label: 1},
@@ -31,6 +37,7 @@ def _nnunet(cases: Sequence[str], about: About) -> dict[str, Any]:
         "file_ending": ".nii.gz",
         "name": about.name,
         "description": "synthetic; made by curvafit",
+        "dataset": listed,
     }
 
 
@@ -56,7 +63,7 @@ _ZARR = "images/{case}.zarr", "labels/{case}.zarr"
 
 #: nnU-Net v2's raw data sets; the Medical Segmentation Decathlon's, which MONAI reads; OME-Zarr with that list.
 LAYOUTS: dict[str, Layout] = {
-    "nnunet": Layout("imagesTr/{case}_0000.nii.gz", "labelsTr/{case}.nii.gz", "parts/{part}/{case}.nii.gz", _nnunet),
+    "nnunet": Layout(*_NNUNET, "parts/{part}/{case}.nii.gz", _nnunet),
     "monai": Layout(*_DECATHLON, "parts/{part}/{case}.nii.gz", _decathlon(*_DECATHLON)),
     "zarr": Layout(*_ZARR, "parts/{part}/{case}.zarr", _decathlon(*_ZARR)),
 }

@@ -62,7 +62,8 @@ def background_of(values: np.ndarray, inside: np.ndarray, steps: np.ndarray) -> 
     weight = where.astype(np.float32)
     rest = (values - level) * weight
     covariances = [covariance(rest, weight, axis) for axis in range(3)]
-    plane = (covariances[1] + covariances[2]) / 2
+    lags = min(map(len, covariances[1:]))
+    plane = (covariances[1][:lags] + covariances[2][:lags]) / 2
     noise, lateral, texture, length = _split(plane)
     _, axial, _, _ = _split(covariances[0])
     bias = _bias(rest, weight, level, values.shape)
@@ -84,10 +85,11 @@ def noise_of(values: np.ndarray, inside: np.ndarray, ground: Background, steps: 
     if len(lines) > 2:
         mean, variance, count = np.array(lines).T
         rise = count * (mean - ground.level)
-        gain = max(float((rise * (variance - ground.noise)).sum() / (rise * (mean - ground.level)).sum()), 0.0)
+        slope = float((rise * (variance - ground.noise)).sum()), float((rise * (mean - ground.level)).sum())
+        gain = max(slope[0] / slope[1], 0.0) if slope[1] else 0.0
     darkest = float(np.quantile(values[ground.where], 0.001))
     gain = min(gain, ground.noise / max(ground.level - darkest, 1e-12))
-    if gain * abs(high - ground.level) < (GROWS - 1) * ground.noise:
+    if not gain or gain * abs(high - ground.level) < (GROWS - 1) * ground.noise:
         floor = 0.0 if ground.level > 2 * ground.texture else ground.level - abs(high - ground.level)
         return Noise(0.0, math.sqrt(ground.noise), floor, ground.width, *rest)
     constant = ground.noise - gain * ground.level
@@ -103,13 +105,13 @@ def covariance(rest: np.ndarray, weight: np.ndarray, axis: int) -> np.ndarray:
     return np.array([product / max(pairs, 1.0) for product, pairs in sums])
 
 
-def _split(covariance: np.ndarray) -> tuple[float, float, float, float]:
+def _split(seen: np.ndarray) -> tuple[float, float, float, float]:
     """Variance and width of the noise, variance and length of the texture, in voxels, by non-negative least squares."""
-    lag = np.arange(len(covariance))
+    lag = np.arange(len(seen))
     short = [np.exp(-((lag / (2 * w)) ** 2)) if w else (lag == 0).astype(float) for w in GRAINS]
     long = [np.exp(-0.5 * (lag / length) ** 2) for length in LENGTHS]
     flat = np.ones(len(lag))
-    parts, _ = optimize.nnls(np.stack([*short, *long, flat], 1), covariance)
+    parts, _ = optimize.nnls(np.stack([*short, *long, flat], 1), seen)
     noise, texture = parts[: len(GRAINS)], parts[len(GRAINS) : -1]
     total, spread = float(noise.sum()), float(texture.sum())
     width = float(noise @ GRAINS / total) if total else 0.0
@@ -146,4 +148,5 @@ def _bins(
 def _variance(residual: np.ndarray) -> float:
     """Of what is within four deviations, these being the median's."""
     square = np.square(residual)
-    return float(square[square < 16 * np.median(square) / 0.455].mean())
+    near = square < 16 * np.median(square) / 0.455
+    return float(square[near].mean() if near.any() else square.mean())

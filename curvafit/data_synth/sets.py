@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import itertools
 import json
@@ -56,6 +57,9 @@ class Order:
             raise ValueError(f"expected a layout among {', '.join(LAYOUTS)}, got {self.layout!r}")
         if unknown := sorted(set(self.parts) - set(PARTS)):
             raise ValueError(f"expected labels among {', '.join(PARTS)}, got {', '.join(unknown)}")
+        if self.parts and min(self.recipe.shape) < 4:
+            told = " x ".join(map(str, self.recipe.shape))
+            raise ValueError(f"expected images of at least 4 voxels along each axis beside --labels, got {told}")
 
     def as_dict(self) -> dict[str, Any]:
         return {"recipe": self.recipe.as_dict(), "layout": self.layout, "parts": list(self.parts)}
@@ -181,8 +185,8 @@ def _list_what_is_there(folder: Path, order: Order) -> None:
     while True:
         try:
             return _list(folder, order, set(done))
-        except OSError:
-            if not done:
+        except OSError as error:
+            if error.errno not in (errno.ENOSPC, errno.EDQUOT) or not done:
                 raise
             _remove_case(folder, order, case_name(done.pop()))
 
@@ -225,6 +229,8 @@ def _write_case(folder: Path, order: Order, index: int, case: Case) -> None:
 
 def _write_parts(order: Order, case: Case, place: Callable[[str], Path], places: list[Path]) -> dict[str, Any]:
     """The labels besides the mask; what is no volume goes into the record."""
+    if not order.parts:
+        return {}
     grid, known = Grid(case.image.shape, case.spacing, "replicate"), {}  # type: ignore[arg-type]
     asked = set(order.parts) - {"centreline"} | ({"skeleton", "distance"} if "centreline" in order.parts else set())
     found = labels_of(case.field, grid, case.epsilon, asked) if asked else None

@@ -63,7 +63,7 @@ class Generated:
     schedule
         Of the flow.
     fraction
-        Share of the volume that every shape fills; instead of the points' masses.
+        Share of the volume that shapes fill, instead of the points' masses, as near as `generate` gets.
 
     Raises
     ------
@@ -131,9 +131,26 @@ class Generated:
 
 @dataclass(frozen=True)
 class Stored:
-    """Random crops of the well-formed shapes of one or more stores, turned at random."""
+    """Random crops of the well-formed shapes of one or more stores, turned at random.
+
+    Parameters
+    ----------
+    draws
+        How many well-formed shapes there are, in all: by default those that are found. A store that has grown since is
+        another source.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        If there is no store, or one has no well-formed shape.
+    """
 
     paths: tuple[Path, ...]
+    draws: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.draws is None:
+            object.__setattr__(self, "draws", len(_formed(self.paths)))
 
     def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> Shape:
         """A crop of any of the stores' shapes that shows both structure and background.
@@ -141,9 +158,13 @@ class Stored:
         Raises
         ------
         ValueError
-            If it is larger than these, there are none, or many crops show only one.
+            If it is larger than these, the stores have grown, or many crops show only one.
         """
         draws = _formed(self.paths)
+        if len(draws) != self.draws:
+            raise ValueError(
+                f"expected stores of {self.draws} well-formed shapes as before, got {len(draws)}: they grew"
+            )
         for _ in range(CROPS):
             store, draw = draws[int(rng.integers(len(draws)))]
             field, moved = any_crop(store.field(draw), voxels, rng)
@@ -158,7 +179,7 @@ class Stored:
         return Shape(field, settings.epsilon / settings.spacing[0], origin)
 
     def as_dict(self) -> dict[str, Any]:
-        return {"kind": "stored", "paths": [str(path) for path in self.paths]}
+        return {"kind": "stored", "paths": [str(path) for path in self.paths], "draws": self.draws}
 
     @property
     def within(self) -> int:
@@ -169,7 +190,7 @@ class Stored:
 def source_of(kept: dict[str, Any]) -> Source:
     """The inverse of `Source.as_dict`."""
     if kept["kind"] == "stored":
-        return Stored(tuple(map(Path, kept["paths"])))
+        return Stored(tuple(map(Path, kept["paths"])), kept.get("draws"))
     return Generated(tuple(map(tuple, kept["points"])), tuple(kept["names"]), kept["schedule"], kept.get("fraction"))
 
 

@@ -85,7 +85,14 @@ class TextureDataset(IterableDataset):
 
     def __len__(self) -> int:
         """Samples of an epoch that this rank gives."""
-        return self.length // _rank()[1]
+        return self.length // self._rank()[1]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """With the rank, which a spawned worker, outside the group, could not ask for."""
+        return self.__dict__ | {"_given": self._rank()}
+
+    def _rank(self) -> tuple[int, int]:
+        return self.__dict__.get("_given") or _rank()
 
     def set_epoch(self, epoch: int) -> None:
         """Which epoch comes next, from 0; workers that stay alive see it too."""
@@ -93,7 +100,7 @@ class TextureDataset(IterableDataset):
 
     def __iter__(self) -> Iterator[Any]:
         """This worker's part of this rank's part of the epoch."""
-        (rank, ranks), worker = _rank(), get_worker_info()
+        (rank, ranks), worker = self._rank(), get_worker_info()
         first, step = (0, 1) if worker is None else (worker.id, worker.num_workers)
         start = int(self._epoch) * self.length
         for k in range(first, len(self), step):

@@ -98,7 +98,8 @@ def read_fit(path: str | PathLike[str]) -> Prior:
         mass, epsilon, voxel = (float(content[key]) for key in ("mass", "epsilon_physical", "working_voxel"))
         if not (epsilon > 0 and voxel > 0):
             raise ValueError(f"expected a positive ε and working voxel in {path}, got {epsilon} and {voxel}")
-        filled = content.get("morphometry", {}).get("volume_fraction")
+        told = (content.get("morphometry") or {}).get("volume_fraction")
+        filled = None if told is None else float(told)
         return Prior(working, mass, physical, epsilon, voxel, str(content["length_unit"]), filled)
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
+    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"expected a fit.json written by `curvafit infer`, got {path} ({error!r})") from error
