@@ -3,7 +3,8 @@
     python -m benchmarks.synthetic [-o synthetic] [--budget full] [--seeds 3]
 
 From the unlabelled x < 240 of one stack come the coefficients, the volume fraction and all degradations (`infer` and
-`like` on the mask that `like` itself guesses); the test is x > 272 of the other; then the two swap. Four kinds of
+`like` on the mask that `like` itself guesses; of the matches that `infer` finds, the one that is nearest when it is as
+dense as the scan); the test is x > 272 of the other; then the two swap. Four kinds of
 shapes are imaged alike: straight tubes, Gaussian level cuts, the packaged atlas, inferred textures. A network sees
 synthetic pairs only, and its threshold is 0.5. Masks hold what the images show (`Imaging.visible`), as an annotator's
 do. Beside them stand the one threshold that is best in hindsight on the test part itself; and three annotated slices,
@@ -24,7 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from benchmarks.synthetic_shapes import EPSILON, KINDS, fields, law
+from benchmarks.synthetic_shapes import EPSILON, KINDS, fields, law, nearest_at_its_density
 from benchmarks.vessel_data import PATCH, SPACING, STACKS, part, raw
 from benchmarks.vessel_report import best_threshold, cells, stacked
 from benchmarks.vessel_scores import SCORES, block_counts, bootstrap
@@ -108,9 +109,9 @@ class Study:
     def fit(self, stack: str) -> Path:
         path = self.folder / f"fit-{stack}.json"
         if not path.exists():
-            found = infer(self.mask(stack), kind="mask", seed=0).fit
+            found = nearest_at_its_density(infer(self.mask(stack), kind="mask", seed=0).fit)
             write_content(path, found.to_json())
-            print(f"{path.name}: {found.chosen}, {found.coefficients}", flush=True)
+            print(f"{path.name}: {found.coefficients}", flush=True)
         return path
 
     def run(self, name: str, stack: str, seed: int) -> dict:

@@ -7,6 +7,8 @@ volume that the scan's structure does. Tubes and cuts have the mean thickness of
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
@@ -16,16 +18,24 @@ from torch import Tensor
 
 from curvafit.data_synth.randomness import correlated
 from curvafit.data_synth.sources import Generated
+from curvafit.diagram import diagram
+from curvafit.fit import Fit
+from curvafit.generation.flow import generate
+from curvafit.generation.schedule import schedule
+from curvafit.generation.viability import well_formed
 from curvafit.index import load_atlas
 from curvafit.morphometry import local_thickness
-from curvafit.priors import Prior, read_fit
-from curvafit.priors.grid import Grid
+from curvafit.priors import Coefficients, Prior, read_fit
+from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.profile import optimal_profile, phase_field
 from curvafit.scan import write_atomically
+from curvafit.transport import wasserstein
 
 KINDS = ("tubes", "cuts", "atlas", "inferred")
 #: Edge of the cubes in µm, the profile's ε in voxels.
 EXTENT, EPSILON = 84.0, 2.0
+#: Edge, in voxels, of the shapes that candidates are judged by.
+TRIED = 80
 #: Spread of the straight tubes' radii: standard deviation of their logarithm.
 SPREAD = 0.25
 
@@ -44,6 +54,21 @@ def fields(kind: str, fit: Path, folder: Path, count: int) -> np.ndarray:
         made = make[kind]()
         write_atomically(path, lambda temporary: np.save(temporary, made))
     return np.load(path)
+
+
+def nearest_at_its_density(fit: Fit) -> Fit:
+    """The fit with the coefficients, of the nearest matches' and the refined, whose shapes lie nearest to the scan when
+    they fill as much of the volume as it does: a match is sought by curvature alone, whatever its density."""
+    grid, found = Grid((TRIED, TRIED, TRIED)), []
+    for six in (*(match.coefficients for match in fit.matches), Coefficients(**fit.refined["coefficients"])):
+        share = fit.morphometry.volume_fraction
+        flow = generate(six, None, grid, volume_fraction=share, schedule=schedule("fast"), reject_early=True)
+        if well_formed(flow.viability):
+            seen = diagram(phase_field(flow.field > 0, grid, WORKING_EPSILON), grid, WORKING_EPSILON)
+            found.append((wasserstein(fit.diagram, seen), six))  # type: ignore[arg-type]
+    best, six = min(found, key=itemgetter(0))
+    print(f"distances at the scan's density: {[round(each, 1) for each, _ in found]}, the least {best:.1f}", flush=True)
+    return replace(fit, coefficients=six)
 
 
 def law(fit: Path) -> Prior:
