@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
 from curvafit.cli_atlas import SchedulerOption, WorkersOption
@@ -139,7 +140,7 @@ def _source(
         fit = read_fit(prior)
         point = (*map(float, fit.coefficients), fit.mass)  # type: ignore[arg-type]
         filled = fit.volume_fraction if filled is None else filled
-        return Generated((point,), (str(prior),), fraction=filled), fit.working_voxel, fit.unit
+        return Generated((point,), (prior.name,), fraction=filled), fit.working_voxel, fit.unit
     assert atlas is not None
     if atlas.suffix.lower() != ".npz":
         if filled is not None:
@@ -167,8 +168,15 @@ def _modality(
     from curvafit.scan import load
 
     scan = load(like, **reading)
-    found = estimate.like(scan, None if mask is None else load(mask, **reading).values > 0)
+    found = estimate.like(scan, None if mask is None else _mask(load(mask, **reading).values))
     return _visible(found, visible, scan)
+
+
+def _mask(values: np.ndarray) -> np.ndarray:
+    kinds = len(np.unique(values))
+    if kinds != 2:
+        raise ValueError(f"expected a mask of two values beside --like-mask, got {kinds} values")
+    return values > values.min()
 
 
 def _named(name: str) -> Modality:

@@ -19,8 +19,8 @@ SHOWN, ROW = 8, 4
 
 
 def write_preview(folder: str | Path) -> Path:
-    """Write `preview.png` of a set into its folder: the first cases' middle slices, each with and without the label's
-    outline."""
+    """Write `preview.png` of a set into its folder: of the first cases the slice with most of the structure, with and
+    without the label's outline."""
     folder = Path(folder)
     layout = LAYOUTS[read_order(folder).layout]
     names = sorted(path.stem for path in (folder / RECORDS).glob("*.json"))[:SHOWN]
@@ -34,12 +34,12 @@ def write_preview(folder: str | Path) -> Path:
         image, label = (read_values(folder / part.format(case=name)) for part in (layout.image, layout.label))
         record = json.loads((folder / RECORDS / f"{name}.json").read_text())
         row, column = 2 * (k // ROW), k % ROW
-        middle = len(image) // 2
-        low, high = np.percentile(image, (0.5, 99.8))
+        shown = int(np.argmax((label > 0).sum((1, 2))))
+        low, high = np.percentile(image[shown], (0.5, 99.5))
         _, h, w = record["imaging"]["spacing"]
         for axis in (axes[row, column], axes[row + 1, column]):
-            axis.imshow(image[middle], cmap="gray", vmin=low, vmax=max(high, low + 1e-6), aspect=h / w)
-        if 0 < label[middle].sum() < label[middle].size:
-            axes[row + 1, column].contour(label[middle], [0.5], colors=CONTOUR, linewidths=0.8)
+            axis.imshow(image[shown], cmap="gray", vmin=low, vmax=max(high, low + 1e-6), aspect=h / w)
+        if 0 < label[shown].sum() < label[shown].size:
+            axes[row + 1, column].contour(label[shown], [0.5], colors=CONTOUR, linewidths=0.8)
         axes[row, column].set_title(f"{name}\n{record['source']['name']}"[:60], fontsize=8)
     return write_picture(figure, folder / "preview.png")

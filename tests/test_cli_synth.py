@@ -88,6 +88,10 @@ def test_bad_input(tmp_path, store):
     refused(call(*some), "expected either --modality or --like, got neither")
     refused(call(*some, "--modality", "x-ray"), "expected --modality among confocal, two-photon")
     refused(call("synth", "-o", out, "--presets", "tube", *kind), "tube")
+    refused(call(*some, *kind, "--shape", "2,8,8", "--labels", "betti"), "expected images of at least 4 voxels along")
+    refused(
+        call("synth", "-o", out, "--presets", "tubes", *kind, "--voxel", "0.001"), "expected shapes of at most 1e+09"
+    )
     refused(call(*some, *kind, "--visible", "auto"), "expected --like beside --visible auto, got none")
     refused(call(*some, *kind, "--visible", "1.5"), "expected visible as a share, got 1.5")
     refused(call(*some, *kind, "--like-mask", "m.nii.gz"), "expected --like beside --like-mask, got none")

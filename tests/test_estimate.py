@@ -130,6 +130,32 @@ def test_integers_saturate_where_their_type_ends(shape: torch.Tensor) -> None:
     assert low < found.base.gain < high and found.draw(1) != found.draw(2)
 
 
+def test_odd_scans(shape: torch.Tensor) -> None:
+    """Values below 0, a background of one value or next to no photons, light on dark 0: an estimate, or a sentence."""
+    mask = regrid(shape, 1.0, [Imaging()])[0, 0].numpy() > 0
+    rng = np.random.default_rng(0)
+    signed = np.where(mask, 500, -500) + rng.normal(0, 40, mask.shape)
+    low = like(Field(signed.astype(np.int16), (1.0, 1.0, 1.0), "um"), mask)
+    assert low.base.ceiling is None
+    assert image(shape, 1.0, [low.base], [0]).amin() < -300
+    for values in (
+        np.where(mask, 80.0, 0.0),
+        rng.poisson(0.02 + 3.0 * mask),
+        rng.normal(0, 10, mask.shape) + 100 * mask,
+    ):
+        found = like(Field(values.astype(np.float32), (1.0, 1.0, 1.0), "um"), mask)
+        assert 0 <= found.base.bias <= 0.9 and np.isfinite(found.base.gain)
+    small = like(Field(signed[:40, :14, :40].astype(np.float32), (1.0, 1.0, 1.0), "um"), mask[:40, :14, :40])
+    assert small.base.foreground > small.base.background
+
+
+def test_lost_stain_does_not_decide_the_texture(shape: torch.Tensor) -> None:
+    scan, mask = scan_of(shape, TEXTURED)
+    lost = np.random.default_rng(0).random(mask.shape) < 0.03
+    scan.values[mask & lost] = scan.values[~mask].mean()
+    assert like(scan, mask).base.foreground_texture < 0.5
+
+
 def test_bad_scans_are_told() -> None:
     values = np.random.default_rng(0).normal(size=(12, 12, 12)).astype(np.float32)
     field = Field(values, (1.0, 1.0, 1.0), "um")

@@ -143,6 +143,27 @@ def test_a_disk_that_fills_leaves_a_valid_set(tmp_path, order, monkeypatch):
     assert len(sums(build_set(tmp_path / "set", order, 4))) == 4
 
 
+def test_another_failure_keeps_every_case(tmp_path, order, monkeypatch):
+    folder, write = build_set(tmp_path / "set", order, 3), sets._write_json
+
+    def broken(path, content):
+        if path.name == "dataset.json":
+            raise OSError(errno.EMFILE, "Too many open files", str(path))
+        return write(path, content)
+
+    monkeypatch.setattr(sets, "_write_json", broken)
+    with pytest.raises(OSError, match="Too many open files"):
+        build_set(folder, order, 3)
+    assert len(sums(folder)) == 3
+
+
+def test_a_set_does_not_go_on_with_a_store_that_grew(order):
+    kept = order.recipe.source.as_dict()
+    assert source_of(kept) == order.recipe.source and kept["draws"] > 0
+    with pytest.raises(ValueError, match="well-formed shapes .*before, got 7"):
+        source_of(kept | {"draws": kept["draws"] + 1}).shape((8, 8, 8), 0, np.random.default_rng(0))
+
+
 def test_a_list_that_finds_no_room_gives_up_the_last_case(tmp_path, order, monkeypatch):
     listed, write = [], sets._list
 

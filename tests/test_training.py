@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import pickle
 from collections.abc import Iterable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -87,6 +89,17 @@ def test_ranks_share_an_epoch_evenly(store, monkeypatch):
         assert len(found) == len(dataset) == 2
         seen += found
     assert sorted(seen) == list(range(6))
+
+
+def test_spawned_workers_know_their_rank(store, monkeypatch):
+    """They are outside the group: the data set brings the rank along; elsewhere the live one counts."""
+    dataset = TextureDataset(store, QUIET, SHAPE, length=4, transform=told)
+    monkeypatch.setattr(training, "_rank", lambda: (1, 2))
+    sent = pickle.loads(pickle.dumps(dataset))
+    monkeypatch.setattr(training, "_rank", lambda: (0, 1))
+    assert numbers(sent) == [0, 1, 2, 3]
+    monkeypatch.setattr(training, "get_worker_info", lambda: SimpleNamespace(id=0, num_workers=1))
+    assert numbers(sent) == [1, 3]
 
 
 def test_a_blend_holds_both_textures(store):

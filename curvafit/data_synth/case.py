@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -15,6 +16,8 @@ from curvafit.data_synth.sources import Source, source_of
 
 #: Shapes that a case gets until one is seen on the image's voxels, which may be coarse.
 TRIES = 8
+#: Voxels that a shape may have.
+MOST = 10**9
 
 
 class Case(NamedTuple):
@@ -125,8 +128,13 @@ def imaged(
 
 
 def check_crop(source: Source, shape: Sequence[int], voxel: float, modality: Modality) -> None:
-    """Raise ValueError where images of `shape` need crops that are larger than a store's shapes."""
+    """Raise ValueError where images of `shape` need crops that are larger than a store's shapes, or than memory is."""
     need = field_shape(shape, voxel, modality.base)
+    if math.prod(need) > MOST:
+        told, unit = " x ".join(map(str, need)), modality.base.unit
+        raise ValueError(
+            f"expected shapes of at most {MOST:.0e} voxels, got {told}: is a voxel of {voxel:g} {unit} meant?"
+        )
     if max(need) > source.within:
         images, crops = (" x ".join(map(str, each)) for each in (shape, need))
         raise ValueError(

@@ -89,10 +89,11 @@ class TextureDataset(IterableDataset):
 
     def __getstate__(self) -> dict[str, Any]:
         """With the rank, which a spawned worker, outside the group, could not ask for."""
-        return self.__dict__ | {"_given": self._rank()}
+        return self.__dict__ | {"_told": self._rank()}
 
     def _rank(self) -> tuple[int, int]:
-        return self.__dict__.get("_given") or _rank()
+        found = _rank()
+        return self.__dict__.get("_told", found) if found == (0, 1) and get_worker_info() else found
 
     def set_epoch(self, epoch: int) -> None:
         """Which epoch comes next, from 0; workers that stay alive see it too."""
