@@ -32,8 +32,8 @@ from benchmarks.vessel_scores import SCORES, block_counts, bootstrap
 from benchmarks.vessel_training import BATCH, Plan, Training, dice_ce, predict
 from benchmarks.vessels import begun, other, provenance
 from curvafit.data_synth.case import imaged
-from curvafit.data_synth.estimate import bright, like, visible_share
-from curvafit.data_synth.modality import Modality, field_shape
+from curvafit.data_synth.estimate import bright, like
+from curvafit.data_synth.modality import Modality, field_shape, visible_share
 from curvafit.data_synth.moves import SYMMETRIES, cropped, turned
 from curvafit.infer import infer
 from curvafit.scan import Field, write_content
@@ -104,7 +104,7 @@ class Study:
     def modality(self, stack: str) -> Modality:
         """Images like that part, with masks of what can be seen."""
         found = like(self.scan(stack))
-        return replace(found, base=replace(found.base, visible=visible_share(self.scan(stack), found)))
+        return replace(found, base=replace(found.base, visible=visible_share(found.base)))
 
     def fit(self, stack: str) -> Path:
         path = self.folder / f"fit-{stack}.json"

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from curvafit.data_synth.modality import Modality
     from curvafit.data_synth.sets import Order
     from curvafit.data_synth.sources import Source
-    from curvafit.scan import Field
 
 EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
     (
@@ -60,7 +59,7 @@ Visible = Annotated[
     str | None,
     _seen(
         help="Masks of what an image shows, as annotators draw: where this share of the structure's light arrives; "
-        "auto takes the share from --like. By default masks hold the structure itself."
+        "auto: midway in the logarithm of the levels. By default masks hold the structure itself."
     ),
 ]
 Spacing = Annotated[str | None, _seen(help="Voxel edges of --like, if its file does not tell: Z,Y,X or one number.")]
@@ -163,13 +162,13 @@ def _modality(
         lone = [key for key, value in reading.items() if value is not None and key != "unit"]
         if lone or mask is not None:
             raise ValueError(f"expected --like beside {'--spacing' if lone else '--like-mask'}, got none")
-        return _visible(_named(str(name)), visible, None)
+        return _visible(_named(str(name)), visible)
     from curvafit.data_synth import estimate
     from curvafit.scan import load
 
     scan = load(like, **reading)
     found = estimate.like(scan, None if mask is None else _mask(load(mask, **reading).values))
-    return _visible(found, visible, scan)
+    return _visible(found, visible)
 
 
 def _mask(values: np.ndarray) -> np.ndarray:
@@ -189,16 +188,13 @@ def _named(name: str) -> Modality:
     return MODALITIES[found]
 
 
-def _visible(seen: Modality, told: str | None, scan: Field | None) -> Modality:
+def _visible(seen: Modality, told: str | None) -> Modality:
     if told is None:
         return seen
-    if told != "auto":
-        return replace(seen, base=replace(seen.base, visible=numbers(told, "--visible", 1)[0]))
-    if scan is None:
-        raise ValueError("expected --like beside --visible auto, got none")
-    from curvafit.data_synth.estimate import visible_share
+    from curvafit.data_synth.modality import visible_share
 
-    return replace(seen, base=replace(seen.base, visible=visible_share(scan, seen)))
+    share = visible_share(seen.base) if told == "auto" else numbers(told, "--visible", 1)[0]
+    return replace(seen, base=replace(seen.base, visible=share))
 
 
 def _edge(edge: float | None, unit: str | None, seen: Modality) -> float:

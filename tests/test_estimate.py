@@ -3,18 +3,16 @@ are some."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from exact import Cylinder, centres
-from scipy.ndimage import gaussian_filter
 
 from curvafit.data_synth.degrade import EPSILON
-from curvafit.data_synth.estimate import like, visible_share
-from curvafit.data_synth.modality import Imaging, image, regrid, visible
+from curvafit.data_synth.estimate import like
+from curvafit.data_synth.modality import Imaging, image, regrid
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
 from curvafit.scan import Field, load
@@ -95,23 +93,6 @@ def test_dark_structures_by_their_mask(shape: torch.Tensor) -> None:
     how = Imaging(background=150, foreground=60, blur=(1.0, 1.0, 1.0), read_noise=5)
     b = like(*scan_of(shape, how)).base
     assert b.foreground == pytest.approx(60, rel=0.1) and b.background == pytest.approx(150, rel=0.05)
-
-
-@pytest.mark.parametrize("name", ["photons", "slices"])
-def test_masks_of_what_looks_bright(shape: torch.Tensor, name: str) -> None:
-    """The share of the light is the height over the background at which Otsu splits the scan, in a clean image."""
-    how = CASES[name]
-    scan, _ = scan_of(shape, how)
-    share = visible_share(scan, like(scan))
-    assert 0.05 < share < 0.5
-    shown = visible(shape, 1.0, [replace(how, visible=share)])[0, 0].numpy()
-    unit = how.gain or 1.0
-    smooth = gaussian_filter(scan.values, 0.7)
-    seen = smooth > how.offset + unit * (how.background + share * (how.foreground - how.background))
-    assert 2 * (shown & seen).sum() > 0.85 * (shown.sum() + seen.sum())
-    dark = like(scan)
-    with pytest.raises(ValueError, match="expected a structure brighter than its background, got levels"):
-        visible_share(scan, replace(dark, base=replace(dark.base, foreground=0.0)))
 
 
 def test_the_same_scan_in_nanometres(shape: torch.Tensor) -> None:

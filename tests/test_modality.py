@@ -11,7 +11,16 @@ from exact import Cylinder, Sphere, centres
 
 from curvafit.data_synth import degrade
 from curvafit.data_synth.modalities import MODALITIES
-from curvafit.data_synth.modality import Imaging, Modality, field_shape, image, image_shape, regrid, visible
+from curvafit.data_synth.modality import (
+    Imaging,
+    Modality,
+    field_shape,
+    image,
+    image_shape,
+    regrid,
+    visible,
+    visible_share,
+)
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
 
@@ -87,6 +96,11 @@ def test_masks_of_what_is_seen() -> None:
     how = replace(PLAIN, spacing=(2.5, 1.0, 1.0), thickness=2.5, blur=(3.0, 1.0, 1.0), blur_growth=0.02, visible=0.1)
     found, clean = visible(FIELDS, 1.0, [how, how]), image(FIELDS, 1.0, [how, how], [1, 2])
     assert found.dtype == torch.bool and torch.equal(found, clean > 10 + 0.1 * 50)
+    level = 10 + visible_share(how) * 50
+    assert level == pytest.approx((10 * 60) ** 0.5)
+    dark = replace(PLAIN, background=60, foreground=10)
+    assert 60 - visible_share(dark) * 50 == pytest.approx((10 * 60) ** 0.5)
+    assert 0 < visible_share(replace(PLAIN, background=0)) < 0.05
     inside = regrid(FIELDS, 1.0, [how, how]) > 0
     assert bool((found | ~inside).all()) and float(found.sum()) > 1.5 * float(inside.sum())
 

@@ -153,28 +153,6 @@ def bright(values: np.ndarray, steps: np.ndarray | Sequence[float]) -> np.ndarra
     return np.logical_and(contrast > local / 2, ndimage.maximum_filter(above, size=3))
 
 
-def visible_share(scan: Field, modality: Modality) -> float:
-    """The share of the structure's light (`Imaging.visible`) at which voxels of a scan look bright, at least 0.01.
-
-    Bright is what exceeds Otsu's threshold of the logarithm of the grey values over the background's darkest. In images
-    of the modality, which is one `like` the scan, a structure of mean brightness passes that level at this share.
-
-    Raises
-    ------
-    ValueError
-        If the modality's structure is not brighter than its background.
-    """
-    base = modality.base
-    low, high = (base.offset + (base.gain or 1.0) * level for level in (base.background, base.foreground))
-    if not low < high:
-        raise ValueError(f"expected a structure brighter than its background, got levels {high:.4g} and {low:.4g}")
-    values, _ = _middle(scan, None)
-    darkest = min(float(np.quantile(values, 0.001)), (low + base.offset) / 2)
-    above = np.log1p(np.maximum(values - darkest, 0) / (low - darkest))
-    level = darkest + (low - darkest) * math.expm1(float(threshold_otsu(above)))
-    return min(max((level - low) / (high - low), 0.01), 0.99)
-
-
 def _structure(values: np.ndarray, inside: np.ndarray, steps: np.ndarray, level: float) -> Structure:
     """The blur (z, and y = x) whose image of the mask is nearest to the scan around it; the brightness inside."""
     finest = steps.min() / steps

@@ -188,6 +188,12 @@ def visible(
     return torch.cat([_reached(one, spacing, how, epsilon) for one, how in zip(shapes.split(1), imaging, strict=True)])
 
 
+def visible_share(imaging: Imaging) -> float:
+    """The share of the structure's light at which an annotator is taken to see it: where its level is midway from the
+    background's to its own in the logarithm, as contrast is seen. 1/2 at faint contrast, less where it is strong."""
+    return 1 / (1 + math.sqrt(imaging.foreground / max(imaging.background, 1e-3 * imaging.foreground, 1e-12)))
+
+
 def field_shape(shape: Sequence[int], spacing: float, imaging: Imaging) -> tuple[int, int, int]:
     """The least voxels (z, y, x) of edge `spacing` that an image of a shape is made from."""
     z, y, x = (math.ceil(n * h / spacing - 1e-6) for n, h in zip(shape, imaging.spacing, strict=True))

@@ -9,10 +9,20 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.data_synth.imaging import TRIPLES, Imaging, field_shape, image, image_shape, known_fields, regrid, visible
+from curvafit.data_synth.imaging import (
+    TRIPLES,
+    Imaging,
+    field_shape,
+    image,
+    image_shape,
+    known_fields,
+    regrid,
+    visible,
+    visible_share,
+)
 from curvafit.data_synth.randomness import seeds_of
 
-__all__ = ["Imaging", "Modality", "field_shape", "image", "image_shape", "regrid", "visible"]
+__all__ = ["Imaging", "Modality", "field_shape", "image", "image_shape", "regrid", "visible", "visible_share"]
 
 
 @dataclass(frozen=True)
