@@ -4,11 +4,12 @@
 
 From the unlabelled x < 240 of one stack come the coefficients, the volume fraction and all degradations (`infer` and
 `like` on the mask that `like` itself guesses; of the matches that `infer` finds, the one that is nearest when it is as
-dense as the scan); the test is x > 272 of the other; then the two swap. Four kinds of
-shapes are imaged alike: straight tubes, Gaussian level cuts, the packaged atlas, inferred textures. A network sees
-synthetic pairs only, and its threshold is 0.5. Masks hold what the images show (`Imaging.visible`), as an annotator's
-do. Beside them stand the one threshold that is best in hindsight on the test part itself; and three annotated slices,
-from scratch and after training on the inferred textures. Shapes, fits and runs are kept: what was stopped goes on.
+dense as the scan); the test is x > 272 of the other; then the two swap. Four kinds of shapes are imaged alike: straight
+tubes, Gaussian level cuts, the packaged atlas, inferred textures. Each is enlarged or reduced at random, since a texture
+has one calibre and the scan's structures have many. A network sees synthetic pairs only, and its threshold is 0.5. Masks
+hold what the images show (`Imaging.visible`), as an annotator's do. Beside them stand the one threshold that is best in
+hindsight on the test part itself; and three annotated slices, from scratch and after training on the inferred textures.
+Shapes, fits and runs are kept: what was stopped goes on.
 """
 
 from __future__ import annotations
@@ -36,9 +37,12 @@ from curvafit.data_synth.estimate import bright, like
 from curvafit.data_synth.modality import Modality, field_shape, visible_share
 from curvafit.data_synth.moves import SYMMETRIES, cropped, turned
 from curvafit.infer import infer
+from curvafit.morphometry import local_thickness
 from curvafit.scan import Field, write_content
 
 SLICES = "three slices"
+#: The least part of its own size that a shape is shown at: less would not fill a patch.
+LEAST = 0.95
 TUNED = "inferred, then three slices"
 
 
@@ -59,11 +63,17 @@ class Synthetic(Training):
     """A network in training on pairs that are made as it goes."""
 
     def __init__(
-        self, shapes: np.ndarray, edge: float, modality: Modality, scan: np.ndarray, plan: Plan, seed: int
+        self,
+        shapes: np.ndarray,
+        edges: tuple[float, float],
+        modality: Modality,
+        scan: np.ndarray,
+        plan: Plan,
+        seed: int,
     ) -> None:
         super().__init__(part(STACKS[0], "fit"), plan, seed)
         values = np.log1p(scan.astype(np.float32))
-        self.shapes, self.edge, self.modality = shapes, edge, modality
+        self.shapes, self.edges, self.modality = shapes, edges, modality
         self.mean, self.spread = values.mean(), values.std()
 
     def batch(self, step: int) -> tuple[Tensor, Tensor]:
@@ -76,10 +86,11 @@ class Synthetic(Training):
         rng, (draw, noise) = np.random.default_rng(words), map(int, words.generate_state(2))
         imaging = self.modality.draw(draw)
         whole = turned(self.shapes[int(rng.integers(len(self.shapes)))], int(rng.integers(SYMMETRIES)))
-        size = field_shape(PATCH, self.edge, imaging)
+        edge = float(np.exp(rng.uniform(*np.log(self.edges))))
+        size = field_shape(PATCH, edge, imaging)
         corner = [int(rng.integers(n - m + 1)) for n, m in zip(whole.shape, size, strict=True)]
         crop = torch.from_numpy(np.ascontiguousarray(cropped(whole, corner, size)))
-        grey, _, mask = imaged(crop, EPSILON, self.edge, imaging, noise, PATCH)
+        grey, _, mask = imaged(crop, EPSILON, edge, imaging, noise, PATCH)
         x = (torch.log1p(grey.clamp_min(0)) - self.mean) / self.spread
         x = float(rng.uniform(0.9, 1.1)) * x + float(rng.uniform(-0.1, 0.1))
         return x[None].float(), mask[None].float()
@@ -105,6 +116,13 @@ class Study:
         """Images like that part, with masks of what can be seen."""
         found = like(self.scan(stack))
         return replace(found, base=replace(found.base, visible=visible_share(found.base)))
+
+    def calibres(self, stack: str) -> tuple[float, float]:
+        """How much thinner and thicker the scan's structure is than its median: the first and the last decile."""
+        mask = self.mask(stack).values > 0
+        thickness = local_thickness(mask, SPACING)[mask]
+        low, middle, high = np.quantile(thickness, (0.1, 0.5, 0.9))
+        return float(max(low / middle, LEAST)), float(high / middle)
 
     def fit(self, stack: str) -> Path:
         path = self.folder / f"fit-{stack}.json"
@@ -150,7 +168,8 @@ class Study:
     def _synthetic(self, kind: str, stack: str, seed: int) -> Synthetic:
         fit, plan = self.fit(stack), Plan(self.budget.steps, 0, self.budget.rate)
         shapes = fields(kind, fit, self.folder, self.budget.count)
-        return Synthetic(shapes, law(fit).working_voxel, self.modality(stack), self.scan(stack).values, plan, seed)
+        edge, (low, high) = law(fit).working_voxel, self.calibres(stack)
+        return Synthetic(shapes, (low * edge, high * edge), self.modality(stack), self.scan(stack).values, plan, seed)
 
 
 def mirrored(model: nn.Module, image: np.ndarray) -> np.ndarray:
