@@ -4,12 +4,12 @@
 
 From the unlabelled x < 240 of one stack come the coefficients, the volume fraction and all degradations (`infer` and
 `like` on the mask that `like` itself guesses; of the matches that `infer` finds, the one that is nearest when it is as
-dense as the scan); the test is x > 272 of the other; then the two swap. Four kinds of shapes are imaged alike: straight
-tubes, Gaussian level cuts, the packaged atlas, inferred textures. Each is enlarged or reduced at random, since a texture
-has one calibre and the scan's structures have many. A network sees synthetic pairs only, and its threshold is 0.5. Masks
-hold what the images show (`Imaging.visible`), as an annotator's do. Beside them stand the one threshold that is best in
-hindsight on the test part itself; and three annotated slices, from scratch and after training on the inferred textures.
-Shapes, fits and runs are kept: what was stopped goes on.
+dense as the scan); the test is x > 272 of the other; then the two swap. Four kinds of shapes are imaged alike:
+straight tubes, Gaussian level cuts, the packaged atlas, inferred textures. Each is enlarged or reduced at random,
+since a texture has one calibre and the scan's structures have many. A network sees synthetic pairs only, and its
+threshold is 0.5. Masks hold what the images show (`Imaging.visible`), as an annotator's do. Beside them stand the one
+threshold that is best in hindsight on the test part itself; and three annotated slices, from scratch and after
+training on the inferred textures. Shapes, fits and runs are kept: what was stopped goes on.
 """
 
 from __future__ import annotations

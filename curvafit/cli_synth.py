@@ -45,6 +45,12 @@ Atlas = Annotated[
     _what(help="Store of `curvafit atlas build`, cropped; or an atlas (.npz), whose shapes are grown anew."),
 ]
 Presets = Annotated[str | None, _what(help="Published shapes, by name: tubes,sponge. See `curvafit presets`.")]
+Calibres = Annotated[
+    str,
+    _seen(
+        help="LOW,HIGH: structures thinner and thicker than --voxel makes them, case by case, by factors in between."
+    ),
+]
 Filled = Annotated[
     float | None,
     _what("--volume-fraction", help="Share of the volume that grown shapes fill. By default the scan's, with --prior."),
@@ -79,6 +85,7 @@ def synth(
     like_mask: Like_mask = None,
     visible: Visible = None,
     voxel: Voxel = None,
+    calibres: Calibres = "1,1",
     spacing: Spacing = None,
     unit: Unit = None,
     layout: Layout = "nnunet",
@@ -98,7 +105,8 @@ def synth(
         from curvafit.data_synth.sets import Order
 
         told, its = (edge, edge_unit) if voxel is None else (voxel, unit)
-        recipe = Recipe(source, seen, box, _edge(told, its, seen), seed)
+        low, high = numbers(calibres, "--calibres", 2)
+        recipe = Recipe(source, seen, box, _edge(told, its, seen), seed, (low, high))
         _build(out, Order(recipe, layout, tuple(labels.split(",")) if labels else ()), count, workers, scheduler)
 
 

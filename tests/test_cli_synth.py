@@ -92,6 +92,10 @@ def test_bad_input(tmp_path, store):
     refused(
         call("synth", "-o", out, "--presets", "tubes", *kind, "--voxel", "0.001"), "expected shapes of at most 1e+09"
     )
+    refused(call(*some, *kind, "--calibres", "2"), "expected --calibres as 2 numbers between commas, got '2'")
+    refused(
+        call(*some, *kind, *QUICK, "--calibres", "2,1"), "expected calibres as two positive factors, the lower first"
+    )
     refused(call(*some, *kind, "--visible", "1.5"), "expected visible as a share, got 1.5")
     refused(call(*some, *kind, "--like-mask", "m.nii.gz"), "expected --like beside --like-mask, got none")
     refused(call(*some, *kind, "--volume-fraction", "0.2"), "expected --volume-fraction beside shapes that are grown")

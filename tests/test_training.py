@@ -102,6 +102,14 @@ def test_spawned_workers_know_their_rank(store, monkeypatch):
     assert numbers(sent) == [1, 3]
 
 
+def test_samples_of_many_calibres(store):
+    dataset = TextureDataset(store, QUIET, SHAPE, calibres=(1.0, 1.5))
+    voxels = [dataset.sample(k).record["voxel"] for k in range(4)]
+    assert len(set(voxels)) == 4 and 1.5 * QUIET.voxel >= max(voxels) > min(voxels) >= QUIET.voxel
+    with pytest.raises(ValueError, match="expected calibres as two positive factors"):
+        TextureDataset(store, QUIET, SHAPE, calibres=(0.0, 1.0))
+
+
 def test_a_blend_holds_both_textures(store):
     dataset = TextureDataset(store, QUIET, (16, 16, 16), blend=1.0)
     sample = dataset[0]

@@ -43,11 +43,14 @@ class Recipe:
         Voxels (z, y, x) of the images.
     voxel
         Edge of a shape's voxels, in the modality's unit: how large the texture is in the images.
+    calibres
+        How much thinner and thicker than that it may be: every case draws its own factor in between.
 
     Raises
     ------
     ValueError
-        If the shape is not 3 whole numbers above 0, the voxel is not positive or the seed is not a whole number from 0.
+        If the shape is not 3 whole numbers above 0, the voxel or a calibre is not positive, or the seed is not a whole
+        number from 0.
     """
 
     source: Source
@@ -55,6 +58,7 @@ class Recipe:
     shape: tuple[int, int, int]
     voxel: float
     seed: int = 0
+    calibres: tuple[float, float] = (1.0, 1.0)
 
     def __post_init__(self) -> None:
         if len(self.shape) != 3 or any(int(n) != n or n < 1 for n in self.shape):
@@ -63,7 +67,8 @@ class Recipe:
             raise ValueError(f"expected a shape's voxel of positive length, got {self.voxel}")
         if isinstance(self.seed, bool) or int(self.seed) != self.seed or self.seed < 0:
             raise ValueError(f"expected a seed that is a whole number from 0, got {self.seed!r}")
-        check_crop(self.source, self.shape, self.voxel, self.modality)
+        check_calibres(self.calibres)
+        check_crop(self.source, self.shape, self.voxel * self.calibres[0], self.modality)
 
     def case(self, index: int) -> Case:
         """Case number `index`, made on one thread.
@@ -76,13 +81,14 @@ class Recipe:
         for_shape, for_imaging, for_image = np.random.SeedSequence(self.seed, spawn_key=(index,)).spawn(3)
         imaging = self.modality.draw(_number(for_imaging))
         rng = np.random.default_rng(for_shape)
-        voxels = field_shape(self.shape, self.voxel, imaging)
+        voxel = drawn_voxel(self.voxel, self.calibres, rng)
+        voxels = field_shape(self.shape, voxel, imaging)
         seed = _number(for_image)
         with one_thread():
             for _ in range(TRIES):
                 made = self.source.shape(voxels, index, rng)
                 u = torch.from_numpy(made.field)
-                made_of = imaged(u, made.epsilon, self.voxel, imaging, seed, self.shape)
+                made_of = imaged(u, made.epsilon, voxel, imaging, seed, self.shape)
                 grey, seen, mask = (each.numpy() for each in made_of)
                 if seen.min() <= 0 < seen.max() and mask.any() and not mask.all():
                     break
@@ -91,25 +97,25 @@ class Recipe:
                 raise ValueError(f"expected structure and background on {told} voxels, got one {TRIES} times")
         record = {"index": index, "source": made.origin, "imaging": imaging.as_dict(), "image_seed": seed}
         record |= {
-            "voxel": self.voxel,
+            "voxel": voxel,
             "volume_fraction": float((seen > 0).mean()),
             "mask_fraction": float(mask.mean()),
         }
-        return Case(
-            _counts(grey, imaging), seen, mask, imaging.spacing, imaging.unit, made.epsilon * self.voxel, record
-        )
+        return Case(_counts(grey, imaging), seen, mask, imaging.spacing, imaging.unit, made.epsilon * voxel, record)
 
     def as_dict(self) -> dict[str, Any]:
         """All of it in JSON's types."""
         parts = {"source": self.source.as_dict(), "modality": self.modality.as_dict()}
-        return parts | {"shape": list(self.shape), "voxel": self.voxel, "seed": self.seed}
+        told = {"shape": list(self.shape), "voxel": self.voxel, "seed": self.seed, "calibres": list(self.calibres)}
+        return parts | told
 
     @staticmethod
     def from_dict(kept: Mapping[str, Any]) -> Recipe:
         """The inverse of `as_dict`."""
         source, modality = source_of(kept["source"]), Modality.from_dict(kept["modality"])
         z, y, x = kept["shape"]
-        return Recipe(source, modality, (z, y, x), kept["voxel"], kept["seed"])
+        low, high = kept.get("calibres", (1.0, 1.0))
+        return Recipe(source, modality, (z, y, x), kept["voxel"], kept["seed"], (low, high))
 
 
 def imaged(
@@ -125,6 +131,18 @@ def imaged(
     mask = visible(u, voxel, [imaging], epsilon) if imaging.visible else seen > 0
     grey, seen, mask = (each[0, 0, :z, :y, :x].contiguous() for each in (grey, seen, mask))
     return grey, seen, mask
+
+
+def drawn_voxel(voxel: float, calibres: Sequence[float], rng: np.random.Generator) -> float:
+    """The edge of a shape's voxel times a factor, drawn evenly in the logarithm; none is drawn where there is one."""
+    low, high = calibres
+    return voxel * (low if low == high else math.exp(rng.uniform(math.log(low), math.log(high))))
+
+
+def check_calibres(calibres: Sequence[float]) -> None:
+    """Raise ValueError where these are not two positive factors, the lower first."""
+    if len(calibres) != 2 or not 0 < calibres[0] <= calibres[1] < math.inf:
+        raise ValueError(f"expected calibres as two positive factors, the lower first, got {tuple(calibres)}")
 
 
 def check_crop(source: Source, shape: Sequence[int], voxel: float, modality: Modality) -> None:

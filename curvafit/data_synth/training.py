@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
-from curvafit.data_synth.case import check_crop, imaged
+from curvafit.data_synth.case import check_calibres, check_crop, drawn_voxel, imaged
 from curvafit.data_synth.modality import Modality, field_shape
 from curvafit.data_synth.randomness import correlated
 from curvafit.data_synth.sources import Stored
@@ -51,6 +51,8 @@ class TextureDataset(IterableDataset):
         Samples of an epoch, over all ranks.
     blend
         Share of samples in which one texture gives way to another.
+    calibres
+        How much thinner and thicker than the voxel makes it a structure may be: every sample draws its own factor.
     voxel
         Edge of a shape's voxels in the modalities' unit; by default each modality's own.
     transform
@@ -73,13 +75,14 @@ class TextureDataset(IterableDataset):
         seed: int = 0,
         blend: float = 0.2,
         voxel: float | None = None,
+        calibres: tuple[float, float] = (1.0, 1.0),
         transform: Callable[[Sample], Any] | None = None,
     ) -> None:
         paths = [stores] if isinstance(stores, (str, Path)) else list(stores)
         self.modalities = [modalities] if isinstance(modalities, Modality) else list(modalities)
         self.source = Stored(tuple(map(Path, paths)))
         self.shape, self.length, self.seed, self.blend = tuple(map(int, shape)), int(length), int(seed), blend
-        self.voxel, self.transform = voxel, transform
+        self.voxel, self.calibres, self.transform = voxel, calibres, transform
         self._check()
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
 
@@ -117,7 +120,7 @@ class TextureDataset(IterableDataset):
         words = np.random.SeedSequence(self.seed, spawn_key=(number,))
         rng, (for_imaging, for_image, for_blend) = np.random.default_rng(words), map(int, words.generate_state(3))
         modality = self.modalities[int(rng.integers(len(self.modalities)))]
-        imaging, voxel = modality.draw(for_imaging), self.voxel or modality.voxel
+        imaging, voxel = modality.draw(for_imaging), drawn_voxel(self.voxel or modality.voxel, self.calibres, rng)
         voxels = field_shape(self.shape, voxel, imaging)
         u, epsilon, origin = self._shape(voxels, rng, for_blend)
         grey, _, mask = imaged(u, epsilon, voxel, imaging, for_image, self.shape)
@@ -145,8 +148,9 @@ class TextureDataset(IterableDataset):
         if len(self.shape) != 3 or min(self.shape) < 1 or self.length < 1 or not 0 <= self.blend <= 1:
             told = f"{self.shape}, {self.length}, {self.blend}"
             raise ValueError(f"expected 3 edges and a length above 0, and a blend in [0, 1], got {told}")
+        check_calibres(self.calibres)
         for modality in self.modalities:
-            check_crop(self.source, self.shape, self.voxel or modality.voxel, modality)
+            check_crop(self.source, self.shape, (self.voxel or modality.voxel) * self.calibres[0], modality)
 
 
 def as_dict(sample: Sample) -> dict[str, Tensor]:

@@ -1,0 +1,119 @@
+"""Cases of a training set: one shape, its image and mask, each by its number alone."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from exact_store import exact_store
+
+from curvafit.data_synth.case import Recipe
+from curvafit.data_synth.modality import Imaging, Modality
+from curvafit.data_synth.sources import Generated, Shape, Stored, source_of
+
+FLAT = Modality("flat", "for tests", 0.5, Imaging(spacing=(1.0, 0.5, 0.5), blur=(0.4, 0.2, 0.2), ceiling=255.0), {
+    "foreground": (80.0, 120.0), "read_noise": (1.0, 3.0),
+})  # fmt: skip
+SHAPE = (8, 16, 16)
+
+
+@pytest.fixture(scope="module")
+def recipe(tmp_path_factory: pytest.TempPathFactory) -> Recipe:
+    store = exact_store(tmp_path_factory.mktemp("shapes") / "s.zarr", 8)
+    return Recipe(Stored((store.path,)), FLAT, SHAPE, 0.5, seed=4)
+
+
+def test_a_case_is_the_image_of_its_field(recipe):
+    case = recipe.case(3)
+    assert case.image.shape == case.field.shape == SHAPE and case.image.dtype == np.uint16
+    assert case.spacing == (1.0, 0.5, 0.5) and case.unit == "um" and case.epsilon == pytest.approx(1.0)
+    inside, outside = (case.image[part].mean() for part in (case.field > 0.9, case.field < -0.9))
+    level = case.record["imaging"]["foreground"]
+    assert abs(inside - level) < 0.15 * level and abs(outside - 10) < 6
+    again, other = recipe.case(3), recipe.case(4)
+    assert (again.image == case.image).all() and again.record == case.record
+    assert (other.image != case.image).any()
+
+
+def test_a_set_does_not_go_on_with_a_store_that_grew(recipe):
+    kept = recipe.source.as_dict()
+    assert source_of(kept) == recipe.source and kept["draws"] > 0
+    with pytest.raises(ValueError, match="well-formed shapes .*before, got 7"):
+        source_of(kept | {"draws": kept["draws"] + 1}).shape((8, 8, 8), 0, np.random.default_rng(0))
+
+
+def test_generated_shapes_take_turns_and_other_seeds():
+    tubes, sheet = (1.0, 2.0, 6.0, -40.0, -40.0, 400.0, -0.5), (1.0, 0.0, 1.0, 0.0, 0.0, 0.0, -0.2)
+    source = Generated((tubes, sheet), ("tubes", "sheet"))
+    made = [source.shape((16, 16, 16), index, np.random.default_rng(index)) for index in (0, 2)]
+    assert [each.origin["name"] for each in made] == ["tubes", "tubes"]
+    assert made[0].origin["seed"] != made[1].origin["seed"] and (made[0].field != made[1].field).any()
+    assert made[0].epsilon == 2.0 and made[0].field.dtype == np.float32
+    again = source.shape((16, 16, 16), 0, np.random.default_rng(0))
+    assert (again.field == made[0].field).all()
+
+
+def test_shapes_fill_the_share_that_is_asked_for():
+    point = (1.0, 2.0, 6.0, -40.0, -40.0, 400.0, -0.5)
+    source = Generated((point,), ("tubes",), fraction=0.15)
+    made = source.shape((20, 20, 20), 0, np.random.default_rng(0))
+    assert (made.field > 0).mean() == 0.15 and made.origin["parameters"]["mass"] != -0.5
+    assert source_of(source.as_dict()) == source
+    assert source_of({"kind": "generated", "points": [point], "names": ["tubes"], "schedule": "fast"}).fraction is None
+    with pytest.raises(ValueError, match="expected a volume fraction between 0 and 1, got 1.5"):
+        Generated((point,), ("tubes",), fraction=1.5)
+
+
+def test_what_does_not_grow_is_said():
+    barren = Generated(((1.0, 0.0, 1.0, 0.0, 0.0, 3000.0, -0.9),), ("nothing",))
+    with pytest.raises(ValueError, match="expected nothing to grow from one of 8 seeds, got none: "):
+        barren.shape((12, 12, 12), 0, np.random.default_rng(0))
+
+
+def test_a_shape_that_falls_between_the_slices_is_not_a_case():
+    class Sheets:
+        """Half sheets beside the only slice, the third one on it, if asked for."""
+
+        within = 11.0
+
+        def __init__(self, third: int) -> None:
+            self.asked, self.places = 0, [0, 0, third]
+
+        def shape(self, voxels, index, rng):
+            field = np.full(voxels, -1.0, np.float32)
+            field[self.places[min(self.asked, 2)], :4] = 1.0
+            self.asked += 1
+            return Shape(field, 2.0, {"name": "sheet"})
+
+        def as_dict(self):
+            return {"kind": "sheets"}
+
+    coarse = Modality("coarse", "for tests", 1.0, Imaging(spacing=(11.0, 1.0, 1.0)))
+    seen = Sheets(third=5)
+    case = Recipe(seen, coarse, (1, 8, 8), 1.0).case(0)
+    assert seen.asked == 3 and (case.field[0, :4] > 0).all() and (case.field[0, 4:] < 0).all()
+    with pytest.raises(ValueError, match="expected structure and background on 1 x 8 x 8 voxels, got one 8 times"):
+        Recipe(Sheets(third=0), coarse, (1, 8, 8), 1.0).case(0)
+
+
+def test_structures_of_many_calibres(recipe):
+    """The same shapes, cropped smaller and shown larger; one calibre leaves a case as it is."""
+    thick = replace(recipe, calibres=(1.0, 2.0))
+    cases = [thick.case(index) for index in range(4)]
+    voxels = [case.record["voxel"] for case in cases]
+    assert len(set(voxels)) == 4 and min(voxels) >= 0.5 and max(voxels) <= 1.0
+    assert [case.epsilon for case in cases] == pytest.approx([2 * voxel for voxel in voxels])
+    assert Recipe.from_dict(json.loads(json.dumps(thick.as_dict()))) == thick
+    before = recipe.as_dict()
+    del before["calibres"]
+    assert Recipe.from_dict(before) == recipe
+    with pytest.raises(ValueError, match="expected calibres as two positive factors, the lower first"):
+        replace(recipe, calibres=(2.0, 1.0))
+    with pytest.raises(ValueError, match="expected crops within the 24 voxels"):
+        replace(recipe, calibres=(0.2, 1.0))
+
+
+def test_a_recipe_reads_back(recipe):
+    assert Recipe.from_dict(json.loads(json.dumps(recipe.as_dict()))).as_dict() == recipe.as_dict()
