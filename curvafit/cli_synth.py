@@ -7,13 +7,14 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 
 from curvafit.cli_atlas import SchedulerOption, WorkersOption
 from curvafit.cli_support import kept, numbers, plainly, reading_of, say, stages, whole_triple
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from curvafit.data_synth.modality import Modality
     from curvafit.data_synth.sets import Order
     from curvafit.data_synth.sources import Source
@@ -180,6 +181,8 @@ def _modality(
 
 
 def _mask(values: np.ndarray) -> np.ndarray:
+    import numpy as np
+
     kinds = len(np.unique(values))
     if kinds != 2:
         raise ValueError(f"expected a mask of two values beside --like-mask, got {kinds} values")
