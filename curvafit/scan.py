@@ -161,7 +161,7 @@ def write_atomically(target: Path, write: Callable[[Path], object]) -> Path:
         write(temporary)
         return move_into_place(temporary, target)
     finally:
-        _remove(temporary)
+        remove(temporary)
 
 
 def write_content(target: Path, content: str | bytes) -> Path:
@@ -185,11 +185,12 @@ def move_into_place(made: Path, target: Path) -> Path:
         if aside.exists():
             os.replace(aside, target)
         raise
-    _remove(aside)
+    remove(aside)
     return target
 
 
-def _remove(path: Path) -> None:
+def remove(path: Path) -> None:
+    """Delete a file or a folder with all in it; none is fine."""
     if path.is_dir():
         shutil.rmtree(path)
     else:

@@ -7,22 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from exact_store import exact_store
+from flat_recipe import SHAPE, flat_recipe
 
 from curvafit.data_synth.case import Recipe
 from curvafit.data_synth.modality import Imaging, Modality
-from curvafit.data_synth.sources import Generated, Shape, Stored, source_of
-
-FLAT = Modality("flat", "for tests", 0.5, Imaging(spacing=(1.0, 0.5, 0.5), blur=(0.4, 0.2, 0.2), ceiling=255.0), {
-    "foreground": (80.0, 120.0), "read_noise": (1.0, 3.0),
-})  # fmt: skip
-SHAPE = (8, 16, 16)
+from curvafit.data_synth.sources import Generated, Shape, source_of
 
 
 @pytest.fixture(scope="module")
 def recipe(tmp_path_factory: pytest.TempPathFactory) -> Recipe:
-    store = exact_store(tmp_path_factory.mktemp("shapes") / "s.zarr", 8)
-    return Recipe(Stored((store.path,)), FLAT, SHAPE, 0.5, seed=4)
+    return flat_recipe(tmp_path_factory.mktemp("shapes") / "s.zarr")
 
 
 def test_a_case_is_the_image_of_its_field(recipe):

@@ -10,25 +10,18 @@ from pathlib import Path
 import nibabel
 import numpy as np
 import pytest
-from exact_store import exact_store
+from flat_recipe import FLAT, SHAPE, flat_recipe
 
 from curvafit.data_synth import sets
 from curvafit.data_synth.case import Recipe
-from curvafit.data_synth.modality import Imaging, Modality
+from curvafit.data_synth.modality import Imaging
 from curvafit.data_synth.sets import Order, build_set, make_cases, read_order
-from curvafit.data_synth.sources import Stored
 from curvafit.scan import load, read_values
-
-FLAT = Modality("flat", "for tests", 0.5, Imaging(spacing=(1.0, 0.5, 0.5), blur=(0.4, 0.2, 0.2), ceiling=255.0), {
-    "foreground": (80.0, 120.0), "read_noise": (1.0, 3.0),
-})  # fmt: skip
-SHAPE = (8, 16, 16)
 
 
 @pytest.fixture(scope="module")
 def order(tmp_path_factory: pytest.TempPathFactory) -> Order:
-    store = exact_store(tmp_path_factory.mktemp("shapes") / "s.zarr", 8)
-    return Order(Recipe(Stored((store.path,)), FLAT, SHAPE, 0.5, seed=4))
+    return Order(flat_recipe(tmp_path_factory.mktemp("shapes") / "s.zarr"))
 
 
 def sums(folder: Path) -> dict[str, dict[str, str]]:

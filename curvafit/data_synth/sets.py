@@ -6,7 +6,6 @@ import errno
 import hashlib
 import itertools
 import json
-import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -23,7 +22,7 @@ from curvafit.data_synth.labels import NAMES, labels_of
 from curvafit.data_synth.layouts import LAYOUTS, About
 from curvafit.data_synth.workers import Here, Workers
 from curvafit.priors.grid import Grid
-from curvafit.scan import Field, save, write_content
+from curvafit.scan import Field, remove, save, write_content
 
 FORMAT = "curvafit set"
 VERSION = 1
@@ -199,14 +198,7 @@ def _remove_case(folder: Path, order: Order, name: str) -> None:
         *(folder / part.format(case=name) for part in (layout.label, layout.image)),
     ]
     for place in [*places, *(folder / "parts").glob(f"*/{name}.*")]:
-        _remove(place)
-
-
-def _remove(place: Path) -> None:
-    if place.is_dir():
-        shutil.rmtree(place)
-    else:
-        place.unlink(missing_ok=True)
+        remove(place)
 
 
 def _write_case(folder: Path, order: Order, index: int, case: Case) -> None:
@@ -223,7 +215,7 @@ def _write_case(folder: Path, order: Order, index: int, case: Case) -> None:
         _write_json(folder / RECORDS / f"{name}.json", case.record | known | {"sha256": sums, "versions": versions()})
     except BaseException:
         for place in places:
-            _remove(place)
+            remove(place)
         raise
 
 
