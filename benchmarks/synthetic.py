@@ -32,7 +32,7 @@ from benchmarks.vessel_report import best_threshold, cells, stacked
 from benchmarks.vessel_scores import SCORES, block_counts, bootstrap
 from benchmarks.vessel_training import BATCH, Plan, Training, dice_ce, predict
 from benchmarks.vessels import begun, other, provenance
-from curvafit.data_synth.case import imaged
+from curvafit.data_synth.case import drawn_voxel, imaged
 from curvafit.data_synth.estimate import bright, like
 from curvafit.data_synth.modality import Modality, field_shape, visible_share
 from curvafit.data_synth.moves import SYMMETRIES, cropped, turned
@@ -65,7 +65,8 @@ class Synthetic(Training):
     def __init__(
         self,
         shapes: np.ndarray,
-        edges: tuple[float, float],
+        edge: float,
+        calibres: tuple[float, float],
         modality: Modality,
         scan: np.ndarray,
         plan: Plan,
@@ -73,7 +74,7 @@ class Synthetic(Training):
     ) -> None:
         super().__init__(part(STACKS[0], "fit"), plan, seed)
         values = np.log1p(scan.astype(np.float32))
-        self.shapes, self.edges, self.modality = shapes, edges, modality
+        self.shapes, self.edge, self.calibres, self.modality = shapes, edge, calibres, modality
         self.mean, self.spread = values.mean(), values.std()
 
     def batch(self, step: int) -> tuple[Tensor, Tensor]:
@@ -86,7 +87,7 @@ class Synthetic(Training):
         rng, (draw, noise) = np.random.default_rng(words), map(int, words.generate_state(2))
         imaging = self.modality.draw(draw)
         whole = turned(self.shapes[int(rng.integers(len(self.shapes)))], int(rng.integers(SYMMETRIES)))
-        edge = float(np.exp(rng.uniform(*np.log(self.edges))))
+        edge = drawn_voxel(self.edge, self.calibres, rng)
         size = field_shape(PATCH, edge, imaging)
         corner = [int(rng.integers(n - m + 1)) for n, m in zip(whole.shape, size, strict=True)]
         crop = torch.from_numpy(np.ascontiguousarray(cropped(whole, corner, size)))
@@ -153,23 +154,21 @@ class Study:
             training.run(dice_ce, self.budget.steps)
             training.save(path.with_suffix(".pt"))
             return training
-        before = self._synthetic("inferred", stack, seed) if name == TUNED else None
-        steps, rate = self.budget.steps + self.budget.tuning, self.budget.rate
-        if before is not None:
-            steps, rate = self.budget.tuning, self.budget.tuning_rate
+        budget, tuned = self.budget, name == TUNED
+        steps, rate = (budget.tuning, budget.tuning_rate) if tuned else (budget.steps + budget.tuning, budget.rate)
         training = Training(part(stack, "fit"), Plan(steps, 0, rate), seed)
-        if before is not None:
+        if tuned:
             self.run("inferred", stack, seed)
-            before.load(self.folder / f"inferred-{seed}-{stack}.pt")
-            training.model.load_state_dict(before.model.state_dict())
+            before = torch.load(self.folder / f"inferred-{seed}-{stack}.pt")
+            training.model.load_state_dict(before["model"])
         training.run(dice_ce, steps)
         return training
 
     def _synthetic(self, kind: str, stack: str, seed: int) -> Synthetic:
         fit, plan = self.fit(stack), Plan(self.budget.steps, 0, self.budget.rate)
         shapes = fields(kind, fit, self.folder, self.budget.count)
-        edge, (low, high) = law(fit).working_voxel, self.calibres(stack)
-        return Synthetic(shapes, (low * edge, high * edge), self.modality(stack), self.scan(stack).values, plan, seed)
+        edge, scan = law(fit).working_voxel, self.scan(stack).values
+        return Synthetic(shapes, edge, self.calibres(stack), self.modality(stack), scan, plan, seed)
 
 
 def mirrored(model: nn.Module, image: np.ndarray) -> np.ndarray:
