@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from curvafit.cli_atlas import SchedulerOption, WorkersOption
-from curvafit.cli_support import kept, numbers, plainly, reading_of, say, stages, whole_triple
+from curvafit.cli_support import error_console, kept, numbers, plainly, reading_of, say, stages, whole_triple
 
 if TYPE_CHECKING:
     import numpy as np
@@ -112,7 +112,7 @@ def synth(
 
 
 def _build(out: Path, order: Order, count: int, workers: int | None, scheduler: str | None) -> None:
-    from curvafit.data_synth.sets import build_set
+    from curvafit.data_synth.sets import build_set, cases_of
     from curvafit.data_synth.workers import cluster
     from curvafit.set_picture import write_preview
     from curvafit.shape_files import check_folder
@@ -122,6 +122,8 @@ def _build(out: Path, order: Order, count: int, workers: int | None, scheduler: 
         progress("starting workers", 0.0)
         with cluster(workers, scheduler) as crew:
             build_set(out, order, count, lambda n, of: progress(f"{n} of {of} cases", n / of), workers=crew)
+    if (held := len(cases_of(out))) > count:
+        say(f"note: {out} held {held} cases, more than --count {count}: all are listed", to=error_console())
     say(str(out / "dataset.json"))
     say(str(write_preview(out)))
 

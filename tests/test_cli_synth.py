@@ -34,6 +34,9 @@ def test_a_set_from_a_store(tmp_path, store):
     assert (out / "preview.png").read_bytes().startswith(b"\x89PNG")
     image = load(out / "imagesTr" / "case_00001_0000.nii.gz")
     assert image.shape == (8, 16, 16) and image.spacing == (1.0, 0.5, 0.5) and image.unit == "um"
+    fewer = call("synth", "-o", out, "--atlas", store, "--modality", "confocal", *QUICK, "--count", "1")
+    assert fewer.exit_code == 0 and listed(out)["numTraining"] == 2
+    assert "held 2 cases, more than --count 1: all are listed" in " ".join(fewer.stderr.split())
 
 
 def test_names_of_modalities_are_forgiving(tmp_path, store):

@@ -213,3 +213,11 @@ def test_bad_input(tmp_path, order):
         build_set(folder, other, 1)
     with pytest.raises(ValueError, match="expected a set of version 1"):
         make_cases(tmp_path / "nowhere", [0])
+
+
+def test_a_set_without_cases_is_begun_anew(tmp_path, order, monkeypatch):
+    with monkeypatch.context() as patched, pytest.raises(ValueError, match="no such shape"):
+        patched.setattr(Recipe, "case", lambda *_: (_ for _ in ()).throw(ValueError("no such shape")))
+        build_set(tmp_path / "set", order, 1)
+    other = Order(Recipe(order.recipe.source, FLAT, SHAPE, 0.5, seed=5))
+    assert sums(build_set(tmp_path / "set", other, 1)) == sums(build_set(tmp_path / "new", other, 1))

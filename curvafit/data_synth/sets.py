@@ -75,7 +75,7 @@ def build_set(
     Parameters
     ----------
     folder
-        Of the set; a new or an empty one, or a set of the same order to go on with.
+        Of the set; a new or an empty one, or a set of the same order to go on with. One without cases is begun anew.
 
     Raises
     ------
@@ -88,7 +88,7 @@ def build_set(
         raise ValueError(f"expected a count of at least 1 case, got {count}")
     folder, workers = Path(folder), workers or Here()
     _begin(folder, order)
-    done = set(_there(folder))
+    done = set(cases_of(folder))
     todo = iter([index for index in range(count) if index not in done])
     asked, listed = 0, -LISTED_EVERY
     try:
@@ -146,6 +146,12 @@ def read_order(folder: str | Path) -> Order:
     return Order(Recipe.from_dict(kept["recipe"]), kept["layout"], tuple(kept["parts"]))
 
 
+def cases_of(folder: Path) -> list[int]:
+    """The cases that are complete: a record is written last."""
+    names = (path.stem.removeprefix("case_") for path in (folder / RECORDS).glob("case_*.json"))
+    return sorted(int(name) for name in names if name.isdigit())
+
+
 def case_name(index: int) -> str:
     """What a case is called in file names."""
     return f"case_{index:05d}"
@@ -154,9 +160,9 @@ def case_name(index: int) -> str:
 def _begin(folder: Path, order: Order) -> None:
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"expected a folder for the set, got the file {folder}")
-    if not (folder / HEADER).exists():
-        if folder.is_dir() and any(folder.iterdir()):
-            raise ValueError(f"expected a new or empty folder, or a set to go on with, got {folder} with other things")
+    if not (folder / HEADER).exists() and folder.is_dir() and any(folder.iterdir()):
+        raise ValueError(f"expected a new or empty folder, or a set to go on with, got {folder} with other things")
+    if not cases_of(folder):
         header = {"format": FORMAT, "version": VERSION, "versions": versions(), "order": order.as_dict()}
         _write_json(folder / HEADER, header)
     found, asked = read_order(folder).as_dict(), order.as_dict()
@@ -164,12 +170,6 @@ def _begin(folder: Path, order: Order) -> None:
         name, was, now = _difference(found, asked)
         raise ValueError(f"expected what {folder} was begun with, got another {name}: {now} for {was}")
     (folder / RECORDS).mkdir(exist_ok=True)
-
-
-def _there(folder: Path) -> list[int]:
-    """The cases that are complete: a record is written last."""
-    names = (path.stem.removeprefix("case_") for path in (folder / RECORDS).glob("case_*.json"))
-    return sorted(int(name) for name in names if name.isdigit())
 
 
 def _list(folder: Path, order: Order, done: set[int]) -> None:
@@ -180,7 +180,7 @@ def _list(folder: Path, order: Order, done: set[int]) -> None:
 
 def _list_what_is_there(folder: Path, order: Order) -> None:
     """Write the list; where the disk is too full for it, without the last cases, which make room."""
-    done = _there(folder)
+    done = cases_of(folder)
     while True:
         try:
             return _list(folder, order, set(done))
