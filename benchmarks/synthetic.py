@@ -28,8 +28,8 @@ from torch import Tensor, nn
 
 from benchmarks.synthetic_shapes import EPSILON, KINDS, fields, law, nearest_at_its_density
 from benchmarks.vessel_data import PATCH, SPACING, STACKS, part, raw
-from benchmarks.vessel_report import best_threshold, cells, stacked
-from benchmarks.vessel_scores import SCORES, block_counts, bootstrap
+from benchmarks.vessel_report import best_thresholds, cells, stacked
+from benchmarks.vessel_scores import SCORES, block_counts, bootstrap, scores
 from benchmarks.vessel_training import BATCH, Plan, Training, dice_ce, predict
 from benchmarks.vessels import begun, other, provenance
 from curvafit.data_synth.case import drawn_voxel, imaged
@@ -179,7 +179,9 @@ def mirrored(model: nn.Module, image: np.ndarray) -> np.ndarray:
 
 
 def table(runs: dict[str, list[list[dict]]]) -> str:
-    found = bootstrap({name: stacked(those) for name, those in runs.items()}, "inferred")
+    counts = {name: stacked(those) for name, those in runs.items()}
+    found, tuned = (bootstrap(counts, base) for base in ("inferred", SLICES))
+    best = best_thresholds()
     every = [run for those in runs.values() for pair in those for run in pair]
     commits, torches = ({run[key] for run in every} for key in ("commit", "torch"))
     steps = {name: those[0][0]["steps"] for name, those in runs.items()}
@@ -190,10 +192,21 @@ def table(runs: dict[str, list[list[dict]]]) -> str:
         f"{'':28}" + "".join(f"{name:>27}" for name in SCORES),
     ]
     lines += [f"{name:28}" + cells(found[name][0], "") for name in runs]
-    lines += [f"{'best threshold, in hindsight':28}" + "".join(f"{value:>27.4f}" for value in best_threshold())]
+    lines += [f"{'best threshold, in hindsight':28}" + "".join(f"{value:>27.4f}" for value in best.mean(0))]
     lines += ["", "Differences to the inferred textures"]
     lines += [f"{name:28}" + cells(found[name][1], "+") for name in runs if name != "inferred"]
-    return "\n".join(lines) + "\n"
+    lines += ["", f"Difference to {SLICES}", f"{TUNED:28}" + cells(tuned[TUNED][1], "+")]
+    return "\n".join([*lines, "", *by_stack(counts, best)]) + "\n"
+
+
+def by_stack(counts: dict[str, dict[str, np.ndarray]], best: np.ndarray) -> list[str]:
+    """Dice on each stack's test half, trained on the other; `best` of the thresholds, in the order of `STACKS`."""
+    lines = ["Dice on each stack's test half: mean, least and most of the seeds"]
+    lines += [f"{'':28}" + "".join(f"{other(stack):>27}" for stack in STACKS)]
+    for name, those in counts.items():
+        dice = scores(those)[..., 0].T
+        lines += [f"{name:28}" + "".join(f"{d.mean():>13.4f} {d.min():.4f} {d.max():.4f}" for d in dice)]
+    return [*lines, f"{'best threshold, in hindsight':28}" + "".join(f"{d:>13.4f}{'':14}" for d in best[::-1, 0])]
 
 
 def pictures(study: Study, names: list[str]) -> None:

@@ -38,7 +38,7 @@ def table(runs: dict[str, list[list[dict]]], tuning: list[tuple[float, list[dict
         f"{'':24}" + "".join(f"{name:>27}" for name in SCORES),
     ]
     lines += [f"{label(those[0][0]):24}" + cells(found[loss][0], "") for loss, those in runs.items()]
-    lines += [f"{'best threshold':24}" + "".join(f"{value:>27.4f}" for value in best_threshold())]
+    lines += [f"{'best threshold':24}" + "".join(f"{value:>27.4f}" for value in best_thresholds().mean(0))]
     lines += ["", "Differences to Dice + CE"]
     others = [loss for loss in runs if loss != "dice+ce"]
     lines += [f"{loss:24}" + cells(found[loss][1], "+") for loss in others]
@@ -105,8 +105,8 @@ def cells(values: np.ndarray, sign: str) -> str:
     return "".join(f"{f'{middle:{sign}.4f} [{low:{sign}.4f}, {high:{sign}.4f}]':>27}" for middle, low, high in values.T)
 
 
-def best_threshold() -> np.ndarray:
-    """Scores of the one threshold a stack that is best in hindsight, mean of both test parts."""
+def best_thresholds() -> np.ndarray:
+    """Scores, `(stacks, 4)`, of the one threshold that is best in hindsight on each stack's test part."""
     found = []
     for stack in STACKS:
         image, true = part(stack, "test")
@@ -114,7 +114,7 @@ def best_threshold() -> np.ndarray:
         overlaps = [2 * ((image > level) & true).sum() / ((image > level).sum() + true.sum()) for level in levels]
         counts = block_counts(image > levels[int(np.argmax(overlaps))], true)
         found.append(scores({name: np.array(values) for name, values in counts.items()}))
-    return np.mean(found, 0)
+    return np.array(found)
 
 
 def _sweep(tuning: list[tuple[float, list[dict]]]) -> list[str]:
