@@ -28,7 +28,7 @@ from torch import Tensor, nn
 
 from benchmarks.synthetic_shapes import EPSILON, KINDS, fields, law, nearest_at_its_density
 from benchmarks.vessel_data import PATCH, SPACING, STACKS, part, raw
-from benchmarks.vessel_report import best_thresholds, cells, stacked
+from benchmarks.vessel_report import WINDOW, best_thresholds, cells, stacked
 from benchmarks.vessel_scores import SCORES, block_counts, bootstrap, scores
 from benchmarks.vessel_training import BATCH, Plan, Training, dice_ce, predict
 from benchmarks.vessels import begun, other, provenance
@@ -210,17 +210,17 @@ def by_stack(counts: dict[str, dict[str, np.ndarray]], best: np.ndarray) -> list
 
 
 def pictures(study: Study, names: list[str]) -> None:
-    """A slice of a synthetic image of every kind beside the real one; and a window of what each network found."""
-    stack, window = STACKS[1], np.s_[8:16, 256:416, 40:200]
+    """A window of the real image, what each network found there, and a synthetic image of every kind."""
+    stack = STACKS[1]
     image, true = part(stack, "test")
-    shown: dict[str, np.ndarray] = {"real image": image[10, :160, :160], "annotation": true[window].sum(0)}
+    shown: dict[str, np.ndarray] = {"image": image[WINDOW].max(0), "annotation": true[WINDOW].sum(0)}
     for kind in KINDS:
         x, _ = study._synthetic(kind, stack, 0).batch(0)
-        shown[f"{kind}: a pair's image"] = x[0, 0, 6].numpy()
+        shown[f"a pair's image, {kind} (half as wide)"] = x[0, 0].amax(0).numpy()
     for name in names:
         path = study.folder / f"{name.replace(' ', '-').replace(',', '')}-0-{other(stack)}.npz"
         with np.load(path) as kept:
-            shown[name] = kept["mask"][window].sum(0)
+            shown[name] = kept["mask"][WINDOW].sum(0)
     figure, axes = plt.subplots(3, 4, figsize=(15, 11.5), layout="constrained")
     for axis in axes.flat:
         axis.set_axis_off()
