@@ -72,7 +72,7 @@ class Synthetic(Training):
         plan: Plan,
         seed: int,
     ) -> None:
-        super().__init__(part(STACKS[0], "fit"), plan, seed)
+        super().__init__(None, plan, seed)
         values = np.log1p(scan.astype(np.float32))
         self.shapes, self.edge, self.calibres, self.modality = shapes, edge, calibres, modality
         self.mean, self.spread = values.mean(), values.std()
@@ -103,6 +103,11 @@ class Study:
     def __init__(self, folder: Path, budget: Budget) -> None:
         self.folder, self.budget = folder, budget
         folder.mkdir(parents=True, exist_ok=True)
+        kept = folder / "budget.json"
+        if not kept.exists():
+            write_content(kept, json.dumps(budget))
+        if (found := json.loads(kept.read_text())) != list(budget):
+            raise SystemExit(f"expected runs of {budget} in {folder}, got some of {found}: choose another folder")
 
     def scan(self, stack: str) -> Field:
         """The unlabelled part that all is taken from."""
@@ -135,7 +140,7 @@ class Study:
 
     def run(self, name: str, stack: str, seed: int) -> dict:
         """Train as `name` says on a stack's side, test on the other; or read what an earlier run kept."""
-        path = self.folder / f"{name.replace(' ', '-').replace(',', '')}-{seed}-{stack}.json"
+        path = self.path(name, stack, seed)
         if not path.exists():
             begun = time.process_time()
             training = self._trained(name, stack, seed, path)
@@ -148,9 +153,12 @@ class Study:
             print(f"{time.strftime('%H:%M')} {path.stem}: {kept['seconds']:.0f} s", flush=True)
         return json.loads(path.read_text())
 
+    def path(self, name: str, stack: str, seed: int) -> Path:
+        return self.folder / f"{name.replace(' ', '-').replace(',', '')}-{seed}-{stack}.json"
+
     def _trained(self, name: str, stack: str, seed: int, path: Path) -> Training:
         if name in KINDS:
-            training = self._synthetic(name, stack, seed)
+            training = self.synthetic(name, stack, seed)
             training.run(dice_ce, self.budget.steps)
             training.save(path.with_suffix(".pt"))
             return training
@@ -159,12 +167,12 @@ class Study:
         training = Training(part(stack, "fit"), Plan(steps, 0, rate), seed)
         if tuned:
             self.run("inferred", stack, seed)
-            before = torch.load(self.folder / f"inferred-{seed}-{stack}.pt")
+            before = torch.load(self.path("inferred", stack, seed).with_suffix(".pt"))
             training.model.load_state_dict(before["model"])
         training.run(dice_ce, steps)
         return training
 
-    def _synthetic(self, kind: str, stack: str, seed: int) -> Synthetic:
+    def synthetic(self, kind: str, stack: str, seed: int) -> Synthetic:
         fit, plan = self.fit(stack), Plan(self.budget.steps, 0, self.budget.rate)
         shapes = fields(kind, fit, self.folder, self.budget.count)
         edge, scan = law(fit).working_voxel, self.scan(stack).values
@@ -215,11 +223,10 @@ def pictures(study: Study, names: list[str]) -> None:
     image, true = part(stack, "test")
     shown: dict[str, np.ndarray] = {"image": image[WINDOW].max(0), "annotation": true[WINDOW].sum(0)}
     for kind in KINDS:
-        x, _ = study._synthetic(kind, stack, 0).batch(0)
+        x, _ = study.synthetic(kind, stack, 0).batch(0)
         shown[f"a pair's image, {kind} (half as wide)"] = x[0, 0].amax(0).numpy()
     for name in names:
-        path = study.folder / f"{name.replace(' ', '-').replace(',', '')}-0-{other(stack)}.npz"
-        with np.load(path) as kept:
+        with np.load(study.path(name, other(stack), 0).with_suffix(".npz")) as kept:
             shown[name] = kept["mask"][WINDOW].sum(0)
     figure, axes = plt.subplots(3, 4, figsize=(15, 11.5), layout="constrained")
     for axis in axes.flat:

@@ -1,11 +1,13 @@
 """Four kinds of shapes to train on: straight tubes, Gaussian level cuts, the packaged atlas, inferred textures.
 
-All are phase fields in cubes of `EXTENT` µm, on working voxels of the inferred texture, and fill the share of the
-volume that the scan's structure does. Tubes and cuts have the mean thickness of the inferred texture too.
+All are phase fields in cubes of `EXTENT` µm, on working voxels of the inferred texture. That is grown as dense as the
+scan's structure, as near as it gets; tubes and cuts fill the same share of the volume as it and have its mean
+thickness; the atlas's shapes fill the same share within `NEAR`.
 """
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import replace
 from operator import itemgetter
@@ -38,20 +40,25 @@ EXTENT, EPSILON = 84.0, 2.0
 TRIED = 80
 #: Spread of the straight tubes' radii: standard deviation of their logarithm.
 SPREAD = 0.25
+#: How far an atlas's shape may be from the inferred textures' share of the volume, relatively.
+NEAR = 0.15
 
 
 def fields(kind: str, fit: Path, folder: Path, count: int) -> np.ndarray:
     """Phase fields `(N, E, E, E)` of a kind, made once; `fit` is the fit.json of the inferred ones."""
-    path = folder / f"{kind}-{fit.stem}-{count}.npy"
+    digest = hashlib.sha256(fit.read_bytes()).hexdigest()[:8]
+    path = folder / f"{kind}-{fit.stem}-{digest}-{count}.npy"
     if not path.exists():
         found = law(fit)
         make: dict[str, Callable[[], np.ndarray]] = {
             "inferred": lambda: inferred(found, count),
-            "atlas": lambda: from_atlas(found, count),
-            "tubes": lambda: drawn(_tubes, found, radius(fields("inferred", fit, folder, count)), count),
-            "cuts": lambda: cuts(found, radius(fields("inferred", fit, folder, count)), count),
+            "atlas": lambda: from_atlas(found, share(fields("inferred", fit, folder, count)), count),
+            "tubes": lambda: alike(_tubes, fields("inferred", fit, folder, count), count),
+            "cuts": lambda: alike(_cut, fields("inferred", fit, folder, count), count),
         }
         made = make[kind]()
+        told = f"share of the volume {share(made):.4f}, radius {radius(made):.2f} voxels"
+        print(f"{path.stem}: {told}", flush=True)
         write_atomically(path, lambda temporary: np.save(temporary, made))
     return np.load(path)
 
@@ -89,32 +96,39 @@ def inferred(found: Prior, count: int) -> np.ndarray:
     return np.stack([shape(source, found, k) for k in track(range(count), "inferred")])
 
 
-def from_atlas(found: Prior, count: int) -> np.ndarray:
+def from_atlas(found: Prior, wanted: float, count: int) -> np.ndarray:
     """Shapes of the packaged atlas's parameters, chosen at random; those that cannot be so thin are passed over."""
     atlas, made = load_atlas(), []
     for k in np.random.default_rng(0).permutation(len(atlas)):
         point = (*map(float, atlas.coefficients[k]), float(atlas.masses[k]))
         try:
-            made.append(shape(Generated((point,), (atlas.ids[k],), fraction=found.volume_fraction), found, int(k)))
+            one = shape(Generated((point,), (atlas.ids[k],), fraction=wanted), found, int(k))
         except ValueError:
             continue
+        if abs(share(one) - wanted) > NEAR * wanted:
+            continue
+        made.append(one)
         print(f"atlas: {len(made)} of {count}", flush=True)
         if len(made) == count:
             break
     return np.stack(made)
 
 
-def drawn(draw: Callable[[float, float, Prior, int], np.ndarray], found: Prior, size: float, count: int) -> np.ndarray:
-    assert found.volume_fraction is not None
-    return np.stack([draw(found.volume_fraction, size, found, k) for k in range(count)])
+def alike(draw: Callable[[tuple[int, ...], float, float, int], np.ndarray], like: np.ndarray, count: int) -> np.ndarray:
+    """Shapes that fill the share of others and have their mean radius."""
+    fraction, wanted, edges = share(like), radius(like), like.shape[1:]
 
+    def drawn(size: float, count: int) -> np.ndarray:
+        return np.stack([draw(edges, fraction, size, k) for k in range(count)])
 
-def cuts(found: Prior, size: float, count: int) -> np.ndarray:
-    """Level sets of Gaussian random fields; their correlation's length is the one that gives the mean radius."""
-    length = 4.0 * size
+    size = wanted
     for _ in range(3):
-        length *= size / radius(drawn(_cut, found, length, 3))
-    return drawn(_cut, found, length, count)
+        size *= wanted / radius(drawn(size, 6))
+    return drawn(size, count)
+
+
+def share(shapes: np.ndarray) -> float:
+    return float((shapes > 0).mean())
 
 
 def radius(shapes: np.ndarray) -> float:
@@ -126,9 +140,10 @@ def shape(source: Generated, found: Prior, k: int) -> np.ndarray:
     return source.shape(box(found), 0, np.random.default_rng(k)).field
 
 
-def _tubes(fraction: float, size: float, found: Prior, seed: int) -> np.ndarray:
-    """Straight cylinders through random points in random directions until they hold the fraction."""
-    rng, edges = np.random.default_rng(seed), box(found)
+def _tubes(edges: tuple[int, ...], fraction: float, size: float, seed: int) -> np.ndarray:
+    """Straight cylinders through random points in random directions, made thinner by the little that the last is over
+    the fraction."""
+    rng = np.random.default_rng(seed)
     places = torch.stack(torch.meshgrid(*(torch.arange(n, dtype=torch.float32) for n in edges), indexing="ij"), -1)
     depth = torch.full(edges, -np.inf)
     while float((depth > 0).float().mean()) < fraction:
@@ -139,11 +154,11 @@ def _tubes(fraction: float, size: float, found: Prior, seed: int) -> np.ndarray:
         across = across - (across @ direction)[..., None] * direction
         own = size * float(np.exp(SPREAD * rng.normal()))
         depth = torch.maximum(depth, own - across.norm(dim=-1))
-    return optimal_profile(depth, EPSILON).numpy()
+    return optimal_profile(depth - float(np.quantile(depth.numpy(), 1 - fraction)), EPSILON).numpy()
 
 
-def _cut(fraction: float, length: float, found: Prior, seed: int) -> np.ndarray:
-    edges = box(found)
-    values: Tensor = correlated(torch.zeros(1, 1, *edges), (length,) * 3, [seed], "cut")[0, 0]
+def _cut(edges: tuple[int, ...], fraction: float, size: float, seed: int) -> np.ndarray:
+    """A level set of a Gaussian random field."""
+    values: Tensor = correlated(torch.zeros(1, 1, *edges), (4 * size,) * 3, [seed], "cut")[0, 0]
     level = np.quantile(values.numpy(), 1 - fraction)
     return phase_field(values > float(level), Grid(edges, (1.0, 1.0, 1.0), "replicate"), EPSILON).numpy()

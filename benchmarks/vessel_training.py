@@ -95,9 +95,11 @@ def curvature(setting: Setting) -> CurvaturePrior:
 class Training:
     """A network in training on a part: `steps` taken with Dice + CE, then with what a setting adds."""
 
-    def __init__(self, part: Part, plan: Plan, seed: int) -> None:
+    def __init__(self, part: Part | None, plan: Plan, seed: int) -> None:
         torch.manual_seed(seed)
-        self.image, self.target, self.plan, self.seed = part.image, sparse(part.label), plan, seed
+        if part is not None:
+            self.image, self.target = part.image, sparse(part.label)
+        self.plan, self.seed = plan, seed
         self.model = network()
         self.optimiser = torch.optim.AdamW(self.model.parameters(), plan.rate)
         self.step = 0
