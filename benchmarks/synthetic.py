@@ -44,6 +44,7 @@ SLICES = "three slices"
 #: The least part of its own size that a shape is shown at: less would not fill a patch.
 LEAST = 0.95
 TUNED = "inferred, then three slices"
+THRESHOLD = "best threshold in hindsight"
 
 
 class Budget(NamedTuple):
@@ -188,33 +189,35 @@ def mirrored(model: nn.Module, image: np.ndarray) -> np.ndarray:
 
 def table(runs: dict[str, list[list[dict]]]) -> str:
     counts = {name: stacked(those) for name, those in runs.items()}
-    found, tuned = (bootstrap(counts, base) for base in ("inferred", SLICES))
-    best = best_thresholds()
+    seeds = len(runs["inferred"])
+    counts[THRESHOLD] = {name: np.repeat(of[:, ::-1], seeds, 0) for name, of in best_thresholds().items()}
+    found, tuned, beyond = (bootstrap(counts, base) for base in ("inferred", SLICES, THRESHOLD))
     every = [run for those in runs.values() for pair in those for run in pair]
     commits, torches = ({run[key] for run in every} for key in ("commit", "torch"))
     steps = {name: those[0][0]["steps"] for name, those in runs.items()}
     lines = [
-        f"Test halves, {len(runs['inferred'])} seeds, both stacks; commit {', '.join(sorted(commits))}, "
+        f"Test halves, {seeds} seeds, both stacks; commit {', '.join(sorted(commits))}, "
         f"torch {', '.join(sorted(torches))}. 95 % intervals: bootstrap over places and seeds.",
         f"Steps: {steps}, the last after those of the inferred textures.",
-        f"{'':28}" + "".join(f"{name:>27}" for name in SCORES),
+        f"{'':28}" + "".join(f"{name:>28}" for name in SCORES),
     ]
-    lines += [f"{name:28}" + cells(found[name][0], "") for name in runs]
-    lines += [f"{'best threshold, in hindsight':28}" + "".join(f"{value:>27.4f}" for value in best.mean(0))]
+    lines += [f"{name:28}" + cells(found[name][0], "") for name in counts]
     lines += ["", "Differences to the inferred textures"]
     lines += [f"{name:28}" + cells(found[name][1], "+") for name in runs if name != "inferred"]
+    lines += ["", f"Differences to the {THRESHOLD}"]
+    lines += [f"{name:28}" + cells(beyond[name][1], "+") for name in runs]
     lines += ["", f"Difference to {SLICES}", f"{TUNED:28}" + cells(tuned[TUNED][1], "+")]
-    return "\n".join([*lines, "", *by_stack(counts, best)]) + "\n"
+    return "\n".join([*lines, "", *by_stack(counts)]) + "\n"
 
 
-def by_stack(counts: dict[str, dict[str, np.ndarray]], best: np.ndarray) -> list[str]:
-    """Dice on each stack's test half, trained on the other; `best` of the thresholds, in the order of `STACKS`."""
+def by_stack(counts: dict[str, dict[str, np.ndarray]]) -> list[str]:
+    """Dice on each stack's test half, trained on the other."""
     lines = ["Dice on each stack's test half: mean, least and most of the seeds"]
-    lines += [f"{'':28}" + "".join(f"{other(stack):>27}" for stack in STACKS)]
+    lines += [f"{'':28}" + "".join(f"{other(stack):>28}" for stack in STACKS)]
     for name, those in counts.items():
         dice = scores(those)[..., 0].T
-        lines += [f"{name:28}" + "".join(f"{d.mean():>13.4f} {d.min():.4f} {d.max():.4f}" for d in dice)]
-    return [*lines, f"{'best threshold, in hindsight':28}" + "".join(f"{d:>13.4f}{'':14}" for d in best[::-1, 0])]
+        lines += [f"{name:28}" + "".join(f"{d.mean():>14.4f} {d.min():.4f} {d.max():.4f}" for d in dice)]
+    return lines
 
 
 def pictures(study: Study, names: list[str]) -> None:

@@ -38,7 +38,8 @@ def table(runs: dict[str, list[list[dict]]], tuning: list[tuple[float, list[dict
         f"{'':24}" + "".join(f"{name:>27}" for name in SCORES),
     ]
     lines += [f"{label(those[0][0]):24}" + cells(found[loss][0], "") for loss, those in runs.items()]
-    lines += [f"{'best threshold':24}" + "".join(f"{value:>27.4f}" for value in best_thresholds().mean(0))]
+    best = scores(best_thresholds()).mean((0, 1))
+    lines += [f"{'best threshold':24}" + "".join(f"{value:>27.4f}" for value in best)]
     lines += ["", "Differences to Dice + CE"]
     others = [loss for loss in runs if loss != "dice+ce"]
     lines += [f"{loss:24}" + cells(found[loss][1], "+") for loss in others]
@@ -105,16 +106,15 @@ def cells(values: np.ndarray, sign: str) -> str:
     return "".join(f"{f'{middle:{sign}.4f} [{low:{sign}.4f}, {high:{sign}.4f}]':>27}" for middle, low, high in values.T)
 
 
-def best_thresholds() -> np.ndarray:
-    """Scores, `(stacks, 4)`, of the one threshold that is best in hindsight on each stack's test part."""
+def best_thresholds() -> dict[str, np.ndarray]:
+    """Counts `(1, stacks, blocks)` of the one threshold that is best in hindsight on each stack's test part."""
     found = []
     for stack in STACKS:
         image, true = part(stack, "test")
         levels = np.quantile(image, np.linspace(0.85, 0.995, 59))
         overlaps = [2 * ((image > level) & true).sum() / ((image > level).sum() + true.sum()) for level in levels]
-        counts = block_counts(image > levels[int(np.argmax(overlaps))], true)
-        found.append(scores({name: np.array(values) for name, values in counts.items()}))
-    return np.array(found)
+        found.append(block_counts(image > levels[int(np.argmax(overlaps))], true))
+    return {name: np.array([[counts[name] for counts in found]]) for name in found[0]}
 
 
 def _sweep(tuning: list[tuple[float, list[dict]]]) -> list[str]:

@@ -123,7 +123,7 @@ def _build(out: Path, order: Order, count: int, workers: int | None, scheduler: 
         with cluster(workers, scheduler) as crew:
             build_set(out, order, count, lambda n, of: progress(f"{n} of {of} cases", n / of), workers=crew)
     if (held := len(cases_of(out))) > count:
-        say(f"note: {out} held {held} cases, more than --count {count}: all are listed", to=error_console())
+        say(f"note: {out} holds {held} cases, more than --count {count}: all are listed", to=error_console())
     say(str(out / "dataset.json"))
     say(str(write_preview(out)))
 

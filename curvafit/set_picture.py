@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from curvafit.data_synth.layouts import LAYOUTS
-from curvafit.data_synth.sets import RECORDS, read_order
+from curvafit.data_synth.sets import RECORDS, case_name, cases_of, read_order
 from curvafit.plot import CONTOUR, write_picture
 from curvafit.scan import read_values
 
@@ -23,7 +23,7 @@ def write_preview(folder: str | Path) -> Path:
     without the label's outline."""
     folder = Path(folder)
     layout = LAYOUTS[read_order(folder).layout]
-    names = sorted(path.stem for path in (folder / RECORDS).glob("*.json"))[:SHOWN]
+    names = [case_name(index) for index in cases_of(folder)[:SHOWN]]
     columns, rows = min(ROW, len(names)), -(-len(names) // ROW)
     figure = Figure(figsize=(2.4 * columns, 5.0 * rows + 0.3), facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)

@@ -34,9 +34,10 @@ def test_a_set_from_a_store(tmp_path, store):
     assert (out / "preview.png").read_bytes().startswith(b"\x89PNG")
     image = load(out / "imagesTr" / "case_00001_0000.nii.gz")
     assert image.shape == (8, 16, 16) and image.spacing == (1.0, 0.5, 0.5) and image.unit == "um"
+    (out / "cases" / ".1a2b.case_00002.json").write_text("torn")  # a killed run's
     fewer = call("synth", "-o", out, "--atlas", store, "--modality", "confocal", *QUICK, "--count", "1")
     assert fewer.exit_code == 0 and listed(out)["numTraining"] == 2
-    assert "held 2 cases, more than --count 1: all are listed" in " ".join(fewer.stderr.split())
+    assert "holds 2 cases, more than --count 1: all are listed" in " ".join(fewer.stderr.split())
 
 
 def test_names_of_modalities_are_forgiving(tmp_path, store):

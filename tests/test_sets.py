@@ -215,9 +215,14 @@ def test_bad_input(tmp_path, order):
         make_cases(tmp_path / "nowhere", [0])
 
 
-def test_a_set_without_cases_is_begun_anew(tmp_path, order, monkeypatch):
-    with monkeypatch.context() as patched, pytest.raises(ValueError, match="no such shape"):
-        patched.setattr(Recipe, "case", lambda *_: (_ for _ in ()).throw(ValueError("no such shape")))
-        build_set(tmp_path / "set", order, 1)
-    other = Order(Recipe(order.recipe.source, FLAT, SHAPE, 0.5, seed=5))
-    assert sums(build_set(tmp_path / "set", other, 1)) == sums(build_set(tmp_path / "new", other, 1))
+def test_what_others_began_is_left_alone(tmp_path, order):
+    """A set whose first case is still being made may be another process's."""
+    folder, other = tmp_path / "set", Order(replace(order.recipe, seed=5))
+    sets._begin(folder, order)
+    with pytest.raises(ValueError, match="another seed: 5 for 4; choose another folder, or delete this one"):
+        build_set(folder, other, 1)
+    assert read_order(folder) == order
+    (folder / "curvafit.json").write_text("{}")
+    with pytest.raises(ValueError, match="expected a set of version 1"):
+        build_set(folder, other, 1)
+    assert (folder / "curvafit.json").read_text() == "{}"

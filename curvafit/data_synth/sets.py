@@ -75,7 +75,7 @@ def build_set(
     Parameters
     ----------
     folder
-        Of the set; a new or an empty one, or a set of the same order to go on with. One without cases is begun anew.
+        Of the set; a new or an empty one, or a set of the same order to go on with.
 
     Raises
     ------
@@ -101,7 +101,7 @@ def build_set(
             done |= set(workers.done())
             asked -= 1
             if progress is not None:
-                progress(len(done), count)
+                progress(min(len(done), count), count)
             if time.monotonic() > listed + LISTED_EVERY:
                 _list(folder, order, done)
                 listed = time.monotonic()
@@ -160,15 +160,16 @@ def case_name(index: int) -> str:
 def _begin(folder: Path, order: Order) -> None:
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"expected a folder for the set, got the file {folder}")
-    if not (folder / HEADER).exists() and folder.is_dir() and any(folder.iterdir()):
-        raise ValueError(f"expected a new or empty folder, or a set to go on with, got {folder} with other things")
-    if not cases_of(folder):
+    if not (folder / HEADER).exists():
+        if folder.is_dir() and any(folder.iterdir()):
+            raise ValueError(f"expected a new or empty folder, or a set to go on with, got {folder} with other things")
         header = {"format": FORMAT, "version": VERSION, "versions": versions(), "order": order.as_dict()}
         _write_json(folder / HEADER, header)
     found, asked = read_order(folder).as_dict(), order.as_dict()
     if found != asked:
         name, was, now = _difference(found, asked)
-        raise ValueError(f"expected what {folder} was begun with, got another {name}: {now} for {was}")
+        told = f"got another {name}: {now} for {was}; choose another folder, or delete this one"
+        raise ValueError(f"expected what {folder} was begun with, {told}")
     (folder / RECORDS).mkdir(exist_ok=True)
 
 
