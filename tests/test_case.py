@@ -12,6 +12,7 @@ from flat_recipe import SHAPE, flat_recipe
 from curvafit.data_synth.case import Recipe
 from curvafit.data_synth.modality import Imaging, Modality
 from curvafit.data_synth.sources import Generated, Shape, source_of
+from curvafit.generation import fraction as steering
 
 
 @pytest.fixture(scope="module")
@@ -49,15 +50,19 @@ def test_generated_shapes_take_turns_and_other_seeds():
     assert (again.field == made[0].field).all()
 
 
-def test_shapes_fill_the_share_that_is_asked_for():
+def test_shapes_fill_the_share_that_is_asked_for(monkeypatch):
     point = (1.0, 2.0, 6.0, -40.0, -40.0, 400.0, -0.5)
     source = Generated((point,), ("tubes",), fraction=0.15)
     made = source.shape((20, 20, 20), 0, np.random.default_rng(0))
     assert (made.field > 0).mean() == 0.15 and made.origin["parameters"]["mass"] != -0.5
+    assert "after 1000 steps" in made.origin["status"] and "volume fraction" not in made.origin["status"]
     assert source_of(source.as_dict()) == source
     assert source_of({"kind": "generated", "points": [point], "names": ["tubes"], "schedule": "fast"}).fraction is None
     with pytest.raises(ValueError, match="expected a volume fraction between 0 and 1, got 1.5"):
         Generated((point,), ("tubes",), fraction=1.5)
+    monkeypatch.setattr(steering, "LAST", -1.0)
+    missed = source.shape((20, 20, 20), 0, np.random.default_rng(0))
+    assert f"volume fraction {(missed.field > 0).mean():.4f} instead of 0.1500" in missed.origin["status"]
 
 
 def test_what_does_not_grow_is_said():

@@ -63,7 +63,8 @@ class Generated:
     schedule
         Of the flow.
     fraction
-        Share of the volume that shapes fill, instead of the points' masses, as near as `generate` gets.
+        Share of the volume that shapes fill, instead of the points' masses, as near as `generate` gets: a shape's
+        `origin` says where it is missed.
 
     Raises
     ------
@@ -114,7 +115,8 @@ class Generated:
                 )
             if well_formed(flow.viability):
                 point = dict(zip(PARAMETERS, (*six, flow.mass), strict=True))
-                origin = {"name": self.names[turn], "parameters": point, "seed": seed, "schedule": self.schedule}
+                grown = {"seed": seed, "schedule": self.schedule, "status": flow.status}
+                origin = {"name": self.names[turn], "parameters": point, **grown}
                 return Shape(flow.field.numpy(), WORKING_EPSILON / WORKING_SPACING, origin)
             status = flow.status
         raise ValueError(f"expected {self.names[turn]} to grow from one of {TRIES} seeds, got none: {status}")
