@@ -67,6 +67,7 @@ def assert_same(one, other) -> None:
     assert all(torch.equal(one.snapshots[step], other.snapshots[step]) for step in one.snapshots)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["torch", "fused"])
 def test_a_killed_program_goes_on(backend, tmp_path):
     """SIGKILL at a random step after the first save, anywhere in it; then the same end as of a run in one go."""
@@ -93,6 +94,7 @@ def test_a_killed_program_goes_on(backend, tmp_path):
     assert_same(resumed, generate(TUBES, None, GRID, **told))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("optimiser", ["adam", "lbfgs"])
 @pytest.mark.parametrize("flow", ["l2", "mass", "h-1"])
 def test_flows_from_a_field_go_on(flow, optimiser, tmp_path):

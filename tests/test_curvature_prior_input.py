@@ -87,6 +87,7 @@ def trained(law: str, share: float, epsilon: float | None = None) -> list[float]
     return (2 * (found & truth).sum(1) / (found.sum(1) + truth.sum(1))).tolist()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", ["trabec", "tubes"])
 def test_a_structure_two_voxels_thick_survives_a_share_of_a_tenth(law):
     """And the tube does not survive equal gradients, least of all at an ε of 8 voxels: the labels do not hold it."""

@@ -198,6 +198,7 @@ def test_thinning_widens_only_the_tails() -> None:
     assert fine.spread < thin.spread < 1.5 * fine.spread
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["tubes", "sponge"])
 def test_masks_stay_near_their_fields(data, name: str) -> None:
     """The published shapes, known only as {u > 0}: within 2 of themselves, in 1 / working unit. Their area is kept."""

@@ -89,6 +89,7 @@ def test_labels() -> None:
 # ---- size and place --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("shape", "spacing", "radius"),
     [((40, 40, 24), (1, 1, 1), 2.1), ((96, 96, 40), (0.5, 0.5, 0.5), 12), ((20, 60, 60), (3, 1, 1), 9)],
@@ -130,6 +131,7 @@ def test_resampling_keeps_linear_functions_of_position(scale, start, slope) -> N
     assert found[inner] == pytest.approx(np.tensordot(slope, new, 1)[inner], abs=1e-6)
 
 
+@pytest.mark.slow
 def test_periodic_boxes_stay_periodic_when_resampled() -> None:
     shape = (80, 80, 60)
     mask = np.roll(tube_mask(shape, (1, 1, 1), 9.6), 40, axis=0)  # the tube crosses the seam
@@ -261,6 +263,7 @@ def test_bone_is_kept_on_its_grid(data) -> None:
     assert dice > 0.99
 
 
+@pytest.mark.slow
 def test_anisotropic_membranes_become_cubic(data) -> None:
     prepared = prepare(load(data / "scans" / "plantseg_sample_ovule.h5::raw"))
     check(prepared)

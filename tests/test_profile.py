@@ -146,6 +146,7 @@ def test_distances_across_tilted_faces_are_short_not_long() -> None:
     assert 0.78 < float(slope) < 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("radius", [4, 6, 8, 10])
 def test_balls_and_rods_keep_their_mean_curvature(radius: int) -> None:
     """Mean κ1 + κ2 over the mesh of a re-profiled mask, four random centres: within 2 % from a thickness of 12 voxels,

@@ -77,6 +77,7 @@ def test_deviations_cover_the_error_within_a_few(found) -> None:
         assert miss < 6 * found.uncertainty[name], name
 
 
+@pytest.mark.slow
 def test_a_field_that_is_not_stationary_is_not_said_to_be(sponge: torch.Tensor, found) -> None:
     bent = (sponge + 0.05 * torch.sin(torch.linspace(0, 6 * math.pi, EDGE))).clamp(-1, 1)
     other = stationarity(bent, GRID, WORKING_EPSILON)
@@ -98,6 +99,7 @@ def test_the_mirror_image_has_mirrored_coefficients(sponge: torch.Tensor, found)
     assert list(other.coefficients)[1:5] == pytest.approx(list(expected)[1:5], rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_crop_says_what_its_inside_says(sponge: torch.Tensor) -> None:
     """The equations of a crop are those of the whole field: its border's continuation is never read."""
     grid, width = Grid((32, 32, 32), 0.01, "replicate"), 2.5
@@ -122,6 +124,7 @@ def test_refusals(sponge: torch.Tensor) -> None:
         stationarity(sponge[:24, :24, :24], Grid((24,) * 3, 0.01, "replicate"), WORKING_EPSILON, width=4)
 
 
+@pytest.mark.slow
 def test_a_rounded_field_is_told_and_treated_like_a_mask(sponge: torch.Tensor, monkeypatch) -> None:
     rounded = torch.floor(sponge * 100) / 100
     assert is_rounded(rounded) and not is_rounded(sponge)

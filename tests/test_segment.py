@@ -169,6 +169,7 @@ def test_a_probability_map_is_regularised() -> None:
     assert dice(found.mask.values, truth) > dice(map_ > 0.5, truth) + 0.05
 
 
+@pytest.mark.slow
 def test_anisotropic_scans_keep_their_grid() -> None:
     truth = tubes(36)[1::3]
     scan = noisy(truth, 40, spacing=(3.0, 1.0, 1.0))

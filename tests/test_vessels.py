@@ -36,6 +36,7 @@ def test_dice_ce_sees_labelled_voxels_only(tubes):
     assert (slope[target == UNKNOWN] == 0).all() and (slope[target != UNKNOWN] != 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", LOSSES)
 def test_a_training_resumes_to_the_same_network(tubes, loss, tmp_path, monkeypatch):
     monkeypatch.setattr("benchmarks.vessel_training.BATCHES", 1)

@@ -46,6 +46,7 @@ def same(one, other) -> bool:
     return whole and all((one.field(i) == other.field(i)).all() for i in kept)
 
 
+@pytest.mark.slow
 def test_two_workers_make_the_store_that_one_process_makes_though_one_is_killed(tmp_path, serial):
     with cluster(2) as crew:
         pids = list(crew._client.run(os.getpid).values())
