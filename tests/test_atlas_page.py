@@ -24,6 +24,7 @@ from curvafit.index import Atlas, extract
 from curvafit.match import Match
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
+pytestmark = pytest.mark.slow
 
 #: WebGL 2 without a graphics card.
 FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]

@@ -210,6 +210,7 @@ def assert_solid(tmp_path: Path, edge: int, *more: object) -> None:
     np.testing.assert_allclose(mesh.bounds, [[-0.01] * 3, [0.02 * (edge - 0.5)] * 3], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_tubes_are_watertight_with_the_volume_of_the_phase(tmp_path: Path) -> None:
     assert_solid(tmp_path, 48, "--steps", 150)
 

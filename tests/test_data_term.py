@@ -114,6 +114,7 @@ def test_known_slices_hold_whatever_the_axis_and_the_spacing(along: int) -> None
     assert np.abs(fields[0] - np.tanh(DISTANCE / (math.sqrt(2) * ε))).mean() < 0.1  # 0.15 at the ε of two voxels
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("epsilon", [1.0, 2.0, 5.0])
 def test_evidence_counts_its_nats_once_whatever_the_volume_of_a_part(epsilon: float, monkeypatch) -> None:
     gained = []

@@ -75,6 +75,7 @@ def measured_gap(u: torch.Tensor, grid: Grid, ε: float) -> tuple[float, float]:
     return first, second
 
 
+@pytest.mark.slow
 def test_forms_part_on_a_generated_field() -> None:
     """Dropping the positive part only ever lowers the |M|² term (a20 + a02 > a11), so 𝓔̃_ε ≥ F_ε."""
     grid, ε = Grid((20, 20, 20), (0.01,) * 3), 0.02

@@ -104,6 +104,7 @@ def test_masks_without_two_phases_are_refused(mask: np.ndarray) -> None:
         morphometry(mask)
 
 
+@pytest.mark.slow
 def test_trabecular_bone(data) -> None:
     scan = load(data / "scans" / "lhdl_trabecular_200_otsu_mask.tif")
     found = morphometry(scan.values[:96, :96, :96] > 0, scan.spacing, scan.unit)

@@ -142,6 +142,7 @@ def test_periodic_boxes_stay_periodic_when_resampled() -> None:
     assert rolled.mask[0, rolled.mask.shape[1] // 2].all() and rolled.mask[-1, rolled.mask.shape[1] // 2].all()
 
 
+@pytest.mark.slow
 def test_specks_and_pinholes_are_dropped() -> None:
     mask = tube_mask((40, 40, 40), (1, 1, 1), 6).copy()
     clean = mask.copy()

@@ -49,6 +49,7 @@ def test_gradients_of_the_six_terms_are_autograds(boundary: str) -> None:
         torch.testing.assert_close(each[k][inside], whole[inside], rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_stationarity_finds_what_made_a_field(found) -> None:
     for name in ("a11", "a02", "a10", "a01"):
         truth = getattr(TRUTH.coefficients, name)
@@ -84,6 +85,7 @@ def test_a_field_that_is_not_stationary_is_not_said_to_be(sponge: torch.Tensor, 
     assert other.residual > 5 * found.residual
 
 
+@pytest.mark.slow
 def test_a_shift_changes_nothing(sponge: torch.Tensor, found) -> None:
     """An even shift maps octants and the propagated noise elsewhere, the equations onto themselves."""
     moved = stationarity(sponge.roll((6, 10, 4), (0, 1, 2)), GRID, WORKING_EPSILON)
@@ -91,6 +93,7 @@ def test_a_shift_changes_nothing(sponge: torch.Tensor, found) -> None:
         assert getattr(moved.coefficients, name) == pytest.approx(getattr(found.coefficients, name), rel=0.02), name
 
 
+@pytest.mark.slow
 def test_the_mirror_image_has_mirrored_coefficients(sponge: torch.Tensor, found) -> None:
     """F_ε[-u; a] = F_ε[u; a'], so -u gives a', in the gauge a20 = 1."""
     mirrored = found.coefficients.mirrored()

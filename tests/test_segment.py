@@ -179,6 +179,7 @@ def test_anisotropic_scans_keep_their_grid() -> None:
     assert dice(found.mask.values, truth) > 0.93
 
 
+@pytest.mark.slow
 def test_known_slices_are_kept_and_the_rest_beats_interpolation() -> None:
     """A ball: lines between its sections cut it short, their spline less, its curvature least."""
     n, every = 41, 8

@@ -63,12 +63,14 @@ def test_symmetry(seeds: tuple[int, int], by: float) -> None:
     assert wasserstein(a, b) == pytest.approx(wasserstein(b, a), rel=1e-3, abs=0.03)
 
 
+@pytest.mark.slow
 def test_triangle_inequality_on_some() -> None:
     ds = [blob(k, (10.0 * k, -3.0 * k), 2.0 + k) for k in range(3)]
     for a, b, c in itertools.permutations(ds):
         assert wasserstein(a, c) <= wasserstein(a, b) + wasserstein(b, c) + 0.02
 
 
+@pytest.mark.slow
 def test_binning_costs_less_than_stated() -> None:
     """At most 0.05 at width 2, and √½ · spread is a bound on the distance to one's binned self."""
     a, b = blob(3, count=2500), blob(4, (24.0, -6.0), 6.0, count=2500)

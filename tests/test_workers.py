@@ -97,6 +97,7 @@ def test_a_scheduler_that_goes_is_one_sentence(monkeypatch, error):
         raise error("gone")
 
 
+@pytest.mark.slow
 def test_workers_here_leave_the_interrupt_to_the_build_and_may_be_gone_for_a_while():
     with cluster(1) as crew:
         heard = crew._client.run(lambda: signal.getsignal(signal.SIGINT))
