@@ -29,7 +29,7 @@ from torch import Tensor, nn
 from benchmarks.synthetic_shapes import EPSILON, KINDS, fields, law, nearest_at_its_density
 from benchmarks.vessel_data import PATCH, SPACING, STACKS, part, raw
 from benchmarks.vessel_report import WINDOW, best_thresholds, cells, stacked
-from benchmarks.vessel_scores import SCORES, block_counts, bootstrap, scores
+from benchmarks.vessel_scores import SCORES, block_counts, interval, resampled, scores
 from benchmarks.vessel_training import BATCH, Plan, Training, dice_ce, predict
 from benchmarks.vessels import begun, other, provenance
 from curvafit.data_synth.case import drawn_voxel, imaged
@@ -144,7 +144,7 @@ class Study:
         path = self.path(name, stack, seed)
         if not path.exists():
             begun = time.process_time()
-            training = self._trained(name, stack, seed, path)
+            training = self._trained(name, stack, seed)
             image, label = part(other(stack), "test")
             mask = mirrored(training.model, image) > 0.5
             kept = {"name": name, "seed": seed, "stack": stack, "seconds": time.process_time() - begun}
@@ -157,11 +157,11 @@ class Study:
     def path(self, name: str, stack: str, seed: int) -> Path:
         return self.folder / f"{name.replace(' ', '-').replace(',', '')}-{seed}-{stack}.json"
 
-    def _trained(self, name: str, stack: str, seed: int, path: Path) -> Training:
+    def _trained(self, name: str, stack: str, seed: int) -> Training:
         if name in KINDS:
             training = self.synthetic(name, stack, seed)
             training.run(dice_ce, self.budget.steps)
-            training.save(path.with_suffix(".pt"))
+            training.save(self.path(name, stack, seed).with_suffix(".pt"))
             return training
         budget, tuned = self.budget, name == TUNED
         steps, rate = (budget.tuning, budget.tuning_rate) if tuned else (budget.steps + budget.tuning, budget.rate)
@@ -191,7 +191,7 @@ def table(runs: dict[str, list[list[dict]]]) -> str:
     counts = {name: stacked(those) for name, those in runs.items()}
     seeds = len(runs["inferred"])
     counts[THRESHOLD] = {name: np.repeat(of[:, ::-1], seeds, 0) for name, of in best_thresholds().items()}
-    found, tuned, beyond = (bootstrap(counts, base) for base in ("inferred", SLICES, THRESHOLD))
+    drawn = resampled(counts)
     every = [run for those in runs.values() for pair in those for run in pair]
     commits, torches = ({run[key] for run in every} for key in ("commit", "torch"))
     steps = {name: those[0][0]["steps"] for name, those in runs.items()}
@@ -199,14 +199,12 @@ def table(runs: dict[str, list[list[dict]]]) -> str:
         f"Test halves, {seeds} seeds, both stacks; commit {', '.join(sorted(commits))}, "
         f"torch {', '.join(sorted(torches))}. 95 % intervals: bootstrap over places and seeds.",
         f"Steps: {steps}, the last after those of the inferred textures.",
-        f"{'':28}" + "".join(f"{name:>28}" for name in SCORES),
+        f"{'':28}" + "".join(f"{name:>27}" for name in SCORES),
     ]
-    lines += [f"{name:28}" + cells(found[name][0], "") for name in counts]
-    lines += ["", "Differences to the inferred textures"]
-    lines += [f"{name:28}" + cells(found[name][1], "+") for name in runs if name != "inferred"]
-    lines += ["", f"Differences to the {THRESHOLD}"]
-    lines += [f"{name:28}" + cells(beyond[name][1], "+") for name in runs]
-    lines += ["", f"Difference to {SLICES}", f"{TUNED:28}" + cells(tuned[TUNED][1], "+")]
+    lines += [f"{name:28}" + cells(interval(drawn[name]), "") for name in counts]
+    for base in ("inferred", THRESHOLD, SLICES):
+        lines += ["", f"Differences to {base}"]
+        lines += [f"{name:28}" + cells(interval(drawn[name] - drawn[base]), "+") for name in runs if name != base]
     return "\n".join([*lines, "", *by_stack(counts)]) + "\n"
 
 

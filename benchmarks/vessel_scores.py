@@ -92,17 +92,22 @@ def bootstrap(runs: dict[str, dict[str, np.ndarray]], base: str, draws: int = 40
     dict
         For each loss `(2, 3, 4)`: its score or difference; mean, lower end, upper end; `SCORES`.
     """
+    drawn = resampled(runs, draws)
+    return {loss: np.stack([interval(found), interval(found - drawn[base])]) for loss, found in drawn.items()}
+
+
+def resampled(runs: dict[str, dict[str, np.ndarray]], draws: int = 4000) -> dict[str, np.ndarray]:
+    """For each loss the scores `(1 + draws, 4)` of the sample itself and of its resamples, as in `bootstrap`."""
     random = np.random.default_rng(0)
-    seeds, _, places = next(iter(runs[base].values())).shape
+    seeds, _, places = next(iter(next(iter(runs.values())).values())).shape
     picks = [(random.integers(seeds, size=seeds), random.integers(places, size=places)) for _ in range(draws)]
     picks.insert(0, (np.arange(seeds), np.arange(places)))
-    drawn = {
+    return {
         loss: np.array([scores({name: c[s][..., p] for name, c in counts.items()}).mean((0, 1)) for s, p in picks])
         for loss, counts in runs.items()
     }
-    return {loss: np.stack([_interval(found), _interval(found - drawn[base])]) for loss, found in drawn.items()}
 
 
-def _interval(drawn: np.ndarray) -> np.ndarray:
+def interval(drawn: np.ndarray) -> np.ndarray:
     """The value of the sample itself, and the quantiles of its resamples."""
     return np.stack([drawn[0], *np.quantile(drawn[1:], (0.025, 0.975), axis=0)])
