@@ -32,9 +32,10 @@ from skimage.restoration import denoise_tv_chambolle
 from skimage.segmentation import random_walker
 
 from curvafit.evidence import interpolated_distance
+from curvafit.files import write_atomically, write_content
 from curvafit.infer import infer
 from curvafit.priors.coefficients import Coefficients
-from curvafit.scan import Field, write_atomically, write_content
+from curvafit.scan import Field
 from curvafit.segment import reconstruct, segment
 from curvafit.topology import betti_numbers
 

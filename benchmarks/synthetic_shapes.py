@@ -21,6 +21,7 @@ from torch import Tensor
 from curvafit.data_synth.randomness import correlated
 from curvafit.data_synth.sources import Generated
 from curvafit.diagram import diagram
+from curvafit.files import write_atomically
 from curvafit.fit import Fit
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import schedule
@@ -30,7 +31,6 @@ from curvafit.morphometry import local_thickness
 from curvafit.priors import Coefficients, Prior, read_fit
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.profile import optimal_profile, phase_field
-from curvafit.scan import write_atomically
 from curvafit.transport import wasserstein
 
 KINDS = ("tubes", "cuts", "atlas", "inferred")

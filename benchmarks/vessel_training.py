@@ -18,9 +18,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from benchmarks.vessel_data import PATCH, SPACING, UNKNOWN, Part, patch, sparse
+from curvafit.files import write_atomically
 from curvafit.priors.combined import CombinedLoss
 from curvafit.priors.segmentation import CurvaturePrior
-from curvafit.scan import write_atomically
 
 LOSSES = ("dice+ce", "cldice", "skeleton", "curvature")
 FILTERS = (8, 16, 32, 48)

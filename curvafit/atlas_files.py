@@ -23,20 +23,48 @@ from curvafit.data_synth.census import census
 from curvafit.data_synth.record import Record
 from curvafit.data_synth.store import Store, open_store
 from curvafit.diagram import Diagram
+from curvafit.files import bears, check_folder, check_free, write_content
 from curvafit.generation.viability import well_formed
 from curvafit.index import Atlas, Measured, extract, measured, shape_id
-from curvafit.scan import write_content
 
 #: Folder beside the two files for what took long: measured shapes, distances, places.
 CACHE = "cache"
+#: Its mark, by which programs that make backups know it too (bford.info/cachedir), and that of the page.
+TAG = "CACHEDIR.TAG"
+_TAGGED = "Signature: 8a477f597d28d172789f06886806bc55\n# curvafit atlas map"
+_MARK = '<meta name="generator" content="curvafit'
 #: Goes up when what is kept changes.
 _CACHE_VERSION = 1
 
 _Arrays = dict[str, np.ndarray]
 
 
+def check_map(directory: str | Path, store: str | Path, overwrite: bool = False) -> Path:
+    """The folder, if the map of a store can be written there; asked before the work is done.
+
+    Raises
+    ------
+    ValueError
+        If it is no folder that can be written to, lies in the store, or something else stands where a file goes.
+    """
+    folder = check_folder(directory)
+    page, cache = folder / "atlas.html", folder / CACHE
+
+    def ours(path: Path) -> bool:
+        return bears(cache / TAG, _TAGGED) if path == cache else path.is_file() and bears(page, _MARK)
+
+    check_free([page, folder / "atlas.png", cache], ours, [store], overwrite)
+    return folder
+
+
 def write_map(
-    store: str | Path | Store, directory: str | Path, *, device: str = "cpu", command: str = "", progress: Progress
+    store: str | Path | Store,
+    directory: str | Path,
+    *,
+    device: str = "cpu",
+    command: str = "",
+    overwrite: bool = False,
+    progress: Progress,
 ) -> tuple[Path, Path]:
     """Write `atlas.png` and `atlas.html` of a store's well-formed shapes into a folder; returns their paths.
 
@@ -48,13 +76,16 @@ def write_map(
     ImportError
         If the extra `[atlas]` is not installed.
     FileNotFoundError, ValueError
-        If there is no such store, or it has too few well-formed shapes.
+        If there is no such store, it has too few well-formed shapes, or as `check_map`; `overwrite` tells whether files
+        that no such call wrote may be replaced.
     """
     check_extra()
     store = store if isinstance(store, Store) else open_store(store)
+    check_map(directory, store.path, overwrite)
     check_size(sum(well_formed(store.record(index).viability) for index in store.indices()))
     folder = Path(directory)
     (folder / CACHE).mkdir(parents=True, exist_ok=True)
+    write_content(folder / CACHE / TAG, f"{_TAGGED}\n")
     atlas, records, shapes, commands = _looked_at(store, folder / CACHE, progress)
     mapped = _mapped(atlas, folder / CACHE, device, progress)
     progress("drawing", 0.95)

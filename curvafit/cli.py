@@ -17,6 +17,7 @@ from curvafit.cli_hosts import nnunet
 from curvafit.cli_samples import samples_app
 from curvafit.cli_segment import RECONSTRUCT_EXAMPLES, SEGMENT_EXAMPLES, reconstruct, segment
 from curvafit.cli_support import (
+    OverwriteOption,
     command_line,
     output,
     plainly,
@@ -101,29 +102,33 @@ def infer(
     dtype: Annotated[str | None, typer.Option(help="Type of a RAW file: u1, u2, f4 …")] = None,
     key: Annotated[str | None, typer.Option(help="Array within an NPZ, HDF5 or Zarr file.")] = None,
     seed: Annotated[int, typer.Option(help="Of the shapes that are regrown for comparison.")] = 0,
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Infer the parameters of a scanned volume, and write a report."""
     with plainly():
         reading = reading_of(spacing, unit, raw_shape, dtype, key)
         level = threshold_of(threshold)
         what = {"kind": kind, "periodic": periodic, "threshold": level, "dark": dark, "roi": roi, "label": label}
-        found, report = _inferred(scan, out, {**what, "atlas": atlas, "seed": seed, **reading})
+        found, report = _inferred(scan, out, {**what, "atlas": atlas, "seed": seed, **reading}, overwrite)
         _show(found)
         say(str(report))
 
 
-def _inferred(scan: str, out: Path, options: dict[str, Any]) -> tuple[Inference, Path]:
+def _inferred(scan: str, out: Path, options: dict[str, Any], overwrite: bool) -> tuple[Inference, Path]:
     """The inference and the path of its report, with progress."""
-    from curvafit.shape_files import check_folder
+    from curvafit.files import check_folder
 
     check_folder(out)
     with stages() as progress:
         from curvafit.infer import infer as find
-        from curvafit.report import with_command, write_inference
+        from curvafit.report import check_report, with_command, write_inference
+
+        read = [each for each in (scan, options["roi"], options["atlas"]) if each is not None]
+        check_report(out, read, overwrite)
 
         found = find(scan, progress=progress, **options)
         progress("drawing the report", 1.0)
-        return found, write_inference(with_command(found, command_line()), out)
+        return found, write_inference(with_command(found, command_line()), out, overwrite=overwrite)
 
 
 def _show(found: Inference) -> None:

@@ -9,7 +9,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from curvafit.cli_support import command_line, device_of, error_console, kept, plainly, say, stages, whole_triple
+from curvafit.cli_support import (
+    OverwriteOption,
+    command_line,
+    device_of,
+    error_console,
+    kept,
+    plainly,
+    say,
+    stages,
+    whole_triple,
+)
 
 if TYPE_CHECKING:
     from curvafit.data_synth.atlas import Progress
@@ -23,6 +33,9 @@ WorkersOption = Annotated[
     int | None, typer.Option(help="Processes on this machine; as many as cores by default, 0 for none but this.")
 ]
 SchedulerOption = Annotated[str | None, typer.Option(help="A running dask scheduler, tcp://HOST:PORT, instead.")]
+DashboardOption = Annotated[
+    int | None, typer.Option(help="Port of dask's own page on 127.0.0.1, for workers on this machine; none by default.")
+]
 _Store = Annotated[Path, typer.Argument(help="Folder of the Zarr store.")]
 
 
@@ -44,6 +57,7 @@ def build_atlas(
     schedule: Annotated[str, typer.Option(help="fast or paper.")] = "fast",
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
+    dashboard: DashboardOption = None,
 ) -> None:
     """Generate shapes into a store, until enough are viable. A killed build goes on where it was."""
     with plainly():
@@ -51,13 +65,13 @@ def build_atlas(
         law = _design(design, around, spread)
         from curvafit.data_synth.atlas import build, settings_of
         from curvafit.data_synth.store import open_store
-        from curvafit.shape_files import check_folder
+        from curvafit.files import check_folder
 
         settings = settings_of(box, seed, schedule, law)
         if store.exists():
             open_store(store, settings)
         check_folder(store.parent)
-        with _made(count, workers, scheduler) as (crew, progress):
+        with _made(count, (workers, scheduler, dashboard)) as (crew, progress):
             build(store, count, box, seed, schedule, progress, design=law, workers=crew)
         say(str(store))
 
@@ -68,6 +82,7 @@ def extend_atlas(
     count: Annotated[int, typer.Option(help="Viable shapes to add; 0 goes on with what was stopped.")] = 100,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
+    dashboard: DashboardOption = None,
 ) -> None:
     """Add shapes to a store, of its own design and settings."""
     with plainly():
@@ -79,7 +94,7 @@ def extend_atlas(
         def again() -> str:
             return "`--count 0`" if open_store(store).wanted == wanted else "the same command"
 
-        with _made(wanted, workers, scheduler, again) as (crew, progress):
+        with _made(wanted, (workers, scheduler, dashboard), again) as (crew, progress):
             extend(store, count, progress, workers=crew)
         say(str(store))
 
@@ -120,15 +135,17 @@ def verify_atlas(
 def extract_atlas(
     store: Annotated[Path, typer.Argument(help="A store made by `curvafit atlas build`.")],
     out: Annotated[Path, typer.Option("-o", "--output", help="The atlas (.npz) to write.")],
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Measure a store's shapes, and write the atlas that `infer --atlas` reads."""
     with plainly():
         if out.suffix.lower() != ".npz":
             raise ValueError(f"expected a name ending in .npz, got {out.name!r}")
-        from curvafit.index import extract, save_atlas
-        from curvafit.shape_files import check_folder
+        from curvafit.files import check_folder, check_free
+        from curvafit.index import extract, is_atlas, save_atlas
 
         check_folder(out.parent)
+        check_free([out], is_atlas, [store], overwrite)
         with stages() as progress:
             atlas = extract(
                 store,
@@ -146,16 +163,19 @@ def map_atlas(
     store: Annotated[Path, typer.Argument(help="A store made by `curvafit atlas build`.")],
     out: Annotated[Path, typer.Option("-o", "--output", help="Folder for atlas.html, atlas.png and a cache.")],
     device: Annotated[str, typer.Option(help="For the distances: cpu, cuda, cuda:1 …")] = "cpu",
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Lay a store's shapes out on a map: a picture, and a page to explore them in and to place scans on."""
     with plainly():
-        from curvafit.shape_files import check_folder
+        from curvafit.files import check_folder
 
         check_folder(out)
         with kept(), stages() as progress:
-            from curvafit.atlas_files import write_map
+            from curvafit.atlas_files import check_map, write_map
 
-            files = write_map(store, out, device=device_of(device), command=command_line(), progress=progress)
+            check_map(out, store, overwrite)
+            told = {"device": device_of(device), "command": command_line(), "overwrite": overwrite}
+            files = write_map(store, out, **told, progress=progress)
         for path in files:
             say(str(path))
 
@@ -178,12 +198,12 @@ def _design(name: str, around: str | None, spread: float | None) -> Design:
 
 @contextmanager
 def _made(
-    count: int, workers: int | None, scheduler: str | None, again: Callable[[], str] = lambda: "the same command"
+    count: int, how: tuple[int | None, str | None, int | None], again: Callable[[], str] = lambda: "the same command"
 ) -> Iterator[tuple[Workers, Progress]]:
     """Workers, and a progress bar for them."""
     from curvafit.data_synth.workers import cluster
 
     with kept(again), stages() as progress:
         progress("starting workers", 0.0)
-        with cluster(workers, scheduler) as crew:
+        with cluster(*how) as crew:
             yield crew, lambda _, viable, draws: progress(f"{viable} viable of {draws} draws", viable / count)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from curvafit.cli_support import (
+    OverwriteOption,
     command_line,
     device_of,
     error_console,
@@ -21,6 +23,7 @@ from curvafit.cli_support import (
     whole_numbers,
     whole_triple,
 )
+from curvafit.interrupts import exit_code
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -101,6 +104,7 @@ def generate(
     tile: Tile = None,
     cap: Cap = True,
     snapshots: Snapshots = None,
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Make a shape from parameters, with a picture (.png) and a record (.json) beside it."""
     with plainly():
@@ -109,10 +113,11 @@ def generate(
         options: dict[str, Any] = {"seed": seed, "checkpoint_every": checkpoint_every, "checkpoint": checkpoint}
         options["snapshots"] = () if snapshots is None else whole_numbers(snapshots, "--snapshots")
         options["orientation"] = Q = None if orientation is None else _orientation(orientation)
-        _check(out, how, checkpoint)
+        read = [str(each) for each in (prior, maps) if each is not None]
+        _check(out, how, checkpoint, options["snapshots"], read, overwrite)
         flow = _grown(law, boundary, schedule, steps, {**options, "device": device_of(device)})
         told = {"orientation": Q if Q is None else Q.tolist(), "maps": maps if maps is None else str(maps)}
-        _write(flow, law, out, how, told)
+        _write(flow, law, out, how, {**told, "overwrite": overwrite})
         _discard(checkpoint)
 
 
@@ -217,11 +222,14 @@ def _orientation(text: str) -> Tensor:
     return orientation(direction, strength)
 
 
-def _check(out: Path, how: Output, checkpoint: Path | None) -> None:
+def _check(
+    out: Path, how: Output, checkpoint: Path | None, steps: Sequence[int], read: Sequence[str], overwrite: bool
+) -> None:
     """Refuse places that cannot be written to, before the work."""
-    from curvafit.shape_files import beside, check_folder, check_target
+    from curvafit.files import check_folder
+    from curvafit.shape_files import beside, check_target
 
-    check_target(out, how)
+    check_target(out, how, steps=steps, inputs=read, overwrite=overwrite)
     if checkpoint is not None:
         check_folder(checkpoint.parent)
         taken = (out, beside(out, ".json"), beside(out, ".png"))
@@ -240,12 +248,12 @@ def _grown(law: _Law, boundary: str, schedule: str, steps: int | None, options: 
     with flow_progress(plan.steps) as watch:
         try:
             flow = make(law.coefficients, law.mass, grid, callbacks=[watch], keep_checkpoint=True, **options)
-        except KeyboardInterrupt:
+        except KeyboardInterrupt as signal:
             if options["checkpoint"] is None or not options["checkpoint"].exists():
                 raise
             said = f"interrupted: the same command goes on from {options['checkpoint']}"
             say(said, to=error_console())
-            raise typer.Exit(130) from None
+            raise typer.Exit(exit_code(signal)) from None
     if not flow.viability.lowest < 0 < flow.viability.highest:
         _discard(options["checkpoint"])
         say(f"{flow.status}; nothing was written", to=error_console())
@@ -264,15 +272,16 @@ def _write(flow: Flow, law: _Law, out: Path, how: Output, told: dict[str, Any]) 
     from curvafit.mesh import NoSurface
     from curvafit.shape_files import shape_record, step_path, write_field, write_shape
 
+    overwrite = told.pop("overwrite")
     if not flow.viability.viable:
         say(f"note: {flow.status}", to=error_console())
     mass = flow.mass if law.mass is None else law.mass
     told |= {"origin": law.origin, "wanted_volume_fraction": law.share, "snapshots": list(flow.snapshots)}
     record = shape_record(flow, law.coefficients, mass, epsilon=law.epsilon, output=how, **told, command=command_line())
-    files = list(write_shape(flow, out, output=how, record=record))
+    files = list(write_shape(flow, out, output=how, record=record, overwrite=overwrite))
     for step, field in flow.snapshots.items():
         try:
-            files.append(write_field(field, flow.grid, step_path(out, step), how))
+            files.append(write_field(field, flow.grid, step_path(out, step), how, overwrite=overwrite))
         except NoSurface:
             say(f"note: no surface after {step} steps", to=error_console())
     say(f"{flow.status}; {100 * record['volume_fraction']:.2f} % of the volume")

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import filecmp
 import shutil
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from curvafit.cli_support import error_console, output, plainly, say
+from curvafit.cli_support import OverwriteOption, error_console, output, plainly, say
 
 #: The sample that needs no network, and what the list says of it.
 SYNTHETIC = "synthetic"
@@ -34,6 +35,7 @@ def get_sample(
     out: Annotated[
         Path | None, typer.Option("-o", "--output", help="Copy it here; else it stays in the cache.")
     ] = None,
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Fetch a sample (once), check it, and print its path."""
     with plainly():
@@ -46,7 +48,7 @@ def get_sample(
         what, licence, source = about[name]
         say(f"{name}: {what}; licence {licence}; {source}", to=error_console())
         path = _synthetic() if name == SYNTHETIC else fetch(name)
-        say(str(path if out is None else _copied(path, out)))
+        say(str(path if out is None else _copied(path, out, overwrite)))
 
 
 def _synthetic() -> Path:
@@ -57,14 +59,15 @@ def _synthetic() -> Path:
     return path if path.is_file() else synthetic_scan(path)
 
 
-def _copied(path: Path, target: Path) -> Path:
+def _copied(path: Path, target: Path, overwrite: bool) -> Path:
     """A copy under the name asked for, which must end as the file does."""
-    from curvafit.scan import write_atomically
+    from curvafit.files import check_free, write_atomically
 
     target = target / path.name if target.is_dir() else target
     suffix = path.name[path.name.index(".") :]
     if not target.name.lower().endswith(suffix):
         raise ValueError(f"expected a name ending in {suffix} for this sample, got {target.name!r}")
+    check_free([target], lambda there: there.is_file() and filecmp.cmp(path, there, shallow=False), [path], overwrite)
     return write_atomically(target, lambda temporary: _copy(path, temporary))
 
 

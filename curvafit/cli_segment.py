@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli_support import command_line, plainly, reading_of, say, stages, threshold_of, whole_numbers
+from curvafit.cli_support import (
+    OverwriteOption,
+    command_line,
+    plainly,
+    reading_of,
+    say,
+    stages,
+    threshold_of,
+    whole_numbers,
+)
 
 if TYPE_CHECKING:
     from curvafit.scan import Field
@@ -69,6 +78,7 @@ def segment(
     raw_shape: RawShape = None,
     dtype: Dtype = None,
     key: Key = None,
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Find the structure of a noisy scan under a curvature prior, with a picture (.png) and a record (.json)."""
     with plainly():
@@ -88,7 +98,7 @@ def segment(
             return find(volume, prior, probability=likely, steps=steps, progress=progress, **options)
 
         more = {"probability": None if probability is None else str(probability), **options}
-        _run(scan, out, prior, reading, made, {"job": "segment", "steps": steps, **more})
+        _run(scan, out, prior, reading, made, {"job": "segment", "steps": steps, **more}, overwrite)
 
 
 def reconstruct(
@@ -106,6 +116,7 @@ def reconstruct(
     raw_shape: RawShape = None,
     dtype: Dtype = None,
     key: Key = None,
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Fill a mask of which only some slices are known, with a picture (.png) and a record (.json)."""
     with plainly():
@@ -122,7 +133,7 @@ def reconstruct(
 
             return fill(volume, prior, epsilon=epsilon, steps=steps, progress=progress, **options)  # type: ignore[arg-type]
 
-        _run(slices, out, prior, reading, made, {"job": "reconstruct", "steps": steps, **options})
+        _run(slices, out, prior, reading, made, {"job": "reconstruct", "steps": steps, **options}, overwrite)
 
 
 def _run(
@@ -132,6 +143,7 @@ def _run(
     reading: dict[str, Any],
     make: Callable[[Field, Callable[[str, float], None]], Segmentation],
     told: dict[str, Any],
+    overwrite: bool,
 ) -> None:
     """Refuse, read, compute, write, say."""
     from curvafit.mask_files import check_mask_target, write_mask
@@ -139,16 +151,17 @@ def _run(
 
     law = prior if prior.endswith(".json") else None  # or a preset's name
     inputs = [each for each in (source, law, told.get("probability")) if each is not None]
-    check_mask_target(out, inputs=inputs)
+    check_mask_target(out, inputs=inputs, overwrite=overwrite)
     with stages() as progress:
         progress("reading", 0.0)
         volume = load(source, **reading)
-        check_mask_target(out, volume.unit)
+        check_mask_target(out, volume.unit, overwrite=overwrite)
         found = make(volume, progress)
         progress("writing", 1.0)
         asked = {"command": command_line(), "prior": prior, **told}
         own = source if reading["spacing"] is None else None
-        files = write_mask(found, volume, out, like=own, unit=reading["unit"], record=asked)
+        more = {"record": asked, "overwrite": overwrite}
+        files = write_mask(found, volume, out, like=own, unit=reading["unit"], **more)
     for note in found.notes:
         say(note)
     say(f"{found.status[0].upper()}{found.status[1:]}.", style="bold")

@@ -10,7 +10,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -18,6 +18,12 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from rich.table import Table
 from rich.text import Text
 
+from curvafit.interrupts import Terminated, exit_code
+
+#: Whether what other programs, or other commands, wrote may be replaced.
+OverwriteOption = Annotated[
+    bool, typer.Option("--overwrite", help="Replace files or folders of these names whatever they are.")
+]
 #: Set to anything, an error keeps its traceback.
 DEBUG = "CURVAFIT_DEBUG"
 #: Signs that look better on a page than in a terminal, where they are copied and some encodings lack them.
@@ -26,14 +32,17 @@ _PLAIN = str.maketrans({"\u2212": "-", "\u2013": "-", "\u202f": " ", "\u00a0": "
 
 @contextmanager
 def plainly() -> Iterator[None]:
-    """Turn an expected exception into its sentence and exit code 2, Ctrl-C into 130, warnings into notes."""
+    """Turn an expected exception into its sentence and exit code 2, Ctrl-C into 130, warnings into notes.
+
+    Another signal gives 128 and its number.
+    """
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _note
             yield
-    except KeyboardInterrupt:
-        say("interrupted: nothing was written", to=error_console())
-        raise typer.Exit(130) from None
+    except KeyboardInterrupt as signal:
+        say(f"{_ended(signal)}: nothing was written", to=error_console())
+        raise typer.Exit(exit_code(signal)) from None
     except (ValueError, OSError, ImportError, MemoryError, RuntimeError) as error:
         if os.environ.get(DEBUG) or not _expected(error):
             raise
@@ -43,12 +52,16 @@ def plainly() -> Iterator[None]:
 
 @contextmanager
 def kept(again: Callable[[], str] = lambda: "the same command") -> Iterator[None]:
-    """Ctrl-C says that nothing is lost, and what goes on."""
+    """Ctrl-C, or another signal, says that nothing is lost, and what goes on."""
     try:
         yield
-    except KeyboardInterrupt:
-        say(f"interrupted: what is made is kept, and {again()} goes on with it", to=error_console())
-        raise typer.Exit(130) from None
+    except KeyboardInterrupt as signal:
+        say(f"{_ended(signal)}: what is made is kept, and {again()} goes on with it", to=error_console())
+        raise typer.Exit(exit_code(signal)) from None
+
+
+def _ended(signal: KeyboardInterrupt) -> str:
+    return "terminated" if isinstance(signal, Terminated) else "interrupted"
 
 
 def _expected(error: Exception) -> bool:

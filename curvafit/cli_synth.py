@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli_atlas import SchedulerOption, WorkersOption
+from curvafit.cli_atlas import DashboardOption, SchedulerOption, WorkersOption
 from curvafit.cli_support import error_console, kept, numbers, plainly, reading_of, say, stages, whole_triple
 
 if TYPE_CHECKING:
@@ -94,6 +94,7 @@ def synth(
     seed: Seed = 0,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
+    dashboard: DashboardOption = None,
 ) -> None:
     """Make a training set: images of generated shapes with exact labels."""
     with plainly():
@@ -108,19 +109,24 @@ def synth(
         told, its = (edge, edge_unit) if voxel is None else (voxel, unit)
         low, high = numbers(calibres, "--calibres", 2)
         recipe = Recipe(source, seen, box, _edge(told, its, seen), seed, (low, high))
-        _build(out, Order(recipe, layout, tuple(labels.split(",")) if labels else ()), count, workers, scheduler)
+        _build(
+            out,
+            Order(recipe, layout, tuple(labels.split(",")) if labels else ()),
+            count,
+            (workers, scheduler, dashboard),
+        )
 
 
-def _build(out: Path, order: Order, count: int, workers: int | None, scheduler: str | None) -> None:
+def _build(out: Path, order: Order, count: int, how: tuple[int | None, str | None, int | None]) -> None:
     from curvafit.data_synth.sets import build_set, cases_of
     from curvafit.data_synth.workers import cluster
+    from curvafit.files import check_folder
     from curvafit.set_picture import write_preview
-    from curvafit.shape_files import check_folder
 
     check_folder(out)
     with kept(), stages() as progress:
         progress("starting workers", 0.0)
-        with cluster(workers, scheduler) as crew:
+        with cluster(*how) as crew:
             build_set(out, order, count, lambda n, of: progress(f"{n} of {of} cases", n / of), workers=crew)
     if (held := len(cases_of(out))) > count:
         say(f"note: {out} holds {held} cases, more than --count {count}: all are listed", to=error_console())

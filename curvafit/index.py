@@ -23,10 +23,10 @@ from curvafit.data_synth.design import boxed
 from curvafit.data_synth.draws import versions
 from curvafit.data_synth.store import Record, Store, open_store
 from curvafit.diagram import Diagram
+from curvafit.files import write_content
 from curvafit.generation.viability import FORMED, well_formed
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
-from curvafit.scan import write_content
 from curvafit.transport import TAIL_SHARE, sliced_embedding
 
 FORMAT = "curvafit atlas"
@@ -209,6 +209,15 @@ def load_atlas(path: str | Path | None = None) -> Atlas:
     if not Path(path).is_file():
         raise FileNotFoundError(f"expected an atlas file, got {path}, where there is none")
     return _parse(Path(path).read_bytes(), str(path))
+
+
+def is_atlas(path: Path) -> bool:
+    """Whether a file bears an atlas's format; all else of it may be wrong."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return json.loads(archive["header"].tobytes())["format"] == FORMAT
+    except _UNREADABLE:
+        return False
 
 
 def _provenance(store: Store, records: list[Record], command: Sequence[str]) -> dict[str, Any]:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import datetime
 import json
-import shutil
-import tempfile
 from collections.abc import Iterable
 from importlib.metadata import version
 from pathlib import Path
@@ -15,12 +13,13 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from curvafit.files import move_together, staged
 from curvafit.formats import pick_writer
 from curvafit.formats.nifti import write_nifti_like
 from curvafit.plot import CONTOUR, DPI
-from curvafit.scan import Field, move_into_place, save
+from curvafit.scan import Field, save
 from curvafit.segment import Segmentation
-from curvafit.shape_files import beside, check_beside
+from curvafit.shape_files import beside, check_outputs
 
 __all__ = ["FORMAT", "check_mask_target", "write_mask"]
 
@@ -30,10 +29,13 @@ FORMAT = "curvafit-mask-1"
 _NIFTI = (".nii", ".nii.gz")
 
 
-def check_mask_target(path: str | Path, unit: str | None = None, inputs: Iterable[str | Path] = ()) -> Path:
+def check_mask_target(
+    path: str | Path, unit: str | None = None, inputs: Iterable[str | Path] = (), overwrite: bool = False
+) -> Path:
     """The path, if a mask in `unit` can be written there; asked before the work is done.
 
-    `inputs` are the files, or folders, that are read: none may be written over.
+    `inputs` are the files, or folders, that are read: none may be written over. `overwrite` tells whether other files
+    that no such command wrote may be.
 
     Raises
     ------
@@ -43,23 +45,7 @@ def check_mask_target(path: str | Path, unit: str | None = None, inputs: Iterabl
     """
     target = Path(path)
     pick_writer(target, unit or "mm")
-    if target.is_dir() and not target.name.lower().endswith(".zarr"):
-        raise ValueError(f"expected the name of a file, got the folder {target}")
-    for each in inputs:
-        _check_apart(target, Path(str(each).partition("::")[0]))
-    check_beside(target, FORMAT)
-    return target
-
-
-def _check_apart(target: Path, source: Path) -> None:
-    if not source.exists():
-        return
-    read = source.resolve()
-    for made in (target, beside(target, ".png"), beside(target, ".json")):
-        place = made.resolve()
-        same = made.exists() and made.samefile(source)
-        if same or place.is_relative_to(read) or read.is_relative_to(place):
-            raise ValueError(f"expected an output that writes over no input, got {made}, where {source} is read")
+    return check_outputs(target, FORMAT, inputs=inputs, overwrite=overwrite)
 
 
 def write_mask(
@@ -70,6 +56,7 @@ def write_mask(
     like: str | Path | None = None,
     unit: str | None = None,
     record: dict[str, Any] | None = None,
+    overwrite: bool = False,
 ) -> tuple[Path, Path, Path]:
     """Write the mask (0 and 1, uint8), a picture of the middle slices, and a record.
 
@@ -83,27 +70,27 @@ def write_mask(
         What the lengths in `like` are said to be in, if not what its header says.
     record
         What to add to the record.
+    overwrite
+        Whether files that no such call wrote may be replaced.
 
     Returns
     -------
     The paths of mask, picture (`.png`) and record (`.json`). All three are made in a temporary folder, then moved.
     """
-    target = check_mask_target(path, scan.unit, () if like is None else (like,))
-    target.parent.mkdir(parents=True, exist_ok=True)
+    target = check_mask_target(path, scan.unit, () if like is None else (like,), overwrite)
     mask = found.mask.values.astype(np.uint8)
-    work = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
-    try:
+    with staged(target) as work:
         made = work / target.name
         if like is not None and all(str(each).lower().endswith(_NIFTI) for each in (like, target)):
             write_nifti_like(mask, Path(like), made, unit)
         else:
-            save(Field(mask, scan.spacing, scan.unit, scan.affine), made)
+            save(Field(mask, scan.spacing, scan.unit, scan.affine), made, kind=FORMAT)
         picture, note = beside(made, ".png"), beside(made, ".json")
         _sections(scan, found).savefig(picture, dpi=DPI)
-        note.write_text(json.dumps(_record(found, scan, record or {}), indent=2) + "\n", encoding="utf-8")
-        return tuple(move_into_place(part, target.parent / part.name) for part in (made, picture, note))  # type: ignore[return-value]
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
+        parts = (made, picture, note)
+        told = {**_record(found, scan, record or {}), "files": [part.name for part in parts]}
+        note.write_text(json.dumps(told, indent=2) + "\n", encoding="utf-8")
+        return move_together(parts, target.parent)  # type: ignore[return-value]
 
 
 def _record(found: Segmentation, scan: Field, more: dict[str, Any]) -> dict[str, Any]:

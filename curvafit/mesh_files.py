@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import base64
-import os
-import uuid
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
+from curvafit.files import write_content
 from curvafit.mesh import Surface, area_vectors
 
 #: Suffixes that `write_surface` knows.
@@ -42,13 +41,7 @@ def write_surface(mesh: Surface, path: str | Path, *, unit: str = "voxel", data:
             raise ValueError(f"expected {name} of shape ({len(mesh.vertices)},), got {np.shape(values)}")
     remark = f"curvafit surface, lengths in {unit}"
     content = _stl(mesh, remark) if suffix == ".stl" else (_ply if suffix == ".ply" else _vtp)(mesh, remark, data or {})
-    temporary = path.with_name(f".{uuid.uuid4().hex[:8]}.{path.name}")
-    try:
-        temporary.write_bytes(content)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-    return path
+    return write_content(path, content)
 
 
 def _stl(mesh: Surface, remark: str) -> bytes:

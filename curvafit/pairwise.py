@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from curvafit.diagram import Diagram
-from curvafit.scan import write_atomically
+from curvafit.files import write_atomically
 from curvafit.sinkhorn import Measures, costs, packed
 from curvafit.transport import comparable
 

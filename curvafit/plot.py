@@ -22,8 +22,8 @@ from matplotlib.patheffects import withStroke
 from scipy.ndimage import gaussian_filter
 
 from curvafit.diagram import Diagram
+from curvafit.files import write_content
 from curvafit.render import View, render
-from curvafit.scan import write_content
 from curvafit.wording import unit_name
 
 #: Colours that stay apart for the colour-blind (Okabe & Ito 2008), and a quiet grey for frames and notes.

@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
-import os
-import shutil
-import tempfile
+from collections.abc import Iterable
 from html import escape
 from importlib.resources import files
 from pathlib import Path
 from string import Template
 from typing import TYPE_CHECKING
 
+from curvafit.files import check_folder, check_free, move_together, record_of, staged, write_content
+from curvafit.interrupts import undisturbed
 from curvafit.priors.coefficients import NAMES
+from curvafit.priors.fit_file import FORMAT
 from curvafit.report_pictures import diagram_figures, slice_figures, surface_figures, window_framed
-from curvafit.scan import Field, save, write_content
+from curvafit.scan import Field, save
 from curvafit.wording import density, describe, length, number, per_unit, percent, unit_name
 
 if TYPE_CHECKING:
     from curvafit.infer import Inference
 
+#: What an inference writes into its folder.
+FILES = ("fit.json", "report.html", "regenerated.nii.gz")
 #: Each coefficient as it is written, what it multiplies, and the power of 1/length that it carries in physical units.
 _TERMS = {
     "a20": ("a₂₀", "κ₁²", 0),
@@ -32,34 +35,45 @@ _TERMS = {
 _NAMES = {"match": "nearest match", "fit": "refined parameters"}
 
 
-def write_inference(inference: Inference, directory: str | Path) -> Path:
-    """Write `fit.json`, `report.html` and `regenerated.nii.gz` into a folder; returns the report's path.
+def check_report(directory: str | Path, inputs: Iterable[str | Path] = (), overwrite: bool = False) -> Path:
+    """The folder, if `write_inference` can write there; asked before the work is done.
 
-    All three are made in a temporary folder beside it and moved once they are whole. Without a regenerated shape there
-    is no `regenerated.nii.gz`.
+    `inputs` are the files, or folders, that are read: none may be written over. `overwrite` tells whether files of the
+    same names that no inference wrote may be.
 
     Raises
     ------
-    NotADirectoryError
-        If there is a file of that name.
+    ValueError
+        If it is no folder that can be written to, or an input or another file stands where one of the three goes.
     """
-    target = Path(directory)
-    if target.exists() and not target.is_dir():
-        raise NotADirectoryError(f"expected a folder to write to, got the file {target}")
-    target.parent.mkdir(parents=True, exist_ok=True)
-    work = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
-    try:
+    folder = check_folder(directory)
+    ours = bool(record_of(folder / "fit.json", FORMAT))
+    check_free([folder / name for name in FILES], lambda _: ours, inputs, overwrite)
+    return folder
+
+
+def write_inference(inference: Inference, directory: str | Path, *, overwrite: bool = False) -> Path:
+    """Write `fit.json`, `report.html` and `regenerated.nii.gz` into a folder; returns the report's path.
+
+    All three are made in a temporary folder beside it and moved once they are whole. Without a regenerated shape there
+    is no `regenerated.nii.gz`. Those of an earlier inference are replaced.
+
+    Raises
+    ------
+    ValueError
+        As `check_report`.
+    """
+    target = check_report(directory, overwrite=overwrite)
+    with staged(target) as work:
         (work / "fit.json").write_text(inference.fit.to_json(), encoding="utf-8")
         write_report(inference, work / "report.html")
         if inference.best is not None:
             edge = inference.fit.working_voxel
             save(Field(inference.best, (edge, edge, edge), inference.fit.length_unit), work / "regenerated.nii.gz")
-        target.mkdir(exist_ok=True)
-        (target / "regenerated.nii.gz").unlink(missing_ok=True)
-        for made in sorted(work.iterdir()):
-            os.replace(made, target / made.name)
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
+        with undisturbed():
+            target.mkdir(exist_ok=True)
+            (target / "regenerated.nii.gz").unlink(missing_ok=True)
+            move_together(sorted(work.iterdir()), target)
     return target / "report.html"
 
 

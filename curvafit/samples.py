@@ -15,10 +15,11 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
+from curvafit.files import write_content
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import schedule
 from curvafit.priors import Grid, preset
-from curvafit.scan import Field, save, write_content
+from curvafit.scan import Field, save
 
 __all__ = ["Sample", "SampleUnavailable", "cache_folder", "fetch", "samples", "synthetic_scan"]
 

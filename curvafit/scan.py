@@ -4,27 +4,17 @@ from __future__ import annotations
 
 import math
 import os
-import shutil
-import uuid
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from curvafit.files import check_free, write_atomically
 from curvafit.formats import READERS, WRITERS, Raw, ScanError, normalise_unit, pick_reader, pick_writer
+from curvafit.formats.ngff import is_ours, mark
 
-__all__ = [
-    "READABLE",
-    "WRITABLE",
-    "Field",
-    "ScanError",
-    "load",
-    "move_into_place",
-    "read_values",
-    "save",
-    "write_atomically",
-]
+__all__ = ["READABLE", "WRITABLE", "Field", "ScanError", "load", "read_values", "save"]
 
 #: Suffixes that `load` and `save` know.
 READABLE = tuple(READERS)
@@ -136,9 +126,9 @@ def read_values(path: str | os.PathLike[str]) -> np.ndarray:
     return values
 
 
-def save(field: Field, path: str | os.PathLike[str]) -> Path:
+def save(field: Field, path: str | os.PathLike[str], *, kind: str = "volume", overwrite: bool = False) -> Path:
     """Write a field as NIfTI, TIFF, NPY, MRC or Zarr, by suffix; a file of that name is replaced once the new one is
-    whole.
+    whole, a folder only if it is empty or a Zarr store that `save` wrote with the same `kind` (or with `overwrite`).
 
     NIfTI keeps the affine (qform and sform) and the unit; TIFF (ImageJ's or OME's metadata), MRC (in Å) and Zarr
     (OME-NGFF 0.5, with halved copies of a large volume) spacing and unit; NPY the values only.
@@ -147,54 +137,19 @@ def save(field: Field, path: str | os.PathLike[str]) -> Path:
     ------
     ScanError
         If the suffix is unknown, the format cannot hold the values' type, or it needs a unit and there is none.
+    ValueError
+        If another folder stands there.
     """
     target = Path(path)
     writer = pick_writer(target, field.unit)
-    return write_atomically(target, lambda temporary: writer(field, temporary))
-
-
-def write_atomically(target: Path, write: Callable[[Path], object]) -> Path:
-    """Call `write` with a temporary name beside `target` (same suffix), then move what it made to `target`."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = target.with_name(f".{uuid.uuid4().hex[:8]}.{target.name}")
-    try:
-        write(temporary)
-        return move_into_place(temporary, target)
-    finally:
-        remove(temporary)
-
-
-def write_content(target: Path, content: str | bytes) -> Path:
-    """Write a text, in UTF-8, or bytes to a file, whole or not at all."""
-    coded = content.encode() if isinstance(content, str) else content
+    check_free([target], lambda there: not there.is_dir() or is_ours(there, kind), overwrite=overwrite)
 
     def write(temporary: Path) -> None:
-        temporary.write_bytes(coded)
+        writer(field, temporary)
+        if temporary.is_dir():
+            mark(temporary, kind)
 
     return write_atomically(target, write)
-
-
-def move_into_place(made: Path, target: Path) -> Path:
-    """Rename a finished file or folder to `target`, on the same disk; what stood there goes once the new one is in."""
-    aside = target.with_name(f".{uuid.uuid4().hex[:8]}.old.{target.name}")
-    if target.is_dir():
-        os.replace(target, aside)
-    try:
-        os.replace(made, target)
-    except OSError:
-        if aside.exists():
-            os.replace(aside, target)
-        raise
-    remove(aside)
-    return target
-
-
-def remove(path: Path) -> None:
-    """Delete a file or a folder with all in it; none is fine."""
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
 
 
 def _split_key(path: str, key: str | None) -> tuple[Path, str | None]:

@@ -5,9 +5,7 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import json
-import os
-import shutil
-import tempfile
+from collections.abc import Iterable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -17,7 +15,9 @@ import torch
 from scipy.ndimage import map_coordinates
 from torch import Tensor
 
+from curvafit.files import check_folder, check_free, move_together, record_of, staged
 from curvafit.formats import normalise_unit, pick_writer
+from curvafit.formats.ngff import is_ours
 from curvafit.generation.flow import Flow
 from curvafit.mesh import Surface, solid_surface, surface
 from curvafit.mesh_files import SUFFIXES, write_surface
@@ -26,7 +26,7 @@ from curvafit.priors.coefficients import NAMES, Coefficients
 from curvafit.priors.curvature import geometric_curvatures, jet
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.priors.profile import profile_distance
-from curvafit.scan import WRITABLE, Field, move_into_place, save
+from curvafit.scan import WRITABLE, Field, save
 
 #: What a record beside a shape says that it is.
 FORMAT = "curvafit-shape-1"
@@ -66,14 +66,30 @@ class Output:
             raise ValueError(f"expected 3 whole repeats of at least 1 (z, y, x), got {self.tile}")
 
 
-def check_target(path: str | Path, output: Output | None = None) -> Path:
+def check_target(
+    path: str | Path,
+    output: Output | None = None,
+    *,
+    steps: Iterable[int] = (),
+    inputs: Iterable[str | Path] = (),
+    overwrite: bool = False,
+) -> Path:
     """The path, if a shape can be written there by its suffix; asked before the work is done.
+
+    Parameters
+    ----------
+    steps
+        Of the snapshots that go beside it.
+    inputs
+        What is read, and must stay.
+    overwrite
+        Whether files that no such command wrote may be replaced.
 
     Raises
     ------
     ValueError
         If the suffix is neither a volume's nor a surface's, its format cannot hold the output's unit, the place cannot
-        be written to, or another file stands where the record or the picture goes.
+        be written to, or something else stands where the shape, a snapshot, the record or the picture goes.
     """
     target = Path(path)
     known = (*WRITABLE, *SUFFIXES)
@@ -81,40 +97,37 @@ def check_target(path: str | Path, output: Output | None = None) -> Path:
         raise ValueError(f"expected a name ending in one of {', '.join(known)}, got {target.name!r}")
     if not target.name.lower().endswith(SUFFIXES):
         pick_writer(target, (output or Output()).unit)
-    if target.is_dir() and not target.name.lower().endswith(".zarr"):
-        raise ValueError(f"expected the name of a file, got the folder {target}")
-    check_beside(target, FORMAT)
-    return target
+    more = [step_path(target, step) for step in steps]
+    return check_outputs(target, FORMAT, more=more, inputs=inputs, overwrite=overwrite)
 
 
-def check_beside(target: Path, kind: str) -> None:
-    """Raise ValueError if a folder cannot take a file with its picture and record, or would lose another file's.
+def check_outputs(
+    target: Path,
+    kind: str,
+    *,
+    more: Iterable[Path] = (),
+    inputs: Iterable[str | Path] = (),
+    overwrite: bool = False,
+) -> Path:
+    """The path, if it can be written with its picture, its record and `more` beside it, and nothing else is lost.
 
-    `kind` is what such a record says that it is.
-    """
-    check_folder(target.parent)
-    note, picture = beside(target, ".json"), beside(target, ".png")
-    if picture.exists() and not note.exists():
-        raise ValueError(f"expected a name whose picture {picture.name} is not another file's, got {target.name!r}")
-    if note.exists() and kind not in note.read_text(encoding="utf-8", errors="replace")[:200]:
-        raise ValueError(f"expected a name whose record {note.name} is not another file's, got {target.name!r}")
-
-
-def check_folder(path: str | Path) -> Path:
-    """The path, if it is a folder that can be written to, or can be made.
+    What the record there, of the same kind, lists as written with it may be replaced.
 
     Raises
     ------
     ValueError
-        If a file is in the way, or the nearest folder there is cannot be written to.
+        As `check_target`.
     """
-    folder = Path(path)
-    there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
-    if not there.is_dir():
-        raise ValueError(f"expected a folder to write to, got {folder}, where {there} is a file")
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise ValueError(f"expected a folder that can be written to, got {there}")
-    return folder
+    check_folder(target.parent)
+    if target.is_dir() and not target.name.lower().endswith(".zarr"):
+        raise ValueError(f"expected the name of a file, got the folder {target}")
+    written = record_of(beside(target, ".json"), kind).get("files") or ()
+
+    def ours(path: Path) -> bool:
+        return path.name in written and (not path.is_dir() or is_ours(path, kind))
+
+    check_free([target, beside(target, ".png"), beside(target, ".json"), *more], ours, inputs, overwrite)
+    return target
 
 
 def beside(path: str | Path, ending: str) -> Path:
@@ -131,7 +144,12 @@ def step_path(path: str | Path, step: int) -> Path:
 
 
 def write_shape(
-    flow: Flow, path: str | Path, *, output: Output | None = None, record: dict[str, Any] | None = None
+    flow: Flow,
+    path: str | Path,
+    *,
+    output: Output | None = None,
+    record: dict[str, Any] | None = None,
+    overwrite: bool = False,
 ) -> tuple[Path, Path, Path]:
     """Write a flow's field as a volume or a surface, by suffix, with a picture of one box and a record.
 
@@ -141,6 +159,8 @@ def write_shape(
         See `Output`.
     record
         What to write into the JSON beside it; see `shape_record`.
+    overwrite
+        Whether files that no such call wrote may be replaced.
 
     Returns
     -------
@@ -149,24 +169,27 @@ def write_shape(
     Raises
     ------
     ValueError
-        If the suffix is unknown, the field has no surface, or a box that is not periodic is to be repeated.
+        If the suffix is unknown, the field has no surface, a box that is not periodic is to be repeated, or something
+        else stands where one of the files goes.
     """
-    target = check_target(path, output)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    work = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
-    try:
+    target = check_target(path, output, overwrite=overwrite)
+    with staged(target) as work:
         made = write_field(flow.field, flow.grid, work / target.name, output)
         picture, note = beside(made, ".png"), beside(made, ".json")
         surface_picture(flow.field.numpy(), picture)
-        note.write_text(json.dumps(record or {}, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-        parts = (made, picture, note)
-        return tuple(move_into_place(part, target.parent / part.name) for part in parts)  # type: ignore[return-value]
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
+        parts = [made, picture, note]
+        snapshots = [step_path(target, step).name for step in flow.snapshots]
+        told = {"format": FORMAT, **(record or {}), "files": [*(part.name for part in parts), *snapshots]}
+        note.write_text(json.dumps(told, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        return move_together(parts, target.parent)  # type: ignore[return-value]
 
 
-def write_field(field: Tensor, grid: Grid, path: str | Path, output: Output | None = None) -> Path:
+def write_field(
+    field: Tensor, grid: Grid, path: str | Path, output: Output | None = None, *, overwrite: bool = False
+) -> Path:
     """Write a field `(Z, Y, X)` as a volume or a surface, by suffix, without picture and record.
+
+    Another file of that name is replaced; another folder only with `overwrite`.
 
     A VTP surface bears its level set's principal curvatures `kappa1` and `kappa2` at the vertices, 0 on caps.
 
@@ -180,7 +203,7 @@ def write_field(field: Tensor, grid: Grid, path: str | Path, output: Output | No
         raise ValueError(f"expected a periodic box to repeat, got boundary {grid.boundary!r}")
     values, edges = np.tile(field.numpy(), how.tile), (how.voxel, how.voxel, how.voxel)
     if not target.name.lower().endswith(SUFFIXES):
-        return save(Field(values, edges, how.unit), target)
+        return save(Field(values, edges, how.unit), target, kind=FORMAT, overwrite=overwrite)
     box = Grid(values.shape, edges, grid.boundary)
     mesh = solid_surface(values, box) if how.cap else surface(values, box)
     data = None

@@ -12,18 +12,20 @@ PACKAGE = Path(__file__).resolve().parent.parent / "curvafit"
 WINGS = ("priors", "generation", "data_synth")
 #: What each part may import of the package beside itself. Leaves stand on one another; what is not named stands on top.
 ALLOWED = {
+    "interrupts": set(),
+    "files": {"interrupts"},
     "priors": set(),
-    "generation": {"priors"},
-    "formats": {"priors"},
-    "scan": {"priors", "formats"},
+    "generation": {"priors", "files", "interrupts"},
+    "formats": {"priors", "files"},
+    "scan": {"priors", "formats", "files"},
     "mesh": {"priors"},
     "diagram": {"priors", "mesh"},
     "transport": {"priors", "diagram"},
     "topology": {"priors"},
     "morphometry": {"priors", "topology"},
     "sinkhorn": {"priors"},
-    "pairwise": {"priors", "scan", "diagram", "transport", "sinkhorn"},
-    "data_synth": {"generation", "priors", "scan", "mesh", "diagram", "transport", "topology", "morphometry"},
+    "pairwise": {"files", "priors", "diagram", "transport", "sinkhorn"},
+    "data_synth": {"files", "generation", "priors", "scan", "mesh", "diagram", "transport", "topology", "morphometry"},
 }
 #: The command line imports everything; of the package, only `__main__` imports it.
 TOP = "cli"

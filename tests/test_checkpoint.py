@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import random
 import signal
 import subprocess
@@ -67,6 +68,11 @@ def assert_same(one, other) -> None:
     assert all(torch.equal(one.snapshots[step], other.snapshots[step]) for step in one.snapshots)
 
 
+def steps_in(path: Path) -> int:
+    """The steps made, by a checkpoint."""
+    return torch.load(io.BytesIO(path.read_bytes().partition(b"\n")[2]), weights_only=True)["content"]["made"]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("backend", ["torch", "fused"])
 def test_a_killed_program_goes_on(backend, tmp_path):
@@ -81,7 +87,7 @@ def test_a_killed_program_goes_on(backend, tmp_path):
             process.stdout.readline()
         process.send_signal(signal.SIGKILL)
         assert process.wait() == -signal.SIGKILL
-    saved = torch.load(path, weights_only=True)["content"]["made"]
+    saved = steps_in(path)
     assert 10 * (steps - 1) <= saved < 200
     seen = []
     plan = Schedule("test", 200, 1e-2, 1e-3, "cosine")
@@ -90,7 +96,7 @@ def test_a_killed_program_goes_on(backend, tmp_path):
         TUBES, None, GRID, **told, checkpoint=path, callbacks=[lambda step, *rest: seen.append(step) or None]
     )
     assert seen[0] == -(-saved // 10) * 10
-    assert not path.exists()
+    assert list(tmp_path.iterdir()) == []
     assert_same(resumed, generate(TUBES, None, GRID, **told))
 
 
@@ -141,10 +147,20 @@ def test_another_runs_checkpoint_is_refused(tmp_path):
         with pytest.raises(ValueError, match=rf"expected a checkpoint of this run, got one with .*\b{name} .* instead"):
             make(checkpoint=path, **changed)
         assert path.read_bytes() == kept
-    for content in (kept[:500], b".....\n", b"", b"\x80\x02c"):
+    flipped = bytearray(kept)
+    flipped[-2000] ^= 1
+    for content, said in (
+        (kept[:500], "one that is damaged"),
+        (bytes(flipped), "one that is damaged"),
+        (kept + b"0", "one that is damaged"),
+        (b".....\n", "a file that is something else"),
+        (b"", "a file that is something else"),
+        (b"\x80\x02c", "a file that is something else"),
+    ):
         path.write_bytes(content)
-        with pytest.raises(ValueError, match="got a file that cannot be read"):
+        with pytest.raises(ValueError, match=said):
             make(checkpoint=path)
+        assert path.read_bytes() == content and [each.name for each in tmp_path.iterdir()] == ["run"]
 
 
 def test_a_checkpoint_is_its_backends(tmp_path):
@@ -177,7 +193,7 @@ def test_a_callback_pauses_a_run(tmp_path):
 
     paused = make(checkpoint=path, callbacks=[lambda step, *rest: step == 30])
     assert paused.status == "stopped by a callback after 30 of 60 steps"
-    assert torch.load(path, weights_only=True)["content"]["made"] == 31
+    assert steps_in(path) == 31
     resumed = make(checkpoint=path)
     assert not path.exists()
     assert_same(resumed, make())
@@ -196,6 +212,26 @@ def test_a_file_is_whole_or_old(tmp_path, monkeypatch):
     with pytest.raises(OSError, match="no space"):
         saved.save({"made": 2})
     assert saved.load() == {"made": 1}
+
+
+def test_two_runs_do_not_share_a_file(tmp_path):
+    """The second is refused while the first is at it, and may have it afterwards."""
+    path = tmp_path / "run"
+
+    def other(step, total, state):
+        with pytest.raises(ValueError, match="expected a checkpoint that no other run uses, got .*run, which one does"):
+            generate(TUBES, MASS, GRID, schedule=PLAN, checkpoint=path)
+
+    generate(TUBES, MASS, GRID, schedule=PLAN, checkpoint=path, callbacks=[other])
+    assert list(tmp_path.iterdir()) == []
+    generate(TUBES, MASS, GRID, schedule=PLAN, checkpoint=path)
+
+
+def test_what_a_killed_save_left_goes(tmp_path):
+    (tmp_path / ".0123abcd.run").write_bytes(b"half")
+    (tmp_path / ".0123abcd.run2").write_bytes(b"another's")
+    generate(TUBES, MASS, GRID, schedule=PLAN, checkpoint=tmp_path / "run")
+    assert [path.name for path in tmp_path.iterdir()] == [".0123abcd.run2"]
 
 
 def test_seconds_between_checkpoints(tmp_path):

@@ -73,7 +73,7 @@ def test_a_checkpoint_outlives_a_write_that_fails(tmp_path: Path, monkeypatch: p
 
 def test_other_files_are_left_alone(tmp_path: Path) -> None:
     (tmp_path / "scan.png").write_bytes(b"mine")
-    refused(call("generate", *QUICK, "-o", tmp_path / "scan.npy"), "picture scan.png is not another file's")
+    refused(call("generate", *QUICK, "-o", tmp_path / "scan.npy"), "expected a name that is free, got")
     for name in ("out.json", "out.png"):
         options = ["--checkpoint", tmp_path / name, "-o", tmp_path / "out.npy"]
         refused(call("generate", *QUICK, *options), "expected a file of its own for the checkpoint")

@@ -201,7 +201,7 @@ def test_wrong_input_is_a_sentence(arguments, said, oblique, tmp_path, monkeypat
 
 @pytest.mark.parametrize(
     ("name", "said"),
-    [("mask.xyz", "ending in one of"), ("taken/mask.tif", "is a file"), ("other.nii.gz", "not another file's")],
+    [("mask.xyz", "ending in one of"), ("taken/mask.tif", "is a file"), ("other.nii.gz", "a name that is free")],
 )
 def test_places_that_cannot_be_written_are_refused_first(name, said, oblique, tmp_path, monkeypatch) -> None:
     (tmp_path / "taken").write_text("")

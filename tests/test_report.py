@@ -16,6 +16,7 @@ from found import EPSILON, RADIUS, SCALE, made_inference, without_drawing
 
 from curvafit.diagram import diagram
 from curvafit.priors import Grid
+from curvafit.priors.fit_file import FORMAT
 from curvafit.report import parameter_table, report_html, with_command, write_inference
 from curvafit.report_pictures import scan_box
 from curvafit.scan import load
@@ -132,17 +133,19 @@ def test_an_inference_is_written_whole(tmp_path: Path, undrawn: None) -> None:
 def test_a_failure_leaves_what_was_there(tmp_path: Path, undrawn: None) -> None:
     target = tmp_path / "out"
     target.mkdir()
-    (target / "fit.json").write_text("mine")
+    mine = f'{{"format": "{FORMAT}"}}'
+    (target / "fit.json").write_text(mine)
     broken = dataclasses.replace(made_inference(), regenerated=np.full((48, 48, 48), np.nan))
     with pytest.raises(ValueError, match="expected a finite volume"):
         write_inference(broken, target)
     assert [path.name for path in tmp_path.rglob("*")] == ["out", "fit.json"]
-    assert (target / "fit.json").read_text() == "mine"
-    with pytest.raises(NotADirectoryError, match="expected a folder"):
+    assert (target / "fit.json").read_text() == mine
+    with pytest.raises(ValueError, match="expected a folder"):
         write_inference(made_inference(), target / "fit.json")
 
 
 def test_a_shape_that_cannot_be_made_leaves_no_older_volume(tmp_path: Path, undrawn: None) -> None:
+    (tmp_path / "fit.json").write_text(f'{{"format": "{FORMAT}"}}')
     (tmp_path / "regenerated.nii.gz").write_text("older")
     nothing = dataclasses.replace(made_inference(lost=True), matched=None, match_diagram=None)
     write_inference(nothing, tmp_path)

@@ -8,8 +8,8 @@ from pathlib import Path
 import networkx as nx
 import numpy as np
 
+from curvafit.files import write_atomically, write_content
 from curvafit.priors.grid import METRES
-from curvafit.scan import write_atomically, write_content
 
 #: SWC's type of what is neither soma, axon nor dendrite.
 UNDEFINED = 0

@@ -21,8 +21,9 @@ from curvafit.data_synth.draws import versions
 from curvafit.data_synth.labels import NAMES, labels_of
 from curvafit.data_synth.layouts import LAYOUTS, About
 from curvafit.data_synth.workers import Here, Workers
+from curvafit.files import remove, write_content
 from curvafit.priors.grid import Grid
-from curvafit.scan import Field, remove, save, write_content
+from curvafit.scan import Field, save
 
 FORMAT = "curvafit set"
 VERSION = 1

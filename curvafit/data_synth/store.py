@@ -175,7 +175,7 @@ def open_store(path: str | Path, settings: Settings | None = None) -> Store:
         If `path` holds something else, a store of another format version, or a store made with other settings.
     """
     path = Path(path)
-    if not path.exists():
+    if not path.exists() or (settings is not None and path.is_dir() and not any(path.iterdir())):
         if settings is None:
             raise FileNotFoundError(f"expected a store of shapes at {path}, got nothing there")
         _create(path, settings)

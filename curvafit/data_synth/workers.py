@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 #: Draws that a worker with an NVIDIA device makes together.
 TOGETHER = 32
+#: Where workers on this machine listen.
+LOOPBACK = "127.0.0.1"
 #: Seconds that a scheduler has to answer.
 PATIENCE = 10
 #: What a worker on this machine runs first: Ctrl-C in the terminal is for the build, which ends its workers.
@@ -98,8 +100,11 @@ class Cluster:
 
 
 @contextmanager
-def cluster(count: int | None = None, scheduler: str | None = None) -> Iterator[Workers]:
+def cluster(count: int | None = None, scheduler: str | None = None, dashboard: int | None = None) -> Iterator[Workers]:
     """Workers: of the scheduler at an address, or so many on this machine (as many as cores); 0 is this process.
+
+    Those on this machine talk over the loopback alone; `dashboard` is the port of dask's own page there, none if not
+    given.
 
     Raises
     ------
@@ -124,17 +129,19 @@ def cluster(count: int | None = None, scheduler: str | None = None) -> Iterator[
             yield Cluster(client)
         return
     quiet = {"distributed.nanny.pre-spawn-environ.DASK_LOGGING__DISTRIBUTED": "critical"}
-    with dask.config.set(quiet), _local(distributed, count or CPU_COUNT) as client:
+    with dask.config.set(quiet), _local(distributed, count or CPU_COUNT, dashboard) as client:
         yield Cluster(client)
 
 
 @contextmanager
-def _local(distributed, count: int) -> Iterator[Client]:
+def _local(distributed, count: int, dashboard: int | None) -> Iterator[Client]:
     here = distributed.LocalCluster(
         n_workers=count,
         threads_per_worker=1,
         processes=True,
-        dashboard_address=":0",
+        host=LOOPBACK,
+        dashboard_address=f"{LOOPBACK}:{dashboard or 0}",
+        scheduler_kwargs={"dashboard": dashboard is not None},
         memory_limit=0,
         silence_logs=logging.ERROR,
         preload=_DEAF,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -9,10 +11,13 @@ from typing import Any
 import numpy as np
 import zarr
 
+from curvafit.files import MARK
 from curvafit.formats.base import Raw, pick_key, stated
 
 #: Edge of a chunk, and of the largest volume that is not halved any more, in voxels.
 CHUNK = 64
+#: Files of a group that `write_zarr` wrote.
+_WRITTEN = re.compile(r"(\d+/)?zarr\.json|\d+/c(/\d+)*")
 #: Our unit -> OME-NGFF's; a voxel has none.
 _UNITS = {"nm": "nanometer", "um": "micrometer", "mm": "millimeter", "m": "meter"}
 
@@ -53,6 +58,23 @@ def write_zarr(field: Any, path: Path) -> None:
             str(k), shape=values.shape, chunks=chunks, dtype=values.dtype, dimension_names=("z", "y", "x")
         )
         array[...] = values
+
+
+def mark(folder: Path, kind: str) -> None:
+    """State in a group's attributes that this program wrote it, and what for."""
+    zarr.open_group(folder, mode="r+").attrs[MARK] = {"kind": kind}
+
+
+def is_ours(folder: Path, kind: str) -> bool:
+    """Whether a folder is a group that `write_zarr` wrote, marked with this kind, and holds nothing else."""
+    try:
+        attributes = json.loads((folder / "zarr.json").read_bytes())["attributes"]
+        if attributes[MARK]["kind"] != kind:
+            return False
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return False
+    inside = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir())
+    return all(_WRITTEN.fullmatch(name) for name in inside)
 
 
 def _halvings(values: np.ndarray) -> Iterator[tuple[np.ndarray, float]]:

@@ -4,25 +4,33 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import os
+import io
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import torch
+from filelock import FileLock, Timeout
 from torch import Tensor
 
+from curvafit.files import sweep, write_content
+from curvafit.interrupts import undisturbed
 from curvafit.priors.coefficients import Coefficients
+
+#: First line of a checkpoint, before the SHA-256 of what follows.
+_HEAD = b"curvafit checkpoint 2 "
 
 
 class Checkpoint:
-    """The file of one run, written under another name and then renamed.
+    """The file of one run: written to memory, then to the disk under another name, then renamed.
 
     Parameters
     ----------
     path
-        Where; `path.part` beside it is used while writing. Its folder is made.
+        Where. Its folder is made; beside it stands `path.lock` while a run holds it.
     every
         Seconds between two saves, at least; 0 saves after every step.
     run
@@ -42,28 +50,54 @@ class Checkpoint:
         self.path, self._every, self._run, self._keep = Path(path), every, run, keep
         self._saved = time.monotonic()
 
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Keep other runs off the file.
+
+        Raises
+        ------
+        ValueError
+            If another run holds it.
+        """
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        place = self.path.with_name(self.path.name + ".lock")
+        lock = FileLock(place)
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            raise ValueError(
+                f"expected a checkpoint that no other run uses, got {self.path}, which one does: wait for it, or name "
+                "another file"
+            ) from None
+        try:
+            sweep(self.path)
+            yield
+        finally:
+            with undisturbed():
+                place.unlink(missing_ok=True)  # while it is held: whoever waits for it sees that it has gone
+                lock.release()
+
     def load(self) -> dict[str, Any] | None:
         """What was saved last, or None where there is no file.
 
         Raises
         ------
         ValueError
-            If the file is not a checkpoint or is another run's.
+            If the file is not a whole checkpoint or is another run's.
         """
         if not self.path.exists():
             return None
-        try:
-            found = torch.load(self.path, weights_only=True)
-            theirs, content = found["run"], found["content"]
-        except OSError:
-            raise
-        except Exception as error:  # torch.load raises many, by what the bytes happen to be
-            raise ValueError(f"expected a checkpoint of a flow, got a file that cannot be read: {self.path}") from error
+        head, _, payload = self.path.read_bytes().partition(b"\n")
+        if head != _HEAD + hashlib.sha256(payload).hexdigest().encode():
+            what = "one that is damaged" if head.startswith(_HEAD) else "a file that is something else"
+            raise ValueError(f"expected a checkpoint of a flow, got {what}: {self.path}; delete it to begin anew")
+        found = torch.load(io.BytesIO(payload), weights_only=True)
+        theirs = found["run"]
         names = [name for name in {**theirs, **self._run} if theirs.get(name) != self._run.get(name)]
         if names:
             parts = (f"{name} {theirs.get(name)} instead of {self._run.get(name)}" for name in names)
             raise ValueError(f"expected a checkpoint of this run, got one with {'; '.join(parts)}: {self.path}")
-        return content
+        return found["content"]
 
     def due(self) -> bool:
         """Whether it is time to save."""
@@ -71,23 +105,17 @@ class Checkpoint:
 
     def save(self, content: dict[str, Any]) -> None:
         """Replace the file by one with this content: tensors, numbers, lists and dictionaries."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        with open(self._part, "wb") as file:
-            torch.save({"run": self._run, "content": content}, file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(self._part, self.path)
+        buffer = io.BytesIO()
+        torch.save({"run": self._run, "content": content}, buffer)
+        payload = buffer.getbuffer()
+        head = _HEAD + hashlib.sha256(payload).hexdigest().encode() + b"\n"
+        write_content(self.path, head, payload)
         self._saved = time.monotonic()
 
     def close(self) -> None:
         """The run is done: remove the file, unless it is to be kept."""
-        self._part.unlink(missing_ok=True)
         if not self._keep:
             self.path.unlink(missing_ok=True)
-
-    @property
-    def _part(self) -> Path:
-        return self.path.with_name(self.path.name + ".part")
 
 
 def identity(**parts: object) -> dict[str, str]:

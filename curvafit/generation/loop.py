@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -68,6 +69,13 @@ def run(
     optimiser stalls. The checkpoint is closed at the end, but saved where a callback stopped the flow.
     """
     lanes = [_Lane(*each) for each in zip(moved.shapes, orders, seeds, strict=True)]
+    with nullcontext() if checkpoint is None else checkpoint.held():
+        _stepped(moved, lanes, orders, checkpoint)
+    return [lane.end() for lane in lanes]
+
+
+def _stepped(moved: Stepper, lanes: list[_Lane], orders: Sequence[Orders], checkpoint: Checkpoint | None) -> None:
+    """Step until the plan is done or no lane is left."""
     plan, made = orders[0].plan, _resumed(moved, lanes, checkpoint)
     while True:
         last = made == plan.steps or moved.stalled
@@ -88,7 +96,6 @@ def run(
             checkpoint.save(_content(moved, lanes, made + 1))
         else:
             checkpoint.close()
-    return [lane.end() for lane in lanes]
 
 
 def _resumed(moved: Stepper, lanes: list[_Lane], checkpoint: Checkpoint | None) -> int:
