@@ -53,7 +53,7 @@ def test_a_damaged_file_of_distances_is_made_anew(tmp_path: Path, monkeypatch: p
     exact_store(tmp_path / "s.zarr", 7)
     (tmp_path / "map" / "cache").mkdir(parents=True)
     (tmp_path / "map" / "cache" / "distances.npz").write_bytes(b"torn")
-    _, page = write_map(tmp_path / "s.zarr", tmp_path / "map", progress=no_progress)
+    _, page = write_map(tmp_path / "s.zarr", tmp_path / "map", overwrite=True, progress=no_progress)
     assert page.exists() and not (tmp_path / "map" / "cache" / "distances.npz").exists()
 
 

@@ -58,7 +58,7 @@ def test_generate_writes_a_surface_in_the_prior_s_unit(tmp_path: Path) -> None:
     assert (record["mass"], record["shape"], record["voxel"], record["unit"]) == (-0.4, [16, 20, 24], 0.0195, "mm")
     assert target.read_bytes().startswith(b"ply\nformat binary_little_endian")
     again = call("generate", "--prior", prior, "--shape", "16", "--steps", 30, "-o", tmp_path / "fit.npy")
-    refused(again, "record fit.json is not another file's")
+    refused(again, "expected an output that writes over no input")
     assert prior.read_text() == made_fit().to_json()
 
 
