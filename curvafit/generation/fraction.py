@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from torch import Tensor
+
+from curvafit.priors.bounds import real
 
 #: Mass is corrected from this part of the steps on: before, u's sign tells little of a shape's volume.
 BEGIN = 0.2
@@ -26,8 +30,7 @@ def first_mass(share: float) -> float:
     ValueError
         If the share is not in (0, 1).
     """
-    if not 0 < share < 1:
-        raise ValueError(f"expected a volume fraction in (0, 1), got {share}")
+    share = real(share, "a volume fraction in (0, 1)", math.ulp(0), math.nextafter(1, 0))
     return min(max(2 * share - 1, -BOUND), BOUND)
 
 
