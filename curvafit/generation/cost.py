@@ -19,7 +19,8 @@ FINEST = 0.1
 #: The most that a coefficient may be, lengths in units of ε; published ones stay below 15. Float32 holds the energy and
 #: its gradient of noise.
 STRONGEST = 1e6
-#: Edges of a voxel whose squared second differences float32 holds, and beside which ξ = 1e-6 (`curvature.XI`) is little.
+#: Edges of a voxel whose squared second differences float32 holds, and beside whose inverse ξ = 1e-6 (`curvature.XI`)
+#: is little.
 VOXELS = (1e-8, 1e5)
 #: Powers of length in the coefficients' units, of a20 … a00.
 _POWERS = (0, 0, 0, 1, 1, 2)

@@ -164,7 +164,7 @@ class _Lane:
         """What came out."""
         assert self._field is not None
         orders, end = self._orders, self._viability(self._field)
-        if self._failure and end.viable:
+        if self._failure:
             end = dataclasses.replace(end, viable=False, reason=self._failure)
         history = History(*np.array(self.rows, dtype=np.float64).T)
         status = self._status(end, history)

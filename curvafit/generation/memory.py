@@ -32,7 +32,7 @@ def check_memory(voxels: Sequence[int], each: int, what: str, device: torch.devi
 
 def memory(device: torch.device | str = "cpu") -> int:
     """Bytes of memory that a device has, or this machine; as many as can be counted where that is not known."""
-    if torch.device(device).type == "cuda":
+    if torch.device(device).type == "cuda" and torch.cuda.is_available():
         return torch.cuda.get_device_properties(device).total_memory
     return min(_installed(), _allowed())
 

@@ -66,7 +66,7 @@ class Flow:
 
     @property
     def finite(self) -> bool:
-        """Whether energy, gradient and field stayed finite: where not, the field is no shape but what is left of one."""
+        """Whether energy, gradient and field stayed finite; the field is no shape where they did not."""
         rows = [self.history.energy, self.history.gradient_max, self.history.gradient_mean, self.history.mass]
         extent = [self.viability.highest, self.viability.lowest]
         return bool(np.isfinite(np.concatenate([*rows, extent])).all())

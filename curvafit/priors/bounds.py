@@ -1,7 +1,8 @@
-"""What numbers that are given must be: whole or real, within bounds that are stated here; and how to quote what came."""
+"""What numbers that are given must be, whole or real and within which bounds; and how a message quotes what came."""
 
 from __future__ import annotations
 
+import contextlib
 import math
 import operator
 from typing import Any
@@ -40,7 +41,7 @@ def whole(value: Any, said: str, least: int, most: int, *, of: Any = None) -> in
     except TypeError:
         number = None
     if number is None or not least <= number <= most:
-        raise ValueError(f"expected {said}{_bounds(number, least, most)}, got {quoted(value if of is None else of)}")
+        raise ValueError(f"expected {said}{_beyond(number, 0, most)}, got {quoted(value if of is None else of)}")
     return number
 
 
@@ -54,12 +55,10 @@ def real(value: Any, said: str, least: float = -math.inf, most: float = math.inf
     """
     number = math.nan
     if not isinstance(value, (bool, str, bytes)) and not getattr(value, "shape", ()):
-        try:
+        with contextlib.suppress(TypeError, ValueError, OverflowError, RuntimeError):
             number = float(value)
-        except (TypeError, ValueError, OverflowError, RuntimeError):
-            pass
     if not (math.isfinite(number) and least <= number <= most):
-        raise ValueError(f"expected {said}{_bounds(number, least, most)}, got {quoted(value if of is None else of)}")
+        raise ValueError(f"expected {said}{_beyond(number, least, most)}, got {quoted(value if of is None else of)}")
     return number
 
 
@@ -91,7 +90,8 @@ def seed_of(value: Any) -> int:
     return whole(value, "a seed that is a whole number from 0", 0, SEEDS - 1)
 
 
-def _bounds(number: float | None, least: float, most: float) -> str:
-    """The bounds of a number of the right kind and sign that is too small or too large."""
-    tell = number is not None and math.isfinite(number) and (number > most or 0 < number < least)
-    return f" from {least:g} to {most:g}" if tell else ""
+def _beyond(number: float | None, least: float, most: float) -> str:
+    """The bound that a number of the right kind and sign is beyond."""
+    if number is None or not math.isfinite(number) or (number <= most and not 0 < number < least):
+        return ""
+    return f", at most {most:g}" if number > most else f", at least {least:g}"
