@@ -77,9 +77,7 @@ def _sentence(error: Exception) -> str:
     return sentence(str(error) or type(error).__name__)
 
 
-def _note(
-    notes: dict[str, None], message: Warning | str, category: type[Warning], *_: object, **__: object
-) -> None:
+def _note(notes: dict[str, None], message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
     if issubclass(category, UserWarning):
         notes[sentence(str(message), "note")] = None
 
@@ -157,6 +155,10 @@ def reading_of(
     spacing: str | None, unit: str | None, raw_shape: str | None, dtype: str | None, key: str | None
 ) -> dict[str, Any]:
     """The options that say how to read a file, as `scan.load` takes them."""
+    if unit is not None:
+        from curvafit.formats import normalise_unit
+
+        normalise_unit(unit)
     return {
         "spacing": None if spacing is None else triple(spacing, "--spacing"),
         "raw_shape": None if raw_shape is None else whole_triple(raw_shape, "--raw-shape"),

@@ -22,8 +22,8 @@ STRONGEST = 1e6
 #: Edges of a voxel whose squared second differences float32 holds, and beside whose inverse ξ = 1e-6 (`curvature.XI`)
 #: is little.
 VOXELS = (1e-8, 1e5)
-#: Powers of length in the coefficients' units, of a20 … a00.
-_POWERS = (0, 0, 0, 1, 1, 2)
+#: Powers of length in the coefficients' units.
+POWERS = dict(zip(NAMES, (0, 0, 0, 1, 1, 2), strict=True))
 
 
 @dataclass(frozen=True)
@@ -93,14 +93,19 @@ class Cost:
     def _check_strengths(self) -> None:
         """Coefficients and orientation, which is of a00's unit, with lengths in units of ε."""
         ε = torch.as_tensor(self.epsilon, dtype=torch.float64)
-        named = dict(zip(NAMES, zip(self.coefficients, _POWERS, strict=True), strict=True))
+        named = {name: (value, POWERS[name]) for name, value in zip(NAMES, self.coefficients, strict=True)}
         if self.orientation is not None:
             named["the orientation"] = self.orientation, 2
         for name, (value, power) in named.items():
-            size = float(torch.as_tensor(value, dtype=torch.float64).detach().abs().max() * ε.max() ** power)
-            if not size <= STRONGEST:
-                of = {0: "", 1: " epsilon", 2: " epsilon²"}[power]
-                raise ValueError(f"expected |{name}|{of} of at most {STRONGEST:g}, got {size:.3g}")
+            check_strength(name, torch.as_tensor(value, dtype=torch.float64).detach().abs().max(), power, ε.max())
+
+
+def check_strength(name: str, value: float | Tensor, power: int, epsilon: float | Tensor) -> None:
+    """Raise ValueError where a coefficient, with lengths in units of ε, is over `STRONGEST`."""
+    size = float(abs(value) * epsilon**power)
+    if not size <= STRONGEST:
+        of = {0: "", 1: " epsilon", 2: " epsilon²"}[power]
+        raise ValueError(f"expected |{name}|{of} of at most {STRONGEST:g}, got {size:.3g}")
 
 
 def check_shape(name: str, value: Tensor, grid: Grid) -> None:

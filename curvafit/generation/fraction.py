@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from torch import Tensor
 
-from curvafit.priors.bounds import real
+from curvafit.priors.bounds import inside
 
 #: Mass is corrected from this part of the steps on: before, u's sign tells little of a shape's volume.
 BEGIN = 0.2
@@ -30,7 +28,7 @@ def first_mass(share: float) -> float:
     ValueError
         If the share is not in (0, 1).
     """
-    share = real(share, "a volume fraction in (0, 1)", math.ulp(0), math.nextafter(1, 0))
+    share = inside(share, "a volume fraction in (0, 1)", 0, 1)
     return min(max(2 * share - 1, -BOUND), BOUND)
 
 

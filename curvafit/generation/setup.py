@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from curvafit.generation.parametrization import Blur, DivergenceForm, Form
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.stepper import LbfgsStepper, Stepper, TorchStepper
 from curvafit.priors import kernels, stencils
-from curvafit.priors.bounds import quoted, real
+from curvafit.priors.bounds import inside, quoted, real
 from curvafit.priors.grid import Grid
 
 
@@ -121,8 +120,7 @@ def base_of(mass: float | Tensor | None, share: float | None, grid: Grid) -> flo
     if share is not None:
         return fraction.first_mass(share)
     if not isinstance(mass, Tensor) or mass.dim() == 0:
-        below_one = math.nextafter(1, 0)
-        return real(mass, "a mass in (-1, 1)", -below_one, below_one)
+        return inside(mass, "a mass in (-1, 1)", -1, 1)
     check_shape("mass", mass, grid)
     if not bool((mass.abs() < 1).all()):
         raise ValueError(f"expected a mass in (-1, 1), got {float(mass.min())} to {float(mass.max())}")

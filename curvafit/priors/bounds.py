@@ -62,6 +62,20 @@ def real(value: Any, said: str, least: float = -math.inf, most: float = math.inf
     return number
 
 
+def inside(value: Any, said: str, low: float, high: float) -> float:
+    """A number between two others, neither of them; as `real`.
+
+    Raises
+    ------
+    ValueError
+        If it is none.
+    """
+    number = real(value, said)
+    if not low < number < high:
+        raise ValueError(f"expected {said}, got {quoted(value)}")
+    return number
+
+
 def several(values: Any, name: str) -> tuple[Any, ...]:
     """The values of a sequence, of any type but text.
 
