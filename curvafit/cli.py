@@ -14,6 +14,7 @@ from curvafit.cli_atlas import atlas_app
 from curvafit.cli_generate import EXAMPLES, generate, presets
 from curvafit.cli_hosts import EXAMPLE as NNUNET_EXAMPLE
 from curvafit.cli_hosts import nnunet
+from curvafit.cli_refusal import Commands
 from curvafit.cli_samples import samples_app
 from curvafit.cli_segment import RECONSTRUCT_EXAMPLES, SEGMENT_EXAMPLES, reconstruct, segment
 from curvafit.cli_support import (
@@ -41,6 +42,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
+    cls=Commands,
 )
 app.command(epilog=EXAMPLES)(generate)
 app.command()(presets)

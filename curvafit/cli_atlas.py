@@ -63,10 +63,16 @@ def build_atlas(
     with plainly():
         box = whole_triple(shape, "--shape")
         law = _design(design, around, spread)
-        from curvafit.data_synth.atlas import build, settings_of
+        from curvafit.data_synth.atlas import build, check_count, settings_of
         from curvafit.data_synth.store import open_store
+        from curvafit.data_synth.workers import check_workers
         from curvafit.files import check_folder
+        from curvafit.generation.memory import FLOW, check_memory
 
+        check_count(count, 1)
+        check_workers(workers, scheduler)
+        if scheduler is None:
+            check_memory(box, FLOW, "shapes")
         settings = settings_of(box, seed, schedule, law)
         if store.exists():
             open_store(store, settings)
@@ -86,9 +92,12 @@ def extend_atlas(
 ) -> None:
     """Add shapes to a store, of its own design and settings."""
     with plainly():
-        from curvafit.data_synth.atlas import extend
+        from curvafit.data_synth.atlas import check_count, extend
         from curvafit.data_synth.store import open_store
+        from curvafit.data_synth.workers import check_workers
 
+        check_count(count, 0)
+        check_workers(workers, scheduler)
         wanted = open_store(store).wanted + count
 
         def again() -> str:

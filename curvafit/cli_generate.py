@@ -73,11 +73,14 @@ Plan = Annotated[str, _how(help="fast (1000 steps) or paper (8000).")]
 Steps = Annotated[int | None, _how(help="Another number of steps.")]
 Device = Annotated[str, _how(help="cpu, cuda, cuda:1 …")]
 Checkpoint = Annotated[Path | None, _how(help="File to save the run to, and to go on from if it is there.")]
-Every = Annotated[float, _how(help="Seconds between two checkpoints.")]
+Every = Annotated[float | None, _how(help="Seconds between two checkpoints; 60 by default.")]
 Spacing = Annotated[str | None, _out(help="Edge of a voxel (a cube), in --unit; by default 1, or the prior's.")]
 Unit = Annotated[str | None, _out(help="nm, um, mm or m; needs --spacing.")]
 Tile = Annotated[str | None, _out(help="Repeat a periodic box N or Z,Y,X times.")]
-Cap = Annotated[bool, _out("--cap/--no-cap", help="Close a surface on the box's faces, or leave it open there.")]
+Cap = Annotated[
+    bool | None,
+    _out("--cap/--no-cap", help="Close a surface on the box's faces (the default), or leave it open there."),
+]
 Snapshots = Annotated[str | None, _out(help="Also write the field after these numbers of steps: 10,100,1000.")]
 
 
@@ -98,11 +101,11 @@ def generate(
     steps: Steps = None,
     device: Device = "cpu",
     checkpoint: Checkpoint = None,
-    checkpoint_every: Every = 60.0,
+    checkpoint_every: Every = None,
     spacing: Spacing = None,
     unit: Unit = None,
     tile: Tile = None,
-    cap: Cap = True,
+    cap: Cap = None,
     snapshots: Snapshots = None,
     overwrite: OverwriteOption = False,
 ) -> None:
@@ -110,11 +113,12 @@ def generate(
     with plainly():
         law = _law(preset, coefficients, prior, mass, volume_fraction, epsilon, maps, shape)
         how = _output(law, spacing, unit, tile, cap, boundary)
-        options: dict[str, Any] = {"seed": seed, "checkpoint_every": checkpoint_every, "checkpoint": checkpoint}
+        options: dict[str, Any] = {"seed": seed, **_checkpoint(checkpoint, checkpoint_every)}
         options["snapshots"] = () if snapshots is None else whole_numbers(snapshots, "--snapshots")
         options["orientation"] = Q = None if orientation is None else _orientation(orientation)
         read = [str(each) for each in (prior, maps) if each is not None]
-        _check(out, how, checkpoint, options["snapshots"], read, overwrite)
+        _check(out, checkpoint, cap)
+        _check_target(out, how, options["snapshots"], read, overwrite)
         flow = _grown(law, boundary, schedule, steps, {**options, "device": device_of(device)})
         told = {"orientation": Q if Q is None else Q.tolist(), "maps": maps if maps is None else str(maps)}
         _write(flow, law, out, how, {**told, "overwrite": overwrite})
@@ -200,7 +204,15 @@ def _source(
     return (1.0, 0.0, 1.0, 0.0, 0.0, 0.0), None, "maps", 1.0, "voxel"
 
 
-def _output(law: _Law, spacing: str | None, unit: str | None, tile: str | None, cap: bool, boundary: str) -> Output:
+def _checkpoint(file: Path | None, every: float | None) -> dict[str, Any]:
+    if file is None and every is not None:
+        raise ValueError(f"expected --checkpoint beside --checkpoint-every, got {every:g} alone")
+    return {"checkpoint": file} if every is None else {"checkpoint": file, "checkpoint_every": every}
+
+
+def _output(
+    law: _Law, spacing: str | None, unit: str | None, tile: str | None, cap: bool | None, boundary: str
+) -> Output:
     """How to write: the voxel of the options, else the prior's."""
     if unit is not None and spacing is None:
         raise ValueError("expected --spacing beside --unit, got none")
@@ -209,10 +221,13 @@ def _output(law: _Law, spacing: str | None, unit: str | None, tile: str | None, 
         raise ValueError(f"expected --spacing of cubic voxels, one number, got {spacing!r}")
     if tile is not None and boundary != "periodic":
         raise ValueError(f"expected --tile with a periodic boundary, got {boundary!r}")
+    from curvafit.priors.grid import Grid
     from curvafit.shape_files import Output
 
     repeats = (1, 1, 1) if tile is None else whole_triple(tile, "--tile")
-    return Output(edges[0], unit or law.unit, repeats, cap)
+    how = Output(edges[0], unit or law.unit, repeats, cap is not False)
+    how.shape(Grid(law.box, boundary=boundary))  # type: ignore[arg-type]
+    return how
 
 
 def _orientation(text: str) -> Tensor:
@@ -222,14 +237,22 @@ def _orientation(text: str) -> Tensor:
     return orientation(direction, strength)
 
 
-def _check(
-    out: Path, how: Output, checkpoint: Path | None, steps: Sequence[int], read: Sequence[str], overwrite: bool
-) -> None:
+def _check_target(out: Path, how: Output, steps: Sequence[int], read: Sequence[str], overwrite: bool) -> None:
     """Refuse places that cannot be written to, before the work."""
-    from curvafit.files import check_folder
-    from curvafit.shape_files import beside, check_target
+    from curvafit.shape_files import check_target
 
     check_target(out, how, steps=steps, inputs=read, overwrite=overwrite)
+
+
+def _check(out: Path, checkpoint: Path | None, cap: bool | None) -> None:
+    """Refuse a checkpoint that has no place of its own, and what only a surface has where none is written."""
+    from curvafit.files import check_folder
+    from curvafit.mesh_files import SUFFIXES
+    from curvafit.shape_files import beside
+
+    if cap is not None and not out.name.lower().endswith(SUFFIXES):
+        option = "--cap" if cap else "--no-cap"
+        raise ValueError(f"expected {option} beside a surface ({', '.join(SUFFIXES)}), got {out.name!r}")
     if checkpoint is not None:
         check_folder(checkpoint.parent)
         taken = (out, beside(out, ".json"), beside(out, ".png"))
@@ -238,7 +261,7 @@ def _check(
 
 
 def _grown(law: _Law, boundary: str, schedule: str, steps: int | None, options: dict[str, Any]) -> Flow:
-    """The flow, with progress; leaves with exit code 1 where it has no surface."""
+    """The flow, with progress; leaves with exit code 1 where it has no surface, or failed."""
     from curvafit.generation.flow import generate as make
     from curvafit.generation.schedule import schedule as named
     from curvafit.priors.grid import Grid
@@ -254,7 +277,7 @@ def _grown(law: _Law, boundary: str, schedule: str, steps: int | None, options: 
             said = f"interrupted: the same command goes on from {options['checkpoint']}"
             say(said, to=error_console())
             raise typer.Exit(exit_code(signal)) from None
-    if not flow.viability.lowest < 0 < flow.viability.highest:
+    if not (flow.finite and flow.viability.lowest < 0 < flow.viability.highest):
         _discard(options["checkpoint"])
         say(f"{flow.status}; nothing was written", to=error_console())
         raise typer.Exit(1)
@@ -273,8 +296,7 @@ def _write(flow: Flow, law: _Law, out: Path, how: Output, told: dict[str, Any]) 
     from curvafit.shape_files import shape_record, step_path, write_field, write_shape
 
     overwrite = told.pop("overwrite")
-    if not flow.viability.viable:
-        say(f"note: {flow.status}", to=error_console())
+    notes = [] if flow.viability.viable else [flow.status]
     mass = flow.mass if law.mass is None else law.mass
     told |= {"origin": law.origin, "wanted_volume_fraction": law.share, "snapshots": list(flow.snapshots)}
     record = shape_record(flow, law.coefficients, mass, epsilon=law.epsilon, output=how, **told, command=command_line())
@@ -283,7 +305,9 @@ def _write(flow: Flow, law: _Law, out: Path, how: Output, told: dict[str, Any]) 
         try:
             files.append(write_field(field, flow.grid, step_path(out, step), how, overwrite=overwrite))
         except NoSurface:
-            say(f"note: no surface after {step} steps", to=error_console())
+            notes.append(f"no surface after {step} steps")
+    for note in notes:
+        say(f"note: {note}", to=error_console())
     say(f"{flow.status}; {100 * record['volume_fraction']:.2f} % of the volume")
     for path in files:
         say(str(path))

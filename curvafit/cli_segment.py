@@ -51,7 +51,7 @@ Dark = Annotated[bool, _what("--dark", help="The structure is the dark phase.")]
 Epsilon = Annotated[float | None, _what(help="ε in the scan's unit; twice the smallest voxel edge by default.")]
 Steps = Annotated[int, _what(help="Steps of the flow.", min=1)]
 Every = Annotated[int | None, _what(help="Every so many slices are known.")]
-First = Annotated[int, _what(help="The first of them.")]
+First = Annotated[int | None, _what(help="The first of them, beside --every; 0 by default.")]
 Axis = Annotated[str, _what(help="What slices are counted along: z, y or x (first, second, last axis of an array).")]
 Spacing = Annotated[str | None, _how(help="Voxel edges z,y,x, or one for all; overrides the file.")]
 Unit = Annotated[str | None, _how(help="nm, um, mm or m; overrides the file.")]
@@ -106,7 +106,7 @@ def reconstruct(
     out: Target,
     prior: Prior,
     every: Every = None,
-    first: First = 0,
+    first: First = None,
     known: Annotated[str | None, _what("--slices", help="Or: the numbers of the known slices, 0,7,15.")] = None,
     axis: Axis = "z",
     epsilon: Epsilon = None,
@@ -126,7 +126,9 @@ def reconstruct(
         if (every is None) == (known is None):
             raise ValueError(f"expected either --every or --slices, got {'neither' if every is None else 'both'}")
         numbers = None if known is None else list(whole_numbers(known, "--slices"))
-        options = {"every": every, "first": first, "known": numbers, "axis": "zyx".index(axis.lower())}
+        if known is not None and first is not None:
+            raise ValueError(f"expected --first beside --every, got {first} beside --slices")
+        options = {"every": every, "first": first or 0, "known": numbers, "axis": "zyx".index(axis.lower())}
 
         def made(volume: Field, progress: Callable[[str, float], None]) -> Segmentation:
             from curvafit.segment import reconstruct as fill
@@ -148,10 +150,12 @@ def _run(
     """Refuse, read, compute, write, say."""
     from curvafit.mask_files import check_mask_target, write_mask
     from curvafit.scan import load
+    from curvafit.working import find_law
 
     law = prior if prior.endswith(".json") else None  # or a preset's name
     inputs = [each for each in (source, law, told.get("probability")) if each is not None]
     check_mask_target(out, inputs=inputs, overwrite=overwrite)
+    find_law(prior, 1.0)
     with stages() as progress:
         progress("reading", 0.0)
         volume = load(source, **reading)

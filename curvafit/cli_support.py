@@ -10,6 +10,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Annotated, Any
 
 import typer
@@ -18,6 +19,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from rich.table import Table
 from rich.text import Text
 
+from curvafit.cli_refusal import sentence, writable
 from curvafit.interrupts import Terminated, exit_code
 
 #: Whether what other programs, or other commands, wrote may be replaced.
@@ -32,14 +34,20 @@ _PLAIN = str.maketrans({"\u2212": "-", "\u2013": "-", "\u202f": " ", "\u00a0": "
 
 @contextmanager
 def plainly() -> Iterator[None]:
-    """Turn an expected exception into its sentence and exit code 2, Ctrl-C into 130, warnings into notes.
+    """Turn an expected exception into its sentence and exit code 2, Ctrl-C into 130, another signal into 128 and its
+    number.
 
-    Another signal gives 128 and its number.
+    Warnings become notes, which are said at the end: where nothing comes of a command, why is all there is to say.
     """
+    notes: dict[str, None] = {}
     try:
         with warnings.catch_warnings():
-            warnings.showwarning = _note
+            warnings.showwarning = partial(_note, notes)
             yield
+        _say_notes(notes)
+    except typer.Exit:
+        _say_notes(notes)
+        raise
     except KeyboardInterrupt as signal:
         say(f"{_ended(signal)}: nothing was written", to=error_console())
         raise typer.Exit(exit_code(signal)) from None
@@ -75,14 +83,18 @@ def _sentence(error: Exception) -> str:
     if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "memory" in str(error).lower()):
         return "error: expected a volume that fits into memory, got a larger one"
     if isinstance(error, OSError) and error.strerror:
-        return f"error: {error.strerror.lower()}: {error.filename or ''}"
-    text = " ".join(str(error).split())
-    return f"error: {text or type(error).__name__}"
+        return sentence(f"{error.strerror.lower()}: {error.filename or ''}")
+    return sentence(str(error) or type(error).__name__)
 
 
-def _note(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
+def _note(notes: dict[str, None], message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
     if issubclass(category, UserWarning):
-        say(f"note: {message}", to=error_console())
+        notes[sentence(str(message), "note")] = None
+
+
+def _say_notes(notes: Iterable[str]) -> None:
+    for note in notes:
+        say(note, to=error_console())
 
 
 def command_line() -> str:
@@ -153,6 +165,10 @@ def reading_of(
     spacing: str | None, unit: str | None, raw_shape: str | None, dtype: str | None, key: str | None
 ) -> dict[str, Any]:
     """The options that say how to read a file, as `scan.load` takes them."""
+    if unit is not None:
+        from curvafit.formats import normalise_unit
+
+        normalise_unit(unit)
     return {
         "spacing": None if spacing is None else triple(spacing, "--spacing"),
         "raw_shape": None if raw_shape is None else whole_triple(raw_shape, "--raw-shape"),
@@ -172,7 +188,8 @@ def error_console() -> Console:
 
 def say(text: str, *, to: Console | None = None, style: str | None = None) -> None:
     """One line as it is: no markup, no wrapping, so that paths can be copied."""
-    (to or Console(highlight=False)).print(text.translate(_PLAIN), style=style, markup=False, soft_wrap=True)
+    console = to or Console(highlight=False)
+    console.print(writable(text.translate(_PLAIN), console), style=style, markup=False, soft_wrap=True)
 
 
 def output(heads: Sequence[str], rows: Iterable[Sequence[str]], right: Iterable[int] = ()) -> None:
@@ -191,20 +208,26 @@ def output(heads: Sequence[str], rows: Iterable[Sequence[str]], right: Iterable[
 def stages() -> Iterator[Callable[[str, float], None]]:
     """A progress bar for a job that names its stages: call it with a sentence and the share done.
 
-    Where the error stream is no terminal, each new sentence is a line; one that only counts on, a line every 5 %.
+    Where the error stream is no terminal, each new sentence is a line; one that only counts on, a line every 5 %. A
+    line waits for the next, so that a job that fails at its start says why in one.
     """
     console = error_console()
     if not console.is_terminal:
         kind, last = "", 0.0
+        waiting: list[str] = []
 
         def write(text: str, share: float) -> None:
             nonlocal kind, last
             now = re.sub(r"\d+", "", text)
             if now != kind or share >= last + 0.05:
                 kind, last = now, share
-                say(f"[{100 * share:3.0f} %] {text}", to=console)
+                waiting.append(f"[{100 * share:3.0f} %] {text}")
+                while len(waiting) > (share == 0):
+                    say(waiting.pop(0), to=console)
 
         yield write
+        for line in waiting:
+            say(line, to=console)
         return
     with Progress(
         TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=console, transient=True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -98,9 +99,14 @@ def synth(
 ) -> None:
     """Make a training set: images of generated shapes with exact labels."""
     with plainly():
+        from curvafit.data_synth.workers import check_workers
+
         box = whole_triple(shape, "--shape")
         if count < 1:
             raise ValueError(f"expected --count of at least 1, got {count}")
+        check_workers(workers, scheduler)
+        if unit is not None and spacing is None and voxel is None:
+            raise ValueError("expected --unit beside --spacing or --voxel, got neither")
         source, edge, edge_unit = _source(prior, atlas, presets, volume_fraction)
         seen = _modality(modality, like, like_mask, visible, reading_of(spacing, unit, None, None, None))
         from curvafit.data_synth.case import Recipe
@@ -121,17 +127,22 @@ def _build(out: Path, order: Order, count: int, how: tuple[int | None, str | Non
     from curvafit.data_synth.sets import build_set, cases_of
     from curvafit.data_synth.workers import cluster
     from curvafit.files import check_folder
+    from curvafit.generation.memory import FLOW, check_memory
     from curvafit.set_picture import write_preview
 
     check_folder(out)
+    _, scheduler, _ = how
+    if scheduler is None and order.recipe.source.within == math.inf:
+        check_memory(order.recipe.largest, FLOW, "shapes")
     with kept(), stages() as progress:
         progress("starting workers", 0.0)
         with cluster(*how) as crew:
             build_set(out, order, count, lambda n, of: progress(f"{n} of {of} cases", n / of), workers=crew)
+    preview = write_preview(out)
     if (held := len(cases_of(out))) > count:
         say(f"note: {out} holds {held} cases, more than --count {count}: all are listed", to=error_console())
     say(str(out / "dataset.json"))
-    say(str(write_preview(out)))
+    say(str(preview))
 
 
 def _source(

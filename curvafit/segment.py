@@ -248,7 +248,7 @@ def _lowered(
         if progress is not None:
             progress("lowering the energy", made / total)
 
-    return descend(
+    flow = descend(
         start,
         law.in_unit(place.unit),
         place.grid,
@@ -258,6 +258,9 @@ def _lowered(
         blur=0.0,
         callbacks=[watch],
     )
+    if not flow.finite:
+        raise ScanError(f"expected an energy that stays finite, got a flow that {flow.status}: lower the weight")
+    return flow
 
 
 def _result(
@@ -275,9 +278,7 @@ def _result(
     count, word = int(flow.history.step[-1]), "settled" if abs(fall) < SETTLED else "still moving"
     made = f"{count} step" if count == 1 else f"{count} steps"
     status = f"{word} after {made}: {100 * share:.2f} % of the volume is inside"
-    if not np.isfinite(energy[-1]):
-        status = f"stopped after {made}: the energy is not finite, lower the weight"
-    elif share in (0.0, 1.0):
+    if share in (0.0, 1.0):
         status = f"no surface is left after {made}: the prior is too strong for the data, lower its weight"
     whole = {"notes": (), "source": scan.source}
     return Segmentation(

@@ -19,9 +19,11 @@ from curvafit.files import check_folder, check_free, move_together, record_of, s
 from curvafit.formats import normalise_unit, pick_writer
 from curvafit.formats.ngff import is_ours
 from curvafit.generation.flow import Flow
+from curvafit.generation.memory import FILE, check_memory
 from curvafit.mesh import Surface, solid_surface, surface
 from curvafit.mesh_files import SUFFIXES, write_surface
 from curvafit.plot import surface_picture
+from curvafit.priors.bounds import LONGEST, SHORTEST, real, several, whole
 from curvafit.priors.coefficients import NAMES, Coefficients
 from curvafit.priors.curvature import geometric_curvatures, jet
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
@@ -30,6 +32,8 @@ from curvafit.scan import WRITABLE, Field, save
 
 #: What a record beside a shape says that it is.
 FORMAT = "curvafit-shape-1"
+#: Times that a box may be repeated along an axis.
+MOST = 10**6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +52,7 @@ class Output:
     Raises
     ------
     ValueError
-        If the unit has no known name, the voxel is not positive or a repeat is under 1.
+        If the unit has no known name, the voxel is not from 1e-12 to 1e12 or a repeat is under 1.
     """
 
     voxel: float = 1.0
@@ -59,11 +63,26 @@ class Output:
     def __post_init__(self) -> None:
         unit, factor = normalise_unit(self.unit)
         object.__setattr__(self, "unit", unit)
-        object.__setattr__(self, "voxel", float(self.voxel) * factor)
-        if not 0 < self.voxel < float("inf"):
-            raise ValueError(f"expected a positive voxel edge, got {self.voxel}")
-        if len(self.tile) != 3 or any(int(n) != n or n < 1 for n in self.tile):
-            raise ValueError(f"expected 3 whole repeats of at least 1 (z, y, x), got {self.tile}")
+        edge = real(self.voxel, "a positive voxel edge", SHORTEST, LONGEST)
+        object.__setattr__(self, "voxel", edge * factor)
+        said = "3 whole repeats of at least 1 (z, y, x)"
+        tile = several(self.tile, "3 whole repeats (z, y, x)")
+        tile = tuple(whole(n, said, 1, MOST, of=tile) for n in (tile if len(tile) == 3 else (None,)))
+        object.__setattr__(self, "tile", tile)
+
+    def shape(self, grid: Grid) -> tuple[int, ...]:
+        """Voxels (z, y, x) of what is written of a field.
+
+        Raises
+        ------
+        ValueError
+            If they do not fit into memory, or the box is not periodic and to be repeated.
+        """
+        if not grid.periodic and self.tile != (1, 1, 1):
+            raise ValueError(f"expected a periodic box to repeat, got boundary {grid.boundary!r}")
+        shape = tuple(n * times for n, times in zip(grid.shape, self.tile, strict=True))
+        check_memory(shape, FILE, "a file")
+        return shape
 
 
 def check_target(
@@ -199,8 +218,7 @@ def write_field(
         As `write_shape` does.
     """
     target, how = Path(path), output or Output()
-    if not grid.periodic and how.tile != (1, 1, 1):
-        raise ValueError(f"expected a periodic box to repeat, got boundary {grid.boundary!r}")
+    how.shape(grid)
     values, edges = np.tile(field.numpy(), how.tile), (how.voxel, how.voxel, how.voxel)
     if not target.name.lower().endswith(SUFFIXES):
         return save(Field(values, edges, how.unit), target, kind=FORMAT, overwrite=overwrite)

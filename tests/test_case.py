@@ -58,7 +58,7 @@ def test_shapes_fill_the_share_that_is_asked_for(monkeypatch):
     assert "after 1000 steps" in made.origin["status"] and "volume fraction" not in made.origin["status"]
     assert source_of(source.as_dict()) == source
     assert source_of({"kind": "generated", "points": [point], "names": ["tubes"], "schedule": "fast"}).fraction is None
-    with pytest.raises(ValueError, match="expected a volume fraction between 0 and 1, got 1.5"):
+    with pytest.raises(ValueError, match="expected a volume fraction in .0, 1., got 1.5"):
         Generated((point,), ("tubes",), fraction=1.5)
     monkeypatch.setattr(steering, "LAST", -1.0)
     missed = source.shape((20, 20, 20), 0, np.random.default_rng(0))

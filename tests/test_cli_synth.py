@@ -104,7 +104,7 @@ def test_bad_input(tmp_path, store):
     refused(call(*some, *kind, "--like-mask", "m.nii.gz"), "expected --like beside --like-mask, got none")
     refused(call(*some, *kind, "--volume-fraction", "0.2"), "expected --volume-fraction beside shapes that are grown")
     presets = ["synth", "-o", out, "--presets", "tubes", *kind]
-    refused(call(*presets, "--volume-fraction", "2"), "expected a volume fraction between 0 and 1, got 2")
+    refused(call(*presets, "--volume-fraction", "2"), "expected a volume fraction in (0, 1), got 2")
     refused(call(*some, *kind, *QUICK, "--labels", "depth"), "expected labels among")
     refused(call(*some, *kind, *QUICK, "--layout", "bids"), "expected a layout among nnunet, monai, zarr")
     refused(call(*some, *kind, *QUICK, "--seed", "-1"), "expected a seed that is a whole number from 0, got -1")

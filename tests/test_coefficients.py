@@ -112,7 +112,7 @@ def test_tensors_that_vary_in_space_keep_their_gradients() -> None:
 def test_domain_and_bad_values() -> None:
     with pytest.warns(UserWarning, match="got least a20 = 1, a02 = -1"):
         Coefficients(1, 0, -1)
-    with pytest.raises(ValueError, match=r"expected finite coefficients, got a11 = nan"):
+    with pytest.raises(ValueError, match=r"expected a finite coefficient a11, got nan"):
         Coefficients(1, math.nan, 1)
     with pytest.raises(ValueError, match=r"expected a positive length unit, got 0"):
         Coefficients(1, 0, 1).in_unit(0)

@@ -106,8 +106,8 @@ def test_start_is_the_published_one():
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_runaway_stops_with_a_sentence(backend):
-    """A step of 1e30 overflows float32; the flow says so instead of returning a shape."""
-    plan = Schedule("test", 100, 1e30, 1e30, "constant")
+    """A step of 1e6 overflows float32; the flow says so instead of returning a shape."""
+    plan = Schedule("test", 100, 1e6, 1e6, "constant")
     flow = generate(TUBES, MASS, Grid((12, 12, 12)), schedule=plan, backend=backend)
     assert "not finite" in flow.status
     assert not flow.viability.viable
@@ -226,7 +226,7 @@ def test_wrong_input_is_refused():
             generate(TUBES, MASS, grid, epsilon=epsilon, blur=blur)
     with pytest.raises(ValueError, match="expected a backend"):
         generate(TUBES, MASS, grid, backend="cuda")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="expected a device with fused kernels .*, got meta"):
+    with pytest.raises(ValueError, match="expected a device that torch computes on, .*, got .meta."):
         generate(TUBES, MASS, grid, backend="fused", device="meta")
     with pytest.raises(ValueError, match="expected a field of shape"):
         relax(torch.zeros(12, 12, 11), TUBES, grid, schedule="fast")

@@ -81,7 +81,7 @@ def test_snapshots(backend):
     assert torch.equal(flow.field, generate(TUBES, MASS, grid, schedule=short(40), backend=backend).field)
     start = gaussian_blur(divergence(white_noise(grid, 0), grid), grid, BLUR) + MASS
     assert float((flow.snapshots[0] - start).abs().max()) < 1e-5
-    with pytest.raises(ValueError, match=r"expected snapshots at 0 to 40 steps, got \[41\]"):
+    with pytest.raises(ValueError, match=r"expected snapshots at 0 to 40 steps.*, got 41"):
         generate(TUBES, MASS, grid, schedule=short(40), snapshots=(1, 41))
 
 

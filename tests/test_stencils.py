@@ -142,7 +142,7 @@ def test_bad_input_is_one_sentence() -> None:
     [
         ((3, 5, 5), (1, 1, 1), "periodic", "each at least 4"),
         ((4.5, 5, 5), (1, 1, 1), "periodic", "whole numbers"),
-        ((5, 5), (1, 1, 1), "periodic", "expected shape as 3 numbers"),
+        ((5, 5), (1, 1, 1), "periodic", "expected a shape of 3 whole numbers, each at least 4, got .5, 5."),
         ((5, 5, 5), (0.2, 0, 0.2), "periodic", r"positive numbers \(z, y, x\), got \(0.2, 0, 0.2\)"),
         ((5, 5, 5), (1, 1, math.nan), "periodic", "positive numbers"),
         ((5, 5, 5), (1, 1, 1), "mirror", "expected boundary 'periodic' or 'replicate', got 'mirror'"),

@@ -15,8 +15,10 @@ from curvafit.data_synth.store import Record, Settings, Store, open_store
 from curvafit.data_synth.workers import Here, Workers
 from curvafit.diagram import Diagram, diagram
 from curvafit.generation.flow import WORKING_BLUR
+from curvafit.generation.memory import FILE, FLOW, check_memory
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.schedule import schedule as named_schedule
+from curvafit.priors.bounds import seed_of, whole
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.profile import phase_field
 from curvafit.transport import TAIL_SHARE
@@ -27,6 +29,8 @@ Progress = Callable[[Record, int, int], None]
 BIN_WIDTH = 2.0
 #: A design is given up when none of its first so many draws was viable, or fewer than one in so many.
 BARREN = 200
+#: Shapes that a store may be asked for.
+MOST = 10**7
 
 
 def build(
@@ -63,13 +67,14 @@ def build(
     Raises
     ------
     ValueError
-        If `count` is not positive, the store was made with other settings or by another format version, or hardly any
-        draw of the design is viable.
+        If `count` is not positive or over 10 million, a shape does not fit into memory, the store was made with other
+        settings or by another format version, or hardly any draw of the design is viable.
     OSError
         If the store can't be written, or the workers are gone. What was made is kept.
     """
-    if count < 1:
-        raise ValueError(f"expected a count of at least 1 shape, got {count}")
+    check_count(count, 1)
+    if workers is None:
+        check_memory(Grid(shape).shape, FLOW, "shapes")  # type: ignore[arg-type]
     settings = settings_of(shape, seed, schedule, design)
     return _filled(open_store(store_path, settings), count, workers or Here(), progress)
 
@@ -86,21 +91,25 @@ def extend(
     FileNotFoundError, ValueError, OSError
         If there is no store, or as `build`.
     """
-    if count < 0:
-        raise ValueError(f"expected a count of shapes from 0, got {count}")
+    check_count(count, 0)
     store = open_store(store_path)
     return _filled(store, store.wanted + count, workers or Here(), progress)
+
+
+def check_count(count: int, least: int) -> None:
+    """Raise ValueError where a number of shapes is none, under the least or over 10 million."""
+    whole(count, f"a count of shapes from {least}", least, MOST)
 
 
 def settings_of(
     shape: int | Sequence[int], seed: int = 0, schedule: str | Schedule = "fast", design: Design | None = None
 ) -> Settings:
     """The settings of the store that `build` makes of these."""
-    z, y, x = (shape,) * 3 if isinstance(shape, int) else shape
-    grid = Grid((z, y, x))
+    grid = Grid(shape)  # type: ignore[arg-type]
+    check_memory(grid.shape, FILE, "shapes")
     plan, law = dataclasses.asdict(named_schedule(schedule)), design or boxed()
     law.draw(seed, 0)  # refuses a wrong seed, before a store is made
-    return Settings(grid.shape, grid.spacing, WORKING_EPSILON, WORKING_BLUR, law.as_dict(), int(seed), plan)
+    return Settings(grid.shape, grid.spacing, WORKING_EPSILON, WORKING_BLUR, law.as_dict(), seed_of(seed), plan)
 
 
 def diagrams(field: torch.Tensor, grid: Grid, epsilon: float) -> tuple[Diagram, Diagram]:

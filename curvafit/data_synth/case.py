@@ -13,11 +13,16 @@ import torch
 from curvafit.data_synth.draws import one_thread
 from curvafit.data_synth.modality import Imaging, Modality, field_shape, image, regrid, visible
 from curvafit.data_synth.sources import Source, source_of
+from curvafit.priors.bounds import LONGEST, SHORTEST, quoted, real, seed_of, several, whole
 
 #: Shapes that a case gets until one is seen on the image's voxels, which may be coarse.
 TRIES = 8
 #: Voxels that a shape may have.
 MOST = 10**9
+#: Voxels that a shape has along its longest edge at least.
+FEWEST = 4
+#: Least and greatest calibre.
+CALIBRES = (1e-3, 1e3)
 
 
 class Case(NamedTuple):
@@ -61,14 +66,20 @@ class Recipe:
     calibres: tuple[float, float] = (1.0, 1.0)
 
     def __post_init__(self) -> None:
-        if len(self.shape) != 3 or any(int(n) != n or n < 1 for n in self.shape):
-            raise ValueError(f"expected 3 whole numbers of voxels above 0 (z, y, x), got {self.shape}")
-        if not 0 < self.voxel < float("inf"):
-            raise ValueError(f"expected a shape's voxel of positive length, got {self.voxel}")
-        if isinstance(self.seed, bool) or int(self.seed) != self.seed or self.seed < 0:
-            raise ValueError(f"expected a seed that is a whole number from 0, got {self.seed!r}")
+        said = "3 whole numbers of voxels above 0 (z, y, x)"
+        shape = several(self.shape, "3 whole numbers of voxels")
+        shape = tuple(whole(n, said, 1, MOST, of=shape) for n in (shape if len(shape) == 3 else (None,)))
+        object.__setattr__(self, "shape", shape)
+        object.__setattr__(self, "voxel", real(self.voxel, "a shape's voxel of positive length", SHORTEST, LONGEST))
+        object.__setattr__(self, "seed", seed_of(self.seed))
         check_calibres(self.calibres)
-        check_crop(self.source, self.shape, self.voxel * self.calibres[0], self.modality)
+        for factor in self.calibres:
+            check_crop(self.source, self.shape, self.voxel * factor, self.modality)
+
+    @property
+    def largest(self) -> tuple[int, int, int]:
+        """Voxels (z, y, x) of the largest shapes, of the thinnest structures."""
+        return field_shape(self.shape, self.voxel * self.calibres[0], self.modality.base)
 
     def case(self, index: int) -> Case:
         """Case number `index`, made on one thread.
@@ -141,13 +152,24 @@ def drawn_voxel(voxel: float, calibres: Sequence[float], rng: np.random.Generato
 
 def check_calibres(calibres: Sequence[float]) -> None:
     """Raise ValueError where these are not two positive factors, the lower first."""
-    if len(calibres) != 2 or not 0 < calibres[0] <= calibres[1] < math.inf:
-        raise ValueError(f"expected calibres as two positive factors, the lower first, got {tuple(calibres)}")
+    said, pair = "calibres as two positive factors, the lower first", several(calibres, "two factors")
+    low, high = (real(n, said, *CALIBRES, of=pair) for n in (pair if len(pair) == 2 else (None, None)))
+    if low > high:
+        raise ValueError(f"expected {said}, got {quoted(pair)}")
 
 
 def check_crop(source: Source, shape: Sequence[int], voxel: float, modality: Modality) -> None:
-    """Raise ValueError where images of `shape` need crops that are larger than a store's shapes, or than memory is."""
+    """Raise ValueError where images of `shape` need crops that are larger than a store's shapes or than memory, or too
+    small to be shapes; or where they are too large or too small themselves."""
     need = field_shape(shape, voxel, modality.base)
+    if not 1 < math.prod(shape) <= MOST:
+        raise ValueError(f"expected images of 2 to {MOST:.0e} voxels, got {' x '.join(map(str, shape))}")
+    if max(need) < FEWEST:
+        told, unit = " x ".join(map(str, need)), modality.base.unit
+        raise ValueError(
+            f"expected images that span {FEWEST} voxels of a shape or more, got {told}: is a voxel of {voxel:g} {unit} "
+            "meant?"
+        )
     if math.prod(need) > MOST:
         told, unit = " x ".join(map(str, need)), modality.base.unit
         raise ValueError(

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from scipy.stats import qmc
 
+from curvafit.generation.cost import POWERS, check_strength
+from curvafit.priors.bounds import SEEDS, quoted, real, seed_of, whole
 from curvafit.priors.coefficients import NAMES, Coefficients
+from curvafit.priors.grid import WORKING_EPSILON
 
 #: Open intervals of the uniform law, in working units; a20 = 1 is the gauge (paper, "Experiment 4").
 INTERVALS: dict[str, tuple[float, float]] = {
@@ -23,6 +26,8 @@ INTERVALS: dict[str, tuple[float, float]] = {
 }
 #: Parameters of a draw, in the order of a point.
 PARAMETERS: tuple[str, ...] = (*NAMES, "mass")
+#: Least and greatest spread of a box around a point.
+SPREADS = (1e-9, 100.0)
 Law = Literal["random", "sobol", "list"]
 
 
@@ -51,7 +56,8 @@ class Design:
     Raises
     ------
     ValueError
-        If the law has another name, there is no box or no point, an interval is not one, or m₀ leaves (-1, 1).
+        If the law has another name, there is no box or no point, an interval is not one, m₀ leaves (-1, 1), or no flow
+        takes a coefficient that large (`generation.cost`).
     """
 
     law: Law
@@ -60,18 +66,20 @@ class Design:
 
     def __post_init__(self) -> None:
         if self.law not in get_args(Law):
-            raise ValueError(f"expected a law among {', '.join(get_args(Law))}, got {self.law!r}")
+            raise ValueError(f"expected a law among {', '.join(get_args(Law))}, got {quoted(self.law)}")
         rows = self.points if self.law == "list" else tuple(zip(*self.box, strict=True))
         if not rows or any(len(row) != len(PARAMETERS) for row in rows):
             raise ValueError(f"expected {len(PARAMETERS)} parameters ({', '.join(PARAMETERS)}) for a {self.law} design")
-        if not all(math.isfinite(value) for row in rows for value in row):
-            raise ValueError("expected finite parameters in a design, got NaN or infinity")
+        for value in (value for row in rows for value in row):
+            real(value, "finite parameters in a design")
         for name, interval in zip(PARAMETERS, self.box, strict=False):
             if interval[0] > interval[1]:
                 raise ValueError(f"expected an interval of {name} from low to high, got {list(interval)}")
         for row in rows:
             if not -1 < row[-1] < 1:
                 raise ValueError(f"expected masses in (-1, 1), got {row[-1]}")
+            for name, value in zip(NAMES, row, strict=False):
+                check_strength(name, value, POWERS[name], WORKING_EPSILON)
 
     def draw(self, seed: int, index: int) -> Draw:
         """Draw `index` of a seed, both whole numbers from 0.
@@ -133,12 +141,12 @@ def around(point: Sequence[float], spread: float, law: Law = "random") -> Design
     Raises
     ------
     ValueError
-        If the spread is not positive, or a20 of the point is not.
+        If the spread is not positive or over 100, or the point is not seven numbers with a20 > 0.
     """
-    if not spread > 0:
-        raise ValueError(f"expected a positive spread, got {spread}")
-    if not point[0] > 0:
-        raise ValueError(f"expected a point with a20 > 0, got {point[0]}")
+    spread = real(spread, "a positive spread", *SPREADS)
+    if len(point) != len(PARAMETERS):
+        raise ValueError(f"expected a point of {len(PARAMETERS)} numbers ({', '.join(PARAMETERS)}), got {len(point)}")
+    real(point[0], "a point with a20 > 0", 1e-6, 1e6)
     centre = dict(zip(PARAMETERS, (*(value / point[0] for value in point[:-1]), point[-1]), strict=True))
     box = {name: _near(centre[name], spread * (high - low) / 2) for name, (low, high) in INTERVALS.items()}
     least = INTERVALS["a02"][0]
@@ -152,18 +160,16 @@ def _near(centre: float, half: float) -> tuple[float, float]:
 
 
 def _interval(name: str, value: Any) -> tuple[float, float]:
-    pair = [value, value] if isinstance(value, (int, float)) else value
+    pair = [value, value] if isinstance(value, Real) else value
     if not isinstance(pair, (list, tuple)) or len(pair) != 2 or not all(_is_number(end) for end in pair):
-        raise ValueError(f"expected {name} as a number or two of them, got {value!r}")
+        raise ValueError(f"expected {name} as a number or two of them, got {quoted(value)}")
     return float(pair[0]), float(pair[1])
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
+    return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def _stream(seed: int, index: int, purpose: str) -> np.random.SeedSequence:
-    for name, value in (("seed", seed), ("index", index)):
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0:
-            raise ValueError(f"expected a {name} that is a whole number from 0, got {value!r}")
-    return np.random.SeedSequence(int(seed), spawn_key=(int(index), ("parameters", "start").index(purpose)))
+    index = whole(index, "an index that is a whole number from 0", 0, SEEDS - 1)
+    return np.random.SeedSequence(seed_of(seed), spawn_key=(index, ("parameters", "start").index(purpose)))

@@ -10,6 +10,7 @@ from typing import Any
 import yaml
 
 from curvafit.data_synth.design import PARAMETERS, Design, around, boxed
+from curvafit.priors.bounds import real
 from curvafit.priors.coefficients import preset
 from curvafit.priors.fit_file import read_fit
 
@@ -111,6 +112,4 @@ def _number(value: Any) -> Any:
 
 def _spread(value: Any) -> float:
     value = _number(value)
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ValueError(f"expected a spread that is a number, got {value!r}")
-    return float(value)
+    return real(value, "a spread that is a number")

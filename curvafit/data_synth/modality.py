@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -21,6 +20,7 @@ from curvafit.data_synth.imaging import (
     visible_share,
 )
 from curvafit.data_synth.randomness import seeds_of
+from curvafit.priors.bounds import LONGEST, SHORTEST, real
 
 __all__ = ["Imaging", "Modality", "field_shape", "image", "image_shape", "regrid", "visible", "visible_share"]
 
@@ -54,8 +54,7 @@ class Modality:
     ranges: Mapping[str, tuple[Any, Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if not 0 < self.voxel < math.inf:
-            raise ValueError(f"expected a shape's voxel of positive length, got {self.voxel}")
+        real(self.voxel, "a shape's voxel of positive length", SHORTEST, LONGEST)
         known_fields(self.ranges, "a modality's ranges")
         for name, (low, high) in self.ranges.items():
             for end in (low, high):

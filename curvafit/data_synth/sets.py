@@ -7,7 +7,8 @@ import hashlib
 import itertools
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from curvafit.data_synth.labels import NAMES, labels_of
 from curvafit.data_synth.layouts import LAYOUTS, About
 from curvafit.data_synth.workers import Here, Workers
 from curvafit.files import remove, write_content
+from curvafit.priors.bounds import quoted, whole
 from curvafit.priors.grid import Grid
 from curvafit.scan import Field, save
 
@@ -29,6 +31,10 @@ FORMAT = "curvafit set"
 VERSION = 1
 #: The set's own record, and the folder of the cases'.
 HEADER, RECORDS = "curvafit.json", "cases"
+#: What the layout's readers want.
+LIST = "dataset.json"
+#: Cases that a set may be asked for.
+MOST = 10**7
 #: Labels besides the mask that a set can have.
 PARTS = (*(name for name in NAMES if name != "mask"), "centreline")
 #: Seconds between two lists of the cases.
@@ -54,7 +60,7 @@ class Order:
 
     def __post_init__(self) -> None:
         if self.layout not in LAYOUTS:
-            raise ValueError(f"expected a layout among {', '.join(LAYOUTS)}, got {self.layout!r}")
+            raise ValueError(f"expected a layout among {', '.join(LAYOUTS)}, got {quoted(self.layout)}")
         if unknown := sorted(set(self.parts) - set(PARTS)):
             raise ValueError(f"expected labels among {', '.join(PARTS)}, got {', '.join(unknown)}")
         if self.parts and min(self.recipe.shape) < 4:
@@ -85,10 +91,13 @@ def build_set(
     OSError
         If the folder can't be written, or the workers are gone. The cases that were made are kept.
     """
-    if count < 1:
-        raise ValueError(f"expected a count of at least 1 case, got {count}")
+    count = whole(count, "a count of at least 1 case", 1, MOST)
     folder, workers = Path(folder), workers or Here()
-    _begin(folder, order)
+    with _begun(folder, order):
+        return _filled(folder, order, count, progress, workers)
+
+
+def _filled(folder: Path, order: Order, count: int, progress: Progress | None, workers: Workers) -> Path:
     done = set(cases_of(folder))
     todo = iter([index for index in range(count) if index not in done])
     asked, listed = 0, -LISTED_EVERY
@@ -158,6 +167,25 @@ def case_name(index: int) -> str:
     return f"case_{index:05d}"
 
 
+@contextmanager
+def _begun(folder: Path, order: Order) -> Iterator[None]:
+    """A set that is begun; where a case can't be had and none was, what was begun here is removed."""
+    new = [place for place in (folder, *folder.absolute().parents) if not place.exists()]
+    anew = not (folder / HEADER).exists()
+    _begin(folder, order)
+    try:
+        yield
+    except ValueError:
+        if anew and not cases_of(folder):
+            for place in (folder / HEADER, folder / LIST):
+                place.unlink(missing_ok=True)
+            within = [place for place in folder.rglob("*") if place.is_dir()]
+            for place in [*sorted(within, reverse=True), *new]:
+                with suppress(OSError):  # it holds something else
+                    place.rmdir()
+        raise
+
+
 def _begin(folder: Path, order: Order) -> None:
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"expected a folder for the set, got the file {folder}")
@@ -177,7 +205,7 @@ def _begin(folder: Path, order: Order) -> None:
 def _list(folder: Path, order: Order, done: set[int]) -> None:
     """Write what the layout's readers want."""
     about, cases = About(folder.resolve().name, order.recipe.modality.name), list(map(case_name, sorted(done)))
-    _write_json(folder / "dataset.json", LAYOUTS[order.layout].listing(cases, about))
+    _write_json(folder / LIST, LAYOUTS[order.layout].listing(cases, about))
 
 
 def _list_what_is_there(folder: Path, order: Order) -> None:

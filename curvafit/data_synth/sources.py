@@ -11,11 +11,12 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from curvafit.data_synth.design import PARAMETERS
+from curvafit.data_synth.design import PARAMETERS, Design
 from curvafit.data_synth.draws import one_thread
 from curvafit.data_synth.moves import any_crop
 from curvafit.data_synth.store import Store, open_store
 from curvafit.generation.flow import generate
+from curvafit.generation.fraction import first_mass
 from curvafit.generation.schedule import schedule as named_schedule
 from curvafit.generation.viability import well_formed
 from curvafit.priors.coefficients import Coefficients
@@ -69,7 +70,8 @@ class Generated:
     Raises
     ------
     ValueError
-        If there is no point, one has another length, the names are not as many, or the fraction is not within (0, 1).
+        If there is no point, one is no parameters of a shape (`Design`), the names are not as many, the schedule is
+        unknown, or the fraction is not within (0, 1).
     """
 
     points: tuple[tuple[float, ...], ...]
@@ -78,12 +80,12 @@ class Generated:
     fraction: float | None = None
 
     def __post_init__(self) -> None:
-        if not self.points or any(len(point) != len(PARAMETERS) for point in self.points):
-            raise ValueError(f"expected points of {len(PARAMETERS)} numbers ({', '.join(PARAMETERS)})")
         if len(self.names) != len(self.points):
             raise ValueError(f"expected a name for each of {len(self.points)} points, got {len(self.names)}")
-        if self.fraction is not None and not 0 < self.fraction < 1:
-            raise ValueError(f"expected a volume fraction between 0 and 1, got {self.fraction:g}")
+        if self.fraction is not None:
+            first_mass(self.fraction)
+        named_schedule(self.schedule)
+        Design("list", points=self.points)
 
     @property
     def within(self) -> float:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from curvafit.data_synth.draws import device
+from curvafit.priors.bounds import whole
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 TOGETHER = 32
 #: Where workers on this machine listen.
 LOOPBACK = "127.0.0.1"
+#: Processes that may be asked for on this machine.
+MOST = 1024
 #: Seconds that a scheduler has to answer.
 PATIENCE = 10
 #: What a worker on this machine runs first: Ctrl-C in the terminal is for the build, which ends its workers.
@@ -99,6 +102,14 @@ class Cluster:
             raise OSError(f"expected workers to survive their work, got one that killed several: {error}") from error
 
 
+def check_workers(count: int | None, scheduler: str | None) -> None:
+    """Raise ValueError where the number of workers is none, or there is a scheduler, whose workers are its own."""
+    if count is not None:
+        whole(count, "a number of workers from 0", 0, MOST)
+        if scheduler is not None:
+            raise ValueError(f"expected either workers or a scheduler, got {count} and {scheduler}")
+
+
 @contextmanager
 def cluster(count: int | None = None, scheduler: str | None = None, dashboard: int | None = None) -> Iterator[Workers]:
     """Workers: of the scheduler at an address, or so many on this machine (as many as cores); 0 is this process.
@@ -113,8 +124,7 @@ def cluster(count: int | None = None, scheduler: str | None = None, dashboard: i
     OSError
         If there is no scheduler at the address, it has no workers, or it goes.
     """
-    if count is not None and count < 0:
-        raise ValueError(f"expected a number of workers from 0, got {count}")
+    check_workers(count, scheduler)
     if count == 0 and scheduler is None:
         yield Here()
         return

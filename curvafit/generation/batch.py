@@ -14,12 +14,14 @@ from curvafit.generation.flow import WORKING_BLUR, Backend, generate
 from curvafit.generation.fused import CudaStepper
 from curvafit.generation.initial import white_noise
 from curvafit.generation.loop import Orders, run
+from curvafit.generation.memory import DEVICE, check_memory
 from curvafit.generation.parametrization import DivergenceForm
 from curvafit.generation.result import Flow
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.schedule import schedule as named_schedule
-from curvafit.generation.setup import base_of
+from curvafit.generation.setup import base_of, kind_of
 from curvafit.priors import kernels
+from curvafit.priors.bounds import several, whole
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.shapes import Float
@@ -61,14 +63,13 @@ def generate_batch(
     ValueError
         If the sequences differ in length, at once; or as `generate`, where a shape's turn comes.
     """
-    if together < 1:
-        raise ValueError(f"expected at least one shape at a time, got {together}")
+    together = whole(together, "at least one shape at a time", 1, 10**6)
     jobs, plan = _jobs(coefficients, masses, seeds), named_schedule(schedule)
     told = {
         "schedule": plan, "epsilon": epsilon, "blur": blur, "orientation": orientation,
         "snapshots": snapshots, "reject_early": reject_early, "backend": backend, "device": device,
     }  # fmt: skip
-    if torch.device(device).type == "cuda" and backend != "torch" and kernels.fused(device):
+    if kind_of(device) == "cuda" and backend != "torch" and kernels.fused(device):
         groups = [jobs[first : first + together] for first in range(0, len(jobs), together)]
         return (flow for group in groups for flow in _together(group, grid, told))
     return (generate(job.coefficients, job.mass, grid, seed=job.seed, **told) for job in jobs)
@@ -83,21 +84,22 @@ class _Job(NamedTuple):
 def _jobs(coefficients, masses, seeds) -> list[_Job]:
     """One a shape."""
     columns = [
-        [coefficients] if isinstance(coefficients, Coefficients) else list(coefficients),
-        [masses] if isinstance(masses, (Real, Tensor)) else list(masses),
-        [seeds] if isinstance(seeds, Real) else list(seeds),
+        [coefficients] if isinstance(coefficients, Coefficients) else several(coefficients, "coefficients"),
+        [masses] if isinstance(masses, (Real, Tensor)) else several(masses, "masses"),
+        [seeds] if isinstance(seeds, Real) else several(seeds, "seeds"),
     ]
     lengths = {len(column) for column in columns} - {1}
     if len(lengths) > 1 or 0 in lengths:
         found = ", ".join(str(len(column)) for column in columns)
         raise ValueError(f"expected coefficients, masses and seeds of one length, or one for all, got {found}")
     count = max(lengths, default=1)
-    return [_Job(*row) for row in zip(*(column * (count // len(column)) for column in columns), strict=True)]
+    return [_Job(*row) for row in zip(*([*column] * (count // len(column)) for column in columns), strict=True)]
 
 
 def _together(jobs: list[_Job], grid: Grid, told: dict[str, Any]) -> list[Flow]:
     """Shapes that share a device's steps."""
     plan = told["schedule"]
+    check_memory((len(jobs), *grid.shape), DEVICE, "shapes made together", told["device"])
     costs = [Cost(job.coefficients, grid, told["epsilon"], told["orientation"], told["blur"]) for job in jobs]
     forms = [
         DivergenceForm.of(grid, told["blur"], base_of(job.mass, None, grid), kernels.gaussian_blur) for job in jobs
@@ -105,5 +107,5 @@ def _together(jobs: list[_Job], grid: Grid, told: dict[str, Any]) -> list[Flow]:
     starts = [white_noise(grid, job.seed) for job in jobs]
     each = [job.coefficients for job in jobs]
     moved = CudaStepper(starts, [form.base for form in forms], costs[0], each, plan.betas, None, told["device"])
-    orders = Orders(grid, told["epsilon"], plan, snapshots=told["snapshots"], reject_early=told["reject_early"])
+    orders = Orders(grid, costs[0].epsilon, plan, snapshots=told["snapshots"], reject_early=told["reject_early"])
     return run(moved, [orders] * len(jobs), [job.seed for job in jobs])

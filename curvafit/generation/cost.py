@@ -4,13 +4,26 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from curvafit.generation.data import Data
+from curvafit.priors.bounds import quoted, real
 from curvafit.priors.coefficients import NAMES, Coefficients
 from curvafit.priors.grid import Grid
+
+#: Voxels that ε spans at least: published are two; below a tenth no voxel sees the interface.
+FINEST = 0.1
+#: The most that a coefficient may be, lengths in units of ε; published ones stay below 15. Float32 holds the energy and
+#: its gradient of noise.
+STRONGEST = 1e6
+#: Edges of a voxel whose squared second differences float32 holds, and beside whose inverse ξ = 1e-6 (`curvature.XI`)
+#: is little.
+VOXELS = (1e-8, 1e5)
+#: Powers of length in the coefficients' units.
+POWERS = dict(zip(NAMES, (0, 0, 0, 1, 1, 2), strict=True))
 
 
 @dataclass(frozen=True)
@@ -20,7 +33,9 @@ class Cost:
     Raises
     ------
     ValueError
-        If ε is not positive, the blur negative, or a tensor does not broadcast with the voxels.
+        If ε is less than a tenth of a voxel or more than the box, the blur negative or more than the box, a coefficient
+        or the orientation over a million with lengths in units of ε, a voxel's edge out of float32's reach, or a tensor
+        does not broadcast with the voxels.
     """
 
     coefficients: Coefficients
@@ -31,17 +46,66 @@ class Cost:
     data: Data | None = None
 
     def __post_init__(self) -> None:
-        lengths = torch.as_tensor(self.epsilon)
-        if not (bool(((lengths > 0) & (lengths < math.inf)).all()) and 0 <= self.blur < math.inf):
-            got = f"{float(lengths.min())} to {float(lengths.max())}" if lengths.dim() else f"{self.epsilon}"
-            got = f"{got} and {self.blur}"
-            raise ValueError(f"expected epsilon > 0 and blur >= 0 in the spacing's unit, got {got}")
+        for name, kind in (("coefficients", Coefficients), ("grid", Grid)):
+            if not isinstance(getattr(self, name), kind):
+                got = quoted(getattr(self, name))
+                raise ValueError(f"expected {name} as {kind.__name__}, got {got}")
+        self._check_lengths()
+        self._check_tensors()
+        self._check_strengths()
+
+    def _check_lengths(self) -> None:
+        """ε and the blur, as numbers, and both and the voxels in range."""
+        edges, box = self.grid.spacing, max(n * h for n, h in zip(self.grid.shape, self.grid.spacing, strict=True))
+        if not VOXELS[0] <= min(edges) <= max(edges) <= VOXELS[1]:
+            raise ValueError(f"expected voxel edges from {VOXELS[0]:g} to {VOXELS[1]:g} for a flow, got {edges}")
+        said = "epsilon > 0 and blur >= 0 in the spacing's unit"
+        if not isinstance(self.epsilon, Tensor):
+            object.__setattr__(self, "epsilon", real(self.epsilon, said, math.ulp(0)))
+        object.__setattr__(self, "blur", real(self.blur, said, 0))
+        lengths = torch.as_tensor(self.epsilon, dtype=torch.float64)
+        low, high = float(lengths.min()), float(lengths.max())
+        if not (low > 0 and math.isfinite(high)):
+            raise ValueError(f"expected {said}, got {low} to {high} and {self.blur}")
+        if not FINEST * min(edges) <= low <= high <= box:
+            got = f"{low:g}" if low == high else f"{low:g} to {high:g}"
+            least = f"{FINEST:g} of a voxel ({FINEST * min(edges):.3g})"
+            raise ValueError(f"expected an epsilon from {least} to the box ({box:.3g}), got {got}")
+        if self.blur > box:
+            raise ValueError(f"expected a blur within the box ({box:.3g}), got {self.blur:g}")
+
+    def _check_tensors(self) -> None:
+        """Whether what varies broadcasts with the voxels, and the orientation is one."""
         for name, value in zip(("epsilon", *NAMES), (self.epsilon, *self.coefficients), strict=True):
             if isinstance(value, Tensor):
                 check_shape(name, value, self.grid)
-        for name, value in vars(self.data).items() if self.data is not None else ():
+        if self.data is not None and not callable(getattr(self.data, "slope", None)):
+            raise ValueError(f"expected data with a slope, as generation.data.Evidence, got {quoted(self.data)}")
+        for name, value in getattr(self.data, "__dict__", {}).items():
             if isinstance(value, Tensor):
                 check_shape(f"the data's {name}", value, self.grid)
+        Q = self.orientation
+        if Q is None:
+            return
+        if not isinstance(Q, Tensor) or tuple(Q.shape) != (3, 3) or not torch.equal(Q, Q.T):
+            raise ValueError(f"expected a symmetric orientation of shape (3, 3) (z, y, x), got {quoted(_plain(Q))}")
+
+    def _check_strengths(self) -> None:
+        """Coefficients and orientation, which is of a00's unit, with lengths in units of ε."""
+        ε = torch.as_tensor(self.epsilon, dtype=torch.float64)
+        named = {name: (value, POWERS[name]) for name, value in zip(NAMES, self.coefficients, strict=True)}
+        if self.orientation is not None:
+            named["the orientation"] = self.orientation, 2
+        for name, (value, power) in named.items():
+            check_strength(name, torch.as_tensor(value, dtype=torch.float64).detach().abs().max(), power, ε.max())
+
+
+def check_strength(name: str, value: float | Tensor, power: int, epsilon: float | Tensor) -> None:
+    """Raise ValueError where a coefficient, with lengths in units of ε, is over `STRONGEST`."""
+    size = float(abs(value) * epsilon**power)
+    if not size <= STRONGEST:
+        of = {0: "", 1: " epsilon", 2: " epsilon²"}[power]
+        raise ValueError(f"expected |{name}|{of} of at most {STRONGEST:g}, got {size:.3g}")
 
 
 def check_shape(name: str, value: Tensor, grid: Grid) -> None:
@@ -52,3 +116,7 @@ def check_shape(name: str, value: Tensor, grid: Grid) -> None:
         fits = False
     if not fits:
         raise ValueError(f"expected {name} to broadcast with the voxels {grid.shape}, got shape {tuple(value.shape)}")
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if isinstance(value, Tensor) else value

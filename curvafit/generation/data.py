@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Protocol, Self
 
 import torch
 from torch import Tensor
 
+from curvafit.priors.bounds import quoted
 from curvafit.priors.grid import Grid
 from curvafit.priors.shapes import Float
 
@@ -32,7 +32,9 @@ class _OfVoxels:
     ratio: Float[Tensor, "z y x"]
 
     def __post_init__(self) -> None:
-        if self.ratio.dim() != 3 or not math.isfinite(float(self.ratio.abs().max())):
+        if not isinstance(self.ratio, Tensor):
+            raise ValueError(f"expected finite evidence (Z, Y, X), got {quoted(self.ratio)}")
+        if self.ratio.dim() != 3 or not self.ratio.numel() or not bool(torch.isfinite(self.ratio).all()):
             got = f"one of shape {tuple(self.ratio.shape)} or not finite"
             raise ValueError(f"expected finite evidence (Z, Y, X), got {got}")
 

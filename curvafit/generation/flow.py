@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,6 +19,7 @@ from curvafit.generation.result import RECORD_EVERY, Callback, Flow, History, St
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.schedule import schedule as named_schedule
 from curvafit.generation.setup import Place, base_of
+from curvafit.priors.bounds import quoted, seed_of
 from curvafit.priors.coefficients import Coefficients, preset
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.shapes import Bool, Float
@@ -104,12 +106,14 @@ def generate(
     if isinstance(coefficients, str):
         named = preset(coefficients)
         coefficients, mass = named.coefficients, named.mass if mass is None and volume_fraction is None else mass
-    grid = grid if isinstance(grid, Grid) else Grid(grid)  # type: ignore[arg-type]
-    base, cost = base_of(mass, volume_fraction, grid), Cost(coefficients, grid, epsilon, orientation, blur)
+    grid, seed = grid if isinstance(grid, Grid) else Grid(grid), seed_of(seed)  # type: ignore[arg-type]
     place, plan = Place(backend, device, checkpoint, checkpoint_every, keep_checkpoint), named_schedule(schedule)
-    form = DivergenceForm.of(grid, blur, base, place.blur)
+    cost = Cost(coefficients, grid, epsilon, orientation, blur)
+    orders = Orders(grid, cost.epsilon, plan, callbacks, snapshots, reject_early, volume_fraction)
+    orders.check_memory(device)
+    base = base_of(mass, volume_fraction, grid)
+    form = DivergenceForm.of(grid, cost.blur, base, place.blur)
     moved = place.stepper(white_noise(grid, seed), form, cost, plan, "adam", None)
-    orders = Orders(grid, epsilon, plan, callbacks, snapshots, reject_early, volume_fraction)
     saved = place.saved(moved, cost, orders, seed=seed, mass=base)
     return run(moved, [orders], [seed], saved)[0]
 
@@ -143,7 +147,7 @@ def relax(
     """
     cost = Cost(coefficients, grid, epsilon, orientation, blur)
     place = Place(backend, device, checkpoint, checkpoint_every)
-    orders = Orders(grid, epsilon, named_schedule(schedule), callbacks, snapshots)
+    orders = Orders(grid, cost.epsilon, named_schedule(schedule), callbacks, snapshots)
     return _from_field(field, cost, place, "h-1", "adam", frozen, orders)
 
 
@@ -194,24 +198,30 @@ def descend(
     ValueError
         As `relax`, or if the flow or the optimiser has another name.
     """
-    if flow not in FORMS:
-        raise ValueError(f"expected a flow among {', '.join(FORMS)}, got {flow!r}")
+    if not isinstance(flow, str) or flow not in FORMS:
+        raise ValueError(f"expected a flow among {', '.join(FORMS)}, got {quoted(flow)}")
     plan = named_schedule(schedule, steps)
     if optimiser == "lbfgs":
         plan = Schedule("lbfgs", steps, 1.0, 1.0, "constant")
-    cost = Cost(coefficients, grid, epsilon, orientation, min(grid.spacing) if blur is None else blur, data)
+    width = min(grid.spacing) if blur is None and isinstance(grid, Grid) else blur
+    cost = Cost(coefficients, grid, epsilon, orientation, width, data)  # type: ignore[arg-type]
     place = Place(backend, device, checkpoint, checkpoint_every)
-    orders = Orders(grid, epsilon, plan, callbacks, snapshots)
+    orders = Orders(grid, cost.epsilon, plan, callbacks, snapshots)
     return _from_field(field, cost, place, flow, optimiser, None, orders)
 
 
 def _from_field(
     field: Tensor, cost: Cost, place: Place, flow: str, optimiser: str, frozen: Tensor | None, orders: Orders
 ) -> Flow:
-    field, grid, plan = torch.as_tensor(field).detach().to("cpu", torch.float32).contiguous(), cost.grid, orders.plan
+    grid, plan = cost.grid, orders.plan
     for name, values in (("field", field), ("frozen mask", frozen)):
-        if values is not None and tuple(values.shape) != grid.shape:
-            raise ValueError(f"expected a {name} of shape {grid.shape}, got {tuple(values.shape)}")
+        if name == "field" or values is not None:
+            if not isinstance(values, (Tensor, np.ndarray)):
+                raise ValueError(f"expected a {name} of shape {grid.shape}, got {quoted(values)}")
+            if tuple(values.shape) != grid.shape:
+                raise ValueError(f"expected a {name} of shape {grid.shape}, got {tuple(values.shape)}")
+    orders.check_memory(place.device)
+    field = torch.as_tensor(field).detach().to("cpu", torch.float32).contiguous()
     if not bool(torch.isfinite(field).all()):
         raise ValueError("expected a finite field, got NaN or infinity in it")
     form, start = FORMS[flow].at(field, grid, cost.blur, place.blur)

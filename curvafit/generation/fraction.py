@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from torch import Tensor
 
+from curvafit.priors.bounds import inside
+
 #: Mass is corrected from this part of the steps on: before, u's sign tells little of a shape's volume.
 BEGIN = 0.2
 #: Part of what is missing that one correction makes good, in a flow of so many steps or fewer: the longer a flow, the
@@ -26,8 +28,7 @@ def first_mass(share: float) -> float:
     ValueError
         If the share is not in (0, 1).
     """
-    if not 0 < share < 1:
-        raise ValueError(f"expected a volume fraction in (0, 1), got {share}")
+    share = inside(share, "a volume fraction in (0, 1)", 0, 1)
     return min(max(2 * share - 1, -BOUND), BOUND)
 
 

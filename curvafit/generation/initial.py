@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import torch
 
+from curvafit.generation.memory import FIELD, check_memory
+from curvafit.priors.bounds import seed_of
 from curvafit.priors.grid import Grid
 from curvafit.priors.shapes import Float
 
@@ -20,10 +22,9 @@ def white_noise(grid: Grid, seed: int, amplitude: float = AMPLITUDE) -> Float[to
     Raises
     ------
     ValueError
-        If the seed is not a whole number from 0.
+        If the seed is not a whole number from 0, or there are more voxels than memory holds.
     """
-    if int(seed) != seed or seed < 0:
-        raise ValueError(f"expected a seed that is a whole number from 0, got {seed}")
-    generator = torch.Generator().manual_seed(int(seed))
+    generator = torch.Generator().manual_seed(seed_of(seed))
+    check_memory((*grid.shape, 3), FIELD, "a box")
     noise = amplitude * torch.rand((3, *grid.shape), generator=generator, dtype=torch.float32)
     return noise if grid.periodic else noise - amplitude / 2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -9,14 +10,17 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from curvafit.generation import fraction
 from curvafit.generation.checkpoint import Checkpoint
+from curvafit.generation.memory import FIELD, FLOW, check_memory
 from curvafit.generation.result import RECORD_EVERY, Callback, Flow, History, State
 from curvafit.generation.schedule import Schedule
-from curvafit.generation.stepper import Shape, Stepper
+from curvafit.generation.stepper import Shape, Statistics, Stepper
 from curvafit.generation.viability import Viability, viability
+from curvafit.priors.bounds import quoted, several, whole
 from curvafit.priors.grid import Grid
 
 #: A flow whose energy falls by less than this share over its last tenth is called converged.
@@ -37,7 +41,7 @@ class Orders:
     Raises
     ------
     ValueError
-        If a snapshot is not among the plan's steps.
+        If a snapshot is not among the plan's steps, or a callback is not one.
     """
 
     grid: Grid
@@ -49,9 +53,19 @@ class Orders:
     volume_fraction: float | None = None
 
     def __post_init__(self) -> None:
-        wrong = [step for step in self.snapshots if step not in range(self.plan.steps + 1)]
-        if wrong:
-            raise ValueError(f"expected snapshots at 0 to {self.plan.steps} steps, got {wrong}")
+        for name in ("snapshots", "callbacks"):
+            object.__setattr__(self, name, several(getattr(self, name), name))
+        if wrong := [each for each in self.callbacks if not callable(each)]:
+            raise ValueError(f"expected callbacks that can be called, got {quoted(wrong[0])}")
+        most = self.plan.steps
+        snapshots = tuple(whole(step, f"snapshots at 0 to {most} steps", 0, most) for step in self.snapshots)
+        object.__setattr__(self, "snapshots", snapshots)
+
+    def check_memory(self, device: torch.device | str) -> None:
+        """Raise ValueError where a flow does not fit into a device's memory, or its snapshots into the machine's."""
+        check_memory(self.grid.shape, FLOW, "a box", device)
+        kept = len(set(self.snapshots))
+        check_memory(self.grid.shape, FIELD * kept, f"a box with {kept} snapshots")
 
     def next_mark(self, made: int) -> int:
         """The number of steps after which to look again."""
@@ -122,7 +136,8 @@ class _Lane:
         self.kept: dict[int, Tensor] = {}
         #: Why it stopped before the plan's end, and whether a callback asked for it.
         self.stop, self.asked = "", False
-        self._missed, self._stalled, self._field, self._mass = "", False, None, math.nan
+        self._missed, self._failure, self._stalled = "", "", False
+        self._field, self._mass = None, math.nan
 
     def settle(self) -> bool:
         """Make the share of volume exact at the end, where a small constant does it; whether one was added."""
@@ -156,6 +171,8 @@ class _Lane:
         """What came out."""
         assert self._field is not None
         orders, end = self._orders, self._viability(self._field)
+        if self._failure:
+            end = dataclasses.replace(end, viable=False, reason=self._failure)
         history = History(*np.array(self.rows, dtype=np.float64).T)
         status = self._status(end, history)
         return Flow(self._field, history, status, orders.grid, end, orders.plan, self._seed, self._mass, self.kept)
@@ -165,8 +182,9 @@ class _Lane:
         orders, shape, total = self._orders, self._shape, self._orders.plan.steps
         statistics, mass = shape.statistics(), shape.mass()
         self.rows.append([made, *statistics, mass])
-        if not math.isfinite(statistics.energy):
-            self.stop = f"stopped after {made} of {total} steps: the energy is not finite"
+        if what := _not_finite(statistics, mass):
+            self.stop = f"stopped after {made} of {total} steps: {what} is not finite"
+            self._failure = f"{what} is not finite"
             return
         if orders.callbacks:
             state = State(shape.field(), *statistics, mass)
@@ -194,3 +212,9 @@ class _Lane:
         return (
             f"{word} after {made} steps: the energy {way} by {100 * abs(fall):.2f} % over the last tenth{self._missed}"
         )
+
+
+def _not_finite(statistics: Statistics, mass: float) -> str:
+    """What of a flow's figures is infinite or NaN, as a sentence's subject."""
+    figures = {"the energy": [statistics.energy], "the gradient": statistics[1:], "the field": [mass]}
+    return next((name for name, values in figures.items() if not all(map(math.isfinite, values))), "")

@@ -63,3 +63,10 @@ class Flow:
     seed: int | None
     mass: float
     snapshots: Mapping[int, Tensor]
+
+    @property
+    def finite(self) -> bool:
+        """Whether energy, gradient and field stayed finite; the field is no shape where they did not."""
+        rows = [self.history.energy, self.history.gradient_max, self.history.gradient_mean, self.history.mass]
+        extent = [self.viability.highest, self.viability.lowest]
+        return bool(np.isfinite(np.concatenate([*rows, extent])).all())

@@ -7,6 +7,11 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+from curvafit.priors.bounds import quoted, real, whole
+
+#: The most steps that a flow may have, and the longest one.
+MOST_STEPS, LONGEST_STEP = 10**7, 1e6
+_BELOW_ONE = math.nextafter(1.0, 0.0)
 #: Steps after which the paper's runs were looked at (Experiment 4).
 _PAPER_CHECKS = (500, 1000, 5000)
 
@@ -20,9 +25,9 @@ class Schedule:
     name
         Recorded with every shape: a schedule can change which shape comes out.
     steps
-        How many; at least 1.
+        How many; 1 to 10 million.
     start, stop
-        First and last step length (Adam's learning rate).
+        First and last step length (Adam's learning rate), above 0 and at most 1e6.
     shape
         `"constant"` (at `start`) or `"cosine"` (half a period from `start` to `stop`).
     momentum, memory
@@ -32,7 +37,7 @@ class Schedule:
     Raises
     ------
     ValueError
-        If there is no step, a length is not positive, or the shape has another name.
+        If a number is out of range, or the shape has another name.
     """
 
     name: str
@@ -44,15 +49,17 @@ class Schedule:
     memory: float = 0.999
 
     def __post_init__(self) -> None:
-        if int(self.steps) != self.steps or self.steps < 1:
-            raise ValueError(f"expected a whole number of steps, at least 1, got {self.steps}")
-        if not (0 < self.start < math.inf and 0 < self.stop < math.inf):
-            raise ValueError(f"expected positive step lengths, got {self.start} and {self.stop}")
+        if not isinstance(self.name, str):
+            raise ValueError(f"expected a schedule's name as text, got {quoted(self.name)}")
+        steps = whole(self.steps, "a whole number of steps, at least 1", 1, MOST_STEPS)
+        object.__setattr__(self, "steps", steps)
+        for name in ("start", "stop"):
+            length = real(getattr(self, name), "positive step lengths", 1e-30, LONGEST_STEP)
+            object.__setattr__(self, name, length)
         if self.shape not in ("constant", "cosine"):
-            raise ValueError(f"expected a schedule's shape 'constant' or 'cosine', got {self.shape!r}")
+            raise ValueError(f"expected a schedule's shape 'constant' or 'cosine', got {quoted(self.shape)}")
         for name in ("momentum", "memory"):
-            if not 0 <= getattr(self, name) < 1:
-                raise ValueError(f"expected {name} in [0, 1), got {getattr(self, name)}")
+            object.__setattr__(self, name, real(getattr(self, name), f"{name} in [0, 1)", 0, _BELOW_ONE))
 
     def rate(self, step: int) -> float:
         """Length of step 0 … steps - 1."""
@@ -90,7 +97,7 @@ def schedule(name: str | Schedule, steps: int | None = None) -> Schedule:
         If there is no schedule of that name.
     """
     if not isinstance(name, Schedule):
-        if name not in SCHEDULES:
-            raise ValueError(f"expected a schedule among {', '.join(SCHEDULES)}, got {name!r}")
+        if not isinstance(name, str) or name not in SCHEDULES:
+            raise ValueError(f"expected a schedule among {', '.join(SCHEDULES)}, got {quoted(name)}")
         name = SCHEDULES[name]
     return name if steps is None else dataclasses.replace(name, steps=steps)

@@ -17,6 +17,7 @@ from curvafit.generation.parametrization import Blur, DivergenceForm, Form
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.stepper import LbfgsStepper, Stepper, TorchStepper
 from curvafit.priors import kernels, stencils
+from curvafit.priors.bounds import inside, quoted, real
 from curvafit.priors.grid import Grid
 
 
@@ -27,7 +28,7 @@ class Place:
     Raises
     ------
     ValueError
-        If the backend is unknown.
+        If the backend or the device is unknown, or the seconds between checkpoints are negative or not finite.
     """
 
     backend: str
@@ -38,7 +39,11 @@ class Place:
 
     def __post_init__(self) -> None:
         if self.backend not in ("auto", "torch", "fused"):
-            raise ValueError(f"expected a backend 'auto', 'torch' or 'fused', got {self.backend!r}")
+            raise ValueError(f"expected a backend 'auto', 'torch' or 'fused', got {quoted(self.backend)}")
+        check_device(self.device)
+        if self.checkpoint is not None and not isinstance(self.checkpoint, (str, Path)):
+            raise ValueError(f"expected a path for the checkpoint, got {quoted(self.checkpoint)}")
+        real(self.every, "a finite number of seconds between checkpoints, at least 0", 0)
 
     @property
     def blur(self) -> Blur:
@@ -56,7 +61,7 @@ class Place:
             If the optimiser is unknown, or a fused kernel is asked for and there is none.
         """
         if optimiser not in ("adam", "lbfgs"):
-            raise ValueError(f"expected an optimiser 'adam' or 'lbfgs', got {optimiser!r}")
+            raise ValueError(f"expected an optimiser 'adam' or 'lbfgs', got {quoted(optimiser)}")
         able, betas = kernels.fused(self.device), plan.betas
         if self.backend == "fused" and not able:
             raise ValueError(f"expected a device with fused kernels (and numba or triton), got {self.device}")
@@ -78,6 +83,30 @@ class Place:
         return Checkpoint(self.checkpoint, self.every, identity(**vars(cost), **mine, **where, **more), self.keep)
 
 
+def kind_of(device: torch.device | str) -> str:
+    """`"cpu"`, `"cuda"`, …
+
+    Raises
+    ------
+    ValueError
+        If the device has no known name.
+    """
+    try:
+        return torch.device(device).type
+    except (RuntimeError, TypeError) as error:
+        raise ValueError(f"expected a device, such as 'cpu' or 'cuda', got {quoted(device)}") from error
+
+
+def check_device(device: torch.device | str) -> None:
+    """Raise ValueError where torch can't compute on a device."""
+    try:
+        known = torch.zeros(1, device=device).add(1).item() == 1
+    except (RuntimeError, TypeError, AssertionError, NotImplementedError):
+        known = False
+    if not known:
+        raise ValueError(f"expected a device that torch computes on, such as 'cpu' or 'cuda', got {quoted(device)}")
+
+
 def base_of(mass: float | Tensor | None, share: float | None, grid: Grid) -> float | Tensor:
     """The base of div A: the mass, a field of it `(Z, Y, X)`, or a first estimate for a share of volume.
 
@@ -87,13 +116,12 @@ def base_of(mass: float | Tensor | None, share: float | None, grid: Grid) -> flo
         If not exactly one of the two is given, or it is out of range or shape.
     """
     if (mass is None) == (share is None):
-        raise ValueError(f"expected either a mass or a volume fraction, got {mass} and {share}")
+        raise ValueError(f"expected either a mass or a volume fraction, got {'neither' if mass is None else 'both'}")
     if share is not None:
         return fraction.first_mass(share)
-    values = torch.as_tensor(mass)
-    if not bool((values.abs() < 1).all()):
-        raise ValueError(f"expected a mass in (-1, 1), got {float(values.min())} to {float(values.max())}")
-    if values.dim() == 0:
-        return float(mass)  # type: ignore[arg-type]
-    check_shape("mass", values, grid)
-    return values.detach().to("cpu", torch.float32).expand(grid.shape).contiguous()
+    if not isinstance(mass, Tensor) or mass.dim() == 0:
+        return inside(mass, "a mass in (-1, 1)", -1, 1)
+    check_shape("mass", mass, grid)
+    if not bool((mass.abs() < 1).all()):
+        raise ValueError(f"expected a mass in (-1, 1), got {float(mass.min())} to {float(mass.max())}")
+    return mass.detach().to("cpu", torch.float32).expand(grid.shape).contiguous()

@@ -65,9 +65,9 @@ def _reason(ratio: float, highest: float, lowest: float) -> str:
     if not (math.isfinite(highest) and math.isfinite(lowest)):
         return "the field is not finite"
     if not highest > PHASE_LIMIT:
-        return f"no inside: the field's maximum is {highest:.3f}, at most {PHASE_LIMIT}"
+        return f"no inside: the field's maximum is {highest:.3g}, at most {PHASE_LIMIT}"
     if not lowest < -PHASE_LIMIT:
-        return f"no outside: the field's minimum is {lowest:.3f}, at least {-PHASE_LIMIT}"
+        return f"no outside: the field's minimum is {lowest:.3g}, at least {-PHASE_LIMIT}"
     if not ratio < DISCREPANCY_LIMIT:
         return f"no interface profile: the discrepancy ratio is {ratio:.3f}, at least {DISCREPANCY_LIMIT}"
     return ""

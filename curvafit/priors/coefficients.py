@@ -10,6 +10,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from curvafit.priors.bounds import LONGEST, SHORTEST, quoted, real
+
 #: Names in the paper's order: κ1², κ1κ2, κ2², κ1, κ2, 1.
 NAMES = ("a20", "a11", "a02", "a10", "a01", "a00")
 
@@ -38,10 +40,10 @@ class Coefficients:
         for name in NAMES:
             value = getattr(self, name)
             if not isinstance(value, Tensor):
-                object.__setattr__(self, name, float(value))
-            if not bool(torch.isfinite(torch.as_tensor(value, dtype=torch.float64)).all()):
-                got = "numbers that are not" if isinstance(value, Tensor) and value.dim() > 0 else value
-                raise ValueError(f"expected finite coefficients, got {name} = {got}")
+                object.__setattr__(self, name, real(value, f"a finite coefficient {name}"))
+            elif value.is_complex() or not bool(torch.isfinite(value).all()):
+                got = "numbers that are not" if value.dim() > 0 else quoted(value.item())
+                raise ValueError(f"expected a finite coefficient {name}, got {got}")
         least = [float(torch.as_tensor(a, dtype=torch.float64).detach().min()) for a in (self.a20, self.a02)]
         if min(least) <= 0:
             warnings.warn(
@@ -69,8 +71,7 @@ class Coefficients:
     def in_unit(self, unit: float) -> Coefficients:
         """The same energy with lengths measured in multiples of `unit` (old lengths): quadratic part kept,
         linear × unit, constant × unit². Working units to physical ones is `in_unit(0.01 / working voxel)`."""
-        if not unit > 0:
-            raise ValueError(f"expected a positive length unit, got {unit}")
+        unit = real(unit, "a positive length unit", SHORTEST, LONGEST)
         a20, a11, a02, a10, a01, a00 = self
         return Coefficients(a20, a11, a02, a10 * unit, a01 * unit, a00 * unit**2)
 
@@ -155,6 +156,6 @@ def preset(name: str) -> Preset:
     ValueError
         If the name is not one of `PRESETS`.
     """
-    if name not in PRESETS:
-        raise ValueError(f"expected a preset among {', '.join(PRESETS)}, got {name!r}")
+    if not isinstance(name, str) or name not in PRESETS:
+        raise ValueError(f"expected a preset among {', '.join(PRESETS)}, got {quoted(name)}")
     return PRESETS[name]

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from curvafit.priors.bounds import quoted, real, several
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.curvature import Jet, diffuse_curvatures, jet, second_form
 from curvafit.priors.grid import Grid
@@ -78,11 +79,12 @@ def orientation(direction: Sequence[int | float] | Tensor, strength: int | float
     ValueError
         If the direction is not three finite numbers that are not all 0, or the strength is not finite.
     """
-    θ = torch.as_tensor(direction, dtype=torch.float64)
+    said = "a direction of 3 finite numbers (z, y, x), not all 0"
+    θ = torch.tensor([real(part, said, of=direction) for part in several(direction, "3 numbers")], dtype=torch.float64)
     if tuple(θ.shape) != (3,) or not bool(torch.isfinite(θ).all()) or not bool(θ.any()):
-        raise ValueError(f"expected a direction of 3 finite numbers (z, y, x), not all 0, got {direction}")
-    if not math.isfinite(strength):
-        raise ValueError(f"expected a finite strength, got {strength}")
+        raise ValueError(f"expected {said}, got {quoted(direction)}")
+    strength = real(strength, "a finite strength")
+    θ = θ * 2.0 ** -math.frexp(float(θ.abs().max()))[1]  # exact, and its square is finite
     θ = θ / θ.norm()
     return strength * torch.outer(θ, θ)
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
+
+from curvafit.priors.bounds import LONGEST, SHORTEST, quoted, real, whole
 
 Boundary = Literal["periodic", "replicate"]
 
@@ -14,6 +16,8 @@ METRES = {"nm": 1e-9, "um": 1e-6, "mm": 1e-3, "m": 1.0}
 WORKING_SPACING = 0.01
 #: Interface parameter ε in working units (two voxels), likewise.
 WORKING_EPSILON = 0.02
+#: Voxels that an axis may have: what a signed 64-bit number holds.
+MOST = 2**63 - 1
 
 
 @dataclass(frozen=True)
@@ -23,9 +27,9 @@ class Grid:
     Parameters
     ----------
     shape
-        Voxels along (z, y, x); each at least 4.
+        Voxels along (z, y, x), each at least 4; a number means a cube.
     spacing
-        Voxel edges along (z, y, x), in one length unit; a number means a cube.
+        Voxel edges along (z, y, x), in one length unit, from 1e-12 to 1e12; a number means a cube.
     boundary
         `"periodic"`: the box repeats. `"replicate"`: the field continues as its mirror image in each face
         (for stencils that reach one voxel this is edge replication, i.e. ∇u·n = 0).
@@ -33,7 +37,7 @@ class Grid:
     Raises
     ------
     ValueError
-        If a shape or spacing is not three positive numbers or the boundary has another name.
+        If a shape or spacing is not three numbers in range or the boundary has another name.
     """
 
     shape: tuple[int, int, int]
@@ -41,16 +45,13 @@ class Grid:
     boundary: Boundary = "periodic"
 
     def __post_init__(self) -> None:
-        shape = _triple(self.shape, "shape")
-        spacing = _triple(self.spacing, "spacing")
-        if any(int(n) != n or n < 4 for n in shape):
-            raise ValueError(f"expected a shape of 3 whole numbers, each at least 4, got {tuple(self.shape)}")
-        if any(not math.isfinite(h) or h <= 0 for h in spacing):
-            raise ValueError(f"expected a spacing of 3 positive numbers (z, y, x), got {tuple(spacing)}")
+        said = "a shape of 3 whole numbers, each at least 4", "a spacing of 3 positive numbers (z, y, x)"
+        shape = tuple(whole(n, said[0], 4, MOST, of=self.shape) for n in _triple(self.shape))
+        spacing = tuple(real(h, said[1], SHORTEST, LONGEST, of=self.spacing) for h in _triple(self.spacing))
         if self.boundary not in ("periodic", "replicate"):
-            raise ValueError(f"expected boundary 'periodic' or 'replicate', got {self.boundary!r}")
-        object.__setattr__(self, "shape", tuple(int(n) for n in shape))
-        object.__setattr__(self, "spacing", tuple(float(h) for h in spacing))
+            raise ValueError(f"expected boundary 'periodic' or 'replicate', got {quoted(self.boundary)}")
+        object.__setattr__(self, "shape", shape)
+        object.__setattr__(self, "spacing", spacing)
 
     @property
     def voxel_volume(self) -> float:
@@ -67,13 +68,11 @@ class Grid:
         return self.boundary == "periodic"
 
 
-def _triple(value: object, name: str) -> tuple:
-    if isinstance(value, (int, float)):
-        return (value,) * 3
+def _triple(value: Any) -> tuple:
+    """Three parts of three, or of one; none, where there are others."""
+    single = isinstance(value, str) or not hasattr(value, "__iter__") or getattr(value, "shape", None) == ()
     try:
-        triple = tuple(value)  # type: ignore[arg-type]
+        parts = (value,) * 3 if single else tuple(value)
     except TypeError:
-        triple = ()
-    if len(triple) != 3:
-        raise ValueError(f"expected {name} as 3 numbers (z, y, x) or one, got {value!r}")
-    return triple
+        parts = ()
+    return parts if len(parts) == 3 else (None,) * 3

@@ -1,0 +1,62 @@
+"""How the command line refuses: one sentence on the error stream and exit code 2, whoever found the mistake."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any, NoReturn
+
+import typer
+from rich.console import Console
+from typer.core import TyperGroup
+
+from curvafit.interrupts import exit_code
+
+#: Characters of a sentence: a quotation that makes it longer is cut in its middle.
+LONGEST = 700
+#: What typer raises where an option does not parse; its name, and where it is from, change with typer's versions.
+_Refusal: type[Exception] = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
+
+
+class Commands(TyperGroup):
+    """A group whose mistakes in use are one line, as all others."""
+
+    def main(self, *args: Any, standalone_mode: bool = True, **more: Any) -> Any:
+        """Run a command and leave, as `click.Group.main`."""
+        if not standalone_mode:
+            return super().main(*args, standalone_mode=False, **more)
+        try:
+            code = super().main(*args, standalone_mode=False, **more)
+        except _Refusal as error:
+            if type(error).__name__ == "NoArgsIsHelpError":
+                error.show()  # type: ignore[attr-defined]
+                sys.exit(2)
+            _leave(error)
+        except typer.Abort as error:  # a signal while no command was at work
+            signal = error.__cause__
+            sys.exit(exit_code(signal) if isinstance(signal, KeyboardInterrupt) else 1)
+        sys.exit(code if isinstance(code, int) else 0)
+
+
+def sentence(text: str, start: str = "error") -> str:
+    """A message on one line, of a sane length, in signs that show: others are escaped."""
+    line = " ".join(text.split())
+    line = "".join(sign if sign.isprintable() else sign.encode("unicode_escape").decode() for sign in line)
+    if len(line) > LONGEST:
+        line = f"{line[: LONGEST * 2 // 3]} … {line[-LONGEST // 3 :]}"
+    return f"{start}: {line}"
+
+
+def writable(text: str, console: Console) -> str:
+    """Text in signs that a stream's encoding has: others are escaped."""
+    return text.encode(console.encoding, "backslashreplace").decode(console.encoding)
+
+
+def _leave(error: Any) -> NoReturn:
+    """Say what typer found, and the command whose help tells more."""
+    text = error.format_message().rstrip(".")
+    context = getattr(error, "ctx", None)
+    more = f" (see {context.command_path} --help)" if context is not None else ""
+    console = Console(stderr=True, highlight=False)
+    told = writable(sentence(f"{text[:1].lower()}{text[1:]}{more}"), console)
+    console.print(told, markup=False, soft_wrap=True)
+    sys.exit(2)
