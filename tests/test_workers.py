@@ -6,6 +6,7 @@ import errno
 import os
 import random
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -20,6 +21,7 @@ from curvafit.data_synth.census import verify
 from curvafit.generation.schedule import schedule
 
 distributed = pytest.importorskip("distributed", reason="needs dask.distributed")
+psutil = pytest.importorskip("psutil")
 CommClosedError = pytest.importorskip("distributed.comm").CommClosedError
 
 COUNT, EDGE, PLAN = 8, 16, schedule("fast", steps=60)
@@ -102,8 +104,25 @@ def test_workers_here_leave_the_interrupt_to_the_build_and_may_be_gone_for_a_whi
     with cluster(1) as crew:
         heard = crew._client.run(lambda: signal.getsignal(signal.SIGINT))
         assert set(heard.values()) == {signal.SIG_IGN}
+        assert listening() == {"127.0.0.1"}
         crew._client = types.SimpleNamespace(nthreads=dict)
         assert crew.places == 1
+
+
+@pytest.mark.slow
+def test_dasks_own_page_is_shown_on_the_loopback_where_it_is_asked_for():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+    with cluster(1, dashboard=port) as crew:
+        assert crew._client.dashboard_link == f"http://127.0.0.1:{port}/status"
+        assert listening() == {"127.0.0.1"}
+
+
+def listening() -> set[str]:
+    """The addresses on which this process and its children wait for others."""
+    here = psutil.Process()
+    sockets = (each for process in (here, *here.children(recursive=True)) for each in process.net_connections("inet"))
+    return {each.laddr.ip for each in sockets if each.status == psutil.CONN_LISTEN}
 
 
 def test_without_dask_the_line_to_type_is_said(monkeypatch):
