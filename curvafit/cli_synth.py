@@ -126,7 +126,7 @@ def _build(out: Path, order: Order, count: int, workers: int | None, scheduler: 
 
     check_folder(out)
     if scheduler is None and order.recipe.source.within == math.inf:
-        check_memory(order.recipe.largest, FLOW, "shapes")
+        check_memory(order.recipe.largest, FLOW, "a shape")
     with kept(), stages() as progress:
         progress("starting workers", 0.0)
         with cluster(workers, scheduler) as crew:
