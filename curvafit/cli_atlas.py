@@ -72,7 +72,7 @@ def build_atlas(
         check_count(count, 1)
         check_workers(workers, scheduler)
         if scheduler is None:
-            check_memory(box, FLOW, "shapes")
+            check_memory(box, FLOW, "a shape")
         settings = settings_of(box, seed, schedule, law)
         if store.exists():
             open_store(store, settings)

@@ -133,7 +133,7 @@ def _build(out: Path, order: Order, count: int, how: tuple[int | None, str | Non
     check_folder(out)
     _, scheduler, _ = how
     if scheduler is None and order.recipe.source.within == math.inf:
-        check_memory(order.recipe.largest, FLOW, "shapes")
+        check_memory(order.recipe.largest, FLOW, "a shape")
     with kept(), stages() as progress:
         progress("starting workers", 0.0)
         with cluster(*how) as crew:

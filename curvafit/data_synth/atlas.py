@@ -74,7 +74,7 @@ def build(
     """
     check_count(count, 1)
     if workers is None:
-        check_memory(Grid(shape).shape, FLOW, "shapes")  # type: ignore[arg-type]
+        check_memory(Grid(shape).shape, FLOW, "a shape")  # type: ignore[arg-type]
     settings = settings_of(shape, seed, schedule, design)
     return _filled(open_store(store_path, settings), count, workers or Here(), progress)
 
@@ -106,7 +106,7 @@ def settings_of(
 ) -> Settings:
     """The settings of the store that `build` makes of these."""
     grid = Grid(shape)  # type: ignore[arg-type]
-    check_memory(grid.shape, FILE, "shapes")
+    check_memory(grid.shape, FILE, "a shape")
     plan, law = dataclasses.asdict(named_schedule(schedule)), design or boxed()
     law.draw(seed, 0)  # refuses a wrong seed, before a store is made
     return Settings(grid.shape, grid.spacing, WORKING_EPSILON, WORKING_BLUR, law.as_dict(), seed_of(seed), plan)

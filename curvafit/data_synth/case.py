@@ -19,7 +19,7 @@ from curvafit.priors.bounds import LONGEST, SHORTEST, quoted, real, seed_of, sev
 TRIES = 8
 #: Voxels that a shape may have.
 MOST = 10**9
-#: Voxels that a shape has along its longest edge at least.
+#: Voxels that a shape has along each edge at least, or a crop of one along its longest.
 FEWEST = 4
 #: Least and greatest calibre.
 CALIBRES = (1e-3, 1e3)
@@ -164,7 +164,7 @@ def check_crop(source: Source, shape: Sequence[int], voxel: float, modality: Mod
     need = field_shape(shape, voxel, modality.base)
     if not 1 < math.prod(shape) <= MOST:
         raise ValueError(f"expected images of 2 to {MOST:.0e} voxels, got {' x '.join(map(str, shape))}")
-    if max(need) < FEWEST:
+    if (min if source.within == math.inf else max)(need) < FEWEST:
         told, unit = " x ".join(map(str, need)), modality.base.unit
         raise ValueError(
             f"expected images that span {FEWEST} voxels of a shape or more, got {told}: is a voxel of {voxel:g} {unit} "

@@ -99,7 +99,7 @@ def _jobs(coefficients, masses, seeds) -> list[_Job]:
 def _together(jobs: list[_Job], grid: Grid, told: dict[str, Any]) -> list[Flow]:
     """Shapes that share a device's steps."""
     plan = told["schedule"]
-    check_memory((len(jobs), *grid.shape), DEVICE, "shapes made together", told["device"])
+    check_memory((len(jobs), *grid.shape), DEVICE, "a batch", told["device"])
     costs = [Cost(job.coefficients, grid, told["epsilon"], told["orientation"], told["blur"]) for job in jobs]
     forms = [
         DivergenceForm.of(grid, told["blur"], base_of(job.mass, None, grid), kernels.gaussian_blur) for job in jobs

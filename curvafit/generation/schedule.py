@@ -7,11 +7,10 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from curvafit.priors.bounds import quoted, real, whole
+from curvafit.priors.bounds import inside, quoted, real, whole
 
 #: The most steps that a flow may have, and the longest one.
 MOST_STEPS, LONGEST_STEP = 10**7, 1e6
-_BELOW_ONE = math.nextafter(1.0, 0.0)
 #: Steps after which the paper's runs were looked at (Experiment 4).
 _PAPER_CHECKS = (500, 1000, 5000)
 
@@ -59,7 +58,7 @@ class Schedule:
         if self.shape not in ("constant", "cosine"):
             raise ValueError(f"expected a schedule's shape 'constant' or 'cosine', got {quoted(self.shape)}")
         for name in ("momentum", "memory"):
-            object.__setattr__(self, name, real(getattr(self, name), f"{name} in [0, 1)", 0, _BELOW_ONE))
+            object.__setattr__(self, name, inside(getattr(self, name), f"{name} in [0, 1)", -math.ulp(0), 1))
 
     def rate(self, step: int) -> float:
         """Length of step 0 … steps - 1."""
