@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numba import get_num_threads, set_num_threads
 
-from curvafit.priors.curvature import ROOT_FLOOR, XI
+from curvafit.priors.curvature import ROOT_FLOOR, ROOT_ROUNDING, XI
 from curvafit.priors.grid import Grid
 from curvafit.priors.kernels import loops
 from curvafit.priors.kernels.loops import EDGE, NARROW, SLACK, TAPS, TOGETHER, WIDE
@@ -393,14 +393,16 @@ def _weights(a, grid: Grid, epsilon) -> list:
 
 
 def _density_constants(weights: list, grid: Grid) -> np.ndarray:
-    """ξ² and small numbers, then the weights, where they do not vary, as the loops take them: see `loops._cost`."""
+    """ξ² and small numbers, then the weights, where they do not vary, as the loops take them (see `loops._cost`), and
+    the share of the squares that rounding leaves undecided."""
     h = grid.spacing[2]
     well, *rest = (float(value) if np.ndim(value) == 0 else math.nan for value in weights)
     low = ROOT_FLOOR * h**2
     varies = any(np.ndim(value) > 0 for value in weights)
     X, T2, *_, s = rest
     small = ((2 * h * XI) ** 2, 0, 0.5, 0.25, 1, 2, 3)
-    return np.array([*small, well, low if varies else low * well, *rest, 2 * X, 2 * T2, 2 * s], np.float32)
+    numbers = [*small, well, low if varies else low * well, *rest, 2 * X, 2 * T2, 2 * s, ROOT_ROUNDING]
+    return np.array(numbers, np.float32)
 
 
 def _local(weights: list, block: int, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
