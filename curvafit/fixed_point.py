@@ -21,7 +21,7 @@ from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
 from curvafit.priors.shapes import Float
 from curvafit.priors.stencils import gaussian_blur, gradient
-from curvafit.refinement import Progress, Refinement, double_precision_on_cpu, named
+from curvafit.refinement import Progress, Refinement, called, double_precision_on_cpu, named
 from curvafit.regrid import rich_boxes, surface_voxels
 from curvafit.stationarity import energy_gradients
 
@@ -220,24 +220,19 @@ def _minimise(flow: ShortFlow, begin: np.ndarray, steps: int) -> _End:
         import optimistix
 
         visited = [np.array(begin, dtype=np.float64)]
-        shape = jax.ShapeDtypeStruct((flow.size,), jnp.float64)
-        wide = jax.ShapeDtypeStruct((flow.size, len(_SIZES)), jnp.float64)
 
         def value(free):
-            visited.append(np.array(free, dtype=np.float64))
-            return flow.residual(visited[-1]) / _UNIT
-
-        def slope_of(free):
-            return flow.jacobian(np.array(free, dtype=np.float64)) / _UNIT
+            visited.append(free)
+            return flow.residual(free) / _UNIT
 
         @jax.custom_jvp
         def residual(free):
-            return jax.pure_callback(value, shape, free)
+            return called(value, (flow.size,), free)
 
         @residual.defjvp
         def residual_jvp(primals, tangents):
             (free,), (change,) = primals, tangents
-            slope = jax.pure_callback(slope_of, wide, free)
+            slope = called(lambda free: flow.jacobian(free) / _UNIT, (flow.size, len(_SIZES)), free)
             return residual(free), slope @ change
 
         solver = optimistix.LevenbergMarquardt(rtol=1e-3, atol=1e-3)

@@ -76,13 +76,31 @@ def named(deviations: Sequence[float] | np.ndarray) -> dict[str, float]:
 
 @contextmanager
 def double_precision_on_cpu():
-    """JAX in float64 on the CPU while inside, in every thread: callbacks run in another one. Restored at the end."""
+    """JAX in float64 on the CPU while inside, in this thread alone: what else the program does with JAX goes on as it is.
+
+    What JAX calls back runs in another one: see `called`.
+    """
     import jax
 
-    before = jax.config.read("jax_enable_x64")
-    jax.config.update("jax_enable_x64", True)
-    try:
-        with jax.default_device(jax.devices("cpu")[0]):
-            yield
-    finally:
-        jax.config.update("jax_enable_x64", before)
+    if hasattr(jax, "enable_x64"):
+        double_precision = jax.enable_x64
+    else:  # an earlier JAX
+        from jax.experimental import enable_x64 as double_precision
+    with double_precision(True), jax.default_device(jax.devices("cpu")[0]):
+        yield
+
+
+def called(function: Callable[[np.ndarray], np.ndarray], shape: tuple[int, ...], values):
+    """A NumPy function of a vector, called from within JAX; both in float64.
+
+    JAX calls it in a thread where arrays may be rounded to float32, so that the numbers go in and out as pairs of words.
+    """
+    import jax
+
+    def of_words(pairs):
+        free = np.array(pairs, dtype=np.uint32).view(np.float64).reshape(-1)
+        return np.array(function(free), dtype=np.float64, order="C").view(np.uint32).reshape(*shape, 2)
+
+    pairs = jax.lax.bitcast_convert_type(values, np.uint32)
+    found = jax.pure_callback(of_words, jax.ShapeDtypeStruct((*shape, 2), np.uint32), pairs)
+    return jax.lax.bitcast_convert_type(found, np.float64)

@@ -13,6 +13,8 @@ import numba
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
+from curvafit.priors.kernels import threads
+
 #: Colour of the level set and of the cut faces, linear in [0, 1].
 SURFACE = (0.945, 0.865, 0.715)
 CAP = (0.86, 0.64, 0.47)
@@ -91,6 +93,7 @@ def render(
     light = np.array(KEY_LIGHT) / np.linalg.norm(KEY_LIGHT) @ camera.frame
     colours = np.array(SURFACE), np.array(CAP)
     pixels = np.zeros((*size, 4), dtype=np.float32)
+    threads.start()
     _draw(pixels, field, smooth, near, far, _blocks(field), edges, top, camera.frame, half, light, *colours)
     return _reduced(pixels, supersample), camera
 

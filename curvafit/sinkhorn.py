@@ -25,6 +25,8 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
+from curvafit.priors.kernels import threads
+
 #: All of fast-math but the leave to assume that no value is NaN or infinite.
 _SERIAL = {
     "cache": True,
@@ -90,6 +92,7 @@ def costs(
     ε, kept = _schedule(measures, first, second, blur)
     ρ = math.inf if reach is None else reach**2
     found = np.empty(len(first))
+    threads.start()
     _costs(measures.x, measures.y, measures.log2, measures.bounds, first, second, ε, kept, ρ, found)
     return found
 

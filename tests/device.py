@@ -18,6 +18,7 @@ from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.energy import energy, orientation
 from curvafit.priors.grid import Grid
 from curvafit.priors.kernels import cuda
+from curvafit.priors.profile import optimal_profile
 from curvafit.priors.stencils import divergence, gaussian_blur
 
 FLOATS = (torch.float64, torch.float32)
@@ -159,6 +160,19 @@ def check_energy(device: str, tuning: cuda.Tuning) -> None:
             assert error.max() < 1e-3, error.max()  # where X in √X⁺ crosses zero, 1/√X magnifies what is rounded off
 
 
+def check_umbilics(device: str, tuning: cuda.Tuning) -> None:
+    """A ball whose surface u = 0 meets voxels on the axes: the root's derivative is taken as 0 there, in any rounding."""
+    grid = Grid((7, 7, 7), 0.01, "replicate")
+    z, y, x = torch.meshgrid(*[torch.arange(7, dtype=torch.float64) - 3] * 3, indexing="ij")
+    r2 = z**2 + y**2 + x**2
+    u = optimal_profile(0.01 * (2 - r2.sqrt()), EPSILON).float()[None]
+    on_axes = ((r2 == 4) & (z * y == 0) & (y * x == 0) & (z * x == 0))[None]
+    exact = gradient(u.double(), a_shape(NUMBERS[1:]), grid, EPSILON, None)[1][on_axes]
+    _, slope = cuda.energy_gradient(u.to(device), NUMBERS[1:], grid, EPSILON, tuning=tuning)
+    assert len(exact) == 6
+    assert (slope.double().cpu()[on_axes] - exact).abs().max() < 1e-3 * exact.abs().max()
+
+
 def gradient(u: Tensor, a: Coefficients, grid: Grid, epsilon, turned, mask=None) -> tuple[Tensor, Tensor]:
     free = u.detach().requires_grad_()
     value = energy(free, a, grid, epsilon, turned, mask)
@@ -170,6 +184,7 @@ CHECKS = {
     "mirrors": (check_mirrors, cuda.Tuning(5, 4, 4, width=1, lanes=64)),
     "wide blur": (check_wide_blur, cuda.Tuning(4, 4, 4, width=2, lanes=32)),
     "energy": (check_energy, cuda.Tuning(4, 2, 3, lanes=32)),
+    "umbilics": (check_umbilics, cuda.Tuning(4, 2, 3, lanes=32)),
 }
 
 

@@ -14,7 +14,6 @@ from curvafit.priors.curvature import (
     geometric_curvatures,
     jet,
     second_form,
-    smooth_positive,
 )
 from curvafit.priors.grid import Grid
 
@@ -157,11 +156,3 @@ def test_constant_fields_have_finite_curvatures_and_gradients() -> None:
             assert all(bool(torch.isfinite(part).all()) for part in found)
         (slope,) = torch.autograd.grad(second_form(jet(u, grid), 2.0).root.sum(), u)
         assert bool(torch.isfinite(slope).all())
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_smooth_positive_part(dtype: torch.dtype) -> None:
-    x = torch.tensor([-1.0, -1e-4, 0.0, 1e-4, 1.0], dtype=dtype)
-    torch.testing.assert_close(
-        smooth_positive(x), torch.tensor([0, 0, 6.931e-7, 1e-4, 1], dtype=dtype), rtol=1e-3, atol=1e-12
-    )

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import nibabel
 import numpy as np
 import pytest
 import torch
 
-from curvafit.fixed_point import ShortFlow, _parameters, fixed_point, sharpened
+from curvafit.fixed_point import ShortFlow, _minimise, _parameters, fixed_point, sharpened
 from curvafit.generation.flow import generate
 from curvafit.priors.coefficients import Coefficients, preset
 from curvafit.priors.grid import WORKING_EPSILON, Grid
@@ -100,3 +102,40 @@ def test_an_unknown_kind_and_no_start_are_refused(mask_phase: torch.Tensor) -> N
         refine(mask_phase, GRID, WORKING_EPSILON, kind="mesh", starts=[Coefficients(1, 2, 1)])
     with pytest.raises(ValueError, match="expected at least one start"):
         refine(mask_phase, GRID, WORKING_EPSILON, kind="mask", starts=[])
+
+
+class Bowl:
+    """In ShortFlow's place: a bowl, which notes where it was asked and what precision another thread has meanwhile."""
+
+    size = 5
+
+    def __init__(self) -> None:
+        self.asked: list[np.ndarray] = []
+        self.precisions: set[bool] = set()
+
+    def residual(self, free: np.ndarray) -> np.ndarray:
+        import jax
+
+        self.asked.append(free)
+        with ThreadPoolExecutor(1) as elsewhere:
+            self.precisions.add(elsewhere.submit(jax.config.read, "jax_enable_x64").result())
+        return (free - 0.3).astype(np.float32)
+
+    def jacobian(self, free: np.ndarray) -> np.ndarray:
+        return np.eye(self.size)
+
+
+def test_a_fit_in_float64_leaves_jax_as_it_is() -> None:
+    """As other threads see it while the fit runs, and afterwards, though two fits run at once."""
+    import jax
+    import jax.numpy as jnp
+
+    before, bowls, starts = jax.config.read("jax_enable_x64"), (Bowl(), Bowl()), (0.1, 0.7)
+    with ThreadPoolExecutor(2) as pool:
+        ends = list(pool.map(lambda bowl, start: _minimise(bowl, np.full(5, start), 20), bowls, starts))  # type: ignore[arg-type]
+    assert jax.config.read("jax_enable_x64") == before
+    assert jnp.ones(1).dtype == (jnp.float64 if before else jnp.float32)
+    for bowl, end, start in zip(bowls, ends, starts, strict=True):
+        assert bowl.precisions == {before}
+        assert np.array_equal(bowl.asked[0], np.full(5, start))
+        np.testing.assert_allclose(end.free, 0.3, rtol=0, atol=1e-4)

@@ -20,6 +20,7 @@ from curvafit.generation.batch import generate_batch
 from curvafit.generation.result import Flow
 from curvafit.generation.schedule import Schedule
 from curvafit.priors.grid import Grid
+from curvafit.priors.kernels import threads
 
 
 def make(path: str | Path, indices: Sequence[int]) -> list[Record]:
@@ -101,7 +102,7 @@ def _record(index: int, draw: Draw, flow: Flow, seconds: float) -> Record:
 @contextmanager
 def one_thread() -> Iterator[None]:
     """Within it torch and numba have one thread: sums, and so voxels, do not depend on how many there are."""
-    before = torch.get_num_threads(), numba.get_num_threads()
+    before = torch.get_num_threads(), threads.allowed()
     torch.set_num_threads(1)
     numba.set_num_threads(1)
     try:

@@ -15,10 +15,12 @@ from curvafit.priors.grid import Grid
 from curvafit.priors.profile import double_well_derivative
 from curvafit.priors.stencils import gradient, hessian
 
-#: Offset ξ of the gradient's norm and width of the smooth positive part (paper, "Implementation details").
+#: Offset ξ of the gradient's norm (paper, "Implementation details").
 XI = 1e-6
 #: Least value under the square root.
 ROOT_FLOOR = 1e-6
+#: What sixteen roundings of float32 leave undecided of the squares whose difference the root is taken of, as a share.
+ROOT_ROUNDING = 2.0**-19
 
 
 class Jet(NamedTuple):
@@ -53,21 +55,41 @@ def jet(u: Tensor, grid: Grid) -> Jet:
 
 
 def second_form(field: Jet, epsilon: float | Tensor, xi: float = XI) -> SecondForm:
-    """M_ε = -ε Hess u + W'(u)/ε n⊗n (eq. `Meps`), with n⊗n = ∇u⊗∇u / (|∇u|² + ξ²); ε broadcasts with the field."""
+    """M_ε = -ε Hess u + W'(u)/ε n⊗n (eq. `Meps`), with n⊗n = ∇u⊗∇u / (|∇u|² + ξ²); ε broadcasts with the field.
+
+    The root's derivative at umbilics is a choice: see `positive_root`.
+    """
     ε = epsilon
     slope2, laplacian, hess2, normal = _invariants(field)
     W_ = double_well_derivative(field.value)
     length2 = slope2 + xi**2
     unit = slope2 / length2
     trace = -ε * laplacian + W_ / ε * unit
-    norm2 = ε**2 * hess2 - 2 * W_ * normal / length2 + (W_ / ε * unit) ** 2
-    root = smooth_positive(2 * norm2 - trace**2, xi).clamp_min(ROOT_FLOOR).sqrt()
+    bend2, well2 = ε**2 * hess2, (W_ / ε * unit) ** 2
+    norm2 = bend2 - 2 * W_ * normal / length2 + well2
+    root = positive_root(2 * norm2 - trace**2, bend2 + well2)
     return SecondForm(trace, norm2, root, length2.sqrt())
 
 
-def smooth_positive(x: Tensor, xi: float = XI) -> Tensor:
-    """x⁺ ≃ ξ log(1 + exp(x / ξ))."""
-    return torch.nn.functional.softplus(x, beta=1 / xi, threshold=30)
+def positive_root(square: Tensor, squares: Tensor) -> Tensor:
+    """√(x⁺) of a difference x of squares, where its derivative is unbounded: there it is taken as 0.
+
+    x = 0 at umbilics, κ1 = κ2, where √(x⁺) = ε|∇u| |κ1 - κ2| has the tip of a cone in the directions that part the two
+    curvatures. Its subdifferential there holds slopes of either sign, and the element of least norm is 0: a step along
+    it prefers no direction. So is the derivative taken wherever x cannot be told from 0: up to `ROOT_FLOOR`, under which
+    the root is constant, and up to the share `ROOT_ROUNDING` of the squares that float32 rounds. The last is for float64
+    too, so that both have one gradient; the root itself is exact there.
+    (The paper's smooth positive part, of width 1e-6, lies within the floor, and its slope was neither side's.)
+
+    Parameters
+    ----------
+    square
+        x = 2|M|² - (Tr M)².
+    squares
+        What |M|² adds up before anything cancels.
+    """
+    resolved = square > (ROOT_ROUNDING * squares).clamp_min(ROOT_FLOOR)
+    return torch.where(resolved, square, square.detach().clamp_min(ROOT_FLOOR)).sqrt()
 
 
 def diffuse_curvatures(field: Jet, epsilon: float | Tensor) -> Curvatures:

@@ -7,17 +7,15 @@ and x, with -∇, Adam, and the next step's blur of div A along y and x.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-from numba import get_num_threads, set_num_threads
 
-from curvafit.priors.curvature import ROOT_FLOOR, XI
+from curvafit.priors.curvature import ROOT_FLOOR, ROOT_ROUNDING, XI
 from curvafit.priors.grid import Grid
 from curvafit.priors.kernels import loops
 from curvafit.priors.kernels.loops import EDGE, NARROW, SLACK, TAPS, TOGETHER, WIDE
+from curvafit.priors.kernels.threads import allowed, limited
 from curvafit.priors.stencils import gaussian_taps
 
 #: Voxels that are worth a thread: below, starting it costs more than it saves.
@@ -183,7 +181,7 @@ class FusedFlow:
         return float(self._highest.max()), float(self._sums.sum()) / max(1, self._free)
 
     def _adam_step(self, moves: bool, adam: np.ndarray) -> None:
-        with _limited(self._threads):
+        with limited(self._threads):
             loops.adam_step(
                 moves,
                 self._between,
@@ -227,12 +225,12 @@ class _Blur:
     def along_z(self, source: np.ndarray, out: np.ndarray, shift: float, base: np.ndarray) -> None:
         """Blur along z, and add a number and, where it is not empty, a field."""
         Z, plane = self._grid.shape[0], _plane(self._grid)
-        with _limited(self._threads):
+        with limited(self._threads):
             loops.blur_z(source, out, base, self._threads, Z, plane, self._index, self._taps, np.float32(shift))
 
     def in_planes(self, source: np.ndarray, out: np.ndarray) -> None:
         """Blur along y and x."""
-        with _limited(self._threads):
+        with limited(self._threads):
             loops.blur_in_planes(source, out, self.work, *self._grid.shape, *self.planes)
 
 
@@ -267,7 +265,7 @@ class _Density:
         self._sums = _scratch(threads, 4 * part + 2 * SLACK)
 
     def __call__(self, u: np.ndarray, gradient: np.ndarray) -> float:
-        with _limited(self._threads):
+        with limited(self._threads):
             loops.energy_gradient(
                 u,
                 gradient,
@@ -290,18 +288,7 @@ _NO_FIELD = np.empty(0, np.float32)
 
 def _threads(grid: Grid) -> int:
     """How many threads a grid is worth, of those allowed."""
-    return max(1, min(get_num_threads(), math.prod(grid.shape) // _WORTH))
-
-
-@contextmanager
-def _limited(threads: int) -> Iterator[None]:
-    """Run numba's loops on so many threads at most."""
-    allowed = get_num_threads()
-    set_num_threads(min(threads, allowed))
-    try:
-        yield
-    finally:
-        set_num_threads(allowed)
+    return max(1, min(allowed(), math.prod(grid.shape) // _WORTH))
 
 
 def _flat(size: int) -> np.ndarray:
@@ -393,14 +380,16 @@ def _weights(a, grid: Grid, epsilon) -> list:
 
 
 def _density_constants(weights: list, grid: Grid) -> np.ndarray:
-    """ξ² and small numbers, then the weights, where they do not vary, as the loops take them: see `loops._cost`."""
+    """ξ² and small numbers, then the weights, where they do not vary, as the loops take them (see `loops._cost`), and
+    the share of the squares that rounding leaves undecided."""
     h = grid.spacing[2]
     well, *rest = (float(value) if np.ndim(value) == 0 else math.nan for value in weights)
     low = ROOT_FLOOR * h**2
     varies = any(np.ndim(value) > 0 for value in weights)
     X, T2, *_, s = rest
     small = ((2 * h * XI) ** 2, 0, 0.5, 0.25, 1, 2, 3)
-    return np.array([*small, well, low if varies else low * well, *rest, 2 * X, 2 * T2, 2 * s], np.float32)
+    numbers = [*small, well, low if varies else low * well, *rest, 2 * X, 2 * T2, 2 * s, ROOT_ROUNDING]
+    return np.array(numbers, np.float32)
 
 
 def _local(weights: list, block: int, grid: Grid) -> tuple[np.ndarray, np.ndarray]:

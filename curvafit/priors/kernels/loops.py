@@ -13,8 +13,8 @@ sample beyond the box and finite and unused for the second. A and Adam's moments
 slack. The last vector of a run overshoots its end, into what is computed later or never read.
 
 Notation follows the plain-torch definition: s = |∇u|², d = s + ξ², G = √d, r = s/d, w = W'(u) = u³ - u, N = |Hess u|²,
-q = ∇uᵀ Hess u ∇u / d, T = Tr M, P = |M|², X = 2P - T², S = √(X⁺), all in the units of `_density_constants`. In float32
-the smooth positive part is 0 or X outside |X| < 2e-5, and under the root's floor of 1e-6: X⁺ = max(X, 1e-6).
+q = ∇uᵀ Hess u ∇u / d, T = Tr M, P = |M|², X = 2P - T², S = √(X⁺), all in the units of `_density_constants`. The root and
+what is taken as its derivative at umbilics, X = 0, are `curvature.positive_root`.
 
 The order of every sum does not depend on the number of threads.
 """
@@ -419,7 +419,8 @@ def _partials(u, m, c, p, stride, n, ring, size, at, inside, from_, k, ratios, o
         wr = w * r
         T = wr - (zz + yy + xx)
         T2 = T * T
-        X = two * (N + wr * wr - (w + w) * q) - T2
+        squares = N + wr * wr
+        X = two * (squares - (w + w) * q) - T2
         inner = _where_above(X, low, X, low)
         i_S = _inverse_root(inner, one, half)
         S = inner * i_S
@@ -432,8 +433,10 @@ def _partials(u, m, c, p, stride, n, ring, size, at, inside, from_, k, ratios, o
             tz, ty, tx = _tilt(gz, gy, gx, orient, local, places, c + i, i)
             e = e + (gz * tz + gy * ty + gx * tx)
         energy = energy + e * _wide(inside, from_ + i)
-        # Its derivatives, from the outside in: by P twice that by X, which is zero in e's root below the floor.
-        e_P = twice_X + e_S * _where_above(X, low, i_S, zero)
+        # Its derivatives, from the outside in: by P twice that by X, which is zero in e's root where X is not resolved
+        # (`curvature.positive_root`).
+        slope = _where_above(X, low, i_S, zero)
+        e_P = twice_X + e_S * _where_above(X, squares * k[18], slope, zero)
         e_T = T * (twice_T2 - e_P) + (of_TS * S + of_GT * G)
         P2 = e_P + e_P
         e_wr = e_T + P2 * wr

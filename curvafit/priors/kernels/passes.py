@@ -17,10 +17,11 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from curvafit.priors.curvature import ROOT_FLOOR, XI
+from curvafit.priors.curvature import ROOT_FLOOR, ROOT_ROUNDING, XI
 
 _XI2 = tl.constexpr(XI**2)
 _FLOOR = tl.constexpr(ROOT_FLOOR)
+_ROUNDING = tl.constexpr(ROOT_ROUNDING)
 
 #: Volumes of partial derivatives that `density` leaves for `gather`: what stays, what comes from the cell after and
 #: before along y and along x, and what goes along the four diagonals of the plane.
@@ -220,14 +221,15 @@ def density(
         q = (gz * hz + gy * hy + gx * hx) * i_d
         wr = w * r * i_ε
         T = wr - ε * (zz + yy + xx)
-        P = ε * ε * N - 2.0 * w * q + wr * wr
+        bend2, well2 = ε * ε * N, wr * wr
+        P = bend2 - 2.0 * w * q + well2
         square = 2.0 * P - T * T
-        above = square > _FLOOR
-        square = tl.where(above, square, _FLOOR)
+        resolved = square > tl.maximum(_ROUNDING * (bend2 + well2), _FLOOR)  # as `curvature.positive_root`
+        square = tl.where(square > _FLOOR, square, _FLOOR)
         i_S = tl.rsqrt(square)
         S = square * i_S
         # Its derivatives, from the outside in.
-        κ = tl.where(above, 0.5 * (wTS * T + wGS * G) * i_S, 0.0)
+        κ = tl.where(resolved, 0.5 * (wTS * T + wGS * G) * i_S, 0.0)
         e_P = wP + κ + κ
         e_T = 2.0 * T * (wT2 - κ) + wTS * S + wGT * G
         e_G = wGT * T + wGS * S
