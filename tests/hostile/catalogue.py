@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from . import damage, options
+from . import belongings, bombs, damage, designs, disks, documents, names, options, signals, together
 from .case import Case, dice, unique
 
 #: Modules of a class each, or of some.
-_CLASSES = (damage, options)
+_CLASSES = (damage, options, documents, designs, bombs, names, belongings, signals, disks, together)
 #: Cases of the quick part.
 QUICK = 150
 

@@ -19,6 +19,9 @@ _TEMPORARY = re.compile(r"(^|/)\.[^/]*|\.part(/|$)|(^|/)tmp[a-z0-9_]{8}(/|$)")
 _ALLOWED = re.compile(r"^(\[ *\d+ %\] |note: )")
 _CRASH = re.compile(r"Traceback \(most recent call last\)|^Exception ignored|Fatal Python error|^Exception in ", re.M)
 
+#: Bytes beyond which a file's time stands for its content.
+_LARGE = 1 << 28
+
 Standing = dict[str, tuple]
 
 
@@ -115,9 +118,12 @@ def standing(folder: Path) -> Standing:
 
 def _identity(path: Path) -> tuple:
     try:
-        mode = path.lstat().st_mode
+        about = path.lstat()
+        mode = about.st_mode
         if stat.S_ISLNK(mode):
             return "link", os.readlink(path)
+        if stat.S_ISREG(mode) and about.st_size > _LARGE:
+            return "file", about.st_size, about.st_mtime_ns
         if stat.S_ISREG(mode):
             return "file", hashlib.sha256(path.read_bytes()).hexdigest()
         return ("folder",) if stat.S_ISDIR(mode) else ("device", stat.S_IFMT(mode))

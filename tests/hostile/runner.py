@@ -177,7 +177,7 @@ def _write_report(path: Path, cases: Sequence[Case], faults: dict[str, list[Faul
         for case in cases
         if faults[case.id]
     ]
-    path.write_text(json.dumps(rows, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    path.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
 
 
 def _show(case: Case, folder: Path, faults: list[Fault]) -> None:

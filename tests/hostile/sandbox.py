@@ -16,7 +16,7 @@ from pathlib import Path
 #: Seconds of processor that a command may take, of waiting while it does nothing, and of waiting at all.
 PROCESSOR, IDLE, WAITING = 20, 20.0, 90.0
 #: Bytes that a command may map beyond what the warm process has, and that it may fill.
-ROOM, FILLED = 4 << 30, 3 << 29
+ROOM, FILLED = 5 << 29, 3 << 29
 
 Job = Callable[[], None]
 
