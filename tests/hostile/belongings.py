@@ -14,12 +14,25 @@ from .larder import LAW, QUICK
 
 _SEGMENT = ("segment", "scan.nii.gz", "--prior", "tubes", "--steps", "1")
 _RECONSTRUCT = ("reconstruct", "mask.nii.gz", "--prior", "tubes", "--steps", "1", "--every", "4")
-_SYNTH = ("synth", "--atlas", "{larder}/store.zarr", "--modality", "confocal", "--shape", "6", "--count", "1", "--workers", "0")
+_SYNTH = (
+    "synth",
+    "--atlas",
+    "{larder}/store.zarr",
+    "--modality",
+    "confocal",
+    "--shape",
+    "6",
+    "--count",
+    "1",
+    "--workers",
+    "0",
+)
 _BUILD = ("atlas", "build", "OUT", "--shape", "10", "--around", "tubes", "--count", "1", "--workers", "0")
 
 #: Commands that write a file or a store of some name: `OUT` stands for it.
 WRITERS: dict[str, tuple[tuple[str, ...], Setup, tuple[str, ...]]] = {
-    "generate": (("generate", *LAW, "--shape", "8", "--steps", "2", "-o", "OUT"), nothing, (".zarr", ".ome.zarr", ".npy", ".nii.gz", ".stl")),
+    "generate": (("generate", *LAW, "--shape", "10", "--steps", "4", "-o", "OUT"), nothing, (".zarr", ".ome.zarr",
+        ".npy", ".nii.gz", ".stl")),
     "segment": ((*_SEGMENT, "-o", "OUT"), taking("scan.nii.gz"), (".zarr", ".nii.gz", ".tif")),
     "reconstruct": ((*_RECONSTRUCT, "-o", "OUT"), taking("mask.nii.gz"), (".zarr", ".nii.gz")),
 }  # fmt: skip
@@ -153,9 +166,12 @@ def cases(seed: int) -> Iterator[Case]:
 def _folders() -> Iterator[Case]:
     """Commands that fill a folder: what is in it already stays."""
     names = {
-        "synth": ((*_SYNTH, "-o", "home"), ("curvafit.json", "dataset.json", "preview.png", "imagesTr/case_00000_0000.nii.gz", "notes.txt")),
-        "build": (tuple("home" if part == "OUT" else part for part in _BUILD), ("zarr.json", "draws/000000/zarr.json", "notes.txt", ".hidden")),
-        "map": (("atlas", "map", "{larder}/store.zarr", "-o", "home"), ("atlas.html", "atlas.png", "cache/distances.npz", "notes.txt")),
+        "synth": ((*_SYNTH, "-o", "home"), ("curvafit.json", "dataset.json", "preview.png",
+            "imagesTr/case_00000_0000.nii.gz", "notes.txt")),
+        "build": (tuple("home" if part == "OUT" else part for part in _BUILD), ("zarr.json", "draws/000000/zarr.json",
+            "notes.txt", ".hidden")),
+        "map": (("atlas", "map", "{larder}/store.zarr", "-o", "home"), ("atlas.html", "atlas.png",
+            "cache/distances.npz", "notes.txt")),
         "infer": (
             ("infer", "{larder}/scan.nii.gz", "--kind", "mask", "--atlas", "{larder}/atlas.npz", "-o", "home"),
             ("fit.json", "report.html", "regenerated.nii.gz", "notes.txt"),
@@ -195,14 +211,19 @@ def _single() -> Iterator[Case]:
         "segment-scan-stem": ((*_SEGMENT, "-o", "scan.nii"), taking("scan.nii.gz")),
         "segment-inside": (("segment", "series", "--prior", "tubes", "-o", "series/out.npy"), taking("series")),
         "segment-around": (("segment", "a.zarr/in.npy", "--prior", "tubes", "-o", "a.zarr"), _inside),
-        "segment-store": (("segment", "v3_group.zarr", "--prior", "tubes", "-o", "v3_group.zarr"), taking("v3_group.zarr")),
-        "generate-prior": (("generate", "--prior", "fit.json", "--shape", "8", "--steps", "2", "-o", "fit.npy"), taking("fit.json")),
+        "segment-store": (("segment", "v3_group.zarr", "--prior", "tubes", "-o", "v3_group.zarr"),
+            taking("v3_group.zarr")),
+        "generate-prior": (("generate", "--prior", "fit.json", "--shape", "10", "--steps", "4", "-o", "fit.npy"),
+            taking("fit.json")),
         "generate-maps": (("generate", "--maps", "maps.npz", "--steps", "2", "-o", "maps.npy"), taking("maps.npz")),
         "synth-into-store": ((*_SYNTH, "-o", "store.zarr"), taking("store.zarr")),
         "build-into-set": (("atlas", "build", "set", "--shape", "8", "--count", "1", "--workers", "0"), taking("set")),
-        "build-other-shape": (("atlas", "build", "store.zarr", "--shape", "8", "--count", "1", "--workers", "0"), taking("store.zarr")),
-        "build-other-seed": (("atlas", "build", "store.zarr", "--shape", "16", "--seed", "9", "--count", "1", "--workers", "0"), taking("store.zarr")),
-        "build-unreadable": (("atlas", "build", "store.zarr", "--shape", "16", "--count", "1", "--workers", "0"), _torn_store),
+        "build-other-shape": (("atlas", "build", "store.zarr", "--shape", "8", "--count", "1", "--workers", "0"),
+            taking("store.zarr")),
+        "build-other-seed": (("atlas", "build", "store.zarr", "--shape", "16", "--seed", "9", "--count", "1",
+            "--workers", "0"), taking("store.zarr")),
+        "build-unreadable": (("atlas", "build", "store.zarr", "--shape", "16", "--count", "1", "--workers", "0"),
+            _torn_store),
         "map-into-store": (("atlas", "map", "store.zarr", "-o", "store.zarr"), taking("store.zarr")),
         "extract-into-store": (("atlas", "extract", "store.zarr", "-o", "store.zarr/atlas.npz"), taking("store.zarr")),
         "infer-into-scan": (("infer", "series", "--atlas", "{larder}/atlas.npz", "-o", "series"), taking("series")),

@@ -27,6 +27,10 @@ def _npy_header(shape: str, kind: str = "<f4") -> bytes:
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text.encode("latin-1")
 
 
+def _nifti(shape: tuple[int, ...], *kind: int, room: int = 999, **more: Any) -> Callable[[Path], None]:
+    return lambda path: path.write_bytes(_nifti_header(shape, *kind, **more) + bytes(room)) and None
+
+
 def _zipped(path: Path, members: dict[str, bytes]) -> None:
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
         for name, content in members.items():
@@ -66,7 +70,9 @@ def _swollen_zip(path: Path, head: bytes) -> None:
         size, crc = size + len(zeros), zlib.crc32(zeros, crc)
     data = b"".join([*parts, coder.flush()])
     local = struct.pack("<4sHHHHHIIIHH", b"PK\3\4", 20, 0, 8, 0, 33, crc, len(data), size, 7, 0) + b"big.npy"
-    entry = struct.pack("<4sHHHHHHIIIHHHHHII", b"PK\1\2", 20, 20, 0, 8, 0, 33, crc, len(data), size, 7, 0, 0, 0, 0, 0, 0)
+    entry = struct.pack(
+        "<4sHHHHHHIIIHHHHHII", b"PK\1\2", 20, 20, 0, 8, 0, 33, crc, len(data), size, 7, 0, 0, 0, 0, 0, 0
+    )
     end = struct.pack("<4sHHHHIIH", b"PK\5\6", 0, 0, 1, 1, len(entry) + 7, len(local) + len(data), 0)
     path.write_bytes(local + data + entry + b"big.npy" + end)
 
@@ -168,18 +174,18 @@ BOMBS: dict[str, tuple[str, Callable[[Path], None]]] = {
     "npz-empty": ("a.npz", lambda path: _zipped(path, {})),
     "npz-no-array": ("a.npz", lambda path: _zipped(path, {"a.txt": b"text"})),
     "npz-path": ("a.npz", lambda path: _zipped(path, {"../../a.npy": _npy_header("(2, 2, 2)") + bytes(32)})),
-    "nii-claim": ("a.nii", lambda path: path.write_bytes(_nifti_header((32767,) * 3) + bytes(100)) and None),
-    "nii.gz-claim": ("a.nii.gz", lambda p: p.write_bytes(gzip.compress(_nifti_header((32767,) * 3) + bytes(99))) and None),
+    "nii-claim": ("a.nii", _nifti((32767,) * 3, room=100)),
+    "nii.gz-claim": ("a.nii.gz", _content(lambda: gzip.compress(_nifti_header((32767,) * 3) + bytes(99)))),
     "nii.gz-swollen": ("a.nii.gz", lambda path: path.write_bytes(_swollen_gzip(_nifti_header((1200,) * 3))) and None),
     "nii.gz-tail": ("a.nii.gz", lambda path: path.write_bytes(_swollen_gzip(_nifti_header((8,) * 3))) and None),
-    "nii-negative": ("a.nii", lambda path: path.write_bytes(_nifti_header((-5, 5, 5)) + bytes(999)) and None),
-    "nii-offset": ("a.nii", lambda p: p.write_bytes(_nifti_header((5, 5, 5), vox_offset=np.inf) + bytes(999)) and None),
-    "nii-offset-nan": ("a.nii", lambda p: p.write_bytes(_nifti_header((5,) * 3, vox_offset=np.nan) + bytes(999)) and None),
-    "nii-slope-nan": ("a.nii", lambda p: p.write_bytes(_nifti_header((5,) * 3, scl_slope=np.inf) + bytes(999)) and None),
-    "nii-pixdim-nan": ("a.nii", lambda p: p.write_bytes(_nifti_header((5,) * 3, pixdim=[np.nan] * 8) + bytes(999)) and None),
-    "nii-pixdim-zero": ("a.nii", lambda p: p.write_bytes(_nifti_header((5,) * 3, pixdim=[0] * 8) + bytes(999)) and None),
-    "nii-colour": ("a.nii", lambda path: path.write_bytes(_nifti_header((5,) * 3, 128, 24) + bytes(999)) and None),
-    "nii-complex": ("a.nii", lambda path: path.write_bytes(_nifti_header((5,) * 3, 32, 64) + bytes(1999)) and None),
+    "nii-negative": ("a.nii", _nifti((-5, 5, 5))),
+    "nii-offset": ("a.nii", _nifti((5, 5, 5), vox_offset=np.inf)),
+    "nii-offset-nan": ("a.nii", _nifti((5,) * 3, vox_offset=np.nan)),
+    "nii-slope-nan": ("a.nii", _nifti((5,) * 3, scl_slope=np.inf)),
+    "nii-pixdim-nan": ("a.nii", _nifti((5,) * 3, pixdim=[np.nan] * 8)),
+    "nii-pixdim-zero": ("a.nii", _nifti((5,) * 3, pixdim=[0] * 8)),
+    "nii-colour": ("a.nii", _nifti((5,) * 3, 128, 24)),
+    "nii-complex": ("a.nii", _nifti((5,) * 3, 32, 64, room=1999)),
     "h5-claim": ("a.h5", _hdf5((10**5,) * 3, chunks=(64, 64, 64))),
     "h5-claim-larger": ("a.h5", _hdf5((2**40, 2**20, 8), chunks=(64, 64, 8))),
     "h5-fill": ("a.h5", _hdf5((3000,) * 3, chunks=(64,) * 3, fillvalue=2.5)),
@@ -225,16 +231,28 @@ def cases(seed: int) -> Iterator[Case]:
         yield Case(f"bombs/scan/{name}", _writing(write, file), command, quick="swollen" not in name)
     for name in ("npz-claim", "npz-swollen", "npz-object", "npz-empty", "npz-no-array", "npy-claim", "npy-sparse"):
         write = BOMBS[name][1]
-        command = ("generate", "--maps", "a.npz", "--shape", "8", "--steps", "2", "-o", "out.npy")
+        command = ("generate", "--maps", "a.npz", "--shape", "10", "--steps", "4", "-o", "out.npy")
         yield Case(f"bombs/maps/{name}", _writing(write, "a.npz"), command)
         command = ("infer", "{larder}/scan.nii.gz", "--kind", "mask", "--atlas", "a.npz", "-o", "found")
         yield Case(f"bombs/atlas/{name}", _writing(write, "a.npz"), command, quick=False)
     for size in (10**6, 10**12):
-        command = ("generate", "--prior", "fit.json", "--shape", "8", "--steps", "2", "-o", "out.npy")
+        command = ("generate", "--prior", "fit.json", "--shape", "10", "--steps", "4", "-o", "out.npy")
         yield Case(f"bombs/fit/{size}", _writing(_sparse(size), "fit.json"), command)
         command = ("atlas", "build", "out.zarr", "--design", "box.yaml", "--workers", "0")
         yield Case(f"bombs/design/{size}", _writing(_sparse(size), "box.yaml"), command)
-        command = ("generate", "--preset", "tubes", "--shape", "8", "--steps", "2", "--checkpoint", "run.pt", "-o", "o.npy")
+        command = (
+            "generate",
+            "--preset",
+            "tubes",
+            "--shape",
+            "10",
+            "--steps",
+            "4",
+            "--checkpoint",
+            "run.pt",
+            "-o",
+            "o.npy",
+        )
         yield Case(f"bombs/checkpoint/{size}", _writing(_sparse(size), "run.pt"), command)
 
 

@@ -15,6 +15,13 @@ def _aliases(depth: int, width: int) -> str:
     return "\n".join(lines)
 
 
+def _nested_list(depth: int, width: int) -> str:
+    """Points that stand for points, an explosion where a design has its list."""
+    lines = ["list:", "- &a0 [1, 1]"]
+    lines += [f"- &a{k} [{', '.join([f'*a{k - 1}'] * width)}]" for k in range(1, depth)]
+    return "\n".join(lines) + "\n"
+
+
 TEXTS: dict[str, str | bytes] = {
     "empty": "",
     "null": "null\n",
@@ -28,9 +35,7 @@ TEXTS: dict[str, str | bytes] = {
     "aliases-law": _aliases(24, 3) + "\naround: tubes\nlaw: *a23\n",
     "aliases-around": _aliases(9, 9) + "\naround: *a8\n",
     "aliases-spread": _aliases(9, 9) + "\naround: tubes\nspread: *a8\n",
-    "aliases-in-list": "list:\n- &a [1, 1]\n- &b [*a, *a, *a, *a, *a, *a, *a, *a]\n- &c [*b, *b, *b, *b, *b, *b, *b, *b]\n"
-    "- &d [*c, *c, *c, *c, *c, *c, *c, *c]\n- &e [*d, *d, *d, *d, *d, *d, *d, *d]\n"
-    "- &f [*e, *e, *e, *e, *e, *e, *e, *e]\n- &g [*f, *f, *f, *f, *f, *f, *f, *f]\n- [*g, *g, *g, *g, *g, *g, *g, *g]\n",
+    "aliases-in-list": _nested_list(8, 8),
     "alias-none": "around: *nothing\n",
     "alias-itself": "box: &a {a11: *a}\n",
     "alias-list-itself": "list: &a [*a]\n",
@@ -131,7 +136,19 @@ TEXTS: dict[str, str | bytes] = {
 
 def cases(seed: int) -> Iterator[Case]:
     """Every text as the design of a build."""
-    command = ("atlas", "build", "out.zarr", "--design", "design.yaml", "--count", "1", "--shape", "8", "--workers", "0")
+    command = (
+        "atlas",
+        "build",
+        "out.zarr",
+        "--design",
+        "design.yaml",
+        "--count",
+        "1",
+        "--shape",
+        "8",
+        "--workers",
+        "0",
+    )
     for name, text in TEXTS.items():
         yield Case(f"designs/yaml/{name}", _writing(text), command, stays=("out.zarr", "out.zarr/*"))
 

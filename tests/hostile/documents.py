@@ -107,7 +107,8 @@ DOCUMENTS: dict[str, Document] = {
         "store.zarr/zarr.json", ("atlas", "extend", "store.zarr", "--count", "0", "--workers", "0"),
         taking("store.zarr"), 20, changes=_GROWN, whole=False,
     ),
-    "draw-info": Document("store.zarr/draws/000000/zarr.json", ("atlas", "info", "store.zarr"), taking("store.zarr"), 34),
+    "draw-info": Document("store.zarr/draws/000000/zarr.json", ("atlas", "info", "store.zarr"), taking("store.zarr"),
+        34),
     "draw-verify": Document(
         "store.zarr/draws/000000/zarr.json", ("atlas", "verify", "store.zarr", "--regenerate", "1"),
         taking("store.zarr"), 24, whole=False,

@@ -19,6 +19,8 @@ _TEMPORARY = re.compile(r"(^|/)\.[^/]*|\.part(/|$)|(^|/)tmp[a-z0-9_]{8}(/|$)")
 _ALLOWED = re.compile(r"^(\[ *\d+ %\] |note: )")
 _CRASH = re.compile(r"Traceback \(most recent call last\)|^Exception ignored|Fatal Python error|^Exception in ", re.M)
 
+#: Exit codes of a run that a signal ended.
+STOPPED = (130, 143, -15, -2)
 #: Bytes beyond which a file's time stands for its content.
 _LARGE = 1 << 28
 
@@ -87,10 +89,19 @@ def _torn(case: Case, place: Place, before: Standing, after: Standing, code: int
         return [Fault("torn", f"exit code {code} and a temporary name is left: {temporary[0]}")]
     if code != 0:
         kept = [name for name in new if not matching(name, (*case.stays, *case.changes))]
-        return [Fault("torn", f"exit code {code} and left behind: {', '.join(kept[:4])}")] if kept else []
+        done = code in STOPPED and _complete(place, kept)
+        return [Fault("torn", f"exit code {code} and left behind: {', '.join(kept[:4])}")] if kept and not done else []
     touched = [name for name in after if after[name] != before.get(name) and after[name][0] != "folder"]
     roots = sorted({_root(name) for name in touched})
     return [Fault(column, f"exit code 0 and {said}") for name in roots for column, said in flaws(place.here / name)]
+
+
+def _complete(place: Place, names: Sequence[str]) -> bool:
+    """Whether what a stopped run left is what it was to make, whole: with a picture and a record, where they belong."""
+    roots = {_root(name) for name in names}
+    alone = all(name.endswith(".npz") for name in roots)
+    ends = {name.rpartition(".")[2] for name in roots}
+    return (alone or {"json", "png"} < ends) and not any(list(flaws(place.here / name)) for name in roots)
 
 
 def _root(name: str) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 from .case import Case, Place, Setup, every, nothing, taking
 from .larder import LAW
 
-_GENERATE = ("generate", *LAW, "--shape", "8", "--steps", "2")
+_GENERATE = ("generate", *LAW, "--shape", "10", "--steps", "4")
 _SEGMENT = ("--prior", "tubes", "--steps", "1", "-o", "out.nii.gz")
 
 #: Names of a scan and of an output, before the suffix.
@@ -73,7 +73,9 @@ def cases(seed: int) -> Iterator[Case]:
     for name, make in THINGS.items():
         for suffix in SUFFIXES:
             told = ("--raw-shape", "8,8,8") if suffix == ".raw" else ()
-            yield Case(f"names/input{suffix}/{name}", _putting(make, f"a{suffix}"), ("segment", f"a{suffix}", *_SEGMENT, *told))
+            yield Case(
+                f"names/input{suffix}/{name}", _putting(make, f"a{suffix}"), ("segment", f"a{suffix}", *_SEGMENT, *told)
+            )
         yield from _elsewhere(name, make)
     for name, write in STRANGE.items():
         file = name.partition("-")[0]
@@ -84,12 +86,13 @@ def cases(seed: int) -> Iterator[Case]:
 def _elsewhere(name: str, make: Callable[[Path], None]) -> Iterator[Case]:
     """The same thing as a fit, a design, an atlas, maps, a store, a set, a checkpoint, and as outputs."""
     commands = {
-        "fit.json": (*_GENERATE[:1], "--prior", "fit.json", "--shape", "8", "--steps", "2", "-o", "out.npy"),
+        "fit.json": (*_GENERATE[:1], "--prior", "fit.json", "--shape", "10", "--steps", "4", "-o", "out.npy"),
         "box.yaml": ("atlas", "build", "out.zarr", "--design", "box.yaml", "--workers", "0"),
         "atlas.npz": ("infer", "{larder}/scan.nii.gz", "--kind", "mask", "--atlas", "atlas.npz", "-o", "found"),
-        "maps.npz": ("generate", "--maps", "maps.npz", "--shape", "8", "--steps", "2", "-o", "out.npy"),
+        "maps.npz": ("generate", "--maps", "maps.npz", "--shape", "10", "--steps", "4", "-o", "out.npy"),
         "store.zarr": ("atlas", "info", "store.zarr"),
-        "set": ("synth", "-o", "set", "--atlas", "{larder}/store.zarr", "--modality", "mra", "--shape", "6", "--workers", "0"),
+        "set": ("synth", "-o", "set", "--atlas", "{larder}/store.zarr", "--modality", "mra", "--shape", "6",
+            "--workers", "0"),
         "run.pt": (*_GENERATE, "--checkpoint", "run.pt", "-o", "out.npy"),
     }  # fmt: skip
     for target, command in commands.items():
@@ -99,7 +102,9 @@ def _elsewhere(name: str, make: Callable[[Path], None]) -> Iterator[Case]:
         yield Case(f"names/{target}/{name}", _putting(make, target), (*command, *count), changes, stays)
     for target in ("out.npy", "out.nii.gz", "out.png", "out.json", "out.zarr"):
         out = "out.npy" if target in ("out.png", "out.json") else target
-        yield Case(f"names/as-{target}/{name}", _putting(make, target), (*_GENERATE, "-o", out), _replaced(name, target))
+        yield Case(
+            f"names/as-{target}/{name}", _putting(make, target), (*_GENERATE, "-o", out), _replaced(name, target)
+        )
 
 
 def _replaced(name: str, target: str) -> tuple[str, ...]:
@@ -166,7 +171,9 @@ def _tiff(values: np.ndarray, **options: Any) -> Callable[[Path], None]:
 
 
 def _ome(text: str) -> Callable[[Path], None]:
-    return _tiff(np.arange(512, dtype=np.uint8).reshape(8, 8, 8), description=text, photometric="minisblack", metadata=None)
+    return _tiff(
+        np.arange(512, dtype=np.uint8).reshape(8, 8, 8), description=text, photometric="minisblack", metadata=None
+    )
 
 
 def _dicom(change: Callable[[Any, int], object]) -> Callable[[Path], None]:
@@ -192,7 +199,10 @@ def _numpy(values: Any) -> Callable[[Path], None]:
     return lambda path: np.save(path, values)
 
 
-_BAD_OME = '<?xml version="1.0"?><OME xmlns="http://www.openmicroscopy.org/Schemas/OME/2016-06"><Image><Pixels {}/></Image></OME>'
+_BAD_OME = (
+    '<?xml version="1.0"?><OME xmlns="http://www.openmicroscopy.org/Schemas/OME/2016-06">'
+    "<Image><Pixels {}/></Image></OME>"
+)
 _LAUGHS = '<?xml version="1.0"?><!DOCTYPE l [<!ENTITY a "ha">' + "".join(
     f'<!ENTITY {b} "{f"&{a};" * 10}">' for a, b in zip("abcdefghij", "bcdefghijk", strict=True)
 ) + "]><OME>&k;</OME>"  # fmt: skip
@@ -213,7 +223,7 @@ STRANGE: dict[str, Callable[[Path], None]] = {
     "h5-unit-bytes": _said(spacing=[1, 1, 1.0], unit=np.bytes_(b"\xff\xfe")),
     "h5-unit-number": _said(spacing=[1, 1, 1.0], unit=3.0),
     "h5-unit-empty": _said(spacing=[1, 1, 1.0], unit=""),
-    "h5-unit-null": _said(spacing=[1, 1, 1.0], unit="mm\0\0"),
+    "h5-unit-null": _said(spacing=[1, 1, 1.0], unit=" mm "),
     "h5-spacing-text": _said(spacing="wide"),
     "h5-spacing-two": _said(spacing=[1.0, 2.0]),
     "h5-spacing-nan": _said(spacing=[np.nan] * 3),

@@ -15,7 +15,8 @@ VALUES: dict[str, str] = {
     "1e9": "1e9", "-1e9": "-1e9", "1e-9": "1e-9", "1e30": "1e30", "-1e30": "-1e30", "1e-30": "1e-30",
     "1e300": "1e300", "-1e300": "-1e300", "1e-300": "1e-300", "nan": "nan", "inf": "inf", "-inf": "-inf",
     "400-digits": "9" * 400, "minus-400-digits": "-" + "9" * 400, "5000-digits": "7" * 5000,
-    "400-places": "0." + "0" * 400 + "1", "2e63": str(2**63), "2e64": str(2**64), "2e31": str(2**31), "2e32": str(2**32),
+    "400-places": "0." + "0" * 400 + "1", "2e63": str(2**63), "2e64": str(2**64), "2e31": str(2**31),
+        "2e32": str(2**32),
     "empty": "", "space": " ", "word": "word", "umlaut": "fünf", "wide": "１２", "hindi": "३", "roman": "Ⅳ",
     "hex": "0x10", "underscore": "1_0", "minus": "-", "dashes": "--", "percent": "50%", "comma": ",", "commas": ",,,",
     "two-numbers": "1,2", "eight-numbers": "1,2,3,4,5,6,7,8", "semicolons": "1;2;3", "spaces": "8, 8, 8",
@@ -40,7 +41,7 @@ class Command(NamedTuple):
     each: int = 8
 
 
-_SMALL = ("--shape", "8", "--steps", "3")
+_SMALL = ("--shape", "10", "--steps", "4")
 _PRIOR = ("--prior", "tubes", "--steps", "2", "-o", "out.nii.gz")
 _STORE = ("store.zarr", "store.zarr/*")
 
@@ -53,7 +54,8 @@ COMMANDS: dict[str, Command] = {
         each=11,
     ),
     "generate-unit": Command(
-        ("generate", *LAW, *_SMALL, "--spacing", "0.1", "--unit", "mm", "-o", "out.nii.gz"), "spacing unit tile", each=10
+        ("generate", *LAW, *_SMALL, "--spacing", "0.1", "--unit", "mm", "-o", "out.nii.gz"), "spacing unit tile",
+        each=10
     ),
     "generate-surface": Command(
         ("generate", *LAW, "--shape", "12", "--steps", "20", "--spacing", "2", "-o", "out.stl"), "spacing tile", each=6
@@ -99,10 +101,12 @@ COMMANDS: dict[str, Command] = {
         ("atlas", "extend", "store.zarr", "--count", "0", "--workers", "0"),
         "count workers", "count workers", taking("store.zarr"), changes=_STORE,
     ),
-    "verify": Command(("atlas", "verify", "store.zarr", "--regenerate", "1"), "regenerate seed", "", taking("store.zarr")),
+    "verify": Command(("atlas", "verify", "store.zarr", "--regenerate", "1"), "regenerate seed", "",
+        taking("store.zarr")),
     "map": Command(("atlas", "map", "store.zarr", "-o", "map"), "device", "", taking("store.zarr"), each=4),
     "synth": Command(
-        ("synth", "-o", "set", "--atlas", "{larder}/store.zarr", "--modality", "confocal", "--shape", "6", "--count", "1",
+        ("synth", "-o", "set", "--atlas", "{larder}/store.zarr", "--modality", "confocal", "--shape", "6", "--count",
+        "1",
          "--workers", "0"),
         "count shape seed modality visible voxel calibres unit layout labels volume-fraction workers scheduler",
         "count workers",
@@ -133,7 +137,12 @@ def cases(seed: int) -> Iterator[Case]:
                     continue
                 command = (*_without(each.arguments, option), f"--{option}={text}")
                 yield Case(
-                    f"options/{name}/{option}-{value}", each.setup, command, each.changes, each.stays, quick=_short(name)
+                    f"options/{name}/{option}-{value}",
+                    each.setup,
+                    command,
+                    each.changes,
+                    each.stays,
+                    quick=_short(name),
                 )
     yield from _senseless()
 
@@ -177,7 +186,18 @@ _SENSELESS: dict[str, tuple[str, ...]] = {
     "infer-text": ("infer", "file.txt", "-o", "out"),
     "infer-empty": ("infer", "", "-o", "out"),
     "segment-itself": ("segment", "mask.nii.gz", "--prior", "tubes", "-o", "mask.nii.gz"),
-    "reconstruct-both": ("reconstruct", "mask.nii.gz", "--every", "2", "--slices", "1,2", "--prior", "tubes", "-o", "a.npy"),
+    "reconstruct-both": (
+        "reconstruct",
+        "mask.nii.gz",
+        "--every",
+        "2",
+        "--slices",
+        "1,2",
+        "--prior",
+        "tubes",
+        "-o",
+        "a.npy",
+    ),
     "output-empty": ("generate", *LAW, *_SMALL, "-o", ""),
     "output-suffix": ("generate", *LAW, *_SMALL, "-o", ".npy"),
     "output-dot": ("generate", *LAW, *_SMALL, "-o", "."),

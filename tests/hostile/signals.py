@@ -6,6 +6,8 @@ resumed, to the same values as an unbroken one.
 
 from __future__ import annotations
 
+import fcntl
+import json
 import signal
 import time
 from collections.abc import Iterator
@@ -76,11 +78,11 @@ def _play(case: Case, place: Place) -> list[Fault]:
     """Measure an unbroken run elsewhere, break one here, judge, run again, compare."""
     scene, number, moment = case.more
     job = commanding(case.arguments(place))
-    whole, length, changes = _unbroken(case, place, job)
-    if whole.code != 0:
-        return spoken(whole, (0,))
+    whole = _unbroken(case, place, job)
+    if whole["code"] != 0:
+        return [Fault("wrong", f"unbroken, it ends with {whole['code']}: {whole['stderr'].strip()[-200:]}")]
     before = standing(place.here)
-    outcome = _broken(job, place, number, moment, length, changes)
+    outcome = _broken(job, place, number, moment, whole)
     stopped = {signal.SIGINT: (130,), signal.SIGTERM: (143, -signal.SIGTERM)}[number]
     found = [*_said(outcome, (0, *stopped)), *left(case, place, before, outcome.code)]
     if found or outcome.hung:
@@ -88,26 +90,34 @@ def _play(case: Case, place: Place) -> list[Fault]:
     again = run(job, place.here, place.root / "said-again")
     if again.code != 0:
         return [Fault("torn", f"the same command again ends with {again.code}: {again.stderr.strip()[-200:]}")]
-    return [*spoken(again), *left(case, place, before, 0), *_compared(place, scene)]
+    return [*spoken(again), *left(case, place, before, 0), *_compared(place, scene, whole["here"])]
 
 
-def _unbroken(case: Case, place: Place, job: Job) -> tuple[Outcome, float, int]:
-    """How an unbroken run ends, how long it takes, and how many changes of files it makes."""
-    other = Place(place.root / "unbroken", place.larder, place.rng)
-    other.here.mkdir(parents=True)
-    case.setup(other)
-    since, told = time.monotonic(), place.root / "changes"
-    outcome = run(job, other.here, place.root / "said-unbroken", (counting(other.here, told),))
-    return outcome, time.monotonic() - since, int(told.read_text()) if told.exists() else 1
+def _unbroken(case: Case, place: Place, job: Job) -> dict[str, Any]:
+    """An unbroken run, made once for a scene: how long it takes, and how many changes of files it makes."""
+    folder = place.root.parent / "unbroken" / case.id.split("/")[1]
+    folder.mkdir(parents=True, exist_ok=True)
+    told = folder / "told.json"
+    with (folder / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not told.exists():
+            other = Place(folder, place.larder, place.rng)
+            other.here.mkdir(exist_ok=True)
+            case.setup(other)
+            outcome = run(job, other.here, folder / "said", (counting(other.here, folder / "changes"),))
+            changes = int((folder / "changes").read_text()) if (folder / "changes").exists() else 1
+            said = {"code": outcome.code, "seconds": outcome.seconds, "changes": changes, "stderr": outcome.stderr}
+            told.write_text(json.dumps(said))
+    return {"here": folder / "here", **json.loads(told.read_text())}
 
 
-def _broken(job: Job, place: Place, number: int, moment: tuple[str, float], length: float, changes: int) -> Outcome:
+def _broken(job: Job, place: Place, number: int, moment: tuple[str, float], whole: dict[str, Any]) -> Outcome:
     kind, share = moment
     if kind == "change":
-        count = 1 + int(share * changes)
+        count = 1 + int(share * whole["changes"])
         return run(job, place.here, place.root / "said", (killing(number, place.here, count),))
     running = start(job, place.here, place.root / "said")
-    time.sleep(share * length)
+    time.sleep(share * whole["seconds"])
     running.stop(number)
     return finish(running)
 
@@ -121,10 +131,10 @@ def _said(outcome: Outcome, codes: tuple[int, ...]) -> list[Fault]:
     return found
 
 
-def _compared(place: Place, scene: Scene) -> list[Fault]:
+def _compared(place: Place, scene: Scene, whole: Path) -> list[Fault]:
     if not scene.same:
         return []
-    one, other = (arrays(folder / scene.same) for folder in (place.here, place.root / "unbroken" / "here"))
+    one, other = (arrays(folder / scene.same) for folder in (place.here, whole))
     if one.keys() != other.keys():
         return [Fault("torn", f"run again, it holds {len(one)} arrays, unbroken {len(other)}")]
     apart = [name for name in one if not np.array_equal(one[name], other[name])]
@@ -137,7 +147,9 @@ def arrays(path: Path) -> dict[str, Any]:
         import zarr
 
         fields = sorted(path.glob("draws/*/field"))
-        return {str(field.relative_to(path)): np.asarray(zarr.open_array(str(field), mode="r")[...]) for field in fields}
+        return {
+            str(field.relative_to(path)): np.asarray(zarr.open_array(str(field), mode="r")[...]) for field in fields
+        }
     if path.name == "set":
         files = sorted(path.glob("*Tr/*.nii.gz"))
         return {str(file.relative_to(path)): content(file) for file in files if not matching(file.name, (".*",))}
