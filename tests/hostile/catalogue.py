@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from itertools import zip_longest
+
 from . import belongings, bombs, damage, designs, disks, documents, names, options, signals, together
 from .case import Case, dice, unique
 
 #: Modules of a class each, or of some.
 _CLASSES = (damage, options, documents, designs, bombs, names, belongings, signals, disks, together)
-#: Cases of the quick part.
-QUICK = 150
+#: Cases of the quick part, by class.
+SHARES = {
+    "damage": 40, "damage-command": 6, "options": 24, "documents": 20, "designs": 12, "bombs": 10, "names": 18,
+    "belongings": 12, "signals": 4, "disks": 5, "together": 3,
+}  # fmt: skip
 
 
 def all_cases(seed: int) -> list[Case]:
@@ -17,17 +22,17 @@ def all_cases(seed: int) -> list[Case]:
 
 
 def quick_part(cases: list[Case], seed: int) -> list[Case]:
-    """About `QUICK` cases, of every class some, of every group of a class at least one, where it has short ones."""
-    groups: dict[str, list[Case]] = {}
+    """Some short cases of every class, by turns from its groups, which the seed shuffles."""
+    groups: dict[str, dict[str, list[Case]]] = {}
     for case in cases:
         if case.quick:
-            groups.setdefault("/".join(case.id.split("/")[:2]), []).append(case)
-    rng, chosen = dice(seed, "quick"), set()
-    for group in groups.values():
-        rng.shuffle(group)
-        chosen.add(group.pop().id)
-    while len(chosen) < QUICK and any(groups.values()):
-        for group in groups.values():
-            if group and len(chosen) < QUICK:
-                chosen.add(group.pop().id)
+            kind, group, *_ = case.id.split("/")
+            groups.setdefault(kind, {}).setdefault(group, []).append(case)
+    chosen: set[str] = set()
+    for kind, inner in groups.items():
+        rng = dice(seed, f"quick {kind}")
+        rows = [rng.sample(group, len(group)) for group in inner.values()]
+        rng.shuffle(rows)
+        turns = [case.id for turn in zip_longest(*rows) for case in turn if case is not None]
+        chosen.update(turns[: SHARES[kind]])
     return [case for case in cases if case.id in chosen]

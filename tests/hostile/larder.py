@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from .damage import write_truths
+from .moments import killing
 from .sandbox import commanding, run
 from .volumes import write_all
 
@@ -99,8 +100,6 @@ def _command(folder: Path, *arguments: str) -> None:
 
 def _checkpoint(folder: Path) -> None:
     """What a run leaves that is killed once it has saved some steps."""
-    from .moments import killing
-
     work = folder / "checkpoint"
     work.mkdir()
     job = commanding(("generate", *LONG, "-o", "long.npy"))

@@ -13,8 +13,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-#: Seconds of processor that a command may take, of waiting while it does nothing, and of waiting at all.
-PROCESSOR, IDLE, WAITING = 20, 20.0, 90.0
+#: Seconds of processor that a command may take, that it may do nothing, and that it may take at all.
+PROCESSOR, IDLE, WAITING = 20, 20.0, 300.0
 #: Bytes that a command may map beyond what the warm process has, and that it may fill.
 ROOM, FILLED = 5 << 29, 3 << 29
 
@@ -66,14 +66,17 @@ def start(job: Job, here: Path, said: Path, first: Sequence[Job] = ()) -> Runnin
 def finish(running: Running) -> Outcome:
     """Wait for a process; kill one that hangs."""
     hung, pause, asked = "", 0.002, time.monotonic()
+    worked, looked = 0.0, asked
     while True:
         pid, status, used = os.wait4(running.pid, os.WNOHANG)
         if pid:
             break
-        waited = time.monotonic() - asked
-        if not hung and (waited > WAITING or (waited > IDLE and _processor(running.pid) < waited / 10)):
-            hung = f"no end within {waited:.0f} s"
-            running.stop(signal.SIGKILL)
+        now = time.monotonic()
+        if not hung and (now > looked + IDLE or now > asked + WAITING):
+            before, worked, looked = worked, _processor(running.pid), now
+            if now > asked + WAITING or worked < before + 0.1:
+                hung = f"no end within {now - asked:.0f} s"
+                running.stop(signal.SIGKILL)
         time.sleep(pause)
         pause = min(0.02, pause * 1.2)
     with contextlib.suppress(ProcessLookupError, PermissionError):
