@@ -113,16 +113,17 @@ def generate(
     with plainly():
         law = _law(preset, coefficients, prior, mass, volume_fraction, epsilon, maps, shape)
         how = _output(law, spacing, unit, tile, cap, boundary)
-        options: dict[str, Any] = {"seed": seed, **_checkpoint(checkpoint, checkpoint_every)}
+        saving = _checkpoint(checkpoint, checkpoint_every)
+        options: dict[str, Any] = {"seed": seed, **saving}
         options["snapshots"] = () if snapshots is None else whole_numbers(snapshots, "--snapshots")
         options["orientation"] = Q = None if orientation is None else _orientation(orientation)
         read = [str(each) for each in (prior, maps) if each is not None]
-        _check(out, checkpoint, cap)
+        _check(out, saving["checkpoint"], cap)
         _check_target(out, how, options["snapshots"], read, overwrite)
         flow = _grown(law, boundary, schedule, steps, {**options, "device": device_of(device)})
         told = {"orientation": Q if Q is None else Q.tolist(), "maps": maps if maps is None else str(maps)}
         _write(flow, law, out, how, {**told, "overwrite": overwrite})
-        _discard(checkpoint)
+        _discard(saving["checkpoint"])
 
 
 def presets() -> None:
@@ -207,7 +208,10 @@ def _source(
 def _checkpoint(file: Path | None, every: float | None) -> dict[str, Any]:
     if file is None and every is not None:
         raise ValueError(f"expected --checkpoint beside --checkpoint-every, got {every:g} alone")
-    return {"checkpoint": file} if every is None else {"checkpoint": file, "checkpoint_every": every}
+    from curvafit.generation.checkpoint import place_of
+
+    place = None if file is None else place_of(file)
+    return {"checkpoint": place} if every is None else {"checkpoint": place, "checkpoint_every": every}
 
 
 def _output(
@@ -256,7 +260,7 @@ def _check(out: Path, checkpoint: Path | None, cap: bool | None) -> None:
     if checkpoint is not None:
         check_folder(checkpoint.parent)
         taken = (out, beside(out, ".json"), beside(out, ".png"))
-        if checkpoint.is_dir() or checkpoint.absolute() in [path.absolute() for path in taken]:
+        if checkpoint in [path.resolve() for path in taken]:
             raise ValueError(f"expected a file of its own for the checkpoint, got {checkpoint}")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import re
@@ -140,7 +141,7 @@ def check_free(
     for target in targets:
         for source in sources:
             _check_apart(target, source)
-        if not os.path.lexists(target) or (target.is_dir() and not any(target.iterdir())):
+        if not (target.exists() or target.is_symlink()) or (target.is_dir() and not any(target.iterdir())):
             continue
         if target.exists() and not (target.is_file() or target.is_dir()):
             raise ValueError(f"expected the name of a file or a folder to write, got the device or pipe {target}")
@@ -155,7 +156,7 @@ def check_free(
 def record_of(path: Path, kind: str) -> dict:
     """The record of this kind in a JSON file: its `format` is `kind`; empty where there is none."""
     try:
-        content = json.loads(path.read_bytes())
+        content = json.loads(path.read_bytes()) if path.is_file() else None
     except (OSError, ValueError, RecursionError):
         return {}
     return content if isinstance(content, dict) and content.get("format") == kind else {}
@@ -164,7 +165,7 @@ def record_of(path: Path, kind: str) -> dict:
 def bears(path: Path, mark: str) -> bool:
     """Whether a file has a mark among its first bytes."""
     try:
-        with path.open("rb") as file:
+        with path.open("rb") if path.is_file() else io.BytesIO() as file:
             return mark.encode() in file.read(_HEAD)
     except OSError:
         return False

@@ -30,9 +30,11 @@ def data() -> Path:
 
 
 @pytest.fixture(scope="session")
-def made():
-    """A generated shape of 32³ voxels, tubes that meet, and its periodic grid."""
-    from curvafit.generation import generate
+def labyrinth():
+    """The profile of one side of a gyroid, 32³ voxels: tubes that meet, by formula; and its periodic grid."""
+    from exact import Gyroid, centres, profile
 
-    flow = generate("sponge", grid=32, seed=3)
-    return flow.field, flow.grid
+    from curvafit.priors.grid import Grid
+
+    grid = Grid((32, 32, 32))
+    return profile(Gyroid(0.32), centres(grid), 0.02).float(), grid

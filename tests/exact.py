@@ -163,6 +163,15 @@ class Gyroid:
         z, y, x = (2 * math.pi / self.period * points).unbind(-1)
         return x.sin() * y.cos() + y.sin() * z.cos() + z.sin() * x.cos()
 
+    def distance(self, points: Tensor) -> Tensor:
+        """The level over its slope: the distance to first order, and of its sign everywhere."""
+        z, y, x = (2 * math.pi / self.period * points).unbind(-1)
+        slope = torch.stack(
+            [z.cos() * x.cos() - y.sin() * z.sin(), y.cos() * z.cos() - x.sin() * y.sin(),
+             x.cos() * y.cos() - z.sin() * x.sin()]
+        )  # fmt: skip
+        return self.period / (2 * math.pi) * self.level(points) / torch.linalg.vector_norm(slope, dim=0)
+
 
 def centres(grid: Grid, origin: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Tensor:
     """Voxel centres `(Z, Y, X, 3)`; the box's lower corner, not the first centre, lies at `origin`."""

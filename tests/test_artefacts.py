@@ -31,8 +31,11 @@ def test_bias_has_its_range_and_is_smooth() -> None:
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_stripes(axis: int) -> None:
+    """Constant along the axis but for rounding. A value is two sums in an order that the processor's matrix product
+    chooses, over 46 nodes whose products come to some 7 strengths: off by 46 · 7 · 0.1 eps, two of them by twice that.
+    """
     factor = degrade.stripes(EMPTY, (1.0, 1.0, 1.0), 0.1, 1.0, [4], axis)
-    assert float(factor.diff(dim=axis - 3).abs().max()) == 0
+    assert float(factor.diff(dim=axis - 3).abs().max()) <= 2 * N * torch.finfo(factor.dtype).eps
     profile = factor.select(axis - 3, 0)
     assert float(profile.mean()) == pytest.approx(1, abs=0.02) and float(profile.std()) == pytest.approx(0.1, rel=0.1)
     off = profile - 1

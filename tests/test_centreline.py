@@ -115,9 +115,9 @@ def test_a_periodic_tube_closes_on_itself(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("boundary", ["periodic", "replicate"])
 @pytest.mark.parametrize("prune", [0.0, 1.0])
-def test_cycles_are_the_tunnels_of_a_generated_shape(made, boundary: str, prune: float) -> None:
+def test_cycles_are_the_tunnels_of_a_labyrinth(labyrinth, boundary: str, prune: float) -> None:
     """Of a mask without cavities, cut or on the torus, whatever is pruned; and the pieces are the pieces."""
-    u, _ = made
+    u, _ = labyrinth
     box = Grid((32, 32, 32), boundary=boundary)  # type: ignore[arg-type]
     found = labels_of(u, box, 0.02, ("skeleton", "distance", "betti"))
     assert found.skeleton is not None and found.distance is not None and found.betti is not None
@@ -178,8 +178,8 @@ def read_swc(path: Path) -> tuple[np.ndarray, list[tuple[int, int]]]:
     return rows, cuts
 
 
-def test_swc_has_a_tree_for_each_piece_and_a_cut_for_each_cycle(made, tmp_path: Path) -> None:
-    u, box = made
+def test_swc_has_a_tree_for_each_piece_and_a_cut_for_each_cycle(labyrinth, tmp_path: Path) -> None:
+    u, box = labyrinth
     found = labels_of(u, box, 0.02, ("skeleton", "distance"))
     assert found.skeleton is not None and found.distance is not None
     graph = centreline(found.skeleton, found.distance, box)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import random
 import signal
 import subprocess
@@ -212,6 +213,22 @@ def test_a_file_is_whole_or_old(tmp_path, monkeypatch):
     with pytest.raises(OSError, match="no space"):
         saved.save({"made": 2})
     assert saved.load() == {"made": 1}
+
+
+def test_links_are_followed_and_stay(tmp_path):
+    """One that leads nowhere yet, too; what is no file is refused."""
+    for name in ("here", "run"):
+        (tmp_path / name).symlink_to(tmp_path / "there" / name)
+    (tmp_path / "there").mkdir()
+    generate(TUBES, MASS, GRID, schedule=PLAN, checkpoint=tmp_path / "run", callbacks=[lambda step, *rest: step == 20])
+    assert steps_in(tmp_path / "there" / "run") == 21 and (tmp_path / "run").is_symlink()
+    generate(TUBES, MASS, GRID, schedule=PLAN, checkpoint=tmp_path / "run")
+    assert list((tmp_path / "there").iterdir()) == [] and (tmp_path / "run").is_symlink()
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    for name in ("pipe", "loop", "there"):
+        with pytest.raises(ValueError, match="expected a file for the checkpoint, got .* which is something else"):
+            Checkpoint(tmp_path / name, 0, {})
 
 
 def test_two_runs_do_not_share_a_file(tmp_path):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from curvafit.files import (
+    bears,
     check_folder,
     check_free,
     move_together,
@@ -108,6 +109,11 @@ def test_devices_and_pipes_are_never_written_over(tmp_path: Path) -> None:
     for place in (tmp_path / "pipe", Path(os.devnull)):
         with pytest.raises(ValueError, match="expected the name of a file or a folder to write, got the device"):
             check_free([place], lambda path: True, overwrite=True)
+
+
+def test_a_pipe_is_no_record_and_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "out.json")
+    assert record_of(tmp_path / "out.json", "ours") == {} and not bears(tmp_path / "out.json", "x")
 
 
 @pytest.mark.parametrize("overwrite", [False, True])

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import json
 
 import numpy as np
 import pytest
 import torch
 
+from curvafit import fixed_point
 from curvafit.diagram import diagram
 from curvafit.generation.flow import generate
 from curvafit.infer import Inference, infer
@@ -31,8 +33,13 @@ def tubes() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def found(tubes: np.ndarray) -> Inference:
+    """With fewer starts and steps than a user's: every stage is passed, none polished."""
     scan = Field((tubes > 0).astype(np.uint8), (2.0, 2.0, 2.0), "um", source="tubes")
-    return infer(scan, kind="mask", periodic=True, seed=3)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(importlib.import_module("curvafit.infer"), "STARTS", 2)
+        patch.setattr(fixed_point, "FIRST_STEPS", 1)
+        patch.setattr(fixed_point, "LAST_STEPS", 2)
+        return infer(scan, kind="mask", periodic=True, seed=3)
 
 
 @pytest.mark.slow

@@ -32,17 +32,19 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
         _ = curvafit.nothing
 
 
-@pytest.mark.parametrize("first", ["import curvafit.infer, curvafit.diagram", "import curvafit; curvafit.infer"])
-def test_functions_win_over_modules_of_their_name(first: str) -> None:
-    script = f"""
-    {first}
+def test_functions_win_over_modules_of_their_name() -> None:
+    script = """
     import sys, types
-    import curvafit
-    for name in ("infer", "diagram"):
-        assert isinstance(getattr(curvafit, name), types.FunctionType), name
-        assert isinstance(sys.modules["curvafit." + name], types.ModuleType), name
-    from curvafit.diagram import Diagram, diagram
-    assert curvafit.diagram is diagram and curvafit.Diagram is Diagram
+    for first in ("import curvafit.infer, curvafit.diagram", "import curvafit; curvafit.infer"):
+        for name in [name for name in sys.modules if name.partition(".")[0] == "curvafit"]:
+            del sys.modules[name]
+        exec(first)
+        import curvafit
+        for name in ("infer", "diagram"):
+            assert isinstance(getattr(curvafit, name), types.FunctionType), name
+            assert isinstance(sys.modules["curvafit." + name], types.ModuleType), name
+        from curvafit.diagram import Diagram, diagram
+        assert curvafit.diagram is diagram and curvafit.Diagram is Diagram
     """
     done = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(script)], cwd=ROOT, capture_output=True, text=True, check=False

@@ -67,7 +67,14 @@ def one_sided(u: Tensor, grid: Grid, place: Tensor, step: float, a: Coefficients
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_roots_derivative_is_zero_or_the_roots(dtype) -> None:
     undecided = 100 * ROOT_ROUNDING
-    cases = [(-1.0, 1.0), (0.0, 0.0), (0.5 * ROOT_FLOOR, 0.1), (0.5 * undecided, 100.0), (2 * undecided, 100.0), (4.0, 9.0)]
+    cases = [
+        (-1.0, 1.0),
+        (0.0, 0.0),
+        (0.5 * ROOT_FLOOR, 0.1),
+        (0.5 * undecided, 100.0),
+        (2 * undecided, 100.0),
+        (4.0, 9.0),
+    ]
     square, squares = torch.tensor(cases, dtype=dtype).unbind(1)
     root = positive_root(square.requires_grad_(), squares)
     (slope,) = torch.autograd.grad(root.sum(), square)

@@ -51,7 +51,10 @@ def same(one, other) -> bool:
 @pytest.mark.slow
 def test_two_workers_make_the_store_that_one_process_makes_though_one_is_killed(tmp_path, serial):
     with cluster(2) as crew:
-        pids = list(crew._client.run(os.getpid).values())
+        heard = crew._client.run(lambda: (os.getpid(), signal.getsignal(signal.SIGINT)))
+        pids, interrupts = zip(*heard.values(), strict=True)
+        assert set(interrupts) == {signal.SIG_IGN}  # they leave the interrupt to the build
+        assert listening() == {"127.0.0.1"}
         killed = []
 
         def kill_once(record, viable, draws):
@@ -59,6 +62,8 @@ def test_two_workers_make_the_store_that_one_process_makes_though_one_is_killed(
                 killed.append(os.kill(pids[0], signal.SIGKILL))
 
         store = build(tmp_path / "s.zarr", COUNT, EDGE, 1, PLAN, kill_once, workers=crew)
+        crew._client = types.SimpleNamespace(nthreads=dict)
+        assert crew.places == 1  # also while all are gone
     assert killed and same(store, serial)
     assert verify(store.path, 0).problems == verify(store.path, 0).notes == ()
 
@@ -97,16 +102,6 @@ def test_a_scheduler_that_goes_is_one_sentence(monkeypatch, error):
     sentence = "expected the dask scheduler at tcp://there:1 to stay, got none any more"
     with pytest.raises(OSError, match=sentence), cluster(scheduler="tcp://there:1"):
         raise error("gone")
-
-
-@pytest.mark.slow
-def test_workers_here_leave_the_interrupt_to_the_build_and_may_be_gone_for_a_while():
-    with cluster(1) as crew:
-        heard = crew._client.run(lambda: signal.getsignal(signal.SIGINT))
-        assert set(heard.values()) == {signal.SIG_IGN}
-        assert listening() == {"127.0.0.1"}
-        crew._client = types.SimpleNamespace(nthreads=dict)
-        assert crew.places == 1
 
 
 @pytest.mark.slow

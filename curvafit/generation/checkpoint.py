@@ -30,7 +30,7 @@ class Checkpoint:
     Parameters
     ----------
     path
-        Where. Its folder is made; beside it stands `path.lock` while a run holds it.
+        Where; a link stays, and leads there. Its folder is made; beside it stands `path.lock` while a run holds it.
     every
         Seconds between two saves, at least; 0 saves after every step.
     run
@@ -41,13 +41,13 @@ class Checkpoint:
     Raises
     ------
     ValueError
-        If the seconds are negative.
+        If the seconds are negative, or the path is no file's.
     """
 
     def __init__(self, path: str | Path, every: float, run: dict[str, str], keep: bool = False) -> None:
         if not every >= 0:
             raise ValueError(f"expected seconds between checkpoints, at least 0, got {every}")
-        self.path, self._every, self._run, self._keep = Path(path), every, run, keep
+        self.path, self._every, self._run, self._keep = place_of(path), every, run, keep
         self._saved = time.monotonic()
 
     @contextmanager
@@ -116,6 +116,24 @@ class Checkpoint:
         """The run is done: remove the file, unless it is to be kept."""
         if not self._keep:
             self.path.unlink(missing_ok=True)
+
+
+def place_of(path: str | Path) -> Path:
+    """The file that a checkpoint's path leads to.
+
+    Raises
+    ------
+    ValueError
+        If it leads to a folder, a device or a pipe, or in a circle.
+    """
+    try:
+        place = Path(path).resolve()
+        taken = place.exists() and not place.is_file()
+    except (OSError, RuntimeError):
+        taken = True
+    if taken or (Path(path).is_symlink() and place.is_symlink()):
+        raise ValueError(f"expected a file for the checkpoint, got {path}, which is something else")
+    return place
 
 
 def identity(**parts: object) -> dict[str, str]:
