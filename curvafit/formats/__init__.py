@@ -13,7 +13,7 @@ from curvafit.formats.ngff import read_zarr, write_zarr
 from curvafit.formats.nifti import read_nifti, write_nifti
 from curvafit.formats.tiff import SLICES, read_slices, read_tiff, write_ome_tiff, write_tiff
 
-__all__ = ["READERS", "WRITERS", "Raw", "ScanError", "normalise_unit", "pick_reader", "pick_writer"]
+__all__ = ["KEYED", "READERS", "WRITERS", "Raw", "ScanError", "normalise_unit", "pick_reader", "pick_writer"]
 
 #: Suffix -> reader(path, key=, raw_shape=, dtype=).
 READERS: dict[str, Callable[..., Raw]] = {
@@ -30,6 +30,9 @@ READERS: dict[str, Callable[..., Raw]] = {
     ".mhd": read_itk,
     **dict.fromkeys((".mrc", ".map", ".rec"), read_mrc),
 }
+
+#: Readers of what can hold several arrays, by key.
+KEYED = (read_npz, read_hdf5, read_zarr, read_dicom)
 
 #: Suffix -> writer(field, path).
 WRITERS: dict[str, Callable[[Any, Path], None]] = {

@@ -1,0 +1,86 @@
+"""JSON read safely, and values quoted briefly: what every header, record and fit of the package goes through."""
+
+from __future__ import annotations
+
+import json
+import math
+import reprlib
+from typing import Any
+
+#: Digits beyond which a whole number is no number of ours, and characters of a quotation.
+DIGITS, QUOTED = 40, 80
+
+_SHORT = reprlib.Repr()
+_SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother, _SHORT.maxlong = 3, QUOTED, QUOTED, DIGITS
+
+
+def quoted(value: object) -> str:
+    """The value as an error quotes it: in one line, cut short however much it holds."""
+    text = _SHORT.repr(value)
+    return text if len(text) <= 2 * QUOTED else f"{text[:QUOTED]}..."
+
+
+def parse_json(content: str | bytes, expected: str, place: object) -> Any:
+    """The value of a JSON text, in UTF-8, with or without a byte order mark.
+
+    Parameters
+    ----------
+    expected, place
+        What the text should be and where it stands, for the sentence of an error.
+
+    Raises
+    ------
+    ValueError
+        If it is no JSON, nested too deeply, names a key twice, or holds a number that is not finite or has more than 40
+        digits.
+    """
+    try:
+        text = content.decode("utf-8-sig") if isinstance(content, bytes) else content.removeprefix("\ufeff")
+        return json.loads(
+            text,
+            parse_int=whole_number,
+            parse_float=_finite,
+            parse_constant=_constant,
+            object_pairs_hook=_single,
+        )
+    except UnicodeDecodeError:
+        said = "which is no text in UTF-8"
+    except json.JSONDecodeError as error:
+        said = f"which is no JSON ({error.msg} in line {error.lineno})"
+    except RecursionError:
+        said = "which is nested too deeply"
+    except ValueError as error:
+        said = f"which holds {error}"
+    raise ValueError(f"expected {expected}, got {place}, {said}")
+
+
+def whole_number(text: str) -> int:
+    """A whole number of at most 40 digits.
+
+    Raises
+    ------
+    ValueError
+        If it has more.
+    """
+    if len(text) > DIGITS:
+        raise ValueError(f"a number of {len(text)} digits")
+    return int(text)
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{quoted(text)}, which is no finite number")
+    return value
+
+
+def _constant(name: str) -> float:
+    raise ValueError(f"{name}, which is no finite number")
+
+
+def _single(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise ValueError(f"the key {quoted(next(name for name in names if names.count(name) > 1))} twice")
+    return found
