@@ -137,7 +137,12 @@ def threshold_of(text: str) -> float | str:
 
 
 def reading_of(
-    spacing: str | None, unit: str | None, raw_shape: str | None, dtype: str | None, key: str | None
+    spacing: str | None,
+    unit: str | None,
+    raw_shape: str | None = None,
+    dtype: str | None = None,
+    key: str | None = None,
+    strict: bool = False,
 ) -> dict[str, Any]:
     """The options that say how to read a file, as `scan.load` takes them."""
     return {
@@ -146,6 +151,7 @@ def reading_of(
         "unit": unit,
         "dtype": dtype,
         "key": key,
+        "strict": strict,
     }
 
 
@@ -160,6 +166,12 @@ def error_console() -> Console:
 def say(text: str, *, to: Console | None = None, style: str | None = None) -> None:
     """One line as it is: no markup, no wrapping, so that paths can be copied."""
     (to or Console(highlight=False)).print(text.translate(_PLAIN), style=style, markup=False, soft_wrap=True)
+
+
+def say_notes(notes: Iterable[str]) -> None:
+    """Sentences on what was assumed of a file, on the error stream."""
+    for note in notes:
+        say(f"note: {note}", to=error_console())
 
 
 def output(heads: Sequence[str], rows: Iterable[Sequence[str]], right: Iterable[int] = ()) -> None:

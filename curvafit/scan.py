@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from curvafit.formats import READERS, WRITERS, Raw, ScanError, normalise_unit, pick_writer
+from curvafit.formats import READERS, WRITERS, Raw, ScanError, normalise_unit, pick_writer, read_archive
 from curvafit.formats.guard import read_file
 from curvafit.priors.json_text import quoted
 
@@ -24,6 +24,7 @@ __all__ = [
     "ScanError",
     "load",
     "move_into_place",
+    "read_archive",
     "read_values",
     "save",
     "write_atomically",

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from curvafit.priors.coefficients import NAMES, Coefficients
+from curvafit.priors.json_text import quoted
 
 #: Open intervals of the uniform law, in working units; a20 = 1 is the gauge (paper, "Experiment 4").
 INTERVALS: dict[str, tuple[float, float]] = {
@@ -60,7 +61,7 @@ class Design:
 
     def __post_init__(self) -> None:
         if self.law not in get_args(Law):
-            raise ValueError(f"expected a law among {', '.join(get_args(Law))}, got {self.law!r}")
+            raise ValueError(f"expected a law among {', '.join(get_args(Law))}, got {quoted(self.law)}")
         rows = self.points if self.law == "list" else tuple(zip(*self.box, strict=True))
         if not rows or any(len(row) != len(PARAMETERS) for row in rows):
             raise ValueError(f"expected {len(PARAMETERS)} parameters ({', '.join(PARAMETERS)}) for a {self.law} design")
@@ -96,8 +97,17 @@ class Design:
 
     @staticmethod
     def from_dict(kept: Mapping[str, Any]) -> Design:
-        """The inverse of `as_dict`."""
-        return Design(kept["law"], *(tuple(tuple(row) for row in kept.get(name, ())) for name in ("box", "points")))
+        """The inverse of `as_dict`.
+
+        Raises
+        ------
+        ValueError
+            If it is none.
+        """
+        try:
+            return Design(kept["law"], *(tuple(map(tuple, kept.get(name, ()))) for name in ("box", "points")))
+        except (LookupError, TypeError, AttributeError, OverflowError) as error:
+            raise ValueError(f"expected a design's law and box or points, got {quoted(kept)}") from error
 
     def _shares(self, seed: int, index: int) -> list[float]:
         """How far into each interval the draw lies, 0 to 1. A fixed parameter takes no random number."""
@@ -154,7 +164,7 @@ def _near(centre: float, half: float) -> tuple[float, float]:
 def _interval(name: str, value: Any) -> tuple[float, float]:
     pair = [value, value] if isinstance(value, (int, float)) else value
     if not isinstance(pair, (list, tuple)) or len(pair) != 2 or not all(_is_number(end) for end in pair):
-        raise ValueError(f"expected {name} as a number or two of them, got {value!r}")
+        raise ValueError(f"expected {name} as a number or two of them, got {quoted(value)}")
     return float(pair[0]), float(pair[1])
 
 
@@ -165,5 +175,5 @@ def _is_number(value: Any) -> bool:
 def _stream(seed: int, index: int, purpose: str) -> np.random.SeedSequence:
     for name, value in (("seed", seed), ("index", index)):
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0:
-            raise ValueError(f"expected a {name} that is a whole number from 0, got {value!r}")
+            raise ValueError(f"expected a {name} that is a whole number from 0, got {quoted(value)}")
     return np.random.SeedSequence(int(seed), spawn_key=(int(index), ("parameters", "start").index(purpose)))

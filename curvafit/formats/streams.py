@@ -36,7 +36,7 @@ def read_numbers(stream: Any, shape: Sequence[int], dtype: np.dtype, place: obje
     """
     check_memory(shape, dtype, place)
     values = np.empty(math.prod(shape), dtype)
-    room, done = memoryview(values.view(np.uint8)) if values.nbytes else memoryview(b""), 0
+    room, done = values.view(np.uint8).data if values.nbytes else memoryview(b""), 0
     while done < values.nbytes and (count := stream.readinto(room[done : done + _PIECE])):
         done += count
     if done < values.nbytes or stream.read(1):
@@ -51,9 +51,9 @@ def check_memory(shape: Sequence[int], dtype: np.dtype, place: object) -> None:
     Raises
     ------
     ScanError
-        If the type is of no plain numbers, an axis is negative or the array larger than the machine's memory.
+        If the type is of objects or records, an axis is negative or the array larger than the machine's memory.
     """
-    if dtype.kind not in "biufc":
+    if dtype.kind in "OV":
         raise ScanError(f"expected numbers, got values of type {str(dtype)[:80]} in {place}")
     wanted = math.prod(int(n) for n in shape) * dtype.itemsize
     if min(shape, default=1) < 0:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import math
 import reprlib
+from collections import Counter
+from collections.abc import Sequence
 from typing import Any
 
 #: Digits beyond which a whole number is no number of ours, and characters of a quotation.
@@ -38,7 +40,7 @@ def parse_json(content: str | bytes, expected: str, place: object) -> Any:
         text = content.decode("utf-8-sig") if isinstance(content, bytes) else content.removeprefix("\ufeff")
         return json.loads(
             text,
-            parse_int=whole_number,
+            parse_int=_whole,
             parse_float=_finite,
             parse_constant=_constant,
             object_pairs_hook=_single,
@@ -54,14 +56,14 @@ def parse_json(content: str | bytes, expected: str, place: object) -> Any:
     raise ValueError(f"expected {expected}, got {place}, {said}")
 
 
-def whole_number(text: str) -> int:
-    """A whole number of at most 40 digits.
+def repeated(names: Sequence[Any]) -> Any:
+    """The first name that stands twice, None where there is none."""
+    if len(set(names)) == len(names):
+        return None
+    return next(name for name, count in Counter(names).items() if count > 1)
 
-    Raises
-    ------
-    ValueError
-        If it has more.
-    """
+
+def _whole(text: str) -> int:
     if len(text) > DIGITS:
         raise ValueError(f"a number of {len(text)} digits")
     return int(text)
@@ -79,8 +81,6 @@ def _constant(name: str) -> float:
 
 
 def _single(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        names = [name for name, _ in pairs]
-        raise ValueError(f"the key {quoted(next(name for name in names if names.count(name) > 1))} twice")
-    return found
+    if (name := repeated([name for name, _ in pairs])) is not None:
+        raise ValueError(f"the key {quoted(name)} twice")
+    return dict(pairs)
