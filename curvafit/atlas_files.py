@@ -6,7 +6,6 @@ import dataclasses
 import hashlib
 import io
 import json
-import zipfile
 from collections.abc import Callable
 from functools import partial
 from importlib.metadata import version
@@ -24,6 +23,7 @@ from curvafit.data_synth.record import Record
 from curvafit.data_synth.store import Store, open_store
 from curvafit.diagram import Diagram
 from curvafit.files import bears, check_folder, check_free, write_content
+from curvafit.formats import read_archive
 from curvafit.generation.viability import well_formed
 from curvafit.index import Atlas, Measured, extract, measured, shape_id
 
@@ -154,9 +154,8 @@ def _compared(progress: Progress, done: int, pairs: int) -> None:
 def _kept(path: Path, make: Callable[[], _Arrays]) -> _Arrays:
     """The arrays in a file; made, and kept there, where there is no sound one."""
     try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as archive:
-            return dict(archive)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile):
+        return read_archive(path)
+    except (OSError, ValueError):
         made = make()
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **made)

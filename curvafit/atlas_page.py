@@ -27,6 +27,7 @@ from curvafit.family import FAMILIES
 from curvafit.index import VIEWS
 from curvafit.plot import DENSITY, shared_limits
 from curvafit.priors.coefficients import NAMES
+from curvafit.priors.fit_schema import FIT_SCHEMA
 
 #: How many nearest shapes are shown beside one, and how many a scan is placed by.
 NEIGHBOURS, PLACED_BY = 8, 5
@@ -41,7 +42,7 @@ _COLUMNS = {
     "m0": ("m₀", "mass: mean of the field"),
     "volume": ("volume", "share of the box inside"),
 }
-_SCRIPTS = ("data", "chart", "moves", "diagram", "solid", "hands", "panel", "scan", "start")
+_SCRIPTS = ("data", "chart", "moves", "diagram", "solid", "hands", "panel", "schema", "scan", "start")
 
 
 def page_html(
@@ -106,6 +107,7 @@ def _small(mapped: AtlasMap, commands: Sequence[str]) -> dict[str, Any]:
             "slope": float(np.sqrt(2) * sampling["epsilon"] / box.max()),
         },
         "diagram": {"limits": [float(np.quantile(limits[:, 0], 0.05)), float(np.quantile(limits[:, 1], 0.95))]},
+        "fit": FIT_SCHEMA,
         "embedding": {"usual": {view: _usual(mapped.atlas.embeddings(view)) for view in VIEWS}, "nearest": PLACED_BY},
         "ramps": {
             "values": [to_hex(colour) for colour in colormaps["viridis"](np.linspace(0, 1, 17))],

@@ -24,6 +24,7 @@ from curvafit.cli_support import (
     plainly,
     reading_of,
     say,
+    say_notes,
     stages,
     threshold_of,
 )
@@ -103,12 +104,13 @@ def infer(
     raw_shape: Annotated[str | None, typer.Option(help="Z,Y,X of a RAW file.")] = None,
     dtype: Annotated[str | None, typer.Option(help="Type of a RAW file: u1, u2, f4 …")] = None,
     key: Annotated[str | None, typer.Option(help="Array within an NPZ, HDF5 or Zarr file.")] = None,
+    strict: Annotated[bool, typer.Option("--strict", help="Refuse a scan with chunks or slices missing.")] = False,
     seed: Annotated[int, typer.Option(help="Of the shapes that are regrown for comparison.")] = 0,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Infer the parameters of a scanned volume, and write a report."""
     with plainly():
-        reading = reading_of(spacing, unit, raw_shape, dtype, key)
+        reading = reading_of(spacing, unit, raw_shape, dtype, key, strict)
         level = threshold_of(threshold)
         what = {"kind": kind, "periodic": periodic, "threshold": level, "dark": dark, "roi": roi, "label": label}
         found, report = _inferred(scan, out, {**what, "atlas": atlas, "seed": seed, **reading}, overwrite)
@@ -130,6 +132,7 @@ def _inferred(scan: str, out: Path, options: dict[str, Any], overwrite: bool) ->
 
         found = find(scan, progress=progress, **options)
         progress("drawing the report", 1.0)
+        say_notes(found.scan.notes)
         return found, write_inference(with_command(found, command_line()), out, overwrite=overwrite)
 
 

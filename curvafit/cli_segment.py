@@ -15,6 +15,7 @@ from curvafit.cli_support import (
     plainly,
     reading_of,
     say,
+    say_notes,
     stages,
     threshold_of,
     whole_numbers,
@@ -58,6 +59,7 @@ Unit = Annotated[str | None, _how(help="nm, um, mm or m; overrides the file.")]
 RawShape = Annotated[str | None, _how(help="Z,Y,X of a RAW file.")]
 Dtype = Annotated[str | None, _how(help="Type of a RAW file: u1, u2, f4 …")]
 Key = Annotated[str | None, _how(help="Array within an NPZ, HDF5 or Zarr file.")]
+Strict = Annotated[bool, _how("--strict", help="Refuse a volume of which chunks or slices are missing.")]
 
 #: Steps of the flow; `segment.STEPS`, which help must not import.
 STEPS = 150
@@ -78,11 +80,12 @@ def segment(
     raw_shape: RawShape = None,
     dtype: Dtype = None,
     key: Key = None,
+    strict: Strict = False,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Find the structure of a noisy scan under a curvature prior, with a picture (.png) and a record (.json)."""
     with plainly():
-        reading = reading_of(spacing, unit, raw_shape, dtype, key)
+        reading = reading_of(spacing, unit, raw_shape, dtype, key, strict)
         options: dict[str, Any] = {"weight": weight, "epsilon": epsilon}
         if probability is None:
             options |= {"threshold": threshold_of(threshold), "dark": dark}
@@ -94,7 +97,10 @@ def segment(
             from curvafit.scan import load
             from curvafit.segment import segment as find
 
-            likely = None if probability is None else load(probability, spacing=reading["spacing"], unit=unit)
+            likely = (
+                None if probability is None else load(probability, spacing=reading["spacing"], unit=unit, strict=strict)
+            )
+            say_notes(() if likely is None else likely.notes)
             return find(volume, prior, probability=likely, steps=steps, progress=progress, **options)
 
         more = {"probability": None if probability is None else str(probability), **options}
@@ -116,11 +122,12 @@ def reconstruct(
     raw_shape: RawShape = None,
     dtype: Dtype = None,
     key: Key = None,
+    strict: Strict = False,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Fill a mask of which only some slices are known, with a picture (.png) and a record (.json)."""
     with plainly():
-        reading = reading_of(spacing, unit, raw_shape, dtype, key)
+        reading = reading_of(spacing, unit, raw_shape, dtype, key, strict)
         if axis.lower() not in ("z", "y", "x"):
             raise ValueError(f"expected --axis z, y or x, got {axis!r}")
         if (every is None) == (known is None):

@@ -162,7 +162,12 @@ def threshold_of(text: str) -> float | str:
 
 
 def reading_of(
-    spacing: str | None, unit: str | None, raw_shape: str | None, dtype: str | None, key: str | None
+    spacing: str | None,
+    unit: str | None,
+    raw_shape: str | None = None,
+    dtype: str | None = None,
+    key: str | None = None,
+    strict: bool = False,
 ) -> dict[str, Any]:
     """The options that say how to read a file, as `scan.load` takes them."""
     if unit is not None:
@@ -175,6 +180,7 @@ def reading_of(
         "unit": unit,
         "dtype": dtype,
         "key": key,
+        "strict": strict,
     }
 
 
@@ -190,6 +196,12 @@ def say(text: str, *, to: Console | None = None, style: str | None = None) -> No
     """One line as it is: no markup, no wrapping, so that paths can be copied."""
     console = to or Console(highlight=False)
     console.print(writable(text.translate(_PLAIN), console), style=style, markup=False, soft_wrap=True)
+
+
+def say_notes(notes: Iterable[str]) -> None:
+    """Sentences on what was assumed of a file, on the error stream."""
+    for note in notes:
+        say(f"note: {note}", to=error_console())
 
 
 def output(heads: Sequence[str], rows: Iterable[Sequence[str]], right: Iterable[int] = ()) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from curvafit.cli_atlas import DashboardOption, SchedulerOption, WorkersOption
-from curvafit.cli_support import error_console, kept, numbers, plainly, reading_of, say, stages, whole_triple
+from curvafit.cli_support import error_console, kept, numbers, plainly, reading_of, say, say_notes, stages, whole_triple
 
 if TYPE_CHECKING:
     import numpy as np
@@ -73,6 +73,8 @@ Visible = Annotated[
 Spacing = Annotated[str | None, _seen(help="Voxel edges of --like, if its file does not tell: Z,Y,X or one number.")]
 Unit = Annotated[str | None, _seen(help="nm, um, mm or m; of --spacing and --voxel.")]
 
+Strict = Annotated[bool, _seen("--strict", help="Refuse a scan for --like of which chunks or slices are missing.")]
+
 
 def synth(
     out: Target,
@@ -90,6 +92,7 @@ def synth(
     calibres: Calibres = "1,1",
     spacing: Spacing = None,
     unit: Unit = None,
+    strict: Strict = False,
     layout: Layout = "nnunet",
     labels: Parts = None,
     seed: Seed = 0,
@@ -108,7 +111,7 @@ def synth(
         if unit is not None and spacing is None and voxel is None:
             raise ValueError("expected --unit beside --spacing or --voxel, got neither")
         source, edge, edge_unit = _source(prior, atlas, presets, volume_fraction)
-        seen = _modality(modality, like, like_mask, visible, reading_of(spacing, unit, None, None, None))
+        seen = _modality(modality, like, like_mask, visible, reading_of(spacing, unit, strict=strict))
         from curvafit.data_synth.case import Recipe
         from curvafit.data_synth.sets import Order
 
@@ -187,14 +190,15 @@ def _modality(
     if (name is None) == (like is None):
         raise ValueError(f"expected either --modality or --like, got {'neither' if name is None else 'both'}")
     if like is None:
-        lone = [key for key, value in reading.items() if value is not None and key != "unit"]
+        lone = [key for key, value in reading.items() if value not in (None, False) and key != "unit"]
         if lone or mask is not None:
-            raise ValueError(f"expected --like beside {'--spacing' if lone else '--like-mask'}, got none")
+            raise ValueError(f"expected --like beside {f'--{lone[0]}' if lone else '--like-mask'}, got none")
         return _visible(_named(str(name)), visible)
     from curvafit.data_synth import estimate
     from curvafit.scan import load
 
     scan = load(like, **reading)
+    say_notes(scan.notes)
     found = estimate.like(scan, None if mask is None else _mask(load(mask, **reading).values))
     return _visible(found, visible)
 

@@ -12,7 +12,7 @@ from curvafit.diagram import Diagram
 from curvafit.match import Match
 from curvafit.morphometry import Morphometry
 from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.fit_file import FORMAT
+from curvafit.priors.fit_schema import FORMAT, violation
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
 
 
@@ -100,8 +100,17 @@ class Fit:
         }
 
     def to_json(self) -> str:
-        """The text of a `fit.json`: indented, but lists of numbers in one line."""
-        text = json.dumps(self.as_dict(), indent=2, allow_nan=False)
+        """The text of a `fit.json`: indented, but lists of numbers in one line.
+
+        Raises
+        ------
+        ValueError
+            If the fit is none that `read_fit` takes.
+        """
+        content = self.as_dict()
+        if wrong := violation(content):
+            raise ValueError(f"expected {wrong} in a fit")
+        text = json.dumps(content, indent=2, allow_nan=False)
         return re.sub(r"\[\s+([-+.\de,\s]+?)\s+\]", lambda found: f"[{' '.join(found[1].split())}]", text)
 
 

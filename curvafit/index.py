@@ -7,8 +7,6 @@ import datetime
 import importlib.resources
 import io
 import json
-import zipfile
-import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -24,15 +22,16 @@ from curvafit.data_synth.draws import versions
 from curvafit.data_synth.store import Record, Store, open_store
 from curvafit.diagram import Diagram
 from curvafit.files import write_content
+from curvafit.formats import read_archive
 from curvafit.generation.viability import FORMED, well_formed
+from curvafit.priors.bounds import quoted
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
+from curvafit.priors.json_text import parse_json
 from curvafit.transport import TAIL_SHARE, sliced_embedding
 
 FORMAT = "curvafit atlas"
 VERSION = 1
-#: What reading a damaged file or another one can raise.
-_UNREADABLE = (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile, zlib.error)
 #: How a shape can be seen: as its phase field, or as the mask {u > 0} re-profiled.
 VIEWS = ("field", "mask")
 
@@ -200,8 +199,8 @@ def load_atlas(path: str | Path | None = None) -> Atlas:
         If it is not an atlas, is truncated, or has another format version.
     """
     if path is None:
-        data = importlib.resources.files("curvafit").joinpath("data", "atlas.npz").read_bytes()
-        return _parse(data, "the packaged atlas")
+        packaged = importlib.resources.files("curvafit") / "data" / "atlas.npz"
+        return _parse(packaged.read_bytes(), "the packaged atlas")
     if Path(path).is_dir():
         raise FileNotFoundError(
             f"expected an atlas file, got the folder {path}: `curvafit atlas extract` makes one of it"
@@ -214,9 +213,9 @@ def load_atlas(path: str | Path | None = None) -> Atlas:
 def is_atlas(path: Path) -> bool:
     """Whether a file bears an atlas's format; all else of it may be wrong."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            return json.loads(archive["header"].tobytes())["format"] == FORMAT
-    except _UNREADABLE:
+        header = read_archive(path)["header"].tobytes() if path.is_file() else b""
+        return parse_json(header, "an atlas's header", path)["format"] == FORMAT
+    except (OSError, ValueError, KeyError, TypeError):
         return False
 
 
@@ -267,23 +266,27 @@ def _packed(measured: tuple[Diagram, ...]) -> dict[str, np.ndarray]:
 def _parse(data: bytes, name: str) -> Atlas:
     """The atlas in a file's bytes."""
     try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-            arrays = {key: archive[key] for key in archive.files}
-        header = json.loads(arrays["header"].tobytes())
+        arrays = read_archive(io.BytesIO(data))
+        header = parse_json(arrays["header"].tobytes(), "an atlas's header", name)
         known = header["format"] == FORMAT
-    except _UNREADABLE as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"expected an atlas file, got {name}, which is truncated or something else") from error
     if not known:
         raise ValueError(f"expected an atlas file, got {name}, which is something else")
-    if header.get("version") != VERSION:
-        raise ValueError(f"expected an atlas of version {VERSION}, got version {header.get('version')} in {name}")
+    if (version := header.get("version")) != VERSION:
+        raise ValueError(f"expected an atlas of version {VERSION}, got version {quoted(version)} in {name}")
     try:
         return _assembled(arrays, header)
-    except (KeyError, IndexError, TypeError) as error:
+    except KeyError as error:
         raise ValueError(f"expected a whole atlas of version {VERSION}, got {name} without {error}") from error
+    except (ValueError, IndexError, TypeError, AttributeError) as error:
+        raise ValueError(f"expected a whole atlas of version {VERSION}, got {name} ({str(error)[:200]})") from error
 
 
 def _assembled(arrays: dict[str, np.ndarray], header: dict[str, Any]) -> Atlas:
+    sound = all(x.dtype.kind in "iuf" and np.isfinite(x).all() for x in arrays.values())
+    if not (sound and (np.abs(arrays["masses"]) < 1).all() and all(isinstance(one, str) for one in header["ids"])):
+        raise ValueError("expected finite numbers, masses in (-1, 1) and ids that are texts, got others")
     return Atlas(
         ids=tuple(header["ids"]),
         coefficients=arrays["coefficients"],
@@ -298,7 +301,9 @@ def _assembled(arrays: dict[str, np.ndarray], header: dict[str, Any]) -> Atlas:
 
 def _unpacked(arrays: dict[str, np.ndarray], view: str) -> tuple[Diagram, ...]:
     points, weights = (arrays[f"{view}_{name}"].astype(np.float64) for name in ("points", "weights"))
-    bounds = arrays[f"{view}_offsets"]
+    bounds = arrays[f"{view}_offsets"].astype(np.int64)
+    if list(bounds[[0, -1]]) != [0, len(points)] or (np.diff(bounds) < 0).any():
+        raise ValueError(f"expected offsets from 0 to {len(points)}, got others")
     figures = (arrays[f"{view}_{name}"] for name in ("areas", "spreads", "excluded"))
     return tuple(
         Diagram(points[first:last], weights[first:last] * area, spread=float(spread), excluded=float(excluded))

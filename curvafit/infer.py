@@ -84,7 +84,7 @@ def infer(
     ----------
     scan
         A volume file (see `curvafit.scan.load`, which takes the remaining keywords: spacing, unit, key, raw_shape,
-        dtype), or a `Field`.
+        dtype, strict), or a `Field`.
     kind
         `"field"`, `"mask"`, `"image"`, or `"auto"`: two values are a mask, plateaus near ±1 a phase field.
     periodic

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import os
 import time
-import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +15,9 @@ import torch
 
 from curvafit.diagram import Diagram
 from curvafit.files import write_atomically
+from curvafit.formats import read_archive
+from curvafit.priors.bounds import quoted
+from curvafit.priors.json_text import parse_json
 from curvafit.sinkhorn import Measures, costs, packed
 from curvafit.transport import comparable
 
@@ -171,14 +172,16 @@ class _File:
     def _content(self, path: Path) -> tuple[list[str], np.ndarray]:
         """Digests and distances of a file that was made with the same settings."""
         try:
-            with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as archive:
-                header = json.loads(archive["header"].tobytes())
-                keys, distances = archive["keys"].astype(str).tolist(), archive["distances"]
+            arrays = read_archive(path)
+            header = parse_json(arrays["header"].tobytes(), "a file of distances", path)
+            keys, distances = arrays["keys"].astype(str).tolist(), arrays["distances"]
             theirs = {name: header.get(name) for name in self._header}
-        except (ValueError, KeyError, EOFError, AttributeError, TypeError, zipfile.BadZipFile) as error:
+            if distances.shape != (len(keys),) * 2 or distances.dtype != np.float64:
+                raise ValueError(f"expected distances of {len(keys)} diagrams, got shape {distances.shape}")
+        except (ValueError, KeyError, AttributeError, TypeError) as error:
             raise ValueError(f"expected a file of distances, got {path}, which is something else") from error
         names = [name for name, value in self._header.items() if theirs[name] != value]
         if names:
-            parts = (f"{name} {theirs[name]} instead of {self._header[name]}" for name in names)
+            parts = (f"{name} {quoted(theirs[name])} instead of {self._header[name]}" for name in names)
             raise ValueError(f"expected distances of this kind, got {path} with {'; '.join(parts)}")
         return keys, distances

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -10,7 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from curvafit.formats import READERS, ScanError
+from curvafit.formats import READERS, ScanError, read_archive
+from curvafit.formats.streams import check_regular
 from curvafit.priors.coefficients import NAMES
 from curvafit.scan import read_values
 
@@ -66,9 +66,8 @@ def map_shape(maps: Mapping[str, float | Tensor]) -> tuple[int, int, int] | None
 
 def _from_npz(path: Path) -> dict[str, np.ndarray]:
     try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            return {name: np.asarray(file[name]) for name in file.files}
-    except (ValueError, OSError, AttributeError, TypeError, zipfile.BadZipFile) as reason:
+        return read_archive(check_regular(path))
+    except (ValueError, OSError) as reason:
         raise ValueError(f"expected an NPZ file or a folder of maps, got {path} that is neither") from reason
 
 

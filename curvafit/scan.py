@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from curvafit.files import check_free, write_atomically
-from curvafit.formats import READERS, WRITERS, Raw, ScanError, normalise_unit, pick_reader, pick_writer
+from curvafit.formats import READERS, WRITERS, Raw, ScanError, normalise_unit, pick_writer
+from curvafit.formats.guard import read_file
 from curvafit.formats.ngff import is_ours, mark
+from curvafit.priors.bounds import quoted
 
 __all__ = ["READABLE", "WRITABLE", "Field", "ScanError", "load", "read_values", "save"]
 
@@ -82,6 +85,7 @@ def load(
     unit: str | None = None,
     raw_shape: Sequence[int] | None = None,
     dtype: str | None = None,
+    strict: bool = False,
 ) -> Field:
     """Read a volume from a file, or from a folder of slices.
 
@@ -95,6 +99,9 @@ def load(
         the file's numbers, it does not convert them.
     raw_shape, dtype
         Voxels (z, y, x) and numpy type of a RAW file, which cannot tell them.
+    strict
+        Refuse a volume of which parts are not stored, which a note tells of otherwise: chunks of Zarr or HDF5, which
+        then have the fill value; slices that a folder's numbers skip.
 
     Raises
     ------
@@ -102,16 +109,20 @@ def load(
         If there is no such file.
     ScanError
         A `ValueError`: unknown suffix, a damaged or truncated file, a missing key, a volume that is not 3D,
-        not finite or constant, a spacing that is not positive.
+        not finite, constant or larger than memory, a spacing that is not positive.
     """
     location, key = _split_key(os.fspath(path), key)
-    raw = _squeezed(_read(location, key=key, raw_shape=raw_shape, dtype=dtype), location)
+    raw = _squeezed(read_file(location, key, raw_shape, dtype), location)
+    if strict and raw.gaps:
+        raise ScanError(f"expected a whole volume, got {location}: {raw.gaps[0]}")
     _check_values(raw.values, location)
     return _placed(raw, f"{location}::{key}" if key else str(location), spacing, unit)
 
 
 def read_values(path: str | os.PathLike[str]) -> np.ndarray:
     """The array in a volume file, z first, whatever it holds; axes of one before the last three are left out.
+
+    Parts that are not stored are a warning.
 
     Raises
     ------
@@ -120,7 +131,10 @@ def read_values(path: str | os.PathLike[str]) -> np.ndarray:
     ScanError
         If the suffix is unknown or the file damaged.
     """
-    values = _read(Path(path)).values
+    raw = read_file(Path(path))
+    values = raw.values
+    for gap in raw.gaps:
+        warnings.warn(f"{path}: {gap}", UserWarning, stacklevel=2)
     while values.ndim > 3 and values.shape[0] == 1:
         values = values[0]
     return values
@@ -153,27 +167,10 @@ def save(field: Field, path: str | os.PathLike[str], *, kind: str = "volume", ov
 
 
 def _split_key(path: str, key: str | None) -> tuple[Path, str | None]:
+    if "::" in path and Path(path).exists():
+        return Path(path), key
     name, separator, inner = path.rpartition("::")
     return (Path(name), key or inner or None) if separator else (Path(path), key)
-
-
-def _guarded(reader: Callable[..., Raw], path: Path, **options: object) -> Raw:
-    """A library's own exceptions become one sentence; ours pass."""
-    try:
-        return reader(path, **options)
-    except (ScanError, MemoryError):
-        raise
-    except Exception as reason:  # every library has its own way to say that a file is damaged
-        said = " ".join(f"{type(reason).__name__}: {reason}".split())[:200]
-        raise ScanError(f"expected a whole, readable file, got {path} that cannot be read ({said})") from reason
-
-
-def _read(path: Path, key: str | None = None, raw_shape: Sequence[int] | None = None, dtype: str | None = None) -> Raw:
-    """What the reader of that file gives."""
-    if not path.exists():
-        raise FileNotFoundError(f"expected a volume file, got no such file: {path}")
-    reader = pick_reader(path, raw_shape is not None)
-    return _guarded(reader, path, key=key, raw_shape=raw_shape, dtype=dtype)
 
 
 def _squeezed(raw: Raw, path: Path) -> Raw:
@@ -205,9 +202,9 @@ def _check_values(values: np.ndarray, path: Path) -> None:
 
 def _placed(raw: Raw, source: str, spacing: Sequence[float] | float | None, unit: str | None) -> Field:
     """Native values with the file's spacing and unit, or the caller's."""
-    notes = list(raw.notes if spacing is not None or unit is not None else raw.notes + raw.guesses)
-    file_unit, factor = normalise_unit(raw.unit)
-    stated = None if raw.spacing is None else tuple(h * factor for h in raw.spacing)
+    notes = [*raw.gaps, *raw.notes, *(() if spacing is not None or unit is not None else raw.guesses)]
+    file_unit, factor = ("voxel", 1.0) if spacing is not None and unit is not None else normalise_unit(raw.unit)
+    stated = None if raw.spacing is None else _scaled(raw.spacing, factor)
     affine = None if raw.affine is None else np.diag([factor, factor, factor, 1.0]) @ raw.affine
     chosen_unit, chosen_factor = (file_unit, 1.0) if unit is None else normalise_unit(unit)
     chosen = _positive_triple(1.0 if stated is None and spacing is None else stated if spacing is None else spacing)
@@ -224,11 +221,16 @@ def _placed(raw: Raw, source: str, spacing: Sequence[float] | float | None, unit
     return Field(values, chosen, chosen_unit, affine, source, tuple(notes))
 
 
+def _scaled(spacing: tuple[object, ...], factor: float) -> tuple[object, ...]:
+    """A file's spacing times a factor, as it stands where it is no numbers."""
+    return tuple(h * factor if isinstance(h, (int, float)) else h for h in spacing)
+
+
 def _positive_triple(spacing: object) -> tuple[float, float, float]:
     try:
         triple = (float(spacing),) * 3 if isinstance(spacing, (int, float)) else tuple(float(h) for h in spacing)  # type: ignore[union-attr]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         triple = ()
     if len(triple) != 3 or any(not math.isfinite(h) or h <= 0 for h in triple):
-        raise ScanError(f"expected a spacing of 3 positive numbers (z, y, x), got {spacing!r}")
+        raise ScanError(f"expected a spacing of 3 positive numbers (z, y, x), got {quoted(spacing)}")
     return triple  # type: ignore[return-value]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ from matplotlib.figure import Figure
 from curvafit.data_synth.layouts import LAYOUTS
 from curvafit.data_synth.sets import RECORDS, case_name, cases_of, read_order
 from curvafit.plot import CONTOUR, write_picture
+from curvafit.priors.json_text import parse_json
 from curvafit.scan import read_values
 
 #: Cases in the picture, and in a row of it.
@@ -32,7 +32,7 @@ def write_preview(folder: str | Path) -> Path:
         each.set_axis_off()
     for k, name in enumerate(names):
         image, label = (read_values(folder / part.format(case=name)) for part in (layout.image, layout.label))
-        record = json.loads((folder / RECORDS / f"{name}.json").read_text())
+        record = parse_json((folder / RECORDS / f"{name}.json").read_bytes(), "a case's record", name)
         row, column = 2 * (k // ROW), k % ROW
         shown = int(np.argmax((label > 0).sum((1, 2))))
         low, high = np.percentile(image[shown], (0.5, 99.5))

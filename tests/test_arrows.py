@@ -24,7 +24,7 @@ ALLOWED = {
     "topology": {"priors"},
     "morphometry": {"priors", "topology"},
     "sinkhorn": {"priors"},
-    "pairwise": {"files", "priors", "diagram", "transport", "sinkhorn"},
+    "pairwise": {"files", "formats", "priors", "diagram", "transport", "sinkhorn"},
     "data_synth": {"files", "generation", "priors", "scan", "mesh", "diagram", "transport", "topology", "morphometry"},
 }
 #: The command line imports everything; of the package, only `__main__` imports it.

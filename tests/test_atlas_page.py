@@ -13,6 +13,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 import typer
+from broken_fits import BROKEN, broken
 from exact_store import exact_store, no_progress, quick_map
 from found import made_fit
 from PIL import Image
@@ -189,9 +190,14 @@ def test_a_scan_without_a_diagram_is_placed_by_its_matches_or_refused(opened: Op
     assert page.locator("#scan-near button").count() == 1
     for text, said in (
         (made_fit().to_json(), "run curvafit infer again"),
-        ("{}", "expected a fit.json of format curvafit-fit-1, got odd.json"),
+        ("{}", "expected a fit.json with format, got none in odd.json"),
+        (made_fit().to_json().replace("curvafit-fit-1", "fit-0"), "format as curvafit-fit-1"),
+        *((broken(*change), f"expected a fit.json with {said}") for *change, said in BROKEN),
         ("κ", "which is no JSON"),
-        (scan_fit(atlas, 1).to_json().replace('"kappa1"', '"kappa"'), "expected a fit.json with a whole diagram"),
+        (
+            scan_fit(atlas, 1).to_json().replace('"kappa1"', '"kappa"'),
+            "expected a fit.json with diagram.kappa1, got none",
+        ),
     ):
         drop(page, text, "odd.json")
         page.locator(f"#message:has-text('{said}')").wait_for()

@@ -17,7 +17,8 @@ from curvafit.infer import Inference, infer
 from curvafit.measure import scan_diagram
 from curvafit.prepare import prepare
 from curvafit.priors.coefficients import preset
-from curvafit.priors.fit_file import FORMAT, read_fit
+from curvafit.priors.fit_file import read_fit
+from curvafit.priors.fit_schema import FORMAT
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.scan import Field
 from curvafit.transport import wasserstein

@@ -104,8 +104,17 @@ class Design:
 
     @staticmethod
     def from_dict(kept: Mapping[str, Any]) -> Design:
-        """The inverse of `as_dict`."""
-        return Design(kept["law"], *(tuple(tuple(row) for row in kept.get(name, ())) for name in ("box", "points")))
+        """The inverse of `as_dict`.
+
+        Raises
+        ------
+        ValueError
+            If it is none.
+        """
+        try:
+            return Design(kept["law"], *(tuple(map(tuple, kept.get(name, ()))) for name in ("box", "points")))
+        except (LookupError, TypeError, AttributeError, OverflowError) as error:
+            raise ValueError(f"expected a design's law and box or points, got {quoted(kept)}") from error
 
     def _shares(self, seed: int, index: int) -> list[float]:
         """How far into each interval the draw lies, 0 to 1. A fixed parameter takes no random number."""

@@ -7,10 +7,9 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from curvafit.data_synth.design import PARAMETERS, Design, around, boxed
-from curvafit.priors.bounds import real
+from curvafit.data_synth.yaml_text import parse_yaml
+from curvafit.priors.bounds import quoted, real
 from curvafit.priors.coefficients import preset
 from curvafit.priors.fit_file import read_fit
 
@@ -30,10 +29,7 @@ def read_design(path: str | PathLike[str]) -> Design:
     """
     if not Path(path).is_file():
         raise FileNotFoundError(f"expected a design in YAML, found no file {path}")
-    try:
-        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"expected a design in YAML, got {path}: {_trouble(error)}") from error
+    content = parse_yaml(Path(path).read_bytes(), "a design in YAML", path)
     try:
         return _design(content, Path(path).parent)
     except ValueError as error:
@@ -55,49 +51,43 @@ def point_of(source: Any, folder: Path = Path()) -> tuple[float, ...]:
         named = preset(source)
         return (*map(float, named.coefficients), float(named.mass))
     if not isinstance(source, Mapping) or set(source) != set(PARAMETERS):
-        raise ValueError(f"expected a preset, a fit.json or {', '.join(PARAMETERS)}, got {source!r}")
+        raise ValueError(f"expected a preset, a fit.json or {', '.join(PARAMETERS)}, got {quoted(source)}")
     try:
         return tuple(float(source[name]) for name in PARAMETERS)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"expected numbers for {', '.join(PARAMETERS)}, got {source!r}") from error
+        raise ValueError(f"expected numbers for {', '.join(PARAMETERS)}, got {quoted(source)}") from error
 
 
 def _design(content: Any, folder: Path) -> Design:
     kind = _kind(content)
     if kind == "list":
         if not isinstance(content["list"], list):
-            raise ValueError(f"expected a list of points, got {content['list']!r}")
+            raise ValueError(f"expected a list of points, got {quoted(content['list'])}")
         return Design("list", points=tuple(point_of(each, folder) for each in content["list"]))
     law = content.get("law", "random")
     if law not in ("random", "sobol"):
-        raise ValueError(f"expected a law random or sobol, got {law!r}")
+        raise ValueError(f"expected a law random or sobol, got {quoted(law)}")
     if kind == "around":
         return around(point_of(content["around"], folder), _spread(content.get("spread", SPREAD)), law)
     if not isinstance(content["box"], Mapping):
-        raise ValueError(f"expected a box of names and intervals, got {content['box']!r}")
+        raise ValueError(f"expected a box of names and intervals, got {quoted(content['box'])}")
     return boxed(law, **{str(name): _number(value) for name, value in content["box"].items()})
 
 
 def _kind(content: Any) -> str:
     """Which of the three a file is; every key must be known."""
     if not isinstance(content, Mapping):
-        raise ValueError(f"expected the keys of a design ({', '.join(KEYS)}), got {content!r}")
+        raise ValueError(f"expected the keys of a design ({', '.join(KEYS)}), got {quoted(content)}")
     kinds = [key for key in KEYS if key in content]
     known = set(KEYS) | set().union(*KEYS.values())
     for key in content:
         if key not in known:
-            raise ValueError(f"expected keys among {', '.join(sorted(known))}, got {key!r}")
+            raise ValueError(f"expected keys among {', '.join(sorted(known))}, got {quoted(key)}")
     if len(kinds) != 1:
         raise ValueError(f"expected one of the keys {', '.join(KEYS)}, got {' and '.join(kinds) or 'none'}")
     for key in set(content) - KEYS[kinds[0]] - {kinds[0]}:
-        raise ValueError(f"expected no key {key!r} beside {kinds[0]!r}")
+        raise ValueError(f"expected no key {quoted(key)} beside {kinds[0]!r}")
     return kinds[0]
-
-
-def _trouble(error: Exception) -> str:
-    """What is wrong, and in which line."""
-    mark = getattr(error, "problem_mark", None)
-    return f"{getattr(error, 'problem', error)} in line {mark.line + 1}" if mark else str(error)
 
 
 def _number(value: Any) -> Any:

@@ -25,6 +25,7 @@ from curvafit.data_synth.workers import Here, Workers
 from curvafit.files import remove, write_content
 from curvafit.priors.bounds import quoted, whole
 from curvafit.priors.grid import Grid
+from curvafit.priors.json_text import parse_json
 from curvafit.scan import Field, save
 
 FORMAT = "curvafit set"
@@ -146,14 +147,18 @@ def read_order(folder: str | Path) -> Order:
         If the folder holds no set of this version.
     """
     try:
-        header = json.loads((Path(folder) / HEADER).read_text())
+        header = parse_json((Path(folder) / HEADER).read_bytes(), "a set", folder)
         known = header["format"] == FORMAT and header["version"] == VERSION
     except (OSError, ValueError, KeyError, TypeError):
         known = False
     if not known:
         raise ValueError(f"expected a set of version {VERSION} in {folder}, got none")
-    kept = header["order"]
-    return Order(Recipe.from_dict(kept["recipe"]), kept["layout"], tuple(kept["parts"]))
+    try:
+        kept = header["order"]
+        return Order(Recipe.from_dict(kept["recipe"]), kept["layout"], tuple(kept["parts"]))
+    except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
+        said = quoted(str(error))
+        raise ValueError(f"expected a whole set in {folder}, got one with a damaged {HEADER} ({said})") from error
 
 
 def cases_of(folder: Path) -> list[int]:

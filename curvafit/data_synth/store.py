@@ -31,6 +31,9 @@ import zarr
 from zarr.codecs import BloscCodec, Crc32cCodec
 
 from curvafit.data_synth.record import Record, Settings, attributes_of, digest, record_of
+from curvafit.priors.bounds import quoted
+from curvafit.priors.grid import Grid
+from curvafit.priors.json_text import parse_json
 
 FORMAT = "curvafit shapes"
 VERSION = 2
@@ -69,10 +72,16 @@ class Store:
 
         Raises
         ------
-        KeyError
-            If the draw is missing or incomplete.
+        KeyError, ValueError
+            If the draw is missing or incomplete, or its record damaged.
         """
-        return record_of(self._complete(index))
+        try:
+            return record_of(self._complete(index))
+        except (TypeError, AttributeError, ValueError, LookupError) as error:
+            if not self.has(index):
+                raise
+            said = f"got a damaged one ({quoted(str(error))}): `curvafit atlas verify` lists such draws"
+            raise ValueError(f"expected a whole record of draw {index} in {self.path}, {said}") from error
 
     def viable(self, index: int) -> bool:
         """Whether a draw is recorded as a shape.
@@ -153,7 +162,10 @@ class Store:
         """A draw's attributes, None where anything of it is missing; a field's bytes are checked when it is read."""
         place = self._place(index)
         attributes = _group_attributes(place)
-        if attributes is None or attributes.get("index") != index or not {"viability", "sha256"} <= set(attributes):
+        if attributes is None or attributes.get("index") != index or "sha256" not in attributes:
+            return None
+        viability = attributes.get("viability")
+        if not isinstance(viability, dict) or not isinstance(viability.get("viable"), bool):
             return None
         complete = not attributes["viability"]["viable"] or (place / "field" / "c" / "0" / "0" / "0").is_file()
         return attributes if complete else None
@@ -182,13 +194,26 @@ def open_store(path: str | Path, settings: Settings | None = None) -> Store:
     attributes = _group_attributes(path)
     if attributes is None or attributes.get("format") != FORMAT:
         raise ValueError(f"expected a store of shapes at {path}, got something else")
-    if attributes.get("version") != VERSION:
-        raise ValueError(f"expected a store of version {VERSION} at {path}, got version {attributes.get('version')}")
-    stored: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in attributes["settings"].items()}
-    found = Settings(**stored)
+    if (version := attributes.get("version")) != VERSION:
+        raise ValueError(f"expected a store of version {VERSION} at {path}, got version {quoted(version)}")
+    found = _settings(path, attributes)
     if settings is not None and settings != found:
         raise ValueError(f"expected the settings of {path}, got another {_difference(found, settings)}")
     return Store(path, found)
+
+
+def _settings(path: Path, attributes: dict[str, Any]) -> Settings:
+    """The settings in a store's header; its other entry is how many shapes are wanted."""
+    try:
+        stored: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in attributes["settings"].items()}
+        found = Settings(**stored)
+        Grid(found.shape, found.spacing)
+        if not (found.epsilon > 0 and found.blur >= 0 and found.seed >= 0 and int(attributes["wanted"]) >= 0):
+            raise ValueError("a number is negative")
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        said = f"got one with a damaged header ({quoted(str(error))})"
+        raise ValueError(f"expected a whole store of shapes at {path}, {said}") from error
+    return found
 
 
 def _create(path: Path, settings: Settings) -> None:
@@ -221,7 +246,7 @@ def _write_draw(folder: Path, record: Record, field: np.ndarray | None) -> None:
 
 def _rewrite(folder: Path, attributes: dict[str, Any]) -> None:
     """Change attributes of the Zarr group in a folder, all at once."""
-    text = json.loads((folder / "zarr.json").read_text())
+    text = parse_json((folder / "zarr.json").read_bytes(), "a Zarr group", folder)
     text["attributes"] |= attributes
     partial = folder / f".partial-{os.getpid()}.json"
     try:
@@ -251,10 +276,11 @@ def _publish(partial: Path, place: Path) -> bool:
 def _group_attributes(folder: Path) -> dict | None:
     """The attributes of the Zarr group in a folder, None where there is no readable one."""
     try:
-        text = json.loads((folder / "zarr.json").read_text())
+        text = parse_json((folder / "zarr.json").read_bytes(), "a Zarr group", folder)
     except (OSError, ValueError):
         return None
-    return text.get("attributes") if isinstance(text, dict) and text.get("node_type") == "group" else None
+    known = isinstance(text, dict) and text.get("node_type") == "group"
+    return found if known and isinstance(found := text.get("attributes"), dict) else None
 
 
 def _difference(found: Settings, asked: Settings) -> str:

@@ -6,14 +6,24 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from curvafit.formats.arrays import read_hdf5, read_npy, read_npz, read_raw, write_npy
+from curvafit.formats.arrays import read_archive, read_hdf5, read_npy, read_npz, read_raw, write_npy
 from curvafit.formats.base import Raw, ScanError, normalise_unit
 from curvafit.formats.medical import check_mrc, is_dicom, read_dicom, read_itk, read_mrc, read_nrrd, write_mrc
 from curvafit.formats.ngff import read_zarr, write_zarr
 from curvafit.formats.nifti import read_nifti, write_nifti
 from curvafit.formats.tiff import SLICES, read_slices, read_tiff, write_ome_tiff, write_tiff
 
-__all__ = ["READERS", "WRITERS", "Raw", "ScanError", "normalise_unit", "pick_reader", "pick_writer"]
+__all__ = [
+    "KEYED",
+    "READERS",
+    "WRITERS",
+    "Raw",
+    "ScanError",
+    "normalise_unit",
+    "pick_reader",
+    "pick_writer",
+    "read_archive",
+]
 
 #: Suffix -> reader(path, key=, raw_shape=, dtype=).
 READERS: dict[str, Callable[..., Raw]] = {
@@ -30,6 +40,9 @@ READERS: dict[str, Callable[..., Raw]] = {
     ".mhd": read_itk,
     **dict.fromkeys((".mrc", ".map", ".rec"), read_mrc),
 }
+
+#: Readers of what can hold several arrays, by key.
+KEYED = (read_npz, read_hdf5, read_zarr, read_dicom)
 
 #: Suffix -> writer(field, path).
 WRITERS: dict[str, Callable[[Any, Path], None]] = {

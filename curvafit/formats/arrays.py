@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import zipfile
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import h5py
 import numpy as np
 
-from curvafit.formats.base import Raw, ScanError, pick_key, stated
+from curvafit.formats.base import Damaged, Raw, ScanError, pick_key, stated
+from curvafit.formats.streams import check_memory, check_regular, read_numbers
+from curvafit.priors.bounds import quoted
 
+#: Attributes that may state a spacing or its unit.
+_ATTRIBUTES = ("element_size_um", "spacing", "voxel_size", "unit", "units")
+#: NPY's versions; the third is for names of fields.
+_NPY_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 _RAW_TYPES = "uint8, int8, uint16, int16, uint32, int32, float32, float64 (or with > for big-endian, as in >u2)"
 
 
 def read_npy(path: Path, **_: object) -> Raw:
-    return Raw(np.load(path, allow_pickle=False))
+    with path.open("rb") as stream:
+        return Raw(_array(stream, path))
 
 
 def write_npy(field: Any, path: Path) -> None:
@@ -25,8 +33,46 @@ def write_npy(field: Any, path: Path) -> None:
 
 
 def read_npz(path: Path, *, key: str | None = None, **_: object) -> Raw:
-    with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-        return Raw(file[pick_key(list(file.files), key, path)])
+    with path.open("rb") as stream, zipfile.ZipFile(stream) as archive:
+        members = _members(archive)
+        return Raw(_member(archive, members[pick_key(list(members), key, path)]))
+
+
+def read_archive(source: Path | IO[bytes]) -> dict[str, np.ndarray]:
+    """All arrays of an NPZ file by name, each read to its end, where its checksum is.
+
+    Raises
+    ------
+    OSError, ValueError
+        If the file cannot be read, or is damaged or something else.
+    """
+    try:
+        with zipfile.ZipFile(source) as archive:
+            return {name: _member(archive, member) for name, member in _members(archive).items()}
+    except (OSError, ValueError):
+        raise
+    except Exception as reason:  # zipfile, zlib and numpy have a dozen ways to say so
+        raise ValueError(f"expected a whole NPZ file, got one that cannot be read ({quoted(str(reason))})") from reason
+
+
+def _members(archive: zipfile.ZipFile) -> dict[str, str]:
+    """Names of the arrays in an NPZ file, and of the members that hold them."""
+    return {name.removesuffix(".npy"): name for name in archive.namelist() if name.endswith(".npy")}
+
+
+def _member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
+    with archive.open(name) as stream:
+        return _array(stream, name)
+
+
+def _array(stream: IO[bytes], place: object) -> np.ndarray:
+    """The numbers of an NPY stream, which must end with them."""
+    version = np.lib.format.read_magic(stream)
+    if version not in _NPY_HEADERS:
+        raise Damaged(f"NPY of version {version} holds no plain numbers")
+    shape, fortran, dtype = _NPY_HEADERS[version](stream)
+    values = read_numbers(stream, shape[::-1] if fortran else shape, dtype, place)
+    return values.T if fortran else values
 
 
 def read_hdf5(path: Path, *, key: str | None = None, **_: object) -> Raw:
@@ -35,8 +81,32 @@ def read_hdf5(path: Path, *, key: str | None = None, **_: object) -> Raw:
         keys: list[str] = []
         file.visititems(lambda name, item: keys.append(name) if isinstance(item, h5py.Dataset) else None)
         dataset: Any = file[pick_key(keys, key, path)]
-        spacing, unit = stated(dict(dataset.attrs), dataset.ndim)
-        return Raw(dataset[()], spacing, unit)
+        if dataset.external:
+            raise ScanError(f"expected values in the file itself, got {path} whose values lie in other files")
+        if dataset.shape is None:
+            raise ScanError(f"expected a 3D volume, got no values in {path}")
+        check_memory(dataset.shape, dataset.dtype, path)
+        attributes = {name: dataset.attrs[name] for name in _ATTRIBUTES if name in dataset.attrs}
+        spacing, unit = stated(attributes, dataset.ndim)
+        gaps = tuple(_gaps(dataset, path))
+        return Raw(np.asarray(dataset[()]), spacing, unit, gaps=gaps)
+
+
+def _gaps(dataset: Any, path: Path) -> Iterator[str]:
+    """What of a dataset is not in the file, in sentences: HDF5 fills it in and says nothing."""
+    filled = f"their voxels have the fill value {dataset.fillvalue}."
+    if dataset.is_virtual:
+        names = {source.file_name for source in dataset.virtual_sources()} - {"."}
+        lost = sorted(name for name in names if not check_regular(path.parent / name).exists())
+        if lost:
+            yield f"{len(lost)} of its {len(names)} source files are not there, {lost[0][:80]} among them; {filled}"
+    elif dataset.chunks:
+        count = math.prod(-(-n // chunk) for n, chunk in zip(dataset.shape, dataset.chunks, strict=True))
+        lost = count - dataset.id.get_num_chunks()
+        if lost > 0:
+            yield f"{lost} of {count} chunks are not stored: {filled}"
+    elif dataset.size and not dataset.id.get_storage_size():
+        yield f"No values are stored: {filled}"
 
 
 def read_raw(path: Path, *, raw_shape: Sequence[int] | None = None, dtype: str | None = None, **_: object) -> Raw:
@@ -52,7 +122,7 @@ def read_raw(path: Path, *, raw_shape: Sequence[int] | None = None, dtype: str |
     try:
         kind = np.dtype(dtype or "uint8")
     except TypeError:
-        raise ScanError(f"expected a dtype such as {_RAW_TYPES}, got {dtype!r}") from None
+        raise ScanError(f"expected a dtype such as {_RAW_TYPES}, got {quoted(dtype)}") from None
     if size != math.prod(shape) * kind.itemsize:
         wanted = math.prod(shape) * kind.itemsize
         raise ScanError(f"expected {wanted} bytes for shape {shape} of {kind}, got {size} in {path}")

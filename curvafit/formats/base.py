@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
+import logging
+import re
+import threading
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from curvafit.priors.bounds import quoted
 from curvafit.priors.grid import METRES
 
 #: Suffixes of what a name may state as a unit -> (our name, factor to it).
@@ -26,15 +32,32 @@ _UNITS: dict[str, tuple[str, float]] = {
 }
 
 
+#: What would break a line, or cannot be printed.
+_UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
+
+
 class ScanError(ValueError):
-    """A volume that cannot be used, said in one sentence."""
+    """A volume that cannot be used, said in one sentence on one line."""
+
+    def __init__(self, sentence: str) -> None:
+        super().__init__(one_line(sentence))
+
+
+class Damaged(Exception):
+    """What is wrong with a file, for the sentence that names it."""
+
+
+def one_line(text: str) -> str:
+    """The text with its line breaks, and what else a file's name can bring along, escaped."""
+    return _UNPRINTABLE.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
 class Raw(NamedTuple):
     """What a file holds: an array with z first, and spacing, unit and affine where it states them.
 
     `spacing` has one number per axis of `values`, or three for (z, y, x). `guesses` are sentences on a spacing or unit
-    that the file leaves open: void where the caller states it.
+    that the file leaves open: void where the caller states it. `gaps` are sentences on values that are not in the file
+    and were filled in.
     """
 
     values: np.ndarray
@@ -43,6 +66,31 @@ class Raw(NamedTuple):
     affine: np.ndarray | None = None
     notes: tuple[str, ...] = ()
     guesses: tuple[str, ...] = ()
+    gaps: tuple[str, ...] = ()
+
+
+@contextmanager
+def complaints(logger: str | None = None) -> Iterator[list[str]]:
+    """What a library logs meanwhile, kept from the host's streams; its warnings go unsaid."""
+    said: list[str] = []
+    here, speaker = threading.get_ident(), logging.getLogger(logger or __name__)
+    level = speaker.level
+
+    def kept(record: logging.LogRecord) -> bool:
+        if record.thread == here:
+            said.append(one_line(record.getMessage()))
+        return record.thread != here
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        speaker.addFilter(kept)
+        if not speaker.isEnabledFor(logging.WARNING):
+            speaker.setLevel(logging.WARNING)
+        try:
+            yield said
+        finally:
+            speaker.setLevel(level)
+            speaker.removeFilter(kept)
 
 
 def normalise_unit(unit: str | None) -> tuple[str, float]:
@@ -53,9 +101,9 @@ def normalise_unit(unit: str | None) -> tuple[str, float]:
     ScanError
         If the name is of no known unit.
     """
-    name = (unit or "").strip().casefold()
+    name = "" if unit is None else unit.strip().casefold() if isinstance(unit, str) else None
     if name not in _UNITS:
-        raise ScanError(f"expected a unit of voxel, nm, um, mm or m, got {unit!r}")
+        raise ScanError(f"expected a unit of voxel, nm, um, mm or m, got {quoted(unit)}")
     return _UNITS[name]
 
 
@@ -69,26 +117,31 @@ def convert_length(length: float, unit: str | None, to: str | None) -> float:
 
 def pick_key(keys: list[str], key: str | None, path: object) -> str:
     """The key asked for, or the only one; else a sentence that lists what there is."""
-    listed = ", ".join(keys[:20]) + (", …" if len(keys) > 20 else "")
+    listed = ", ".join(name[:80] for name in keys[:20]) + (", …" if len(keys) > 20 else "")
     if key is None:
         if len(keys) == 1:
             return keys[0]
         raise ScanError(f"expected a key as in {path}::KEY, got none, and {path} has {listed or 'no arrays'}")
     found = key if key in keys else key.strip("/")
     if found not in keys:
-        raise ScanError(f"expected a key of {path}, got {key!r}, and it has {listed or 'no arrays'}")
+        raise ScanError(f"expected a key of {path}, got {quoted(key)}, and it has {listed or 'no arrays'}")
     return found
 
 
-def stated(attributes: Mapping[str, Any], ndim: int) -> tuple[tuple[float, ...] | None, str | None]:
-    """Spacing and unit of an array's attributes; one number counts for all axes."""
+def stated(attributes: Mapping[str, Any], ndim: int) -> tuple[tuple[Any, ...] | None, Any]:
+    """Spacing and unit of an array's attributes, as they stand; one number counts for all axes."""
     for name, known in (("element_size_um", "um"), ("spacing", None), ("voxel_size", None)):
         if name in attributes:
-            sizes = np.atleast_1d(np.asarray(attributes[name], dtype=np.float64))
-            unit = known or attributes.get("unit", attributes.get("units"))
-            unit = unit.decode() if isinstance(unit, bytes) else unit
-            return tuple(float(h) for h in (np.repeat(sizes, ndim) if sizes.size == 1 else sizes)), unit
+            sizes = _listed(attributes[name])
+            unit = known or (_listed(attributes.get("unit", attributes.get("units"))) or (None,))[0]
+            return sizes * ndim if len(sizes) == 1 else sizes, unit
     return None, None
+
+
+def _listed(value: Any) -> tuple[Any, ...]:
+    """What an attribute holds: numbers, texts, or what it is."""
+    held = np.ravel(np.asarray(value, dtype=object) if isinstance(value, list | tuple) else np.asarray(value)).tolist()
+    return tuple(each.decode(errors="replace") if isinstance(each, bytes) else each for each in held[:99])
 
 
 def extra(module: str, what: str) -> Any:

@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.formats.base import Raw, ScanError, convert_length, extra, pick_key
+from curvafit.formats.base import Raw, ScanError, complaints, convert_length, extra, pick_key
+from curvafit.formats.headers import check_meta, nrrd_values
+from curvafit.formats.streams import opened, read_numbers
 
 #: From DICOM's and ITK's patient frame (left, posterior, superior) to NIfTI's (right, anterior, superior).
 _LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -15,7 +17,9 @@ _LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 def read_nrrd(path: Path, **_: object) -> Raw:
     nrrd = extra("nrrd", "NRRD files")
-    values, header = nrrd.read(str(path), index_order="C")
+    with path.open("rb") as file:
+        header = nrrd.read_header(file)
+        values = nrrd_values(nrrd, header, file, path)
     units = header.get("space units") or header.get("units")
     unit = next((u for u in units if u), None) if units is not None else None
     if "space directions" in header:
@@ -35,7 +39,13 @@ def read_nrrd(path: Path, **_: object) -> Raw:
 def read_itk(path: Path, **_: object) -> Raw:
     """MetaImage; ITK's unit is the millimetre."""
     itk = extra("SimpleITK", "MHA and MHD files")
-    image = itk.ReadImage(str(path))
+    check_meta(path)
+    shown = itk.ProcessObject.GetGlobalWarningDisplay()
+    itk.ProcessObject.SetGlobalWarningDisplay(False)
+    try:
+        image = itk.ReadImage(str(path))
+    finally:
+        itk.ProcessObject.SetGlobalWarningDisplay(shown)
     spacing = np.array(image.GetSpacing())
     values = itk.GetArrayFromImage(image)
     affine = None
@@ -50,10 +60,15 @@ def read_itk(path: Path, **_: object) -> Raw:
 def read_mrc(path: Path, **_: object) -> Raw:
     """MRC and CCP4 maps; voxel sizes in Å."""
     mrcfile = extra("mrcfile", "MRC files")
-    with mrcfile.open(path, mode="r") as file:
-        size = file.voxel_size
-        spacing = (float(size.z), float(size.y), float(size.x))
-        return Raw(np.array(file.data), spacing if min(spacing) > 0 else None, "angstrom")
+    with mrcfile.open(path, mode="r", header_only=True) as file:
+        header, size = file.header, file.voxel_size
+        shape, dtype = mrcfile.utils.data_shape_from_header(header), mrcfile.utils.data_dtype_from_header(header)
+        start = header.nbytes + int(header.nsymbt)
+    with opened(path) as stream:
+        stream.seek(start)
+        values = read_numbers(stream, [int(n) for n in shape], dtype, path)
+    spacing = (float(size.z), float(size.y), float(size.x))
+    return Raw(values, spacing if min(spacing) > 0 else None, "angstrom")
 
 
 def check_mrc(unit: str) -> None:
@@ -78,14 +93,16 @@ def read_dicom(path: Path, *, key: str | None = None, **_: object) -> Raw:
     """A folder of one series' slices, in the order of their positions; `key` picks a series by its UID."""
     pydicom = extra("pydicom", "DICOM folders")
     files = sorted(p for p in path.iterdir() if p.is_file() and is_dicom(p))
-    images = [image for image in map(pydicom.dcmread, files) if "PixelData" in image]
+    with complaints("pydicom"):
+        images = [image for image in map(pydicom.dcmread, files) if "PixelData" in image]
     series = sorted({str(image.get("SeriesInstanceUID", "")) for image in images})
     chosen = pick_key(series, key, path)
     slices = [image for image in images if str(image.get("SeriesInstanceUID", "")) == chosen]
     rows, columns = np.array(slices[0].ImageOrientationPatient, dtype=float).reshape(2, 3)
     normal = np.cross(rows, columns)
     slices.sort(key=lambda image: float(np.dot(normal, np.array(image.ImagePositionPatient, dtype=float))))
-    values = np.stack([_rescaled(image) for image in slices])
+    with complaints("pydicom"):
+        values = np.stack([_rescaled(image) for image in slices])
     z, origin = _slice_distance(slices, normal, path)
     y, x = (float(h) for h in slices[0].PixelSpacing)
     affine = np.eye(4)

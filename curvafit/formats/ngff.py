@@ -13,6 +13,8 @@ import zarr
 
 from curvafit.files import MARK
 from curvafit.formats.base import Raw, pick_key, stated
+from curvafit.formats.chunks import check_store, missing_chunks
+from curvafit.formats.streams import check_memory
 
 #: Edge of a chunk, and of the largest volume that is not halved any more, in voxels.
 CHUNK = 64
@@ -24,10 +26,10 @@ _UNITS = {"nm": "nanometer", "um": "micrometer", "mm": "millimeter", "m": "meter
 
 def read_zarr(path: Path, *, key: str | None = None, **_: object) -> Raw:
     """An array, or one of a group; spacing and unit from its attributes or from OME-Zarr's multiscales."""
+    check_store(path)
     node: Any = zarr.open(path, mode="r")
     if isinstance(node, zarr.Array):
-        spacing, unit = stated(node.attrs.asdict(), node.ndim)
-        return Raw(np.asarray(node[...]), spacing, unit)
+        return _raw(node, path, stated(node.attrs.asdict(), node.ndim))
     arrays = _arrays(node)
     attributes = node.attrs.asdict()
     scales = _multiscales(attributes)
@@ -35,8 +37,15 @@ def read_zarr(path: Path, *, key: str | None = None, **_: object) -> Raw:
         key = next(iter(scales))
     name = pick_key(sorted(arrays), key, path)
     array = arrays[name]
-    spacing, unit = scales.get(name) or stated({**attributes, **array.attrs.asdict()}, array.ndim)
-    return Raw(np.asarray(array[...]), spacing, unit)
+    place = scales.get(name) or stated({**attributes, **array.attrs.asdict()}, array.ndim)
+    return _raw(array, path / array.path, place)
+
+
+def _raw(array: Any, folder: Path, place: tuple[tuple[Any, ...] | None, Any]) -> Raw:
+    """The values of an array in a folder, with what of them is not stored."""
+    check_memory(array.shape, array.dtype, folder)
+    gaps = missing_chunks(array, folder)
+    return Raw(np.asarray(array[...]), *place, gaps=gaps)
 
 
 def write_zarr(field: Any, path: Path) -> None:
@@ -55,7 +64,12 @@ def write_zarr(field: Any, path: Path) -> None:
     for k, (values, _) in enumerate(levels):
         chunks = tuple(min(CHUNK, n) for n in values.shape)
         array = group.create_array(
-            str(k), shape=values.shape, chunks=chunks, dtype=values.dtype, dimension_names=("z", "y", "x")
+            str(k),
+            shape=values.shape,
+            chunks=chunks,
+            dtype=values.dtype,
+            dimension_names=("z", "y", "x"),
+            config={"write_empty_chunks": True},  # so that a chunk that is not there is one that was lost
         )
         array[...] = values
 

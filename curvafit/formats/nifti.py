@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import math
 import re
 from pathlib import Path
@@ -9,8 +10,10 @@ from typing import Any
 
 import nibabel
 import numpy as np
+from nibabel.volumeutils import apply_read_scaling
 
-from curvafit.formats.base import Raw, ScanError, normalise_unit
+from curvafit.formats.base import Raw, ScanError, complaints, normalise_unit
+from curvafit.formats.streams import read_numbers
 
 #: Our unit -> (NIfTI's, factor to it).
 _TO_FILE = {
@@ -24,15 +27,16 @@ _TO_FILE = {
 
 def read_nifti(path: Path, **_: object) -> Raw:
     """Values, zooms, unit and affine. Without a unit, zooms other than 1 are taken for mm, as NIfTI's readers do."""
-    image: Any = nibabel.load(path)
-    values = np.asanyarray(image.dataobj).T
+    with complaints("nibabel.global") as said:
+        image: Any = nibabel.load(path)
+        values = _values(image, path)
     zooms = tuple(float(f"{h:.7g}") for h in image.header.get_zooms())[:3]  # stored as float32
     if len(zooms) < 3:
         raise ScanError(f"expected a 3D volume, got {values.ndim}D of shape {values.shape} in {path}")
     unit = image.header.get_xyzt_units()[0]
     affine = np.array(image.affine, dtype=np.float64)
     spacing: tuple[float, ...] | None = (1.0,) * (values.ndim - 3) + zooms[::-1]
-    guesses: list[str] = []
+    guesses = [f"The file's header is mended: {text}." for text in dict.fromkeys(said)]
     wrote = _own_unit(image.header)
     if wrote:
         unit, factor = wrote
@@ -47,6 +51,15 @@ def read_nifti(path: Path, **_: object) -> Raw:
     if spacing is not None and not np.allclose(lengths, spacing[-3:], rtol=0.01):
         guesses.append("The file's affine and voxel sizes disagree: the voxel sizes are used.")
     return Raw(values, spacing, unit, affine, guesses=tuple(guesses))
+
+
+def _values(image: Any, path: Path) -> np.ndarray:
+    """The scaled values, z first, of a file that ends with them and whose checksum, if it is compressed, holds."""
+    stored = image.dataobj
+    with gzip.open(path) if path.name.lower().endswith(".gz") else path.open("rb") as stream:
+        stream.seek(stored.offset)
+        values = read_numbers(stream, stored.shape[::-1], stored.dtype, path)
+    return apply_read_scaling(values, np.asanyarray(stored.slope), np.asanyarray(stored.inter))
 
 
 def write_nifti(field: Any, path: Path) -> None:
@@ -78,7 +91,8 @@ def write_nifti_like(values: np.ndarray, like: Path, path: Path, unit: str | Non
     ScanError
         If the other file has another number of voxels.
     """
-    image: Any = nibabel.load(like)
+    with complaints("nibabel.global"):
+        image: Any = nibabel.load(like)
     header = image.header.copy()
     if math.prod(image.shape) != values.size:
         raise ScanError(f"expected values of the file's shape {image.shape[::-1]}, got {values.shape}")

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import logging
+import math
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -13,7 +12,8 @@ from xml.etree import ElementTree
 import numpy as np
 import tifffile
 
-from curvafit.formats.base import Raw, ScanError, convert_length, normalise_unit
+from curvafit.formats.base import Damaged, Raw, ScanError, complaints, convert_length, normalise_unit
+from curvafit.formats.streams import check_memory, check_regular
 
 #: Suffixes of a folder's slices.
 SLICES = (".tif", ".tiff")
@@ -21,38 +21,87 @@ SLICES = (".tif", ".tiff")
 _IMAGEJ_LIMIT = 2**32 - 2**25
 #: Voxels a unit that TIFF's resolution can state.
 _RESOLUTION_LIMIT = 2**31
+#: What tifffile says where it goes on without a part of a file.
+_LOST = (
+    "invalid page offset",
+    "invalid offset",
+    "missing",
+    "corrupted",
+    "not match",
+    "failed to",
+    "out of range",
+    "raised",
+)
 _TAG_UNITS = {2: "inch", 3: "cm"}
 #: Resolutions that programs write when they know none (dots an inch; 25.4 is a dot a millimetre).
 _SCREEN = (1, 25.4, 72, 96, 100, 150, 200, 300, 600)
 
 
 def read_tiff(path: Path, **_: object) -> Raw:
-    """The first series of a file."""
-    with _complaints() as said, tifffile.TiffFile(path) as file:
+    """The first series of a file, if every strip and page that it speaks of is there."""
+    with complaints("tifffile") as said, tifffile.TiffFile(path) as file:
         series = file.series[0]
         if "S" in series.axes:
             raise ScanError(f"expected a grey volume, got a colour image (axes {series.axes}) in {path}")
-        values = series.asarray()
+        check_memory(series.shape, series.dtype or np.dtype("V1"), path)
+        _check_pages(file, series)
+        values = np.asarray(series.asarray())
         spacing, unit, guesses = _spacing(file)
         count = len(file.series)
-    lost = next((text for text in said if "invalid page offset" in text), None)
-    if lost:
-        raise ScanError(f"expected a whole, readable file, got {path} that cannot be read ({lost})")
+    tags = [text for text in said if text.startswith("<TiffTag")]
+    if lost := [text for text in said if text not in tags and any(mark in text.lower() for mark in _LOST)]:
+        raise Damaged(lost[0])
     notes = (f"The file holds {count} images: the first is used.",) if count > 1 else ()
+    notes += (f"{len(tags)} of the file's tags cannot be read: what they state is not known.",) if tags else ()
     return Raw(values, spacing, unit, notes=notes, guesses=guesses)
 
 
 def read_slices(path: Path, **_: object) -> Raw:
     """A folder of 2D slices in the natural order of their names; in-plane size from the first slice's tags."""
     names = sorted((p for p in path.iterdir() if p.suffix.lower() in SLICES), key=lambda p: natural_key(p.name))
-    first = read_tiff(names[0])
-    slices = [np.squeeze(tifffile.imread(name)) for name in names]
-    for name, plane in zip(names, slices, strict=True):
+    first, slices = None, []
+    for name in names:
+        raw = read_tiff(check_regular(name))
+        first, plane = first or raw, np.squeeze(raw.values)
+        slices.append(plane)
         if plane.ndim != 2 or plane.shape != slices[0].shape:
             raise ScanError(
                 f"expected 2D slices of one shape {slices[0].shape}, got {plane.shape} in {name.name} of {path}"
             )
-    return first._replace(values=np.stack(slices))
+    assert first is not None
+    return first._replace(values=np.stack(slices), gaps=_skipped([name.stem for name in names]))
+
+
+def _skipped(names: Sequence[str]) -> tuple[str, ...]:
+    """A sentence on the numbers that a folder's names skip, where all but their last number is alike."""
+    parts = [re.fullmatch(r"(.*?)(\d{1,15})(\D*)", name) for name in names]
+    if len(names) < 3 or None in parts or len({(part[1], part[3]) for part in parts if part}) > 1:
+        return ()
+    numbers = np.array([int(part[2]) for part in parts if part])
+    steps = np.diff(numbers)
+    at = int(steps.argmax())
+    if steps.min() < 1 or steps[at] == np.median(steps):
+        return ()
+    return (f"The numbers of the slices skip some, after {names[at]} for one: what is there is stacked.",)
+
+
+def _check_pages(file: tifffile.TiffFile, series: tifffile.TiffPageSeries) -> None:
+    """Refuse what tifffile would fill with zeros: pages, strips and tiles that are not there, or beyond the end."""
+    metadata = file.imagej_metadata or {}
+    if file.is_imagej and int(metadata.get("images", 1)) > math.prod(series.shape[:-2]):
+        raise Damaged(f"{metadata['images']} images by its description, {math.prod(series.shape[:-2])} in the file")
+    if series.dataoffset is not None:  # all values in one piece, whatever its pages are
+        wanted = math.prod(series.shape) * np.dtype(series.dtype).itemsize
+        if series.dataoffset + wanted > file.filehandle.size:
+            raise Damaged(f"{wanted} bytes of values by its header, fewer in the file")
+        return
+    for number, page in enumerate(series.pages):
+        if page is None:
+            raise Damaged(f"page {number} is not there")
+        places = list(zip(page.dataoffsets, page.databytecounts, strict=False))
+        whole = all(start > 0 and count > 0 and start + count <= file.filehandle.size for start, count in places)
+        if not whole or len(places) < (1 if page.is_contiguous else math.prod(page.chunked)):
+            raise Damaged(f"strips or tiles of page {number} are not there")
 
 
 def write_tiff(field: Any, path: Path) -> None:
@@ -86,22 +135,6 @@ def _stored(field: Any) -> np.ndarray:
 def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
     """Sorts slice2 before slice10."""
     return tuple((0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", name.casefold()))
-
-
-@contextmanager
-def _complaints() -> Iterator[list[str]]:
-    """What tifffile logs meanwhile: it reads what is left of a damaged file and raises nothing."""
-    said: list[str] = []
-    handler = logging.Handler(logging.WARNING)
-    handler.emit = lambda record: said.append(record.getMessage())  # type: ignore[method-assign]
-    logger = logging.getLogger("tifffile")
-    propagate, logger.propagate = logger.propagate, False
-    logger.addHandler(handler)
-    try:
-        yield said
-    finally:
-        logger.removeHandler(handler)
-        logger.propagate = propagate
 
 
 def _spacing(file: tifffile.TiffFile) -> tuple[tuple[float, ...] | None, str | None, tuple[str, ...]]:

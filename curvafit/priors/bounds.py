@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import operator
+import reprlib
 from typing import Any
 
 #: Seeds are below this: what a signed 64-bit number holds.
@@ -14,10 +15,13 @@ SHORTEST, LONGEST = 1e-12, 1e12
 #: Characters of a value that a message shows.
 SHOWN = 80
 
+_SHORT = reprlib.Repr()
+_SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother, _SHORT.maxlong = 3, SHOWN, SHOWN, SHOWN // 2
+
 
 def quoted(value: Any) -> str:
-    """A value as a message shows it: on one line, and no longer than fits on it."""
-    text = " ".join(repr(value).split())
+    """A value as a message shows it: on one line, and no longer than fits on it, however much it holds."""
+    text = " ".join(_SHORT.repr(value).split())
     return text if len(text) <= SHOWN else f"{text[: SHOWN - 2]} …"
 
 

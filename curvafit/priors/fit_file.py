@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
 
 from torch import Tensor
 
+from curvafit.priors.bounds import quoted
 from curvafit.priors.coefficients import NAMES, PRESETS, Coefficients
+from curvafit.priors.fit_schema import FORMAT, violation
 from curvafit.priors.grid import METRES, WORKING_SPACING
-
-FORMAT = "curvafit-fit-1"
+from curvafit.priors.json_text import parse_json
 
 
 class Prior(NamedTuple):
@@ -80,26 +80,23 @@ def read_fit(path: str | PathLike[str]) -> Prior:
     Raises
     ------
     FileNotFoundError, ValueError
-        If there is no such file, or it is not a `fit.json` of this format.
+        If there is no such file, or it is not a `fit.json` of this format (`fit_schema`).
     """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"expected a fit.json, found no file {path}")
-    try:
-        content = json.loads(path.read_text())
-        found = content["format"]
-        if found != FORMAT:
-            raise ValueError(
-                f"expected a fit.json of format {FORMAT}, got {found!r} in {path}: run `curvafit infer` again"
-            )
-        working, physical = (
-            Coefficients(*(content[key][name] for name in NAMES)) for key in ("coefficients", "coefficients_physical")
-        )
-        mass, epsilon, voxel = (float(content[key]) for key in ("mass", "epsilon_physical", "working_voxel"))
-        if not (epsilon > 0 and voxel > 0):
-            raise ValueError(f"expected a positive ε and working voxel in {path}, got {epsilon} and {voxel}")
-        told = (content.get("morphometry") or {}).get("volume_fraction")
-        filled = None if told is None else float(told)
-        return Prior(working, mass, physical, epsilon, voxel, str(content["length_unit"]), filled)
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"expected a fit.json written by `curvafit infer`, got {path} ({error!r})") from error
+    expected = "a fit.json written by `curvafit infer`"
+    content = parse_json(path.read_bytes(), expected, path)
+    said = content.get("format", FORMAT) if isinstance(content, dict) else FORMAT
+    if said != FORMAT:
+        got = f"got {quoted(said)} in {path}: run `curvafit infer` again"
+        raise ValueError(f"expected a fit.json of format {FORMAT}, {got}")
+    if wrong := violation(content):
+        raise ValueError(f"expected {expected} with {wrong} in {path}")
+    working, physical = (
+        Coefficients(*(float(content[key][name]) for name in NAMES))
+        for key in ("coefficients", "coefficients_physical")
+    )
+    mass, epsilon, voxel = (float(content[key]) for key in ("mass", "epsilon_physical", "working_voxel"))
+    filled = (content.get("morphometry") or {}).get("volume_fraction")
+    return Prior(working, mass, physical, epsilon, voxel, content["length_unit"], filled)

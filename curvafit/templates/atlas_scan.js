@@ -1,7 +1,6 @@
 // A scan's fit.json on the map. Nothing is sent anywhere: the page measures it against what it holds.
 
 const [DIRECTIONS, QUANTILES] = [12, 24];
-const FIT_FORMAT = "curvafit-fit-1";
 let embeddings;
 
 /** Sliced-quantile embedding of a diagram, as `curvafit.transport.sliced_embedding` has it. */
@@ -44,7 +43,8 @@ function nearestShapes(diagram, seenAs) {
 
 /** What a fit.json says of its place; raises a sentence where it says nothing. */
 function placed(fit, file) {
-  if (fit?.format !== FIT_FORMAT) throw new Error(`expected a fit.json of format ${FIT_FORMAT}, got ${file}`);
+  const wrong = violation(fit, atlas.fit);
+  if (wrong) throw new Error(`expected a fit.json with ${wrong} in ${file}`);
   if (fit.diagram && !whole(fit.diagram)) throw new Error(`expected a fit.json with a whole diagram, got ${file}`);
   const diagram = fit.diagram && {
     kappa1: fit.diagram.kappa1, kappa2: fit.diagram.kappa2, share: fit.diagram.share,
@@ -61,19 +61,18 @@ function placed(fit, file) {
   return { fit, file, diagram, seenAs, near, place, spread };
 }
 
-/** Whether a diagram is three columns of numbers, with some area. */
+/** Whether a diagram's three columns are of one length, with some area. */
 function whole({ kappa1, kappa2, share }) {
-  return [kappa1, kappa2, share].every((list) => Array.isArray(list) && list.length === share.length && list.every(Number.isFinite))
-    && share.some((part) => part > 0);
+  return kappa1.length === share.length && kappa2.length === share.length && share.some((part) => part > 0);
 }
 
 /** Matches that `infer` found, where they are shapes of this very atlas: same name, same parameters. */
 function ownMatches(fit) {
   const same = (match, k) => k >= 0 && ["a11", "a02", "a10", "a01", "a00"].every((name) => {
-    const [mine, other] = [columns[name].values[k], match.coefficients?.[name]];
+    const [mine, other] = [columns[name].values[k], match.coefficients[name]];
     return Math.abs(mine - other) <= 1e-9 * Math.max(1, Math.abs(mine));
   });
-  return (Array.isArray(fit.matches) ? fit.matches : []).map((match) => [match, atlas.ids.indexOf(match.id)]).filter(([match, k]) => same(match, k))
+  return (fit.matches ?? []).map((match) => [match, atlas.ids.indexOf(match.id)]).filter(([match, k]) => same(match, k))
     .map(([match, k]) => [k, match.distance]);
 }
 

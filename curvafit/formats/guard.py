@@ -1,0 +1,56 @@
+"""One way into all readers: whatever is wrong with a file becomes one sentence, and no library speaks for itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from curvafit.formats import KEYED, pick_reader
+from curvafit.formats.base import Damaged, Raw, ScanError, complaints, one_line
+from curvafit.formats.streams import check_regular
+from curvafit.priors.bounds import quoted
+
+
+def read_file(
+    path: Path, key: str | None = None, raw_shape: Sequence[int] | None = None, dtype: str | None = None
+) -> Raw:
+    """What the reader of a file, chosen by its suffix or by what lies in it, gives.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ScanError
+        If it is neither a file nor a folder, of an unknown suffix, damaged, or has no keys and one is asked for.
+    """
+    if not path.exists():
+        raise FileNotFoundError(one_line(f"expected a volume file, got no such file: {path}"))
+    reader = pick_reader(check_regular(path), raw_shape is not None)
+    if key is not None and reader not in KEYED:
+        raise ScanError(f"expected a key only for NPZ, HDF5, Zarr and DICOM, got {quoted(key)} for {path}")
+    return guarded(reader, path, key=key, raw_shape=raw_shape, dtype=dtype)
+
+
+def guarded(reader: Callable[..., Raw], path: Path, **options: object) -> Raw:
+    """A library's own exceptions become one sentence; ours pass.
+
+    Raises
+    ------
+    ScanError
+        If the reader raises.
+    """
+    try:
+        with complaints():
+            return reader(path, **options)
+    except ScanError:
+        raise
+    except MemoryError as reason:
+        raise ScanError(f"expected a volume that fits into memory, got {path}, which does not") from reason
+    except Damaged as reason:
+        said = str(reason)
+        cause = reason
+    except Exception as reason:  # every library has its own way to say that a file is damaged
+        said = f"{type(reason).__name__}: {reason}"
+        cause = reason
+    said = " ".join(said[:2000].split())[:200]
+    raise ScanError(f"expected a whole, readable file, got {path} that cannot be read ({said})") from cause

@@ -1,0 +1,133 @@
+"""What a `fit.json` must hold: a schema, and a check of it that the page of an atlas has in JavaScript too.
+
+The schema is data in the words of JSON Schema. Both checks know `type`, `enum`, `required`, `properties`, `items`,
+`minItems`, `minimum`, `maximum` and their exclusive forms; `description` is what an error says was expected.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from curvafit.priors.bounds import quoted
+from curvafit.priors.coefficients import NAMES
+from curvafit.priors.grid import METRES
+
+FORMAT = "curvafit-fit-1"
+
+_NUMBER = {"type": "number", "description": "a finite number"}
+_POSITIVE = {"type": "number", "exclusiveMinimum": 0, "description": "a positive number"}
+_TEXT = {"type": "string", "description": "a text"}
+_SIX = {
+    "type": "object",
+    "required": list(NAMES),
+    "properties": dict.fromkeys(NAMES, _NUMBER),
+    "description": "an object of six coefficients",
+}
+_CURVATURES = {"type": "array", "items": _NUMBER, "minItems": 1, "description": "a list of numbers"}
+_SHARE = {"type": "number", "minimum": 0, "description": "a number from 0"}
+_DIAGRAM = {
+    "type": ["object", "null"],
+    "required": ["kappa1", "kappa2", "share"],
+    "properties": {
+        "seen_as": {"enum": ["field", "mask"], "description": "field or mask"},
+        "kappa1": _CURVATURES,
+        "kappa2": _CURVATURES,
+        "share": {"type": "array", "items": _SHARE, "minItems": 1, "description": "a list of numbers"},
+    },
+    "description": "an object of columns, or null",
+}
+_MATCH = {
+    "type": "object",
+    "required": ["id", "distance", "coefficients"],
+    "properties": {"id": _TEXT, "distance": _SHARE, "coefficients": _SIX},
+    "description": "an object",
+}
+_FILLED = {"type": ["number", "null"], "minimum": 0, "maximum": 1, "description": "a number from 0 to 1, or null"}
+_MASS = {"type": "number", "exclusiveMinimum": -1, "exclusiveMaximum": 1, "description": "a number between -1 and 1"}
+
+FIT_SCHEMA: dict[str, Any] = {
+    "type": "object",
+    "required": [
+        "format",
+        "coefficients",
+        "mass",
+        "coefficients_physical",
+        "epsilon_physical",
+        "working_voxel",
+        "length_unit",
+    ],
+    "properties": {
+        "format": {"enum": [FORMAT], "description": FORMAT},
+        "kind": {"enum": ["field", "mask", "image"], "description": "field, mask or image"},
+        "family": _TEXT,
+        "coefficients": _SIX,
+        "mass": _MASS,
+        "coefficients_physical": _SIX,
+        "epsilon_physical": _POSITIVE,
+        "working_voxel": _POSITIVE,
+        "length_unit": {"enum": ["voxel", *METRES], "description": f"one of voxel, {', '.join(METRES)}"},
+        "matches": {"type": "array", "items": _MATCH, "description": "a list"},
+        "morphometry": {
+            "type": ["object", "null"],
+            "properties": {"volume_fraction": _FILLED},
+            "description": "an object, or null",
+        },
+        "diagram": _DIAGRAM,
+        "provenance": {
+            "type": "object",
+            "properties": {"scan": {"type": ["string", "null"], "description": "a text, or null"}},
+            "description": "an object",
+        },
+    },
+    "description": "an object",
+}
+
+_BOUNDS = {
+    "minimum": lambda value, bound: value >= bound,
+    "maximum": lambda value, bound: value <= bound,
+    "exclusiveMinimum": lambda value, bound: value > bound,
+    "exclusiveMaximum": lambda value, bound: value < bound,
+}
+
+
+def violation(value: Any, schema: Mapping[str, Any] = FIT_SCHEMA, name: str = "the content") -> str | None:
+    """The first thing in a value that breaks a schema, as in `"mass as a positive number, got 0"`; None if nothing."""
+    if not _fits(value, schema):
+        return f"{name} as {schema['description']}, got {quoted(value)}"
+    prefix = "" if name == "the content" else f"{name}."
+    if isinstance(value, Mapping):
+        for key in schema.get("required", ()):
+            if key not in value:
+                return f"{prefix}{key}, got none"
+        for key, inner in schema.get("properties", {}).items():
+            if key in value and (found := violation(value[key], inner, prefix + key)):
+                return found
+    if isinstance(value, list) and "items" in schema:
+        for k, each in enumerate(value):
+            if found := violation(each, schema["items"], f"{name}[{k}]"):
+                return found
+    return None
+
+
+def _fits(value: Any, schema: Mapping[str, Any]) -> bool:
+    """Whether a value alone, without what is in it, is as its schema says."""
+    if "enum" in schema:
+        return isinstance(value, str) and value in schema["enum"]
+    kind, known = _type(value), schema["type"]
+    if kind not in ([known] if isinstance(known, str) else known):
+        return False
+    if kind == "number":
+        return all(fits(value, schema[bound]) for bound, fits in _BOUNDS.items() if bound in schema)
+    return kind != "array" or len(value) >= schema.get("minItems", 0)
+
+
+def _type(value: Any) -> str | None:
+    """JSON's name of a value's type; None for what JSON has not, numbers that are not finite among it."""
+    if isinstance(value, bool):
+        return "boolean"
+    if isinstance(value, (int, float)):
+        return "number" if math.isfinite(value) else None
+    names = {type(None): "null", str: "string", list: "array", dict: "object"}
+    return next((name for kind, name in names.items() if isinstance(value, kind)), None)

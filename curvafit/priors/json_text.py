@@ -1,0 +1,78 @@
+"""JSON read safely, and values quoted briefly: what every header, record and fit of the package goes through."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+from curvafit.priors.bounds import quoted
+
+#: Digits beyond which a whole number is no number of ours.
+DIGITS = 40
+
+
+def parse_json(content: str | bytes, expected: str, place: object) -> Any:
+    """The value of a JSON text, in UTF-8, with or without a byte order mark.
+
+    Parameters
+    ----------
+    expected, place
+        What the text should be and where it stands, for the sentence of an error.
+
+    Raises
+    ------
+    ValueError
+        If it is no JSON, nested too deeply, names a key twice, or holds a number that is not finite or has more than 40
+        digits.
+    """
+    try:
+        text = content.decode("utf-8-sig") if isinstance(content, bytes) else content.removeprefix("\ufeff")
+        return json.loads(
+            text,
+            parse_int=_whole,
+            parse_float=_finite,
+            parse_constant=_constant,
+            object_pairs_hook=_single,
+        )
+    except UnicodeDecodeError:
+        said = "which is no text in UTF-8"
+    except json.JSONDecodeError as error:
+        said = f"which is no JSON ({error.msg} in line {error.lineno})"
+    except RecursionError:
+        said = "which is nested too deeply"
+    except ValueError as error:
+        said = f"which holds {error}"
+    raise ValueError(f"expected {expected}, got {place}, {said}")
+
+
+def repeated(names: Sequence[Any]) -> Any:
+    """The first name that stands twice, None where there is none."""
+    if len(set(names)) == len(names):
+        return None
+    return next(name for name, count in Counter(names).items() if count > 1)
+
+
+def _whole(text: str) -> int:
+    if len(text) > DIGITS:
+        raise ValueError(f"a number of {len(text)} digits")
+    return int(text)
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{quoted(text)}, which is no finite number")
+    return value
+
+
+def _constant(name: str) -> float:
+    raise ValueError(f"{name}, which is no finite number")
+
+
+def _single(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    if (name := repeated([name for name, _ in pairs])) is not None:
+        raise ValueError(f"the key {quoted(name)} twice")
+    return dict(pairs)
