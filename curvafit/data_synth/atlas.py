@@ -98,7 +98,7 @@ def extend(
 
 def check_count(count: int, least: int) -> None:
     """Raise ValueError where a number of shapes is none, under the least or over 10 million."""
-    whole(count, f"a count of shapes from {least}", least, MOST)
+    whole(count, "a count of at least 1 shape" if least else "a count of shapes from 0", least, MOST)
 
 
 def settings_of(
