@@ -1,4 +1,4 @@
-"""Refusals on the command line: one line, exit code 2, nothing on the other stream, nothing begun; by whoever refuses."""
+"""Refusals on the command line: one line, exit code 2, nothing on the other stream, nothing begun."""
 
 from __future__ import annotations
 
