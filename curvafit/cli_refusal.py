@@ -55,7 +55,7 @@ def _leave(error: Any) -> NoReturn:
     """Say what typer found, and the command whose help tells more."""
     text = error.format_message().rstrip(".")
     context = getattr(error, "ctx", None)
-    more = f" (see {context.command_path} --help)" if context is not None else ""
+    more = "" if context is None else f" (see {' '.join(['curvafit', *context.command_path.split()[1:], '--help'])})"
     console = Console(stderr=True, highlight=False)
     told = writable(sentence(f"{text[:1].lower()}{text[1:]}{more}"), console)
     console.print(told, markup=False, soft_wrap=True)

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from curvafit.mesh import NoSurface, Surface, areas, surface
+from curvafit.priors.bounds import LONGEST, SHORTEST, instance, named, real
 from curvafit.priors.curvature import diffuse_curvatures, geometric_curvatures, jet
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import profile_distance
@@ -172,8 +173,12 @@ def surface_curvatures(
     ValueError
         If there is no surface in the box or in `where`, the field is not finite, or `curvature` has another name.
     """
-    if curvature not in ("geometric", "diffuse"):
-        raise ValueError(f"expected curvature 'geometric' or 'diffuse', got {curvature!r}")
+    named(curvature, ("geometric", "diffuse"), "curvature 'geometric' or 'diffuse'")
+    instance(grid, Grid, "a Grid")
+    instance(u, (np.ndarray, Tensor), f"a field of shape {grid.shape}")
+    epsilon = real(epsilon, "a positive epsilon", SHORTEST, LONGEST)
+    if where is not None and np.shape(where) != grid.shape:
+        raise ValueError(f"expected a mask of shape {grid.shape}, got {np.shape(where)}")
     values = torch.as_tensor(u)
     values = values if values.is_floating_point() else values.to(torch.get_default_dtype())
     mesh = _inner_surface(values, grid, margin)

@@ -23,8 +23,9 @@ from curvafit.index import Atlas, load_atlas
 from curvafit.match import Match, nearest
 from curvafit.measure import scan_diagram
 from curvafit.morphometry import morphometry
+from curvafit.phases import check_options
 from curvafit.prepare import Prepared, prepare
-from curvafit.priors.bounds import SEEDS, quoted, real, whole
+from curvafit.priors.bounds import SEEDS, instance, whole
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.profile import phase_field
@@ -103,6 +104,9 @@ def infer(
     """
     say = progress or (lambda text, share: None)
     check_options(kind, threshold, label)
+    for value, its, said in ((scan, Field, "a scan"), (atlas, Atlas, "an atlas"), (roi, np.ndarray, "a mask")):
+        if value is not None or said == "a scan":
+            instance(value, (str, Path, its), f"{said}, as the path of a file or as {its.__name__}")
     seed = whole(seed, "a seed that is a whole number from 0", 0, SEEDS - 2)  # and the next one
     say("reading the scan", 0.0)
     atlas = atlas if isinstance(atlas, Atlas) else load_atlas(atlas)
@@ -122,19 +126,6 @@ def infer(
     say("done", 1.0)
     of_match, of_fit = twins["match"][0], twins["fit"][0]
     return Inference(volume, prepared, seen, of_match.diagram, of_fit.diagram, of_match.phase, of_fit.phase, fit)
-
-
-def check_options(kind: str, threshold: float | str, label: int | None) -> None:
-    """Raise ValueError where what tells the structure is no such thing, or counts for nothing beside another option."""
-    if kind not in ("auto", "field", "mask", "image"):
-        raise ValueError(f"expected kind auto, field, mask or image, got {quoted(kind)}")
-    level = threshold if threshold == "otsu" else real(threshold, "a threshold that is a number or 'otsu'")
-    if label is not None:
-        whole(label, "a label that is a whole number", -SEEDS, SEEDS)
-        if kind in ("field", "image") or level != "otsu":
-            raise ValueError("expected a label, which tells the structure, without a kind or a threshold, got both")
-    if kind in ("field", "mask") and level != "otsu":
-        raise ValueError(f"expected a threshold beside grey levels, got kind {kind}")
 
 
 @dataclass(frozen=True)

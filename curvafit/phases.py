@@ -10,9 +10,10 @@ import numpy as np
 from scipy import ndimage
 from skimage.filters import threshold_otsu
 
+from curvafit.priors.bounds import SEEDS, named, real, whole
 from curvafit.scan import Field, ScanError, load
 
-__all__ = ["Kind", "Level", "find_level", "region_of_interest"]
+__all__ = ["Kind", "Level", "check_options", "find_level", "region_of_interest"]
 
 Kind = Literal["field", "mask", "image"]
 
@@ -75,6 +76,19 @@ def find_level(
     if counted.all():
         raise ScanError("expected background in the scan, got none: every voxel is structure")
     return level
+
+
+def check_options(kind: str, threshold: float | str, label: int | None) -> None:
+    """Raise ValueError where what tells the structure is no such thing, or counts for nothing beside another option."""
+    named(kind, ("auto", "field", "mask", "image"), "kind auto, field, mask or image")
+    otsu = isinstance(threshold, str) and threshold == "otsu"
+    level = "otsu" if otsu else real(threshold, "a threshold that is a number or 'otsu'")
+    if label is not None:
+        whole(label, "a label that is a whole number", -SEEDS, SEEDS)
+        if kind in ("field", "image") or level != "otsu":
+            raise ValueError("expected a label, which tells the structure, without a kind or a threshold, got both")
+    if kind in ("field", "mask") and level != "otsu":
+        raise ValueError(f"expected a threshold beside grey levels, got kind {kind}")
 
 
 def region_of_interest(roi: Field | np.ndarray | str | os.PathLike[str] | None, field: Field) -> np.ndarray | None:

@@ -13,6 +13,7 @@ from curvafit.evidence import interpolated_distance, of_intensities, of_probabil
 from curvafit.generation import data
 from curvafit.generation.flow import Flow, descend
 from curvafit.priors import kernels
+from curvafit.priors.bounds import instance, real, whole
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON
 from curvafit.priors.profile import optimal_profile, phase_field
@@ -30,6 +31,8 @@ STIFFNESS = 1e6
 
 #: Values that known slices may have; more are grey levels.
 LABELS = 256
+#: Least and greatest weight.
+WEIGHTS = (1e-9, 1e9)
 #: A flow whose last ten steps lower the energy by less than this share has settled.
 SETTLED = 0.001
 
@@ -109,8 +112,11 @@ def segment(
     """
     law, notes = law_of(prior, scan)
     place = Place.of(scan, epsilon)
-    if weight is not None and not 0 < weight < math.inf:
-        raise ScanError(f"expected a positive weight, got {weight}")
+    weight = None if weight is None else real(weight, "a positive weight", *WEIGHTS)
+    if not (isinstance(threshold, str) and threshold == "otsu"):
+        real(threshold, "a threshold that is a number or 'otsu'")
+    if probability is not None:
+        instance(probability, (Field, np.ndarray), "a probability map as Field or array")
     if probability is None:
         found = of_intensities(scan, threshold, dark)
     elif dark or threshold != "otsu":
@@ -167,8 +173,7 @@ def reconstruct(
     """
     law, notes = law_of(prior, slices)
     place = Place.of(slices, epsilon)
-    if axis not in (0, 1, 2):
-        raise ScanError(f"expected an axis 0, 1 or 2 (z, y, x), got {axis}")
+    axis = whole(axis, "an axis 0, 1 or 2 (z, y, x)", 0, 2)
     places = _places(slices.shape[axis], every, first, known)
     there = _labels(np.moveaxis(slices.values, axis, 0)[places]) > 0
     if there.all() or not there.any():
@@ -193,7 +198,7 @@ def reconstruct(
 def _places(length: int, every: int | None, first: int, known: Sequence[int] | None) -> list[int]:
     if (every is None) == (known is None):
         raise ScanError("expected either every how many slices are known, or their numbers")
-    given = (every, first) if known is None else known
+    given = [real(n, "whole numbers of slices") for n in ((every, first) if known is None else known)]
     if not all(math.isfinite(number) and number == int(number) for number in given):  # type: ignore[arg-type, operator]
         raise ScanError(f"expected whole numbers of slices, got {', '.join(map(str, given))}")
     if every is not None and (every < 1 or first < 0):

@@ -23,7 +23,7 @@ from curvafit.generation.memory import FILE, check_memory
 from curvafit.mesh import Surface, solid_surface, surface
 from curvafit.mesh_files import SUFFIXES, write_surface
 from curvafit.plot import surface_picture
-from curvafit.priors.bounds import LONGEST, SHORTEST, real, several, whole
+from curvafit.priors.bounds import LONGEST, SHORTEST, instance, real, several, whole
 from curvafit.priors.coefficients import NAMES, Coefficients
 from curvafit.priors.curvature import geometric_curvatures, jet
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
@@ -61,6 +61,7 @@ class Output:
     cap: bool = True
 
     def __post_init__(self) -> None:
+        instance(self.unit, str, "a unit as text")
         unit, factor = normalise_unit(self.unit)
         object.__setattr__(self, "unit", unit)
         edge = real(self.voxel, "a positive voxel edge", SHORTEST, LONGEST)

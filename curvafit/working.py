@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import math
+import os
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from curvafit.priors.bounds import LONGEST, SHORTEST, instance, real
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.fit_file import Law, find_law
 from curvafit.priors.grid import WORKING_EPSILON, Grid
@@ -29,6 +30,8 @@ def law_of(prior: Law, scan: Field) -> tuple[Coefficients, tuple[str, ...]]:
     FileNotFoundError
         If there is no such file.
     """
+    instance(scan, Field, "a scan as Field")
+    instance(prior, (Coefficients, str, os.PathLike), "a prior as Coefficients, a preset's name or a fit.json")
     found = find_law(prior, min(scan.spacing))
     if isinstance(found, Coefficients):
         named = f"The preset {prior}, at a working voxel of one scan voxel."
@@ -70,9 +73,8 @@ class Place:
         ScanError
             If ε is not positive or the scan is too small.
         """
-        ε = RESOLVED * min(scan.spacing) if epsilon is None else float(epsilon)
-        if not 0 < ε < math.inf:
-            raise ScanError(f"expected a positive epsilon in {scan.unit}, got {epsilon}")
+        said = f"a positive epsilon in {scan.unit}"
+        ε = RESOLVED * min(scan.spacing) if epsilon is None else real(epsilon, said, SHORTEST, LONGEST)
         if min(scan.shape) < 4:
             raise ScanError(f"expected at least 4 voxels along each axis, got {scan.shape}")
         times, unit = upsampling(scan.spacing, ε), ε / WORKING_EPSILON

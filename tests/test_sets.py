@@ -199,7 +199,7 @@ def test_bad_input(tmp_path, order):
         Recipe(recipe.source, FLAT, SHAPE, 0)
     with pytest.raises(ValueError, match="expected a layout among nnunet, monai, zarr, got 'bids'"):
         Order(recipe, "bids")
-    with pytest.raises(ValueError, match="expected labels among .*, got depth"):
+    with pytest.raises(ValueError, match="expected labels among .*, got .depth"):
         Order(recipe, parts=("depth",))
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "notes.txt").write_text("mine")

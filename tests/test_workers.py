@@ -130,7 +130,7 @@ def test_a_barren_design_ends(tmp_path, monkeypatch):
     monkeypatch.setattr("curvafit.data_synth.atlas.BARREN", 3)
     from curvafit.data_synth import Design
 
-    empty = Design("list", points=((1.0, 0.0, 1.0, 0.0, 0.0, 9e9, -0.9),))
+    empty = Design("list", points=((1.0, 0.0, 1.0, 0.0, 0.0, 1e9, -0.9),))
     with pytest.raises(ValueError, match="expected a design with viable shapes, got 0 of 4 draws"):
         build(tmp_path / "s.zarr", 1, 8, schedule=PLAN, design=empty)
     assert len(open_store(tmp_path / "s.zarr").indices()) == 4

@@ -18,7 +18,7 @@ from curvafit.generation.flow import WORKING_BLUR
 from curvafit.generation.memory import FILE, FLOW, check_memory
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.schedule import schedule as named_schedule
-from curvafit.priors.bounds import seed_of, whole
+from curvafit.priors.bounds import instance, seed_of, whole
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.profile import phase_field
 from curvafit.transport import TAIL_SHARE
@@ -98,7 +98,7 @@ def extend(
 
 def check_count(count: int, least: int) -> None:
     """Raise ValueError where a number of shapes is none, under the least or over 10 million."""
-    whole(count, f"a count of shapes from {least}", least, MOST)
+    whole(count, "a count of at least 1 shape" if least else "a count of shapes from 0", least, MOST)
 
 
 def settings_of(
@@ -107,6 +107,8 @@ def settings_of(
     """The settings of the store that `build` makes of these."""
     grid = Grid(shape)  # type: ignore[arg-type]
     check_memory(grid.shape, FILE, "a shape")
+    if design is not None:
+        instance(design, Design, "a Design")
     plan, law = dataclasses.asdict(named_schedule(schedule)), design or boxed()
     law.draw(seed, 0)  # refuses a wrong seed, before a store is made
     return Settings(grid.shape, grid.spacing, WORKING_EPSILON, WORKING_BLUR, law.as_dict(), seed_of(seed), plan)

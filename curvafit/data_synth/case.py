@@ -13,7 +13,7 @@ import torch
 from curvafit.data_synth.draws import one_thread
 from curvafit.data_synth.modality import Imaging, Modality, field_shape, image, regrid, visible
 from curvafit.data_synth.sources import Source, source_of
-from curvafit.priors.bounds import LONGEST, SHORTEST, quoted, real, seed_of, several, whole
+from curvafit.priors.bounds import LONGEST, SHORTEST, instance, quoted, real, seed_of, several, whole
 
 #: Shapes that a case gets until one is seen on the image's voxels, which may be coarse.
 TRIES = 8
@@ -66,6 +66,9 @@ class Recipe:
     calibres: tuple[float, float] = (1.0, 1.0)
 
     def __post_init__(self) -> None:
+        instance(self.modality, Modality, "a Modality")
+        if not callable(getattr(self.source, "shape", None)):
+            raise ValueError(f"expected a source of shapes, got {quoted(self.source)}")
         said = "3 whole numbers of voxels above 0 (z, y, x)"
         shape = several(self.shape, "3 whole numbers of voxels")
         shape = tuple(whole(n, said, 1, MOST, of=shape) for n in (shape if len(shape) == 3 else (None,)))

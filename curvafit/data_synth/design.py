@@ -11,7 +11,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from curvafit.generation.cost import POWERS, check_strength
-from curvafit.priors.bounds import SEEDS, quoted, real, seed_of, whole
+from curvafit.priors.bounds import SEEDS, named, quoted, real, seed_of, several, whole
 from curvafit.priors.coefficients import NAMES, Coefficients
 from curvafit.priors.grid import WORKING_EPSILON
 
@@ -65,8 +65,12 @@ class Design:
     points: tuple[tuple[float, ...], ...] = ()
 
     def __post_init__(self) -> None:
-        if self.law not in get_args(Law):
-            raise ValueError(f"expected a law among {', '.join(get_args(Law))}, got {quoted(self.law)}")
+        named(self.law, get_args(Law), f"a law among {', '.join(get_args(Law))}")
+        for name in ("box", "points"):
+            rows = (several(row, f"numbers in each row of {name}") for row in several(getattr(self, name), name))
+            object.__setattr__(self, name, tuple(rows))
+        if any(len(interval) != 2 for interval in self.box):
+            raise ValueError("expected intervals of two numbers in a box, got one of another length")
         rows = self.points if self.law == "list" else tuple(zip(*self.box, strict=True))
         if not rows or any(len(row) != len(PARAMETERS) for row in rows):
             raise ValueError(f"expected {len(PARAMETERS)} parameters ({', '.join(PARAMETERS)}) for a {self.law} design")
@@ -153,6 +157,7 @@ def around(point: Sequence[float], spread: float, law: Law = "random") -> Design
         If the spread is not positive or over 100, or the point is not seven numbers with a20 > 0.
     """
     spread = real(spread, "a positive spread", *SPREADS)
+    point = several(point, "seven numbers as a point")
     if len(point) != len(PARAMETERS):
         raise ValueError(f"expected a point of {len(PARAMETERS)} numbers ({', '.join(PARAMETERS)}), got {len(point)}")
     real(point[0], "a point with a20 > 0", 1e-6, 1e6)

@@ -23,7 +23,7 @@ from curvafit.data_synth.labels import NAMES, labels_of
 from curvafit.data_synth.layouts import LAYOUTS, About
 from curvafit.data_synth.workers import Here, Workers
 from curvafit.files import remove, write_content
-from curvafit.priors.bounds import quoted, whole
+from curvafit.priors.bounds import instance, named, several, whole
 from curvafit.priors.grid import Grid
 from curvafit.priors.json_text import parse_json
 from curvafit.scan import Field, save
@@ -60,10 +60,11 @@ class Order:
     parts: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.layout not in LAYOUTS:
-            raise ValueError(f"expected a layout among {', '.join(LAYOUTS)}, got {quoted(self.layout)}")
-        if unknown := sorted(set(self.parts) - set(PARTS)):
-            raise ValueError(f"expected labels among {', '.join(PARTS)}, got {', '.join(unknown)}")
+        instance(self.recipe, Recipe, "a Recipe")
+        named(self.layout, LAYOUTS, f"a layout among {', '.join(LAYOUTS)}")
+        object.__setattr__(self, "parts", several(self.parts, "labels"))
+        for part in self.parts:
+            named(part, PARTS, f"labels among {', '.join(PARTS)}")
         if self.parts and min(self.recipe.shape) < 4:
             told = " x ".join(map(str, self.recipe.shape))
             raise ValueError(f"expected images of at least 4 voxels along each axis beside --labels, got {told}")

@@ -19,6 +19,7 @@ from curvafit.generation.flow import generate
 from curvafit.generation.fraction import first_mass
 from curvafit.generation.schedule import schedule as named_schedule
 from curvafit.generation.viability import well_formed
+from curvafit.priors.bounds import several
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 
@@ -80,12 +81,13 @@ class Generated:
     fraction: float | None = None
 
     def __post_init__(self) -> None:
-        if len(self.names) != len(self.points):
+        object.__setattr__(self, "names", several(self.names, "names"))
+        if len(self.names) != len(several(self.points, "points")):
             raise ValueError(f"expected a name for each of {len(self.points)} points, got {len(self.names)}")
         if self.fraction is not None:
             first_mass(self.fraction)
         named_schedule(self.schedule)
-        Design("list", points=self.points)
+        object.__setattr__(self, "points", Design("list", points=self.points).points)
 
     @property
     def within(self) -> float:

@@ -21,7 +21,7 @@ from curvafit.generation.schedule import Schedule
 from curvafit.generation.schedule import schedule as named_schedule
 from curvafit.generation.setup import base_of, kind_of
 from curvafit.priors import kernels
-from curvafit.priors.bounds import several, whole
+from curvafit.priors.bounds import named, several, whole
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.shapes import Float
@@ -69,6 +69,7 @@ def generate_batch(
         "schedule": plan, "epsilon": epsilon, "blur": blur, "orientation": orientation,
         "snapshots": snapshots, "reject_early": reject_early, "backend": backend, "device": device,
     }  # fmt: skip
+    named(backend, ("auto", "torch", "fused"), "a backend 'auto', 'torch' or 'fused'")
     if kind_of(device) == "cuda" and backend != "torch" and kernels.fused(device):
         groups = [jobs[first : first + together] for first in range(0, len(jobs), together)]
         return (flow for group in groups for flow in _together(group, grid, told))

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from curvafit.generation.data import Data
-from curvafit.priors.bounds import quoted, real
+from curvafit.priors.bounds import instance, quoted, real
 from curvafit.priors.coefficients import NAMES, Coefficients
 from curvafit.priors.grid import Grid
 
@@ -47,9 +47,7 @@ class Cost:
 
     def __post_init__(self) -> None:
         for name, kind in (("coefficients", Coefficients), ("grid", Grid)):
-            if not isinstance(getattr(self, name), kind):
-                got = quoted(getattr(self, name))
-                raise ValueError(f"expected {name} as {kind.__name__}, got {got}")
+            instance(getattr(self, name), kind, f"{name} as {kind.__name__}")
         self._check_lengths()
         self._check_tensors()
         self._check_strengths()

@@ -19,7 +19,7 @@ from curvafit.generation.result import RECORD_EVERY, Callback, Flow, History, St
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.schedule import schedule as named_schedule
 from curvafit.generation.setup import Place, base_of
-from curvafit.priors.bounds import quoted, seed_of
+from curvafit.priors.bounds import named, quoted, seed_of
 from curvafit.priors.coefficients import Coefficients, preset
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.shapes import Bool, Float
@@ -104,8 +104,8 @@ def generate(
         voxels, a name is unknown, a file is not this run's checkpoint, or there is no fused step for the device.
     """
     if isinstance(coefficients, str):
-        named = preset(coefficients)
-        coefficients, mass = named.coefficients, named.mass if mass is None and volume_fraction is None else mass
+        known = preset(coefficients)
+        coefficients, mass = known.coefficients, known.mass if mass is None and volume_fraction is None else mass
     grid, seed = grid if isinstance(grid, Grid) else Grid(grid), seed_of(seed)  # type: ignore[arg-type]
     place, plan = Place(backend, device, checkpoint, checkpoint_every, keep_checkpoint), named_schedule(schedule)
     cost = Cost(coefficients, grid, epsilon, orientation, blur)
@@ -198,10 +198,9 @@ def descend(
     ValueError
         As `relax`, or if the flow or the optimiser has another name.
     """
-    if not isinstance(flow, str) or flow not in FORMS:
-        raise ValueError(f"expected a flow among {', '.join(FORMS)}, got {quoted(flow)}")
+    named(flow, FORMS, f"a flow among {', '.join(FORMS)}")
     plan = named_schedule(schedule, steps)
-    if optimiser == "lbfgs":
+    if isinstance(optimiser, str) and optimiser == "lbfgs":
         plan = Schedule("lbfgs", steps, 1.0, 1.0, "constant")
     width = min(grid.spacing) if blur is None and isinstance(grid, Grid) else blur
     cost = Cost(coefficients, grid, epsilon, orientation, width, data)  # type: ignore[arg-type]

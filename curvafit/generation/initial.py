@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from curvafit.generation.memory import FIELD, check_memory
-from curvafit.priors.bounds import seed_of
+from curvafit.priors.bounds import instance, real, seed_of
 from curvafit.priors.grid import Grid
 from curvafit.priors.shapes import Float
 
@@ -24,6 +24,8 @@ def white_noise(grid: Grid, seed: int, amplitude: float = AMPLITUDE) -> Float[to
     ValueError
         If the seed is not a whole number from 0, or there are more voxels than memory holds.
     """
+    instance(grid, Grid, "a Grid")
+    amplitude = real(amplitude, "a finite amplitude")
     generator = torch.Generator().manual_seed(seed_of(seed))
     check_memory((*grid.shape, 3), FIELD, "a box")
     noise = amplitude * torch.rand((3, *grid.shape), generator=generator, dtype=torch.float32)

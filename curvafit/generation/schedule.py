@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from curvafit.priors.bounds import inside, quoted, real, whole
+from curvafit.priors.bounds import inside, instance, named, real, whole
 
 #: The most steps that a flow may have, and the longest one.
 MOST_STEPS, LONGEST_STEP = 10**7, 1e6
@@ -48,15 +48,13 @@ class Schedule:
     memory: float = 0.999
 
     def __post_init__(self) -> None:
-        if not isinstance(self.name, str):
-            raise ValueError(f"expected a schedule's name as text, got {quoted(self.name)}")
+        instance(self.name, str, "a schedule's name as text")
         steps = whole(self.steps, "a whole number of steps, at least 1", 1, MOST_STEPS)
         object.__setattr__(self, "steps", steps)
         for name in ("start", "stop"):
             length = real(getattr(self, name), "positive step lengths", 1e-30, LONGEST_STEP)
             object.__setattr__(self, name, length)
-        if self.shape not in ("constant", "cosine"):
-            raise ValueError(f"expected a schedule's shape 'constant' or 'cosine', got {quoted(self.shape)}")
+        named(self.shape, ("constant", "cosine"), "a schedule's shape 'constant' or 'cosine'")
         for name in ("momentum", "memory"):
             object.__setattr__(self, name, inside(getattr(self, name), f"{name} in [0, 1)", -math.ulp(0), 1))
 
@@ -96,7 +94,6 @@ def schedule(name: str | Schedule, steps: int | None = None) -> Schedule:
         If there is no schedule of that name.
     """
     if not isinstance(name, Schedule):
-        if not isinstance(name, str) or name not in SCHEDULES:
-            raise ValueError(f"expected a schedule among {', '.join(SCHEDULES)}, got {quoted(name)}")
+        named(name, SCHEDULES, f"a schedule among {', '.join(SCHEDULES)}")
         name = SCHEDULES[name]
     return name if steps is None else dataclasses.replace(name, steps=steps)

@@ -17,7 +17,7 @@ from curvafit.generation.parametrization import Blur, DivergenceForm, Form
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.stepper import LbfgsStepper, Stepper, TorchStepper
 from curvafit.priors import kernels, stencils
-from curvafit.priors.bounds import inside, quoted, real
+from curvafit.priors.bounds import inside, instance, named, quoted, real
 from curvafit.priors.grid import Grid
 
 
@@ -38,11 +38,10 @@ class Place:
     keep: bool = False
 
     def __post_init__(self) -> None:
-        if self.backend not in ("auto", "torch", "fused"):
-            raise ValueError(f"expected a backend 'auto', 'torch' or 'fused', got {quoted(self.backend)}")
+        named(self.backend, ("auto", "torch", "fused"), "a backend 'auto', 'torch' or 'fused'")
         check_device(self.device)
-        if self.checkpoint is not None and not isinstance(self.checkpoint, (str, Path)):
-            raise ValueError(f"expected a path for the checkpoint, got {quoted(self.checkpoint)}")
+        if self.checkpoint is not None:
+            instance(self.checkpoint, (str, Path), "a path for the checkpoint")
         real(self.every, "a finite number of seconds between checkpoints, at least 0", 0)
 
     @property
@@ -60,8 +59,7 @@ class Place:
         ValueError
             If the optimiser is unknown, or a fused kernel is asked for and there is none.
         """
-        if optimiser not in ("adam", "lbfgs"):
-            raise ValueError(f"expected an optimiser 'adam' or 'lbfgs', got {quoted(optimiser)}")
+        named(optimiser, ("adam", "lbfgs"), "an optimiser 'adam' or 'lbfgs'")
         able, betas = kernels.fused(self.device), plan.betas
         if self.backend == "fused" and not able:
             raise ValueError(f"expected a device with fused kernels (and numba or triton), got {self.device}")
@@ -93,15 +91,15 @@ def kind_of(device: torch.device | str) -> str:
     """
     try:
         return torch.device(device).type
-    except (RuntimeError, TypeError) as error:
+    except (RuntimeError, TypeError, ValueError) as error:
         raise ValueError(f"expected a device, such as 'cpu' or 'cuda', got {quoted(device)}") from error
 
 
 def check_device(device: torch.device | str) -> None:
     """Raise ValueError where torch can't compute on a device."""
     try:
-        known = torch.zeros(1, device=device).add(1).item() == 1
-    except (RuntimeError, TypeError, AssertionError, NotImplementedError):
+        known = device is not None and torch.zeros(1, device=device).add(1).item() == 1
+    except (RuntimeError, TypeError, ValueError, AssertionError):
         known = False
     if not known:
         raise ValueError(f"expected a device that torch computes on, such as 'cpu' or 'cuda', got {quoted(device)}")

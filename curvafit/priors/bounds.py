@@ -6,6 +6,7 @@ import contextlib
 import math
 import operator
 import reprlib
+from collections.abc import Iterable
 from typing import Any
 
 #: Seeds are below this: what a signed 64-bit number holds.
@@ -95,6 +96,18 @@ def several(values: Any, name: str) -> tuple[Any, ...]:
     if found is None:
         raise ValueError(f"expected a sequence of {name}, got {quoted(values)}")
     return found
+
+
+def instance(value: Any, kinds: type | tuple[type, ...], said: str) -> None:
+    """Raise ValueError where a value is of another kind than it must be; `said` is what was expected."""
+    if not isinstance(value, kinds):
+        raise ValueError(f"expected {said}, got {quoted(value)}")
+
+
+def named(value: Any, names: Iterable[str], said: str) -> None:
+    """Raise ValueError where a value is none of some names; `said` is what was expected."""
+    if not isinstance(value, str) or value not in names:
+        raise ValueError(f"expected {said}, got {quoted(value)}")
 
 
 def seed_of(value: Any) -> int:

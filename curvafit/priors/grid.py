@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from curvafit.priors.bounds import LONGEST, SHORTEST, quoted, real, whole
+from curvafit.priors.bounds import LONGEST, SHORTEST, named, real, whole
 
 Boundary = Literal["periodic", "replicate"]
 
@@ -48,8 +48,7 @@ class Grid:
         said = "a shape of 3 whole numbers, each at least 4", "a spacing of 3 positive numbers (z, y, x)"
         shape = tuple(whole(n, said[0], 4, MOST, of=self.shape) for n in _triple(self.shape))
         spacing = tuple(real(h, said[1], SHORTEST, LONGEST, of=self.spacing) for h in _triple(self.spacing))
-        if self.boundary not in ("periodic", "replicate"):
-            raise ValueError(f"expected boundary 'periodic' or 'replicate', got {quoted(self.boundary)}")
+        named(self.boundary, ("periodic", "replicate"), "boundary 'periodic' or 'replicate'")
         object.__setattr__(self, "shape", shape)
         object.__setattr__(self, "spacing", spacing)
 

@@ -1,0 +1,191 @@
+"""Numbers that are given: NumPy's are taken as Python's, and what is of another kind or out of range is refused."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from curvafit.data_synth.case import Recipe
+from curvafit.data_synth.design import Design, around, boxed
+from curvafit.data_synth.modalities import MODALITIES
+from curvafit.data_synth.sources import Generated
+from curvafit.data_synth.workers import check_workers
+from curvafit.generation import Schedule, descend, generate, generate_batch, white_noise
+from curvafit.generation.memory import check_memory, memory
+from curvafit.priors.bounds import SHOWN, quoted, real, whole
+from curvafit.priors.coefficients import Coefficients, preset
+from curvafit.priors.energy import orientation
+from curvafit.priors.grid import Grid
+from curvafit.shape_files import Output
+
+TUBES, MASS = preset("tubes").coefficients, preset("tubes").mass
+BRIEF = Schedule("brief", 2, 1e-3, 1e-3, "constant")
+NO_NUMBERS: list[Any] = [None, True, "8", b"8", [8], {}, object(), math.nan, 1j, np.zeros(2), torch.zeros(2)]
+
+
+@pytest.mark.parametrize("wrong", NO_NUMBERS)
+def test_what_is_no_number_is_refused(wrong: Any) -> None:
+    for check in (lambda: whole(wrong, "a count", 0, 9), lambda: real(wrong, "a length", 0, 9)):
+        with pytest.raises(ValueError, match="^expected a (count|length), got "):
+            check()
+
+
+def test_numbers_of_any_type_are_numbers() -> None:
+    for three in (3, np.int8(3), np.int64(3), np.uint64(3), torch.tensor(3)):
+        assert whole(three, "a count", 0, 9) == real(three, "a length", 0, 9) == 3
+        assert type(whole(three, "a count", 0, 9)) is int
+    assert real(np.float32(0.5), "a length") == real(torch.tensor(0.5), "a length") == 0.5
+    for broken in (3.0, np.float64(3)):
+        with pytest.raises(ValueError, match="expected a count, got"):
+            whole(broken, "a count", 0, 9)
+
+
+def test_a_bound_is_named_where_it_counts() -> None:
+    with pytest.raises(ValueError, match="expected a count from 1, got 0$"):
+        whole(0, "a count from 1", 1, 9)
+    with pytest.raises(ValueError, match="expected a count from 1, at most 9, got 10$"):
+        whole(10, "a count from 1", 1, 9)
+    with pytest.raises(ValueError, match="expected a positive length, at least 0.001, got 1e-09$"):
+        real(1e-9, "a positive length", 1e-3, 9)
+    with pytest.raises(ValueError, match="expected a positive length, got -1$"):
+        real(-1, "a positive length", 1e-3, 9)
+    with pytest.raises(ValueError, match="expected a length, got 10{50,}"):
+        real(10**400, "a length")
+
+
+def test_quotations_are_one_short_line() -> None:
+    assert quoted("a\nb") == r"'a\nb'"
+    assert len(quoted("x" * 9999)) <= SHOWN and "\n" not in quoted(torch.zeros(9, 9))
+
+
+def test_numpy_numbers_make_the_same_shape() -> None:
+    eight, two = np.int64(8), np.float64(0.02)
+    flow = generate(
+        TUBES, np.float64(MASS), eight, schedule=BRIEF, seed=np.int32(3), epsilon=two, blur=np.float64(0.02)
+    )
+    assert torch.equal(flow.field, generate(TUBES, MASS, 8, schedule=BRIEF, seed=3).field)
+    assert flow.grid == Grid((eight, eight, 8), np.float64(0.01)) == Grid(np.array([8, 8, 8]))  # type: ignore[arg-type]
+    assert Schedule("x", np.int64(5), np.float32(0.5), 1, "constant").steps == 5
+    assert Output(np.float64(2), tile=(np.int64(1), 2, 3)).tile == (1, 2, 3)
+    assert boxed(a11=np.float64(1)) == boxed(a11=1) and boxed().draw(np.int64(1), np.int64(2)) == boxed().draw(1, 2)
+    snapshots = generate(TUBES, MASS, 8, schedule=BRIEF, snapshots=np.array([0, 2])).snapshots
+    assert list(snapshots) == [0, 2]
+
+
+@pytest.mark.parametrize(
+    "grid", [0, -5, True, "64", (64, 64), None, 64.0, (64, 64, 6.5), math.nan, {}, 10**30], ids=repr
+)
+def test_wrong_grids_are_refused_in_one_sentence(grid: Any) -> None:
+    with pytest.raises(ValueError, match="^expected a shape of 3 whole numbers, each at least 4.*, got [^\n]*$"):
+        generate(TUBES, MASS, grid)
+
+
+@pytest.mark.parametrize("seed", [-1, 2**63, 2**70, 1.5, "a", None, True])
+def test_wrong_seeds_are_refused(seed: Any) -> None:
+    for make in (lambda: generate(TUBES, MASS, 8, seed=seed), lambda: white_noise(Grid((8, 8, 8)), seed)):
+        with pytest.raises(ValueError, match="expected a seed that is a whole number from 0"):
+            make()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"coefficients": Coefficients(1e300, 0, 1e300)}, r"expected \|a20\| of at most 1e\+06, got 1e\+300"),
+        ({"coefficients": Coefficients(1, 0, 1, 1e9)}, r"expected \|a10\| epsilon of at most 1e\+06, got 2e\+07"),
+        ({"coefficients": Coefficients(1, 0, 1, a00=torch.full((8, 8, 8), 1e20))}, r"expected \|a00\| epsilon²"),
+        ({"coefficients": "tube"}, "expected a preset among"),
+        ({"coefficients": (1, 2, 6)}, "expected coefficients as Coefficients, got"),
+        ({"epsilon": 1e30}, "expected an epsilon from 0.1 of a voxel"),
+        ({"epsilon": 1e-9}, "expected an epsilon from 0.1 of a voxel"),
+        ({"epsilon": torch.tensor([0.02, 1e9])}, "expected"),
+        ({"blur": 1e3}, "expected a blur within the box"),
+        ({"orientation": orientation((0, 0, 1), 1e30)}, r"expected \|the orientation\| epsilon² of at most 1e\+06"),
+        ({"orientation": [[1]]}, "expected a symmetric orientation of shape"),
+        ({"grid": Grid(8, 1e-10)}, "expected voxel edges from 1e-08 to 100000 for a flow"),  # type: ignore[arg-type]
+        ({"grid": (10**5,) * 3}, "expected a box that fits into memory, got 100000 x 100000 x 100000 voxels: at least"),
+        ({"snapshots": 5}, "expected a sequence of snapshots, got 5"),
+        ({"snapshots": [1.5]}, "expected snapshots at 0 to 2 steps, got 1.5"),
+        ({"callbacks": [3]}, "expected callbacks that can be called, got 3"),
+        ({"device": "abacus"}, "expected a device that torch computes on, .*, got 'abacus'"),
+        ({"checkpoint_every": math.inf}, "expected a finite number of seconds between checkpoints"),
+        ({"volume_fraction": math.nan, "mass": None}, "expected a volume fraction in"),
+        ({"mass": "half"}, "expected a mass in"),
+        ({"schedule": None}, "expected a schedule among paper, fast, got None"),
+    ],
+)
+def test_flows_refuse_what_is_out_of_range(wrong: dict[str, Any], said: str) -> None:
+    given = {"coefficients": TUBES, "mass": MASS, "grid": 8, "schedule": BRIEF} | wrong
+    with pytest.raises(ValueError, match=said):
+        generate(**given)
+
+
+@pytest.mark.parametrize("field", [None, 3, "u", np.zeros((8, 8)), object()])
+def test_a_flow_starts_at_a_field_only(field: Any) -> None:
+    with pytest.raises(ValueError, match="expected a field of shape .8, 8, 8., got"):
+        descend(field, TUBES, Grid((8, 8, 8)))
+
+
+def test_batches_refuse_what_is_no_sequence() -> None:
+    for name in ("coefficients", "masses", "seeds"):
+        given = {"coefficients": TUBES, "masses": MASS, "seeds": 0} | {name: None}
+        with pytest.raises(ValueError, match=f"expected a sequence of {name}, got None"):
+            generate_batch(grid=Grid((8, 8, 8)), **given)  # type: ignore[arg-type]
+
+
+def test_designs_stay_within_what_a_flow_takes() -> None:
+    point = (1.0, 2.0, 6.0, -40.0, -40.0, 400.0, -0.6)
+    for spread in (1e300, math.nan, -1, "wide"):
+        with pytest.raises(ValueError, match="expected a positive spread"):
+            around(point, spread)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"expected \|a10\| epsilon of at most 1e\+06"):
+        boxed(a10=(0, 1e300))
+    with pytest.raises(ValueError, match=r"expected \|a00\| epsilon² of at most 1e\+06"):
+        Generated(((*point[:5], 1e300, -0.6),), ("far",))
+    with pytest.raises(ValueError, match="expected intervals of two numbers"):
+        Design("random", box=((0, 1, 2),) * 7)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="expected a number of workers from 0, at most 1024, got 1000000"):
+        check_workers(10**6, None)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"shape": (1, 1, 1)}, "expected images of 2 to"),
+        ({"shape": (10**9,) * 3}, "expected images of 2 to"),
+        ({"shape": (16, 16, "16")}, "expected 3 whole numbers of voxels above 0"),
+        ({"voxel": 1e300}, "expected a shape's voxel of positive length, at most"),
+        ({"voxel": 1e6}, "expected images that span 4 voxels of a shape or more, got 1 x 1 x 1"),
+        ({"calibres": (1, 1e300)}, "expected calibres as two positive factors, the lower first, at most 1000"),
+        ({"calibres": (1, 500)}, "expected images that span 4 voxels"),
+        ({"calibres": 1}, "expected a sequence of two factors"),
+        ({"seed": 2**63}, "expected a seed"),
+        ({"source": None}, "expected a source of shapes, got None"),
+    ],
+)
+def test_recipes_refuse_what_no_case_can_be_made_of(wrong: dict[str, Any], said: str) -> None:
+    source, confocal = Generated(((1.0, 2.0, 6.0, -40.0, -40.0, 400.0, -0.6),), ("tubes",)), MODALITIES["confocal"]
+    given = {"source": source, "modality": confocal, "shape": (16, 16, 16), "voxel": confocal.voxel} | wrong
+    with pytest.raises(ValueError, match=said):
+        Recipe(**given)
+
+
+def test_outputs_have_bounds() -> None:
+    for edge in (1e300, 1e-300, 0, math.inf):
+        with pytest.raises(ValueError, match="expected a positive voxel edge"):
+            Output(edge)
+    with pytest.raises(ValueError, match="expected 3 whole repeats of at least 1"):
+        Output(tile=(2, 2, 2.5))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="expected a file that fits into memory"):
+        Output(tile=(10**6, 10**6, 1)).shape(Grid((8, 8, 8)))
+
+
+def test_memory_is_told_before_it_is_taken() -> None:
+    room = memory()
+    assert room > 2**28
+    check_memory((1, 1, room), 1, "a line")
+    with pytest.raises(ValueError, match="expected a line that fits into memory, got .* voxels: at least .* GiB"):
+        check_memory((1, 2, room), 1, "a line")
