@@ -182,9 +182,9 @@ def _folders() -> Iterator[Case]:
             setup = _planting(f"home/{file}")
             yield Case(f"belongings/{name}/{file}", setup, command, quick=name not in ("infer", "map"))
         for what in ("link-to-folder", "set", "image", "store-of-shapes", "link-to-store"):
-            yield Case(
-                f"belongings/{name}/{what}", BELONGINGS[what]("home"), command, quick=name not in ("infer", "map")
-            )
+            own = ("home/dataset.json", "home/preview.png") if (name, what) == ("synth", "set") else ()
+            put = BELONGINGS[what]("home")
+            yield Case(f"belongings/{name}/{what}", put, command, own, quick=name not in ("infer", "map"))
 
 
 def _planting(name: str) -> Setup:
