@@ -118,7 +118,7 @@ class Bowl:
 
         self.asked.append(free)
         with ThreadPoolExecutor(1) as elsewhere:
-            self.precisions.add(elsewhere.submit(jax.config.read, "jax_enable_x64").result())
+            self.precisions.add(elsewhere.submit(lambda: jax.config.jax_enable_x64).result())
         return (free - 0.3).astype(np.float32)
 
     def jacobian(self, free: np.ndarray) -> np.ndarray:
@@ -130,10 +130,10 @@ def test_a_fit_in_float64_leaves_jax_as_it_is() -> None:
     import jax
     import jax.numpy as jnp
 
-    before, bowls, starts = jax.config.read("jax_enable_x64"), (Bowl(), Bowl()), (0.1, 0.7)
+    before, bowls, starts = jax.config.jax_enable_x64, (Bowl(), Bowl()), (0.1, 0.7)
     with ThreadPoolExecutor(2) as pool:
         ends = list(pool.map(lambda bowl, start: _minimise(bowl, np.full(5, start), 20), bowls, starts))  # type: ignore[arg-type]
-    assert jax.config.read("jax_enable_x64") == before
+    assert jax.config.jax_enable_x64 == before
     assert jnp.ones(1).dtype == (jnp.float64 if before else jnp.float32)
     for bowl, end, start in zip(bowls, ends, starts, strict=True):
         assert bowl.precisions == {before}
