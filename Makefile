@@ -19,7 +19,7 @@ demo: .venv/installed
 	&& $(BIN)/curvafit infer "$$scan" -o demo_out
 
 test: .venv/installed-dev
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist worksteal
 
 test-hostile: .venv/installed-dev
 	$(BIN)/python -m tests.hostile

@@ -79,7 +79,7 @@ def histogram(axes: Axes, kind: str, near: np.ndarray, far: np.ndarray) -> None:
     axes.axvline(far.mean(), color=CONTOUR, label=f"random shapes, mean {far.mean():.2f}")
     axes.set(title=f"{kind} curvature: ratio {near.mean() / far.mean():.1%}", xlabel="distance", ylabel="pairs")
     axes.set(xlim=(0, None), ylim=(0, 1.3 * top))
-    axes.legend(edgecolor="none", framealpha=0.9)
+    axes.legend(loc="upper right", edgecolor="none", framealpha=0.9)
 
 
 if __name__ == "__main__":

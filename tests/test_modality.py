@@ -92,10 +92,13 @@ def test_images_and_labels_share_a_grid() -> None:
 
 
 def test_masks_of_what_is_seen() -> None:
-    """With even stain and no noise, a share of the light is that share of the contrast."""
+    """With even stain and no noise, a share of the light is that share of the contrast, but where the image is within
+    what float32 rounds off some fifty levels."""
     how = replace(PLAIN, spacing=(2.5, 1.0, 1.0), thickness=2.5, blur=(3.0, 1.0, 1.0), blur_growth=0.02, visible=0.1)
     found, clean = visible(FIELDS, 1.0, [how, how]), image(FIELDS, 1.0, [how, how], [1, 2])
-    assert found.dtype == torch.bool and torch.equal(found, clean > 10 + 0.1 * 50)
+    clear = (clean - (10 + 0.1 * 50)).abs() > 1e-4
+    assert found.dtype == torch.bool and torch.equal(found[clear], clean[clear] > 10 + 0.1 * 50)
+    assert float(clear.double().mean()) > 0.99
     level = 10 + visible_share(how) * 50
     assert level == pytest.approx((10 * 60) ** 0.5)
     dark = replace(PLAIN, background=60, foreground=10)

@@ -9,21 +9,23 @@ import numpy as np
 import pytest
 import torch
 
+from curvafit import fixed_point as method
 from curvafit.fixed_point import ShortFlow, _minimise, _parameters, fixed_point, sharpened
 from curvafit.generation.flow import generate
+from curvafit.generation.schedule import schedule
 from curvafit.priors.coefficients import Coefficients, preset
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.profile import phase_field
 from curvafit.priors.stencils import gaussian_blur
 from curvafit.refine import literal_loss_descent, refine
 
-GRID = Grid((48, 48, 48))
+GRID = Grid((40, 40, 40))
 
 
 @pytest.fixture(scope="module")
 def tubes() -> torch.Tensor:
     shape = preset("tubes")
-    return generate(shape.coefficients, shape.mass, GRID, seed=1).field
+    return generate(shape.coefficients, shape.mass, GRID, seed=1, schedule=schedule("fast", steps=500)).field
 
 
 @pytest.fixture(scope="module")
@@ -44,6 +46,7 @@ def test_the_authors_sponge_gives_its_coefficients_back(data) -> None:
 
 
 def test_the_right_parameters_leave_a_mask_where_it_is(mask_phase: torch.Tensor) -> None:
+    """Of six seeds the interface moves by 0.25 to 0.71 voxels, by 0.08 to 0.26 of what the wrong ones move it."""
     flow = ShortFlow(mask_phase, GRID, WORKING_EPSILON, preset("tubes").coefficients)
     truth = np.linalg.norm(flow.residual(_parameters(preset("tubes").coefficients)))
     wrong = np.linalg.norm(flow.residual(_parameters(preset("sponge").coefficients)))
@@ -58,7 +61,10 @@ def test_only_the_direction_of_a_counts(mask_phase: torch.Tensor) -> None:
 
 
 @pytest.mark.slow
-def test_the_fixed_point_fit_improves_on_its_start(mask_phase: torch.Tensor) -> None:
+def test_the_fixed_point_fit_improves_on_its_start(mask_phase: torch.Tensor, monkeypatch) -> None:
+    """Already in few steps: none is taken that raises the residual."""
+    monkeypatch.setattr(method, "FIRST_STEPS", 1)
+    monkeypatch.setattr(method, "LAST_STEPS", 2)
     start = Coefficients(1, 1, 3, -60, 20, 800)
     flow = ShortFlow(mask_phase, GRID, WORKING_EPSILON, start)
     before = np.linalg.norm(flow.residual(_parameters(start)))

@@ -23,7 +23,7 @@ from curvafit.data_synth.labels import NAMES, labels_of
 from curvafit.data_synth.layouts import LAYOUTS, About
 from curvafit.data_synth.workers import Here, Workers
 from curvafit.files import remove, write_content
-from curvafit.priors.bounds import instance, named, several, whole
+from curvafit.priors.bounds import instance, named, quoted, several, whole
 from curvafit.priors.grid import Grid
 from curvafit.priors.json_text import parse_json
 from curvafit.scan import Field, save
