@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.formats.base import ScanError
+from curvafit.formats.base import Damaged, ScanError
 
 #: Chunks of an array at most; more would take hours to look for.
 _MOST = 10_000_000
@@ -50,7 +50,7 @@ def missing_chunks(array: Any, folder: Path) -> tuple[str, ...]:
     counts, chunks = _counts(array.shape, outer), math.prod(_counts(array.shape, array.chunks))
     if chunks > _MOST:
         raise ScanError(f"expected at most {_MOST:,} chunks in a Zarr array, got {chunks:,} in {folder}")
-    lost = 0
+    lost, blosc = 0, "blosc" in type(array.compressors[-1] if array.compressors else None).__name__.lower()
     for place in itertools.product(*map(range, counts)):
         path = folder / array.metadata.encode_chunk_key(place)
         rest = [min(edge, n - k * edge) for n, edge, k in zip(array.shape, outer, place, strict=True)]
@@ -59,8 +59,18 @@ def missing_chunks(array: Any, folder: Path) -> tuple[str, ...]:
             lost += math.prod(inside)
         elif array.shards:
             lost += _missing_within(array, path, inside)
+        elif blosc:
+            _check_blosc(path)
     fill = f"their voxels have the fill value {array.fill_value}."
     return (f"{lost} of {chunks} chunks are not stored: {fill}",) if lost else ()
+
+
+def _check_blosc(chunk: Path) -> None:
+    """Compare a chunk's size with the one in its header, which Blosc itself does not."""
+    with chunk.open("rb") as stream:
+        told = int.from_bytes(stream.read(16)[12:], "little")
+    if told != (held := chunk.stat().st_size):
+        raise Damaged(f"{told} bytes by the header of chunk {chunk.name}, {held} in the file")
 
 
 def _counts(shape: Sequence[int], edges: Sequence[int]) -> list[int]:

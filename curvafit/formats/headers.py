@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+import os
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 
 from curvafit.formats.base import Damaged, ScanError
-from curvafit.formats.streams import check_memory, check_regular, decompressed, read_numbers
+from curvafit.formats.streams import check_memory, check_regular, decompressed, read_numbers, skip
 
 #: NRRD's names of types -> numpy's. `signed` and `_t` are taken off first.
 _NRRD_TYPES = {
@@ -25,12 +26,23 @@ _NRRD_TYPES = {
     "double": "f8",
 }
 _NRRD_ENCODINGS = {"raw": "raw", "gzip": "gzip", "gz": "gzip", "bzip2": "bzip2", "bz2": "bzip2"}
-#: MetaImage's types -> bytes of a number.
-_META_SIZES = {
-    **dict.fromkeys(("MET_CHAR", "MET_UCHAR"), 1),
-    **dict.fromkeys(("MET_SHORT", "MET_USHORT"), 2),
-    **dict.fromkeys(("MET_INT", "MET_UINT", "MET_FLOAT"), 4),
-    **dict.fromkeys(("MET_LONG", "MET_ULONG", "MET_LONG_LONG", "MET_ULONG_LONG", "MET_DOUBLE"), 8),
+#: MetaImage's types -> numpy's.
+_META_TYPES = {
+    "MET_CHAR": "i1",
+    "MET_UCHAR": "u1",
+    "MET_SHORT": "i2",
+    "MET_USHORT": "u2",
+    **dict.fromkeys(("MET_INT", "MET_LONG"), "i4"),
+    **dict.fromkeys(("MET_UINT", "MET_ULONG"), "u4"),
+    "MET_LONG_LONG": "i8",
+    "MET_ULONG_LONG": "u8",
+    "MET_FLOAT": "f4",
+    "MET_DOUBLE": "f8",
+}
+#: MetaImage's lines of a number for each axis (1), or for each pair of axes (2).
+_META_COUNTS = {
+    **dict.fromkeys(("ElementSpacing", "ElementSize", "Offset", "Position", "Origin", "CenterOfRotation"), 1),
+    **dict.fromkeys(("TransformMatrix", "Rotation", "Orientation"), 2),
 }
 #: Bytes of a MetaImage's header at most.
 _HEADER = 1 << 16
@@ -69,7 +81,7 @@ def _nrrd_body(nrrd: Any, header: dict[str, Any], file: IO[bytes], path: Path, k
     if skipped < 0:
         stream.seek(-math.prod(shape) * dtype.itemsize, 2)
     else:
-        stream.read(skipped)
+        skip(stream, skipped)
     return read_numbers(stream, shape, dtype, path)
 
 
@@ -81,27 +93,32 @@ def _nrrd_type(header: dict[str, Any]) -> np.dtype:
     return dtype.newbyteorder(">" if header.get("endian") == "big" else "<")
 
 
-def check_meta(path: Path) -> None:
-    """Make sure that a MetaImage's values are all there, and whole where they are compressed.
+def read_meta(path: Path) -> tuple[dict[str, str], np.ndarray | None]:
+    """The header of a MetaImage and its values, z first; None where they are text or in several files.
 
     Raises
     ------
-    ScanError, Damaged, OSError, EOFError, zlib.error
-        If they are not.
+    ScanError, Damaged, OSError, zlib.error
+        If the header is damaged, or the values are not as many as it says or damaged.
     """
     with path.open("rb") as file:
         header = _meta_header(file)
         name = header.get("ElementDataFile", "")
-        places = [name]
-        if name.upper() == "LIST":
-            places = file.read(_HEADER).decode("latin-1").splitlines()
-        elif name.upper() == "LOCAL":
-            return _check_meta_body(header, file, path)
+        if name.upper() == "LOCAL":
+            return header, _meta_values(header, file, path)
+        listed = name.upper() == "LIST"
+        places = file.read(_HEADER).decode("latin-1").splitlines() if listed else [name]
     for place in places:
         check_regular(path.parent / place.strip())
-    if len(places) == 1 and "%" not in name:
-        with (path.parent / name).open("rb") as file:
-            _check_meta_body(header, file, path)
+    if listed or "%" in name:
+        return header, None
+    with (path.parent / name).open("rb") as file:
+        return header, _meta_values(header, file, path)
+
+
+def meta_numbers(header: dict[str, str], *names: str) -> np.ndarray | None:
+    """The numbers of the first of these lines that a MetaImage's header has."""
+    return next((np.array(header[name].split(), dtype=np.float64) for name in names if name in header), None)
 
 
 def _meta_header(file: IO[bytes]) -> dict[str, str]:
@@ -113,22 +130,40 @@ def _meta_header(file: IO[bytes]) -> dict[str, str]:
     return found
 
 
-def _check_meta_body(header: dict[str, str], file: IO[bytes], path: Path) -> None:
-    """Count the bytes of values from where the file stands, decompressed; at its end zlib compares its checksum."""
-    kind = header.get("ElementType", "")
-    if kind not in _META_SIZES:
-        raise ScanError(f"expected an element type among {', '.join(_META_SIZES)}, got {kind[:40]!r} in {path}")
+def _meta_shape(header: dict[str, str]) -> list[int]:
+    """The size along each axis, if the other lines speak of as many axes."""
     shape = [int(n) for n in header.get("DimSize", "").split()]
-    channels = int(header.get("ElementNumberOfChannels", 1))
-    check_memory([*shape, channels], np.dtype(f"u{_META_SIZES[kind]}"), path)
-    if header.get("BinaryData", "True").lower().startswith("f"):
-        return
-    wanted = math.prod(shape) * channels * _META_SIZES[kind]
-    packed = header.get("CompressedData", "False").lower().startswith("t")
-    skipped = int(header.get("HeaderSize", 0))
-    file.seek(max(0, path.stat().st_size - wanted) if skipped < 0 else file.tell() + skipped)
-    stream, count = decompressed(file, "zlib" if packed else "raw"), 0
-    while count <= wanted and (piece := stream.read(1 << 20)):
-        count += len(piece)
-    if count != wanted:
-        raise Damaged(f"{wanted} bytes of values by its header, {'more' if count > wanted else count} in the file")
+    if header.get("ObjectType", "Image") != "Image" or str(len(shape)) != header.get("NDims") or min(shape) < 1:
+        raise Damaged(f"an image of {header.get('NDims', 'no')[:20]} axes with the sizes {shape[:9]}")
+    for name, value in header.items():
+        count = _META_COUNTS.get(name, 0)
+        if count and len([float(each) for each in value.split()]) != len(shape) ** count:
+            raise Damaged(f"{name} of {len(value.split())} numbers for {len(shape)} axes")
+    return shape
+
+
+def _meta_values(header: dict[str, str], file: IO[bytes], path: Path) -> np.ndarray | None:
+    """The values from where the file stands, to its end; None where they are text."""
+    kind = header.get("ElementType", "")
+    if kind not in _META_TYPES:
+        raise ScanError(f"expected an element type among {', '.join(_META_TYPES)}, got {kind[:40]!r} in {path}")
+    shape, channels = _meta_shape(header), int(header.get("ElementNumberOfChannels", 1))
+    order = header.get("BinaryDataByteOrderMSB", header.get("ElementByteOrderMSB", "False"))
+    dtype = np.dtype(_META_TYPES[kind]).newbyteorder(">" if _meta_truth(order) else "<")
+    shape = [*shape[::-1], *([channels] if channels != 1 else [])]
+    check_memory(shape, dtype, path)
+    if not _meta_truth(header.get("BinaryData", "True")):
+        return None
+    packed, skipped = _meta_truth(header.get("CompressedData", "False")), int(header.get("HeaderSize", 0))
+    held = os.fstat(file.fileno()).st_size
+    file.seek(max(0, held - math.prod(shape) * dtype.itemsize) if skipped < 0 else file.tell() + skipped)
+    left = held - file.tell()
+    if packed and int(header.get("CompressedDataSize", left)) != left:
+        raise Damaged(f"{header['CompressedDataSize']} compressed bytes by its header, {left} in the file")
+    return read_numbers(decompressed(file, "zlib" if packed else "raw"), shape, dtype, path)
+
+
+def _meta_truth(text: str) -> bool:
+    if text.lower() not in ("true", "false", "t", "f", "1", "0"):
+        raise Damaged(f"{text[:20]!r} for True or False")
+    return text.lower() in ("true", "t", "1")

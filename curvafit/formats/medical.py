@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.formats.base import Raw, ScanError, complaints, convert_length, extra, pick_key
-from curvafit.formats.headers import check_meta, nrrd_values
-from curvafit.formats.streams import opened, read_numbers
+from curvafit.formats.base import Damaged, Raw, ScanError, complaints, convert_length, extra, pick_key
+from curvafit.formats.headers import meta_numbers, nrrd_values, read_meta
+from curvafit.formats.streams import opened, read_numbers, skip
 
+#: Suffixes of files that must be DICOM's.
+_DICOM = (".dcm", ".dicom", ".ima")
 #: From DICOM's and ITK's patient frame (left, posterior, superior) to NIfTI's (right, anterior, superior).
 _LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
@@ -37,22 +39,39 @@ def read_nrrd(path: Path, **_: object) -> Raw:
 
 
 def read_itk(path: Path, **_: object) -> Raw:
-    """MetaImage; ITK's unit is the millimetre."""
+    """MetaImage, whose unit is the millimetre; ITK reads what is text or in several files."""
     itk = extra("SimpleITK", "MHA and MHD files")
-    check_meta(path)
+    header, values = read_meta(path)
+    if values is None:
+        return _itk_image(itk, path)
+    axes = len(header["DimSize"].split())
+    spacing = meta_numbers(header, "ElementSpacing", "ElementSize")
+    spacing = np.ones(axes) if spacing is None else spacing
+    turned = meta_numbers(header, "TransformMatrix", "Rotation", "Orientation")
+    origin = meta_numbers(header, "Offset", "Position", "Origin")
+    directions = np.eye(axes) if turned is None else turned.reshape(axes, axes).T
+    return _in_millimetres(values, spacing, directions, np.zeros(axes) if origin is None else origin)
+
+
+def _itk_image(itk: Any, path: Path) -> Raw:
     shown = itk.ProcessObject.GetGlobalWarningDisplay()
     itk.ProcessObject.SetGlobalWarningDisplay(False)
     try:
         image = itk.ReadImage(str(path))
     finally:
         itk.ProcessObject.SetGlobalWarningDisplay(shown)
-    spacing = np.array(image.GetSpacing())
-    values = itk.GetArrayFromImage(image)
+    spacing, axes = np.array(image.GetSpacing()), image.GetDimension()
+    directions = np.array(image.GetDirection()).reshape(axes, axes)
+    return _in_millimetres(itk.GetArrayFromImage(image), spacing, directions, np.array(image.GetOrigin()))
+
+
+def _in_millimetres(values: np.ndarray, spacing: np.ndarray, directions: np.ndarray, origin: np.ndarray) -> Raw:
+    """Values with ITK's account of their place; an affine where they have three axes."""
     affine = None
     if len(spacing) == 3:
         affine = np.eye(4)
-        affine[:3, :3] = np.array(image.GetDirection()).reshape(3, 3) * spacing
-        affine[:3, 3] = image.GetOrigin()
+        affine[:3, :3] = directions * spacing
+        affine[:3, 3] = origin
         affine = _LPS_TO_RAS @ affine
     return Raw(values, tuple(float(h) for h in spacing[::-1]), "mm", affine)
 
@@ -65,7 +84,7 @@ def read_mrc(path: Path, **_: object) -> Raw:
         shape, dtype = mrcfile.utils.data_shape_from_header(header), mrcfile.utils.data_dtype_from_header(header)
         start = header.nbytes + int(header.nsymbt)
     with opened(path) as stream:
-        stream.seek(start)
+        skip(stream, start)
         values = read_numbers(stream, [int(n) for n in shape], dtype, path)
     spacing = (float(size.z), float(size.y), float(size.x))
     return Raw(values, spacing if min(spacing) > 0 else None, "angstrom")
@@ -92,9 +111,9 @@ def write_mrc(field: Any, path: Path) -> None:
 def read_dicom(path: Path, *, key: str | None = None, **_: object) -> Raw:
     """A folder of one series' slices, in the order of their positions; `key` picks a series by its UID."""
     pydicom = extra("pydicom", "DICOM folders")
-    files = sorted(p for p in path.iterdir() if p.is_file() and is_dicom(p))
+    files = sorted(p for p in path.iterdir() if p.is_file() and (is_dicom(p) or p.suffix.lower() in _DICOM))
     with complaints("pydicom"):
-        images = [image for image in map(pydicom.dcmread, files) if "PixelData" in image]
+        images = [image for file in files if (image := _image(pydicom, file)) is not None]
     series = sorted({str(image.get("SeriesInstanceUID", "")) for image in images})
     chosen = pick_key(series, key, path)
     slices = [image for image in images if str(image.get("SeriesInstanceUID", "")) == chosen]
@@ -109,6 +128,19 @@ def read_dicom(path: Path, *, key: str | None = None, **_: object) -> Raw:
     affine[:3, :3] = np.column_stack([rows * x, columns * y, normal * z])
     affine[:3, 3] = origin
     return Raw(values, (z, y, x), "mm", _LPS_TO_RAS @ affine)
+
+
+def _image(pydicom: Any, file: Path) -> Any:
+    """A slice with its pixels; None for what is no image, such as a folder's index or a report."""
+    if not is_dicom(file):
+        raise Damaged(f"{file.name} is no DICOM file")
+    image = pydicom.dcmread(file)
+    if "PixelData" in image:
+        return image
+    kind = pydicom.uid.UID(str(image.file_meta.get("MediaStorageSOPClassUID", "")))
+    if not kind or "Image Storage" in kind.name:
+        raise Damaged(f"{file.name} has no pixels")
+    return None
 
 
 def is_dicom(path: Path) -> bool:

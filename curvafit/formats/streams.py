@@ -8,7 +8,8 @@ import io
 import math
 import os
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
@@ -19,7 +20,7 @@ from curvafit.formats.base import Damaged, ScanError
 #: Bytes that are read at once.
 _PIECE = 1 << 22
 #: What a compressed file begins with -> what opens it.
-_COMPRESSED = {b"\x1f\x8b": gzip.GzipFile, b"BZh": bz2.BZ2File}
+_COMPRESSED = {b"\x1f\x8b": "gzip", b"BZh": "bzip2"}
 
 
 def read_numbers(stream: Any, shape: Sequence[int], dtype: np.dtype, place: object) -> np.ndarray:
@@ -75,42 +76,56 @@ def check_regular(path: Path) -> Path:
     return path
 
 
-def opened(path: Path) -> Any:
+@contextmanager
+def opened(path: Path) -> Iterator[Any]:
     """A file's stream of bytes, decompressed where it begins as gzip's or bzip2's do."""
     with path.open("rb") as file:
         start = file.read(3)
-    kind = next((kind for mark, kind in _COMPRESSED.items() if start.startswith(mark)), None)
-    return path.open("rb") if kind is None else kind(path)
+        file.seek(0)
+        kind = next((kind for mark, kind in _COMPRESSED.items() if start.startswith(mark)), "raw")
+        yield decompressed(file, kind)
+
+
+def skip(stream: Any, count: int) -> None:
+    """Read and forget so many bytes, which fewer end quietly."""
+    while count > 0 and (piece := stream.read(min(count, _PIECE))):
+        count -= len(piece)
 
 
 def decompressed(stream: IO[bytes], encoding: str) -> Any:
     """The bytes of the rest of a stream in `"gzip"`, `"bzip2"`, `"zlib"` or `"raw"`."""
-    if encoding == "zlib":
-        return io.BufferedReader(_Inflated(stream))
-    kinds = {"gzip": lambda: gzip.GzipFile(fileobj=stream), "bzip2": lambda: bz2.BZ2File(stream)}
-    return kinds[encoding]() if encoding in kinds else stream
+    if encoding == "gzip":
+        return gzip.GzipFile(fileobj=stream)
+    kinds: dict[str, Any] = {"bzip2": bz2.BZ2Decompressor, "zlib": zlib.decompressobj}
+    return io.BufferedReader(_Inflated(stream, kinds[encoding]())) if encoding in kinds else stream
 
 
 class _Inflated(io.RawIOBase):
-    """A zlib stream's bytes; at its end its checksum counts, and nothing may follow."""
+    """The bytes of one compressed stream; at its end its checksum counts, and nothing may follow."""
 
-    def __init__(self, stream: IO[bytes]) -> None:
-        self._stream, self._inflate = stream, zlib.decompressobj()
+    def __init__(self, stream: IO[bytes], inflate: Any) -> None:
+        self._stream, self._inflate = stream, inflate
 
     def readable(self) -> bool:
         return True
 
     def readinto(self, room: Any, /) -> int:
         while not self._inflate.eof:
-            given = self._inflate.unconsumed_tail or self._stream.read(1 << 16)
-            if not given:
-                raise EOFError("the compressed stream ends too early")
-            if piece := self._inflate.decompress(given, len(room)):
+            if piece := self._inflate.decompress(self._given(), len(room)):
                 room[: len(piece)] = piece
                 return len(piece)
         if self._inflate.unused_data or self._stream.read(1):
-            raise EOFError("bytes follow the compressed stream")
+            raise Damaged("bytes follow the compressed stream")
         return 0
+
+    def _given(self) -> bytes:
+        """What is to be decompressed next: nothing where the decompressor still has some."""
+        if not getattr(self._inflate, "needs_input", True):
+            return b""
+        given = getattr(self._inflate, "unconsumed_tail", b"") or self._stream.read(1 << 16)
+        if not given:
+            raise Damaged("the compressed stream ends too early")
+        return given
 
 
 def _memory() -> float:

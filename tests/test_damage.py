@@ -1,0 +1,173 @@
+"""Damage is never read as data: checksums, sizes and headers of volume files are taken at their word."""
+
+from __future__ import annotations
+
+import gzip
+import os
+import random
+import sys
+from pathlib import Path
+
+import nibabel
+import numpy as np
+import pytest
+
+pytest.importorskip("nrrd")
+pytest.importorskip("SimpleITK")
+pytest.importorskip("mrcfile")
+
+from damage import CHECKED, COUNTED, OTHERS, VALUES, damaged, files_of, gzipped
+
+from curvafit.scan import Field, ScanError, load, save
+
+CASES = 30
+
+
+def outcome(path: Path) -> np.ndarray | None:
+    """The values, or None where they are refused in one sentence."""
+    try:
+        return load(path).values
+    except ScanError as error:
+        assert str(error).startswith("expected ") and str(error).isprintable() and len(str(error)) < 900
+        return None
+
+
+def outcomes(path: Path, seed: str):
+    """Every damage to every file of a volume in turn, and what is read then."""
+    chance = random.Random(seed)
+    for _ in range(CASES):
+        file = chance.choice(files_of(path))
+        whole = file.read_bytes()
+        broken = damaged(whole, chance)
+        file.write_bytes(broken)
+        yield len(broken) - len(whole), outcome(path)
+        file.write_bytes(whole)
+
+
+@pytest.mark.parametrize("name", CHECKED)
+def test_values_with_a_checksum_are_the_truth_or_refused(tmp_path: Path, capfd, name: str) -> None:
+    CHECKED[name](tmp_path / name)
+    assert np.array_equal(load(tmp_path / name).values, VALUES)
+    refused = 0
+    for _, values in outcomes(tmp_path / name, name):
+        refused += values is None
+        assert values is None or np.array_equal(values, VALUES)
+    assert refused > CASES / 3
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("name", COUNTED)
+def test_values_without_one_are_as_many_as_the_header_says(tmp_path: Path, capfd, name: str) -> None:
+    COUNTED[name](tmp_path / name)
+    assert np.array_equal(load(tmp_path / name).values, VALUES)
+    for change, values in outcomes(tmp_path / name, name):
+        assert change == 0 or values is None
+        assert values is None or values.size == VALUES.size
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_other_damage_ends_in_values_or_a_sentence(tmp_path: Path, capfd, name: str) -> None:
+    OTHERS[name](tmp_path / name)
+    assert np.array_equal(load(tmp_path / name).values, VALUES)
+    assert sum(values is None for _, values in outcomes(tmp_path / name, name)) > 3
+    assert capfd.readouterr() == ("", "")
+
+
+# ---- gzip ------------------------------------------------------------------------------------------------------------
+
+
+def test_every_bit_of_a_gzip_trailer_counts(tmp_path: Path) -> None:
+    path = save(Field(VALUES, 1.0, "mm"), tmp_path / "scan.nii.gz")
+    whole = path.read_bytes()
+    for place in range(-8, 0):
+        broken = bytearray(whole)
+        broken[place] ^= 1
+        path.write_bytes(broken)
+        with pytest.raises(ScanError, match="expected a whole, readable file, got"):
+            load(path)
+    for cut in range(1, 9):
+        path.write_bytes(whole[:-cut])
+        with pytest.raises(ScanError, match="expected a whole, readable file, got"):
+            load(path)
+
+
+def test_gzip_members_are_joined_and_what_follows_is_refused(tmp_path: Path) -> None:
+    content = gzip.decompress(save(Field(VALUES, 1.0, "mm"), tmp_path / "scan.nii.gz").read_bytes())
+    path = tmp_path / "scan.nii.gz"
+    path.write_bytes(b"".join(gzipped(content[k : k + 500]) for k in range(0, len(content), 500)))
+    assert np.array_equal(load(path).values, VALUES)
+    path.write_bytes(gzipped(content) + b"garbage")
+    with pytest.raises(ScanError, match="expected a whole, readable file"):
+        load(path)
+
+
+def test_a_stream_that_goes_on_and_a_header_that_claims_the_moon_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "scan.nii.gz"
+    content = gzip.decompress(save(Field(VALUES, 1.0, "mm"), path).read_bytes())
+    path.write_bytes(gzipped(content + bytes(50_000_000)))
+    with pytest.raises(ScanError, match=rf"{VALUES.nbytes} bytes of values by its header, more in the file"):
+        load(path)
+    header = nibabel.Nifti1Image(np.zeros((2, 2, 2), np.float32), np.eye(4)).header.copy()
+    header["dim"][1:4] = 10_000
+    for name in ("scan.nii", "scan.nii.gz"):
+        moon = header.binaryblock + bytes(4) + bytes(32)
+        (tmp_path / name).write_bytes(gzipped(moon) if name.endswith("gz") else moon)
+        with pytest.raises(ScanError, match=r"^expected [^\n]*$"):
+            load(tmp_path / name)
+
+
+def test_nibabel_keeps_its_complaints_to_itself_and_the_note_tells(tmp_path: Path, capfd) -> None:
+    path = save(Field(VALUES, (3.0, 2.0, 1.0), "mm"), tmp_path / "scan.nii")
+    content = bytearray(path.read_bytes())
+    content[80:84] = np.float32(-1).tobytes()  # pixdim[1]
+    path.write_bytes(content)
+    field = load(path)
+    assert field.spacing == (3, 2, 1) and any("header is mended: pixdim" in note for note in field.notes)
+    assert capfd.readouterr() == ("", "")
+
+
+# ---- what is no file -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs named pipes")
+@pytest.mark.parametrize("suffix", [".nii", ".nii.gz", ".tif", ".npy", ".npz", ".h5", ".nrrd", ".mha", ".mrc", ".raw"])
+def test_pipes_and_devices_are_refused_at_once(tmp_path: Path, suffix: str) -> None:
+    os.mkfifo(tmp_path / f"pipe{suffix}")
+    (tmp_path / f"endless{suffix}").symlink_to("/dev/zero")
+    for name in ("pipe", "endless"):
+        with pytest.raises(ScanError, match="expected a file or a folder, got .* which is neither"):
+            load(tmp_path / f"{name}{suffix}", raw_shape=(2, 2, 2))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs named pipes")
+def test_pipes_within_folders_and_headers_are_refused(tmp_path: Path) -> None:
+    OTHERS["v3.zarr"](tmp_path / "scan.zarr")
+    os.mkfifo(tmp_path / "scan.zarr" / "pipe")
+    (tmp_path / "slices").mkdir()
+    os.mkfifo(tmp_path / "slices" / "a.tif")
+    (tmp_path / "a.mhd").write_text(
+        "NDims = 3\nDimSize = 2 2 2\nElementType = MET_UCHAR\nElementDataFile = slices/a.tif\n"
+    )
+    for name in ("scan.zarr", "slices", "a.mhd"):
+        with pytest.raises(ScanError, match="^expected (a file|files) "):
+            load(tmp_path / name)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs symbolic links")
+def test_links_in_circles_and_strange_names(tmp_path: Path) -> None:
+    (tmp_path / "a.nii").symlink_to(tmp_path / "a.nii")
+    with pytest.raises(FileNotFoundError, match="got no such file"):
+        load(tmp_path / "a.nii")
+    OTHERS["v3.zarr"](tmp_path / "scan.zarr")
+    (tmp_path / "scan.zarr" / "inner").symlink_to(tmp_path / "scan.zarr")
+    with pytest.raises(ScanError, match="leads back to a folder above it"):
+        load(tmp_path / "scan.zarr")
+    np.save(tmp_path / "two\nlines.npy", np.zeros((2, 2, 2)))
+    with pytest.raises(ScanError, match=r"got 0.0 everywhere in .*two\\nlines.npy$"):
+        load(tmp_path / "two\nlines.npy")
+    np.save(tmp_path / "a::b.npy", VALUES)
+    assert np.array_equal(load(tmp_path / "a::b.npy").values, VALUES)
+    for name in ("::", "::a", f"{tmp_path}/none.h5::a::b", "nul\0.nii"):
+        with pytest.raises((ScanError, FileNotFoundError), match=r"^expected [^\n]*$"):
+            load(name)
