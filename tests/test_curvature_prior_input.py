@@ -132,7 +132,7 @@ def test_it_can_be_copied():
         ({"border": 0.5}, "expected a border of whole voxels"),
         ({"weight": -1}, "expected a weight from 0"),
         ({"weight": None}, "expected a weight from 0, or one a class, got None"),
-        ({"shape": (8, 8)}, "expected shape as 3 numbers"),
+        ({"shape": (8, 8)}, "expected a shape of 3 whole numbers"),
     ],
 )
 def test_wrong_arguments_are_said(options, message):
