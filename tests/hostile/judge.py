@@ -16,7 +16,7 @@ from .sandbox import Outcome, commanding, run
 
 #: A name that a program gives to what it has not finished.
 _TEMPORARY = re.compile(r"(^|/)\.[^/]*|\.part(/|$)|(^|/)tmp[a-z0-9_]{8}(/|$)")
-_ALLOWED = re.compile(r"^(\[ *\d+ %\] |note: )")
+_ALLOWED = re.compile(r"^(\[ *\d+ %\] |note: |\w+: .*; licence )")
 _CRASH = re.compile(r"Traceback \(most recent call last\)|^Exception ignored|Fatal Python error|^Exception in ", re.M)
 
 #: Exit codes of a run that a signal ended.
