@@ -27,7 +27,7 @@ _SYNTH = (
     "--workers",
     "0",
 )
-_BUILD = ("atlas", "build", "OUT", "--shape", "10", "--around", "tubes", "--count", "1", "--workers", "0")
+_BUILD = ("atlas", "build", "OUT", "--shape", "16", "--around", "tubes", "--count", "1", "--workers", "0")
 
 #: Commands that write a file or a store of some name: `OUT` stands for it.
 WRITERS: dict[str, tuple[tuple[str, ...], Setup, tuple[str, ...]]] = {

@@ -95,7 +95,7 @@ DOCUMENTS: dict[str, Document] = {
     ),
     "fit-around": Document(
         "fit.json",
-        ("atlas", "build", "out.zarr", "--around", "fit.json", "--count", "1", "--shape", "10", "--workers", "0"),
+        ("atlas", "build", "out.zarr", "--around", "fit.json", "--count", "1", "--shape", "16", "--workers", "0"),
         _FIT, 6, stays=("out.zarr", "out.zarr/*"), whole=False, quick=False,
     ),
     "store-info": Document("store.zarr/zarr.json", ("atlas", "info", "store.zarr"), taking("store.zarr"), 26),

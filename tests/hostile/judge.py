@@ -12,13 +12,15 @@ from pathlib import Path
 
 from .case import Case, Fault, Place
 from .outputs import flaws
-from .sandbox import Outcome, commanding, run
+from .sandbox import FILLED, Outcome, commanding, run
 
 #: A name that a program gives to what it has not finished.
 _TEMPORARY = re.compile(r"(^|/)\.[^/]*|\.part(/|$)|(^|/)tmp[a-z0-9_]{8}(/|$)")
 _ALLOWED = re.compile(r"^(\[ *\d+ %\] |note: |\w+: .*; licence )")
 _CRASH = re.compile(r"Traceback \(most recent call last\)|^Exception ignored|Fatal Python error|^Exception in ", re.M)
 
+#: What a build says that draws on, as it should where hardly any shape of a design is viable: it is given time to.
+_AT_WORK = re.compile(r"viable of \d+ draws|a design with viable shapes")
 #: Exit codes of a run that a signal ended.
 STOPPED = (130, 143, -15, -2)
 #: Bytes beyond which a file's time stands for its content.
@@ -40,6 +42,8 @@ def spoken(outcome: Outcome, codes: Iterable[int] = (0, 1, 2)) -> list[Fault]:
     """What the exit code and the two streams say."""
     found = []
     last = (outcome.stderr.strip().splitlines() or [""])[-1][:200]
+    if outcome.hung and _AT_WORK.search(last) and outcome.filled < FILLED:
+        return []
     if outcome.hung:
         return [Fault("hung", f"{outcome.hung}; last said: {last!r}")]
     crashed = _CRASH.search(outcome.stderr)

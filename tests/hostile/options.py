@@ -91,7 +91,7 @@ COMMANDS: dict[str, Command] = {
         each=3,
     ),
     "build": Command(
-        ("atlas", "build", "out.zarr", "--count", "1", "--shape", "12", "--around", "tubes", "--workers", "0"),
+        ("atlas", "build", "out.zarr", "--count", "1", "--shape", "16", "--around", "tubes", "--workers", "0"),
         "count shape seed design around spread schedule workers scheduler",
         "count workers shape",
         stays=("out.zarr", "out.zarr/*"),
