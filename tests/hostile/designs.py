@@ -159,7 +159,7 @@ def cases(seed: int) -> Iterator[Case]:
         "--count",
         "1",
         "--shape",
-        "8",
+        "16",
         "--workers",
         "0",
     )
