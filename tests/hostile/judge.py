@@ -88,7 +88,7 @@ def _lost(before: Standing, after: Standing, changes: Sequence[str]) -> list[Fau
 
 def _torn(case: Case, place: Place, before: Standing, after: Standing, code: int) -> list[Fault]:
     new = [name for name in after if name not in before]
-    temporary = [name for name in new if _TEMPORARY.search(name)]
+    temporary = [name for name in new if _TEMPORARY.search(name) and not _asked_for(case, name)]
     if temporary:
         return [Fault("torn", f"exit code {code} and a temporary name is left: {temporary[0]}")]
     if code != 0:
@@ -98,6 +98,12 @@ def _torn(case: Case, place: Place, before: Standing, after: Standing, code: int
     touched = [name for name in after if after[name] != before.get(name) and after[name][0] != "folder"]
     roots = sorted({_root(name) for name in touched})
     return [Fault(column, f"exit code 0 and {said}") for name in roots for column, said in flaws(place.here / name)]
+
+
+def _asked_for(case: Case, name: str) -> bool:
+    """Whether the command names a hidden output, whose picture and record are hidden as well."""
+    told = [part.removeprefix("--output=").rpartition(".")[0] for part in case.command]
+    return any(stem.startswith(".") and name.startswith(f"{stem}.") for stem in told)
 
 
 def _complete(place: Place, names: Sequence[str]) -> bool:

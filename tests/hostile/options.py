@@ -199,7 +199,6 @@ _SENSELESS: dict[str, tuple[str, ...]] = {
         "a.npy",
     ),
     "output-empty": ("generate", *LAW, *_SMALL, "-o", ""),
-    "output-suffix": ("generate", *LAW, *_SMALL, "-o", ".npy"),
     "output-dot": ("generate", *LAW, *_SMALL, "-o", "."),
     "output-none": ("generate", *LAW, *_SMALL, "-o", "out.xyz"),
     "output-file-as-folder": ("generate", *LAW, *_SMALL, "-o", "file.txt/out.npy"),
