@@ -17,7 +17,7 @@ misread         A damaged input is not read as other values, shape, spacing or a
 hung            No case takes more than 20 s of processor, nor of waiting, nor 1.5 GiB beyond what the program holds.
 wrong           The exit code is 0, 1 or 2 (130 or 143 where a signal came). With 2 the output stream is empty and
                 the error stream has one line that starts `error: `; lines before it that start `[` (progress) or
-                `note: ` are allowed. With 0 no output holds a number that is not finite.
+                `note: `, or tell a sample's licence, are allowed. With 0 no output holds a number that is not finite.
 
 Cases are the same on every machine: what is random comes from the seed and the case's name.
 """

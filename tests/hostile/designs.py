@@ -22,6 +22,12 @@ def _nested_list(depth: int, width: int) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _inside(depth: int, width: int) -> str:
+    """The same within one value, which a message would spell out."""
+    parts = ["&a0 [1, 1]", *(f"&a{k} [{', '.join([f'*a{k - 1}'] * width)}]" for k in range(1, depth))]
+    return f"[{', '.join(parts)}]"
+
+
 TEXTS: dict[str, str | bytes] = {
     "empty": "",
     "null": "null\n",
@@ -36,6 +42,14 @@ TEXTS: dict[str, str | bytes] = {
     "aliases-around": _aliases(9, 9) + "\naround: *a8\n",
     "aliases-spread": _aliases(9, 9) + "\naround: tubes\nspread: *a8\n",
     "aliases-in-list": _nested_list(8, 8),
+    "aliases-in-around": f"around: {_inside(9, 9)}\n",
+    "aliases-in-spread": f"around: tubes\nspread: {_inside(9, 9)}\n",
+    "aliases-in-law": f"around: tubes\nlaw: {_inside(22, 2)}\n",
+    "aliases-in-box": f"box: {{a11: {_inside(9, 9)}}}\n",
+    "aliases-as-box": f"box: {_inside(30, 2)}\n",
+    "aliases-as-design": f"{_inside(9, 9)}\n",
+    "aliases-in-point": f"around: {_POINT.replace('400', _inside(9, 9))}\n",
+    "aliases-in-points": f"list: [{_inside(9, 9)}]\n",
     "alias-none": "around: *nothing\n",
     "alias-itself": "box: &a {a11: *a}\n",
     "alias-list-itself": "list: &a [*a]\n",
@@ -69,7 +83,7 @@ TEXTS: dict[str, str | bytes] = {
     "directive": "%YAML 9.9\n---\naround: tubes\n",
     "directive-wrong": "%YAML abc\n---\naround: tubes\n",
     "two-documents": "around: tubes\n---\naround: sponge\n",
-    "doubled-keys": "around: tubes\naround: sponge\n",
+    "doubled-keys": "around: tubes\naround: nonsense\n",
     "doubled-names": "box: {a11: 1, a11: 2}\n",
     "list-key": "? [1, 2]\n: 3\naround: tubes\n",
     "table-key": "? {a: 1}\n: 3\n",
@@ -145,7 +159,7 @@ def cases(seed: int) -> Iterator[Case]:
         "--count",
         "1",
         "--shape",
-        "8",
+        "16",
         "--workers",
         "0",
     )

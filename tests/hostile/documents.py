@@ -78,8 +78,8 @@ _GROWN = ("store.zarr", "store.zarr/*")
 _FIT = taking("fit.json")
 
 DOCUMENTS: dict[str, Document] = {
-    "fit-generate": Document("fit.json", _GENERATE, _FIT, 60),
-    "fit-nnunet": Document("fit.json", ("nnunet", "--prior", "fit.json"), _FIT, 40),
+    "fit-generate": Document("fit.json", _GENERATE, _FIT, 36),
+    "fit-nnunet": Document("fit.json", ("nnunet", "--prior", "fit.json"), _FIT, 24),
     "fit-segment": Document(
         "fit.json",
         ("segment", "scan.nii.gz", "--prior", "fit.json", "--steps", "2", "-o", "out.nii.gz"),
@@ -91,43 +91,43 @@ DOCUMENTS: dict[str, Document] = {
         "fit.json",
         ("synth", "-o", "set", "--prior", "fit.json", "--modality", "confocal", "--shape", "6", "--count", "1",
          "--workers", "0"),
-        _FIT, 14, stays=_BEGUN, whole=False, quick=False,
+        _FIT, 6, stays=_BEGUN, whole=False, quick=False,
     ),
     "fit-around": Document(
         "fit.json",
-        ("atlas", "build", "out.zarr", "--around", "fit.json", "--count", "1", "--shape", "10", "--workers", "0"),
-        _FIT, 14, stays=("out.zarr", "out.zarr/*"), whole=False, quick=False,
+        ("atlas", "build", "out.zarr", "--around", "fit.json", "--count", "1", "--shape", "16", "--workers", "0"),
+        _FIT, 6, stays=("out.zarr", "out.zarr/*"), whole=False, quick=False,
     ),
-    "store-info": Document("store.zarr/zarr.json", ("atlas", "info", "store.zarr"), taking("store.zarr"), 40),
+    "store-info": Document("store.zarr/zarr.json", ("atlas", "info", "store.zarr"), taking("store.zarr"), 26),
     "store-verify": Document(
-        "store.zarr/zarr.json", ("atlas", "verify", "store.zarr", "--regenerate", "1"), taking("store.zarr"), 14,
+        "store.zarr/zarr.json", ("atlas", "verify", "store.zarr", "--regenerate", "1"), taking("store.zarr"), 10,
         whole=False,
     ),
     "store-extend": Document(
         "store.zarr/zarr.json", ("atlas", "extend", "store.zarr", "--count", "0", "--workers", "0"),
-        taking("store.zarr"), 20, changes=_GROWN, whole=False,
+        taking("store.zarr"), 12, changes=_GROWN, whole=False,
     ),
     "draw-info": Document("store.zarr/draws/000000/zarr.json", ("atlas", "info", "store.zarr"), taking("store.zarr"),
         34),
     "draw-verify": Document(
         "store.zarr/draws/000000/zarr.json", ("atlas", "verify", "store.zarr", "--regenerate", "1"),
-        taking("store.zarr"), 24, whole=False,
+        taking("store.zarr"), 16, whole=False,
     ),
     "draw-extract": Document(
         "store.zarr/draws/000000/zarr.json", ("atlas", "extract", "store.zarr", "-o", "out.npz"),
-        taking("store.zarr"), 24, whole=False,
+        taking("store.zarr"), 16, whole=False,
     ),
     "field-extract": Document(
         "store.zarr/draws/000000/field/zarr.json", ("atlas", "extract", "store.zarr", "-o", "out.npz"),
-        taking("store.zarr"), 20, whole=False,
+        taking("store.zarr"), 14, whole=False,
     ),
     "draw-synth": Document(
         "store.zarr/draws/000000/zarr.json",
         ("synth", "-o", "set", "--atlas", "store.zarr", "--modality", "confocal", "--shape", "6", "--count", "1",
          "--workers", "0"),
-        taking("store.zarr"), 14, stays=_BEGUN, whole=False,
+        taking("store.zarr"), 8, stays=_BEGUN, whole=False,
     ),
-    "set": Document("set/curvafit.json", (*_SET, "--count", "4"), taking("set"), 40, changes=_BEGUN),
+    "set": Document("set/curvafit.json", (*_SET, "--count", "4"), taking("set"), 26, changes=_BEGUN),
     "set-case": Document("set/cases/case_00001.json", (*_SET, "--count", "4"), taking("set"), 8, changes=_BEGUN),
     "record": Document(
         "shape.json", ("generate", *_GENERATE[1:-1], "shape.nii.gz"),
@@ -136,11 +136,11 @@ DOCUMENTS: dict[str, Document] = {
     "scan-zarr": Document(
         "v3_group.zarr/volume/zarr.json",
         ("segment", "v3_group.zarr", "--prior", "tubes", "--steps", "1", "-o", "out.nii.gz"),
-        taking("v3_group.zarr"), 30,
+        taking("v3_group.zarr"), 20,
     ),
     "scan-zarray": Document(
         "v2_zlib.zarr/.zarray", ("segment", "v2_zlib.zarr", "--prior", "tubes", "--steps", "1", "-o", "out.nii.gz"),
-        taking("v2_zlib.zarr"), 24, whole=False,
+        taking("v2_zlib.zarr"), 16, whole=False,
     ),
 }  # fmt: skip
 

@@ -12,13 +12,15 @@ from pathlib import Path
 
 from .case import Case, Fault, Place
 from .outputs import flaws
-from .sandbox import Outcome, commanding, run
+from .sandbox import FILLED, Outcome, commanding, run
 
 #: A name that a program gives to what it has not finished.
 _TEMPORARY = re.compile(r"(^|/)\.[^/]*|\.part(/|$)|(^|/)tmp[a-z0-9_]{8}(/|$)")
-_ALLOWED = re.compile(r"^(\[ *\d+ %\] |note: )")
+_ALLOWED = re.compile(r"^(\[ *\d+ %\] |note: |\w+: .*; licence )")
 _CRASH = re.compile(r"Traceback \(most recent call last\)|^Exception ignored|Fatal Python error|^Exception in ", re.M)
 
+#: What a build says that draws on, as it should where hardly any shape of a design is viable: it is given time to.
+_AT_WORK = re.compile(r"viable of \d+ draws|a design with viable shapes")
 #: Exit codes of a run that a signal ended.
 STOPPED = (130, 143, -15, -2)
 #: Bytes beyond which a file's time stands for its content.
@@ -40,6 +42,8 @@ def spoken(outcome: Outcome, codes: Iterable[int] = (0, 1, 2)) -> list[Fault]:
     """What the exit code and the two streams say."""
     found = []
     last = (outcome.stderr.strip().splitlines() or [""])[-1][:200]
+    if outcome.hung and _AT_WORK.search(last) and outcome.filled < FILLED:
+        return []
     if outcome.hung:
         return [Fault("hung", f"{outcome.hung}; last said: {last!r}")]
     crashed = _CRASH.search(outcome.stderr)
@@ -84,7 +88,7 @@ def _lost(before: Standing, after: Standing, changes: Sequence[str]) -> list[Fau
 
 def _torn(case: Case, place: Place, before: Standing, after: Standing, code: int) -> list[Fault]:
     new = [name for name in after if name not in before]
-    temporary = [name for name in new if _TEMPORARY.search(name)]
+    temporary = [name for name in new if _TEMPORARY.search(name) and not _asked_for(case, name)]
     if temporary:
         return [Fault("torn", f"exit code {code} and a temporary name is left: {temporary[0]}")]
     if code != 0:
@@ -94,6 +98,12 @@ def _torn(case: Case, place: Place, before: Standing, after: Standing, code: int
     touched = [name for name in after if after[name] != before.get(name) and after[name][0] != "folder"]
     roots = sorted({_root(name) for name in touched})
     return [Fault(column, f"exit code 0 and {said}") for name in roots for column, said in flaws(place.here / name)]
+
+
+def _asked_for(case: Case, name: str) -> bool:
+    """Whether the command names a hidden output, whose picture and record are hidden as well."""
+    told = [part.removeprefix("--output=").rpartition(".")[0] for part in case.command]
+    return any(stem.startswith(".") and name.startswith(f"{stem}.") for stem in told)
 
 
 def _complete(place: Place, names: Sequence[str]) -> bool:

@@ -38,7 +38,7 @@ class Command(NamedTuple):
     setup: Setup = nothing
     stays: tuple[str, ...] = ()
     changes: tuple[str, ...] = ()
-    each: int = 8
+    each: int = 5
 
 
 _SMALL = ("--shape", "10", "--steps", "4")
@@ -51,51 +51,51 @@ COMMANDS: dict[str, Command] = {
         "mass shape epsilon seed schedule steps device checkpoint-every spacing tile snapshots boundary orientation "
         "coefficients volume-fraction",
         "steps",
-        each=11,
+        each=7,
     ),
     "generate-unit": Command(
         ("generate", *LAW, *_SMALL, "--spacing", "0.1", "--unit", "mm", "-o", "out.nii.gz"), "spacing unit tile",
-        each=10
+        each=6
     ),
     "generate-surface": Command(
-        ("generate", *LAW, "--shape", "12", "--steps", "20", "--spacing", "2", "-o", "out.stl"), "spacing tile", each=6
+        ("generate", *LAW, "--shape", "12", "--steps", "20", "--spacing", "2", "-o", "out.stl"), "spacing tile", each=4
     ),
-    "generate-preset": Command(("generate", *_SMALL, "-o", "out.npy"), "preset prior maps", each=7),
+    "generate-preset": Command(("generate", *_SMALL, "-o", "out.npy"), "preset prior maps", each=5),
     "segment": Command(
         ("segment", "scan.nii.gz", *_PRIOR),
         "weight threshold epsilon steps spacing unit key prior raw-shape dtype probability",
         "steps",
         taking("scan.nii.gz"),
-        each=9,
+        each=6,
     ),
     "reconstruct": Command(
         ("reconstruct", "mask.nii.gz", "--every", "4", *_PRIOR),
         "every first slices axis epsilon steps spacing unit",
         "steps",
         taking("mask.nii.gz"),
-        each=8,
+        each=5,
     ),
     "reconstruct-slices": Command(
-        ("reconstruct", "mask.nii.gz", *_PRIOR), "slices", setup=taking("mask.nii.gz"), each=8
+        ("reconstruct", "mask.nii.gz", *_PRIOR), "slices", setup=taking("mask.nii.gz"), each=5
     ),
     "raw": Command(
         ("segment", "bare.raw", "--raw-shape", "9,10,12", "--dtype", "u2", *_PRIOR),
         "raw-shape dtype",
         setup=taking("bare.raw"),
-        each=9,
+        each=6,
     ),
     "infer": Command(
         ("infer", "scan.nii.gz", "--atlas", "{larder}/atlas.npz", "--kind", "mask", "-o", "found"),
         "spacing unit threshold label raw-shape dtype key seed kind atlas roi",
         setup=taking("scan.nii.gz"),
-        each=5,
+        each=3,
     ),
     "build": Command(
-        ("atlas", "build", "out.zarr", "--count", "1", "--shape", "12", "--around", "tubes", "--workers", "0"),
+        ("atlas", "build", "out.zarr", "--count", "1", "--shape", "16", "--around", "tubes", "--workers", "0"),
         "count shape seed design around spread schedule workers scheduler",
         "count workers shape",
         stays=("out.zarr", "out.zarr/*"),
-        each=9,
+        each=6,
     ),
     "extend": Command(
         ("atlas", "extend", "store.zarr", "--count", "0", "--workers", "0"),
@@ -103,7 +103,7 @@ COMMANDS: dict[str, Command] = {
     ),
     "verify": Command(("atlas", "verify", "store.zarr", "--regenerate", "1"), "regenerate seed", "",
         taking("store.zarr")),
-    "map": Command(("atlas", "map", "store.zarr", "-o", "map"), "device", "", taking("store.zarr"), each=4),
+    "map": Command(("atlas", "map", "store.zarr", "-o", "map"), "device", "", taking("store.zarr"), each=3),
     "synth": Command(
         ("synth", "-o", "set", "--atlas", "{larder}/store.zarr", "--modality", "confocal", "--shape", "6", "--count",
         "1",
@@ -111,18 +111,18 @@ COMMANDS: dict[str, Command] = {
         "count shape seed modality visible voxel calibres unit layout labels volume-fraction workers scheduler",
         "count workers",
         stays=("set", "set/*"),
-        each=9,
+        each=6,
     ),
     "synth-like": Command(
         ("synth", "-o", "set", "--atlas", "{larder}/store.zarr", "--like", "{larder}/scan.nii.gz", "--shape", "6",
          "--count", "1", "--workers", "0"),
-        "spacing unit like like-mask visible", stays=("set", "set/*"), each=5,
+        "spacing unit like like-mask visible", stays=("set", "set/*"), each=3,
     ),
     "synth-grown": Command(
         ("synth", "-o", "set", "--modality", "confocal", "--shape", "8", "--count", "1", "--workers", "0"),
-        "presets prior atlas", stays=("set", "set/*"), each=6,
+        "presets prior atlas", stays=("set", "set/*"), each=4,
     ),
-    "nnunet": Command(("nnunet", "--prior", "tubes"), "share weight epsilon warmup prior", each=11),
+    "nnunet": Command(("nnunet", "--prior", "tubes"), "share weight epsilon warmup prior", each=7),
 }  # fmt: skip
 
 
@@ -199,7 +199,6 @@ _SENSELESS: dict[str, tuple[str, ...]] = {
         "a.npy",
     ),
     "output-empty": ("generate", *LAW, *_SMALL, "-o", ""),
-    "output-suffix": ("generate", *LAW, *_SMALL, "-o", ".npy"),
     "output-dot": ("generate", *LAW, *_SMALL, "-o", "."),
     "output-none": ("generate", *LAW, *_SMALL, "-o", "out.xyz"),
     "output-file-as-folder": ("generate", *LAW, *_SMALL, "-o", "file.txt/out.npy"),
