@@ -76,7 +76,7 @@ def named(deviations: Sequence[float] | np.ndarray) -> dict[str, float]:
 
 @contextmanager
 def double_precision_on_cpu():
-    """JAX in float64 on the CPU while inside, in this thread alone: what else the program does with JAX goes on as it is.
+    """JAX in float64 on the CPU while inside, in this thread alone: what else a program does with JAX goes on as it is.
 
     What JAX calls back runs in another one: see `called`.
     """
@@ -93,7 +93,7 @@ def double_precision_on_cpu():
 def called(function: Callable[[np.ndarray], np.ndarray], shape: tuple[int, ...], values):
     """A NumPy function of a vector, called from within JAX; both in float64.
 
-    JAX calls it in a thread where arrays may be rounded to float32, so that the numbers go in and out as pairs of words.
+    JAX calls it in a thread where arrays may be rounded to float32, so the numbers go in and out as pairs of words.
     """
     import jax
 

@@ -161,7 +161,7 @@ def check_energy(device: str, tuning: cuda.Tuning) -> None:
 
 
 def check_umbilics(device: str, tuning: cuda.Tuning) -> None:
-    """A ball whose surface u = 0 meets voxels on the axes: the root's derivative is taken as 0 there, in any rounding."""
+    """A ball whose surface meets voxels on the axes: the root's derivative is taken as 0 there, in any rounding."""
     grid = Grid((7, 7, 7), 0.01, "replicate")
     z, y, x = torch.meshgrid(*[torch.arange(7, dtype=torch.float64) - 3] * 3, indexing="ij")
     r2 = z**2 + y**2 + x**2

@@ -131,7 +131,7 @@ def test_it_can_be_copied():
         ({"epsilon": -1.0}, "expected epsilon > 0"),
         ({"border": 0.5}, "expected a border of whole voxels"),
         ({"weight": -1}, "expected a weight from 0"),
-        ({"weight": None}, "expected a weight from 0, or one a class, got None"),
+        ({"weight": None}, "expected a weight from 0 to 1e.09, or one a class, got None"),
         ({"shape": (8, 8)}, "expected a shape of 3 whole numbers"),
     ],
 )

@@ -66,8 +66,8 @@ def test_the_warm_up_counts_training_steps_and_survives_a_restart():
 
 
 def test_combined_loss_refuses_negative_numbers():
-    for options in ({"weight": -1.0}, {"weight": None}, {"warmup": -1}):
-        with pytest.raises(ValueError, match="expected a weight and a warm-up from 0"):
+    for options in ({"weight": -1.0}, {"weight": None}, {"weight": float("inf")}, {"warmup": -1}, {"warmup": 0.5}):
+        with pytest.raises(ValueError, match=r"expected a (finite weight|warm-up of whole calls) from 0, got"):
             CombinedLoss(nn.BCEWithLogitsLoss(), CurvaturePrior("tubes"), **options)
 
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter1d
 
-from curvafit.priors import stencils
+from curvafit.priors import kernels, stencils
 from curvafit.priors.grid import Grid
 
 edges = st.floats(0.05, 5.0)
@@ -131,8 +131,13 @@ def test_bad_input_is_one_sentence() -> None:
     grid = Grid((4, 5, 6), 1.0)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"expected a field whose last axes are \(4, 5, 6\), got \(4, 5, 5\)"):
         stencils.gradient(torch.zeros(4, 5, 5), grid)
-    with pytest.raises(ValueError, match="expected a blur width above 0"):
-        stencils.gaussian_blur(torch.zeros(4, 5, 6), grid, -1.0)
+    for width in (-1.0, 6.1, 1e6, math.inf, math.nan):
+        for blur in (stencils.gaussian_blur, kernels.gaussian_blur):
+            with pytest.raises(ValueError, match="expected a blur from 0 to the box's longest side, 6, got"):
+                blur(torch.zeros(4, 5, 6), grid, width)
+    thin = Grid((4, 5, 6), (1e-6, 1.0, 1.0))
+    with pytest.raises(ValueError, match="expected a blur width above 0 and of at most 10000 voxels, got 1e.06"):
+        stencils.gaussian_blur(torch.zeros(4, 5, 6), thin, 1.0)
     with pytest.raises(ValueError, match="expected at least 7 voxels"):
         stencils.pad(torch.zeros(4, 5, 6), grid, 7)
 

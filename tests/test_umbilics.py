@@ -32,7 +32,7 @@ def ramp(boundary, level: float) -> tuple[Tensor, Grid, Tensor]:
 
 
 def ball(boundary) -> tuple[Tensor, Grid, Tensor]:
-    """A ball's field, and the six voxels where its surface u = 0 meets the axes: M is κ times the tangents' identity."""
+    """A ball's field, and the six voxels where u = 0 on the axes: M is κ times the tangents' identity."""
     grid, n, radius = Grid((13, 13, 13), 0.01, boundary), 13, 4
     z, y, x = torch.meshgrid(*[torch.arange(n, dtype=torch.float64) - n // 2] * 3, indexing="ij")
     r2 = z**2 + y**2 + x**2

@@ -10,9 +10,8 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 from scipy.stats import qmc
 
-from curvafit.generation.cost import POWERS, check_strength
 from curvafit.priors.bounds import SEEDS, named, quoted, real, seed_of, several, whole
-from curvafit.priors.coefficients import NAMES, Coefficients
+from curvafit.priors.coefficients import NAMES, POWERS, Coefficients, check_strength
 from curvafit.priors.grid import WORKING_EPSILON
 
 #: Open intervals of the uniform law, in working units; a20 = 1 is the gauge (paper, "Experiment 4").

@@ -11,19 +11,14 @@ from torch import Tensor
 
 from curvafit.generation.data import Data
 from curvafit.priors.bounds import instance, quoted, real
-from curvafit.priors.coefficients import NAMES, Coefficients
+from curvafit.priors.coefficients import NAMES, POWERS, Coefficients, check_strength
 from curvafit.priors.grid import Grid
 
 #: Voxels that ε spans at least: published are two; below a tenth no voxel sees the interface.
 FINEST = 0.1
-#: The most that a coefficient may be, lengths in units of ε; published ones stay below 15. Float32 holds the energy and
-#: its gradient of noise.
-STRONGEST = 1e6
 #: Edges of a voxel whose squared second differences float32 holds, and beside whose inverse ξ = 1e-6 (`curvature.XI`)
 #: is little.
 VOXELS = (1e-8, 1e5)
-#: Powers of length in the coefficients' units.
-POWERS = dict(zip(NAMES, (0, 0, 0, 1, 1, 2), strict=True))
 
 
 @dataclass(frozen=True)
@@ -54,7 +49,7 @@ class Cost:
 
     def _check_lengths(self) -> None:
         """ε and the blur, as numbers, and both and the voxels in range."""
-        edges, box = self.grid.spacing, max(n * h for n, h in zip(self.grid.shape, self.grid.spacing, strict=True))
+        edges, box = self.grid.spacing, self.grid.longest
         if not VOXELS[0] <= min(edges) <= max(edges) <= VOXELS[1]:
             raise ValueError(f"expected voxel edges from {VOXELS[0]:g} to {VOXELS[1]:g} for a flow, got {edges}")
         said = "epsilon > 0 and blur >= 0 in the spacing's unit"
@@ -96,14 +91,6 @@ class Cost:
             named["the orientation"] = self.orientation, 2
         for name, (value, power) in named.items():
             check_strength(name, torch.as_tensor(value, dtype=torch.float64).detach().abs().max(), power, ε.max())
-
-
-def check_strength(name: str, value: float | Tensor, power: int, epsilon: float | Tensor) -> None:
-    """Raise ValueError where a coefficient, with lengths in units of ε, is over `STRONGEST`."""
-    size = float(abs(value) * epsilon**power)
-    if not size <= STRONGEST:
-        of = {0: "", 1: " epsilon", 2: " epsilon²"}[power]
-        raise ValueError(f"expected |{name}|{of} of at most {STRONGEST:g}, got {size:.3g}")
 
 
 def check_shape(name: str, value: Tensor, grid: Grid) -> None:

@@ -123,6 +123,6 @@ def seed_of(value: Any) -> int:
 
 def _beyond(number: float | None, least: float, most: float) -> str:
     """The bound that a number of the right kind and sign is beyond."""
-    if number is None or not math.isfinite(number) or (number <= most and not 0 < number < least):
+    if number is None or not -math.inf < number < math.inf or (number <= most and not 0 < number < least):
         return ""
     return f", at most {most:g}" if number > most else f", at least {least:g}"

@@ -14,6 +14,11 @@ from curvafit.priors.bounds import LONGEST, SHORTEST, quoted, real
 
 #: Names in the paper's order: κ1², κ1κ2, κ2², κ1, κ2, 1.
 NAMES = ("a20", "a11", "a02", "a10", "a01", "a00")
+#: Powers of length in their units.
+POWERS = dict(zip(NAMES, (0, 0, 0, 1, 1, 2), strict=True))
+#: The most that a coefficient may be, lengths in units of ε; published ones stay below 15. Float32 holds the energy and
+#: its gradient of noise.
+STRONGEST = 1e6
 
 
 @dataclass(frozen=True)
@@ -105,6 +110,14 @@ class Coefficients:
     def as_dict(self) -> dict[str, float]:
         """Names to numbers; for coefficients that do not vary."""
         return {name: float(value) for name, value in dataclasses.asdict(self).items()}
+
+
+def check_strength(name: str, value: float | Tensor, power: int, epsilon: float | Tensor) -> None:
+    """Raise ValueError where a coefficient, with lengths in units of ε, is over `STRONGEST`."""
+    size = float(abs(value) * epsilon**power)
+    if not size <= STRONGEST:
+        of = {0: "", 1: " epsilon", 2: " epsilon²"}[power]
+        raise ValueError(f"expected |{name}|{of} of at most {STRONGEST:g}, got {size:.3g}")
 
 
 class Preset(NamedTuple):

@@ -7,6 +7,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
+from curvafit.priors.bounds import real, whole
+
 
 class CombinedLoss(nn.Module):
     """base(input, target) + weight × prior(input, target), the second faded in over the first calls.
@@ -26,7 +28,7 @@ class CombinedLoss(nn.Module):
     Raises
     ------
     ValueError
-        If the weight or the warm-up is negative.
+        If the weight is not a finite number from 0, or the warm-up not a whole one.
     """
 
     calls: Tensor
@@ -35,9 +37,9 @@ class CombinedLoss(nn.Module):
         self, base: Callable[[Tensor, Tensor], Tensor], prior: nn.Module, weight: float = 1.0, warmup: int = 0
     ) -> None:
         super().__init__()
-        if weight is None or not weight >= 0 or warmup < 0:
-            raise ValueError(f"expected a weight and a warm-up from 0, got {weight} and {warmup}")
-        self.base, self.prior, self.weight, self.warmup = base, prior, float(weight), int(warmup)
+        self.weight = real(weight, "a finite weight from 0", 0)
+        self.warmup = whole(warmup, "a warm-up of whole calls from 0", 0, 2**53)
+        self.base, self.prior = base, prior
         self.register_buffer("calls", torch.zeros((), dtype=torch.int64))
 
     def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:

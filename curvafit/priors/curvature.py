@@ -76,10 +76,10 @@ def positive_root(square: Tensor, squares: Tensor) -> Tensor:
 
     x = 0 at umbilics, κ1 = κ2, where √(x⁺) = ε|∇u| |κ1 - κ2| has the tip of a cone in the directions that part the two
     curvatures. Its subdifferential there holds slopes of either sign, and the element of least norm is 0: a step along
-    it prefers no direction. So is the derivative taken wherever x cannot be told from 0: up to `ROOT_FLOOR`, under which
-    the root is constant, and up to the share `ROOT_ROUNDING` of the squares that float32 rounds. The last is for float64
-    too, so that both have one gradient; the root itself is exact there.
-    (The paper's smooth positive part, of width 1e-6, lies within the floor, and its slope was neither side's.)
+    it prefers no direction. So is the derivative taken wherever x cannot be told from 0: up to `ROOT_FLOOR`, under
+    which the root is constant, and up to the share `ROOT_ROUNDING` of the squares that float32 rounds. The last holds
+    for float64 too, so that both have one gradient; the root itself is exact there. (The paper's smooth positive part,
+    1e-6 wide, ends about the floor; its slope was that of neither side.)
 
     Parameters
     ----------

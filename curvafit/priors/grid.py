@@ -63,6 +63,11 @@ class Grid:
         return self.voxel_volume * math.prod(self.shape)
 
     @property
+    def longest(self) -> float:
+        """The box's longest side."""
+        return max(n * h for n, h in zip(self.shape, self.spacing, strict=True))
+
+    @property
     def periodic(self) -> bool:
         return self.boundary == "periodic"
 

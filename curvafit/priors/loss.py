@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from curvafit.priors.coefficients import Coefficients
+from curvafit.priors.coefficients import NAMES, POWERS, Coefficients, check_strength
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.kernels.differentiable import areas, energies
 from curvafit.priors.refined import refined
@@ -20,6 +20,8 @@ from curvafit.priors.stencils import gaussian_blur
 RESOLVED = 2
 #: How many times an axis is refined at most.
 MOST = 16
+#: Voxels that ε spans at most, of the smallest edge: no window has more.
+COARSEST = 10_000
 
 
 def curvature_prior(
@@ -55,13 +57,16 @@ def curvature_prior(
     Raises
     ------
     ValueError
-        If the window is too small for its border, or as `upsampling`.
+        If the window is too small for its border, ε or the blur is longer than the window's longest side, a coefficient
+        is over `STRONGEST` with lengths in units of ε, or as `upsampling`.
     """
     shape = tuple(probability.shape[1:])
     if min(shape) < max(4, 2 * border + 1):
         least = max(4, 2 * border + 1)
         raise ValueError(f"expected a volume of at least {least} voxels along each axis, got {shape}: it has no inside")
     times = upsampling(spacing, epsilon)
+    check_numbers(coefficients, epsilon)
+    check_lengths(epsilon, blur, max(n * h for n, h in zip(shape, spacing, strict=True)))
     unit = epsilon / WORKING_EPSILON
     u, kept = 2 * probability - 1, _window(probability, mask, border)
     for axis, n in enumerate(times):
@@ -84,8 +89,13 @@ def upsampling(spacing: Sequence[float], epsilon: float) -> tuple[int, int, int]
     Raises
     ------
     ValueError
-        If an axis would be refined more than 16-fold.
+        If an axis would be refined more than 16-fold, or ε spans more than `COARSEST` voxels.
     """
+    if not 0 < epsilon <= COARSEST * min(spacing):
+        most = COARSEST * min(spacing)
+        raise ValueError(
+            f"expected an ε above 0 and of at most {most:g} for voxels of {tuple(spacing)}, got {epsilon:g}"
+        )
     ratios = [RESOLVED * h / epsilon for h in spacing]
     times = tuple(1 if ratio <= 1.1 else math.ceil(ratio - 1e-3) for ratio in ratios)
     if max(times) > MOST:
@@ -95,6 +105,31 @@ def upsampling(spacing: Sequence[float], epsilon: float) -> tuple[int, int, int]
             f"is refined {max(times)}-fold: give ε in spacing's unit, or coarser"
         )
     return times  # type: ignore[return-value]
+
+
+def check_numbers(coefficients: Coefficients, epsilon: float) -> None:
+    """Refuse coefficients whose products with ε and with differences float32 does not hold.
+
+    Raises
+    ------
+    ValueError
+        If one is over `STRONGEST` with lengths in units of ε.
+    """
+    for name, value in zip(NAMES, coefficients, strict=True):
+        check_strength(name, value, POWERS[name], epsilon)
+
+
+def check_lengths(epsilon: float, blur: float, longest: float) -> None:
+    """Refuse lengths beyond a window: a surface as thick as it, or a field blurred to its mean, costs nothing.
+
+    Raises
+    ------
+    ValueError
+        If ε or the blur is over the window's longest side.
+    """
+    for name, length in (("an ε", epsilon), ("a blur", blur)):
+        if not 0 <= length <= longest:
+            raise ValueError(f"expected {name} of at most the window's longest side, {longest:g}, got {length:g}")
 
 
 def _window(probability: Tensor, mask: Tensor | None, border: int) -> Tensor:

@@ -11,11 +11,16 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from curvafit.priors.bounds import quoted, real, whole
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.fit_file import Law, find_law
 from curvafit.priors.grid import METRES, Grid
-from curvafit.priors.loss import MOST, RESOLVED, curvature_prior, upsampling
+from curvafit.priors.loss import COARSEST, MOST, RESOLVED, check_numbers, curvature_prior, upsampling
+from curvafit.priors.values import plain, seen
 
+#: The most that a weight or a mask's value may be: float32 holds its products.
+HEAVIEST = 1e9
+_MOST_BORDER = 2**31
 _REDUCTIONS, _NORMALIZATIONS = ("mean", "sum", "none"), ("voxel", "area")
 
 
@@ -101,23 +106,24 @@ class CurvaturePrior(nn.Module):
         self.normalize: Literal["voxel", "area"] = normalize
         self.include_background, self.to_onehot_y, self.ignore_index = include_background, to_onehot_y, ignore_index
         self.spacing = _edges(spacing)
-        self.epsilon = RESOLVED * min(self.spacing) if epsilon is None else float(epsilon)
-        if not 0 < self.epsilon < math.inf or not 0 <= blur < math.inf:
-            raise ValueError(f"expected epsilon > 0 and blur >= 0 in spacing's unit, got {epsilon} and {blur}")
-        if border != int(border) or border < 0:
-            raise ValueError(f"expected a border of whole voxels from 0, got {border}")
-        self.border, self.blur, self._said = int(border), float(blur), set()
-        self.shape = None if shape is None else Grid(tuple(shape), self.spacing).shape  # type: ignore[arg-type]
+        given = RESOLVED * min(self.spacing) if epsilon is None else epsilon
+        self.epsilon = real(given, "epsilon > 0 in spacing's unit", math.ulp(0), COARSEST * min(self.spacing))
+        self.blur = real(blur, "blur >= 0 in spacing's unit", 0, COARSEST * min(self.spacing))
+        self.border = whole(border, "a border of whole voxels from 0", 0, _MOST_BORDER)
+        self._said: set[str] = set()
+        self.shape = None if shape is None else Grid(shape, self.spacing).shape  # type: ignore[arg-type]
         self.weight = _weights(weight)
         laws = [coefficients] if isinstance(coefficients, (Coefficients, str, PathLike)) else list(coefficients)
         self.coefficients = tuple(_numbers(law, min(self.spacing), unit, self.epsilon) for law in laws)
+        for law in self.coefficients:
+            check_numbers(law, self.epsilon)
         _tell(self.spacing, self.epsilon)
 
     def extra_repr(self) -> str:
         return f"spacing={self.spacing}, epsilon={self.epsilon:g}, weight={self.weight}, border={self.border}"
 
     def forward(self, input: Tensor, target: Tensor | None = None, mask: Tensor | None = None) -> Tensor:
-        input, target, mask = _plain(input), _plain(target), _plain(mask)
+        input, target, mask = plain(input), plain(target), plain(mask)
         with torch.autocast(input.device.type, enabled=False):
             probability, kept = self._probability(input), self._kept(input, target, mask)
             classes = probability.shape[1]
@@ -202,8 +208,8 @@ class CurvaturePrior(nn.Module):
             if not fits or tuple(mask.shape[2:]) != space:
                 expected = f"({batch} or 1, {classes} or 1, {', '.join(map(str, space))})"
                 raise ValueError(f"expected a mask of shape {expected}, got {tuple(mask.shape)}")
-            if not torch.compiler.is_compiling() and not bool(((mask >= 0) & (mask < math.inf)).all()):
-                raise ValueError("expected a mask of finite numbers from 0, got others")
+            if seen(((mask >= 0) & (mask <= HEAVIEST)).all()) == 0:
+                raise ValueError(f"expected a mask of finite numbers from 0, at most {HEAVIEST:g}, got others")
             if mask.shape[1] > 1 and not self.include_background:
                 mask = mask[:, 1:]
         if target is not None and (target.dim() != 5 or target.shape[0] != batch or tuple(target.shape[2:]) != space):
@@ -239,8 +245,8 @@ class CurvaturePrior(nn.Module):
     def _look(self, probability: Tensor) -> None:
         if torch.compiler.is_compiling() or "range" in self._said:
             return
-        low, high = (float(value) for value in probability.detach().aminmax())
-        if low < -1e-3 or high > 1 + 1e-3:
+        low, high = (seen(value) for value in probability.detach().aminmax())
+        if low is not None and high is not None and not (low >= -1e-3 and high <= 1 + 1e-3):
             self._say("range", f"expected probabilities, got {low:g} to {high:g}: is sigmoid or softmax missing?")
 
     def _say(self, what: str, message: str) -> None:
@@ -250,11 +256,6 @@ class CurvaturePrior(nn.Module):
             warnings.warn(message, stacklevel=3)
 
 
-def _plain(values):
-    """Without what subclasses (MONAI's `MetaTensor`) add."""
-    return values if values is None or type(values) is Tensor else values.as_subclass(Tensor)
-
-
 def _edges(spacing: float | Sequence[float]) -> tuple[float, float, float]:
     return Grid((4, 4, 4), spacing).spacing  # type: ignore[arg-type]
 
@@ -262,10 +263,10 @@ def _edges(spacing: float | Sequence[float]) -> tuple[float, float, float]:
 def _weights(weight: float | Sequence[float]) -> tuple[float, ...]:
     try:
         values = tuple(torch.as_tensor(weight, dtype=torch.float64).flatten().tolist())
-    except (TypeError, ValueError, RuntimeError):
+    except (TypeError, ValueError, RuntimeError, OverflowError):
         values = ()
-    if not values or not all(0 <= value < math.inf for value in values):
-        raise ValueError(f"expected a weight from 0, or one a class, got {weight}")
+    if not values or not all(0 <= value <= HEAVIEST for value in values):
+        raise ValueError(f"expected a weight from 0 to {HEAVIEST:g}, or one a class, got {quoted(weight)}")
     return values
 
 

@@ -18,6 +18,8 @@ from torch import Tensor
 from curvafit.priors.grid import Grid
 from curvafit.priors.shapes import Float
 
+#: Voxels that a blur's standard deviation spans at most: eighty thousand weights.
+WIDEST = 10_000
 #: Axis pairs of the six Hessian components, in storage order.
 HESSIAN_AXES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
@@ -77,8 +79,14 @@ def gaussian_blur(u: Float[Tensor, "*batch z y x"], grid: Grid, width: float) ->
     """k ∗ u with a separable Gaussian of standard deviation `width` (in spacing's unit), cut at four deviations.
 
     The continuation beyond the box is a reflection group's, so the blur is its own adjoint under both boundaries.
+
+    Raises
+    ------
+    ValueError
+        If the field's shape is not the grid's, or as `check_blur`.
     """
     _checked(u, grid)
+    check_blur(grid, width)
     if width == 0:
         return u
     for axis, h in enumerate(grid.spacing):
@@ -91,13 +99,31 @@ def gaussian_blur(u: Float[Tensor, "*batch z y x"], grid: Grid, width: float) ->
     return u
 
 
+def check_blur(grid: Grid, width: float) -> None:
+    """Refuse a blur that is wider than the box, of which it would leave the mean.
+
+    Raises
+    ------
+    ValueError
+        If the standard deviation is not from 0 to the box's longest side.
+    """
+    if not 0 <= width <= grid.longest:
+        raise ValueError(f"expected a blur from 0 to the box's longest side, {grid.longest:g}, got {width:g}")
+
+
 @lru_cache(maxsize=64)
 def gaussian_taps(deviation: float) -> tuple[float, ...]:
-    """Weights of the one-dimensional blur, 2⌈4σ⌉ + 1 of them, summing to one; `deviation` in voxels."""
-    if not deviation > 0:
-        raise ValueError(f"expected a blur width above 0, got {deviation} voxels")
+    """Weights of the one-dimensional blur, 2⌈4σ⌉ + 1 of them, summing to one; `deviation` in voxels.
+
+    Raises
+    ------
+    ValueError
+        If the deviation is not above 0, or spans more than `WIDEST` voxels.
+    """
+    if not 0 < deviation <= WIDEST:
+        raise ValueError(f"expected a blur width above 0 and of at most {WIDEST} voxels, got {deviation:g}")
     radius = math.ceil(4 * deviation)
-    taps = [math.exp(-0.5 * (k / deviation) ** 2) for k in range(-radius, radius + 1)]
+    taps = [math.exp(-0.5 * (k / deviation) * (k / deviation)) for k in range(-radius, radius + 1)]
     return tuple(w / math.fsum(taps) for w in taps)
 
 

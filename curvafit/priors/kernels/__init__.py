@@ -96,8 +96,9 @@ def gaussian_blur(u: Tensor, grid: Grid, width: float) -> Tensor:
     Raises
     ------
     ValueError
-        If the field's shape is not the grid's.
+        If the field's shape is not the grid's, or as `stencils.check_blur`.
     """
+    stencils.check_blur(grid, width)
     if u.dtype == torch.float32 and u.dim() == 3 and u.device.type == "cpu" and importlib.util.find_spec("numba"):
         from curvafit.priors.kernels import cpu
 

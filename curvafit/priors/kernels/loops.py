@@ -13,8 +13,8 @@ sample beyond the box and finite and unused for the second. A and Adam's moments
 slack. The last vector of a run overshoots its end, into what is computed later or never read.
 
 Notation follows the plain-torch definition: s = |∇u|², d = s + ξ², G = √d, r = s/d, w = W'(u) = u³ - u, N = |Hess u|²,
-q = ∇uᵀ Hess u ∇u / d, T = Tr M, P = |M|², X = 2P - T², S = √(X⁺), all in the units of `_density_constants`. The root and
-what is taken as its derivative at umbilics, X = 0, are `curvature.positive_root`.
+q = ∇uᵀ Hess u ∇u / d, T = Tr M, P = |M|², X = 2P - T², S = √(X⁺), all in the units of `_density_constants`. The root
+and what is taken as its derivative at umbilics, X = 0, are `curvature.positive_root`.
 
 The order of every sum does not depend on the number of threads.
 """
