@@ -1,6 +1,6 @@
 # Needs Python 3.11 or newer, and make.
 #   make demo   install; take a real CT volume of bone to its parameters and a report
-#   make test   install with the test tools; run all tests
+#   make test   install with the test tools; run all tests but the few of make test-long
 #   make test-hostile   damaged files, odd options, failing disks: all cases; make test-hostile-quick: some of each kind
 #   make lint   ruff and the type checker
 # A CPU-only torch, several GB smaller on Linux: make demo TORCH_INDEX=https://download.pytorch.org/whl/cpu
@@ -11,7 +11,7 @@ TORCH_INDEX ?=
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
 
-.PHONY: demo test test-hostile test-hostile-quick lint clean
+.PHONY: demo test test-long test-hostile test-hostile-quick lint clean
 
 demo: .venv/installed
 	@scan=$$($(BIN)/curvafit samples get bone) \
@@ -19,7 +19,10 @@ demo: .venv/installed
 	&& $(BIN)/curvafit infer "$$scan" -o demo_out
 
 test: .venv/installed-dev
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist worksteal
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist worksteal -m "not long"
+
+test-long: .venv/installed-dev
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist worksteal -m long
 
 test-hostile: .venv/installed-dev
 	$(BIN)/python -m tests.hostile

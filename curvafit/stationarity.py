@@ -8,9 +8,10 @@ the two agree.
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -226,30 +227,38 @@ def _total_least_squares(problem: _Problem) -> tuple[np.ndarray, np.ndarray]:
 def _solve(problems: Sequence[_Problem], begun: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Minimisers `(n, 6)` of |R a| / |N a| with a20 + a02 = 2, both positive, from `(n, 6)` starts; their values."""
     with double_precision_on_cpu():
-        import jax
         import jax.numpy as jnp
-        import optimistix
-
-        def coefficients(free):
-            share = jax.nn.sigmoid(free[0])
-            return jnp.stack([2 * share, free[1], 2 - 2 * share, free[2], free[3], free[4]])
-
-        def residual(free, args):
-            columns, error = args
-            a = coefficients(free)
-            return columns @ a / jnp.linalg.norm(error @ a)
-
-        def minimise(columns, error, start):
-            begin = jnp.concatenate([jnp.log(start[:1] / start[2:3]), start[1:2], start[3:]])
-            solver = optimistix.LevenbergMarquardt(rtol=1e-8, atol=1e-10)
-            found = optimistix.least_squares(
-                residual, solver, begin, args=(columns, error), max_steps=500, throw=False
-            ).value
-            return coefficients(found), jnp.linalg.norm(residual(found, (columns, error)))
 
         columns, errors = (jnp.asarray(np.stack(part)) for part in zip(*problems, strict=True))
-        found = jax.jit(jax.vmap(minimise))(columns, errors, jnp.asarray(begun))
+        found = _minimiser()(columns, errors, jnp.asarray(begun))
         return np.asarray(found[0]), np.asarray(found[1])
+
+
+@functools.cache
+def _minimiser() -> Callable[..., Any]:
+    """The solver of many problems at once; compiled but once for each number of them."""
+    import jax
+    import jax.numpy as jnp
+    import optimistix
+
+    def coefficients(free):
+        share = jax.nn.sigmoid(free[0])
+        return jnp.stack([2 * share, free[1], 2 - 2 * share, free[2], free[3], free[4]])
+
+    def residual(free, args):
+        columns, error = args
+        a = coefficients(free)
+        return columns @ a / jnp.linalg.norm(error @ a)
+
+    def minimise(columns, error, start):
+        begin = jnp.concatenate([jnp.log(start[:1] / start[2:3]), start[1:2], start[3:]])
+        solver = optimistix.LevenbergMarquardt(rtol=1e-8, atol=1e-10)
+        found = optimistix.least_squares(
+            residual, solver, begin, args=(columns, error), max_steps=500, throw=False
+        ).value
+        return coefficients(found), jnp.linalg.norm(residual(found, (columns, error)))
+
+    return jax.jit(jax.vmap(minimise))
 
 
 def _replicas(octants: np.ndarray, error: np.ndarray, best: np.ndarray) -> np.ndarray:

@@ -70,6 +70,7 @@ def test_kernels_compile_without_spilling(boundary, observe, held, width, tmp_pa
 
 @needs_triton
 @pytest.mark.slow
+@pytest.mark.long
 def test_kernels_compile_without_spilling_as_they_run(tmp_path, monkeypatch) -> None:
     """The published blur, and the outputs a thread that 100 cells a row get."""
     monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path))
