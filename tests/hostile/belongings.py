@@ -177,7 +177,8 @@ def _folders() -> Iterator[Case]:
         "map": (("atlas", "map", "{larder}/store.zarr", "-o", "home"), ("atlas.html", "atlas.png",
             "cache/distances.npz", "notes.txt")),
         "infer": (
-            ("infer", "{larder}/scan.nii.gz", "--kind", "mask", "--atlas", "{larder}/atlas.npz", "-o", "home"),
+            ("infer", "{larder}/long.npy", "--kind", "field", "--periodic", "--atlas", "{larder}/atlas.npz", "-o",
+            "home"),
             ("fit.json", "report.html", "regenerated.nii.gz", "notes.txt"),
         ),
     }  # fmt: skip

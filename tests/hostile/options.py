@@ -85,9 +85,9 @@ COMMANDS: dict[str, Command] = {
         each=6,
     ),
     "infer": Command(
-        ("infer", "scan.nii.gz", "--atlas", "{larder}/atlas.npz", "--kind", "mask", "-o", "found"),
+        ("infer", "long.npy", "--atlas", "{larder}/atlas.npz", "--kind", "field", "--periodic", "-o", "found"),
         "spacing unit threshold label raw-shape dtype key seed kind atlas roi",
-        setup=taking("scan.nii.gz"),
+        setup=taking("long.npy"),
         each=3,
     ),
     "build": Command(
@@ -184,6 +184,7 @@ _SENSELESS: dict[str, tuple[str, ...]] = {
     "infer-none": ("infer", "none.nii.gz", "-o", "out"),
     "infer-no-output": ("infer", "file.txt"),
     "infer-text": ("infer", "file.txt", "-o", "out"),
+    "infer-small": ("infer", "mask.nii.gz", "--kind", "mask", "--atlas", "{larder}/atlas.npz", "-o", "out"),
     "infer-empty": ("infer", "", "-o", "out"),
     "segment-itself": ("segment", "mask.nii.gz", "--prior", "tubes", "-o", "mask.nii.gz"),
     "reconstruct-both": (

@@ -49,13 +49,14 @@ SCENES: dict[str, Scene] = {
         taking("store.zarr"), count=6,
     ),
     "extract": Scene(("atlas", "extract", "{larder}/store.zarr", "-o", "out.npz"), count=4),
-    "synth": Scene((*_SET, "--count", "3"), ("set", "set/*"), same="set", count=12),
+    "synth": Scene((*_SET, "--count", "3"), ("set", "set/*"), same="set", count=20),
     "segment": Scene(
         ("segment", "{larder}/scan.nii.gz", "--prior", "tubes", "--steps", "4", "-o", "out.nii.gz"), same="out.nii.gz",
         count=6,
     ),
     "infer": Scene(
-        ("infer", "{larder}/scan.nii.gz", "--kind", "mask", "--atlas", "{larder}/atlas.npz", "-o", "found"), ("found",),
+        ("infer", "{larder}/long.npy", "--kind", "field", "--periodic", "--atlas", "{larder}/atlas.npz", "-o",
+        "found"), ("found",),
         count=5, quick=False,
     ),
 }  # fmt: skip
