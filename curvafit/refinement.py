@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -74,12 +76,23 @@ def named(deviations: Sequence[float] | np.ndarray) -> dict[str, float]:
     return {name: float(value) for name, value in zip(NAMES, deviations, strict=True)}
 
 
+@cache
+def import_jax() -> None:
+    """Import JAX, which draws from NumPy's global generator on the way: that goes on as if it had not."""
+    state = np.random.get_state()  # noqa: NPY002
+    try:
+        importlib.import_module("jax")
+    finally:
+        np.random.set_state(state)  # noqa: NPY002
+
+
 @contextmanager
 def double_precision_on_cpu():
     """JAX in float64 on the CPU while inside, in this thread alone: what else a program does with JAX goes on as it is.
 
     What JAX calls back runs in another one: see `called`.
     """
+    import_jax()
     import jax
 
     if hasattr(jax, "enable_x64"):

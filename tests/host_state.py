@@ -1,15 +1,17 @@
 """What a program that calls curvafit may have set, and which call changes any of it.
 
-This file, run as a program, makes every public call in a process that has done nothing yet, and prints what each of them
-changed, by name. What a first call alone can change (threads, libraries that it imports) shows only there.
+This file, run as a program, makes every public call in a process that has done nothing yet, and prints what each call
+changed, by name. What a first call alone can change, as numbers of threads, shows only there.
 """
 
 from __future__ import annotations
 
+import contextlib
 import decimal
 import faulthandler
 import gc
 import hashlib
+import importlib
 import json
 import locale
 import logging
@@ -30,6 +32,9 @@ from typing import Any
 import numpy as np
 import torch
 
+import curvafit
+from curvafit import priors
+
 #: Numbers of threads that are nobody's default.
 TORCH_THREADS, NUMBA_THREADS = 2, 3
 
@@ -46,6 +51,11 @@ def changes(before: dict[str, str], after: dict[str, str]) -> dict[str, list[str
 
 
 _ABSENT = "not imported"
+#: Libraries that set warning filters and names in the environment where they are imported: a program has them already.
+#: Not JAX, whose import is known to draw random numbers; the names that it sets are these. Zarr's threads stay its own.
+_LIBRARIES = ("numba", "scipy.sparse", "scipy.special", "zarr", "torch._dynamo")
+_OF_ZARR = "zarr_io", "asyncio_"
+_OF_JAX = ("TF_CPP_MIN_LOG_LEVEL", "TPU_SKIP_MDS_QUERY")
 
 
 def _torch() -> dict[str, Any]:
@@ -105,12 +115,14 @@ def _process() -> dict[str, Any]:
     mask = os.umask(0)
     os.umask(mask)
     return {
-        "environment": sorted(os.environ.items()),
+        "environment": {name: value for name, value in sorted(os.environ.items()) if name not in _OF_JAX},
         "folder": os.getcwd(),
         "file mode": mask,
         "locale": locale.setlocale(locale.LC_ALL),
         "signals": [signal.getsignal(number) for number in sorted(signal.valid_signals())],
-        "Python threads": sorted(thread.name for thread in threading.enumerate()),
+        "Python threads": sorted(
+            thread.name for thread in threading.enumerate() if not thread.name.startswith(_OF_ZARR)
+        ),
         "children": len(multiprocessing.active_children()),
     }
 
@@ -118,11 +130,12 @@ def _process() -> dict[str, Any]:
 def _optional() -> dict[str, Any]:
     """Of libraries that the host may use too."""
     numba, jax, matplotlib = (sys.modules.get(name) for name in ("numba", "jax", "matplotlib"))
+    started = getattr(sys.modules.get("numba.np.ufunc.parallel"), "_is_initialized", False)  # asking would start them
     return {
-        "numba's threads": _ABSENT if numba is None else numba.get_num_threads(),
+        "numba's threads": _ABSENT if numba is None or not started else numba.get_num_threads(),
         "JAX's precision": _ABSENT if jax is None else jax.config.jax_enable_x64,
         "JAX's device": _ABSENT if jax is None else jax.config.jax_default_device,
-        "matplotlib": _ABSENT if matplotlib is None else _digest(repr(sorted(matplotlib.rcParams.items()))),
+        "matplotlib": _ABSENT if matplotlib is None else _digest(repr(sorted(dict.items(matplotlib.rcParams)))),
         "pyplot": "matplotlib.pyplot" in sys.modules,
     }
 
@@ -131,97 +144,115 @@ def _digest(value: str | bytes) -> str:
     return hashlib.sha256(value.encode() if isinstance(value, str) else value).hexdigest()[:12]
 
 
-def calls(folder: Path) -> dict[str, Callable[[], object]]:
-    """Every public name at work, by name; small."""
-    import curvafit
-    from curvafit import priors
+class Calls:
+    """Every public name at work, small; later calls take what earlier ones left."""
 
-    shape = (24, 24, 24)
-    noise = torch.rand((1, 1, *shape), generator=torch.Generator().manual_seed(0))
-    memory: dict[str, Any] = {}
-
-    def grid():
-        return priors.Grid(shape)
-
-    def ball():
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.grid = folder, priors.Grid((24, 24, 24))
+        self.noise = torch.rand((1, 1, 24, 24, 24), generator=torch.Generator().manual_seed(0))
         z, y, x = np.mgrid[:24, :24, :24] - 11.5
-        return z**2 + y**2 + x**2 < 49
+        self.ball = z**2 + y**2 + x**2 < 49
+        self.a = priors.preset("tubes").coefficients
 
-    def trained(loss) -> None:
-        value = noise.clone().requires_grad_()
-        loss(value, noise.round()).backward()
+    def of_fields(self) -> dict[str, Callable[[], object]]:
+        """The score's functions."""
+        u, grid, a, mask = self.noise[0, 0], self.grid, self.a, torch.from_numpy(self.ball)
+        return {
+            "Coefficients": lambda: curvafit.Coefficients(1, 2, 6).in_unit(2.0),
+            "Grid": lambda: curvafit.Grid((8, 8, 8)).volume,
+            "__version__": lambda: curvafit.__version__,
+            "preset": lambda: curvafit.preset("tubes"),
+            "energy": lambda: priors.energy(u, a, grid, 0.02),
+            "energy_terms": lambda: priors.energy_terms(priors.jet(u, grid), 0.02),
+            "jet": lambda: priors.jet(u, grid),
+            "diffuse_curvatures": lambda: priors.diffuse_curvatures(priors.jet(u, grid), 0.02),
+            "geometric_curvatures": lambda: priors.geometric_curvatures(priors.jet(u, grid)),
+            "cahn_hilliard_area": lambda: priors.cahn_hilliard_area(u, grid, 0.02),
+            "discrepancy_ratio": lambda: priors.discrepancy_ratio(u, grid, 0.02),
+            "orientation": lambda: priors.orientation((1, 0, 0), 2.0),
+            "optimal_profile": lambda: priors.optimal_profile(u, 0.02),
+            "profile_distance": lambda: priors.profile_distance(u, 0.02),
+            "signed_distance": lambda: priors.signed_distance(mask, grid),
+            "phase_field": lambda: priors.phase_field(mask, grid, 0.02),
+        }
 
-    def generated() -> None:
-        memory["flow"] = curvafit.generate("tubes", grid=shape, seed=1)
+    def of_losses(self) -> dict[str, Callable[[], object]]:
+        """The score as a loss: the first fused call."""
+        mse = torch.nn.functional.mse_loss
+        return {
+            "curvature_prior": lambda: priors.curvature_prior(self.noise[0], self.a, (0.01, 0.01, 0.01), 0.02),
+            "CurvaturePrior": lambda: self._train(priors.CurvaturePrior("tubes", blur=1.0, normalize="area")),
+            "CombinedLoss": lambda: self._train(priors.CombinedLoss(mse, priors.CurvaturePrior("tubes"), 0.1, 2)),
+        }
 
-    def drawn() -> None:
-        memory["diagram"] = curvafit.diagram(memory["flow"].field, memory["flow"].grid, 0.02)
+    def of_shapes(self) -> dict[str, Callable[[], object]]:
+        """Making and measuring."""
+        return {
+            "generate": self._generate,
+            "generate_batch": lambda: list(
+                curvafit.generate_batch(self.a, -0.4, priors.Grid((12, 12, 12)), seeds=[1, 2])
+            ),
+            "descend": self._descend,
+            "diagram": self._diagram,
+            "Diagram": lambda: curvafit.Diagram(np.zeros((1, 2)), np.ones(1)),
+            "wasserstein": lambda: curvafit.wasserstein(self.diagram, self.diagram),
+            "plot": self._plot,
+        }
 
-    def descended() -> None:
-        a = curvafit.preset("tubes").coefficients
-        for flow, optimiser in (("l2", "lbfgs"), ("h-1", "adam")):
-            curvafit.descend(memory["flow"].field, a, memory["flow"].grid, flow=flow, optimiser=optimiser, steps=2)
+    def of_scans(self) -> dict[str, Callable[[], object]]:
+        """Volumes, files and what is inferred from them."""
+        scan, slices = curvafit.Field(200 * self.ball + 1.0), curvafit.Field(self.ball.astype(np.uint8))
+        return {
+            "Field": lambda: curvafit.Field(self.ball),
+            "save": self._save,
+            "load": lambda: [curvafit.load(path) for path in sorted(self.folder.glob("a.*"))],
+            "segment": lambda: curvafit.segment(scan, "tubes", threshold=100.0, steps=2),
+            "reconstruct": lambda: curvafit.reconstruct(slices, "tubes", every=4, steps=2),
+            "infer": self._infer,
+            "read_fit": lambda: priors.read_fit(self.folder / "fit.json"),
+        }
 
-    def saved() -> None:
-        for name in ("a.nii.gz", "a.tif", "a.npy", "a.mha", "a.zarr", "a.nrrd"):
-            curvafit.save(curvafit.Field(ball().astype(np.uint8), (2.0, 1.0, 1.0), "um"), folder / name)
+    def _train(self, loss) -> None:
+        value = self.noise.clone().requires_grad_()
+        loss(value, self.noise.round()).backward()
 
-    def inferred() -> None:
-        values = memory["flow"].field.numpy()
-        found = curvafit.infer(curvafit.Field(values), kind="field", periodic=True)
-        (folder / "fit.json").write_text(found.fit.to_json())
+    def _generate(self) -> None:
+        self.flow = curvafit.generate("tubes", grid=(24, 24, 24), seed=1)
 
-    def pictured() -> None:
+    def _descend(self) -> None:
+        curvafit.descend(self.flow.field, self.a, self.flow.grid, flow="l2", optimiser="lbfgs", steps=2)
+        curvafit.descend(self.flow.field, self.a, self.flow.grid, flow="h-1", optimiser="adam", steps=2)
+
+    def _diagram(self) -> None:
+        self.diagram = curvafit.diagram(self.flow.field, self.flow.grid, 0.02)
+
+    def _plot(self) -> None:
         from curvafit import plot
 
-        plot.png(plot.diagram_figure(memory["diagram"]))
-        plot.png(plot.surface_figure(memory["flow"].field.numpy(), width=32))
+        plot.png(plot.diagram_figure(self.diagram))
+        plot.png(plot.surface_figure(self.flow.field.numpy(), width=32))
 
-    names: dict[str, Callable[[], object]] = {
-        "Coefficients": lambda: curvafit.Coefficients(1, 2, 6).in_unit(2.0),
-        "Grid": lambda: curvafit.Grid(8).volume,
-        "__version__": lambda: curvafit.__version__,
-        "preset": lambda: curvafit.preset("tubes"),
-        "energy": lambda: priors.energy(noise[0], curvafit.preset("tubes").coefficients, grid(), 0.02),
-        "energy_terms": lambda: priors.energy_terms(priors.jet(noise[0, 0], grid()), 0.02),
-        "jet": lambda: priors.jet(noise[0, 0], grid()),
-        "diffuse_curvatures": lambda: priors.diffuse_curvatures(priors.jet(noise[0, 0], grid()), 0.02),
-        "geometric_curvatures": lambda: priors.geometric_curvatures(priors.jet(noise[0, 0], grid())),
-        "cahn_hilliard_area": lambda: priors.cahn_hilliard_area(noise[0, 0], grid(), 0.02),
-        "discrepancy_ratio": lambda: priors.discrepancy_ratio(noise[0, 0], grid(), 0.02),
-        "orientation": lambda: priors.orientation((1, 0, 0), 2.0),
-        "optimal_profile": lambda: priors.optimal_profile(noise, 0.02),
-        "profile_distance": lambda: priors.profile_distance(noise, 0.02),
-        "signed_distance": lambda: priors.signed_distance(torch.from_numpy(ball()), grid()),
-        "phase_field": lambda: priors.phase_field(torch.from_numpy(ball()), grid(), 0.02),
-        "curvature_prior": lambda: priors.curvature_prior(noise[0], priors.Coefficients(1, 1, 1), (1.0,) * 3, 2.0),
-        "CurvaturePrior": lambda: trained(priors.CurvaturePrior("tubes", blur=1.0, normalize="area")),
-        "CombinedLoss": lambda: trained(
-            priors.CombinedLoss(torch.nn.functional.mse_loss, priors.CurvaturePrior("tubes"), 0.1, warmup=2)
-        ),
-        "generate": generated,
-        "generate_batch": lambda: list(
-            curvafit.generate_batch(curvafit.preset("tubes").coefficients, -0.4, curvafit.Grid(12), seeds=[1, 2])
-        ),
-        "descend": descended,
-        "diagram": drawn,
-        "Diagram": lambda: curvafit.Diagram(np.zeros((1, 2)), np.ones(1)),
-        "wasserstein": lambda: curvafit.wasserstein(memory["diagram"], memory["diagram"]),
-        "Field": lambda: curvafit.Field(ball()),
-        "save": saved,
-        "load": lambda: [curvafit.load(path) for path in sorted(folder.glob("a.*"))],
-        "segment": lambda: curvafit.segment(curvafit.Field(200 * ball() + 1.0), "tubes", threshold=100.0, steps=2),
-        "reconstruct": lambda: curvafit.reconstruct(curvafit.Field(ball().astype(np.uint8)), "tubes", every=4, steps=2),
-        "infer": inferred,
-        "read_fit": lambda: priors.read_fit(folder / "fit.json"),
-        "plot": pictured,
-    }
-    return names
+    def _save(self) -> None:
+        for name in ("a.nii.gz", "a.tif", "a.ome.tif", "a.npy", "a.mrc", "a.zarr"):
+            curvafit.save(curvafit.Field(self.ball.astype(np.uint8), (2.0, 1.0, 1.0), "um"), self.folder / name)
+
+    def _infer(self) -> None:
+        found = curvafit.infer(curvafit.Field(self.flow.field.numpy()), kind="field", periodic=True)
+        (self.folder / "fit.json").write_text(found.fit.to_json())
+
+
+def calls(folder: Path) -> dict[str, Callable[[], object]]:
+    """Every public call by name, in the order to make them."""
+    made = Calls(folder)
+    return {**made.of_fields(), **made.of_losses(), **made.of_shapes(), **made.of_scans()}
 
 
 def main() -> None:
     """What each call changed, or how it failed, as JSON."""
     torch.set_num_threads(TORCH_THREADS)
+    for name in _LIBRARIES:
+        with contextlib.suppress(ImportError):
+            importlib.import_module(name)
     found: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as folder:
         for name, call in calls(Path(folder)).items():

@@ -30,8 +30,9 @@ class CurvaturePrior(nn.Module):
     `forward(input, target=None, mask=None)`: `input` is `(B, N, D, H, W)`, N classes or one; a scalar comes back, or
     `(B, N, 1, 1, 1)` with `reduction="none"`. Everything is computed in float32 whatever autocast says (float64 input
     stays). The target says only which voxels to ignore, the mask (from 0, of that shape or with one for B or N) how
-    much each counts. Deterministic; a constant or saturated input has a finite value and gradient. Second derivatives
-    are for float64 alone; in float32 they raise a RuntimeError.
+    much each counts. Deterministic; a constant or saturated input has a finite value and gradient. First derivatives
+    go in reverse and forward mode and through `torch.func`, batches of batches too; second ones are for float64 alone:
+    in float32 they raise a RuntimeError.
 
     Parameters
     ----------
@@ -58,7 +59,7 @@ class CurvaturePrior(nn.Module):
     epsilon
         ε in that unit; twice the smallest edge if not given. Structures thinner than two smallest edges do not
         survive it. An axis on which ε spans fewer than two voxels, by more than a tenth, is interpolated: a warning
-        says so. More than 16-fold is refused.
+        says so. More than 16-fold is refused, as is an ε longer than the window.
     weight
         A factor, or one a class; classes of weight 0 are not computed.
     normalize
@@ -74,7 +75,7 @@ class CurvaturePrior(nn.Module):
     Raises
     ------
     ValueError
-        If an argument is out of range, or in `forward` a shape does not fit.
+        If an argument is out of range, or in `forward` a shape does not fit, or ε or the blur in the window.
     """
 
     def __init__(
