@@ -47,7 +47,7 @@ def read_archive(source: Path | IO[bytes]) -> dict[str, np.ndarray]:
         If the file cannot be read, or is damaged or something else.
     """
     try:
-        with zipfile.ZipFile(source) as archive:
+        with zipfile.ZipFile(check_regular(source) if isinstance(source, Path) else source) as archive:
             return {name: _member(archive, member) for name, member in _members(archive).items()}
     except (OSError, ValueError):
         raise
