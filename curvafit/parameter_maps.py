@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from curvafit.formats import READERS, ScanError, read_archive
-from curvafit.formats.streams import check_regular
 from curvafit.priors.coefficients import NAMES
 from curvafit.scan import read_values
 
@@ -66,7 +65,7 @@ def map_shape(maps: Mapping[str, float | Tensor]) -> tuple[int, int, int] | None
 
 def _from_npz(path: Path) -> dict[str, np.ndarray]:
     try:
-        return read_archive(check_regular(path))
+        return read_archive(path)
     except (ValueError, OSError) as reason:
         raise ValueError(f"expected an NPZ file or a folder of maps, got {path} that is neither") from reason
 

@@ -205,6 +205,26 @@ def test_other_files_are_no_atlas(tmp_path):
             load_atlas(tmp_path / name)
 
 
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("masses", lambda values: values + 2),
+        ("coefficients", lambda values: values * np.nan),
+        ("mask_offsets", lambda values: values[::-1]),
+        ("field_points", lambda values: values[:-1]),
+        ("mask_areas", lambda values: values.astype("S9")),
+        ("header", lambda values: np.frombuffer(b"[" * 100_000, np.uint8)),
+    ],
+)
+def test_an_atlas_with_damaged_arrays_is_one_sentence(tmp_path, atlas, name, change):
+    save_atlas(atlas, tmp_path / "atlas.npz")
+    with np.load(tmp_path / "atlas.npz") as archive:
+        arrays = dict(archive)
+    np.savez(tmp_path / "atlas.npz", **arrays | {name: change(arrays[name])})
+    with pytest.raises(ValueError, match=r"^expected an? (whole )?atlas [^\n]{1,400}$"):
+        load_atlas(tmp_path / "atlas.npz")
+
+
 def test_arrays_that_do_not_fit_together_are_refused(atlas):
     with pytest.raises(ValueError, match=r"expected masses of shape \(6,\), got \(5,\)"):
         dataclasses.replace(atlas, masses=atlas.masses[1:])

@@ -18,6 +18,7 @@ pytest.importorskip("mrcfile")
 
 from damage import CHECKED, COUNTED, OTHERS, VALUES, damaged, files_of, gzipped
 
+from curvafit.parameter_maps import read_maps
 from curvafit.scan import Field, ScanError, load, save
 
 CASES = 30
@@ -149,6 +150,9 @@ def test_pipes_within_folders_and_headers_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a.mhd").write_text(
         "NDims = 3\nDimSize = 2 2 2\nElementType = MET_UCHAR\nElementDataFile = slices/a.tif\n"
     )
+    os.mkfifo(tmp_path / "maps.npz")
+    with pytest.raises(ValueError, match="^expected an NPZ file or a folder of maps, got .* that is neither$"):
+        read_maps(tmp_path / "maps.npz")
     for name in ("scan.zarr", "slices", "a.mhd"):
         with pytest.raises(ScanError, match="^expected (a file|files) "):
             load(tmp_path / name)

@@ -75,6 +75,10 @@ def test_a_list_comes_in_turn_with_other_noise(tmp_path):
     assert draws[0].seed != draws[2].seed
 
 
+#: Aliases of aliases: nine to the power of twelve values, in half a kilobyte.
+BOMB = "a0: &a0 [1]\n" + "".join(f"a{k + 1}: &a{k + 1} [{', '.join([f'*a{k}'] * 9)}]\n" for k in range(12))
+
+
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
@@ -93,6 +97,19 @@ def test_a_list_comes_in_turn_with_other_noise(tmp_path):
         ("box: {a11: .nan}", "expected finite parameters"),
         ("box: {mass: [-2, 0]}", r"expected masses in \(-1, 1\), got -2"),
         ("law: even\nbox: {}", "expected a law random or sobol, got 'even'"),
+        ("box: {a11: 1, a11: 2}", "expected a design in YAML, got .*: the key 'a11' twice in line 1"),
+        ("box: !!bool abc", "expected a design in YAML, got .*: 'abc', which is neither true nor false"),
+        ("box: !!int abc", "expected a design in YAML, got"),
+        ("box: !!timestamp abc", "expected a design in YAML, got"),
+        ("box: !!python/object:os.system {}", "expected a design in YAML, got"),
+        (f"box: {{a11: {'1' * 400}}}", "a number of 400 digits in line 1"),
+        (f"box: {{a11: 1{'0' * 5000}}}", "a number of 5001 digits in line 1"),
+        ("[" * 100_000, "nested too deeply"),
+        ("- " * 100_000, "nested too deeply"),
+        ("box: &a [*a]", "more than 1,000,000 values, with what its aliases repeat"),
+        (BOMB, "more than 1,000,000 values, with what its aliases repeat"),
+        (f"box: {'x' * 100_000}", "expected a box of names and intervals, got 'x[^\n]{1,90}$"),
+        ("\ufeffbox: {a11: [2, 1]}", "expected an interval of a11 from low to high"),
         ("around: tubs", "expected a preset among"),
         ("around: nowhere/fit.json", "found no file"),
         ("around: tubes\nspread: wide", "expected a spread that is a number"),

@@ -226,3 +226,17 @@ def test_what_others_began_is_left_alone(tmp_path, order):
     with pytest.raises(ValueError, match="expected a set of version 1"):
         build_set(folder, other, 1)
     assert (folder / "curvafit.json").read_text() == "{}"
+
+
+def test_a_damaged_header_is_one_sentence(tmp_path, order):
+    folder = build_set(tmp_path / "set", order, 1)
+    header = json.loads((folder / "curvafit.json").read_text())
+    for where, value in (("recipe", 7), ("layout", "cubes"), ("parts", None), ("recipe", {"source": []})):
+        broken = header | {"order": header["order"] | {where: value}}
+        (folder / "curvafit.json").write_text(json.dumps(broken))
+        with pytest.raises(ValueError, match=r"^expected a whole set in [^\n]*, got one with a damaged curvafit.json"):
+            read_order(folder)
+    for bomb in ("[" * 100_000, '{"version": ' + "9" * 5000 + "}", '{"version": NaN}'):
+        (folder / "curvafit.json").write_text(bomb)
+        with pytest.raises(ValueError, match="^expected a set of version 1 in [^\n]*, got none$"):
+            read_order(folder)

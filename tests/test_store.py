@@ -177,3 +177,45 @@ def test_what_is_no_store_is_refused(tmp_path):
         with pytest.raises(ValueError, match="expected a f(ield exactly|loat32 field)"):
             store.write(record(0), wrong)
     assert store.indices() == []
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("shape", [6, 5]), ("shape", "x"), ("epsilon", None), ("seed", []), ("schedule", 3), ("spacing", 10**30)],
+)
+def test_a_damaged_header_is_one_sentence(tmp_path, name, value):
+    store = open_store(tmp_path / "s.zarr", SETTINGS)
+    path = store.path / "zarr.json"
+    text = json.loads(path.read_text())
+    text["attributes"]["settings"][name] = value
+    path.write_text(json.dumps(text))
+    with pytest.raises(ValueError, match=r"^expected a whole store of shapes at [^\n]*, got one with a damaged header"):
+        open_store(store.path)
+    for bomb in (
+        "[" * 100_000,
+        '{"node_type": "group", "attributes": ' + "9" * 5000 + "}",
+        "[]",
+        '{"attributes": NaN}',
+    ):
+        path.write_text(bomb)
+        with pytest.raises(ValueError, match=r"^expected a store of shapes at [^\n]*, got something else$"):
+            open_store(store.path)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("mass", "x"), ("coefficients", {}), ("versions", 7), ("seed", 1.5), ("viability", {"viable": True})],
+)
+def test_a_damaged_record_is_one_sentence(tmp_path, name, value):
+    store = open_store(tmp_path / "s.zarr", SETTINGS)
+    store.write(record(3), field(3))
+    path = store.path / "draws" / "000003" / "zarr.json"
+    text = json.loads(path.read_text())
+    text["attributes"][name] = value
+    path.write_text(json.dumps(text))
+    with pytest.raises(ValueError, match=r"^expected a whole record of draw 3 in [^\n]*, got a damaged one"):
+        store.record(3)
+    assert not store.intact(3)
+    (store.path / "draws" / "000003" / "field" / "zarr.json").write_text("{}")
+    with pytest.raises(ValueError, match=r"^expected a whole field of draw 3 in [^\n]*, got a damaged one"):
+        store.field(3)

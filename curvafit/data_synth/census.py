@@ -29,6 +29,7 @@ class Verdict:
 def census(store: Store) -> dict[str, str]:
     """What there is to say of a store, by name."""
     records = [store.record(index) for index in store.indices()]
+    Design.from_dict(store.settings.design)
     settings, viable = store.settings, sum(record.viability.viable for record in records)
     schedule = settings.schedule
     return {

@@ -115,9 +115,15 @@ class Design:
             If it is none.
         """
         try:
-            return Design(kept["law"], *(tuple(map(tuple, kept.get(name, ()))) for name in ("box", "points")))
-        except (LookupError, TypeError, AttributeError, OverflowError) as error:
-            raise ValueError(f"expected a design's law and box or points, got {quoted(kept)}") from error
+            box, points = (tuple(map(tuple, kept.get(name, ()))) for name in ("box", "points"))
+            sound = all(len(row) == 2 for row in box) and all(
+                map(_is_number, [each for row in box + points for each in row])
+            )
+        except (TypeError, AttributeError):
+            box, points, sound = (), (), False
+        if not sound or "law" not in kept:
+            raise ValueError(f"expected a design's law and box or points, got {quoted(kept)}")
+        return Design(kept["law"], box, points)
 
     def _shares(self, seed: int, index: int) -> list[float]:
         """How far into each interval the draw lies, 0 to 1. A fixed parameter takes no random number."""

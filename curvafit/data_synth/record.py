@@ -13,6 +13,7 @@ import numpy as np
 
 from curvafit.generation.viability import Viability
 from curvafit.priors.coefficients import NAMES, Coefficients
+from curvafit.priors.fit_schema import violation
 
 
 @dataclass(frozen=True)
@@ -53,8 +54,51 @@ def attributes_of(record: Record) -> dict[str, Any]:
     return {name: _plain(value) for name, value in attributes.items()}
 
 
+_NUMBER = {"type": ["number", "null"], "description": "a number or null"}
+_COUNT = {"type": "number", "minimum": 0, "maximum": 2**63 - 1, "description": "a whole number from 0"}
+_TEXT = {"type": "string", "description": "a text"}
+#: What a record's attributes hold, in the words of `priors.fit_schema`.
+_SCHEMA: dict[str, Any] = {
+    "type": "object",
+    "required": [field.name for field in dataclasses.fields(Record)],
+    "properties": {
+        **dict.fromkeys(("index", "seed", "steps"), _COUNT),
+        **dict.fromkeys(("mass", "energy", "seconds"), _NUMBER),
+        "status": _TEXT,
+        "versions": {"type": "object", "description": "an object"},
+        "coefficients": {
+            "type": "object",
+            "required": list(NAMES),
+            "properties": {name: {"type": "number", "description": "a finite number"} for name in NAMES},
+            "description": "an object of six coefficients",
+        },
+        "viability": {
+            "type": "object",
+            "required": [field.name for field in dataclasses.fields(Viability)],
+            "properties": {
+                **{field.name: _NUMBER for field in dataclasses.fields(Viability)},
+                "viable": {"type": "boolean", "description": "true or false"},
+                "reason": _TEXT,
+            },
+            "description": "an object of figures",
+        },
+    },
+    "description": "an object",
+}
+
+
 def record_of(attributes: dict[str, Any]) -> Record:
-    """The inverse of `attributes_of`; further attributes are left out."""
+    """The inverse of `attributes_of`; further attributes are left out.
+
+    Raises
+    ------
+    ValueError
+        If an attribute is missing or of another type.
+    """
+    if wrong := violation(attributes, _SCHEMA):
+        raise ValueError(wrong)
+    if not all(isinstance(attributes[name], int) for name in ("index", "seed", "steps")):
+        raise ValueError("index, seed or steps as no whole number")
     return Record(
         **{name: attributes[name] for name in ("index", "seed", "status", "versions", "steps")},
         **{name: _number(attributes[name]) for name in ("mass", "energy", "seconds")},

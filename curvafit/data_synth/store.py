@@ -75,13 +75,11 @@ class Store:
         KeyError, ValueError
             If the draw is missing or incomplete, or its record damaged.
         """
+        attributes = self._complete(index)
         try:
-            return record_of(self._complete(index))
-        except (TypeError, AttributeError, ValueError, LookupError) as error:
-            if not self.has(index):
-                raise
-            said = f"got a damaged one ({quoted(str(error))}): `curvafit atlas verify` lists such draws"
-            raise ValueError(f"expected a whole record of draw {index} in {self.path}, {said}") from error
+            return record_of(attributes)
+        except ValueError as error:
+            raise self._damaged("record", index, error) from error
 
     def viable(self, index: int) -> bool:
         """Whether a draw is recorded as a shape.
@@ -98,13 +96,19 @@ class Store:
 
         Raises
         ------
-        KeyError
-            If the draw is missing, incomplete or was not viable.
+        KeyError, ValueError
+            If the draw is missing, incomplete or was not viable, or its field damaged.
         """
         folder = self._place(index) / "field"
         if not self.has(index) or not folder.is_dir():
             raise KeyError(f"expected a viable draw {index} in {self.path}, got none")
-        return np.asarray(zarr.open_array(store=str(folder), mode="r")[...])
+        try:
+            array = zarr.open_array(store=str(folder), mode="r")
+            if array.shape != self.settings.shape or array.dtype != np.float32:
+                raise ValueError(f"{array.dtype} of shape {array.shape}")
+            return np.asarray(array[...])
+        except Exception as error:  # zarr and its codecs have many ways to say that a field is damaged
+            raise self._damaged("field", index, error) from error
 
     def intact(self, index: int) -> bool:
         """Whether a draw's record and field are, bit for bit, what was written.
@@ -117,7 +121,7 @@ class Store:
         attributes = self._complete(index)
         try:
             field = self.field(index) if attributes["viability"]["viable"] else None
-        except (RuntimeError, ValueError, OSError):  # a chunk that is truncated, or whose own checksum is wrong
+        except ValueError:  # a chunk that is truncated, or whose own checksum is wrong
             return False
         return digest(attributes, field) == attributes["sha256"]
 
@@ -148,6 +152,10 @@ class Store:
             return _publish(partial / place.name, place)
         finally:
             shutil.rmtree(partial, ignore_errors=True)
+
+    def _damaged(self, what: str, index: int, error: Exception) -> ValueError:
+        said = f"got a damaged one ({quoted(str(error))}): `curvafit atlas verify` lists such draws"
+        return ValueError(f"expected a whole {what} of draw {index} in {self.path}, {said}")
 
     def _complete(self, index: int) -> dict:
         attributes = self._attributes(index)
@@ -208,8 +216,9 @@ def _settings(path: Path, attributes: dict[str, Any]) -> Settings:
         stored: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in attributes["settings"].items()}
         found = Settings(**stored)
         Grid(found.shape, found.spacing)
-        if not (found.epsilon > 0 and found.blur >= 0 and found.seed >= 0 and int(attributes["wanted"]) >= 0):
-            raise ValueError("a number is negative")
+        sound = len(found.shape) == len(found.spacing) == 3 and {"name", "steps"} <= set(found.schedule)
+        if not (sound and found.epsilon > 0 and found.blur >= 0 and found.seed >= 0 and int(attributes["wanted"]) >= 0):
+            raise ValueError("a setting is missing or negative")
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
         said = f"got one with a damaged header ({quoted(str(error))})"
         raise ValueError(f"expected a whole store of shapes at {path}, {said}") from error

@@ -24,7 +24,7 @@ _RAW_TYPES = "uint8, int8, uint16, int16, uint32, int32, float32, float64 (or wi
 
 def read_npy(path: Path, **_: object) -> Raw:
     with path.open("rb") as stream:
-        return Raw(_array(stream, path))
+        return Raw(_array(stream, path, path.stat().st_size))
 
 
 def write_npy(field: Any, path: Path) -> None:
@@ -47,7 +47,7 @@ def read_archive(source: Path | IO[bytes]) -> dict[str, np.ndarray]:
         If the file cannot be read, or is damaged or something else.
     """
     try:
-        with zipfile.ZipFile(source) as archive:
+        with zipfile.ZipFile(check_regular(source) if isinstance(source, Path) else source) as archive:
             return {name: _member(archive, member) for name, member in _members(archive).items()}
     except (OSError, ValueError):
         raise
@@ -62,15 +62,17 @@ def _members(archive: zipfile.ZipFile) -> dict[str, str]:
 
 def _member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
     with archive.open(name) as stream:
-        return _array(stream, name)
+        return _array(stream, name, archive.getinfo(name).file_size)
 
 
-def _array(stream: IO[bytes], place: object) -> np.ndarray:
-    """The numbers of an NPY stream, which must end with them."""
+def _array(stream: IO[bytes], place: object, size: int) -> np.ndarray:
+    """The numbers of an NPY stream of so many bytes, which must end with them."""
     version = np.lib.format.read_magic(stream)
     if version not in _NPY_HEADERS:
         raise Damaged(f"NPY of version {version} holds no plain numbers")
     shape, fortran, dtype = _NPY_HEADERS[version](stream)
+    if not dtype.hasobject and math.prod(shape) * dtype.itemsize != size - stream.tell():
+        raise Damaged(f"{math.prod(shape) * dtype.itemsize} bytes of values by its header, not so many in the file")
     values = read_numbers(stream, shape[::-1] if fortran else shape, dtype, place)
     return values.T if fortran else values
 
