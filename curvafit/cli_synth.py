@@ -127,8 +127,9 @@ def _build(out: Path, order: Order, count: int, workers: int | None, scheduler: 
             build_set(out, order, count, lambda n, of: progress(f"{n} of {of} cases", n / of), workers=crew)
     if (held := len(cases_of(out))) > count:
         say(f"note: {out} holds {held} cases, more than --count {count}: all are listed", to=error_console())
-    say(str(out / "dataset.json"))
-    say(str(write_preview(out)))
+    files = out / "dataset.json", write_preview(out)
+    for path in files:
+        say(str(path))
 
 
 def _source(
