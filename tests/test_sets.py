@@ -17,6 +17,7 @@ from curvafit.data_synth.case import Recipe
 from curvafit.data_synth.modality import Imaging
 from curvafit.data_synth.sets import Order, build_set, make_cases, read_order
 from curvafit.scan import load, read_values
+from curvafit.set_picture import write_preview
 
 
 @pytest.fixture(scope="module")
@@ -240,3 +241,13 @@ def test_a_damaged_header_is_one_sentence(tmp_path, order):
         (folder / "curvafit.json").write_text(bomb)
         with pytest.raises(ValueError, match="^expected a set of version 1 in [^\n]*, got none$"):
             read_order(folder)
+
+
+@pytest.mark.parametrize(
+    "text", ["{", "null", "[]", '{"imaging": {"spacing": [1, 2]}, "source": {"name": "x"}}', "NaN"]
+)
+def test_a_damaged_record_of_a_case_is_one_sentence(tmp_path, order, text):
+    folder = build_set(tmp_path / "set", order, 1)
+    (folder / "cases" / "case_00000.json").write_text(text)
+    with pytest.raises(ValueError, match=r"^expected a case's record[^\n]*case_00000.json[^\n]*$"):
+        write_preview(folder)

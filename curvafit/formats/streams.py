@@ -6,7 +6,6 @@ import bz2
 import gzip
 import io
 import math
-import os
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -16,6 +15,7 @@ from typing import IO, Any
 import numpy as np
 
 from curvafit.formats.base import Damaged, ScanError
+from curvafit.machine import memory
 
 #: Bytes that are read at once.
 _PIECE = 1 << 22
@@ -59,7 +59,7 @@ def check_memory(shape: Sequence[int], dtype: np.dtype, place: object) -> None:
     wanted = math.prod(int(n) for n in shape) * dtype.itemsize
     if min(shape, default=1) < 0:
         raise ScanError(f"expected a shape of positive whole numbers, got {tuple(shape)} in {place}")
-    if wanted > _memory():
+    if wanted > memory():
         raise ScanError(f"expected a volume that fits into memory, got {wanted:.3g} bytes by the header of {place}")
 
 
@@ -126,11 +126,3 @@ class _Inflated(io.RawIOBase):
         if not given:
             raise Damaged("the compressed stream ends too early")
         return given
-
-
-def _memory() -> float:
-    """Bytes of this machine's memory, infinity where it does not tell."""
-    try:
-        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
-    except (AttributeError, OSError, ValueError):
-        return math.inf

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-import os
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 import torch
+
+from curvafit.machine import memory as installed
 
 #: Bytes a voxel that a flow holds at least: A, Adam's two moments and the start, three float32 numbers each; u, its
 #: gradient, and what is between two passes of the blur.
@@ -34,22 +34,7 @@ def memory(device: torch.device | str = "cpu") -> int:
     """Bytes of memory that a device has, or this machine; as many as can be counted where that is not known."""
     if torch.device(device).type == "cuda" and torch.cuda.is_available():
         return torch.cuda.get_device_properties(device).total_memory
-    return min(_installed(), _allowed())
-
-
-def _installed() -> int:
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):
-        return sys.maxsize
-
-
-def _allowed() -> int:
-    """What a container may use."""
-    try:
-        return int(Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii"))
-    except (OSError, ValueError):
-        return sys.maxsize
+    return installed()
 
 
 def _said(size: int) -> str:
