@@ -98,7 +98,7 @@ def double_precision_on_cpu():
     if hasattr(jax, "enable_x64"):
         double_precision = jax.enable_x64
     else:  # an earlier JAX
-        from jax.experimental import enable_x64 as double_precision
+        from jax.experimental import enable_x64 as double_precision  # pyright: ignore[reportAttributeAccessIssue]
     with double_precision(True), jax.default_device(jax.devices("cpu")[0]):
         yield
 

@@ -7,12 +7,12 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-_Given = TypeVar("_Given", Tensor, None)
+_Given = TypeVar("_Given", bound=Tensor | None)
 
 
 def plain(values: _Given) -> _Given:
     """Without what subclasses (MONAI's `MetaTensor`) add."""
-    return values if values is None or type(values) is Tensor else values.as_subclass(Tensor)
+    return values if values is None or type(values) is Tensor else values.as_subclass(Tensor)  # type: ignore[return-value]
 
 
 def seen(value: Tensor) -> float | None:
