@@ -109,8 +109,8 @@ def _elsewhere(name: str, make: Callable[[Path], None]) -> Iterator[Case]:
 
 
 def _replaced(name: str, target: str) -> tuple[str, ...]:
-    """An empty folder may become a store."""
-    return (target,) if name == "folder" and target == "out.zarr" else ()
+    """A file without a byte may be replaced, an empty folder may become a store."""
+    return (target,) if name == "empty" or (name == "folder" and target == "out.zarr") else ()
 
 
 def _named(stem: str) -> Setup:
