@@ -22,7 +22,7 @@ from curvafit.data_synth.census import census
 from curvafit.data_synth.record import Record
 from curvafit.data_synth.store import Store, open_store
 from curvafit.diagram import Diagram
-from curvafit.files import bears, check_folder, check_free, write_content
+from curvafit.files import bears, check_folder, check_free, is_empty, write_content
 from curvafit.formats import read_archive
 from curvafit.generation.viability import well_formed
 from curvafit.index import Atlas, Measured, extract, measured, shape_id
@@ -51,7 +51,9 @@ def check_map(directory: str | Path, store: str | Path, overwrite: bool = False)
     page, cache = folder / "atlas.html", folder / CACHE
 
     def ours(path: Path) -> bool:
-        return bears(cache / TAG, _TAGGED) if path == cache else path.is_file() and bears(page, _MARK)
+        if path == cache:
+            return is_empty(cache) or bears(cache / TAG, _TAGGED)
+        return path.is_file() and bears(page, _MARK)
 
     check_free([page, folder / "atlas.png", cache], ours, [store], overwrite)
     return folder

@@ -130,7 +130,8 @@ def check_free(
     targets
         Files or folders that are to be written, or replaced.
     ours
-        Whether what stands at a target may go: it bears this program's mark, and the kind's.
+        Whether what stands at a target may go: it bears this program's mark, and the kind's; or, where a folder is to
+        be written, is an empty one.
     inputs
         Files or folders that are read, as `file.h5::key` too: no target may be one of them, lie in one or hold one,
         whatever `overwrite` says.
@@ -141,7 +142,7 @@ def check_free(
     for target in targets:
         for source in sources:
             _check_apart(target, source)
-        if not (target.exists() or target.is_symlink()) or (target.is_dir() and not any(target.iterdir())):
+        if not (target.exists() or target.is_symlink()):
             continue
         if target.exists() and not (target.is_file() or target.is_dir()):
             raise ValueError(f"expected the name of a file or a folder to write, got the device or pipe {target}")
@@ -151,6 +152,11 @@ def check_free(
                 f"expected a name that is free, got {target}, a {what} that no such command wrote: choose another name "
                 "(or replace it with --overwrite; in Python, overwrite=True)"
             )
+
+
+def is_empty(folder: Path) -> bool:
+    """Whether there is a folder, and no link to one, with nothing in it."""
+    return folder.is_dir() and not folder.is_symlink() and not any(folder.iterdir())
 
 
 def record_of(path: Path, kind: str) -> dict:

@@ -144,7 +144,9 @@ def check_outputs(
     written = record_of(beside(target, ".json"), kind).get("files") or ()
 
     def ours(path: Path) -> bool:
-        return path.name in written and (not path.is_dir() or is_ours(path, kind))
+        if path.is_dir():
+            return path.name.lower().endswith(".zarr") and is_ours(path, kind)
+        return path.name in written
 
     check_free([target, beside(target, ".png"), beside(target, ".json"), *more], ours, inputs, overwrite)
     return target

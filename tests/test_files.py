@@ -13,6 +13,7 @@ from curvafit.files import (
     bears,
     check_folder,
     check_free,
+    is_empty,
     move_together,
     record_of,
     remove,
@@ -99,9 +100,12 @@ def test_a_place_that_is_taken_is_refused(what: str, tmp_path: Path) -> None:
     assert tree(tmp_path) == before
 
 
-def test_nothing_and_an_empty_folder_are_free(tmp_path: Path) -> None:
+def test_nothing_is_free_and_an_empty_folder_where_a_folder_goes(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
-    check_free([tmp_path / "none", tmp_path / "empty"], lambda path: False)
+    (tmp_path / "link").symlink_to(tmp_path / "empty")
+    check_free([tmp_path / "none", tmp_path / "empty"], is_empty)
+    with pytest.raises(ValueError, match="expected a name that is free, got .*link, a folder"):
+        check_free([tmp_path / "link"], is_empty)
 
 
 def test_devices_and_pipes_are_never_written_over(tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from curvafit.data_synth.labels import NAMES, labels_of
 from curvafit.data_synth.layouts import LAYOUTS, About
 from curvafit.data_synth.workers import Here, Workers
 from curvafit.files import remove, write_content
+from curvafit.interrupts import undisturbed
 from curvafit.priors.bounds import instance, named, quoted, several, whole
 from curvafit.priors.grid import Grid
 from curvafit.priors.json_text import parse_json
@@ -240,6 +241,7 @@ def _remove_case(folder: Path, order: Order, name: str) -> None:
 def _write_case(folder: Path, order: Order, index: int, case: Case) -> None:
     """Labels, image, record, in this order; all or none."""
     layout, name = LAYOUTS[order.layout], case_name(index)
+    record = folder / RECORDS / f"{name}.json"
     places = [folder / layout.label.format(case=name), folder / layout.image.format(case=name)]
     parts = folder / layout.part
     try:
@@ -248,10 +250,11 @@ def _write_case(folder: Path, order: Order, index: int, case: Case) -> None:
         for values, place in zip((mask, case.image), places, strict=False):
             save(Field(values, case.spacing, case.unit), place)
         sums = {"image": _digest(case.image), "label": _digest(mask)}
-        _write_json(folder / RECORDS / f"{name}.json", case.record | known | {"sha256": sums, "versions": versions()})
+        _write_json(record, case.record | known | {"sha256": sums, "versions": versions()})
     except BaseException:
-        for place in places:
-            remove(place)
+        with undisturbed():
+            for place in (record, *places):
+                remove(place)
         raise
 
 

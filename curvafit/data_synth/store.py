@@ -21,7 +21,6 @@ import dataclasses
 import json
 import os
 import shutil
-import tempfile
 import time
 from pathlib import Path
 from typing import Any
@@ -31,12 +30,15 @@ import zarr
 from zarr.codecs import BloscCodec, Crc32cCodec
 
 from curvafit.data_synth.record import Record, Settings, attributes_of, digest, record_of
+from curvafit.files import staged, write_content
 from curvafit.priors.bounds import quoted
 from curvafit.priors.grid import Grid
 from curvafit.priors.json_text import parse_json
 
 FORMAT = "curvafit shapes"
 VERSION = 2
+#: What a draw's folder is called, behind a dot, until it is whole.
+PARTIAL = "partial"
 #: A draw's folder is written in less than this; an older one was left by a killed process.
 _STALE_SECONDS = 600.0
 
@@ -141,8 +143,7 @@ class Store:
         if self.has(record.index):
             return False
         self._clear_stale()
-        partial = Path(tempfile.mkdtemp(dir=self.path / "draws", prefix=".partial-"))
-        try:
+        with staged(self.path / "draws" / PARTIAL) as partial:
             _write_draw(partial / place.name, record, field)
             if _publish(partial / place.name, place):
                 return True
@@ -150,8 +151,6 @@ class Store:
                 return False
             shutil.rmtree(place)  # what is there is torn
             return _publish(partial / place.name, place)
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
 
     def _damaged(self, what: str, index: int, error: Exception) -> ValueError:
         said = f"got a damaged one ({quoted(str(error))}): `curvafit atlas verify` lists such draws"
@@ -179,7 +178,7 @@ class Store:
         return attributes if complete else None
 
     def _clear_stale(self) -> None:
-        for left in (self.path / "draws").glob(".partial-*"):
+        for left in (self.path / "draws").glob(f".{PARTIAL}*"):
             if time.time() - left.stat().st_mtime > _STALE_SECONDS:
                 shutil.rmtree(left, ignore_errors=True)
 
@@ -226,15 +225,11 @@ def _settings(path: Path, attributes: dict[str, Any]) -> Settings:
 
 
 def _create(path: Path, settings: Settings) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}-"))
-    try:
+    with staged(path) as partial:
         header = {"format": FORMAT, "version": VERSION, "settings": dataclasses.asdict(settings), "wanted": 0}
         zarr.create_group(store=str(partial / "store"), attributes=header)
         zarr.create_group(store=str(partial / "store" / "draws"))
         _publish(partial / "store", path)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 def _write_draw(folder: Path, record: Record, field: np.ndarray | None) -> None:
@@ -257,14 +252,7 @@ def _rewrite(folder: Path, attributes: dict[str, Any]) -> None:
     """Change attributes of the Zarr group in a folder, all at once."""
     text = parse_json((folder / "zarr.json").read_bytes(), "a Zarr group", folder)
     text["attributes"] |= attributes
-    partial = folder / f".partial-{os.getpid()}.json"
-    try:
-        partial.write_text(json.dumps(text, indent=2))
-        with partial.open("rb+") as handle:
-            os.fsync(handle.fileno())
-        os.replace(partial, folder / "zarr.json")
-    finally:
-        partial.unlink(missing_ok=True)
+    write_content(folder / "zarr.json", json.dumps(text, indent=2))
 
 
 def _publish(partial: Path, place: Path) -> bool:

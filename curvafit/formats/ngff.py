@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import zarr
 
-from curvafit.files import MARK
+from curvafit.files import MARK, is_empty
 from curvafit.formats.base import Raw, pick_key, stated
 from curvafit.formats.chunks import check_store, missing_chunks
 from curvafit.formats.streams import check_memory
@@ -80,7 +80,9 @@ def mark(folder: Path, kind: str) -> None:
 
 
 def is_ours(folder: Path, kind: str) -> bool:
-    """Whether a folder is a group that `write_zarr` wrote, marked with this kind, and holds nothing else."""
+    """Whether a folder is empty, or a group that `write_zarr` wrote, marked with this kind, with nothing else in it."""
+    if folder.is_symlink() or is_empty(folder):
+        return not folder.is_symlink()
     try:
         attributes = json.loads((folder / "zarr.json").read_bytes())["attributes"]
         if attributes[MARK]["kind"] != kind:

@@ -96,7 +96,7 @@ def commanding(arguments: Sequence[str]) -> Job:
 
     def job() -> None:
         sys.argv = ["curvafit", *arguments]
-        from curvafit.cli import main
+        from curvafit.__main__ import main
 
         main()
 

@@ -88,5 +88,5 @@ def _play(case: Case, place: Place) -> list[Fault]:
 
 def _inner(outcome: Outcome) -> list[Fault]:
     """A sentence about a file that is none of the user's tells the user nothing."""
-    found = re.search(r"\S*(\.part\b|\.partial-|\.[0-9a-f]{8}\.)\S*", outcome.stderr)
+    found = re.search(r"\S*(\.part\b|\.partial\.|\.[0-9a-f]{8}\.)\S*", outcome.stderr)
     return [Fault("wrong", f"exit code {outcome.code}, about a temporary name: {found[0]}")] if found else []
