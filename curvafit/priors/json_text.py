@@ -29,9 +29,9 @@ def parse_json(content: str | bytes, expected: str, place: object) -> Any:
         digits.
     """
     try:
-        text = content.decode("utf-8-sig") if isinstance(content, bytes) else content.removeprefix("\ufeff")
+        text = content.decode() if isinstance(content, bytes) else content
         return json.loads(
-            text,
+            text.removeprefix("\ufeff"),
             parse_int=_whole,
             parse_float=_finite,
             parse_constant=_constant,
