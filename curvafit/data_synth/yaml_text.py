@@ -33,7 +33,7 @@ def parse_yaml(content: bytes, expected: str, place: object) -> Any:
         number of more than 40 digits.
     """
     try:
-        loader = _Loader(content.decode("utf-8-sig"))
+        loader = _Loader(content.decode().removeprefix("\ufeff"))
         node = loader.get_single_node()
         if node is None:
             return None
