@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from curvafit.generation.flow import Flow
+    from curvafit.generation.schedule import Schedule
     from curvafit.priors.coefficients import Coefficients
     from curvafit.shape_files import Output
 
@@ -115,12 +116,13 @@ def generate(
         how = _output(law, spacing, unit, tile, cap, boundary)
         saving = _checkpoint(checkpoint, checkpoint_every)
         options: dict[str, Any] = {"seed": seed, **saving}
-        options["snapshots"] = () if snapshots is None else whole_numbers(snapshots, "--snapshots")
+        options["schedule"] = plan = _plan(schedule, steps)
+        options["snapshots"] = () if snapshots is None else (*map(plan.among, whole_numbers(snapshots, "--snapshots")),)
         options["orientation"] = Q = None if orientation is None else _orientation(orientation)
         read = [str(each) for each in (prior, maps) if each is not None]
         _check(out, saving["checkpoint"], cap)
         _check_target(out, how, options["snapshots"], read, overwrite)
-        flow = _grown(law, boundary, schedule, steps, {**options, "device": device_of(device)})
+        flow = _grown(law, boundary, {**options, "device": device_of(device)})
         told = {"orientation": Q if Q is None else Q.tolist(), "maps": maps if maps is None else str(maps)}
         _write(flow, law, out, how, {**told, "overwrite": overwrite})
         _discard(saving["checkpoint"])
@@ -264,15 +266,20 @@ def _check(out: Path, checkpoint: Path | None, cap: bool | None) -> None:
             raise ValueError(f"expected a file of its own for the checkpoint, got {checkpoint}")
 
 
-def _grown(law: _Law, boundary: str, schedule: str, steps: int | None, options: dict[str, Any]) -> Flow:
+def _plan(schedule: str, steps: int | None) -> Schedule:
+    from curvafit.generation.schedule import schedule as named
+
+    return named(schedule, steps)
+
+
+def _grown(law: _Law, boundary: str, options: dict[str, Any]) -> Flow:
     """The flow, with progress; leaves with exit code 1 where it has no surface, or failed."""
     from curvafit.generation.flow import generate as make
-    from curvafit.generation.schedule import schedule as named
     from curvafit.priors.grid import Grid
 
-    plan, grid = named(schedule, steps), Grid(law.box, boundary=boundary)  # type: ignore[arg-type]
-    options |= {"volume_fraction": law.share, "epsilon": law.epsilon, "schedule": plan}
-    with flow_progress(plan.steps) as watch:
+    grid = Grid(law.box, boundary=boundary)  # type: ignore[arg-type]
+    options |= {"volume_fraction": law.share, "epsilon": law.epsilon}
+    with flow_progress(options["schedule"].steps) as watch:
         try:
             flow = make(law.coefficients, law.mass, grid, callbacks=[watch], keep_checkpoint=True, **options)
         except KeyboardInterrupt as signal:

@@ -108,7 +108,7 @@ def test_generate_refuses_a_place_before_it_works(tmp_path: Path) -> None:
     refused(call("generate", *QUICK, "-o", tmp_path / "out.xyz"), "expected a name ending in one of")
     refused(call("generate", *QUICK, "-o", tmp_path / "file" / "out.npy"), "is a file")
     refused(call("generate", *QUICK, "-o", tmp_path / "out.mrc"), "expected a unit of nm, um, mm or m for an MRC file")
-    refused(call("generate", *QUICK, "--checkpoint", tmp_path, "-o", tmp_path / "out.npy"), "a file of its own")
+    refused(call("generate", *QUICK, "--checkpoint", tmp_path, "-o", tmp_path / "out.npy"), "expected a file for")
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 

@@ -22,7 +22,7 @@ HEARD = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
 @pytest.fixture
 def listening() -> Iterator[None]:
-    before = {number: signal.getsignal(number) for number in HEARD}
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in HEARD}
     listen()
     yield
     for number, handler in before.items():
@@ -122,7 +122,9 @@ def test_a_program_that_is_ended_leaves_nothing(number: int, word: str, tmp_path
 
 
 SLOW = """
-import sys, time
+import signal, sys, time
+for number in (signal.SIGINT, signal.SIGTERM):  # a program in the background ignores Ctrl-C
+    signal.signal(number, signal.SIG_DFL)
 import curvafit.shape_files
 def slow(*_):
     print("writing", file=sys.stderr, flush=True)

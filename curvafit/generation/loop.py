@@ -20,7 +20,7 @@ from curvafit.generation.result import RECORD_EVERY, Callback, Flow, History, St
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.stepper import Shape, Statistics, Stepper
 from curvafit.generation.viability import Viability, viability
-from curvafit.priors.bounds import quoted, several, whole
+from curvafit.priors.bounds import quoted, several
 from curvafit.priors.grid import Grid
 
 #: A flow whose energy falls by less than this share over its last tenth is called converged.
@@ -57,9 +57,7 @@ class Orders:
             object.__setattr__(self, name, several(getattr(self, name), name))
         if wrong := [each for each in self.callbacks if not callable(each)]:
             raise ValueError(f"expected callbacks that can be called, got {quoted(wrong[0])}")
-        most = self.plan.steps
-        snapshots = tuple(whole(step, f"snapshots at 0 to {most} steps", 0, most) for step in self.snapshots)
-        object.__setattr__(self, "snapshots", snapshots)
+        object.__setattr__(self, "snapshots", tuple(map(self.plan.among, self.snapshots)))
 
     def check_memory(self, device: torch.device | str) -> None:
         """Raise ValueError where a flow does not fit into a device's memory, or its snapshots into the machine's."""

@@ -58,6 +58,16 @@ class Schedule:
         for name in ("momentum", "memory"):
             object.__setattr__(self, name, inside(getattr(self, name), f"{name} in [0, 1)", -math.ulp(0), 1))
 
+    def among(self, step: int) -> int:
+        """A number of steps after which there is a snapshot.
+
+        Raises
+        ------
+        ValueError
+            If it is no whole number from 0 to the number of steps.
+        """
+        return whole(step, f"snapshots at 0 to {self.steps} steps", 0, self.steps)
+
     def rate(self, step: int) -> float:
         """Length of step 0 … steps - 1."""
         if self.shape == "constant" or self.steps == 1:
