@@ -17,7 +17,7 @@ ALLOWED = {
     "files": {"interrupts"},
     "priors": set(),
     "generation": {"priors", "files", "interrupts", "machine"},
-    "formats": {"priors", "files", "machine"},
+    "formats": {"priors", "files", "interrupts", "machine"},
     "scan": {"priors", "formats", "files"},
     "mesh": {"priors"},
     "diagram": {"priors", "mesh"},
@@ -26,7 +26,18 @@ ALLOWED = {
     "morphometry": {"priors", "topology"},
     "sinkhorn": {"priors"},
     "pairwise": {"files", "formats", "priors", "diagram", "transport", "sinkhorn"},
-    "data_synth": {"files", "generation", "priors", "scan", "mesh", "diagram", "transport", "topology", "morphometry"},
+    "data_synth": {
+        "files",
+        "interrupts",
+        "generation",
+        "priors",
+        "scan",
+        "mesh",
+        "diagram",
+        "transport",
+        "topology",
+        "morphometry",
+    },
 }
 #: The command line imports everything; of the package, only `__main__` imports it.
 TOP = "cli"

@@ -53,7 +53,7 @@ def test_a_bound_is_named_where_it_counts() -> None:
         real(1e-9, "a positive length", 1e-3, 9)
     with pytest.raises(ValueError, match="expected a positive length, got -1$"):
         real(-1, "a positive length", 1e-3, 9)
-    with pytest.raises(ValueError, match=r"expected a length, got 10{20,}\.\.\.0{10,}"):
+    with pytest.raises(ValueError, match=r"expected a length, got 10{9,}\.\.\.0{9,}$"):
         real(10**400, "a length")
 
 

@@ -31,6 +31,7 @@ from zarr.codecs import BloscCodec, Crc32cCodec
 
 from curvafit.data_synth.record import Record, Settings, attributes_of, digest, record_of
 from curvafit.files import staged, write_content
+from curvafit.interrupts import undisturbed
 from curvafit.priors.bounds import quoted
 from curvafit.priors.grid import Grid
 from curvafit.priors.json_text import parse_json
@@ -227,11 +228,13 @@ def _settings(path: Path, attributes: dict[str, Any]) -> Settings:
 def _create(path: Path, settings: Settings) -> None:
     with staged(path) as partial:
         header = {"format": FORMAT, "version": VERSION, "settings": dataclasses.asdict(settings), "wanted": 0}
-        zarr.create_group(store=str(partial / "store"), attributes=header)
-        zarr.create_group(store=str(partial / "store" / "draws"))
+        with undisturbed():
+            zarr.create_group(store=str(partial / "store"), attributes=header)
+            zarr.create_group(store=str(partial / "store" / "draws"))
         _publish(partial / "store", path)
 
 
+@undisturbed()  # Zarr writes in threads of its own, which would go on beside what cleans up
 def _write_draw(folder: Path, record: Record, field: np.ndarray | None) -> None:
     attributes = attributes_of(record)
     zarr.create_group(store=str(folder), attributes=attributes | {"sha256": digest(attributes, field)})

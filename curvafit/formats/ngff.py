@@ -15,6 +15,7 @@ from curvafit.files import MARK, is_empty
 from curvafit.formats.base import Raw, pick_key, stated
 from curvafit.formats.chunks import check_store, missing_chunks
 from curvafit.formats.streams import check_memory
+from curvafit.interrupts import undisturbed
 
 #: Edge of a chunk, and of the largest volume that is not halved any more, in voxels.
 CHUNK = 64
@@ -60,20 +61,26 @@ def write_zarr(field: Any, path: Path) -> None:
             for k, (_, first) in enumerate(levels)
         ],
     }
-    group = zarr.create_group(path, attributes={"ome": {"version": "0.5", "multiscales": [image]}})
+    with undisturbed():
+        group = zarr.create_group(path, attributes={"ome": {"version": "0.5", "multiscales": [image]}})
     for k, (values, _) in enumerate(levels):
-        chunks = tuple(min(CHUNK, n) for n in values.shape)
-        array = group.create_array(
-            str(k),
-            shape=values.shape,
-            chunks=chunks,
-            dtype=values.dtype,
-            dimension_names=("z", "y", "x"),
-            config={"write_empty_chunks": True},  # so that a chunk that is not there is one that was lost
-        )
-        array[...] = values
+        _write_level(group, str(k), values)
 
 
+@undisturbed()  # Zarr writes in threads of its own, which would go on beside what cleans up
+def _write_level(group: Any, name: str, values: np.ndarray) -> None:
+    array = group.create_array(
+        name,
+        shape=values.shape,
+        chunks=tuple(min(CHUNK, n) for n in values.shape),
+        dtype=values.dtype,
+        dimension_names=("z", "y", "x"),
+        config={"write_empty_chunks": True},  # so that a chunk that is not there is one that was lost
+    )
+    array[...] = values
+
+
+@undisturbed()
 def mark(folder: Path, kind: str) -> None:
     """State in a group's attributes that this program wrote it, and what for."""
     zarr.open_group(folder, mode="r+").attrs[MARK] = {"kind": kind}
