@@ -107,7 +107,7 @@ def _checkpoint(folder: Path) -> None:
     work = folder / "checkpoint"
     work.mkdir()
     job = commanding(("generate", *LONG, "-o", "long.npy"))
-    run(job, work, folder.parent / "said", (killing(9, work, 60),))
+    run(job, work, folder.parent / "said", (killing(9, work, 24),))
     if not (work / "run.pt").is_file():
         raise RuntimeError("expected a checkpoint of a run that was killed, got none")
     os.replace(work / "run.pt", folder / "run.pt")
