@@ -303,20 +303,15 @@ def _discard(checkpoint: Path | None) -> None:
 
 def _write(flow: Flow, law: _Law, out: Path, how: Output, told: dict[str, Any]) -> None:
     """Write everything, and print what and where."""
-    from curvafit.mesh import NoSurface
-    from curvafit.shape_files import shape_record, step_path, write_field, write_shape
+    from curvafit.shape_files import shape_record, step_path, write_shape
 
     overwrite = told.pop("overwrite")
     notes = [] if flow.viability.viable else [flow.status]
     mass = flow.mass if law.mass is None else law.mass
     told |= {"origin": law.origin, "wanted_volume_fraction": law.share, "snapshots": list(flow.snapshots)}
     record = shape_record(flow, law.coefficients, mass, epsilon=law.epsilon, output=how, **told, command=command_line())
-    files = list(write_shape(flow, out, output=how, record=record, overwrite=overwrite))
-    for step, field in flow.snapshots.items():
-        try:
-            files.append(write_field(field, flow.grid, step_path(out, step), how, overwrite=overwrite))
-        except NoSurface:
-            notes.append(f"no surface after {step} steps")
+    files = write_shape(flow, out, output=how, record=record, overwrite=overwrite)
+    notes += [f"no surface after {step} steps" for step in flow.snapshots if step_path(out, step) not in files]
     for note in notes:
         say(f"note: {note}", to=error_console())
     say(f"{flow.status}; {100 * record['volume_fraction']:.2f} % of the volume")

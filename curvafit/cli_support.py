@@ -49,7 +49,7 @@ def plainly() -> Iterator[None]:
         _say_notes(notes)
         raise
     except KeyboardInterrupt as signal:
-        say(f"{_ended(signal)}: nothing was written", to=error_console())
+        say(f"{_ended(signal)}: nothing is left half-written", to=error_console())
         raise typer.Exit(exit_code(signal)) from None
     except (ValueError, OSError, ImportError, MemoryError, RuntimeError) as error:
         if os.environ.get(DEBUG) or not _expected(error):

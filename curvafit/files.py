@@ -149,8 +149,8 @@ def check_free(
         if not (overwrite or ours(target)):
             what = "folder" if target.is_dir() else "file"
             raise ValueError(
-                f"expected a name that is free, got {target}, a {what} that no such command wrote: choose another name "
-                "(or replace it with --overwrite; in Python, overwrite=True)"
+                f"expected a name that is free, got {target}, a {what} that this command did not write: choose another "
+                "name (or replace it with --overwrite; in Python, overwrite=True)"
             )
 
 
@@ -159,7 +159,7 @@ def is_empty(folder: Path) -> bool:
     return folder.is_dir() and not folder.is_symlink() and not any(folder.iterdir())
 
 
-def record_of(path: Path, kind: str) -> dict:
+def own_record(path: Path, kind: str) -> dict:
     """The record of this kind in a JSON file: its `format` is `kind`; empty where there is none."""
     try:
         content = json.loads(path.read_bytes()) if path.is_file() else None

@@ -10,7 +10,7 @@ from pathlib import Path
 from string import Template
 from typing import TYPE_CHECKING
 
-from curvafit.files import check_folder, check_free, move_together, record_of, staged, write_content
+from curvafit.files import bears, check_folder, check_free, move_together, own_record, staged, write_content
 from curvafit.interrupts import undisturbed
 from curvafit.priors.coefficients import NAMES
 from curvafit.priors.fit_file import FORMAT
@@ -21,6 +21,8 @@ from curvafit.wording import density, describe, length, number, per_unit, percen
 if TYPE_CHECKING:
     from curvafit.infer import Inference
 
+#: What tells that a page is this program's.
+_MARK = '<meta name="generator" content="curvafit'
 #: What an inference writes into its folder.
 FILES = ("fit.json", "report.html", "regenerated.nii.gz")
 #: Each coefficient as it is written, what it multiplies, and the power of 1/length that it carries in physical units.
@@ -47,7 +49,7 @@ def check_report(directory: str | Path, inputs: Iterable[str | Path] = (), overw
         If it is no folder that can be written to, or an input or another file stands where one of the three goes.
     """
     folder = check_folder(directory)
-    ours = bool(record_of(folder / "fit.json", FORMAT))
+    ours = bool(own_record(folder / "fit.json", FORMAT)) and bears(folder / "report.html", _MARK)
     check_free([folder / name for name in FILES], lambda _: ours, inputs, overwrite)
     return folder
 
@@ -64,7 +66,7 @@ def write_inference(inference: Inference, directory: str | Path, *, overwrite: b
         As `check_report`.
     """
     target = check_report(directory, overwrite=overwrite)
-    with staged(target) as work:
+    with staged(target / FILES[0] if target.is_dir() else target) as work:
         (work / "fit.json").write_text(inference.fit.to_json(), encoding="utf-8")
         write_report(inference, work / "report.html")
         if inference.best is not None:

@@ -6,6 +6,7 @@ import dataclasses
 import datetime
 import json
 from collections.abc import Iterable
+from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -15,12 +16,12 @@ import torch
 from scipy.ndimage import map_coordinates
 from torch import Tensor
 
-from curvafit.files import check_folder, check_free, move_together, record_of, staged
+from curvafit.files import check_folder, check_free, move_together, own_record, staged
 from curvafit.formats import normalise_unit, pick_writer
 from curvafit.formats.ngff import is_ours
 from curvafit.generation.flow import Flow
 from curvafit.generation.memory import FILE, check_memory
-from curvafit.mesh import Surface, solid_surface, surface
+from curvafit.mesh import NoSurface, Surface, solid_surface, surface
 from curvafit.mesh_files import SUFFIXES, write_surface
 from curvafit.plot import surface_picture
 from curvafit.priors.bounds import LONGEST, SHORTEST, instance, real, several, whole
@@ -131,7 +132,7 @@ def check_outputs(
 ) -> Path:
     """The path, if it can be written with its picture, its record and `more` beside it, and nothing else is lost.
 
-    What the record there, of the same kind, lists as written with it may be replaced.
+    What the record there, of the same kind, lists as written with this very file may be replaced.
 
     Raises
     ------
@@ -141,7 +142,8 @@ def check_outputs(
     check_folder(target.parent)
     if target.is_dir() and not target.name.lower().endswith(".zarr"):
         raise ValueError(f"expected the name of a file, got the folder {target}")
-    written = record_of(beside(target, ".json"), kind).get("files") or ()
+    listed = own_record(beside(target, ".json"), kind).get("files")
+    written = listed if isinstance(listed, list) and target.name in listed else []
 
     def ours(path: Path) -> bool:
         if path.is_dir():
@@ -172,7 +174,7 @@ def write_shape(
     output: Output | None = None,
     record: dict[str, Any] | None = None,
     overwrite: bool = False,
-) -> tuple[Path, Path, Path]:
+) -> tuple[Path, ...]:
     """Write a flow's field as a volume or a surface, by suffix, with a picture of one box and a record.
 
     Parameters
@@ -186,7 +188,8 @@ def write_shape(
 
     Returns
     -------
-    The paths of shape, picture (`.png`) and record (`.json`). All three are made in a temporary folder, then moved.
+    The paths of shape, picture (`.png`), record (`.json`) and the flow's snapshots, but those that have no surface
+    where one is written. All are made in a temporary folder, then moved.
 
     Raises
     ------
@@ -194,24 +197,24 @@ def write_shape(
         If the suffix is unknown, the field has no surface, a box that is not periodic is to be repeated, or something
         else stands where one of the files goes.
     """
-    target = check_target(path, output, overwrite=overwrite)
+    target = check_target(path, output, steps=flow.snapshots, overwrite=overwrite)
     with staged(target) as work:
         made = write_field(flow.field, flow.grid, work / target.name, output)
         picture, note = beside(made, ".png"), beside(made, ".json")
         surface_picture(flow.field.numpy(), picture)
         parts = [made, picture, note]
-        snapshots = [step_path(target, step).name for step in flow.snapshots]
-        told = {"format": FORMAT, **(record or {}), "files": [*(part.name for part in parts), *snapshots]}
+        for step, field in flow.snapshots.items():
+            with suppress(NoSurface):
+                parts.append(write_field(field, flow.grid, step_path(made, step), output))
+        told = {"format": FORMAT, **(record or {}), "files": [part.name for part in parts]}
         note.write_text(json.dumps(told, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-        return move_together(parts, target.parent)  # type: ignore[return-value]
+        return move_together(parts, target.parent)
 
 
-def write_field(
-    field: Tensor, grid: Grid, path: str | Path, output: Output | None = None, *, overwrite: bool = False
-) -> Path:
+def write_field(field: Tensor, grid: Grid, path: str | Path, output: Output | None = None) -> Path:
     """Write a field `(Z, Y, X)` as a volume or a surface, by suffix, without picture and record.
 
-    Another file of that name is replaced; another folder only with `overwrite`.
+    Another file of that name is replaced, another folder is not.
 
     A VTP surface bears its level set's principal curvatures `kappa1` and `kappa2` at the vertices, 0 on caps.
 
@@ -224,7 +227,7 @@ def write_field(
     how.shape(grid)
     values, edges = np.tile(field.numpy(), how.tile), (how.voxel, how.voxel, how.voxel)
     if not target.name.lower().endswith(SUFFIXES):
-        return save(Field(values, edges, how.unit), target, kind=FORMAT, overwrite=overwrite)
+        return save(Field(values, edges, how.unit), target, kind=FORMAT)
     box = Grid(values.shape, edges, grid.boundary)
     mesh = solid_surface(values, box) if how.cap else surface(values, box)
     data = None

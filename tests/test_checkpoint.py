@@ -244,6 +244,12 @@ def test_two_runs_do_not_share_a_file(tmp_path):
     generate(TUBES, MASS, GRID, schedule=PLAN, checkpoint=path)
 
 
+def test_a_users_own_lock_stays(tmp_path):
+    (tmp_path / "flake.lock").write_text("mine")
+    generate(TUBES, MASS, GRID, schedule=PLAN, checkpoint=tmp_path / "flake")
+    assert (tmp_path / "flake.lock").read_text() == "mine"
+
+
 def test_what_a_killed_save_left_goes(tmp_path):
     (tmp_path / ".0123abcd.run").write_bytes(b"half")
     (tmp_path / ".0123abcd.run2").write_bytes(b"another's")

@@ -171,7 +171,7 @@ def refused_after_stages(result: Result, said: str) -> None:
 @pytest.mark.parametrize(
     ("error", "code", "said"),
     [
-        (KeyboardInterrupt(), 130, "interrupted: nothing was written"),
+        (KeyboardInterrupt(), 130, "interrupted: nothing is left half-written"),
         (MemoryError(), 2, "fits into memory"),
         (RuntimeError("not enough memory: you tried to allocate"), 2, "fits into memory"),
         (ModuleNotFoundError("expected pynrrd, got none: pip install curvafit[io]", name="nrrd"), 2, "pip install"),

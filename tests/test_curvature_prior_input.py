@@ -186,3 +186,11 @@ def test_what_a_single_channel_ignores_is_said(option):
     with pytest.warns(UserWarning, match="single channel prediction"):
         found = CurvaturePrior("tubes", **option)(p)
     assert torch.equal(found, CurvaturePrior("tubes")(p))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_mask_that_asks_for_a_gradient_is_refused(dtype):
+    probability = torch.rand((1, 1, 8, 8, 8), generator=torch.Generator().manual_seed(0)).to(dtype)
+    mask = torch.ones_like(probability, requires_grad=True)
+    with pytest.raises(ValueError, match="expected a mask that asks for no gradient, got one that does: detach it"):
+        CurvaturePrior("tubes")(probability, mask=mask)

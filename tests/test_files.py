@@ -15,7 +15,7 @@ from curvafit.files import (
     check_free,
     is_empty,
     move_together,
-    record_of,
+    own_record,
     remove,
     staged,
     sweep,
@@ -93,7 +93,7 @@ def test_a_place_that_is_taken_is_refused(what: str, tmp_path: Path) -> None:
         place.mkdir()
         (place / (".thesis" if what == "hidden" else "thesis")).write_text("mine")
     before = tree(tmp_path)
-    with pytest.raises(ValueError, match="expected a name that is free, got .*out, a .* that no such command wrote"):
+    with pytest.raises(ValueError, match="a name that is free, got .*out, a .* that this command did not write"):
         check_free([place], lambda path: False)
     check_free([place], lambda path: path == place)
     check_free([place], lambda path: False, overwrite=True)
@@ -117,7 +117,7 @@ def test_devices_and_pipes_are_never_written_over(tmp_path: Path) -> None:
 
 def test_a_pipe_is_no_record_and_is_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "out.json")
-    assert record_of(tmp_path / "out.json", "ours") == {} and not bears(tmp_path / "out.json", "x")
+    assert own_record(tmp_path / "out.json", "ours") == {} and not bears(tmp_path / "out.json", "x")
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
@@ -161,9 +161,9 @@ def test_a_record_is_of_its_kind(tmp_path: Path) -> None:
     note = tmp_path / "a.json"
     for content in ("", "[]", "{", '"x"', '{"format": "other"}', "[" * 100_000):
         note.write_text(content)
-        assert record_of(note, "ours") == {}
+        assert own_record(note, "ours") == {}
     note.write_text('{"format": "ours", "files": ["a"]}')
-    assert record_of(note, "ours")["files"] == ["a"] and record_of(tmp_path / "b.json", "ours") == {}
+    assert own_record(note, "ours")["files"] == ["a"] and own_record(tmp_path / "b.json", "ours") == {}
 
 
 # ---- Zarr stores -----------------------------------------------------------------------------------------------------
@@ -177,10 +177,10 @@ def test_save_replaces_its_own_stores_alone(tmp_path: Path) -> None:
     for kind in ("volume", "volume"):
         save(FIELD, place, kind=kind)
     assert np.array_equal(load(place).values, FIELD.values)
-    with pytest.raises(ValueError, match="that no such command wrote"):
+    with pytest.raises(ValueError, match="that this command did not write"):
         save(FIELD, place, kind="mask")
     (place / "notes.txt").write_text("mine")
-    with pytest.raises(ValueError, match="that no such command wrote"):
+    with pytest.raises(ValueError, match="that this command did not write"):
         save(FIELD, place)
     assert (place / "notes.txt").read_text() == "mine"
     save(FIELD, place, overwrite=True)
@@ -197,7 +197,7 @@ def test_what_bears_no_mark_is_nobodys_to_replace(damage: str, tmp_path: Path) -
         text = {"another's": '{"attributes": {"curvafit": 3}}', "torn": '{"attri', "nested": "[" * 100_000}[damage]
         (place / "zarr.json").write_text(text)
     before = tree(tmp_path)
-    with pytest.raises(ValueError, match="that no such command wrote"):
+    with pytest.raises(ValueError, match="that this command did not write"):
         save(FIELD, place)
     assert tree(tmp_path) == before
     shutil.rmtree(place)

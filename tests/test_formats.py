@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import bz2
+import gzip
 import sys
 import tempfile
 from pathlib import Path
@@ -283,3 +285,20 @@ def test_a_missing_library_says_how_to_get_it(tmp_path: Path, monkeypatch, suffi
     (tmp_path / f"scan{suffix}").write_bytes(b"x")
     with pytest.raises(ScanError, match=rf'expected {module} for .*, got none: pip install "curvafit\[io\]"'):
         load(tmp_path / f"scan{suffix}")
+
+
+def test_streams_of_several_parts_are_read_whole(tmp_path: Path) -> None:
+    """As parallel compressors write them; a bit that is flipped in the last part is seen."""
+    values = ramp()
+    halves = np.array_split(np.frombuffer(values.tobytes(), np.uint8), 2)
+    header = f"NRRD0004\ntype: float\ndimension: 3\nsizes: {' '.join(map(str, values.shape[::-1]))}\n"
+    header += "endian: little\nencoding: {}\n\n"
+    for encoding, compress in (("gzip", gzip.compress), ("bzip2", bz2.compress)):
+        path, parts = tmp_path / f"{encoding}.nrrd", [compress(half.tobytes()) for half in halves]
+        path.write_bytes(header.format(encoding).encode() + b"".join(parts))
+        assert np.array_equal(load(path).values, values)
+        flipped = bytearray(path.read_bytes())
+        flipped[-len(parts[1]) // 2] ^= 4
+        path.write_bytes(flipped)
+        with pytest.raises(ScanError, match="cannot be read"):
+            load(path)

@@ -117,7 +117,7 @@ def test_a_program_that_is_ended_leaves_nothing(number: int, word: str, tmp_path
         process.send_signal(number)
         said = process.stderr.read()
     assert process.returncode == 128 + number
-    assert said == f"{word}: nothing was written\n"
+    assert said == f"{word}: nothing is left half-written\n"
     assert list(tmp_path.iterdir()) == []
 
 

@@ -103,10 +103,14 @@ def test_a_record_speaks_for_its_own_files_alone(tmp_path: Path) -> None:
     assert (tmp_path / "a.nii.gz").read_text() == (tmp_path / "a_step00001.tif").read_text() == "mine"
     for _ in range(2):
         made(*quick, "--snapshots", 1, "-o", tmp_path / "b.tif")
+    refused(call("generate", *quick, "-o", tmp_path / "b.stl"), "b.png, a file that this command did not write")
+    (tmp_path / "a.json").write_text('{"format": "curvafit-shape-1", "files": 5}')
+    refused(call("generate", *quick, "-o", tmp_path / "a.tif"), TAKEN)
 
 
 def test_infer_leaves_other_peoples_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("curvafit.report.write_report", lambda found, path: path.write_text("page"))
+    page = '<meta name="generator" content="curvafit 0">'
+    monkeypatch.setattr("curvafit.report.write_report", lambda found, path: path.write_text(page))
     monkeypatch.setattr(importlib.import_module("curvafit.infer"), "infer", lambda *_, **__: made_inference())
     told = ["infer", save(MASK, tmp_path / "scan.npy")]
     for name in FILES:
@@ -120,6 +124,8 @@ def test_infer_leaves_other_peoples_files(tmp_path: Path, monkeypatch: pytest.Mo
         assert call(*told, "-o", folder, "--overwrite").exit_code == 0
         assert call(*told, "-o", folder).exit_code == 0
         assert sorted(tree(folder)) == sorted([*FILES, "thesis.txt"])
+        (folder / "report.html").write_text("mine")  # beside a fit.json that was copied there
+        refused(call(*told, "-o", folder), TAKEN)
         again = ["infer", folder / "regenerated.nii.gz", "-o", folder, "--overwrite"]
         refused(call(*again), "expected an output that writes over no input")
 

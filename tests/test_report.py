@@ -135,10 +135,11 @@ def test_a_failure_leaves_what_was_there(tmp_path: Path, undrawn: None) -> None:
     target.mkdir()
     mine = f'{{"format": "{FORMAT}"}}'
     (target / "fit.json").write_text(mine)
+    (target / "report.html").write_text('<meta name="generator" content="curvafit 0">')
     broken = dataclasses.replace(made_inference(), regenerated=np.full((48, 48, 48), np.nan))
     with pytest.raises(ValueError, match="expected a finite volume"):
         write_inference(broken, target)
-    assert [path.name for path in tmp_path.rglob("*")] == ["out", "fit.json"]
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["fit.json", "out", "report.html"]
     assert (target / "fit.json").read_text() == mine
     with pytest.raises(ValueError, match="expected a folder"):
         write_inference(made_inference(), target / "fit.json")
@@ -146,6 +147,7 @@ def test_a_failure_leaves_what_was_there(tmp_path: Path, undrawn: None) -> None:
 
 def test_a_shape_that_cannot_be_made_leaves_no_older_volume(tmp_path: Path, undrawn: None) -> None:
     (tmp_path / "fit.json").write_text(f'{{"format": "{FORMAT}"}}')
+    (tmp_path / "report.html").write_text('<meta name="generator" content="curvafit 0">')
     (tmp_path / "regenerated.nii.gz").write_text("older")
     nothing = dataclasses.replace(made_inference(lost=True), matched=None, match_diagram=None)
     write_inference(nothing, tmp_path)

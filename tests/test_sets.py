@@ -159,6 +159,35 @@ def test_a_list_that_finds_no_room_gives_up_the_last_case(tmp_path, order, monke
         assert [path.name.partition(".")[0][:10] for path in (folder / part).iterdir()] == ["case_00000"], part
 
 
+def test_cases_of_an_earlier_run_stay_however_full_the_disk(tmp_path, order, monkeypatch):
+    folder = build_set(tmp_path / "set", order, 2)
+
+    def full(folder, order, done):
+        raise OSError(errno.ENOSPC, "No space left on device", str(folder))
+
+    monkeypatch.setattr(sets, "_list", full)
+    for count in (2, 3):
+        with pytest.raises(OSError, match="No space left on device"):
+            build_set(folder, order, count)
+        assert sorted(sums(folder)) == ["case_00000", "case_00001"]
+
+
+def test_a_run_that_is_stopped_leaves_the_case_that_another_completed(tmp_path, order, monkeypatch):
+    folder = build_set(tmp_path / "set", order, 1)
+    monkeypatch.setattr(sets, "save", lambda *_, **__: pytest.fail("made again"))
+    make_cases(folder, [0])
+    (folder / "cases" / "case_00000.json").rename(tmp_path / "record")
+
+    def stopped(field, path):
+        (tmp_path / "record").rename(folder / "cases" / "case_00000.json")  # the other is first
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sets, "save", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        make_cases(folder, [0])
+    assert len(sums(folder)) == 1 and (folder / "imagesTr" / "case_00000_0000.nii.gz").exists()
+
+
 def test_labels_besides_the_mask(tmp_path, order):
     asked = Order(order.recipe, parts=("distance", "instances", "kappa1", "betti", "centreline"))
     folder = build_set(tmp_path / "set", asked, 1)

@@ -101,7 +101,8 @@ def build_set(
 
 
 def _filled(folder: Path, order: Order, count: int, progress: Progress | None, workers: Workers) -> Path:
-    done = set(cases_of(folder))
+    before = set(cases_of(folder))
+    done = set(before)
     todo = iter([index for index in range(count) if index not in done])
     asked, listed = 0, -LISTED_EVERY
     try:
@@ -119,7 +120,7 @@ def _filled(folder: Path, order: Order, count: int, progress: Progress | None, w
                 _list(folder, order, done)
                 listed = time.monotonic()
     finally:
-        _list_what_is_there(folder, order)
+        _list_what_is_there(folder, order, before)
 
 
 def make_cases(folder: str | Path, indices: Sequence[int]) -> list[int]:
@@ -215,16 +216,21 @@ def _list(folder: Path, order: Order, done: set[int]) -> None:
     _write_json(folder / LIST, LAYOUTS[order.layout].listing(cases, about))
 
 
-def _list_what_is_there(folder: Path, order: Order) -> None:
-    """Write the list; where the disk is too full for it, without the last cases, which make room."""
-    done = cases_of(folder)
+def _list_what_is_there(folder: Path, order: Order, before: set[int]) -> None:
+    """Write the list; where the disk is too full for it, without the last cases, which make room.
+
+    Cases that were there before this run stay.
+    """
+    done = set(cases_of(folder))
     while True:
         try:
-            return _list(folder, order, set(done))
+            return _list(folder, order, done)
         except OSError as error:
-            if error.errno not in (errno.ENOSPC, errno.EDQUOT) or not done:
+            if error.errno not in (errno.ENOSPC, errno.EDQUOT) or done <= before:
                 raise
-            _remove_case(folder, order, case_name(done.pop()))
+            last = max(done - before)
+            _remove_case(folder, order, case_name(last))
+            done.remove(last)
 
 
 def _remove_case(folder: Path, order: Order, name: str) -> None:
@@ -239,11 +245,13 @@ def _remove_case(folder: Path, order: Order, name: str) -> None:
 
 
 def _write_case(folder: Path, order: Order, index: int, case: Case) -> None:
-    """Labels, image, record, in this order; all or none."""
+    """Labels, image, record, in this order; all or none. With its record a case is complete, whoever made it."""
     layout, name = LAYOUTS[order.layout], case_name(index)
     record = folder / RECORDS / f"{name}.json"
     places = [folder / layout.label.format(case=name), folder / layout.image.format(case=name)]
     parts = folder / layout.part
+    if record.exists():
+        return
     try:
         known = _write_parts(order, case, lambda part: Path(str(parts).format(part=part, case=name)), places)
         mask = case.mask.astype(np.uint8)
@@ -253,7 +261,7 @@ def _write_case(folder: Path, order: Order, index: int, case: Case) -> None:
         _write_json(record, case.record | known | {"sha256": sums, "versions": versions()})
     except BaseException:
         with undisturbed():
-            for place in (record, *places):
+            for place in () if record.exists() else places:
                 remove(place)
         raise
 

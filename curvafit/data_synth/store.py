@@ -226,12 +226,17 @@ def _settings(path: Path, attributes: dict[str, Any]) -> Settings:
 
 
 def _create(path: Path, settings: Settings) -> None:
-    with staged(path) as partial:
+    there = path.is_dir()  # an empty folder, which may be another disk's
+    with staged(path / "store" if there else path) as partial:
         header = {"format": FORMAT, "version": VERSION, "settings": dataclasses.asdict(settings), "wanted": 0}
         with undisturbed():
             zarr.create_group(store=str(partial / "store"), attributes=header)
             zarr.create_group(store=str(partial / "store" / "draws"))
-        _publish(partial / "store", path)
+        if there:
+            for part in ("draws", "zarr.json"):
+                os.replace(partial / "store" / part, path / part)
+        else:
+            _publish(partial / "store", path)
 
 
 @undisturbed()  # Zarr writes in threads of its own, which would go on beside what cleans up

@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 
 from curvafit.formats.base import Damaged, Raw, ScanError, pick_key, stated
-from curvafit.formats.streams import check_memory, check_regular, read_numbers
+from curvafit.formats.streams import check_array, check_regular, read_numbers
 from curvafit.priors.bounds import quoted
 
 #: Attributes that may state a spacing or its unit.
@@ -87,7 +87,7 @@ def read_hdf5(path: Path, *, key: str | None = None, **_: object) -> Raw:
             raise ScanError(f"expected values in the file itself, got {path} whose values lie in other files")
         if dataset.shape is None:
             raise ScanError(f"expected a 3D volume, got no values in {path}")
-        check_memory(dataset.shape, dataset.dtype, path)
+        check_array(dataset.shape, dataset.dtype, path)
         attributes = {name: dataset.attrs[name] for name in _ATTRIBUTES if name in dataset.attrs}
         spacing, unit = stated(attributes, dataset.ndim)
         gaps = tuple(_gaps(dataset, path))

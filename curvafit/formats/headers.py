@@ -10,7 +10,7 @@ from typing import IO, Any
 import numpy as np
 
 from curvafit.formats.base import Damaged, ScanError
-from curvafit.formats.streams import check_memory, check_regular, decompressed, read_numbers, skip
+from curvafit.formats.streams import check_array, check_regular, decompressed, read_numbers, skip
 
 #: NRRD's names of types -> numpy's. `signed` and `_t` are taken off first.
 _NRRD_TYPES = {
@@ -59,7 +59,7 @@ def nrrd_values(nrrd: Any, header: dict[str, Any], file: IO[bytes], path: Path) 
     if header["dimension"] != len(header["sizes"]):
         raise Damaged(f"{len(header['sizes'])} sizes for {header['dimension']} axes")
     shape, dtype = [int(n) for n in header["sizes"]][::-1], _nrrd_type(header)
-    check_memory(shape, dtype, path)
+    check_array(shape, dtype, path)
     named = header.get("data file", header.get("datafile"))
     if named is None:
         return _nrrd_body(nrrd, header, file, path, (shape, dtype))
@@ -151,7 +151,7 @@ def _meta_values(header: dict[str, str], file: IO[bytes], path: Path) -> np.ndar
     order = header.get("BinaryDataByteOrderMSB", header.get("ElementByteOrderMSB", "False"))
     dtype = np.dtype(_META_TYPES[kind]).newbyteorder(">" if _meta_truth(order) else "<")
     shape = [*shape[::-1], *([channels] if channels != 1 else [])]
-    check_memory(shape, dtype, path)
+    check_array(shape, dtype, path)
     if not _meta_truth(header.get("BinaryData", "True")):
         return None
     packed, skipped = _meta_truth(header.get("CompressedData", "False")), int(header.get("HeaderSize", 0))

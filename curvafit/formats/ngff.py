@@ -14,7 +14,7 @@ import zarr
 from curvafit.files import MARK, is_empty
 from curvafit.formats.base import Raw, pick_key, stated
 from curvafit.formats.chunks import check_store, missing_chunks
-from curvafit.formats.streams import check_memory
+from curvafit.formats.streams import check_array
 from curvafit.interrupts import undisturbed
 
 #: Edge of a chunk, and of the largest volume that is not halved any more, in voxels.
@@ -44,7 +44,7 @@ def read_zarr(path: Path, *, key: str | None = None, **_: object) -> Raw:
 
 def _raw(array: Any, folder: Path, place: tuple[tuple[Any, ...] | None, Any]) -> Raw:
     """The values of an array in a folder, with what of them is not stored."""
-    check_memory(array.shape, array.dtype, folder)
+    check_array(array.shape, array.dtype, folder)
     gaps = missing_chunks(array, folder)
     return Raw(np.asarray(array[...]), *place, gaps=gaps)
 

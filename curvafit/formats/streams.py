@@ -35,7 +35,7 @@ def read_numbers(stream: Any, shape: Sequence[int], dtype: np.dtype, place: obje
     Damaged, OSError, EOFError, zlib.error, zipfile.BadZipFile
         If the stream is shorter, longer or damaged.
     """
-    check_memory(shape, dtype, place)
+    check_array(shape, dtype, place)
     values = np.empty(math.prod(shape), dtype)
     room, done = values.view(np.uint8).data if values.nbytes else memoryview(b""), 0
     while done < values.nbytes and (count := stream.readinto(room[done : done + _PIECE])):
@@ -46,7 +46,7 @@ def read_numbers(stream: Any, shape: Sequence[int], dtype: np.dtype, place: obje
     return values.reshape(tuple(shape))
 
 
-def check_memory(shape: Sequence[int], dtype: np.dtype, place: object) -> None:
+def check_array(shape: Sequence[int], dtype: np.dtype, place: object) -> None:
     """Refuse an array of a header before there is room made for it.
 
     Raises
@@ -94,17 +94,17 @@ def skip(stream: Any, count: int) -> None:
 
 def decompressed(stream: IO[bytes], encoding: str) -> Any:
     """The bytes of the rest of a stream in `"gzip"`, `"bzip2"`, `"zlib"` or `"raw"`."""
-    if encoding == "gzip":
-        return gzip.GzipFile(fileobj=stream)
-    kinds: dict[str, Any] = {"bzip2": bz2.BZ2Decompressor, "zlib": zlib.decompressobj}
-    return io.BufferedReader(_Inflated(stream, kinds[encoding]())) if encoding in kinds else stream
+    if encoding == "zlib":
+        return io.BufferedReader(_Inflated(stream))
+    several: dict[str, Any] = {"gzip": lambda: gzip.GzipFile(fileobj=stream), "bzip2": lambda: bz2.BZ2File(stream)}
+    return several[encoding]() if encoding in several else stream
 
 
 class _Inflated(io.RawIOBase):
-    """The bytes of one compressed stream; at its end its checksum counts, and nothing may follow."""
+    """The bytes of one zlib stream; at its end its checksum counts, and nothing may follow."""
 
-    def __init__(self, stream: IO[bytes], inflate: Any) -> None:
-        self._stream, self._inflate = stream, inflate
+    def __init__(self, stream: IO[bytes]) -> None:
+        self._stream, self._inflate = stream, zlib.decompressobj()
 
     def readable(self) -> bool:
         return True
@@ -119,10 +119,8 @@ class _Inflated(io.RawIOBase):
         return 0
 
     def _given(self) -> bytes:
-        """What is to be decompressed next: nothing where the decompressor still has some."""
-        if not getattr(self._inflate, "needs_input", True):
-            return b""
-        given = getattr(self._inflate, "unconsumed_tail", b"") or self._stream.read(1 << 16)
+        """What is to be decompressed next."""
+        given = self._inflate.unconsumed_tail or self._stream.read(1 << 16)
         if not given:
             raise Damaged("the compressed stream ends too early")
         return given

@@ -13,7 +13,7 @@ import numpy as np
 import tifffile
 
 from curvafit.formats.base import Damaged, Raw, ScanError, complaints, convert_length, normalise_unit
-from curvafit.formats.streams import check_memory, check_regular
+from curvafit.formats.streams import check_array, check_regular
 
 #: Suffixes of a folder's slices.
 SLICES = (".tif", ".tiff")
@@ -43,7 +43,7 @@ def read_tiff(path: Path, **_: object) -> Raw:
         series = file.series[0]
         if "S" in series.axes:
             raise ScanError(f"expected a grey volume, got a colour image (axes {series.axes}) in {path}")
-        check_memory(series.shape, series.dtype or np.dtype("V1"), path)
+        check_array(series.shape, series.dtype or np.dtype("V1"), path)
         _check_pages(file, series)
         values = np.asarray(series.asarray())
         spacing, unit, guesses = _spacing(file)
@@ -98,8 +98,9 @@ def _check_pages(file: tifffile.TiffFile, series: tifffile.TiffPageSeries) -> No
     for number, page in enumerate(series.pages):
         if page is None:
             raise Damaged(f"page {number} is not there")
+        size = page.parent.filehandle.size  # a series may have its pages in several files
         places = list(zip(page.dataoffsets, page.databytecounts, strict=False))
-        whole = all(start > 0 and count > 0 and start + count <= file.filehandle.size for start, count in places)
+        whole = all(start > 0 and count > 0 and start + count <= size for start, count in places)
         if not whole or len(places) < (1 if page.is_contiguous else math.prod(page.chunked)):
             raise Damaged(f"strips or tiles of page {number} are not there")
 

@@ -7,7 +7,7 @@ import hashlib
 import io
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,8 @@ class Checkpoint:
     Parameters
     ----------
     path
-        Where; a link stays, and leads there. Its folder is made; beside it stands `path.lock` while a run holds it.
+        Where; a link stays, and leads there. Its folder is made; beside it stands `.NAME.curvafit-lock` while a run
+        holds it.
     every
         Seconds between two saves, at least; 0 saves after every step.
     run
@@ -60,7 +61,7 @@ class Checkpoint:
             If another run holds it.
         """
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        place = self.path.with_name(self.path.name + ".lock")
+        place = self.path.with_name(f".{self.path.name}.curvafit-lock")
         lock = FileLock(place)
         try:
             lock.acquire(timeout=0)
@@ -74,7 +75,8 @@ class Checkpoint:
             yield
         finally:
             with undisturbed():
-                place.unlink(missing_ok=True)  # while it is held: whoever waits for it sees that it has gone
+                with suppress(PermissionError):  # Windows deletes no file that is open
+                    place.unlink(missing_ok=True)  # while it is held: whoever waits for it sees that it has gone
                 lock.release()
 
     def load(self) -> dict[str, Any] | None:

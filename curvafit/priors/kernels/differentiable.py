@@ -34,7 +34,13 @@ def energies(
         A grid with mirrors; ε in its spacing's unit.
     mask
         Gets no gradient.
+
+    Raises
+    ------
+    ValueError
+        If the mask asks for a gradient.
     """
+    _check_mask(mask)
     if u.dtype != torch.float32 or not kernels.fused(u.device):
         return energy(u, coefficients, grid, epsilon, mask=mask)
     return _first_derivatives(u, mask, [float(value) for value in coefficients], grid, epsilon)
@@ -44,10 +50,16 @@ def areas(
     u: Float[Tensor, "batch z y x"], grid: Grid, epsilon: float, mask: Float[Tensor, "#batch z y x"]
 ) -> Float[Tensor, " batch"]:
     """∫ ε|∇u|², about σ × area, of every field, likewise: the term of F_ε that a00 multiplies."""
+    _check_mask(mask)
     if u.dtype != torch.float32 or not kernels.fused(u.device):
         slope2 = gradient(u, grid).square().sum(-4)
         return epsilon * (slope2 * mask.to(u)).sum((-3, -2, -1)) * grid.voxel_volume
     return _first_derivatives(u, mask, [0.0] * 5 + [1.0], grid, epsilon)
+
+
+def _check_mask(mask: Tensor) -> None:
+    if mask.requires_grad:
+        raise ValueError("expected a mask that asks for no gradient, got one that does: detach it")
 
 
 def _first_derivatives(u: Tensor, mask: Tensor, a: list[float], grid: Grid, epsilon: float) -> Tensor:
