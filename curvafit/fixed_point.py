@@ -82,12 +82,18 @@ def fixed_point(
     Raises
     ------
     ValueError
-        If there is no start, or the field is not finite.
+        If there is no start, or the field is not finite or too small to have an inside apart from its borders.
     """
     if not starts:
         raise ValueError("expected at least one start for the fixed-point fit, got none")
     if not bool(torch.isfinite(phase).all()):
         raise ValueError("expected a finite phase field, got NaN or infinity in it")
+    if not grid.periodic and min(grid.shape) <= 2 * HALO + STRIDE:
+        told = " x ".join(map(str, grid.shape))
+        raise ValueError(
+            f"expected a structure that spans more than {2 * HALO + STRIDE} working voxels along each axis, got {told}: "
+            "the scan is too small to refine parameters on"
+        )
     flow = ShortFlow(phase, grid, epsilon, starts[0])
     total = (1 + len(_SIZES)) * (len(starts) * (FIRST_STEPS + 1) + LAST_STEPS)
     flow.after = lambda count: progress("flowing from the scan", min(1.0, count / total)) if progress else None

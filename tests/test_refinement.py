@@ -145,3 +145,10 @@ def test_a_fit_in_float64_leaves_jax_as_it_is() -> None:
         assert bowl.precisions == {before}
         assert np.array_equal(bowl.asked[0], np.full(5, start))
         np.testing.assert_allclose(end.free, 0.3, rtol=0, atol=1e-4)
+
+
+def test_a_crop_without_an_inside_is_one_sentence() -> None:
+    """All of it would be the halo that is held."""
+    start = [preset("tubes").coefficients]
+    with pytest.raises(ValueError, match="expected a structure that spans more than 18 working voxels along each axis"):
+        fixed_point(torch.ones((16, 24, 24)), Grid((16, 24, 24), boundary="replicate"), WORKING_EPSILON, starts=start)
