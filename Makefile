@@ -19,10 +19,10 @@ demo: .venv/installed
 	&& $(BIN)/curvafit infer "$$scan" -o demo_out
 
 test: .venv/installed-dev
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist worksteal -m "not long"
+	OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(BIN)/python -m pytest -q -n 2 --dist worksteal -m "not long"
 
 test-long: .venv/installed-dev
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist worksteal -m long
+	OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(BIN)/python -m pytest -q -n 2 --dist worksteal -m long
 
 test-hostile: .venv/installed-dev
 	$(BIN)/python -m tests.hostile

@@ -91,8 +91,8 @@ def fixed_point(
     if not grid.periodic and min(grid.shape) <= 2 * HALO + STRIDE:
         told = " x ".join(map(str, grid.shape))
         raise ValueError(
-            f"expected a structure that spans more than {2 * HALO + STRIDE} working voxels along each axis, got {told}: "
-            "the scan is too small to refine parameters on"
+            f"expected a structure that spans more than {2 * HALO + STRIDE} working voxels along each axis, got "
+            f"{told}: the scan is too small to refine parameters on"
         )
     flow = ShortFlow(phase, grid, epsilon, starts[0])
     total = (1 + len(_SIZES)) * (len(starts) * (FIRST_STEPS + 1) + LAST_STEPS)
