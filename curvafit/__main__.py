@@ -1,10 +1,14 @@
 """The program: `curvafit`, or `python -m curvafit`. It listens to signals before anything that takes long is loaded."""
 
+import warnings
+
 from curvafit.interrupts import exit_code, listen
 
 
 def main() -> None:
     """The entry point."""
+    # What Zarr was about to read where a signal came: nothing that a user could do anything about.
+    warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)
     try:
         listen()
         from curvafit.cli import main as run
