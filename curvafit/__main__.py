@@ -2,7 +2,7 @@
 
 import warnings
 
-from curvafit.interrupts import exit_code, listen
+from curvafit.interrupts import exit_code, leave, listen
 
 
 def main() -> None:
@@ -16,6 +16,8 @@ def main() -> None:
         run()
     except KeyboardInterrupt as signal:
         raise SystemExit(exit_code(signal)) from None
+    finally:
+        leave()
 
 
 if __name__ == "__main__":

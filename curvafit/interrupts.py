@@ -43,6 +43,13 @@ def listen() -> None:
             signal.signal(number, _arrive)
 
 
+def leave() -> None:
+    """Ignore these signals: the program's work is done, and it is at its exit."""
+    for name in ("SIGINT", *_ENDS):
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.SIG_IGN)
+
+
 @contextmanager
 def undisturbed() -> Iterator[None]:
     """Hold signals back that `listen` listens to, until the block is done: for changes that are all or nothing."""
