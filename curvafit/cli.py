@@ -120,9 +120,6 @@ def infer(
 
 def _inferred(scan: str, out: Path, options: dict[str, Any], overwrite: bool) -> tuple[Inference, Path]:
     """The inference and the path of its report, with progress."""
-    from curvafit.files import check_folder
-
-    check_folder(out)
     with stages() as progress:
         from curvafit.infer import infer as find
         from curvafit.report import check_report, with_command, write_inference

@@ -176,9 +176,6 @@ def map_atlas(
 ) -> None:
     """Lay a store's shapes out on a map: a picture, and a page to explore them in and to place scans on."""
     with plainly():
-        from curvafit.files import check_folder
-
-        check_folder(out)
         with kept(), stages() as progress:
             from curvafit.atlas_files import check_map, write_map
 

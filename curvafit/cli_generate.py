@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -29,7 +28,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from curvafit.generation.flow import Flow
-    from curvafit.generation.schedule import Schedule
     from curvafit.priors.coefficients import Coefficients
     from curvafit.shape_files import Output
 
@@ -116,12 +114,15 @@ def generate(
         how = _output(law, spacing, unit, tile, cap, boundary)
         saving = _checkpoint(checkpoint, checkpoint_every)
         options: dict[str, Any] = {"seed": seed, **saving}
-        options["schedule"] = plan = _plan(schedule, steps)
+        from curvafit.generation.schedule import schedule as named
+        from curvafit.shape_files import check_target
+
+        options["schedule"] = plan = named(schedule, steps)
         options["snapshots"] = () if snapshots is None else (*map(plan.among, whole_numbers(snapshots, "--snapshots")),)
         options["orientation"] = Q = None if orientation is None else _orientation(orientation)
         read = [str(each) for each in (prior, maps) if each is not None]
         _check(out, saving["checkpoint"], cap)
-        _check_target(out, how, options["snapshots"], read, overwrite)
+        check_target(out, how, steps=options["snapshots"], inputs=read, overwrite=overwrite)
         flow = _grown(law, boundary, {**options, "device": device_of(device)})
         told = {"orientation": Q if Q is None else Q.tolist(), "maps": maps if maps is None else str(maps)}
         _write(flow, law, out, how, {**told, "overwrite": overwrite})
@@ -243,13 +244,6 @@ def _orientation(text: str) -> Tensor:
     return orientation(direction, strength)
 
 
-def _check_target(out: Path, how: Output, steps: Sequence[int], read: Sequence[str], overwrite: bool) -> None:
-    """Refuse places that cannot be written to, before the work."""
-    from curvafit.shape_files import check_target
-
-    check_target(out, how, steps=steps, inputs=read, overwrite=overwrite)
-
-
 def _check(out: Path, checkpoint: Path | None, cap: bool | None) -> None:
     """Refuse a checkpoint that has no place of its own, and what only a surface has where none is written."""
     from curvafit.files import check_folder
@@ -264,12 +258,6 @@ def _check(out: Path, checkpoint: Path | None, cap: bool | None) -> None:
         taken = (out, beside(out, ".json"), beside(out, ".png"))
         if checkpoint in [path.resolve() for path in taken]:
             raise ValueError(f"expected a file of its own for the checkpoint, got {checkpoint}")
-
-
-def _plan(schedule: str, steps: int | None) -> Schedule:
-    from curvafit.generation.schedule import schedule as named
-
-    return named(schedule, steps)
 
 
 def _grown(law: _Law, boundary: str, options: dict[str, Any]) -> Flow:
