@@ -21,8 +21,8 @@ from scipy.ndimage import gaussian_filter
 from curvafit.atlas_map import NOISE, AtlasMap
 from curvafit.atlas_page import page_html
 from curvafit.atlas_shapes import shown
-from curvafit.diagram import Diagram
-from curvafit.family import FAMILIES
+from curvafit.geometry.diagram import Diagram
+from curvafit.geometry.family import FAMILIES
 from curvafit.index import Atlas
 
 BINS, TEXTURES, EDGE = 300, 20, 64

@@ -33,11 +33,11 @@ from skimage.segmentation import random_walker
 
 from curvafit.evidence import interpolated_distance
 from curvafit.files import write_atomically, write_content
+from curvafit.geometry.topology import betti_numbers
 from curvafit.infer import infer
 from curvafit.priors.coefficients import Coefficients
-from curvafit.scan import Field
 from curvafit.segment import reconstruct, segment
-from curvafit.topology import betti_numbers
+from curvafit.volumes.scan import Field
 
 EDGE, SPACING = 96, 0.0195
 KEPT = (4, 8, 12)

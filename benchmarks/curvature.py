@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from curvafit.diagram import diagram, surface_curvatures
+from curvafit.geometry.diagram import diagram, surface_curvatures
+from curvafit.geometry.transport import wasserstein
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import phase_field
-from curvafit.transport import wasserstein
 from tests.exact import Cylinder, Shape, Sphere, Torus, centres, profile
 
 #: Shapes with the octant's size, in ε; the rest is mirror image.

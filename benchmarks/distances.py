@@ -27,14 +27,14 @@ from rich.progress import track
 
 from curvafit.data_synth.atlas import build
 from curvafit.data_synth.store import open_store
-from curvafit.diagram import Diagram, diagram
 from curvafit.generation.viability import well_formed
+from curvafit.geometry.diagram import Diagram, diagram
+from curvafit.geometry.pairwise import one_to_many, pairwise
+from curvafit.geometry.transport import comparable, wasserstein
 from curvafit.index import VIEWS, Atlas, load_atlas
 from curvafit.match import nearest
-from curvafit.pairwise import one_to_many, pairwise
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import phase_field
-from curvafit.transport import comparable, wasserstein
 
 #: Diagrams and rounds of the timing, and the pairs of them that geomloss takes.
 TIMED, ROUNDS, SLOW = 64, 5, 8

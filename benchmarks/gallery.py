@@ -17,11 +17,11 @@ import nibabel
 import numpy as np
 import torch
 
-from curvafit.diagram import Diagram, diagram
 from curvafit.generation.flow import generate
+from curvafit.geometry.diagram import Diagram, diagram
+from curvafit.geometry.transport import wasserstein
 from curvafit.priors.coefficients import preset
 from curvafit.priors.grid import WORKING_EPSILON, Grid
-from curvafit.transport import wasserstein
 
 #: Gallery files that were saved unquantised; the others were floored to 1/100.
 UNQUANTISED = ("bilayers", "sponge", "tubes")

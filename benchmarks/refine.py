@@ -20,8 +20,8 @@ import numpy as np
 import torch
 
 from benchmarks.gallery import author_volume
-from curvafit.diagram import diagram
 from curvafit.fixed_point import ShortFlow, _parameters, fixed_point
+from curvafit.geometry.diagram import diagram
 from curvafit.index import load_atlas
 from curvafit.match import nearest
 from curvafit.priors.coefficients import NAMES, Coefficients, preset

@@ -37,9 +37,9 @@ from curvafit.data_synth.estimate import bright, like
 from curvafit.data_synth.modality import Modality, field_shape, visible_share
 from curvafit.data_synth.moves import SYMMETRIES, cropped, turned
 from curvafit.files import write_content
+from curvafit.geometry.morphometry import local_thickness
 from curvafit.infer import infer
-from curvafit.morphometry import local_thickness
-from curvafit.scan import Field
+from curvafit.volumes.scan import Field
 
 SLICES = "three slices"
 #: The least part of its own size that a shape is shown at: less would not fill a patch.

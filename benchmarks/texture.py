@@ -27,13 +27,13 @@ import numpy as np
 from rich.progress import Progress
 
 from benchmarks.step import plain_stepper
-from curvafit.diagram import Diagram, diagram
 from curvafit.files import write_atomically
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import SCHEDULES
+from curvafit.geometry.diagram import Diagram, diagram
+from curvafit.geometry.transport import wasserstein
 from curvafit.priors.coefficients import preset
 from curvafit.priors.grid import WORKING_EPSILON, Grid
-from curvafit.transport import wasserstein
 
 #: Tubes of three kinds, layers, spheres of two kinds, sponges of two kinds, trabeculae, metatubes, the paper's flow.
 PRESETS = (

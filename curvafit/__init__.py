@@ -10,15 +10,15 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from curvafit.diagram import Diagram, diagram
     from curvafit.generation.batch import generate_batch
     from curvafit.generation.flow import descend, generate
+    from curvafit.geometry.diagram import Diagram, diagram
+    from curvafit.geometry.transport import wasserstein
     from curvafit.infer import infer
     from curvafit.priors.coefficients import Coefficients, preset
     from curvafit.priors.grid import Grid
-    from curvafit.scan import Field, load, save
     from curvafit.segment import reconstruct, segment
-    from curvafit.transport import wasserstein
+    from curvafit.volumes.scan import Field, load, save
 
     __version__: str
 
@@ -43,20 +43,20 @@ __all__ = [
 
 _SOURCES = {
     "Coefficients": "curvafit.priors.coefficients",
-    "Diagram": "curvafit.diagram",
-    "Field": "curvafit.scan",
+    "Diagram": "curvafit.geometry.diagram",
+    "Field": "curvafit.volumes.scan",
     "Grid": "curvafit.priors.grid",
     "descend": "curvafit.generation.flow",
-    "diagram": "curvafit.diagram",
+    "diagram": "curvafit.geometry.diagram",
     "generate": "curvafit.generation.flow",
     "generate_batch": "curvafit.generation.batch",
     "infer": "curvafit.infer",
-    "load": "curvafit.scan",
+    "load": "curvafit.volumes.scan",
     "preset": "curvafit.priors.coefficients",
     "reconstruct": "curvafit.segment",
-    "save": "curvafit.scan",
+    "save": "curvafit.volumes.scan",
     "segment": "curvafit.segment",
-    "wasserstein": "curvafit.transport",
+    "wasserstein": "curvafit.geometry.transport",
 }
 
 

@@ -21,11 +21,11 @@ from curvafit.atlas_shapes import Shown, regrow_command, shown
 from curvafit.data_synth.census import census
 from curvafit.data_synth.record import Record
 from curvafit.data_synth.store import Store, open_store
-from curvafit.diagram import Diagram
 from curvafit.files import bears, check_folder, check_free, is_empty, write_content
-from curvafit.formats import read_archive
 from curvafit.generation.viability import well_formed
+from curvafit.geometry.diagram import Diagram
 from curvafit.index import Atlas, Measured, extract, measured, shape_id
+from curvafit.volumes.formats import read_archive
 
 #: Folder beside the two files for what took long: measured shapes, distances, places.
 CACHE = "cache"

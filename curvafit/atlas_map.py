@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from curvafit.data_synth.atlas import BIN_WIDTH
-from curvafit.diagram import Diagram
-from curvafit.family import FAMILIES, family_of, family_shares, half_thickness, leading_family
+from curvafit.geometry.diagram import Diagram
+from curvafit.geometry.family import FAMILIES, family_of, family_shares, half_thickness, leading_family
 from curvafit.index import Atlas
 
 #: The paper's settings (Experiment 4): of UMAP, of HDBSCAN on the embedded points, of the distances.
@@ -104,7 +104,7 @@ def diagram_distances(
 ) -> np.ndarray:
     """Wasserstein distances of all pairs `(N, N)`, with the paper's settings: `pairwise`, with its progress and its
     checkpoint `saved`."""
-    from curvafit.pairwise import pairwise
+    from curvafit.geometry.pairwise import pairwise
 
     return pairwise(diagrams, **DISTANCE, device=device, progress=progress, checkpoint=saved)
 

@@ -22,8 +22,8 @@ from scipy.spatial.distance import cdist
 from curvafit.atlas_map import NOISE, AtlasMap
 from curvafit.atlas_picture import CLUSTER_COLOURS, FAMILY_COLOURS
 from curvafit.atlas_shapes import CUT, LEVELS, Shown, small_shape
-from curvafit.diagram import Diagram
-from curvafit.family import FAMILIES
+from curvafit.geometry.diagram import Diagram
+from curvafit.geometry.family import FAMILIES
 from curvafit.index import VIEWS
 from curvafit.plot import DENSITY, shared_limits
 from curvafit.priors.coefficients import NAMES

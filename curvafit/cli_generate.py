@@ -166,9 +166,9 @@ def _law(
 ) -> _Law:
     """One source of coefficients, one of the mass; maps take the place of single ones."""
     box = None if shape is None else whole_triple(shape, "--shape")
-    from curvafit.parameter_maps import map_shape, read_maps
     from curvafit.priors.coefficients import NAMES, Coefficients
     from curvafit.priors.grid import WORKING_EPSILON
+    from curvafit.volumes.parameter_maps import map_shape, read_maps
 
     drawn = {} if maps is None else read_maps(maps, box)
     for option, value, name in (("--mass", mass, "mass"), ("--epsilon", epsilon, "epsilon")):
@@ -247,7 +247,7 @@ def _orientation(text: str) -> Tensor:
 def _check(out: Path, checkpoint: Path | None, cap: bool | None) -> None:
     """Refuse a checkpoint that has no place of its own, and what only a surface has where none is written."""
     from curvafit.files import check_folder
-    from curvafit.mesh_files import SUFFIXES
+    from curvafit.geometry.mesh_files import SUFFIXES
     from curvafit.shape_files import beside
 
     if cap is not None and not out.name.lower().endswith(SUFFIXES):

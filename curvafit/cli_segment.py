@@ -22,8 +22,8 @@ from curvafit.cli_support import (
 )
 
 if TYPE_CHECKING:
-    from curvafit.scan import Field
     from curvafit.segment import Segmentation
+    from curvafit.volumes.scan import Field
 
 SEGMENT_EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
     (
@@ -94,8 +94,8 @@ def segment(
             raise ValueError(f"expected neither --threshold nor --dark with --probability, got {given}")
 
         def made(volume: Field, progress: Callable[[str, float], None]) -> Segmentation:
-            from curvafit.scan import load
             from curvafit.segment import segment as find
+            from curvafit.volumes.scan import load
 
             likely = (
                 None if probability is None else load(probability, spacing=reading["spacing"], unit=unit, strict=strict)
@@ -156,7 +156,7 @@ def _run(
 ) -> None:
     """Refuse, read, compute, write, say."""
     from curvafit.mask_files import check_mask_target, write_mask
-    from curvafit.scan import load
+    from curvafit.volumes.scan import load
     from curvafit.working import find_law
 
     law = prior if prior.endswith(".json") else None  # or a preset's name

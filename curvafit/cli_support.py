@@ -171,7 +171,7 @@ def reading_of(
 ) -> dict[str, Any]:
     """The options that say how to read a file, as `scan.load` takes them."""
     if unit is not None:
-        from curvafit.formats import normalise_unit
+        from curvafit.volumes.formats import normalise_unit
 
         normalise_unit(unit)
     return {

@@ -195,7 +195,7 @@ def _modality(
             raise ValueError(f"expected --like beside {f'--{lone[0]}' if lone else '--like-mask'}, got none")
         return _visible(_named(str(name)), visible)
     from curvafit.data_synth import estimate
-    from curvafit.scan import load
+    from curvafit.volumes.scan import load
 
     scan = load(like, **reading)
     say_notes(scan.notes)
@@ -233,6 +233,6 @@ def _visible(seen: Modality, told: str | None) -> Modality:
 
 def _edge(edge: float | None, unit: str | None, seen: Modality) -> float:
     """The edge of a shape's voxel in the images' unit."""
-    from curvafit.formats.base import convert_length
+    from curvafit.volumes.formats.base import convert_length
 
     return seen.voxel if edge is None else convert_length(edge, unit, seen.base.unit)

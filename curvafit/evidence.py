@@ -13,7 +13,7 @@ from scipy.interpolate import CubicSpline
 from skimage.filters import threshold_otsu
 
 from curvafit.priors.grid import METRES
-from curvafit.scan import Field, ScanError
+from curvafit.volumes.scan import Field, ScanError
 
 __all__ = ["Evidence", "interpolated_distance", "of_intensities", "of_probability"]
 

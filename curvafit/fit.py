@@ -8,9 +8,9 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
-from curvafit.diagram import Diagram
+from curvafit.geometry.diagram import Diagram
+from curvafit.geometry.morphometry import Morphometry
 from curvafit.match import Match
-from curvafit.morphometry import Morphometry
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.fit_schema import FORMAT, violation
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING

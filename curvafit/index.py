@@ -20,15 +20,15 @@ from curvafit.data_synth.atlas import BIN_WIDTH, diagrams
 from curvafit.data_synth.design import boxed
 from curvafit.data_synth.draws import versions
 from curvafit.data_synth.store import Record, Store, open_store
-from curvafit.diagram import Diagram
 from curvafit.files import write_content
-from curvafit.formats import read_archive
 from curvafit.generation.viability import FORMED, well_formed
+from curvafit.geometry.diagram import Diagram
+from curvafit.geometry.transport import TAIL_SHARE, sliced_embedding
 from curvafit.priors.bounds import quoted
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
 from curvafit.priors.json_text import parse_json
-from curvafit.transport import TAIL_SHARE, sliced_embedding
+from curvafit.volumes.formats import read_archive
 
 FORMAT = "curvafit atlas"
 VERSION = 1

@@ -15,14 +15,15 @@ import numpy as np
 import torch
 
 from curvafit.data_synth.atlas import BIN_WIDTH
-from curvafit.diagram import Diagram, diagram
-from curvafit.family import family_of
 from curvafit.fit import Fit
 from curvafit.generation.flow import Flow, generate
+from curvafit.geometry.diagram import Diagram, diagram
+from curvafit.geometry.family import family_of
+from curvafit.geometry.morphometry import morphometry
+from curvafit.geometry.transport import TAIL_SHARE, wasserstein
 from curvafit.index import Atlas, load_atlas
 from curvafit.match import Match, nearest
 from curvafit.measure import scan_diagram
-from curvafit.morphometry import morphometry
 from curvafit.phases import check_options
 from curvafit.prepare import Prepared, prepare
 from curvafit.priors.bounds import SEEDS, instance, whole
@@ -31,8 +32,7 @@ from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.profile import phase_field
 from curvafit.refine import refine
 from curvafit.refinement import Refinement
-from curvafit.scan import Field, load
-from curvafit.transport import TAIL_SHARE, wasserstein
+from curvafit.volumes.scan import Field, load
 
 #: Longest edge, in working voxels, of the boxes in which shapes are regenerated for comparison.
 REGENERATED_EDGE = 100
@@ -84,7 +84,7 @@ def infer(
     Parameters
     ----------
     scan
-        A volume file (see `curvafit.scan.load`, which takes the remaining keywords: spacing, unit, key, raw_shape,
+        A volume file (see `curvafit.load`, which takes the remaining keywords: spacing, unit, key, raw_shape,
         dtype, strict), or a `Field`.
     kind
         `"field"`, `"mask"`, `"image"`, or `"auto"`: two values are a mask, plateaus near ±1 a phase field.

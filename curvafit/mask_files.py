@@ -14,12 +14,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from curvafit.files import move_together, staged
-from curvafit.formats import pick_writer
-from curvafit.formats.nifti import write_nifti_like
 from curvafit.plot import CONTOUR, DPI
-from curvafit.scan import Field, save
 from curvafit.segment import Segmentation
 from curvafit.shape_files import beside, check_outputs
+from curvafit.volumes.formats import pick_writer
+from curvafit.volumes.formats.nifti import write_nifti_like
+from curvafit.volumes.scan import Field, save
 
 __all__ = ["FORMAT", "check_mask_target", "write_mask"]
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from curvafit.diagram import Diagram
+from curvafit.geometry.diagram import Diagram
+from curvafit.geometry.pairwise import one_to_many
+from curvafit.geometry.transport import sliced_embedding
 from curvafit.index import Atlas
-from curvafit.pairwise import one_to_many
 from curvafit.priors.coefficients import Coefficients
-from curvafit.transport import sliced_embedding
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ def nearest(
 ) -> tuple[Match, ...]:
     """The `count` shapes nearest to a diagram, nearest first.
 
-    Distances are those of `curvafit.pairwise`, taken on the `shortlist` shapes that are nearest in sliced distance.
+    Distances are those of `curvafit.geometry.pairwise`, taken on the `shortlist` shapes nearest in sliced distance.
 
     Parameters
     ----------

@@ -9,8 +9,8 @@ import math
 import numpy as np
 from scipy import ndimage
 
-from curvafit.diagram import MARGIN, Diagram, diagram
-from curvafit.mesh import NoSurface
+from curvafit.geometry.diagram import MARGIN, Diagram, diagram
+from curvafit.geometry.mesh import NoSurface
 from curvafit.prepare import LARGEST_WINDOW, Prepared
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 

@@ -11,7 +11,7 @@ from scipy import ndimage
 from skimage.filters import threshold_otsu
 
 from curvafit.priors.bounds import SEEDS, named, real, whole
-from curvafit.scan import Field, ScanError, load
+from curvafit.volumes.scan import Field, ScanError, load
 
 __all__ = ["Kind", "Level", "check_options", "find_level", "region_of_interest"]
 

@@ -21,8 +21,8 @@ from matplotlib.patches import Polygon, Rectangle
 from matplotlib.patheffects import withStroke
 from scipy.ndimage import gaussian_filter
 
-from curvafit.diagram import Diagram
 from curvafit.files import write_content
+from curvafit.geometry.diagram import Diagram
 from curvafit.render import View, render
 from curvafit.wording import unit_name
 

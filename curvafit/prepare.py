@@ -23,7 +23,7 @@ from curvafit.regrid import (
     surface_voxels,
     without_specks,
 )
-from curvafit.scan import Field, ScanError
+from curvafit.volumes.scan import Field, ScanError
 
 __all__ = ["KEPT_THICKNESS", "LARGEST_BOX", "LARGEST_WINDOW", "WORKING_THICKNESS", "Prepared", "prepare"]
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import ndimage
 
-from curvafit.morphometry import local_thickness
+from curvafit.geometry.morphometry import local_thickness
 
 __all__ = [
     "Window",

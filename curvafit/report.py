@@ -15,7 +15,7 @@ from curvafit.interrupts import undisturbed
 from curvafit.priors.coefficients import NAMES
 from curvafit.priors.fit_file import FORMAT
 from curvafit.report_pictures import diagram_figures, slice_figures, surface_figures, window_framed
-from curvafit.scan import Field, save
+from curvafit.volumes.scan import Field, save
 from curvafit.wording import density, describe, length, number, per_unit, percent, unit_name
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ from curvafit.files import write_content
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import schedule
 from curvafit.priors import Grid, preset
-from curvafit.scan import Field, save
+from curvafit.volumes.scan import Field, save
 
 __all__ = ["Sample", "SampleUnavailable", "cache_folder", "fetch", "samples", "synthetic_scan"]
 

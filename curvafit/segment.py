@@ -17,7 +17,7 @@ from curvafit.priors.bounds import instance, real, whole
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON
 from curvafit.priors.profile import optimal_profile, phase_field
-from curvafit.scan import Field, ScanError
+from curvafit.volumes.scan import Field, ScanError
 from curvafit.working import Law, Place, law_of
 
 __all__ = ["STEPS", "Segmentation", "reconstruct", "segment"]

@@ -14,7 +14,7 @@ from curvafit.data_synth.sets import RECORDS, case_name, cases_of, read_order
 from curvafit.plot import CONTOUR, write_picture
 from curvafit.priors.fit_schema import violation
 from curvafit.priors.json_text import parse_json
-from curvafit.scan import read_values
+from curvafit.volumes.scan import read_values
 
 #: Cases in the picture, and in a row of it.
 SHOWN, ROW = 8, 4

@@ -17,19 +17,19 @@ from scipy.ndimage import map_coordinates
 from torch import Tensor
 
 from curvafit.files import check_folder, check_free, move_together, own_record, staged
-from curvafit.formats import normalise_unit, pick_writer
-from curvafit.formats.ngff import is_ours
 from curvafit.generation.flow import Flow
 from curvafit.generation.memory import FILE, check_memory
-from curvafit.mesh import NoSurface, Surface, solid_surface, surface
-from curvafit.mesh_files import SUFFIXES, write_surface
+from curvafit.geometry.mesh import NoSurface, Surface, solid_surface, surface
+from curvafit.geometry.mesh_files import SUFFIXES, write_surface
 from curvafit.plot import surface_picture
 from curvafit.priors.bounds import LONGEST, SHORTEST, instance, real, several, whole
 from curvafit.priors.coefficients import NAMES, Coefficients
 from curvafit.priors.curvature import geometric_curvatures, jet
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.priors.profile import profile_distance
-from curvafit.scan import WRITABLE, Field, save
+from curvafit.volumes.formats import normalise_unit, pick_writer
+from curvafit.volumes.formats.ngff import is_ours
+from curvafit.volumes.scan import WRITABLE, Field, save
 
 #: What a record beside a shape says that it is.
 FORMAT = "curvafit-shape-1"

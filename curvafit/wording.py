@@ -11,7 +11,7 @@ import numpy as np
 from curvafit.priors.grid import METRES
 
 if TYPE_CHECKING:
-    from curvafit.diagram import Diagram
+    from curvafit.geometry.diagram import Diagram
     from curvafit.infer import Inference
 
 #: tan 22.5°: how far in direction a point may lie from a family's ideal one.

@@ -15,7 +15,7 @@ from curvafit.priors.fit_file import Law, find_law
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.loss import RESOLVED, upsampling
 from curvafit.priors.refined import refined
-from curvafit.scan import Field, ScanError
+from curvafit.volumes.scan import Field, ScanError
 
 __all__ = ["Law", "Place", "law_of"]
 

@@ -11,14 +11,14 @@ import numpy as np
 from common import CELL, DIAGRAM, SURFACE, draw, parser, plan_of, program, write_table
 from matplotlib.figure import Figure
 
-from curvafit.diagram import Diagram, diagram
 from curvafit.generation.flow import Flow, generate
 from curvafit.generation.viability import viability
-from curvafit.mesh import NoSurface
+from curvafit.geometry.diagram import Diagram, diagram
+from curvafit.geometry.mesh import NoSurface
+from curvafit.geometry.transport import wasserstein
 from curvafit.plot import write_picture
 from curvafit.priors.coefficients import preset
 from curvafit.priors.grid import WORKING_EPSILON, Grid
-from curvafit.transport import wasserstein
 
 #: Numbers of steps in the table, and those that the paper shows.
 MARKS = (10, 30, 100, 300, 1000, 2000, 4000, 8000)

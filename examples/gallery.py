@@ -16,11 +16,11 @@ import numpy as np
 from common import CELL, DIAGRAM, KINDS, SURFACE, Shape, draw, grown, parser, write_table
 from matplotlib.figure import Figure
 
-from curvafit.diagram import Diagram, diagram
+from curvafit.geometry.diagram import Diagram, diagram
+from curvafit.geometry.transport import wasserstein
 from curvafit.plot import write_picture
 from curvafit.priors.coefficients import PRESETS
 from curvafit.priors.grid import WORKING_EPSILON, Grid
-from curvafit.transport import wasserstein
 
 NAMES = tuple(name for name, shape in PRESETS.items() if "gallery" in shape.source)
 #: The author's files that were saved as they are; the others were floored to 1/100, and so are ours beside them.

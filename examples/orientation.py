@@ -16,8 +16,8 @@ import numpy as np
 from common import CELL, DIAGRAM, KINDS, SURFACE, draw, grown, parser, write_table
 from matplotlib.figure import Figure
 
-from curvafit.diagram import Diagram
-from curvafit.mesh import area_vectors, surface
+from curvafit.geometry.diagram import Diagram
+from curvafit.geometry.mesh import area_vectors, surface
 from curvafit.plot import DIAGONAL, write_picture
 from curvafit.priors.coefficients import preset
 from curvafit.priors.energy import orientation

@@ -4,8 +4,8 @@ python examples/seeds.py [--small] [--edge 100] [--count 100] [--schedule fast] 
 
 Five seeds of preset `seeds`, a = (1, -0.35, 1.02, -40, 100, 1600), m₀ = -0.69; viable shapes of the random law, each
 from its own noise; and the mean distance between the former over the mean distance between the latter, all pairs of
-each. The distance is the paper's, by `curvafit.pairwise`: the square root of geomloss's Sinkhorn divergence with p = 2,
-blur 1 and reach 20. Finished shapes are kept: a killed run goes on where it was.
+each. The distance is the paper's, by `curvafit.geometry.pairwise`: the square root of geomloss's Sinkhorn divergence
+with p = 2, blur 1 and reach 20. Finished shapes are kept: a killed run goes on where it was.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from curvafit.data_synth.design import boxed
-from curvafit.pairwise import pairwise
+from curvafit.geometry.pairwise import pairwise
 from curvafit.plot import CONTOUR, DIAGONAL, write_picture
 from curvafit.priors.coefficients import preset
 

@@ -23,7 +23,7 @@ import torch
 from rich.progress import Progress
 
 from curvafit.generation.flow import Flow, descend
-from curvafit.mesh import surface
+from curvafit.geometry.mesh import surface
 from curvafit.plot import gallery_picture
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.energy import cahn_hilliard_area

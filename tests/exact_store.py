@@ -13,8 +13,8 @@ from curvafit.data_synth.design import boxed
 from curvafit.data_synth.record import Record, Settings
 from curvafit.data_synth.store import Store, open_store
 from curvafit.generation.viability import Viability
+from curvafit.geometry.transport import sliced_embedding
 from curvafit.priors.coefficients import Coefficients
-from curvafit.transport import sliced_embedding
 
 SHAPE = 24
 EPSILON = 0.02

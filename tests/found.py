@@ -9,14 +9,14 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
-from curvafit.diagram import Diagram, diagram
 from curvafit.fit import Fit
+from curvafit.geometry.diagram import Diagram, diagram
+from curvafit.geometry.morphometry import Morphometry
 from curvafit.infer import Inference
 from curvafit.match import Match
-from curvafit.morphometry import Morphometry
 from curvafit.prepare import Prepared
 from curvafit.priors import Coefficients, Grid, preset
-from curvafit.scan import Field
+from curvafit.volumes.scan import Field
 
 EPSILON = 0.02
 RADIUS = 5.0

@@ -24,7 +24,7 @@ from curvafit.atlas_shapes import CUT, LEVELS, regrow_command, shown, small_volu
 from curvafit.generation.flow import generate
 from curvafit.index import extract
 from curvafit.priors import Coefficients, Grid
-from curvafit.scan import load
+from curvafit.volumes.scan import load
 
 COUNT = 16
 
@@ -91,8 +91,8 @@ def test_umap_keeps_apart_what_is_far_and_takes_few_shapes() -> None:
 
 
 def test_distances_are_the_paper_s(mapped: AtlasMap) -> None:
-    pairwise = pytest.importorskip("curvafit.pairwise")
-    from curvafit.transport import wasserstein
+    pairwise = pytest.importorskip("curvafit.geometry.pairwise")
+    from curvafit.geometry.transport import wasserstein
 
     first = mapped.atlas.field_diagrams[:3]
     found = atlas_map.diagram_distances(first)

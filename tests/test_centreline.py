@@ -16,8 +16,8 @@ from scipy import ndimage
 from curvafit.data_synth.centreline import centreline, cycle_rank
 from curvafit.data_synth.centreline_files import write_graphml, write_swc
 from curvafit.data_synth.labels import labels_of
+from curvafit.geometry.topology import betti_numbers
 from curvafit.priors.grid import Grid
-from curvafit.topology import betti_numbers
 
 pytestmark = pytest.mark.slow
 

@@ -15,7 +15,7 @@ from calling import QUICK, call, refused
 from found import made_inference, without_drawing
 from typer.testing import Result
 
-from curvafit.scan import Field, save
+from curvafit.volumes.scan import Field, save
 
 # ---- help ------------------------------------------------------------------------------------------------------------
 

@@ -21,7 +21,7 @@ from curvafit.generation.schedule import schedule
 from curvafit.priors.coefficients import preset
 from curvafit.priors.energy import orientation
 from curvafit.priors.grid import Grid
-from curvafit.scan import load
+from curvafit.volumes.scan import load
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 

@@ -13,7 +13,7 @@ import tifffile
 from calling import QUICK, call, made, refused
 from found import made_fit
 
-from curvafit.scan import load
+from curvafit.volumes.scan import load
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 

@@ -12,7 +12,7 @@ from exact_store import exact_store
 
 from curvafit.cli_refusal import LONGEST, sentence, writable
 from curvafit.cli_support import error_console, stages
-from curvafit.scan import Field, save
+from curvafit.volumes.scan import Field, save
 
 SYNTH = ["--presets", "tubes", "--modality", "confocal", "--workers", "0", "--count", "1"]
 

@@ -12,7 +12,7 @@ import pytest
 from calling import call, refused
 from found import made_fit
 
-from curvafit.scan import Field, load, save
+from curvafit.volumes.scan import Field, load, save
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 
@@ -206,7 +206,7 @@ def test_wrong_input_is_a_sentence(arguments, said, oblique, tmp_path, monkeypat
 def test_places_that_cannot_be_written_are_refused_first(name, said, oblique, tmp_path, monkeypatch) -> None:
     (tmp_path / "taken").write_text("")
     (tmp_path / "other.json").write_text("{}")
-    monkeypatch.setattr("curvafit.scan.load", lambda *_, **__: pytest.fail("read all the same"))
+    monkeypatch.setattr("curvafit.volumes.scan.load", lambda *_, **__: pytest.fail("read all the same"))
     refused(call("segment", oblique, "--prior", "tubes", "-o", tmp_path / name), said)
 
 
@@ -231,7 +231,7 @@ def test_no_input_is_written_over(arguments, target, tmp_path, monkeypatch) -> N
     (tmp_path / "mine.json").write_text('{"format": "curvafit-mask-1"}')
     (tmp_path / "link.npy").symlink_to("g.npy")
     (tmp_path / "hard.npy").hardlink_to("h.h5")
-    monkeypatch.setattr("curvafit.scan.load", lambda *_, **__: pytest.fail("read all the same"))
+    monkeypatch.setattr("curvafit.volumes.scan.load", lambda *_, **__: pytest.fail("read all the same"))
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     refused(call(*arguments, "-o", target), "writes over no input")
     assert before == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}

@@ -11,7 +11,7 @@ from calling import call, refused
 from exact_store import exact_store
 
 from curvafit.priors.fit_schema import FORMAT
-from curvafit.scan import Field, load, save
+from curvafit.volumes.scan import Field, load, save
 
 QUICK = ["--count", "2", "--shape", "8,16,16", "--workers", "0", "--voxel", "0.5"]
 

@@ -18,8 +18,8 @@ pytest.importorskip("mrcfile")
 
 from damage import CHECKED, COUNTED, OTHERS, VALUES, damaged, files_of, gzipped
 
-from curvafit.parameter_maps import read_maps
-from curvafit.scan import Field, ScanError, load, save
+from curvafit.volumes.parameter_maps import read_maps
+from curvafit.volumes.scan import Field, ScanError, load, save
 
 CASES = 30
 

@@ -11,10 +11,10 @@ from exact import Cylinder, Gyroid, Shape, Sphere, Torus, centres, profile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from curvafit.diagram import Diagram, diagram, surface_curvatures
+from curvafit.geometry.diagram import Diagram, diagram, surface_curvatures
+from curvafit.geometry.transport import wasserstein
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import phase_field
-from curvafit.transport import wasserstein
 
 #: On one octant (the rest is its mirror image), tube radius 8 ε; ε is 1 and the spacing 1 over voxels an ε.
 OCTANTS: dict[str, tuple[Shape, tuple[float, float, float]]] = {

@@ -15,7 +15,7 @@ from curvafit.data_synth.estimate import like
 from curvafit.data_synth.modality import Imaging, image, regrid
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
-from curvafit.scan import Field, load
+from curvafit.volumes.scan import Field, load
 
 pytestmark = pytest.mark.slow
 

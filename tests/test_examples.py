@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from curvafit.mesh import surface
+from curvafit.geometry.mesh import surface
 from curvafit.priors.coefficients import preset
 
 pytestmark = pytest.mark.slow

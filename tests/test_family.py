@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from curvafit.diagram import Diagram
-from curvafit.family import family_of, family_shares, half_thickness
+from curvafit.geometry.diagram import Diagram
+from curvafit.geometry.family import family_of, family_shares, half_thickness
 
 RADIUS = 0.04
 

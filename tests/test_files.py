@@ -22,7 +22,7 @@ from curvafit.files import (
     write_atomically,
     write_content,
 )
-from curvafit.scan import Field, load, save
+from curvafit.volumes.scan import Field, load, save
 
 
 def tree(folder: Path) -> dict[str, bytes]:

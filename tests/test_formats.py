@@ -17,9 +17,9 @@ import zarr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from curvafit.formats import normalise_unit
-from curvafit.formats.tiff import natural_key
-from curvafit.scan import Field, ScanError, load, save
+from curvafit.volumes.formats import normalise_unit
+from curvafit.volumes.formats.tiff import natural_key
+from curvafit.volumes.scan import Field, ScanError, load, save
 
 UNITS = ("voxel", "nm", "um", "mm", "m")
 

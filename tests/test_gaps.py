@@ -13,7 +13,7 @@ import tifffile
 import zarr
 from calling import call
 
-from curvafit.scan import Field, ScanError, load, read_values, save
+from curvafit.volumes.scan import Field, ScanError, load, read_values, save
 
 VALUES = (np.random.default_rng(0).random((9, 10, 11)) * 200 + 1).astype(np.uint16)
 

@@ -11,8 +11,9 @@ import pytest
 import torch
 
 from curvafit import fixed_point
-from curvafit.diagram import diagram
 from curvafit.generation.flow import generate
+from curvafit.geometry.diagram import diagram
+from curvafit.geometry.transport import wasserstein
 from curvafit.infer import Inference, infer
 from curvafit.measure import scan_diagram
 from curvafit.prepare import prepare
@@ -20,8 +21,7 @@ from curvafit.priors.coefficients import preset
 from curvafit.priors.fit_file import read_fit
 from curvafit.priors.fit_schema import FORMAT
 from curvafit.priors.grid import WORKING_EPSILON, Grid
-from curvafit.scan import Field
-from curvafit.transport import wasserstein
+from curvafit.volumes.scan import Field
 
 GRID = Grid((44, 44, 44))
 

@@ -11,10 +11,10 @@ from scipy.spatial import cKDTree
 from curvafit.data_synth.distance import field_distance
 from curvafit.data_synth.labels import NAMES, Labels, instances_of, labels_of
 from curvafit.data_synth.skeleton import skeleton_of
-from curvafit.diagram import MARGIN
-from curvafit.mesh import surface
+from curvafit.geometry.diagram import MARGIN
+from curvafit.geometry.mesh import surface
+from curvafit.geometry.topology import betti_numbers
 from curvafit.priors.grid import Grid
-from curvafit.topology import betti_numbers
 
 pytestmark = pytest.mark.slow
 

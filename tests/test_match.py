@@ -7,11 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from curvafit.diagram import Diagram
+from curvafit.geometry.diagram import Diagram
+from curvafit.geometry.pairwise import one_to_many
+from curvafit.geometry.transport import wasserstein
 from curvafit.index import Atlas, load_atlas
 from curvafit.match import nearest
-from curvafit.pairwise import one_to_many
-from curvafit.transport import wasserstein
 
 
 def blob(centre: tuple[float, float], count: int = 60) -> Diagram:

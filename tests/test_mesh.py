@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
-from curvafit.mesh import (
+from curvafit.geometry.mesh import (
     NoSurface,
     Surface,
     areas,

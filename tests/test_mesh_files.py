@@ -11,8 +11,8 @@ import pytest
 import trimesh
 from exact import Sphere, centres
 
-from curvafit.mesh import Surface, capped_surface, volume
-from curvafit.mesh_files import write_surface
+from curvafit.geometry.mesh import Surface, capped_surface, volume
+from curvafit.geometry.mesh_files import write_surface
 from curvafit.priors.grid import Grid
 
 SPACING = (0.1, 0.08, 0.12)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from curvafit.morphometry import local_thickness, morphometry
-from curvafit.scan import load
+from curvafit.geometry.morphometry import local_thickness, morphometry
+from curvafit.volumes.scan import load
 
 
 def distance_from_axes(n: int, axes: int) -> np.ndarray:

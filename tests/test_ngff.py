@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import zarr
 
-from curvafit.scan import Field, load, save
+from curvafit.volumes.scan import Field, load, save
 
 
 def image(path: Path) -> dict:

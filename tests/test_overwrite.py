@@ -15,7 +15,7 @@ from test_files import tree
 from curvafit.atlas_files import check_map, write_map
 from curvafit.data_synth.store import open_store
 from curvafit.report import FILES, write_inference
-from curvafit.scan import Field, load, save
+from curvafit.volumes.scan import Field, load, save
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 

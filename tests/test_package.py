@@ -35,7 +35,7 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
 def test_functions_win_over_modules_of_their_name() -> None:
     script = """
     import sys, types
-    for first in ("import curvafit.infer, curvafit.diagram", "import curvafit; curvafit.infer"):
+    for first in ("import curvafit.infer, curvafit.geometry.diagram", "import curvafit; curvafit.infer"):
         for name in [name for name in sys.modules if name.partition(".")[0] == "curvafit"]:
             del sys.modules[name]
         exec(first)
@@ -43,7 +43,7 @@ def test_functions_win_over_modules_of_their_name() -> None:
         for name in ("infer", "diagram"):
             assert isinstance(getattr(curvafit, name), types.FunctionType), name
             assert isinstance(sys.modules["curvafit." + name], types.ModuleType), name
-        from curvafit.diagram import Diagram, diagram
+        from curvafit.geometry.diagram import Diagram, diagram
         assert curvafit.diagram is diagram and curvafit.Diagram is Diagram
     """
     done = subprocess.run(

@@ -10,12 +10,12 @@ import pytest
 import torch
 from geomloss import SamplesLoss
 
-from curvafit import pairwise as module
-from curvafit import sinkhorn
-from curvafit.diagram import Diagram
+from curvafit.geometry import pairwise as module
+from curvafit.geometry import sinkhorn
+from curvafit.geometry.diagram import Diagram
+from curvafit.geometry.pairwise import one_to_many, pairwise
+from curvafit.geometry.transport import wasserstein
 from curvafit.index import load_atlas
-from curvafit.pairwise import one_to_many, pairwise
-from curvafit.transport import wasserstein
 
 
 def cloud(seed: int, count: int, centre: tuple[float, float] = (0.0, 0.0), width: float = 10.0) -> Diagram:

@@ -12,7 +12,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from curvafit.diagram import Diagram
+from curvafit.geometry.diagram import Diagram
 from curvafit.plot import (
     DIAGONAL,
     diagram_figure,

@@ -12,7 +12,7 @@ from curvafit.phases import find_level
 from curvafit.prepare import LARGEST_WINDOW, WORKING_THICKNESS, Prepared, prepare
 from curvafit.priors import Grid, phase_field
 from curvafit.regrid import resample, rich_boxes, without_specks
-from curvafit.scan import Field, ScanError, load, save
+from curvafit.volumes.scan import Field, ScanError, load, save
 
 
 def tube_mask(shape: tuple[int, int, int], spacing: tuple[float, float, float], radius: float) -> np.ndarray:

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.ndimage import distance_transform_edt
 
-from curvafit.diagram import diagram
-from curvafit.mesh import surface
+from curvafit.geometry.diagram import diagram
+from curvafit.geometry.mesh import surface
 from curvafit.priors import profile
 from curvafit.priors.grid import Grid
 

@@ -13,7 +13,7 @@ import pytest
 
 import curvafit.samples as module
 from curvafit.samples import SampleUnavailable, cache_folder, fetch, samples, synthetic_scan
-from curvafit.scan import load
+from curvafit.volumes.scan import load
 
 CONTENT = b"a volume"
 

@@ -15,8 +15,8 @@ from skimage.filters import threshold_otsu
 
 from curvafit.evidence import interpolated_distance, of_intensities, of_probability
 from curvafit.priors.coefficients import Coefficients, preset
-from curvafit.scan import Field
 from curvafit.segment import reconstruct, segment
+from curvafit.volumes.scan import Field
 from curvafit.working import Place, law_of
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")

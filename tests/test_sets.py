@@ -16,8 +16,8 @@ from curvafit.data_synth import sets
 from curvafit.data_synth.case import Recipe
 from curvafit.data_synth.modality import Imaging
 from curvafit.data_synth.sets import Order, build_set, make_cases, read_order
-from curvafit.scan import load, read_values
 from curvafit.set_picture import write_preview
+from curvafit.volumes.scan import load, read_values
 
 
 @pytest.fixture(scope="module")

@@ -13,8 +13,8 @@ from test_mesh_files import vtk_array
 from torch import Tensor
 
 from curvafit.priors.grid import Grid
-from curvafit.scan import load
 from curvafit.shape_files import Output, beside, step_path, write_field
+from curvafit.volumes.scan import load
 
 
 def ball(boundary) -> tuple[Tensor, Grid]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from curvafit.topology import betti_numbers, components, euler_number
+from curvafit.geometry.topology import betti_numbers, components, euler_number
 
 
 def solid(*boxes: tuple[slice, slice, slice], less: tuple[tuple[slice, slice, slice], ...] = ()) -> np.ndarray:

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from curvafit.diagram import Diagram
-from curvafit.transport import sliced_embedding, wasserstein
+from curvafit.geometry.diagram import Diagram
+from curvafit.geometry.transport import sliced_embedding, wasserstein
 
 
 def blob(seed: int = 0, centre: tuple[float, float] = (20.0, -5.0), width: float = 4.0, count: int = 300) -> Diagram:

@@ -13,15 +13,15 @@ from curvafit.data_synth.design import Design, boxed
 from curvafit.data_synth.draws import make
 from curvafit.data_synth.store import Record, Settings, Store, open_store
 from curvafit.data_synth.workers import Here, Workers
-from curvafit.diagram import Diagram, diagram
 from curvafit.generation.flow import WORKING_BLUR
 from curvafit.generation.memory import FILE, FLOW, check_memory
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.schedule import schedule as named_schedule
+from curvafit.geometry.diagram import Diagram, diagram
+from curvafit.geometry.transport import TAIL_SHARE
 from curvafit.priors.bounds import instance, seed_of, whole
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.profile import phase_field
-from curvafit.transport import TAIL_SHARE
 
 #: Progress(record, viable so far, draws so far), called after every new draw.
 Progress = Callable[[Record, int, int], None]

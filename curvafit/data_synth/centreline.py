@@ -9,8 +9,8 @@ import networkx as nx
 import numpy as np
 from scipy import ndimage
 
+from curvafit.geometry.topology import betti_numbers
 from curvafit.priors.grid import Grid
-from curvafit.topology import betti_numbers
 
 #: Weights by which voxels' places are averaged along a line, twice, so that their steps do not count.
 SMOOTH = (1 / 9, 2 / 9, 3 / 9, 2 / 9, 1 / 9)

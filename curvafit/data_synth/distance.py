@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from torch import Tensor
 
-from curvafit.mesh import NoSurface
+from curvafit.geometry.mesh import NoSurface
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import profile_distance
 

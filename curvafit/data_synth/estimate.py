@@ -15,7 +15,7 @@ from curvafit.data_synth.imaging import Imaging
 from curvafit.data_synth.modality import Modality
 from curvafit.data_synth.noise_estimate import Noise, background_of, covariance, noise_of
 from curvafit.data_synth.optics import blur
-from curvafit.scan import Field
+from curvafit.volumes.scan import Field
 
 #: Share of the mean brightness from which on the structure's brightness counts for its texture.
 DIMMEST = 0.1

@@ -13,13 +13,13 @@ from torch import Tensor
 
 from curvafit.data_synth.distance import field_distance
 from curvafit.data_synth.skeleton import skeleton_of
-from curvafit.diagram import LEAST_RADIUS, LEAST_SLOPE, MARGIN
-from curvafit.mesh import NoSurface
-from curvafit.morphometry import local_thickness
+from curvafit.geometry.diagram import LEAST_RADIUS, LEAST_SLOPE, MARGIN
+from curvafit.geometry.mesh import NoSurface
+from curvafit.geometry.morphometry import local_thickness
+from curvafit.geometry.topology import betti_numbers, components
 from curvafit.priors.curvature import geometric_curvatures, jet
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import profile_distance
-from curvafit.topology import betti_numbers, components
 
 #: Pieces that touch are two where the neck between them is thinner than this part of the thinner one.
 NECK = 0.5

@@ -27,7 +27,7 @@ from curvafit.interrupts import undisturbed
 from curvafit.priors.bounds import instance, named, quoted, several, whole
 from curvafit.priors.grid import Grid
 from curvafit.priors.json_text import parse_json
-from curvafit.scan import Field, save
+from curvafit.volumes.scan import Field, save
 
 FORMAT = "curvafit set"
 VERSION = 1

@@ -3,7 +3,7 @@
 const [DIRECTIONS, QUANTILES] = [12, 24];
 let embeddings;
 
-/** Sliced-quantile embedding of a diagram, as `curvafit.transport.sliced_embedding` has it. */
+/** Sliced-quantile embedding of a diagram, as `curvafit.geometry.transport.sliced_embedding` has it. */
 function embedded({ kappa1, kappa2, share }) {
   const total = share.reduce((sum, part) => sum + part, 0);
   const found = [];

@@ -12,10 +12,10 @@ import numpy as np
 import zarr
 
 from curvafit.files import MARK, is_empty
-from curvafit.formats.base import Raw, pick_key, stated
-from curvafit.formats.chunks import check_store, missing_chunks
-from curvafit.formats.streams import check_array
 from curvafit.interrupts import undisturbed
+from curvafit.volumes.formats.base import Raw, pick_key, stated
+from curvafit.volumes.formats.chunks import check_store, missing_chunks
+from curvafit.volumes.formats.streams import check_array
 
 #: Edge of a chunk, and of the largest volume that is not halved any more, in voxels.
 CHUNK = 64

@@ -11,9 +11,9 @@ from typing import IO, Any
 import h5py
 import numpy as np
 
-from curvafit.formats.base import Damaged, Raw, ScanError, pick_key, stated
-from curvafit.formats.streams import check_array, check_regular, read_numbers
 from curvafit.priors.bounds import quoted
+from curvafit.volumes.formats.base import Damaged, Raw, ScanError, pick_key, stated
+from curvafit.volumes.formats.streams import check_array, check_regular, read_numbers
 
 #: Attributes that may state a spacing or its unit.
 _ATTRIBUTES = ("element_size_um", "spacing", "voxel_size", "unit", "units")

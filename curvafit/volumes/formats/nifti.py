@@ -12,8 +12,8 @@ import nibabel
 import numpy as np
 from nibabel.volumeutils import apply_read_scaling
 
-from curvafit.formats.base import Raw, ScanError, complaints, normalise_unit
-from curvafit.formats.streams import read_numbers
+from curvafit.volumes.formats.base import Raw, ScanError, complaints, normalise_unit
+from curvafit.volumes.formats.streams import read_numbers
 
 #: Our unit -> (NIfTI's, factor to it).
 _TO_FILE = {

@@ -12,8 +12,8 @@ from xml.etree import ElementTree
 import numpy as np
 import tifffile
 
-from curvafit.formats.base import Damaged, Raw, ScanError, complaints, convert_length, normalise_unit
-from curvafit.formats.streams import check_array, check_regular
+from curvafit.volumes.formats.base import Damaged, Raw, ScanError, complaints, convert_length, normalise_unit
+from curvafit.volumes.formats.streams import check_array, check_regular
 
 #: Suffixes of a folder's slices.
 SLICES = (".tif", ".tiff")

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.formats.base import Damaged, ScanError
+from curvafit.volumes.formats.base import Damaged, ScanError
 
 #: Chunks of an array at most; more would take hours to look for.
 _MOST = 10_000_000

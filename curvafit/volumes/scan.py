@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from curvafit.files import check_free, write_atomically
-from curvafit.formats import READERS, WRITERS, Raw, ScanError, normalise_unit, pick_writer
-from curvafit.formats.guard import read_file
-from curvafit.formats.ngff import is_ours, mark
 from curvafit.priors.bounds import quoted
+from curvafit.volumes.formats import READERS, WRITERS, Raw, ScanError, normalise_unit, pick_writer
+from curvafit.volumes.formats.guard import read_file
+from curvafit.volumes.formats.ngff import is_ours, mark
 
 __all__ = ["READABLE", "WRITABLE", "Field", "ScanError", "load", "read_values", "save"]
 

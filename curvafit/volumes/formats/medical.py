@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.formats.base import Damaged, Raw, ScanError, complaints, convert_length, extra, pick_key
-from curvafit.formats.headers import meta_numbers, nrrd_values, read_meta
-from curvafit.formats.streams import opened, read_numbers, skip
+from curvafit.volumes.formats.base import Damaged, Raw, ScanError, complaints, convert_length, extra, pick_key
+from curvafit.volumes.formats.headers import meta_numbers, nrrd_values, read_meta
+from curvafit.volumes.formats.streams import opened, read_numbers, skip
 
 #: Suffixes of files that must be DICOM's.
 _DICOM = (".dcm", ".dicom", ".ima")

@@ -1,4 +1,4 @@
-"""One module a file format; `curvafit.scan` chooses among them by suffix."""
+"""One module a file format; `curvafit.volumes.scan` chooses among them by suffix."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from curvafit.formats.arrays import read_archive, read_hdf5, read_npy, read_npz, read_raw, write_npy
-from curvafit.formats.base import Raw, ScanError, normalise_unit
-from curvafit.formats.medical import check_mrc, is_dicom, read_dicom, read_itk, read_mrc, read_nrrd, write_mrc
-from curvafit.formats.ngff import read_zarr, write_zarr
-from curvafit.formats.nifti import read_nifti, write_nifti
-from curvafit.formats.tiff import SLICES, read_slices, read_tiff, write_ome_tiff, write_tiff
+from curvafit.volumes.formats.arrays import read_archive, read_hdf5, read_npy, read_npz, read_raw, write_npy
+from curvafit.volumes.formats.base import Raw, ScanError, normalise_unit
+from curvafit.volumes.formats.medical import check_mrc, is_dicom, read_dicom, read_itk, read_mrc, read_nrrd, write_mrc
+from curvafit.volumes.formats.ngff import read_zarr, write_zarr
+from curvafit.volumes.formats.nifti import read_nifti, write_nifti
+from curvafit.volumes.formats.tiff import SLICES, read_slices, read_tiff, write_ome_tiff, write_tiff
 
 __all__ = [
     "KEYED",

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from curvafit.formats import KEYED, pick_reader
-from curvafit.formats.base import Damaged, Raw, ScanError, complaints, one_line
-from curvafit.formats.streams import check_regular
 from curvafit.priors.bounds import quoted
+from curvafit.volumes.formats import KEYED, pick_reader
+from curvafit.volumes.formats.base import Damaged, Raw, ScanError, complaints, one_line
+from curvafit.volumes.formats.streams import check_regular
 
 
 def read_file(

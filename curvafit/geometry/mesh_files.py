@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from curvafit.files import write_content
-from curvafit.mesh import Surface, area_vectors
+from curvafit.geometry.mesh import Surface, area_vectors
 
 #: Suffixes that `write_surface` knows.
 SUFFIXES = (".stl", ".ply", ".vtp")

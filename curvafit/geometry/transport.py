@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from geomloss import SamplesLoss
 
-from curvafit.diagram import Diagram
+from curvafit.geometry.diagram import Diagram
 
 #: Part of the area, times (edge / bin width)², that a widened bin may hold.
 TAIL_SHARE = 3e-3
@@ -33,7 +33,7 @@ def wasserstein(
         Edge of the bins, widened in the tails (`Diagram.thinned`); 0 compares the points as they are. On published
         fields and their masks (distances of 0.4 to 7), bins of 1, 2 and 3 changed a distance by at most 0.01, 0.03 and
         0.1; at 2 a diagram has 150 to 500 bins, and a distance takes a twentieth of a second once they are binned;
-        `curvafit.pairwise` takes half a millisecond for each of many.
+        `curvafit.geometry.pairwise` takes half a millisecond for each of many.
 
     Raises
     ------

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from curvafit.diagram import Diagram
 from curvafit.files import write_atomically
-from curvafit.formats import read_archive
+from curvafit.geometry.diagram import Diagram
+from curvafit.geometry.sinkhorn import Measures, costs, packed
+from curvafit.geometry.transport import comparable
 from curvafit.priors.bounds import quoted
 from curvafit.priors.json_text import parse_json
-from curvafit.sinkhorn import Measures, costs, packed
-from curvafit.transport import comparable
+from curvafit.volumes.formats import read_archive
 
 #: Pairs that are taken at once: a few seconds on a processor.
 BLOCK = 8192

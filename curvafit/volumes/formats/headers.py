@@ -9,8 +9,8 @@ from typing import IO, Any
 
 import numpy as np
 
-from curvafit.formats.base import Damaged, ScanError
-from curvafit.formats.streams import check_array, check_regular, decompressed, read_numbers, skip
+from curvafit.volumes.formats.base import Damaged, ScanError
+from curvafit.volumes.formats.streams import check_array, check_regular, decompressed, read_numbers, skip
 
 #: NRRD's names of types -> numpy's. `signed` and `_t` are taken off first.
 _NRRD_TYPES = {

@@ -16,7 +16,7 @@ from numba import njit
 from scipy import ndimage
 from skimage import measure
 
-from curvafit.topology import euler_number
+from curvafit.geometry.topology import euler_number
 
 __all__ = ["Morphometry", "local_thickness", "morphometry"]
 

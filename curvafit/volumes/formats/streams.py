@@ -14,8 +14,8 @@ from typing import IO, Any
 
 import numpy as np
 
-from curvafit.formats.base import Damaged, ScanError
 from curvafit.machine import memory
+from curvafit.volumes.formats.base import Damaged, ScanError
 
 #: Bytes that are read at once.
 _PIECE = 1 << 22
