@@ -23,7 +23,7 @@ from curvafit.atlas_page import page_html
 from curvafit.atlas_shapes import shown
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.family import FAMILIES
-from curvafit.index import Atlas
+from curvafit.inference.atlas import Atlas
 
 BINS, TEXTURES, EDGE = 300, 20, 64
 FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]

@@ -34,7 +34,7 @@ from skimage.segmentation import random_walker
 from curvafit.evidence import interpolated_distance
 from curvafit.files import write_atomically, write_content
 from curvafit.geometry.topology import betti_numbers
-from curvafit.infer import infer
+from curvafit.inference.infer import infer
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segment import reconstruct, segment
 from curvafit.volumes.scan import Field

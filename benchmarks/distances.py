@@ -31,8 +31,8 @@ from curvafit.generation.viability import well_formed
 from curvafit.geometry.diagram import Diagram, diagram
 from curvafit.geometry.pairwise import one_to_many, pairwise
 from curvafit.geometry.transport import comparable, wasserstein
-from curvafit.index import VIEWS, Atlas, load_atlas
-from curvafit.match import nearest
+from curvafit.inference.atlas import VIEWS, Atlas, load_atlas
+from curvafit.inference.match import nearest
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import phase_field
 

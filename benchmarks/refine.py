@@ -20,15 +20,15 @@ import numpy as np
 import torch
 
 from benchmarks.gallery import author_volume
-from curvafit.fixed_point import ShortFlow, _parameters, fixed_point
 from curvafit.geometry.diagram import diagram
-from curvafit.index import load_atlas
-from curvafit.match import nearest
+from curvafit.inference.atlas import load_atlas
+from curvafit.inference.fixed_point import ShortFlow, _parameters, fixed_point
+from curvafit.inference.match import nearest
+from curvafit.inference.refinement import Refinement
+from curvafit.inference.stationarity import stationarity
 from curvafit.priors.coefficients import NAMES, Coefficients, preset
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.profile import phase_field
-from curvafit.refinement import Refinement
-from curvafit.stationarity import stationarity
 
 CROP = 64
 STARTS = 3

@@ -38,7 +38,7 @@ from curvafit.data_synth.modality import Modality, field_shape, visible_share
 from curvafit.data_synth.moves import SYMMETRIES, cropped, turned
 from curvafit.files import write_content
 from curvafit.geometry.morphometry import local_thickness
-from curvafit.infer import infer
+from curvafit.inference.infer import infer
 from curvafit.volumes.scan import Field
 
 SLICES = "three slices"

@@ -21,14 +21,14 @@ from torch import Tensor
 from curvafit.data_synth.randomness import correlated
 from curvafit.data_synth.sources import Generated
 from curvafit.files import write_atomically
-from curvafit.fit import Fit
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import schedule
 from curvafit.generation.viability import well_formed
 from curvafit.geometry.diagram import diagram
 from curvafit.geometry.morphometry import local_thickness
 from curvafit.geometry.transport import wasserstein
-from curvafit.index import load_atlas
+from curvafit.inference.atlas import load_atlas
+from curvafit.inference.fit import Fit
 from curvafit.priors import Coefficients, Prior, read_fit
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.profile import optimal_profile, phase_field

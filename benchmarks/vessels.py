@@ -29,7 +29,7 @@ from benchmarks.vessel_report import picture, table
 from benchmarks.vessel_scores import block_counts, scores
 from benchmarks.vessel_training import LOSSES, Plan, Setting, Training, dice_ce, predict
 from curvafit.files import write_content
-from curvafit.infer import infer
+from curvafit.inference.infer import infer
 from curvafit.volumes.scan import Field
 
 #: The seed of the tuning runs; those reported count from 0.

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from curvafit.generation.flow import descend, generate
     from curvafit.geometry.diagram import Diagram, diagram
     from curvafit.geometry.transport import wasserstein
-    from curvafit.infer import infer
+    from curvafit.inference.infer import infer
     from curvafit.priors.coefficients import Coefficients, preset
     from curvafit.priors.grid import Grid
     from curvafit.segment import reconstruct, segment
@@ -50,7 +50,7 @@ _SOURCES = {
     "diagram": "curvafit.geometry.diagram",
     "generate": "curvafit.generation.flow",
     "generate_batch": "curvafit.generation.batch",
-    "infer": "curvafit.infer",
+    "infer": "curvafit.inference.infer",
     "load": "curvafit.volumes.scan",
     "preset": "curvafit.priors.coefficients",
     "reconstruct": "curvafit.segment",

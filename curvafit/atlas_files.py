@@ -24,7 +24,7 @@ from curvafit.data_synth.store import Store, open_store
 from curvafit.files import bears, check_folder, check_free, is_empty, write_content
 from curvafit.generation.viability import well_formed
 from curvafit.geometry.diagram import Diagram
-from curvafit.index import Atlas, Measured, extract, measured, shape_id
+from curvafit.inference.atlas import Atlas, Measured, extract, measured, shape_id
 from curvafit.volumes.formats import read_archive
 
 #: Folder beside the two files for what took long: measured shapes, distances, places.

@@ -15,7 +15,7 @@ import numpy as np
 from curvafit.data_synth.atlas import BIN_WIDTH
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.family import FAMILIES, family_of, family_shares, half_thickness, leading_family
-from curvafit.index import Atlas
+from curvafit.inference.atlas import Atlas
 
 #: The paper's settings (Experiment 4): of UMAP, of HDBSCAN on the embedded points, of the distances.
 UMAP: dict[str, Any] = {"n_neighbors": 25, "min_dist": 0.05, "spread": 1.0, "random_state": 1}

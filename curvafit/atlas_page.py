@@ -24,7 +24,7 @@ from curvafit.atlas_picture import CLUSTER_COLOURS, FAMILY_COLOURS
 from curvafit.atlas_shapes import CUT, LEVELS, Shown, small_shape
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.family import FAMILIES
-from curvafit.index import VIEWS
+from curvafit.inference.atlas import VIEWS
 from curvafit.plot import DENSITY, shared_limits
 from curvafit.priors.coefficients import NAMES
 from curvafit.priors.fit_schema import FIT_SCHEMA

@@ -32,7 +32,7 @@ from curvafit.cli_synth import EXAMPLES as SYNTH_EXAMPLES
 from curvafit.cli_synth import synth
 
 if TYPE_CHECKING:
-    from curvafit.infer import Inference
+    from curvafit.inference.infer import Inference
 
 app = typer.Typer(
     help="Shape texture of tubes and membranes in 3D: a scan in, its parameters out; parameters in, shapes out.",
@@ -121,7 +121,7 @@ def infer(
 def _inferred(scan: str, out: Path, options: dict[str, Any], overwrite: bool) -> tuple[Inference, Path]:
     """The inference and the path of its report, with progress."""
     with stages() as progress:
-        from curvafit.infer import infer as find
+        from curvafit.inference.infer import infer as find
         from curvafit.report import check_report, with_command, write_inference
 
         read = [each for each in (scan, options["roi"], options["atlas"]) if each is not None]

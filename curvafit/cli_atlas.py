@@ -151,7 +151,7 @@ def extract_atlas(
         if out.suffix.lower() != ".npz":
             raise ValueError(f"expected a name ending in .npz, got {out.name!r}")
         from curvafit.files import check_folder, check_free
-        from curvafit.index import extract, is_atlas, save_atlas
+        from curvafit.inference.atlas import extract, is_atlas, save_atlas
 
         check_folder(out.parent)
         check_free([out], is_atlas, [store], overwrite)

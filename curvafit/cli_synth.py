@@ -176,7 +176,7 @@ def _source(
         if filled is not None:
             raise ValueError("expected --volume-fraction beside shapes that are grown, got a store of shapes")
         return Stored((atlas.resolve(),)), None, None
-    from curvafit.index import load_atlas
+    from curvafit.inference.atlas import load_atlas
 
     held = load_atlas(atlas)
     points = tuple((*map(float, row), float(mass)) for row, mass in zip(held.coefficients, held.masses, strict=True))

@@ -19,7 +19,7 @@ from curvafit.volumes.scan import Field, save
 from curvafit.wording import density, describe, length, number, per_unit, percent, unit_name
 
 if TYPE_CHECKING:
-    from curvafit.infer import Inference
+    from curvafit.inference.infer import Inference
 
 #: What tells that a page is this program's.
 _MARK = '<meta name="generator" content="curvafit'

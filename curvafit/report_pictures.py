@@ -13,7 +13,7 @@ from curvafit.plot import diagram_figure, png, shared_limits, slice_figure, surf
 from curvafit.wording import length
 
 if TYPE_CHECKING:
-    from curvafit.infer import Inference
+    from curvafit.inference.infer import Inference
 
 _AXES = "zyx"
 #: The three shapes of a report: which parameters made it, its title.

@@ -12,7 +12,7 @@ from curvafit.priors.grid import METRES
 
 if TYPE_CHECKING:
     from curvafit.geometry.diagram import Diagram
-    from curvafit.infer import Inference
+    from curvafit.inference.infer import Inference
 
 #: tan 22.5°: how far in direction a point may lie from a family's ideal one.
 _NARROW = math.tan(math.pi / 8)

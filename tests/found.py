@@ -9,12 +9,12 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
-from curvafit.fit import Fit
 from curvafit.geometry.diagram import Diagram, diagram
 from curvafit.geometry.morphometry import Morphometry
-from curvafit.infer import Inference
-from curvafit.match import Match
-from curvafit.prepare import Prepared
+from curvafit.inference.fit import Fit
+from curvafit.inference.infer import Inference
+from curvafit.inference.match import Match
+from curvafit.inference.prepare import Prepared
 from curvafit.priors import Coefficients, Grid, preset
 from curvafit.volumes.scan import Field
 

@@ -17,7 +17,7 @@ from curvafit.data_synth.design import INTERVALS, boxed
 from curvafit.data_synth.store import open_store
 from curvafit.generation.schedule import schedule
 from curvafit.generation.viability import Viability
-from curvafit.index import VERSION, Atlas, extract, load_atlas, save_atlas
+from curvafit.inference.atlas import VERSION, Atlas, extract, load_atlas, save_atlas
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
 

@@ -22,7 +22,7 @@ from curvafit.atlas_map import NOISE, AtlasMap, embed, find_clusters, map_atlas
 from curvafit.atlas_picture import _assigned, _slots, spread_out
 from curvafit.atlas_shapes import CUT, LEVELS, regrow_command, shown, small_volume
 from curvafit.generation.flow import generate
-from curvafit.index import extract
+from curvafit.inference.atlas import extract
 from curvafit.priors import Coefficients, Grid
 from curvafit.volumes.scan import load
 

@@ -20,9 +20,9 @@ from PIL import Image
 
 from curvafit.atlas_files import write_map
 from curvafit.cli import app
-from curvafit.fit import Fit
-from curvafit.index import Atlas, extract
-from curvafit.match import Match
+from curvafit.inference.atlas import Atlas, extract
+from curvafit.inference.fit import Fit
+from curvafit.inference.match import Match
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
 pytestmark = pytest.mark.slow

@@ -78,7 +78,7 @@ def finding(monkeypatch: pytest.MonkeyPatch, undrawn: None) -> dict[str, Any]:
         calls.update(scan=scan, **given)
         return made_inference()
 
-    monkeypatch.setattr(importlib.import_module("curvafit.infer"), "infer", find)
+    monkeypatch.setattr(importlib.import_module("curvafit.inference.infer"), "infer", find)
     return calls
 
 

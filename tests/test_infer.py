@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-from curvafit import fixed_point
 from curvafit.generation.flow import generate
 from curvafit.geometry.diagram import diagram
 from curvafit.geometry.transport import wasserstein
-from curvafit.infer import Inference, infer
-from curvafit.measure import scan_diagram
-from curvafit.prepare import prepare
+from curvafit.inference import fixed_point
+from curvafit.inference.infer import Inference, infer
+from curvafit.inference.measure import scan_diagram
+from curvafit.inference.prepare import prepare
 from curvafit.priors.coefficients import preset
 from curvafit.priors.fit_file import read_fit
 from curvafit.priors.fit_schema import FORMAT
@@ -37,7 +37,7 @@ def found(tubes: np.ndarray) -> Inference:
     """With fewer starts and steps than a user's: every stage is passed, none polished."""
     scan = Field((tubes > 0).astype(np.uint8), (2.0, 2.0, 2.0), "um", source="tubes")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(importlib.import_module("curvafit.infer"), "STARTS", 2)
+        patch.setattr(importlib.import_module("curvafit.inference.infer"), "STARTS", 2)
         patch.setattr(fixed_point, "FIRST_STEPS", 1)
         patch.setattr(fixed_point, "LAST_STEPS", 2)
         return infer(scan, kind="mask", periodic=True, seed=3)

@@ -10,8 +10,8 @@ import pytest
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.pairwise import one_to_many
 from curvafit.geometry.transport import wasserstein
-from curvafit.index import Atlas, load_atlas
-from curvafit.match import nearest
+from curvafit.inference.atlas import Atlas, load_atlas
+from curvafit.inference.match import nearest
 
 
 def blob(centre: tuple[float, float], count: int = 60) -> Diagram:

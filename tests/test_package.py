@@ -35,7 +35,7 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
 def test_functions_win_over_modules_of_their_name() -> None:
     script = """
     import sys, types
-    for first in ("import curvafit.infer, curvafit.geometry.diagram", "import curvafit; curvafit.infer"):
+    for first in ("import curvafit.inference.infer, curvafit.geometry.diagram", "import curvafit; curvafit.infer"):
         for name in [name for name in sys.modules if name.partition(".")[0] == "curvafit"]:
             del sys.modules[name]
         exec(first)

@@ -15,7 +15,7 @@ from curvafit.geometry import sinkhorn
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.pairwise import one_to_many, pairwise
 from curvafit.geometry.transport import wasserstein
-from curvafit.index import load_atlas
+from curvafit.inference.atlas import load_atlas
 
 
 def cloud(seed: int, count: int, centre: tuple[float, float] = (0.0, 0.0), width: float = 10.0) -> Diagram:

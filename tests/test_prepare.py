@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
 
-from curvafit.phases import find_level
-from curvafit.prepare import LARGEST_WINDOW, WORKING_THICKNESS, Prepared, prepare
+from curvafit.inference.phases import find_level
+from curvafit.inference.prepare import LARGEST_WINDOW, WORKING_THICKNESS, Prepared, prepare
+from curvafit.inference.regrid import resample, rich_boxes, without_specks
 from curvafit.priors import Grid, phase_field
-from curvafit.regrid import resample, rich_boxes, without_specks
 from curvafit.volumes.scan import Field, ScanError, load, save
 
 

@@ -10,10 +10,10 @@ import torch
 
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import schedule
+from curvafit.inference.refine import mass_of_mask, refine
+from curvafit.inference.refinement import admissible, in_gauge, units
+from curvafit.inference.stationarity import _tested, energy_gradients, is_rounded, stationarity
 from curvafit.priors import WORKING_EPSILON, Coefficients, Grid, energy_terms, jet, preset
-from curvafit.refine import mass_of_mask, refine
-from curvafit.refinement import admissible, in_gauge, units
-from curvafit.stationarity import _tested, energy_gradients, is_rounded, stationarity
 
 EDGE = 36
 GRID = Grid((EDGE,) * 3)
@@ -132,7 +132,7 @@ def test_a_rounded_field_is_told_and_treated_like_a_mask(sponge: torch.Tensor, m
     rounded = torch.floor(sponge * 100) / 100
     assert is_rounded(rounded) and not is_rounded(sponge)
     assert "not supported" in stationarity(rounded, GRID, WORKING_EPSILON).status
-    import curvafit.fixed_point as method
+    import curvafit.inference.fixed_point as method
 
     monkeypatch.setattr(method, "FIRST_STEPS", 1)
     monkeypatch.setattr(method, "LAST_STEPS", 1)

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 import torch
 
-from curvafit import fixed_point as method
-from curvafit.fixed_point import ShortFlow, _minimise, _parameters, fixed_point, sharpened
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import schedule
+from curvafit.inference import fixed_point as method
+from curvafit.inference.fixed_point import ShortFlow, _minimise, _parameters, fixed_point, sharpened
+from curvafit.inference.refine import literal_loss_descent, refine
 from curvafit.priors.coefficients import Coefficients, preset
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.profile import phase_field
 from curvafit.priors.stencils import gaussian_blur
-from curvafit.refine import literal_loss_descent, refine
 
 GRID = Grid((40, 40, 40))
 

@@ -11,9 +11,8 @@ from typing import Literal
 import numpy as np
 import torch
 
-from curvafit.phases import Kind, Level, find_level, region_of_interest
-from curvafit.priors import WORKING_EPSILON, WORKING_SPACING, Grid, phase_field
-from curvafit.regrid import (
+from curvafit.inference.phases import Kind, Level, find_level, region_of_interest
+from curvafit.inference.regrid import (
     Window,
     bounding_box,
     median_thickness,
@@ -23,6 +22,7 @@ from curvafit.regrid import (
     surface_voxels,
     without_specks,
 )
+from curvafit.priors import WORKING_EPSILON, WORKING_SPACING, Grid, phase_field
 from curvafit.volumes.scan import Field, ScanError
 
 __all__ = ["KEPT_THICKNESS", "LARGEST_BOX", "LARGEST_WINDOW", "WORKING_THICKNESS", "Prepared", "prepare"]

@@ -9,7 +9,7 @@ import numpy as np
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.pairwise import one_to_many
 from curvafit.geometry.transport import sliced_embedding
-from curvafit.index import Atlas
+from curvafit.inference.atlas import Atlas
 from curvafit.priors.coefficients import Coefficients
 
 
@@ -37,7 +37,7 @@ def nearest(
     diagram
         The query's geometric diagram, in 1 / working unit.
     atlas
-        Where to search; see `curvafit.index.load_atlas`.
+        Where to search; see `curvafit.inference.atlas.load_atlas`.
     seen_as
         What the query was measured on, `"field"` or `"mask"`: it is compared with diagrams of the same kind.
     count

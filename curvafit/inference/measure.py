@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from curvafit.geometry.diagram import MARGIN, Diagram, diagram
 from curvafit.geometry.mesh import NoSurface
-from curvafit.prepare import LARGEST_WINDOW, Prepared
+from curvafit.inference.prepare import LARGEST_WINDOW, Prepared
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 
 

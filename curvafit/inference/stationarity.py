@@ -17,13 +17,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from curvafit.inference.refinement import (
+    Progress,
+    Refinement,
+    admissible,
+    double_precision_on_cpu,
+    in_gauge,
+    named,
+    units,
+)
 from curvafit.priors.coefficients import NAMES, Coefficients
 from curvafit.priors.curvature import jet
 from curvafit.priors.energy import energy_terms
 from curvafit.priors.grid import Grid
 from curvafit.priors.shapes import Float
 from curvafit.priors.stencils import gaussian_blur, pad
-from curvafit.refinement import Progress, Refinement, admissible, double_precision_on_cpu, in_gauge, named, units
 
 #: Standard deviation of the test functions, in voxels; in a crop less, for what their support takes from each side.
 TEST_WIDTH, CROP_WIDTH = 4.0, 3.0

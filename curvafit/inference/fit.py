@@ -10,7 +10,7 @@ from typing import Any
 
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.morphometry import Morphometry
-from curvafit.match import Match
+from curvafit.inference.match import Match
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.fit_schema import FORMAT, violation
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING

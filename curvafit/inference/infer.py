@@ -15,23 +15,23 @@ import numpy as np
 import torch
 
 from curvafit.data_synth.atlas import BIN_WIDTH
-from curvafit.fit import Fit
 from curvafit.generation.flow import Flow, generate
 from curvafit.geometry.diagram import Diagram, diagram
 from curvafit.geometry.family import family_of
 from curvafit.geometry.morphometry import morphometry
 from curvafit.geometry.transport import TAIL_SHARE, wasserstein
-from curvafit.index import Atlas, load_atlas
-from curvafit.match import Match, nearest
-from curvafit.measure import scan_diagram
-from curvafit.phases import check_options
-from curvafit.prepare import Prepared, prepare
+from curvafit.inference.atlas import Atlas, load_atlas
+from curvafit.inference.fit import Fit
+from curvafit.inference.match import Match, nearest
+from curvafit.inference.measure import scan_diagram
+from curvafit.inference.phases import check_options
+from curvafit.inference.prepare import Prepared, prepare
+from curvafit.inference.refine import refine
+from curvafit.inference.refinement import Refinement
 from curvafit.priors.bounds import SEEDS, instance, whole
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.profile import phase_field
-from curvafit.refine import refine
-from curvafit.refinement import Refinement
 from curvafit.volumes.scan import Field, load
 
 #: Longest edge, in working voxels, of the boxes in which shapes are regenerated for comparison.
@@ -93,7 +93,7 @@ def infer(
     atlas
         The shapes to match against; the packaged ones by default.
     threshold, dark, roi, label
-        What is inside: see `curvafit.prepare.prepare`.
+        What is inside: see `curvafit.inference.prepare.prepare`.
     progress
         Called with a sentence and the share done.
 

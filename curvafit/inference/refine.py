@@ -9,14 +9,14 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from curvafit.fixed_point import fixed_point
+from curvafit.inference.fixed_point import fixed_point
+from curvafit.inference.refinement import Progress, Refinement
+from curvafit.inference.stationarity import is_rounded, stationarity
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.curvature import geometric_curvatures, jet
 from curvafit.priors.energy import energy_terms
 from curvafit.priors.grid import Grid
 from curvafit.priors.shapes import Float
-from curvafit.refinement import Progress, Refinement
-from curvafit.stationarity import is_rounded, stationarity
 
 __all__ = ["Refinement", "literal_loss_descent", "mass_of_mask", "refine"]
 
