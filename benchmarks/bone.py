@@ -31,12 +31,12 @@ from skimage.filters import threshold_otsu
 from skimage.restoration import denoise_tv_chambolle
 from skimage.segmentation import random_walker
 
-from curvafit.evidence import interpolated_distance
 from curvafit.files import write_atomically, write_content
 from curvafit.geometry.topology import betti_numbers
 from curvafit.inference.infer import infer
 from curvafit.priors.coefficients import Coefficients
-from curvafit.segment import reconstruct, segment
+from curvafit.segmentation.evidence import interpolated_distance
+from curvafit.segmentation.segment import reconstruct, segment
 from curvafit.volumes.scan import Field
 
 EDGE, SPACING = 96, 0.0195

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from curvafit.inference.infer import infer
     from curvafit.priors.coefficients import Coefficients, preset
     from curvafit.priors.grid import Grid
-    from curvafit.segment import reconstruct, segment
+    from curvafit.segmentation.segment import reconstruct, segment
     from curvafit.volumes.scan import Field, load, save
 
     __version__: str
@@ -53,9 +53,9 @@ _SOURCES = {
     "infer": "curvafit.inference.infer",
     "load": "curvafit.volumes.scan",
     "preset": "curvafit.priors.coefficients",
-    "reconstruct": "curvafit.segment",
+    "reconstruct": "curvafit.segmentation.segment",
     "save": "curvafit.volumes.scan",
-    "segment": "curvafit.segment",
+    "segment": "curvafit.segmentation.segment",
     "wasserstein": "curvafit.geometry.transport",
 }
 

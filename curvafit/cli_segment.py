@@ -22,7 +22,7 @@ from curvafit.cli_support import (
 )
 
 if TYPE_CHECKING:
-    from curvafit.segment import Segmentation
+    from curvafit.segmentation.segment import Segmentation
     from curvafit.volumes.scan import Field
 
 SEGMENT_EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
@@ -94,7 +94,7 @@ def segment(
             raise ValueError(f"expected neither --threshold nor --dark with --probability, got {given}")
 
         def made(volume: Field, progress: Callable[[str, float], None]) -> Segmentation:
-            from curvafit.segment import segment as find
+            from curvafit.segmentation.segment import segment as find
             from curvafit.volumes.scan import load
 
             likely = (
@@ -138,7 +138,7 @@ def reconstruct(
         options = {"every": every, "first": first or 0, "known": numbers, "axis": "zyx".index(axis.lower())}
 
         def made(volume: Field, progress: Callable[[str, float], None]) -> Segmentation:
-            from curvafit.segment import reconstruct as fill
+            from curvafit.segmentation.segment import reconstruct as fill
 
             return fill(volume, prior, epsilon=epsilon, steps=steps, progress=progress, **options)  # type: ignore[arg-type]
 
@@ -155,9 +155,9 @@ def _run(
     overwrite: bool,
 ) -> None:
     """Refuse, read, compute, write, say."""
-    from curvafit.mask_files import check_mask_target, write_mask
+    from curvafit.segmentation.mask_files import check_mask_target, write_mask
+    from curvafit.segmentation.working import find_law
     from curvafit.volumes.scan import load
-    from curvafit.working import find_law
 
     law = prior if prior.endswith(".json") else None  # or a preset's name
     inputs = [each for each in (source, law, told.get("probability")) if each is not None]

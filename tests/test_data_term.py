@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import torch
 
-from curvafit.evidence import of_probability
 from curvafit.generation.checkpoint import identity
 from curvafit.generation.data import Evidence, Hinge
 from curvafit.generation.flow import descend
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
-from curvafit.segment import reconstruct, segment
+from curvafit.segmentation.evidence import of_probability
+from curvafit.segmentation.segment import reconstruct, segment
 from curvafit.volumes.scan import Field
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
@@ -130,7 +130,7 @@ def test_evidence_counts_its_nats_once_whatever_the_volume_of_a_part(epsilon: fl
         gained.append(ends[1] - ends[0])
         return descend(start, law, grid, data=data, **options)
 
-    monkeypatch.setattr(import_module("curvafit.segment"), "descend", watched)
+    monkeypatch.setattr(import_module("curvafit.segmentation.segment"), "descend", watched)
     noise = np.random.default_rng(0).standard_normal(SHAPE)
     likely = Field((1 / (1 + np.exp(-DISTANCE - noise))).astype(np.float32), EDGES)
     law = Coefficients(1.5, 0.5, 2.5)

@@ -13,11 +13,11 @@ from found import made_fit
 from scipy import ndimage
 from skimage.filters import threshold_otsu
 
-from curvafit.evidence import interpolated_distance, of_intensities, of_probability
 from curvafit.priors.coefficients import Coefficients, preset
-from curvafit.segment import reconstruct, segment
+from curvafit.segmentation.evidence import interpolated_distance, of_intensities, of_probability
+from curvafit.segmentation.segment import reconstruct, segment
+from curvafit.segmentation.working import Place, law_of
 from curvafit.volumes.scan import Field
-from curvafit.working import Place, law_of
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 

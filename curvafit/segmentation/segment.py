@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from torch import Tensor
 
-from curvafit.evidence import interpolated_distance, of_intensities, of_probability
 from curvafit.generation import data
 from curvafit.generation.flow import Flow, descend
 from curvafit.priors import kernels
@@ -17,8 +16,9 @@ from curvafit.priors.bounds import instance, real, whole
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON
 from curvafit.priors.profile import optimal_profile, phase_field
+from curvafit.segmentation.evidence import interpolated_distance, of_intensities, of_probability
+from curvafit.segmentation.working import Law, Place, law_of
 from curvafit.volumes.scan import Field, ScanError
-from curvafit.working import Law, Place, law_of
 
 __all__ = ["STEPS", "Segmentation", "reconstruct", "segment"]
 

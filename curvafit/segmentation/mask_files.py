@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from curvafit.files import move_together, staged
 from curvafit.plot import CONTOUR, DPI
-from curvafit.segment import Segmentation
+from curvafit.segmentation.segment import Segmentation
 from curvafit.shape_files import beside, check_outputs
 from curvafit.volumes.formats import pick_writer
 from curvafit.volumes.formats.nifti import write_nifti_like
