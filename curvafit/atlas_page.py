@@ -22,10 +22,10 @@ from scipy.spatial.distance import cdist
 from curvafit.atlas_map import NOISE, AtlasMap
 from curvafit.atlas_picture import CLUSTER_COLOURS, FAMILY_COLOURS
 from curvafit.atlas_shapes import CUT, LEVELS, Shown, small_shape
+from curvafit.drawing.plot import DENSITY, shared_limits
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.family import FAMILIES
 from curvafit.inference.atlas import VIEWS
-from curvafit.plot import DENSITY, shared_limits
 from curvafit.priors.coefficients import NAMES
 from curvafit.priors.fit_schema import FIT_SCHEMA
 

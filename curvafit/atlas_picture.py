@@ -18,9 +18,9 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
 from curvafit.atlas_map import AtlasMap
+from curvafit.drawing.plot import DPI, INK, QUIET
+from curvafit.drawing.render import render
 from curvafit.files import write_atomically
-from curvafit.plot import DPI, INK, QUIET
-from curvafit.render import render
 
 #: Colours that stay apart for the colour-blind: of families (Okabe & Ito 2008), and of clusters (Tol's muted ones).
 FAMILY_COLOURS = {

@@ -12,10 +12,10 @@ from PIL import Image
 from scipy.signal import resample
 
 from curvafit.data_synth.record import Record, Settings
+from curvafit.drawing.render import render
 from curvafit.generation.flow import WORKING_BLUR
 from curvafit.generation.schedule import SCHEDULES
 from curvafit.priors.grid import WORKING_EPSILON
-from curvafit.render import render
 
 #: Width of a thumbnail in pixels, and the longest edge of a small volume in voxels.
 THUMBNAIL, EDGE = 144, 32

@@ -27,9 +27,9 @@ from curvafit.interrupts import exit_code
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from curvafit.drawing.shape_files import Output
     from curvafit.generation.flow import Flow
     from curvafit.priors.coefficients import Coefficients
-    from curvafit.shape_files import Output
 
 #: Voxels along an edge, if nothing says otherwise.
 EDGE = 100
@@ -114,8 +114,8 @@ def generate(
         how = _output(law, spacing, unit, tile, cap, boundary)
         saving = _checkpoint(checkpoint, checkpoint_every)
         options: dict[str, Any] = {"seed": seed, **saving}
+        from curvafit.drawing.shape_files import check_target
         from curvafit.generation.schedule import schedule as named
-        from curvafit.shape_files import check_target
 
         options["schedule"] = plan = named(schedule, steps)
         options["snapshots"] = () if snapshots is None else (*map(plan.among, whole_numbers(snapshots, "--snapshots")),)
@@ -228,8 +228,8 @@ def _output(
         raise ValueError(f"expected --spacing of cubic voxels, one number, got {spacing!r}")
     if tile is not None and boundary != "periodic":
         raise ValueError(f"expected --tile with a periodic boundary, got {boundary!r}")
+    from curvafit.drawing.shape_files import Output
     from curvafit.priors.grid import Grid
-    from curvafit.shape_files import Output
 
     repeats = (1, 1, 1) if tile is None else whole_triple(tile, "--tile")
     how = Output(edges[0], unit or law.unit, repeats, cap is not False)
@@ -246,9 +246,9 @@ def _orientation(text: str) -> Tensor:
 
 def _check(out: Path, checkpoint: Path | None, cap: bool | None) -> None:
     """Refuse a checkpoint that has no place of its own, and what only a surface has where none is written."""
+    from curvafit.drawing.shape_files import beside
     from curvafit.files import check_folder
     from curvafit.geometry.mesh_files import SUFFIXES
-    from curvafit.shape_files import beside
 
     if cap is not None and not out.name.lower().endswith(SUFFIXES):
         option = "--cap" if cap else "--no-cap"
@@ -291,7 +291,7 @@ def _discard(checkpoint: Path | None) -> None:
 
 def _write(flow: Flow, law: _Law, out: Path, how: Output, told: dict[str, Any]) -> None:
     """Write everything, and print what and where."""
-    from curvafit.shape_files import shape_record, step_path, write_shape
+    from curvafit.drawing.shape_files import shape_record, step_path, write_shape
 
     overwrite = told.pop("overwrite")
     notes = [] if flow.viability.viable else [flow.status]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.figure import Figure
 
-from curvafit.plot import diagram_figure, png, shared_limits, slice_figure, surface_figure
+from curvafit.drawing.plot import diagram_figure, png, shared_limits, slice_figure, surface_figure
 from curvafit.wording import length
 
 if TYPE_CHECKING:

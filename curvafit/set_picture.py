@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from curvafit.data_synth.layouts import LAYOUTS
 from curvafit.data_synth.sets import RECORDS, case_name, cases_of, read_order
-from curvafit.plot import CONTOUR, write_picture
+from curvafit.drawing.plot import CONTOUR, write_picture
 from curvafit.priors.fit_schema import violation
 from curvafit.priors.json_text import parse_json
 from curvafit.volumes.scan import read_values

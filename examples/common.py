@@ -13,11 +13,11 @@ import numpy as np
 from matplotlib.figure import FigureBase
 
 from curvafit.data_synth.draws import versions
+from curvafit.drawing.plot import QUIET, diagram_on, shared_limits, surface_on
 from curvafit.files import write_atomically
 from curvafit.generation.flow import Flow, generate
 from curvafit.generation.schedule import Schedule, schedule
 from curvafit.geometry.diagram import Diagram, diagram
-from curvafit.plot import QUIET, diagram_on, shared_limits, surface_on
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 

@@ -11,12 +11,12 @@ import numpy as np
 from common import CELL, DIAGRAM, SURFACE, draw, parser, plan_of, program, write_table
 from matplotlib.figure import Figure
 
+from curvafit.drawing.plot import write_picture
 from curvafit.generation.flow import Flow, generate
 from curvafit.generation.viability import viability
 from curvafit.geometry.diagram import Diagram, diagram
 from curvafit.geometry.mesh import NoSurface
 from curvafit.geometry.transport import wasserstein
-from curvafit.plot import write_picture
 from curvafit.priors.coefficients import preset
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 

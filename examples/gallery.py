@@ -16,9 +16,9 @@ import numpy as np
 from common import CELL, DIAGRAM, KINDS, SURFACE, Shape, draw, grown, parser, write_table
 from matplotlib.figure import Figure
 
+from curvafit.drawing.plot import write_picture
 from curvafit.geometry.diagram import Diagram, diagram
 from curvafit.geometry.transport import wasserstein
-from curvafit.plot import write_picture
 from curvafit.priors.coefficients import PRESETS
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 

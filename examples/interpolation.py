@@ -15,9 +15,9 @@ import numpy as np
 from common import CELL, KINDS, Shape, grown, parser, write_table
 from matplotlib.figure import Figure
 
+from curvafit.drawing.plot import diagram_on, shared_limits, surface_on, write_picture
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.transport import wasserstein
-from curvafit.plot import diagram_on, shared_limits, surface_on, write_picture
 from curvafit.priors.coefficients import Coefficients, preset
 
 #: Presets at the table's corners (0, 0), (0, 1), (1, 0) and (1, 1), row by row.

@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 
 from curvafit.data_synth.modalities import MODALITIES
 from curvafit.data_synth.modality import Modality, image, regrid
+from curvafit.drawing.plot import CONTOUR, write_picture
 from curvafit.generation.flow import generate
-from curvafit.plot import CONTOUR, write_picture
 from curvafit.priors.coefficients import preset
 from curvafit.priors.grid import Grid
 

@@ -16,9 +16,9 @@ import numpy as np
 from common import CELL, DIAGRAM, KINDS, SURFACE, draw, grown, parser, write_table
 from matplotlib.figure import Figure
 
+from curvafit.drawing.plot import DIAGONAL, write_picture
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.mesh import area_vectors, surface
-from curvafit.plot import DIAGONAL, write_picture
 from curvafit.priors.coefficients import preset
 from curvafit.priors.energy import orientation
 from curvafit.priors.grid import Grid

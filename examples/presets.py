@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from curvafit.drawing.plot import gallery_picture
 from curvafit.files import write_atomically
 from curvafit.generation.flow import generate
-from curvafit.plot import gallery_picture
 from curvafit.priors.coefficients import NAMES, PRESETS
 from curvafit.priors.grid import Grid
 

@@ -18,8 +18,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from curvafit.data_synth.design import boxed
+from curvafit.drawing.plot import CONTOUR, DIAGONAL, write_picture
 from curvafit.geometry.pairwise import pairwise
-from curvafit.plot import CONTOUR, DIAGONAL, write_picture
 from curvafit.priors.coefficients import preset
 
 SEEDS = 5

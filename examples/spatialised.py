@@ -19,14 +19,14 @@ from common import DIAGRAM, Shape, grown, kept, parser, plan_of, write_table
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 
+from curvafit.drawing.plot import INK, diagram_on, shared_limits, surface_on, write_picture
+from curvafit.drawing.render import view
 from curvafit.generation.flow import Flow, generate
 from curvafit.geometry.diagram import Diagram, diagram
 from curvafit.geometry.mesh import NoSurface
 from curvafit.geometry.transport import wasserstein
-from curvafit.plot import INK, diagram_on, shared_limits, surface_on, write_picture
 from curvafit.priors.coefficients import Coefficients, preset
 from curvafit.priors.grid import WORKING_EPSILON, Grid
-from curvafit.render import view
 
 #: The preset in the middle of each cube; the first and the last cube are cropped.
 ORDER = (1, 1, 2, 3, 4, 4)

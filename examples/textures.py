@@ -8,8 +8,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from curvafit.drawing.plot import gallery_picture
 from curvafit.generation.flow import generate
-from curvafit.plot import gallery_picture
 from curvafit.priors.coefficients import preset
 from curvafit.priors.grid import Grid
 

@@ -22,9 +22,9 @@ import numpy as np
 import torch
 from rich.progress import Progress
 
+from curvafit.drawing.plot import gallery_picture
 from curvafit.generation.flow import Flow, descend
 from curvafit.geometry.mesh import surface
-from curvafit.plot import gallery_picture
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.energy import cahn_hilliard_area
 from curvafit.priors.grid import Grid

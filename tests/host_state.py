@@ -227,7 +227,7 @@ class Calls:
         self.diagram = curvafit.diagram(self.flow.field, self.flow.grid, 0.02)
 
     def _plot(self) -> None:
-        from curvafit import plot
+        from curvafit.drawing import plot
 
         plot.png(plot.diagram_figure(self.diagram))
         plot.png(plot.surface_figure(self.flow.field.numpy(), width=32))

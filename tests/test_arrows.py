@@ -51,7 +51,7 @@ def test_modules_do_not_import_each_other_in_a_circle() -> None:
         ("data_synth/atlas.py", "import curvafit", "curvafit.data_synth.atlas imports bare curvafit"),
         ("data_synth/atlas.py", "from ..generation import flow", "curvafit.data_synth.atlas imports relatively"),
         ("report.py", "from curvafit.cli import main", "report may not import cli"),
-        ("plot.py", "from priors import energy", "curvafit.plot imports through the link priors"),
+        ("plot.py", "from priors import energy", "curvafit.drawing.plot imports through the link priors"),
     ],
 )
 def test_an_arrow_that_runs_back_is_found(tmp_path: Path, file: str, line: str, complaint: str) -> None:

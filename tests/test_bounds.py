@@ -14,13 +14,13 @@ from curvafit.data_synth.design import Design, around, boxed
 from curvafit.data_synth.modalities import MODALITIES
 from curvafit.data_synth.sources import Generated
 from curvafit.data_synth.workers import check_workers
+from curvafit.drawing.shape_files import Output
 from curvafit.generation import Schedule, descend, generate, generate_batch, white_noise
 from curvafit.generation.memory import check_memory, memory
 from curvafit.priors.bounds import SHOWN, quoted, real, whole
 from curvafit.priors.coefficients import Coefficients, preset
 from curvafit.priors.energy import orientation
 from curvafit.priors.grid import Grid
-from curvafit.shape_files import Output
 
 TUBES, MASS = preset("tubes").coefficients, preset("tubes").mass
 BRIEF = Schedule("brief", 2, 1e-3, 1e-3, "constant")

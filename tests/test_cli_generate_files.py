@@ -20,7 +20,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 
 @pytest.fixture(autouse=True)
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("curvafit.shape_files.surface_picture", lambda u, path: path.write_bytes(b""))
+    monkeypatch.setattr("curvafit.drawing.shape_files.surface_picture", lambda u, path: path.write_bytes(b""))
 
 
 def test_an_interrupted_run_goes_on_from_its_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -49,7 +49,7 @@ def test_a_failure_while_writing_leaves_nothing(tmp_path: Path, monkeypatch: pyt
     def full(*_: Any, **__: Any) -> None:
         raise OSError(28, "No space left on device", "out")
 
-    monkeypatch.setattr("curvafit.shape_files.surface_picture", full)
+    monkeypatch.setattr("curvafit.drawing.shape_files.surface_picture", full)
     result = call("generate", *QUICK, "-o", tmp_path / "out.zarr")
     assert result.exit_code == 2 and result.stderr.endswith("error: no space left on device: out\n")
     assert list(tmp_path.iterdir()) == []
@@ -64,7 +64,7 @@ def test_a_checkpoint_outlives_a_write_that_fails(tmp_path: Path, monkeypatch: p
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as broken:
-        broken.setattr("curvafit.shape_files.write_field", full)
+        broken.setattr("curvafit.drawing.shape_files.write_field", full)
         assert call(*command).exit_code == 2
     assert [path.name for path in tmp_path.iterdir()] == ["run.pt"]
     assert call(*command).exit_code == 0

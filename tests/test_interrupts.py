@@ -125,11 +125,11 @@ SLOW = """
 import signal, sys, time
 for number in (signal.SIGINT, signal.SIGTERM):  # a program in the background ignores Ctrl-C
     signal.signal(number, signal.SIG_DFL)
-import curvafit.shape_files
+import curvafit.drawing.shape_files
 def slow(*_):
     print("writing", file=sys.stderr, flush=True)
     time.sleep(60)
-curvafit.shape_files.surface_picture = slow
+curvafit.drawing.shape_files.surface_picture = slow
 from curvafit.__main__ import main
 main()
 """

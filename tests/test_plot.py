@@ -12,8 +12,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from curvafit.geometry.diagram import Diagram
-from curvafit.plot import (
+from curvafit.drawing.plot import (
     DIAGONAL,
     diagram_figure,
     gallery_picture,
@@ -23,7 +22,8 @@ from curvafit.plot import (
     slice_figure,
     surface_picture,
 )
-from curvafit.render import render, view
+from curvafit.drawing.render import render, view
+from curvafit.geometry.diagram import Diagram
 
 
 def ball(shape: tuple[int, int, int], radius: float, spacing: tuple[float, float, float] = (1, 1, 1)) -> np.ndarray:
@@ -159,6 +159,6 @@ def test_png_bytes_are_a_picture() -> None:
 
 
 def test_drawing_leaves_pyplot_alone() -> None:
-    script = "import sys, curvafit.plot; print('matplotlib.pyplot' in sys.modules)"
+    script = "import sys, curvafit.drawing.plot; print('matplotlib.pyplot' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"

@@ -12,8 +12,8 @@ from exact import Sphere, centres
 from test_mesh_files import vtk_array
 from torch import Tensor
 
+from curvafit.drawing.shape_files import Output, beside, step_path, write_field
 from curvafit.priors.grid import Grid
-from curvafit.shape_files import Output, beside, step_path, write_field
 from curvafit.volumes.scan import load
 
 

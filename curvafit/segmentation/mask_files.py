@@ -13,10 +13,10 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from curvafit.drawing.plot import CONTOUR, DPI
+from curvafit.drawing.shape_files import beside, check_outputs
 from curvafit.files import move_together, staged
-from curvafit.plot import CONTOUR, DPI
 from curvafit.segmentation.segment import Segmentation
-from curvafit.shape_files import beside, check_outputs
 from curvafit.volumes.formats import pick_writer
 from curvafit.volumes.formats.nifti import write_nifti_like
 from curvafit.volumes.scan import Field, save

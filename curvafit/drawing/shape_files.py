@@ -16,12 +16,12 @@ import torch
 from scipy.ndimage import map_coordinates
 from torch import Tensor
 
+from curvafit.drawing.plot import surface_picture
 from curvafit.files import check_folder, check_free, move_together, own_record, staged
 from curvafit.generation.flow import Flow
 from curvafit.generation.memory import FILE, check_memory
 from curvafit.geometry.mesh import NoSurface, Surface, solid_surface, surface
 from curvafit.geometry.mesh_files import SUFFIXES, write_surface
-from curvafit.plot import surface_picture
 from curvafit.priors.bounds import LONGEST, SHORTEST, instance, real, several, whole
 from curvafit.priors.coefficients import NAMES, Coefficients
 from curvafit.priors.curvature import geometric_curvatures, jet

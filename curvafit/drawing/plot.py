@@ -21,9 +21,9 @@ from matplotlib.patches import Polygon, Rectangle
 from matplotlib.patheffects import withStroke
 from scipy.ndimage import gaussian_filter
 
+from curvafit.drawing.render import View, render
 from curvafit.files import write_content
 from curvafit.geometry.diagram import Diagram
-from curvafit.render import View, render
 from curvafit.wording import unit_name
 
 #: Colours that stay apart for the colour-blind (Okabe & Ito 2008), and a quiet grey for frames and notes.
