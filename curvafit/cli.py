@@ -122,7 +122,7 @@ def _inferred(scan: str, out: Path, options: dict[str, Any], overwrite: bool) ->
     """The inference and the path of its report, with progress."""
     with stages() as progress:
         from curvafit.inference.infer import infer as find
-        from curvafit.report import check_report, with_command, write_inference
+        from curvafit.report.page import check_report, with_command, write_inference
 
         read = [each for each in (scan, options["roi"], options["atlas"]) if each is not None]
         check_report(out, read, overwrite)
@@ -135,8 +135,8 @@ def _inferred(scan: str, out: Path, options: dict[str, Any], overwrite: bool) ->
 
 def _show(found: Inference) -> None:
     """The sentence, the verdict, a small table."""
-    from curvafit.report import parameter_table
-    from curvafit.wording import describe, length, number
+    from curvafit.report.page import parameter_table
+    from curvafit.report.wording import describe, length, number
 
     fit = found.fit
     say(f"{describe(found)}.", style="bold")

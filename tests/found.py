@@ -88,7 +88,7 @@ def made_fit(chosen: str = "fit", lost: bool = False) -> Fit:
 
 def without_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reports with empty pictures, where their text is what matters. What cannot be drawn is still refused."""
-    import curvafit.report_pictures as pictures
+    import curvafit.report.pictures as pictures
 
     def blank(u: np.ndarray) -> Figure:
         if not np.isfinite(u).all():

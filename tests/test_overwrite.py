@@ -14,7 +14,7 @@ from test_files import tree
 
 from curvafit.atlas_files import check_map, write_map
 from curvafit.data_synth.store import open_store
-from curvafit.report import FILES, write_inference
+from curvafit.report.page import FILES, write_inference
 from curvafit.volumes.scan import Field, load, save
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
@@ -110,7 +110,7 @@ def test_a_record_speaks_for_its_own_files_alone(tmp_path: Path) -> None:
 
 def test_infer_leaves_other_peoples_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     page = '<meta name="generator" content="curvafit 0">'
-    monkeypatch.setattr("curvafit.report.write_report", lambda found, path: path.write_text(page))
+    monkeypatch.setattr("curvafit.report.page.write_report", lambda found, path: path.write_text(page))
     monkeypatch.setattr(importlib.import_module("curvafit.inference.infer"), "infer", lambda *_, **__: made_inference())
     told = ["infer", save(MASK, tmp_path / "scan.npy")]
     for name in FILES:

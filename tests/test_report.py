@@ -17,10 +17,10 @@ from found import EPSILON, RADIUS, SCALE, made_inference, without_drawing
 from curvafit.geometry.diagram import diagram
 from curvafit.priors import Grid
 from curvafit.priors.fit_file import FORMAT
-from curvafit.report import parameter_table, report_html, with_command, write_inference
-from curvafit.report_pictures import scan_box
+from curvafit.report.page import parameter_table, report_html, with_command, write_inference
+from curvafit.report.pictures import scan_box
+from curvafit.report.wording import density, describe, family_radius, length, number
 from curvafit.volumes.scan import load
-from curvafit.wording import density, describe, family_radius, length, number
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}
 

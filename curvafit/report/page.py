@@ -14,9 +14,9 @@ from curvafit.files import bears, check_folder, check_free, move_together, own_r
 from curvafit.interrupts import undisturbed
 from curvafit.priors.coefficients import NAMES
 from curvafit.priors.fit_file import FORMAT
-from curvafit.report_pictures import diagram_figures, slice_figures, surface_figures, window_framed
+from curvafit.report.pictures import diagram_figures, slice_figures, surface_figures, window_framed
+from curvafit.report.wording import density, describe, length, number, per_unit, percent, unit_name
 from curvafit.volumes.scan import Field, save
-from curvafit.wording import density, describe, length, number, per_unit, percent, unit_name
 
 if TYPE_CHECKING:
     from curvafit.inference.infer import Inference
