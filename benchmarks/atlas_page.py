@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from curvafit.atlas_map import NOISE, AtlasMap
-from curvafit.atlas_page import page_html
-from curvafit.atlas_shapes import shown
+from curvafit.atlas_map.layout import NOISE, AtlasMap
+from curvafit.atlas_map.page import page_html
+from curvafit.atlas_map.shapes import shown
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.family import FAMILIES
 from curvafit.inference.atlas import Atlas

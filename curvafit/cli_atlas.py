@@ -177,7 +177,7 @@ def map_atlas(
     """Lay a store's shapes out on a map: a picture, and a page to explore them in and to place scans on."""
     with plainly():
         with kept(), stages() as progress:
-            from curvafit.atlas_files import check_map, write_map
+            from curvafit.atlas_map.files import check_map, write_map
 
             check_map(out, store, overwrite)
             told = {"device": device_of(device), "command": command_line(), "overwrite": overwrite}

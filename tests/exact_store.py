@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-import curvafit.atlas_files as atlas_files
+import curvafit.atlas_map.files as atlas_files
 from curvafit.data_synth.design import boxed
 from curvafit.data_synth.record import Record, Settings
 from curvafit.data_synth.store import Store, open_store

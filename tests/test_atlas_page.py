@@ -18,7 +18,7 @@ from exact_store import exact_store, no_progress, quick_map
 from found import made_fit
 from PIL import Image
 
-from curvafit.atlas_files import write_map
+from curvafit.atlas_map.files import write_map
 from curvafit.cli import app
 from curvafit.inference.atlas import Atlas, extract
 from curvafit.inference.fit import Fit
@@ -64,7 +64,7 @@ def atlas_page(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Atlas]:
     exact_store(folder / "s.zarr", COUNT)
     with pytest.MonkeyPatch.context() as patch:
         quick_map(patch)
-        patch.setattr("curvafit.atlas_files.map_picture", lambda mapped, field, path: path)
+        patch.setattr("curvafit.atlas_map.files.map_picture", lambda mapped, field, path: path)
         _, page = write_map(folder / "s.zarr", folder / "map", progress=no_progress)
     return page.as_uri(), extract(folder / "s.zarr")
 

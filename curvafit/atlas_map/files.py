@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.atlas_map import AtlasMap, Progress, check_extra, check_size, diagram_distances, embed, map_atlas
-from curvafit.atlas_page import page_html
-from curvafit.atlas_picture import map_picture
-from curvafit.atlas_shapes import Shown, regrow_command, shown
+from curvafit.atlas_map.layout import AtlasMap, Progress, check_extra, check_size, diagram_distances, embed, map_atlas
+from curvafit.atlas_map.page import page_html
+from curvafit.atlas_map.picture import map_picture
+from curvafit.atlas_map.shapes import Shown, regrow_command, shown
 from curvafit.data_synth.census import census
 from curvafit.data_synth.record import Record
 from curvafit.data_synth.store import Store, open_store

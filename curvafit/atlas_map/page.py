@@ -19,9 +19,9 @@ from matplotlib import colormaps
 from matplotlib.colors import to_hex
 from scipy.spatial.distance import cdist
 
-from curvafit.atlas_map import NOISE, AtlasMap
-from curvafit.atlas_picture import CLUSTER_COLOURS, FAMILY_COLOURS
-from curvafit.atlas_shapes import CUT, LEVELS, Shown, small_shape
+from curvafit.atlas_map.layout import NOISE, AtlasMap
+from curvafit.atlas_map.picture import CLUSTER_COLOURS, FAMILY_COLOURS
+from curvafit.atlas_map.shapes import CUT, LEVELS, Shown, small_shape
 from curvafit.drawing.plot import DENSITY, shared_limits
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.family import FAMILIES

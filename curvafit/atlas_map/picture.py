@@ -17,7 +17,7 @@ from matplotlib.patheffects import withStroke
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
-from curvafit.atlas_map import AtlasMap
+from curvafit.atlas_map.layout import AtlasMap
 from curvafit.drawing.plot import DPI, INK, QUIET
 from curvafit.drawing.render import render
 from curvafit.files import write_atomically
