@@ -22,7 +22,7 @@ import numpy as np
 import psutil
 
 from curvafit.data_synth import build, cluster, open_store
-from curvafit.data_synth.census import verify
+from curvafit.data_synth.atlas.census import verify
 
 
 def begun(path: Path, count: int, shape: int, workers: int) -> subprocess.Popen:

@@ -25,8 +25,8 @@ import numpy as np
 import torch
 from rich.progress import track
 
-from curvafit.data_synth.atlas import build
-from curvafit.data_synth.store import open_store
+from curvafit.data_synth.atlas.build import build
+from curvafit.data_synth.atlas.store import open_store
 from curvafit.generation.viability import well_formed
 from curvafit.geometry.diagram import Diagram, diagram
 from curvafit.geometry.pairwise import one_to_many, pairwise

@@ -23,11 +23,11 @@ import torch
 from torch.utils.data import DataLoader
 
 from curvafit.data_synth import build, cluster, degrade
-from curvafit.data_synth import case as case_module
-from curvafit.data_synth.modalities import MODALITIES
-from curvafit.data_synth.modality import Modality
-from curvafit.data_synth.sources import Stored
-from curvafit.data_synth.training import TextureDataset, as_dict
+from curvafit.data_synth.imaging.modalities import MODALITIES
+from curvafit.data_synth.imaging.modality import Modality
+from curvafit.data_synth.sets import case as case_module
+from curvafit.data_synth.sets.sources import Stored
+from curvafit.data_synth.sets.training import TextureDataset, as_dict
 
 #: What is timed in one process: names in `degrade`, and the stage that each belongs to.
 STAGES = {

@@ -32,10 +32,10 @@ from benchmarks.vessel_report import WINDOW, best_thresholds, cells, stacked
 from benchmarks.vessel_scores import SCORES, block_counts, interval, resampled, scores
 from benchmarks.vessel_training import BATCH, Plan, Training, dice_ce, predict
 from benchmarks.vessels import begun, other, provenance
-from curvafit.data_synth.case import drawn_voxel, imaged
-from curvafit.data_synth.estimate import bright, like
-from curvafit.data_synth.modality import Modality, field_shape, visible_share
-from curvafit.data_synth.moves import SYMMETRIES, cropped, turned
+from curvafit.data_synth.imaging.estimate import bright, like
+from curvafit.data_synth.imaging.modality import Modality, field_shape, visible_share
+from curvafit.data_synth.sets.case import drawn_voxel, imaged
+from curvafit.data_synth.sets.moves import SYMMETRIES, cropped, turned
 from curvafit.files import write_content
 from curvafit.geometry.morphometry import local_thickness
 from curvafit.inference.infer import infer

@@ -18,8 +18,8 @@ import torch
 from rich.progress import track
 from torch import Tensor
 
-from curvafit.data_synth.randomness import correlated
-from curvafit.data_synth.sources import Generated
+from curvafit.data_synth.imaging.randomness import correlated
+from curvafit.data_synth.sets.sources import Generated
 from curvafit.files import write_atomically
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import schedule

@@ -22,9 +22,9 @@ from curvafit.cli_support import (
 )
 
 if TYPE_CHECKING:
-    from curvafit.data_synth.atlas import Progress
-    from curvafit.data_synth.design import Design
-    from curvafit.data_synth.workers import Workers
+    from curvafit.data_synth.atlas.build import Progress
+    from curvafit.data_synth.atlas.design import Design
+    from curvafit.data_synth.atlas.workers import Workers
 
 atlas_app = typer.Typer(help="Collections of generated shapes to match scans against.", no_args_is_help=True)
 
@@ -63,9 +63,9 @@ def build_atlas(
     with plainly():
         box = whole_triple(shape, "--shape")
         law = _design(design, around, spread)
-        from curvafit.data_synth.atlas import build, check_count, settings_of
-        from curvafit.data_synth.store import open_store
-        from curvafit.data_synth.workers import check_workers
+        from curvafit.data_synth.atlas.build import build, check_count, settings_of
+        from curvafit.data_synth.atlas.store import open_store
+        from curvafit.data_synth.atlas.workers import check_workers
         from curvafit.files import check_folder
         from curvafit.generation.memory import FLOW, check_memory
 
@@ -92,9 +92,9 @@ def extend_atlas(
 ) -> None:
     """Add shapes to a store, of its own design and settings."""
     with plainly():
-        from curvafit.data_synth.atlas import check_count, extend
-        from curvafit.data_synth.store import open_store
-        from curvafit.data_synth.workers import check_workers
+        from curvafit.data_synth.atlas.build import check_count, extend
+        from curvafit.data_synth.atlas.store import open_store
+        from curvafit.data_synth.atlas.workers import check_workers
 
         check_count(count, 0)
         check_workers(workers, scheduler)
@@ -112,8 +112,8 @@ def extend_atlas(
 def atlas_info(store: _Store) -> None:
     """What a store holds, and how it was made."""
     with plainly():
-        from curvafit.data_synth.census import census
-        from curvafit.data_synth.store import open_store
+        from curvafit.data_synth.atlas.census import census
+        from curvafit.data_synth.atlas.store import open_store
 
         for name, value in census(open_store(store)).items():
             say(f"{name}: {value}")
@@ -127,7 +127,7 @@ def verify_atlas(
 ) -> None:
     """Check every draw of a store. Exit code 1 where something is lost, torn, doubled or not what it says."""
     with plainly():
-        from curvafit.data_synth.census import verify
+        from curvafit.data_synth.atlas.census import verify
 
         with stages() as progress:
             found = verify(store, regenerate, seed, progress)
@@ -207,7 +207,7 @@ def _made(
     count: int, how: tuple[int | None, str | None, int | None], again: Callable[[], str] = lambda: "the same command"
 ) -> Iterator[tuple[Workers, Progress]]:
     """Workers, and a progress bar for them."""
-    from curvafit.data_synth.workers import cluster
+    from curvafit.data_synth.atlas.workers import cluster
 
     with kept(again), stages() as progress:
         progress("starting workers", 0.0)

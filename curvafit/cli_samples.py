@@ -23,7 +23,7 @@ def list_samples(context: typer.Context) -> None:
     """Volumes to try things on. Without a command: list them."""
     if context.invoked_subcommand is None:
         with plainly():
-            from curvafit.samples import samples
+            from curvafit.data_synth.samples import samples
 
             rows = [(each.name, each.description, each.licence, each.source) for each in samples()]
             output(("name", "what", "licence", "source"), [*rows, (SYNTHETIC, *_SYNTHETIC_SAYS)])
@@ -39,7 +39,7 @@ def get_sample(
 ) -> None:
     """Fetch a sample (once), check it, and print its path."""
     with plainly():
-        from curvafit.samples import fetch, samples
+        from curvafit.data_synth.samples import fetch, samples
 
         about = {each.name: (each.description, each.licence, each.source) for each in samples()}
         about[SYNTHETIC] = _SYNTHETIC_SAYS
@@ -53,7 +53,7 @@ def get_sample(
 
 def _synthetic() -> Path:
     """The synthetic scan, made once."""
-    from curvafit.samples import cache_folder, synthetic_scan
+    from curvafit.data_synth.samples import cache_folder, synthetic_scan
 
     path = cache_folder() / "synthetic.nii.gz"
     return path if path.is_file() else synthetic_scan(path)

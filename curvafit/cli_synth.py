@@ -16,9 +16,9 @@ from curvafit.cli_support import error_console, kept, numbers, plainly, reading_
 if TYPE_CHECKING:
     import numpy as np
 
-    from curvafit.data_synth.modality import Modality
-    from curvafit.data_synth.sets import Order
-    from curvafit.data_synth.sources import Source
+    from curvafit.data_synth.imaging.modality import Modality
+    from curvafit.data_synth.sets.sets import Order
+    from curvafit.data_synth.sets.sources import Source
 
 EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
     (
@@ -102,7 +102,7 @@ def synth(
 ) -> None:
     """Make a training set: images of generated shapes with exact labels."""
     with plainly():
-        from curvafit.data_synth.workers import check_workers
+        from curvafit.data_synth.atlas.workers import check_workers
 
         box = whole_triple(shape, "--shape")
         if count < 1:
@@ -112,8 +112,8 @@ def synth(
             raise ValueError("expected --unit beside --spacing or --voxel, got neither")
         source, edge, edge_unit = _source(prior, atlas, presets, volume_fraction)
         seen = _modality(modality, like, like_mask, visible, reading_of(spacing, unit, strict=strict))
-        from curvafit.data_synth.case import Recipe
-        from curvafit.data_synth.sets import Order
+        from curvafit.data_synth.sets.case import Recipe
+        from curvafit.data_synth.sets.sets import Order
 
         told, its = (edge, edge_unit) if voxel is None else (voxel, unit)
         low, high = numbers(calibres, "--calibres", 2)
@@ -127,11 +127,11 @@ def synth(
 
 
 def _build(out: Path, order: Order, count: int, how: tuple[int | None, str | None, int | None]) -> None:
-    from curvafit.data_synth.sets import build_set, cases_of
-    from curvafit.data_synth.workers import cluster
+    from curvafit.data_synth.atlas.workers import cluster
+    from curvafit.data_synth.sets.picture import write_preview
+    from curvafit.data_synth.sets.sets import build_set, cases_of
     from curvafit.files import check_folder
     from curvafit.generation.memory import FLOW, check_memory
-    from curvafit.set_picture import write_preview
 
     check_folder(out)
     _, scheduler, _ = how
@@ -155,7 +155,7 @@ def _source(
     given = [value for value in (prior, atlas, presets) if value is not None]
     if len(given) != 1:
         raise ValueError(f"expected one of --prior, --atlas and --presets, got {len(given)} of them")
-    from curvafit.data_synth.sources import Generated, Stored
+    from curvafit.data_synth.sets.sources import Generated, Stored
 
     if presets is not None:
         from curvafit.priors.coefficients import preset
@@ -194,7 +194,7 @@ def _modality(
         if lone or mask is not None:
             raise ValueError(f"expected --like beside {f'--{lone[0]}' if lone else '--like-mask'}, got none")
         return _visible(_named(str(name)), visible)
-    from curvafit.data_synth import estimate
+    from curvafit.data_synth.imaging import estimate
     from curvafit.volumes.scan import load
 
     scan = load(like, **reading)
@@ -213,7 +213,7 @@ def _mask(values: np.ndarray) -> np.ndarray:
 
 
 def _named(name: str) -> Modality:
-    from curvafit.data_synth.modalities import MODALITIES
+    from curvafit.data_synth.imaging.modalities import MODALITIES
 
     plain = {key.casefold().replace(" ", "-"): key for key in MODALITIES}
     found = plain.get(name.strip().casefold().replace(" ", "-"))
@@ -225,7 +225,7 @@ def _named(name: str) -> Modality:
 def _visible(seen: Modality, told: str | None) -> Modality:
     if told is None:
         return seen
-    from curvafit.data_synth.modality import visible_share
+    from curvafit.data_synth.imaging.modality import visible_share
 
     share = visible_share(seen.base) if told == "auto" else numbers(told, "--visible", 1)[0]
     return replace(seen, base=replace(seen.base, visible=share))

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import FigureBase
 
-from curvafit.data_synth.draws import versions
+from curvafit.data_synth.atlas.draws import versions
 from curvafit.drawing.plot import QUIET, diagram_on, shared_limits, surface_on
 from curvafit.files import write_atomically
 from curvafit.generation.flow import Flow, generate

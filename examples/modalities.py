@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from curvafit.data_synth.modalities import MODALITIES
-from curvafit.data_synth.modality import Modality, image, regrid
+from curvafit.data_synth.imaging.modalities import MODALITIES
+from curvafit.data_synth.imaging.modality import Modality, image, regrid
 from curvafit.drawing.plot import CONTOUR, write_picture
 from curvafit.generation.flow import generate
 from curvafit.priors.coefficients import preset

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from exact_store import exact_store
 
-from curvafit.data_synth.case import Recipe
-from curvafit.data_synth.modality import Imaging, Modality
-from curvafit.data_synth.sources import Stored
+from curvafit.data_synth.imaging.modality import Imaging, Modality
+from curvafit.data_synth.sets.case import Recipe
+from curvafit.data_synth.sets.sources import Stored
 
 FLAT = Modality("flat", "for tests", 0.5, Imaging(spacing=(1.0, 0.5, 0.5), blur=(0.4, 0.2, 0.2), ceiling=255.0), {
     "foreground": (80.0, 120.0), "read_noise": (1.0, 3.0),

@@ -11,7 +11,7 @@ from exact import Cylinder, centres
 from scipy import ndimage
 from torch import Tensor
 
-from curvafit.data_synth import degrade
+from curvafit.data_synth.imaging import degrade
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
 

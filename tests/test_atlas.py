@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import torch
 
-from curvafit.data_synth import atlas as building
-from curvafit.data_synth import draws
-from curvafit.data_synth.design import INTERVALS, boxed
-from curvafit.data_synth.store import open_store
+from curvafit.data_synth.atlas import build as building
+from curvafit.data_synth.atlas import draws
+from curvafit.data_synth.atlas.design import INTERVALS, boxed
+from curvafit.data_synth.atlas.store import open_store
 from curvafit.generation.schedule import schedule
 from curvafit.generation.viability import Viability
 from curvafit.inference.atlas import VERSION, Atlas, extract, load_atlas, save_atlas

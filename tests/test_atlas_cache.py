@@ -13,7 +13,7 @@ from exact_store import exact_field, exact_store, no_progress, quick_map
 
 import curvafit.atlas_map.files as atlas_files
 from curvafit.atlas_map.files import write_map
-from curvafit.data_synth.record import Record
+from curvafit.data_synth.atlas.record import Record
 
 
 def test_nothing_is_measured_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

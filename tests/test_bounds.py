@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from curvafit.data_synth.case import Recipe
-from curvafit.data_synth.design import Design, around, boxed
-from curvafit.data_synth.modalities import MODALITIES
-from curvafit.data_synth.sources import Generated
-from curvafit.data_synth.workers import check_workers
+from curvafit.data_synth.atlas.design import Design, around, boxed
+from curvafit.data_synth.atlas.workers import check_workers
+from curvafit.data_synth.imaging.modalities import MODALITIES
+from curvafit.data_synth.sets.case import Recipe
+from curvafit.data_synth.sets.sources import Generated
 from curvafit.drawing.shape_files import Output
 from curvafit.generation import Schedule, descend, generate, generate_batch, white_noise
 from curvafit.generation.memory import check_memory, memory

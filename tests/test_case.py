@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from flat_recipe import SHAPE, flat_recipe
 
-from curvafit.data_synth.case import Recipe
-from curvafit.data_synth.modality import Imaging, Modality
-from curvafit.data_synth.sources import Generated, Shape, source_of
+from curvafit.data_synth.imaging.modality import Imaging, Modality
+from curvafit.data_synth.sets.case import Recipe
+from curvafit.data_synth.sets.sources import Generated, Shape, source_of
 from curvafit.generation import fraction as steering
 
 

@@ -13,8 +13,8 @@ from kornia.filters import filter3d, get_gaussian_kernel1d
 from scipy import stats
 from torch import Tensor
 
-from curvafit.data_synth import degrade
-from curvafit.data_synth.noise import poisson_quantile
+from curvafit.data_synth.imaging import degrade
+from curvafit.data_synth.imaging.noise import poisson_quantile
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
 

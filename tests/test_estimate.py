@@ -10,9 +10,9 @@ import pytest
 import torch
 from exact import Cylinder, centres
 
-from curvafit.data_synth.degrade import EPSILON
-from curvafit.data_synth.estimate import like
-from curvafit.data_synth.modality import Imaging, image, regrid
+from curvafit.data_synth.imaging.degrade import EPSILON
+from curvafit.data_synth.imaging.estimate import like
+from curvafit.data_synth.imaging.modality import Imaging, image, regrid
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
 from curvafit.volumes.scan import Field, load

@@ -9,9 +9,9 @@ import pytest
 import torch
 from exact import Cylinder, Sphere, centres
 
-from curvafit.data_synth import degrade
-from curvafit.data_synth.modalities import MODALITIES
-from curvafit.data_synth.modality import (
+from curvafit.data_synth.imaging import degrade
+from curvafit.data_synth.imaging.modalities import MODALITIES
+from curvafit.data_synth.imaging.modality import (
     Imaging,
     Modality,
     field_shape,

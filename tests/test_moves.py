@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from curvafit.data_synth.moves import SYMMETRIES, any_crop, cropped, turned
+from curvafit.data_synth.sets.moves import SYMMETRIES, any_crop, cropped, turned
 
 VALUES = np.random.default_rng(0).random((3, 4, 5))
 

@@ -13,7 +13,7 @@ from found import made_inference
 from test_files import tree
 
 from curvafit.atlas_map.files import check_map, write_map
-from curvafit.data_synth.store import open_store
+from curvafit.data_synth.atlas.store import open_store
 from curvafit.report.page import FILES, write_inference
 from curvafit.volumes.scan import Field, load, save
 
@@ -160,7 +160,7 @@ def test_a_store_may_begin_in_an_empty_folder(tmp_path: Path) -> None:
     told = ["atlas", "build", tmp_path / "s.zarr", "--count", 1, "--shape", 12, "--around", "sponge", "--workers", 0]
     monkey = pytest.MonkeyPatch()
     with monkey.context() as patch:
-        patch.setattr("curvafit.data_synth.atlas.build", lambda *_, **__: None)
+        patch.setattr("curvafit.data_synth.atlas.build.build", lambda *_, **__: None)
         assert call(*told).exit_code == 0
     assert open_store(tmp_path / "s.zarr").indices() == []
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import curvafit.samples as module
-from curvafit.samples import SampleUnavailable, cache_folder, fetch, samples, synthetic_scan
+import curvafit.data_synth.samples as module
+from curvafit.data_synth.samples import SampleUnavailable, cache_folder, fetch, samples, synthetic_scan
 from curvafit.volumes.scan import load
 
 CONTENT = b"a volume"

@@ -14,11 +14,11 @@ import torch
 from exact_store import exact_store
 from torch.utils.data import DataLoader
 
-from curvafit.data_synth import training
-from curvafit.data_synth.modality import Imaging, Modality
-from curvafit.data_synth.moves import cropped, turned
-from curvafit.data_synth.store import open_store
-from curvafit.data_synth.training import Sample, TextureDataset, as_dict, as_monai, as_subject
+from curvafit.data_synth.atlas.store import open_store
+from curvafit.data_synth.imaging.modality import Imaging, Modality
+from curvafit.data_synth.sets import training
+from curvafit.data_synth.sets.moves import cropped, turned
+from curvafit.data_synth.sets.training import Sample, TextureDataset, as_dict, as_monai, as_subject
 
 QUIET = Modality("quiet", "for tests", 1.0, Imaging(blur=(0.5, 0.5, 0.5), read_noise=1.0))
 SHAPE = (12, 16, 20)

@@ -18,9 +18,9 @@ from curvafit.atlas_map.layout import AtlasMap, Progress, check_extra, check_siz
 from curvafit.atlas_map.page import page_html
 from curvafit.atlas_map.picture import map_picture
 from curvafit.atlas_map.shapes import Shown, regrow_command, shown
-from curvafit.data_synth.census import census
-from curvafit.data_synth.record import Record
-from curvafit.data_synth.store import Store, open_store
+from curvafit.data_synth.atlas.census import census
+from curvafit.data_synth.atlas.record import Record
+from curvafit.data_synth.atlas.store import Store, open_store
 from curvafit.files import bears, check_folder, check_free, is_empty, write_content
 from curvafit.generation.viability import well_formed
 from curvafit.geometry.diagram import Diagram

@@ -5,15 +5,15 @@ if __name__ != "curvafit.data_synth":
         "import curvafit.data_synth, not data_synth: the folder at the project's root is a link into the package"
     )
 
-from curvafit.data_synth.atlas import build, diagrams, extend
-from curvafit.data_synth.design import INTERVALS, Design, Draw, around, boxed
-from curvafit.data_synth.design_file import read_design
-from curvafit.data_synth.labels import Labels, labels_of
-from curvafit.data_synth.modalities import MODALITIES
-from curvafit.data_synth.modality import Imaging, Modality
-from curvafit.data_synth.store import Record, Settings, Store, open_store
-from curvafit.data_synth.training import TextureDataset, as_dict, as_monai, as_subject
-from curvafit.data_synth.workers import Cluster, cluster
+from curvafit.data_synth.atlas.build import build, diagrams, extend
+from curvafit.data_synth.atlas.design import INTERVALS, Design, Draw, around, boxed
+from curvafit.data_synth.atlas.design_file import read_design
+from curvafit.data_synth.atlas.store import Record, Settings, Store, open_store
+from curvafit.data_synth.atlas.workers import Cluster, cluster
+from curvafit.data_synth.imaging.modalities import MODALITIES
+from curvafit.data_synth.imaging.modality import Imaging, Modality
+from curvafit.data_synth.labels.labels import Labels, labels_of
+from curvafit.data_synth.sets.training import TextureDataset, as_dict, as_monai, as_subject
 
 __all__ = [
     "INTERVALS",

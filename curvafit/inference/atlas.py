@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from curvafit.data_synth.atlas import BIN_WIDTH, diagrams
-from curvafit.data_synth.design import boxed
-from curvafit.data_synth.draws import versions
-from curvafit.data_synth.store import Record, Store, open_store
+from curvafit.data_synth.atlas.build import BIN_WIDTH, diagrams
+from curvafit.data_synth.atlas.design import boxed
+from curvafit.data_synth.atlas.draws import versions
+from curvafit.data_synth.atlas.store import Record, Store, open_store
 from curvafit.files import write_content
 from curvafit.generation.viability import FORMED, well_formed
 from curvafit.geometry.diagram import Diagram

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from curvafit.data_synth.atlas import BIN_WIDTH
+from curvafit.data_synth.atlas.build import BIN_WIDTH
 from curvafit.generation.flow import Flow, generate
 from curvafit.geometry.diagram import Diagram, diagram
 from curvafit.geometry.family import family_of

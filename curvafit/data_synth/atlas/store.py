@@ -29,7 +29,7 @@ import numpy as np
 import zarr
 from zarr.codecs import BloscCodec, Crc32cCodec
 
-from curvafit.data_synth.record import Record, Settings, attributes_of, digest, record_of
+from curvafit.data_synth.atlas.record import Record, Settings, attributes_of, digest, record_of
 from curvafit.files import staged, write_content
 from curvafit.interrupts import undisturbed
 from curvafit.priors.bounds import quoted

@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.data_synth.case import Case, Recipe
-from curvafit.data_synth.centreline import centreline
-from curvafit.data_synth.centreline_files import write_graphml, write_swc
-from curvafit.data_synth.draws import versions
-from curvafit.data_synth.labels import NAMES, labels_of
-from curvafit.data_synth.layouts import LAYOUTS, About
-from curvafit.data_synth.workers import Here, Workers
+from curvafit.data_synth.atlas.draws import versions
+from curvafit.data_synth.atlas.workers import Here, Workers
+from curvafit.data_synth.labels.centreline import centreline
+from curvafit.data_synth.labels.centreline_files import write_graphml, write_swc
+from curvafit.data_synth.labels.labels import NAMES, labels_of
+from curvafit.data_synth.sets.case import Case, Recipe
+from curvafit.data_synth.sets.layouts import LAYOUTS, About
 from curvafit.files import remove, write_content
 from curvafit.interrupts import undisturbed
 from curvafit.priors.bounds import instance, named, quoted, several, whole

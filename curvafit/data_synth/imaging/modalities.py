@@ -4,8 +4,8 @@ Widths of optical point-spread functions: 0.2 λ / NA across (Zhang, Zerubia and
 0.37 λ / (n - √(n² - NA²)) along the axis, as deviations; a specimen's aberrations make them up to twice as wide.
 """
 
-from curvafit.data_synth.imaging import Imaging
-from curvafit.data_synth.modality import Modality
+from curvafit.data_synth.imaging.imaging import Imaging
+from curvafit.data_synth.imaging.modality import Modality
 
 CONFOCAL = Modality(
     "confocal",

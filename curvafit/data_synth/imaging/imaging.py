@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from curvafit.data_synth import degrade
-from curvafit.data_synth.optics import EPSILON
-from curvafit.data_synth.randomness import seeds_of
-from curvafit.data_synth.separable import Triple, sampled
+from curvafit.data_synth.imaging import degrade
+from curvafit.data_synth.imaging.optics import EPSILON
+from curvafit.data_synth.imaging.randomness import seeds_of
+from curvafit.data_synth.imaging.separable import Triple, sampled
 from curvafit.priors.grid import METRES
 from curvafit.priors.shapes import Bool, Float
 

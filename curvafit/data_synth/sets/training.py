@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
-from curvafit.data_synth.case import check_calibres, check_crop, drawn_voxel, imaged
-from curvafit.data_synth.modality import Modality, field_shape
-from curvafit.data_synth.randomness import correlated
-from curvafit.data_synth.sources import Stored
+from curvafit.data_synth.imaging.modality import Modality, field_shape
+from curvafit.data_synth.imaging.randomness import correlated
+from curvafit.data_synth.sets.case import check_calibres, check_crop, drawn_voxel, imaged
+from curvafit.data_synth.sets.sources import Stored
 
 #: Length over which one texture gives way to another, as a share of the crop's longest edge.
 BLEND_LENGTH = 0.5

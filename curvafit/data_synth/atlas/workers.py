@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from curvafit.data_synth.draws import device
+from curvafit.data_synth.atlas.draws import device
 from curvafit.priors.bounds import whole
 
 if TYPE_CHECKING:

@@ -11,10 +11,10 @@ import torch
 from scipy import ndimage, optimize
 from skimage.filters import threshold_otsu
 
-from curvafit.data_synth.imaging import Imaging
-from curvafit.data_synth.modality import Modality
-from curvafit.data_synth.noise_estimate import Noise, background_of, covariance, noise_of
-from curvafit.data_synth.optics import blur
+from curvafit.data_synth.imaging.imaging import Imaging
+from curvafit.data_synth.imaging.modality import Modality
+from curvafit.data_synth.imaging.noise_estimate import Noise, background_of, covariance, noise_of
+from curvafit.data_synth.imaging.optics import blur
 from curvafit.volumes.scan import Field
 
 #: Share of the mean brightness from which on the structure's brightness counts for its texture.

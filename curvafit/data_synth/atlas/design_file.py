@@ -7,8 +7,8 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from curvafit.data_synth.design import PARAMETERS, Design, around, boxed
-from curvafit.data_synth.yaml_text import parse_yaml
+from curvafit.data_synth.atlas.design import PARAMETERS, Design, around, boxed
+from curvafit.data_synth.atlas.yaml_text import parse_yaml
 from curvafit.priors.bounds import quoted, real
 from curvafit.priors.coefficients import preset
 from curvafit.priors.fit_file import read_fit

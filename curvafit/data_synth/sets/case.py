@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from curvafit.data_synth.draws import one_thread
-from curvafit.data_synth.modality import Imaging, Modality, field_shape, image, regrid, visible
-from curvafit.data_synth.sources import Source, source_of
+from curvafit.data_synth.atlas.draws import one_thread
+from curvafit.data_synth.imaging.modality import Imaging, Modality, field_shape, image, regrid, visible
+from curvafit.data_synth.sets.sources import Source, source_of
 from curvafit.priors.bounds import LONGEST, SHORTEST, instance, quoted, real, seed_of, several, whole
 
 #: Shapes that a case gets until one is seen on the image's voxels, which may be coarse.

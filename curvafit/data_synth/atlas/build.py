@@ -9,10 +9,10 @@ from pathlib import Path
 
 import torch
 
-from curvafit.data_synth.design import Design, boxed
-from curvafit.data_synth.draws import make
-from curvafit.data_synth.store import Record, Settings, Store, open_store
-from curvafit.data_synth.workers import Here, Workers
+from curvafit.data_synth.atlas.design import Design, boxed
+from curvafit.data_synth.atlas.draws import make
+from curvafit.data_synth.atlas.store import Record, Settings, Store, open_store
+from curvafit.data_synth.atlas.workers import Here, Workers
 from curvafit.generation.flow import WORKING_BLUR
 from curvafit.generation.memory import FILE, FLOW, check_memory
 from curvafit.generation.schedule import Schedule

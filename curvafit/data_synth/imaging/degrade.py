@@ -2,12 +2,12 @@
 
 Volumes are `(B, 1, Z, Y, X)` tensors of a floating type, on any device; lengths are in the unit of the spacing;
 `seeds` holds one whole number a sample, which alone decides the sample's random numbers, whatever batch it is in and
-whatever else is applied. `curvafit.data_synth.modality.image` chains them.
+whatever else is applied. `curvafit.data_synth.imaging.modality.image` chains them.
 """
 
-from curvafit.data_synth.artefacts import bias, clutter, dropout, rings, stripes
-from curvafit.data_synth.noise import digitised, gaussian_noise, poisson, poisson_gaussian, rician
-from curvafit.data_synth.optics import EPSILON, blur, blur_with_depth, intensities, occupancy, sample, texture
+from curvafit.data_synth.imaging.artefacts import bias, clutter, dropout, rings, stripes
+from curvafit.data_synth.imaging.noise import digitised, gaussian_noise, poisson, poisson_gaussian, rician
+from curvafit.data_synth.imaging.optics import EPSILON, blur, blur_with_depth, intensities, occupancy, sample, texture
 
 __all__ = [
     "EPSILON",

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.data_synth.imaging import (
+from curvafit.data_synth.imaging.imaging import (
     TRIPLES,
     Imaging,
     field_shape,
@@ -19,7 +19,7 @@ from curvafit.data_synth.imaging import (
     visible,
     visible_share,
 )
-from curvafit.data_synth.randomness import seeds_of
+from curvafit.data_synth.imaging.randomness import seeds_of
 from curvafit.priors.bounds import LONGEST, SHORTEST, real
 
 __all__ = ["Imaging", "Modality", "field_shape", "image", "image_shape", "regrid", "visible", "visible_share"]
