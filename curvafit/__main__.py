@@ -11,7 +11,7 @@ def main() -> None:
     warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)
     try:
         listen()
-        from curvafit.cli import main as run
+        from curvafit.cli.app import main as run
 
         run()
     except KeyboardInterrupt as signal:

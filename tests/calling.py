@@ -9,7 +9,7 @@ from unittest.mock import patch
 
 from typer.testing import CliRunner, Result
 
-from curvafit.cli import app
+from curvafit.cli.app import app
 
 LAW = ["--coefficients", "1,2,6,-40,-40,400", "--mass", "-0.6"]
 QUICK = [*LAW, "--shape", "24", "--steps", "30"]

@@ -50,7 +50,7 @@ def test_modules_do_not_import_each_other_in_a_circle() -> None:
         ("data_synth/atlas.py", "import curvafit.inference.atlas as i", "data_synth may not import inference"),
         ("data_synth/atlas.py", "import curvafit", "curvafit.data_synth.atlas.build imports bare curvafit"),
         ("data_synth/atlas.py", "from ..generation import flow", "curvafit.data_synth.atlas.build imports relatively"),
-        ("report.py", "from curvafit.cli import main", "report may not import cli"),
+        ("report.py", "from curvafit.cli.app import main", "report may not import cli"),
         ("plot.py", "from priors import energy", "curvafit.drawing.plot imports through the link priors"),
     ],
 )

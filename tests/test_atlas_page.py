@@ -19,7 +19,7 @@ from found import made_fit
 from PIL import Image
 
 from curvafit.atlas_map.files import write_map
-from curvafit.cli import app
+from curvafit.cli.app import app
 from curvafit.inference.atlas import Atlas, extract
 from curvafit.inference.fit import Fit
 from curvafit.inference.match import Match

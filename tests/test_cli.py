@@ -23,7 +23,7 @@ from curvafit.volumes.scan import Field, save
 def test_help_and_version_load_nothing_heavy() -> None:
     script = """
 import sys
-from curvafit.cli import app
+from curvafit.cli.app import app
 try:
     app(["--help"])
 except SystemExit as leave:

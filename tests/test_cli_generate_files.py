@@ -34,7 +34,7 @@ def test_an_interrupted_run_goes_on_from_its_checkpoint(tmp_path: Path, monkeypa
 
     saving = [*QUICK, "--checkpoint", tmp_path / "run.pt", "--checkpoint-every", 0]
     with monkeypatch.context() as patch:
-        patch.setattr("curvafit.cli_generate.flow_progress", interrupting)
+        patch.setattr("curvafit.cli.generate.flow_progress", interrupting)
         result = call("generate", *saving, "-o", tmp_path / "out.npy")
     assert result.exit_code == 130 and "the same command goes on from" in result.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["run.pt"]

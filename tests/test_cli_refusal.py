@@ -10,8 +10,8 @@ import pytest
 from calling import LAW, call, refused
 from exact_store import exact_store
 
-from curvafit.cli_refusal import LONGEST, sentence, writable
-from curvafit.cli_support import error_console, stages
+from curvafit.cli.refusal import LONGEST, sentence, writable
+from curvafit.cli.support import error_console, stages
 from curvafit.volumes.scan import Field, save
 
 SYNTH = ["--presets", "tubes", "--modality", "confocal", "--workers", "0", "--count", "1"]

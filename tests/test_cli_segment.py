@@ -239,4 +239,4 @@ def test_no_input_is_written_over(arguments, target, tmp_path, monkeypatch) -> N
 
 def test_steps_are_those_of_the_library() -> None:
     library = importlib.import_module("curvafit.segmentation.segment")
-    assert importlib.import_module("curvafit.cli_segment").STEPS == library.STEPS
+    assert importlib.import_module("curvafit.cli.segment").STEPS == library.STEPS

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from curvafit.cli_support import stages
+from curvafit.cli.support import stages
 
 
 def test_a_stage_that_counts_on_is_a_line_every_five_percent(capsys):

@@ -89,7 +89,7 @@ def _import_all() -> None:
     for name in dir(curvafit):
         with contextlib.suppress(Exception):
             getattr(curvafit, name)
-    importlib.import_module("curvafit.cli")
+    importlib.import_module("curvafit.cli.app")
     for path in sorted(Path(curvafit.__file__).parent.glob("**/*.py")):
         parts = path.relative_to(Path(curvafit.__file__).parent).with_suffix("").parts
         if parts[0] not in ("nnunet", "napari") and not parts[-1].startswith("__") and "cuda" not in parts[-1]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli_support import (
+from curvafit.cli.support import (
     OverwriteOption,
     command_line,
     plainly,

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli_atlas import atlas_app
-from curvafit.cli_generate import EXAMPLES, generate, presets
-from curvafit.cli_hosts import EXAMPLE as NNUNET_EXAMPLE
-from curvafit.cli_hosts import nnunet
-from curvafit.cli_refusal import Commands
-from curvafit.cli_samples import samples_app
-from curvafit.cli_segment import RECONSTRUCT_EXAMPLES, SEGMENT_EXAMPLES, reconstruct, segment
-from curvafit.cli_support import (
+from curvafit.cli.atlas import atlas_app
+from curvafit.cli.generate import EXAMPLES, generate, presets
+from curvafit.cli.hosts import EXAMPLE as NNUNET_EXAMPLE
+from curvafit.cli.hosts import nnunet
+from curvafit.cli.refusal import Commands
+from curvafit.cli.samples import samples_app
+from curvafit.cli.segment import RECONSTRUCT_EXAMPLES, SEGMENT_EXAMPLES, reconstruct, segment
+from curvafit.cli.support import (
     OverwriteOption,
     command_line,
     output,
@@ -28,8 +28,8 @@ from curvafit.cli_support import (
     stages,
     threshold_of,
 )
-from curvafit.cli_synth import EXAMPLES as SYNTH_EXAMPLES
-from curvafit.cli_synth import synth
+from curvafit.cli.synth import EXAMPLES as SYNTH_EXAMPLES
+from curvafit.cli.synth import synth
 
 if TYPE_CHECKING:
     from curvafit.inference.infer import Inference

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from curvafit.cli_support import OverwriteOption, error_console, output, plainly, say
+from curvafit.cli.support import OverwriteOption, error_console, output, plainly, say
 
 #: The sample that needs no network, and what the list says of it.
 SYNTHETIC = "synthetic"

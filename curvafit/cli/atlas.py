@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from curvafit.cli_support import (
+from curvafit.cli.support import (
     OverwriteOption,
     command_line,
     device_of,

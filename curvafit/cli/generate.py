@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from curvafit.cli_support import (
+from curvafit.cli.support import (
     OverwriteOption,
     command_line,
     device_of,

@@ -19,7 +19,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from rich.table import Table
 from rich.text import Text
 
-from curvafit.cli_refusal import sentence, writable
+from curvafit.cli.refusal import sentence, writable
 from curvafit.interrupts import Terminated, exit_code
 
 #: Whether what other programs, or other commands, wrote may be replaced.

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from curvafit.cli_support import plainly, say
+from curvafit.cli.support import plainly, say
 
 EXAMPLE = """[bold]Example[/bold]
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli_atlas import DashboardOption, SchedulerOption, WorkersOption
-from curvafit.cli_support import error_console, kept, numbers, plainly, reading_of, say, say_notes, stages, whole_triple
+from curvafit.cli.atlas import DashboardOption, SchedulerOption, WorkersOption
+from curvafit.cli.support import error_console, kept, numbers, plainly, reading_of, say, say_notes, stages, whole_triple
 
 if TYPE_CHECKING:
     import numpy as np
