@@ -164,4 +164,4 @@ def _joined(pieces: Iterable[bytes]) -> tuple[str, list[int]]:
 
 
 def _template(name: str) -> str:
-    return files("curvafit").joinpath("templates", name).read_text(encoding="utf-8")
+    return files("curvafit.atlas_map").joinpath("templates", name).read_text(encoding="utf-8")

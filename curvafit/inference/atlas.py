@@ -199,7 +199,7 @@ def load_atlas(path: str | Path | None = None) -> Atlas:
         If it is not an atlas, is truncated, or has another format version.
     """
     if path is None:
-        packaged = importlib.resources.files("curvafit") / "data" / "atlas.npz"
+        packaged = importlib.resources.files("curvafit.inference") / "data" / "atlas.npz"
         return _parse(packaged.read_bytes(), "the packaged atlas")
     if Path(path).is_dir():
         raise FileNotFoundError(

@@ -106,7 +106,7 @@ def write_report(inference: Inference, path: str | Path) -> Path:
 
 def report_html(inference: Inference) -> str:
     """The page itself."""
-    template = Template(files("curvafit").joinpath("templates", "report.html").read_text(encoding="utf-8"))
+    template = Template(files("curvafit.report").joinpath("templates", "report.html").read_text(encoding="utf-8"))
     fit = inference.fit
     sentence = escape(describe(inference))
     return template.substitute(
