@@ -1,23 +1,35 @@
 """curvafit: read, make and enforce the shape texture of tubes and membranes in 3D.
 
-The public names are loaded when first used: importing the package imports nothing.
+A texture is six coefficients and a mass: shapes that minimise the integral of a quadratic polynomial of the principal
+curvatures at constant volume.
+
+Infer       `infer(scan)` gives the parameters of a scanned volume, with `.fit`, `.plot()` and a report.
+Synthesise  `generate(law)` grows a shape of a texture; `generate_batch` grows several at once.
+Prior       `segment(scan, prior=law)` and `reconstruct(labels, prior=law)` give a mask; `curvafit.priors` has the loss.
+Files       `load(path)` and `save(path, field)` read and write volumes with their spacing and unit.
+Measures    `diagram(u, grid, epsilon)` and `wasserstein(a, b)`; more in `curvafit.geometry`.
+
+A law is `Coefficients`, the name of a preset (`preset`), or the path of a `fit.json`. The public names are loaded when
+they are first used: importing the package imports nothing.
 """
 
 from __future__ import annotations
 
-import sys
-from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from curvafit.faces import offer
 
 if TYPE_CHECKING:
     from curvafit.generation.batch import generate_batch
     from curvafit.generation.flow import descend, generate
+    from curvafit.generation.result import Flow
     from curvafit.geometry.diagram import Diagram, diagram
     from curvafit.geometry.transport import wasserstein
-    from curvafit.inference.infer import infer
+    from curvafit.inference.fit import Fit
+    from curvafit.inference.infer import Inference, infer
     from curvafit.priors.coefficients import Coefficients, preset
     from curvafit.priors.grid import Grid
-    from curvafit.segmentation.segment import reconstruct, segment
+    from curvafit.segmentation.segment import Segmentation, reconstruct, segment
     from curvafit.volumes.scan import Field, load, save
 
     __version__: str
@@ -26,7 +38,11 @@ __all__ = [
     "Coefficients",
     "Diagram",
     "Field",
+    "Fit",
+    "Flow",
     "Grid",
+    "Inference",
+    "Segmentation",
     "__version__",
     "descend",
     "diagram",
@@ -41,11 +57,15 @@ __all__ = [
     "wasserstein",
 ]
 
-_SOURCES = {
+_HOMES = {
     "Coefficients": "curvafit.priors.coefficients",
     "Diagram": "curvafit.geometry.diagram",
     "Field": "curvafit.volumes.scan",
+    "Fit": "curvafit.inference.fit",
+    "Flow": "curvafit.generation.result",
     "Grid": "curvafit.priors.grid",
+    "Inference": "curvafit.inference.infer",
+    "Segmentation": "curvafit.segmentation.segment",
     "descend": "curvafit.generation.flow",
     "diagram": "curvafit.geometry.diagram",
     "generate": "curvafit.generation.flow",
@@ -59,34 +79,4 @@ _SOURCES = {
     "wasserstein": "curvafit.geometry.transport",
 }
 
-
-def __getattr__(name: str) -> Any:
-    if name == "__version__":
-        from importlib.metadata import version
-
-        return version("curvafit")
-    if name not in _SOURCES:
-        raise AttributeError(f"module 'curvafit' has no attribute {name!r}")
-    from importlib import import_module
-
-    value = getattr(import_module(_SOURCES[name]), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
-
-
-class _Package(ModuleType):
-    """`curvafit.diagram`, `infer` and `segment` are functions, in modules of the same names: the functions win.
-
-    Importing such a module would otherwise bind it here in the function's place.
-    """
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if not (name in _SOURCES and isinstance(value, ModuleType)):
-            super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Package
+offer(__name__, _HOMES)

@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 import torch
 
+from curvafit.atlas_map.extract import extract
 from curvafit.data_synth.atlas import build as building
 from curvafit.data_synth.atlas import draws
 from curvafit.data_synth.atlas.design import INTERVALS, boxed
 from curvafit.data_synth.atlas.store import open_store
 from curvafit.generation.schedule import schedule
 from curvafit.generation.viability import Viability
-from curvafit.inference.atlas import VERSION, Atlas, extract, load_atlas, save_atlas
+from curvafit.inference.atlas import VERSION, Atlas, load_atlas, save_atlas
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
 

@@ -18,9 +18,10 @@ from exact_store import exact_store, no_progress, quick_map
 from found import made_fit
 from PIL import Image
 
+from curvafit.atlas_map.extract import extract
 from curvafit.atlas_map.files import write_map
 from curvafit.cli.app import app
-from curvafit.inference.atlas import Atlas, extract
+from curvafit.inference.atlas import Atlas
 from curvafit.inference.fit import Fit
 from curvafit.inference.match import Match
 

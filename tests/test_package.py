@@ -16,6 +16,11 @@ import pytest
 import curvafit
 
 ROOT = Path(__file__).resolve().parent.parent
+ROOMS = ["curvafit"] + [
+    f"curvafit.{path.parent.name}"
+    for path in sorted((ROOT / "curvafit").glob("*/__init__.py"))
+    if "offer(__name__" in path.read_text(encoding="utf-8")
+]
 
 
 # ---- public names ----------------------------------------------------------------------------------------------------
@@ -27,29 +32,26 @@ def test_every_public_name_loads_and_is_listed() -> None:
         assert name in dir(curvafit)
 
 
-def test_an_unknown_name_is_an_attribute_error() -> None:
-    with pytest.raises(AttributeError, match="module 'curvafit' has no attribute 'nothing'"):
-        _ = curvafit.nothing
-
-
-def test_functions_win_over_modules_of_their_name() -> None:
-    script = """
-    import sys, types
-    for first in ("import curvafit.inference.infer, curvafit.geometry.diagram", "import curvafit; curvafit.infer"):
-        for name in [name for name in sys.modules if name.partition(".")[0] == "curvafit"]:
-            del sys.modules[name]
-        exec(first)
-        import curvafit
-        for name in ("infer", "diagram"):
-            assert isinstance(getattr(curvafit, name), types.FunctionType), name
-            assert isinstance(sys.modules["curvafit." + name], types.ModuleType), name
-        from curvafit.geometry.diagram import Diagram, diagram
-        assert curvafit.diagram is diagram and curvafit.Diagram is Diagram
+@pytest.mark.parametrize("room", ROOMS)
+def test_a_room_offers_its_names_and_nothing_else(room: str) -> None:
+    """In a fresh interpreter: every name loads, also after its module was imported, and completion lists no other."""
+    script = f"""
+    import importlib, types
+    face = importlib.import_module("{room}")
+    assert sorted(face.__all__) == dir(face), set(dir(face)) ^ set(face.__all__)
+    for name, home in face._homes.items():
+        module = importlib.import_module(home)
+        assert getattr(face, name) is getattr(module, name) and not isinstance(getattr(face, name), types.ModuleType)
+    try:
+        face.nothing
+    except AttributeError as error:
+        print(error)
     """
     done = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(script)], cwd=ROOT, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == f"module '{room}' has no attribute 'nothing'"
 
 
 def test_the_version_is_the_project_s() -> None:

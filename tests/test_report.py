@@ -19,7 +19,8 @@ from curvafit.priors import Grid
 from curvafit.priors.fit_file import FORMAT
 from curvafit.report.page import parameter_table, report_html, with_command, write_inference
 from curvafit.report.pictures import scan_box
-from curvafit.report.wording import density, describe, family_radius, length, number
+from curvafit.report.wording import describe, family_radius
+from curvafit.units import density, length, number
 from curvafit.volumes.scan import load
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from curvafit.atlas_map.extract import Measured, extract, measured, shape_id
 from curvafit.atlas_map.layout import AtlasMap, Progress, check_extra, check_size, diagram_distances, embed, map_atlas
 from curvafit.atlas_map.page import page_html
 from curvafit.atlas_map.picture import map_picture
@@ -24,7 +25,7 @@ from curvafit.data_synth.atlas.store import Store, open_store
 from curvafit.files import bears, check_folder, check_free, is_empty, write_content
 from curvafit.generation.viability import well_formed
 from curvafit.geometry.diagram import Diagram
-from curvafit.inference.atlas import Atlas, Measured, extract, measured, shape_id
+from curvafit.inference.atlas import Atlas
 from curvafit.volumes.formats import read_archive
 
 #: Folder beside the two files for what took long: measured shapes, distances, places.

@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.data_synth.atlas.build import BIN_WIDTH
-from curvafit.geometry.diagram import Diagram
+from curvafit.geometry.diagram import BIN_WIDTH, Diagram
 from curvafit.geometry.family import FAMILIES, family_of, family_shares, half_thickness, leading_family
 from curvafit.inference.atlas import Atlas
 

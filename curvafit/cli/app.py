@@ -136,7 +136,8 @@ def _inferred(scan: str, out: Path, options: dict[str, Any], overwrite: bool) ->
 def _show(found: Inference) -> None:
     """The sentence, the verdict, a small table."""
     from curvafit.report.page import parameter_table
-    from curvafit.report.wording import describe, length, number
+    from curvafit.report.wording import describe
+    from curvafit.units import length, number
 
     fit = found.fit
     say(f"{describe(found)}.", style="bold")

@@ -150,8 +150,9 @@ def extract_atlas(
     with plainly():
         if out.suffix.lower() != ".npz":
             raise ValueError(f"expected a name ending in .npz, got {out.name!r}")
+        from curvafit.atlas_map.extract import extract
         from curvafit.files import check_folder, check_free
-        from curvafit.inference.atlas import extract, is_atlas, save_atlas
+        from curvafit.inference.atlas import is_atlas, save_atlas
 
         check_folder(out.parent)
         check_free([out], is_atlas, [store], overwrite)
@@ -188,7 +189,7 @@ def map_atlas(
 
 def _design(name: str, around: str | None, spread: float | None) -> Design:
     """The design that the options name."""
-    from curvafit.data_synth import design, design_file
+    from curvafit.data_synth.atlas import design, design_file
 
     if around is not None:
         if name not in ("random", "sobol"):

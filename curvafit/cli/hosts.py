@@ -47,7 +47,7 @@ def nnunet(
         for name, value in given.items():
             if value is not None and not (0 <= value < math.inf and (value or name in ("WEIGHT", "WARMUP"))):
                 raise ValueError(f"expected --{name.lower()} to be a positive number, got {value}")
-        folder = shlex.quote(str(Path(__file__).resolve().parent / "nnunet"))
+        folder = shlex.quote(str(Path(__file__).resolve().parent.parent / "nnunet"))
         say(f"export nnUNet_extTrainer={folder}${{nnUNet_extTrainer:+:$nnUNet_extTrainer}}")
         say(f"export CURVAFIT_PRIOR={shlex.quote(prior)}")
         for name, value in given.items():

@@ -5,15 +5,23 @@ if __name__ != "curvafit.data_synth":
         "import curvafit.data_synth, not data_synth: the folder at the project's root is a link into the package"
     )
 
-from curvafit.data_synth.atlas.build import build, diagrams, extend
-from curvafit.data_synth.atlas.design import INTERVALS, Design, Draw, around, boxed
-from curvafit.data_synth.atlas.design_file import read_design
-from curvafit.data_synth.atlas.store import Record, Settings, Store, open_store
-from curvafit.data_synth.atlas.workers import Cluster, cluster
-from curvafit.data_synth.imaging.modalities import MODALITIES
-from curvafit.data_synth.imaging.modality import Imaging, Modality
-from curvafit.data_synth.labels.labels import Labels, labels_of
-from curvafit.data_synth.sets.training import TextureDataset, as_dict, as_monai, as_subject
+from typing import TYPE_CHECKING
+
+from curvafit.faces import offer
+
+if TYPE_CHECKING:
+    from curvafit.data_synth.atlas.build import build, extend
+    from curvafit.data_synth.atlas.design import INTERVALS, Design, Draw, around, boxed
+    from curvafit.data_synth.atlas.design_file import read_design
+    from curvafit.data_synth.atlas.record import Record, Settings
+    from curvafit.data_synth.atlas.store import Store, open_store
+    from curvafit.data_synth.atlas.workers import Cluster, cluster
+    from curvafit.data_synth.imaging.imaging import Imaging
+    from curvafit.data_synth.imaging.modalities import MODALITIES
+    from curvafit.data_synth.imaging.modality import Modality
+    from curvafit.data_synth.labels.labels import Labels, labels_of
+    from curvafit.data_synth.sets.training import TextureDataset, as_dict, as_monai, as_subject
+    from curvafit.geometry.diagram import diagrams
 
 __all__ = [
     "INTERVALS",
@@ -41,3 +49,32 @@ __all__ = [
     "open_store",
     "read_design",
 ]
+
+_HOMES = {
+    "Cluster": "curvafit.data_synth.atlas.workers",
+    "Design": "curvafit.data_synth.atlas.design",
+    "Draw": "curvafit.data_synth.atlas.design",
+    "INTERVALS": "curvafit.data_synth.atlas.design",
+    "Imaging": "curvafit.data_synth.imaging.imaging",
+    "Labels": "curvafit.data_synth.labels.labels",
+    "MODALITIES": "curvafit.data_synth.imaging.modalities",
+    "Modality": "curvafit.data_synth.imaging.modality",
+    "Record": "curvafit.data_synth.atlas.record",
+    "Settings": "curvafit.data_synth.atlas.record",
+    "Store": "curvafit.data_synth.atlas.store",
+    "TextureDataset": "curvafit.data_synth.sets.training",
+    "around": "curvafit.data_synth.atlas.design",
+    "as_dict": "curvafit.data_synth.sets.training",
+    "as_monai": "curvafit.data_synth.sets.training",
+    "as_subject": "curvafit.data_synth.sets.training",
+    "boxed": "curvafit.data_synth.atlas.design",
+    "build": "curvafit.data_synth.atlas.build",
+    "cluster": "curvafit.data_synth.atlas.workers",
+    "diagrams": "curvafit.geometry.diagram",
+    "extend": "curvafit.data_synth.atlas.build",
+    "labels_of": "curvafit.data_synth.labels.labels",
+    "open_store": "curvafit.data_synth.atlas.store",
+    "read_design": "curvafit.data_synth.atlas.design_file",
+}
+
+offer(__name__, _HOMES)

@@ -24,7 +24,7 @@ from scipy.ndimage import gaussian_filter
 from curvafit.drawing.render import View, render
 from curvafit.files import write_content
 from curvafit.geometry.diagram import Diagram
-from curvafit.report.wording import unit_name
+from curvafit.units import unit_name
 
 #: Colours that stay apart for the colour-blind (Okabe & Ito 2008), and a quiet grey for frames and notes.
 CONTOUR, DIAGONAL, QUIET, INK = "#E69F00", "#C8372D", "#8A8F98", "#22262B"

@@ -5,8 +5,9 @@ if __name__ != "curvafit.generation":
         "import curvafit.generation, not generation: the folder at the project's root is a link into the package"
     )
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from curvafit.faces import offer
 
 if TYPE_CHECKING:
     from curvafit.generation.batch import generate_batch
@@ -16,23 +17,6 @@ if TYPE_CHECKING:
     from curvafit.generation.result import Flow, History, State
     from curvafit.generation.schedule import SCHEDULES, Schedule
     from curvafit.generation.viability import Viability
-
-_HOMES = {
-    "Data": "data",
-    "Evidence": "data",
-    "Flow": "result",
-    "Hinge": "data",
-    "History": "result",
-    "State": "result",
-    "descend": "flow",
-    "generate": "flow",
-    "generate_batch": "batch",
-    "relax": "flow",
-    "white_noise": "initial",
-    "SCHEDULES": "schedule",
-    "Schedule": "schedule",
-    "Viability": "viability",
-}
 
 __all__ = [
     "SCHEDULES",
@@ -51,9 +35,21 @@ __all__ = [
     "white_noise",
 ]
 
+_HOMES = {
+    "Data": "curvafit.generation.data",
+    "Evidence": "curvafit.generation.data",
+    "Flow": "curvafit.generation.result",
+    "Hinge": "curvafit.generation.data",
+    "History": "curvafit.generation.result",
+    "SCHEDULES": "curvafit.generation.schedule",
+    "Schedule": "curvafit.generation.schedule",
+    "State": "curvafit.generation.result",
+    "Viability": "curvafit.generation.viability",
+    "descend": "curvafit.generation.flow",
+    "generate": "curvafit.generation.flow",
+    "generate_batch": "curvafit.generation.batch",
+    "relax": "curvafit.generation.flow",
+    "white_noise": "curvafit.generation.initial",
+}
 
-def __getattr__(name: str) -> Any:
-    """Public names, loaded when they are asked for."""
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+offer(__name__, _HOMES)

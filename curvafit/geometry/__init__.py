@@ -1,1 +1,88 @@
-"""TODO."""
+"""What a surface is and measures: meshes, curvature diagrams and their distances, topology, morphometry."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from curvafit.faces import offer
+
+if TYPE_CHECKING:
+    from curvafit.geometry.diagram import Diagram, SurfaceCurvatures, diagram, diagrams, surface_curvatures
+    from curvafit.geometry.family import family_of, family_shares, half_thickness
+    from curvafit.geometry.mesh import (
+        NoSurface,
+        Surface,
+        areas,
+        capped_surface,
+        euler_characteristic,
+        solid_surface,
+        surface,
+        volume,
+    )
+    from curvafit.geometry.mesh_files import write_surface
+    from curvafit.geometry.morphometry import Morphometry, local_thickness, morphometry
+    from curvafit.geometry.pairwise import one_to_many, pairwise
+    from curvafit.geometry.topology import betti_numbers, components, euler_number
+    from curvafit.geometry.transport import sliced_embedding, wasserstein
+
+__all__ = [
+    "Diagram",
+    "Morphometry",
+    "NoSurface",
+    "Surface",
+    "SurfaceCurvatures",
+    "areas",
+    "betti_numbers",
+    "capped_surface",
+    "components",
+    "diagram",
+    "diagrams",
+    "euler_characteristic",
+    "euler_number",
+    "family_of",
+    "family_shares",
+    "half_thickness",
+    "local_thickness",
+    "morphometry",
+    "one_to_many",
+    "pairwise",
+    "sliced_embedding",
+    "solid_surface",
+    "surface",
+    "surface_curvatures",
+    "volume",
+    "wasserstein",
+    "write_surface",
+]
+
+_HOMES = {
+    "Diagram": "curvafit.geometry.diagram",
+    "Morphometry": "curvafit.geometry.morphometry",
+    "NoSurface": "curvafit.geometry.mesh",
+    "Surface": "curvafit.geometry.mesh",
+    "SurfaceCurvatures": "curvafit.geometry.diagram",
+    "areas": "curvafit.geometry.mesh",
+    "betti_numbers": "curvafit.geometry.topology",
+    "capped_surface": "curvafit.geometry.mesh",
+    "components": "curvafit.geometry.topology",
+    "diagram": "curvafit.geometry.diagram",
+    "diagrams": "curvafit.geometry.diagram",
+    "euler_characteristic": "curvafit.geometry.mesh",
+    "euler_number": "curvafit.geometry.topology",
+    "family_of": "curvafit.geometry.family",
+    "family_shares": "curvafit.geometry.family",
+    "half_thickness": "curvafit.geometry.family",
+    "local_thickness": "curvafit.geometry.morphometry",
+    "morphometry": "curvafit.geometry.morphometry",
+    "one_to_many": "curvafit.geometry.pairwise",
+    "pairwise": "curvafit.geometry.pairwise",
+    "sliced_embedding": "curvafit.geometry.transport",
+    "solid_surface": "curvafit.geometry.mesh",
+    "surface": "curvafit.geometry.mesh",
+    "surface_curvatures": "curvafit.geometry.diagram",
+    "volume": "curvafit.geometry.mesh",
+    "wasserstein": "curvafit.geometry.transport",
+    "write_surface": "curvafit.geometry.mesh_files",
+}
+
+offer(__name__, _HOMES)

@@ -15,7 +15,7 @@ from curvafit.geometry.mesh import NoSurface, Surface, areas, surface
 from curvafit.priors.bounds import LONGEST, SHORTEST, instance, named, real
 from curvafit.priors.curvature import diffuse_curvatures, geometric_curvatures, jet
 from curvafit.priors.grid import Grid
-from curvafit.priors.profile import profile_distance
+from curvafit.priors.profile import phase_field, profile_distance
 
 Kind = Literal["geometric", "diffuse"]
 
@@ -25,6 +25,10 @@ LEAST_TRIANGLE = 1e-4
 MARGIN = 3
 #: A level set is defined where the slope of the distance, 1 for a perfect profile, exceeds this.
 LEAST_SLOPE = 0.1
+#: Edge of the bins in the (κ1, κ2) plane, in 1 / working unit, with which diagrams are compared and stored.
+BIN_WIDTH = 2.0
+#: Part of the area, times (edge / bin width)², that a widened bin may hold.
+TAIL_SHARE = 3e-3
 #: How many times bins may double in the tails of a thinned diagram.
 WIDENINGS = 5
 #: Radii of curvature below this many voxels are not resolved.
@@ -140,6 +144,16 @@ def diagram(
     """The curvature diagram of {u = 0}: what `surface_curvatures` finds, without the places; takes what that takes."""
     found = surface_curvatures(u, grid, epsilon, curvature, margin, where)
     return Diagram(found.points, found.areas, excluded=found.excluded)
+
+
+def diagrams(field: Tensor, grid: Grid, epsilon: float) -> tuple[Diagram, Diagram]:
+    """Measure a phase field (Z, Y, X) and its mask {u > 0}, re-profiled as a scan's mask is: two geometric diagrams.
+
+    Thinned with the bins that `transport.wasserstein` uses, so that a distance to them is the one to the whole diagram.
+    """
+    profile = phase_field(field > 0, grid, epsilon)
+    of_field, of_mask = (diagram(u, grid, epsilon).thinned(BIN_WIDTH, TAIL_SHARE) for u in (field, profile))
+    return of_field, of_mask
 
 
 def surface_curvatures(

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from curvafit.files import write_atomically
-from curvafit.geometry.diagram import Diagram
+from curvafit.geometry.diagram import BIN_WIDTH, Diagram
 from curvafit.geometry.sinkhorn import Measures, costs, packed
 from curvafit.geometry.transport import comparable
 from curvafit.priors.bounds import quoted
@@ -35,7 +35,7 @@ def pairwise(
     *,
     blur: float = 1.0,
     reach: float | None = 20.0,
-    bin_width: float = 2.0,
+    bin_width: float = BIN_WIDTH,
     device: torch.device | str = "cpu",
     checkpoint: str | Path | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -98,7 +98,7 @@ def one_to_many(
     *,
     blur: float = 1.0,
     reach: float | None = 20.0,
-    bin_width: float = 2.0,
+    bin_width: float = BIN_WIDTH,
     device: torch.device | str = "cpu",
 ) -> np.ndarray:
     """Distances `(N,)` of one diagram to each of N; as `pairwise`, which says what is taken and raised."""

@@ -9,14 +9,11 @@ import numpy as np
 import torch
 from geomloss import SamplesLoss
 
-from curvafit.geometry.diagram import Diagram
-
-#: Part of the area, times (edge / bin width)², that a widened bin may hold.
-TAIL_SHARE = 3e-3
+from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram
 
 
 def wasserstein(
-    a: Diagram, b: Diagram, *, blur: float = 1.0, reach: float | None = 20.0, bin_width: float = 2.0
+    a: Diagram, b: Diagram, *, blur: float = 1.0, reach: float | None = 20.0, bin_width: float = BIN_WIDTH
 ) -> float:
     """√ of the debiased unbalanced Sinkhorn divergence of two normalised diagrams, cost ½|x - y|².
 

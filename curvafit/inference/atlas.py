@@ -2,31 +2,21 @@
 
 from __future__ import annotations
 
-import dataclasses
-import datetime
 import importlib.resources
 import io
 import json
-from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
-from curvafit.data_synth.atlas.build import BIN_WIDTH, diagrams
-from curvafit.data_synth.atlas.design import boxed
-from curvafit.data_synth.atlas.draws import versions
-from curvafit.data_synth.atlas.store import Record, Store, open_store
 from curvafit.files import write_content
-from curvafit.generation.viability import FORMED, well_formed
 from curvafit.geometry.diagram import Diagram
-from curvafit.geometry.transport import TAIL_SHARE, sliced_embedding
+from curvafit.geometry.transport import sliced_embedding
 from curvafit.priors.bounds import quoted
 from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.grid import Grid
 from curvafit.priors.json_text import parse_json
 from curvafit.volumes.formats import read_archive
 
@@ -98,75 +88,6 @@ class Atlas:
         return np.stack([np.asarray(sliced_embedding(d)) for d in self.mask_diagrams])
 
 
-#: What is measured of a draw: volume fraction of {u > 0}, diagram of the field, diagram of its mask.
-Measured = tuple[float, Diagram, Diagram]
-#: Progress(shapes measured, shapes), called before each.
-Progress = Callable[[int, int], None]
-
-
-def extract(
-    store: str | Path | Store,
-    command: Sequence[str] = (),
-    measure: Callable[[Store, Record], Measured] | None = None,
-    progress: Progress | None = None,
-) -> Atlas:
-    """Measure every well-formed shape of a store (`generation.viability.well_formed`), as field and as mask.
-
-    Parameters
-    ----------
-    store
-        An open store, or its folder.
-    command
-        Command lines for the provenance, after the one that makes the store.
-    measure
-        What to call in place of `measured`: one that remembers.
-    progress
-        Called before each shape with the number of those measured, and of all.
-
-    Raises
-    ------
-    FileNotFoundError, ValueError
-        If there is no such store, it is of another version, or holds no well-formed shape.
-    """
-    store = store if isinstance(store, Store) else open_store(store)
-    records = [store.record(index) for index in store.indices()]
-    kept = [record for record in records if well_formed(record.viability)]
-    if not kept:
-        raise ValueError(f"expected at least one well-formed shape in {store.path}, got none in {len(records)} draws")
-    fractions, of_fields, of_masks = zip(*_measures(store, kept, measure or measured, progress), strict=True)
-    return Atlas(
-        ids=tuple(shape_id(store, record) for record in kept),
-        coefficients=np.array([list(record.coefficients) for record in kept], dtype=np.float64),
-        masses=np.array([record.mass for record in kept]),
-        seeds=np.array([record.seed for record in kept], dtype=np.int64),
-        volume_fractions=np.array(fractions),
-        field_diagrams=of_fields,
-        mask_diagrams=of_masks,
-        provenance=_provenance(store, records, command),
-    )
-
-
-def _measures(
-    store: Store, kept: list[Record], measure: Callable[[Store, Record], Measured], progress: Progress | None
-) -> Iterator[Measured]:
-    for done, record in enumerate(kept):
-        if progress is not None:
-            progress(done, len(kept))
-        yield measure(store, record)
-
-
-def shape_id(store: Store, record: Record) -> str:
-    """What a draw is called in an atlas: the law's seed and the draw's index."""
-    return f"{store.settings.seed}-{record.index:05d}"
-
-
-def measured(store: Store, record: Record) -> Measured:
-    """Volume fraction of {u > 0}, and the diagrams of field and mask, of one viable draw."""
-    field = torch.from_numpy(store.field(record.index))
-    grid = Grid(store.settings.shape, store.settings.spacing)
-    return float((field > 0).double().mean()), *diagrams(field, grid, store.settings.epsilon)
-
-
 def save_atlas(atlas: Atlas, path: str | Path) -> None:
     """Write an atlas as one compressed `.npz`: arrays, and a JSON header with format, version and provenance.
 
@@ -217,37 +138,6 @@ def is_atlas(path: Path) -> bool:
         return parse_json(header, "an atlas's header", path)["format"] == FORMAT
     except (OSError, ValueError, KeyError, TypeError):
         return False
-
-
-def _provenance(store: Store, records: list[Record], command: Sequence[str]) -> dict[str, Any]:
-    viable = sum(record.viability.viable for record in records)
-    made = sorted({json.dumps(record.versions, sort_keys=True) for record in records})
-    return {
-        "command": [_build_command(store, viable), *command],
-        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
-        "draws": len(records),
-        "viable": viable,
-        "selection": {"extent_of_both_phases": FORMED},
-        "settings": dataclasses.asdict(store.settings),
-        "diagrams": {
-            "curvature": "geometric",
-            "bin_width": BIN_WIDTH,
-            "tail_share": TAIL_SHARE,
-            "unit": "1/working unit",
-        },
-        "generated_with": [json.loads(text) for text in made],
-        "measured_with": versions(),
-    }
-
-
-def _build_command(store: Store, viable: int) -> str:
-    """The command that makes the same store: building stops at its last viable draw."""
-    settings = store.settings
-    shape, name = ",".join(map(str, settings.shape)), settings.schedule["name"]
-    known = {json.dumps(boxed(law).as_dict()): law for law in ("random", "sobol")}
-    design = known.get(json.dumps(settings.design), "design.yaml")
-    options = f"--count {viable} --shape {shape} --seed {settings.seed} --design {design} --schedule {name}"
-    return f"curvafit atlas build {store.path.name} {options}"
 
 
 def _packed(measured: tuple[Diagram, ...]) -> dict[str, np.ndarray]:

@@ -14,12 +14,11 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from curvafit.data_synth.atlas.build import BIN_WIDTH
 from curvafit.generation.flow import Flow, generate
-from curvafit.geometry.diagram import Diagram, diagram
+from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram, diagram
 from curvafit.geometry.family import family_of
 from curvafit.geometry.morphometry import morphometry
-from curvafit.geometry.transport import TAIL_SHARE, wasserstein
+from curvafit.geometry.transport import wasserstein
 from curvafit.inference.atlas import Atlas, load_atlas
 from curvafit.inference.fit import Fit
 from curvafit.inference.match import Match, nearest

@@ -11,8 +11,9 @@ from torch import Tensor
 from curvafit.priors.bounds import quoted
 from curvafit.priors.coefficients import NAMES, PRESETS, Coefficients
 from curvafit.priors.fit_schema import FORMAT, violation
-from curvafit.priors.grid import METRES, WORKING_SPACING
+from curvafit.priors.grid import WORKING_SPACING
 from curvafit.priors.json_text import parse_json
+from curvafit.units import METRES
 
 
 class Prior(NamedTuple):

@@ -12,7 +12,7 @@ from typing import Any
 
 from curvafit.priors.bounds import quoted
 from curvafit.priors.coefficients import NAMES
-from curvafit.priors.grid import METRES
+from curvafit.units import METRES
 
 FORMAT = "curvafit-fit-1"
 

@@ -10,8 +10,6 @@ from curvafit.priors.bounds import LONGEST, SHORTEST, named, real, whole
 
 Boundary = Literal["periodic", "replicate"]
 
-#: Metres in each unit of length that files name, small to large.
-METRES = {"nm": 1e-9, "um": 1e-6, "mm": 1e-3, "m": 1.0}
 #: Length of a voxel's edge in working units; the published parameters are all stated at this sampling.
 WORKING_SPACING = 0.01
 #: Interface parameter ε in working units (two voxels), likewise.

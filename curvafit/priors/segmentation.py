@@ -14,9 +14,10 @@ from torch import Tensor, nn
 from curvafit.priors.bounds import quoted, real, whole
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.fit_file import Law, find_law
-from curvafit.priors.grid import METRES, Grid
+from curvafit.priors.grid import Grid
 from curvafit.priors.loss import COARSEST, MOST, RESOLVED, check_numbers, curvature_prior, upsampling
 from curvafit.priors.values import plain, seen
+from curvafit.units import METRES
 
 #: The most that a weight or a mask's value may be: float32 holds its products.
 HEAVIEST = 1e9

@@ -15,7 +15,8 @@ from curvafit.interrupts import undisturbed
 from curvafit.priors.coefficients import NAMES
 from curvafit.priors.fit_file import FORMAT
 from curvafit.report.pictures import diagram_figures, slice_figures, surface_figures, window_framed
-from curvafit.report.wording import density, describe, length, number, per_unit, percent, unit_name
+from curvafit.report.wording import describe
+from curvafit.units import density, length, number, per_unit, percent, unit_name
 from curvafit.volumes.scan import Field, save
 
 if TYPE_CHECKING:

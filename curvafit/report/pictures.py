@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from curvafit.drawing.plot import diagram_figure, png, shared_limits, slice_figure, surface_figure
-from curvafit.report.wording import length
+from curvafit.units import length
 
 if TYPE_CHECKING:
     from curvafit.inference.infer import Inference

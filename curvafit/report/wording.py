@@ -1,4 +1,4 @@
-"""How results are said: lengths with a fitting unit, numbers with a fitting number of digits, the first sentence."""
+"""The sentence that a report opens with: family, size, share of the volume."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from curvafit.priors.grid import METRES
+from curvafit.units import length, percent
 
 if TYPE_CHECKING:
     from curvafit.geometry.diagram import Diagram
@@ -16,9 +16,6 @@ if TYPE_CHECKING:
 
 #: tan 22.5°: how far in direction a point may lie from a family's ideal one.
 _NARROW = math.tan(math.pi / 8)
-#: A space that no line breaks at.
-_GLUE = "\u00a0"
-
 _Radii = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 #: For each round family: which points (κ1, κ2) are its own, and the curvature that its radius is one over.
 _ROUND: dict[str, _Radii] = {
@@ -64,50 +61,3 @@ def family_radius(diagram: Diagram, family: str) -> float | None:
     cumulated = np.cumsum(np.asarray(diagram.weights)[own][order])
     middle = min(int(np.searchsorted(cumulated, cumulated[-1] / 2)), len(order) - 1)
     return float(1 / kappa[own][order][middle])
-
-
-def number(value: float | None, digits: int = 3) -> str:
-    """A number to so many significant digits, without an exponent where it reads well; a dash for none."""
-    if value is None or math.isnan(value):
-        return "–"
-    if value == 0 or math.isinf(value):
-        return f"{value:g}"
-    rounded = f"{value:.{digits - 1}e}"
-    power = int(rounded.partition("e")[2])
-    if -4 <= power <= 6:
-        rounded = f"{float(rounded):,.{max(0, digits - 1 - power)}f}".replace(",", "\u202f")
-    return rounded.replace("-", "−")
-
-
-def percent(share: float) -> str:
-    return f"{number(100 * share, 2)}{_GLUE}%"
-
-
-def length(value: float, unit: str, digits: int = 2) -> str:
-    """A length in the unit in which it is 1 to 1000."""
-    if unit not in METRES or not math.isfinite(value) or value <= 0:
-        return f"{number(value, digits)}{_GLUE}{unit_name(unit, value)}"
-    metres = value * METRES[unit]
-    fitting = [name for name, size in METRES.items() if metres / size >= 0.9995]
-    best = fitting[-1] if fitting else "nm"
-    return f"{number(metres / METRES[best], digits)}{_GLUE}{unit_name(best)}"
-
-
-def density(value: float, unit: str, power: int, digits: int = 3) -> str:
-    """A number per unit of length to a power; another unit where it would be tiny or huge."""
-    names = [unit, *(name for name in ("mm", "um", "nm", "m") if unit in METRES and name != unit)]
-    scaled = {name: value * (METRES[name] / METRES[unit]) ** power if name != unit else value for name in names}
-    best = next((name for name in names if 0.1 <= abs(scaled[name]) < 1e4), unit)
-    return f"{number(scaled[best], digits)}{_GLUE}{per_unit(best, power)[1:]}"
-
-
-def per_unit(unit: str, power: int) -> str:
-    """1/µm, 1/µm², 1/µm³."""
-    return f"1/{unit_name(unit)}{ {1: '', 2: '²', 3: '³'}[power] }"
-
-
-def unit_name(unit: str, count: float = 1) -> str:
-    """How a unit is written: µm for `um`, voxels for several."""
-    if unit == "um":
-        return "µm"
-    return "voxels" if unit == "voxel" and count != 1 else unit

@@ -12,7 +12,7 @@ from scipy import ndimage
 from scipy.interpolate import CubicSpline
 from skimage.filters import threshold_otsu
 
-from curvafit.priors.grid import METRES
+from curvafit.units import METRES
 from curvafit.volumes.scan import Field, ScanError
 
 __all__ = ["Evidence", "interpolated_distance", "of_intensities", "of_probability"]

@@ -7,8 +7,6 @@ import itertools
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-import torch
-
 from curvafit.data_synth.atlas.design import Design, boxed
 from curvafit.data_synth.atlas.draws import make
 from curvafit.data_synth.atlas.store import Record, Settings, Store, open_store
@@ -17,16 +15,11 @@ from curvafit.generation.flow import WORKING_BLUR
 from curvafit.generation.memory import FILE, FLOW, check_memory
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.schedule import schedule as named_schedule
-from curvafit.geometry.diagram import Diagram, diagram
-from curvafit.geometry.transport import TAIL_SHARE
 from curvafit.priors.bounds import instance, seed_of, whole
 from curvafit.priors.grid import WORKING_EPSILON, Grid
-from curvafit.priors.profile import phase_field
 
 #: Progress(record, viable so far, draws so far), called after every new draw.
 Progress = Callable[[Record, int, int], None]
-#: Edge of the bins in the (κ1, κ2) plane, in 1 / working unit: the one that distances are taken with.
-BIN_WIDTH = 2.0
 #: A design is given up when none of its first so many draws was viable, or fewer than one in so many.
 BARREN = 200
 #: Shapes that a store may be asked for.
@@ -112,17 +105,6 @@ def settings_of(
     plan, law = dataclasses.asdict(named_schedule(schedule)), design or boxed()
     law.draw(seed, 0)  # refuses a wrong seed, before a store is made
     return Settings(grid.shape, grid.spacing, WORKING_EPSILON, WORKING_BLUR, law.as_dict(), seed_of(seed), plan)
-
-
-def diagrams(field: torch.Tensor, grid: Grid, epsilon: float) -> tuple[Diagram, Diagram]:
-    """Geometric diagrams of a phase field (Z, Y, X) and of its mask {u > 0}, re-profiled as a scan's mask is.
-
-    Thinned with the bins that `transport.wasserstein` uses, so that a distance to them is the one to the whole diagram.
-    """
-    profile = phase_field(field > 0, grid, epsilon)
-    seen = (diagram(u, grid, epsilon, curvature="geometric") for u in (field, profile))
-    of_field, of_mask = (measure.thinned(BIN_WIDTH, TAIL_SHARE) for measure in seen)
-    return of_field, of_mask
 
 
 def _filled(store: Store, count: int, workers: Workers, progress: Progress | None) -> Store:

@@ -14,8 +14,8 @@ from curvafit.data_synth.imaging import degrade
 from curvafit.data_synth.imaging.optics import EPSILON
 from curvafit.data_synth.imaging.randomness import seeds_of
 from curvafit.data_synth.imaging.separable import Triple, sampled
-from curvafit.priors.grid import METRES
 from curvafit.priors.shapes import Bool, Float
+from curvafit.units import METRES
 
 #: Fields of an `Imaging` that are three numbers (z, y, x).
 TRIPLES = ("spacing", "blur", "noise_width")

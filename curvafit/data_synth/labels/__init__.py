@@ -1,1 +1,1 @@
-"""TODO."""
+"""What is exactly known of a generated shape: masks, distances, skeletons, centrelines."""

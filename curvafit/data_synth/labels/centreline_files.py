@@ -9,7 +9,7 @@ import networkx as nx
 import numpy as np
 
 from curvafit.files import write_atomically, write_content
-from curvafit.priors.grid import METRES
+from curvafit.units import METRES
 
 #: SWC's type of what is neither soma, axon nor dendrite.
 UNDEFINED = 0

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from curvafit.priors.bounds import quoted
-from curvafit.priors.grid import METRES
+from curvafit.units import METRES
 
 #: Suffixes of what a name may state as a unit -> (our name, factor to it).
 _UNITS: dict[str, tuple[str, float]] = {

@@ -1,0 +1,49 @@
+"""The face of a package: the names that it offers, loaded when they are first asked for."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from importlib import import_module
+from importlib.metadata import version
+from types import ModuleType
+from typing import Any
+
+
+def offer(package: str, homes: Mapping[str, str]) -> None:
+    """Let a package offer names that live in modules; nothing is imported before a name is asked for.
+
+    Parameters
+    ----------
+    package
+        `__name__` of the package.
+    homes
+        The module of each name.
+    """
+    face = sys.modules[package]
+    face.__dict__["_homes"] = dict(homes)
+    face.__class__ = _Face
+
+
+class _Face(ModuleType):
+    """A package whose names win over its modules: `curvafit.geometry.diagram` is the function in the module so named.
+
+    Importing that module would otherwise bind it in the function's place; `importlib.import_module` gives the module.
+    """
+
+    def __getattr__(self, name: str) -> Any:
+        homes = self.__dict__["_homes"]
+        if name == "__version__" and name in self.__all__:
+            return version(self.__name__)
+        if name not in homes:
+            raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")
+        value = getattr(import_module(homes[name]), name)
+        self.__dict__[name] = value
+        return value
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not (name in self.__dict__["_homes"] and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+    def __dir__(self) -> list[str]:
+        return sorted(self.__dict__["__all__"])

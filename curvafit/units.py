@@ -1,0 +1,57 @@
+"""Units of length, and numbers in words: lengths with a fitting unit, numbers with a fitting number of digits."""
+
+from __future__ import annotations
+
+import math
+
+#: Metres in each unit of length that files name, small to large.
+METRES = {"nm": 1e-9, "um": 1e-6, "mm": 1e-3, "m": 1.0}
+#: A space that no line breaks at.
+_GLUE = "\u00a0"
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """A number to so many significant digits, without an exponent where it reads well; a dash for none."""
+    if value is None or math.isnan(value):
+        return "–"
+    if value == 0 or math.isinf(value):
+        return f"{value:g}"
+    rounded = f"{value:.{digits - 1}e}"
+    power = int(rounded.partition("e")[2])
+    if -4 <= power <= 6:
+        rounded = f"{float(rounded):,.{max(0, digits - 1 - power)}f}".replace(",", "\u202f")
+    return rounded.replace("-", "−")
+
+
+def percent(share: float) -> str:
+    return f"{number(100 * share, 2)}{_GLUE}%"
+
+
+def length(value: float, unit: str, digits: int = 2) -> str:
+    """A length in the unit in which it is 1 to 1000."""
+    if unit not in METRES or not math.isfinite(value) or value <= 0:
+        return f"{number(value, digits)}{_GLUE}{unit_name(unit, value)}"
+    metres = value * METRES[unit]
+    fitting = [name for name, size in METRES.items() if metres / size >= 0.9995]
+    best = fitting[-1] if fitting else "nm"
+    return f"{number(metres / METRES[best], digits)}{_GLUE}{unit_name(best)}"
+
+
+def density(value: float, unit: str, power: int, digits: int = 3) -> str:
+    """A number per unit of length to a power; another unit where it would be tiny or huge."""
+    names = [unit, *(name for name in ("mm", "um", "nm", "m") if unit in METRES and name != unit)]
+    scaled = {name: value * (METRES[name] / METRES[unit]) ** power if name != unit else value for name in names}
+    best = next((name for name in names if 0.1 <= abs(scaled[name]) < 1e4), unit)
+    return f"{number(scaled[best], digits)}{_GLUE}{per_unit(best, power)[1:]}"
+
+
+def per_unit(unit: str, power: int) -> str:
+    """1/µm, 1/µm², 1/µm³."""
+    return f"1/{unit_name(unit)}{ {1: '', 2: '²', 3: '³'}[power] }"
+
+
+def unit_name(unit: str, count: float = 1) -> str:
+    """How a unit is written: µm for `um`, voxels for several."""
+    if unit == "um":
+        return "µm"
+    return "voxels" if unit == "voxel" and count != 1 else unit
