@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from importlib import import_module
-from importlib.metadata import version
 from types import ModuleType
 from typing import Any
 
@@ -34,6 +33,8 @@ class _Face(ModuleType):
     def __getattr__(self, name: str) -> Any:
         homes = self.__dict__["_homes"]
         if name == "__version__" and name in self.__all__:
+            from importlib.metadata import version
+
             return version(self.__name__)
         if name not in homes:
             raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")
