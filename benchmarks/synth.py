@@ -22,7 +22,8 @@ from unittest.mock import patch
 import torch
 from torch.utils.data import DataLoader
 
-from curvafit.data_synth import build, cluster, degrade
+from curvafit.data_synth import build, cluster
+from curvafit.data_synth.imaging import degrade
 from curvafit.data_synth.imaging.modalities import MODALITIES
 from curvafit.data_synth.imaging.modality import Modality
 from curvafit.data_synth.sets import case as case_module

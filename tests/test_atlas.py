@@ -243,7 +243,7 @@ def test_a_store_without_well_formed_shapes_gives_no_atlas(tmp_path):
 
 def test_the_packaged_atlas_is_of_the_random_law_and_small():
     atlas = load_atlas()
-    file = building.Path(__file__).parent.parent / "curvafit" / "data" / "atlas.npz"
+    file = building.Path(__file__).parent.parent / "curvafit" / "inference" / "data" / "atlas.npz"
     assert file.stat().st_size < 5e6
     assert len(atlas) >= 1000 and len(set(atlas.ids)) == len(set(atlas.seeds.tolist())) == len(atlas)
     settings = atlas.provenance["settings"]

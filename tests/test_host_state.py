@@ -18,7 +18,8 @@ import curvafit
 from curvafit import priors
 
 #: Types and tables whose makers, or users, are among the calls.
-PASSIVE = {"Preset", "Prior", "PRESETS", "SIGMA", "WORKING_EPSILON", "WORKING_SPACING"}
+PASSIVE = {"Fit", "Flow", "Inference", "Segmentation"}
+PASSIVE |= {"Preset", "Prior", "PRESETS", "SIGMA", "WORKING_EPSILON", "WORKING_SPACING"}
 NAMES = list(host_state.calls(Path(tempfile.gettempdir())))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import json
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -13,7 +14,6 @@ import torch
 from curvafit.generation.flow import generate
 from curvafit.geometry.diagram import diagram
 from curvafit.geometry.transport import wasserstein
-from curvafit.inference import fixed_point
 from curvafit.inference.infer import Inference, infer
 from curvafit.inference.measure import scan_diagram
 from curvafit.inference.prepare import prepare
@@ -38,8 +38,8 @@ def found(tubes: np.ndarray) -> Inference:
     scan = Field((tubes > 0).astype(np.uint8), (2.0, 2.0, 2.0), "um", source="tubes")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(importlib.import_module("curvafit.inference.infer"), "STARTS", 2)
-        patch.setattr(fixed_point, "FIRST_STEPS", 1)
-        patch.setattr(fixed_point, "LAST_STEPS", 2)
+        patch.setattr(import_module("curvafit.inference.fixed_point"), "FIRST_STEPS", 1)
+        patch.setattr(import_module("curvafit.inference.fixed_point"), "LAST_STEPS", 2)
         return infer(scan, kind="mask", periodic=True, seed=3)
 
 

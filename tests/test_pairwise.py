@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +11,13 @@ import pytest
 import torch
 from geomloss import SamplesLoss
 
-from curvafit.geometry import pairwise as module
 from curvafit.geometry import sinkhorn
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.pairwise import one_to_many, pairwise
 from curvafit.geometry.transport import wasserstein
 from curvafit.inference.atlas import load_atlas
+
+module = import_module("curvafit.geometry.pairwise")
 
 
 def cloud(seed: int, count: int, centre: tuple[float, float] = (0.0, 0.0), width: float = 10.0) -> Diagram:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from importlib import import_module
 
 import nibabel
 import numpy as np
@@ -11,7 +12,6 @@ import torch
 
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import schedule
-from curvafit.inference import fixed_point as method
 from curvafit.inference.fixed_point import ShortFlow, _minimise, _parameters, fixed_point, sharpened
 from curvafit.inference.refine import literal_loss_descent, refine
 from curvafit.priors.coefficients import Coefficients, preset
@@ -63,8 +63,8 @@ def test_only_the_direction_of_a_counts(mask_phase: torch.Tensor) -> None:
 @pytest.mark.slow
 def test_the_fixed_point_fit_improves_on_its_start(mask_phase: torch.Tensor, monkeypatch) -> None:
     """Already in few steps: none is taken that raises the residual."""
-    monkeypatch.setattr(method, "FIRST_STEPS", 1)
-    monkeypatch.setattr(method, "LAST_STEPS", 2)
+    monkeypatch.setattr(import_module("curvafit.inference.fixed_point"), "FIRST_STEPS", 1)
+    monkeypatch.setattr(import_module("curvafit.inference.fixed_point"), "LAST_STEPS", 2)
     start = Coefficients(1, 1, 3, -60, 20, 800)
     flow = ShortFlow(mask_phase, GRID, WORKING_EPSILON, start)
     before = np.linalg.norm(flow.residual(_parameters(start)))

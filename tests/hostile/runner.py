@@ -161,6 +161,9 @@ def _print_table(cases: Sequence[Case], faults: dict[str, list[Fault]], seconds:
     for kind, count in [*counts.items(), ("all", total)]:
         print(f"{kind:{width}}{count['cases']:>7}" + "".join(f"{count[name]:>14}" for name in COLUMNS))
     wrong = sum(bool(each) for each in faults.values())
+    for name, each in faults.items():
+        for column, text in each:
+            print(f"{name}: {_HEADS[column]}: {' '.join(text.split())[:600]}")
     print(f"{len(cases)} cases, {wrong} went wrong, {seconds:.0f} s", flush=True)
 
 
