@@ -84,6 +84,12 @@ def test_coefficients_that_vary_have_no_unit_to_go_to() -> None:
         texture_of(Coefficients(torch.ones(4, 4, 4), 0, 1)).in_unit("mm", 1.0)
 
 
+def test_a_law_with_a_mass_is_a_point_of_seven_numbers() -> None:
+    assert texture_of("tubes").point == (*TUBES.coefficients, TUBES.mass)
+    with pytest.raises(ValueError, match="expected a preset or a fit, which have a mass, got coefficients"):
+        texture_of(TUBES.coefficients).point  # noqa: B018
+
+
 def test_several_laws_are_several_textures(fit_path) -> None:
     prior = read_fit(fit_path)
     assert [texture.mass for texture in textures_of(["tubes", fit_path, TUBES])] == [TUBES.mass, prior.mass, TUBES.mass]

@@ -36,8 +36,8 @@ class CurvaturePrior(nn.Module):
 
     Parameters
     ----------
-    coefficients
-        A law: `Coefficients` with lengths in spacing's unit; a preset or its name, in working units of which the
+    law
+        `Coefficients` with lengths in spacing's unit; a preset or its name, in working units of which the
         smallest voxel edge is 0.01; the path of a `fit.json`, or a fit. Or a sequence of laws, one a class.
     sigmoid, softmax
         The input is logits: apply this first. Without either it is probabilities; others are warned of.
@@ -80,7 +80,7 @@ class CurvaturePrior(nn.Module):
 
     def __init__(
         self,
-        coefficients: Law | Sequence[Law],
+        law: Law | Sequence[Law],
         *,
         sigmoid: bool = False,
         softmax: bool = False,
@@ -115,7 +115,7 @@ class CurvaturePrior(nn.Module):
         self.shape = None if shape is None else Grid(shape, self.spacing).shape  # type: ignore[arg-type]
         self.weight = _weights(weight)
         edge = min(self.spacing)
-        self.coefficients = tuple(_numbers(each, edge, unit, self.epsilon) for each in textures_of(coefficients))
+        self.coefficients = tuple(_numbers(each, edge, unit, self.epsilon) for each in textures_of(law))
         for law in self.coefficients:
             check_numbers(law, self.epsilon)
         _tell(self.spacing, self.epsilon)
