@@ -210,6 +210,7 @@ class Calls:
             "reconstruct": lambda: curvafit.reconstruct(slices, "tubes", every=4, steps=2),
             "infer": self._infer,
             "read_fit": lambda: priors.read_fit(self.folder / "fit.json"),
+            "texture_of": lambda: [priors.texture_of(law) for law in ("tubes", self.a, self.folder / "fit.json")],
         }
 
     def _train(self, loss) -> None:

@@ -55,6 +55,14 @@ def test_one_for_all():
     assert flow.mass == pytest.approx(-0.5, abs=1e-6)
 
 
+def test_the_mass_is_the_law_s_own():
+    flows = generate_batch(["tubes", SPONGE], grid=GRID, seeds=(3, 4), schedule=PLAN)
+    for flow, known, seed in zip(flows, (TUBES, SPONGE), (3, 4), strict=True):
+        assert_same(flow, generate(known.coefficients, known.mass, GRID, seed=seed, schedule=PLAN))
+    with pytest.raises(ValueError, match="expected either a mass or a volume fraction, got neither"):
+        next(generate_batch(TUBES.coefficients, grid=GRID, schedule=PLAN))
+
+
 def test_lengths_that_differ_are_refused_at_once():
     with pytest.raises(ValueError, match="of one length, or one for all, got 1, 2, 3"):
         generate_batch(TUBES.coefficients, (-0.5, -0.4), GRID, seeds=(1, 2, 3))

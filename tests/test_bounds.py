@@ -94,11 +94,11 @@ def test_wrong_seeds_are_refused(seed: Any) -> None:
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ({"coefficients": Coefficients(1e300, 0, 1e300)}, r"expected \|a20\| of at most 1e\+06, got 1e\+300"),
-        ({"coefficients": Coefficients(1, 0, 1, 1e9)}, r"expected \|a10\| epsilon of at most 1e\+06, got 2e\+07"),
-        ({"coefficients": Coefficients(1, 0, 1, a00=torch.full((8, 8, 8), 1e20))}, r"expected \|a00\| epsilon²"),
-        ({"coefficients": "tube"}, "expected a preset among"),
-        ({"coefficients": (1, 2, 6)}, "expected coefficients as Coefficients, got"),
+        ({"law": Coefficients(1e300, 0, 1e300)}, r"expected \|a20\| of at most 1e\+06, got 1e\+300"),
+        ({"law": Coefficients(1, 0, 1, 1e9)}, r"expected \|a10\| epsilon of at most 1e\+06, got 2e\+07"),
+        ({"law": Coefficients(1, 0, 1, a00=torch.full((8, 8, 8), 1e20))}, r"expected \|a00\| epsilon²"),
+        ({"law": "tube"}, "expected a preset among"),
+        ({"law": (1, 2, 6)}, r"expected a law \(.*\), got \(1, 2, 6\)"),
         ({"epsilon": 1e30}, "expected an epsilon from 0.1 of a voxel"),
         ({"epsilon": 1e-9}, "expected an epsilon from 0.1 of a voxel"),
         ({"epsilon": torch.tensor([0.02, 1e9])}, "expected"),
@@ -118,7 +118,7 @@ def test_wrong_seeds_are_refused(seed: Any) -> None:
     ],
 )
 def test_flows_refuse_what_is_out_of_range(wrong: dict[str, Any], said: str) -> None:
-    given = {"coefficients": TUBES, "mass": MASS, "grid": 8, "schedule": BRIEF} | wrong
+    given = {"law": TUBES, "mass": MASS, "grid": 8, "schedule": BRIEF} | wrong
     with pytest.raises(ValueError, match=said):
         generate(**given)
 
@@ -130,9 +130,9 @@ def test_a_flow_starts_at_a_field_only(field: Any) -> None:
 
 
 def test_batches_refuse_what_is_no_sequence() -> None:
-    for name in ("coefficients", "masses", "seeds"):
-        given = {"coefficients": TUBES, "masses": MASS, "seeds": 0} | {name: None}
-        with pytest.raises(ValueError, match=f"expected a sequence of {name}, got None"):
+    for name, said in (("laws", r"a law \(.*\)"), ("masses", "a sequence of masses"), ("seeds", "a sequence of seeds")):
+        given = {"laws": TUBES, "masses": MASS, "seeds": 0} | {name: object()}
+        with pytest.raises(ValueError, match=f"expected {said}, got <object object"):
             generate_batch(grid=Grid((8, 8, 8)), **given)  # type: ignore[arg-type]
 
 

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from found import made_fit
 
 from curvafit.generation.flow import RECORD_EVERY, generate, relax
 from curvafit.generation.initial import white_noise
@@ -14,6 +15,7 @@ from curvafit.generation.schedule import SCHEDULES, Schedule, schedule
 from curvafit.generation.viability import viability
 from curvafit.priors.coefficients import Coefficients, preset
 from curvafit.priors.energy import energy
+from curvafit.priors.fit_file import read_fit
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
 from curvafit.priors.stencils import gaussian_blur
@@ -242,6 +244,15 @@ def test_fast_makes_a_shape():
     flow = generate(TUBES, MASS, Grid((24, 24, 24)), schedule=schedule("fast", steps=400))
     assert flow.viability.viable
     assert "after 400 steps" in flow.status
+
+
+def test_every_law_grows_the_same_shape(tmp_path) -> None:
+    brief, path = Schedule("brief", 3, 1e-3, 1e-3, "constant"), tmp_path / "fit.json"
+    fit = made_fit()
+    path.write_text(fit.to_json(), encoding="utf-8")
+    stated = generate(fit.coefficients, fit.mass, 12, schedule=brief).field
+    for law in (fit, path, str(path), read_fit(path)):
+        assert torch.equal(generate(law, grid=12, schedule=brief).field, stated)
 
 
 def test_a_preset_by_name_has_its_own_mass_unless_told_otherwise() -> None:

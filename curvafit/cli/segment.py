@@ -155,14 +155,14 @@ def _run(
     overwrite: bool,
 ) -> None:
     """Refuse, read, compute, write, say."""
+    from curvafit.priors.law import texture_of
     from curvafit.segmentation.mask_files import check_mask_target, write_mask
-    from curvafit.segmentation.working import find_law
     from curvafit.volumes.scan import load
 
     law = prior if prior.endswith(".json") else None  # or a preset's name
     inputs = [each for each in (source, law, told.get("probability")) if each is not None]
     check_mask_target(out, inputs=inputs, overwrite=overwrite)
-    find_law(prior, 1.0)
+    texture_of(prior)
     with stages() as progress:
         progress("reading", 0.0)
         volume = load(source, **reading)

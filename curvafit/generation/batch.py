@@ -24,6 +24,7 @@ from curvafit.priors import kernels
 from curvafit.priors.bounds import named, several, whole
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, Grid
+from curvafit.priors.law import Law, textures_of
 from curvafit.priors.shapes import Float
 
 #: Shapes that a device makes together, if not said otherwise.
@@ -31,9 +32,9 @@ TOGETHER = 64
 
 
 def generate_batch(
-    coefficients: Coefficients | Sequence[Coefficients],
-    masses: float | Tensor | Sequence[float | Tensor],
-    grid: Grid,
+    laws: Law | Sequence[Law],
+    masses: float | Tensor | Sequence[float | Tensor] | None = None,
+    grid: Grid | int | tuple[int, int, int] = 100,
     *,
     seeds: int | Sequence[int] = 0,
     schedule: str | Schedule = "fast",
@@ -50,9 +51,9 @@ def generate_batch(
 
     Parameters
     ----------
-    coefficients, masses, seeds
-        One for all shapes, or a sequence of one a shape; all sequences have one length. (A mass that is a tensor varies
-        in space, for all shapes.)
+    laws, masses, seeds
+        One for all shapes, or a sequence of one a shape; all sequences have one length. No masses are the laws' own. (A
+        mass that is a tensor varies in space, for all shapes.)
     together
         How many shapes an NVIDIA device makes at once, each some 70 bytes a voxel. A processor makes one at a time.
 
@@ -64,7 +65,8 @@ def generate_batch(
         If the sequences differ in length, at once; or as `generate`, where a shape's turn comes.
     """
     together = whole(together, "at least one shape at a time", 1, 10**6)
-    jobs, plan = _jobs(coefficients, masses, seeds), named_schedule(schedule)
+    jobs, plan = _jobs(laws, masses, seeds), named_schedule(schedule)
+    grid = grid if isinstance(grid, Grid) else Grid(grid)  # type: ignore[arg-type]
     told = {
         "schedule": plan, "epsilon": epsilon, "blur": blur, "orientation": orientation,
         "snapshots": snapshots, "reject_early": reject_early, "backend": backend, "device": device,
@@ -78,23 +80,24 @@ def generate_batch(
 
 class _Job(NamedTuple):
     coefficients: Coefficients
-    mass: float | Tensor
+    mass: float | Tensor | None
     seed: int
 
 
-def _jobs(coefficients, masses, seeds) -> list[_Job]:
+def _jobs(laws, masses, seeds) -> list[_Job]:
     """One a shape."""
     columns = [
-        [coefficients] if isinstance(coefficients, Coefficients) else several(coefficients, "coefficients"),
-        [masses] if isinstance(masses, (Real, Tensor)) else several(masses, "masses"),
+        textures_of(laws),
+        [masses] if masses is None or isinstance(masses, (Real, Tensor)) else several(masses, "masses"),
         [seeds] if isinstance(seeds, Real) else several(seeds, "seeds"),
     ]
     lengths = {len(column) for column in columns} - {1}
     if len(lengths) > 1 or 0 in lengths:
         found = ", ".join(str(len(column)) for column in columns)
-        raise ValueError(f"expected coefficients, masses and seeds of one length, or one for all, got {found}")
+        raise ValueError(f"expected laws, masses and seeds of one length, or one for all, got {found}")
     count = max(lengths, default=1)
-    return [_Job(*row) for row in zip(*([*column] * (count // len(column)) for column in columns), strict=True)]
+    rows = zip(*([*column] * (count // len(column)) for column in columns), strict=True)
+    return [_Job(law.coefficients, law.mass if mass is None else mass, seed) for law, mass, seed in rows]
 
 
 def _together(jobs: list[_Job], grid: Grid, told: dict[str, Any]) -> list[Flow]:

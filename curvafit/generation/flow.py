@@ -20,8 +20,8 @@ from curvafit.generation.schedule import Schedule
 from curvafit.generation.schedule import schedule as named_schedule
 from curvafit.generation.setup import Place, base_of
 from curvafit.priors.bounds import named, quoted, seed_of
-from curvafit.priors.coefficients import Coefficients, preset
 from curvafit.priors.grid import WORKING_EPSILON, Grid
+from curvafit.priors.law import Law, texture_of
 from curvafit.priors.shapes import Bool, Float
 
 __all__ = ["RECORD_EVERY", "WORKING_BLUR", "Flow", "History", "State", "descend", "generate", "relax"]
@@ -35,7 +35,7 @@ Backend = Literal["auto", "torch", "fused"]
 
 
 def generate(
-    coefficients: Coefficients | str,
+    law: Law,
     mass: float | Tensor | None = None,
     grid: Grid | int | tuple[int, int, int] = 100,
     *,
@@ -58,11 +58,12 @@ def generate(
 
     Parameters
     ----------
-    coefficients
-        The six numbers, or tensors that broadcast with the voxels `(Z, Y, X)`: they vary in space. Or a preset's name.
+    law
+        `Coefficients`: numbers, or tensors that broadcast with the voxels `(Z, Y, X)` and vary in space. Or a preset or
+        its name, the path of a `fit.json`, or a fit, all in working units.
     mass
-        m₀, the mean of u, in (-1, 1); exact to 1e-6 at every step. A tensor is m(x): u = k ∗ (div A + m). None where
-        the volume fraction is given, or for the preset's own.
+        m₀, the mean of u, in (-1, 1); exact to 1e-6 at every step. A tensor is m(x): u = k ∗ (div A + m). None takes
+        the law's own mass, or leaves it to the volume fraction.
     grid, epsilon, blur
         The sampling, or voxels along (z, y, x), or along each, of a periodic box in working units; ε, a number or a
         tensor that broadcasts with the voxels, and the blur's standard deviation, in spacing's unit.
@@ -103,12 +104,11 @@ def generate(
         If the mass is outside (-1, 1), ε is not positive or the blur negative, a tensor does not broadcast with the
         voxels, a name is unknown, a file is not this run's checkpoint, or there is no fused step for the device.
     """
-    if isinstance(coefficients, str):
-        known = preset(coefficients)
-        coefficients, mass = known.coefficients, known.mass if mass is None and volume_fraction is None else mass
+    texture = texture_of(law)
+    mass = texture.mass if mass is None and volume_fraction is None else mass
     grid, seed = grid if isinstance(grid, Grid) else Grid(grid), seed_of(seed)  # type: ignore[arg-type]
     place, plan = Place(backend, device, checkpoint, checkpoint_every, keep_checkpoint), named_schedule(schedule)
-    cost = Cost(coefficients, grid, epsilon, orientation, blur)
+    cost = Cost(texture.coefficients, grid, epsilon, orientation, blur)
     orders = Orders(grid, cost.epsilon, plan, callbacks, snapshots, reject_early, volume_fraction)
     orders.check_memory(device)
     base = base_of(mass, volume_fraction, grid)
@@ -120,7 +120,7 @@ def generate(
 
 def relax(
     field: Float[Tensor, "z y x"],
-    coefficients: Coefficients,
+    law: Law,
     grid: Grid,
     *,
     schedule: str | Schedule,
@@ -145,7 +145,7 @@ def relax(
     ValueError
         If the field or the mask does not have the grid's shape, or is not finite; or as `generate`.
     """
-    cost = Cost(coefficients, grid, epsilon, orientation, blur)
+    cost = Cost(texture_of(law).coefficients, grid, epsilon, orientation, blur)
     place = Place(backend, device, checkpoint, checkpoint_every)
     orders = Orders(grid, cost.epsilon, named_schedule(schedule), callbacks, snapshots)
     return _from_field(field, cost, place, "h-1", "adam", frozen, orders)
@@ -153,7 +153,7 @@ def relax(
 
 def descend(
     field: Float[Tensor, "z y x"],
-    coefficients: Coefficients,
+    law: Law,
     grid: Grid,
     *,
     flow: Literal["l2", "mass", "h-1"] = "l2",
@@ -203,7 +203,7 @@ def descend(
     if isinstance(optimiser, str) and optimiser == "lbfgs":
         plan = Schedule("lbfgs", steps, 1.0, 1.0, "constant")
     width = min(grid.spacing) if blur is None and isinstance(grid, Grid) else blur
-    cost = Cost(coefficients, grid, epsilon, orientation, width, data)  # type: ignore[arg-type]
+    cost = Cost(texture_of(law).coefficients, grid, epsilon, orientation, width, data)  # type: ignore[arg-type]
     place = Place(backend, device, checkpoint, checkpoint_every)
     orders = Orders(grid, cost.epsilon, plan, callbacks, snapshots)
     return _from_field(field, cost, place, flow, optimiser, None, orders)

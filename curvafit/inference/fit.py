@@ -12,6 +12,7 @@ from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.morphometry import Morphometry
 from curvafit.inference.match import Match
 from curvafit.priors.coefficients import Coefficients
+from curvafit.priors.fit_file import Prior
 from curvafit.priors.fit_schema import FORMAT, violation
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
 
@@ -73,6 +74,12 @@ class Fit:
     @property
     def epsilon_physical(self) -> float:
         return WORKING_EPSILON * self.length
+
+    def to_prior(self) -> Prior:
+        """Return what `read_fit` reads from the fit's file: the fit as a law."""
+        six, ε = self.coefficients_physical, self.epsilon_physical
+        filled = self.morphometry.volume_fraction
+        return Prior(self.coefficients, self.mass, six, ε, self.working_voxel, self.length_unit, filled)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers, strings, lists and dicts, as `fit.json` holds them."""

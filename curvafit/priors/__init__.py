@@ -9,6 +9,7 @@ from curvafit.priors.curvature import diffuse_curvatures, geometric_curvatures, 
 from curvafit.priors.energy import cahn_hilliard_area, discrepancy_ratio, energy, energy_terms, orientation
 from curvafit.priors.fit_file import Prior, read_fit
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
+from curvafit.priors.law import Law, Texture, texture_of
 from curvafit.priors.loss import curvature_prior
 from curvafit.priors.profile import SIGMA, optimal_profile, phase_field, profile_distance, signed_distance
 from curvafit.priors.segmentation import CurvaturePrior
@@ -22,8 +23,10 @@ __all__ = [
     "CombinedLoss",
     "CurvaturePrior",
     "Grid",
+    "Law",
     "Preset",
     "Prior",
+    "Texture",
     "cahn_hilliard_area",
     "curvature_prior",
     "diffuse_curvatures",
@@ -39,4 +42,5 @@ __all__ = [
     "profile_distance",
     "read_fit",
     "signed_distance",
+    "texture_of",
 ]

@@ -6,12 +6,9 @@ from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
 
-from torch import Tensor
-
 from curvafit.priors.bounds import quoted
-from curvafit.priors.coefficients import NAMES, PRESETS, Coefficients
+from curvafit.priors.coefficients import NAMES, Coefficients
 from curvafit.priors.fit_schema import FORMAT, violation
-from curvafit.priors.grid import WORKING_SPACING
 from curvafit.priors.json_text import parse_json
 from curvafit.units import METRES
 
@@ -50,29 +47,6 @@ class Prior(NamedTuple):
         if unit not in METRES or self.unit not in METRES:
             raise ValueError(f"expected two units among {', '.join(METRES)}, got {unit} and the fit's {self.unit}")
         return self.physical.in_unit(METRES[unit] / METRES[self.unit])
-
-
-#: What may stand for a prior: coefficients, a preset's name, or the path of a `fit.json`.
-Law = Coefficients | str | PathLike[str]
-
-
-def find_law(law: Law, edge: float) -> Coefficients | Prior:
-    """Coefficients, those of a preset with its working voxel of length `edge`, or a `fit.json` that is to be converted.
-
-    Raises
-    ------
-    FileNotFoundError, ValueError
-        If the coefficients vary, there is no preset of that name, or as `read_fit`.
-    """
-    if isinstance(law, Coefficients):
-        if any(isinstance(value, Tensor) and value.dim() > 0 for value in law):
-            raise ValueError("expected coefficients that are numbers, got some that vary")
-        return law
-    if isinstance(law, str) and law in PRESETS:
-        return PRESETS[law].coefficients.in_unit(WORKING_SPACING / edge)
-    if isinstance(law, str) and not law.endswith(".json"):
-        raise ValueError(f"expected a preset among {', '.join(PRESETS)}, or a fit.json, got {law!r}")
-    return read_fit(law)
 
 
 def read_fit(path: str | PathLike[str]) -> Prior:

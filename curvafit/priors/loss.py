@@ -12,6 +12,7 @@ from torch import Tensor
 from curvafit.priors.coefficients import NAMES, POWERS, Coefficients, check_strength
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.kernels.differentiable import areas, energies
+from curvafit.priors.law import Law, texture_of
 from curvafit.priors.refined import refined
 from curvafit.priors.shapes import Float
 from curvafit.priors.stencils import gaussian_blur
@@ -26,7 +27,7 @@ COARSEST = 10_000
 
 def curvature_prior(
     probability: Float[Tensor, "batch z y x"],
-    coefficients: Coefficients,
+    law: Law,
     spacing: tuple[float, float, float],
     epsilon: float,
     *,
@@ -41,8 +42,10 @@ def curvature_prior(
     ----------
     probability
         In [0, 1], float32 or float64 (the definition, for tests).
-    coefficients, epsilon, blur
-        Numbers, ε, and the standard deviation of a Gaussian that is applied first, in spacing's unit.
+    law
+        Coefficients in spacing's unit, or another law, as `CurvaturePrior` takes it.
+    epsilon, blur
+        ε, and the standard deviation of a Gaussian that is applied first, in spacing's unit.
     spacing
         Voxel edges (z, y, x). An axis with fewer than two voxels to ε is interpolated (cubic) until it has two;
         up to a tenth less is left as it is.
@@ -65,6 +68,7 @@ def curvature_prior(
         least = max(4, 2 * border + 1)
         raise ValueError(f"expected a volume of at least {least} voxels along each axis, got {shape}: it has no inside")
     times = upsampling(spacing, epsilon)
+    coefficients = texture_of(law).in_unit(None, min(spacing))
     check_numbers(coefficients, epsilon)
     check_lengths(epsilon, blur, max(n * h for n, h in zip(shape, spacing, strict=True)))
     unit = epsilon / WORKING_EPSILON

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Sequence
-from os import PathLike
 from typing import Literal
 
 import torch
@@ -13,8 +12,8 @@ from torch import Tensor, nn
 
 from curvafit.priors.bounds import quoted, real, whole
 from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.fit_file import Law, find_law
 from curvafit.priors.grid import Grid
+from curvafit.priors.law import Law, Texture, textures_of
 from curvafit.priors.loss import COARSEST, MOST, RESOLVED, check_numbers, curvature_prior, upsampling
 from curvafit.priors.values import plain, seen
 from curvafit.units import METRES
@@ -37,9 +36,9 @@ class CurvaturePrior(nn.Module):
 
     Parameters
     ----------
-    coefficients
-        `Coefficients` with lengths in spacing's unit; or a preset's name, in working units of which the smallest
-        voxel edge is 0.01; or the path of a `fit.json`. Or a sequence of such, one a class.
+    law
+        `Coefficients` with lengths in spacing's unit; a preset or its name, in working units of which the
+        smallest voxel edge is 0.01; the path of a `fit.json`, or a fit. Or a sequence of laws, one a class.
     sigmoid, softmax
         The input is logits: apply this first. Without either it is probabilities; others are warned of.
     include_background
@@ -81,7 +80,7 @@ class CurvaturePrior(nn.Module):
 
     def __init__(
         self,
-        coefficients: Law | Sequence[Law],
+        law: Law | Sequence[Law],
         *,
         sigmoid: bool = False,
         softmax: bool = False,
@@ -115,8 +114,8 @@ class CurvaturePrior(nn.Module):
         self._said: set[str] = set()
         self.shape = None if shape is None else Grid(shape, self.spacing).shape  # type: ignore[arg-type]
         self.weight = _weights(weight)
-        laws = [coefficients] if isinstance(coefficients, (Coefficients, str, PathLike)) else list(coefficients)
-        self.coefficients = tuple(_numbers(law, min(self.spacing), unit, self.epsilon) for law in laws)
+        edge = min(self.spacing)
+        self.coefficients = tuple(_numbers(each, edge, unit, self.epsilon) for each in textures_of(law))
         for law in self.coefficients:
             check_numbers(law, self.epsilon)
         _tell(self.spacing, self.epsilon)
@@ -272,15 +271,16 @@ def _weights(weight: float | Sequence[float]) -> tuple[float, ...]:
     return values
 
 
-def _numbers(law: Law, edge: float, unit: str | None, epsilon: float) -> Coefficients:
-    """Coefficients with lengths in spacing's unit."""
-    found = find_law(law, edge)
-    if isinstance(found, Coefficients):
+def _numbers(texture: Texture, edge: float, unit: str | None, epsilon: float) -> Coefficients:
+    """Return coefficients with lengths in spacing's unit; warn where ε is far from the fit's."""
+    numbers = texture.in_unit(unit, edge)
+    if texture.prior is None:
         if unit is not None and unit not in METRES:
-            raise ValueError(f"expected a unit among {', '.join(METRES)}, got {unit!r}")
-        return found
-    numbers, unit = found.in_unit(unit), unit or found.unit
-    fitted = found.epsilon * (1 if unit == found.unit else METRES[found.unit] / METRES[unit])
+            raise ValueError(f"expected a unit among {', '.join(METRES)}, got {quoted(unit)}")
+        return numbers
+    fitted, own = texture.prior.epsilon, texture.prior.unit
+    unit = unit or own
+    fitted *= 1 if unit == own else METRES[own] / METRES[unit]
     if not 1 / 4 <= epsilon / fitted <= 4:
         both = f"ε is {epsilon:g} {unit} here and was {fitted:g} {unit} in the fit"
         warnings.warn(f"{both}: give spacing and its unit, if these are not meant", stacklevel=4)

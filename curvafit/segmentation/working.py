@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,8 +10,8 @@ from torch import Tensor
 
 from curvafit.priors.bounds import LONGEST, SHORTEST, instance, real
 from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.fit_file import Law, find_law
 from curvafit.priors.grid import WORKING_EPSILON, Grid
+from curvafit.priors.law import Law, texture_of
 from curvafit.priors.loss import RESOLVED, upsampling
 from curvafit.priors.refined import refined
 from curvafit.volumes.scan import Field, ScanError
@@ -31,18 +30,16 @@ def law_of(prior: Law, scan: Field) -> tuple[Coefficients, tuple[str, ...]]:
         If there is no such file.
     """
     instance(scan, Field, "a scan as Field")
-    instance(prior, (Coefficients, str, os.PathLike), "a prior as Coefficients, a preset's name or a fit.json")
-    found = find_law(prior, min(scan.spacing))
-    if isinstance(found, Coefficients):
-        named = f"The preset {prior}, at a working voxel of one scan voxel."
-        return found, () if isinstance(prior, Coefficients) else (named,)
-    if found.unit == scan.unit:
-        return found.physical, ()
+    texture = texture_of(prior)
+    if texture.prior is None:
+        said = f"The {texture.origin}, at a working voxel of one scan voxel."
+        return texture.in_unit(scan.unit, min(scan.spacing)), (said,) if texture.working else ()
     try:
-        law = found.in_unit(scan.unit)
+        law = texture.in_unit(scan.unit, min(scan.spacing))
     except ValueError as reason:
         raise ScanError(f"{reason}: give --spacing and --unit") from None
-    return law, (f"The prior's lengths, in {found.unit}, are taken to {scan.unit}.",)
+    moved = f"The prior's lengths, in {texture.unit}, are taken to {scan.unit}."
+    return law, () if texture.unit == scan.unit else (moved,)
 
 
 @dataclass(frozen=True)
