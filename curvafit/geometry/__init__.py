@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from curvafit.geometry.morphometry import Morphometry, local_thickness, morphometry
     from curvafit.geometry.pairwise import one_to_many, pairwise
     from curvafit.geometry.topology import betti_numbers, components, euler_number
-    from curvafit.geometry.transport import sliced_embedding, wasserstein
+    from curvafit.geometry.transport import sinkhorn_divergence, sliced_embedding, wasserstein
 
 __all__ = [
     "Diagram",
@@ -46,6 +46,7 @@ __all__ = [
     "morphometry",
     "one_to_many",
     "pairwise",
+    "sinkhorn_divergence",
     "sliced_embedding",
     "solid_surface",
     "surface",
@@ -76,6 +77,7 @@ _HOMES = {
     "morphometry": "curvafit.geometry.morphometry",
     "one_to_many": "curvafit.geometry.pairwise",
     "pairwise": "curvafit.geometry.pairwise",
+    "sinkhorn_divergence": "curvafit.geometry.transport",
     "sliced_embedding": "curvafit.geometry.transport",
     "solid_surface": "curvafit.geometry.mesh",
     "surface": "curvafit.geometry.mesh",
