@@ -12,7 +12,7 @@ import torch
 
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import schedule
-from curvafit.inference.fixed_point import ShortFlow, _minimise, _parameters, fixed_point, sharpened
+from curvafit.inference.fixed_point import ShortFlow, _minimiser, _parameters, fixed_point, sharpened
 from curvafit.inference.refine import literal_loss_descent, refine
 from curvafit.priors.coefficients import Coefficients, preset
 from curvafit.priors.grid import WORKING_EPSILON, Grid
@@ -138,7 +138,7 @@ def test_a_fit_in_float64_leaves_jax_as_it_is() -> None:
 
     before, bowls, starts = jax.config.jax_enable_x64, (Bowl(), Bowl()), (0.1, 0.7)
     with ThreadPoolExecutor(2) as pool:
-        ends = list(pool.map(lambda bowl, start: _minimise(bowl, np.full(5, start), 20), bowls, starts))  # type: ignore[arg-type]
+        ends = list(pool.map(lambda bowl, start: _minimiser(bowl)(np.full(5, start), 20), bowls, starts))  # type: ignore[arg-type]
     assert jax.config.jax_enable_x64 == before
     assert jnp.ones(1).dtype == (jnp.float64 if before else jnp.float32)
     for bowl, end, start in zip(bowls, ends, starts, strict=True):

@@ -95,7 +95,7 @@ def comparable(diagrams: Sequence[Diagram], blur: float, reach: float | None, bi
 
 
 def sliced_embedding(diagram: Diagram, directions: int = 12, quantiles: int = 24) -> np.ndarray:
-    """Return quantiles of the diagram's projections on `directions` lines through the origin, `(directions · quantiles,)`.
+    """Return quantiles of a diagram's projections on lines through the origin, `(directions · quantiles,)`.
 
     Scaled so that the Euclidean distance of two embeddings is their sliced W₂, the mean over directions of the squared
     one-dimensional distances: |s| / √2 for a shift by s, as in `wasserstein`.

@@ -10,13 +10,14 @@ import torch
 from torch import Tensor
 
 from curvafit.inference.fixed_point import fixed_point
-from curvafit.inference.refinement import Progress, Refinement
+from curvafit.inference.refinement import Refinement
 from curvafit.inference.stationarity import is_rounded, stationarity
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.curvature import geometric_curvatures, jet
 from curvafit.priors.energy import energy_terms
 from curvafit.priors.grid import Grid
 from curvafit.priors.shapes import Float
+from curvafit.progress import Progress, silent
 
 __all__ = ["Refinement", "literal_loss_descent", "mass_of_mask", "refine"]
 
@@ -29,7 +30,7 @@ def refine(
     kind: str,
     starts: Sequence[Coefficients],
     seed: int = 0,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Refinement:
     """Refine the nearest matches: stationarity for a phase field, the fixed point of a short flow for a mask or image.
 
