@@ -1,4 +1,4 @@
-"""What pins the parameters down, what does not, and why the paper's literal loss cannot."""
+"""What pins the parameters down, and what does not."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import torch
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import schedule
 from curvafit.inference.fixed_point import ShortFlow, _minimiser, _parameters, fixed_point, sharpened
-from curvafit.inference.refine import literal_loss_descent, refine
+from curvafit.inference.refine import refine
 from curvafit.priors.coefficients import Coefficients, preset
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.profile import phase_field
@@ -91,16 +91,6 @@ def test_the_halo_of_a_crop_is_held(mask_phase: torch.Tensor) -> None:
     flow = ShortFlow(crop, Grid((32, 32, 32), boundary="replicate"), WORKING_EPSILON, preset("tubes").coefficients)
     assert flow._frozen is not None
     assert bool(flow._frozen[0].all()) and not bool(flow._frozen[16, 16, 16])
-
-
-def test_the_literal_loss_falls_for_ever(tubes: torch.Tensor) -> None:
-    losses, path = literal_loss_descent(tubes, GRID, WORKING_EPSILON, preset("tubes").coefficients, 1000, 1e-3)
-    falls = losses.diff()
-    assert bool((falls < 0).all())
-    torch.testing.assert_close(falls, falls[:1].expand_as(falls), rtol=1e-6, atol=0)
-    assert losses[-1] < 0 < losses[0]
-    turned = torch.nn.functional.cosine_similarity(path[-1] - path[0], path[1] - path[0], dim=0)
-    assert float(turned) == pytest.approx(1)
 
 
 def test_an_unknown_kind_and_no_start_are_refused(mask_phase: torch.Tensor) -> None:
