@@ -23,6 +23,7 @@ from curvafit.atlas_map.layout import NOISE, AtlasMap, embed, find_clusters, map
 from curvafit.atlas_map.picture import _assigned, _slots, spread_out
 from curvafit.atlas_map.shapes import CUT, LEVELS, regrow_command, shown, small_volume
 from curvafit.generation.flow import generate
+from curvafit.geometry.transport import wasserstein
 from curvafit.priors import Coefficients, Grid
 from curvafit.volumes.scan import load
 
@@ -91,13 +92,10 @@ def test_umap_keeps_apart_what_is_far_and_takes_few_shapes() -> None:
 
 
 def test_distances_are_the_paper_s(mapped: AtlasMap) -> None:
-    pairwise = pytest.importorskip("curvafit.geometry.pairwise")
-    from curvafit.geometry.transport import wasserstein
-
     first = mapped.atlas.field_diagrams[:3]
     found = atlas_map.diagram_distances(first)
     truth = [wasserstein(first[0], other) for other in first[1:]]
-    assert pairwise and found[0, 1:] == pytest.approx(truth, rel=0.03, abs=0.05)
+    assert found[0, 1:] == pytest.approx(truth, rel=1e-4, abs=1e-5)
 
 
 def test_wrong_distances_and_too_few_shapes_are_refused(mapped: AtlasMap) -> None:

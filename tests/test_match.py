@@ -43,7 +43,7 @@ def test_matches_come_by_distance_with_the_parameters_of_their_shape():
     found = nearest(blob((30.0, 0.0)), atlas, count=3)
     assert [match.id for match in found] == ["0-00001", "0-00003", "0-00002"]
     assert found[0].distance == pytest.approx(0, abs=1e-3)
-    assert found[1].distance == pytest.approx(wasserstein(blob((30.0, 0.0)), fields[3]), rel=5e-3)
+    assert found[1].distance == pytest.approx(wasserstein(blob((30.0, 0.0)), fields[3]), rel=1e-4)
     assert list(found[1].coefficients) == list(atlas.coefficients[3])
     assert (found[1].mass, found[1].seed) == (atlas.masses[3], 103)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from importlib import import_module
 from pathlib import Path
 
@@ -36,9 +37,10 @@ CLOUDS = [
 ]
 
 
-def cost(a: Diagram, b: Diagram, blur: float, reach: float | None) -> float:
+def cost(a: Diagram, b: Diagram, blur: float, reach: float | None, falls: int) -> float:
     """OT_ε by geomloss in float64."""
-    loss = SamplesLoss("sinkhorn", p=2, blur=blur, reach=reach, debias=False, backend="tensorized")
+    options = {"blur": blur, "reach": reach, "diameter": blur * 2.0 ** (falls - 0.5)}
+    loss = SamplesLoss("sinkhorn", p=2, debias=False, backend="tensorized", **options)
     with torch.no_grad():
         return float(loss(*(torch.from_numpy(v) for d in (a, b) for v in (d.normalised.weights, d.points))))
 
@@ -51,30 +53,69 @@ def measures(diagrams: list[Diagram]) -> sinkhorn.Measures:
 def test_costs_are_geomloss_s(blur: float, reach: float | None) -> None:
     """On processors and in torch, whose small batches hold sets of unlike sizes. Float32 keeps 1e-6 of a potential."""
     first, second = np.triu_indices(len(CLOUDS), 1)
-    truth = [cost(CLOUDS[i], CLOUDS[j], blur, reach) for i, j in zip(first, second, strict=True)]
-    found = sinkhorn.costs(measures(CLOUDS), first, second, blur, reach)
-    np.testing.assert_allclose(found, truth, rtol=2e-5, atol=1e-4)
+    falls = sinkhorn.pair_halvings(measures(CLOUDS), first, second, blur)
+    truth = [cost(CLOUDS[i], CLOUDS[j], blur, reach, n) for i, j, n in zip(first, second, falls, strict=True)]
+    values = sinkhorn.costs(measures(CLOUDS), first, second, falls, blur=blur, reach=reach)
+    np.testing.assert_allclose(values, truth, rtol=2e-5, atol=1e-4)
 
 
 @pytest.mark.parametrize("reach", [20.0, None])
 def test_batches_cost_what_single_pairs_do(reach: float | None, monkeypatch: pytest.MonkeyPatch) -> None:
     packed = measures(CLOUDS)
     first, second = np.triu_indices(len(CLOUDS))
+    falls = sinkhorn.pair_halvings(packed, first, second, 1.0)
+    truth = sinkhorn.costs(packed, first, second, falls, blur=1.0, reach=reach)
+    ε, shares = sinkhorn.schedule(falls, 1.0)
     for entries in (1, 3 * 70**2, 1 << 26):
         monkeypatch.setattr(sinkhorn, "_ENTRIES", entries)
-        found = sinkhorn.batched(packed, first, second, 1.0, reach, "cpu")
-        np.testing.assert_allclose(found, sinkhorn.costs(packed, first, second, 1.0, reach), rtol=2e-5, atol=1e-4)
+        values = sinkhorn.batched(packed, first, second, ε, shares, math.inf if reach is None else reach**2, "cpu")
+        np.testing.assert_allclose(values, truth, rtol=2e-5, atol=1e-4)
+
+
+@pytest.mark.parametrize("edge", [1.0, 0.3, 3.7, 181.0, 181.1, 1e5])
+def test_a_box_fits_its_diameter_and_would_not_fit_half_of_it(edge: float) -> None:
+    """At 2^7.5 = 181.02 a further step is needed; points that are one start at blur · √½ above and end at blur."""
+    n = int(sinkhorn.halvings(np.array([edge, 0.0]), 1.0))
+    assert max(edge, 1.0) <= 2.0 ** (n - 0.5) < 2 * max(edge, 1.0)
+    assert sinkhorn.halvings(np.zeros(2), 0.5) == 1
+
+
+def close(distance: float, truth: float) -> bool:
+    """To 1e-4 of itself; under 0.1, where the debiased cost is all rounding, to 1e-5."""
+    return distance == pytest.approx(truth, rel=1e-4, abs=1e-5)
 
 
 def test_distances_are_wasserstein_s_on_the_packaged_atlas() -> None:
-    """But for the terms of the diagrams themselves, with steps from their own diameters: 5e-3 at most."""
+    """Of shapes of all sizes, and of each with its nearest by the sliced distance."""
     atlas = load_atlas()
-    diagrams = sorted(atlas.mask_diagrams, key=lambda d: len(d.points))[:: len(atlas) // 7][:7]
-    found = pairwise(diagrams)
+    embeddings = atlas.embeddings("mask")
+    for k in range(0, len(atlas), len(atlas) // 5):
+        near = int(np.argsort(np.linalg.norm(embeddings - embeddings[k], axis=1))[1])
+        others = [atlas.mask_diagrams[near], atlas.mask_diagrams[k // 2 + 1], atlas.field_diagrams[k]]
+        distances = one_to_many(atlas.mask_diagrams[k], others)
+        for distance, other in zip(distances, others, strict=True):
+            assert close(distance, wasserstein(atlas.mask_diagrams[k], other))
+
+
+@pytest.mark.parametrize(("blur", "reach"), [(1.0, 20.0), (0.3, 5.0), (1.0, None)])
+def test_distances_are_wasserstein_s_far_near_narrow_and_on_single_points(blur: float, reach: float | None) -> None:
+    near = [dataclasses.replace(CLOUDS[0], points=CLOUDS[0].points + shift) for shift in (0.01, 0.1, 1.0)]
+    diagrams = [*CLOUDS, *near, cloud(5, 1, (900.0, -900.0))]
+    distances = pairwise(diagrams, blur=blur, reach=reach, bin_width=0)
     for i, j in zip(*np.triu_indices(len(diagrams), 1), strict=True):
-        assert found[i, j] == pytest.approx(wasserstein(diagrams[i], diagrams[j]), rel=5e-3)
-    assert (found == found.T).all()
-    assert (np.diag(found) == 0).all()
+        assert close(distances[i, j], wasserstein(diagrams[i], diagrams[j], blur=blur, reach=reach, bin_width=0)), (
+            i,
+            j,
+        )
+    assert (distances == distances.T).all()
+    assert (np.diag(distances) == 0).all()
+
+
+def test_a_distance_is_the_pair_s_own_whoever_else_is_there() -> None:
+    """Not of the company: the number of steps is the pair's."""
+    together = pairwise(CLOUDS)
+    for i, j in zip(*np.triu_indices(len(CLOUDS), 1), strict=True):
+        assert pairwise([CLOUDS[i], CLOUDS[j]])[0, 1] == pytest.approx(together[i, j], rel=1e-5)
 
 
 def test_one_to_many_is_a_row_and_weights_are_shares() -> None:
@@ -90,7 +131,7 @@ def test_points_without_weight_do_not_count() -> None:
     assert one_to_many(a, [more], bin_width=0)[0] == 0
 
 
-def interrupt(done: int, total: int) -> None:
+def interrupt(text: str, share: float) -> None:
     raise KeyboardInterrupt
 
 
@@ -101,14 +142,15 @@ def test_an_interrupted_run_goes_on_and_a_longer_list_costs_its_new_rows(
     path, truth = tmp_path / "distances.npz", pairwise(CLOUDS)
     with pytest.raises(KeyboardInterrupt):
         pairwise(CLOUDS[:4], checkpoint=path, progress=interrupt)
-    reports: list[tuple[int, int]] = []
-    found = pairwise(CLOUDS[:4], checkpoint=path, progress=lambda *report: reports.append(report))
-    assert reports == [(4, 6), (6, 6)]
-    np.testing.assert_array_equal(found, truth[:4, :4])
-    reports.clear()
-    np.testing.assert_array_equal(pairwise(CLOUDS, checkpoint=path, progress=lambda *r: reports.append(r)), truth)
-    assert reports == [(8, 10), (10, 10)]
-    np.testing.assert_array_equal(pairwise(CLOUDS, checkpoint=path, progress=interrupt), truth)
+    shares: list[float] = []
+    resumed = pairwise(CLOUDS[:4], checkpoint=path, progress=lambda text, share: shares.append(share))
+    assert shares == pytest.approx([4 / 6, 1])
+    np.testing.assert_allclose(resumed, truth[:4, :4], rtol=1e-5)
+    shares.clear()
+    longer = pairwise(CLOUDS, checkpoint=path, progress=lambda text, share: shares.append(share))
+    np.testing.assert_allclose(longer, truth, rtol=1e-5)
+    assert shares == pytest.approx([0.8, 1])
+    np.testing.assert_array_equal(pairwise(CLOUDS, checkpoint=path, progress=interrupt), longer)
     assert [each.name for each in tmp_path.iterdir()] == ["distances.npz"]
 
 

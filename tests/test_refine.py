@@ -1,8 +1,9 @@
-"""Stationarity on fields that are stationary, or are not; rounded fields; the mass of a mask."""
+"""Stationarity on fields that are stationary, or are not; rounded fields."""
 
 from __future__ import annotations
 
 import math
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import torch
 
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import schedule
-from curvafit.inference.refine import mass_of_mask, refine
+from curvafit.inference.refine import refine
 from curvafit.inference.refinement import admissible, in_gauge, units
 from curvafit.inference.stationarity import _tested, energy_gradients, is_rounded, stationarity
 from curvafit.priors import WORKING_EPSILON, Coefficients, Grid, energy_terms, jet, preset
@@ -132,8 +133,7 @@ def test_a_rounded_field_is_told_and_treated_like_a_mask(sponge: torch.Tensor, m
     rounded = torch.floor(sponge * 100) / 100
     assert is_rounded(rounded) and not is_rounded(sponge)
     assert "not supported" in stationarity(rounded, GRID, WORKING_EPSILON).status
-    import curvafit.inference.fixed_point as method
-
+    method = import_module("curvafit.inference.fixed_point")
     monkeypatch.setattr(method, "FIRST_STEPS", 1)
     monkeypatch.setattr(method, "LAST_STEPS", 1)
     other = refine(rounded, GRID, WORKING_EPSILON, kind="field", starts=[TRUTH.coefficients])
@@ -150,17 +150,3 @@ def test_gauge_and_domain() -> None:
     assert inside[0] > 0 and inside[2] > 0 and inside[0] + inside[2] == pytest.approx(2)
     a = Coefficients(1, 2, 3, 4, 5, 6)
     assert np.array(list(a)) / units(0.5) == pytest.approx(list(a.in_unit(0.5)))
-
-
-@pytest.mark.parametrize("radius", [0.12, 0.16])
-def test_the_mass_of_a_ball_is_its_profiles_mean(radius: float) -> None:
-    """2·fraction - 1 + (π²/6) ε² ∫H dA / |Ω|, ∫H dA = 8πR; the rest is the voxel count's error and order ε⁴."""
-    grid = Grid((56,) * 3)
-    axis = (torch.arange(56, dtype=torch.float64) + 0.5) * 0.01 - 0.28
-    distance = radius - (axis[:, None, None] ** 2 + axis[:, None] ** 2 + axis**2).sqrt()
-    u = torch.tanh(distance / (math.sqrt(2) * WORKING_EPSILON))
-    fraction = float((u > 0).double().mean())
-    shift = math.pi**2 / 6 * WORKING_EPSILON**2 * 8 * math.pi * radius / grid.volume
-    found = mass_of_mask(u, grid, WORKING_EPSILON)
-    assert found - (2 * fraction - 1) == pytest.approx(shift, rel=0.06)
-    assert found == pytest.approx(float(u.mean()), abs=0.1 * shift)

@@ -1,4 +1,4 @@
-"""What pins the parameters down, what does not, and why the paper's literal loss cannot."""
+"""What pins the parameters down, and what does not."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import torch
 
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import schedule
-from curvafit.inference.fixed_point import ShortFlow, _minimise, _parameters, fixed_point, sharpened
-from curvafit.inference.refine import literal_loss_descent, refine
+from curvafit.inference.fixed_point import ShortFlow, _minimiser, _parameters, fixed_point, sharpened
+from curvafit.inference.refine import refine
 from curvafit.priors.coefficients import Coefficients, preset
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.profile import phase_field
@@ -93,16 +93,6 @@ def test_the_halo_of_a_crop_is_held(mask_phase: torch.Tensor) -> None:
     assert bool(flow._frozen[0].all()) and not bool(flow._frozen[16, 16, 16])
 
 
-def test_the_literal_loss_falls_for_ever(tubes: torch.Tensor) -> None:
-    losses, path = literal_loss_descent(tubes, GRID, WORKING_EPSILON, preset("tubes").coefficients, 1000, 1e-3)
-    falls = losses.diff()
-    assert bool((falls < 0).all())
-    torch.testing.assert_close(falls, falls[:1].expand_as(falls), rtol=1e-6, atol=0)
-    assert losses[-1] < 0 < losses[0]
-    turned = torch.nn.functional.cosine_similarity(path[-1] - path[0], path[1] - path[0], dim=0)
-    assert float(turned) == pytest.approx(1)
-
-
 def test_an_unknown_kind_and_no_start_are_refused(mask_phase: torch.Tensor) -> None:
     with pytest.raises(ValueError, match="expected kind"):
         refine(mask_phase, GRID, WORKING_EPSILON, kind="mesh", starts=[Coefficients(1, 2, 1)])
@@ -138,7 +128,7 @@ def test_a_fit_in_float64_leaves_jax_as_it_is() -> None:
 
     before, bowls, starts = jax.config.jax_enable_x64, (Bowl(), Bowl()), (0.1, 0.7)
     with ThreadPoolExecutor(2) as pool:
-        ends = list(pool.map(lambda bowl, start: _minimise(bowl, np.full(5, start), 20), bowls, starts))  # type: ignore[arg-type]
+        ends = list(pool.map(lambda bowl, start: _minimiser(bowl)(np.full(5, start), 20), bowls, starts))  # type: ignore[arg-type]
     assert jax.config.jax_enable_x64 == before
     assert jnp.ones(1).dtype == (jnp.float64 if before else jnp.float32)
     for bowl, end, start in zip(bowls, ends, starts, strict=True):

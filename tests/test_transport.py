@@ -8,11 +8,12 @@ import math
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from curvafit.geometry.diagram import Diagram
-from curvafit.geometry.transport import sliced_embedding, wasserstein
+from curvafit.geometry.transport import sinkhorn_divergence, sliced_embedding, wasserstein
 
 
 def blob(seed: int = 0, centre: tuple[float, float] = (20.0, -5.0), width: float = 4.0, count: int = 300) -> Diagram:
@@ -78,6 +79,65 @@ def test_binning_costs_less_than_stated() -> None:
     assert abs(fine - coarse) < 0.05
     binned = a.binned(4.0)
     assert wasserstein(a, binned, reach=None, bin_width=0) <= math.sqrt(0.5) * binned.spread + 0.01
+
+
+def measure(d: Diagram) -> tuple[torch.Tensor, torch.Tensor]:
+    return torch.from_numpy(d.points), torch.from_numpy(d.normalised.weights)
+
+
+def test_the_divergence_is_the_distance_squared() -> None:
+    a, b = blob(1), blob(2, (24.0, -6.0), 6.0)
+    squared = sinkhorn_divergence(*measure(a), *measure(b), blur=1.0, reach=20.0)
+    assert float(squared) == pytest.approx(wasserstein(a, b, bin_width=0) ** 2, rel=1e-6)
+
+
+def test_the_gradient_of_a_shift_is_the_shift() -> None:
+    """Balanced, D = ½|s|²; each point is pulled back by its weight times s, and one step along it brings b onto a."""
+    a, shift = blob(), np.array([3.0, -4.0])
+    points, weights = measure(moved(a, tuple(shift)))
+    points.requires_grad_()
+    sinkhorn_divergence(*measure(a), points, weights, blur=1.0, reach=None).backward()
+    assert points.grad is not None
+    np.testing.assert_allclose(points.grad.sum(0), shift, rtol=1e-3)
+    back = points.detach() - points.grad / weights[:, None]
+    assert float(sinkhorn_divergence(*measure(a), back, weights, blur=1.0, reach=None)) < 0.02 * (shift @ shift) / 2
+
+
+def test_the_gradient_climbs() -> None:
+    """By central differences along it, in points and in weights (their total kept) alike. The steps stop short of
+    convergence while the gradient is that of converged potentials, so the slopes agree within a factor of two only."""
+    clouds = blob(5, count=40), blob(6, (26.0, -3.0), count=40)
+    measures = [part.requires_grad_() for d in clouds for part in measure(d)]
+    sinkhorn_divergence(*measures, blur=1.0, reach=20.0).backward()
+    for k, part in enumerate(measures):
+        assert part.grad is not None
+        up = part.grad - part.grad.mean() if part.ndim == 1 else part.grad
+        step = 1e-3 * float(part.detach().norm() / up.norm())
+        ends = []
+        for move in (step, -step):
+            there = [each.detach() + (move * up if place == k else 0) for place, each in enumerate(measures)]
+            ends.append(float(sinkhorn_divergence(*there, blur=1.0, reach=20.0)))
+        slope = (ends[0] - ends[1]) / (2 * step)
+        assert 0.5 < slope / float(up.square().sum()) < 2, k
+
+
+def test_descent_brings_one_cloud_onto_the_other() -> None:
+    a, (points, weights) = measure(blob(5, count=40)), measure(blob(6, (26.0, -3.0), count=40))
+    values = []
+    for _ in range(12):
+        points = points.detach().requires_grad_()
+        value = sinkhorn_divergence(*a, points, weights, blur=1.0, reach=20.0)
+        value.backward()
+        assert points.grad is not None
+        values.append(float(value.detach()))
+        points = points - 0.5 * points.grad / weights[:, None]
+    assert values[-1] < 0.05 * values[0]
+
+
+def test_a_caller_who_wants_no_gradients_gets_none_and_keeps_that() -> None:
+    with torch.no_grad():
+        assert not sinkhorn_divergence(*measure(blob()), *measure(blob(1)), blur=1.0, reach=20.0).requires_grad
+        assert not torch.is_grad_enabled()
 
 
 def test_points_that_are_one_have_a_distance() -> None:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from curvafit.atlas_map.extract import Measured, extract, measured, shape_id
-from curvafit.atlas_map.layout import AtlasMap, Progress, check_extra, check_size, diagram_distances, embed, map_atlas
+from curvafit.atlas_map.layout import AtlasMap, check_extra, check_size, diagram_distances, embed, map_atlas
 from curvafit.atlas_map.page import page_html
 from curvafit.atlas_map.picture import map_picture
 from curvafit.atlas_map.shapes import Shown, regrow_command, shown
@@ -26,6 +26,7 @@ from curvafit.files import bears, check_folder, check_free, is_empty, write_cont
 from curvafit.generation.viability import well_formed
 from curvafit.geometry.diagram import Diagram
 from curvafit.inference.atlas import Atlas
+from curvafit.progress import Progress
 from curvafit.volumes.formats import read_archive
 
 #: Folder beside the two files for what took long: measured shapes, distances, places.
@@ -112,10 +113,7 @@ def _looked_at(store: Store, cache: Path, progress: Progress) -> tuple[Atlas, li
         shapes.append(Shown(kept["thumbnail"].tobytes(), kept["volume"].tobytes()))
         return float(kept["fraction"]), _diagram(kept, "field"), _diagram(kept, "mask")
 
-    def told(done: int, count: int) -> None:
-        progress(f"measuring {count} shapes", 0.6 * done / count)
-
-    return extract(store, measure=look, progress=told), records, shapes, commands
+    return extract(store, measure=look, progress=_part(progress, 0.0, 0.6)), records, shapes, commands
 
 
 def _look(store: Store, record: Record) -> _Arrays:
@@ -137,8 +135,8 @@ def _diagram(kept: _Arrays, view: str) -> Diagram:
 
 def _mapped(atlas: Atlas, cache: Path, device: str, progress: Progress) -> AtlasMap:
     """Distances, places, clusters, families."""
-    saved, told = cache / "distances.npz", partial(_compared, progress)
-    compare = partial(diagram_distances, atlas.field_diagrams, device=device, progress=told, saved=saved)
+    saved, part = cache / "distances.npz", _part(progress, 0.6, 0.85)
+    compare = partial(diagram_distances, atlas.field_diagrams, device=device, progress=part, saved=saved)
     try:
         distances = compare()
     except ValueError:  # a file that is damaged, or of other settings
@@ -150,8 +148,9 @@ def _mapped(atlas: Atlas, cache: Path, device: str, progress: Progress) -> Atlas
     return map_atlas(atlas, distances, places["positions"])
 
 
-def _compared(progress: Progress, done: int, pairs: int) -> None:
-    progress(f"comparing {pairs} pairs", 0.6 + 0.25 * done / max(pairs, 1))
+def _part(progress: Progress, first: float, last: float) -> Progress:
+    """Return the progress of a part of the work, from the share `first` to the share `last` of the whole."""
+    return lambda text, share: progress(text, first + (last - first) * share)
 
 
 def _kept(path: Path, make: Callable[[], _Arrays]) -> _Arrays:

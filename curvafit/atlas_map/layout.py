@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -14,7 +14,9 @@ import numpy as np
 
 from curvafit.geometry.diagram import BIN_WIDTH, Diagram
 from curvafit.geometry.family import FAMILIES, family_of, family_shares, half_thickness, leading_family
+from curvafit.geometry.pairwise import pairwise
 from curvafit.inference.atlas import Atlas
+from curvafit.progress import Progress, silent
 
 #: The paper's settings (Experiment 4): of UMAP, of HDBSCAN on the embedded points, of the distances.
 UMAP: dict[str, Any] = {"n_neighbors": 25, "min_dist": 0.05, "spread": 1.0, "random_state": 1}
@@ -24,8 +26,6 @@ DISTANCE: dict[str, Any] = {"blur": 1.0, "reach": 20.0, "bin_width": BIN_WIDTH}
 LEAST_SHAPES = 5
 #: What HDBSCAN calls a point of no cluster.
 NOISE = -1
-
-Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,13 +98,11 @@ def diagram_distances(
     diagrams: Sequence[Diagram],
     *,
     device: str = "cpu",
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress = silent,
     saved: Path | None = None,
 ) -> np.ndarray:
     """Wasserstein distances of all pairs `(N, N)`, with the paper's settings: `pairwise`, with its progress and its
     checkpoint `saved`."""
-    from curvafit.geometry.pairwise import pairwise
-
     return pairwise(diagrams, **DISTANCE, device=device, progress=progress, checkpoint=saved)
 
 

@@ -157,11 +157,7 @@ def extract_atlas(
         check_folder(out.parent)
         check_free([out], is_atlas, [store], overwrite)
         with stages() as progress:
-            atlas = extract(
-                store,
-                [command_line()],
-                progress=lambda done, count: progress(f"measuring {count} shapes", done / count),
-            )
+            atlas = extract(store, [command_line()], progress=progress)
         out.parent.mkdir(parents=True, exist_ok=True)
         save_atlas(atlas, out)
         say(f"{len(atlas.ids)} shapes", to=error_console())

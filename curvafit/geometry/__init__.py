@@ -14,7 +14,6 @@ if TYPE_CHECKING:
         Surface,
         areas,
         capped_surface,
-        euler_characteristic,
         solid_surface,
         surface,
         volume,
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
     from curvafit.geometry.morphometry import Morphometry, local_thickness, morphometry
     from curvafit.geometry.pairwise import one_to_many, pairwise
     from curvafit.geometry.topology import betti_numbers, components, euler_number
-    from curvafit.geometry.transport import sliced_embedding, wasserstein
+    from curvafit.geometry.transport import sinkhorn_divergence, sliced_embedding, wasserstein
 
 __all__ = [
     "Diagram",
@@ -37,7 +36,6 @@ __all__ = [
     "components",
     "diagram",
     "diagrams",
-    "euler_characteristic",
     "euler_number",
     "family_of",
     "family_shares",
@@ -46,6 +44,7 @@ __all__ = [
     "morphometry",
     "one_to_many",
     "pairwise",
+    "sinkhorn_divergence",
     "sliced_embedding",
     "solid_surface",
     "surface",
@@ -67,7 +66,6 @@ _HOMES = {
     "components": "curvafit.geometry.topology",
     "diagram": "curvafit.geometry.diagram",
     "diagrams": "curvafit.geometry.diagram",
-    "euler_characteristic": "curvafit.geometry.mesh",
     "euler_number": "curvafit.geometry.topology",
     "family_of": "curvafit.geometry.family",
     "family_shares": "curvafit.geometry.family",
@@ -76,6 +74,7 @@ _HOMES = {
     "morphometry": "curvafit.geometry.morphometry",
     "one_to_many": "curvafit.geometry.pairwise",
     "pairwise": "curvafit.geometry.pairwise",
+    "sinkhorn_divergence": "curvafit.geometry.transport",
     "sliced_embedding": "curvafit.geometry.transport",
     "solid_surface": "curvafit.geometry.mesh",
     "surface": "curvafit.geometry.mesh",

@@ -211,6 +211,20 @@ def surface_curvatures(
     return SurfaceCurvatures(centres[known] * np.array(grid.spacing), points[known], weights[known], excluded)
 
 
+def resolved(slope: Tensor, kappa1: Tensor, kappa2: Tensor, grid: Grid) -> Tensor:
+    """Return where the grid resolves curvature, as bool: the level set is defined, and no radius is under a voxel.
+
+    Parameters
+    ----------
+    slope
+        Of the distance that the profile gives (`profile_distance`): 1 for a perfect profile.
+    kappa1, kappa2
+        Principal curvatures, in 1 / the grid's unit.
+    """
+    sharpest = 1 / (LEAST_RADIUS * max(grid.spacing))
+    return (slope > LEAST_SLOPE) & (kappa1.abs() < sharpest) & (kappa2.abs() < sharpest)
+
+
 def _inner_surface(values: Tensor, grid: Grid, margin: int | None) -> Surface:
     """The surface without a margin along the sides of a box that is not periodic, in the whole box's coordinates."""
     m = 0 if grid.periodic else MARGIN if margin is None else margin
@@ -231,9 +245,8 @@ def _voxel_curvatures(values: Tensor, grid: Grid, epsilon: float, curvature: str
     else:
         κ1, κ2, _, _ = diffuse_curvatures(jet(values, grid), epsilon)
     slope = distance.gradient.square().sum(-4).sqrt()
-    sharpest = 1 / (LEAST_RADIUS * max(grid.spacing))
-    resolved = (slope > LEAST_SLOPE) & (κ1.abs() < sharpest) & (κ2.abs() < sharpest)
-    parts = (torch.where(resolved, κ1, 0.0), torch.where(resolved, κ2, 0.0), resolved.to(values.dtype))
+    known = resolved(slope, κ1, κ2, grid)
+    parts = (torch.where(known, κ1, 0.0), torch.where(known, κ2, 0.0), known.to(values.dtype))
     return tuple(part.detach().cpu().numpy() for part in parts)
 
 

@@ -122,20 +122,6 @@ def volume(mesh: Surface) -> float:
     return float((mesh.barycentres[:, ::-1] * area_vectors(mesh)).sum() / 3)
 
 
-def euler_characteristic(mesh: Surface, grid: Grid) -> int:
-    """V - E + F; vertices on opposite faces of a periodic box are one."""
-    spacing = np.array(grid.spacing)
-    keys = np.rint(mesh.vertices / spacing * 2**20).astype(np.int64)
-    if grid.periodic:
-        keys %= np.array(grid.shape) * 2**20
-    _, merged = np.unique(keys, axis=0, return_inverse=True)
-    faces = merged.reshape(-1)[mesh.faces]
-    a, b, c = faces.T
-    faces = faces[(a != b) & (b != c) & (c != a)]
-    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    return len(np.unique(faces)) - len(np.unique(edges, axis=0)) + len(faces)
-
-
 def _checked(u: np.ndarray | Tensor, grid: Grid) -> np.ndarray:
     values = u.detach().cpu().numpy() if isinstance(u, Tensor) else np.asarray(u)
     if values.shape != grid.shape:

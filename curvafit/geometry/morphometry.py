@@ -9,7 +9,7 @@ radius is left out.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
@@ -36,9 +36,6 @@ class Morphometry:
     euler: int
     surface_to_volume: float
     unit: str
-
-    def to_dict(self) -> dict[str, float | int | str]:
-        return asdict(self)
 
 
 def morphometry(

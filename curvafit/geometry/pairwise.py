@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +15,11 @@ import torch
 
 from curvafit.files import write_atomically
 from curvafit.geometry.diagram import BIN_WIDTH, Diagram
-from curvafit.geometry.sinkhorn import Measures, costs, packed
+from curvafit.geometry.sinkhorn import Measures, costs, packed, pair_halvings
 from curvafit.geometry.transport import comparable
 from curvafit.priors.bounds import quoted
 from curvafit.priors.json_text import parse_json
+from curvafit.progress import Progress, silent
 from curvafit.volumes.formats import read_archive
 
 #: Pairs that are taken at once: a few seconds on a processor.
@@ -27,7 +28,7 @@ BLOCK = 8192
 EVERY = 30.0
 FORMAT = "curvafit distances"
 #: Goes up when distances change: rows of another version are never reused.
-VERSION = 1
+VERSION = 2
 
 
 def pairwise(
@@ -38,14 +39,15 @@ def pairwise(
     bin_width: float = BIN_WIDTH,
     device: torch.device | str = "cpu",
     checkpoint: str | Path | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress = silent,
 ) -> np.ndarray:
-    """`transport.wasserstein` of every pair of N diagrams: `(N, N)` float64, symmetric, with zeros on its diagonal.
+    """Return `transport.wasserstein` of every pair of N diagrams: `(N, N)` float64, symmetric, with a zero diagonal.
 
-    A diagram's own term of the debiased distance is computed once, with steps from its own diameter instead of the
-    pair's: `wasserstein` is met to 1e-4 in the median and 5e-3 at most. Bins of 2 change the distances of random shapes
-    by 0.3 % in the median and 1.3 % at most, those to a shape's nearest by 0.7 % and 1.6 %, or 0.05 where they are
-    under 2; bins of 1 a third of that, for seven times the time (`benchmarks.distances`).
+    `wasserstein` is met to 1e-4 of itself: the steps are the same, in float32. A diagram's own term of the debiased
+    distance depends on the pair by the number of steps alone, of which there are two or three, and is computed once for
+    each. Bins of 2 change the distances of random shapes by 0.3 % in the median and 1.3 % at most, those to a shape's
+    nearest by 0.7 % and 1.6 %, or 0.05 where they are under 2; bins of 1 a third of that, for seven times the time
+    (`benchmarks.distances`).
 
     Parameters
     ----------
@@ -60,7 +62,7 @@ def pairwise(
         these diagrams is taken from it: a killed run goes on, a longer list costs its new rows. Diagrams are known by
         their content, so order and position do not matter; rows of diagrams that are not listed any more go.
     progress
-        Called after every block with the number of pairs done and of all pairs.
+        Called after every block of pairs with a sentence and the share done.
 
     Raises
     ------
@@ -75,16 +77,15 @@ def pairwise(
     distances = file.read()
     first, second = np.nonzero(np.triu(np.isnan(distances)))
     order = np.random.default_rng(0).permutation(len(first))  # so that threads get pairs of like sizes
+    first, second = first[order], second[order]
     total = len(distances) * (len(distances) - 1) // 2
     file.write(distances)
-    own = _own(measures, blur, reach, device)
+    blocks = _distances(measures, first, second, blur=blur, reach=reach, device=device)
     try:
-        for start in range(0, len(order), BLOCK):
-            block = order[start : start + BLOCK]
-            i, j = first[block], second[block]
-            distances[i, j] = distances[j, i] = _distances(measures, i, j, own, blur, reach, device)
-            if progress is not None:
-                progress(total - len(order) + start + len(block), total)
+        for start, block in zip(range(0, len(first), BLOCK), blocks, strict=True):
+            i, j = first[start : start + BLOCK], second[start : start + BLOCK]
+            distances[i, j] = distances[j, i] = block
+            progress(f"comparing {total} pairs", (total - len(first) + start + len(block)) / total)
             if file.due():
                 file.write(distances)
     finally:
@@ -101,11 +102,11 @@ def one_to_many(
     bin_width: float = BIN_WIDTH,
     device: torch.device | str = "cpu",
 ) -> np.ndarray:
-    """Distances `(N,)` of one diagram to each of N; as `pairwise`, which says what is taken and raised."""
+    """Return the distances `(N,)` of one diagram to each of N; `pairwise` says what is taken and raised."""
     measures = _measures([query, *diagrams], blur, reach, bin_width)
     others = np.arange(1, len(diagrams) + 1)
-    own = _own(measures, blur, reach, device)
-    return _distances(measures, np.zeros_like(others), others, own, blur, reach, device)
+    blocks = _distances(measures, np.zeros_like(others), others, blur=blur, reach=reach, device=device)
+    return np.concatenate([np.empty(0), *blocks])
 
 
 def _measures(diagrams: Sequence[Diagram], blur: float, reach: float | None, bin_width: float) -> Measures:
@@ -113,15 +114,20 @@ def _measures(diagrams: Sequence[Diagram], blur: float, reach: float | None, bin
     return packed([d.points for d in reduced], [d.weights for d in reduced])
 
 
-def _own(measures: Measures, blur: float, reach: float | None, device) -> np.ndarray:
-    """Half of what each measure costs with itself: what the debiased divergence takes off."""
-    numbers = np.arange(len(measures.bounds) - 1)
-    return costs(measures, numbers, numbers, blur, reach, device) / 2
+def _distances(measures: Measures, first: np.ndarray, second: np.ndarray, **options: Any) -> Iterator[np.ndarray]:
+    """Yield the distances of the pairs, block by block.
 
-
-def _distances(measures: Measures, first, second, own: np.ndarray, blur, reach, device) -> np.ndarray:
-    divergence = costs(measures, first, second, blur, reach, device) - own[first] - own[second]
-    return np.sqrt(np.maximum(divergence, 0))
+    Half of what a measure costs with itself, in as many steps as the pair's, is what debiasing takes off.
+    """
+    falls = pair_halvings(measures, first, second, options["blur"])
+    keys = np.concatenate([np.stack([ends, falls], axis=1) for ends in (first, second)])
+    distinct, places = np.unique(keys, axis=0, return_inverse=True)
+    own = costs(measures, distinct[:, 0], distinct[:, 0], distinct[:, 1], **options)
+    bias = own[places.reshape(2, -1)].sum(0) / 2
+    for start in range(0, len(first), BLOCK):
+        block = slice(start, start + BLOCK)
+        divergence = costs(measures, first[block], second[block], falls[block], **options) - bias[block]
+        yield np.sqrt(np.maximum(divergence, 0))
 
 
 def _keys(measures: Measures) -> list[str]:

@@ -1,8 +1,12 @@
 """Entropic transport costs of many pairs of measures in the plane: numba on processors, batched torch elsewhere.
 
-The steps are those of geomloss's `SamplesLoss("sinkhorn", p=2)` with its default scaling: ε falls from the pair's
-diameter squared to blur², by 4 a step; both potentials move half way to their soft transforms; a last whole step is
-made at blur². That is not convergence: converged distances between diagrams are 9 % larger in the median, up to 20 %.
+The steps are those of geomloss's `SamplesLoss("sinkhorn", p=2)` with its default scaling: ε falls from a diameter
+squared to blur², by 4 a step; both potentials move half way to their soft transforms; a last whole step is made at
+blur². That is not convergence: converged distances between diagrams are 9 % larger in the median, up to 20 %.
+
+The diameter is rounded up to blur · 2^(n - ½), so that a measure's cost with itself, which the debiased distance takes
+off, is shared by all pairs with the same n (`halvings`); the half keeps geomloss's list of ε clear of rounding. Against
+geomloss's own choice, the exact diameter, that changes a distance by 0.1 % in the median and 0.4 % at most.
 
 On a grid exp(-C/ε) is a product over rows and columns. In plain sums that leaves float32's range at small ε (e⁻²⁴⁵⁰
 over a distance of 70 at ε = 1); in sums of exponentials it takes more of them, over the rows and columns of both
@@ -59,21 +63,46 @@ class Measures(NamedTuple):
 
 
 def packed(points: Sequence[np.ndarray], weights: Sequence[np.ndarray]) -> Measures:
-    """Point sets `(n, 2)` with weights `(n,)`, some of each above 0; points without weight are left out."""
-    kept = [w > 0 for w in weights]
-    points = [p[k].astype(np.float32) for p, k in zip(points, kept, strict=True)]
+    """Pack point sets `(n, 2)` with weights `(n,)`, some of each above 0; points without weight are left out."""
+    heavy = [w > 0 for w in weights]
+    points = [p[k].astype(np.float32) for p, k in zip(points, heavy, strict=True)]
     flat = np.concatenate([np.empty((0, 2), np.float32), *points])
-    log2 = np.concatenate([np.empty(0), *(np.log2(w[k]) for w, k in zip(weights, kept, strict=True))])
+    log2 = np.concatenate([np.empty(0), *(np.log2(w[k]) for w, k in zip(weights, heavy, strict=True))])
     low, high = (np.array([end(p, axis=0) for p in points], np.float64).reshape(-1, 2) for end in (np.min, np.max))
     bounds = np.cumsum([0, *map(len, points)])
     x, y = np.ascontiguousarray(flat.T)
     return Measures(x, y, log2.astype(np.float32), bounds, low, high)
 
 
+def halvings(size: np.ndarray, blur: float) -> np.ndarray:
+    """Return n, the times that √ε halves: blur · 2^(n - ½) is the least such diameter that holds boxes of `size`.
+
+    Parameters
+    ----------
+    size
+        Edges of the box that holds both measures of a pair, `(…, 2)`.
+    """
+    diameter = np.maximum(np.hypot(size[..., 0], size[..., 1]), blur)
+    return np.ceil(np.log2(diameter / blur) + 0.5).astype(np.int64)
+
+
+def pair_halvings(measures: Measures, first: np.ndarray, second: np.ndarray, blur: float) -> np.ndarray:
+    """Return `halvings` of the box that holds both measures of each pair, `(K,)`."""
+    high = np.maximum(measures.high[first], measures.high[second])
+    return halvings(high - np.minimum(measures.low[first], measures.low[second]), blur)
+
+
 def costs(
-    measures: Measures, first: np.ndarray, second: np.ndarray, blur: float, reach: float | None, device="cpu"
+    measures: Measures,
+    first: np.ndarray,
+    second: np.ndarray,
+    falls: np.ndarray,
+    *,
+    blur: float,
+    reach: float | None,
+    device: torch.device | str = "cpu",
 ) -> np.ndarray:
-    """The entropic, unbalanced cost OT_ε of each pair of measures, ½|x - y|² a unit moved, `(K,)` float64.
+    """Return the entropic, unbalanced cost OT_ε of each pair of measures, ½|x - y|² a unit moved, `(K,)` float64.
 
     The debiased divergence is the pair's cost less half of each measure's with itself (Séjourné et al. 2019).
 
@@ -81,55 +110,50 @@ def costs(
     ----------
     first, second
         Numbers of the measures of each pair, `(K,)`.
+    falls
+        How often √ε halves for each pair, `(K,)`: see `halvings`.
     blur, reach
         √ε at the end, and √ρ of the penalty on what is not moved, in the points' unit; no reach moves everything.
     device
         `"cpu"` takes numba's loops on its threads, any other one batches of tensors there.
     """
     first, second = (np.asarray(numbers, dtype=np.int64) for numbers in (first, second))
+    ε, shares = schedule(falls, blur)
+    ρ = math.inf if reach is None else reach**2
     if torch.device(device).type != "cpu":
-        return batched(measures, first, second, blur, reach, device)
-    ε, kept = _schedule(measures, first, second, blur)
-    ρ = math.inf if reach is None else reach**2
-    found = np.empty(len(first))
+        return batched(measures, first, second, ε, shares, ρ, device)
+    values = np.empty(len(first))
     threads.start()
-    _costs(measures.x, measures.y, measures.log2, measures.bounds, first, second, ε, kept, ρ, found)
-    return found
+    _costs(measures.x, measures.y, measures.log2, measures.bounds, first, second, ε, shares, ρ, values)
+    return values
 
 
-def batched(
-    measures: Measures, first: np.ndarray, second: np.ndarray, blur: float, reach: float | None, device
-) -> np.ndarray:
-    """`costs` in torch, several pairs at a time, each padded to the batch's largest by points without weight."""
-    ε, kept = _schedule(measures, first, second, blur)
-    ρ = math.inf if reach is None else reach**2
-    found = np.empty(len(first))
+def batched(measures: Measures, first, second, ε: np.ndarray, shares: np.ndarray, ρ: float, device) -> np.ndarray:
+    """Return the costs by torch, several pairs at a time, each padded to the batch's largest by weightless points."""
+    values = np.empty(len(first))
     for pairs, size in _batches(np.diff(measures.bounds), first, second):
         (x, log_a), (y, log_b) = (_padded(measures, numbers[pairs], size, device) for numbers in (first, second))
         cost = (x[:, :, None] - y[:, None]).square_().sum(-1) / 2
         f, g = torch.zeros_like(log_a), torch.zeros_like(log_b)
-        for εs, keep in zip(ε[pairs].T, kept[pairs].T, strict=True):
+        for εs, keep in zip(ε[pairs].T, shares[pairs].T, strict=True):
             step, keep = (torch.tensor(v, dtype=f.dtype, device=device)[:, None] for v in (εs, keep))
             damping, scaled = step / (1 + step / ρ), cost / step[..., None]
             to_f = -damping * torch.logsumexp((log_b + g / step)[:, None] - scaled, 2)
             to_g = -damping * torch.logsumexp((log_a + f / step)[:, :, None] - scaled, 1)
             f, g = keep * f + (1 - keep) * to_f, keep * g + (1 - keep) * to_g
         value = _dual(log_a, f, ε[0, -1], ρ) + _dual(log_b, g, ε[0, -1], ρ)
-        found[pairs] = value.cpu().numpy()
-    return found
+        values[pairs] = value.cpu().numpy()
+    return values
 
 
-def _schedule(measures: Measures, first: np.ndarray, second: np.ndarray, blur: float) -> tuple[np.ndarray, np.ndarray]:
-    """ε of every step of every pair, and how much of its potentials a step keeps, `(K, T)`: 1 before a pair begins, 0
-    at its first step and its last, ½ between. Diameters are the joint box's diagonal, as geomloss has it."""
-    size = np.maximum(measures.high[first], measures.high[second])
-    size -= np.minimum(measures.low[first], measures.low[second])
-    diameter = np.maximum(np.hypot(*size.T), blur)[:, None]
-    falls = np.ceil(np.log2(diameter / blur)).astype(int)
+def schedule(falls: np.ndarray, blur: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return ε of every step of every pair, and the share of its potentials that a step keeps, `(K, T)`: 1 before a
+    pair begins, 0 at its first step and its last, ½ between."""
+    falls = np.asarray(falls, dtype=np.int64)[:, None]
     steps = falls + 4
     longest = int(steps.max(initial=0))
     place = np.arange(longest) - (longest - steps)
-    ε = np.where(place >= falls + 2, blur**2, (diameter * 0.5 ** np.maximum(place - 2, 0)) ** 2)
+    ε = np.where(place >= falls + 2, blur**2, (blur * 2.0 ** (falls - 0.5 - np.maximum(place - 2, 0))) ** 2)
     ends = (place == 0) | (place == steps - 1)
     return ε, np.where(ends, 0.0, np.where(place < 0, 1.0, 0.5))
 
@@ -164,22 +188,22 @@ def _dual(log_weights: Tensor, potentials: Tensor, ε: float, ρ: float) -> Tens
 
 
 @njit(**_PARALLEL)
-def _costs(x, y, log2, bounds, first, second, ε, kept, ρ, found):
+def _costs(x, y, log2, bounds, first, second, ε, shares, ρ, values):
     """The cost of every pair."""
     for k in prange(len(first)):
         a, b = slice(bounds[first[k]], bounds[first[k] + 1]), slice(bounds[second[k]], bounds[second[k] + 1])
-        found[k] = _cost(x[a], y[a], log2[a], x[b], y[b], log2[b], ε[k], kept[k], ρ)
+        values[k] = _cost(x[a], y[a], log2[a], x[b], y[b], log2[b], ε[k], shares[k], ρ)
 
 
 @njit(**_SERIAL)
-def _cost(x, y, log_a, X, Y, log_b, ε, kept, ρ):
+def _cost(x, y, log_a, X, Y, log_b, ε, shares, ρ):
     """The cost of one pair."""
     n, m = len(x), len(X)
     f, g = np.zeros(n), np.zeros(m)
     F, G = np.empty(n, np.float32), np.empty(m, np.float32)
     to_f, to_g = np.empty(n, np.float32), np.empty(m, np.float32)
     for t in range(len(ε)):
-        if kept[t] == 1:
+        if shares[t] == 1:
             continue
         unit = ε[t] * _LN2
         h = np.float32(0.5 / unit)
@@ -190,11 +214,11 @@ def _cost(x, y, log_a, X, Y, log_b, ε, kept, ρ):
         _plan_sums(x, y, F, X, Y, G, h, to_f, to_g)
         _transformed(x, y, F, X, Y, G, h, to_f)
         _transformed(X, Y, G, x, y, F, h, to_g)
-        moved = (1 - kept[t]) * unit / (1 + ε[t] / ρ)
+        moved = (1 - shares[t]) * unit / (1 + ε[t] / ρ)
         for i in range(n):
-            f[i] = kept[t] * f[i] - moved * to_f[i]
+            f[i] = shares[t] * f[i] - moved * to_f[i]
         for j in range(m):
-            g[j] = kept[t] * g[j] - moved * to_g[j]
+            g[j] = shares[t] * g[j] - moved * to_g[j]
     return _part(log_a, f, ε[-1], ρ) + _part(log_b, g, ε[-1], ρ)
 
 

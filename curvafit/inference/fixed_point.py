@@ -17,13 +17,14 @@ from torch import Tensor
 
 from curvafit.generation.flow import relax
 from curvafit.generation.schedule import Schedule
-from curvafit.inference.refinement import Progress, Refinement, called, double_precision_on_cpu, named
+from curvafit.inference.refinement import Refinement, called, double_precision_on_cpu, import_jax, named
 from curvafit.inference.regrid import rich_boxes, surface_voxels
 from curvafit.inference.stationarity import energy_gradients
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
 from curvafit.priors.shapes import Float
 from curvafit.priors.stencils import gaussian_blur, gradient
+from curvafit.progress import Progress, silent
 
 #: The short flow: Adam steps of 1e-3 as published.
 SHORT_FLOW = Schedule("short", 150, 1e-3, 1e-3, "constant")
@@ -55,7 +56,7 @@ def fixed_point(
     epsilon: float,
     *,
     starts: Sequence[Coefficients],
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Refinement:
     """Coefficients (a20 = 1, a02 > 0) under which a short flow started at `phase` moves its interface least.
 
@@ -96,10 +97,11 @@ def fixed_point(
         )
     flow = ShortFlow(phase, grid, epsilon, starts[0])
     total = (1 + len(_SIZES)) * (len(starts) * (FIRST_STEPS + 1) + LAST_STEPS)
-    flow.after = lambda count: progress("flowing from the scan", min(1.0, count / total)) if progress else None
-    ends = [_minimise(flow, _parameters(start), FIRST_STEPS) for start in starts]
+    flow.after = lambda count: progress("flowing from the scan", min(1.0, count / total))
+    minimise = _minimiser(flow)
+    ends = [minimise(_parameters(start), FIRST_STEPS) for start in starts]
     order = np.argsort([end.residual for end in ends])
-    best = _minimise(flow, ends[order[0]].free, LAST_STEPS)
+    best = minimise(ends[order[0]].free, LAST_STEPS)
     deviations = np.hypot(_deviations(best, flow.patches), _valley(flow, best))
     singular = np.linalg.svd(best.jacobian, compute_uv=False)
     return Refinement(
@@ -218,35 +220,44 @@ def _parameters(start: Coefficients) -> np.ndarray:
     return np.array([a11, np.log(a02), a10, a01, a00]) / _SIZES
 
 
-def _minimise(flow: ShortFlow, begin: np.ndarray, steps: int) -> _End:
-    """The best of the points that Levenberg-Marquardt visits from a start."""
-    with double_precision_on_cpu():
-        import jax
-        import jax.numpy as jnp
-        import optimistix
+def _minimiser(flow: ShortFlow) -> Callable[[np.ndarray, int], _End]:
+    """Return what runs Levenberg-Marquardt from a start for some steps and gives the best of the points it visits.
 
-        visited = [np.array(begin, dtype=np.float64)]
+    One residual serves all starts, so that optimistix compiles its solver for each number of steps and not each start.
+    """
+    import_jax()
+    import jax
+    import jax.numpy as jnp
+    import optimistix
 
-        def value(free):
-            visited.append(free)
-            return flow.residual(free) / _UNIT
+    visited: list[np.ndarray] = []
 
-        @jax.custom_jvp
-        def residual(free):
-            return called(value, (flow.size,), free)
+    def value(free: np.ndarray) -> np.ndarray:
+        visited.append(free)
+        return flow.residual(free) / _UNIT
 
-        @residual.defjvp
-        def residual_jvp(primals, tangents):
-            (free,), (change,) = primals, tangents
-            slope = called(lambda free: flow.jacobian(free) / _UNIT, (flow.size, len(_SIZES)), free)
-            return residual(free), slope @ change
+    @jax.custom_jvp
+    def residual(free):
+        return called(value, (flow.size,), free)
 
-        solver = optimistix.LevenbergMarquardt(rtol=1e-3, atol=1e-3)
-        optimistix.least_squares(
-            lambda free, args: residual(free), solver, jnp.asarray(begin), max_steps=steps, throw=False
-        )
-    best = min(visited, key=lambda free: float(np.linalg.norm(flow.residual(free))))
-    return _End(best, float(np.linalg.norm(flow.residual(best))), flow.jacobian(best))
+    @residual.defjvp
+    def residual_jvp(primals, tangents):
+        (free,), (change,) = primals, tangents
+        slope = called(lambda free: flow.jacobian(free) / _UNIT, (flow.size, len(_SIZES)), free)
+        return residual(free), slope @ change
+
+    def misfit(free, args):
+        return residual(free)
+
+    def minimise(begin: np.ndarray, steps: int) -> _End:
+        visited[:] = [np.array(begin, dtype=np.float64)]
+        with double_precision_on_cpu():
+            solver = optimistix.LevenbergMarquardt(rtol=1e-3, atol=1e-3)
+            optimistix.least_squares(misfit, solver, jnp.asarray(begin), max_steps=steps, throw=False)
+        best = min(visited, key=lambda free: float(np.linalg.norm(flow.residual(free))))
+        return _End(best, float(np.linalg.norm(flow.residual(best))), flow.jacobian(best))
+
+    return minimise
 
 
 def _deviations(end: _End, patches: float) -> np.ndarray:

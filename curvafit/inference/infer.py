@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import platform
-from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -18,7 +17,7 @@ from curvafit.generation.flow import Flow, generate
 from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram, diagram
 from curvafit.geometry.family import family_of
 from curvafit.geometry.morphometry import morphometry
-from curvafit.geometry.transport import wasserstein
+from curvafit.geometry.pairwise import one_to_many
 from curvafit.inference.atlas import Atlas, load_atlas
 from curvafit.inference.fit import Fit
 from curvafit.inference.match import Match, nearest
@@ -31,14 +30,13 @@ from curvafit.priors.bounds import SEEDS, instance, whole
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.profile import phase_field
+from curvafit.progress import Progress, silent
 from curvafit.volumes.scan import Field, load
 
 #: Longest edge, in working voxels, of the boxes in which shapes are regenerated for comparison.
 REGENERATED_EDGE = 100
 #: How many of the nearest shapes are kept, and how many of them refinement starts from.
 MATCHES, STARTS = 5, 3
-
-Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
@@ -75,7 +73,7 @@ def infer(
     roi: str | Path | np.ndarray | None = None,
     label: int | None = None,
     seed: int = 0,
-    progress: Progress | None = None,
+    progress: Progress = silent,
     **reading: Any,
 ) -> Inference:
     """Infer the generation parameters (a, m₀) of a scanned volume.
@@ -101,28 +99,27 @@ def infer(
     ValueError, FileNotFoundError
         One sentence on a volume that cannot be measured.
     """
-    say = progress or (lambda text, share: None)
     check_options(kind, threshold, label)
     for value, its, said in ((scan, Field, "a scan"), (atlas, Atlas, "an atlas"), (roi, np.ndarray, "a mask")):
         if value is not None or said == "a scan":
             instance(value, (str, Path, its), f"{said}, as the path of a file or as {its.__name__}")
     seed = whole(seed, "a seed that is a whole number from 0", 0, SEEDS - 2)  # and the next one
-    say("reading the scan", 0.0)
+    progress("reading the scan", 0.0)
     atlas = atlas if isinstance(atlas, Atlas) else load_atlas(atlas)
     volume = scan if isinstance(scan, Field) else load(scan, **reading)
     prepared = prepare(volume, kind=kind, periodic=periodic, threshold=threshold, dark=dark, roi=roi, label=label)
-    say("measuring curvature", 0.05)
+    progress("measuring curvature", 0.05)
     seen = scan_diagram(prepared)
     seen_as = "field" if prepared.kind == "field" else "mask"
-    say("searching the atlas", 0.1)
+    progress("searching the atlas", 0.1)
     matches = nearest(seen, atlas, seen_as=seen_as, count=MATCHES)
-    say("refining the parameters", 0.2)
-    refined = _refined(prepared, matches, seed, say)
-    say("regenerating", 0.6)
+    progress("refining the parameters", 0.2)
+    refined = _refined(prepared, matches, seed, progress)
+    progress("regenerating", 0.6)
     refined = _with_mass(refined, prepared, seed)
-    twins = _regenerate(prepared, matches[0], refined, seed, say)
+    twins = _regenerate(prepared, matches[0], refined, seed, progress)
     fit = _fit(prepared, seen, matches, refined, twins, _provenance(volume, atlas, seed))
-    say("done", 1.0)
+    progress("done", 1.0)
     of_match, of_fit = twins["match"][0], twins["fit"][0]
     return Inference(volume, prepared, seen, of_match.diagram, of_fit.diagram, of_match.phase, of_fit.phase, fit)
 
@@ -136,7 +133,7 @@ class _Twin:
     diagram: Diagram | None
 
 
-def _refined(prepared: Prepared, matches: tuple[Match, ...], seed: int, say: Progress) -> Refinement:
+def _refined(prepared: Prepared, matches: tuple[Match, ...], seed: int, progress: Progress) -> Refinement:
     phase = torch.from_numpy(np.ascontiguousarray(prepared.phase[prepared.windows[0]]))
     whole = phase.shape == prepared.grid.shape
     z, y, x = phase.shape
@@ -149,7 +146,7 @@ def _refined(prepared: Prepared, matches: tuple[Match, ...], seed: int, say: Pro
         kind=prepared.kind,
         starts=starts,
         seed=seed,
-        progress=lambda text, share: say(text, 0.2 + 0.4 * share),
+        progress=lambda text, share: progress(text, 0.2 + 0.4 * share),
     )
 
 
@@ -175,7 +172,7 @@ def _twin_grid(prepared: Prepared) -> Grid:
 
 
 def _regenerate(
-    prepared: Prepared, match: Match, refined: Refinement, seed: int, say: Progress
+    prepared: Prepared, match: Match, refined: Refinement, seed: int, progress: Progress
 ) -> dict[str, tuple[_Twin, _Twin]]:
     """Two seeds each of the nearest match and of the refined parameters."""
     grid = _twin_grid(prepared)
@@ -183,7 +180,7 @@ def _regenerate(
     for step, (name, source) in enumerate((("match", match), ("fit", refined))):
         pair = []
         for k in range(2):
-            say(f"regenerating the {name}, seed {seed + k}", 0.6 + 0.2 * step + 0.1 * k)
+            progress(f"regenerating the {name}, seed {seed + k}", 0.6 + 0.2 * step + 0.1 * k)
             pair.append(_twin(source.coefficients, source.mass, grid, seed + k, prepared.kind))
         twins[name] = (pair[0], pair[1])
     return twins
@@ -233,13 +230,13 @@ def _fit(
 
 
 def _distance(seen: Diagram, pair: tuple[_Twin, _Twin]) -> float | None:
-    found = [wasserstein(seen, twin.diagram) for twin in pair if twin.diagram is not None]
-    return float(np.mean(found)) if found else None
+    diagrams = [twin.diagram for twin in pair if twin.diagram is not None]
+    return float(one_to_many(seen, diagrams).mean()) if diagrams else None
 
 
 def _noise(pair: tuple[_Twin, _Twin]) -> float | None:
     first, second = pair[0].diagram, pair[1].diagram
-    return wasserstein(first, second) if first is not None and second is not None else None
+    return float(one_to_many(first, [second])[0]) if first is not None and second is not None else None
 
 
 def _verdict(

@@ -15,10 +15,10 @@ from curvafit.inference.phases import Kind, Level, find_level, region_of_interes
 from curvafit.inference.regrid import (
     Window,
     bounding_box,
+    centre_distance,
     median_thickness,
     resample,
     rich_boxes,
-    signed_distance,
     surface_voxels,
     without_specks,
 )
@@ -260,7 +260,7 @@ def _moved(
         return values[box], None if region is None else region[box]
     if scan.level.kind == "mask":
         reach = 4 * max(max(s * h, h) for s, h in zip(scale, scan.spacing, strict=True))
-        values = signed_distance(scan.level.mask, scan.spacing, reach, scan.periodic)
+        values = centre_distance(scan.level.mask, scan.spacing, reach, scan.periodic)
     moved = resample(values, scale, start, shape, periodic=scan.periodic)
     if region is None:
         return moved, None

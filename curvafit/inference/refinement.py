@@ -15,8 +15,6 @@ from curvafit.priors.coefficients import NAMES, Coefficients
 #: A share of a20 + a02 that a start is kept away from the domain's edges, a20 = 0 and a02 = 0.
 _EDGE = 0.01
 
-Progress = Callable[[str, float], None]
-
 
 @dataclass(frozen=True)
 class Refinement:

@@ -18,7 +18,6 @@ import torch
 from torch import Tensor
 
 from curvafit.inference.refinement import (
-    Progress,
     Refinement,
     admissible,
     double_precision_on_cpu,
@@ -32,6 +31,7 @@ from curvafit.priors.energy import energy_terms
 from curvafit.priors.grid import Grid
 from curvafit.priors.shapes import Float
 from curvafit.priors.stencils import gaussian_blur, pad
+from curvafit.progress import Progress, silent
 
 #: Standard deviation of the test functions, in voxels; in a crop less, for what their support takes from each side.
 TEST_WIDTH, CROP_WIDTH = 4.0, 3.0
@@ -84,7 +84,7 @@ def stationarity(
     starts: Sequence[Coefficients] = (),
     width: float | None = None,
     seed: int = 0,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Refinement:
     """Coefficients up to scale under which a phase field is stationary at fixed mass: Σ a_α k ∗ ∂F_α/∂u = λ.
 
@@ -116,14 +116,13 @@ def stationarity(
         If the field is not finite, has another shape than the grid, or is a crop under 24 voxels along an axis.
     """
     values = _checked(u, grid)
-    say = progress or (lambda text, share: None)
     width = _width(grid) if width is None else width
-    say("differentiating the energy", 0.0)
+    progress("differentiating the energy", 0.0)
     gradients = energy_gradients(values, grid, epsilon)
     octants = _equations(gradients, grid, epsilon, width)
-    say("propagating the field's error", 0.2)
+    progress("propagating the field's error", 0.2)
     problem, size, trials = _with_error(values, gradients, _triangle(octants), grid, epsilon, width, seed)
-    say("solving", 0.8)
+    progress("solving", 0.8)
     tls, singular = _total_least_squares(problem)
     given = [np.array([float(value) for value in start]) / units(epsilon) for start in starts]
     begun = np.stack([admissible(start) for start in (tls, *given)])
@@ -133,7 +132,7 @@ def stationarity(
     replicas = _replicas(octants, problem.error, solutions[order[0]]) * units(epsilon)
     deviations = _jackknife_deviation(replicas / replicas[:, fixed : fixed + 1])
     residual = float(size * residuals[order[0]])
-    say("solved", 1.0)
+    progress("solved", 1.0)
     return Refinement(
         method="stationarity",
         coefficients=coefficients,

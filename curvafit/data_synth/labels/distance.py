@@ -6,12 +6,14 @@ import numpy as np
 from numba import njit
 from torch import Tensor
 
+from curvafit.geometry.diagram import LEAST_SLOPE
 from curvafit.geometry.mesh import NoSurface
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import profile_distance
 
-#: A profile's slope (1 for a perfect one) under which its distance is not taken, and under which its normal is not.
-LEAST_SLOPE, LEAST_NORMAL = 0.5, 0.1
+#: Slope of the profile's distance (1 for a perfect one) from which that is taken off the surface too. Curvature and
+#: normals ask for less, `LEAST_SLOPE`: they hang on the level set's direction and not on how far away it is.
+STEEP = 0.5
 #: Radius (voxels) with which surfaces are taken to curve away from points far off.
 BEND = 4.0
 
@@ -78,13 +80,13 @@ def _at_surface(near, edges, periodic):  # pragma: no cover
         steep = np.sqrt(slope[0] ** 2 + slope[1] ** 2 + slope[2] ** 2)
         sign = 1 if here > 0 else -1
         if side < 0:
-            if steep > LEAST_SLOPE and abs(here) <= 1.5 * steep * widest:
+            if steep > STEEP and abs(here) <= 1.5 * steep * widest:
                 distance[z, y, x] = here / steep
             continue
         shell[z, y, x] = True
-        length = min(least, abs(here) / steep) if steep > LEAST_NORMAL else least
+        length = min(least, abs(here) / steep) if steep > LEAST_SLOPE else least
         feet[z, y, x, 3 + side] = -sign * way
-        if steep > LEAST_NORMAL:
+        if steep > LEAST_SLOPE:
             feet[z, y, x, 3:] = slope / steep
         feet[z, y, x, :3] = -sign * length * feet[z, y, x, 3:]
         distance[z, y, x] = sign * length

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from curvafit.data_synth.labels.distance import field_distance
 from curvafit.data_synth.labels.skeleton import skeleton_of
-from curvafit.geometry.diagram import LEAST_RADIUS, LEAST_SLOPE, MARGIN
+from curvafit.geometry.diagram import LEAST_SLOPE, MARGIN, resolved
 from curvafit.geometry.mesh import NoSurface
 from curvafit.geometry.morphometry import local_thickness
 from curvafit.geometry.topology import betti_numbers, components
@@ -171,8 +171,7 @@ def _curvatures(u: Tensor, mask: np.ndarray, grid: Grid, epsilon: float) -> tupl
     slope = near.gradient.square().sum(-4).sqrt()
     d = near.value / slope.clamp_min(LEAST_SLOPE)
     κ1, κ2 = (κ / (1 + κ * d) for κ in geometric_curvatures(near)[:2])
-    sharpest = 1 / (LEAST_RADIUS * max(grid.spacing))
-    known = (slope > LEAST_SLOPE) & (κ1.abs() < sharpest) & (κ2.abs() < sharpest) & torch.from_numpy(_shell(mask, grid))
+    known = resolved(slope, κ1, κ2, grid) & torch.from_numpy(_shell(mask, grid))
     return torch.where(known, κ1, torch.nan).float().numpy(), torch.where(known, κ2, torch.nan).float().numpy()
 
 
