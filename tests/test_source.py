@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from curvafit import infer, reconstruct, segment
 from curvafit.volumes import Field, ScanError, field_of, load, save
 
 
@@ -65,3 +67,57 @@ def test_what_counts_for_nothing_is_refused(source, options: dict, complaint: st
         return
     with pytest.raises(ScanError, match=complaint):
         field_of(source, **options)
+
+
+# ---- the jobs take each alike ----------------------------------------------------------------------------------------
+
+BALL = (np.linalg.norm(np.indices((10, 11, 12)).T - (4.5, 5.0, 5.5), axis=-1).T < 4).astype(np.float32)
+AT = {"spacing": (3.0, 2.0, 2.0), "unit": "um"}
+
+
+def test_segment_takes_each_source(tmp_path: Path) -> None:
+    scan = Field(100 * BALL + np.random.default_rng(0).normal(0, 20, BALL.shape).astype(np.float32), **AT)
+    path = save(scan, tmp_path / "scan.nii.gz")
+    wanted = segment(scan, "tubes", steps=2)
+    tensor = torch.from_numpy(scan.values)
+    for found in (
+        segment(path, "tubes", steps=2),
+        segment(scan.values, "tubes", steps=2, **AT),
+        segment(tensor, "tubes", steps=2, **AT),
+    ):
+        assert np.array_equal(found.mask.values, wanted.mask.values)
+        assert (found.mask.spacing, found.mask.unit) == (scan.spacing, "um")
+    likely = save(Field(0.1 + 0.8 * BALL, **AT), tmp_path / "likely.nii.gz")
+    by_path, by_array = (segment(scan, "tubes", probability=p, steps=2) for p in (likely, 0.1 + 0.8 * BALL))
+    assert np.array_equal(by_path.phase.values, by_array.phase.values)
+
+
+def test_reconstruct_takes_each_source(tmp_path: Path) -> None:
+    mask = Field(BALL.astype(np.uint8), **AT)
+    wanted = reconstruct(mask, "tubes", every=4, steps=2)
+    for source, options in ((save(mask, tmp_path / "mask.nii"), {}), (mask.values, AT)):
+        assert np.array_equal(reconstruct(source, "tubes", every=4, steps=2, **options).mask.values, wanted.mask.values)
+
+
+@pytest.mark.parametrize("job", [infer, lambda *a, **o: segment(*a, "tubes", **o)])
+def test_no_job_drops_an_option_in_silence(job) -> None:
+    for options, got in (({"spacing": 2}, "spacing"), ({"unit": "mm"}, "unit"), ({"strict": True}, "strict")):
+        with pytest.raises(ScanError, match=f"expected {got} only with .*, got it with a Field"):
+            job(Field(BALL), **options)
+    with pytest.raises(ScanError, match="expected a volume as the path of a file, a Field, an array or a tensor"):
+        job(None)
+
+
+def test_infer_prepares_the_field_of_an_array(monkeypatch) -> None:
+    seen: list[Field] = []
+
+    def prepare(field: Field, **_: object) -> None:
+        seen.append(field)
+        raise ScanError("enough")
+
+    monkeypatch.setattr(import_module("curvafit.inference.infer"), "prepare", prepare)
+    for source in (BALL, torch.from_numpy(BALL)):
+        with pytest.raises(ScanError, match="enough"):
+            infer(source, **AT)
+        assert np.array_equal(seen[-1].values, BALL)
+        assert (seen[-1].spacing, seen[-1].unit) == (AT["spacing"], "um")

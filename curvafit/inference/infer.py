@@ -31,7 +31,8 @@ from curvafit.priors.bounds import SEEDS, instance, whole
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.profile import phase_field
-from curvafit.volumes.scan import Field, load
+from curvafit.volumes.field import Field
+from curvafit.volumes.source import Source, field_of
 
 #: Longest edge, in working voxels, of the boxes in which shapes are regenerated for comparison.
 REGENERATED_EDGE = 100
@@ -65,7 +66,7 @@ class Inference:
 
 
 def infer(
-    scan: str | Path | Field,
+    scan: Source,
     *,
     kind: Literal["auto", "field", "mask", "image"] = "auto",
     periodic: bool = False,
@@ -83,8 +84,7 @@ def infer(
     Parameters
     ----------
     scan
-        A volume file (see `curvafit.load`, which takes the remaining keywords: spacing, unit, key, raw_shape,
-        dtype, strict), or a `Field`.
+        The path of a volume file, a `Field`, or an array or tensor (Z, Y, X).
     kind
         `"field"`, `"mask"`, `"image"`, or `"auto"`: two values are a mask, plateaus near ±1 a phase field.
     periodic
@@ -95,6 +95,8 @@ def infer(
         What is inside: see `curvafit.inference.prepare.prepare`.
     progress
         Called with a sentence and the share done.
+    reading
+        How a file is read, or an array placed: spacing, unit and the others of `curvafit.load`.
 
     Raises
     ------
@@ -103,13 +105,13 @@ def infer(
     """
     say = progress or (lambda text, share: None)
     check_options(kind, threshold, label)
-    for value, its, said in ((scan, Field, "a scan"), (atlas, Atlas, "an atlas"), (roi, np.ndarray, "a mask")):
-        if value is not None or said == "a scan":
+    for value, its, said in ((atlas, Atlas, "an atlas"), (roi, np.ndarray, "a mask")):
+        if value is not None:
             instance(value, (str, Path, its), f"{said}, as the path of a file or as {its.__name__}")
     seed = whole(seed, "a seed that is a whole number from 0", 0, SEEDS - 2)  # and the next one
     say("reading the scan", 0.0)
     atlas = atlas if isinstance(atlas, Atlas) else load_atlas(atlas)
-    volume = scan if isinstance(scan, Field) else load(scan, **reading)
+    volume = field_of(scan, **reading)
     prepared = prepare(volume, kind=kind, periodic=periodic, threshold=threshold, dark=dark, roi=roi, label=label)
     say("measuring curvature", 0.05)
     seen = scan_diagram(prepared)

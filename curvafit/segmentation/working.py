@@ -30,7 +30,6 @@ def law_of(prior: Law, scan: Field) -> tuple[Coefficients, tuple[str, ...]]:
     FileNotFoundError
         If there is no such file.
     """
-    instance(scan, Field, "a scan as Field")
     instance(prior, (Coefficients, str, os.PathLike), "a prior as Coefficients, a preset's name or a fit.json")
     found = find_law(prior, min(scan.spacing))
     if isinstance(found, Coefficients):
