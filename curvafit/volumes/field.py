@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from curvafit.priors.bounds import quoted
+from curvafit.priors.bounds import SEEDS, quoted, whole
 from curvafit.volumes.formats.base import ScanError, normalise_unit
+from curvafit.volumes.formats.part import Crop, box_of, fitted
 
 __all__ = ["Field", "ScanError", "positive_triple"]
 
@@ -64,6 +66,49 @@ class Field:
     @property
     def shape(self) -> tuple[int, int, int]:
         return self.values.shape  # type: ignore[return-value]
+
+    def crop(self, crop: Crop) -> Field:
+        """Return a box of voxels, whose affine says where it was.
+
+        Parameters
+        ----------
+        crop
+            `"z0:z1,y0:y1,x0:x1"`, or three slices, as Python counts: `":,10:,-64:"` is all of z, y from voxel 10 on and
+            the last 64 of x.
+
+        Raises
+        ------
+        ScanError
+            If it is no box, or leaves the volume.
+        """
+        box = fitted(box_of(crop), self.shape, self.source or "the volume")
+        return replace(self, values=self.values[box]).moved([edge.start for edge in box])
+
+    def label(self, label: int) -> Field:
+        """Return the mask of the voxels that have a value.
+
+        Raises
+        ------
+        ScanError
+            If there are none, or no others.
+        ValueError
+            If the label is no whole number.
+        """
+        label = whole(label, "a label that is a whole number", -SEEDS, SEEDS)
+        mask = self.values == label
+        if mask.all() or not mask.any():
+            values = np.unique(self.values)
+            listed = ", ".join(f"{float(value):g}" for value in values[:12]) + (", …" if len(values) > 12 else "")
+            expected = "beside others" if mask.any() else "of the scan"
+            raise ScanError(f"expected a label {expected} ({listed}), got {label}")
+        return replace(self, values=mask, notes=(*self.notes, f"The structure is label {label}."))
+
+    def moved(self, start: Sequence[int]) -> Field:
+        """Return the same values, placed where this field's voxel `start` (z, y, x) is."""
+        affine = np.diag([*self.spacing[::-1], 1.0]) if self.affine is None else self.affine.copy()
+        affine[:3, 3] += affine[:3, :3] @ np.array(start[::-1], dtype=np.float64)
+        ends = (f"{first}:{first + n}" for first, n in zip(start, self.shape, strict=True))
+        return replace(self, affine=affine, notes=(*self.notes, f"Voxels {', '.join(ends)} (z, y, x) are used."))
 
 
 def positive_triple(spacing: object) -> tuple[float, float, float]:

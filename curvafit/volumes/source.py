@@ -16,6 +16,7 @@ from curvafit.priors.bounds import quoted
 from curvafit.volumes.field import Field, positive_triple
 from curvafit.volumes.formats import Raw, ScanError, normalise_unit
 from curvafit.volumes.formats.guard import read_file
+from curvafit.volumes.formats.part import Crop, Part, box_of, selected
 
 __all__ = ["Source", "field_of", "load", "read_values"]
 
@@ -24,7 +25,13 @@ Source = str | os.PathLike[str] | Field | np.ndarray | torch.Tensor
 
 
 def field_of(
-    source: Source, *, spacing: Sequence[float] | float | None = None, unit: str | None = None, **reading: Any
+    source: Source,
+    *,
+    spacing: Sequence[float] | float | None = None,
+    unit: str | None = None,
+    label: int | None = None,
+    crop: Crop | None = None,
+    **reading: Any,
 ) -> Field:
     """Return a volume as a `Field`, whatever it is given as.
 
@@ -35,6 +42,8 @@ def field_of(
     spacing, unit
         Voxel edges (z, y, x), or one for all, and their unit: of a file, in place of what it says; of an array, a voxel
         by default. A `Field` has its own.
+    label, crop
+        The voxels of one value as a mask; a box of voxels: of any source, see `Field.label` and `Field.crop`.
     reading
         How to read a file: see `load`.
 
@@ -46,7 +55,12 @@ def field_of(
         A `ValueError`: the source is none of these, an option beside it counts for nothing, or `load` refuses the file.
     """
     if isinstance(source, str | os.PathLike):
-        return load(source, spacing=spacing, unit=unit, **reading)
+        return load(source, spacing=spacing, unit=unit, label=label, crop=crop, **reading)
+    return _part(_field_of(source, spacing, unit, reading), label, crop)
+
+
+def _field_of(source: Any, spacing: Sequence[float] | float | None, unit: str | None, reading: dict[str, Any]) -> Field:
+    """Return what is in memory as a `Field`."""
     if isinstance(source, Field):
         _refuse({"spacing": spacing, "unit": unit}, "a file or an array", "a Field, which has its own")
         _refuse(reading, "the path of a file", "a Field, which is read already")
@@ -64,6 +78,9 @@ def load(
     key: str | None = None,
     spacing: Sequence[float] | float | None = None,
     unit: str | None = None,
+    channel: int | None = None,
+    label: int | None = None,
+    crop: Crop | None = None,
     raw_shape: Sequence[int] | None = None,
     dtype: str | None = None,
     strict: bool = False,
@@ -78,6 +95,13 @@ def load(
     spacing, unit
         Override what the file says: voxel edges (z, y, x), or one for all; nm, um, mm or m. A `unit` alone renames
         the file's numbers, it does not convert them.
+    channel
+        Which channel, counted from 0, of a file of several: colours, times and components of vectors are channels too.
+    label
+        The voxels that have this value, as a mask.
+    crop
+        A box of voxels, `"z0:z1,y0:y1,x0:x1"` or three slices: the affine says where it was. Of Zarr, HDF5, NPY, RAW
+        and NIfTI without compression no more is read.
     raw_shape, dtype
         Voxels (z, y, x) and numpy type of a RAW file, which cannot tell them.
     strict
@@ -90,14 +114,18 @@ def load(
         If there is no such file.
     ScanError
         A `ValueError`: unknown suffix, a damaged or truncated file, a missing key, a volume that is not 3D,
-        not finite, constant or larger than memory, a spacing that is not positive.
+        not finite, constant or larger than memory, a spacing that is not positive; a channel, label or crop that is
+        not there.
     """
     location, key = _split_key(os.fspath(path), key)
-    raw = _squeezed(read_file(location, key, raw_shape, dtype), location)
+    part = Part(channel, box_of(crop))
+    read = read_file(location, key, raw_shape, dtype, None if part.whole else part)
+    raw, start = selected(read, part, location)
     if strict and raw.gaps:
         raise ScanError(f"expected a whole volume, got {location}: {raw.gaps[0]}")
     _check_values(raw.values, location)
-    return _placed(raw, f"{location}::{key}" if key else str(location), spacing, unit)
+    field = _placed(raw, f"{location}::{key}" if key else str(location), spacing, unit)
+    return _part(field if part.crop is None else field.moved(start), label)
 
 
 def read_values(path: str | os.PathLike[str]) -> np.ndarray:
@@ -119,6 +147,12 @@ def read_values(path: str | os.PathLike[str]) -> np.ndarray:
     while values.ndim > 3 and values.shape[0] == 1:
         values = values[0]
     return values
+
+
+def _part(field: Field, label: int | None, crop: Crop | None = None) -> Field:
+    """Return the part of a field that is asked for."""
+    field = field if crop is None else field.crop(crop)
+    return field if label is None else field.label(label)
 
 
 def _refuse(options: dict[str, Any], expected: str, got: str) -> None:
@@ -145,21 +179,6 @@ def _split_key(path: str, key: str | None) -> tuple[Path, str | None]:
         return Path(path), key
     name, separator, inner = path.rpartition("::")
     return (Path(name), key or inner or None) if separator else (Path(path), key)
-
-
-def _squeezed(raw: Raw, path: Path) -> Raw:
-    """Drop axes of length 1 beyond three, with their spacing."""
-    values = raw.values
-    if values.dtype.kind not in "biuf":
-        raise ScanError(f"expected numbers, got values of type {values.dtype} in {path}")
-    kept = [axis for axis, n in enumerate(values.shape) if n != 1]
-    if len(kept) != 3:
-        got = "no values" if values.size == 0 else f"{len(kept)}D of shape {tuple(values.shape)}"
-        raise ScanError(f"expected a 3D volume, got {got} in {path}")
-    spacing = raw.spacing
-    if spacing is not None and len(spacing) == values.ndim:
-        spacing = tuple(spacing[axis] for axis in kept)
-    return raw._replace(values=values.reshape([values.shape[axis] for axis in kept]), spacing=spacing)
 
 
 def _check_values(values: np.ndarray, path: Path) -> None:
