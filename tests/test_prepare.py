@@ -80,10 +80,10 @@ def test_labels() -> None:
     labels = np.zeros((32, 32, 32), np.uint16)
     labels[tube_mask(labels.shape, (1, 1, 1), 4)] = 7
     labels[:6] = 3
-    assert np.array_equal(prepare(Field(labels), label=7).mask, labels == 7)
+    assert np.array_equal(prepare(Field(labels).label(7)).mask, labels == 7)
     assert np.array_equal(prepare(Field(labels), kind="mask").mask, labels != 0)
     with pytest.raises(ScanError, match=r"expected a label of the scan \(0, 3, 7\), got 5"):
-        prepare(Field(labels), label=5)
+        Field(labels).label(5)
 
 
 # ---- size and place --------------------------------------------------------------------------------------------------

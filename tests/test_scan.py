@@ -144,7 +144,7 @@ def test_bad_names_are_refused(tmp_path: Path) -> None:
         load(tmp_path)
     with pytest.raises(ScanError, match="expected a unit of voxel, nm, um, mm or m, got 'furlong'"):
         Field(ramp(), unit="furlong")
-    with pytest.raises(ScanError, match="expected a grey volume, got a colour image"):
+    with pytest.raises(ScanError, match="expected a channel from 0 to 2 of .*, which holds 3 channels, got none"):
         tifffile.imwrite(tmp_path / "scan.tif", np.zeros((5, 6, 3), np.uint8), photometric="rgb")
         load(tmp_path / "scan.tif")
 

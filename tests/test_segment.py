@@ -67,11 +67,11 @@ def test_a_rare_structure_needs_a_threshold_and_is_told_so() -> None:
 
 def test_a_probability_is_its_own_evidence() -> None:
     p = np.random.default_rng(0).random((6, 7, 8)).astype(np.float32)
-    found = of_probability(p, Field(p))
+    found = of_probability(Field(p), Field(p))
     np.testing.assert_allclose(1 / (1 + np.exp(-found.ratio.astype(float))), p.clip(1e-4, 1 - 1e-4), atol=1e-6)
     for bad, said in ((p[1:], "shape"), (2 * p, r"\[0, 1\]")):
         with pytest.raises(ValueError, match=said):
-            of_probability(bad, Field(p))
+            of_probability(Field(bad), Field(p))
 
 
 def test_a_probability_map_is_at_the_scan_s_place() -> None:
@@ -82,7 +82,7 @@ def test_a_probability_map_is_at_the_scan_s_place() -> None:
         spacing = (0.03 * factor, 0.02 * factor, 0.02 * factor)
         other = np.diag([factor] * 3 + [1]) @ affine
         same = of_probability(Field(p, spacing, unit, other.astype(np.float32)), scan)
-        np.testing.assert_array_equal(same.ratio, of_probability(p, scan).ratio)
+        np.testing.assert_array_equal(same.ratio, of_probability(scan, scan).ratio)
         for column in (0, 3):  # mirrored, or a voxel away
             moved = other.copy()
             moved[0, column] += (0.04, None, None, 0.02)[column] * factor  # type: ignore[operator]

@@ -31,7 +31,9 @@ from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.profile import phase_field
 from curvafit.progress import Progress, silent
-from curvafit.volumes.scan import Field, load
+from curvafit.volumes.field import Field
+from curvafit.volumes.formats.part import Crop
+from curvafit.volumes.source import Source, field_of
 
 #: Longest edge, in working voxels, of the boxes in which shapes are regenerated for comparison.
 REGENERATED_EDGE = 100
@@ -63,15 +65,16 @@ class Inference:
 
 
 def infer(
-    scan: str | Path | Field,
+    scan: Source,
     *,
     kind: Literal["auto", "field", "mask", "image"] = "auto",
     periodic: bool = False,
     atlas: str | Path | Atlas | None = None,
     threshold: float | Literal["otsu"] = "otsu",
     dark: bool = False,
-    roi: str | Path | np.ndarray | None = None,
+    roi: Source | None = None,
     label: int | None = None,
+    crop: Crop | None = None,
     seed: int = 0,
     progress: Progress = silent,
     **reading: Any,
@@ -81,18 +84,21 @@ def infer(
     Parameters
     ----------
     scan
-        A volume file (see `curvafit.load`, which takes the remaining keywords: spacing, unit, key, raw_shape,
-        dtype, strict), or a `Field`.
+        The path of a volume file, a `Field`, or an array or tensor (Z, Y, X).
     kind
         `"field"`, `"mask"`, `"image"`, or `"auto"`: two values are a mask, plateaus near ±1 a phase field.
     periodic
         Whether the box repeats; true of generated fields, of scans hardly ever.
     atlas
         The shapes to match against; the packaged ones by default.
-    threshold, dark, roi, label
+    threshold, dark, roi
         What is inside: see `curvafit.inference.prepare.prepare`.
+    label, crop
+        The voxels of one value as a mask; a box of voxels, of the scan and of `roi`: see `curvafit.load`.
     progress
         Called with a sentence and the share done.
+    reading
+        How a file is read, or an array placed: spacing, unit and the others of `curvafit.load`.
 
     Raises
     ------
@@ -100,14 +106,15 @@ def infer(
         One sentence on a volume that cannot be measured.
     """
     check_options(kind, threshold, label)
-    for value, its, said in ((scan, Field, "a scan"), (atlas, Atlas, "an atlas"), (roi, np.ndarray, "a mask")):
-        if value is not None or said == "a scan":
-            instance(value, (str, Path, its), f"{said}, as the path of a file or as {its.__name__}")
+    if atlas is not None:
+        instance(atlas, (str, Path, Atlas), "an atlas, as the path of a file or as Atlas")
     seed = whole(seed, "a seed that is a whole number from 0", 0, SEEDS - 2)  # and the next one
     progress("reading the scan", 0.0)
     atlas = atlas if isinstance(atlas, Atlas) else load_atlas(atlas)
-    volume = scan if isinstance(scan, Field) else load(scan, **reading)
-    prepared = prepare(volume, kind=kind, periodic=periodic, threshold=threshold, dark=dark, roi=roi, label=label)
+    volume = field_of(scan, label=label, crop=crop, **reading)
+    region = None if roi is None else field_of(roi)
+    region = region if region is None or crop is None else region.crop(crop)
+    prepared = prepare(volume, kind=kind, periodic=periodic, threshold=threshold, dark=dark, roi=region)
     progress("measuring curvature", 0.05)
     seen = scan_diagram(prepared)
     seen_as = "field" if prepared.kind == "field" else "mask"

@@ -41,7 +41,6 @@ def find_level(
     kind: Literal["auto", "field", "mask", "image"] = "auto",
     threshold: Literal["otsu"] | float = "otsu",
     dark: bool = False,
-    label: int | None = None,
     region: np.ndarray | None = None,
     periodic: bool = False,
     extremes: tuple[float, float] | None = None,
@@ -53,23 +52,20 @@ def find_level(
     Raises
     ------
     ScanError
-        If the kind, label or threshold fits nothing in the scan, or a phase is empty.
+        If the kind or threshold fits nothing in the scan, or a phase is empty.
     """
     if kind not in ("auto", "field", "mask", "image"):
         raise ScanError(f"expected kind auto, field, mask or image, got {kind!r}")
     values = field.values
     lowest, highest = (values.min(), values.max()) if extremes is None else extremes
     two = bool(np.all((values == lowest) | (values == highest)))
-    if label is not None:
-        level = _signed(_label_mask(values, label), dark, f"The structure is label {label}.")
+    kind = _guess_kind(values, threshold, two) if kind == "auto" else kind
+    if kind == "field":
+        level = _field_level(values, dark)
+    elif kind == "mask":
+        level = _mask_level(values, dark, lowest, highest, two)
     else:
-        kind = _guess_kind(values, threshold, two) if kind == "auto" else kind
-        if kind == "field":
-            level = _field_level(values, dark)
-        elif kind == "mask":
-            level = _mask_level(values, dark, lowest, highest, two)
-        else:
-            level = _image_level(field, threshold, dark, region, periodic)
+        level = _image_level(field, threshold, dark, region, periodic)
     counted = level.mask if region is None else level.mask[region]
     if not counted.any():
         raise ScanError("expected a structure in the scan, got none: every voxel is background")
@@ -132,15 +128,6 @@ def _mask_level(values: np.ndarray, dark: bool, lowest: float, highest: float, t
         note = f"Taken for a mask of the values {float(lowest):g} and {float(highest):g}."
         return _signed(values == highest, dark, note)
     return _signed(values > 0, dark, "Taken for a mask: the structure is where it is positive.")
-
-
-def _label_mask(values: np.ndarray, label: int) -> np.ndarray:
-    mask = values == label
-    if not mask.any():
-        found = np.unique(values)
-        listed = ", ".join(f"{float(value):g}" for value in found[:12]) + (", …" if len(found) > 12 else "")
-        raise ScanError(f"expected a label of the scan ({listed}), got {label}")
-    return mask
 
 
 def _signed(mask: np.ndarray, dark: bool, note: str) -> Level:

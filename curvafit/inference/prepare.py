@@ -97,7 +97,6 @@ def prepare(
     threshold: Literal["otsu"] | float = "otsu",
     dark: bool = False,
     roi: Field | np.ndarray | str | os.PathLike[str] | None = None,
-    label: int | None = None,
 ) -> Prepared:
     """Find the structure and put it on the working grid, where its median thickness is a known number of voxels.
 
@@ -121,13 +120,11 @@ def prepare(
         The structure is the dark phase (of a mask: its lower value; of a field: where it is negative).
     roi
         Nonzero where the scan counts (array, field or file of the scan's shape).
-    label
-        The structure is where the scan has this value.
 
     Raises
     ------
     ScanError
-        If there is no structure, nothing else, no surface, or nothing at least 3 voxels thick; or if `roi`, `label` or
+        If there is no structure, nothing else, no surface, or nothing at least 3 voxels thick; or if `roi` or
         `threshold` do not fit the scan.
     """
     region = region_of_interest(roi, field)
@@ -135,7 +132,7 @@ def prepare(
     region = None if region is None else region[where]
     part = replace(field, values=field.values[where], affine=None)
     periodic = periodic and part.shape == field.shape
-    options = {"kind": kind, "threshold": threshold, "dark": dark, "label": label}
+    options = {"kind": kind, "threshold": threshold, "dark": dark}
     extremes = (field.values.min(), field.values.max())
     level = find_level(part, region=region, periodic=periodic, extremes=extremes, **options)  # type: ignore[arg-type]
     scan = _Scan(level, part.shape, part.spacing, periodic, region, field.notes + notes + (level.note,))

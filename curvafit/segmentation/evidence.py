@@ -88,7 +88,7 @@ def of_intensities(scan: Field, threshold: float | str = "otsu", dark: bool = Fa
     return Evidence(sign * (values - middle) * np.float32(contrast / noise**2), sign * (smooth - middle), said)
 
 
-def of_probability(probability: Field | np.ndarray, scan: Field) -> Evidence:
+def of_probability(probability: Field, scan: Field) -> Evidence:
     """r = log p / (1 - p) of a map (Z, Y, X) in [0, 1].
 
     Raises
@@ -96,11 +96,10 @@ def of_probability(probability: Field | np.ndarray, scan: Field) -> Evidence:
     ScanError
         If its shape or place is not the scan's or it leaves [0, 1].
     """
-    if isinstance(probability, Field) and probability.shape == scan.shape:
-        _check_place(probability, scan)
-    values = np.asarray(probability.values if isinstance(probability, Field) else probability, dtype=np.float32)
-    if values.shape != scan.shape:
-        raise ScanError(f"expected a probability map of the scan's shape {scan.shape}, got {values.shape}")
+    if probability.shape != scan.shape:
+        raise ScanError(f"expected a probability map of the scan's shape {scan.shape}, got {probability.shape}")
+    _check_place(probability, scan)
+    values = probability.values.astype(np.float32)
     lowest, highest = float(values.min()), float(values.max())
     if not 0 <= lowest <= highest <= 1:
         raise ScanError(f"expected probabilities in [0, 1], got {lowest:g} to {highest:g}")

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -12,13 +13,15 @@ from torch import Tensor
 from curvafit.generation import data
 from curvafit.generation.flow import Flow, descend
 from curvafit.priors import kernels
-from curvafit.priors.bounds import instance, real, whole
+from curvafit.priors.bounds import real, whole
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON
 from curvafit.priors.profile import optimal_profile, phase_field
+from curvafit.progress import Progress, silent
 from curvafit.segmentation.evidence import interpolated_distance, of_intensities, of_probability
 from curvafit.segmentation.working import Law, Place, law_of
-from curvafit.volumes.scan import Field, ScanError
+from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.source import Source, field_of
 
 __all__ = ["STEPS", "Segmentation", "reconstruct", "segment"]
 
@@ -35,8 +38,6 @@ LABELS = 256
 WEIGHTS = (1e-9, 1e9)
 #: A flow whose last ten steps lower the energy by less than this share has settled.
 SETTLED = 0.001
-
-Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
@@ -67,23 +68,24 @@ class Segmentation:
 
 
 def segment(
-    scan: Field,
+    scan: Source,
     prior: Law,
     *,
-    probability: Field | np.ndarray | None = None,
+    probability: Source | None = None,
     weight: float | None = None,
     threshold: float | str = "otsu",
     dark: bool = False,
     epsilon: float | None = None,
     steps: int = STEPS,
-    progress: Progress | None = None,
+    progress: Progress = silent,
+    **reading: Any,
 ) -> Segmentation:
     """Find the structure of a scan: lower -log p(scan | mask) + λ F_ε from a smoothed, thresholded start.
 
     Parameters
     ----------
     scan
-        Grey levels of two phases with noise.
+        Grey levels of two phases with noise: the path of a file, a `Field`, or an array or tensor (Z, Y, X).
     prior
         `Coefficients` with lengths in the scan's unit; or a preset's name, in working units of which the smallest voxel
         edge is 0.01; or the path of a `fit.json`, whose unit is converted.
@@ -102,6 +104,8 @@ def segment(
         Of Adam.
     progress
         Called with a sentence and the share done.
+    reading
+        How a file is read, or an array placed: spacing, unit and the others of `curvafit.load`.
 
     Raises
     ------
@@ -110,19 +114,18 @@ def segment(
     FileNotFoundError
         If there is no such `fit.json`.
     """
+    scan = field_of(scan, **reading)
     law, notes = law_of(prior, scan)
     place = Place.of(scan, epsilon)
     weight = None if weight is None else real(weight, "a positive weight", *WEIGHTS)
     if not (isinstance(threshold, str) and threshold == "otsu"):
         real(threshold, "a threshold that is a number or 'otsu'")
-    if probability is not None:
-        instance(probability, (Field, np.ndarray), "a probability map as Field or array")
     if probability is None:
         found = of_intensities(scan, threshold, dark)
     elif dark or threshold != "otsu":
         raise ScanError("expected neither a threshold nor dark with a probability map, which says what is inside")
     else:
-        found = of_probability(probability, scan)
+        found = of_probability(field_of(probability), scan)
     start = _started(found.level, place)
     stiffness = float(law.a20 + law.a02) / 2
     if stiffness <= 0:
@@ -136,7 +139,7 @@ def segment(
 
 
 def reconstruct(
-    slices: Field,
+    slices: Source,
     prior: Law,
     *,
     every: int | None = None,
@@ -145,16 +148,17 @@ def reconstruct(
     axis: int = 0,
     epsilon: float | None = None,
     steps: int = STEPS,
-    progress: Progress | None = None,
+    progress: Progress = silent,
+    **reading: Any,
 ) -> Segmentation:
     """Fill a volume of which some slices are known: lower F_ε while these hold, from interpolated signed distances.
 
     Parameters
     ----------
     slices
-        A mask, or labels, of the whole volume's shape, positive inside; only its known slices are read, and kept as
-        they are.
-    prior, epsilon, steps, progress
+        A mask, or labels, of the whole volume's shape, positive inside, as a path, a `Field`, an array or a tensor;
+        only its known slices count, and are kept as they are.
+    prior, epsilon, steps, progress, reading
         As in `segment`.
     every, first
         Known are `first`, `first + every`, … along `axis`. Before the first and beyond the last known slice these are
@@ -171,6 +175,7 @@ def reconstruct(
     FileNotFoundError
         If there is no such `fit.json`.
     """
+    slices = field_of(slices, **reading)
     law, notes = law_of(prior, slices)
     place = Place.of(slices, epsilon)
     axis = whole(axis, "an axis 0, 1 or 2 (z, y, x)", 0, 2)
@@ -246,12 +251,9 @@ def _force(law: Coefficients, place: Place, u: Tensor) -> float:
     return sizes[0] / sizes[1]
 
 
-def _lowered(
-    start: Tensor, law: Coefficients, term: data.Data, place: Place, steps: int, progress: Progress | None
-) -> Flow:
-    def watch(made: int, total: int, state: object) -> None:
-        if progress is not None:
-            progress("lowering the energy", made / total)
+def _lowered(start: Tensor, law: Coefficients, term: data.Data, place: Place, steps: int, progress: Progress) -> Flow:
+    def watch(step: int, total: int, state: object) -> None:
+        progress("lowering the energy", step / total)
 
     flow = descend(
         start,

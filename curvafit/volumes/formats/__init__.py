@@ -1,4 +1,4 @@
-"""One module a file format; `curvafit.volumes.scan` chooses among them by suffix."""
+"""One module a file format; `curvafit.volumes.source` chooses among them by suffix."""
 
 from __future__ import annotations
 

@@ -13,7 +13,8 @@ import numpy as np
 
 from curvafit.priors.bounds import quoted
 from curvafit.volumes.formats.base import Damaged, Raw, ScanError, pick_key, stated
-from curvafit.volumes.formats.streams import check_array, check_regular, read_numbers
+from curvafit.volumes.formats.part import Part, part_of
+from curvafit.volumes.formats.streams import check_regular, mapped, read_numbers
 
 #: Attributes that may state a spacing or its unit.
 _ATTRIBUTES = ("element_size_um", "spacing", "voxel_size", "unit", "units")
@@ -22,9 +23,14 @@ _NPY_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.form
 _RAW_TYPES = "uint8, int8, uint16, int16, uint32, int32, float32, float64 (or with > for big-endian, as in >u2)"
 
 
-def read_npy(path: Path, **_: object) -> Raw:
+def read_npy(path: Path, *, part: Part | None = None, **_: object) -> Raw:
+    """The numbers of a file; those of a part alone where one is asked for."""
     with path.open("rb") as stream:
-        return Raw(_array(stream, path, path.stat().st_size))
+        if part is None:
+            return Raw(_array(stream, path, path.stat().st_size))
+        shape, fortran, dtype = _npy_header(stream, path.stat().st_size)
+        values = mapped(path, stream.tell(), shape[::-1] if fortran else shape, dtype)
+    return part_of(values.T if fortran else values, part, path)
 
 
 def write_npy(field: Any, path: Path) -> None:
@@ -67,17 +73,23 @@ def _member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
 
 def _array(stream: IO[bytes], place: object, size: int) -> np.ndarray:
     """The numbers of an NPY stream of so many bytes, which must end with them."""
+    shape, fortran, dtype = _npy_header(stream, size)
+    values = read_numbers(stream, shape[::-1] if fortran else shape, dtype, place)
+    return values.T if fortran else values
+
+
+def _npy_header(stream: IO[bytes], size: int) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Shape, whether the first axis is the fastest, and type, of an NPY stream of so many bytes."""
     version = np.lib.format.read_magic(stream)
     if version not in _NPY_HEADERS:
         raise Damaged(f"NPY of version {version} holds no plain numbers")
     shape, fortran, dtype = _NPY_HEADERS[version](stream)
     if not dtype.hasobject and math.prod(shape) * dtype.itemsize != size - stream.tell():
         raise Damaged(f"{math.prod(shape) * dtype.itemsize} bytes of values by its header, not so many in the file")
-    values = read_numbers(stream, shape[::-1] if fortran else shape, dtype, place)
-    return values.T if fortran else values
+    return shape, fortran, dtype
 
 
-def read_hdf5(path: Path, *, key: str | None = None, **_: object) -> Raw:
+def read_hdf5(path: Path, *, key: str | None = None, part: Part | None = None, **_: object) -> Raw:
     """A dataset, with its attribute `element_size_um` or `spacing` and `unit` where it has one."""
     with h5py.File(path, "r") as file:
         keys: list[str] = []
@@ -87,11 +99,10 @@ def read_hdf5(path: Path, *, key: str | None = None, **_: object) -> Raw:
             raise ScanError(f"expected values in the file itself, got {path} whose values lie in other files")
         if dataset.shape is None:
             raise ScanError(f"expected a 3D volume, got no values in {path}")
-        check_array(dataset.shape, dataset.dtype, path)
         attributes = {name: dataset.attrs[name] for name in _ATTRIBUTES if name in dataset.attrs}
         spacing, unit = stated(attributes, dataset.ndim)
         gaps = tuple(_gaps(dataset, path))
-        return Raw(np.asarray(dataset[()]), spacing, unit, gaps=gaps)
+        return part_of(dataset, part, path)._replace(spacing=spacing, unit=unit, gaps=gaps)
 
 
 def _gaps(dataset: Any, path: Path) -> Iterator[str]:
@@ -111,7 +122,14 @@ def _gaps(dataset: Any, path: Path) -> Iterator[str]:
         yield f"No values are stored: {filled}"
 
 
-def read_raw(path: Path, *, raw_shape: Sequence[int] | None = None, dtype: str | None = None, **_: object) -> Raw:
+def read_raw(
+    path: Path,
+    *,
+    raw_shape: Sequence[int] | None = None,
+    dtype: str | None = None,
+    part: Part | None = None,
+    **_: object,
+) -> Raw:
     """Bare numbers, x fastest: shape and type come from the caller (a byte a voxel needs no type)."""
     if raw_shape is None:
         raise ScanError(f"expected --raw-shape Z,Y,X for the bare numbers in {path}, got none")
@@ -128,4 +146,6 @@ def read_raw(path: Path, *, raw_shape: Sequence[int] | None = None, dtype: str |
     if size != math.prod(shape) * kind.itemsize:
         wanted = math.prod(shape) * kind.itemsize
         raise ScanError(f"expected {wanted} bytes for shape {shape} of {kind}, got {size} in {path}")
-    return Raw(np.fromfile(path, dtype=kind).reshape(shape))
+    if part is None:
+        return Raw(np.fromfile(path, dtype=kind).reshape(shape))
+    return part_of(mapped(path, 0, shape, kind), part, path)

@@ -57,7 +57,8 @@ class Raw(NamedTuple):
 
     `spacing` has one number per axis of `values`, or three for (z, y, x). `guesses` are sentences on a spacing or unit
     that the file leaves open: void where the caller states it. `gaps` are sentences on values that are not in the file
-    and were filled in.
+    and were filled in. `channels` is the axis of channels, where the file says that there is one. `whole` is the shape
+    of the file's array where `values` are but the part that was asked for, with as many axes.
     """
 
     values: np.ndarray
@@ -67,6 +68,8 @@ class Raw(NamedTuple):
     notes: tuple[str, ...] = ()
     guesses: tuple[str, ...] = ()
     gaps: tuple[str, ...] = ()
+    channels: int | None = None
+    whole: tuple[int, ...] | None = None
 
 
 @contextmanager

@@ -8,13 +8,20 @@ from pathlib import Path
 from curvafit.priors.bounds import quoted
 from curvafit.volumes.formats import KEYED, pick_reader
 from curvafit.volumes.formats.base import Damaged, Raw, ScanError, complaints, one_line
+from curvafit.volumes.formats.part import Part
 from curvafit.volumes.formats.streams import check_regular
 
 
 def read_file(
-    path: Path, key: str | None = None, raw_shape: Sequence[int] | None = None, dtype: str | None = None
+    path: Path,
+    key: str | None = None,
+    raw_shape: Sequence[int] | None = None,
+    dtype: str | None = None,
+    part: Part | None = None,
 ) -> Raw:
-    """What the reader of a file, chosen by its suffix or by what lies in it, gives.
+    """Return what the reader of a file, chosen by its suffix or by what lies in it, gives.
+
+    Of some formats a part is read alone: see `Raw.whole`.
 
     Raises
     ------
@@ -28,7 +35,7 @@ def read_file(
     reader = pick_reader(check_regular(path), raw_shape is not None)
     if key is not None and reader not in KEYED:
         raise ScanError(f"expected a key only for NPZ, HDF5, Zarr and DICOM, got {quoted(key)} for {path}")
-    return guarded(reader, path, key=key, raw_shape=raw_shape, dtype=dtype)
+    return guarded(reader, path, key=key, raw_shape=raw_shape, dtype=dtype, part=part)
 
 
 def guarded(reader: Callable[..., Raw], path: Path, **options: object) -> Raw:

@@ -22,6 +22,7 @@ def read_nrrd(path: Path, **_: object) -> Raw:
     with path.open("rb") as file:
         header = nrrd.read_header(file)
         values = nrrd_values(nrrd, header, file, path)
+    channels = _channel_axis(header)
     units = header.get("space units") or header.get("units")
     unit = next((u for u in units if u), None) if units is not None else None
     if "space directions" in header:
@@ -32,10 +33,21 @@ def read_nrrd(path: Path, **_: object) -> Raw:
         affine[:3, 3] = header.get("space origin", np.zeros(3))
         if str(header.get("space", "")).startswith("left-posterior"):
             affine = _LPS_TO_RAS @ affine
-        return Raw(values, tuple(np.linalg.norm(directions, axis=1)[::-1]), unit or "mm", affine)
+        return Raw(values, tuple(np.linalg.norm(directions, axis=1)[::-1]), unit or "mm", affine, channels=channels)
     if "spacings" in header:
-        return Raw(values, tuple(float(h) for h in header["spacings"])[::-1], unit)
-    return Raw(values)
+        return Raw(values, tuple(float(h) for h in header["spacings"])[::-1], unit, channels=channels)
+    return Raw(values, channels=channels)
+
+
+def _channel_axis(header: dict[str, Any]) -> int | None:
+    """The axis, of the values with z first, that an NRRD header says is none of space."""
+    axes = int(header["dimension"])
+    if "space directions" in header:
+        directions = np.asarray(header["space directions"], dtype=np.float64)
+        other = [bool(np.isnan(each).any()) for each in directions]
+    else:
+        other = [str(kind).lower() not in ("domain", "space", "none", "???") for kind in header.get("kinds", ())]
+    return axes - 1 - other.index(True) if sum(other) == 1 and len(other) == axes else None
 
 
 def read_itk(path: Path, **_: object) -> Raw:
@@ -66,14 +78,18 @@ def _itk_image(itk: Any, path: Path) -> Raw:
 
 
 def _in_millimetres(values: np.ndarray, spacing: np.ndarray, directions: np.ndarray, origin: np.ndarray) -> Raw:
-    """Values with ITK's account of their place; an affine where they have three axes."""
-    affine = None
-    if len(spacing) == 3:
+    """Values with ITK's account of their place; an affine where they have three axes, or a fourth of channels.
+
+    Channels are the last axis where ITK does not count it, else the first.
+    """
+    affine, axes = None, len(spacing)
+    if axes in (3, 4):
         affine = np.eye(4)
-        affine[:3, :3] = directions * spacing
-        affine[:3, 3] = origin
+        affine[:3, :3] = directions[:3, :3] * spacing[:3]
+        affine[:3, 3] = origin[:3]
         affine = _LPS_TO_RAS @ affine
-    return Raw(values, tuple(float(h) for h in spacing[::-1]), "mm", affine)
+    channels = axes if values.ndim > axes else 0 if axes == 4 else None
+    return Raw(values, tuple(float(h) for h in spacing[::-1]), "mm", affine, channels=channels)
 
 
 def read_mrc(path: Path, **_: object) -> Raw:
@@ -87,7 +103,7 @@ def read_mrc(path: Path, **_: object) -> Raw:
         skip(stream, start)
         values = read_numbers(stream, [int(n) for n in shape], dtype, path)
     spacing = (float(size.z), float(size.y), float(size.x))
-    return Raw(values, spacing if min(spacing) > 0 else None, "angstrom")
+    return Raw(values, spacing if min(spacing) > 0 else None, "angstrom", channels=0 if values.ndim == 4 else None)
 
 
 def check_mrc(unit: str) -> None:
@@ -127,7 +143,7 @@ def read_dicom(path: Path, *, key: str | None = None, **_: object) -> Raw:
     affine = np.eye(4)
     affine[:3, :3] = np.column_stack([rows * x, columns * y, normal * z])
     affine[:3, 3] = origin
-    return Raw(values, (z, y, x), "mm", _LPS_TO_RAS @ affine)
+    return Raw(values, (z, y, x), "mm", _LPS_TO_RAS @ affine, channels=3 if values.ndim == 4 else None)
 
 
 def _image(pydicom: Any, file: Path) -> Any:

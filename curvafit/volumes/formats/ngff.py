@@ -15,22 +15,24 @@ from curvafit.files import MARK, is_empty
 from curvafit.interrupts import undisturbed
 from curvafit.volumes.formats.base import Raw, pick_key, stated
 from curvafit.volumes.formats.chunks import check_store, missing_chunks
-from curvafit.volumes.formats.streams import check_array
+from curvafit.volumes.formats.part import Part, part_of
 
 #: Edge of a chunk, and of the largest volume that is not halved any more, in voxels.
 CHUNK = 64
 #: Files of a group that `write_zarr` wrote.
 _WRITTEN = re.compile(r"(\d+/)?zarr\.json|\d+/c(/\d+)*")
+#: Spacing along all axes, unit and axis of channels of an array, each where it is known.
+_Place = tuple[tuple[Any, ...] | None, Any, int | None]
 #: Our unit -> OME-NGFF's; a voxel has none.
 _UNITS = {"nm": "nanometer", "um": "micrometer", "mm": "millimeter", "m": "meter"}
 
 
-def read_zarr(path: Path, *, key: str | None = None, **_: object) -> Raw:
+def read_zarr(path: Path, *, key: str | None = None, part: Part | None = None, **_: object) -> Raw:
     """An array, or one of a group; spacing and unit from its attributes or from OME-Zarr's multiscales."""
     check_store(path)
     node: Any = zarr.open(path, mode="r")
     if isinstance(node, zarr.Array):
-        return _raw(node, path, stated(node.attrs.asdict(), node.ndim))
+        return _raw(node, path, (*stated(node.attrs.asdict(), node.ndim), None), part)
     arrays = _arrays(node)
     attributes = node.attrs.asdict()
     scales = _multiscales(attributes)
@@ -38,15 +40,15 @@ def read_zarr(path: Path, *, key: str | None = None, **_: object) -> Raw:
         key = next(iter(scales))
     name = pick_key(sorted(arrays), key, path)
     array = arrays[name]
-    place = scales.get(name) or stated({**attributes, **array.attrs.asdict()}, array.ndim)
-    return _raw(array, path / array.path, place)
+    place = scales.get(name) or (*stated({**attributes, **array.attrs.asdict()}, array.ndim), None)
+    return _raw(array, path / array.path, place, part)
 
 
-def _raw(array: Any, folder: Path, place: tuple[tuple[Any, ...] | None, Any]) -> Raw:
+def _raw(array: Any, folder: Path, place: _Place, part: Part | None) -> Raw:
     """The values of an array in a folder, with what of them is not stored."""
-    check_array(array.shape, array.dtype, folder)
+    spacing, unit, channels = place
     gaps = missing_chunks(array, folder)
-    return Raw(np.asarray(array[...]), *place, gaps=gaps)
+    return part_of(array, part, folder, channels)._replace(spacing=spacing, unit=unit, gaps=gaps)
 
 
 def write_zarr(field: Any, path: Path) -> None:
@@ -134,14 +136,16 @@ def _arrays(group: Any, prefix: str = "") -> dict[str, Any]:
     return found
 
 
-def _multiscales(attributes: Mapping[str, Any]) -> dict[str, tuple[tuple[float, ...] | None, str | None]]:
-    """OME-Zarr: path of each level -> (scale of its axes, unit of the last one)."""
+def _multiscales(attributes: Mapping[str, Any]) -> dict[str, _Place]:
+    """OME-Zarr: path of each level -> (scale of its axes, unit of the last one, axis of channels)."""
     described = attributes.get("ome", attributes).get("multiscales") or []
-    found: dict[str, tuple[tuple[float, ...] | None, str | None]] = {}
+    found: dict[str, _Place] = {}
     for image in described[:1]:
         axes = [axis if isinstance(axis, dict) else {"name": axis} for axis in image.get("axes", [])]
         unit = axes[-1].get("unit") if axes else None
+        named = [k for k, axis in enumerate(axes) if axis.get("type", axis.get("name")) in ("channel", "c")]
+        channels = named[0] if named else None
         for level in image.get("datasets", []):
             scales = [t["scale"] for t in level.get("coordinateTransformations", []) if t.get("type") == "scale"]
-            found[level["path"]] = (tuple(float(h) for h in scales[0]) if scales else None, unit)
+            found[level["path"]] = (tuple(float(h) for h in scales[0]) if scales else None, unit, channels)
     return found

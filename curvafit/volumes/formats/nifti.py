@@ -13,7 +13,8 @@ import numpy as np
 from nibabel.volumeutils import apply_read_scaling
 
 from curvafit.volumes.formats.base import Raw, ScanError, complaints, normalise_unit
-from curvafit.volumes.formats.streams import read_numbers
+from curvafit.volumes.formats.part import Part, part_of
+from curvafit.volumes.formats.streams import mapped, read_numbers
 
 #: Our unit -> (NIfTI's, factor to it).
 _TO_FILE = {
@@ -25,23 +26,23 @@ _TO_FILE = {
 }
 
 
-def read_nifti(path: Path, **_: object) -> Raw:
+def read_nifti(path: Path, *, part: Part | None = None, **_: object) -> Raw:
     """Values, zooms, unit and affine. Without a unit, zooms other than 1 are taken for mm, as NIfTI's readers do."""
     with complaints("nibabel.global") as said:
         image: Any = nibabel.load(path)
-        values = _values(image, path)
+        raw = _values(image, path, part)
     zooms = tuple(float(f"{h:.7g}") for h in image.header.get_zooms())[:3]  # stored as float32
     if len(zooms) < 3:
-        raise ScanError(f"expected a 3D volume, got {values.ndim}D of shape {values.shape} in {path}")
+        raise ScanError(f"expected a 3D volume, got {len(image.shape)}D of shape {image.shape[::-1]} in {path}")
     unit = image.header.get_xyzt_units()[0]
     affine = np.array(image.affine, dtype=np.float64)
-    spacing: tuple[float, ...] | None = (1.0,) * (values.ndim - 3) + zooms[::-1]
+    spacing: tuple[float, ...] | None = (1.0,) * (raw.values.ndim - 3) + zooms[::-1]
     guesses = [f"The file's header is mended: {text}." for text in dict.fromkeys(said)]
     wrote = _own_unit(image.header)
     if wrote:
         unit, factor = wrote
         affine[:3] *= factor
-        spacing = (1.0,) * (values.ndim - 3) + tuple(h * factor for h in zooms[::-1])
+        spacing = (1.0,) * (raw.values.ndim - 3) + tuple(h * factor for h in zooms[::-1])
     elif unit == "unknown" and all(h == 1 for h in zooms):
         spacing = None
     elif unit == "unknown":
@@ -50,16 +51,26 @@ def read_nifti(path: Path, **_: object) -> Raw:
     lengths = np.linalg.norm(affine[:3, :3], axis=0)[::-1]
     if spacing is not None and not np.allclose(lengths, spacing[-3:], rtol=0.01):
         guesses.append("The file's affine and voxel sizes disagree: the voxel sizes are used.")
-    return Raw(values, spacing, unit, affine, guesses=tuple(guesses))
+    return raw._replace(spacing=spacing, unit=unit, affine=affine, guesses=tuple(guesses))
 
 
-def _values(image: Any, path: Path) -> np.ndarray:
-    """The scaled values, z first, of a file that ends with them and whose checksum, if it is compressed, holds."""
-    stored = image.dataobj
-    with gzip.open(path) if path.name.lower().endswith(".gz") else path.open("rb") as stream:
-        stream.seek(stored.offset)
-        values = read_numbers(stream, stored.shape[::-1], stored.dtype, path)
-    return apply_read_scaling(values, np.asanyarray(stored.slope), np.asanyarray(stored.inter))
+def _values(image: Any, path: Path, part: Part | None) -> Raw:
+    """The scaled values, z first, of a file that ends with them and whose checksum, if it is compressed, holds.
+
+    Of one that is not compressed a part is read alone.
+    """
+    stored, packed = image.dataobj, path.name.lower().endswith(".gz")
+    shape = stored.shape[::-1]
+    long = [axis for axis, n in enumerate(shape[:-3]) if n != 1]
+    channels = long[0] if len(long) == 1 else None
+    if part is not None and not packed:
+        raw = part_of(mapped(path, stored.offset, shape, stored.dtype), part, path, channels)
+    else:
+        with gzip.open(path) if packed else path.open("rb") as stream:
+            stream.seek(stored.offset)
+            raw = Raw(read_numbers(stream, shape, stored.dtype, path), channels=channels)
+    scaled = apply_read_scaling(raw.values, np.asanyarray(stored.slope), np.asanyarray(stored.inter))
+    return raw._replace(values=scaled)
 
 
 def write_nifti(field: Any, path: Path) -> None:

@@ -46,6 +46,23 @@ def read_numbers(stream: Any, shape: Sequence[int], dtype: np.dtype, place: obje
     return values.reshape(tuple(shape))
 
 
+def mapped(path: Path, start: int, shape: Sequence[int], dtype: np.dtype) -> np.ndarray:
+    """Return the array, last axis fastest, that a file holds from a byte to its end, without reading it.
+
+    Raises
+    ------
+    ScanError
+        If its type is none of numbers.
+    Damaged
+        If the file is shorter or longer.
+    """
+    check_array([0], dtype, path)
+    wanted, held = math.prod(shape) * dtype.itemsize, path.stat().st_size - start
+    if wanted != held:
+        raise Damaged(f"{wanted} bytes of values by its header, {held} in the file")
+    return np.memmap(path, dtype, "r", start, tuple(shape)) if wanted else np.empty(tuple(shape), dtype)
+
+
 def check_array(shape: Sequence[int], dtype: np.dtype, place: object) -> None:
     """Refuse an array of a header before there is room made for it.
 

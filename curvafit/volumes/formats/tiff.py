@@ -41,19 +41,27 @@ def read_tiff(path: Path, **_: object) -> Raw:
     """The first series of a file, if every strip and page that it speaks of is there."""
     with complaints("tifffile") as said, tifffile.TiffFile(path) as file:
         series = file.series[0]
-        if "S" in series.axes:
-            raise ScanError(f"expected a grey volume, got a colour image (axes {series.axes}) in {path}")
         check_array(series.shape, series.dtype or np.dtype("V1"), path)
         _check_pages(file, series)
         values = np.asarray(series.asarray())
         spacing, unit, guesses = _spacing(file)
+        channels, guess = _channel_axis(series)
         count = len(file.series)
     tags = [text for text in said if text.startswith("<TiffTag")]
     if lost := [text for text in said if text not in tags and any(mark in text.lower() for mark in _LOST)]:
         raise Damaged(lost[0])
     notes = (f"The file holds {count} images: the first is used.",) if count > 1 else ()
     notes += (f"{len(tags)} of the file's tags cannot be read: what they state is not known.",) if tags else ()
-    return Raw(values, spacing, unit, notes=notes, guesses=guesses)
+    return Raw(values, spacing, unit, notes=(*notes, *guess), guesses=guesses, channels=channels)
+
+
+def _channel_axis(series: tifffile.TiffPageSeries) -> tuple[int | None, tuple[str, ...]]:
+    """The axis of colours or channels; where only two others are left, channels that are no colours are taken for z."""
+    named = [axis for axis, name in enumerate(series.axes) if name in "SC" and series.shape[axis] != 1]
+    axis = named[-1] if named else None
+    if axis is None or series.axes[axis] == "S" or sum(n != 1 for n in series.shape) != 3:
+        return axis, ()
+    return None, (f"The file calls an axis of {series.shape[axis]} channels: it is taken for slices.",)
 
 
 def read_slices(path: Path, **_: object) -> Raw:
@@ -62,14 +70,23 @@ def read_slices(path: Path, **_: object) -> Raw:
     first, slices = None, []
     for name in names:
         raw = read_tiff(check_regular(name))
-        first, plane = first or raw, np.squeeze(raw.values)
+        first, plane = first or raw, _plane(raw)
         slices.append(plane)
-        if plane.ndim != 2 or plane.shape != slices[0].shape:
+        if plane.ndim != 2 + (raw.channels is not None) or plane.shape != slices[0].shape:
             raise ScanError(
                 f"expected 2D slices of one shape {slices[0].shape}, got {plane.shape} in {name.name} of {path}"
             )
     assert first is not None
-    return first._replace(values=np.stack(slices), gaps=_skipped([name.stem for name in names]))
+    channels = None if first.channels is None else 3
+    return first._replace(values=np.stack(slices), gaps=_skipped([name.stem for name in names]), channels=channels)
+
+
+def _plane(raw: Raw) -> np.ndarray:
+    """A slice (Y, X), or (Y, X, channels)."""
+    if raw.channels is None:
+        return np.squeeze(raw.values)
+    values = np.moveaxis(raw.values, raw.channels, -1)
+    return values.reshape([*(n for n in values.shape[:-1] if n != 1), values.shape[-1]])
 
 
 def _skipped(names: Sequence[str]) -> tuple[str, ...]:

@@ -1,0 +1,128 @@
+"""A volume and its place in the world: values in z,y,x, with spacing, unit and affine."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from curvafit.priors.bounds import SEEDS, quoted, whole
+from curvafit.volumes.formats.base import ScanError, normalise_unit
+from curvafit.volumes.formats.part import Crop, box_of, fitted
+
+__all__ = ["Field", "ScanError", "positive_triple"]
+
+
+@dataclass(frozen=True, eq=False)
+class Field:
+    """A volume and its place in the world.
+
+    Parameters
+    ----------
+    values
+        Array (Z, Y, X), in the file's own type.
+    spacing
+        Voxel edges along (z, y, x), in `unit`.
+    unit
+        `"voxel"` (unknown), `"nm"`, `"um"`, `"mm"` or `"m"`.
+    affine
+        4x4 map from voxel index (x, y, z, 1) to position in `unit`, NIfTI's convention; its columns are as long as
+        the spacing. None where the file has none.
+    source
+        Where it came from.
+    notes
+        Sentences on what was assumed while reading.
+
+    Raises
+    ------
+    ValueError
+        If values are not a 3D array, spacing is not 3 positive numbers or the unit has no known name.
+    """
+
+    values: np.ndarray
+    spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    unit: str = "voxel"
+    affine: np.ndarray | None = None
+    source: str = ""
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if np.ndim(self.values) != 3:
+            raise ScanError(f"expected a 3D volume, got an array of shape {np.shape(self.values)}")
+        spacing = positive_triple(self.spacing)
+        unit, factor = normalise_unit(self.unit)
+        object.__setattr__(self, "values", np.asarray(self.values))
+        object.__setattr__(self, "spacing", tuple(h * factor for h in spacing))
+        object.__setattr__(self, "unit", unit)
+        if self.affine is not None:
+            affine = np.array(self.affine, dtype=np.float64)
+            if affine.shape != (4, 4):
+                raise ScanError(f"expected an affine of shape (4, 4), got {affine.shape}")
+            affine[:3] *= factor
+            object.__setattr__(self, "affine", affine)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        return self.values.shape  # type: ignore[return-value]
+
+    def crop(self, crop: Crop) -> Field:
+        """Return a box of voxels, whose affine says where it was.
+
+        Parameters
+        ----------
+        crop
+            `"z0:z1,y0:y1,x0:x1"`, or three slices, as Python counts: `":,10:,-64:"` is all of z, y from voxel 10 on and
+            the last 64 of x.
+
+        Raises
+        ------
+        ScanError
+            If it is no box, or leaves the volume.
+        """
+        box = fitted(box_of(crop), self.shape, self.source or "the volume")
+        return replace(self, values=self.values[box]).moved([edge.start for edge in box])
+
+    def label(self, label: int) -> Field:
+        """Return the mask of the voxels that have a value.
+
+        Raises
+        ------
+        ScanError
+            If there are none, or no others.
+        ValueError
+            If the label is no whole number.
+        """
+        label = whole(label, "a label that is a whole number", -SEEDS, SEEDS)
+        mask = self.values == label
+        if mask.all() or not mask.any():
+            values = np.unique(self.values)
+            listed = ", ".join(f"{float(value):g}" for value in values[:12]) + (", …" if len(values) > 12 else "")
+            expected = "beside others" if mask.any() else "of the scan"
+            raise ScanError(f"expected a label {expected} ({listed}), got {label}")
+        return replace(self, values=mask, notes=(*self.notes, f"The structure is label {label}."))
+
+    def moved(self, start: Sequence[int]) -> Field:
+        """Return the same values, placed where this field's voxel `start` (z, y, x) is."""
+        affine = np.diag([*self.spacing[::-1], 1.0]) if self.affine is None else self.affine.copy()
+        affine[:3, 3] += affine[:3, :3] @ np.array(start[::-1], dtype=np.float64)
+        ends = (f"{first}:{first + n}" for first, n in zip(start, self.shape, strict=True))
+        return replace(self, affine=affine, notes=(*self.notes, f"Voxels {', '.join(ends)} (z, y, x) are used."))
+
+
+def positive_triple(spacing: object) -> tuple[float, float, float]:
+    """Return a spacing as three numbers, one number counting for all axes.
+
+    Raises
+    ------
+    ScanError
+        If it is not one or three positive numbers.
+    """
+    try:
+        triple = (float(spacing),) * 3 if isinstance(spacing, (int, float)) else tuple(float(h) for h in spacing)  # type: ignore[union-attr]
+    except (TypeError, ValueError, OverflowError):
+        triple = ()
+    if len(triple) != 3 or any(not math.isfinite(h) or h <= 0 for h in triple):
+        raise ScanError(f"expected a spacing of 3 positive numbers (z, y, x), got {quoted(spacing)}")
+    return triple  # type: ignore[return-value]

@@ -1,0 +1,178 @@
+"""Which part of a file's array is wanted: one channel of several, and a box of voxels."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from curvafit.priors.bounds import SEEDS, quoted, whole
+from curvafit.volumes.formats.base import Raw, ScanError
+from curvafit.volumes.formats.streams import check_array
+
+__all__ = ["Box", "Crop", "Part", "box_of", "fitted", "part_of", "selected"]
+
+#: A box of voxels along (z, y, x).
+Box = tuple[slice, slice, slice]
+#: A box as a caller gives it: `"z0:z1,y0:y1,x0:x1"`, or three slices.
+Crop = str | Sequence[slice]
+
+_SAID = 'a crop as "z0:z1,y0:y1,x0:x1" or three slices'
+
+
+@dataclass(frozen=True)
+class Part:
+    """A channel, counted from 0, and a box; None for what is not given."""
+
+    channel: int | None = None
+    crop: Box | None = None
+
+    @property
+    def whole(self) -> bool:
+        """Whether nothing is left out."""
+        return self.channel is None and self.crop is None
+
+    def index(
+        self, shape: Sequence[int], channels: int | None, place: object
+    ) -> tuple[tuple[slice, ...], tuple[int, ...]]:
+        """Return the slices, one for each axis, that take this part of an array in a file, and the axes z, y and x.
+
+        Parameters
+        ----------
+        shape
+            Of the whole array, z before y before x.
+        channels
+            The axis of channels, if the file says which it is. Of four axes without a name, it is the first or the
+            last, whichever is shorter.
+
+        Raises
+        ------
+        ScanError
+            If what is left has not three axes, or the channel or the box is not there.
+        """
+        long = [axis for axis, n in enumerate(shape) if n != 1]
+        channels = self._channel_axis(shape, channels, long, place)
+        space = [axis for axis in long if axis != channels]
+        if len(space) != 3:
+            got = "no values" if 0 in shape else f"{len(space)}D of shape {tuple(shape)}"
+            hint = "; a channel, counted from 0, picks one volume of several" if len(space) == 4 == len(long) else ""
+            raise ScanError(f"expected a 3D volume, got {got} in {place}{hint}")
+        index = [slice(0, n) for n in shape]
+        if channels is not None and self.channel is not None:
+            index[channels] = slice(self.channel, self.channel + 1)
+        box = fitted(self.crop, [shape[axis] for axis in space], place)
+        for axis, edge in zip(space, box, strict=True):
+            index[axis] = edge
+        return tuple(index), tuple(space)
+
+    def _channel_axis(
+        self, shape: Sequence[int], channels: int | None, long: Sequence[int], place: object
+    ) -> int | None:
+        """Return the axis that a channel is taken from, None where there is none."""
+        if self.channel is None:
+            if channels in long:
+                count = shape[channels]  # type: ignore[index]
+                raise ScanError(
+                    f"expected a channel from 0 to {count - 1} of {place}, which holds {count} channels, got none"
+                )
+            return channels
+        if channels is None and len(long) == 4:
+            channels = long[0] if shape[long[0]] <= shape[long[-1]] else long[-1]
+        if channels is None:
+            raise ScanError(f"expected no channel of {place}, which holds a single one, got {quoted(self.channel)}")
+        count = shape[channels]
+        if not 0 <= whole(self.channel, "a channel that is a whole number from 0", -SEEDS, SEEDS) < count:
+            raise ScanError(f"expected a channel from 0 to {count - 1} of {place}, got {self.channel}")
+        return channels
+
+
+def part_of(array: Any, part: Part | None, place: object, channels: int | None = None) -> Raw:
+    """Read a part, or all, of an array that is not in memory: a dataset, a mapped file.
+
+    Raises
+    ------
+    ScanError
+        If the part is not there, has no numbers or fits into no memory.
+    """
+    if part is None:
+        check_array(array.shape, array.dtype, place)
+        return Raw(np.asarray(array[...]), channels=channels)
+    index, _ = part.index(array.shape, channels, place)
+    check_array([edge.stop - edge.start for edge in index], array.dtype, place)
+    return Raw(np.array(array[index]), channels=channels, whole=tuple(array.shape))
+
+
+def selected(raw: Raw, part: Part, place: object) -> tuple[Raw, tuple[int, ...]]:
+    """Return the part of what a file holds, with three axes and their spacing, and the voxel (z, y, x) it starts at.
+
+    Raises
+    ------
+    ScanError
+        If there are no numbers, the part is not there, or what is left has not three axes.
+    """
+    if raw.values.dtype.kind not in "biuf":
+        raise ScanError(f"expected numbers, got values of type {raw.values.dtype} in {place}")
+    shape = raw.values.shape if raw.whole is None else raw.whole
+    index, space = part.index(shape, raw.channels, place)
+    values, spacing = raw.values[index] if raw.whole is None else raw.values, raw.spacing
+    if spacing is not None and len(spacing) == len(shape):
+        spacing = tuple(spacing[axis] for axis in space)
+    volume = values.reshape([values.shape[axis] for axis in space])
+    notes = raw.notes if part.channel is None else (*raw.notes, f"Channel {part.channel} is used.")
+    return raw._replace(values=volume, spacing=spacing, notes=notes), tuple(index[axis].start for axis in space)
+
+
+def box_of(crop: Crop | None) -> Box | None:
+    """Return a crop as three slices.
+
+    Raises
+    ------
+    ScanError
+        If it is no such text, or not three slices of whole numbers without a step.
+    """
+    if crop is None:
+        return None
+    parts: list[Any] = list(map(_slice, crop.split(","))) if isinstance(crop, str) else [*_sequence(crop)]
+    if len(parts) != 3 or not all(isinstance(part, slice) and _is_plain(part) for part in parts):
+        raise ScanError(f"expected {_SAID}, got {quoted(crop)}")
+    return parts[0], parts[1], parts[2]
+
+
+def fitted(box: Box | None, shape: Sequence[int], place: object) -> Box:
+    """Return a box in a volume of a shape (z, y, x) with its first and last voxels counted from the start.
+
+    Raises
+    ------
+    ScanError
+        If the box is empty or leaves the volume.
+    """
+    whole_box = (slice(0, shape[0]), slice(0, shape[1]), slice(0, shape[2]))
+    if box is None:
+        return whole_box
+    edges = []
+    for name, edge, n in zip("zyx", box, shape, strict=True):
+        start, stop = (0 if edge.start is None else edge.start), (n if edge.stop is None else edge.stop)
+        first, last = (start + n if start < 0 else start), (stop + n if stop < 0 else stop)
+        if not 0 <= first < last <= n:
+            raise ScanError(f"expected a crop within 0:{n} along {name} of {place}, got {start}:{stop}")
+        edges.append(slice(first, last))
+    return edges[0], edges[1], edges[2]
+
+
+def _slice(text: str) -> slice | None:
+    """Return the slice that `"3:7"`, `":7"` or `":"` is."""
+    match = re.fullmatch(r"\s*(-?\d{1,18})?\s*:\s*(-?\d{1,18})?\s*", text)
+    return slice(*(None if edge is None else int(edge) for edge in match.groups())) if match else None
+
+
+def _sequence(crop: Any) -> Sequence[Any]:
+    return crop if isinstance(crop, Sequence) else ()
+
+
+def _is_plain(edge: slice) -> bool:
+    """Whether a slice has whole ends, or none, and no step."""
+    ends = (end for end in (edge.start, edge.stop) if end is not None)
+    return edge.step in (None, 1) and all(isinstance(end, int) and not isinstance(end, bool) for end in ends)

@@ -1,0 +1,225 @@
+"""Where a volume comes from: the path of a file, an array, or a `Field` that is there already."""
+
+from __future__ import annotations
+
+import math
+import os
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from curvafit.priors.bounds import quoted
+from curvafit.volumes.field import Field, positive_triple
+from curvafit.volumes.formats import Raw, ScanError, normalise_unit
+from curvafit.volumes.formats.guard import read_file
+from curvafit.volumes.formats.part import Crop, Part, box_of, selected
+
+__all__ = ["Source", "field_of", "load", "read_values"]
+
+#: What a volume may be given as.
+Source = str | os.PathLike[str] | Field | np.ndarray | torch.Tensor
+
+
+def field_of(
+    source: Source,
+    *,
+    spacing: Sequence[float] | float | None = None,
+    unit: str | None = None,
+    label: int | None = None,
+    crop: Crop | None = None,
+    **reading: Any,
+) -> Field:
+    """Return a volume as a `Field`, whatever it is given as.
+
+    Parameters
+    ----------
+    source
+        The path of a file, which is read; a `Field`, which is taken as it is; or an array or tensor (Z, Y, X).
+    spacing, unit
+        Voxel edges (z, y, x), or one for all, and their unit: of a file, in place of what it says; of an array, a voxel
+        by default. A `Field` has its own.
+    label, crop
+        The voxels of one value as a mask; a box of voxels: of any source, see `Field.label` and `Field.crop`.
+    reading
+        How to read a file: see `load`.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ScanError
+        A `ValueError`: the source is none of these, an option beside it counts for nothing, or `load` refuses the file.
+    """
+    if isinstance(source, str | os.PathLike):
+        return load(source, spacing=spacing, unit=unit, label=label, crop=crop, **reading)
+    return _part(_field_of(source, spacing, unit, reading), label, crop)
+
+
+def _field_of(source: Any, spacing: Sequence[float] | float | None, unit: str | None, reading: dict[str, Any]) -> Field:
+    """Return what is in memory as a `Field`."""
+    if isinstance(source, Field):
+        _refuse({"spacing": spacing, "unit": unit}, "a file or an array", "a Field, which has its own")
+        _refuse(reading, "the path of a file", "a Field, which is read already")
+        return source
+    if isinstance(source, np.ndarray | torch.Tensor):
+        _refuse(reading, "the path of a file", "an array")
+        values = _array(source)
+        return Field(values, positive_triple(1.0 if spacing is None else spacing), "voxel" if unit is None else unit)
+    raise ScanError(f"expected a volume as the path of a file, a Field, an array or a tensor, got {quoted(source)}")
+
+
+def load(
+    path: str | os.PathLike[str],
+    *,
+    key: str | None = None,
+    spacing: Sequence[float] | float | None = None,
+    unit: str | None = None,
+    channel: int | None = None,
+    label: int | None = None,
+    crop: Crop | None = None,
+    raw_shape: Sequence[int] | None = None,
+    dtype: str | None = None,
+    strict: bool = False,
+) -> Field:
+    """Read a volume from a file, or from a folder of slices.
+
+    Parameters
+    ----------
+    path
+        NIfTI, TIFF, NPY, NPZ, HDF5, RAW, Zarr; with `curvafit[io]` also NRRD, MHA/MHD, MRC and DICOM folders.
+        `file.h5::key` names an array within a file; `key` does the same.
+    spacing, unit
+        Override what the file says: voxel edges (z, y, x), or one for all; nm, um, mm or m. A `unit` alone renames
+        the file's numbers, it does not convert them.
+    channel
+        Which channel, counted from 0, of a file of several: colours, times and components of vectors are channels too.
+    label
+        The voxels that have this value, as a mask.
+    crop
+        A box of voxels, `"z0:z1,y0:y1,x0:x1"` or three slices: the affine says where it was. Of Zarr, HDF5, NPY, RAW
+        and NIfTI without compression no more is read.
+    raw_shape, dtype
+        Voxels (z, y, x) and numpy type of a RAW file, which cannot tell them.
+    strict
+        Refuse a volume of which parts are not stored, which a note tells of otherwise: chunks of Zarr or HDF5, which
+        then have the fill value; slices that a folder's numbers skip.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ScanError
+        A `ValueError`: unknown suffix, a damaged or truncated file, a missing key, a volume that is not 3D,
+        not finite, constant or larger than memory, a spacing that is not positive; a channel, label or crop that is
+        not there.
+    """
+    location, key = _split_key(os.fspath(path), key)
+    part = Part(channel, box_of(crop))
+    read = read_file(location, key, raw_shape, dtype, None if part.whole else part)
+    raw, start = selected(read, part, location)
+    if strict and raw.gaps:
+        raise ScanError(f"expected a whole volume, got {location}: {raw.gaps[0]}")
+    _check_values(raw.values, location)
+    field = _placed(raw, f"{location}::{key}" if key else str(location), spacing, unit)
+    return _part(field if part.crop is None else field.moved(start), label)
+
+
+def read_values(path: str | os.PathLike[str]) -> np.ndarray:
+    """The array in a volume file, z first, whatever it holds; axes of one before the last three are left out.
+
+    Parts that are not stored are a warning.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ScanError
+        If the suffix is unknown or the file damaged.
+    """
+    raw = read_file(Path(path))
+    values = raw.values
+    for gap in raw.gaps:
+        warnings.warn(f"{path}: {gap}", UserWarning, stacklevel=2)
+    while values.ndim > 3 and values.shape[0] == 1:
+        values = values[0]
+    return values
+
+
+def _part(field: Field, label: int | None, crop: Crop | None = None) -> Field:
+    """Return the part of a field that is asked for."""
+    field = field if crop is None else field.crop(crop)
+    return field if label is None else field.label(label)
+
+
+def _refuse(options: dict[str, Any], expected: str, got: str) -> None:
+    """Refuse an option that would count for nothing."""
+    given = next((name for name, value in options.items() if value is not None and value is not False), None)
+    if given is not None:
+        raise ScanError(f"expected {given} only with {expected}, got it with {got}")
+
+
+def _array(source: np.ndarray | torch.Tensor) -> np.ndarray:
+    """Return the numbers of an array or tensor."""
+    if isinstance(source, torch.Tensor):
+        tensor = source.detach().cpu()
+        source = (tensor.float() if tensor.dtype == torch.bfloat16 else tensor).numpy()
+    if source.dtype.kind not in "biuf":
+        raise ScanError(f"expected numbers, got an array of type {source.dtype}")
+    if source.size:
+        _check_finite(source, "an array")
+    return source
+
+
+def _split_key(path: str, key: str | None) -> tuple[Path, str | None]:
+    if "::" in path and Path(path).exists():
+        return Path(path), key
+    name, separator, inner = path.rpartition("::")
+    return (Path(name), key or inner or None) if separator else (Path(path), key)
+
+
+def _check_values(values: np.ndarray, path: Path) -> None:
+    if values.size == 0:
+        raise ScanError(f"expected a 3D volume, got no values (shape {values.shape}) in {path}")
+    lowest, highest = _check_finite(values, path)
+    if lowest == highest:
+        raise ScanError(f"expected a volume that varies, got {lowest} everywhere in {path}")
+
+
+def _check_finite(values: np.ndarray, place: object) -> tuple[float, float]:
+    """Return the lowest and highest of some values, if all are finite."""
+    lowest, highest = values.min(), values.max()
+    if values.dtype.kind == "f" and not (math.isfinite(lowest) and math.isfinite(highest)):
+        what = "NaN" if math.isnan(lowest) else "infinite"
+        count = np.count_nonzero(np.isnan(values) if what == "NaN" else np.isinf(values))
+        raise ScanError(f"expected finite values, got {count} that are {what} in {place}")
+    return lowest, highest
+
+
+def _placed(raw: Raw, source: str, spacing: Sequence[float] | float | None, unit: str | None) -> Field:
+    """Native values with the file's spacing and unit, or the caller's."""
+    notes = [*raw.gaps, *raw.notes, *(() if spacing is not None or unit is not None else raw.guesses)]
+    file_unit, factor = ("voxel", 1.0) if spacing is not None and unit is not None else normalise_unit(raw.unit)
+    stated = None if raw.spacing is None else _scaled(raw.spacing, factor)
+    affine = None if raw.affine is None else np.diag([factor, factor, factor, 1.0]) @ raw.affine
+    chosen_unit, chosen_factor = (file_unit, 1.0) if unit is None else normalise_unit(unit)
+    chosen = positive_triple(1.0 if stated is None and spacing is None else stated if spacing is None else spacing)
+    if stated is None and spacing is None:
+        counted = "counted in voxels" if chosen_unit == "voxel" else f"those of voxels of 1 {chosen_unit}"
+        notes.append(f"The file states no spacing: lengths are {counted}.")
+    if affine is not None and stated != chosen:
+        lengths = np.linalg.norm(affine[:3, :3], axis=0)
+        affine[:3, :3] *= np.array(chosen)[::-1] / np.where(lengths > 0, lengths, 1)
+    if unit is not None:
+        chosen = (chosen[0] * chosen_factor, chosen[1] * chosen_factor, chosen[2] * chosen_factor)
+        affine = None if affine is None else np.diag([chosen_factor] * 3 + [1.0]) @ affine
+    values = np.ascontiguousarray(raw.values, dtype=raw.values.dtype.newbyteorder("="))
+    return Field(values, chosen, chosen_unit, affine, source, tuple(notes))
+
+
+def _scaled(spacing: tuple[object, ...], factor: float) -> tuple[object, ...]:
+    """A file's spacing times a factor, as it stands where it is no numbers."""
+    return tuple(h * factor if isinstance(h, (int, float)) else h for h in spacing)

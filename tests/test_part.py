@@ -1,0 +1,266 @@
+"""Channels, labels and crops: the same voxels at the same place, whatever the format, and one sentence where not."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import nibabel
+import numpy as np
+import pytest
+import tifffile
+import zarr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from curvafit.volumes import Field, ScanError, field_of, load, save
+from curvafit.volumes.formats.part import box_of
+
+SHAPE = (6, 7, 8)
+VALUES = np.arange(np.prod(SHAPE), dtype=np.float32).reshape(SHAPE)
+#: Three channels: what is read of the second must be VALUES.
+CHANNELS = np.stack([VALUES + 1000, VALUES, VALUES - 1000])
+TURNED = np.array([[0, -0.2, 0, 5.0], [0.1, 0, 0, -7.0], [0, 0, 0.3, 11.0], [0, 0, 0, 1]])
+
+
+# ---- channels --------------------------------------------------------------------------------------------------------
+
+
+def write_ome_tiff(path: Path) -> None:
+    tifffile.imwrite(path, CHANNELS, ome=True, photometric="minisblack", metadata={"axes": "CZYX"})
+
+
+def write_imagej(path: Path) -> None:
+    values = np.moveaxis(CHANNELS, 0, 1)
+    tifffile.imwrite(path, values, imagej=True, photometric="minisblack", metadata={"axes": "ZCYX"})
+
+
+def write_rgb(path: Path) -> None:
+    tifffile.imwrite(path, np.moveaxis(CHANNELS, 0, -1).astype(np.uint16), photometric="rgb")
+
+
+def write_rgb_slices(path: Path) -> None:
+    path.mkdir()
+    for z, plane in enumerate(np.moveaxis(CHANNELS, 0, -1).astype(np.uint16)):
+        tifffile.imwrite(path / f"{z}.tif", plane, photometric="rgb")
+
+
+def write_nifti(path: Path) -> None:
+    nibabel.save(nibabel.Nifti1Image(CHANNELS.T, np.diag([0.1, 0.2, 0.3, 1])), path)
+
+
+def write_vector_nifti(path: Path) -> None:
+    nibabel.save(nibabel.Nifti1Image(CHANNELS[:, None].T, np.diag([0.1, 0.2, 0.3, 1])), path)
+
+
+def write_nrrd(path: Path) -> None:
+    nrrd = pytest.importorskip("nrrd")
+    directions = np.array([[np.nan] * 3, [0.1, 0, 0], [0, 0.2, 0], [0, 0, 0.3]])
+    header = {"space": "right-anterior-superior", "space directions": directions, "space origin": [0, 0, 0]}
+    nrrd.write(
+        str(path), np.moveaxis(CHANNELS, 0, -1), {**header, "kinds": ["vector", *["domain"] * 3]}, index_order="C"
+    )
+
+
+def write_kinds_nrrd(path: Path) -> None:
+    nrrd = pytest.importorskip("nrrd")
+    nrrd.write(str(path), CHANNELS, {"kinds": [*["domain"] * 3, "list"]}, index_order="C")
+
+
+def write_mha(path: Path) -> None:
+    itk = pytest.importorskip("SimpleITK")
+    image = itk.GetImageFromArray(np.moveaxis(CHANNELS, 0, -1), isVector=True)
+    image.SetSpacing((0.1, 0.2, 0.3))
+    itk.WriteImage(image, str(path))
+
+
+def write_times_mha(path: Path) -> None:
+    itk = pytest.importorskip("SimpleITK")
+    itk.WriteImage(itk.GetImageFromArray(CHANNELS, isVector=False), str(path))
+
+
+def write_ome_zarr(path: Path) -> None:
+    axes = [{"name": "c", "type": "channel"}, *({"name": n, "type": "space", "unit": "millimeter"} for n in "zyx")]
+    scale = [{"type": "scale", "scale": [1, 0.3, 0.2, 0.1]}]
+    image = {"axes": axes, "datasets": [{"path": "0", "coordinateTransformations": scale}]}
+    group = zarr.create_group(path, attributes={"ome": {"version": "0.5", "multiscales": [image]}})
+    group.create_array("0", data=CHANNELS, chunks=(1, 4, 4, 4))
+
+
+def write_hdf5(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        file["raw"] = np.moveaxis(CHANNELS, 0, -1)
+
+
+CHANNELLED: dict[str, tuple[str, Callable[[Path], None]]] = {
+    "ome-tiff": ("scan.ome.tif", write_ome_tiff),
+    "imagej": ("scan.tif", write_imagej),
+    "rgb": ("rgb.tif", write_rgb),
+    "rgb slices": ("slices", write_rgb_slices),
+    "nifti": ("scan.nii", write_nifti),
+    "nifti.gz": ("scan.nii.gz", write_nifti),
+    "vector nifti": ("scan.nii", write_vector_nifti),
+    "nrrd": ("scan.nrrd", write_nrrd),
+    "nrrd kinds": ("scan.nrrd", write_kinds_nrrd),
+    "mha": ("scan.mha", write_mha),
+    "mha times": ("scan.mha", write_times_mha),
+    "ome-zarr": ("scan.ome.zarr", write_ome_zarr),
+    "hdf5": ("scan.h5", write_hdf5),
+    "npy": ("scan.npy", lambda path: np.save(path, CHANNELS)),
+    "npy, fortran": ("scan.npy", lambda path: np.save(path, np.asfortranarray(CHANNELS))),
+    "npz": ("scan.npz", lambda path: np.savez(path, np.moveaxis(CHANNELS, 0, -1))),
+}
+
+
+@pytest.mark.parametrize("kind", CHANNELLED)
+def test_a_channel_is_read_of_every_format(tmp_path: Path, kind: str) -> None:
+    name, write = CHANNELLED[kind]
+    path = tmp_path / name
+    write(path)
+    whole = load(path, channel=1)
+    assert np.array_equal(whole.values, VALUES)
+    assert "Channel 1 is used." in whole.notes
+    if whole.unit == "mm" and whole.spacing != (1, 1, 1):
+        assert whole.spacing == pytest.approx((0.3, 0.2, 0.1))
+    part = load(path, channel=1, crop="1:5,:,-3:-1")
+    assert np.array_equal(part.values, VALUES[1:5, :, -3:-1])
+    assert part.spacing == whole.spacing and part.affine is not None
+    with pytest.raises(ScanError, match=r"expected a channel from 0 to 2 of .*, got 3$"):
+        load(path, channel=3)
+    with pytest.raises(ScanError, match=r"expected a (channel from 0 to 2|3D volume, got 4D .* a channel, counted)"):
+        load(path)
+
+
+def test_a_file_of_one_channel_has_none_to_choose(tmp_path: Path) -> None:
+    path = save(Field(VALUES), tmp_path / "scan.nii.gz")
+    with pytest.raises(ScanError, match="expected no channel of .*scan.nii.gz, which holds a single one, got 0"):
+        load(path, channel=0)
+    np.save(tmp_path / "scan.npy", CHANNELS)
+    for wrong in (-1, 1.5, True, "1"):
+        with pytest.raises(ValueError, match="expected a channel"):
+            load(tmp_path / "scan.npy", channel=wrong)  # type: ignore[arg-type]
+    np.save(tmp_path / "five.npy", np.zeros((2, 2, *SHAPE)))
+    with pytest.raises(ScanError, match="expected no channel|expected a 3D volume, got 5D"):
+        load(tmp_path / "five.npy", channel=0)
+
+
+def test_channels_without_slices_are_said_to_be_taken_for_them(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "scan.tif", VALUES, ome=True, photometric="minisblack", metadata={"axes": "CYX"})
+    field = load(tmp_path / "scan.tif")
+    assert np.array_equal(field.values, VALUES)
+    assert "The file calls an axis of 6 channels: it is taken for slices." in field.notes
+
+
+# ---- crops -----------------------------------------------------------------------------------------------------------
+
+WRITTEN = ("scan.nii", "scan.nii.gz", "scan.tif", "scan.npy", "scan.zarr", "scan.h5", "scan.raw", "scan.npz")
+
+
+def written(path: Path) -> tuple[Path, dict]:
+    """The volume in a file of this name, and the options that read it."""
+    if path.suffix == ".h5":
+        with h5py.File(path, "w") as file:
+            file.create_dataset("raw", data=VALUES, chunks=(2, 3, 4))
+    elif path.suffix == ".raw":
+        VALUES.tofile(path)
+        return path, {"raw_shape": SHAPE, "dtype": "f4"}
+    elif path.suffix == ".npz":
+        np.savez(path, raw=VALUES)
+    else:
+        save(Field(VALUES, (0.3, 0.2, 0.1), "mm", TURNED[:, [1, 0, 2, 3]] if ".nii" in path.name else None), path)
+    return path, {}
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_a_crop_is_where_it_was_in_the_whole(tmp_path: Path, name: str) -> None:
+    path, options = written(tmp_path / name)
+    whole = load(path, **options)
+    box = (slice(2, 5), slice(1, 4), slice(3, None))
+    for part in (load(path, crop="2:5,1:4,3:", **options), field_of(path, crop=box, **options), whole.crop(box)):
+        assert np.array_equal(part.values, VALUES[box])
+        assert (part.spacing, part.unit) == (whole.spacing, whole.unit)
+        assert "Voxels 2:5, 1:4, 3:8 (z, y, x) are used." in part.notes
+        image = nibabel.load(save(part, tmp_path / "part.nii"))
+        full = nibabel.load(save(whole, tmp_path / "whole.nii"))
+        assert image.affine @ [0, 1, 2, 1] == pytest.approx(full.affine @ [3, 2, 4, 1], rel=1e-5)
+        assert np.asanyarray(image.dataobj)[0, 1, 2] == np.asanyarray(full.dataobj)[3, 2, 4]
+
+
+edges = st.integers(-9, 9) | st.none()
+texts = st.tuples(*[st.tuples(edges, edges)] * 3)
+
+
+@given(texts)
+@settings(max_examples=100, deadline=None)
+def test_a_crop_is_what_python_s_slices_are_or_refused(ends) -> None:
+    text = ",".join(":".join("" if edge is None else str(edge) for edge in pair) for pair in ends)
+    slices = tuple(slice(*pair) for pair in ends)
+    assert box_of(text) == slices == box_of(slices)
+    try:
+        part = Field(VALUES).crop(text)
+    except ScanError as error:
+        assert "expected a crop within 0:" in str(error)
+        return
+    assert np.array_equal(part.values, VALUES[slices]) and part.values.size
+
+
+@pytest.mark.parametrize("crop", ["", "1:2", "1:2,3:4", "1:2,3:4,5", "a:b,:,:", "::2,:,:", (slice(0, 4, 2),) * 3, 3.5])
+def test_what_is_no_crop_is_refused(crop) -> None:
+    with pytest.raises(ScanError, match='expected a crop as "z0:z1,y0:y1,x0:x1" or three slices, got'):
+        field_of(VALUES, crop=crop)
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+@pytest.mark.parametrize("crop", ["0:7,:,:", ":,3:3,:", ":,:,5:2", ":,:,-9:"])
+def test_a_crop_outside_is_refused(tmp_path: Path, name: str, crop: str) -> None:
+    path, options = written(tmp_path / name)
+    with pytest.raises(ScanError, match=r"expected a crop within 0:[678] along [zyx] of .*scan\.\S+, got -?\d:\d$"):
+        load(path, crop=crop, **options)
+
+
+@pytest.mark.parametrize("name", ["scan.nii", "scan.npy", "scan.raw", "scan.zarr", "scan.h5"])
+def test_no_more_than_the_crop_needs_memory(tmp_path: Path, name: str, monkeypatch) -> None:
+    path, options = written(tmp_path / name)
+    monkeypatch.setattr("curvafit.volumes.formats.streams.memory", lambda: VALUES.nbytes // 2)
+    part = load(path, crop="0:2,:,:", **options)
+    assert np.array_equal(part.values, VALUES[:2])
+    if name != "scan.raw":
+        with pytest.raises(ScanError, match="expected a volume that fits into memory"):
+            load(path, **options)
+
+
+@pytest.mark.parametrize("name", ["scan.nii", "scan.npy", "scan.raw"])
+def test_a_truncated_file_is_refused_whatever_the_crop(tmp_path: Path, name: str) -> None:
+    path, options = written(tmp_path / name)
+    path.write_bytes(path.read_bytes()[:-8])
+    with pytest.raises(ScanError, match="^expected "):
+        load(path, crop="0:2,:,:", **options)
+
+
+# ---- labels ----------------------------------------------------------------------------------------------------------
+
+
+@given(st.integers(0, 3))
+@settings(max_examples=8, deadline=None)
+def test_a_label_is_a_mask(label: int) -> None:
+    labels = np.random.default_rng(0).integers(0, 4, SHAPE).astype(np.uint8)
+    with tempfile.TemporaryDirectory() as folder:
+        path = save(labels, Path(folder) / "labels.nii.gz")
+        for mask in (load(path, label=label), field_of(labels, label=label), Field(labels).label(label)):
+            assert mask.values.dtype == bool and np.array_equal(mask.values, labels == label)
+            assert f"The structure is label {label}." in mask.notes
+
+
+def test_a_label_that_is_not_there_is_told_those_that_are() -> None:
+    labels = np.where(VALUES > 200, 7, 3)
+    labels[0] = 0
+    with pytest.raises(ScanError, match=r"expected a label of the scan \(0, 3, 7\), got 5"):
+        field_of(labels, label=5)
+    with pytest.raises(ScanError, match=r"expected a label of the scan \(0, 3\), got 7"):
+        field_of(labels, label=7, crop=":3,:,:")
+    with pytest.raises(ScanError, match=r"expected a label beside others \(0\), got 0"):
+        field_of(labels, label=0, crop=":1,:,:")
+    with pytest.raises(ValueError, match="expected a label that is a whole number"):
+        field_of(labels, label=0.5)  # type: ignore[arg-type]
