@@ -12,15 +12,16 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
+from curvafit.data_synth.imaging.imaging import image, regrid
 from curvafit.data_synth.imaging.modalities import MODALITIES
-from curvafit.data_synth.imaging.modality import Modality, image, regrid
+from curvafit.data_synth.imaging.modality import Modality
 from curvafit.drawing.plot import CONTOUR, write_picture
 from curvafit.generation.flow import generate
 from curvafit.priors.coefficients import preset
 from curvafit.priors.grid import Grid
 
 #: The preset whose shape each modality images.
-SHAPES = {"micro-CT": "trabec", "EM membrane": "bilayers"}
+SHAPES = {"micro-ct": "trabec", "em-membrane": "bilayers"}
 #: Of those that are not named.
 SHAPE = "tubes"
 #: What is drawn of each image; the projection is of a quarter of the depth, the minimum where structures are dark.
@@ -57,7 +58,7 @@ def draw(axes: np.ndarray, modality: Modality, field: torch.Tensor, seed: int) -
     seen = image(field, modality.voxel, [imaging], [seed])[0, 0].numpy()
     truth = regrid(field, modality.voxel, [imaging])[0, 0].numpy()
     z, y = seen.shape[0] // 2, seen.shape[1] // 2
-    project = np.max if imaging.foreground > imaging.background else np.min
+    project = np.max if imaging.contrast.foreground > imaging.contrast.background else np.min
     slab = seen[z - len(seen) // 8 : z + len(seen) // 8]
     pictures = (seen[z], seen[z], seen[:, y], project(slab, axis=0))
     steps = ((1, 2), (1, 2), (0, 2), (1, 2))

@@ -6,13 +6,18 @@ from pathlib import Path
 
 from exact_store import exact_store
 
-from curvafit.data_synth.imaging.modality import Imaging, Modality
+from curvafit.data_synth.imaging.modality import Modality
+from curvafit.data_synth.imaging.parameters import Detector, Imaging, Optics
 from curvafit.data_synth.sets.case import Recipe
 from curvafit.data_synth.sets.sources import Stored
 
-FLAT = Modality("flat", "for tests", 0.5, Imaging(spacing=(1.0, 0.5, 0.5), blur=(0.4, 0.2, 0.2), ceiling=255.0), {
-    "foreground": (80.0, 120.0), "read_noise": (1.0, 3.0),
-})  # fmt: skip
+FLAT = Modality(
+    "flat",
+    "for tests",
+    0.5,
+    Imaging(spacing=(1.0, 0.5, 0.5), optics=Optics((0.4, 0.2, 0.2)), detector=Detector(ceiling=255.0)),
+    {"contrast.foreground": (80.0, 120.0), "noise.gaussian": (1.0, 3.0)},
+)
 SHAPE = (8, 16, 16)
 
 

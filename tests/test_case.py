@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from flat_recipe import SHAPE, flat_recipe
 
-from curvafit.data_synth.imaging.modality import Imaging, Modality
+from curvafit.data_synth.imaging.modality import Modality
+from curvafit.data_synth.imaging.parameters import Imaging
 from curvafit.data_synth.sets.case import Recipe
 from curvafit.data_synth.sets.sources import Generated, Shape, source_of
 from curvafit.generation import fraction as steering
@@ -25,7 +26,7 @@ def test_a_case_is_the_image_of_its_field(recipe):
     assert case.image.shape == case.field.shape == SHAPE and case.image.dtype == np.uint16
     assert case.spacing == (1.0, 0.5, 0.5) and case.unit == "um" and case.epsilon == pytest.approx(1.0)
     inside, outside = (case.image[part].mean() for part in (case.field > 0.9, case.field < -0.9))
-    level = case.record["imaging"]["foreground"]
+    level = case.record["imaging"]["contrast"]["foreground"]
     assert abs(inside - level) < 0.15 * level and abs(outside - 10) < 6
     again, other = recipe.case(3), recipe.case(4)
     assert (again.image == case.image).all() and again.record == case.record

@@ -42,8 +42,8 @@ def test_a_set_from_a_store(tmp_path, store):
 
 def test_names_of_modalities_are_forgiving(tmp_path, store):
     quick = ["--count", "1", "--shape", "8", "--workers", "0"]
-    result = call("synth", "-o", tmp_path / "s", "--atlas", store, "--modality", "em-membrane", *quick)
-    assert result.exit_code == 0 and listed(tmp_path / "s")["channel_names"] == {"0": "EM membrane"}
+    result = call("synth", "-o", tmp_path / "s", "--atlas", store, "--modality", "EM_membrane", *quick)
+    assert result.exit_code == 0 and listed(tmp_path / "s")["channel_names"] == {"0": "em-membrane"}
 
 
 @pytest.mark.slow
@@ -90,7 +90,7 @@ def test_bad_input(tmp_path, store):
     refused(call("synth", "-o", out, *kind), "expected one of --prior, --atlas and --presets, got 0 of them")
     refused(call(*some, *kind, "--presets", "tubes"), "got 2 of them")
     refused(call(*some), "expected either --modality or --like, got neither")
-    refused(call(*some, "--modality", "x-ray"), "expected --modality among confocal, two-photon")
+    refused(call(*some, "--modality", "x-ray"), "expected a modality among confocal, two-photon")
     refused(call("synth", "-o", out, "--presets", "tube", *kind), "tube")
     refused(call(*some, *kind, "--shape", "2,8,8", "--labels", "betti"), "expected images of at least 4 voxels along")
     refused(
@@ -100,7 +100,7 @@ def test_bad_input(tmp_path, store):
     refused(
         call(*some, *kind, *QUICK, "--calibres", "2,1"), "expected calibres as two positive factors, the lower first"
     )
-    refused(call(*some, *kind, "--visible", "1.5"), "expected visible as a share, got 1.5")
+    refused(call(*some, *kind, "--visible", "1.5"), "expected visible as a share below 1, got 1.5")
     refused(call(*some, *kind, "--like-mask", "m.nii.gz"), "expected --like beside --like-mask, got none")
     refused(call(*some, *kind, "--volume-fraction", "0.2"), "expected --volume-fraction beside shapes that are grown")
     presets = ["synth", "-o", out, "--presets", "tubes", *kind]

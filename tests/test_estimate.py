@@ -12,7 +12,8 @@ from exact import Cylinder, centres
 
 from curvafit.data_synth.imaging.degrade import EPSILON
 from curvafit.data_synth.imaging.estimate import like
-from curvafit.data_synth.imaging.modality import Imaging, image, regrid
+from curvafit.data_synth.imaging.imaging import image, regrid
+from curvafit.data_synth.imaging.parameters import Contrast, Detector, Imaging, Noise, Optics
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
 from curvafit.volumes.scan import Field, load
@@ -26,14 +27,31 @@ TUBES = [
     Cylinder(4.5, (0.5, 0.4, 1), (54, 18, 36)),
 ]
 
-PHOTONS = Imaging(background=6, foreground=60, blur=(1.6, 0.9, 0.9), gain=3, read_noise=2, offset=15, ceiling=4095)
+PHOTONS = Imaging(
+    contrast=Contrast(background=6, foreground=60),
+    optics=Optics(blur=(1.6, 0.9, 0.9)),
+    noise=Noise(gaussian=2),
+    detector=Detector(gain=3, offset=15, ceiling=4095),
+)
 SLICES = Imaging(
-    spacing=(2, 1, 1), background=40, foreground=160, blur=(2, 1.2, 1.2), read_noise=12, noise_width=(0, 0.7, 0.7)
+    spacing=(2, 1, 1),
+    contrast=Contrast(background=40, foreground=160),
+    optics=Optics(blur=(2, 1.2, 1.2)),
+    noise=Noise(gaussian=12, width=(0, 0.7, 0.7)),
 )
 TEXTURED = Imaging(
-    background=60, foreground=180, background_texture=0.15, texture_length=5, foreground_texture=0.2,
-    foreground_length=8, blur=(1.2, 1.2, 1.2), read_noise=8, ceiling=255,
-)  # fmt: skip
+    contrast=Contrast(
+        background=60,
+        foreground=180,
+        background_texture=0.15,
+        background_length=5,
+        foreground_texture=0.2,
+        foreground_length=8,
+    ),
+    optics=Optics(blur=(1.2, 1.2, 1.2)),
+    noise=Noise(gaussian=8),
+    detector=Detector(ceiling=255),
+)
 CASES = {"photons": PHOTONS, "slices": SLICES, "textured": TEXTURED}
 
 
@@ -58,14 +76,14 @@ def test_parameters_are_found_again(shape: torch.Tensor, name: str, masked: bool
     found = like(scan, mask if masked else None)
     b, close = found.base, 0.12 if masked else 0.25
     assert (b.unit, b.spacing, found.voxel) == ("um", how.spacing, 1.0)
-    assert b.blur == pytest.approx(how.blur, rel=close)
-    unit, true = b.gain or 1.0, how.gain or 1.0
-    level = b.background * unit + b.offset
-    assert level == pytest.approx(how.background * true + how.offset, rel=0.06)
-    contrast = (b.foreground - b.background) * unit
-    assert contrast == pytest.approx((how.foreground - how.background) * true, rel=close)
-    assert b.noise_width == pytest.approx(how.noise_width, abs=0.1)
-    assert b.ceiling is None
+    assert b.optics.blur == pytest.approx(how.optics.blur, rel=close)
+    unit, true = b.detector.gain or 1.0, how.detector.gain or 1.0
+    level = b.contrast.background * unit + b.detector.offset
+    assert level == pytest.approx(how.contrast.background * true + how.detector.offset, rel=0.06)
+    contrast = (b.contrast.foreground - b.contrast.background) * unit
+    assert contrast == pytest.approx((how.contrast.foreground - how.contrast.background) * true, rel=close)
+    assert b.noise.width == pytest.approx(how.noise.width, abs=0.1)
+    assert b.detector.ceiling is None
 
 
 def test_noise_is_found_again(shape: torch.Tensor) -> None:
@@ -73,42 +91,44 @@ def test_noise_is_found_again(shape: torch.Tensor) -> None:
     for how in (PHOTONS, SLICES, TEXTURED):
         scan, mask = scan_of(shape, how)
         b = like(scan, mask).base
-        assert (b.gain > 0) == (how.gain > 0)
-        assert b.gain == pytest.approx(how.gain, rel=0.1)
-        height = b.gain**2 * b.background + b.read_noise**2
-        assert height == pytest.approx(how.gain**2 * how.background + how.read_noise**2, rel=0.1)
+        assert (b.detector.gain > 0) == (how.detector.gain > 0)
+        assert b.detector.gain == pytest.approx(how.detector.gain, rel=0.1)
+        height = b.detector.gain**2 * b.contrast.background + b.noise.gaussian**2
+        assert height == pytest.approx(how.detector.gain**2 * how.contrast.background + how.noise.gaussian**2, rel=0.1)
 
 
 def test_textures_are_found_again(shape: torch.Tensor) -> None:
     b = like(*scan_of(shape, TEXTURED)).base
-    assert b.background_texture == pytest.approx(0.15, rel=0.3)
-    assert b.texture_length == pytest.approx(5, rel=0.35)
-    assert b.foreground_texture == pytest.approx(0.2, rel=0.6)
-    assert b.foreground_length == pytest.approx(8, rel=0.6)
+    assert b.contrast.background_texture == pytest.approx(0.15, rel=0.3)
+    assert b.contrast.background_length == pytest.approx(5, rel=0.35)
+    assert b.contrast.foreground_texture == pytest.approx(0.2, rel=0.6)
+    assert b.contrast.foreground_length == pytest.approx(8, rel=0.6)
     plain = like(*scan_of(shape, PHOTONS)).base
-    assert plain.background_texture < 0.08 and plain.foreground_texture < 0.1
+    assert plain.contrast.background_texture < 0.08 and plain.contrast.foreground_texture < 0.1
 
 
 def test_dark_structures_by_their_mask(shape: torch.Tensor) -> None:
-    how = Imaging(background=150, foreground=60, blur=(1.0, 1.0, 1.0), read_noise=5)
+    how = Imaging(
+        contrast=Contrast(background=150, foreground=60), optics=Optics(blur=(1.0, 1.0, 1.0)), noise=Noise(gaussian=5)
+    )
     b = like(*scan_of(shape, how)).base
-    assert b.foreground == pytest.approx(60, rel=0.1) and b.background == pytest.approx(150, rel=0.05)
+    assert b.contrast.foreground == pytest.approx(60, rel=0.1) and b.contrast.background == pytest.approx(150, rel=0.05)
 
 
 def test_the_same_scan_in_nanometres(shape: torch.Tensor) -> None:
     scan, mask = scan_of(shape, SLICES)
     one = like(scan, mask).base
     other = like(Field(scan.values, (2000.0, 1000.0, 1000.0), "nm"), mask).base
-    assert other.blur == pytest.approx(tuple(1000 * width for width in one.blur))
-    assert other.read_noise == pytest.approx(one.read_noise)
+    assert other.optics.blur == pytest.approx(tuple(1000 * width for width in one.optics.blur))
+    assert other.noise.gaussian == pytest.approx(one.noise.gaussian)
 
 
 def test_integers_saturate_where_their_type_ends(shape: torch.Tensor) -> None:
     scan, mask = scan_of(shape, PHOTONS)
     found = like(Field(scan.values.astype(np.uint16), scan.spacing, "um"), mask)
-    assert found.base.ceiling == 65535
-    low, high = found.ranges["gain"]
-    assert low < found.base.gain < high and found.draw(1) != found.draw(2)
+    assert found.base.detector.ceiling == 65535
+    low, high = found.ranges["detector.gain"]
+    assert low < found.base.detector.gain < high and found.draw(1) != found.draw(2)
 
 
 def test_odd_scans(shape: torch.Tensor) -> None:
@@ -117,7 +137,7 @@ def test_odd_scans(shape: torch.Tensor) -> None:
     rng = np.random.default_rng(0)
     signed = np.where(mask, 500, -500) + rng.normal(0, 40, mask.shape)
     low = like(Field(signed.astype(np.int16), (1.0, 1.0, 1.0), "um"), mask)
-    assert low.base.ceiling is None
+    assert low.base.detector.ceiling is None
     assert image(shape, 1.0, [low.base], [0]).amin() < -300
     for values in (
         np.where(mask, 80.0, 0.0),
@@ -125,16 +145,16 @@ def test_odd_scans(shape: torch.Tensor) -> None:
         rng.normal(0, 10, mask.shape) + 100 * mask,
     ):
         found = like(Field(values.astype(np.float32), (1.0, 1.0, 1.0), "um"), mask)
-        assert 0 <= found.base.bias <= 0.9 and np.isfinite(found.base.gain)
+        assert 0 <= found.base.illumination.bias <= 0.9 and np.isfinite(found.base.detector.gain)
     small = like(Field(signed[:40, :14, :40].astype(np.float32), (1.0, 1.0, 1.0), "um"), mask[:40, :14, :40])
-    assert small.base.foreground > small.base.background
+    assert small.base.contrast.foreground > small.base.contrast.background
 
 
 def test_lost_stain_does_not_decide_the_texture(shape: torch.Tensor) -> None:
     scan, mask = scan_of(shape, TEXTURED)
     lost = np.random.default_rng(0).random(mask.shape) < 0.03
     scan.values[mask & lost] = scan.values[~mask].mean()
-    assert like(scan, mask).base.foreground_texture < 0.5
+    assert like(scan, mask).base.contrast.foreground_texture < 0.5
 
 
 def test_bad_scans_are_told() -> None:
@@ -156,6 +176,6 @@ def test_a_real_bone(data: Path) -> None:
     scan = load(data / "scans" / "lhdl_trabecular_200.tif", spacing=19.5, unit="um")
     cut = Field(scan.values[50:130, 50:130, 50:130], scan.spacing, "um")
     b = like(cut).base
-    assert 10 < b.background * (b.gain or 1) + b.offset < 40
-    assert 120 < b.foreground * (b.gain or 1) + b.offset < 220
-    assert 15 < b.blur[1] < 45 and 0.5 < b.noise_width[1] < 1.1
+    assert 10 < b.contrast.background * (b.detector.gain or 1) + b.detector.offset < 40
+    assert 120 < b.contrast.foreground * (b.detector.gain or 1) + b.detector.offset < 220
+    assert 15 < b.optics.blur[1] < 45 and 0.5 < b.noise.width[1] < 1.1

@@ -10,17 +10,10 @@ import torch
 from exact import Cylinder, Sphere, centres
 
 from curvafit.data_synth.imaging import degrade
-from curvafit.data_synth.imaging.modalities import MODALITIES
-from curvafit.data_synth.imaging.modality import (
-    Imaging,
-    Modality,
-    field_shape,
-    image,
-    image_shape,
-    regrid,
-    visible,
-    visible_share,
-)
+from curvafit.data_synth.imaging.imaging import field_shape, image, image_shape, regrid, visible, visible_share
+from curvafit.data_synth.imaging.modalities import MODALITIES, modality
+from curvafit.data_synth.imaging.modality import Modality
+from curvafit.data_synth.imaging.parameters import Contrast, Imaging, Optics
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
 
@@ -29,20 +22,20 @@ POINTS = centres(Grid((N, N, N), (1.0, 1.0, 1.0)))
 SHAPES = [Cylinder(5.0, (0.3, 1, 0.2), (16, 16, 16)), Sphere(9.0, (16, 16, 16))]
 FIELDS = torch.stack([optimal_profile(shape.distance(POINTS), degrade.EPSILON).float()[None] for shape in SHAPES])
 
-PLAIN = Imaging(background=10, foreground=60)
+PLAIN = Imaging(contrast=Contrast(background=10, foreground=60))
 
 
 @pytest.mark.parametrize("name", MODALITIES)
 def test_presets_make_images(name: str) -> None:
-    modality = MODALITIES[name]
-    drawn = [modality.draw(seed) for seed in (1, 2)]
-    images = image(FIELDS, modality.voxel, drawn, [1, 2])
-    labels = regrid(FIELDS, modality.voxel, drawn) > 0
+    kind = MODALITIES[name]
+    drawn = [kind.draw(seed) for seed in (1, 2)]
+    images = image(FIELDS, kind.voxel, drawn, [1, 2])
+    labels = regrid(FIELDS, kind.voxel, drawn) > 0
     assert images.shape == labels.shape and bool(torch.isfinite(images).all())
-    assert tuple(images.shape[2:]) == image_shape((N, N, N), modality.voxel, drawn[0])
-    assert float(images.amin()) >= 0 and float(images.amax()) <= drawn[0].ceiling
+    assert tuple(images.shape[2:]) == image_shape((N, N, N), kind.voxel, drawn[0])
+    assert float(images.amin()) >= 0 and float(images.amax()) <= drawn[0]["detector.ceiling"]
     assert torch.equal(images, images.round())
-    sign = 1 if drawn[0].foreground > drawn[0].background else -1
+    sign = 1 if drawn[0].contrast.foreground > drawn[0].contrast.background else -1
     for seen, inside in zip(images, labels, strict=True):
         contrast = sign * float(seen[inside].mean() - seen[~inside].mean())
         assert contrast > 0.5 * float(seen[~inside].std())
@@ -51,12 +44,12 @@ def test_presets_make_images(name: str) -> None:
 @pytest.mark.parametrize("name", MODALITIES)
 def test_an_image_is_its_own(name: str) -> None:
     """The same voxels, bit by bit, in any batch."""
-    modality = MODALITIES[name]
-    first, second = modality.draw(1), modality.draw(2)
-    batch = image(FIELDS, modality.voxel, [first, second], [1, 2])
-    assert torch.equal(batch[1:], image(FIELDS[1:], modality.voxel, [second], [2]))
-    assert torch.equal(batch, image(FIELDS, modality.voxel, [first, second], [1, 2]))
-    assert not torch.equal(batch[1:], image(FIELDS[1:], modality.voxel, [second], [3]))
+    kind = MODALITIES[name]
+    first, second = kind.draw(1), kind.draw(2)
+    batch = image(FIELDS, kind.voxel, [first, second], [1, 2])
+    assert torch.equal(batch[1:], image(FIELDS[1:], kind.voxel, [second], [2]))
+    assert torch.equal(batch, image(FIELDS, kind.voxel, [first, second], [1, 2]))
+    assert not torch.equal(batch[1:], image(FIELDS[1:], kind.voxel, [second], [3]))
 
 
 def test_without_effects_an_image_is_its_occupancy() -> None:
@@ -67,18 +60,29 @@ def test_without_effects_an_image_is_its_occupancy() -> None:
 @pytest.mark.parametrize(
     "effect",
     [
-        {"background_texture": 0.3}, {"foreground_texture": 0.3}, {"blur": (2.0, 1.0, 1.0)}, {"attenuation": 0.02},
-        {"bias": 0.2, "bias_length": 20}, {"stripes": 0.1}, {"rings": 0.1}, {"dropout": 0.3, "dropout_length": 5},
-        {"clutter": 1e-3}, {"gain": 2.0}, {"read_noise": 3.0}, {"rician": 3.0}, {"offset": 7.0}, {"ceiling": 40.0},
+        {"contrast.background_texture": 0.3},
+        {"contrast.foreground_texture": 0.3},
+        {"optics.blur": (2.0, 1.0, 1.0)},
+        {"optics.attenuation": 0.02},
+        {"illumination.bias": 0.2, "illumination.bias_length": 20},
+        {"illumination.stripes": 0.1},
+        {"detector.rings": 0.1},
+        {"specimen.dropout": 0.3, "specimen.dropout_length": 5},
+        {"specimen.clutter": 1e-3},
+        {"detector.gain": 2.0},
+        {"noise.gaussian": 3.0},
+        {"noise.rician": 3.0},
+        {"detector.offset": 7.0},
+        {"detector.ceiling": 40.0},
     ],
-)  # fmt: skip
+)
 def test_every_effect_counts_and_leaves_the_others_numbers(effect: dict) -> None:
-    noisy = replace(PLAIN, read_noise=2.0)
-    with_it = image(FIELDS[:1], 1.0, [replace(PLAIN, **effect)], [5])
+    noisy = PLAIN.assign({"noise.gaussian": 2.0})
+    with_it = image(FIELDS[:1], 1.0, [PLAIN.assign(effect)], [5])
     assert not torch.equal(with_it, image(FIELDS[:1], 1.0, [PLAIN], [5]))
-    if not {"read_noise", "rician", "gain", "ceiling"} & set(effect):
+    if not {"noise.gaussian", "noise.rician", "detector.gain", "detector.ceiling"} & set(effect):
         noise = image(FIELDS[:1], 1.0, [noisy], [5]) - image(FIELDS[:1], 1.0, [PLAIN], [5])
-        same = image(FIELDS[:1], 1.0, [replace(noisy, **effect)], [5]) - with_it
+        same = image(FIELDS[:1], 1.0, [noisy.assign(effect)], [5]) - with_it
         torch.testing.assert_close(same, noise, rtol=0, atol=1e-4)
 
 
@@ -94,38 +98,38 @@ def test_images_and_labels_share_a_grid() -> None:
 def test_masks_of_what_is_seen() -> None:
     """With even stain and no noise, a share of the light is that share of the contrast, but where the image is within
     what float32 rounds off some fifty levels."""
-    how = replace(PLAIN, spacing=(2.5, 1.0, 1.0), thickness=2.5, blur=(3.0, 1.0, 1.0), blur_growth=0.02, visible=0.1)
+    how = replace(PLAIN, spacing=(2.5, 1.0, 1.0), thickness=2.5, optics=Optics((3.0, 1.0, 1.0), 0.02), visible=0.1)
     found, clean = visible(FIELDS, 1.0, [how, how]), image(FIELDS, 1.0, [how, how], [1, 2])
     clear = (clean - (10 + 0.1 * 50)).abs() > 1e-4
     assert found.dtype == torch.bool and torch.equal(found[clear], clean[clear] > 10 + 0.1 * 50)
     assert float(clear.double().mean()) > 0.99
     level = 10 + visible_share(how) * 50
     assert level == pytest.approx((10 * 60) ** 0.5)
-    dark = replace(PLAIN, background=60, foreground=10)
+    dark = replace(PLAIN, contrast=Contrast(60, 10))
     assert 60 - visible_share(dark) * 50 == pytest.approx((10 * 60) ** 0.5)
-    assert 0 < visible_share(replace(PLAIN, background=0)) < 0.05
+    assert 0 < visible_share(PLAIN.assign({"contrast.background": 0})) < 0.05
     inside = regrid(FIELDS, 1.0, [how, how]) > 0
     assert bool((found | ~inside).all()) and float(found.sum()) > 1.5 * float(inside.sum())
 
 
 def test_parameters_are_drawn_in_range_and_reproducibly() -> None:
-    for modality in MODALITIES.values():
-        draws = [modality.draw(seed) for seed in range(40)]
-        assert draws[3] == modality.draw(3) and draws[3] != draws[4]
-        for name, (low, high) in modality.ranges.items():
-            values = [getattr(each, name) for each in draws]
+    for kind in MODALITIES.values():
+        draws = [kind.draw(seed) for seed in range(40)]
+        assert draws[3] == kind.draw(3) and draws[3] != draws[4]
+        for name, (low, high) in kind.ranges.items():
+            values = [each[name] for each in draws]
             first = [value[0] if isinstance(value, tuple) else value for value in values]
             ends = [end[0] if isinstance(end, tuple) else end for end in (low, high)]
             assert ends[0] <= min(first) < max(first) <= ends[1], name
-    one = Modality("one", "", 1.0, PLAIN, {"bias": (0.0, 0.5)})
-    both = replace(one, ranges={"stripes": (0.1, 0.2), **one.ranges})
-    assert one.draw(3).bias == both.draw(3).bias
+    one = Modality("one", "", 1.0, PLAIN, {"illumination.bias": (0.0, 0.5)})
+    both = replace(one, ranges={"illumination.stripes": (0.1, 0.2), **one.ranges})
+    assert one.draw(3).illumination == replace(both.draw(3).illumination, stripes=0.0)
 
 
 def test_parameters_go_through_json() -> None:
-    for modality in MODALITIES.values():
-        assert Modality.from_dict(json.loads(json.dumps(modality.as_dict()))) == modality
-        drawn = modality.draw(5)
+    for kind in MODALITIES.values():
+        assert Modality.from_dict(json.loads(json.dumps(kind.as_dict()))) == kind
+        drawn = kind.draw(5)
         assert Imaging.from_dict(json.loads(json.dumps(drawn.as_dict()))) == drawn
 
 
@@ -133,17 +137,17 @@ def test_parameters_go_through_json() -> None:
     ("wrong", "said"),
     [
         ({"spacing": (1, 0, 1)}, "expected spacing as 3 numbers (z, y, x), each a number above 0, got (1, 0, 1)"),
-        ({"blur": (1, 1)}, "expected blur as 3 numbers"),
-        ({"dropout": 1.2}, "expected dropout as a share, got 1.2"),
-        ({"gain": -1}, "expected gain as a number from 0, got -1"),
-        ({"foreground": float("nan")}, "expected foreground as a number from 0, got nan"),
-        ({"ceiling": 0}, "expected ceiling as a number above 0, got 0"),
+        ({"optics.blur": (1, 1)}, "expected blur as 3 numbers"),
+        ({"specimen.dropout": 1.2}, "expected dropout as a share, got 1.2"),
+        ({"detector.gain": -1}, "expected gain as a number from 0, got -1"),
+        ({"contrast.foreground": float("nan")}, "expected foreground as a number from 0, got nan"),
+        ({"detector.ceiling": 0}, "expected ceiling as a number above 0, got 0"),
         ({"unit": "ell"}, "expected a unit among"),
     ],
 )
 def test_bad_parameters_are_named(wrong: dict, said: str) -> None:
     with pytest.raises(ValueError) as told:
-        Imaging(**wrong)
+        Imaging().assign(wrong)
     assert said in str(told.value)
 
 
@@ -157,10 +161,22 @@ def test_bad_input_is_told() -> None:
         (lambda: image(FIELDS, 1.0, [PLAIN, PLAIN], [1]), "expected 2 seeds"),
         (lambda: image(broken, 1.0, [PLAIN, PLAIN], [1, 2]), "expected phase fields of finite values"),
         (lambda: image(FIELDS, 0.0, [PLAIN, PLAIN], [1, 2]), "expected a spacing of 3 positive numbers"),
-        (lambda: Imaging.from_dict({"blurr": 1}), "expected fields of an image in an image, got blurr"),
-        (lambda: Modality("m", "", 1.0, PLAIN, {"gain": (2.0, 1.0)}), "expected a range of gain from low to high"),
+        (lambda: Imaging.from_dict({"blurr": 1}), "expected parameters of an image, as optics.blur, got 'blurr'"),
+        (
+            lambda: Modality("m", "", 1.0, PLAIN, {"detector.gain": (2.0, 1.0)}),
+            "expected a range of detector.gain from low to high",
+        ),
+        (lambda: replace(PLAIN, optics=Contrast()), "expected optics as Optics, got Contrast"),
+        (lambda: modality("x-ray"), "expected a modality among confocal, two-photon, .*, got 'x-ray'"),
         (lambda: Modality("m", "", 0.0, PLAIN), "expected a shape's voxel of positive length, got 0.0"),
         (lambda: Modality("m", "", 1.0, PLAIN).draw(-1), "expected 1 seeds, whole numbers from 0"),
     ):
         with pytest.raises(ValueError, match=said):
             call()
+
+
+def test_names_of_modalities_are_forgiving() -> None:
+    for name, kind in MODALITIES.items():
+        assert kind.name == name
+        for written in (name, name.replace("-", "_"), name.upper(), f" {name.replace('-', ' ')} "):
+            assert modality(written) is kind

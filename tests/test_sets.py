@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from flat_recipe import FLAT, SHAPE, flat_recipe
 
-from curvafit.data_synth.imaging.modality import Imaging
+from curvafit.data_synth.imaging.parameters import Imaging
 from curvafit.data_synth.sets import sets
 from curvafit.data_synth.sets.case import Recipe
 from curvafit.data_synth.sets.picture import write_preview
@@ -45,7 +45,9 @@ def test_nnunet_s_layout(tmp_path, order):
         case = order.recipe.case(index)
         assert ((case.field > 0) == values.T).all() and (case.image == np.asanyarray(image.dataobj).T).all()
         record = json.loads((folder / "cases" / f"case_{index:05d}.json").read_text())
-        assert Imaging.from_dict(record["imaging"]).foreground == case.record["imaging"]["foreground"]
+        assert (
+            Imaging.from_dict(record["imaging"]).contrast.foreground == case.record["imaging"]["contrast"]["foreground"]
+        )
         assert set(record["source"]["parameters"]) == {"a20", "a11", "a02", "a10", "a01", "a00", "mass"}
 
 
@@ -204,7 +206,7 @@ def test_labels_besides_the_mask(tmp_path, order):
 
 def test_labels_are_what_an_image_shows_where_asked(tmp_path, order):
     modality = order.recipe.modality
-    wide = replace(modality, base=replace(modality.base, blur=(1.5, 1.5, 1.5), visible=0.1))
+    wide = replace(modality, base=modality.base.assign({"optics.blur": (1.5, 1.5, 1.5), "visible": 0.1}))
     asked = Order(replace(order.recipe, modality=wide), parts=("distance",))
     folder, case = build_set(tmp_path / "set", asked, 1), asked.recipe.case(0)
     inside = load(folder / "parts" / "distance" / "case_00000.nii.gz").values > 0
@@ -235,13 +237,13 @@ def test_bad_input(tmp_path, order):
     (tmp_path / "taken" / "notes.txt").write_text("mine")
     with pytest.raises(ValueError, match="expected a new or empty folder, or a set to go on with, got .*taken with"):
         build_set(tmp_path / "taken", order, 1)
-    with pytest.raises(ValueError, match="expected a set of version 1 in .*taken, got none"):
+    with pytest.raises(ValueError, match="expected a set of version 2 in .*taken, got none"):
         read_order(tmp_path / "taken")
     folder = build_set(tmp_path / "set", order, 1)
     other = Order(Recipe(recipe.source, FLAT, SHAPE, 0.5, seed=5))
     with pytest.raises(ValueError, match="expected what .*set was begun with, got another seed: 5 for 4"):
         build_set(folder, other, 1)
-    with pytest.raises(ValueError, match="expected a set of version 1"):
+    with pytest.raises(ValueError, match="expected a set of version 2"):
         make_cases(tmp_path / "nowhere", [0])
 
 
@@ -252,8 +254,12 @@ def test_what_others_began_is_left_alone(tmp_path, order):
     with pytest.raises(ValueError, match="another seed: 5 for 4; choose another folder, or delete this one"):
         build_set(folder, other, 1)
     assert read_order(folder) == order
+    header = json.loads((folder / "curvafit.json").read_text())
+    (folder / "curvafit.json").write_text(json.dumps(header | {"version": 1}))
+    with pytest.raises(ValueError, match="^expected a set of version 2 in .*, got version 1: begin it anew in another"):
+        build_set(folder, order, 1)
     (folder / "curvafit.json").write_text("{}")
-    with pytest.raises(ValueError, match="expected a set of version 1"):
+    with pytest.raises(ValueError, match="expected a set of version 2"):
         build_set(folder, other, 1)
     assert (folder / "curvafit.json").read_text() == "{}"
 
@@ -268,7 +274,7 @@ def test_a_damaged_header_is_one_sentence(tmp_path, order):
             read_order(folder)
     for bomb in ("[" * 100_000, '{"version": ' + "9" * 5000 + "}", '{"version": NaN}'):
         (folder / "curvafit.json").write_text(bomb)
-        with pytest.raises(ValueError, match="^expected a set of version 1 in [^\n]*, got none$"):
+        with pytest.raises(ValueError, match="^expected a set of version 2 in [^\n]*, got none$"):
             read_order(folder)
 
 

@@ -15,12 +15,13 @@ from exact_store import exact_store
 from torch.utils.data import DataLoader
 
 from curvafit.data_synth.atlas.store import open_store
-from curvafit.data_synth.imaging.modality import Imaging, Modality
+from curvafit.data_synth.imaging.modality import Modality
+from curvafit.data_synth.imaging.parameters import Contrast, Imaging, Noise, Optics
 from curvafit.data_synth.sets import training
 from curvafit.data_synth.sets.moves import cropped, turned
 from curvafit.data_synth.sets.training import Sample, TextureDataset, as_dict, as_monai, as_subject
 
-QUIET = Modality("quiet", "for tests", 1.0, Imaging(blur=(0.5, 0.5, 0.5), read_noise=1.0))
+QUIET = Modality("quiet", "for tests", 1.0, Imaging(optics=Optics(blur=(0.5, 0.5, 0.5)), noise=Noise(gaussian=1.0)))
 SHAPE = (12, 16, 20)
 
 
@@ -115,7 +116,7 @@ def test_a_blend_holds_both_textures(store):
 
 
 def test_modalities_take_turns_at_random(store):
-    loud = Modality("loud", "for tests", 1.0, Imaging(foreground=1000.0))
+    loud = Modality("loud", "for tests", 1.0, Imaging(contrast=Contrast(foreground=1000.0)))
     names = {TextureDataset(store, [QUIET, loud], SHAPE)[k].record["modality"] for k in range(12)}
     assert names == {"quiet", "loud"}
 

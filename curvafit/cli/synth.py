@@ -193,7 +193,9 @@ def _modality(
         lone = [key for key, value in reading.items() if value not in (None, False) and key != "unit"]
         if lone or mask is not None:
             raise ValueError(f"expected --like beside {f'--{lone[0]}' if lone else '--like-mask'}, got none")
-        return _visible(_named(str(name)), visible)
+        from curvafit.data_synth.imaging.modalities import modality
+
+        return _visible(modality(str(name)), visible)
     from curvafit.data_synth.imaging import estimate
     from curvafit.volumes.scan import load
 
@@ -212,20 +214,10 @@ def _mask(values: np.ndarray) -> np.ndarray:
     return values > values.min()
 
 
-def _named(name: str) -> Modality:
-    from curvafit.data_synth.imaging.modalities import MODALITIES
-
-    plain = {key.casefold().replace(" ", "-"): key for key in MODALITIES}
-    found = plain.get(name.strip().casefold().replace(" ", "-"))
-    if found is None:
-        raise ValueError(f"expected --modality among {', '.join(plain)}, got {name!r}")
-    return MODALITIES[found]
-
-
 def _visible(seen: Modality, told: str | None) -> Modality:
     if told is None:
         return seen
-    from curvafit.data_synth.imaging.modality import visible_share
+    from curvafit.data_synth.imaging.imaging import visible_share
 
     share = visible_share(seen.base) if told == "auto" else numbers(told, "--visible", 1)[0]
     return replace(seen, base=replace(seen.base, visible=share))

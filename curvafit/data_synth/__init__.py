@@ -16,9 +16,17 @@ if TYPE_CHECKING:
     from curvafit.data_synth.atlas.record import Record, Settings
     from curvafit.data_synth.atlas.store import Store, open_store
     from curvafit.data_synth.atlas.workers import Cluster, cluster
-    from curvafit.data_synth.imaging.imaging import Imaging
-    from curvafit.data_synth.imaging.modalities import MODALITIES
+    from curvafit.data_synth.imaging.modalities import MODALITIES, modality
     from curvafit.data_synth.imaging.modality import Modality
+    from curvafit.data_synth.imaging.parameters import (
+        Contrast,
+        Detector,
+        Illumination,
+        Imaging,
+        Noise,
+        Optics,
+        Specimen,
+    )
     from curvafit.data_synth.labels.labels import Labels, labels_of
     from curvafit.data_synth.sets.training import TextureDataset, as_dict, as_monai, as_subject
     from curvafit.geometry.diagram import diagrams
@@ -27,13 +35,19 @@ __all__ = [
     "INTERVALS",
     "MODALITIES",
     "Cluster",
+    "Contrast",
     "Design",
+    "Detector",
     "Draw",
+    "Illumination",
     "Imaging",
     "Labels",
     "Modality",
+    "Noise",
+    "Optics",
     "Record",
     "Settings",
+    "Specimen",
     "Store",
     "TextureDataset",
     "around",
@@ -46,21 +60,28 @@ __all__ = [
     "diagrams",
     "extend",
     "labels_of",
+    "modality",
     "open_store",
     "read_design",
 ]
 
 _HOMES = {
     "Cluster": "curvafit.data_synth.atlas.workers",
+    "Contrast": "curvafit.data_synth.imaging.parameters",
     "Design": "curvafit.data_synth.atlas.design",
+    "Detector": "curvafit.data_synth.imaging.parameters",
     "Draw": "curvafit.data_synth.atlas.design",
     "INTERVALS": "curvafit.data_synth.atlas.design",
-    "Imaging": "curvafit.data_synth.imaging.imaging",
+    "Illumination": "curvafit.data_synth.imaging.parameters",
+    "Imaging": "curvafit.data_synth.imaging.parameters",
     "Labels": "curvafit.data_synth.labels.labels",
     "MODALITIES": "curvafit.data_synth.imaging.modalities",
     "Modality": "curvafit.data_synth.imaging.modality",
+    "Noise": "curvafit.data_synth.imaging.parameters",
+    "Optics": "curvafit.data_synth.imaging.parameters",
     "Record": "curvafit.data_synth.atlas.record",
     "Settings": "curvafit.data_synth.atlas.record",
+    "Specimen": "curvafit.data_synth.imaging.parameters",
     "Store": "curvafit.data_synth.atlas.store",
     "TextureDataset": "curvafit.data_synth.sets.training",
     "around": "curvafit.data_synth.atlas.design",
@@ -73,6 +94,7 @@ _HOMES = {
     "diagrams": "curvafit.geometry.diagram",
     "extend": "curvafit.data_synth.atlas.build",
     "labels_of": "curvafit.data_synth.labels.labels",
+    "modality": "curvafit.data_synth.imaging.modalities",
     "open_store": "curvafit.data_synth.atlas.store",
     "read_design": "curvafit.data_synth.atlas.design_file",
 }

@@ -11,10 +11,10 @@ import torch
 from scipy import ndimage, optimize
 from skimage.filters import threshold_otsu
 
-from curvafit.data_synth.imaging.imaging import Imaging
 from curvafit.data_synth.imaging.modality import Modality
-from curvafit.data_synth.imaging.noise_estimate import Noise, background_of, covariance, noise_of
+from curvafit.data_synth.imaging.noise_estimate import NoiseEstimate, background_of, covariance, noise_of
 from curvafit.data_synth.imaging.optics import blur
+from curvafit.data_synth.imaging.parameters import Contrast, Detector, Illumination, Imaging, Noise, Optics
 from curvafit.volumes.scan import Field
 
 #: Share of the mean brightness from which on the structure's brightness counts for its texture.
@@ -29,14 +29,14 @@ LENGTHS = np.geomspace(WINDOW, 6 * WINDOW, 50)
 SMOOTH = 0.8
 #: What a drawn parameter is the estimate's, low and high.
 SPREAD: dict[str, tuple[float, float]] = {
-    "background": (0.8, 1.25),
-    "foreground": (0.7, 1.4),
-    "background_texture": (0.7, 1.4),
-    "foreground_texture": (0.7, 1.4),
-    "blur": (0.8, 1.25),
-    "bias": (0.5, 1.5),
-    "gain": (0.7, 1.4),
-    "read_noise": (0.7, 1.4),
+    "contrast.background": (0.8, 1.25),
+    "contrast.foreground": (0.7, 1.4),
+    "contrast.background_texture": (0.7, 1.4),
+    "contrast.foreground_texture": (0.7, 1.4),
+    "optics.blur": (0.8, 1.25),
+    "illumination.bias": (0.5, 1.5),
+    "detector.gain": (0.7, 1.4),
+    "noise.gaussian": (0.7, 1.4),
 }
 
 
@@ -85,14 +85,14 @@ def like(scan: Field, mask: np.ndarray | None = None) -> Modality:
     structure = _structure(values, inside, steps, ground.level)
     noise = noise_of(values, inside, ground, steps, ground.level + structure.contrast)
     base = _imaging(scan, structure, noise)
-    ranges = {name: _around(getattr(base, name), *ends) for name, ends in SPREAD.items() if np.any(getattr(base, name))}
-    if "bias" in ranges:
-        ranges["bias"] = ranges["bias"][0], min(ranges["bias"][1], 1.0)
+    ranges = {name: _around(base[name], *ends) for name, ends in SPREAD.items() if np.any(base[name])}
+    if bias := ranges.get("illumination.bias"):
+        ranges["illumination.bias"] = bias[0], min(bias[1], 1.0)
     about = f"estimated from {scan.source or 'a scan'}, {'its mask' if given is not None else 'without a mask'}"
     return Modality("like", about, float(min(scan.spacing)), base, ranges)
 
 
-def _imaging(scan: Field, structure: Structure, noise: Noise) -> Imaging:
+def _imaging(scan: Field, structure: Structure, noise: NoiseEstimate) -> Imaging:
     """Levels in photons where the variance grows with the mean; textures as they were before the blur."""
     unit = noise.gain or 1.0
     low = max(noise.level - noise.offset, 0.0) / unit
@@ -103,20 +103,25 @@ def _imaging(scan: Field, structure: Structure, noise: Noise) -> Imaging:
     return Imaging(
         unit=scan.unit,
         spacing=scan.spacing,
-        background=low,
-        foreground=high,
-        background_texture=min(noise.texture * shrunk / max(low * unit, 1e-9), 2.0),
-        texture_length=length,
-        foreground_texture=min(structure.texture * abs(structure.contrast) / max(high * unit, 1e-9), 2.0),
-        foreground_length=structure.length * min(scan.spacing),
-        blur=structure.blur,
-        bias=min(noise.bias * abs(noise.level) / max(low * unit, 1e-9), 0.9),
-        bias_length=max(n * h for n, h in zip(scan.shape, scan.spacing, strict=True)) / 2,
-        gain=noise.gain,
-        read_noise=noise.read_noise,
-        offset=noise.offset,
-        noise_width=noise.width,
-        ceiling=float(np.iinfo(scan.values.dtype).max) if counts else None,
+        contrast=Contrast(
+            background=low,
+            foreground=high,
+            background_texture=min(noise.texture * shrunk / max(low * unit, 1e-9), 2.0),
+            background_length=length,
+            foreground_texture=min(structure.texture * abs(structure.contrast) / max(high * unit, 1e-9), 2.0),
+            foreground_length=structure.length * min(scan.spacing),
+        ),
+        optics=Optics(structure.blur),
+        illumination=Illumination(
+            bias=min(noise.bias * abs(noise.level) / max(low * unit, 1e-9), 0.9),
+            bias_length=max(n * h for n, h in zip(scan.shape, scan.spacing, strict=True)) / 2,
+        ),
+        noise=Noise(gaussian=noise.read_noise, width=noise.width),
+        detector=Detector(
+            gain=noise.gain,
+            offset=noise.offset,
+            ceiling=float(np.iinfo(scan.values.dtype).max) if counts else None,
+        ),
     )
 
 

@@ -3,26 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from curvafit.data_synth.imaging.imaging import (
-    TRIPLES,
-    Imaging,
-    field_shape,
-    image,
-    image_shape,
-    known_fields,
-    regrid,
-    visible,
-    visible_share,
-)
+from curvafit.data_synth.imaging.parameters import Imaging
 from curvafit.data_synth.imaging.randomness import seeds_of
 from curvafit.priors.bounds import LONGEST, SHORTEST, real
-
-__all__ = ["Imaging", "Modality", "field_shape", "image", "image_shape", "regrid", "visible", "visible_share"]
 
 
 @dataclass(frozen=True)
@@ -38,8 +26,8 @@ class Modality:
     base
         A typical image.
     ranges
-        By field of `Imaging`: low and high, numbers or three of them that move together. Drawn evenly in the logarithm
-        where both ends are above zero, else evenly.
+        By the name of a parameter, as `optics.blur`: low and high, numbers or three of them that move together. Drawn
+        evenly in the logarithm where both ends are above zero, else evenly.
 
     Raises
     ------
@@ -55,12 +43,13 @@ class Modality:
 
     def __post_init__(self) -> None:
         real(self.voxel, "a shape's voxel of positive length", SHORTEST, LONGEST)
-        known_fields(self.ranges, "a modality's ranges")
-        for name, (low, high) in self.ranges.items():
-            for end in (low, high):
-                replace(self.base, **{name: end})
+        ranges = {
+            name: tuple(self.base.assign({name: end})[name] for end in ends) for name, ends in self.ranges.items()
+        }
+        for name, (low, high) in ranges.items():
             if np.any(np.asarray(low) > np.asarray(high)):
                 raise ValueError(f"expected a range of {name} from low to high, got {low} to {high}")
+        object.__setattr__(self, "ranges", ranges)
 
     def draw(self, seed: int) -> Imaging:
         """One image's parameters; each is drawn from (seed, its own name)."""
@@ -70,21 +59,19 @@ class Modality:
             key = tuple(name.encode())
             share = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key)).random()
             drawn[name] = _between(low, high, share)
-        return replace(self.base, **drawn)
+        return self.base.assign(drawn)
 
     def as_dict(self) -> dict[str, Any]:
         """All fields in JSON's types."""
         ends = {name: [np.asarray(end).tolist() for end in pair] for name, pair in self.ranges.items()}
-        kept = {name: getattr(self, name) for name in ("name", "about", "voxel")}
-        return kept | {"base": self.base.as_dict(), "ranges": ends}
+        head = {"name": self.name, "about": self.about, "voxel": self.voxel}
+        return head | {"base": self.base.as_dict(), "ranges": ends}
 
     @staticmethod
-    def from_dict(kept: Mapping[str, Any]) -> Modality:
-        """The inverse of `as_dict`."""
-        ends: dict[str, tuple[Any, Any]] = {}
-        for name, (low, high) in kept["ranges"].items():
-            ends[name] = (tuple(low), tuple(high)) if name in TRIPLES else (low, high)
-        return Modality(kept["name"], kept["about"], kept["voxel"], Imaging.from_dict(kept["base"]), ends)
+    def from_dict(content: Mapping[str, Any]) -> Modality:
+        """Return the modality that `as_dict` wrote."""
+        base = Imaging.from_dict(content["base"])
+        return Modality(content["name"], content["about"], content["voxel"], base, content["ranges"])
 
 
 def _between(low: Any, high: Any, share: float) -> Any:

@@ -35,7 +35,7 @@ class Background(NamedTuple):
     bias: float
 
 
-class Noise(NamedTuple):
+class NoiseEstimate(NamedTuple):
     """Of counts: gain, read noise, offset; the rest as the background has it."""
 
     gain: float
@@ -72,7 +72,9 @@ def background_of(values: np.ndarray, inside: np.ndarray, steps: np.ndarray) -> 
     )
 
 
-def noise_of(values: np.ndarray, inside: np.ndarray, ground: Background, steps: np.ndarray, high: float) -> Noise:
+def noise_of(
+    values: np.ndarray, inside: np.ndarray, ground: Background, steps: np.ndarray, high: float
+) -> NoiseEstimate:
     """The line of variance over mean through the residuals' bins and the background, if it rises by the structure.
 
     The line is gain · mean + rest. A negative rest is an offset, -rest / gain, a positive one read noise: of the two
@@ -91,10 +93,10 @@ def noise_of(values: np.ndarray, inside: np.ndarray, ground: Background, steps: 
     gain = min(gain, ground.noise / max(ground.level - darkest, 1e-12))
     if not gain or gain * abs(high - ground.level) < (GROWS - 1) * ground.noise:
         floor = 0.0 if ground.level > 2 * ground.texture else ground.level - abs(high - ground.level)
-        return Noise(0.0, math.sqrt(ground.noise), floor, ground.width, *rest)
+        return NoiseEstimate(0.0, math.sqrt(ground.noise), floor, ground.width, *rest)
     constant = ground.noise - gain * ground.level
     offset = max(-constant / gain, 0.0)
-    return Noise(gain, math.sqrt(max(constant, 0.0)), offset, ground.width, *rest)
+    return NoiseEstimate(gain, math.sqrt(max(constant, 0.0)), offset, ground.width, *rest)
 
 
 def covariance(rest: np.ndarray, weight: np.ndarray, axis: int) -> np.ndarray:

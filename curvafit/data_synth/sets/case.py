@@ -11,7 +11,9 @@ import numpy as np
 import torch
 
 from curvafit.data_synth.atlas.draws import one_thread
-from curvafit.data_synth.imaging.modality import Imaging, Modality, field_shape, image, regrid, visible
+from curvafit.data_synth.imaging.imaging import field_shape, image, regrid, visible
+from curvafit.data_synth.imaging.modality import Modality
+from curvafit.data_synth.imaging.parameters import Imaging
 from curvafit.data_synth.sets.sources import Source, source_of
 from curvafit.priors.bounds import LONGEST, SHORTEST, instance, quoted, real, seed_of, several, whole
 
@@ -188,7 +190,8 @@ def check_crop(source: Source, shape: Sequence[int], voxel: float, modality: Mod
 
 def _counts(grey: np.ndarray, imaging: Imaging) -> np.ndarray:
     """Whole counts as uint16, where they fit in; else float32."""
-    whole = imaging.ceiling is not None and imaging.ceiling <= np.iinfo(np.uint16).max
+    ceiling = imaging.detector.ceiling
+    whole = ceiling is not None and ceiling <= np.iinfo(np.uint16).max
     return grey.astype(np.uint16 if whole else np.float32)
 
 

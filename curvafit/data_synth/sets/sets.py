@@ -30,7 +30,7 @@ from curvafit.priors.json_text import parse_json
 from curvafit.volumes.scan import Field, save
 
 FORMAT = "curvafit set"
-VERSION = 1
+VERSION = 2
 #: The set's own record, and the folder of the cases'.
 HEADER, RECORDS = "curvafit.json", "cases"
 #: What the layout's readers want.
@@ -151,11 +151,12 @@ def read_order(folder: str | Path) -> Order:
     """
     try:
         header = parse_json((Path(folder) / HEADER).read_bytes(), "a set", folder)
-        known = header["format"] == FORMAT and header["version"] == VERSION
+        version = header["version"] if header["format"] == FORMAT else None
     except (OSError, ValueError, KeyError, TypeError):
-        known = False
-    if not known:
-        raise ValueError(f"expected a set of version {VERSION} in {folder}, got none")
+        version = None
+    if version != VERSION:
+        came = "none" if version is None else f"version {quoted(version)}: begin it anew in another folder"
+        raise ValueError(f"expected a set of version {VERSION} in {folder}, got {came}")
     try:
         kept = header["order"]
         return Order(Recipe.from_dict(kept["recipe"]), kept["layout"], tuple(kept["parts"]))

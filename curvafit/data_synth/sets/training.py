@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
-from curvafit.data_synth.imaging.modality import Modality, field_shape
+from curvafit.data_synth.imaging.imaging import field_shape
+from curvafit.data_synth.imaging.modality import Modality
 from curvafit.data_synth.imaging.randomness import correlated
 from curvafit.data_synth.sets.case import check_calibres, check_crop, drawn_voxel, imaged
 from curvafit.data_synth.sets.sources import Stored
