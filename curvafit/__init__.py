@@ -79,4 +79,9 @@ _HOMES = {
     "wasserstein": "curvafit.geometry.transport",
 }
 
+#: The function that draws each type with a picture, as `module:function`; see `curvafit.pictures`.
+_FIGURES = {
+    "Flow": "curvafit.drawing.figures:flow_figure",
+}
+
 offer(__name__, _HOMES)

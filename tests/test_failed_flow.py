@@ -15,6 +15,7 @@ from torch import Tensor
 from curvafit.data_synth.atlas import build as atlas
 from curvafit.data_synth.atlas.store import open_store
 from curvafit.generation import SCHEDULES, Schedule, descend, generate_batch, relax
+from curvafit.generation.cost import Cost
 from curvafit.generation.loop import Orders, run
 from curvafit.generation.stepper import Statistics, Stepper
 from curvafit.generation.viability import viability
@@ -24,6 +25,7 @@ from curvafit.priors.profile import optimal_profile
 
 TUBES, MASS = preset("tubes").coefficients, preset("tubes").mass
 GRID = Grid((26, 26, 26))
+COST = Cost(TUBES, GRID, 0.02, None, 0.02)
 RUNAWAY = Schedule("fast", 60, 1e6, 1e6, "constant")
 
 
@@ -65,7 +67,7 @@ def test_figures_that_are_not_finite_end_a_flow(part: str, step: int, bad: float
     good = Statistics(1.0, 1.0, 1.0)
     figures = {"energy": good._replace(energy=bad), "gradient": good._replace(gradient_max=bad)}
     stepper = Seen({step: figures.get(part, good)}, bad if part == "field" else 0.0)
-    flow = run(stepper, [Orders(GRID, 0.02, Schedule("x", 20, 1e-3, 1e-3, "constant"))], [0])[0]
+    flow = run(stepper, [Orders(COST, Schedule("x", 20, 1e-3, 1e-3, "constant"))], [0])[0]
     at = 0 if part == "field" else step
     assert not flow.finite and not flow.viability.viable
     assert flow.viability.reason == f"the {part} is not finite"
@@ -73,7 +75,7 @@ def test_figures_that_are_not_finite_end_a_flow(part: str, step: int, bad: float
 
 
 def test_a_flow_that_goes_well_is_finite() -> None:
-    flow = run(Seen({}), [Orders(GRID, 0.02, Schedule("x", 20, 1e-3, 1e-3, "constant"))], [0])[0]
+    flow = run(Seen({}), [Orders(COST, Schedule("x", 20, 1e-3, 1e-3, "constant"))], [0])[0]
     assert flow.finite and flow.viability.viable
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -29,7 +30,11 @@ if TYPE_CHECKING:
 
     from curvafit.drawing.shape_files import Output
     from curvafit.generation.flow import Flow
-    from curvafit.priors.coefficients import Coefficients
+    from curvafit.priors.grid import Grid
+    from curvafit.priors.law import Texture
+
+    #: Parameters that vary in space, by name; see `volumes.parameter_maps`.
+    Maps3D = dict[str, float | Tensor]
 
 #: Voxels along an edge, if nothing says otherwise.
 EDGE = 100
@@ -56,7 +61,7 @@ Target = Annotated[
 ]
 Preset = Annotated[str | None, _what(help="A published shape; see `curvafit presets`.")]
 Six = Annotated[str | None, _what(help="a20,a11,a02,a10,a01,a00 in working units; needs a mass.")]
-Prior = Annotated[Path | None, _what(help="fit.json of `curvafit infer`.")]
+Prior = Annotated[str | None, _what(help="fit.json of `curvafit infer`, or a preset's name.")]
 Mass = Annotated[float | None, _what(help="Mean of the field, in (-1, 1).")]
 Share = Annotated[float | None, _what(help="Share of the volume inside, in (0, 1), instead of a mass.")]
 Orientation = Annotated[str | None, _what(help="θz,θy,θx,μ: tubes and layers lie along θ, the more the larger μ.")]
@@ -110,22 +115,34 @@ def generate(
 ) -> None:
     """Make a shape from parameters, with a picture (.png) and a record (.json) beside it."""
     with plainly():
-        law = _law(preset, coefficients, prior, mass, volume_fraction, epsilon, maps, shape)
-        how = _output(law, spacing, unit, tile, cap, boundary)
+        box = None if shape is None else whole_triple(shape, "--shape")
+        from curvafit.priors.grid import Grid
+        from curvafit.volumes.parameter_maps import map_shape, read_maps
+
+        volumes = {} if maps is None else read_maps(maps, box)
+        texture = _texture(preset, coefficients, prior, volumes)
+        options = _parameters(texture, volumes, mass, volume_fraction, epsilon)
+        grid = Grid(box or map_shape(volumes) or EDGE, boundary=boundary)  # type: ignore[arg-type]
+        how = _output(texture, grid, spacing, unit, tile, cap)
         saving = _checkpoint(checkpoint, checkpoint_every)
-        options: dict[str, Any] = {"seed": seed, **saving}
+        options |= {"grid": grid, "seed": seed, **saving}
         from curvafit.drawing.shape_files import check_target
         from curvafit.generation.schedule import schedule as named
 
         options["schedule"] = plan = named(schedule, steps)
         options["snapshots"] = () if snapshots is None else (*map(plan.among, whole_numbers(snapshots, "--snapshots")),)
         options["orientation"] = Q = None if orientation is None else _orientation(orientation)
-        read = [str(each) for each in (prior, maps) if each is not None]
+        law_file = None if texture.prior is None else prior or preset
+        read = [str(each) for each in (law_file, maps) if each is not None]
         _check(out, saving["checkpoint"], cap)
         check_target(out, how, steps=options["snapshots"], inputs=read, overwrite=overwrite)
-        flow = _grown(law, boundary, {**options, "device": device_of(device)})
-        told = {"orientation": Q if Q is None else Q.tolist(), "maps": maps if maps is None else str(maps)}
-        _write(flow, law, out, how, {**told, "overwrite": overwrite})
+        flow = _grown({**options, "device": device_of(device)})
+        more = {"orientation": Q if Q is None else Q.tolist(), "maps": maps if maps is None else str(maps)}
+        more |= {"origin": texture.origin, "wanted_volume_fraction": volume_fraction, "command": command_line()}
+        from curvafit.drawing.shape_files import shape_record
+
+        record = shape_record(flow, mass=options["mass"], output=how, snapshots=list(flow.snapshots), **more)
+        _write(flow, out, how, record, overwrite)
         _discard(saving["checkpoint"])
 
 
@@ -141,71 +158,43 @@ def presets() -> None:
         output(("name", *NAMES, "mass", "source"), rows, right=range(1, 8))
 
 
-class _Law(NamedTuple):
-    """Parameters of a shape, its voxels, and where the parameters came from. `mass` is None for a volume fraction."""
+def _texture(preset: str | None, six: str | None, prior: str | None, maps: Maps3D) -> Texture:
+    """Return the one law that the options state; maps may state all six coefficients."""
+    from curvafit.priors.coefficients import NAMES, Coefficients
+    from curvafit.priors.law import Texture, texture_of
 
-    coefficients: Coefficients
-    mass: float | Tensor | None
-    share: float | None
-    epsilon: float | Tensor
-    box: tuple[int, int, int]
-    origin: str
-    voxel: float = 1.0
-    unit: str = "voxel"
+    stated = [value for value in (preset, six, prior) if value is not None]
+    if len(stated) > 1 or (not stated and not set(NAMES) <= maps.keys()):
+        raise ValueError(f"expected one of --preset, --coefficients and --prior, got {len(stated)} of them")
+    if not stated:
+        return Texture(Coefficients(1, 0, 1), None, "maps")
+    return texture_of(stated[0] if six is None else Coefficients(*numbers(six, "--coefficients", 6)))
 
 
-def _law(
-    preset: str | None,
-    six: str | None,
-    prior: Path | None,
+def _parameters(
+    texture: Texture,
+    maps: Maps3D,
     mass: float | None,
     share: float | None,
     epsilon: float | None,
-    maps: Path | None,
-    shape: str | None,
-) -> _Law:
-    """One source of coefficients, one of the mass; maps take the place of single ones."""
-    box = None if shape is None else whole_triple(shape, "--shape")
-    from curvafit.priors.coefficients import NAMES, Coefficients
+) -> dict[str, Any]:
+    """Return the law, the mass or the share, and ε as `generate` takes them; maps take the place of single ones."""
+    from curvafit.priors.coefficients import NAMES
     from curvafit.priors.grid import WORKING_EPSILON
-    from curvafit.volumes.parameter_maps import map_shape, read_maps
 
-    drawn = {} if maps is None else read_maps(maps, box)
     for option, value, name in (("--mass", mass, "mass"), ("--epsilon", epsilon, "epsilon")):
-        if value is not None and name in drawn:
+        if value is not None and name in maps:
             raise ValueError(f"expected either {option} or a map of {name}, got both")
-    given = [value for value in (preset, six, prior) if value is not None]
-    if len(given) > 1 or (not given and not set(NAMES) <= drawn.keys()):
-        raise ValueError(f"expected one of --preset, --coefficients and --prior, got {len(given)} of them")
-    values, own_mass, origin, voxel, unit = _source(preset, six, prior)
-    told = drawn.get("mass", mass)
-    if told is not None and share is not None:
+    mean = maps.get("mass", mass)
+    if mean is not None and share is not None:
         raise ValueError("expected either a mass or --volume-fraction, got both")
-    m0 = None if share is not None else own_mass if told is None else told
-    if m0 is None and share is None:
+    if mean is None and share is None:
+        mean = texture.mass
+    if mean is None and share is None:
         raise ValueError("expected --mass or --volume-fraction beside the coefficients, got none")
-    law = Coefficients(*(drawn.get(name, value) for name, value in zip(NAMES, values, strict=True)))
-    ε = drawn.get("epsilon", WORKING_EPSILON if epsilon is None else epsilon)
-    return _Law(law, m0, share, ε, box or map_shape(drawn) or (EDGE, EDGE, EDGE), origin, voxel, unit)
-
-
-def _source(
-    preset: str | None, six: str | None, prior: Path | None
-) -> tuple[tuple[float, ...], float | None, str, float, str]:
-    """Six coefficients, the mass that goes with them, what they are, and the voxel's edge and unit."""
-    if preset is not None:
-        from curvafit.priors.coefficients import preset as named
-
-        found = named(preset)
-        return tuple(found.coefficients), found.mass, f"preset {preset}", 1.0, "voxel"  # type: ignore[arg-type]
-    if prior is not None:
-        from curvafit.priors import read_fit
-
-        fit = read_fit(prior)
-        return tuple(fit.coefficients), fit.mass, f"prior {prior}", fit.working_voxel, fit.unit
-    if six is not None:
-        return numbers(six, "--coefficients", 6), None, "coefficients", 1.0, "voxel"
-    return (1.0, 0.0, 1.0, 0.0, 0.0, 0.0), None, "maps", 1.0, "voxel"
+    law = replace(texture.coefficients, **{name: maps[name] for name in NAMES if name in maps})
+    width = maps.get("epsilon", WORKING_EPSILON if epsilon is None else epsilon)
+    return {"law": law, "mass": mean, "volume_fraction": share, "epsilon": width}
 
 
 def _checkpoint(file: Path | None, every: float | None) -> dict[str, Any]:
@@ -218,22 +207,22 @@ def _checkpoint(file: Path | None, every: float | None) -> dict[str, Any]:
 
 
 def _output(
-    law: _Law, spacing: str | None, unit: str | None, tile: str | None, cap: bool | None, boundary: str
+    texture: Texture, grid: Grid, spacing: str | None, unit: str | None, tile: str | None, cap: bool | None
 ) -> Output:
-    """How to write: the voxel of the options, else the prior's."""
+    """How to write: the voxel of the options, else the fit's."""
     if unit is not None and spacing is None:
         raise ValueError("expected --spacing beside --unit, got none")
-    edges = (law.voxel,) * 3 if spacing is None else triple(spacing, "--spacing")
+    own, own_unit = (1.0, "voxel") if texture.prior is None else (texture.prior.working_voxel, texture.prior.unit)
+    edges = (own,) * 3 if spacing is None else triple(spacing, "--spacing")
     if len(set(edges)) > 1:
         raise ValueError(f"expected --spacing of cubic voxels, one number, got {spacing!r}")
-    if tile is not None and boundary != "periodic":
-        raise ValueError(f"expected --tile with a periodic boundary, got {boundary!r}")
+    if tile is not None and not grid.periodic:
+        raise ValueError(f"expected --tile with a periodic boundary, got {grid.boundary!r}")
     from curvafit.drawing.shape_files import Output
-    from curvafit.priors.grid import Grid
 
     repeats = (1, 1, 1) if tile is None else whole_triple(tile, "--tile")
-    how = Output(edges[0], unit or law.unit, repeats, cap is not False)
-    how.shape(Grid(law.box, boundary=boundary))  # type: ignore[arg-type]
+    how = Output(edges[0], unit or own_unit, repeats, cap is not False)
+    how.shape(grid)
     return how
 
 
@@ -260,16 +249,13 @@ def _check(out: Path, checkpoint: Path | None, cap: bool | None) -> None:
             raise ValueError(f"expected a file of its own for the checkpoint, got {checkpoint}")
 
 
-def _grown(law: _Law, boundary: str, options: dict[str, Any]) -> Flow:
+def _grown(options: dict[str, Any]) -> Flow:
     """The flow, with progress; leaves with exit code 1 where it has no surface, or failed."""
     from curvafit.generation.flow import generate as make
-    from curvafit.priors.grid import Grid
 
-    grid = Grid(law.box, boundary=boundary)  # type: ignore[arg-type]
-    options |= {"volume_fraction": law.share, "epsilon": law.epsilon}
     with flow_progress(options["schedule"].steps) as watch:
         try:
-            flow = make(law.coefficients, law.mass, grid, callbacks=[watch], keep_checkpoint=True, **options)
+            flow = make(**options, callbacks=[watch], keep_checkpoint=True)
         except KeyboardInterrupt as signal:
             if options["checkpoint"] is None or not options["checkpoint"].exists():
                 raise
@@ -289,15 +275,11 @@ def _discard(checkpoint: Path | None) -> None:
         checkpoint.unlink(missing_ok=True)
 
 
-def _write(flow: Flow, law: _Law, out: Path, how: Output, told: dict[str, Any]) -> None:
+def _write(flow: Flow, out: Path, how: Output, record: dict[str, Any], overwrite: bool) -> None:
     """Write everything, and print what and where."""
-    from curvafit.drawing.shape_files import shape_record, step_path, write_shape
+    from curvafit.drawing.shape_files import step_path, write_shape
 
-    overwrite = told.pop("overwrite")
     notes = [] if flow.viability.viable else [flow.status]
-    mass = flow.mass if law.mass is None else law.mass
-    told |= {"origin": law.origin, "wanted_volume_fraction": law.share, "snapshots": list(flow.snapshots)}
-    record = shape_record(flow, law.coefficients, mass, epsilon=law.epsilon, output=how, **told, command=command_line())
     files = write_shape(flow, out, output=how, record=record, overwrite=overwrite)
     notes += [f"no surface after {step} steps" for step in flow.snapshots if step_path(out, step) not in files]
     for note in notes:

@@ -23,7 +23,7 @@ from curvafit.generation.memory import FILE, check_memory
 from curvafit.geometry.mesh import NoSurface, Surface, solid_surface, surface
 from curvafit.geometry.mesh_files import SUFFIXES, write_surface
 from curvafit.priors.bounds import LONGEST, SHORTEST, instance, real, several, whole
-from curvafit.priors.coefficients import NAMES, Coefficients
+from curvafit.priors.coefficients import NAMES
 from curvafit.priors.curvature import geometric_curvatures, jet
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.priors.profile import profile_distance
@@ -240,24 +240,23 @@ def write_field(field: Tensor, grid: Grid, path: str | Path, output: Output | No
 
 def shape_record(
     flow: Flow,
-    coefficients: Coefficients,
-    mass: float | Tensor,
     *,
-    epsilon: float | Tensor = WORKING_EPSILON,
+    mass: float | Tensor | None = None,
     output: Output | None = None,
     **more: Any,
 ) -> dict[str, Any]:
     """What is needed to make the shape again: parameters, sampling, seed, schedule, versions; and how it ended.
 
-    A parameter that varies in space is stated by its least and greatest value.
+    The mass is the flow's own where none is given: that of the field, to float32. A parameter that varies in space is
+    stated by its least and greatest value.
     """
     return {
         "format": FORMAT,
-        "coefficients": dict(zip(NAMES, map(_stated, coefficients), strict=True)),
-        "mass": _stated(mass),
+        "coefficients": dict(zip(NAMES, map(_stated, flow.coefficients), strict=True)),
+        "mass": _stated(flow.mass if mass is None else mass),
         "shape": list(flow.grid.shape),
         "working_spacing": list(flow.grid.spacing),
-        "epsilon": _stated(epsilon),
+        "epsilon": _stated(flow.epsilon),
         "boundary": flow.grid.boundary,
         "seed": flow.seed,
         "schedule": dataclasses.asdict(flow.schedule),

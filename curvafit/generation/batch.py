@@ -111,5 +111,5 @@ def _together(jobs: list[_Job], grid: Grid, told: dict[str, Any]) -> list[Flow]:
     starts = [white_noise(grid, job.seed) for job in jobs]
     each = [job.coefficients for job in jobs]
     moved = CudaStepper(starts, [form.base for form in forms], costs[0], each, plan.betas, None, told["device"])
-    orders = Orders(grid, costs[0].epsilon, plan, snapshots=told["snapshots"], reject_early=told["reject_early"])
-    return run(moved, [orders] * len(jobs), [job.seed for job in jobs])
+    shared = {name: told[name] for name in ("snapshots", "reject_early")}
+    return run(moved, [Orders(cost, plan, **shared) for cost in costs], [job.seed for job in jobs])

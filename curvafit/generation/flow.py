@@ -109,7 +109,7 @@ def generate(
     grid, seed = grid if isinstance(grid, Grid) else Grid(grid), seed_of(seed)  # type: ignore[arg-type]
     place, plan = Place(backend, device, checkpoint, checkpoint_every, keep_checkpoint), named_schedule(schedule)
     cost = Cost(texture.coefficients, grid, epsilon, orientation, blur)
-    orders = Orders(grid, cost.epsilon, plan, callbacks, snapshots, reject_early, volume_fraction)
+    orders = Orders(cost, plan, callbacks, snapshots, reject_early, volume_fraction)
     orders.check_memory(device)
     base = base_of(mass, volume_fraction, grid)
     form = DivergenceForm.of(grid, cost.blur, base, place.blur)
@@ -147,7 +147,7 @@ def relax(
     """
     cost = Cost(texture_of(law).coefficients, grid, epsilon, orientation, blur)
     place = Place(backend, device, checkpoint, checkpoint_every)
-    orders = Orders(grid, cost.epsilon, named_schedule(schedule), callbacks, snapshots)
+    orders = Orders(cost, named_schedule(schedule), callbacks, snapshots)
     return _from_field(field, cost, place, "h-1", "adam", frozen, orders)
 
 
@@ -205,7 +205,7 @@ def descend(
     width = min(grid.spacing) if blur is None and isinstance(grid, Grid) else blur
     cost = Cost(texture_of(law).coefficients, grid, epsilon, orientation, width, data)  # type: ignore[arg-type]
     place = Place(backend, device, checkpoint, checkpoint_every)
-    orders = Orders(grid, cost.epsilon, plan, callbacks, snapshots)
+    orders = Orders(cost, plan, callbacks, snapshots)
     return _from_field(field, cost, place, flow, optimiser, None, orders)
 
 

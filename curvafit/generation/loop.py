@@ -15,13 +15,13 @@ from torch import Tensor
 
 from curvafit.generation import fraction
 from curvafit.generation.checkpoint import Checkpoint
+from curvafit.generation.cost import Cost
 from curvafit.generation.memory import FIELD, FLOW, check_memory
 from curvafit.generation.result import RECORD_EVERY, Callback, Flow, History, State
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.stepper import Shape, Statistics, Stepper
 from curvafit.generation.viability import Viability, viability
 from curvafit.priors.bounds import quoted, several
-from curvafit.priors.grid import Grid
 
 #: A flow whose energy falls by less than this share over its last tenth is called converged.
 SETTLED = 0.01
@@ -33,8 +33,8 @@ class Orders:
 
     Parameters
     ----------
-    grid, epsilon, plan
-        The sampling, ε for the viability checks, and the steps.
+    cost, plan
+        What is lowered, and the steps.
     callbacks, reject_early, snapshots, volume_fraction
         As in `generate`.
 
@@ -44,8 +44,7 @@ class Orders:
         If a snapshot is not among the plan's steps, or a callback is not one.
     """
 
-    grid: Grid
-    epsilon: float | Tensor
+    cost: Cost
     plan: Schedule
     callbacks: Sequence[Callback] = ()
     snapshots: Sequence[int] = ()
@@ -61,9 +60,9 @@ class Orders:
 
     def check_memory(self, device: torch.device | str) -> None:
         """Raise ValueError where a flow does not fit into a device's memory, or its snapshots into the machine's."""
-        check_memory(self.grid.shape, FLOW, "a box", device)
+        check_memory(self.cost.grid.shape, FLOW, "a box", device)
         kept = len(set(self.snapshots))
-        check_memory(self.grid.shape, FIELD * kept, f"a box with {kept} snapshots")
+        check_memory(self.cost.grid.shape, FIELD * kept, f"a box with {kept} snapshots")
 
     def next_mark(self, made: int) -> int:
         """The number of steps after which to look again."""
@@ -168,12 +167,15 @@ class _Lane:
     def end(self) -> Flow:
         """What came out."""
         assert self._field is not None
-        orders, end = self._orders, self._viability(self._field)
+        orders, cost, end = self._orders, self._orders.cost, self._viability(self._field)
         if self._failure:
             end = dataclasses.replace(end, viable=False, reason=self._failure)
         history = History(*np.array(self.rows, dtype=np.float64).T)
         status = self._status(end, history)
-        return Flow(self._field, history, status, orders.grid, end, orders.plan, self._seed, self._mass, self.kept)
+        return Flow(
+            self._field, history, status, cost.grid, end, orders.plan, self._seed, self._mass, self.kept,
+            cost.coefficients, cost.epsilon,
+        )  # fmt: skip
 
     def _record(self, made: int, last: bool) -> None:
         """The history's newest row, the guard against NaN, the callbacks, and the next mass."""
@@ -194,7 +196,7 @@ class _Lane:
             shape.shift(fraction.correction(shape.field(), share, mass, total))
 
     def _viability(self, u: Tensor) -> Viability:
-        return viability(u, self._orders.grid, self._orders.epsilon)
+        return viability(u, self._orders.cost.grid, self._orders.cost.epsilon)
 
     def _status(self, end: Viability, history: History) -> str:
         if self.stop:

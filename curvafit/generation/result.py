@@ -11,6 +11,8 @@ from torch import Tensor
 
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.viability import Viability
+from curvafit.pictures import Pictured
+from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
 
 #: Steps between two entries of the history (and two calls of the callbacks).
@@ -46,12 +48,26 @@ class Callback(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class Flow:
-    """The end of a flow: the field, float32 `(Z, Y, X)`, how it came there, and whether it is a shape.
+@dataclass(frozen=True, repr=False, eq=False)
+class Flow(Pictured):
+    """The end of a flow: the field, how it came there, and whether it is a shape.
 
-    `status` is a sentence; `seed` is None where the flow started from a given field; `mass` is the mean of the field,
-    and `snapshots` the fields that were asked for, by the number of steps made.
+    Attributes
+    ----------
+    field
+        u, float32 `(Z, Y, X)`.
+    history
+        Figures on the way.
+    status
+        A sentence.
+    coefficients, epsilon
+        What was lowered: numbers, or tensors that vary in space, in the unit of the grid's spacing.
+    seed
+        None where the flow started from a given field.
+    mass
+        The mean of the field.
+    snapshots
+        The fields that were asked for, by the number of steps.
     """
 
     field: Tensor
@@ -63,6 +79,13 @@ class Flow:
     seed: int | None
     mass: float
     snapshots: Mapping[int, Tensor]
+    coefficients: Coefficients
+    epsilon: float | Tensor
+
+    def __repr__(self) -> str:
+        voxels, energy = " x ".join(map(str, self.grid.shape)), self.history.energy[-1]
+        viable = "viable" if self.viability.viable else "not viable"
+        return f"Flow({voxels} voxels of {self.grid.spacing[0]:g}, energy {energy:.4g}, {viable}: {self.status})"
 
     @property
     def finite(self) -> bool:
