@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
     from curvafit.data_synth.imaging.modality import Modality
     from curvafit.data_synth.sets.sets import Order
-    from curvafit.data_synth.sets.sources import Source
+    from curvafit.data_synth.sets.sources import ShapeSource
 
 EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
     (
-        "curvafit synth -o Dataset101_Tubes --presets tubes,sponge --modality confocal --count 200 --shape 96",
+        "curvafit synth -o Dataset101_Tubes --preset tubes,sponge --modality confocal --count 200 --shape 96",
         "curvafit synth -o Dataset102_Bone --prior bone/fit.json --like bone.nii.gz --count 200 --shape 64",
         "curvafit synth -o set --atlas store.zarr --layout monai --labels distance,centreline --shape 48",
     )
@@ -41,12 +41,20 @@ Parts = Annotated[
     _out("--labels", help="Besides masks: distance, skeleton, instances, kappa1, kappa2, radius, betti, centreline."),
 ]
 Seed = Annotated[int, _out(help="The same seed makes the same voxels.")]
-Prior = Annotated[Path | None, _what(help="fit.json of `curvafit infer`.")]
+Laws = Annotated[
+    str | None,
+    _what(
+        "--prior",
+        "--preset",
+        "--presets",
+        help="Laws to grow shapes of: published shapes by name (`curvafit presets`) or fit.json files of `curvafit "
+        "infer`, several between commas.",
+    ),
+]
 Atlas = Annotated[
     Path | None,
     _what(help="Store of `curvafit atlas build`, cropped; or an atlas (.npz), whose shapes are grown anew."),
 ]
-Presets = Annotated[str | None, _what(help="Published shapes, by name: tubes,sponge. See `curvafit presets`.")]
 Calibres = Annotated[
     str,
     _seen(
@@ -80,9 +88,8 @@ def synth(
     out: Target,
     count: Count = 200,
     shape: Shape = "96",
-    prior: Prior = None,
+    laws: Laws = None,
     atlas: Atlas = None,
-    presets: Presets = None,
     volume_fraction: Filled = None,
     modality: Kind = None,
     like: Like = None,
@@ -110,14 +117,17 @@ def synth(
         check_workers(workers, scheduler)
         if unit is not None and spacing is None and voxel is None:
             raise ValueError("expected --unit beside --spacing or --voxel, got neither")
-        source, edge, edge_unit = _source(prior, atlas, presets, volume_fraction)
+        stated = [] if laws is None else laws.split(",")
+        source = _source(stated, atlas, volume_fraction)
         seen = _modality(modality, like, like_mask, visible, reading_of(spacing, unit, strict=strict))
         from curvafit.data_synth.sets.case import Recipe
         from curvafit.data_synth.sets.sets import Order
+        from curvafit.data_synth.sets.sources import voxel_of
+        from curvafit.volumes.formats.base import convert_length
 
-        told, its = (edge, edge_unit) if voxel is None else (voxel, unit)
+        edge = voxel_of(stated, seen) if voxel is None else convert_length(voxel, unit, seen.base.unit)
         low, high = numbers(calibres, "--calibres", 2)
-        recipe = Recipe(source, seen, box, _edge(told, its, seen), seed, (low, high))
+        recipe = Recipe(source, seen, box, edge, seed, (low, high))
         _build(
             out,
             Order(recipe, layout, tuple(labels.split(",")) if labels else ()),
@@ -148,39 +158,23 @@ def _build(out: Path, order: Order, count: int, how: tuple[int | None, str | Non
     say(str(preview))
 
 
-def _source(
-    prior: Path | None, atlas: Path | None, presets: str | None, filled: float | None
-) -> tuple[Source, float | None, str | None]:
-    """Where shapes come from, and the edge and unit of their voxels where that is known."""
-    given = [value for value in (prior, atlas, presets) if value is not None]
-    if len(given) != 1:
-        raise ValueError(f"expected one of --prior, --atlas and --presets, got {len(given)} of them")
+def _source(laws: list[str], atlas: Path | None, filled: float | None) -> ShapeSource:
+    """Where shapes come from."""
+    if bool(laws) == (atlas is not None):
+        raise ValueError(f"expected either --prior (or --preset) or --atlas, got {'both' if laws else 'neither'}")
     from curvafit.data_synth.sets.sources import Generated, Stored
 
-    if presets is not None:
-        from curvafit.priors.coefficients import preset
-
-        names = tuple(presets.split(","))
-        found = [preset(name) for name in names]
-        points = tuple((*map(float, each.coefficients), each.mass) for each in found)  # type: ignore[arg-type]
-        return Generated(points, names, fraction=filled), None, None
-    if prior is not None:
-        from curvafit.priors import read_fit
-
-        fit = read_fit(prior)
-        point = (*map(float, fit.coefficients), fit.mass)  # type: ignore[arg-type]
-        filled = fit.volume_fraction if filled is None else filled
-        return Generated((point,), (prior.name,), fraction=filled), fit.working_voxel, fit.unit
-    assert atlas is not None
+    if atlas is None:
+        return Generated.of(laws, filled)
     if atlas.suffix.lower() != ".npz":
         if filled is not None:
             raise ValueError("expected --volume-fraction beside shapes that are grown, got a store of shapes")
-        return Stored((atlas.resolve(),)), None, None
+        return Stored((atlas.resolve(),))
     from curvafit.inference.atlas import load_atlas
 
     held = load_atlas(atlas)
     points = tuple((*map(float, row), float(mass)) for row, mass in zip(held.coefficients, held.masses, strict=True))
-    return Generated(points, held.ids, fraction=filled), None, None
+    return Generated(points, held.ids, fraction=filled)
 
 
 def _modality(
@@ -221,10 +215,3 @@ def _visible(seen: Modality, told: str | None) -> Modality:
 
     share = visible_share(seen.base) if told == "auto" else numbers(told, "--visible", 1)[0]
     return replace(seen, base=replace(seen.base, visible=share))
-
-
-def _edge(edge: float | None, unit: str | None, seen: Modality) -> float:
-    """The edge of a shape's voxel in the images' unit."""
-    from curvafit.volumes.formats.base import convert_length
-
-    return seen.voxel if edge is None else convert_length(edge, unit, seen.base.unit)
