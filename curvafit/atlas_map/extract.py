@@ -19,18 +19,17 @@ from curvafit.generation.viability import FORMED, well_formed
 from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram, diagrams
 from curvafit.inference.atlas import Atlas
 from curvafit.priors.grid import Grid
+from curvafit.progress import Progress, silent
 
 #: What is measured of a draw: volume fraction of {u > 0}, diagram of the field, diagram of its mask.
 Measured = tuple[float, Diagram, Diagram]
-#: Progress(shapes measured, shapes), called before each.
-Progress = Callable[[int, int], None]
 
 
 def extract(
     store: str | Path | Store,
     command: Sequence[str] = (),
     measure: Callable[[Store, Record], Measured] | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Atlas:
     """Measure every well-formed shape of a store (`generation.viability.well_formed`), as field and as mask.
 
@@ -43,7 +42,7 @@ def extract(
     measure
         What to call in place of `measured`: one that remembers.
     progress
-        Called before each shape with the number of those measured, and of all.
+        Called before each shape with a sentence and the share of the shapes that are measured.
 
     Raises
     ------
@@ -69,11 +68,10 @@ def extract(
 
 
 def _measures(
-    store: Store, kept: list[Record], measure: Callable[[Store, Record], Measured], progress: Progress | None
+    store: Store, kept: list[Record], measure: Callable[[Store, Record], Measured], progress: Progress
 ) -> Iterator[Measured]:
     for done, record in enumerate(kept):
-        if progress is not None:
-            progress(done, len(kept))
+        progress(f"measuring {len(kept)} shapes", done / len(kept))
         yield measure(store, record)
 
 

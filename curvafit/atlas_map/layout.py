@@ -25,8 +25,6 @@ LEAST_SHAPES = 5
 #: What HDBSCAN calls a point of no cluster.
 NOISE = -1
 
-Progress = Callable[[str, float], None]
-
 
 @dataclass(frozen=True, eq=False)
 class AtlasMap:

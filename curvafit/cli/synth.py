@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli.atlas import DashboardOption, SchedulerOption, WorkersOption
-from curvafit.cli.support import error_console, kept, numbers, plainly, reading_of, say, say_notes, stages, whole_triple
+from curvafit.cli.support import error_console, numbers, plainly, reading_of, say, say_notes, whole_triple
+from curvafit.cli.workers import Crew, DashboardOption, SchedulerOption, WorkersOption
 
 if TYPE_CHECKING:
     import numpy as np
@@ -109,12 +109,11 @@ def synth(
 ) -> None:
     """Make a training set: images of generated shapes with exact labels."""
     with plainly():
-        from curvafit.data_synth.atlas.workers import check_workers
-
         box = whole_triple(shape, "--shape")
         if count < 1:
             raise ValueError(f"expected --count of at least 1, got {count}")
-        check_workers(workers, scheduler)
+        crew = Crew(workers, scheduler, dashboard)
+        crew.check()
         if unit is not None and spacing is None and voxel is None:
             raise ValueError("expected --unit beside --spacing or --voxel, got neither")
         stated = [] if laws is None else laws.split(",")
@@ -128,29 +127,19 @@ def synth(
         edge = voxel_of(stated, seen) if voxel is None else convert_length(voxel, unit, seen.base.unit)
         low, high = numbers(calibres, "--calibres", 2)
         recipe = Recipe(source, seen, box, edge, seed, (low, high))
-        _build(
-            out,
-            Order(recipe, layout, tuple(labels.split(",")) if labels else ()),
-            count,
-            (workers, scheduler, dashboard),
-        )
+        _build(out, Order(recipe, layout, tuple(labels.split(",")) if labels else ()), count, crew)
 
 
-def _build(out: Path, order: Order, count: int, how: tuple[int | None, str | None, int | None]) -> None:
-    from curvafit.data_synth.atlas.workers import cluster
+def _build(out: Path, order: Order, count: int, crew: Crew) -> None:
     from curvafit.data_synth.sets.picture import write_preview
     from curvafit.data_synth.sets.sets import build_set, cases_of
     from curvafit.files import check_folder
-    from curvafit.generation.memory import FLOW, check_memory
 
     check_folder(out)
-    _, scheduler, _ = how
-    if scheduler is None and order.recipe.source.within == math.inf:
-        check_memory(order.recipe.largest, FLOW, "a shape")
-    with kept(), stages() as progress:
-        progress("starting workers", 0.0)
-        with cluster(*how) as crew:
-            build_set(out, order, count, lambda n, of: progress(f"{n} of {of} cases", n / of), workers=crew)
+    if order.recipe.source.within == math.inf:
+        crew.check(order.recipe.largest)
+    with crew.at_work() as (makers, progress):
+        build_set(out, order, count, progress, workers=makers)
     preview = write_preview(out)
     if (held := len(cases_of(out))) > count:
         say(f"note: {out} holds {held} cases, more than --count {count}: all are listed", to=error_console())

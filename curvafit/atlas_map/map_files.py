@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from curvafit.atlas_map.extract import Measured, extract, measured, shape_id
-from curvafit.atlas_map.layout import AtlasMap, Progress, check_extra, check_size, diagram_distances, embed, map_atlas
+from curvafit.atlas_map.layout import AtlasMap, check_extra, check_size, diagram_distances, embed, map_atlas
 from curvafit.atlas_map.page import page_html
 from curvafit.atlas_map.picture import map_picture
 from curvafit.atlas_map.shapes import Shown, regrow_command, shown
@@ -26,6 +26,7 @@ from curvafit.files import bears, check_folder, check_free, is_empty, write_cont
 from curvafit.generation.viability import well_formed
 from curvafit.geometry.diagram import Diagram
 from curvafit.inference.atlas import Atlas
+from curvafit.progress import Progress, silent
 from curvafit.volumes.formats import read_archive
 
 #: Folder beside the two files for what took long: measured shapes, distances, places.
@@ -67,7 +68,7 @@ def write_map(
     device: str = "cpu",
     command: str = "",
     overwrite: bool = False,
-    progress: Progress,
+    progress: Progress = silent,
 ) -> tuple[Path, Path]:
     """Write `atlas.png` and `atlas.html` of a store's well-formed shapes into a folder; returns their paths.
 
@@ -112,10 +113,8 @@ def _looked_at(store: Store, cache: Path, progress: Progress) -> tuple[Atlas, li
         shapes.append(Shown(kept["thumbnail"].tobytes(), kept["volume"].tobytes()))
         return float(kept["fraction"]), _diagram(kept, "field"), _diagram(kept, "mask")
 
-    def told(done: int, count: int) -> None:
-        progress(f"measuring {count} shapes", 0.6 * done / count)
-
-    return extract(store, measure=look, progress=told), records, shapes, commands
+    atlas = extract(store, measure=look, progress=lambda text, share: progress(text, 0.6 * share))
+    return atlas, records, shapes, commands
 
 
 def _look(store: Store, record: Record) -> _Arrays:
