@@ -126,7 +126,7 @@ def main() -> None:
         speed, start = rate(dataset, options.workers)
         total, spent = shares(dataset)
         told = ", ".join(f"{stage} {ms / total:.0%}" for stage, ms in spent.most_common())
-        voxels = " x ".join(map(str, dataset.shape))
+        voxels = " x ".join(map(str, dataset.size))
         rest = 1 - sum(spent.values()) / total
         print(f"{name:>14} {voxels:>14} {speed:8.1f} {start:8.1f} {total:10.1f}; {told}, rest {rest:.0%}", flush=True)
 

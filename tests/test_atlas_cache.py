@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from exact_store import exact_field, exact_store, no_progress, quick_map
+from exact_store import exact_field, exact_store, quick_map
 
-import curvafit.atlas_map.files as atlas_files
-from curvafit.atlas_map.files import write_map
+import curvafit.atlas_map.map_files as atlas_files
+from curvafit.atlas_map.map_files import write_map
 from curvafit.data_synth.atlas.record import Record
 
 
@@ -28,13 +28,13 @@ def test_nothing_is_measured_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(atlas_files, "_look", look)
     monkeypatch.setattr(atlas_files, "map_picture", lambda mapped, field, path: path)
     exact_store(tmp_path / "s.zarr", 7)
-    _, page = write_map(tmp_path / "s.zarr", tmp_path / "map", progress=no_progress)
+    _, page = write_map(tmp_path / "s.zarr", tmp_path / "map")
     assert looked == [0, 1, 3, 4, 5, 6]
     before = page.read_text()
     exact_store(tmp_path / "s.zarr", 9, first=7)
     kept = sorted((tmp_path / "map" / "cache").glob("shape-3-00004-*"))
     kept[0].write_bytes(kept[0].read_bytes()[:100])
-    write_map(tmp_path / "s.zarr", tmp_path / "map", progress=no_progress)
+    write_map(tmp_path / "s.zarr", tmp_path / "map")
     assert looked == [0, 1, 3, 4, 5, 6, 4, 7, 8] and page.read_text() != before
     assert not list((tmp_path / "map").rglob(".*"))
 
@@ -53,7 +53,7 @@ def test_a_damaged_file_of_distances_is_made_anew(tmp_path: Path, monkeypatch: p
     exact_store(tmp_path / "s.zarr", 7)
     (tmp_path / "map" / "cache").mkdir(parents=True)
     (tmp_path / "map" / "cache" / "distances.npz").write_bytes(b"torn")
-    _, page = write_map(tmp_path / "s.zarr", tmp_path / "map", overwrite=True, progress=no_progress)
+    _, page = write_map(tmp_path / "s.zarr", tmp_path / "map", overwrite=True)
     assert page.exists() and not (tmp_path / "map" / "cache" / "distances.npz").exists()
 
 
@@ -72,7 +72,7 @@ def test_shapes_that_a_build_adds_meanwhile_mix_up_nothing(tmp_path: Path, monke
 
     monkeypatch.setattr(atlas_files, "extract", extract_later)
     monkeypatch.setattr(atlas_files, "map_picture", picture)
-    _, page = write_map(store, tmp_path / "map", progress=no_progress)
+    _, page = write_map(store, tmp_path / "map")
     assert len(shown_of) == 8
     for name, u in shown_of.items():
         np.testing.assert_array_equal(u, exact_field(int(name.split("-")[1])))

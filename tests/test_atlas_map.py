@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calling import call, refused
-from exact_store import FAMILIES, SETTINGS, exact_field, exact_record, exact_store, no_progress, quick_map
+from exact_store import FAMILIES, SETTINGS, exact_field, exact_record, exact_store, quick_map
 from scipy.spatial.distance import cdist
 
 import curvafit.atlas_map.layout as atlas_map
 from curvafit.atlas_map.extract import extract
-from curvafit.atlas_map.files import write_map
 from curvafit.atlas_map.layout import NOISE, AtlasMap, embed, find_clusters, map_atlas
+from curvafit.atlas_map.map_files import write_map
 from curvafit.atlas_map.picture import _assigned, _slots, spread_out
 from curvafit.atlas_map.shapes import CUT, LEVELS, regrow_command, shown, small_volume
 from curvafit.generation.flow import generate
@@ -44,7 +44,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     exact_store(folder / "s.zarr", COUNT)
     with pytest.MonkeyPatch.context() as patch:
         quick_map(patch)
-        write_map(folder / "s.zarr", folder / "map", command="curvafit atlas map <s>", progress=no_progress)
+        write_map(folder / "s.zarr", folder / "map", command="curvafit atlas map <s>")
     return folder
 
 

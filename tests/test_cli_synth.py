@@ -76,7 +76,7 @@ def test_a_set_of_inferred_shapes_like_a_scan(tmp_path, store):
 def test_a_set_of_presets_and_of_an_atlas_file(tmp_path):
     quick = ["--count", "1", "--shape", "16", "--workers", "0", "--modality", "micro-CT"]
     out = tmp_path / "presets"
-    assert call("synth", "-o", out, "--presets", "tubes,sponge", *quick).exit_code == 0
+    assert call("synth", "-o", out, "--preset", "tubes,sponge", *quick).exit_code == 0
     assert json.loads((out / "cases" / "case_00000.json").read_text())["source"]["name"] == "tubes"
 
 
@@ -87,11 +87,12 @@ def test_bad_input(tmp_path, store):
     refused(call(*some, *kind, "--shape", "64"), "expected crops within the 24 voxels of the stored shapes")
     missing = ["synth", "-o", out, "--atlas", tmp_path / "none.zarr", *kind]
     refused(call(*missing), "expected a store of shapes at")
-    refused(call("synth", "-o", out, *kind), "expected one of --prior, --atlas and --presets, got 0 of them")
-    refused(call(*some, *kind, "--presets", "tubes"), "got 2 of them")
+    refused(call("synth", "-o", out, *kind), "expected either --prior (or --preset) or --atlas, got neither")
+    refused(call(*some, *kind, "--presets", "tubes"), "expected either --prior (or --preset) or --atlas, got both")
     refused(call(*some), "expected either --modality or --like, got neither")
     refused(call(*some, "--modality", "x-ray"), "expected a modality among confocal, two-photon")
-    refused(call("synth", "-o", out, "--presets", "tube", *kind), "tube")
+    for option in ("--preset", "--prior"):
+        refused(call("synth", "-o", out, option, "tube", *kind), "expected a preset among")
     refused(call(*some, *kind, "--shape", "2,8,8", "--labels", "betti"), "expected images of at least 4 voxels along")
     refused(
         call("synth", "-o", out, "--presets", "tubes", *kind, "--voxel", "0.001"), "expected shapes of at most 1e+09"

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from curvafit.data_synth.sets.moves import SYMMETRIES, any_crop, cropped, turned
+from curvafit.data_synth.sets.moves import SYMMETRIES, any_crop, cropped, rotated, turned
 
 VALUES = np.random.default_rng(0).random((3, 4, 5))
 
@@ -44,8 +45,35 @@ def test_a_crop_of_the_whole_is_a_shift():
     assert (cropped(turned(VALUES, how["symmetry"]), how["corner"], (3, 3, 3)) == found).all()
 
 
+def test_a_rotation_by_a_quarter_is_a_symmetry():
+    """About the middle of the crop, for each axis; float32 rounds the places of the voxels off."""
+    cube = np.random.default_rng(1).random((9, 9, 9))
+    half = np.sqrt(0.5)
+    for k, plane in enumerate(((1, 2), (2, 0), (0, 1))):
+        quaternion = [half * (k == axis) for axis in range(3)] + [half]
+        found = rotated(cube, (2, 1, 3), (5, 5, 5), quaternion)
+        np.testing.assert_allclose(found, np.rot90(cropped(cube, (2, 1, 3), (5, 5, 5)), 1, plane), atol=1e-4)
+
+
+def test_a_rotated_plane_is_the_plane_rotated():
+    """The profile tanh(d / √2 ε) has |u''| < 0.385 / ε², and linear interpolation is off by up to an eighth of the sum
+    over the axes."""
+    epsilon, normal = 2.0, np.array([0.6, 0.0, 0.8])
+    points = np.stack(np.meshgrid(*(np.arange(n) - (n - 1) / 2 for n in (48, 48, 48)), indexing="ij"), -1)
+    profile = np.tanh(points @ normal / (np.sqrt(2) * epsilon))
+    quaternion, shape = [0.1, -0.4, 0.3, 0.7], (12, 16, 20)
+    corner = [(48 - n) // 2 for n in shape]
+    turn = Rotation.from_quat(quaternion).as_matrix()
+    own = np.stack(np.meshgrid(*(np.arange(n) - (n - 1) / 2 for n in shape), indexing="ij"), -1)
+    exact = np.tanh(own @ (turn @ normal) / (np.sqrt(2) * epsilon))
+    error = np.abs(rotated(profile, corner, shape, quaternion) - exact).max()
+    assert error < 0.385 / epsilon**2 / 8 + 1e-3
+    assert np.abs(profile[18:30, 16:32, 14:34] - exact).max() > 0.5
+    assert rotated(profile, corner, (1, 4, 4), quaternion).shape == (1, 4, 4)
+
+
 def test_what_cannot_be():
-    with pytest.raises(ValueError, match=r"expected a crop within the shape's \(3, 4, 5\) voxels, got \(4, 4, 4\)"):
-        cropped(VALUES, (0, 0, 0), (4, 4, 4))
+    with pytest.raises(ValueError, match=r"expected a crop within the shape's .* voxels, got \(6, 6, 6\)"):
+        any_crop(VALUES, (6, 6, 6), np.random.default_rng(0))
     with pytest.raises(ValueError, match="expected a symmetry from 0 to 47, got 48"):
         turned(VALUES, 48)

@@ -79,9 +79,9 @@ def test_a_set_goes_on_and_ends_the_same(tmp_path, order):
     whole = build_set(tmp_path / "whole", order, 4)
     part = build_set(tmp_path / "part", order, 2)
     untouched = (part / "labelsTr" / "case_00000.nii.gz").stat().st_mtime_ns
-    told = []
-    build_set(part, order, 4, lambda done, count: told.append((done, count)))
-    assert told == [(3, 4), (4, 4)]
+    reports = []
+    build_set(part, order, 4, lambda text, share: reports.append((text, share)))
+    assert reports == [("3 of 4 cases", 0.75), ("4 of 4 cases", 1.0)]
     assert sums(whole) == sums(part) and len(sums(part)) == 4
     assert (part / "labelsTr" / "case_00000.nii.gz").stat().st_mtime_ns == untouched
     assert json.loads((part / "dataset.json").read_text())["numTraining"] == 4

@@ -18,8 +18,9 @@ from curvafit.data_synth.atlas.store import open_store
 from curvafit.data_synth.imaging.modality import Modality
 from curvafit.data_synth.imaging.parameters import Contrast, Imaging, Noise, Optics
 from curvafit.data_synth.sets import training
-from curvafit.data_synth.sets.moves import cropped, turned
+from curvafit.data_synth.sets.moves import cropped, rotated, turned
 from curvafit.data_synth.sets.training import Sample, TextureDataset, as_dict, as_monai, as_subject
+from curvafit.priors import preset
 
 QUIET = Modality("quiet", "for tests", 1.0, Imaging(optics=Optics(blur=(0.5, 0.5, 0.5)), noise=Noise(gaussian=1.0)))
 SHAPE = (12, 16, 20)
@@ -135,6 +136,62 @@ def test_monai_s_form(store):
     assert (made["label"].numpy() == sample.label.numpy()).all()
 
 
+def test_one_number_is_a_cube_and_a_name_a_modality(store):
+    dataset = TextureDataset(store, "Micro_CT", 12, length=5)
+    assert dataset[0].image.shape == (1, 12, 12, 12) and dataset[0].record["modality"] == "micro-ct"
+    assert repr(dataset) == "TextureDataset(7 shapes of s.zarr; micro-ct; 12 x 12 x 12 voxels; 5 samples an epoch)"
+
+
+def test_images_are_normalised_as_asked(store):
+    plain, score, share, own = (
+        TextureDataset(store, QUIET, SHAPE, normalise=how)[0].image for how in (None, "zscore", "percentile", torch.neg)
+    )
+    assert float(score.mean()) == pytest.approx(0, abs=1e-4) and float(score.std()) == pytest.approx(1, abs=1e-4)
+    torch.testing.assert_close(score * plain.std() + plain.mean(), plain)
+    assert float(share.min()) == 0 and float(share.max()) == 1
+    assert 0.985 < float(((share > 0) & (share < 1)).double().mean()) < 0.995
+    assert torch.equal(own, -plain)
+    with pytest.raises(ValueError, match="expected a normalisation among zscore, percentile, a function or None"):
+        TextureDataset(store, QUIET, SHAPE, normalise="minmax")
+
+
+def test_shapes_turned_by_any_angle(store):
+    dataset = TextureDataset(store, QUIET, SHAPE, blend=0.0, rotate=True)
+    image, label, _, record = dataset[3]
+    (origin,) = record["source"]
+    whole = turned(open_store(store).field(int(origin["name"].split()[-1])), origin["symmetry"])
+    field = rotated(whole, origin["corner"], SHAPE, origin["quaternion"])
+    assert ((label[0].numpy() > 0) == (field > 0)).all() and not (
+        field == cropped(whole, origin["corner"], SHAPE)
+    ).all()
+    assert np.corrcoef(image.numpy().ravel(), field.ravel())[0, 1] > 0.9
+
+
+def test_shapes_of_laws(tmp_path):
+    """A few shapes that are generated once, by each process; a law by its name, by its numbers, or both."""
+    made = []
+    tubes = preset("tubes")
+    for laws in ("tubes", [tubes, "sponge"]):
+        dataset = TextureDataset(laws, QUIET, 12, shapes=2, seed=1)
+        assert dataset.source.within == 16
+        made.append([dataset[k] for k in (0, 1)])
+    for sample in (sample for samples in made for sample in samples):
+        assert 0 < float(sample.label.float().mean()) < 1
+        assert sample.record["source"][0]["parameters"]["a02"] in (
+            tubes.coefficients.a02,
+            preset("sponge").coefficients.a02,
+        )
+    filled = TextureDataset(tubes.coefficients, QUIET, 12, shapes=1, volume_fraction=0.2)
+    assert dataset.voxels == filled.voxels == [QUIET.voxel]
+    assert repr(filled).startswith("TextureDataset(1 shapes of coefficients; quiet; 12 x 12 x 12 voxels")
+    with pytest.raises(
+        ValueError, match="expected a law with a mass, or a volume fraction beside it, got coefficients"
+    ):
+        TextureDataset(tubes.coefficients, QUIET, 12)
+    with pytest.raises(ValueError, match="expected a preset among"):
+        TextureDataset("tubez", QUIET, 12)
+
+
 def test_torchio_s_form(store):
     pytest.importorskip("torchio", reason="needs TorchIO")
     wide = Modality("wide", "for tests", 1.0, Imaging(spacing=(2.0, 1.0, 1.0)))
@@ -149,7 +206,7 @@ def test_bad_input(store, tmp_path):
         TextureDataset(store, QUIET, (25, 8, 8))
     with pytest.raises(FileNotFoundError, match="expected a store of shapes at .*missing.zarr"):
         TextureDataset(tmp_path / "missing.zarr", QUIET, SHAPE)
-    with pytest.raises(ValueError, match="expected at least one store and one modality, got 1 and 0"):
+    with pytest.raises(ValueError, match="expected at least one source and one modality, got 1 and 0"):
         TextureDataset(store, [], SHAPE)
     with pytest.raises(ValueError, match="expected 3 edges and a length above 0, and a blend in"):
         TextureDataset(store, QUIET, SHAPE, blend=1.5)

@@ -33,7 +33,7 @@ from curvafit.generation.schedule import schedule
 if __name__ == "__main__":
     with cluster(2) as crew:
         plan = schedule("fast", steps={PLAN.steps})
-        build(sys.argv[1], {COUNT}, {EDGE}, 1, plan, lambda r, v, n: print(r.index, flush=True), workers=crew)
+        build(sys.argv[1], {COUNT}, {EDGE}, 1, plan, lambda text, share: print(text, flush=True), workers=crew)
 """
 
 
@@ -57,7 +57,7 @@ def test_two_workers_make_the_store_that_one_process_makes_though_one_is_killed(
         assert listening() == {"127.0.0.1"}
         killed = []
 
-        def kill_once(record, viable, draws):
+        def kill_once(text, share):
             if not killed:
                 killed.append(os.kill(pids[0], signal.SIGKILL))
 

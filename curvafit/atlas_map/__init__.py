@@ -8,8 +8,8 @@ from curvafit.faces import offer
 
 if TYPE_CHECKING:
     from curvafit.atlas_map.extract import extract
-    from curvafit.atlas_map.files import write_map
     from curvafit.atlas_map.layout import AtlasMap, map_atlas
+    from curvafit.atlas_map.map_files import write_map
 
 __all__ = [
     "AtlasMap",
@@ -22,7 +22,7 @@ _HOMES = {
     "AtlasMap": "curvafit.atlas_map.layout",
     "extract": "curvafit.atlas_map.extract",
     "map_atlas": "curvafit.atlas_map.layout",
-    "write_map": "curvafit.atlas_map.files",
+    "write_map": "curvafit.atlas_map.map_files",
 }
 
 offer(__name__, _HOMES)

@@ -42,7 +42,7 @@ def extract(
     measure
         What to call in place of `measured`: one that remembers.
     progress
-        Called before each shape with a sentence and the share done.
+        Called before each shape with a sentence and the share of the shapes that are measured.
 
     Raises
     ------

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -20,22 +18,14 @@ from curvafit.cli.support import (
     stages,
     whole_triple,
 )
+from curvafit.cli.workers import Crew, DashboardOption, SchedulerOption, WorkersOption
 
 if TYPE_CHECKING:
-    from curvafit.data_synth.atlas.build import Progress
     from curvafit.data_synth.atlas.design import Design
-    from curvafit.data_synth.atlas.workers import Workers
 
 atlas_app = typer.Typer(help="Collections of generated shapes to match scans against.", no_args_is_help=True)
 
 
-WorkersOption = Annotated[
-    int | None, typer.Option(help="Processes on this machine; as many as cores by default, 0 for none but this.")
-]
-SchedulerOption = Annotated[str | None, typer.Option(help="A running dask scheduler, tcp://HOST:PORT, instead.")]
-DashboardOption = Annotated[
-    int | None, typer.Option(help="Port of dask's own page on 127.0.0.1, for workers on this machine; none by default.")
-]
 _Store = Annotated[Path, typer.Argument(help="Folder of the Zarr store.")]
 
 
@@ -65,20 +55,17 @@ def build_atlas(
         law = _design(design, around, spread)
         from curvafit.data_synth.atlas.build import build, check_count, settings_of
         from curvafit.data_synth.atlas.store import open_store
-        from curvafit.data_synth.atlas.workers import check_workers
         from curvafit.files import check_folder
-        from curvafit.generation.memory import FLOW, check_memory
 
         check_count(count, 1)
-        check_workers(workers, scheduler)
-        if scheduler is None:
-            check_memory(box, FLOW, "a shape")
+        crew = Crew(workers, scheduler, dashboard)
+        crew.check(box)
         settings = settings_of(box, seed, schedule, law)
         if store.exists():
             open_store(store, settings)
         check_folder(store.parent)
-        with _made(count, (workers, scheduler, dashboard)) as (crew, progress):
-            build(store, count, box, seed, schedule, progress, design=law, workers=crew)
+        with crew.at_work() as (makers, progress):
+            build(store, count, box, seed, schedule, progress, design=law, workers=makers)
         say(str(store))
 
 
@@ -94,17 +81,17 @@ def extend_atlas(
     with plainly():
         from curvafit.data_synth.atlas.build import check_count, extend
         from curvafit.data_synth.atlas.store import open_store
-        from curvafit.data_synth.atlas.workers import check_workers
 
         check_count(count, 0)
-        check_workers(workers, scheduler)
+        crew = Crew(workers, scheduler, dashboard)
+        crew.check()
         wanted = open_store(store).wanted + count
 
         def again() -> str:
             return "`--count 0`" if open_store(store).wanted == wanted else "the same command"
 
-        with _made(wanted, (workers, scheduler, dashboard), again) as (crew, progress):
-            extend(store, count, progress, workers=crew)
+        with crew.at_work(again) as (makers, progress):
+            extend(store, count, progress, workers=makers)
         say(str(store))
 
 
@@ -174,7 +161,7 @@ def map_atlas(
     """Lay a store's shapes out on a map: a picture, and a page to explore them in and to place scans on."""
     with plainly():
         with kept(), stages() as progress:
-            from curvafit.atlas_map.files import check_map, write_map
+            from curvafit.atlas_map.map_files import check_map, write_map
 
             check_map(out, store, overwrite)
             told = {"device": device_of(device), "command": command_line(), "overwrite": overwrite}
@@ -197,16 +184,3 @@ def _design(name: str, around: str | None, spread: float | None) -> Design:
     if name in ("random", "sobol"):
         return design.boxed(name)  # type: ignore[arg-type]
     return design_file.read_design(name)
-
-
-@contextmanager
-def _made(
-    count: int, how: tuple[int | None, str | None, int | None], again: Callable[[], str] = lambda: "the same command"
-) -> Iterator[tuple[Workers, Progress]]:
-    """Workers, and a progress bar for them."""
-    from curvafit.data_synth.atlas.workers import cluster
-
-    with kept(again), stages() as progress:
-        progress("starting workers", 0.0)
-        with cluster(*how) as crew:
-            yield crew, lambda _, viable, draws: progress(f"{viable} viable of {draws} draws", viable / count)

@@ -10,19 +10,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli.atlas import DashboardOption, SchedulerOption, WorkersOption
-from curvafit.cli.support import error_console, kept, numbers, plainly, reading_of, say, say_notes, stages, whole_triple
+from curvafit.cli.support import error_console, numbers, plainly, reading_of, say, say_notes, whole_triple
+from curvafit.cli.workers import Crew, DashboardOption, SchedulerOption, WorkersOption
 
 if TYPE_CHECKING:
     import numpy as np
 
     from curvafit.data_synth.imaging.modality import Modality
     from curvafit.data_synth.sets.sets import Order
-    from curvafit.data_synth.sets.sources import Source
+    from curvafit.data_synth.sets.sources import ShapeSource
 
 EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
     (
-        "curvafit synth -o Dataset101_Tubes --presets tubes,sponge --modality confocal --count 200 --shape 96",
+        "curvafit synth -o Dataset101_Tubes --preset tubes,sponge --modality confocal --count 200 --shape 96",
         "curvafit synth -o Dataset102_Bone --prior bone/fit.json --like bone.nii.gz --count 200 --shape 64",
         "curvafit synth -o set --atlas store.zarr --layout monai --labels distance,centreline --shape 48",
     )
@@ -41,12 +41,20 @@ Parts = Annotated[
     _out("--labels", help="Besides masks: distance, skeleton, instances, kappa1, kappa2, radius, betti, centreline."),
 ]
 Seed = Annotated[int, _out(help="The same seed makes the same voxels.")]
-Prior = Annotated[Path | None, _what(help="fit.json of `curvafit infer`.")]
+Laws = Annotated[
+    str | None,
+    _what(
+        "--prior",
+        "--preset",
+        "--presets",
+        help="Laws to grow shapes of: published shapes by name (`curvafit presets`) or fit.json files of `curvafit "
+        "infer`, several between commas.",
+    ),
+]
 Atlas = Annotated[
     Path | None,
     _what(help="Store of `curvafit atlas build`, cropped; or an atlas (.npz), whose shapes are grown anew."),
 ]
-Presets = Annotated[str | None, _what(help="Published shapes, by name: tubes,sponge. See `curvafit presets`.")]
 Calibres = Annotated[
     str,
     _seen(
@@ -80,9 +88,8 @@ def synth(
     out: Target,
     count: Count = 200,
     shape: Shape = "96",
-    prior: Prior = None,
+    laws: Laws = None,
     atlas: Atlas = None,
-    presets: Presets = None,
     volume_fraction: Filled = None,
     modality: Kind = None,
     like: Like = None,
@@ -102,45 +109,37 @@ def synth(
 ) -> None:
     """Make a training set: images of generated shapes with exact labels."""
     with plainly():
-        from curvafit.data_synth.atlas.workers import check_workers
-
         box = whole_triple(shape, "--shape")
         if count < 1:
             raise ValueError(f"expected --count of at least 1, got {count}")
-        check_workers(workers, scheduler)
+        crew = Crew(workers, scheduler, dashboard)
+        crew.check()
         if unit is not None and spacing is None and voxel is None:
             raise ValueError("expected --unit beside --spacing or --voxel, got neither")
-        source, edge, edge_unit = _source(prior, atlas, presets, volume_fraction)
+        stated = [] if laws is None else laws.split(",")
+        source = _source(stated, atlas, volume_fraction)
         seen = _modality(modality, like, like_mask, visible, reading_of(spacing, unit, strict=strict))
         from curvafit.data_synth.sets.case import Recipe
         from curvafit.data_synth.sets.sets import Order
+        from curvafit.data_synth.sets.sources import voxel_of
+        from curvafit.volumes.formats.base import convert_length
 
-        told, its = (edge, edge_unit) if voxel is None else (voxel, unit)
+        edge = voxel_of(stated, seen) if voxel is None else convert_length(voxel, unit, seen.base.unit)
         low, high = numbers(calibres, "--calibres", 2)
-        recipe = Recipe(source, seen, box, _edge(told, its, seen), seed, (low, high))
-        _build(
-            out,
-            Order(recipe, layout, tuple(labels.split(",")) if labels else ()),
-            count,
-            (workers, scheduler, dashboard),
-        )
+        recipe = Recipe(source, seen, box, edge, seed, (low, high))
+        _build(out, Order(recipe, layout, tuple(labels.split(",")) if labels else ()), count, crew)
 
 
-def _build(out: Path, order: Order, count: int, how: tuple[int | None, str | None, int | None]) -> None:
-    from curvafit.data_synth.atlas.workers import cluster
+def _build(out: Path, order: Order, count: int, crew: Crew) -> None:
     from curvafit.data_synth.sets.picture import write_preview
     from curvafit.data_synth.sets.sets import build_set, cases_of
     from curvafit.files import check_folder
-    from curvafit.generation.memory import FLOW, check_memory
 
     check_folder(out)
-    _, scheduler, _ = how
-    if scheduler is None and order.recipe.source.within == math.inf:
-        check_memory(order.recipe.largest, FLOW, "a shape")
-    with kept(), stages() as progress:
-        progress("starting workers", 0.0)
-        with cluster(*how) as crew:
-            build_set(out, order, count, lambda n, of: progress(f"{n} of {of} cases", n / of), workers=crew)
+    if order.recipe.source.within == math.inf:
+        crew.check(order.recipe.largest)
+    with crew.at_work() as (makers, progress):
+        build_set(out, order, count, progress, workers=makers)
     preview = write_preview(out)
     if (held := len(cases_of(out))) > count:
         say(f"note: {out} holds {held} cases, more than --count {count}: all are listed", to=error_console())
@@ -148,39 +147,23 @@ def _build(out: Path, order: Order, count: int, how: tuple[int | None, str | Non
     say(str(preview))
 
 
-def _source(
-    prior: Path | None, atlas: Path | None, presets: str | None, filled: float | None
-) -> tuple[Source, float | None, str | None]:
-    """Where shapes come from, and the edge and unit of their voxels where that is known."""
-    given = [value for value in (prior, atlas, presets) if value is not None]
-    if len(given) != 1:
-        raise ValueError(f"expected one of --prior, --atlas and --presets, got {len(given)} of them")
+def _source(laws: list[str], atlas: Path | None, filled: float | None) -> ShapeSource:
+    """Where shapes come from."""
+    if bool(laws) == (atlas is not None):
+        raise ValueError(f"expected either --prior (or --preset) or --atlas, got {'both' if laws else 'neither'}")
     from curvafit.data_synth.sets.sources import Generated, Stored
 
-    if presets is not None:
-        from curvafit.priors.coefficients import preset
-
-        names = tuple(presets.split(","))
-        found = [preset(name) for name in names]
-        points = tuple((*map(float, each.coefficients), each.mass) for each in found)  # type: ignore[arg-type]
-        return Generated(points, names, fraction=filled), None, None
-    if prior is not None:
-        from curvafit.priors import read_fit
-
-        fit = read_fit(prior)
-        point = (*map(float, fit.coefficients), fit.mass)  # type: ignore[arg-type]
-        filled = fit.volume_fraction if filled is None else filled
-        return Generated((point,), (prior.name,), fraction=filled), fit.working_voxel, fit.unit
-    assert atlas is not None
+    if atlas is None:
+        return Generated.of(laws, filled)
     if atlas.suffix.lower() != ".npz":
         if filled is not None:
             raise ValueError("expected --volume-fraction beside shapes that are grown, got a store of shapes")
-        return Stored((atlas.resolve(),)), None, None
+        return Stored((atlas.resolve(),))
     from curvafit.inference.atlas import load_atlas
 
     held = load_atlas(atlas)
     points = tuple((*map(float, row), float(mass)) for row, mass in zip(held.coefficients, held.masses, strict=True))
-    return Generated(points, held.ids, fraction=filled), None, None
+    return Generated(points, held.ids, fraction=filled)
 
 
 def _modality(
@@ -221,10 +204,3 @@ def _visible(seen: Modality, told: str | None) -> Modality:
 
     share = visible_share(seen.base) if told == "auto" else numbers(told, "--visible", 1)[0]
     return replace(seen, base=replace(seen.base, visible=share))
-
-
-def _edge(edge: float | None, unit: str | None, seen: Modality) -> float:
-    """The edge of a shape's voxel in the images' unit."""
-    from curvafit.volumes.formats.base import convert_length
-
-    return seen.voxel if edge is None else convert_length(edge, unit, seen.base.unit)

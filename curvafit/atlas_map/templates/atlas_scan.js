@@ -78,18 +78,18 @@ function ownMatches(fit) {
 
 /** How it was placed, and how far to trust that. */
 function account({ diagram, seenAs, near, spread }) {
-  const say = [`It lies at the barycentre of its ${near.length} nearest shapes, each weighted by 1/distance².`];
+  const say = [`The scan lies at the barycentre of its ${near.length} nearest shapes, each weighted by 1/distance².`];
   if (!diagram) {
-    say.push("This fit.json holds no diagram: they are the matches that curvafit infer found, with its distances.");
+    say.push("This fit.json holds no diagram: the nearest shapes are the matches of curvafit infer, with its distances.");
   } else {
     const [half, most] = atlas.embedding.usual[seenAs];
     const least = near[0][1];
-    say.push(`The page measured it against the atlas’s ${seenAs}s, by sliced Wasserstein distance.`);
+    say.push(`The page compared its diagram with those of the atlas’s ${seenAs}s, by sliced Wasserstein distance.`);
     say.push(least <= most
-      ? `Its nearest shape is ${number(least)} away; half of the atlas’s shapes have one within ${number(half)}.`
-      : `Its nearest shape is ${number(least)} away, farther than 95 % of the atlas’s shapes are from theirs: it may lie off the map.`);
+      ? `The nearest shape is ${number(least)} away; half of the atlas’s shapes have a neighbour within ${number(half)}.`
+      : `The nearest shape is ${number(least)} away, farther than 95 % of the atlas’s shapes are from their neighbours: the scan may lie off the map.`);
   }
-  if (spread > 0.15) say.push("Its nearest shapes lie far apart on the map, so the place is uncertain.");
+  if (spread > 0.15) say.push("The nearest shapes lie far apart on the map, so the scan’s place is uncertain.");
   return say.join(" ");
 }
 

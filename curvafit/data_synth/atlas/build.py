@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from curvafit.data_synth.atlas.design import Design, boxed
 from curvafit.data_synth.atlas.draws import make
-from curvafit.data_synth.atlas.store import Record, Settings, Store, open_store
+from curvafit.data_synth.atlas.store import Settings, Store, open_store
 from curvafit.data_synth.atlas.workers import Here, Workers
 from curvafit.generation.flow import WORKING_BLUR
 from curvafit.generation.memory import FILE, FLOW, check_memory
@@ -17,9 +17,8 @@ from curvafit.generation.schedule import Schedule
 from curvafit.generation.schedule import schedule as named_schedule
 from curvafit.priors.bounds import instance, seed_of, whole
 from curvafit.priors.grid import WORKING_EPSILON, Grid
+from curvafit.progress import Progress, silent
 
-#: Progress(record, viable so far, draws so far), called after every new draw.
-Progress = Callable[[Record, int, int], None]
 #: A design is given up when none of its first so many draws was viable, or fewer than one in so many.
 BARREN = 200
 #: Shapes that a store may be asked for.
@@ -32,7 +31,7 @@ def build(
     shape: int | Sequence[int],
     seed: int = 0,
     schedule: str | Schedule = "fast",
-    progress: Progress | None = None,
+    progress: Progress = silent,
     *,
     design: Design | None = None,
     workers: Workers | None = None,
@@ -51,7 +50,7 @@ def build(
     shape
         Voxels (z, y, x), or one number for a cube; the box is periodic, in working units.
     progress
-        Called after every new draw with its record, the number of viable draws and of all draws.
+        Called after every new draw with a sentence and the share of the viable shapes that are there.
     design
         Experiment 4's random law by default.
     workers
@@ -72,9 +71,7 @@ def build(
     return _filled(open_store(store_path, settings), count, workers or Here(), progress)
 
 
-def extend(
-    store_path: str | Path, count: int, progress: Progress | None = None, *, workers: Workers | None = None
-) -> Store:
+def extend(store_path: str | Path, count: int, progress: Progress = silent, *, workers: Workers | None = None) -> Store:
     """Go on with a store, by its own settings, until it has `count` more viable shapes than were asked of it so far.
 
     With 0, what was stopped is brought to its end.
@@ -107,7 +104,7 @@ def settings_of(
     return Settings(grid.shape, grid.spacing, WORKING_EPSILON, WORKING_BLUR, law.as_dict(), seed_of(seed), plan)
 
 
-def _filled(store: Store, count: int, workers: Workers, progress: Progress | None) -> Store:
+def _filled(store: Store, count: int, workers: Workers, progress: Progress) -> Store:
     """Ask for draws in order, never for more than may still be wanted: nothing is made beyond the last viable one."""
     store.want(count)
     viable = {index: store.viable(index) for index in store.indices()}
@@ -120,8 +117,7 @@ def _filled(store: Store, count: int, workers: Workers, progress: Progress | Non
         for record in workers.done():
             asked -= 1
             viable[record.index] = record.viability.viable
-            if progress is not None:
-                progress(record, sum(viable.values()), len(viable))
+            progress(f"{sum(viable.values())} viable of {len(viable)} draws", sum(viable.values()) / count)
         if len(viable) > BARREN * (1 + sum(viable.values())):
             raise ValueError(
                 f"expected a design with viable shapes, got {sum(viable.values())} of {len(viable)} draws: "

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from curvafit.data_synth.atlas.design import Design
 from curvafit.data_synth.atlas.draws import flows, versions
 from curvafit.data_synth.atlas.record import Record
 from curvafit.data_synth.atlas.store import Store, open_store
+from curvafit.progress import Progress, silent
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def verify(
     path: str | Path,
     regenerate: int = 3,
     seed: int = 0,
-    progress: Callable[[str, float], None] = lambda text, share: None,
+    progress: Progress = silent,
 ) -> Verdict:
     """Check every draw: that it is there, whole, itself and single; and that some come out again as they are.
 

@@ -14,7 +14,7 @@ from curvafit.data_synth.atlas.draws import one_thread
 from curvafit.data_synth.imaging.imaging import field_shape, image, regrid, visible
 from curvafit.data_synth.imaging.modality import Modality
 from curvafit.data_synth.imaging.parameters import Imaging
-from curvafit.data_synth.sets.sources import Source, source_of
+from curvafit.data_synth.sets.sources import ShapeSource, source_of
 from curvafit.priors.bounds import LONGEST, SHORTEST, instance, quoted, real, seed_of, several, whole
 
 #: Shapes that a case gets until one is seen on the image's voxels, which may be coarse.
@@ -60,7 +60,7 @@ class Recipe:
         number from 0.
     """
 
-    source: Source
+    source: ShapeSource
     modality: Modality
     shape: tuple[int, int, int]
     voxel: float
@@ -79,7 +79,7 @@ class Recipe:
         object.__setattr__(self, "seed", seed_of(self.seed))
         check_calibres(self.calibres)
         for factor in self.calibres:
-            check_crop(self.source, self.shape, self.voxel * factor, self.modality)
+            check_crop(self.source.within, self.shape, self.voxel * factor, self.modality)
 
     @property
     def largest(self) -> tuple[int, int, int]:
@@ -103,7 +103,7 @@ class Recipe:
         with one_thread():
             for _ in range(TRIES):
                 made = self.source.shape(voxels, index, rng)
-                u = torch.from_numpy(made.field)
+                u = torch.from_numpy(made.values)
                 made_of = imaged(u, made.epsilon, voxel, imaging, seed, self.shape)
                 grey, seen, mask = (each.numpy() for each in made_of)
                 if seen.min() <= 0 < seen.max() and mask.any() and not mask.all():
@@ -130,7 +130,7 @@ class Recipe:
         """The inverse of `as_dict`."""
         source, modality = source_of(kept["source"]), Modality.from_dict(kept["modality"])
         z, y, x = kept["shape"]
-        low, high = kept.get("calibres", (1.0, 1.0))
+        low, high = kept["calibres"]
         return Recipe(source, modality, (z, y, x), kept["voxel"], kept["seed"], (low, high))
 
 
@@ -163,13 +163,13 @@ def check_calibres(calibres: Sequence[float]) -> None:
         raise ValueError(f"expected {said}, got {quoted(pair)}")
 
 
-def check_crop(source: Source, shape: Sequence[int], voxel: float, modality: Modality) -> None:
-    """Raise ValueError where images of `shape` need crops that are larger than a store's shapes or than memory, or too
-    small to be shapes; or where they are too large or too small themselves."""
+def check_crop(within: float, shape: Sequence[int], voxel: float, modality: Modality) -> None:
+    """Raise ValueError where images of `shape` need crops that are larger than a source's shapes (`within`) or than
+    memory, or too small to be shapes; or where they are too large or too small themselves."""
     need = field_shape(shape, voxel, modality.base)
     if not 1 < math.prod(shape) <= MOST:
         raise ValueError(f"expected images of 2 to {MOST:.0e} voxels, got {' x '.join(map(str, shape))}")
-    if (min if source.within == math.inf else max)(need) < FEWEST:
+    if (min if within == math.inf else max)(need) < FEWEST:
         told, unit = " x ".join(map(str, need)), modality.base.unit
         raise ValueError(
             f"expected images that span {FEWEST} voxels of a shape or more, got {told}: is a voxel of {voxel:g} {unit} "
@@ -180,10 +180,10 @@ def check_crop(source: Source, shape: Sequence[int], voxel: float, modality: Mod
         raise ValueError(
             f"expected shapes of at most {MOST:.0e} voxels, got {told}: is a voxel of {voxel:g} {unit} meant?"
         )
-    if max(need) > source.within:
+    if max(need) > within:
         images, crops = (" x ".join(map(str, each)) for each in (shape, need))
         raise ValueError(
-            f"expected crops within the {source.within} voxels of the stored shapes, but {images} voxels of "
+            f"expected crops within the {within} voxels of the stored shapes, but {images} voxels of "
             f"{modality.name} need {crops}: take fewer, or build a store with a larger --shape"
         )
 

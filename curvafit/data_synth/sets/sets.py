@@ -27,6 +27,7 @@ from curvafit.interrupts import undisturbed
 from curvafit.priors.bounds import instance, named, quoted, several, whole
 from curvafit.priors.grid import Grid
 from curvafit.priors.json_text import parse_json
+from curvafit.progress import Progress, silent
 from curvafit.volumes.scan import Field, save
 
 FORMAT = "curvafit set"
@@ -41,9 +42,6 @@ MOST = 10**7
 PARTS = (*(name for name in NAMES if name != "mask"), "centreline")
 #: Seconds between two lists of the cases.
 LISTED_EVERY = 1.0
-
-#: Progress(cases done, of how many).
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -75,7 +73,7 @@ class Order:
 
 
 def build_set(
-    folder: str | Path, order: Order, count: int, progress: Progress | None = None, *, workers: Workers | None = None
+    folder: str | Path, order: Order, count: int, progress: Progress = silent, *, workers: Workers | None = None
 ) -> Path:
     """Make cases 0 to `count` - 1 of a set, those that are not there yet, and the list that its readers want.
 
@@ -100,7 +98,7 @@ def build_set(
         return _filled(folder, order, count, progress, workers)
 
 
-def _filled(folder: Path, order: Order, count: int, progress: Progress | None, workers: Workers) -> Path:
+def _filled(folder: Path, order: Order, count: int, progress: Progress, workers: Workers) -> Path:
     before = set(cases_of(folder))
     done = set(before)
     todo = iter([index for index in range(count) if index not in done])
@@ -114,8 +112,7 @@ def _filled(folder: Path, order: Order, count: int, progress: Progress | None, w
                 return folder
             done |= set(workers.done())
             asked -= 1
-            if progress is not None:
-                progress(min(len(done), count), count)
+            progress(f"{min(len(done), count)} of {count} cases", min(len(done), count) / count)
             if time.monotonic() > listed + LISTED_EVERY:
                 _list(folder, order, done)
                 listed = time.monotonic()

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypeVar, get_args, get_origin
 
 import numpy as np
 
 from curvafit.data_synth.atlas.design import PARAMETERS, Design
 from curvafit.data_synth.atlas.draws import one_thread
 from curvafit.data_synth.atlas.store import Store, open_store
+from curvafit.data_synth.imaging.modality import Modality
 from curvafit.data_synth.sets.moves import any_crop
 from curvafit.generation.flow import generate
 from curvafit.generation.fraction import first_mass
@@ -22,22 +24,28 @@ from curvafit.generation.viability import well_formed
 from curvafit.priors.bounds import several
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
+from curvafit.priors.law import Law, Texture, textures_of
+from curvafit.volumes.formats.base import convert_length
 
 #: Seeds that a shape gets to become well-formed.
 TRIES = 8
 #: Crops that are looked at for one with both structure and background.
 CROPS = 32
+#: The types of one law or one store.
+LAWS = tuple(get_origin(kind) or kind for kind in get_args(Law))
+
+_Crop = TypeVar("_Crop", bound=tuple[Any, ...])
 
 
-class Shape(NamedTuple):
-    """A phase field, float32 (Z, Y, X); its ε in voxels; and what it was made of, in JSON's types."""
+class PhaseField(NamedTuple):
+    """A phase field, float32 (Z, Y, X); its ε in voxels; and its origin, in JSON's types."""
 
-    field: np.ndarray
+    values: np.ndarray
     epsilon: float
     origin: dict[str, Any]
 
 
-class Source(Protocol):
+class ShapeSource(Protocol):
     """Shapes without end, each of the random numbers it is given."""
 
     @property
@@ -45,8 +53,8 @@ class Source(Protocol):
         """The most voxels that a shape can have along an edge."""
         ...
 
-    def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> Shape:
-        """Shape number `index` of so many voxels (z, y, x)."""
+    def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> PhaseField:
+        """PhaseField number `index` of so many voxels (z, y, x)."""
         ...
 
     def as_dict(self) -> dict[str, Any]:
@@ -94,7 +102,7 @@ class Generated:
         """A shape is grown as large as it is asked for."""
         return math.inf
 
-    def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> Shape:
+    def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> PhaseField:
         """A well-formed shape, of the first of some seeds that gives one.
 
         Raises
@@ -121,9 +129,35 @@ class Generated:
                 point = dict(zip(PARAMETERS, (*six, flow.mass), strict=True))
                 grown = {"seed": seed, "schedule": self.schedule, "status": flow.status}
                 origin = {"name": self.names[turn], "parameters": point, **grown}
-                return Shape(flow.field.numpy(), WORKING_EPSILON / WORKING_SPACING, origin)
+                return PhaseField(flow.field.numpy(), WORKING_EPSILON / WORKING_SPACING, origin)
             status = flow.status
         raise ValueError(f"expected {self.names[turn]} to grow from one of {TRIES} seeds, got none: {status}")
+
+    @staticmethod
+    def of(laws: Iterable[Law], fraction: float | None = None) -> Generated:
+        """Return the source of the shapes of one law or several.
+
+        Parameters
+        ----------
+        fraction
+            As above; by default the volume fraction of the scan, where the laws are fits and agree on it.
+
+        Raises
+        ------
+        FileNotFoundError, ValueError
+            If a law cannot be read (`texture_of`), or states neither a mass nor a volume fraction.
+        """
+        stated = tuple(laws)
+        textures = textures_of(stated)
+        shares = {None if each.prior is None else each.prior.volume_fraction for each in textures}
+        if fraction is None and len(shares) == 1:
+            (fraction,) = shares
+        points = tuple(_point(each, fraction) for each in textures)
+        names = (
+            Path(law).name if isinstance(law, (str, PathLike)) else texture.origin
+            for law, texture in zip(stated, textures, strict=True)
+        )
+        return Generated(points, tuple(names), fraction=fraction)
 
     def as_dict(self) -> dict[str, Any]:
         return {
@@ -142,8 +176,10 @@ class Stored:
     Parameters
     ----------
     draws
-        How many well-formed shapes there are, in all: by default those that are found. A store that has grown since is
-        another source.
+        How many well-formed shapes there are, in all: by default as many as there are now. A store that has grown since
+        is another source.
+    rotate
+        Whether crops are turned by any rotation, besides the symmetries of the cube.
 
     Raises
     ------
@@ -153,12 +189,13 @@ class Stored:
 
     paths: tuple[Path, ...]
     draws: int | None = None
+    rotate: bool = False
 
     def __post_init__(self) -> None:
         if self.draws is None:
             object.__setattr__(self, "draws", len(_formed(self.paths)))
 
-    def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> Shape:
+    def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> PhaseField:
         """A crop of any of the stores' shapes that shows both structure and background.
 
         Raises
@@ -171,21 +208,29 @@ class Stored:
             raise ValueError(
                 f"expected stores of {self.draws} well-formed shapes as before, got {len(draws)}: they grew"
             )
-        for _ in range(CROPS):
+
+        def crop() -> tuple[np.ndarray, dict[str, Any], Store, int]:
             store, draw = draws[int(rng.integers(len(draws)))]
-            field, moved = any_crop(store.field(draw), voxels, rng)
-            if field.min() < 0 < field.max():
-                break
-        else:
-            edges = " x ".join(map(str, voxels))
-            raise ValueError(f"expected structure and background in crops of {edges} voxels, got one {CROPS} times")
+            return *any_crop(store.field(draw), voxels, rng, self.rotate), store, draw
+
+        field, move, store, draw = _two_phases(crop, voxels)
         record, settings = store.record(draw), store.settings
         point = dict(zip(PARAMETERS, (*map(float, record.coefficients), record.mass), strict=True))
-        origin = {"name": f"{store.path.name} {draw}", "parameters": point, "seed": record.seed, **moved}
-        return Shape(field, settings.epsilon / settings.spacing[0], origin)
+        origin = {"name": f"{store.path.name} {draw}", "parameters": point, "seed": record.seed, **move}
+        return PhaseField(field, settings.epsilon / settings.spacing[0], origin)
 
     def as_dict(self) -> dict[str, Any]:
-        return {"kind": "stored", "paths": [str(path) for path in self.paths], "draws": self.draws}
+        return {
+            "kind": "stored",
+            "paths": [str(path) for path in self.paths],
+            "draws": self.draws,
+            "rotate": self.rotate,
+        }
+
+    @property
+    def about(self) -> str:
+        """The source in a few words."""
+        return f"{self.draws} shapes of {', '.join(path.name for path in self.paths)}"
 
     @property
     def within(self) -> int:
@@ -193,11 +238,94 @@ class Stored:
         return min(min(store.settings.shape) for store, _ in _formed(self.paths))
 
 
-def source_of(kept: dict[str, Any]) -> Source:
-    """The inverse of `Source.as_dict`."""
-    if kept["kind"] == "stored":
-        return Stored(tuple(map(Path, kept["paths"])), kept.get("draws"))
-    return Generated(tuple(map(tuple, kept["points"])), tuple(kept["names"]), kept["schedule"], kept.get("fraction"))
+@dataclass(frozen=True)
+class Pool:
+    """Random crops, turned at random, of a few shapes that each process generates once, when they are first wanted.
+
+    Parameters
+    ----------
+    count
+        Shapes in the pool.
+    within
+        Voxels along each edge of the shapes.
+    rotate
+        As of `Stored`.
+    """
+
+    generated: Generated
+    count: int
+    within: int
+    rotate: bool = False
+
+    @property
+    def about(self) -> str:
+        """The source in a few words."""
+        return f"{self.count} shapes of {', '.join(self.generated.names)}"
+
+    def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> PhaseField:
+        """A crop of any of the pool's shapes that shows both structure and background.
+
+        Raises
+        ------
+        ValueError
+            If it is larger than these, a shape cannot be had, or many crops show only one.
+        """
+
+        def crop() -> tuple[np.ndarray, dict[str, Any], PhaseField]:
+            whole = _pooled(self.generated, int(rng.integers(self.count)), self.within)
+            return *any_crop(whole.values, voxels, rng, self.rotate), whole
+
+        values, move, whole = _two_phases(crop, voxels)
+        return PhaseField(values, whole.epsilon, whole.origin | move)
+
+
+def source_of(content: dict[str, Any]) -> ShapeSource:
+    """Return the source that `ShapeSource.as_dict` wrote."""
+    if content["kind"] == "stored":
+        return Stored(tuple(map(Path, content["paths"])), content["draws"], content["rotate"])
+    return Generated(
+        tuple(map(tuple, content["points"])), tuple(content["names"]), content["schedule"], content["fraction"]
+    )
+
+
+def voxel_of(laws: Iterable[Law], kind: Modality) -> float:
+    """Return the edge of a shape's voxel in a modality's unit: that of a law that is a fit, else the modality's own.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        If a law cannot be read (`texture_of`), or the laws are several fits of different edges.
+    """
+    fits = [each.prior for each in textures_of(laws) if each.prior is not None]
+    edges = {convert_length(fit.working_voxel, fit.unit, kind.base.unit) for fit in fits}
+    if len(edges) > 1:
+        raise ValueError(f"expected fits of one voxel's edge, or a voxel beside them, got edges of {sorted(edges)}")
+    return edges.pop() if edges else kind.voxel
+
+
+def _point(texture: Texture, fraction: float | None) -> tuple[float, ...]:
+    """The seven numbers of a law; a mass that it does not state is that of the volume fraction."""
+    mass = texture.mass
+    if mass is None:
+        if fraction is None:
+            raise ValueError(f"expected a law with a mass, or a volume fraction beside it, got {texture.origin} alone")
+        mass = first_mass(fraction)
+    return (*map(float, texture.coefficients), mass)  # type: ignore[arg-type]
+
+
+def _two_phases(crop: Callable[[], _Crop], voxels: Sequence[int]) -> _Crop:
+    """The first crop that shows both structure and background."""
+    for _ in range(CROPS):
+        parts = crop()
+        if parts[0].min() < 0 < parts[0].max():
+            return parts
+    edges = " x ".join(map(str, voxels))
+    raise ValueError(f"expected structure and background in crops of {edges} voxels, got one {CROPS} times")
+
+
+@lru_cache(maxsize=256)
+def _pooled(generated: Generated, number: int, edge: int) -> PhaseField:
+    return generated.shape((edge,) * 3, number, np.random.default_rng(number))
 
 
 @lru_cache(maxsize=16)

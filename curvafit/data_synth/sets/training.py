@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,10 +13,13 @@ from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
 from curvafit.data_synth.imaging.imaging import field_shape
+from curvafit.data_synth.imaging.modalities import modality
 from curvafit.data_synth.imaging.modality import Modality
 from curvafit.data_synth.imaging.randomness import correlated
 from curvafit.data_synth.sets.case import check_calibres, check_crop, drawn_voxel, imaged
-from curvafit.data_synth.sets.sources import Stored
+from curvafit.data_synth.sets.sources import LAWS, Generated, Pool, Stored, voxel_of
+from curvafit.priors.bounds import named, whole
+from curvafit.priors.law import Law
 
 #: Length over which one texture gives way to another, as a share of the crop's longest edge.
 BLEND_LENGTH = 0.5
@@ -23,9 +27,17 @@ BLEND_LENGTH = 0.5
 BLEND_STEEPNESS = 4.0
 
 
+#: Percentiles that `percentile` makes 0 and 1, beyond which it cuts.
+PERCENTILES = (0.5, 99.5)
+#: Shapes that a pool may have.
+MOST_POOLED = 4096
+#: Voxels by which a generated shape's edge is rounded up.
+ROUND = 8
+
+
 class Sample(NamedTuple):
-    """A training pair: image float32 and label uint8 (0, 1), both (1, Z, Y, X), voxel edges (z, y, x), and how it was
-    made, in JSON's types."""
+    """A training pair: image float32 and label uint8 (0, 1), both (1, Z, Y, X), voxel edges (z, y, x), and a record of
+    how the pair came about, in JSON's types."""
 
     image: Tensor
     label: Tensor
@@ -34,7 +46,7 @@ class Sample(NamedTuple):
 
 
 class TextureDataset(IterableDataset):
-    """Images with exact labels, cut from stores of shapes and imaged on the fly; an epoch is `length` samples.
+    """Images with exact labels, cut from generated shapes and imaged on the fly; an epoch is `length` samples.
 
     Sample k depends on the arguments and k alone; epoch e is samples e·length, e·length + 1, … Workers of a
     `DataLoader` and ranks of a `torch.distributed` group share them out: none is seen twice, none has another's random
@@ -42,50 +54,81 @@ class TextureDataset(IterableDataset):
 
     Parameters
     ----------
-    stores
-        Folders of one or more stores made by `curvafit atlas build`.
+    source
+        The shapes: folders of one or more stores of `curvafit atlas build`; or one or more laws (coefficients, presets,
+        `fit.json`s, fits), of which each process generates `shapes` shapes, each when it is first wanted.
     modalities
-        What images are like; each sample is of one of them at random. All of one spacing where samples go into batches.
-    shape
-        Voxels (z, y, x) of an image.
+        The kinds of image, as `Modality` or by name; each sample is of one of them at random. All of one spacing where
+        samples go into batches.
+    size
+        Voxels (z, y, x) of an image, or one number for a cube.
     length
         Samples of an epoch, over all ranks.
     blend
         Share of samples in which one texture gives way to another.
+    voxel
+        Edge of a shape's voxels in the modalities' unit; by default that of the one `fit.json`, else each modality's
+        own.
     calibres
         How much thinner and thicker than the voxel makes it a structure may be: every sample draws its own factor.
-    voxel
-        Edge of a shape's voxels in the modalities' unit; by default each modality's own.
+    normalise
+        `zscore` (mean 0, deviation 1), `percentile` (percentiles 0.5 and 99.5 become 0 and 1, values beyond are cut),
+        or your own function of an image (1, Z, Y, X); by default images keep their counts.
+    rotate
+        Turn shapes by any rotation (interpolated linearly), not by the symmetries of the cube alone.
+    shapes, volume_fraction
+        With laws: how many shapes are generated, in turn of each law; and the share of the volume that they fill, by
+        default as the law's mass or scan has it.
     transform
         What to make of each `Sample`: `as_dict`, `as_monai`, `as_subject`, or your own function.
 
     Raises
     ------
     ValueError
-        If there is no store, modality or well-formed shape, a crop would be larger than a shape, or a number is out of
+        If there is no source, modality or well-formed shape, a crop would be larger than a shape, or a number is out of
         range.
     """
 
     def __init__(
         self,
-        stores: str | Path | Sequence[str | Path],
-        modalities: Modality | Sequence[Modality],
-        shape: Sequence[int],
+        source: Law | Sequence[Law],
+        modalities: str | Modality | Sequence[str | Modality],
+        size: int | Sequence[int],
         *,
         length: int = 1000,
         seed: int = 0,
         blend: float = 0.2,
         voxel: float | None = None,
         calibres: tuple[float, float] = (1.0, 1.0),
+        normalise: str | Callable[[Tensor], Tensor] | None = None,
+        rotate: bool = False,
+        shapes: int = 16,
+        volume_fraction: float | None = None,
         transform: Callable[[Sample], Any] | None = None,
     ) -> None:
-        paths = [stores] if isinstance(stores, (str, Path)) else list(stores)
-        self.modalities = [modalities] if isinstance(modalities, Modality) else list(modalities)
-        self.source = Stored(tuple(map(Path, paths)))
-        self.shape, self.length, self.seed, self.blend = tuple(map(int, shape)), int(length), int(seed), blend
-        self.voxel, self.calibres, self.transform = voxel, calibres, transform
-        self._check()
+        kinds = [modalities] if isinstance(modalities, (str, Modality)) else list(modalities)
+        self.modalities = [modality(kind) if isinstance(kind, str) else kind for kind in kinds]
+        self.size = (size,) * 3 if isinstance(size, int) else tuple(map(int, size))
+        self.length, self.seed, self.blend = int(length), int(seed), blend
+        self.calibres, self.normalise, self.transform = calibres, _normalisation(normalise), transform
+        sources: list[Any] = [source] if isinstance(source, LAWS) else list(source)  # type: ignore[arg-type]
+        self._check(sources)
+        stores = all(map(_is_store, sources))
+        self.voxels = [voxel or voxel_of([] if stores else sources, kind) for kind in self.modalities]
+        if stores:
+            if volume_fraction is not None:
+                raise ValueError("expected a volume fraction beside laws, got stores of shapes")
+            self.source = Stored(tuple(map(Path, sources)), rotate=rotate)
+        else:
+            self.source = self._pool(Generated.of(sources, volume_fraction), shapes, rotate)
+        for kind, edge in zip(self.modalities, self.voxels, strict=True):
+            check_crop(self.source.within, self.size, edge * calibres[0], kind)
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
+
+    def __repr__(self) -> str:
+        """One line: where shapes come from, the kinds of image, their size, and the epoch's length."""
+        kinds, size = ", ".join(kind.name for kind in self.modalities), " x ".join(map(str, self.size))
+        return f"TextureDataset({self.source.about}; {kinds}; {size} voxels; {self.length} samples an epoch)"
 
     def __len__(self) -> int:
         """Samples of an epoch that this rank gives."""
@@ -120,14 +163,21 @@ class TextureDataset(IterableDataset):
         """Sample `number`, from 0, before the transform."""
         words = np.random.SeedSequence(self.seed, spawn_key=(number,))
         rng, (for_imaging, for_image, for_blend) = np.random.default_rng(words), map(int, words.generate_state(3))
-        modality = self.modalities[int(rng.integers(len(self.modalities)))]
-        imaging, voxel = modality.draw(for_imaging), drawn_voxel(self.voxel or modality.voxel, self.calibres, rng)
-        voxels = field_shape(self.shape, voxel, imaging)
+        turn = int(rng.integers(len(self.modalities)))
+        kind = self.modalities[turn]
+        imaging, voxel = kind.draw(for_imaging), drawn_voxel(self.voxels[turn], self.calibres, rng)
+        voxels = field_shape(self.size, voxel, imaging)
         u, epsilon, origin = self._shape(voxels, rng, for_blend)
-        grey, _, mask = imaged(u, epsilon, voxel, imaging, for_image, self.shape)
-        record = {"number": number, "source": origin, "modality": modality.name, "imaging": imaging.as_dict()}
+        grey, _, mask = imaged(u, epsilon, voxel, imaging, for_image, self.size)
+        record = {"number": number, "source": origin, "modality": kind.name, "imaging": imaging.as_dict()}
         record |= {"image_seed": for_image, "voxel": voxel}
-        return Sample(grey[None].float(), mask[None].to(torch.uint8), imaging.spacing, record)
+        image = grey[None].float()
+        return Sample(
+            image if self.normalise is None else self.normalise(image),
+            mask[None].to(torch.uint8),
+            imaging.spacing,
+            record,
+        )
 
     def _shape(
         self, voxels: Sequence[int], rng: np.random.Generator, seed: int
@@ -135,23 +185,29 @@ class TextureDataset(IterableDataset):
         """A phase field (Z, Y, X): a crop of one shape, or of two that share the volume."""
         blended = rng.random() < self.blend
         one, *more = (self.source.shape(voxels, 0, rng) for _ in range(1 + blended))
-        u = torch.from_numpy(one.field)
+        u = torch.from_numpy(one.values)
         if more:
             length = BLEND_LENGTH * max(voxels)
             share = torch.sigmoid(BLEND_STEEPNESS * correlated(u[None, None], (length,) * 3, [seed], "blend"))[0, 0]
-            u = share * u + (1 - share) * torch.from_numpy(more[0].field)
+            u = share * u + (1 - share) * torch.from_numpy(more[0].values)
         return u, one.epsilon, [shape.origin for shape in (one, *more)]
 
-    def _check(self) -> None:
-        if not self.source.paths or not self.modalities:
-            told = f"{len(self.source.paths)} and {len(self.modalities)}"
-            raise ValueError(f"expected at least one store and one modality, got {told}")
-        if len(self.shape) != 3 or min(self.shape) < 1 or self.length < 1 or not 0 <= self.blend <= 1:
-            told = f"{self.shape}, {self.length}, {self.blend}"
-            raise ValueError(f"expected 3 edges and a length above 0, and a blend in [0, 1], got {told}")
+    def _pool(self, generated: Generated, count: int, rotate: bool) -> Pool:
+        """A pool of shapes as large as the largest crop."""
+        whole(count, "a pool of at least 1 shape", 1, MOST_POOLED)
+        crops = zip(self.modalities, self.voxels, strict=True)
+        largest = max(max(field_shape(self.size, edge * self.calibres[0], kind.base)) for kind, edge in crops)
+        return Pool(generated, count, ROUND * -(-largest // ROUND), rotate)
+
+    def _check(self, sources: list[Any]) -> None:
+        if not (sources and self.modalities):
+            raise ValueError(
+                f"expected at least one source and one modality, got {len(sources)} and {len(self.modalities)}"
+            )
+        if len(self.size) != 3 or min(self.size) < 1 or self.length < 1 or not 0 <= self.blend <= 1:
+            values = f"{self.size}, {self.length}, {self.blend}"
+            raise ValueError(f"expected 3 edges and a length above 0, and a blend in [0, 1], got {values}")
         check_calibres(self.calibres)
-        for modality in self.modalities:
-            check_crop(self.source, self.shape, (self.voxel or modality.voxel) * self.calibres[0], modality)
 
 
 def as_dict(sample: Sample) -> dict[str, Tensor]:
@@ -194,6 +250,32 @@ def as_subject(sample: Sample) -> Any:
         label=torchio.LabelMap(tensor=label, affine=affine),
         record=sample.record,
     )
+
+
+def zscore(image: Tensor) -> Tensor:
+    """Return an image of mean 0 and deviation 1."""
+    return (image - image.mean()) / image.std().clamp_min(1e-8)
+
+
+def percentile(image: Tensor) -> Tensor:
+    """Return an image whose percentiles `PERCENTILES` are 0 and 1, cut beyond."""
+    low, high = np.percentile(image.numpy(), PERCENTILES)
+    return ((image - low) / max(high - low, 1e-8)).clamp_(0, 1)
+
+
+#: Normalisations of an image (1, Z, Y, X), by name.
+NORMALISATIONS: dict[str, Callable[[Tensor], Tensor]] = {"zscore": zscore, "percentile": percentile}
+
+
+def _is_store(source: Any) -> bool:
+    return isinstance(source, (str, PathLike)) and (Path(source).is_dir() or Path(source).suffix == ".zarr")
+
+
+def _normalisation(normalise: str | Callable[[Tensor], Tensor] | None) -> Callable[[Tensor], Tensor] | None:
+    if normalise is None or callable(normalise):
+        return normalise
+    named(normalise, NORMALISATIONS, f"a normalisation among {', '.join(NORMALISATIONS)}, a function or None")
+    return NORMALISATIONS[normalise]
 
 
 def _rank() -> tuple[int, int]:

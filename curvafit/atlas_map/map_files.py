@@ -26,7 +26,7 @@ from curvafit.files import bears, check_folder, check_free, is_empty, write_cont
 from curvafit.generation.viability import well_formed
 from curvafit.geometry.diagram import Diagram
 from curvafit.inference.atlas import Atlas
-from curvafit.progress import Progress
+from curvafit.progress import Progress, silent
 from curvafit.volumes.formats import read_archive
 
 #: Folder beside the two files for what took long: measured shapes, distances, places.
@@ -68,7 +68,7 @@ def write_map(
     device: str = "cpu",
     command: str = "",
     overwrite: bool = False,
-    progress: Progress,
+    progress: Progress = silent,
 ) -> tuple[Path, Path]:
     """Write `atlas.png` and `atlas.html` of a store's well-formed shapes into a folder; returns their paths.
 
@@ -113,7 +113,8 @@ def _looked_at(store: Store, cache: Path, progress: Progress) -> tuple[Atlas, li
         shapes.append(Shown(kept["thumbnail"].tobytes(), kept["volume"].tobytes()))
         return float(kept["fraction"]), _diagram(kept, "field"), _diagram(kept, "mask")
 
-    return extract(store, measure=look, progress=_part(progress, 0.0, 0.6)), records, shapes, commands
+    atlas = extract(store, measure=look, progress=lambda text, share: progress(text, 0.6 * share))
+    return atlas, records, shapes, commands
 
 
 def _look(store: Store, record: Record) -> _Arrays:

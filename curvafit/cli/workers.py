@@ -1,0 +1,52 @@
+"""The options that say who makes draws and cases, and the workers that they name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Annotated, NamedTuple
+
+import typer
+
+from curvafit.cli.support import kept, stages
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from curvafit.data_synth.atlas.workers import Workers
+    from curvafit.progress import Progress
+
+WorkersOption = Annotated[
+    int | None, typer.Option(help="Processes on this machine; as many as cores by default, 0 for none but this.")
+]
+SchedulerOption = Annotated[str | None, typer.Option(help="A running dask scheduler, tcp://HOST:PORT, instead.")]
+DashboardOption = Annotated[
+    int | None, typer.Option(help="Port of dask's own page on 127.0.0.1, for workers on this machine; none by default.")
+]
+
+
+class Crew(NamedTuple):
+    """The workers that the options ask for."""
+
+    workers: int | None
+    scheduler: str | None
+    dashboard: int | None
+
+    def check(self, shape: Sequence[int] | None = None) -> None:
+        """Raise ValueError where the options contradict, or a shape of so many voxels does not fit into this memory."""
+        from curvafit.data_synth.atlas.workers import check_workers
+        from curvafit.generation.memory import FLOW, check_memory
+
+        check_workers(self.workers, self.scheduler)
+        if shape is not None and self.scheduler is None:
+            check_memory(shape, FLOW, "a shape")
+
+    @contextmanager
+    def at_work(self, again: Callable[[], str] = lambda: "the same command") -> Iterator[tuple[Workers, Progress]]:
+        """Start the workers, and a progress bar for them; `again` is what goes on after an interrupt."""
+        from curvafit.data_synth.atlas.workers import cluster
+
+        with kept(again), stages() as progress:
+            progress("starting workers", 0.0)
+            with cluster(*self) as workers:
+                yield workers, progress
