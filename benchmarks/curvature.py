@@ -69,7 +69,8 @@ def gallery_gaps(folder: Path) -> list[tuple[str, float, float]]:
         u = torch.from_numpy(nibabel.load(path).get_fdata(dtype=np.float32))
         grid = Grid(tuple(u.shape), (0.01,) * 3)  # type: ignore[arg-type]
         profiled = phase_field(u > 0, grid, 0.02)
-        gaps = (wasserstein(diagram(u, grid, 0.02, k), diagram(profiled, grid, 0.02, k)) for k in KINDS)  # type: ignore[arg-type]
+        pairs = ([diagram(field, grid, 0.02, curvature=kind) for field in (u, profiled)] for kind in KINDS)
+        gaps = (wasserstein(*pair) for pair in pairs)
         rows.append((path.name.split(" coeffs")[0], *gaps))
     return rows
 

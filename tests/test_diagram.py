@@ -153,7 +153,7 @@ def test_flat_noise_never_gives_nan() -> None:
 def test_bad_input_is_one_sentence() -> None:
     u, grid = octant("sphere", 2)
     with pytest.raises(ValueError, match="expected curvature 'geometric' or 'diffuse', got 'mean'"):
-        diagram(u, grid, 1.0, "mean")  # type: ignore[arg-type]
+        diagram(u, grid, 1.0, curvature="mean")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="expected a field that crosses 0"):
         diagram(u.abs() + 0.1, grid, 1.0)
     with pytest.raises(ValueError, match=r"expected points \(N, 2\) and weights \(N,\), got \(3, 2\) and \(2,\)"):

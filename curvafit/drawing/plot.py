@@ -197,7 +197,7 @@ def diagram_figure(
     """A figure of one diagram; see `diagram_on`."""
     figure = _figure(4.2, 4.2)
     axes = figure.add_axes((0.16, 0.13, 0.82, 0.79 if title else 0.85))
-    diagram_on(axes, diagram, limits=limits or shared_limits([diagram], length), unit=unit, length=length)
+    diagram_on(axes, diagram, limits=limits or shared_limits([diagram], length=length), unit=unit, length=length)
     if title:
         axes.set_title(title, fontsize=11)
     return figure
@@ -234,7 +234,7 @@ def diagram_on(
     _name_families(axes, limits)
 
 
-def shared_limits(diagrams: Sequence[Diagram], length: float = 1.0, tail: float = 0.006) -> Limits:
+def shared_limits(diagrams: Sequence[Diagram], *, length: float = 1.0, tail: float = 0.006) -> Limits:
     """The interval that holds both curvatures of every diagram but for the outermost `tail` of area at either end."""
     bounds = [0.0, 0.0]
     for diagram in diagrams:

@@ -35,7 +35,7 @@ class View(NamedTuple):
     half: tuple[float, float]
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Points `(N, 3)` of the box, (z, y, x) in [0, 1], to picture coordinates `(N, 2)` in [0, 1], y downwards."""
+        """Return where points `(N, 3)` of the box, (z, y, x) in [0, 1], lie on the picture: `(N, 2)`, x and y down."""
         centred = (np.asarray(points) - 0.5) * self.box
         right, up = centred @ self.frame[0], centred @ self.frame[1]
         return np.stack([0.5 + right / (2 * self.half[0]), 0.5 - up / (2 * self.half[1])], axis=-1)
@@ -44,10 +44,11 @@ class View(NamedTuple):
 def view(
     shape: tuple[int, int, int],
     spacing: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    *,
     azimuth: float = 32.0,
     elevation: float = 24.0,
 ) -> View:
-    """The projection that shows a whole box: z up, turned by `azimuth` and seen from `elevation` degrees above."""
+    """Return the projection that shows a whole box, z up: turned by `azimuth`, seen from `elevation` degrees above."""
     α, β = math.radians(azimuth), math.radians(elevation)
     right = np.array([0.0, math.sin(α), math.cos(α)])
     towards = np.array([math.sin(β), -math.cos(α) * math.cos(β), math.sin(α) * math.cos(β)])
@@ -68,8 +69,9 @@ def render(
     azimuth: float = 32.0,
     elevation: float = 24.0,
 ) -> tuple[np.ndarray, View]:
-    """The level set of `u` `(Z, Y, X)` as an RGBA picture `(height, width, 4)` of bytes, transparent where there is
-    nothing, and the projection that made it.
+    """Return the level set of `u` `(Z, Y, X)` as a picture, and the projection that it was drawn by.
+
+    The picture is RGBA, `(height, width, 4)` bytes, transparent where there is nothing.
 
     Raises
     ------
@@ -81,7 +83,7 @@ def render(
         raise ValueError(f"expected a volume of 3 axes of at least 4 voxels to draw, got shape {field.shape}")
     if not np.isfinite(field).all():
         raise ValueError("expected a finite volume to draw, got NaN or infinite values")
-    camera = view(field.shape, spacing, azimuth, elevation)
+    camera = view(field.shape, spacing, azimuth=azimuth, elevation=elevation)
     height = max(2, round(width * camera.half[1] / camera.half[0]))
     size = (height * supersample, width * supersample)
     field = field - np.float32(level)
@@ -99,7 +101,7 @@ def render(
 
 
 def _blocks(field: np.ndarray) -> np.ndarray:
-    """Whether any voxel of a block of `BLOCK`³, or of the layer around it, is inside."""
+    """Return whether any voxel of a block of `BLOCK`³, or of the layer around it, is inside."""
     count = [-(-n // BLOCK) for n in field.shape]
     occupied = np.zeros(count, dtype=np.bool_)
     for index in np.ndindex(*count):
@@ -109,7 +111,7 @@ def _blocks(field: np.ndarray) -> np.ndarray:
 
 
 def _reduced(pixels: np.ndarray, factor: int) -> np.ndarray:
-    """Means over factor² samples (colour weighted by cover), encoded as bytes."""
+    """Return means over factor² samples (colour weighted by cover), encoded as bytes."""
     height, width = pixels.shape[0] // factor, pixels.shape[1] // factor
     cover = pixels[..., 3:]
     weighted = np.concatenate([pixels[..., :3] * cover, cover], axis=-1)
@@ -121,7 +123,7 @@ def _reduced(pixels: np.ndarray, factor: int) -> np.ndarray:
 
 @numba.njit(cache=True, nogil=True, parallel=True)
 def _draw(pixels, f, smooth, near, far, occupied, edges, top, frame, half, light, surface, cap):
-    """One ray a pixel: find the surface or the cut face, then light it."""
+    """Send one ray a pixel: find the surface or the cut face, then light it."""
     height, width = pixels.shape[:2]
     reach = math.sqrt(((top * edges) ** 2).sum()) / 2
     for row in numba.prange(height):
@@ -159,7 +161,7 @@ def _draw(pixels, f, smooth, near, far, occupied, edges, top, frame, half, light
 
 @numba.njit(cache=True, nogil=True)
 def _normal(smooth, edges, p, n):
-    """Unit normal out of the phase at `p`, into `n`."""
+    """Write the unit normal out of the phase at `p` into `n`."""
     n[0] = (_at(smooth, p[0] - 1, p[1], p[2]) - _at(smooth, p[0] + 1, p[1], p[2])) / edges[0]
     n[1] = (_at(smooth, p[0], p[1] - 1, p[2]) - _at(smooth, p[0], p[1] + 1, p[2])) / edges[1]
     n[2] = (_at(smooth, p[0], p[1], p[2] - 1) - _at(smooth, p[0], p[1], p[2] + 1)) / edges[2]
@@ -170,7 +172,7 @@ def _normal(smooth, edges, p, n):
 
 @numba.njit(cache=True, nogil=True)
 def _sky(near, far, edges, p, n):
-    """The share of the sky that is open above `p`, judged from occupancies blurred by 2.5 and by 7 edges."""
+    """Return the share of the sky that is open above `p`, judged from occupancies blurred by 2.5 and by 7 edges."""
     a, b, c = n[0] / edges[0], n[1] / edges[1], n[2] / edges[2]
     close = _at(near, p[0] + 2.5 * a, p[1] + 2.5 * b, p[2] + 2.5 * c)
     wide = _at(far, p[0] + 7.0 * a, p[1] + 7.0 * b, p[2] + 7.0 * c)
@@ -179,7 +181,7 @@ def _sky(near, far, edges, p, n):
 
 @numba.njit(cache=True, nogil=True)
 def _lit(f, occupied, edges, p, n, light, top, q, d):
-    """What the key light gives at `p`: its cosine, less in shadow. `q` and `d` are scratch."""
+    """Return what the key light gives at `p`: its cosine, less in shadow. `q` and `d` are scratch."""
     facing = n[0] * light[0] + n[1] * light[1] + n[2] * light[2]
     if facing <= 0:
         return 0.0
@@ -194,7 +196,7 @@ def _lit(f, occupied, edges, p, n, light, top, q, d):
 
 @numba.njit(cache=True, nogil=True)
 def _march(f, occupied, o, d, start, stop):
-    """The least t in [start, stop] where the ray o + t d (in voxels) enters the phase, or `MISS`."""
+    """Return the least t in [start, stop] where the ray o + t d (in voxels) enters the phase, or `MISS`."""
     t, last = start, start
     while t <= stop:
         z, y, x = o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]
@@ -215,7 +217,7 @@ def _march(f, occupied, o, d, start, stop):
 
 @numba.njit(cache=True, nogil=True)
 def _shadow(f, occupied, o, d, start, stop):
-    """How much of the key light is kept from o: 0 for none, 1 where the ray meets the phase, between near it."""
+    """Return the share of the key light that does not reach o: 1 where the ray meets the phase, less near it."""
     t, highest = start, -1.0
     while t <= stop and highest < 0:
         z, y, x = o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]
@@ -229,7 +231,7 @@ def _shadow(f, occupied, o, d, start, stop):
 
 @numba.njit(cache=True, nogil=True)
 def _jump(occupied, z, y, x, d):
-    """How far a ray may go before it leaves an empty block; 0 in an occupied one."""
+    """Return how far a ray may go before it leaves an empty block; 0 in an occupied one."""
     i = min(max(int(z) // BLOCK, 0), occupied.shape[0] - 1)
     j = min(max(int(y) // BLOCK, 0), occupied.shape[1] - 1)
     k = min(max(int(x) // BLOCK, 0), occupied.shape[2] - 1)
@@ -240,7 +242,7 @@ def _jump(occupied, z, y, x, d):
 
 @numba.njit(cache=True, nogil=True)
 def _leave(position, direction, block):
-    """How far a ray goes before it leaves a block along one axis."""
+    """Return how far a ray goes before it leaves a block along one axis."""
     if abs(direction) < 1e-9:
         return MISS
     return ((block + (direction > 0)) * BLOCK - position) / direction
@@ -248,7 +250,7 @@ def _leave(position, direction, block):
 
 @numba.njit(cache=True, nogil=True)
 def _span(position, direction, top):
-    """Where a line enters and leaves [0, top] along each axis: (t in, t out, axis of entry)."""
+    """Return where a line enters and leaves the box [0, top], and the axis along which it enters."""
     start, stop, axis = -1e9, 1e9, 0
     for a in range(3):
         if abs(direction[a]) < 1e-9:
@@ -266,7 +268,7 @@ def _span(position, direction, top):
 
 @numba.njit(cache=True, nogil=True)
 def _at(f, z, y, x):
-    """Trilinear interpolation, clamped to the box."""
+    """Interpolate linearly along each axis, clamped to the box."""
     nz, ny, nx = f.shape
     z, y, x = min(max(z, 0.0), nz - 1.0), min(max(y, 0.0), ny - 1.0), min(max(x, 0.0), nx - 1.0)
     i, j, k = min(int(z), nz - 2), min(int(y), ny - 2), min(int(x), nx - 2)

@@ -137,13 +137,14 @@ def diagram(
     u: np.ndarray | Tensor,
     grid: Grid,
     epsilon: float,
+    *,
     curvature: Kind = "geometric",
     margin: int | None = None,
     where: np.ndarray | None = None,
 ) -> Diagram:
     """The curvature diagram of {u = 0}: what `surface_curvatures` finds, without the places; takes what that takes."""
-    found = surface_curvatures(u, grid, epsilon, curvature, margin, where)
-    return Diagram(found.points, found.areas, excluded=found.excluded)
+    curvatures = surface_curvatures(u, grid, epsilon, curvature=curvature, margin=margin, where=where)
+    return Diagram(curvatures.points, curvatures.areas, excluded=curvatures.excluded)
 
 
 def diagrams(field: Tensor, grid: Grid, epsilon: float) -> tuple[Diagram, Diagram]:
@@ -160,6 +161,7 @@ def surface_curvatures(
     u: np.ndarray | Tensor,
     grid: Grid,
     epsilon: float,
+    *,
     curvature: Kind = "geometric",
     margin: int | None = None,
     where: np.ndarray | None = None,

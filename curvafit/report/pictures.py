@@ -40,7 +40,7 @@ def diagram_figures(inference: Inference) -> str:
     """The three curvature diagrams with shared axes, in the scan's unit."""
     found = (inference.diagram, inference.match_diagram, inference.fit_diagram)
     λ, unit = inference.fit.length, inference.fit.length_unit
-    limits = shared_limits([diagram for diagram in found if diagram is not None], λ)
+    limits = shared_limits([diagram for diagram in found if diagram is not None], length=λ)
     parts = []
     for (name, title), diagram in zip(_SHAPES, found, strict=True):
         caption = f"<b>{title}</b>{_badge(inference, name)}"
