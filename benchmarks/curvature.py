@@ -38,7 +38,7 @@ def exact_errors(name: str, voxels: int, kind: str) -> tuple[np.ndarray, np.ndar
     shape, size = EXACT[name]
     nz, ny, nx = (edge * voxels for edge in size)
     grid = Grid((nz, ny, nx), (1 / voxels,) * 3, "replicate")
-    found = surface_curvatures(profile(shape, centres(grid), 1.0), grid, 1.0, kind, margin=0)  # type: ignore[arg-type]
+    found = surface_curvatures(profile(shape, centres(grid), 1.0), grid, 1.0, curvature=kind, margin=0)  # type: ignore[arg-type]
     truth = torch.stack(shape.curvatures(torch.from_numpy(found.centres) + 0.5 / voxels), -1).numpy()
     error = np.abs(found.points - truth) / np.abs(truth).max(1, keepdims=True)
     return 8 * found.areas @ found.points / found.areas.sum(), error

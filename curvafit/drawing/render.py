@@ -41,6 +41,19 @@ class View(NamedTuple):
         return np.stack([0.5 + right / (2 * self.half[0]), 0.5 - up / (2 * self.half[1])], axis=-1)
 
 
+class _Scene(NamedTuple):
+    """What the loops draw: the field `(Z, Y, X)` less its level; the same smoothed, for normals; how much lies near and
+    farther off; which blocks are not empty; voxel edges over the shortest; the last voxel's index."""
+
+    field: np.ndarray
+    smooth: np.ndarray
+    near: np.ndarray
+    far: np.ndarray
+    occupied: np.ndarray
+    edges: np.ndarray
+    top: np.ndarray
+
+
 def view(
     shape: tuple[int, int, int],
     spacing: tuple[float, float, float] = (1.0, 1.0, 1.0),
@@ -91,12 +104,12 @@ def render(
     smooth = gaussian_filter(field, 0.9 / edges)
     inside = (field > 0).astype(np.float32)
     near, far = (gaussian_filter(inside, distance / edges, mode="constant") for distance in (2.5, 7.0))
-    top, half = np.array(field.shape) - 1.0, np.array(camera.half)
+    scene = _Scene(field, smooth, near, far, _blocks(field), edges, np.array(field.shape) - 1.0)
     light = np.array(KEY_LIGHT) / np.linalg.norm(KEY_LIGHT) @ camera.frame
     colours = np.array(SURFACE), np.array(CAP)
     pixels = np.zeros((*size, 4), dtype=np.float32)
     threads.start()
-    _draw(pixels, field, smooth, near, far, _blocks(field), edges, top, camera.frame, half, light, *colours)
+    _draw(pixels, scene, camera.frame, np.array(camera.half), light, *colours)
     return _reduced(pixels, supersample), camera
 
 
@@ -122,8 +135,9 @@ def _reduced(pixels: np.ndarray, factor: int) -> np.ndarray:
 
 
 @numba.njit(cache=True, nogil=True, parallel=True)
-def _draw(pixels, f, smooth, near, far, occupied, edges, top, frame, half, light, surface, cap):
+def _draw(pixels, scene, frame, half, light, surface, cap):
     """Send one ray a pixel: find the surface or the cut face, then light it."""
+    f, smooth, occupied, edges, top = scene.field, scene.smooth, scene.occupied, scene.edges, scene.top
     height, width = pixels.shape[:2]
     reach = math.sqrt(((top * edges) ** 2).sum()) / 2
     for row in numba.prange(height):
@@ -148,8 +162,8 @@ def _draw(pixels, f, smooth, near, far, occupied, edges, top, frame, half, light
             n[axis] = -1.0 if d[axis] > 0 else 1.0
             if not capped:
                 _normal(smooth, edges, o, n)
-            sky = 1.0 if capped else _sky(near, far, edges, o, n)
-            lit = _lit(f, occupied, edges, o, n, light, top, q, s)
+            sky = 1.0 if capped else _sky(scene, o, n)
+            lit = _lit(scene, o, n, light, q, s)
             eye = n[0] * frame[2, 0] + n[1] * frame[2, 1] + n[2] * frame[2, 2]
             glow = 1.12 * ((0.50 + 0.14 * eye) * sky + 0.52 * lit * (0.55 + 0.45 * sky))
             haze = 0.30 * min(max(0.5 + t / (2 * reach), 0.0), 1.0) ** 1.5
@@ -171,8 +185,9 @@ def _normal(smooth, edges, p, n):
 
 
 @numba.njit(cache=True, nogil=True)
-def _sky(near, far, edges, p, n):
+def _sky(scene, p, n):
     """Return the share of the sky that is open above `p`, judged from occupancies blurred by 2.5 and by 7 edges."""
+    near, far, edges = scene.near, scene.far, scene.edges
     a, b, c = n[0] / edges[0], n[1] / edges[1], n[2] / edges[2]
     close = _at(near, p[0] + 2.5 * a, p[1] + 2.5 * b, p[2] + 2.5 * c)
     wide = _at(far, p[0] + 7.0 * a, p[1] + 7.0 * b, p[2] + 7.0 * c)
@@ -180,18 +195,19 @@ def _sky(near, far, edges, p, n):
 
 
 @numba.njit(cache=True, nogil=True)
-def _lit(f, occupied, edges, p, n, light, top, q, d):
+def _lit(scene, p, n, light, q, d):
     """Return what the key light gives at `p`: its cosine, less in shadow. `q` and `d` are scratch."""
+    edges = scene.edges
     facing = n[0] * light[0] + n[1] * light[1] + n[2] * light[2]
     if facing <= 0:
         return 0.0
     for a in range(3):
         q[a] = p[a] + 1.5 * n[a] / edges[a]
         d[a] = light[a] / edges[a]
-    begin, end, _ = _span(q, d, top)
+    begin, end, _ = _span(q, d, scene.top)
     if end < 2 or begin > end:
         return facing
-    return facing * (1 - 0.6 * _shadow(f, occupied, q, d, 2.0, end))
+    return facing * (1 - 0.6 * _shadow(scene.field, scene.occupied, q, d, 2.0, end))
 
 
 @numba.njit(cache=True, nogil=True)
