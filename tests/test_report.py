@@ -20,7 +20,7 @@ from curvafit.priors.fit_file import FORMAT
 from curvafit.report.page import parameter_table, report_html, with_command, write_inference
 from curvafit.report.pictures import scan_box
 from curvafit.report.wording import describe, family_radius
-from curvafit.units import density, length, number
+from curvafit.units import GLOSSARY, density, length, number
 from curvafit.volumes.scan import load
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}
@@ -63,13 +63,20 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_page_stands_alone_and_is_well_formed(html: str) -> None:
     page = Page(html)
-    links = [value or "" for name, value in page.attributes if name in ("src", "href", "action", "srcset")]
+    links = [value or "" for name, value in page.attributes if name in ("src", "action", "srcset")]
     assert len(links) == 9 and all(link.startswith("data:image/png;base64,") for link in links)
-    assert "url(" not in html and "<script" not in html and not re.search(r"https?:", html)
+    assert "url(" not in html and "<script" not in html
     assert all(base64.b64decode(link.partition(",")[2])[:4] == b"\x89PNG" for link in links)
     alts = [value for name, value in page.attributes if name == "alt"]
     assert len(alts) == 9 and all(alts)
     assert len(html) < 4_000_000
+
+
+def test_words_with_a_special_meaning_lead_to_the_glossary(html: str) -> None:
+    """And nothing else leads out of the page."""
+    links = [value or "" for name, value in Page(html).attributes if name == "href"]
+    assert {link.removeprefix(GLOSSARY) for link in links} == {"#law", "#working-unit"}
+    assert len(re.findall(r"https?:", html)) == len(links)
 
 
 def test_what_the_user_named_is_escaped(html: str) -> None:
