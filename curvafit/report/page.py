@@ -244,7 +244,7 @@ def _parameters_say(inference: Inference) -> str:
     method = escape(str(fit.refined.get("method", "refinement")))
     return (
         f"The nearest match and the refined parameters are in {glossary_link('working unit', 's')} (voxel 0.01, ε "
-        f"0.02); a working voxel is {escape(voxel)}. Bold: the {_NAMES[fit.chosen]}, the better supported of the two, which "
+        f"0.02); a working voxel is {escape(voxel)}. Bold: the {_NAMES[fit.chosen]}, the better supported, which "
         f"fit.json holds. ± is one standard deviation of the refinement ({method}), without what the model leaves out."
     )
 
