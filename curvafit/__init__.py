@@ -79,4 +79,10 @@ _HOMES = {
     "wasserstein": "curvafit.geometry.transport",
 }
 
+#: The function that draws each type with a picture, as `module:function`; see `curvafit.pictures`.
+_FIGURES = {
+    "Diagram": "curvafit.drawing.plot:diagram_figure",
+    "Inference": "curvafit.report.pictures:inference_figure",
+}
+
 offer(__name__, _HOMES)

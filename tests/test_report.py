@@ -118,6 +118,20 @@ def test_without_a_match_the_scan_alone_is_drawn(undrawn: None) -> None:
     assert report_html(alone).count("no shape grew") == 2
 
 
+def test_an_inference_shows_the_scan_beside_its_twin() -> None:
+    """In one line, in a notebook and as a figure; alone where nothing grew."""
+    inference = made_inference()
+    assert repr(inference).startswith(
+        "Inference(tubes from an image of 48 x 48 x 48 voxels, distances: match 2.2, fit 1.6"
+    )
+    assert "\n" not in repr(inference) and inference.fit.status in repr(inference)
+    assert [text.get_text() for text in inference.plot().texts] == ["the scan", "regrown: refined parameters"]
+    assert "1.6 &lt; 2.2" in inference._repr_html_() and "data:image/png;base64," in inference._repr_html_()
+    alone = dataclasses.replace(made_inference(lost=True), matched=None)
+    assert [text.get_text() for text in alone.plot(width=300).texts] == ["the scan"]
+    assert "fit –" in repr(alone)
+
+
 def test_the_scan_is_cut_to_the_regenerated_box() -> None:
     found = made_inference()
     smaller = dataclasses.replace(found, regenerated=found.regenerated[:32, :40, :])

@@ -87,10 +87,16 @@ def surface_on(
     axes.add_collection(_edges(camera, (width, height), front=True))
 
 
-def gallery_picture(
-    fields: Mapping[str, np.ndarray], path: str | Path, *, columns: int = 4, width: int = 1600, **options
-) -> Path:
-    """Write a table of surfaces, each above its name."""
+def gallery_picture(fields: Mapping[str, np.ndarray], path: str | Path, *, width: int = 1600, **options) -> Path:
+    """Write a picture of a table of surfaces; `options` are those of `gallery_figure`."""
+    return write_picture(gallery_figure(fields, width=width, **options), path)
+
+
+def gallery_figure(fields: Mapping[str, np.ndarray], *, columns: int = 4, width: int = 1600, **options) -> Figure:
+    """Return a figure `width` pixels wide of a table of surfaces, each above its name.
+
+    `options` are those of `surface_on`.
+    """
     if not fields:
         raise ValueError("expected at least one field to draw, got none")
     columns = min(columns, len(fields))
@@ -103,7 +109,7 @@ def gallery_picture(
         axes = figure.add_axes((column / columns + 0.004, bottom + 0.11 / rows, 1 / columns - 0.008, 0.88 / rows))
         surface_on(axes, u, width=round(width / columns), **options)
         figure.text((column + 0.5) / columns, bottom + 0.05 / rows, name, ha="center", va="center", fontsize=12)
-    return write_picture(figure, path)
+    return figure
 
 
 def _edges(camera: View, size: tuple[int, int], *, front: bool) -> LineCollection:
@@ -192,9 +198,18 @@ def round_length(length: float) -> float:
 
 
 def diagram_figure(
-    diagram: Diagram, *, limits: Limits | None = None, unit: str = "working unit", length: float = 1.0, title: str = ""
+    diagram: Diagram, *, limits: Limits | None = None, unit: str | None = None, length: float = 1.0, title: str = ""
 ) -> Figure:
-    """A figure of one diagram; see `diagram_on`."""
+    """Return a figure of one diagram, in its own unit or another; see `diagram_on`.
+
+    Raises
+    ------
+    ValueError
+        If the diagram is empty.
+    """
+    if not diagram.area > 0:
+        raise ValueError("expected a diagram with area to draw, got an empty one")
+    unit = diagram.unit.removeprefix("1/") if unit is None else unit
     figure = _figure(4.2, 4.2)
     axes = figure.add_axes((0.16, 0.13, 0.82, 0.79 if title else 0.85))
     diagram_on(axes, diagram, limits=limits or shared_limits([diagram], length=length), unit=unit, length=length)

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from curvafit.geometry.mesh import NoSurface, Surface, areas, surface
+from curvafit.pictures import Pictured
 from curvafit.priors.bounds import LONGEST, SHORTEST, instance, named, real
 from curvafit.priors.curvature import diffuse_curvatures, geometric_curvatures, jet
 from curvafit.priors.grid import Grid
@@ -35,8 +36,8 @@ WIDENINGS = 5
 LEAST_RADIUS = 1.0
 
 
-@dataclass(frozen=True, eq=False)
-class Diagram:
+@dataclass(frozen=True, eq=False, repr=False)
+class Diagram(Pictured):
     """A measure on the (κ1, κ2) plane.
 
     Attributes
@@ -66,6 +67,14 @@ class Diagram:
             raise ValueError("expected finite points and finite weights of at least 0, got others")
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "weights", weights)
+
+    def __repr__(self) -> str:
+        if not len(self.points):
+            return f"Diagram(no points, in {self.unit})"
+        low, high = self.points.min(), self.points.max()
+        return (
+            f"Diagram({len(self.points)} points, area {self.area:.4g}, κ from {low:.4g} to {high:.4g} in {self.unit})"
+        )
 
     @property
     def area(self) -> float:

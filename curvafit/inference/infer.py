@@ -26,25 +26,38 @@ from curvafit.inference.phases import check_options
 from curvafit.inference.prepare import Prepared, prepare
 from curvafit.inference.refine import refine
 from curvafit.inference.refinement import Refinement
+from curvafit.pictures import Pictured
 from curvafit.priors.bounds import SEEDS, instance, whole
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.profile import phase_field
 from curvafit.progress import Progress, silent
+from curvafit.units import number
 from curvafit.volumes.scan import Field, load
 
 #: Longest edge, in working voxels, of the boxes in which shapes are regenerated for comparison.
 REGENERATED_EDGE = 100
 #: How many of the nearest shapes are kept, and how many of them refinement starts from.
 MATCHES, STARTS = 5, 3
+#: The distances of a fit that an inference shows, by the names that people read.
+_DISTANCES = (("match", "match"), ("fit", "fit"), ("two seeds", "seed_noise"))
+_ARTICLES = {"field": "a phase field", "mask": "a mask", "image": "an image"}
 
 
-@dataclass(frozen=True)
-class Inference:
+@dataclass(frozen=True, repr=False, eq=False)
+class Inference(Pictured):
     """An inference with all that its report shows.
 
-    `scan` as read and `prepared` for measurement; curvature diagrams of the scan, the regenerated match and the
-    regenerated fit; the phase fields of the last two, `(Z, Y, X)` (None where the shape could not be made).
+    Attributes
+    ----------
+    scan, prepared
+        The scan as it was read, and as it was prepared for measurement.
+    diagram, match_diagram, fit_diagram
+        Curvature diagrams of the scan, the regenerated match and the regenerated fit.
+    matched, regenerated
+        Phase fields `(Z, Y, X)` of the regenerated match and fit, None where no shape grew.
+    fit
+        The parameters with their account.
     """
 
     scan: Field
@@ -55,6 +68,12 @@ class Inference:
     matched: np.ndarray | None
     regenerated: np.ndarray | None
     fit: Fit
+
+    def __repr__(self) -> str:
+        fit = self.fit
+        voxels = " x ".join(map(str, self.scan.values.shape))
+        near = ", ".join(f"{name} {number(fit.distances.get(key), 2)}" for name, key in _DISTANCES)
+        return f"Inference({fit.family} from {_ARTICLES[fit.kind]} of {voxels} voxels, distances: {near}. {fit.status})"
 
     @property
     def best(self) -> np.ndarray | None:

@@ -14,7 +14,7 @@ from curvafit.files import bears, check_folder, check_free, move_together, own_r
 from curvafit.interrupts import undisturbed
 from curvafit.priors.coefficients import NAMES
 from curvafit.priors.fit_file import FORMAT
-from curvafit.report.pictures import diagram_figures, slice_figures, surface_figures, window_framed
+from curvafit.report.pictures import TWINS, diagram_figures, slice_figures, surface_figures, window_framed
 from curvafit.report.wording import describe, glossary_link
 from curvafit.units import density, length, number, per_unit, percent, unit_name
 from curvafit.volumes.scan import Field, save
@@ -35,7 +35,6 @@ _TERMS = {
     "a01": ("a₀₁", "κ₂", 1),
     "a00": ("a₀₀", "1", 2),
 }
-_NAMES = {"match": "nearest match", "fit": "refined parameters"}
 
 
 def check_report(directory: str | Path, inputs: Iterable[str | Path] = (), overwrite: bool = False) -> Path:
@@ -126,7 +125,7 @@ def report_html(inference: Inference) -> str:
         bars=_bars(inference),
         law=glossary_link("law"),
         scale_say=_scale_say(inference),
-        physical_head=f"{_NAMES[fit.chosen].split()[0]}, physical",
+        physical_head=f"{TWINS[fit.chosen].split()[0]}, physical",
         parameters=_parameter_rows(inference),
         parameters_say=_parameters_say(inference),
         numbers=_number_rows(inference),
@@ -202,7 +201,7 @@ def _parameter_rows(inference: Inference) -> str:
     match, refined = fit.matches[0].coefficients.as_dict(), fit.refined["coefficients"]
     physical = fit.coefficients_physical.as_dict()
     rows = [_coefficient_row(inference, name, match[name], refined[name], physical[name]) for name in NAMES]
-    marks = {name: " chosen" if name == fit.chosen else "" for name in _NAMES}
+    marks = {name: " chosen" if name == fit.chosen else "" for name in TWINS}
     rows.append(
         '<tr><th scope="row">m₀</th><td>mass</td>'
         f'<td class="n{marks["match"]}">{number(fit.matches[0].mass)}</td>'
@@ -223,7 +222,7 @@ def _coefficient_row(inference: Inference, name: str, match: float, refined: flo
     deviation = fit.uncertainty.get(name)
     working_sd = _deviation(deviation, 1.0)
     physical_sd = _deviation(deviation, fit.length**-power) if fit.chosen == "fit" else ""
-    best = {key: " chosen" if key == fit.chosen else "" for key in _NAMES}
+    best = {key: " chosen" if key == fit.chosen else "" for key in TWINS}
     unit = per_unit(fit.length_unit, power) if power else ""
     return (
         f'<tr><th scope="row">{symbol}</th><td>{factor}</td><td class="n{best["match"]}">{number(match)}</td>'
@@ -244,7 +243,7 @@ def _parameters_say(inference: Inference) -> str:
     method = escape(str(fit.refined.get("method", "refinement")))
     return (
         f"The nearest match and the refined parameters are in {glossary_link('working unit', 's')} (voxel 0.01, ε "
-        f"0.02); a working voxel is {escape(voxel)}. Bold: the {_NAMES[fit.chosen]}, the better supported, which "
+        f"0.02); a working voxel is {escape(voxel)}. Bold: the {TWINS[fit.chosen]}, the better supported, which "
         f"fit.json holds. ± is one standard deviation of the refinement ({method}), without what the model leaves out."
     )
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import base64
 from html import escape
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from curvafit.drawing.plot import diagram_figure, png, shared_limits, slice_figure, surface_figure
+from curvafit.drawing.plot import diagram_figure, gallery_figure, png, shared_limits, slice_figure, surface_figure
 from curvafit.units import length
 
 if TYPE_CHECKING:
@@ -18,6 +18,19 @@ if TYPE_CHECKING:
 _AXES = "zyx"
 #: The three shapes of a report: which parameters made it, its title.
 _SHAPES = ((None, "The scan"), ("match", "Nearest match, regrown"), ("fit", "Refined, regrown"))
+#: What the better supported shape was grown from.
+TWINS = {"match": "nearest match", "fit": "refined parameters"}
+
+
+def inference_figure(inference: Inference, **options: Any) -> Figure:
+    """Return a figure of the scan's surface beside its regrown twin, the better supported of the two.
+
+    Where no twin grew, the scan is alone. `options` are those of `gallery_figure`.
+    """
+    shapes = {"the scan": scan_box(inference)}
+    if inference.best is not None:
+        shapes[f"regrown: {TWINS[inference.fit.chosen]}"] = inference.best
+    return gallery_figure(shapes, **{"columns": 2, "width": 900, **options})
 
 
 def slice_figures(inference: Inference) -> str:
