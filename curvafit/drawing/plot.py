@@ -56,7 +56,7 @@ def surface_picture(u: np.ndarray, path: str | Path, *, width: int = 900, title:
 
 
 def surface_figure(u: np.ndarray, *, width: int = 720, title: str = "", **options) -> Figure:
-    """A figure `width` pixels wide of one surface."""
+    """Return a figure `width` pixels wide of one surface."""
     figure = _figure(width / DPI, width / DPI)
     axes = figure.add_axes((0, 0, 1, 0.93 if title else 1))
     surface_on(axes, u, width=width, **options)
@@ -113,7 +113,7 @@ def gallery_figure(fields: Mapping[str, np.ndarray], *, columns: int = 4, width:
 
 
 def _edges(camera: View, size: tuple[int, int], *, front: bool) -> LineCollection:
-    """The box's edges in picture pixels: the nine in front of the shape, or the three behind it."""
+    """Return the box's edges in picture pixels: the nine in front of the shape, or the three behind it."""
     corners = np.array(list(np.ndindex(2, 2, 2)), dtype=float)
     towards = camera.frame[2]
     hidden = (corners == (towards < 0)).all(axis=1).argmax()
@@ -137,7 +137,7 @@ def slice_figure(
     axes_names: tuple[str, str],
     window: tuple[float, float, float, float] | None = None,
 ) -> Figure:
-    """A grey slice with the zero contour of `structure` over it.
+    """Return a grey slice with the zero contour of `structure` over it.
 
     Parameters
     ----------
@@ -176,7 +176,7 @@ def slice_figure(
 
 
 def _scale_bar(figure: Figure, axes: Axes, length: float, unit: str, name: str) -> None:
-    """A bar of a round length above the slice, with the horizontal axis's name."""
+    """Draw a bar of a round length above the slice, with the horizontal axis's name."""
     bar = round_length(0.3 * abs(length))
     share = bar / abs(length)
     above = 1 + 0.19 / (axes.get_position().height * figure.get_figheight())
@@ -187,7 +187,7 @@ def _scale_bar(figure: Figure, axes: Axes, length: float, unit: str, name: str) 
 
 
 def round_length(length: float) -> float:
-    """The largest of 1, 2, 5 × 10ⁿ that is not above `length`."""
+    """Return the largest of 1, 2, 5 × 10ⁿ that is not above `length`."""
     if not length > 0:
         raise ValueError(f"expected a positive length, got {length}")
     power = 10.0 ** math.floor(math.log10(length))
@@ -250,7 +250,8 @@ def diagram_on(
 
 
 def shared_limits(diagrams: Sequence[Diagram], *, length: float = 1.0, tail: float = 0.006) -> Limits:
-    """The interval that holds both curvatures of every diagram but for the outermost `tail` of area at either end."""
+    """Return the interval that holds both curvatures of every diagram but for the outermost `tail` of area at either
+    end."""
     bounds = [0.0, 0.0]
     for diagram in diagrams:
         for kappa in np.asarray(diagram.points).T / length:
@@ -264,7 +265,7 @@ def shared_limits(diagrams: Sequence[Diagram], *, length: float = 1.0, tail: flo
 
 
 def _name_families(axes: Axes, limits: Limits) -> None:
-    """Small words where spheres, tubes and saddles lie, in the corners that hold no mass."""
+    """Write small words where spheres, tubes and saddles lie, in the corners that hold no mass."""
     low, high = limits
     pad = 0.02 * (high - low)
     style = {"fontsize": 8.5, "color": "#5B616B", "style": "italic", "zorder": 4}
@@ -284,7 +285,7 @@ def _name_families(axes: Axes, limits: Limits) -> None:
 
 
 def png(figure: Figure) -> bytes:
-    """The figure as a PNG."""
+    """Return the figure as a PNG."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=DPI)
     return buffer.getvalue()

@@ -77,7 +77,7 @@ class Inference(Pictured):
 
     @property
     def best(self) -> np.ndarray | None:
-        """The regenerated shape of the better supported parameters."""
+        """Return the regenerated shape of the better supported parameters."""
         return self.regenerated if self.fit.chosen == "fit" else self.matched
 
 
@@ -170,7 +170,8 @@ def _refined(prepared: Prepared, matches: tuple[Match, ...], seed: int, progress
 
 
 def _with_mass(refined: Refinement, prepared: Prepared, seed: int) -> Refinement:
-    """The mass that gives a regenerated shape the scan's volume fraction, to first order; a field's own is its mean.
+    """Return the mass that gives a regenerated shape the scan's volume fraction, to first order; a field's own is its
+    mean.
 
     A mask does not tell its mass: the phases of a minimiser stop short of ±1 by an amount that curvature decides.
     """
@@ -185,7 +186,7 @@ def _with_mass(refined: Refinement, prepared: Prepared, seed: int) -> Refinement
 
 
 def _twin_grid(prepared: Prepared) -> Grid:
-    """A periodic box of the main window's size, for shapes to compare with."""
+    """Return a periodic box of the main window's size, for shapes to compare with."""
     z, y, x = (min(edge.stop - edge.start, REGENERATED_EDGE) for edge in prepared.windows[0])
     return Grid((z, y, x), prepared.grid.spacing, "periodic")
 
@@ -193,7 +194,7 @@ def _twin_grid(prepared: Prepared) -> Grid:
 def _regenerate(
     prepared: Prepared, match: Match, refined: Refinement, seed: int, progress: Progress
 ) -> dict[str, tuple[_Twin, _Twin]]:
-    """Two seeds each of the nearest match and of the refined parameters."""
+    """Regrow two seeds each of the nearest match and of the refined parameters."""
     grid = _twin_grid(prepared)
     twins = {}
     for step, (name, source) in enumerate((("match", match), ("fit", refined))):
@@ -261,7 +262,7 @@ def _noise(pair: tuple[_Twin, _Twin]) -> float | None:
 def _verdict(
     distances: dict[str, float | None], noises: dict[str, float | None], refined: Refinement, twins: dict
 ) -> tuple[str, str]:
-    """Which of match and fit is better supported, in a word and in a sentence."""
+    """Return which of match and fit is better supported, in a word and in a sentence."""
     match, fit = distances["match"], distances["fit"]
     if fit is None:
         reason = twins["fit"][0].flow.viability.reason
