@@ -38,7 +38,7 @@ def exact_errors(name: str, voxels: int, kind: str) -> tuple[np.ndarray, np.ndar
     shape, size = EXACT[name]
     nz, ny, nx = (edge * voxels for edge in size)
     grid = Grid((nz, ny, nx), (1 / voxels,) * 3, "replicate")
-    found = surface_curvatures(profile(shape, centres(grid), 1.0), grid, 1.0, kind, margin=0)  # type: ignore[arg-type]
+    found = surface_curvatures(profile(shape, centres(grid), 1.0), grid, 1.0, curvature=kind, margin=0)  # type: ignore[arg-type]
     truth = torch.stack(shape.curvatures(torch.from_numpy(found.centres) + 0.5 / voxels), -1).numpy()
     error = np.abs(found.points - truth) / np.abs(truth).max(1, keepdims=True)
     return 8 * found.areas @ found.points / found.areas.sum(), error
@@ -69,7 +69,8 @@ def gallery_gaps(folder: Path) -> list[tuple[str, float, float]]:
         u = torch.from_numpy(nibabel.load(path).get_fdata(dtype=np.float32))
         grid = Grid(tuple(u.shape), (0.01,) * 3)  # type: ignore[arg-type]
         profiled = phase_field(u > 0, grid, 0.02)
-        gaps = (wasserstein(diagram(u, grid, 0.02, k), diagram(profiled, grid, 0.02, k)) for k in KINDS)  # type: ignore[arg-type]
+        pairs = ([diagram(field, grid, 0.02, curvature=kind) for field in (u, profiled)] for kind in KINDS)
+        gaps = (wasserstein(*pair) for pair in pairs)
         rows.append((path.name.split(" coeffs")[0], *gaps))
     return rows
 

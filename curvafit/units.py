@@ -6,6 +6,8 @@ import math
 
 #: Metres in each unit of length that files name, small to large.
 METRES = {"nm": 1e-9, "um": 1e-6, "mm": 1e-3, "m": 1.0}
+#: The page where words with a special meaning stand, each under its own anchor.
+GLOSSARY = "https://curvafit.readthedocs.io/en/latest/glossary/"
 #: A space that no line breaks at.
 _GLUE = "\u00a0"
 

@@ -79,7 +79,9 @@ def middle(whole: Shape, cube: int, options: Namespace) -> tuple[Diagram | None,
     where[..., first:last] = True
     inside = float((whole.field[..., first:last] > 0).mean())
     try:
-        return diagram(whole.field, Grid(whole.field.shape), WORKING_EPSILON, options.curvature, where=where), inside
+        return diagram(
+            whole.field, Grid(whole.field.shape), WORKING_EPSILON, curvature=options.curvature, where=where
+        ), inside
     except NoSurface:
         return None, inside
 

@@ -35,7 +35,7 @@ def octant(name: str, voxels: int) -> tuple[torch.Tensor, Grid]:
 def errors(name: str, voxels: int, kind: str) -> np.ndarray:
     """|κ - exact κ| at every triangle's barycentre, over max(|κ1|, |κ2|) there: `(N, 2)`."""
     u, grid = octant(name, voxels)
-    found = surface_curvatures(u, grid, 1.0, kind, margin=0)  # type: ignore[arg-type]
+    found = surface_curvatures(u, grid, 1.0, curvature=kind, margin=0)  # type: ignore[arg-type]
     assert found.excluded == 0
     places = torch.from_numpy(found.centres) + 0.5 / voxels
     truth = torch.stack(OCTANTS[name][0].curvatures(places), -1).numpy()
@@ -59,7 +59,7 @@ def test_diffuse_curvatures_are_far_more_biased(name: str, least: float) -> None
 
 def test_diffuse_sphere_opens_up() -> None:
     """The direction: κ1 too large, κ2 too small, as measured on the published program's fields."""
-    mean = diagram(*octant("sphere", 2), 1.0, "diffuse", margin=0).mean() * 8
+    mean = diagram(*octant("sphere", 2), 1.0, curvature="diffuse", margin=0).mean() * 8
     assert mean[0] == pytest.approx(1.21, abs=0.05)
     assert mean[1] == pytest.approx(0.79, abs=0.05)
 
@@ -153,7 +153,7 @@ def test_flat_noise_never_gives_nan() -> None:
 def test_bad_input_is_one_sentence() -> None:
     u, grid = octant("sphere", 2)
     with pytest.raises(ValueError, match="expected curvature 'geometric' or 'diffuse', got 'mean'"):
-        diagram(u, grid, 1.0, "mean")  # type: ignore[arg-type]
+        diagram(u, grid, 1.0, curvature="mean")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="expected a field that crosses 0"):
         diagram(u.abs() + 0.1, grid, 1.0)
     with pytest.raises(ValueError, match=r"expected points \(N, 2\) and weights \(N,\), got \(3, 2\) and \(2,\)"):

@@ -26,6 +26,18 @@ from curvafit.drawing.render import render, view
 from curvafit.geometry.diagram import Diagram
 
 
+def test_a_diagram_shows_itself() -> None:
+    """Its unit is its own; an empty one is a line without a picture."""
+    some = Diagram(np.array([[2.0, 1.0], [3.0, -4.0]]), np.array([1.0, 0.5]), unit="1/um")
+    assert repr(some) == "Diagram(2 points, area 1.5, κ from -4 to 3 in 1/um)"
+    assert some.plot().axes[0].get_xlabel() == "κ₁ (1/µm)"
+    assert "<img src=" in some._repr_html_()
+    none = Diagram(np.zeros((0, 2)), np.zeros(0))
+    assert none._repr_html_() == "<code>Diagram(no points, in 1/working unit)</code>"
+    with pytest.raises(ValueError, match="expected a diagram with area to draw, got an empty one"):
+        none.plot()
+
+
 def ball(shape: tuple[int, int, int], radius: float, spacing: tuple[float, float, float] = (1, 1, 1)) -> np.ndarray:
     """radius - distance from the box's centre, in units of `spacing`."""
     axes = [(np.arange(n) - (n - 1) / 2) * h for n, h in zip(shape, spacing, strict=True)]

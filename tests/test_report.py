@@ -20,7 +20,7 @@ from curvafit.priors.fit_file import FORMAT
 from curvafit.report.page import parameter_table, report_html, with_command, write_inference
 from curvafit.report.pictures import scan_box
 from curvafit.report.wording import describe, family_radius
-from curvafit.units import density, length, number
+from curvafit.units import GLOSSARY, density, length, number
 from curvafit.volumes.scan import load
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}
@@ -63,13 +63,20 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_page_stands_alone_and_is_well_formed(html: str) -> None:
     page = Page(html)
-    links = [value or "" for name, value in page.attributes if name in ("src", "href", "action", "srcset")]
+    links = [value or "" for name, value in page.attributes if name in ("src", "action", "srcset")]
     assert len(links) == 9 and all(link.startswith("data:image/png;base64,") for link in links)
-    assert "url(" not in html and "<script" not in html and not re.search(r"https?:", html)
+    assert "url(" not in html and "<script" not in html
     assert all(base64.b64decode(link.partition(",")[2])[:4] == b"\x89PNG" for link in links)
     alts = [value for name, value in page.attributes if name == "alt"]
     assert len(alts) == 9 and all(alts)
     assert len(html) < 4_000_000
+
+
+def test_words_with_a_special_meaning_lead_to_the_glossary(html: str) -> None:
+    """And nothing else leads out of the page."""
+    links = [value or "" for name, value in Page(html).attributes if name == "href"]
+    assert {link.removeprefix(GLOSSARY) for link in links} == {"#law", "#working-unit"}
+    assert len(re.findall(r"https?:", html)) == len(links)
 
 
 def test_what_the_user_named_is_escaped(html: str) -> None:
@@ -109,6 +116,20 @@ def test_what_could_not_be_made_is_said(undrawn: None) -> None:
 def test_without_a_match_the_scan_alone_is_drawn(undrawn: None) -> None:
     alone = dataclasses.replace(made_inference(), matched=None, match_diagram=None)
     assert report_html(alone).count("no shape grew") == 2
+
+
+def test_an_inference_shows_the_scan_beside_its_twin() -> None:
+    """In one line, in a notebook and as a figure; alone where nothing grew."""
+    inference = made_inference()
+    assert repr(inference).startswith(
+        "Inference(tubes from an image of 48 x 48 x 48 voxels, distances: match 2.2, fit 1.6"
+    )
+    assert "\n" not in repr(inference) and inference.fit.status in repr(inference)
+    assert [text.get_text() for text in inference.plot().texts] == ["the scan", "regrown: refined parameters"]
+    assert "1.6 &lt; 2.2" in inference._repr_html_() and "data:image/png;base64," in inference._repr_html_()
+    alone = dataclasses.replace(made_inference(lost=True), matched=None)
+    assert [text.get_text() for text in alone.plot(width=300).texts] == ["the scan"]
+    assert "fit –" in repr(alone)
 
 
 def test_the_scan_is_cut_to_the_regenerated_box() -> None:

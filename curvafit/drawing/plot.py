@@ -56,7 +56,7 @@ def surface_picture(u: np.ndarray, path: str | Path, *, width: int = 900, title:
 
 
 def surface_figure(u: np.ndarray, *, width: int = 720, title: str = "", **options) -> Figure:
-    """A figure `width` pixels wide of one surface."""
+    """Return a figure `width` pixels wide of one surface."""
     figure = _figure(width / DPI, width / DPI)
     axes = figure.add_axes((0, 0, 1, 0.93 if title else 1))
     surface_on(axes, u, width=width, **options)
@@ -87,10 +87,16 @@ def surface_on(
     axes.add_collection(_edges(camera, (width, height), front=True))
 
 
-def gallery_picture(
-    fields: Mapping[str, np.ndarray], path: str | Path, *, columns: int = 4, width: int = 1600, **options
-) -> Path:
-    """Write a table of surfaces, each above its name."""
+def gallery_picture(fields: Mapping[str, np.ndarray], path: str | Path, *, width: int = 1600, **options) -> Path:
+    """Write a picture of a table of surfaces; `options` are those of `gallery_figure`."""
+    return write_picture(gallery_figure(fields, width=width, **options), path)
+
+
+def gallery_figure(fields: Mapping[str, np.ndarray], *, columns: int = 4, width: int = 1600, **options) -> Figure:
+    """Return a figure `width` pixels wide of a table of surfaces, each above its name.
+
+    `options` are those of `surface_on`.
+    """
     if not fields:
         raise ValueError("expected at least one field to draw, got none")
     columns = min(columns, len(fields))
@@ -103,11 +109,11 @@ def gallery_picture(
         axes = figure.add_axes((column / columns + 0.004, bottom + 0.11 / rows, 1 / columns - 0.008, 0.88 / rows))
         surface_on(axes, u, width=round(width / columns), **options)
         figure.text((column + 0.5) / columns, bottom + 0.05 / rows, name, ha="center", va="center", fontsize=12)
-    return write_picture(figure, path)
+    return figure
 
 
 def _edges(camera: View, size: tuple[int, int], *, front: bool) -> LineCollection:
-    """The box's edges in picture pixels: the nine in front of the shape, or the three behind it."""
+    """Return the box's edges in picture pixels: the nine in front of the shape, or the three behind it."""
     corners = np.array(list(np.ndindex(2, 2, 2)), dtype=float)
     towards = camera.frame[2]
     hidden = (corners == (towards < 0)).all(axis=1).argmax()
@@ -131,7 +137,7 @@ def slice_figure(
     axes_names: tuple[str, str],
     window: tuple[float, float, float, float] | None = None,
 ) -> Figure:
-    """A grey slice with the zero contour of `structure` over it.
+    """Return a grey slice with the zero contour of `structure` over it.
 
     Parameters
     ----------
@@ -170,7 +176,7 @@ def slice_figure(
 
 
 def _scale_bar(figure: Figure, axes: Axes, length: float, unit: str, name: str) -> None:
-    """A bar of a round length above the slice, with the horizontal axis's name."""
+    """Draw a bar of a round length above the slice, with the horizontal axis's name."""
     bar = round_length(0.3 * abs(length))
     share = bar / abs(length)
     above = 1 + 0.19 / (axes.get_position().height * figure.get_figheight())
@@ -181,7 +187,7 @@ def _scale_bar(figure: Figure, axes: Axes, length: float, unit: str, name: str) 
 
 
 def round_length(length: float) -> float:
-    """The largest of 1, 2, 5 × 10ⁿ that is not above `length`."""
+    """Return the largest of 1, 2, 5 × 10ⁿ that is not above `length`."""
     if not length > 0:
         raise ValueError(f"expected a positive length, got {length}")
     power = 10.0 ** math.floor(math.log10(length))
@@ -192,12 +198,21 @@ def round_length(length: float) -> float:
 
 
 def diagram_figure(
-    diagram: Diagram, *, limits: Limits | None = None, unit: str = "working unit", length: float = 1.0, title: str = ""
+    diagram: Diagram, *, limits: Limits | None = None, unit: str | None = None, length: float = 1.0, title: str = ""
 ) -> Figure:
-    """A figure of one diagram; see `diagram_on`."""
+    """Return a figure of one diagram, in its own unit or another; see `diagram_on`.
+
+    Raises
+    ------
+    ValueError
+        If the diagram is empty.
+    """
+    if not diagram.area > 0:
+        raise ValueError("expected a diagram with area to draw, got an empty one")
+    unit = diagram.unit.removeprefix("1/") if unit is None else unit
     figure = _figure(4.2, 4.2)
     axes = figure.add_axes((0.16, 0.13, 0.82, 0.79 if title else 0.85))
-    diagram_on(axes, diagram, limits=limits or shared_limits([diagram], length), unit=unit, length=length)
+    diagram_on(axes, diagram, limits=limits or shared_limits([diagram], length=length), unit=unit, length=length)
     if title:
         axes.set_title(title, fontsize=11)
     return figure
@@ -234,8 +249,9 @@ def diagram_on(
     _name_families(axes, limits)
 
 
-def shared_limits(diagrams: Sequence[Diagram], length: float = 1.0, tail: float = 0.006) -> Limits:
-    """The interval that holds both curvatures of every diagram but for the outermost `tail` of area at either end."""
+def shared_limits(diagrams: Sequence[Diagram], *, length: float = 1.0, tail: float = 0.006) -> Limits:
+    """Return the interval that holds both curvatures of every diagram but for the outermost `tail` of area at either
+    end."""
     bounds = [0.0, 0.0]
     for diagram in diagrams:
         for kappa in np.asarray(diagram.points).T / length:
@@ -249,7 +265,7 @@ def shared_limits(diagrams: Sequence[Diagram], length: float = 1.0, tail: float 
 
 
 def _name_families(axes: Axes, limits: Limits) -> None:
-    """Small words where spheres, tubes and saddles lie, in the corners that hold no mass."""
+    """Write small words where spheres, tubes and saddles lie, in the corners that hold no mass."""
     low, high = limits
     pad = 0.02 * (high - low)
     style = {"fontsize": 8.5, "color": "#5B616B", "style": "italic", "zorder": 4}
@@ -269,7 +285,7 @@ def _name_families(axes: Axes, limits: Limits) -> None:
 
 
 def png(figure: Figure) -> bytes:
-    """The figure as a PNG."""
+    """Return the figure as a PNG."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=DPI)
     return buffer.getvalue()

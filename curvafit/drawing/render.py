@@ -35,19 +35,33 @@ class View(NamedTuple):
     half: tuple[float, float]
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Points `(N, 3)` of the box, (z, y, x) in [0, 1], to picture coordinates `(N, 2)` in [0, 1], y downwards."""
+        """Return where points `(N, 3)` of the box, (z, y, x) in [0, 1], lie on the picture: `(N, 2)`, x and y down."""
         centred = (np.asarray(points) - 0.5) * self.box
         right, up = centred @ self.frame[0], centred @ self.frame[1]
         return np.stack([0.5 + right / (2 * self.half[0]), 0.5 - up / (2 * self.half[1])], axis=-1)
 
 
+class _Scene(NamedTuple):
+    """What the loops draw: the field `(Z, Y, X)` less its level; the same smoothed, for normals; how much lies near and
+    farther off; which blocks are not empty; voxel edges over the shortest; the last voxel's index."""
+
+    field: np.ndarray
+    smooth: np.ndarray
+    near: np.ndarray
+    far: np.ndarray
+    occupied: np.ndarray
+    edges: np.ndarray
+    top: np.ndarray
+
+
 def view(
     shape: tuple[int, int, int],
     spacing: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    *,
     azimuth: float = 32.0,
     elevation: float = 24.0,
 ) -> View:
-    """The projection that shows a whole box: z up, turned by `azimuth` and seen from `elevation` degrees above."""
+    """Return the projection that shows a whole box, z up: turned by `azimuth`, seen from `elevation` degrees above."""
     α, β = math.radians(azimuth), math.radians(elevation)
     right = np.array([0.0, math.sin(α), math.cos(α)])
     towards = np.array([math.sin(β), -math.cos(α) * math.cos(β), math.sin(α) * math.cos(β)])
@@ -68,8 +82,9 @@ def render(
     azimuth: float = 32.0,
     elevation: float = 24.0,
 ) -> tuple[np.ndarray, View]:
-    """The level set of `u` `(Z, Y, X)` as an RGBA picture `(height, width, 4)` of bytes, transparent where there is
-    nothing, and the projection that made it.
+    """Return the level set of `u` `(Z, Y, X)` as a picture, and the projection that it was drawn by.
+
+    The picture is RGBA, `(height, width, 4)` bytes, transparent where there is nothing.
 
     Raises
     ------
@@ -81,7 +96,7 @@ def render(
         raise ValueError(f"expected a volume of 3 axes of at least 4 voxels to draw, got shape {field.shape}")
     if not np.isfinite(field).all():
         raise ValueError("expected a finite volume to draw, got NaN or infinite values")
-    camera = view(field.shape, spacing, azimuth, elevation)
+    camera = view(field.shape, spacing, azimuth=azimuth, elevation=elevation)
     height = max(2, round(width * camera.half[1] / camera.half[0]))
     size = (height * supersample, width * supersample)
     field = field - np.float32(level)
@@ -89,17 +104,17 @@ def render(
     smooth = gaussian_filter(field, 0.9 / edges)
     inside = (field > 0).astype(np.float32)
     near, far = (gaussian_filter(inside, distance / edges, mode="constant") for distance in (2.5, 7.0))
-    top, half = np.array(field.shape) - 1.0, np.array(camera.half)
+    scene = _Scene(field, smooth, near, far, _blocks(field), edges, np.array(field.shape) - 1.0)
     light = np.array(KEY_LIGHT) / np.linalg.norm(KEY_LIGHT) @ camera.frame
     colours = np.array(SURFACE), np.array(CAP)
     pixels = np.zeros((*size, 4), dtype=np.float32)
     threads.start()
-    _draw(pixels, field, smooth, near, far, _blocks(field), edges, top, camera.frame, half, light, *colours)
+    _draw(pixels, scene, camera.frame, np.array(camera.half), light, *colours)
     return _reduced(pixels, supersample), camera
 
 
 def _blocks(field: np.ndarray) -> np.ndarray:
-    """Whether any voxel of a block of `BLOCK`³, or of the layer around it, is inside."""
+    """Return whether any voxel of a block of `BLOCK`³, or of the layer around it, is inside."""
     count = [-(-n // BLOCK) for n in field.shape]
     occupied = np.zeros(count, dtype=np.bool_)
     for index in np.ndindex(*count):
@@ -109,7 +124,7 @@ def _blocks(field: np.ndarray) -> np.ndarray:
 
 
 def _reduced(pixels: np.ndarray, factor: int) -> np.ndarray:
-    """Means over factor² samples (colour weighted by cover), encoded as bytes."""
+    """Return means over factor² samples (colour weighted by cover), encoded as bytes."""
     height, width = pixels.shape[0] // factor, pixels.shape[1] // factor
     cover = pixels[..., 3:]
     weighted = np.concatenate([pixels[..., :3] * cover, cover], axis=-1)
@@ -120,8 +135,9 @@ def _reduced(pixels: np.ndarray, factor: int) -> np.ndarray:
 
 
 @numba.njit(cache=True, nogil=True, parallel=True)
-def _draw(pixels, f, smooth, near, far, occupied, edges, top, frame, half, light, surface, cap):
-    """One ray a pixel: find the surface or the cut face, then light it."""
+def _draw(pixels, scene, frame, half, light, surface, cap):
+    """Send one ray a pixel: find the surface or the cut face, then light it."""
+    f, smooth, occupied, edges, top = scene.field, scene.smooth, scene.occupied, scene.edges, scene.top
     height, width = pixels.shape[:2]
     reach = math.sqrt(((top * edges) ** 2).sum()) / 2
     for row in numba.prange(height):
@@ -146,8 +162,8 @@ def _draw(pixels, f, smooth, near, far, occupied, edges, top, frame, half, light
             n[axis] = -1.0 if d[axis] > 0 else 1.0
             if not capped:
                 _normal(smooth, edges, o, n)
-            sky = 1.0 if capped else _sky(near, far, edges, o, n)
-            lit = _lit(f, occupied, edges, o, n, light, top, q, s)
+            sky = 1.0 if capped else _sky(scene, o, n)
+            lit = _lit(scene, o, n, light, q, s)
             eye = n[0] * frame[2, 0] + n[1] * frame[2, 1] + n[2] * frame[2, 2]
             glow = 1.12 * ((0.50 + 0.14 * eye) * sky + 0.52 * lit * (0.55 + 0.45 * sky))
             haze = 0.30 * min(max(0.5 + t / (2 * reach), 0.0), 1.0) ** 1.5
@@ -159,7 +175,7 @@ def _draw(pixels, f, smooth, near, far, occupied, edges, top, frame, half, light
 
 @numba.njit(cache=True, nogil=True)
 def _normal(smooth, edges, p, n):
-    """Unit normal out of the phase at `p`, into `n`."""
+    """Write the unit normal out of the phase at `p` into `n`."""
     n[0] = (_at(smooth, p[0] - 1, p[1], p[2]) - _at(smooth, p[0] + 1, p[1], p[2])) / edges[0]
     n[1] = (_at(smooth, p[0], p[1] - 1, p[2]) - _at(smooth, p[0], p[1] + 1, p[2])) / edges[1]
     n[2] = (_at(smooth, p[0], p[1], p[2] - 1) - _at(smooth, p[0], p[1], p[2] + 1)) / edges[2]
@@ -169,8 +185,9 @@ def _normal(smooth, edges, p, n):
 
 
 @numba.njit(cache=True, nogil=True)
-def _sky(near, far, edges, p, n):
-    """The share of the sky that is open above `p`, judged from occupancies blurred by 2.5 and by 7 edges."""
+def _sky(scene, p, n):
+    """Return the share of the sky that is open above `p`, judged from occupancies blurred by 2.5 and by 7 edges."""
+    near, far, edges = scene.near, scene.far, scene.edges
     a, b, c = n[0] / edges[0], n[1] / edges[1], n[2] / edges[2]
     close = _at(near, p[0] + 2.5 * a, p[1] + 2.5 * b, p[2] + 2.5 * c)
     wide = _at(far, p[0] + 7.0 * a, p[1] + 7.0 * b, p[2] + 7.0 * c)
@@ -178,23 +195,24 @@ def _sky(near, far, edges, p, n):
 
 
 @numba.njit(cache=True, nogil=True)
-def _lit(f, occupied, edges, p, n, light, top, q, d):
-    """What the key light gives at `p`: its cosine, less in shadow. `q` and `d` are scratch."""
+def _lit(scene, p, n, light, q, d):
+    """Return what the key light gives at `p`: its cosine, less in shadow. `q` and `d` are scratch."""
+    edges = scene.edges
     facing = n[0] * light[0] + n[1] * light[1] + n[2] * light[2]
     if facing <= 0:
         return 0.0
     for a in range(3):
         q[a] = p[a] + 1.5 * n[a] / edges[a]
         d[a] = light[a] / edges[a]
-    begin, end, _ = _span(q, d, top)
+    begin, end, _ = _span(q, d, scene.top)
     if end < 2 or begin > end:
         return facing
-    return facing * (1 - 0.6 * _shadow(f, occupied, q, d, 2.0, end))
+    return facing * (1 - 0.6 * _shadow(scene.field, scene.occupied, q, d, 2.0, end))
 
 
 @numba.njit(cache=True, nogil=True)
 def _march(f, occupied, o, d, start, stop):
-    """The least t in [start, stop] where the ray o + t d (in voxels) enters the phase, or `MISS`."""
+    """Return the least t in [start, stop] where the ray o + t d (in voxels) enters the phase, or `MISS`."""
     t, last = start, start
     while t <= stop:
         z, y, x = o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]
@@ -215,7 +233,7 @@ def _march(f, occupied, o, d, start, stop):
 
 @numba.njit(cache=True, nogil=True)
 def _shadow(f, occupied, o, d, start, stop):
-    """How much of the key light is kept from o: 0 for none, 1 where the ray meets the phase, between near it."""
+    """Return the share of the key light that does not reach o: 1 where the ray meets the phase, less near it."""
     t, highest = start, -1.0
     while t <= stop and highest < 0:
         z, y, x = o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]
@@ -229,7 +247,7 @@ def _shadow(f, occupied, o, d, start, stop):
 
 @numba.njit(cache=True, nogil=True)
 def _jump(occupied, z, y, x, d):
-    """How far a ray may go before it leaves an empty block; 0 in an occupied one."""
+    """Return how far a ray may go before it leaves an empty block; 0 in an occupied one."""
     i = min(max(int(z) // BLOCK, 0), occupied.shape[0] - 1)
     j = min(max(int(y) // BLOCK, 0), occupied.shape[1] - 1)
     k = min(max(int(x) // BLOCK, 0), occupied.shape[2] - 1)
@@ -240,7 +258,7 @@ def _jump(occupied, z, y, x, d):
 
 @numba.njit(cache=True, nogil=True)
 def _leave(position, direction, block):
-    """How far a ray goes before it leaves a block along one axis."""
+    """Return how far a ray goes before it leaves a block along one axis."""
     if abs(direction) < 1e-9:
         return MISS
     return ((block + (direction > 0)) * BLOCK - position) / direction
@@ -248,7 +266,7 @@ def _leave(position, direction, block):
 
 @numba.njit(cache=True, nogil=True)
 def _span(position, direction, top):
-    """Where a line enters and leaves [0, top] along each axis: (t in, t out, axis of entry)."""
+    """Return where a line enters and leaves the box [0, top], and the axis along which it enters."""
     start, stop, axis = -1e9, 1e9, 0
     for a in range(3):
         if abs(direction[a]) < 1e-9:
@@ -266,7 +284,7 @@ def _span(position, direction, top):
 
 @numba.njit(cache=True, nogil=True)
 def _at(f, z, y, x):
-    """Trilinear interpolation, clamped to the box."""
+    """Interpolate linearly along each axis, clamped to the box."""
     nz, ny, nx = f.shape
     z, y, x = min(max(z, 0.0), nz - 1.0), min(max(y, 0.0), ny - 1.0), min(max(x, 0.0), nx - 1.0)
     i, j, k = min(int(z), nz - 2), min(int(y), ny - 2), min(int(x), nx - 2)

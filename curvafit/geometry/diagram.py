@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from curvafit.geometry.mesh import NoSurface, Surface, areas, surface
+from curvafit.pictures import Pictured
 from curvafit.priors.bounds import LONGEST, SHORTEST, instance, named, real
 from curvafit.priors.curvature import diffuse_curvatures, geometric_curvatures, jet
 from curvafit.priors.grid import Grid
@@ -35,8 +36,8 @@ WIDENINGS = 5
 LEAST_RADIUS = 1.0
 
 
-@dataclass(frozen=True, eq=False)
-class Diagram:
+@dataclass(frozen=True, eq=False, repr=False)
+class Diagram(Pictured):
     """A measure on the (κ1, κ2) plane.
 
     Attributes
@@ -67,31 +68,39 @@ class Diagram:
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "weights", weights)
 
+    def __repr__(self) -> str:
+        if not len(self.points):
+            return f"Diagram(no points, in {self.unit})"
+        low, high = self.points.min(), self.points.max()
+        return (
+            f"Diagram({len(self.points)} points, area {self.area:.4g}, κ from {low:.4g} to {high:.4g} in {self.unit})"
+        )
+
     @property
     def area(self) -> float:
-        """Total weight."""
+        """Return the total weight."""
         return float(self.weights.sum())
 
     @property
     def normalised(self) -> Diagram:
-        """The same diagram with total weight 1."""
+        """Return the same diagram with total weight 1."""
         if not self.area > 0:
             raise ValueError("expected a diagram with area, got an empty one")
         return dataclasses.replace(self, weights=self.weights / self.area)
 
     def mean(self) -> np.ndarray:
-        """Area-weighted mean (κ1, κ2)."""
+        """Return the area-weighted mean (κ1, κ2)."""
         return self.normalised.weights @ self.points
 
     def binned(self, width: float) -> Diagram:
-        """Bins of edge `width`, each replaced by its barycentre: means and total weight are kept exactly."""
+        """Return bins of edge `width`, each replaced by its barycentre: means and total weight are kept exactly."""
         if not width > 0:
             raise ValueError(f"expected a bin width above 0, got {width}")
         return self._merged(self._cells(width))
 
     def thinned(self, width: float, share: float) -> Diagram:
-        """Bins of edge `width` where the area is and wider ones, by powers of two, in the tails: a bin is the widest
-        whose part of the area times (edge / width)² is at most `share`."""
+        """Return bins of edge `width` where the area is and wider ones, by powers of two, in the tails: a bin is the
+        widest whose part of the area times (edge / width)² is at most `share`."""
         if not share > 0:
             raise ValueError(f"expected a share above 0, got {share}")
         fine = self.binned(width)
@@ -106,13 +115,13 @@ class Diagram:
         return fine._merged(np.unique(chosen, return_inverse=True)[1])
 
     def _cells(self, width: float) -> np.ndarray:
-        """Number of the square of edge `width` that each point is in: 0, 1, … over the occupied ones."""
+        """Return the number of the square of edge `width` that each point is in: 0, 1, … over the occupied ones."""
         cells = np.floor(self.points / width).astype(np.int64)
         cells -= cells.min(0, initial=0)
         return np.unique(cells @ np.array([cells[:, 1].max(initial=0) + 1, 1]), return_inverse=True)[1]
 
     def _merged(self, index: np.ndarray) -> Diagram:
-        """Points with the same index (0, 1, …) replaced by their barycentre."""
+        """Return the points with the same index (0, 1, …) replaced by their barycentre."""
         weights = np.bincount(index, self.weights)
         kept = weights > 0
         safe = np.where(kept, weights, 1)
@@ -137,13 +146,15 @@ def diagram(
     u: np.ndarray | Tensor,
     grid: Grid,
     epsilon: float,
+    *,
     curvature: Kind = "geometric",
     margin: int | None = None,
     where: np.ndarray | None = None,
 ) -> Diagram:
-    """The curvature diagram of {u = 0}: what `surface_curvatures` finds, without the places; takes what that takes."""
-    found = surface_curvatures(u, grid, epsilon, curvature, margin, where)
-    return Diagram(found.points, found.areas, excluded=found.excluded)
+    """Return the curvature diagram of {u = 0}: what `surface_curvatures` gives, without the places; it takes the
+    same."""
+    curvatures = surface_curvatures(u, grid, epsilon, curvature=curvature, margin=margin, where=where)
+    return Diagram(curvatures.points, curvatures.areas, excluded=curvatures.excluded)
 
 
 def diagrams(field: Tensor, grid: Grid, epsilon: float) -> tuple[Diagram, Diagram]:
@@ -160,6 +171,7 @@ def surface_curvatures(
     u: np.ndarray | Tensor,
     grid: Grid,
     epsilon: float,
+    *,
     curvature: Kind = "geometric",
     margin: int | None = None,
     where: np.ndarray | None = None,
@@ -226,7 +238,8 @@ def resolved(slope: Tensor, kappa1: Tensor, kappa2: Tensor, grid: Grid) -> Tenso
 
 
 def _inner_surface(values: Tensor, grid: Grid, margin: int | None) -> Surface:
-    """The surface without a margin along the sides of a box that is not periodic, in the whole box's coordinates."""
+    """Return the surface without a margin along the sides of a box that is not periodic, in the whole box's
+    coordinates."""
     m = 0 if grid.periodic else MARGIN if margin is None else margin
     if m == 0:
         return surface(values, grid)
@@ -253,7 +266,8 @@ def _voxel_curvatures(values: Tensor, grid: Grid, epsilon: float, curvature: str
 def _interpolated(
     fields: tuple[np.ndarray, ...], resolved: np.ndarray, centres: np.ndarray, periodic: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Values at `centres` `(N, 3)` (in voxels) of the resolved voxels around, `(N, 2)`, and where there are any."""
+    """Return the values at `centres` `(N, 3)` (in voxels) of the resolved voxels around, `(N, 2)`, and where there are
+    any."""
     corners, weights = _corners(resolved.shape, centres, periodic)
     weights = weights * resolved.reshape(-1)[corners]
     total = weights.sum(0)
@@ -264,7 +278,7 @@ def _interpolated(
 
 
 def _corners(shape: tuple[int, ...], centres: np.ndarray, periodic: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Flat indices and weights `(8, N)` of linear interpolation."""
+    """Return the flat indices and weights `(8, N)` of linear interpolation."""
     size = np.array(shape)
     low = np.floor(centres).astype(np.int64)
     low = low if periodic else np.clip(low, 0, size - 2)

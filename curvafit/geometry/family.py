@@ -20,7 +20,7 @@ _DEEPEST = 6.0
 
 
 def family_shares(diagram: Diagram, radius: float) -> dict[str, float]:
-    """The share of area nearest in direction to each family's ideal point, and the flat share (`layers`).
+    """Return the share of area nearest in direction to each family's ideal point, and the flat share (`layers`).
 
     Directions after Koenderink's shape index; `radius` is the structure's half-thickness in the diagram's unit.
     """
@@ -35,19 +35,19 @@ def family_shares(diagram: Diagram, radius: float) -> dict[str, float]:
 
 
 def family_of(diagram: Diagram, radius: float) -> str:
-    """The family's name: the largest share, or layers where at least half the area is flat."""
+    """Return the family's name: the largest share, or layers where at least half the area is flat."""
     return leading_family(family_shares(diagram, radius))
 
 
 def leading_family(shares: dict[str, float]) -> str:
-    """The family that shares of area speak for: the largest, or layers where they hold at least half."""
+    """Return the family that shares of area speak for: the largest, or layers where they hold at least half."""
     if shares["layers"] >= _LAYERS:
         return "layers"
     return max(_ANGLES, key=lambda name: shares[name])
 
 
 def half_thickness(diagram: Diagram, volume: float) -> float:
-    """Half-thickness of what a surface bounds, from its volume and its diagram alone, in the diagram's unit.
+    """Return the half-thickness of what a surface bounds, from its volume and its diagram alone, in the diagram's unit.
 
     The depth h at which the inner parallel surfaces have swept the volume: an element of area dA has
     (1 - κ1 t)(1 - κ2 t) dA at depth t, nothing beyond its centres of curvature (Steiner's formula). Exact for plates,

@@ -34,12 +34,12 @@ class Surface:
 
     @property
     def barycentres(self) -> np.ndarray:
-        """Centre of each triangle, `(F, 3)`."""
+        """Return the centre of each triangle, `(F, 3)`."""
         return self.vertices[self.faces].mean(1)
 
 
 def surface(u: np.ndarray | Tensor, grid: Grid, level: float = 0.0) -> Surface:
-    """The level set of `u` `(Z, Y, X)` by Lewiner's marching cubes.
+    """Return the level set of `u` `(Z, Y, X)` by Lewiner's marching cubes.
 
     The cells between the last and the first voxels of a periodic box belong to it, each once; a box with other borders
     ends at its outermost voxels' centres.
@@ -56,7 +56,8 @@ def surface(u: np.ndarray | Tensor, grid: Grid, level: float = 0.0) -> Surface:
 
 
 def capped_surface(u: np.ndarray | Tensor, grid: Grid, level: float = 0.0) -> Surface:
-    """The boundary of {u > level} within the box, closed by flat caps on the box's faces; for printing and export.
+    """Return the boundary of {u > level} within the box, closed by flat caps on the box's faces; for printing and
+    export.
 
     It is watertight, and stays so in float32: no vertex comes closer to a voxel's centre than some ten-thousandths of
     an edge, and none stands twice. The caps of opposite faces of a periodic box are the same, so that copies tile.
@@ -79,7 +80,7 @@ def capped_surface(u: np.ndarray | Tensor, grid: Grid, level: float = 0.0) -> Su
 
 
 def solid_surface(u: np.ndarray | Tensor, grid: Grid) -> Surface:
-    """The boundary of {u > 0}, closed as `capped_surface` closes it, around the volume of the voxels in {u > 0}.
+    """Return the boundary of {u > 0}, closed as `capped_surface` closes it, around the volume of the voxels in {u > 0}.
 
     Flat triangles cut a curved surface short, by 1 % of the volume of tubes 10 voxels thick. The level is moved by as
     little as makes up for it, some hundredths of a voxel.
@@ -107,18 +108,18 @@ def solid_surface(u: np.ndarray | Tensor, grid: Grid) -> Surface:
 
 
 def areas(mesh: Surface) -> np.ndarray:
-    """Area of each triangle, `(F,)`, in the grid's unit squared."""
+    """Return the area of each triangle, `(F,)`, in the grid's unit squared."""
     return np.linalg.norm(area_vectors(mesh), axis=1)
 
 
 def area_vectors(mesh: Surface) -> np.ndarray:
-    """Half the cross product of each triangle's edges, `(F, 3)` in (x, y, z)."""
+    """Return half the cross product of each triangle's edges, `(F, 3)` in (x, y, z)."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]][:, ::-1] for k in range(3))
     return np.cross(b - a, c - a) / 2
 
 
 def volume(mesh: Surface) -> float:
-    """Volume enclosed by a closed surface, by the divergence theorem, in the grid's unit cubed."""
+    """Return the volume enclosed by a closed surface, by the divergence theorem, in the grid's unit cubed."""
     return float((mesh.barycentres[:, ::-1] * area_vectors(mesh)).sum() / 3)
 
 
@@ -140,7 +141,7 @@ def _march(values: np.ndarray, grid: Grid, level: float) -> Surface:
 
 
 def _with_walls(values: np.ndarray, axis: int, periodic: bool) -> np.ndarray:
-    """Two layers more on both sides of an axis: the field on the box's face, and the outside right beyond it."""
+    """Add two layers on both sides of an axis: the field on the box's face, and the outside right beyond it."""
     first, last = np.take(values, [0], axis), np.take(values, [-1], axis)
     if periodic:
         first = last = (first + last) / 2
@@ -149,14 +150,15 @@ def _with_walls(values: np.ndarray, axis: int, periodic: bool) -> np.ndarray:
 
 
 def _unpadded(index: np.ndarray, count: int) -> np.ndarray:
-    """Positions in a padded axis in voxels of the unpadded one: both layers of a side are on the box's face."""
+    """Return the positions in a padded axis in voxels of the unpadded one: both layers of a side are on the box's
+    face."""
     inner = np.arange(count, dtype=np.float64)
     knots = np.concatenate([[-0.5, -0.5], inner, [count - 0.5, count - 0.5]])
     return np.interp(index, np.arange(count + 4), knots)
 
 
 def _welded(mesh: Surface) -> Surface:
-    """Vertices of one place as one, without the triangles that this closes."""
+    """Merge the vertices of one place, without the triangles that this closes."""
     vertices, index = np.unique(mesh.vertices, axis=0, return_inverse=True)
     faces = index.reshape(-1)[mesh.faces]
     a, b, c = faces.T

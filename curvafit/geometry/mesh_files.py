@@ -69,7 +69,7 @@ def _ply(mesh: Surface, remark: str, data: Data) -> bytes:
 
 
 def _vtp(mesh: Surface, remark: str, data: Data) -> bytes:
-    """XML PolyData; every array inline, base64 of its length in bytes and its numbers."""
+    """Return XML PolyData; every array inline, base64 of its length in bytes and its numbers."""
     count, ends = len(mesh.vertices), np.arange(3, 3 * len(mesh.faces) + 1, 3)
     lines = (
         '<?xml version="1.0"?>',

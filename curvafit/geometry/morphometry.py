@@ -45,7 +45,8 @@ def morphometry(
     *,
     periodic: bool = False,
 ) -> Morphometry:
-    """Volume fraction (BV/TV), thickness (Tb.Th), spacing (Tb.Sp), Euler number, connectivity density, BS/BV.
+    """Return the volume fraction (BV/TV), thickness (Tb.Th), spacing (Tb.Sp), Euler number, connectivity density,
+    BS/BV.
 
     Parameters
     ----------
@@ -98,7 +99,8 @@ def local_thickness(
     periodic: bool = False,
     largest: float = 24.0,
 ) -> np.ndarray:
-    """Diameter of the largest ball inside `mask` that covers each voxel; 0 outside, infinite where there is no outside.
+    """Return the diameter of the largest ball inside `mask` that covers each voxel; 0 outside, infinite where there is
+    no outside.
 
     Diameters are 2·EDT, EDT being the distance to the nearest outer voxel's centre: half a voxel too much on plates
     (on average over their positions), up to a voxel too little on tubes and balls, whose axes miss the grid; for the
@@ -138,7 +140,7 @@ def local_thickness(
 
 
 def _coarsened(radius: np.ndarray, factor: int) -> np.ndarray:
-    """Largest radius of each block of factor³ voxels."""
+    """Return the largest radius of each block of factor³ voxels."""
     padded = np.pad(radius, [(0, -n % factor) for n in radius.shape])
     z, y, x = (n // factor for n in padded.shape)
     return padded.reshape(z, factor, y, factor, x, factor).max(axis=(1, 3, 5))
@@ -155,7 +157,7 @@ def _largest_balls(radius: np.ndarray, spacing: np.ndarray, edge: float) -> np.n
 
 @njit(cache=True)
 def _paint(order, radius, painted, owner, shape, spacing, edge):  # pragma: no cover
-    """Balls in descending size; each voxel keeps the first, hence largest, that covers it (and which it was)."""
+    """Paint balls in descending size; each voxel keeps the first, hence largest, that covers it (and which it was)."""
     ny, nx = shape[1], shape[2]
     hz, hy, hx = spacing
     for centre in order:
@@ -183,7 +185,7 @@ def _paint(order, radius, painted, owner, shape, spacing, edge):  # pragma: no c
 
 
 def _surface(mask: np.ndarray, spacing: tuple[float, float, float], periodic: bool) -> float:
-    """Marching-cubes area of the mask after a Gaussian of 0.7 voxels, so that its stairs do not count.
+    """Return the marching-cubes area of the mask after a Gaussian of 0.7 voxels, so that its stairs do not count.
 
     On balls and tubes the area is within 4 % at a radius of 5 voxels and 2 % at 9; less blur counts stairs, more
     shrinks what is small.

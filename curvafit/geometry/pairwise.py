@@ -131,7 +131,7 @@ def _distances(measures: Measures, first: np.ndarray, second: np.ndarray, **opti
 
 
 def _keys(measures: Measures) -> list[str]:
-    """A digest of each measure's points and weights."""
+    """Return a digest of each measure's points and weights."""
     rows = np.stack([measures.x, measures.y, measures.log2], axis=1)
     parts = (rows[start:end] for start, end in zip(measures.bounds[:-1], measures.bounds[1:], strict=True))
     return [hashlib.sha256(part.tobytes()).hexdigest() for part in parts]
@@ -149,7 +149,7 @@ class _File:
         self._keys, self._written = keys, time.monotonic()
 
     def read(self) -> np.ndarray:
-        """What the file knows of the distances between the measures."""
+        """Return what the file knows of the distances between the measures."""
         distances = np.full((len(self._keys),) * 2, np.nan)
         if self._path is not None and self._path.exists():
             keys, known = self._content(self._path)
@@ -176,7 +176,7 @@ class _File:
             os.fsync(file.fileno())
 
     def _content(self, path: Path) -> tuple[list[str], np.ndarray]:
-        """Digests and distances of a file that was made with the same settings."""
+        """Return the digests and distances of a file that was made with the same settings."""
         try:
             arrays = read_archive(path)
             header = parse_json(arrays["header"].tobytes(), "a file of distances", path)

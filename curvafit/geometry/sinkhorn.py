@@ -124,7 +124,7 @@ def costs(
         return batched(measures, first, second, ε, shares, ρ, device)
     values = np.empty(len(first))
     threads.start()
-    _costs(measures.x, measures.y, measures.log2, measures.bounds, first, second, ε, shares, ρ, values)
+    _costs(measures, first, second, ε, shares, ρ, values)
     return values
 
 
@@ -159,7 +159,7 @@ def schedule(falls: np.ndarray, blur: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _batches(sizes: np.ndarray, first: np.ndarray, second: np.ndarray) -> Iterator[tuple[np.ndarray, int]]:
-    """Pairs of like size, and the size that all their measures are padded to."""
+    """Yield pairs of like size, and the size that all their measures are padded to."""
     larger = np.maximum(sizes[first], sizes[second])
     order = np.argsort(-larger, kind="stable")
     start = 0
@@ -171,7 +171,7 @@ def _batches(sizes: np.ndarray, first: np.ndarray, second: np.ndarray) -> Iterat
 
 
 def _padded(measures: Measures, numbers: np.ndarray, size: int, device) -> tuple[Tensor, Tensor]:
-    """Points `(B, size, 2)` and natural logarithms of their weights `(B, size)`."""
+    """Return points `(B, size, 2)` and natural logarithms of their weights `(B, size)`."""
     start, count = measures.bounds[numbers], np.diff(measures.bounds)[numbers]
     place = np.arange(size)
     real = place < count[:, None]
@@ -182,22 +182,30 @@ def _padded(measures: Measures, numbers: np.ndarray, size: int, device) -> tuple
 
 
 def _dual(log_weights: Tensor, potentials: Tensor, ε: float, ρ: float) -> Tensor:
-    """The potentials' part of the cost, `(B,)`: ∑ a (ρ + ε/2) (1 - exp(-f/ρ)), or ∑ a f where all is moved."""
+    """Return the potentials' part of the cost, `(B,)`: ∑ a (ρ + ε/2) (1 - exp(-f/ρ)), or ∑ a f where all is moved."""
     weights, f = log_weights.double().exp(), potentials.double()
     return (weights * (f if math.isinf(ρ) else -(ρ + ε / 2) * torch.expm1(-f / ρ))).sum(1)
 
 
 @njit(**_PARALLEL)
-def _costs(x, y, log2, bounds, first, second, ε, shares, ρ, values):
-    """The cost of every pair."""
+def _costs(measures, first, second, ε, shares, ρ, values):
+    """Write the cost of every pair into `values`."""
     for k in prange(len(first)):
-        a, b = slice(bounds[first[k]], bounds[first[k] + 1]), slice(bounds[second[k]], bounds[second[k] + 1])
-        values[k] = _cost(x[a], y[a], log2[a], x[b], y[b], log2[b], ε[k], shares[k], ρ)
+        a, b = _points(measures, first[k]), _points(measures, second[k])
+        values[k] = _cost(a, b, ε[k], shares[k], ρ)
 
 
 @njit(**_SERIAL)
-def _cost(x, y, log_a, X, Y, log_b, ε, shares, ρ):
-    """The cost of one pair."""
+def _points(measures, number):
+    """Return x, y and the weights' log2 of one measure."""
+    rows = slice(measures.bounds[number], measures.bounds[number + 1])
+    return measures.x[rows], measures.y[rows], measures.log2[rows]
+
+
+@njit(**_SERIAL)
+def _cost(a, b, ε, shares, ρ):
+    """Return the cost of one pair."""
+    (x, y, log_a), (X, Y, log_b) = a, b
     n, m = len(x), len(X)
     f, g = np.zeros(n), np.zeros(m)
     F, G = np.empty(n, np.float32), np.empty(m, np.float32)
@@ -211,9 +219,10 @@ def _cost(x, y, log_a, X, Y, log_b, ε, shares, ρ):
             F[i] = f[i] / unit + log_a[i]
         for j in range(m):
             G[j] = g[j] / unit + log_b[j]
-        _plan_sums(x, y, F, X, Y, G, h, to_f, to_g)
-        _transformed(x, y, F, X, Y, G, h, to_f)
-        _transformed(X, Y, G, x, y, F, h, to_g)
+        here, there = (x, y, F), (X, Y, G)
+        _plan_sums(here, there, h, to_f, to_g)
+        _transformed(here, there, h, to_f)
+        _transformed(there, here, h, to_g)
         moved = (1 - shares[t]) * unit / (1 + ε[t] / ρ)
         for i in range(n):
             f[i] = shares[t] * f[i] - moved * to_f[i]
@@ -223,8 +232,9 @@ def _cost(x, y, log_a, X, Y, log_b, ε, shares, ρ):
 
 
 @njit(**_SERIAL)
-def _plan_sums(x, y, F, X, Y, G, h, rows, columns):
-    """Sums of the plan 2^(F + G - h d²) over its second and over its first index."""
+def _plan_sums(here, there, h, rows, columns):
+    """Write the sums of the plan 2^(F + G - h d²) over its second and over its first index."""
+    (x, y, F), (X, Y, G) = here, there
     columns[:] = _ZERO
     for i in range(len(x)):
         xi, yi, Fi = x[i], y[i], F[i]
@@ -238,18 +248,20 @@ def _plan_sums(x, y, F, X, Y, G, h, rows, columns):
 
 
 @njit(**_SERIAL)
-def _transformed(x, y, F, X, Y, G, h, sums):
-    """log2 ∑ 2^(G - h d²) for every row, in place of the sums over the plan's rows."""
+def _transformed(here, there, h, sums):
+    """Write log2 ∑ 2^(G - h d²) of every row in place of the sums over the plan's rows."""
+    x, y, F = here
     for i in range(len(x)):
         if _LEAST < sums[i] < _MOST:
             sums[i] = np.log2(sums[i]) - F[i]
         else:
-            sums[i] = _log_sum(x[i], y[i], X, Y, G, h)
+            sums[i] = _log_sum(x[i], y[i], there, h)
 
 
 @njit(**_SERIAL)
-def _log_sum(x, y, X, Y, G, h):
-    """log2 ∑ 2^(G - h d²) of one row, with its largest term taken out."""
+def _log_sum(x, y, there, h):
+    """Return log2 ∑ 2^(G - h d²) of one row, with its largest term taken out."""
+    X, Y, G = there
     top = np.float32(-np.inf)
     for j in range(len(X)):
         dx, dy = x - X[j], y - Y[j]
@@ -263,7 +275,7 @@ def _log_sum(x, y, X, Y, G, h):
 
 @njit(inline="always")
 def _exp2(t):
-    """2^t in float32 to 3e-7, within its range: a polynomial, and the whole part put into the exponent's bits."""
+    """Return 2^t in float32 to 3e-7 of itself: a polynomial, and the whole part put into the exponent's bits."""
     t = min(max(t, _LOW), _HIGH)
     whole = np.rint(t)
     r = t - whole
@@ -273,7 +285,7 @@ def _exp2(t):
 
 @njit(**_SERIAL)
 def _part(log_weights, f, ε, ρ):
-    """`_dual` of one measure."""
+    """Return `_dual` of one measure."""
     total = 0.0
     for i in range(len(f)):
         value = f[i] if np.isinf(ρ) else -(ρ + ε / 2) * math.expm1(-f[i] / ρ)

@@ -12,7 +12,7 @@ from skimage import measure
 
 
 def components(mask: np.ndarray, *, periodic: bool = False, connectivity: int = 26) -> tuple[np.ndarray, int]:
-    """Connected pieces: int32 (Z, Y, X) of 0 outside and 1, 2, … in the pieces, and how many there are.
+    """Find the connected pieces: int32 (Z, Y, X) of 0 outside and 1, 2, … in the pieces, and how many there are.
 
     Voxels touch by corners (`connectivity` 26) or by faces (6); in a periodic box also across its faces.
     """
@@ -61,14 +61,14 @@ def betti_numbers(mask: np.ndarray, *, periodic: bool = False) -> tuple[int, int
 
 
 def _within(mask: np.ndarray, corners: bool) -> tuple[np.ndarray, int]:
-    """Pieces within the box, and how many."""
+    """Return the pieces within the box, and how many."""
     labels = np.empty(mask.shape, dtype=np.int32)
     ndimage.label(mask, ndimage.generate_binary_structure(3, 3 if corners else 1), output=labels)
     return labels, int(labels.max(initial=0))
 
 
 def _seams(labels: np.ndarray, corners: bool) -> np.ndarray:
-    """Which labels touch across the faces of a periodic box: unique rows (last layer's, first layer's, axis)."""
+    """Return which labels touch across the faces of a periodic box: unique rows (last layer's, first layer's, axis)."""
     found = [np.empty((0, 3), dtype=np.int64)]
     for axis in range(3):
         last, first = np.take(labels, -1, axis), np.take(labels, 0, axis)
@@ -85,8 +85,8 @@ def _graph(pairs: np.ndarray, count: int) -> coo_array:
 
 
 def _directions(mask: np.ndarray) -> int:
-    """Rank of the loops of a 6-connected phase around the torus: of what is left over when its pieces within the box
-    are laid out along a spanning tree."""
+    """Return the rank of the loops of a 6-connected phase around the torus: of what is left over when its pieces within
+    the box are laid out along a spanning tree."""
     labels, count = _within(mask, corners=False)
     seams = _seams(labels, False)
     one, other, steps = seams[:, 0] - 1, seams[:, 1] - 1, np.eye(3, dtype=np.int64)[seams[:, 2]]

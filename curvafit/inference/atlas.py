@@ -59,11 +59,11 @@ class Atlas:
         return len(self.ids)
 
     def shape_coefficients(self, position: int) -> Coefficients:
-        """The six coefficients of the shape at a position."""
+        """Return the six coefficients of the shape at a position."""
         return Coefficients(*map(float, self.coefficients[position]))
 
     def diagrams(self, seen_as: str) -> tuple[Diagram, ...]:
-        """The diagrams of the shapes seen as `"field"` or as `"mask"`.
+        """Return the diagrams of the shapes seen as `"field"` or as `"mask"`.
 
         Raises
         ------
@@ -75,7 +75,7 @@ class Atlas:
         return self.field_diagrams if seen_as == "field" else self.mask_diagrams
 
     def embeddings(self, seen_as: str) -> np.ndarray:
-        """Sliced-quantile embeddings (N, 288) of those diagrams; computed once."""
+        """Return the sliced-quantile embeddings (N, 288) of those diagrams; computed once."""
         self.diagrams(seen_as)
         return self._field_embeddings if seen_as == "field" else self._mask_embeddings
 
@@ -132,7 +132,7 @@ def load_atlas(path: str | Path | None = None) -> Atlas:
 
 
 def is_atlas(path: Path) -> bool:
-    """Whether a file bears an atlas's format; all else of it may be wrong."""
+    """Return whether a file bears an atlas's format; all else of it may be wrong."""
     try:
         header = read_archive(path)["header"].tobytes() if path.is_file() else b""
         return parse_json(header, "an atlas's header", path)["format"] == FORMAT
@@ -141,7 +141,7 @@ def is_atlas(path: Path) -> bool:
 
 
 def _packed(measured: tuple[Diagram, ...]) -> dict[str, np.ndarray]:
-    """Diagrams as flat arrays: the points of number i are rows offsets[i] to offsets[i + 1]."""
+    """Return the diagrams as flat arrays: the points of number i are rows offsets[i] to offsets[i + 1]."""
     areas = np.array([d.weights.sum() for d in measured])
     return {
         "points": np.concatenate([d.points for d in measured]).astype(np.float16),
@@ -154,7 +154,7 @@ def _packed(measured: tuple[Diagram, ...]) -> dict[str, np.ndarray]:
 
 
 def _parse(data: bytes, name: str) -> Atlas:
-    """The atlas in a file's bytes."""
+    """Return the atlas in a file's bytes."""
     try:
         arrays = read_archive(io.BytesIO(data))
         header = parse_json(arrays["header"].tobytes(), "an atlas's header", name)

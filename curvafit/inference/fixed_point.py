@@ -58,7 +58,7 @@ def fixed_point(
     starts: Sequence[Coefficients],
     progress: Progress = silent,
 ) -> Refinement:
-    """Coefficients (a20 = 1, a02 > 0) under which a short flow started at `phase` moves its interface least.
+    """Find the coefficients (a20 = 1, a02 > 0) under which a short flow started at `phase` moves its interface least.
 
     Least squares in the low-passed displacement of the interface, by optimistix (Levenberg-Marquardt, float64): some
     steps from each start, then more from the best end. The mass is the phase field's mean, which the flow keeps.
@@ -148,25 +148,26 @@ class ShortFlow:
         return int(self._kept.sum())
 
     def residual(self, free: np.ndarray) -> np.ndarray:
-        """Displacement in voxels, low-passed, weighted by interface so that its square sums to the mean square."""
+        """Return the displacement in voxels, low-passed, weighted by interface so that its square sums to the mean
+        square."""
         key = free.tobytes()
         if key not in self._known:
             self._known[key] = self._flowed(free)
         return self._known[key]
 
     def nearly(self, residual: float) -> np.ndarray:
-        """Parameters `(n, 5)` of the flows made so far that left at most this residual."""
+        """Return the parameters `(n, 5)` of the flows made so far that left at most this residual."""
         good = [np.frombuffer(key) for key, left in self._known.items() if np.linalg.norm(left) <= residual]
         return np.array(good).reshape(-1, len(_SIZES))
 
     def jacobian(self, free: np.ndarray) -> np.ndarray:
-        """One-sided differences, `(size, 5)`."""
+        """Return one-sided differences, `(size, 5)`."""
         here = self.residual(free)
         ahead = [self.residual(free + DIFFERENCE * unit) for unit in np.eye(len(free))]
         return (np.stack(ahead, 1) - here[:, None]) / DIFFERENCE
 
     def _force_of_each_term(self) -> np.ndarray:
-        """Root mean square of the six low-passed ∂F_α/∂u where the residual is read."""
+        """Return the root mean square of the six low-passed ∂F_α/∂u where the residual is read."""
         terms = energy_gradients(self._before.double(), self.grid, self.epsilon)
         low = gaussian_blur(terms, self.grid, LOW_PASS * self._voxel)[(slice(None), *self._read)][:, self._kept]
         return low.square().mean(1).sqrt().numpy()
@@ -202,7 +203,7 @@ class _End(NamedTuple):
 
 
 def _box(phase: Tensor, grid: Grid) -> tuple[Tensor, Grid]:
-    """The whole, or the part of at most `LARGEST_BOX` voxels a side that is richest in surface."""
+    """Return the whole, or the part of at most `LARGEST_BOX` voxels a side that is richest in surface."""
     if max(grid.shape) <= LARGEST_BOX:
         return phase, grid
     windows = rich_boxes(surface_voxels((phase > 0).numpy()), LARGEST_BOX)
@@ -261,7 +262,7 @@ def _minimiser(flow: ShortFlow) -> Callable[[np.ndarray, int], _End]:
 
 
 def _deviations(end: _End, patches: float) -> np.ndarray:
-    """Standard deviations of the six coefficients from the residual's covariance."""
+    """Return the standard deviations of the six coefficients from the residual's covariance."""
     variance = end.residual**2 / max(patches - len(_SIZES), 1.0)
     covariance = variance * np.linalg.pinv(end.jacobian.T @ end.jacobian)
     free = np.sqrt(np.diag(covariance)) * _SIZES
@@ -270,7 +271,7 @@ def _deviations(end: _End, patches: float) -> np.ndarray:
 
 
 def _valley(flow: ShortFlow, best: _End) -> np.ndarray:
-    """Largest distance `(6,)` of a nearly as good flow's coefficients from the best."""
+    """Return the largest distance `(6,)` of a nearly as good flow's coefficients from the best."""
     centre = _coefficients(best.free).tensor().numpy()
     near = [_coefficients(free).tensor().numpy() for free in flow.nearly(_AS_GOOD * best.residual)]
     return np.abs(np.array(near) - centre).max(0)

@@ -26,11 +26,13 @@ from curvafit.inference.phases import check_options
 from curvafit.inference.prepare import Prepared, prepare
 from curvafit.inference.refine import refine
 from curvafit.inference.refinement import Refinement
+from curvafit.pictures import Pictured
 from curvafit.priors.bounds import SEEDS, instance, whole
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.profile import phase_field
 from curvafit.progress import Progress, silent
+from curvafit.units import number
 from curvafit.volumes.field import Field
 from curvafit.volumes.formats.part import Crop
 from curvafit.volumes.source import Source, field_of
@@ -39,14 +41,25 @@ from curvafit.volumes.source import Source, field_of
 REGENERATED_EDGE = 100
 #: How many of the nearest shapes are kept, and how many of them refinement starts from.
 MATCHES, STARTS = 5, 3
+#: The distances of a fit that an inference shows, by the names that people read.
+_DISTANCES = (("match", "match"), ("fit", "fit"), ("two seeds", "seed_noise"))
+_ARTICLES = {"field": "a phase field", "mask": "a mask", "image": "an image"}
 
 
-@dataclass(frozen=True)
-class Inference:
+@dataclass(frozen=True, repr=False, eq=False)
+class Inference(Pictured):
     """An inference with all that its report shows.
 
-    `scan` as read and `prepared` for measurement; curvature diagrams of the scan, the regenerated match and the
-    regenerated fit; the phase fields of the last two, `(Z, Y, X)` (None where the shape could not be made).
+    Attributes
+    ----------
+    scan, prepared
+        The scan as it was read, and as it was prepared for measurement.
+    diagram, match_diagram, fit_diagram
+        Curvature diagrams of the scan, the regenerated match and the regenerated fit.
+    matched, regenerated
+        Phase fields `(Z, Y, X)` of the regenerated match and fit, None where no shape grew.
+    fit
+        The parameters with their account.
     """
 
     scan: Field
@@ -58,9 +71,15 @@ class Inference:
     regenerated: np.ndarray | None
     fit: Fit
 
+    def __repr__(self) -> str:
+        fit = self.fit
+        voxels = " x ".join(map(str, self.scan.values.shape))
+        near = ", ".join(f"{name} {number(fit.distances.get(key), 2)}" for name, key in _DISTANCES)
+        return f"Inference({fit.family} from {_ARTICLES[fit.kind]} of {voxels} voxels, distances: {near}. {fit.status})"
+
     @property
     def best(self) -> np.ndarray | None:
-        """The regenerated shape of the better supported parameters."""
+        """Return the regenerated shape of the better supported parameters."""
         return self.regenerated if self.fit.chosen == "fit" else self.matched
 
 
@@ -158,7 +177,8 @@ def _refined(prepared: Prepared, matches: tuple[Match, ...], seed: int, progress
 
 
 def _with_mass(refined: Refinement, prepared: Prepared, seed: int) -> Refinement:
-    """The mass that gives a regenerated shape the scan's volume fraction, to first order; a field's own is its mean.
+    """Return the mass that gives a regenerated shape the scan's volume fraction, to first order; a field's own is its
+    mean.
 
     A mask does not tell its mass: the phases of a minimiser stop short of ±1 by an amount that curvature decides.
     """
@@ -173,7 +193,7 @@ def _with_mass(refined: Refinement, prepared: Prepared, seed: int) -> Refinement
 
 
 def _twin_grid(prepared: Prepared) -> Grid:
-    """A periodic box of the main window's size, for shapes to compare with."""
+    """Return a periodic box of the main window's size, for shapes to compare with."""
     z, y, x = (min(edge.stop - edge.start, REGENERATED_EDGE) for edge in prepared.windows[0])
     return Grid((z, y, x), prepared.grid.spacing, "periodic")
 
@@ -181,7 +201,7 @@ def _twin_grid(prepared: Prepared) -> Grid:
 def _regenerate(
     prepared: Prepared, match: Match, refined: Refinement, seed: int, progress: Progress
 ) -> dict[str, tuple[_Twin, _Twin]]:
-    """Two seeds each of the nearest match and of the refined parameters."""
+    """Regrow two seeds each of the nearest match and of the refined parameters."""
     grid = _twin_grid(prepared)
     twins = {}
     for step, (name, source) in enumerate((("match", match), ("fit", refined))):
@@ -249,7 +269,7 @@ def _noise(pair: tuple[_Twin, _Twin]) -> float | None:
 def _verdict(
     distances: dict[str, float | None], noises: dict[str, float | None], refined: Refinement, twins: dict
 ) -> tuple[str, str]:
-    """Which of match and fit is better supported, in a word and in a sentence."""
+    """Return which of match and fit is better supported, in a word and in a sentence."""
     match, fit = distances["match"], distances["fit"]
     if fit is None:
         reason = twins["fit"][0].flow.viability.reason

@@ -28,7 +28,7 @@ class Match:
 def nearest(
     diagram: Diagram, atlas: Atlas, *, seen_as: str = "field", count: int = 5, shortlist: int = 40
 ) -> tuple[Match, ...]:
-    """The `count` shapes nearest to a diagram, nearest first.
+    """Return the `count` shapes nearest to a diagram, nearest first.
 
     Distances are those of `curvafit.geometry.pairwise`, taken on the `shortlist` shapes nearest in sliced distance.
 
@@ -61,13 +61,13 @@ def nearest(
 
 
 def _shortlist(query: np.ndarray, embeddings: np.ndarray, length: int) -> list[int]:
-    """Positions of the embeddings nearest to the query's, nearest first."""
+    """Return the positions of the embeddings nearest to the query's, nearest first."""
     distances = np.linalg.norm(embeddings - query, axis=1)
     return np.argsort(distances, kind="stable")[:length].tolist()
 
 
 def _sorted(diagram: Diagram, atlas: Atlas, candidates: tuple[Diagram, ...], near: list[int]) -> tuple[Match, ...]:
-    """Matches at the given positions of the atlas, by increasing distance."""
+    """Return the matches at the given positions of the atlas, by increasing distance."""
     distances = one_to_many(diagram, [candidates[i] for i in near]).tolist()
     found = (
         Match(

@@ -16,7 +16,7 @@ from curvafit.priors.grid import WORKING_EPSILON, Grid
 
 
 def scan_diagram(prepared: Prepared) -> Diagram:
-    """The geometric curvature diagram of a prepared scan; of a large one tile by tile, each cell in one tile."""
+    """Return the geometric curvature diagram of a prepared scan; of a large one tile by tile, each cell in one tile."""
     grid = prepared.grid
     cuts = [[slice(None)] if grid.periodic else _tiles(n) for n in grid.shape]
     found: list[Diagram] = []
@@ -31,7 +31,8 @@ def scan_diagram(prepared: Prepared) -> Diagram:
 
 
 def _tiles(n: int) -> list[slice]:
-    """Stretches of at most a window's length whose interiors (`MARGIN` voxels in) share their end planes only."""
+    """Return stretches of at most a window's length whose interiors (`MARGIN` voxels in) share their end planes
+    only."""
     count = math.ceil((n - 2 * MARGIN) / (LARGEST_WINDOW - 2 * MARGIN))
     ends = np.linspace(MARGIN, n - 1 - MARGIN, count + 1).astype(int)
     return [slice(a - MARGIN, b + MARGIN + 1) for a, b in itertools.pairwise(ends)]

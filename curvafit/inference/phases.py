@@ -45,7 +45,7 @@ def find_level(
     periodic: bool = False,
     extremes: tuple[float, float] | None = None,
 ) -> Level:
-    """The structure of a scan; parameters as in `prepare.prepare`.
+    """Find the structure of a scan; the parameters are as in `prepare.prepare`.
 
     `extremes` are the lowest and highest value of the whole that `field` is a part of: they tell a mask's two values.
 
@@ -88,7 +88,7 @@ def check_options(kind: str, threshold: float | str, label: int | None) -> None:
 
 
 def region_of_interest(roi: Field | np.ndarray | str | os.PathLike[str] | None, field: Field) -> np.ndarray | None:
-    """Where the scan counts: a mask of its shape, or None for everywhere.
+    """Return where the scan counts: a mask of its shape, or None for everywhere.
 
     Raises
     ------
@@ -107,7 +107,8 @@ def region_of_interest(roi: Field | np.ndarray | str | os.PathLike[str] | None, 
 
 
 def _guess_kind(values: np.ndarray, threshold: Literal["otsu"] | float, two: bool) -> Kind:
-    """Two values: a mask. Floats from about -1 to about 1, without noise, mostly far from 0: a phase field."""
+    """Guess the kind: two values are a mask; floats Floats from about -1 to about 1, without noise, mostly far from 0:
+    a phase field."""
     if two:
         return "mask"
     lowest, highest = values.min(), values.max()
@@ -137,7 +138,8 @@ def _signed(mask: np.ndarray, dark: bool, note: str) -> Level:
 def _image_level(
     field: Field, threshold: Literal["otsu"] | float, dark: bool, region: np.ndarray | None, periodic: bool
 ) -> Level:
-    """Grey levels smoothed by one voxel of the finest axis, minus the threshold; Otsu's is that of the raw levels.
+    """Return the grey levels smoothed by one voxel of the finest axis, minus the threshold; Otsu's is that of the raw
+    levels.
 
     Smoothing lowers thin structures' grey: their own threshold would then sink and make them fat.
     """

@@ -154,7 +154,7 @@ class _Scan:
 
     @property
     def counted(self) -> np.ndarray:
-        """The structure within the region of interest."""
+        """Return the structure within the region of interest."""
         return self.level.mask if self.region is None else self.level.mask & self.region
 
 
@@ -197,7 +197,7 @@ def _on_working_grid(scan: _Scan) -> Prepared:
 
 
 def _thickness(scan: _Scan) -> tuple[float, tuple[str, ...]]:
-    """Median thickness in the scan's unit; refused where next to nothing is thick enough to have a shape."""
+    """Return the median thickness in the scan's unit; refused where next to nothing is thick enough to have a shape."""
     median, thick = median_thickness(scan.counted, scan.spacing, scan.periodic)
     voxel = math.prod(scan.spacing) ** (1 / 3)
     if scan.level.kind != "field" and thick < (THINNEST - 0.5) * voxel:  # balls on the grid understate thin tubes
@@ -211,7 +211,7 @@ def _thickness(scan: _Scan) -> tuple[float, tuple[str, ...]]:
 
 
 def _scale(scan: _Scan, thickness: float) -> tuple[tuple[float, float, float], tuple[str, ...]]:
-    """Working voxel in scan voxels, per axis; all ones where the scan's grid is kept."""
+    """Return the working voxel in scan voxels, per axis; all ones where the scan's grid is kept."""
     spacing, finest = scan.spacing, min(scan.spacing)
     isotropic = max(spacing) <= 1.01 * finest
     if isotropic and (scan.level.kind == "field" or KEPT_THICKNESS[0] <= thickness / finest <= KEPT_THICKNESS[1]):
@@ -232,7 +232,7 @@ def _scale(scan: _Scan, thickness: float) -> tuple[tuple[float, float, float], t
 def _working_box(
     scan: _Scan, scale: tuple[float, float, float]
 ) -> tuple[tuple[int, int, int], tuple[int, int, int], tuple[str, ...]]:
-    """First working voxel, number of voxels, and a note where that is not all of the scan."""
+    """Return the first working voxel, number of voxels, and a note where that is not all of the scan."""
     full = [math.floor(n / s + 1e-6) for n, s in zip(scan.shape, scale, strict=True)]
     if min(full) < 4:
         raise ScanError(f"expected at least 4 working voxels along each axis, got {_times(full)}")
@@ -250,7 +250,7 @@ def _working_box(
 def _moved(
     scan: _Scan, scale: tuple[float, float, float], start: tuple[int, int, int], shape: tuple[int, int, int]
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Level values and region of interest on the working grid."""
+    """Return the level values and region of interest on the working grid."""
     values, region = scan.level.values, scan.region
     if scale == (1.0, 1.0, 1.0):
         box = tuple(slice(a, a + n) for a, n in zip(start, shape, strict=True))
@@ -267,7 +267,7 @@ def _moved(
 def _structure(
     kind: Kind, values: np.ndarray, region: np.ndarray | None, thickness: float, periodic: bool
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """The mask on the working grid, without what is too small to be structure."""
+    """Return the mask on the working grid, without what is too small to be structure."""
     mask = values > 0 if region is None else (values > 0) & region
     if kind == "field":
         return mask, ()

@@ -57,20 +57,21 @@ def units(epsilon: float) -> np.ndarray:
 
 
 def in_gauge(values: np.ndarray) -> tuple[Coefficients, int]:
-    """Coefficients with a20 = 1, or with a02 = 1 where a20 is under a thousandth of it; and which of the two (0, 2)."""
+    """Return the coefficients with a20 = 1, or with a02 = 1 where a20 is under a thousandth of it; and which of the two
+    (0, 2)."""
     fixed = 0 if values[0] > 1e-3 * values[2] else 2
     return Coefficients(*(float(value) for value in values / values[fixed])), fixed
 
 
 def admissible(values: np.ndarray) -> np.ndarray:
-    """The nearest six with a20 + a02 = 2 and both positive, away from the edge."""
+    """Return the nearest six with a20 + a02 = 2 and both positive, away from the edge."""
     share = np.clip(values[0] / max(values[0] + values[2], 1e-12), _EDGE, 1 - _EDGE)
     scaled = 2 * values / max(values[0] + values[2], 1e-12)
     return np.concatenate(([2 * share, scaled[1], 2 - 2 * share], scaled[3:]))
 
 
 def named(deviations: Sequence[float] | np.ndarray) -> dict[str, float]:
-    """Names to numbers."""
+    """Return the deviations by the coefficients' names."""
     return {name: float(value) for name, value in zip(NAMES, deviations, strict=True)}
 
 
@@ -86,7 +87,8 @@ def import_jax() -> None:
 
 @contextmanager
 def double_precision_on_cpu():
-    """JAX in float64 on the CPU while inside, in this thread alone: what else a program does with JAX goes on as it is.
+    """Run JAX in float64 on the CPU while inside, in this thread alone: what else a program does with JAX goes on as it
+    is.
 
     What JAX calls back runs in another one: see `called`.
     """
@@ -102,7 +104,7 @@ def double_precision_on_cpu():
 
 
 def called(function: Callable[[np.ndarray], np.ndarray], shape: tuple[int, ...], values):
-    """A NumPy function of a vector, called from within JAX; both in float64.
+    """Call a NumPy function of a vector from within JAX, both in float64.
 
     JAX calls it in a thread where arrays may be rounded to float32, so the numbers go in and out as pairs of words.
     """

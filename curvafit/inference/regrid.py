@@ -31,7 +31,8 @@ _CONNECTED_26 = np.ones((3, 3, 3), dtype=bool)
 def bounding_box(
     shape: tuple[int, int, int], region: np.ndarray | None, longest: int
 ) -> tuple[Window, tuple[str, ...]]:
-    """The box around a region (else all), its middle where a side is over `longest` voxels, and notes on both."""
+    """Return the box around a region (else all), its middle where a side is over `longest` voxels, and notes on
+    both."""
     box, notes = [slice(0, n) for n in shape], []
     if region is not None:
         box = list(ndimage.find_objects(region.astype(np.uint8))[0])
@@ -44,7 +45,7 @@ def bounding_box(
 
 
 def median_thickness(mask: np.ndarray, spacing: tuple[float, float, float], periodic: bool) -> tuple[float, float]:
-    """Median and 95th percentile, over the structure's surface, of the local thickness beneath it.
+    """Return the median and 95th percentile, over the structure's surface, of the local thickness beneath it.
 
     By surface and not by volume, since that is what a curvature diagram weighs by: a solid rind beside thin struts
     would else set the scale. Measured in the box of at most 160 voxels a side that `rich_boxes` puts first.
@@ -63,12 +64,13 @@ def median_thickness(mask: np.ndarray, spacing: tuple[float, float, float], peri
 
 
 def surface_voxels(mask: np.ndarray) -> np.ndarray:
-    """Voxels of the structure with a face on the background, inside the box."""
+    """Return the voxels of the structure with a face on the background, inside the box."""
     return mask & ~ndimage.binary_erosion(mask, border_value=1)  # pyright: ignore[reportOperatorIssue]
 
 
 def rich_boxes(content: np.ndarray, size: int | Sequence[int]) -> list[Window]:
-    """Boxes of at most `size` voxels a side that cover the volume and hold content; the first is the one to look at.
+    """Return the boxes of at most `size` voxels a side that cover the volume and hold content; the first is the one to
+    look at.
 
     That is the middle one, unless it holds less than half of what the others hold on average: then the fullest.
     """
@@ -112,7 +114,8 @@ def resample(
     periodic: bool = False,
     nearest: bool = False,
 ) -> np.ndarray:
-    """Values on a grid whose voxels are `scale` old voxels long; the corners of both grids' first voxels coincide.
+    """Resample values to a grid whose voxels are `scale` old voxels long; the corners of both grids' first voxels
+    coincide.
 
     New voxel i covers the old voxels from i·scale to (i + 1)·scale. Linear, after a Gaussian of (scale - 1)/2 old
     voxels along axes that become coarser.
@@ -143,7 +146,7 @@ def resample(
 
 
 def without_specks(mask: np.ndarray, smallest: float, periodic: bool) -> tuple[np.ndarray, int, int]:
-    """The mask less its components (26-connected) and pinholes (6-connected) of under `smallest` voxels.
+    """Return the mask less its components (26-connected) and pinholes (6-connected) of under `smallest` voxels.
 
     Pieces that touch the faces of a periodic box may go on beyond, and stay.
 
@@ -178,7 +181,7 @@ def _middle(whole: slice, length: int) -> slice:
 
 
 def _tiles(n: int, size: int) -> list[slice]:
-    """The fewest intervals of `size` that cover 0..n, evenly spread."""
+    """Return the fewest intervals of `size` that cover 0..n, evenly spread."""
     length = min(n, size)
     count = math.ceil(n / length)
     starts = [round(i * (n - length) / max(count - 1, 1)) for i in range(count)]

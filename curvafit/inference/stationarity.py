@@ -57,7 +57,7 @@ class _Problem(NamedTuple):
 
 
 def is_rounded(u: np.ndarray | Tensor) -> bool:
-    """Whether a field holds so few values that it was quantised: second differences of it are then noise."""
+    """Return whether a field holds so few values that it was quantised: second differences of it are then noise."""
     return len(np.unique(np.asarray(u))) <= min(_ROUNDED_VALUES, math.prod(u.shape) // 16)
 
 
@@ -86,7 +86,7 @@ def stationarity(
     seed: int = 0,
     progress: Progress = silent,
 ) -> Refinement:
-    """Coefficients up to scale under which a phase field is stationary at fixed mass: Σ a_α k ∗ ∂F_α/∂u = λ.
+    """Find the coefficients, up to scale, under which a phase field is stationary at fixed mass: Σ a_α k ∗ ∂F_α/∂u = λ.
 
     Minimises |R a| / |N a| over a20, a02 > 0: R the QR-compressed columns, λ eliminated, N those that an error of the
     field alone would cause. Its unconstrained minimiser, one of the starts, is the whitened columns' smallest singular
@@ -156,7 +156,7 @@ def _checked(u: Tensor, grid: Grid) -> Tensor:
 
 
 def _width(grid: Grid) -> float:
-    """The default test width; in a small crop the one that leaves a core of eight voxels."""
+    """Return the default test width; in a small crop the one that leaves a core of eight voxels."""
     if grid.periodic:
         return TEST_WIDTH
     if min(grid.shape) < 24:
@@ -187,7 +187,7 @@ def _tested(columns: Tensor, grid: Grid, epsilon: float, width: float) -> np.nda
 
 
 def _compressed(columns: np.ndarray) -> np.ndarray:
-    """Triangle `(7, 7)` of the QR factorisation of [1 | columns]."""
+    """Return the triangle `(7, 7)` of the QR factorisation of [1 | columns]."""
     rows = np.concatenate((np.ones((1, columns.shape[1])), columns)).T
     triangle = np.linalg.qr(rows, mode="r")
     return np.pad(triangle, ((0, 7 - len(triangle)), (0, 0)))
@@ -202,7 +202,7 @@ def _triangle(stack: np.ndarray) -> np.ndarray:
 def _with_error(
     u: Tensor, clean: Tensor, columns: np.ndarray, grid: Grid, epsilon: float, width: float, seed: int
 ) -> tuple[_Problem, float, int]:
-    """The problem whitened by a field error, the error's root mean square and the number of trials.
+    """Return the problem whitened by a field error, the error's root mean square and the number of trials.
 
     A finite error, not its linearisation: the columns are singular where ∇u = 0 and at umbilics. Its size is searched
     until the misfit is what it causes (smallest singular value 1).
@@ -224,7 +224,8 @@ def _with_error(
 
 
 def _total_least_squares(problem: _Problem) -> tuple[np.ndarray, np.ndarray]:
-    """Smallest singular vector of the columns whitened by the error, with a20 + a02 > 0, and the singular values."""
+    """Return the smallest singular vector of the columns whitened by the error, with a20 + a02 > 0, and the singular
+    values."""
     whitened = np.linalg.solve(problem.error.T, problem.columns.T).T
     _, singular, rows = np.linalg.svd(whitened)
     a = np.linalg.solve(problem.error, rows[-1])
@@ -232,7 +233,8 @@ def _total_least_squares(problem: _Problem) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _solve(problems: Sequence[_Problem], begun: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Minimisers `(n, 6)` of |R a| / |N a| with a20 + a02 = 2, both positive, from `(n, 6)` starts; their values."""
+    """Return the minimisers `(n, 6)` of |R a| / |N a| with a20 + a02 = 2, both positive, from `(n, 6)` starts; their
+    values."""
     with double_precision_on_cpu():
         import jax.numpy as jnp
 
@@ -243,7 +245,7 @@ def _solve(problems: Sequence[_Problem], begun: np.ndarray) -> tuple[np.ndarray,
 
 @functools.cache
 def _minimiser() -> Callable[..., Any]:
-    """The solver of many problems at once; compiled but once for each number of them."""
+    """Return the solver of many problems at once; compiled but once for each number of them."""
     import jax
     import jax.numpy as jnp
     import optimistix
@@ -269,19 +271,19 @@ def _minimiser() -> Callable[..., Any]:
 
 
 def _replicas(octants: np.ndarray, error: np.ndarray, best: np.ndarray) -> np.ndarray:
-    """Solutions `(n, 6)` with one octant left out each."""
+    """Return the solutions `(n, 6)` with one octant left out each."""
     problems = [_Problem(_triangle(np.delete(octants, k, 0)), error) for k in range(len(octants))]
     return _solve(problems, np.stack([best] * len(problems)))[0]
 
 
 def _jackknife_deviation(replicas: np.ndarray) -> np.ndarray:
-    """Standard deviation over delete-one replicas `(n, …)`."""
+    """Return the standard deviation over delete-one replicas `(n, …)`."""
     n = len(replicas)
     return np.sqrt((n - 1) / n * ((replicas - replicas.mean(0)) ** 2).sum(0))
 
 
 def _status(coefficients: Coefficients, deviations: np.ndarray, fixed: int, residual: float, rounded: bool) -> str:
-    """How well stationarity supports the coefficients, in a sentence."""
+    """Say in a sentence how well stationarity supports the coefficients."""
     if rounded:
         return (
             "Stationarity is not supported: the field was rounded to few values, which its second differences amplify."

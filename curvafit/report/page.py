@@ -14,15 +14,15 @@ from curvafit.files import bears, check_folder, check_free, move_together, own_r
 from curvafit.interrupts import undisturbed
 from curvafit.priors.coefficients import NAMES
 from curvafit.priors.fit_file import FORMAT
-from curvafit.report.pictures import diagram_figures, slice_figures, surface_figures, window_framed
-from curvafit.report.wording import describe
+from curvafit.report.pictures import TWINS, diagram_figures, slice_figures, surface_figures, window_framed
+from curvafit.report.wording import describe, glossary_link
 from curvafit.units import density, length, number, per_unit, percent, unit_name
 from curvafit.volumes.scan import Field, save
 
 if TYPE_CHECKING:
     from curvafit.inference.infer import Inference
 
-#: What tells that a page is this program's.
+#: The mark by which a page is known as this program's.
 _MARK = '<meta name="generator" content="curvafit'
 #: What an inference writes into its folder.
 FILES = ("fit.json", "report.html", "regenerated.nii.gz")
@@ -35,11 +35,10 @@ _TERMS = {
     "a01": ("a₀₁", "κ₂", 1),
     "a00": ("a₀₀", "1", 2),
 }
-_NAMES = {"match": "nearest match", "fit": "refined parameters"}
 
 
 def check_report(directory: str | Path, inputs: Iterable[str | Path] = (), overwrite: bool = False) -> Path:
-    """The folder, if `write_inference` can write there; asked before the work is done.
+    """Return the folder if `write_inference` can write there; ask before the work is done.
 
     `inputs` are the files, or folders, that are read: none may be written over. `overwrite` tells whether files of the
     same names that no inference wrote may be.
@@ -56,10 +55,10 @@ def check_report(directory: str | Path, inputs: Iterable[str | Path] = (), overw
 
 
 def write_inference(inference: Inference, directory: str | Path, *, overwrite: bool = False) -> Path:
-    """Write `fit.json`, `report.html` and `regenerated.nii.gz` into a folder; returns the report's path.
+    """Write `fit.json`, `report.html` and `regenerated.nii.gz` into a folder and return the report's path.
 
-    All three are made in a temporary folder beside it and moved once they are whole. Without a regenerated shape there
-    is no `regenerated.nii.gz`. Those of an earlier inference are replaced.
+    All three are written into a temporary folder beside it and moved once they are whole. Without a regenerated shape
+    there is no `regenerated.nii.gz`. The files of an earlier inference are replaced.
 
     Raises
     ------
@@ -81,13 +80,13 @@ def write_inference(inference: Inference, directory: str | Path, *, overwrite: b
 
 
 def with_command(inference: Inference, command: str) -> Inference:
-    """The inference with the command line that made it in its provenance."""
+    """Return the inference with the command line that made it in its provenance."""
     provenance = {**inference.fit.provenance, "command": command}
     return dataclasses.replace(inference, fit=dataclasses.replace(inference.fit, provenance=provenance))
 
 
 def parameter_table(inference: Inference) -> list[tuple[str, str, str, str]]:
-    """Rows of name, working value, deviation and physical value with its unit, for the better supported parameters."""
+    """Return rows of name, working value, deviation and physical value for the better supported parameters."""
     fit = inference.fit
     physical = fit.coefficients_physical.as_dict()
     rows = []
@@ -100,13 +99,13 @@ def parameter_table(inference: Inference) -> list[tuple[str, str, str, str]]:
 
 
 def write_report(inference: Inference, path: str | Path) -> Path:
-    """Write the report of an inference as one HTML page without outside parts; returns its path."""
+    """Write the report of an inference as one HTML page without outside parts, and return its path."""
     page = report_html(inference)
     return write_content(Path(path), page)
 
 
 def report_html(inference: Inference) -> str:
-    """The page itself."""
+    """Return the page itself."""
     template = Template(files("curvafit.report").joinpath("templates", "report.html").read_text(encoding="utf-8"))
     fit = inference.fit
     sentence = escape(describe(inference))
@@ -121,11 +120,12 @@ def report_html(inference: Inference) -> str:
         notes=_list(fit.notes),
         surfaces=surface_figures(inference),
         diagrams=diagram_figures(inference),
-        distance_unit=escape(_distance_unit(inference)),
+        distance_unit=_distance_unit(inference),
         distances_say=_distances_say(inference),
         bars=_bars(inference),
+        law=glossary_link("law"),
         scale_say=_scale_say(inference),
-        physical_head=f"{_NAMES[fit.chosen].split()[0]}, physical",
+        physical_head=f"{TWINS[fit.chosen].split()[0]}, physical",
         parameters=_parameter_rows(inference),
         parameters_say=_parameters_say(inference),
         numbers=_number_rows(inference),
@@ -164,13 +164,13 @@ def _list(notes: tuple[str, ...]) -> str:
 
 def _distance_unit(inference: Inference) -> str:
     voxel = length(inference.fit.length, inference.fit.length_unit, 3)
-    return f"1/working unit (100 working voxels, {voxel})"
+    return f"1/{glossary_link('working unit')} (100 working voxels, {escape(voxel)})"
 
 
 def _distances_say(inference: Inference) -> str:
     noise = inference.fit.distances.get("seed_noise")
     if noise is None:
-        return "The same parameters could not be grown twice, so how much two seeds differ is not known."
+        return "The same parameters could not be grown twice, so it is not known how far apart two seeds lie."
     return f"Two seeds of the same parameters lie {number(noise, 2)} apart: smaller differences mean nothing."
 
 
@@ -186,14 +186,14 @@ def _bars(inference: Inference) -> str:
             f'<span class="bar {style}" style="width:{100 * value / longest:.1f}%"></span>' if value is not None else ""
         )
         bold = ' class="chosen"' if key == fit.chosen else ""
-        said = number(value, 2) if value is not None else "could not be made" if key != "seed_noise" else "not known"
-        parts.append(f"<span{bold}>{name}</span><span>{bar}</span><span{bold}>{said}</span>")
+        text = number(value, 2) if value is not None else "could not be made" if key != "seed_noise" else "not known"
+        parts.append(f"<span{bold}>{name}</span><span>{bar}</span><span{bold}>{text}</span>")
     return "\n".join(parts)
 
 
 def _scale_say(inference: Inference) -> str:
-    held = [name for name in ("a20", "a02") if abs(inference.fit.coefficients.as_dict()[name] - 1) < 1e-9]
-    return f"here {_TERMS[held[0]][0]} = 1" if held else "any common factor may be put on them"
+    fixed = [name for name in ("a20", "a02") if abs(inference.fit.coefficients.as_dict()[name] - 1) < 1e-9]
+    return f"here {_TERMS[fixed[0]][0]} = 1" if fixed else "all six may be multiplied by one factor"
 
 
 def _parameter_rows(inference: Inference) -> str:
@@ -201,7 +201,7 @@ def _parameter_rows(inference: Inference) -> str:
     match, refined = fit.matches[0].coefficients.as_dict(), fit.refined["coefficients"]
     physical = fit.coefficients_physical.as_dict()
     rows = [_coefficient_row(inference, name, match[name], refined[name], physical[name]) for name in NAMES]
-    marks = {name: " chosen" if name == fit.chosen else "" for name in _NAMES}
+    marks = {name: " chosen" if name == fit.chosen else "" for name in TWINS}
     rows.append(
         '<tr><th scope="row">m₀</th><td>mass</td>'
         f'<td class="n{marks["match"]}">{number(fit.matches[0].mass)}</td>'
@@ -222,7 +222,7 @@ def _coefficient_row(inference: Inference, name: str, match: float, refined: flo
     deviation = fit.uncertainty.get(name)
     working_sd = _deviation(deviation, 1.0)
     physical_sd = _deviation(deviation, fit.length**-power) if fit.chosen == "fit" else ""
-    best = {key: " chosen" if key == fit.chosen else "" for key in _NAMES}
+    best = {key: " chosen" if key == fit.chosen else "" for key in TWINS}
     unit = per_unit(fit.length_unit, power) if power else ""
     return (
         f'<tr><th scope="row">{symbol}</th><td>{factor}</td><td class="n{best["match"]}">{number(match)}</td>'
@@ -242,9 +242,9 @@ def _parameters_say(inference: Inference) -> str:
     voxel = length(fit.working_voxel, fit.length_unit, 3)
     method = escape(str(fit.refined.get("method", "refinement")))
     return (
-        f"Match and refined are in working units (voxel 0.01, ε 0.02); a working voxel is {escape(voxel)}. "
-        f"Bold: the {_NAMES[fit.chosen]}, the better supported, kept in fit.json. "
-        f"± is one standard deviation of the refinement ({method}); it does not hold what the model leaves out."
+        f"The nearest match and the refined parameters are in {glossary_link('working unit', 's')} (voxel 0.01, ε "
+        f"0.02); a working voxel is {escape(voxel)}. Bold: the {TWINS[fit.chosen]}, the better supported, which "
+        f"fit.json holds. ± is one standard deviation of the refinement ({method}), without what the model leaves out."
     )
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import base64
 from html import escape
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from curvafit.drawing.plot import diagram_figure, png, shared_limits, slice_figure, surface_figure
+from curvafit.drawing.plot import diagram_figure, gallery_figure, png, shared_limits, slice_figure, surface_figure
 from curvafit.units import length
 
 if TYPE_CHECKING:
@@ -18,10 +18,23 @@ if TYPE_CHECKING:
 _AXES = "zyx"
 #: The three shapes of a report: which parameters made it, its title.
 _SHAPES = ((None, "The scan"), ("match", "Nearest match, regrown"), ("fit", "Refined, regrown"))
+#: What the better supported shape was grown from.
+TWINS = {"match": "nearest match", "fit": "refined parameters"}
+
+
+def inference_figure(inference: Inference, **options: Any) -> Figure:
+    """Return a figure of the scan's surface beside its regrown twin, the better supported of the two.
+
+    Where no twin grew, the scan is alone. `options` are those of `gallery_figure`.
+    """
+    shapes = {"the scan": scan_box(inference)}
+    if inference.best is not None:
+        shapes[f"regrown: {TWINS[inference.fit.chosen]}"] = inference.best
+    return gallery_figure(shapes, **{"columns": 2, "width": 900, **options})
 
 
 def slice_figures(inference: Inference) -> str:
-    """Slices across z, y and x through the middle of the main window, the scan's grey values under the contour."""
+    """Return slices across z, y and x through the main window's middle: the scan's grey values, the contour on top."""
     values, prepared = inference.scan.values, inference.prepared
     sample = np.asarray(values[:: max(1, values.shape[0] // 64)], dtype=np.float32)
     low, high = (float(v) for v in np.percentile(sample, (0.5, 99.5)))
@@ -31,18 +44,18 @@ def slice_figures(inference: Inference) -> str:
 
 
 def surface_figures(inference: Inference) -> str:
-    """The scan's surface, the matched and the regenerated shape, in boxes of one size."""
+    """Return pictures of the scan's surface, the matched and the regenerated shape, in boxes of one size."""
     shapes = (scan_box(inference), inference.matched, inference.regenerated)
     return "".join(_shape(inference, name, title, u) for (name, title), u in zip(_SHAPES, shapes, strict=True))
 
 
 def diagram_figures(inference: Inference) -> str:
-    """The three curvature diagrams with shared axes, in the scan's unit."""
-    found = (inference.diagram, inference.match_diagram, inference.fit_diagram)
+    """Return the three curvature diagrams with shared axes, in the scan's unit."""
+    diagrams = (inference.diagram, inference.match_diagram, inference.fit_diagram)
     λ, unit = inference.fit.length, inference.fit.length_unit
-    limits = shared_limits([diagram for diagram in found if diagram is not None], λ)
+    limits = shared_limits([diagram for diagram in diagrams if diagram is not None], length=λ)
     parts = []
-    for (name, title), diagram in zip(_SHAPES, found, strict=True):
+    for (name, title), diagram in zip(_SHAPES, diagrams, strict=True):
         caption = f"<b>{title}</b>{_badge(inference, name)}"
         if diagram is None:
             parts.append(_missing(caption))
@@ -53,7 +66,7 @@ def diagram_figures(inference: Inference) -> str:
 
 
 def scan_box(inference: Inference) -> np.ndarray:
-    """The main window's phase field, cut to the size of the regenerated boxes so that all three show one scale."""
+    """Return the main window's phase field, cut to the regenerated boxes' size so that all three have one scale."""
     phase = inference.prepared.phase[inference.prepared.windows[0]]
     other = inference.best
     if other is None:
@@ -63,13 +76,13 @@ def scan_box(inference: Inference) -> np.ndarray:
 
 
 def window_framed(inference: Inference) -> bool:
-    """Whether the main window is smaller than what the slices show."""
+    """Return whether the main window is smaller than what the slices show."""
     shape = inference.prepared.phase.shape
     return any(edge.stop - edge.start < n for edge, n in zip(inference.prepared.windows[0], shape, strict=True))
 
 
 def _slice(inference: Inference, axis: int, index: int, limits: tuple[float, float]) -> str:
-    """One slice: the scan and the structure are placed by their voxels' edges, in the scan's unit."""
+    """Return one slice: the scan and the structure are placed by their voxels' edges, in the scan's unit."""
     scan, prepared = inference.scan, inference.prepared
     down, across = (k for k in range(3) if k != axis)
     place = prepared.origin[axis] + (index + 0.5) * prepared.scale[axis]

@@ -1,4 +1,4 @@
-"""The sentence that a report opens with: family, size, share of the volume."""
+"""Words of a report: the sentence that it opens with, and links to the glossary."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from curvafit.units import length, percent
+from curvafit.units import GLOSSARY, length, percent
 
 if TYPE_CHECKING:
     from curvafit.geometry.diagram import Diagram
@@ -24,7 +24,7 @@ _ROUND: dict[str, _Radii] = {
     "tubular cavities": lambda k1, k2: ((k2 < 0) & (np.abs(k1) < -_NARROW * k2), -k2),
     "bubbles": lambda k1, k2: ((k1 < 0) & (-k1 > -_NARROW * k2), -(k1 + k2) / 2),
 }
-#: How each family's size is said.
+#: The sentence for each family.
 _SIZES = {
     "layers": "{family}, {thickness} thick, {share} of the volume",
     "sponge": "{family}, struts {thickness} thick, {share} of the volume",
@@ -36,21 +36,26 @@ _SIZES = {
 
 
 def describe(inference: Inference) -> str:
-    """The sentence that a report opens with: family, size, share of the volume."""
+    """Return the sentence that a report opens with: family, size, share of the volume."""
     fit, numbers = inference.fit, inference.fit.morphometry
     radius = family_radius(inference.diagram, fit.family)
-    said = numbers.thickness_mean / 2 if radius is None else radius * fit.length
+    physical = numbers.thickness_mean / 2 if radius is None else radius * fit.length
     pattern = _SIZES.get(fit.family, "{family}, {thickness} thick, {share} of the volume")
     return pattern.format(
         family=fit.family.capitalize(),
-        radius=length(said, fit.length_unit),
+        radius=length(physical, fit.length_unit),
         thickness=length(numbers.thickness_mean, fit.length_unit),
         share=percent(numbers.volume_fraction),
     )
 
 
+def glossary_link(word: str, ending: str = "") -> str:
+    """Return a word with a special meaning, in the plural perhaps, as a link to its place in the glossary."""
+    return f'<a href="{GLOSSARY}#{word.replace(" ", "-")}">{word}{ending}</a>'
+
+
 def family_radius(diagram: Diagram, family: str) -> float | None:
-    """Median radius over the area that a round family holds, in the diagram's unit; None for the others."""
+    """Return the median radius over the area that a round family holds, in the diagram's unit; None for the others."""
     if family not in _ROUND:
         return None
     own, kappa = _ROUND[family](*np.asarray(diagram.points).T)
