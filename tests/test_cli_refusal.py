@@ -146,7 +146,7 @@ def test_infer_checks_before_it_reads(
     def read(*_: object, **__: object) -> None:
         raise AssertionError("the scan was read")
 
-    monkeypatch.setattr(importlib.import_module("curvafit.inference.infer"), "load", read)
+    monkeypatch.setattr(importlib.import_module("curvafit.inference.infer"), "field_of", read)
     refused(call("infer", "scan.npy", "-o", tmp_path / "out", *arguments), said)
     assert list(tmp_path.iterdir()) == []
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -13,9 +13,10 @@ from scipy.interpolate import CubicSpline
 from skimage.filters import threshold_otsu
 
 from curvafit.units import METRES
-from curvafit.volumes.scan import Field, ScanError
+from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.formats.part import Crop
 
-__all__ = ["Evidence", "interpolated_distance", "of_intensities", "of_probability"]
+__all__ = ["Evidence", "cropped_map", "interpolated_distance", "of_intensities", "of_probability"]
 
 #: Where Otsu's threshold is to be found, grey levels beyond these percentiles count as these.
 TAILS = (0.1, 99.9)
@@ -106,6 +107,14 @@ def of_probability(probability: Field, scan: Field) -> Evidence:
     p = values.clip(CERTAIN, 1 - CERTAIN)
     said = f"probabilities from {lowest:.3g} to {highest:.3g}"
     return Evidence(np.log(p / (1 - p)), _smoothed(values, scan, WIDTHS[0]) - 0.5, said)
+
+
+def cropped_map(probability: Field, crop: Crop | None) -> Field:
+    """Return a map's part that belongs to the same crop of its scan; a map without a place stays one without."""
+    if crop is None:
+        return probability
+    part = probability.crop(crop)
+    return part if probability.affine is not None else replace(part, affine=None)
 
 
 def _check_place(other: Field, scan: Field) -> None:

@@ -18,9 +18,10 @@ from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON
 from curvafit.priors.profile import optimal_profile, phase_field
 from curvafit.progress import Progress, silent
-from curvafit.segmentation.evidence import interpolated_distance, of_intensities, of_probability
+from curvafit.segmentation.evidence import cropped_map, interpolated_distance, of_intensities, of_probability
 from curvafit.segmentation.working import Law, Place, law_of
 from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.formats.part import Crop
 from curvafit.volumes.source import Source, field_of
 
 __all__ = ["STEPS", "Segmentation", "reconstruct", "segment"]
@@ -77,6 +78,7 @@ def segment(
     dark: bool = False,
     epsilon: float | None = None,
     steps: int = STEPS,
+    crop: Crop | None = None,
     progress: Progress = silent,
     **reading: Any,
 ) -> Segmentation:
@@ -102,6 +104,8 @@ def segment(
         ε in the scan's unit; twice the smallest voxel edge if not given. What is thinner does not survive.
     steps
         Of Adam.
+    crop
+        A box of voxels, of the scan and of the probability map: see `curvafit.load`.
     progress
         Called with a sentence and the share done.
     reading
@@ -114,7 +118,7 @@ def segment(
     FileNotFoundError
         If there is no such `fit.json`.
     """
-    scan = field_of(scan, **reading)
+    scan = field_of(scan, crop=crop, **reading)
     law, notes = law_of(prior, scan)
     place = Place.of(scan, epsilon)
     weight = None if weight is None else real(weight, "a positive weight", *WEIGHTS)
@@ -125,7 +129,7 @@ def segment(
     elif dark or threshold != "otsu":
         raise ScanError("expected neither a threshold nor dark with a probability map, which says what is inside")
     else:
-        found = of_probability(field_of(probability), scan)
+        found = of_probability(cropped_map(field_of(probability), crop), scan)
     start = _started(found.level, place)
     stiffness = float(law.a20 + law.a02) / 2
     if stiffness <= 0:
