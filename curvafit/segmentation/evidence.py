@@ -16,7 +16,7 @@ from curvafit.units import METRES
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.part import Crop
 
-__all__ = ["Evidence", "cropped_map", "interpolated_distance", "of_intensities", "of_probability"]
+__all__ = ["VoxelEvidence", "cropped_map", "interpolated_distance", "of_intensities", "of_probability"]
 
 #: Where Otsu's threshold is to be found, grey levels beyond these percentiles count as these.
 TAILS = (0.1, 99.9)
@@ -31,7 +31,7 @@ FAINT = 1.0
 
 
 @dataclass(frozen=True)
-class Evidence:
+class VoxelEvidence:
     """What each voxel says, and a first guess.
 
     Attributes
@@ -49,7 +49,7 @@ class Evidence:
     note: str
 
 
-def of_intensities(scan: Field, threshold: float | str = "otsu", dark: bool = False) -> Evidence:
+def of_intensities(scan: Field, threshold: float | str = "otsu", dark: bool = False) -> VoxelEvidence:
     """Two classes of grey levels with one Gaussian noise: r = (g - t) (c₁ - c₀) / σ².
 
     The scan is smoothed and split by Otsu's threshold; c₀, c₁ and σ are the raw levels' means and pooled deviation on
@@ -86,10 +86,10 @@ def of_intensities(scan: Field, threshold: float | str = "otsu", dark: bool = Fa
     said = f"classes at {means[0]:.4g} and {means[1]:.4g}, noise {noise:.3g}, split at {middle:.4g}"
     if found and contrast < FAINT * noise:
         said += "; they differ by less than the noise, as where the structure is rare: better give a threshold"
-    return Evidence(sign * (values - middle) * np.float32(contrast / noise**2), sign * (smooth - middle), said)
+    return VoxelEvidence(sign * (values - middle) * np.float32(contrast / noise**2), sign * (smooth - middle), said)
 
 
-def of_probability(probability: Field, scan: Field) -> Evidence:
+def of_probability(probability: Field, scan: Field) -> VoxelEvidence:
     """r = log p / (1 - p) of a map (Z, Y, X) in [0, 1].
 
     Raises
@@ -106,7 +106,7 @@ def of_probability(probability: Field, scan: Field) -> Evidence:
         raise ScanError(f"expected probabilities in [0, 1], got {lowest:g} to {highest:g}")
     p = values.clip(CERTAIN, 1 - CERTAIN)
     said = f"probabilities from {lowest:.3g} to {highest:.3g}"
-    return Evidence(np.log(p / (1 - p)), _smoothed(values, scan, WIDTHS[0]) - 0.5, said)
+    return VoxelEvidence(np.log(p / (1 - p)), _smoothed(values, scan, WIDTHS[0]) - 0.5, said)
 
 
 def cropped_map(probability: Field, crop: Crop | None) -> Field:
