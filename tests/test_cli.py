@@ -98,10 +98,12 @@ def test_infer_writes_three_files_and_says_what_it_found(tmp_path: Path, finding
 
 def test_infer_hands_every_option_on(tmp_path: Path, finding: dict[str, Any]) -> None:
     options = "--kind mask --periodic --threshold -12.5 --label 3 --raw-shape 4,5,6 --dtype u1 --key k --seed 9"
+    options += " --channel 2 --crop 1:3,:,-4:"
     result = call("infer", "a.raw", "-o", tmp_path, *options.split(), "--spacing", "0.5", "--roi", "r.npy")
     assert result.exit_code == 0, (result.output, result.exception)
     wanted = {"kind": "mask", "periodic": True, "threshold": -12.5, "label": 3, "raw_shape": (4, 5, 6), "dtype": "u1"}
     wanted |= {"key": "k", "seed": 9, "spacing": (0.5, 0.5, 0.5), "roi": Path("r.npy"), "atlas": None}
+    wanted |= {"channel": 2, "crop": "1:3,:,-4:"}
     assert {name: finding[name] for name in wanted} == wanted
 
 
@@ -118,6 +120,9 @@ def test_infer_hands_every_option_on(tmp_path: Path, finding: dict[str, Any]) ->
         (["--atlas", "nowhere.npz"], "expected an atlas file"),
         (["--roi", "nowhere.npy"], "no such file"),
         (["--label", "77"], "expected a label of the scan"),
+        (["--crop", "1:4"], "expected a crop as"),
+        (["--crop", "1:4,:,0:21"], "expected a crop within 0:20 along x of"),
+        (["--channel", "0"], "which holds a single one"),
         (["--threshold", "5"], "expected a threshold within"),
     ],
 )

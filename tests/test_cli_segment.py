@@ -199,6 +199,46 @@ def test_wrong_input_is_a_sentence(arguments, said, oblique, tmp_path, monkeypat
     assert not (tmp_path / "m.nii.gz").exists() and not list(tmp_path.glob(".m*"))
 
 
+def test_a_part_of_a_file_is_segmented_where_it_was(oblique: Path, tmp_path: Path) -> None:
+    whole = nibabel.load(oblique)
+    times = np.stack([np.asanyarray(whole.dataobj)[::-1], np.asanyarray(whole.dataobj)], axis=-1)
+    nibabel.save(nibabel.Nifti1Image(times, OBLIQUE), tmp_path / "times.nii")
+    save(Field(ball().astype(np.float32) * 0.8 + 0.1), tmp_path / "likely.npy")
+    options = ["--channel", "1", "--crop", "2:,1:17,:-1", "--spacing", "0.09,0.06,0.06", "--unit", "mm"]
+    likely = ["--probability", tmp_path / "likely.npy"]
+    for k, (source, part, more) in enumerate(
+        ((tmp_path / "times.nii", options, []), (oblique, options[2:4], []), (oblique, options[2:4], likely))
+    ):
+        target = tmp_path / f"mask{k}.nii.gz"
+        result = call("segment", source, *part, *more, "--prior", "tubes", "--steps", 5, "-o", target)
+        assert result.exit_code == 0, (result.output, result.exception)
+        mask = nibabel.load(target)
+        assert mask.shape == (15, 16, 18)
+        assert (
+            "Voxels 2:20, 1:17, 0:15 (z, y, x) are used."
+            in json.loads(target.with_suffix("").with_suffix(".json").read_text())["notes"]
+        )
+        values, there = np.asanyarray(mask.dataobj).T > 0, ball()[2:, 1:17, :-1]
+        assert 2 * (values & there).sum() / (values.sum() + there.sum()) > 0.8
+        if not k:
+            continue  # the place of voxels of another size than the file's is another
+        for voxel in ([0, 0, 0], [3, 4, 5]):
+            at = [voxel[0], voxel[1] + 1, voxel[2] + 2]
+            assert mask.affine @ [*voxel, 1] == pytest.approx(whole.affine @ [*at, 1], rel=1e-3, abs=1e-4)
+
+
+def test_a_label_of_a_volume_is_filled_in(tmp_path: Path) -> None:
+    labels = np.where(ball(), 3, 1)
+    labels[:, :3] = 7
+    np.save(tmp_path / "labels.npy", labels)
+    some = ("reconstruct", tmp_path / "labels.npy", "--every", 4, "--prior", "tubes", "--steps", 2)
+    result = call(*some, "--label", 3, "-o", tmp_path / "mask.npy")
+    assert result.exit_code == 0, (result.output, result.exception)
+    assert np.array_equal(np.load(tmp_path / "mask.npy")[::4] > 0, (labels == 3)[::4])
+    result = call(*some, "--label", 4, "-o", tmp_path / "none.npy")
+    assert result.exit_code == 2 and "expected a label of the scan (1, 3, 7), got 4" in result.stderr
+
+
 @pytest.mark.parametrize(
     ("name", "said"),
     [("mask.xyz", "ending in one of"), ("taken/mask.tif", "is a file"), ("other.nii.gz", "a name that is free")],

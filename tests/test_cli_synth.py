@@ -61,7 +61,7 @@ def test_a_set_of_inferred_shapes_like_a_scan(tmp_path, store):
     save(Field(inside.astype(np.uint8), (0.002, 0.001, 0.001), "mm"), tmp_path / "mask.nii.gz")
     quick = ["--count", "1", "--shape", "8,16,16", "--workers", "0"]
     out, scan = tmp_path / "set", tmp_path / "scan.nii.gz"
-    told = ["--like", scan, "--like-mask", tmp_path / "mask.nii.gz", "--visible", "auto"]
+    told = ["--like", scan, "--like-mask", tmp_path / "mask.nii.gz", "--label", "1", "--visible", "auto"]
     result = call("synth", "-o", out, "--prior", tmp_path / "fit.json", *told, *quick)
     assert result.exit_code == 0, (result.output, result.exception)
     image = load(out / "imagesTr" / "case_00000_0000.nii.gz")
@@ -103,6 +103,9 @@ def test_bad_input(tmp_path, store):
     )
     refused(call(*some, *kind, "--visible", "1.5"), "expected visible as a share below 1, got 1.5")
     refused(call(*some, *kind, "--like-mask", "m.nii.gz"), "expected --like beside --like-mask, got none")
+    refused(call(*some, *kind, "--channel", "0"), "expected --like beside --channel, got none")
+    refused(call(*some, "--like", "m.nii.gz", "--label", "0"), "expected --like-mask beside --label, which is a value")
+    refused(call(*some, "--like", "m.nii.gz", "--crop", "0:4"), "expected a crop as")
     refused(call(*some, *kind, "--volume-fraction", "0.2"), "expected --volume-fraction beside shapes that are grown")
     presets = ["synth", "-o", out, "--presets", "tubes", *kind]
     refused(call(*presets, "--volume-fraction", "2"), "expected a volume fraction in (0, 1), got 2")

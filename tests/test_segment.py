@@ -16,7 +16,7 @@ from skimage.filters import threshold_otsu
 from curvafit.priors.coefficients import Coefficients, preset
 from curvafit.segmentation.evidence import interpolated_distance, of_intensities, of_probability
 from curvafit.segmentation.segment import reconstruct, segment
-from curvafit.segmentation.working import Place, law_of
+from curvafit.segmentation.working import WorkingGrid, law_of
 from curvafit.volumes.scan import Field
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
@@ -121,7 +121,7 @@ def test_a_prior_comes_in_the_scan_s_unit(tmp_path: Path) -> None:
 
 
 def test_axes_are_refined_and_brought_back() -> None:
-    place = Place.of(Field(np.zeros((6, 7, 8)), (2.5, 1.0, 1.0)), None)
+    place = WorkingGrid.of(Field(np.zeros((6, 7, 8)), (2.5, 1.0, 1.0)), None)
     assert place.times == (3, 1, 1) and place.grid.shape == (18, 7, 8) and place.epsilon == 2
     assert min(place.grid.spacing) * 100 == pytest.approx(2.5 / 3)
     values = np.random.default_rng(0).random((6, 7, 8)).astype(np.float32)

@@ -69,6 +69,16 @@ def test_what_counts_for_nothing_is_refused(source, options: dict, complaint: st
         field_of(source, **options)
 
 
+# ---- what a field says of itself -------------------------------------------------------------------------------------
+
+
+def test_a_field_is_one_line_and_equals_itself() -> None:
+    field = Field(ramp(), (3.0, 2.0, 1.0), "um", source="scan\n.nii.gz")
+    assert repr(field) == "Field(4 x 5 x 6 voxels of 3 x 2 x 1 um, float32 from 0 to 119, from scan\\n.nii.gz)"
+    assert repr(Field(ramp(dtype="uint8"), 0.0195, "mm")) == "Field(4 x 5 x 6 voxels of 0.0195 mm, uint8 from 0 to 119)"
+    assert field == field and field != Field(ramp()) and len({field, field}) == 1
+
+
 # ---- the jobs take each alike ----------------------------------------------------------------------------------------
 
 BALL = (np.linalg.norm(np.indices((10, 11, 12)).T - (4.5, 5.0, 5.5), axis=-1).T < 4).astype(np.float32)
@@ -88,6 +98,8 @@ def test_segment_takes_each_source(tmp_path: Path) -> None:
         assert np.array_equal(found.mask.values, wanted.mask.values)
         assert (found.mask.spacing, found.mask.unit) == (scan.spacing, "um")
     likely = save(Field(0.1 + 0.8 * BALL, **AT), tmp_path / "likely.nii.gz")
+    assert repr(wanted).startswith(f"Segmentation(10 x 11 x 12 voxels of 3 x 2 x 2 um, {wanted.mask.values.sum()} in")
+    assert repr(wanted).endswith(f"%): {wanted.status})") and "\n" not in repr(wanted) and wanted == wanted
     by_path, by_array = (segment(scan, "tubes", probability=p, steps=2) for p in (likely, 0.1 + 0.8 * BALL))
     assert np.array_equal(by_path.phase.values, by_array.phase.values)
 

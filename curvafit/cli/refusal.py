@@ -10,6 +10,7 @@ from rich.console import Console
 from typer.core import TyperGroup
 
 from curvafit.interrupts import exit_code
+from curvafit.messages import one_line
 
 #: Characters of a sentence: a quotation that makes it longer is cut in its middle.
 LONGEST = 700
@@ -39,8 +40,7 @@ class Commands(TyperGroup):
 
 def sentence(text: str, start: str = "error") -> str:
     """A message on one line, of a sane length, in signs that show: others are escaped."""
-    line = " ".join(text.split())
-    line = "".join(sign if sign.isprintable() else sign.encode("unicode_escape").decode() for sign in line)
+    line = one_line(" ".join(text.split()))
     if len(line) > LONGEST:
         line = f"{line[: LONGEST * 2 // 3]} … {line[-LONGEST // 3 :]}"
     return f"{start}: {line}"

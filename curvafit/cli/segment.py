@@ -9,11 +9,23 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from curvafit.cli.reading import (
+    Channel,
+    Crop,
+    Dtype,
+    Key,
+    Label,
+    RawShape,
+    Spacing,
+    Strict,
+    Unit,
+    Volume,
+    reading_of,
+)
 from curvafit.cli.support import (
     OverwriteOption,
     command_line,
     plainly,
-    reading_of,
     say,
     say_notes,
     stages,
@@ -40,9 +52,7 @@ RECONSTRUCT_EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
 )
 
 _what = partial(typer.Option, rich_help_panel="What to do")
-_how = partial(typer.Option, rich_help_panel="How to read the file")
 
-Volume = Annotated[str, typer.Argument(help="NIfTI, TIFF (or folder of slices), NPY, NPZ, HDF5 (file.h5::key), Zarr …")]
 Target = Annotated[Path, typer.Option("-o", "--output", help="Mask to write: .nii.gz .nii .tif .npy .mrc .zarr.")]
 Prior = Annotated[str, _what(help="fit.json of `curvafit infer`, or a preset's name (see `curvafit presets`).")]
 Probability = Annotated[Path | None, _what(help="Volume of probabilities of the inside, instead of grey levels.")]
@@ -54,12 +64,6 @@ Steps = Annotated[int, _what(help="Steps of the flow.", min=1)]
 Every = Annotated[int | None, _what(help="Every so many slices are known.")]
 First = Annotated[int | None, _what(help="The first of them, beside --every; 0 by default.")]
 Axis = Annotated[str, _what(help="What slices are counted along: z, y or x (first, second, last axis of an array).")]
-Spacing = Annotated[str | None, _how(help="Voxel edges z,y,x, or one for all; overrides the file.")]
-Unit = Annotated[str | None, _how(help="nm, um, mm or m; overrides the file.")]
-RawShape = Annotated[str | None, _how(help="Z,Y,X of a RAW file.")]
-Dtype = Annotated[str | None, _how(help="Type of a RAW file: u1, u2, f4 …")]
-Key = Annotated[str | None, _how(help="Array within an NPZ, HDF5 or Zarr file.")]
-Strict = Annotated[bool, _how("--strict", help="Refuse a volume of which chunks or slices are missing.")]
 
 #: Steps of the flow; `segment.STEPS`, which help must not import.
 STEPS = 150
@@ -77,6 +81,9 @@ def segment(
     steps: Steps = STEPS,
     spacing: Spacing = None,
     unit: Unit = None,
+    channel: Channel = None,
+    label: Label = None,
+    crop: Crop = None,
     raw_shape: RawShape = None,
     dtype: Dtype = None,
     key: Key = None,
@@ -85,7 +92,17 @@ def segment(
 ) -> None:
     """Find the structure of a noisy scan under a curvature prior, with a picture (.png) and a record (.json)."""
     with plainly():
-        reading = reading_of(spacing, unit, raw_shape, dtype, key, strict)
+        reading = reading_of(
+            spacing=spacing,
+            unit=unit,
+            channel=channel,
+            label=label,
+            crop=crop,
+            raw_shape=raw_shape,
+            dtype=dtype,
+            key=key,
+            strict=strict,
+        )
         options: dict[str, Any] = {"weight": weight, "epsilon": epsilon}
         if probability is None:
             options |= {"threshold": threshold_of(threshold), "dark": dark}
@@ -94,12 +111,12 @@ def segment(
             raise ValueError(f"expected neither --threshold nor --dark with --probability, got {given}")
 
         def made(volume: Field, progress: Callable[[str, float], None]) -> Segmentation:
+            from curvafit.segmentation.evidence import cropped_map
             from curvafit.segmentation.segment import segment as find
             from curvafit.volumes.scan import load
 
-            likely = (
-                None if probability is None else load(probability, spacing=reading["spacing"], unit=unit, strict=strict)
-            )
+            alike = {name: reading[name] for name in ("spacing", "unit", "strict")}
+            likely = None if probability is None else cropped_map(load(probability, **alike), reading["crop"])
             say_notes(() if likely is None else likely.notes)
             return find(volume, prior, probability=likely, steps=steps, progress=progress, **options)
 
@@ -119,6 +136,9 @@ def reconstruct(
     steps: Steps = STEPS,
     spacing: Spacing = None,
     unit: Unit = None,
+    channel: Channel = None,
+    label: Label = None,
+    crop: Crop = None,
     raw_shape: RawShape = None,
     dtype: Dtype = None,
     key: Key = None,
@@ -127,7 +147,17 @@ def reconstruct(
 ) -> None:
     """Fill a mask of which only some slices are known, with a picture (.png) and a record (.json)."""
     with plainly():
-        reading = reading_of(spacing, unit, raw_shape, dtype, key, strict)
+        reading = reading_of(
+            spacing=spacing,
+            unit=unit,
+            channel=channel,
+            label=label,
+            crop=crop,
+            raw_shape=raw_shape,
+            dtype=dtype,
+            key=key,
+            strict=strict,
+        )
         if axis.lower() not in ("z", "y", "x"):
             raise ValueError(f"expected --axis z, y or x, got {axis!r}")
         if (every is None) == (known is None):
@@ -170,7 +200,8 @@ def _run(
         found = make(volume, progress)
         progress("writing", 1.0)
         asked = {"command": command_line(), "prior": prior, **told}
-        own = source if reading["spacing"] is None else None
+        placed = ("spacing", "crop", "channel")
+        own = source if all(reading[name] is None for name in placed) else None
         more = {"record": asked, "overwrite": overwrite}
         files = write_mask(found, volume, out, like=own, unit=reading["unit"], **more)
     for note in found.notes:

@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -159,29 +159,6 @@ def device_of(text: str) -> str:
 def threshold_of(text: str) -> float | str:
     """A grey level, or `"otsu"`."""
     return text.lower() if text.lower() == "otsu" else numbers(text, "--threshold", 1)[0]
-
-
-def reading_of(
-    spacing: str | None,
-    unit: str | None,
-    raw_shape: str | None = None,
-    dtype: str | None = None,
-    key: str | None = None,
-    strict: bool = False,
-) -> dict[str, Any]:
-    """The options that say how to read a file, as `scan.load` takes them."""
-    if unit is not None:
-        from curvafit.volumes.formats import normalise_unit
-
-        normalise_unit(unit)
-    return {
-        "spacing": None if spacing is None else triple(spacing, "--spacing"),
-        "raw_shape": None if raw_shape is None else whole_triple(raw_shape, "--raw-shape"),
-        "unit": unit,
-        "dtype": dtype,
-        "key": key,
-        "strict": strict,
-    }
 
 
 # ---- printing --------------------------------------------------------------------------------------------------------

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli.support import error_console, numbers, plainly, reading_of, say, say_notes, whole_triple
+from curvafit.cli.reading import reading_of
+from curvafit.cli.support import error_console, numbers, plainly, say, say_notes, whole_triple
 from curvafit.cli.workers import Crew, DashboardOption, SchedulerOption, WorkersOption
 
 if TYPE_CHECKING:
@@ -80,7 +81,9 @@ Visible = Annotated[
 ]
 Spacing = Annotated[str | None, _seen(help="Voxel edges of --like, if its file does not tell: Z,Y,X or one number.")]
 Unit = Annotated[str | None, _seen(help="nm, um, mm or m; of --spacing and --voxel.")]
-
+Channel = Annotated[int | None, _seen(help="Which channel of --like, counted from 0, where its file has several.")]
+Label = Annotated[int | None, _seen(help="The structure is where --like-mask has this value.")]
+Crop = Annotated[str | None, _seen(help="Box of voxels of --like and --like-mask: z0:z1,y0:y1,x0:x1; : is all.")]
 Strict = Annotated[bool, _seen("--strict", help="Refuse a scan for --like of which chunks or slices are missing.")]
 
 
@@ -99,6 +102,9 @@ def synth(
     calibres: Calibres = "1,1",
     spacing: Spacing = None,
     unit: Unit = None,
+    channel: Channel = None,
+    label: Label = None,
+    crop: Crop = None,
     strict: Strict = False,
     layout: Layout = "nnunet",
     labels: Parts = None,
@@ -118,7 +124,8 @@ def synth(
             raise ValueError("expected --unit beside --spacing or --voxel, got neither")
         stated = [] if laws is None else laws.split(",")
         source = _source(stated, atlas, volume_fraction)
-        seen = _modality(modality, like, like_mask, visible, reading_of(spacing, unit, strict=strict))
+        reading = reading_of(spacing=spacing, unit=unit, crop=crop, channel=channel, label=label, strict=strict)
+        seen = _modality(modality, like, like_mask, visible, reading)
         from curvafit.data_synth.sets.case import Recipe
         from curvafit.data_synth.sets.sets import Order
         from curvafit.data_synth.sets.sources import voxel_of
@@ -173,7 +180,7 @@ def _modality(
     if (name is None) == (like is None):
         raise ValueError(f"expected either --modality or --like, got {'neither' if name is None else 'both'}")
     if like is None:
-        lone = [key for key, value in reading.items() if value not in (None, False) and key != "unit"]
+        lone = [key for key, value in reading.items() if value is not None and value is not False and key != "unit"]
         if lone or mask is not None:
             raise ValueError(f"expected --like beside {f'--{lone[0]}' if lone else '--like-mask'}, got none")
         from curvafit.data_synth.imaging.modalities import modality
@@ -182,9 +189,11 @@ def _modality(
     from curvafit.data_synth.imaging import estimate
     from curvafit.volumes.scan import load
 
-    scan = load(like, **reading)
+    if reading["label"] is not None and mask is None:
+        raise ValueError("expected --like-mask beside --label, which is a value of that mask, got none")
+    scan = load(like, **{**reading, "label": None})
     say_notes(scan.notes)
-    found = estimate.like(scan, None if mask is None else _mask(load(mask, **reading).values))
+    found = estimate.like(scan, None if mask is None else _mask(load(mask, **{**reading, "channel": None}).values))
     return _visible(found, visible)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -13,9 +13,10 @@ from scipy.interpolate import CubicSpline
 from skimage.filters import threshold_otsu
 
 from curvafit.units import METRES
-from curvafit.volumes.scan import Field, ScanError
+from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.formats.part import Crop
 
-__all__ = ["Evidence", "interpolated_distance", "of_intensities", "of_probability"]
+__all__ = ["VoxelEvidence", "cropped_map", "interpolated_distance", "of_intensities", "of_probability"]
 
 #: Where Otsu's threshold is to be found, grey levels beyond these percentiles count as these.
 TAILS = (0.1, 99.9)
@@ -30,7 +31,7 @@ FAINT = 1.0
 
 
 @dataclass(frozen=True)
-class Evidence:
+class VoxelEvidence:
     """What each voxel says, and a first guess.
 
     Attributes
@@ -48,7 +49,7 @@ class Evidence:
     note: str
 
 
-def of_intensities(scan: Field, threshold: float | str = "otsu", dark: bool = False) -> Evidence:
+def of_intensities(scan: Field, threshold: float | str = "otsu", dark: bool = False) -> VoxelEvidence:
     """Two classes of grey levels with one Gaussian noise: r = (g - t) (c₁ - c₀) / σ².
 
     The scan is smoothed and split by Otsu's threshold; c₀, c₁ and σ are the raw levels' means and pooled deviation on
@@ -85,10 +86,10 @@ def of_intensities(scan: Field, threshold: float | str = "otsu", dark: bool = Fa
     said = f"classes at {means[0]:.4g} and {means[1]:.4g}, noise {noise:.3g}, split at {middle:.4g}"
     if found and contrast < FAINT * noise:
         said += "; they differ by less than the noise, as where the structure is rare: better give a threshold"
-    return Evidence(sign * (values - middle) * np.float32(contrast / noise**2), sign * (smooth - middle), said)
+    return VoxelEvidence(sign * (values - middle) * np.float32(contrast / noise**2), sign * (smooth - middle), said)
 
 
-def of_probability(probability: Field, scan: Field) -> Evidence:
+def of_probability(probability: Field, scan: Field) -> VoxelEvidence:
     """r = log p / (1 - p) of a map (Z, Y, X) in [0, 1].
 
     Raises
@@ -105,7 +106,15 @@ def of_probability(probability: Field, scan: Field) -> Evidence:
         raise ScanError(f"expected probabilities in [0, 1], got {lowest:g} to {highest:g}")
     p = values.clip(CERTAIN, 1 - CERTAIN)
     said = f"probabilities from {lowest:.3g} to {highest:.3g}"
-    return Evidence(np.log(p / (1 - p)), _smoothed(values, scan, WIDTHS[0]) - 0.5, said)
+    return VoxelEvidence(np.log(p / (1 - p)), _smoothed(values, scan, WIDTHS[0]) - 0.5, said)
+
+
+def cropped_map(probability: Field, crop: Crop | None) -> Field:
+    """Return a map's part that belongs to the same crop of its scan; a map without a place stays one without."""
+    if crop is None:
+        return probability
+    part = probability.crop(crop)
+    return part if probability.affine is not None else replace(part, affine=None)
 
 
 def _check_place(other: Field, scan: Field) -> None:

@@ -18,9 +18,10 @@ from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON
 from curvafit.priors.profile import optimal_profile, phase_field
 from curvafit.progress import Progress, silent
-from curvafit.segmentation.evidence import interpolated_distance, of_intensities, of_probability
-from curvafit.segmentation.working import Law, Place, law_of
-from curvafit.volumes.field import Field, ScanError
+from curvafit.segmentation.evidence import cropped_map, interpolated_distance, of_intensities, of_probability
+from curvafit.segmentation.working import Law, WorkingGrid, law_of
+from curvafit.volumes.field import Field, ScanError, voxels_of
+from curvafit.volumes.formats.part import Crop
 from curvafit.volumes.source import Source, field_of
 
 __all__ = ["STEPS", "Segmentation", "reconstruct", "segment"]
@@ -40,7 +41,7 @@ WEIGHTS = (1e-9, 1e9)
 SETTLED = 0.001
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Segmentation:
     """A mask, and how it came about.
 
@@ -66,6 +67,11 @@ class Segmentation:
     status: str
     notes: tuple[str, ...]
 
+    def __repr__(self) -> str:
+        mask = self.mask.values
+        count = f"{np.count_nonzero(mask)} inside ({100 * mask.mean():.3g} %)"
+        return f"Segmentation({voxels_of(self.mask)}, {count}: {self.status})"
+
 
 def segment(
     scan: Source,
@@ -77,6 +83,7 @@ def segment(
     dark: bool = False,
     epsilon: float | None = None,
     steps: int = STEPS,
+    crop: Crop | None = None,
     progress: Progress = silent,
     **reading: Any,
 ) -> Segmentation:
@@ -102,6 +109,8 @@ def segment(
         ε in the scan's unit; twice the smallest voxel edge if not given. What is thinner does not survive.
     steps
         Of Adam.
+    crop
+        A box of voxels, of the scan and of the probability map: see `curvafit.load`.
     progress
         Called with a sentence and the share done.
     reading
@@ -114,9 +123,9 @@ def segment(
     FileNotFoundError
         If there is no such `fit.json`.
     """
-    scan = field_of(scan, **reading)
+    scan = field_of(scan, crop=crop, **reading)
     law, notes = law_of(prior, scan)
-    place = Place.of(scan, epsilon)
+    place = WorkingGrid.of(scan, epsilon)
     weight = None if weight is None else real(weight, "a positive weight", *WEIGHTS)
     if not (isinstance(threshold, str) and threshold == "otsu"):
         real(threshold, "a threshold that is a number or 'otsu'")
@@ -125,7 +134,7 @@ def segment(
     elif dark or threshold != "otsu":
         raise ScanError("expected neither a threshold nor dark with a probability map, which says what is inside")
     else:
-        found = of_probability(field_of(probability), scan)
+        found = of_probability(cropped_map(field_of(probability), crop), scan)
     start = _started(found.level, place)
     stiffness = float(law.a20 + law.a02) / 2
     if stiffness <= 0:
@@ -177,7 +186,7 @@ def reconstruct(
     """
     slices = field_of(slices, **reading)
     law, notes = law_of(prior, slices)
-    place = Place.of(slices, epsilon)
+    place = WorkingGrid.of(slices, epsilon)
     axis = whole(axis, "an axis 0, 1 or 2 (z, y, x)", 0, 2)
     places = _places(slices.shape[axis], every, first, known)
     there = _labels(np.moveaxis(slices.values, axis, 0)[places]) > 0
@@ -230,7 +239,7 @@ def _labels(values: np.ndarray) -> np.ndarray:
     return values
 
 
-def _started(level: np.ndarray, place: Place) -> Tensor:
+def _started(level: np.ndarray, place: WorkingGrid) -> Tensor:
     """The phase field of where a smooth volume is positive."""
     inside = place.finer(level) > 0
     if not inside.any() or inside.all():
@@ -240,7 +249,7 @@ def _started(level: np.ndarray, place: Place) -> Tensor:
     return phase_field(inside, place.grid, WORKING_EPSILON)
 
 
-def _force(law: Coefficients, place: Place, u: Tensor) -> float:
+def _force(law: Coefficients, place: WorkingGrid, u: Tensor) -> float:
     """Root mean square of ∂F_ε/∂u, over that of the Willmore energy: what makes Adam's steps and springs comparable."""
     sizes = []
     for each in (law.in_unit(place.unit), Coefficients.willmore()):
@@ -251,7 +260,9 @@ def _force(law: Coefficients, place: Place, u: Tensor) -> float:
     return sizes[0] / sizes[1]
 
 
-def _lowered(start: Tensor, law: Coefficients, term: data.Data, place: Place, steps: int, progress: Progress) -> Flow:
+def _lowered(
+    start: Tensor, law: Coefficients, term: data.Data, place: WorkingGrid, steps: int, progress: Progress
+) -> Flow:
     def watch(step: int, total: int, state: object) -> None:
         progress("lowering the energy", step / total)
 
@@ -275,7 +286,7 @@ def _result(
     mask: np.ndarray,
     u: np.ndarray,
     law: Coefficients,
-    place: Place,
+    place: WorkingGrid,
     weight: float | None,
     notes: tuple[str, ...],
     flow: Flow,

@@ -16,7 +16,7 @@ from curvafit.priors.loss import RESOLVED, upsampling
 from curvafit.priors.refined import refined
 from curvafit.volumes.scan import Field, ScanError
 
-__all__ = ["Law", "Place", "law_of"]
+__all__ = ["Law", "WorkingGrid", "law_of"]
 
 
 def law_of(prior: Law, scan: Field) -> tuple[Coefficients, tuple[str, ...]]:
@@ -43,7 +43,7 @@ def law_of(prior: Law, scan: Field) -> tuple[Coefficients, tuple[str, ...]]:
 
 
 @dataclass(frozen=True)
-class Place:
+class WorkingGrid:
     """Where a flow runs: working units, and axes refined until ε spans two voxels.
 
     Attributes
@@ -62,7 +62,7 @@ class Place:
     epsilon: float
 
     @classmethod
-    def of(cls, scan: Field, epsilon: float | None) -> Place:
+    def of(cls, scan: Field, epsilon: float | None) -> WorkingGrid:
         """The place for a scan; ε is twice the smallest voxel edge if not given.
 
         Raises

@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from curvafit.messages import one_line
 from curvafit.priors.bounds import SEEDS, quoted, whole
 from curvafit.volumes.formats.base import ScanError, normalise_unit
 from curvafit.volumes.formats.part import Crop, box_of, fitted
 
-__all__ = ["Field", "ScanError", "positive_triple"]
+__all__ = ["Field", "ScanError", "positive_triple", "voxels_of"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +64,11 @@ class Field:
             affine[:3] *= factor
             object.__setattr__(self, "affine", affine)
 
+    def __repr__(self) -> str:
+        extent = f" from {self.values.min():.4g} to {self.values.max():.4g}" if self.values.size else ""
+        source = f", from {self.source}" if self.source else ""
+        return one_line(f"Field({voxels_of(self)}, {self.values.dtype}{extent}{source})")
+
     @property
     def shape(self) -> tuple[int, int, int]:
         return self.values.shape  # type: ignore[return-value]
@@ -109,6 +115,13 @@ class Field:
         affine[:3, 3] += affine[:3, :3] @ np.array(start[::-1], dtype=np.float64)
         ends = (f"{first}:{first + n}" for first, n in zip(start, self.shape, strict=True))
         return replace(self, affine=affine, notes=(*self.notes, f"Voxels {', '.join(ends)} (z, y, x) are used."))
+
+
+def voxels_of(field: Field) -> str:
+    """Return how many voxels a field has, and of which size, in words."""
+    cube = len(set(field.spacing)) == 1
+    edges = " x ".join(f"{h:.4g}" for h in field.spacing[: 1 if cube else 3])
+    return f"{' x '.join(map(str, field.shape))} voxels of {edges} {field.unit}"
 
 
 def positive_triple(spacing: object) -> tuple[float, float, float]:

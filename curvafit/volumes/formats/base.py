@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import logging
-import re
 import threading
 import warnings
 from collections.abc import Iterator, Mapping
@@ -13,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from curvafit.messages import one_line
 from curvafit.priors.bounds import quoted
 from curvafit.units import METRES
 
@@ -32,10 +32,6 @@ _UNITS: dict[str, tuple[str, float]] = {
 }
 
 
-#: What would break a line, or cannot be printed.
-_UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
-
-
 class ScanError(ValueError):
     """A volume that cannot be used, said in one sentence on one line."""
 
@@ -45,11 +41,6 @@ class ScanError(ValueError):
 
 class Damaged(Exception):
     """What is wrong with a file, for the sentence that names it."""
-
-
-def one_line(text: str) -> str:
-    """The text with its line breaks, and what else a file's name can bring along, escaped."""
-    return _UNPRINTABLE.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
 class Raw(NamedTuple):

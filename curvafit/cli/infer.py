@@ -1,0 +1,116 @@
+"""The command that infers the parameters of a scan."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from curvafit.cli.reading import (
+    Channel,
+    Crop,
+    Dtype,
+    Key,
+    Label,
+    RawShape,
+    Spacing,
+    Strict,
+    Unit,
+    Volume,
+    reading_of,
+)
+from curvafit.cli.support import (
+    OverwriteOption,
+    command_line,
+    output,
+    plainly,
+    say,
+    say_notes,
+    stages,
+    threshold_of,
+)
+
+if TYPE_CHECKING:
+    from curvafit.inference.infer import Inference
+
+EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
+    (
+        "curvafit infer bone.tif --spacing 0.0195 --unit mm -o bone",
+        "curvafit infer vessels.nii.gz --kind mask -o vessels",
+        "curvafit infer cells.ome.zarr --channel 1 --crop 0:64,100:300,100:300 --dark --threshold 90 -o cells",
+        "curvafit infer fibres.raw --raw-shape 128,128,128 --dtype u1 -o fibres",
+    )
+)
+
+
+def infer(
+    scan: Volume,
+    out: Annotated[Path, typer.Option("-o", "--output", help="Folder for fit.json, report.html, regenerated.nii.gz.")],
+    kind: Annotated[str, typer.Option(help="auto, field, mask or image.")] = "auto",
+    periodic: Annotated[bool, typer.Option("--periodic", help="The box repeats (generated fields).")] = False,
+    atlas: Annotated[Path | None, typer.Option(help="Another atlas (.npz) than the packaged one.")] = None,
+    threshold: Annotated[str, typer.Option(help="Grey level, or otsu.")] = "otsu",
+    dark: Annotated[bool, typer.Option("--dark", help="The structure is the dark phase.")] = False,
+    roi: Annotated[Path | None, typer.Option(help="Mask of what counts, of the scan's shape.")] = None,
+    spacing: Spacing = None,
+    unit: Unit = None,
+    channel: Channel = None,
+    label: Label = None,
+    crop: Crop = None,
+    raw_shape: RawShape = None,
+    dtype: Dtype = None,
+    key: Key = None,
+    strict: Strict = False,
+    seed: Annotated[int, typer.Option(help="Seed of the shapes that are regrown for comparison.")] = 0,
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Infer the parameters of a scanned volume, and write a report."""
+    with plainly():
+        reading = reading_of(
+            spacing=spacing,
+            unit=unit,
+            channel=channel,
+            label=label,
+            crop=crop,
+            raw_shape=raw_shape,
+            dtype=dtype,
+            key=key,
+            strict=strict,
+        )
+        level = threshold_of(threshold)
+        what = {"kind": kind, "periodic": periodic, "threshold": level, "dark": dark, "roi": roi}
+        inference, report = _inferred(scan, out, {**what, "atlas": atlas, "seed": seed, **reading}, overwrite)
+        _show(inference)
+        say(str(report))
+
+
+def _inferred(scan: str, out: Path, options: dict[str, Any], overwrite: bool) -> tuple[Inference, Path]:
+    """Return the inference and the path of its report; the progress is shown."""
+    with stages() as progress:
+        from curvafit.inference.infer import infer as find
+        from curvafit.report.page import check_report, with_command, write_inference
+
+        inputs = [each for each in (scan, options["roi"], options["atlas"]) if each is not None]
+        check_report(out, inputs, overwrite)
+
+        inference = find(scan, progress=progress, **options)
+        progress("drawing the report", 1.0)
+        say_notes(inference.scan.notes)
+        return inference, write_inference(with_command(inference, command_line()), out, overwrite=overwrite)
+
+
+def _show(inference: Inference) -> None:
+    """Print the sentence, the verdict and a small table."""
+    from curvafit.report.page import parameter_table
+    from curvafit.report.wording import describe
+    from curvafit.units import length, number
+
+    fit = inference.fit
+    say(f"{describe(inference)}.", style="bold")
+    say(fit.status)
+    heads = ("", "working units", "±", f"with lengths in {fit.length_unit}")
+    output(heads, parameter_table(inference), right=range(1, 4))
+    names = {"match": "nearest match", "fit": "refined", "seed_noise": "two seeds"}
+    apart = ", ".join(f"{names[name]} {number(value, 2)}" for name, value in fit.distances.items())
+    say(f"Distances in 1/working unit ({length(fit.length, fit.length_unit, 3)}): {apart}.")
