@@ -3,6 +3,7 @@
 #   make test   install with the test tools; run all tests but the few of make test-long
 #   make test-hostile   damaged files, odd options, failing disks: all cases; make test-hostile-quick: some of each kind
 #   make lint   ruff and the type checker
+#   make docs   the documentation, into site/ (open site/index.html); every warning is an error
 # A CPU-only torch, several GB smaller on Linux: make demo TORCH_INDEX=https://download.pytorch.org/whl/cpu
 
 PYTHON ?= python3
@@ -11,7 +12,7 @@ TORCH_INDEX ?=
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
 
-.PHONY: demo test test-long test-hostile test-hostile-quick lint clean
+.PHONY: demo test test-long test-hostile test-hostile-quick lint docs clean
 
 demo: .venv/installed
 	@scan=$$($(BIN)/curvafit samples get bone) \
@@ -35,8 +36,11 @@ lint: .venv/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
+docs: .venv/installed-dev
+	NO_MKDOCS_2_WARNING=1 PYTHONWARNINGS=ignore $(BIN)/python -m mkdocs build --strict --quiet
+
 clean:
-	rm -rf .venv demo_out build dist
+	rm -rf .venv demo_out build dist site
 
 .venv/installed: EXTRAS :=
 .venv/installed-dev: EXTRAS := [dev]

@@ -36,7 +36,7 @@ class Seen(NamedTuple):
     by_vector: Tensor
 
 
-def definition(start, base, a, grid, width, rates, frozen=None, Q=None) -> tuple[Tensor, list[Seen]]:
+def definition(start, base, a, grid, width, rates, *, frozen=None, Q=None) -> tuple[Tensor, list[Seen]]:
     """The flow in plain torch and float64, one field a shape: A at the end, and what every step saw."""
     vector = start.double().clone().requires_grad_()
     adam = torch.optim.Adam([vector], betas=BETAS, eps=ADAM_EPS)
@@ -110,7 +110,7 @@ def check_mirrors(device: str, tuning: cuda.Tuning) -> None:
         orientation=Q, betas=BETAS, adam_eps=ADAM_EPS, device=device, tuning=tuning,
     )  # fmt: skip
     flow.shift(0, 0.125)
-    moved, seen = definition(start, base + 0.125, a_shape(NUMBERS[0]), grid, width, rates, frozen, Q)
+    moved, seen = definition(start, base + 0.125, a_shape(NUMBERS[0]), grid, width, rates, frozen=frozen, Q=Q)
     compare_flow(flow, rates, moved, seen[-1])
     assert torch.equal(flow.vector[0][:, frozen].cpu(), start.float()[:, frozen])
 

@@ -41,7 +41,7 @@ def build_atlas(
     count: Annotated[int, typer.Option(help="Viable shapes to end with.")] = 1000,
     shape: Annotated[str, typer.Option(help="Voxels: N or Z,Y,X.")] = "64",
     seed: Annotated[int, typer.Option(help="Of the design.")] = 0,
-    design: Annotated[str, typer.Option(help="random, sobol, or a YAML file (docs/atlas.md).")] = "random",
+    design: Annotated[str, typer.Option(help="random, sobol, or a YAML file (docs/howto/atlas.md).")] = "random",
     around: Annotated[str | None, typer.Option(help="A preset or fit.json to draw around, instead.")] = None,
     spread: Annotated[float | None, typer.Option(help="With --around: share of the random law's intervals.")] = None,
     schedule: Annotated[str, typer.Option(help="fast or paper.")] = "fast",

@@ -19,7 +19,7 @@ SPREAD = 0.1
 
 
 def read_design(path: str | PathLike[str]) -> Design:
-    """Read a design; see docs/atlas.md for its keys.
+    """Read a design; see docs/howto/atlas.md for its keys.
 
     Raises
     ------
