@@ -111,8 +111,8 @@ def region_of_interest(roi: Field | np.ndarray | str | os.PathLike[str] | None, 
 
 
 def _guess_kind(values: np.ndarray, threshold: Literal["otsu"] | float, two: bool) -> Kind:
-    """Guess the kind: two values are a mask; floats Floats from about -1 to about 1, without noise, mostly far from 0:
-    a phase field."""
+    """Guess the kind: two values are a mask; floats from about -1 to about 1, without noise and mostly far from 0, are
+    a phase field; anything else is an image."""
     if two:
         return "mask"
     lowest, highest = values.min(), values.max()
@@ -138,8 +138,8 @@ def _mask_level(values: np.ndarray, dark: bool, lowest: float, highest: float, t
 def _label_mask(values: np.ndarray, label: int) -> np.ndarray:
     mask = values == label
     if not mask.any():
-        found = np.unique(values)
-        listed = ", ".join(f"{float(value):g}" for value in found[:12]) + (", …" if len(found) > 12 else "")
+        labels = np.unique(values)
+        listed = ", ".join(f"{float(value):g}" for value in labels[:12]) + (", …" if len(labels) > 12 else "")
         raise ScanError(f"expected a label of the scan ({listed}), got {label}")
     return mask
 
