@@ -137,7 +137,7 @@ def slice_figure(
     axes_names: tuple[str, str],
     window: tuple[float, float, float, float] | None = None,
 ) -> Figure:
-    """Return a grey slice with the zero contour of `structure` over it.
+    """Return a figure of a grey slice with the zero contour of `structure` over it.
 
     Parameters
     ----------
@@ -250,8 +250,7 @@ def diagram_on(
 
 
 def shared_limits(diagrams: Sequence[Diagram], *, length: float = 1.0, tail: float = 0.006) -> Limits:
-    """Return the interval that holds both curvatures of every diagram but for the outermost `tail` of area at either
-    end."""
+    """Return the interval of both curvatures of all diagrams, but for the outermost `tail` of area at either end."""
     bounds = [0.0, 0.0]
     for diagram in diagrams:
         for kappa in np.asarray(diagram.points).T / length:

@@ -99,20 +99,22 @@ class Diagram(Pictured):
         return self._merged(self._cells(width))
 
     def thinned(self, width: float, share: float) -> Diagram:
-        """Return bins of edge `width` where the area is and wider ones, by powers of two, in the tails: a bin is the
-        widest whose part of the area times (edge / width)² is at most `share`."""
+        """Return bins of edge `width` where the area is, and wider ones, by powers of two, in the tails.
+
+        A bin is the widest whose part of the area times (edge / width)² is at most `share`.
+        """
         if not share > 0:
             raise ValueError(f"expected a share above 0, got {share}")
         fine = self.binned(width)
         parts = fine.normalised.weights
-        chosen = fine._cells(width)
-        taken = np.zeros(len(parts), dtype=bool)
+        index = fine._cells(width)
+        merged = np.zeros(len(parts), dtype=bool)
         for level in range(WIDENINGS, 0, -1):
             cells = fine._cells(width * 2**level)
-            light = (np.bincount(cells, parts * ~taken) * 4.0**level <= share)[cells] & ~taken
-            chosen[light] = level * len(parts) + cells[light]
-            taken |= light
-        return fine._merged(np.unique(chosen, return_inverse=True)[1])
+            light = (np.bincount(cells, parts * ~merged) * 4.0**level <= share)[cells] & ~merged
+            index[light] = level * len(parts) + cells[light]
+            merged |= light
+        return fine._merged(np.unique(index, return_inverse=True)[1])
 
     def _cells(self, width: float) -> np.ndarray:
         """Return the number of the square of edge `width` that each point is in: 0, 1, … over the occupied ones."""
@@ -123,13 +125,13 @@ class Diagram(Pictured):
     def _merged(self, index: np.ndarray) -> Diagram:
         """Return the points with the same index (0, 1, …) replaced by their barycentre."""
         weights = np.bincount(index, self.weights)
-        kept = weights > 0
-        safe = np.where(kept, weights, 1)
+        heavy = weights > 0
+        safe = np.where(heavy, weights, 1)
         means = np.stack([np.bincount(index, self.weights * self.points[:, k]) / safe for k in range(2)], axis=1)
         square = ((self.points - means[index]) ** 2).sum(1)
         added = float(self.weights @ square) / self.area if self.area > 0 else 0.0
         spread = math.sqrt(self.spread**2 + added)
-        return dataclasses.replace(self, points=means[kept], weights=weights[kept], spread=spread)
+        return dataclasses.replace(self, points=means[heavy], weights=weights[heavy], spread=spread)
 
 
 class SurfaceCurvatures(NamedTuple):
@@ -151,8 +153,7 @@ def diagram(
     margin: int | None = None,
     where: np.ndarray | None = None,
 ) -> Diagram:
-    """Return the curvature diagram of {u = 0}: what `surface_curvatures` gives, without the places; it takes the
-    same."""
+    """Return the curvature diagram of {u = 0}: `surface_curvatures`, which takes the same, without the places."""
     curvatures = surface_curvatures(u, grid, epsilon, curvature=curvature, margin=margin, where=where)
     return Diagram(curvatures.points, curvatures.areas, excluded=curvatures.excluded)
 
@@ -176,7 +177,7 @@ def surface_curvatures(
     margin: int | None = None,
     where: np.ndarray | None = None,
 ) -> SurfaceCurvatures:
-    """κ1, κ2 of {u = 0} on every triangle of its mesh.
+    """Return κ1, κ2 of {u = 0} on every triangle of its mesh.
 
     Curvatures of the voxels around a triangle are interpolated linearly at its barycentre. The geometric ones are those
     of the level sets of √2 ε artanh(u), which are u's own: differences of that near-distance err far less than
@@ -210,12 +211,12 @@ def surface_curvatures(
     mesh = _inner_surface(values, grid, margin)
     kappa1, kappa2, resolved = _voxel_curvatures(values, grid, epsilon, curvature)
     weights, centres = areas(mesh), mesh.barycentres / np.array(grid.spacing)
-    kept = weights >= LEAST_TRIANGLE * grid.voxel_volume ** (2 / 3)
+    counted = weights >= LEAST_TRIANGLE * grid.voxel_volume ** (2 / 3)
     if where is not None:
-        kept &= np.asarray(where, dtype=bool)[tuple((np.rint(centres).astype(int) % grid.shape).T)]
-    if not kept.any():
+        counted &= np.asarray(where, dtype=bool)[tuple((np.rint(centres).astype(int) % grid.shape).T)]
+    if not counted.any():
         raise NoSurface("expected a surface in the part that counts, got none")
-    weights, centres = weights[kept], centres[kept]
+    weights, centres = weights[counted], centres[counted]
     points, known = _interpolated((kappa1, kappa2), resolved, centres, grid.periodic)
     if not known.any():
         raise NoSurface("expected a surface whose curvature the grid resolves, got none")
@@ -238,8 +239,7 @@ def resolved(slope: Tensor, kappa1: Tensor, kappa2: Tensor, grid: Grid) -> Tenso
 
 
 def _inner_surface(values: Tensor, grid: Grid, margin: int | None) -> Surface:
-    """Return the surface without a margin along the sides of a box that is not periodic, in the whole box's
-    coordinates."""
+    """Return the surface in the whole box's coordinates, without a margin along the sides that are not periodic."""
     m = 0 if grid.periodic else MARGIN if margin is None else margin
     if m == 0:
         return surface(values, grid)
@@ -251,7 +251,7 @@ def _inner_surface(values: Tensor, grid: Grid, margin: int | None) -> Surface:
 
 
 def _voxel_curvatures(values: Tensor, grid: Grid, epsilon: float, curvature: str) -> tuple[np.ndarray, ...]:
-    """κ1, κ2 of every voxel (0 where not resolved) and whether they are resolved, as 1 or 0."""
+    """Return κ1, κ2 of every voxel (0 where not resolved) and whether they are resolved, as 1 or 0."""
     distance = jet(profile_distance(values, epsilon), grid)
     if curvature == "geometric":
         κ1, κ2, _, _ = geometric_curvatures(distance)
@@ -266,8 +266,7 @@ def _voxel_curvatures(values: Tensor, grid: Grid, epsilon: float, curvature: str
 def _interpolated(
     fields: tuple[np.ndarray, ...], resolved: np.ndarray, centres: np.ndarray, periodic: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the values at `centres` `(N, 3)` (in voxels) of the resolved voxels around, `(N, 2)`, and where there are
-    any."""
+    """Return values `(N, 2)` at `centres` `(N, 3)` (in voxels) from the resolved voxels around, and where any are."""
     corners, weights = _corners(resolved.shape, centres, periodic)
     weights = weights * resolved.reshape(-1)[corners]
     total = weights.sum(0)

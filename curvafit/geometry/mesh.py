@@ -56,8 +56,7 @@ def surface(u: np.ndarray | Tensor, grid: Grid, level: float = 0.0) -> Surface:
 
 
 def capped_surface(u: np.ndarray | Tensor, grid: Grid, level: float = 0.0) -> Surface:
-    """Return the boundary of {u > level} within the box, closed by flat caps on the box's faces; for printing and
-    export.
+    """Return the boundary of {u > level}, closed by flat caps on the box's faces, for printing and export.
 
     It is watertight, and stays so in float32: no vertex comes closer to a voxel's centre than some ten-thousandths of
     an edge, and none stands twice. The caps of opposite faces of a periodic box are the same, so that copies tile.
@@ -91,20 +90,20 @@ def solid_surface(u: np.ndarray | Tensor, grid: Grid) -> Surface:
         As `surface` does.
     """
     values = _checked(u, grid)
-    wanted = np.count_nonzero(values > 0) * grid.voxel_volume
+    target = np.count_nonzero(values > 0) * grid.voxel_volume
 
     def attempt(level: float) -> tuple[float, Surface]:
         mesh = capped_surface(values, grid, level)
-        return volume(mesh) - wanted, mesh
+        return volume(mesh) - target, mesh
 
-    tried = [attempt(0.0)]
-    error, highest = tried[0][0], float(values.max())
+    attempts = [attempt(0.0)]
+    error, highest = attempts[0][0], float(values.max())
     step = math.copysign(0.01 * highest, error)
-    tried.append(attempt(step))
-    if tried[1][0] != error:
-        level = step * error / (error - tried[1][0])  # where the line through both has its zero
-        tried.append(attempt(min(max(level, -0.1 * highest), 0.1 * highest)))
-    return min(tried, key=lambda each: abs(each[0]))[1]
+    attempts.append(attempt(step))
+    if attempts[1][0] != error:
+        level = step * error / (error - attempts[1][0])  # where the line through both has its zero
+        attempts.append(attempt(min(max(level, -0.1 * highest), 0.1 * highest)))
+    return min(attempts, key=lambda each: abs(each[0]))[1]
 
 
 def areas(mesh: Surface) -> np.ndarray:
@@ -150,15 +149,14 @@ def _with_walls(values: np.ndarray, axis: int, periodic: bool) -> np.ndarray:
 
 
 def _unpadded(index: np.ndarray, count: int) -> np.ndarray:
-    """Return the positions in a padded axis in voxels of the unpadded one: both layers of a side are on the box's
-    face."""
+    """Return positions in a padded axis as voxels of the unpadded one: both layers of a side are on the box's face."""
     inner = np.arange(count, dtype=np.float64)
     knots = np.concatenate([[-0.5, -0.5], inner, [count - 0.5, count - 0.5]])
     return np.interp(index, np.arange(count + 4), knots)
 
 
 def _welded(mesh: Surface) -> Surface:
-    """Merge the vertices of one place, without the triangles that this closes."""
+    """Merge the vertices that lie in one place, and drop the triangles that this closes."""
     vertices, index = np.unique(mesh.vertices, axis=0, return_inverse=True)
     faces = index.reshape(-1)[mesh.faces]
     a, b, c = faces.T

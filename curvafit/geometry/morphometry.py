@@ -45,8 +45,7 @@ def morphometry(
     *,
     periodic: bool = False,
 ) -> Morphometry:
-    """Return the volume fraction (BV/TV), thickness (Tb.Th), spacing (Tb.Sp), Euler number, connectivity density,
-    BS/BV.
+    """Measure volume fraction (BV/TV), thickness (Tb.Th), spacing (Tb.Sp), Euler number, connectivity density, BS/BV.
 
     Parameters
     ----------
@@ -99,8 +98,7 @@ def local_thickness(
     periodic: bool = False,
     largest: float = 24.0,
 ) -> np.ndarray:
-    """Return the diameter of the largest ball inside `mask` that covers each voxel; 0 outside, infinite where there is
-    no outside.
+    """Return the diameter of the largest ball inside `mask` that covers each voxel: 0 outside, infinite in a full mask.
 
     Diameters are 2·EDT, EDT being the distance to the nearest outer voxel's centre: half a voxel too much on plates
     (on average over their positions), up to a voxel too little on tubes and balls, whose axes miss the grid; for the

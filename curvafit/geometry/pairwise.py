@@ -43,11 +43,11 @@ def pairwise(
 ) -> np.ndarray:
     """Return `transport.wasserstein` of every pair of N diagrams: `(N, N)` float64, symmetric, with a zero diagonal.
 
-    `wasserstein` is met to 1e-4 of itself: the steps are the same, in float32. A diagram's own term of the debiased
-    distance depends on the pair by the number of steps alone, of which there are two or three, and is computed once for
-    each. Bins of 2 change the distances of random shapes by 0.3 % in the median and 1.3 % at most, those to a shape's
-    nearest by 0.7 % and 1.6 %, or 0.05 where they are under 2; bins of 1 a third of that, for seven times the time
-    (`benchmarks.distances`).
+    `wasserstein` is met to 1e-4 of itself, or 1e-5 where that is less than 0.1: the steps are the same, in float32. A
+    diagram's own term of the debiased distance depends on the pair by the number of steps alone, of which there are two
+    or three, and is computed once for each. Bins of 2 change the distances of random shapes by 0.3 % in the median and
+    1.3 % at most, those to a shape's nearest by 0.7 % and 1.6 %, or 0.05 where they are under 2; bins of 1 a third of
+    that, for seven times the time (`benchmarks.distances`).
 
     Parameters
     ----------

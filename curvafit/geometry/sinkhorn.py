@@ -6,7 +6,8 @@ blur². That is not convergence: converged distances between diagrams are 9 % la
 
 The diameter is rounded up to blur · 2^(n - ½), so that a measure's cost with itself, which the debiased distance takes
 off, is shared by all pairs with the same n (`halvings`); the half keeps geomloss's list of ε clear of rounding. Against
-geomloss's own choice, the exact diameter, that changes a distance by 0.1 % in the median and 0.4 % at most.
+geomloss's own choice, the exact diameter, that changed 35 distances between shapes of the packaged atlas by 0.1 to 0.2
+% in the median and 0.4 % at most.
 
 On a grid exp(-C/ε) is a product over rows and columns. In plain sums that leaves float32's range at small ε (e⁻²⁴⁵⁰
 over a distance of 70 at ε = 1); in sums of exponentials it takes more of them, over the rows and columns of both

@@ -28,7 +28,7 @@ def components(mask: np.ndarray, *, periodic: bool = False, connectivity: int = 
 
 
 def euler_number(mask: np.ndarray, *, periodic: bool = False) -> int:
-    """χ of the union of the closed voxels (26-connected); a periodic box's is that on the torus."""
+    """Return χ of the union of the closed voxels (26-connected); a periodic box's is that on the torus."""
     if not periodic:
         return int(measure.euler_number(mask, connectivity=3))
     total = 0
@@ -41,7 +41,7 @@ def euler_number(mask: np.ndarray, *, periodic: bool = False) -> int:
 
 
 def betti_numbers(mask: np.ndarray, *, periodic: bool = False) -> tuple[int, int, int]:
-    """b0 pieces (26-connected), b1 tunnels, b2 cavities (6-connected).
+    """Return b0 pieces (26-connected), b1 tunnels, b2 cavities (6-connected).
 
     A box that is not periodic is all there is: what opens to its faces is no cavity. A periodic one is a torus: a tube
     that goes around it is a tunnel, and b2 = (pieces of the outside) - 1 + 3 - (directions in which the outside goes
@@ -69,15 +69,15 @@ def _within(mask: np.ndarray, corners: bool) -> tuple[np.ndarray, int]:
 
 def _seams(labels: np.ndarray, corners: bool) -> np.ndarray:
     """Return which labels touch across the faces of a periodic box: unique rows (last layer's, first layer's, axis)."""
-    found = [np.empty((0, 3), dtype=np.int64)]
+    rows = [np.empty((0, 3), dtype=np.int64)]
     for axis in range(3):
         last, first = np.take(labels, -1, axis), np.take(labels, 0, axis)
         for shift in product((-1, 0, 1), repeat=2) if corners else [(0, 0)]:
             moved = np.roll(first, shift, (0, 1))
             touch = (last > 0) & (moved > 0)
             pairs = np.unique(np.stack([last[touch], moved[touch]], axis=1), axis=0)
-            found.append(np.insert(pairs, 2, axis, axis=1))
-    return np.unique(np.concatenate(found), axis=0).astype(np.int64)
+            rows.append(np.insert(pairs, 2, axis, axis=1))
+    return np.unique(np.concatenate(rows), axis=0).astype(np.int64)
 
 
 def _graph(pairs: np.ndarray, count: int) -> coo_array:

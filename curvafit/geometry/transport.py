@@ -22,9 +22,9 @@ def wasserstein(
     The paper's distance (blur 1, reach 20: all in 1 / grid's unit), by geomloss, on binned diagrams instead of random
     triangles. Two diagrams that differ by a small shift s are |s| / √2 apart; far apart, the distance levels off.
 
-    `curvafit.geometry.pairwise` and `one_to_many` give the same numbers to 1e-4, many at a time; the atlas, matches and
-    reports take theirs, so that all distances that a person compares come from one code. `sinkhorn_divergence` is the
-    square of this distance, differentiable.
+    `curvafit.geometry.pairwise` and `one_to_many` give the same numbers to 1e-4 of them or 1e-5, many at a time; the
+    atlas, matches and reports take theirs, so that all distances that a person compares come from one code.
+    `sinkhorn_divergence` is the square of this distance, differentiable.
 
     Parameters
     ----------

@@ -90,10 +90,10 @@ def fixed_point(
     if not bool(torch.isfinite(phase).all()):
         raise ValueError("expected a finite phase field, got NaN or infinity in it")
     if not grid.periodic and min(grid.shape) <= 2 * HALO + STRIDE:
-        told = " x ".join(map(str, grid.shape))
+        voxels = " x ".join(map(str, grid.shape))
         raise ValueError(
             f"expected a structure that spans more than {2 * HALO + STRIDE} working voxels along each axis, got "
-            f"{told}: the scan is too small to refine parameters on"
+            f"{voxels}: the scan is too small to refine parameters on"
         )
     flow = ShortFlow(phase, grid, epsilon, starts[0])
     total = (1 + len(_SIZES)) * (len(starts) * (FIRST_STEPS + 1) + LAST_STEPS)
@@ -189,7 +189,7 @@ class ShortFlow:
 
 
 def sharpened(phase: Tensor, grid: Grid, width: float) -> Tensor:
-    """v₀ with k ∗ v₀ close to `phase`: two Van Cittert steps."""
+    """Return v₀ with k ∗ v₀ close to `phase`, by two Van Cittert steps."""
     v = phase
     for _ in range(2):
         v = v + phase - gaussian_blur(v, grid, width)
@@ -271,7 +271,7 @@ def _deviations(end: _End, patches: float) -> np.ndarray:
 
 
 def _valley(flow: ShortFlow, best: _End) -> np.ndarray:
-    """Return the largest distance `(6,)` of a nearly as good flow's coefficients from the best."""
+    """Return how far `(6,)` the coefficients of a nearly as good flow lie from the best, at most."""
     centre = _coefficients(best.free).tensor().numpy()
     near = [_coefficients(free).tensor().numpy() for free in flow.nearly(_AS_GOOD * best.residual)]
     return np.abs(np.array(near) - centre).max(0)
@@ -282,5 +282,5 @@ def _status(end: _End, deviations: np.ndarray) -> str:
         name for name, size, deviation in zip(("a11", "a02", "a10", "a01", "a00"), _SIZES, deviations[1:], strict=True)
         if deviation > _WEAK * size
     ]  # fmt: skip
-    held = f"weakly held: {', '.join(weak)}" if weak else "all coefficients held"
-    return f"A short flow from the scan moves its surface by {end.residual:.2f} voxels; {held}."
+    support = f"weakly held: {', '.join(weak)}" if weak else "all coefficients held"
+    return f"A short flow from the scan moves its surface by {end.residual:.2f} voxels; {support}."

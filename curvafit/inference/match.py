@@ -69,7 +69,7 @@ def _shortlist(query: np.ndarray, embeddings: np.ndarray, length: int) -> list[i
 def _sorted(diagram: Diagram, atlas: Atlas, candidates: tuple[Diagram, ...], near: list[int]) -> tuple[Match, ...]:
     """Return the matches at the given positions of the atlas, by increasing distance."""
     distances = one_to_many(diagram, [candidates[i] for i in near]).tolist()
-    found = (
+    matches = (
         Match(
             id=atlas.ids[i],
             distance=distance,
@@ -79,4 +79,4 @@ def _sorted(diagram: Diagram, atlas: Atlas, candidates: tuple[Diagram, ...], nea
         )
         for i, distance in zip(near, distances, strict=True)
     )
-    return tuple(sorted(found, key=lambda match: match.distance))
+    return tuple(sorted(matches, key=lambda match: match.distance))

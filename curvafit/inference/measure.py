@@ -19,20 +19,19 @@ def scan_diagram(prepared: Prepared) -> Diagram:
     """Return the geometric curvature diagram of a prepared scan; of a large one tile by tile, each cell in one tile."""
     grid = prepared.grid
     cuts = [[slice(None)] if grid.periodic else _tiles(n) for n in grid.shape]
-    found: list[Diagram] = []
+    parts: list[Diagram] = []
     for tile in itertools.product(*cuts):
         with contextlib.suppress(NoSurface):
-            found.append(_tile_diagram(prepared, tile))
-    if not found:
+            parts.append(_tile_diagram(prepared, tile))
+    if not parts:
         raise ValueError("expected a surface inside the scan, got none away from its borders")
-    points, weights = (np.concatenate([getattr(part, name) for part in found]) for name in ("points", "weights"))
-    lost = sum(part.excluded * part.area for part in found) / weights.sum()
+    points, weights = (np.concatenate([getattr(part, name) for part in parts]) for name in ("points", "weights"))
+    lost = sum(part.excluded * part.area for part in parts) / weights.sum()
     return Diagram(points, weights, excluded=float(lost))
 
 
 def _tiles(n: int) -> list[slice]:
-    """Return stretches of at most a window's length whose interiors (`MARGIN` voxels in) share their end planes
-    only."""
+    """Return stretches of at most a window's length; their interiors (`MARGIN` voxels in) share end planes alone."""
     count = math.ceil((n - 2 * MARGIN) / (LARGEST_WINDOW - 2 * MARGIN))
     ends = np.linspace(MARGIN, n - 1 - MARGIN, count + 1).astype(int)
     return [slice(a - MARGIN, b + MARGIN + 1) for a, b in itertools.pairwise(ends)]

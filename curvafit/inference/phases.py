@@ -107,8 +107,8 @@ def region_of_interest(roi: Field | np.ndarray | str | os.PathLike[str] | None, 
 
 
 def _guess_kind(values: np.ndarray, threshold: Literal["otsu"] | float, two: bool) -> Kind:
-    """Guess the kind: two values are a mask; floats Floats from about -1 to about 1, without noise, mostly far from 0:
-    a phase field."""
+    """Guess the kind: two values are a mask; floats from about -1 to about 1, without noise and mostly far from 0, are
+    a phase field; anything else is an image."""
     if two:
         return "mask"
     lowest, highest = values.min(), values.max()

@@ -225,8 +225,8 @@ def _scale(scan: _Scan, thickness: float) -> tuple[tuple[float, float, float], t
     scale = [edge / h for h in spacing]
     if scan.periodic:
         scale = [n / max(4, round(n / s)) for n, s in zip(scan.shape, scale, strict=True)]
-    said = " x ".join(f"{s:.3g}" for s in scale)
-    return (scale[0], scale[1], scale[2]), (f"{note}: a working voxel is {said} scan voxels (z, y, x).",)
+    edges = " x ".join(f"{s:.3g}" for s in scale)
+    return (scale[0], scale[1], scale[2]), (f"{note}: a working voxel is {edges} scan voxels (z, y, x).",)
 
 
 def _working_box(

@@ -49,8 +49,8 @@ def refine(
     rounded = kind == "field" and is_rounded(phase)
     if kind == "field" and not rounded:
         return stationarity(phase, grid, epsilon, starts=starts, seed=seed, progress=progress)
-    found = fixed_point(phase, grid, epsilon, starts=starts, progress=progress)
+    refinement = fixed_point(phase, grid, epsilon, starts=starts, progress=progress)
     if not rounded:
-        return found
+        return refinement
     why = "Stationarity is not supported by a field rounded to few values."
-    return dataclasses.replace(found, status=f"{why} {found.status}")
+    return dataclasses.replace(refinement, status=f"{why} {refinement.status}")

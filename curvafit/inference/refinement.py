@@ -52,13 +52,12 @@ class Refinement:
 
 
 def units(epsilon: float) -> np.ndarray:
-    """`(6,)` factors from dimensionless coefficients (lengths in ε) to those in spacing's unit."""
+    """Return the factors `(6,)` from dimensionless coefficients (lengths in ε) to those in spacing's unit."""
     return np.array([1, 1, 1, 1 / epsilon, 1 / epsilon, 1 / epsilon**2])
 
 
 def in_gauge(values: np.ndarray) -> tuple[Coefficients, int]:
-    """Return the coefficients with a20 = 1, or with a02 = 1 where a20 is under a thousandth of it; and which of the two
-    (0, 2)."""
+    """Return the coefficients with a20 = 1 and 0; or with a02 = 1 and 2, where a20 is under a thousandth of a02."""
     fixed = 0 if values[0] > 1e-3 * values[2] else 2
     return Coefficients(*(float(value) for value in values / values[fixed])), fixed
 
@@ -87,8 +86,7 @@ def import_jax() -> None:
 
 @contextmanager
 def double_precision_on_cpu():
-    """Run JAX in float64 on the CPU while inside, in this thread alone: what else a program does with JAX goes on as it
-    is.
+    """Run JAX in float64 on the CPU while inside, in this thread alone; a program's other use of JAX is not touched.
 
     What JAX calls back runs in another one: see `called`.
     """
@@ -115,5 +113,5 @@ def called(function: Callable[[np.ndarray], np.ndarray], shape: tuple[int, ...],
         return np.array(function(free), dtype=np.float64, order="C").view(np.uint32).reshape(*shape, 2)
 
     pairs = jax.lax.bitcast_convert_type(values, np.uint32)
-    found = jax.pure_callback(of_words, jax.ShapeDtypeStruct((*shape, 2), np.uint32), pairs)
-    return jax.lax.bitcast_convert_type(found, np.float64)
+    words = jax.pure_callback(of_words, jax.ShapeDtypeStruct((*shape, 2), np.uint32), pairs)
+    return jax.lax.bitcast_convert_type(words, np.float64)

@@ -31,8 +31,7 @@ _CONNECTED_26 = np.ones((3, 3, 3), dtype=bool)
 def bounding_box(
     shape: tuple[int, int, int], region: np.ndarray | None, longest: int
 ) -> tuple[Window, tuple[str, ...]]:
-    """Return the box around a region (else all), its middle where a side is over `longest` voxels, and notes on
-    both."""
+    """Return the box around a region (else all), or its middle where a side is over `longest` voxels; and notes."""
     box, notes = [slice(0, n) for n in shape], []
     if region is not None:
         box = list(ndimage.find_objects(region.astype(np.uint8))[0])
@@ -59,8 +58,8 @@ def median_thickness(mask: np.ndarray, spacing: tuple[float, float, float], peri
     boxes = rich_boxes(surface, _MEASURED)
     part = mask[boxes[0]] if boxes else mask
     thickness = local_thickness(part, spacing, periodic=periodic and part.shape == mask.shape)
-    found = thickness[surface[boxes[0]]] if boxes else thickness[part]
-    return float(np.median(found)), float(np.percentile(found, 95))
+    values = thickness[surface[boxes[0]]] if boxes else thickness[part]
+    return float(np.median(values)), float(np.percentile(values, 95))
 
 
 def surface_voxels(mask: np.ndarray) -> np.ndarray:
@@ -69,10 +68,9 @@ def surface_voxels(mask: np.ndarray) -> np.ndarray:
 
 
 def rich_boxes(content: np.ndarray, size: int | Sequence[int]) -> list[Window]:
-    """Return the boxes of at most `size` voxels a side that cover the volume and hold content; the first is the one to
-    look at.
+    """Return boxes of at most `size` voxels a side that cover the volume and hold content, the one to look at first.
 
-    That is the middle one, unless it holds less than half of what the others hold on average: then the fullest.
+    The first is the middle one, unless it holds less than half of what the others hold on average: then the fullest.
     """
     sides = [size] * 3 if isinstance(size, int) else list(size)
     middle = tuple(_middle(slice(0, n), side) for n, side in zip(content.shape, sides, strict=True))
@@ -114,8 +112,7 @@ def resample(
     periodic: bool = False,
     nearest: bool = False,
 ) -> np.ndarray:
-    """Resample values to a grid whose voxels are `scale` old voxels long; the corners of both grids' first voxels
-    coincide.
+    """Resample values to a grid whose voxels are `scale` old voxels long; the first voxels' corners coincide.
 
     New voxel i covers the old voxels from i·scale to (i + 1)·scale. Linear, after a Gaussian of (scale - 1)/2 old
     voxels along axes that become coarser.

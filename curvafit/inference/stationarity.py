@@ -62,8 +62,10 @@ def is_rounded(u: np.ndarray | Tensor) -> bool:
 
 
 def energy_gradients(u: Float[Tensor, "z y x"], grid: Grid, epsilon: float) -> Float[Tensor, "6 z y x"]:
-    """∂F_α/∂u per volume for the six terms, in u's precision; within a voxel of a border that is not periodic the
-    field is taken to continue as its mirror image."""
+    """Return ∂F_α/∂u per volume for the six terms, in u's precision.
+
+    Within a voxel of a border that is not periodic, the field is taken to continue as its mirror image.
+    """
     padded = pad(u, grid, _REACH)
     slabs = []
     for start in range(0, grid.shape[0], _SLAB):
@@ -124,9 +126,9 @@ def stationarity(
     problem, size, trials = _with_error(values, gradients, _triangle(octants), grid, epsilon, width, seed)
     progress("solving", 0.8)
     tls, singular = _total_least_squares(problem)
-    given = [np.array([float(value) for value in start]) / units(epsilon) for start in starts]
-    begun = np.stack([admissible(start) for start in (tls, *given)])
-    solutions, residuals = _solve([problem] * len(begun), begun)
+    matches = [np.array([float(value) for value in start]) / units(epsilon) for start in starts]
+    origins = np.stack([admissible(start) for start in (tls, *matches)])
+    solutions, residuals = _solve([problem] * len(origins), origins)
     order = np.argsort(residuals)
     coefficients, fixed = in_gauge(solutions[order[0]] * units(epsilon))
     replicas = _replicas(octants, problem.error, solutions[order[0]]) * units(epsilon)
@@ -140,7 +142,7 @@ def stationarity(
         uncertainty=named(deviations),
         singular_values=tuple(float(value) for value in singular),
         residual=residual,
-        starts=tuple((in_gauge(begun[k] * units(epsilon))[0], float(size * residuals[k])) for k in order),
+        starts=tuple((in_gauge(origins[k] * units(epsilon))[0], float(size * residuals[k])) for k in order),
         status=_status(coefficients, deviations, fixed, residual, is_rounded(values)),
         evaluations=1 + trials,
     )
@@ -165,7 +167,7 @@ def _width(grid: Grid) -> float:
 
 
 def _equations(gradients: Tensor, grid: Grid, epsilon: float, width: float) -> np.ndarray:
-    """`(8, 7, 7)`: each octant's equations [1 | columns], dimensionless, QR-compressed."""
+    """Return each octant's equations [1 | columns], dimensionless and QR-compressed, `(8, 7, 7)`."""
     tested = _tested(gradients, grid, epsilon, width)
     halves = [np.array_split(np.arange(n), 2) for n in tested.shape[1:]]
     parts = [tested[:, z][:, :, y][..., x] for z in halves[0] for y in halves[1] for x in halves[2]]
@@ -174,7 +176,7 @@ def _equations(gradients: Tensor, grid: Grid, epsilon: float, width: float) -> n
 
 
 def _tested(columns: Tensor, grid: Grid, epsilon: float, width: float) -> np.ndarray:
-    """`(6, …)` columns against Gaussian test functions whose support stays in the box (or goes round it)."""
+    """Return the columns `(6, …)` against Gaussian test functions whose support stays in the box (or goes round it)."""
     deviation = width * max(grid.spacing)
     core = []
     for n, h in zip(grid.shape, grid.spacing, strict=True):
@@ -194,7 +196,7 @@ def _compressed(columns: np.ndarray) -> np.ndarray:
 
 
 def _triangle(stack: np.ndarray) -> np.ndarray:
-    """`(6, 6)`: stacked triangles `(n, 7, 7)` as one, the multiplier's column eliminated."""
+    """Return stacked triangles `(n, 7, 7)` as one, `(6, 6)`: the multiplier's column is eliminated."""
     triangle = np.asarray(np.linalg.qr(stack.reshape(-1, 7), mode="r"))
     return triangle[1:, 1:]
 
@@ -216,36 +218,34 @@ def _with_error(
         triangle = _compressed(change.reshape(6, -1))[1:, 1:] / math.sqrt(change[0].size)
         problem = _Problem(columns, triangle)
         least = _total_least_squares(problem)[1][-1]
-        wanted = float(np.clip(size * least, *_ERROR_LIMITS))
-        if trial == _ERROR_STEPS or abs(math.log(wanted / size)) < 0.1:
+        target = float(np.clip(size * least, *_ERROR_LIMITS))
+        if trial == _ERROR_STEPS or abs(math.log(target / size)) < 0.1:
             break
-        size = wanted
+        size = target
     return problem, size, trial
 
 
 def _total_least_squares(problem: _Problem) -> tuple[np.ndarray, np.ndarray]:
-    """Return the smallest singular vector of the columns whitened by the error, with a20 + a02 > 0, and the singular
-    values."""
+    """Return the least singular vector (a20 + a02 > 0) and the singular values of the columns whitened by the error."""
     whitened = np.linalg.solve(problem.error.T, problem.columns.T).T
     _, singular, rows = np.linalg.svd(whitened)
     a = np.linalg.solve(problem.error, rows[-1])
     return a * np.sign(a[0] + a[2]), singular
 
 
-def _solve(problems: Sequence[_Problem], begun: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the minimisers `(n, 6)` of |R a| / |N a| with a20 + a02 = 2, both positive, from `(n, 6)` starts; their
-    values."""
+def _solve(problems: Sequence[_Problem], origins: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the minimisers `(n, 6)` of |R a| / |N a| with a20 + a02 = 2, both positive, and their values `(n,)`."""
     with double_precision_on_cpu():
         import jax.numpy as jnp
 
         columns, errors = (jnp.asarray(np.stack(part)) for part in zip(*problems, strict=True))
-        found = _minimiser()(columns, errors, jnp.asarray(begun))
-        return np.asarray(found[0]), np.asarray(found[1])
+        solutions, residuals = _minimiser()(columns, errors, jnp.asarray(origins))
+        return np.asarray(solutions), np.asarray(residuals)
 
 
 @functools.cache
 def _minimiser() -> Callable[..., Any]:
-    """Return the solver of many problems at once; compiled but once for each number of them."""
+    """Return the solver of many problems at once, compiled once for each number of them."""
     import jax
     import jax.numpy as jnp
     import optimistix
@@ -262,10 +262,8 @@ def _minimiser() -> Callable[..., Any]:
     def minimise(columns, error, start):
         begin = jnp.concatenate([jnp.log(start[:1] / start[2:3]), start[1:2], start[3:]])
         solver = optimistix.LevenbergMarquardt(rtol=1e-8, atol=1e-10)
-        found = optimistix.least_squares(
-            residual, solver, begin, args=(columns, error), max_steps=500, throw=False
-        ).value
-        return coefficients(found), jnp.linalg.norm(residual(found, (columns, error)))
+        end = optimistix.least_squares(residual, solver, begin, args=(columns, error), max_steps=500, throw=False).value
+        return coefficients(end), jnp.linalg.norm(residual(end, (columns, error)))
 
     return jax.jit(jax.vmap(minimise))
 
@@ -291,5 +289,5 @@ def _status(coefficients: Coefficients, deviations: np.ndarray, fixed: int, resi
     weak = [name for name, value, d in zip(NAMES, coefficients, deviations, strict=True) if d > max(abs(value) / 2, 0)]
     gauge = "" if fixed == 0 else " a20 is at the edge of the domain, so a02 = 1 fixes the scale."
     verdict = "Stationarity is weakly supported" if residual > _LARGE_ERROR else "Stationarity is supported"
-    held = f"; weakly held: {', '.join(weak)}" if weak else ""
-    return f"{verdict}: a field error of {residual:.1e} would explain the misfit{held}.{gauge}"
+    weakness = f"; weakly held: {', '.join(weak)}" if weak else ""
+    return f"{verdict}: a field error of {residual:.1e} would explain the misfit{weakness}.{gauge}"
