@@ -108,15 +108,15 @@ def diagram_distances(
 
 def embed(distances: np.ndarray) -> np.ndarray:
     """UMAP's places `(N, 2)` of shapes with distances `(N, N)`; with fewer than 26 shapes, all are neighbours."""
-    chosen = UMAP | {"n_neighbors": min(UMAP["n_neighbors"], len(distances) - 1)}
+    options = UMAP | {"n_neighbors": min(UMAP["n_neighbors"], len(distances) - 1)}
     with warnings.catch_warnings():
         # It tells that a neural kin of it is not installed, that precomputed distances cannot be inverted, and that
         # far families are not connected.
         warnings.simplefilter("ignore")
         from umap import UMAP as Umap
 
-        found = Umap(metric="precomputed", n_jobs=1, **chosen).fit_transform(distances.astype(np.float32))
-    return np.asarray(found, dtype=np.float64)
+        places = Umap(metric="precomputed", n_jobs=1, **options).fit_transform(distances.astype(np.float32))
+    return np.asarray(places, dtype=np.float64)
 
 
 def find_clusters(positions: np.ndarray) -> np.ndarray:
@@ -126,10 +126,10 @@ def find_clusters(positions: np.ndarray) -> np.ndarray:
     from sklearn.cluster import HDBSCAN as Hdbscan
 
     options: dict[str, Any] = HDBSCAN | {"copy": True}
-    found = Hdbscan(**options).fit_predict(positions)
-    sizes = np.bincount(found[found >= 0], minlength=1)
+    labels = Hdbscan(**options).fit_predict(positions)
+    sizes = np.bincount(labels[labels >= 0], minlength=1)
     rank = np.argsort(np.argsort(-sizes, kind="stable"))
-    return np.where(found >= 0, rank[found], NOISE)
+    return np.where(labels >= 0, rank[labels], NOISE)
 
 
 def check_size(count: int) -> None:
@@ -153,8 +153,8 @@ def _families(atlas: Atlas) -> tuple[tuple[str, ...], np.ndarray]:
     for diagram, fraction in zip(atlas.field_diagrams, atlas.volume_fractions, strict=True):
         radius = half_thickness(diagram, float(fraction) * box)
         names.append(family_of(diagram, radius))
-        found = family_shares(diagram, radius)
-        shares.append([found[name] for name in FAMILIES])
+        parts = family_shares(diagram, radius)
+        shares.append([parts[name] for name in FAMILIES])
     return tuple(names), np.array(shares)
 
 

@@ -46,7 +46,7 @@ _SCRIPTS = ("data", "chart", "moves", "diagram", "solid", "hands", "panel", "sch
 
 
 def page_html(
-    mapped: AtlasMap, shapes: Sequence[Shown], commands: Sequence[str], made: Sequence[tuple[str, str]]
+    mapped: AtlasMap, shapes: Sequence[Shown], commands: Sequence[str], account: Sequence[tuple[str, str]]
 ) -> str:
     """The page.
 
@@ -72,7 +72,7 @@ def page_html(
         title=f"Atlas of {len(mapped)} shapes",
         style=_template("atlas.css"),
         script="\n".join(_template(f"atlas_{name}.js") for name in _SCRIPTS),
-        made="\n".join(f"<dt>{escape(name)}</dt><dd>{escape(value)}</dd>" for name, value in made),
+        made="\n".join(f"<dt>{escape(name)}</dt><dd>{escape(value)}</dd>" for name, value in account),
         data=json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
         blobs="\n".join(f'<script type="text/plain" id="{name}">{text}</script>' for name, (text, _) in blobs.items()),
     )
@@ -152,9 +152,9 @@ def _diagrams(diagrams: Sequence[Diagram]) -> tuple[float, list[bytes]]:
 
 def _embeddings(mapped: AtlasMap) -> tuple[float, list[bytes]]:
     """The step, and the sliced embeddings of fields and of masks `(N, 288)`, int16."""
-    found = [mapped.atlas.embeddings(view) for view in VIEWS]
-    step = max(float(np.abs(each).max()) for each in found) / 32767
-    return step, [np.rint(each / step).astype("<i2").tobytes() for each in found]
+    views = [mapped.atlas.embeddings(view) for view in VIEWS]
+    step = max(float(np.abs(each).max()) for each in views) / 32767
+    return step, [np.rint(each / step).astype("<i2").tobytes() for each in views]
 
 
 def _joined(pieces: Iterable[bytes]) -> tuple[str, list[int]]:

@@ -72,9 +72,9 @@ def map_figure(mapped: AtlasMap, field: Callable[[int], np.ndarray]) -> Figure:
     _name_families(axes, mapped)
     figure.draw_without_rendering()
     slots = _slots()
-    chosen = spread_out(mapped.positions, len(slots))
-    places = axes.transData.transform(mapped.positions[chosen]) / (figure.dpi * np.array([_WIDTH, _HEIGHT]))
-    for position, slot in zip(chosen, slots[_assigned(places, slots)], strict=True):
+    sample = spread_out(mapped.positions, len(slots))
+    places = axes.transData.transform(mapped.positions[sample]) / (figure.dpi * np.array([_WIDTH, _HEIGHT]))
+    for position, slot in zip(sample, slots[_assigned(places, slots)], strict=True):
         _thumbnail(figure, axes, field(position), slot, mapped.positions[position], colours[position])
     _legend(figure, mapped)
     return figure
@@ -82,12 +82,12 @@ def map_figure(mapped: AtlasMap, field: Callable[[int], np.ndarray]) -> Figure:
 
 def spread_out(positions: np.ndarray, count: int) -> np.ndarray:
     """Numbers of up to `count` points, each the farthest from those before it; the first is nearest to the middle."""
-    chosen = [int(np.linalg.norm(positions - np.median(positions, axis=0), axis=1).argmin())]
-    apart = np.linalg.norm(positions - positions[chosen[0]], axis=1)
-    while len(chosen) < min(count, len(positions)):
-        chosen.append(int(apart.argmax()))
-        apart = np.minimum(apart, np.linalg.norm(positions - positions[chosen[-1]], axis=1))
-    return np.array(chosen)
+    sample = [int(np.linalg.norm(positions - np.median(positions, axis=0), axis=1).argmin())]
+    apart = np.linalg.norm(positions - positions[sample[0]], axis=1)
+    while len(sample) < min(count, len(positions)):
+        sample.append(int(apart.argmax()))
+        apart = np.minimum(apart, np.linalg.norm(positions - positions[sample[-1]], axis=1))
+    return np.array(sample)
 
 
 def _slots() -> np.ndarray:
@@ -125,13 +125,13 @@ def _thumbnail(
 def _name_families(axes: Axes, mapped: AtlasMap) -> None:
     """The name of each larger family, where its shapes lie densest."""
     for name in FAMILY_COLOURS:
-        own = mapped.positions[np.array(mapped.families) == name]
-        if len(own) < _NAMED * len(mapped):
+        places = mapped.positions[np.array(mapped.families) == name]
+        if len(places) < _NAMED * len(mapped):
             continue
-        apart = cdist(own, own)
-        near = np.argsort(apart, axis=1)[:, : math.ceil(len(own) / 4)]
+        apart = cdist(places, places)
+        near = np.argsort(apart, axis=1)[:, : math.ceil(len(places) / 4)]
         densest = np.take_along_axis(apart, near, axis=1).mean(1).argmin()
-        x, y = own[near[densest]].mean(0)
+        x, y = places[near[densest]].mean(0)
         text = axes.text(x, y, name, ha="center", va="center", fontsize=15, color=INK, zorder=5, style="italic")
         text.set_path_effects([withStroke(linewidth=4, foreground="white", alpha=0.85)])
 
@@ -147,10 +147,10 @@ def _legend(figure: Figure, mapped: AtlasMap) -> None:
         handles=marks, loc="lower left", ncols=len(marks), frameon=False, fontsize=11, handletextpad=0.2,
         bbox_to_anchor=(0.005, 0.026),
     )  # fmt: skip
-    chosen = mapped.settings
-    said = (
-        f"{len(mapped)} shapes · Wasserstein distances of curvature diagrams · UMAP of {chosen['umap']['n_neighbors']} "
-        f"neighbours, seed {chosen['umap']['random_state']} · colour: where a shape's own area lies · curvafit "
-        f"{chosen['versions']['curvafit']}"
+    settings = mapped.settings
+    caption = (
+        f"{len(mapped)} shapes · Wasserstein distances of curvature diagrams · UMAP of "
+        f"{settings['umap']['n_neighbors']} neighbours, seed {settings['umap']['random_state']} · "
+        f"colour: where the area of a shape lies · curvafit {settings['versions']['curvafit']}"
     )
-    figure.text(0.014, 0.012, said, va="bottom", fontsize=9, color=QUIET)
+    figure.text(0.014, 0.012, caption, va="bottom", fontsize=9, color=QUIET)

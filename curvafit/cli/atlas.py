@@ -117,13 +117,13 @@ def verify_atlas(
         from curvafit.data_synth.atlas.census import verify
 
         with stages() as progress:
-            found = verify(store, regenerate, seed, progress)
-        for note in found.notes:
+            verdict = verify(store, regenerate, seed, progress)
+        for note in verdict.notes:
             say(f"note: {note}")
-        for problem in found.problems:
+        for problem in verdict.problems:
             say(f"error: {problem}", to=error_console())
-        say(found.status)
-    if found.problems:
+        say(verdict.status)
+    if verdict.problems:
         raise typer.Exit(1)
 
 
@@ -164,8 +164,8 @@ def map_atlas(
             from curvafit.atlas_map.map_files import check_map, write_map
 
             check_map(out, store, overwrite)
-            told = {"device": device_of(device), "command": command_line(), "overwrite": overwrite}
-            files = write_map(store, out, **told, progress=progress)
+            options = {"device": device_of(device), "command": command_line(), "overwrite": overwrite}
+            files = write_map(store, out, **options, progress=progress)
         for path in files:
             say(str(path))
 

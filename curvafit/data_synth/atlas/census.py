@@ -90,13 +90,15 @@ def verify(
             f"{viable} of {store.wanted} shapes are made" + f"; {lost}" * bool(missing)
         )
     problems += _strangers(store, indices)
-    chosen = np.random.default_rng(seed).permutation(sound)[:regenerate].tolist()
-    for k, index in enumerate(chosen):
+    sample = np.random.default_rng(seed).permutation(sound)[:regenerate].tolist()
+    for k, index in enumerate(sample):
         progress(f"making draw {index} again", (len(indices) + k) / (len(indices) + regenerate))
         _compare(store, index, problems, notes)
-    made = f"{len(chosen)} made again"
-    said = "nothing is wrong" if not problems else f"{len(problems)} things are wrong"
-    return Verdict(tuple(problems), tuple(notes), f"{len(indices)} draws, {viable} shapes checked, {made}: {said}")
+    repeats = f"{len(sample)} made again"
+    finding = "nothing is wrong" if not problems else f"{len(problems)} things are wrong"
+    return Verdict(
+        tuple(problems), tuple(notes), f"{len(indices)} draws, {viable} shapes checked, {repeats}: {finding}"
+    )
 
 
 def _wrong(store: Store, record: Record, design: Design) -> list[str]:

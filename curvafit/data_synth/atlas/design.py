@@ -106,7 +106,7 @@ class Design:
         return {"law": self.law} | {name: [list(row) for row in value] for name, value in rows.items()}
 
     @staticmethod
-    def from_dict(kept: Mapping[str, Any]) -> Design:
+    def from_dict(content: Mapping[str, Any]) -> Design:
         """The inverse of `as_dict`.
 
         Raises
@@ -115,15 +115,15 @@ class Design:
             If it is none.
         """
         try:
-            box, points = (tuple(map(tuple, kept.get(name, ()))) for name in ("box", "points"))
+            box, points = (tuple(map(tuple, content.get(name, ()))) for name in ("box", "points"))
             sound = all(len(row) == 2 for row in box) and all(
                 map(_is_number, [each for row in box + points for each in row])
             )
         except (TypeError, AttributeError):
             box, points, sound = (), (), False
-        if not sound or "law" not in kept:
-            raise ValueError(f"expected a design's law and box or points, got {quoted(kept)}")
-        return Design(kept["law"], box, points)
+        if not sound or "law" not in content:
+            raise ValueError(f"expected a design's law and box or points, got {quoted(content)}")
+        return Design(content["law"], box, points)
 
     def _shares(self, seed: int, index: int) -> list[float]:
         """How far into each interval the draw lies, 0 to 1. A fixed parameter takes no random number."""

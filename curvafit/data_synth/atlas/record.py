@@ -109,10 +109,10 @@ def record_of(attributes: dict[str, Any]) -> Record:
 
 def digest(attributes: dict[str, Any], field: np.ndarray | None) -> str:
     """SHA-256 of a record as canonical JSON, and of the field's bytes."""
-    kept = {name: value for name, value in attributes.items() if name != "sha256"}
-    found = hashlib.sha256(json.dumps(kept, sort_keys=True).encode())
-    found.update(b"" if field is None else np.ascontiguousarray(field).tobytes())
-    return found.hexdigest()
+    content = {name: value for name, value in attributes.items() if name != "sha256"}
+    checksum = hashlib.sha256(json.dumps(content, sort_keys=True).encode())
+    checksum.update(b"" if field is None else np.ascontiguousarray(field).tobytes())
+    return checksum.hexdigest()
 
 
 def _plain(value: Any) -> Any:

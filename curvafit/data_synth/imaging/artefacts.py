@@ -83,8 +83,8 @@ def rings(
     if not 0 <= strength < math.inf or not width > 0:
         raise ValueError(f"expected rings from 0 and a width above 0, got {strength} and {width}")
     steps = edges(spacing)
-    made = [_rings(like[k : k + 1], steps, width, seed, centre) for k, seed in enumerate(seeds_of(seeds, len(like)))]
-    return torch.cat(made) * strength
+    terms = [_rings(like[k : k + 1], steps, width, seed, centre) for k, seed in enumerate(seeds_of(seeds, len(like)))]
+    return torch.cat(terms) * strength
 
 
 def dropout(

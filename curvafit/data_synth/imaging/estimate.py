@@ -187,20 +187,20 @@ def _texture(relative: np.ndarray, inside: np.ndarray, steps: np.ndarray) -> tup
     """Deviation and length, in voxels of the finest edge, of a brightness that was averaged over a window of `WINDOW`:
     by the covariance of its logarithm in the plane. The average lengthens the one, and along a tube it lessens the
     other. What has lost its light is not looked at: a logarithm would see little else."""
-    used = inside & (relative > DIMMEST)
-    logs = np.log(np.where(used, relative, 1.0))
-    weight = used.astype(np.float32)
-    rest = (logs - logs[used].mean()) * weight
+    bright_part = inside & (relative > DIMMEST)
+    logs = np.log(np.where(bright_part, relative, 1.0))
+    weight = bright_part.astype(np.float32)
+    rest = (logs - logs[bright_part].mean()) * weight
     first, second = (covariance(rest, weight, axis) for axis in (1, 2))
-    seen = np.concatenate([first, second])
+    covariances = np.concatenate([first, second])
     lags = np.concatenate(
         [np.arange(len(each)) * h / steps.min() for each, h in ((first, steps[1]), (second, steps[2]))]
     )
-    share = seen / max(seen[0], 1e-12)
+    share = covariances / max(covariances[0], 1e-12)
     misfit = [np.square(share - np.exp(-0.5 * (lags / length) ** 2)).sum() for length in LENGTHS]
-    found = float(LENGTHS[int(np.argmin(misfit))])
-    length = math.sqrt(max(found**2 - 2 * WINDOW**2, WINDOW**2))
-    return math.sqrt(math.expm1(float(seen[0]) * max(found / length, 1.0))), length
+    width = float(LENGTHS[int(np.argmin(misfit))])
+    length = math.sqrt(max(width**2 - 2 * WINDOW**2, WINDOW**2))
+    return math.sqrt(math.expm1(float(covariances[0]) * max(width / length, 1.0))), length
 
 
 def _around(value: Any, low: float, high: float) -> tuple[Any, Any]:

@@ -107,13 +107,13 @@ def covariance(rest: np.ndarray, weight: np.ndarray, axis: int) -> np.ndarray:
     return np.array([product / max(pairs, 1.0) for product, pairs in sums])
 
 
-def _split(seen: np.ndarray) -> tuple[float, float, float, float]:
+def _split(covariances: np.ndarray) -> tuple[float, float, float, float]:
     """Variance and width of the noise, variance and length of the texture, in voxels, by non-negative least squares."""
-    lag = np.arange(len(seen))
+    lag = np.arange(len(covariances))
     short = [np.exp(-((lag / (2 * w)) ** 2)) if w else (lag == 0).astype(float) for w in GRAINS]
     long = [np.exp(-0.5 * (lag / length) ** 2) for length in LENGTHS]
     flat = np.ones(len(lag))
-    parts, _ = optimize.nnls(np.stack([*short, *long, flat], 1), seen)
+    parts, _ = optimize.nnls(np.stack([*short, *long, flat], 1), covariances)
     noise, texture = parts[: len(GRAINS)], parts[len(GRAINS) : -1]
     total, spread = float(noise.sum()), float(texture.sum())
     width = float(noise @ GRAINS / total) if total else 0.0

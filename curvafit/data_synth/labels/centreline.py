@@ -84,20 +84,20 @@ def _traced(skeleton: np.ndarray, distance: np.ndarray, grid: Grid) -> nx.MultiG
         cloud = np.stack(_unwrapped([places[i] for i in members], grid))
         radius = max(float(distance[tuple(places[i])]) for i in members)
         graph.add_node(k, place=cloud.mean(0), radius=radius, rings=_rings(cloud, grid))
-    seen: set[int] = set()
+    visited: set[int] = set()
     for i, k in list(node.items()):
         for first in beside[i]:
             if first in node and (node[first] > k):
                 _join(graph, k, node[first], [places[i], places[first]], grid)
-            elif first not in node and first not in seen:
+            elif first not in node and first not in visited:
                 path = _walk(i, first, beside, node)
-                seen.update(path[1:-1])
+                visited.update(path[1:-1])
                 _join(graph, k, node[path[-1]], [places[j] for j in path], grid)
     for i in range(len(places)):
-        if i not in node and i not in seen:  # a line that closes on itself
+        if i not in node and i not in visited:  # a line that closes on itself
             node[i] = len(graph)
             path = _walk(i, beside[i][0], beside, node)
-            seen.update(path)
+            visited.update(path)
             graph.add_node(node[i], place=places[i].astype(float), radius=float(distance[tuple(places[i])]), rings=0)
             _join(graph, node[i], node[i], [places[j] for j in path], grid)
     return graph

@@ -84,21 +84,21 @@ def labels_of(field: Tensor | np.ndarray, grid: Grid, epsilon: float, which: Col
     if unknown := sorted(wanted - set(NAMES)):
         raise ValueError(f"expected labels of {', '.join(NAMES)}, got {', '.join(unknown)}")
     u = _checked(field, grid, epsilon)
-    found: dict[str, np.ndarray | tuple[int, int, int]] = {}
+    labels: dict[str, np.ndarray | tuple[int, int, int]] = {}
     mask = (u > 0).cpu().numpy()
     if wanted & {"distance", "skeleton", "instances", "radius"}:
-        found["distance"] = distance = field_distance(u, grid, epsilon)
+        labels["distance"] = distance = field_distance(u, grid, epsilon)
         if "skeleton" in wanted:
-            found["skeleton"] = skeleton_of(distance, grid)
+            labels["skeleton"] = skeleton_of(distance, grid)
         if "instances" in wanted:
-            found["instances"] = instances_of(distance, grid)
+            labels["instances"] = instances_of(distance, grid)
         if "radius" in wanted:
-            found["radius"] = _radius(distance, grid)
+            labels["radius"] = _radius(distance, grid)
     if wanted & {"kappa1", "kappa2"}:
-        found["kappa1"], found["kappa2"] = _curvatures(u, mask, grid, epsilon)
+        labels["kappa1"], labels["kappa2"] = _curvatures(u, mask, grid, epsilon)
     if "betti" in wanted:
-        found["betti"] = betti_numbers(mask, periodic=grid.periodic)
-    return Labels(grid, **{name: value for name, value in ({"mask": mask} | found).items() if name in wanted})  # type: ignore[arg-type]
+        labels["betti"] = betti_numbers(mask, periodic=grid.periodic)
+    return Labels(grid, **{name: value for name, value in ({"mask": mask} | labels).items() if name in wanted})  # type: ignore[arg-type]
 
 
 def instances_of(distance: np.ndarray, grid: Grid, neck: float = NECK) -> np.ndarray:

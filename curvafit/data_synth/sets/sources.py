@@ -331,10 +331,10 @@ def _pooled(generated: Generated, number: int, edge: int) -> PhaseField:
 @lru_cache(maxsize=16)
 def _formed(paths: tuple[Path, ...]) -> list[tuple[Store, int]]:
     """The well-formed draws of some stores, each with its store."""
-    found = []
+    draws = []
     for store in map(open_store, paths):
-        own = [(store, index) for index in store.indices() if well_formed(store.record(index).viability)]
-        if not own:
+        formed = [(store, index) for index in store.indices() if well_formed(store.record(index).viability)]
+        if not formed:
             raise ValueError(f"expected a store with well-formed shapes, got none in {store.path}")
-        found += own
-    return found
+        draws += formed
+    return draws

@@ -136,11 +136,11 @@ class TextureDataset(IterableDataset):
 
     def __getstate__(self) -> dict[str, Any]:
         """With the rank, which a spawned worker, outside the group, could not ask for."""
-        return self.__dict__ | {"_told": self._rank()}
+        return self.__dict__ | {"_group_rank": self._rank()}
 
     def _rank(self) -> tuple[int, int]:
-        found = _rank()
-        return self.__dict__.get("_told", found) if found == (0, 1) and get_worker_info() else found
+        live = _rank()
+        return self.__dict__.get("_group_rank", live) if live == (0, 1) and get_worker_info() else live
 
     def set_epoch(self, epoch: int) -> None:
         """Which epoch comes next, from 0; workers that stay alive see it too."""
