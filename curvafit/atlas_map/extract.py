@@ -78,12 +78,12 @@ def _measures(
 
 
 def shape_id(store: Store, record: Record) -> str:
-    """What a draw is called in an atlas: the law's seed and the draw's index."""
+    """Return the name of a draw in an atlas: the seed of the design and the index of the draw."""
     return f"{store.settings.seed}-{record.index:05d}"
 
 
 def measured(store: Store, record: Record) -> Measured:
-    """Volume fraction of {u > 0}, and the diagrams of field and mask, of one viable draw."""
+    """Return the volume fraction of {u > 0}, and the diagrams of field and mask, of one viable draw."""
     field = torch.from_numpy(store.field(record.index))
     grid = Grid(store.settings.shape, store.settings.spacing)
     return float((field > 0).double().mean()), *diagrams(field, grid, store.settings.epsilon)
@@ -111,7 +111,7 @@ def _provenance(store: Store, records: list[Record], command: Sequence[str]) -> 
 
 
 def _build_command(store: Store, viable: int) -> str:
-    """The command that makes the same store: building stops at its last viable draw."""
+    """Return the command that makes the same store: building stops at its last viable draw."""
     settings = store.settings
     shape, name = ",".join(map(str, settings.shape)), settings.schedule["name"]
     known = {json.dumps(boxed(law).as_dict()): law for law in ("random", "sobol")}

@@ -58,7 +58,8 @@ class AtlasMap:
         return len(self.atlas)
 
     def neighbours(self, count: int) -> np.ndarray:
-        """The other shapes nearest to each one, nearest first: `(N, count)`, or `(N, N - 1)` where that is less."""
+        """Return the other shapes nearest to each one, nearest first: `(N, count)`, or `(N, N - 1)` where that is
+        less."""
         others = self.distances + np.diag(np.full(len(self), np.inf))
         return np.argsort(others, axis=1, kind="stable")[:, : min(count, len(self) - 1)]
 
@@ -99,15 +100,16 @@ def diagram_distances(
     progress: Callable[[int, int], None] | None = None,
     saved: Path | None = None,
 ) -> np.ndarray:
-    """Wasserstein distances of all pairs `(N, N)`, with the paper's settings: `pairwise`, with its progress and its
-    checkpoint `saved`."""
+    """Return the Wasserstein distances of all pairs `(N, N)`, with the paper's settings: `pairwise`, with its progress
+    and its checkpoint `saved`."""
     from curvafit.geometry.pairwise import pairwise
 
     return pairwise(diagrams, **DISTANCE, device=device, progress=progress, checkpoint=saved)
 
 
 def embed(distances: np.ndarray) -> np.ndarray:
-    """UMAP's places `(N, 2)` of shapes with distances `(N, N)`; with fewer than 26 shapes, all are neighbours."""
+    """Return UMAP's places `(N, 2)` of shapes with distances `(N, N)`; with fewer than 26 shapes, all are
+    neighbours."""
     options = UMAP | {"n_neighbors": min(UMAP["n_neighbors"], len(distances) - 1)}
     with warnings.catch_warnings():
         # It tells that a neural kin of it is not installed, that precomputed distances cannot be inverted, and that
@@ -120,7 +122,7 @@ def embed(distances: np.ndarray) -> np.ndarray:
 
 
 def find_clusters(positions: np.ndarray) -> np.ndarray:
-    """HDBSCAN's clusters `(N,)` of places `(N, 2)`, the largest first, `NOISE` for none."""
+    """Return HDBSCAN's clusters `(N,)` of places `(N, 2)`, the largest first, `NOISE` for none."""
     if len(positions) < HDBSCAN["min_cluster_size"]:
         return np.full(len(positions), NOISE)
     from sklearn.cluster import HDBSCAN as Hdbscan
@@ -146,7 +148,7 @@ def check_extra() -> None:
 
 
 def _families(atlas: Atlas) -> tuple[tuple[str, ...], np.ndarray]:
-    """The family of each shape, and its shares of area in the order of `FAMILIES`, `(N, 6)`."""
+    """Return the family of each shape, and its shares of area in the order of `FAMILIES`, `(N, 6)`."""
     sampling = atlas.provenance["settings"]
     box = float(np.prod(sampling["shape"]) * np.prod(sampling["spacing"]))
     names, shares = [], []

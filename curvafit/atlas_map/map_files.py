@@ -42,7 +42,7 @@ _Arrays = dict[str, np.ndarray]
 
 
 def check_map(directory: str | Path, store: str | Path, overwrite: bool = False) -> Path:
-    """The folder, if the map of a store can be written there; asked before the work is done.
+    """Return the folder, if the map of a store can be written there; for a check before long work.
 
     Raises
     ------
@@ -101,7 +101,7 @@ def write_map(
 
 
 def _measures(store: Store, cache: Path, progress: Progress) -> tuple[Atlas, list[Record], list[Shown], list[str]]:
-    """Every shape's measures, and with each its record, its pictures and the command that grows it again."""
+    """Return every shape's measures, and with each its record, its pictures and the command that grows it again."""
     records: list[Record] = []
     shapes: list[Shown] = []
     commands: list[str] = []
@@ -135,7 +135,7 @@ def _diagram(cached: _Arrays, view: str) -> Diagram:
 
 
 def _mapped(atlas: Atlas, cache: Path, device: str, progress: Progress) -> AtlasMap:
-    """Distances, places, clusters, families."""
+    """Return the map of an atlas, its distances and places from the cache where they are there."""
     saved, report = cache / "distances.npz", partial(_compared, progress)
     compare = partial(diagram_distances, atlas.field_diagrams, device=device, progress=report, saved=saved)
     try:
@@ -154,7 +154,7 @@ def _compared(progress: Progress, done: int, pairs: int) -> None:
 
 
 def _cached(path: Path, make: Callable[[], _Arrays]) -> _Arrays:
-    """The arrays in a file; made, and kept there, where there is no sound one."""
+    """Return the arrays in a file; where there is no sound one, make them and write them there."""
     try:
         return read_archive(path)
     except (OSError, ValueError):
@@ -166,14 +166,14 @@ def _cached(path: Path, make: Callable[[], _Arrays]) -> _Arrays:
 
 
 def _key(store: Store, record: Record) -> str:
-    """A name that changes with anything a shape's measures and pictures depend on."""
+    """Return a name that changes with anything a shape's measures and pictures depend on."""
     settings, facts = dataclasses.asdict(store.settings), dataclasses.asdict(record)
     content = json.dumps([_CACHE_VERSION, version("curvafit"), settings, facts], sort_keys=True, default=str)
     return f"{shape_id(store, record)}-{hashlib.sha256(content.encode()).hexdigest()[:12]}"
 
 
 def _account(mapped: AtlasMap, store: Store, command: str) -> list[tuple[str, str]]:
-    """How the map was made, in rows for the page."""
+    """Return the rows of the page that say how the map was made."""
     settings = mapped.settings
     rows = {
         "command": command,

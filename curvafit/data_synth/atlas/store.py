@@ -52,7 +52,7 @@ class Store:
 
     @property
     def wanted(self) -> int:
-        """How many viable shapes the store is to have."""
+        """Return how many viable shapes the store is to have."""
         attributes = _group_attributes(self.path)
         return 0 if attributes is None else int(attributes["wanted"])
 
@@ -67,11 +67,11 @@ class Store:
         return sorted(int(name) for name in names if name.isdigit() and self.has(int(name)))
 
     def has(self, index: int) -> bool:
-        """Whether a draw is there, complete."""
+        """Return whether a draw is there, complete."""
         return self._attributes(index) is not None
 
     def record(self, index: int) -> Record:
-        """The record of a draw.
+        """Return the record of a draw.
 
         Raises
         ------
@@ -85,7 +85,7 @@ class Store:
             raise self._damaged("record", index, error) from error
 
     def viable(self, index: int) -> bool:
-        """Whether a draw is recorded as a shape.
+        """Return whether a draw is recorded as a shape.
 
         Raises
         ------
@@ -95,7 +95,7 @@ class Store:
         return self._complete(index)["viability"]["viable"]
 
     def field(self, index: int) -> np.ndarray:
-        """The phase field of a viable draw, float32 (Z, Y, X).
+        """Return the phase field of a viable draw, float32 (Z, Y, X).
 
         Raises
         ------
@@ -114,7 +114,7 @@ class Store:
             raise self._damaged("field", index, error) from error
 
     def intact(self, index: int) -> bool:
-        """Whether a draw's record and field are, bit for bit, what was written.
+        """Return whether a draw's record and field are, bit for bit, what was written.
 
         Raises
         ------
@@ -167,7 +167,8 @@ class Store:
         return self.path / "draws" / f"{index:06d}"
 
     def _attributes(self, index: int) -> dict | None:
-        """A draw's attributes, None where anything of it is missing; a field's bytes are checked when it is read."""
+        """Return a draw's attributes, None where anything of it is missing; a field's bytes are checked when it is
+        read."""
         place = self._place(index)
         attributes = _group_attributes(place)
         if attributes is None or attributes.get("index") != index or "sha256" not in attributes:
@@ -211,7 +212,7 @@ def open_store(path: str | Path, settings: Settings | None = None) -> Store:
 
 
 def _settings(path: Path, attributes: dict[str, Any]) -> Settings:
-    """The settings in a store's header; its other entry is how many shapes are wanted."""
+    """Return the settings in a store's header; its other entry is how many shapes are wanted."""
     try:
         values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in attributes["settings"].items()}
         settings = Settings(**values)
@@ -285,7 +286,7 @@ def _publish(partial: Path, place: Path) -> bool:
 
 
 def _group_attributes(folder: Path) -> dict | None:
-    """The attributes of the Zarr group in a folder, None where there is no readable one."""
+    """Return the attributes of the Zarr group in a folder, None where there is no readable one."""
     try:
         text = parse_json((folder / "zarr.json").read_bytes(), "a Zarr group", folder)
     except (OSError, ValueError):
@@ -295,7 +296,7 @@ def _group_attributes(folder: Path) -> dict | None:
 
 
 def _difference(stored: Settings, wanted: Settings) -> str:
-    """The first setting that differs, with both values."""
+    """Return the first setting that differs, with both values."""
     for name, value in dataclasses.asdict(stored).items():
         other = getattr(wanted, name)
         if other != value:

@@ -19,7 +19,7 @@ class _Loader(yaml.SafeLoader):
 
 
 def parse_yaml(content: bytes, expected: str, place: object) -> Any:
-    """The value of a YAML text in UTF-8.
+    """Return the value of a YAML text in UTF-8.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def parse_yaml(content: bytes, expected: str, place: object) -> Any:
 
 
 def _size(node: yaml.Node, known: dict[int, float]) -> float:
-    """How many values a node holds when its aliases are written out; one within itself has no end."""
+    """Return how many values a node holds when its aliases are written out; one within itself has no end."""
     if id(node) in known:
         if known[id(node)] > _MOST:
             raise ValueError(f"more than {_MOST:,} values, with what its aliases repeat")

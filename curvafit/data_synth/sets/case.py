@@ -83,11 +83,11 @@ class Recipe:
 
     @property
     def largest(self) -> tuple[int, int, int]:
-        """Voxels (z, y, x) of the largest shapes, of the thinnest structures."""
+        """Return voxels (z, y, x) of the largest shapes, of the thinnest structures."""
         return field_shape(self.shape, self.voxel * self.calibres[0], self.modality.base)
 
     def case(self, index: int) -> Case:
-        """Case number `index`, made on one thread.
+        """Return case number `index`, made on one thread.
 
         Raises
         ------
@@ -122,14 +122,14 @@ class Recipe:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """All of it in JSON's types."""
+        """Return all of the recipe in JSON's types."""
         parts = {"source": self.source.as_dict(), "modality": self.modality.as_dict()}
         numbers = {"shape": list(self.shape), "voxel": self.voxel, "seed": self.seed, "calibres": list(self.calibres)}
         return parts | numbers
 
     @staticmethod
     def from_dict(content: Mapping[str, Any]) -> Recipe:
-        """The inverse of `as_dict`."""
+        """Return what `as_dict` wrote."""
         source, modality = source_of(content["source"]), Modality.from_dict(content["modality"])
         z, y, x = content["shape"]
         low, high = content["calibres"]
@@ -139,7 +139,7 @@ class Recipe:
 def imaged(
     field: torch.Tensor, epsilon: float, voxel: float, imaging: Imaging, seed: int, shape: Sequence[int]
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """The image of a phase field (Z, Y, X), the field on the image's voxels, and its mask there, all of `shape`.
+    """Return the image of a phase field (Z, Y, X), the field on the image's voxels, and its mask there, all of `shape`.
 
     `epsilon` is in the field's voxels, whose edge is `voxel`. A field of whole voxels may hold a few more than an image
     asks for. See `imaging.image` and `Imaging.visible`.
@@ -152,7 +152,8 @@ def imaged(
 
 
 def drawn_voxel(voxel: float, calibres: Sequence[float], rng: np.random.Generator) -> float:
-    """The edge of a shape's voxel times a factor, drawn evenly in the logarithm; none is drawn where there is one."""
+    """Return the edge of a shape's voxel times a factor, drawn evenly in the logarithm; none is drawn where there is
+    one."""
     low, high = calibres
     return voxel * (low if low == high else math.exp(rng.uniform(math.log(low), math.log(high))))
 
@@ -191,7 +192,7 @@ def check_crop(within: float, shape: Sequence[int], voxel: float, modality: Moda
 
 
 def _counts(grey: np.ndarray, imaging: Imaging) -> np.ndarray:
-    """Whole counts as uint16, where they fit in; else float32."""
+    """Return whole counts as uint16, where they fit in; else float32."""
     ceiling = imaging.detector.ceiling
     whole = ceiling is not None and ceiling <= np.iinfo(np.uint16).max
     return grey.astype(np.uint16 if whole else np.float32)

@@ -139,7 +139,7 @@ def make_cases(folder: str | Path, indices: Sequence[int]) -> list[int]:
 
 
 def read_order(folder: str | Path) -> Order:
-    """What a set is to be.
+    """Return the order that a set was begun with.
 
     Raises
     ------
@@ -163,19 +163,19 @@ def read_order(folder: str | Path) -> Order:
 
 
 def cases_of(folder: Path) -> list[int]:
-    """The cases that are complete: a record is written last."""
+    """Return the indices of the complete cases: those with a record, which is written last."""
     names = (path.stem.removeprefix("case_") for path in (folder / RECORDS).glob("case_*.json"))
     return sorted(int(name) for name in names if name.isdigit())
 
 
 def case_name(index: int) -> str:
-    """What a case is called in file names."""
+    """Return the name of a case in files."""
     return f"case_{index:05d}"
 
 
 @contextmanager
 def _begun(folder: Path, order: Order) -> Iterator[None]:
-    """A set that is begun; where a case can't be had and none was, what was begun here is removed."""
+    """Begin a set; where the first case can't be had, remove what was begun."""
     new = [place for place in (folder, *folder.absolute().parents) if not place.exists()]
     anew = not (folder / HEADER).exists()
     _begin(folder, order)
@@ -232,7 +232,7 @@ def _list_what_is_there(folder: Path, order: Order, before: set[int]) -> None:
 
 
 def _remove_case(folder: Path, order: Order, name: str) -> None:
-    """Its record first: what is left without one is no case."""
+    """Remove a case, its record first: files without a record are no case."""
     layout = LAYOUTS[order.layout]
     places = [
         folder / RECORDS / f"{name}.json",
@@ -243,7 +243,7 @@ def _remove_case(folder: Path, order: Order, name: str) -> None:
 
 
 def _write_case(folder: Path, order: Order, index: int, case: Case) -> None:
-    """Labels, image, record, in this order; all or none. With its record a case is complete, whoever made it."""
+    """Write labels, image and record of a case, in this order, all or none; with its record a case is complete."""
     layout, name = LAYOUTS[order.layout], case_name(index)
     record = folder / RECORDS / f"{name}.json"
     places = [folder / layout.label.format(case=name), folder / layout.image.format(case=name)]
@@ -265,7 +265,7 @@ def _write_case(folder: Path, order: Order, index: int, case: Case) -> None:
 
 
 def _write_parts(order: Order, case: Case, place: Callable[[str], Path], places: list[Path]) -> dict[str, Any]:
-    """The labels besides the mask; what is no volume goes into the record."""
+    """Return the labels besides the mask; what is no volume goes into the record."""
     if not order.parts:
         return {}
     grid, known = Grid(case.image.shape, case.spacing, "replicate"), {}  # type: ignore[arg-type]
@@ -296,7 +296,7 @@ def _write_json(path: Path, content: dict[str, Any]) -> None:
 
 
 def _difference(stored: Any, wanted: Any, name: str = "order") -> tuple[str, Any, Any]:
-    """The name of the first value that differs, and both."""
+    """Return the name of the first value that differs, and both."""
     if isinstance(stored, dict) and isinstance(wanted, dict) and stored.keys() == wanted.keys():
         for key in stored:
             if stored[key] != wanted[key]:
