@@ -64,6 +64,19 @@ class Texture:
         """The unit of a fit's lengths, None where the law is no fit."""
         return None if self.prior is None else self.prior.unit
 
+    @property
+    def point(self) -> tuple[float, ...]:
+        """The six coefficients and the mass: seven numbers.
+
+        Raises
+        ------
+        ValueError
+            If the law has no mass, or its coefficients vary in space.
+        """
+        if self.mass is None:
+            raise ValueError(f"expected a preset or a fit, which have a mass, got {self.origin}")
+        return (*map(float, self._numbers()), float(self.mass))  # type: ignore[arg-type]
+
     def in_unit(self, unit: str | None, edge: float) -> Coefficients:
         """Return the coefficients with lengths in the unit of a scan or a training patch.
 
@@ -82,11 +95,15 @@ class Texture:
         ValueError
             If the coefficients vary in space, or the two units cannot be compared.
         """
-        if any(isinstance(value, Tensor) and value.dim() > 0 for value in self.coefficients):
-            raise ValueError("expected coefficients that are numbers, got some that vary")
+        numbers = self._numbers()
         if self.prior is not None:
             return self.prior.in_unit(unit)
-        return self.coefficients.in_unit(WORKING_SPACING / edge) if self.working else self.coefficients
+        return numbers.in_unit(WORKING_SPACING / edge) if self.working else numbers
+
+    def _numbers(self) -> Coefficients:
+        if any(isinstance(value, Tensor) and value.dim() > 0 for value in self.coefficients):
+            raise ValueError("expected coefficients that are numbers, got some that vary")
+        return self.coefficients
 
 
 def texture_of(law: Law) -> Texture:

@@ -10,8 +10,7 @@ from typing import Any
 from curvafit.data_synth.atlas.design import PARAMETERS, Design, around, boxed
 from curvafit.data_synth.atlas.yaml_text import parse_yaml
 from curvafit.priors.bounds import quoted, real
-from curvafit.priors.coefficients import preset
-from curvafit.priors.fit_file import read_fit
+from curvafit.priors.law import texture_of
 
 #: The kinds of design, and the keys that may stand beside each.
 KEYS = {"box": {"law"}, "around": {"law", "spread"}, "list": set()}
@@ -45,12 +44,8 @@ def point_of(source: Any, folder: Path = Path()) -> tuple[float, ...]:
     FileNotFoundError, ValueError
         If it is none of these, or a number is missing.
     """
-    if isinstance(source, str) and source.endswith(".json"):
-        fit = read_fit(folder / source)
-        return (*map(float, fit.coefficients), fit.mass)
     if isinstance(source, str):
-        named = preset(source)
-        return (*map(float, named.coefficients), float(named.mass))
+        return texture_of(folder / source if source.endswith(".json") else source).point
     if not isinstance(source, Mapping) or set(source) != set(PARAMETERS):
         raise ValueError(f"expected a preset, a fit.json or {', '.join(PARAMETERS)}, got {quoted(source)}")
     try:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from os import PathLike
 from pathlib import Path
@@ -305,12 +305,9 @@ def voxel_of(laws: Iterable[Law], kind: Modality) -> float:
 
 def _point(texture: Texture, fraction: float | None) -> tuple[float, ...]:
     """Return the seven numbers of a law; a mass that it does not state is that of the volume fraction."""
-    mass = texture.mass
-    if mass is None:
-        if fraction is None:
-            raise ValueError(f"expected a law with a mass, or a volume fraction beside it, got {texture.origin} alone")
-        mass = first_mass(fraction)
-    return (*map(float, texture.coefficients), mass)  # type: ignore[arg-type]
+    if texture.mass is None and fraction is not None:
+        return replace(texture, mass=first_mass(fraction)).point
+    return texture.point
 
 
 def _two_phases(crop: Callable[[], _Crop], voxels: Sequence[int]) -> _Crop:
