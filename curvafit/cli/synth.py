@@ -24,7 +24,7 @@ EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
     (
         "curvafit synth -o Dataset101_Tubes --preset tubes,sponge --modality confocal --count 200 --shape 96",
         "curvafit synth -o Dataset102_Bone --prior bone/fit.json --like bone.nii.gz --count 200 --shape 64",
-        "curvafit synth -o set --atlas store.zarr --modality micro-ct --layout monai --labels distance,centreline --shape 48",
+        "curvafit synth -o set --atlas store.zarr --modality micro-ct --layout monai --labels distance --shape 48",
     )
 )
 
