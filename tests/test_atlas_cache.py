@@ -19,13 +19,13 @@ from curvafit.data_synth.atlas.record import Record
 def test_nothing_is_measured_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     quick_map(monkeypatch)
     looked: list[int] = []
-    real = atlas_files._look
+    real = atlas_files._measure
 
     def look(store, record: Record):
         looked.append(record.index)
         return real(store, record)
 
-    monkeypatch.setattr(atlas_files, "_look", look)
+    monkeypatch.setattr(atlas_files, "_measure", look)
     monkeypatch.setattr(atlas_files, "map_picture", lambda mapped, field, path: path)
     exact_store(tmp_path / "s.zarr", 7)
     _, page = write_map(tmp_path / "s.zarr", tmp_path / "map")

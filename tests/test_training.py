@@ -184,9 +184,7 @@ def test_shapes_of_laws(tmp_path):
     filled = TextureDataset(tubes.coefficients, QUIET, 12, shapes=1, volume_fraction=0.2)
     assert dataset.voxels == filled.voxels == [QUIET.voxel]
     assert repr(filled).startswith("TextureDataset(1 shapes of coefficients; quiet; 12 x 12 x 12 voxels")
-    with pytest.raises(
-        ValueError, match="expected a law with a mass, or a volume fraction beside it, got coefficients"
-    ):
+    with pytest.raises(ValueError, match="expected a preset or a fit, which have a mass, got coefficients"):
         TextureDataset(tubes.coefficients, QUIET, 12)
     with pytest.raises(ValueError, match="expected a preset among"):
         TextureDataset("tubez", QUIET, 12)

@@ -51,37 +51,39 @@ def extract(
     """
     store = store if isinstance(store, Store) else open_store(store)
     records = [store.record(index) for index in store.indices()]
-    kept = [record for record in records if well_formed(record.viability)]
-    if not kept:
+    formed = [record for record in records if well_formed(record.viability)]
+    if not formed:
         raise ValueError(f"expected at least one well-formed shape in {store.path}, got none in {len(records)} draws")
-    fractions, of_fields, of_masks = zip(*_measures(store, kept, measure or measured, progress), strict=True)
+    fractions, field_diagrams, mask_diagrams = zip(
+        *_measures(store, formed, measure or measured, progress), strict=True
+    )
     return Atlas(
-        ids=tuple(shape_id(store, record) for record in kept),
-        coefficients=np.array([list(record.coefficients) for record in kept], dtype=np.float64),
-        masses=np.array([record.mass for record in kept]),
-        seeds=np.array([record.seed for record in kept], dtype=np.int64),
+        ids=tuple(shape_id(store, record) for record in formed),
+        coefficients=np.array([list(record.coefficients) for record in formed], dtype=np.float64),
+        masses=np.array([record.mass for record in formed]),
+        seeds=np.array([record.seed for record in formed], dtype=np.int64),
         volume_fractions=np.array(fractions),
-        field_diagrams=of_fields,
-        mask_diagrams=of_masks,
+        field_diagrams=field_diagrams,
+        mask_diagrams=mask_diagrams,
         provenance=_provenance(store, records, command),
     )
 
 
 def _measures(
-    store: Store, kept: list[Record], measure: Callable[[Store, Record], Measured], progress: Progress
+    store: Store, records: list[Record], measure: Callable[[Store, Record], Measured], progress: Progress
 ) -> Iterator[Measured]:
-    for done, record in enumerate(kept):
-        progress(f"measuring {len(kept)} shapes", done / len(kept))
+    for done, record in enumerate(records):
+        progress(f"measuring {len(records)} shapes", done / len(records))
         yield measure(store, record)
 
 
 def shape_id(store: Store, record: Record) -> str:
-    """What a draw is called in an atlas: the law's seed and the draw's index."""
+    """Return the name of a draw in an atlas: the seed of the design and the index of the draw."""
     return f"{store.settings.seed}-{record.index:05d}"
 
 
 def measured(store: Store, record: Record) -> Measured:
-    """Volume fraction of {u > 0}, and the diagrams of field and mask, of one viable draw."""
+    """Return the volume fraction of {u > 0}, and the diagrams of field and mask, of one viable draw."""
     field = torch.from_numpy(store.field(record.index))
     grid = Grid(store.settings.shape, store.settings.spacing)
     return float((field > 0).double().mean()), *diagrams(field, grid, store.settings.epsilon)
@@ -89,7 +91,7 @@ def measured(store: Store, record: Record) -> Measured:
 
 def _provenance(store: Store, records: list[Record], command: Sequence[str]) -> dict[str, Any]:
     viable = sum(record.viability.viable for record in records)
-    made = sorted({json.dumps(record.versions, sort_keys=True) for record in records})
+    generators = sorted({json.dumps(record.versions, sort_keys=True) for record in records})
     return {
         "command": [_build_command(store, viable), *command],
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
@@ -103,13 +105,13 @@ def _provenance(store: Store, records: list[Record], command: Sequence[str]) -> 
             "tail_share": TAIL_SHARE,
             "unit": "1/working unit",
         },
-        "generated_with": [json.loads(text) for text in made],
+        "generated_with": [json.loads(text) for text in generators],
         "measured_with": versions(),
     }
 
 
 def _build_command(store: Store, viable: int) -> str:
-    """The command that makes the same store: building stops at its last viable draw."""
+    """Return the command that makes the same store: building stops at its last viable draw."""
     settings = store.settings
     shape, name = ",".join(map(str, settings.shape)), settings.schedule["name"]
     known = {json.dumps(boxed(law).as_dict()): law for law in ("random", "sobol")}

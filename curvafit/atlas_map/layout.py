@@ -60,7 +60,8 @@ class AtlasMap:
         return len(self.atlas)
 
     def neighbours(self, count: int) -> np.ndarray:
-        """The other shapes nearest to each one, nearest first: `(N, count)`, or `(N, N - 1)` where that is less."""
+        """Return the other shapes nearest to each one, nearest first: `(N, count)`, or `(N, N - 1)` where that is
+        less."""
         others = self.distances + np.diag(np.full(len(self), np.inf))
         return np.argsort(others, axis=1, kind="stable")[:, : min(count, len(self) - 1)]
 
@@ -101,35 +102,36 @@ def diagram_distances(
     progress: Progress = silent,
     saved: Path | None = None,
 ) -> np.ndarray:
-    """Wasserstein distances of all pairs `(N, N)`, with the paper's settings: `pairwise`, with its progress and its
-    checkpoint `saved`."""
+    """Return the Wasserstein distances of all pairs `(N, N)`, with the paper's settings: `pairwise`, with its progress
+    and its checkpoint `saved`."""
     return pairwise(diagrams, **DISTANCE, device=device, progress=progress, checkpoint=saved)
 
 
 def embed(distances: np.ndarray) -> np.ndarray:
-    """UMAP's places `(N, 2)` of shapes with distances `(N, N)`; with fewer than 26 shapes, all are neighbours."""
-    chosen = UMAP | {"n_neighbors": min(UMAP["n_neighbors"], len(distances) - 1)}
+    """Return UMAP's places `(N, 2)` of shapes with distances `(N, N)`; with fewer than 26 shapes, all are
+    neighbours."""
+    options = UMAP | {"n_neighbors": min(UMAP["n_neighbors"], len(distances) - 1)}
     with warnings.catch_warnings():
         # It tells that a neural kin of it is not installed, that precomputed distances cannot be inverted, and that
         # far families are not connected.
         warnings.simplefilter("ignore")
         from umap import UMAP as Umap
 
-        found = Umap(metric="precomputed", n_jobs=1, **chosen).fit_transform(distances.astype(np.float32))
-    return np.asarray(found, dtype=np.float64)
+        places = Umap(metric="precomputed", n_jobs=1, **options).fit_transform(distances.astype(np.float32))
+    return np.asarray(places, dtype=np.float64)
 
 
 def find_clusters(positions: np.ndarray) -> np.ndarray:
-    """HDBSCAN's clusters `(N,)` of places `(N, 2)`, the largest first, `NOISE` for none."""
+    """Return HDBSCAN's clusters `(N,)` of places `(N, 2)`, the largest first, `NOISE` for none."""
     if len(positions) < HDBSCAN["min_cluster_size"]:
         return np.full(len(positions), NOISE)
     from sklearn.cluster import HDBSCAN as Hdbscan
 
     options: dict[str, Any] = HDBSCAN | {"copy": True}
-    found = Hdbscan(**options).fit_predict(positions)
-    sizes = np.bincount(found[found >= 0], minlength=1)
+    labels = Hdbscan(**options).fit_predict(positions)
+    sizes = np.bincount(labels[labels >= 0], minlength=1)
     rank = np.argsort(np.argsort(-sizes, kind="stable"))
-    return np.where(found >= 0, rank[found], NOISE)
+    return np.where(labels >= 0, rank[labels], NOISE)
 
 
 def check_size(count: int) -> None:
@@ -146,15 +148,15 @@ def check_extra() -> None:
 
 
 def _families(atlas: Atlas) -> tuple[tuple[str, ...], np.ndarray]:
-    """The family of each shape, and its shares of area in the order of `FAMILIES`, `(N, 6)`."""
+    """Return the family of each shape, and its shares of area in the order of `FAMILIES`, `(N, 6)`."""
     sampling = atlas.provenance["settings"]
     box = float(np.prod(sampling["shape"]) * np.prod(sampling["spacing"]))
     names, shares = [], []
     for diagram, fraction in zip(atlas.field_diagrams, atlas.volume_fractions, strict=True):
         radius = half_thickness(diagram, float(fraction) * box)
         names.append(family_of(diagram, radius))
-        found = family_shares(diagram, radius)
-        shares.append([found[name] for name in FAMILIES])
+        parts = family_shares(diagram, radius)
+        shares.append([parts[name] for name in FAMILIES])
     return tuple(names), np.array(shares)
 
 

@@ -42,7 +42,7 @@ _Arrays = dict[str, np.ndarray]
 
 
 def check_map(directory: str | Path, store: str | Path, overwrite: bool = False) -> Path:
-    """The folder, if the map of a store can be written there; asked before the work is done.
+    """Return the folder, if the map of a store can be written there; for a check before long work.
 
     Raises
     ------
@@ -90,7 +90,7 @@ def write_map(
     folder = Path(directory)
     (folder / CACHE).mkdir(parents=True, exist_ok=True)
     write_content(folder / CACHE / TAG, f"{_TAGGED}\n")
-    atlas, records, shapes, commands = _looked_at(store, folder / CACHE, progress)
+    atlas, records, shapes, commands = _measures(store, folder / CACHE, progress)
     mapped = _mapped(atlas, folder / CACHE, device, progress)
     progress("drawing", 0.95)
     picture = map_picture(mapped, lambda k: store.field(records[k].index), folder / "atlas.png")
@@ -100,8 +100,8 @@ def write_map(
     return picture, page
 
 
-def _looked_at(store: Store, cache: Path, progress: Progress) -> tuple[Atlas, list[Record], list[Shown], list[str]]:
-    """Every shape's measures, and with each its record, its pictures and the command that grows it again."""
+def _measures(store: Store, cache: Path, progress: Progress) -> tuple[Atlas, list[Record], list[Shown], list[str]]:
+    """Return every shape's measures, and with each its record, its pictures and the command that grows it again."""
     records: list[Record] = []
     shapes: list[Shown] = []
     commands: list[str] = []
@@ -109,33 +109,33 @@ def _looked_at(store: Store, cache: Path, progress: Progress) -> tuple[Atlas, li
     def look(store: Store, record: Record) -> Measured:
         records.append(record)
         commands.append(regrow_command(record, store.settings, f"shape_{shape_id(store, record)}.nii.gz"))
-        kept = _kept(cache / f"shape-{_key(store, record)}.npz", lambda: _look(store, record))
-        shapes.append(Shown(kept["thumbnail"].tobytes(), kept["volume"].tobytes()))
-        return float(kept["fraction"]), _diagram(kept, "field"), _diagram(kept, "mask")
+        cached = _cached(cache / f"shape-{_key(store, record)}.npz", lambda: _measure(store, record))
+        shapes.append(Shown(cached["thumbnail"].tobytes(), cached["volume"].tobytes()))
+        return float(cached["fraction"]), _diagram(cached, "field"), _diagram(cached, "mask")
 
     atlas = extract(store, measure=look, progress=lambda text, share: progress(text, 0.6 * share))
     return atlas, records, shapes, commands
 
 
-def _look(store: Store, record: Record) -> _Arrays:
+def _measure(store: Store, record: Record) -> _Arrays:
     fraction, *diagrams = measured(store, record)
-    seen = shown(store.field(record.index))
-    found = {"fraction": np.array(fraction)} | {
-        name: np.frombuffer(part, dtype=np.uint8) for name, part in seen._asdict().items()
+    views = shown(store.field(record.index))
+    arrays = {"fraction": np.array(fraction)} | {
+        name: np.frombuffer(part, dtype=np.uint8) for name, part in views._asdict().items()
     }
     for view, diagram in zip(("field", "mask"), diagrams, strict=True):
         figures = np.array([diagram.spread, diagram.excluded])
-        found |= {f"{view}_points": diagram.points, f"{view}_weights": diagram.weights, f"{view}_figures": figures}
-    return found
+        arrays |= {f"{view}_points": diagram.points, f"{view}_weights": diagram.weights, f"{view}_figures": figures}
+    return arrays
 
 
-def _diagram(kept: _Arrays, view: str) -> Diagram:
-    spread, excluded = map(float, kept[f"{view}_figures"])
-    return Diagram(kept[f"{view}_points"], kept[f"{view}_weights"], spread=spread, excluded=excluded)
+def _diagram(cached: _Arrays, view: str) -> Diagram:
+    spread, excluded = map(float, cached[f"{view}_figures"])
+    return Diagram(cached[f"{view}_points"], cached[f"{view}_weights"], spread=spread, excluded=excluded)
 
 
 def _mapped(atlas: Atlas, cache: Path, device: str, progress: Progress) -> AtlasMap:
-    """Distances, places, clusters, families."""
+    """Return the map of an atlas, its distances and places from the cache where they are there."""
     saved, part = cache / "distances.npz", _part(progress, 0.6, 0.85)
     compare = partial(diagram_distances, atlas.field_diagrams, device=device, progress=part, saved=saved)
     try:
@@ -145,7 +145,7 @@ def _mapped(atlas: Atlas, cache: Path, device: str, progress: Progress) -> Atlas
         distances = compare()
     progress("laying out the map", 0.86)
     key = hashlib.sha256(distances.tobytes()).hexdigest()[:12]
-    places = _kept(cache / f"places-{key}-{version('umap-learn')}.npz", lambda: {"positions": embed(distances)})
+    places = _cached(cache / f"places-{key}-{version('umap-learn')}.npz", lambda: {"positions": embed(distances)})
     return map_atlas(atlas, distances, places["positions"])
 
 
@@ -154,39 +154,39 @@ def _part(progress: Progress, first: float, last: float) -> Progress:
     return lambda text, share: progress(text, first + (last - first) * share)
 
 
-def _kept(path: Path, make: Callable[[], _Arrays]) -> _Arrays:
-    """The arrays in a file; made, and kept there, where there is no sound one."""
+def _cached(path: Path, make: Callable[[], _Arrays]) -> _Arrays:
+    """Return the arrays in a file; where there is no sound one, make them and write them there."""
     try:
         return read_archive(path)
     except (OSError, ValueError):
-        made = make()
+        arrays = make()
     buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **made)
+    np.savez(buffer, allow_pickle=False, **arrays)
     write_content(path, buffer.getvalue())
-    return made
+    return arrays
 
 
 def _key(store: Store, record: Record) -> str:
-    """A name that changes with anything a shape's measures and pictures depend on."""
-    settings, told = dataclasses.asdict(store.settings), dataclasses.asdict(record)
-    content = json.dumps([_CACHE_VERSION, version("curvafit"), settings, told], sort_keys=True, default=str)
+    """Return a name that changes with anything a shape's measures and pictures depend on."""
+    settings, facts = dataclasses.asdict(store.settings), dataclasses.asdict(record)
+    content = json.dumps([_CACHE_VERSION, version("curvafit"), settings, facts], sort_keys=True, default=str)
     return f"{shape_id(store, record)}-{hashlib.sha256(content.encode()).hexdigest()[:12]}"
 
 
 def _account(mapped: AtlasMap, store: Store, command: str) -> list[tuple[str, str]]:
-    """How the map was made, in rows for the page."""
-    chosen = mapped.settings
+    """Return the rows of the page that say how the map was made."""
+    settings = mapped.settings
     rows = {
         "command": command,
         "well-formed": f"{len(mapped)} of the store's shapes",
         **census(store),
-        "distances": _listed(chosen["distances"]),
-        "UMAP": _listed(chosen["umap"]),
-        "HDBSCAN": _listed(chosen["hdbscan"]) + f": {max(mapped.clusters) + 1} clusters",
-        "measured with": _listed(chosen["versions"]),
+        "distances": _listed(settings["distances"]),
+        "UMAP": _listed(settings["umap"]),
+        "HDBSCAN": _listed(settings["hdbscan"]) + f": {max(mapped.clusters) + 1} clusters",
+        "measured with": _listed(settings["versions"]),
         "measured on": mapped.atlas.provenance["date"],
     }
-    return [(name, said) for name, said in rows.items() if said]
+    return [(name, words) for name, words in rows.items() if words]
 
 
 def _listed(values: dict[str, Any]) -> str:

@@ -46,9 +46,9 @@ _SCRIPTS = ("data", "chart", "moves", "diagram", "solid", "hands", "panel", "sch
 
 
 def page_html(
-    mapped: AtlasMap, shapes: Sequence[Shown], commands: Sequence[str], made: Sequence[tuple[str, str]]
+    mapped: AtlasMap, shapes: Sequence[Shown], commands: Sequence[str], account: Sequence[tuple[str, str]]
 ) -> str:
-    """The page.
+    """Return the text of the page.
 
     Parameters
     ----------
@@ -72,14 +72,14 @@ def page_html(
         title=f"Atlas of {len(mapped)} shapes",
         style=_template("atlas.css"),
         script="\n".join(_template(f"atlas_{name}.js") for name in _SCRIPTS),
-        made="\n".join(f"<dt>{escape(name)}</dt><dd>{escape(value)}</dd>" for name, value in made),
+        made="\n".join(f"<dt>{escape(name)}</dt><dd>{escape(value)}</dd>" for name, value in account),
         data=json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
         blobs="\n".join(f'<script type="text/plain" id="{name}">{text}</script>' for name, (text, _) in blobs.items()),
     )
 
 
 def _small(mapped: AtlasMap, commands: Sequence[str]) -> dict[str, Any]:
-    """What the page has at hand at once."""
+    """Return the data that the page decodes at its start."""
     near = mapped.neighbours(NEIGHBOURS)
     sampling = mapped.atlas.provenance["settings"]
     box = np.array(sampling["shape"]) * sampling["spacing"]
@@ -128,20 +128,21 @@ def _columns(mapped: AtlasMap) -> list[dict[str, Any]]:
 
 
 def _unit_square(positions: np.ndarray) -> np.ndarray:
-    """Places moved and scaled (both axes alike) so that they are in the middle of [0, 1]²."""
+    """Return the places moved and scaled (both axes alike) so that they are in the middle of [0, 1]²."""
     low, high = positions.min(0), positions.max(0)
     return (positions - (low + high) / 2) / max(float((high - low).max()), 1e-9) + 0.5
 
 
 def _usual(embeddings: np.ndarray) -> list[float]:
-    """The distance to the nearest other shape, that half of the shapes and that 95 % of them stay below."""
+    """Return the median and the 95 % quantile of the distance to the nearest other shape."""
     apart = cdist(embeddings, embeddings)
     np.fill_diagonal(apart, np.inf)
     return np.quantile(apart.min(1), [0.5, 0.95]).round(4).tolist()
 
 
 def _diagrams(diagrams: Sequence[Diagram]) -> tuple[float, list[bytes]]:
-    """The step of κ, and of each diagram κ1, κ2 (int16) and shares of area (uint16, of 65535), one after another."""
+    """Return the step of κ, and of each diagram κ1, κ2 (int16) and shares of area (uint16, of 65535), one after
+    another."""
     step = max(float(np.abs(diagram.points).max()) for diagram in diagrams) / 32767
     return step, [
         np.rint(diagram.points.T / step).astype("<i2").tobytes()
@@ -151,14 +152,14 @@ def _diagrams(diagrams: Sequence[Diagram]) -> tuple[float, list[bytes]]:
 
 
 def _embeddings(mapped: AtlasMap) -> tuple[float, list[bytes]]:
-    """The step, and the sliced embeddings of fields and of masks `(N, 288)`, int16."""
-    found = [mapped.atlas.embeddings(view) for view in VIEWS]
-    step = max(float(np.abs(each).max()) for each in found) / 32767
-    return step, [np.rint(each / step).astype("<i2").tobytes() for each in found]
+    """Return the step, and the sliced embeddings of fields and of masks `(N, 288)`, int16."""
+    views = [mapped.atlas.embeddings(view) for view in VIEWS]
+    step = max(float(np.abs(each).max()) for each in views) / 32767
+    return step, [np.rint(each / step).astype("<i2").tobytes() for each in views]
 
 
 def _joined(pieces: Iterable[bytes]) -> tuple[str, list[int]]:
-    """Pieces in base64, joined, and where each begins and the last ends."""
+    """Return the pieces in base64, joined, and the offsets at which each begins and the last ends."""
     texts = [base64.b64encode(piece).decode("ascii") for piece in pieces]
     return "".join(texts), np.cumsum([0, *map(len, texts)]).tolist()
 

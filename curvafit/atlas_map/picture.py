@@ -55,7 +55,7 @@ def map_picture(mapped: AtlasMap, field: Callable[[int], np.ndarray], path: str 
 
 
 def map_figure(mapped: AtlasMap, field: Callable[[int], np.ndarray]) -> Figure:
-    """The figure itself."""
+    """Return the map as a figure."""
     figure = Figure(figsize=(_WIDTH, _HEIGHT), facecolor="white")
     FigureCanvasAgg(figure)
     margin = _CELL + 0.28
@@ -72,26 +72,27 @@ def map_figure(mapped: AtlasMap, field: Callable[[int], np.ndarray]) -> Figure:
     _name_families(axes, mapped)
     figure.draw_without_rendering()
     slots = _slots()
-    chosen = spread_out(mapped.positions, len(slots))
-    places = axes.transData.transform(mapped.positions[chosen]) / (figure.dpi * np.array([_WIDTH, _HEIGHT]))
-    for position, slot in zip(chosen, slots[_assigned(places, slots)], strict=True):
+    sample = spread_out(mapped.positions, len(slots))
+    places = axes.transData.transform(mapped.positions[sample]) / (figure.dpi * np.array([_WIDTH, _HEIGHT]))
+    for position, slot in zip(sample, slots[_assigned(places, slots)], strict=True):
         _thumbnail(figure, axes, field(position), slot, mapped.positions[position], colours[position])
     _legend(figure, mapped)
     return figure
 
 
 def spread_out(positions: np.ndarray, count: int) -> np.ndarray:
-    """Numbers of up to `count` points, each the farthest from those before it; the first is nearest to the middle."""
-    chosen = [int(np.linalg.norm(positions - np.median(positions, axis=0), axis=1).argmin())]
-    apart = np.linalg.norm(positions - positions[chosen[0]], axis=1)
-    while len(chosen) < min(count, len(positions)):
-        chosen.append(int(apart.argmax()))
-        apart = np.minimum(apart, np.linalg.norm(positions - positions[chosen[-1]], axis=1))
-    return np.array(chosen)
+    """Return the indices of up to `count` points, each the farthest from those before it; the first is nearest to the
+    middle."""
+    sample = [int(np.linalg.norm(positions - np.median(positions, axis=0), axis=1).argmin())]
+    apart = np.linalg.norm(positions - positions[sample[0]], axis=1)
+    while len(sample) < min(count, len(positions)):
+        sample.append(int(apart.argmax()))
+        apart = np.minimum(apart, np.linalg.norm(positions - positions[sample[-1]], axis=1))
+    return np.array(sample)
 
 
 def _slots() -> np.ndarray:
-    """Middles of the thumbnails' cells around the page, `(20, 2)` in figure coordinates."""
+    """Return the middles of the thumbnails' cells around the page, `(20, 2)` in figure coordinates."""
     low, high = (_CELL / 2 + 0.75) / _HEIGHT, 1 - (_CELL / 2 + 0.1) / _HEIGHT
     left, right = (_CELL / 2 + 0.1) / _WIDTH, 1 - (_CELL / 2 + 0.1) / _WIDTH
     across = [(x, y) for y in (low, high) for x in np.linspace(left, right, _ACROSS)]
@@ -100,7 +101,7 @@ def _slots() -> np.ndarray:
 
 
 def _assigned(places: np.ndarray, slots: np.ndarray) -> np.ndarray:
-    """A slot for each place, so that the lines are shortest in all: then no two of them cross."""
+    """Return a slot for each place, so that the lines are shortest in all: then no two of them cross."""
     inches = np.array([_WIDTH, _HEIGHT])
     return linear_sum_assignment(cdist(places * inches, slots * inches))[1]
 
@@ -108,7 +109,7 @@ def _assigned(places: np.ndarray, slots: np.ndarray) -> np.ndarray:
 def _thumbnail(
     figure: Figure, axes: Axes, u: np.ndarray, slot: np.ndarray, place: np.ndarray, colour: str | tuple
 ) -> None:
-    """A shape in its cell, a dot in its colour beneath, a line to its point."""
+    """Draw a shape in its cell, a ring in its colour around its point, and a line between them."""
     width, height = _CELL / _WIDTH, _CELL / _HEIGHT
     cell = figure.add_axes((slot[0] - width / 2, slot[1] - height / 2, width, height), zorder=3)
     cell.imshow(render(u, width=round(_CELL * DPI))[0], interpolation="antialiased")
@@ -123,15 +124,15 @@ def _thumbnail(
 
 
 def _name_families(axes: Axes, mapped: AtlasMap) -> None:
-    """The name of each larger family, where its shapes lie densest."""
+    """Write the name of each larger family where its shapes lie densest."""
     for name in FAMILY_COLOURS:
-        own = mapped.positions[np.array(mapped.families) == name]
-        if len(own) < _NAMED * len(mapped):
+        places = mapped.positions[np.array(mapped.families) == name]
+        if len(places) < _NAMED * len(mapped):
             continue
-        apart = cdist(own, own)
-        near = np.argsort(apart, axis=1)[:, : math.ceil(len(own) / 4)]
+        apart = cdist(places, places)
+        near = np.argsort(apart, axis=1)[:, : math.ceil(len(places) / 4)]
         densest = np.take_along_axis(apart, near, axis=1).mean(1).argmin()
-        x, y = own[near[densest]].mean(0)
+        x, y = places[near[densest]].mean(0)
         text = axes.text(x, y, name, ha="center", va="center", fontsize=15, color=INK, zorder=5, style="italic")
         text.set_path_effects([withStroke(linewidth=4, foreground="white", alpha=0.85)])
 
@@ -147,10 +148,10 @@ def _legend(figure: Figure, mapped: AtlasMap) -> None:
         handles=marks, loc="lower left", ncols=len(marks), frameon=False, fontsize=11, handletextpad=0.2,
         bbox_to_anchor=(0.005, 0.026),
     )  # fmt: skip
-    chosen = mapped.settings
-    said = (
-        f"{len(mapped)} shapes · Wasserstein distances of curvature diagrams · UMAP of {chosen['umap']['n_neighbors']} "
-        f"neighbours, seed {chosen['umap']['random_state']} · colour: where a shape's own area lies · curvafit "
-        f"{chosen['versions']['curvafit']}"
+    settings = mapped.settings
+    caption = (
+        f"{len(mapped)} shapes · Wasserstein distances of curvature diagrams · UMAP of "
+        f"{settings['umap']['n_neighbors']} neighbours, seed {settings['umap']['random_state']} · "
+        f"colour: where the area of a shape lies · curvafit {settings['versions']['curvafit']}"
     )
-    figure.text(0.014, 0.012, said, va="bottom", fontsize=9, color=QUIET)
+    figure.text(0.014, 0.012, caption, va="bottom", fontsize=9, color=QUIET)

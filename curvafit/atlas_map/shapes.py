@@ -31,20 +31,20 @@ class Shown(NamedTuple):
 
 
 def shown(u: np.ndarray) -> Shown:
-    """The thumbnail and the small volume of a periodic field `(Z, Y, X)`."""
+    """Return the thumbnail and the small volume of a periodic field `(Z, Y, X)`."""
     buffer = io.BytesIO()
     Image.fromarray(render(u, width=THUMBNAIL)[0]).save(buffer, "webp", quality=80, alpha_quality=80)
     return Shown(buffer.getvalue(), zlib.compress(small_volume(u).tobytes(), 9))
 
 
 def small_shape(shape: tuple[int, ...]) -> tuple[int, ...]:
-    """The shape of a small volume: at most `EDGE` voxels an edge, and in proportion."""
+    """Return the shape of a small volume: at most `EDGE` voxels an edge, and in proportion."""
     factor = min(1.0, EDGE / max(shape))
     return tuple(max(2, round(n * factor)) for n in shape)
 
 
 def small_volume(u: np.ndarray) -> np.ndarray:
-    """A periodic field `(Z, Y, X)` in fewer voxels (its lower frequencies), uint8 from 0 to `LEVELS`."""
+    """Return a periodic field `(Z, Y, X)` in fewer voxels (its lower frequencies), uint8 from 0 to `LEVELS`."""
     values = np.clip(u, -1, 1).astype(np.float64)
     for axis, count in enumerate(small_shape(u.shape)):
         if count < values.shape[axis]:
@@ -54,8 +54,8 @@ def small_volume(u: np.ndarray) -> np.ndarray:
 
 
 def regrow_command(record: Record, settings: Settings, name: str) -> str:
-    """The `curvafit generate` line that makes a draw's field again: with the same versions, processor and number of
-    threads (stores are made on one) bit for bit.
+    """Return the `curvafit generate` line that makes a draw's field again: with the same versions, processor and number
+    of threads (stores are made on one) bit for bit.
 
     Raises
     ------
@@ -77,6 +77,6 @@ def regrow_command(record: Record, settings: Settings, name: str) -> str:
 
 
 def _plain(value: object) -> str:
-    """All digits of a number, and no more."""
+    """Return all digits of a number without trailing zeros."""
     number = float(value)  # type: ignore[arg-type]
     return str(int(number)) if number.is_integer() else repr(number)

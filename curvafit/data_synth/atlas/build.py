@@ -94,7 +94,7 @@ def check_count(count: int, least: int) -> None:
 def settings_of(
     shape: int | Sequence[int], seed: int = 0, schedule: str | Schedule = "fast", design: Design | None = None
 ) -> Settings:
-    """The settings of the store that `build` makes of these."""
+    """Return the settings of the store that `build` makes of these."""
     grid = Grid(shape)  # type: ignore[arg-type]
     check_memory(grid.shape, FILE, "a shape")
     if design is not None:
@@ -108,14 +108,14 @@ def _filled(store: Store, count: int, workers: Workers, progress: Progress) -> S
     """Ask for draws in order, never for more than may still be wanted: nothing is made beyond the last viable one."""
     store.want(count)
     viable = {index: store.viable(index) for index in store.indices()}
-    asked = 0
+    pending = 0
     todo = (index for index in itertools.count() if index not in viable)
-    while (found := sum(viable.values())) < count:
-        while chunk := _chunk(todo, min(workers.chunk, count - found - asked), asked, workers):
+    while (total := sum(viable.values())) < count:
+        while chunk := _chunk(todo, min(workers.chunk, count - total - pending), pending, workers):
             workers.submit(make, store.path, chunk)
-            asked += len(chunk)
+            pending += len(chunk)
         for record in workers.done():
-            asked -= 1
+            pending -= 1
             viable[record.index] = record.viability.viable
             progress(f"{sum(viable.values())} viable of {len(viable)} draws", sum(viable.values()) / count)
         if len(viable) > BARREN * (1 + sum(viable.values())):
@@ -126,6 +126,6 @@ def _filled(store: Store, count: int, workers: Workers, progress: Progress) -> S
     return store
 
 
-def _chunk(todo: Iterator[int], most: int, asked: int, workers: Workers) -> list[int]:
-    """The next indices to ask for; none where the workers have enough."""
-    return list(itertools.islice(todo, most)) if most > 0 and asked < workers.places * workers.chunk else []
+def _chunk(todo: Iterator[int], most: int, pending: int, workers: Workers) -> list[int]:
+    """Return the next indices to ask for; none where the workers have enough."""
+    return list(itertools.islice(todo, most)) if most > 0 and pending < workers.places * workers.chunk else []

@@ -27,7 +27,7 @@ class Verdict:
 
 
 def census(store: Store) -> dict[str, str]:
-    """What there is to say of a store, by name."""
+    """Return the facts about a store, by name."""
     records = [store.record(index) for index in store.indices()]
     Design.from_dict(store.settings.design)
     settings, viable = store.settings, sum(record.viability.viable for record in records)
@@ -90,17 +90,19 @@ def verify(
             f"{viable} of {store.wanted} shapes are made" + f"; {lost}" * bool(missing)
         )
     problems += _strangers(store, indices)
-    chosen = np.random.default_rng(seed).permutation(sound)[:regenerate].tolist()
-    for k, index in enumerate(chosen):
+    sample = np.random.default_rng(seed).permutation(sound)[:regenerate].tolist()
+    for k, index in enumerate(sample):
         progress(f"making draw {index} again", (len(indices) + k) / (len(indices) + regenerate))
         _compare(store, index, problems, notes)
-    made = f"{len(chosen)} made again"
-    said = "nothing is wrong" if not problems else f"{len(problems)} things are wrong"
-    return Verdict(tuple(problems), tuple(notes), f"{len(indices)} draws, {viable} shapes checked, {made}: {said}")
+    repeats = f"{len(sample)} made again"
+    finding = "nothing is wrong" if not problems else f"{len(problems)} things are wrong"
+    return Verdict(
+        tuple(problems), tuple(notes), f"{len(indices)} draws, {viable} shapes checked, {repeats}: {finding}"
+    )
 
 
 def _wrong(store: Store, record: Record, design: Design) -> list[str]:
-    """What is wrong with one intact draw, but for its flow."""
+    """Return the faults of one intact draw, its flow aside."""
     if (record.coefficients, record.mass, record.seed) != design.draw(store.settings.seed, record.index):
         return [f"draw {record.index} has other parameters than the design's"]
     if record.viability.viable:
@@ -111,8 +113,8 @@ def _wrong(store: Store, record: Record, design: Design) -> list[str]:
 
 
 def _strangers(store: Store, indices: list[int]) -> list[str]:
-    """Entries of the folder that are neither draws, those that a build adds meanwhile among them, nor what a killed
-    worker leaves."""
+    """Return the entries of the folder that are neither draws, those that a build adds meanwhile among them, nor what a
+    killed worker leaves."""
     expected = {f"{index:06d}" for index in indices} | {"zarr.json"}
     entries = (each.name for each in (store.path / "draws").iterdir())
     others = sorted(name for name in entries if name not in expected and not name.startswith("."))
@@ -136,7 +138,7 @@ def _compare(store: Store, index: int, problems: list[str], notes: list[str]) ->
 
 
 def _size(folder: Path) -> int:
-    """Bytes of a folder's files; those that a build takes away meanwhile do not count."""
+    """Return the bytes of a folder's files; those that a build takes away meanwhile do not count."""
     total = 0
     for place, _, names in os.walk(folder):
         for name in names:

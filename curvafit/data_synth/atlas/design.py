@@ -101,13 +101,13 @@ class Design:
         return Draw(Coefficients(*map(float, values[:-1])), float(values[-1]), start)
 
     def as_dict(self) -> dict[str, Any]:
-        """What a store records: `Design(**…)` of it, in JSON's types."""
+        """Return the design in JSON's types, for a store's record."""
         rows = {"points": self.points} if self.law == "list" else {"box": self.box}
         return {"law": self.law} | {name: [list(row) for row in value] for name, value in rows.items()}
 
     @staticmethod
-    def from_dict(kept: Mapping[str, Any]) -> Design:
-        """The inverse of `as_dict`.
+    def from_dict(content: Mapping[str, Any]) -> Design:
+        """Return what `as_dict` wrote.
 
         Raises
         ------
@@ -115,18 +115,18 @@ class Design:
             If it is none.
         """
         try:
-            box, points = (tuple(map(tuple, kept.get(name, ()))) for name in ("box", "points"))
+            box, points = (tuple(map(tuple, content.get(name, ()))) for name in ("box", "points"))
             sound = all(len(row) == 2 for row in box) and all(
                 map(_is_number, [each for row in box + points for each in row])
             )
         except (TypeError, AttributeError):
             box, points, sound = (), (), False
-        if not sound or "law" not in kept:
-            raise ValueError(f"expected a design's law and box or points, got {quoted(kept)}")
-        return Design(kept["law"], box, points)
+        if not sound or "law" not in content:
+            raise ValueError(f"expected a design's law and box or points, got {quoted(content)}")
+        return Design(content["law"], box, points)
 
     def _shares(self, seed: int, index: int) -> list[float]:
-        """How far into each interval the draw lies, 0 to 1. A fixed parameter takes no random number."""
+        """Return how far into each interval the draw lies, 0 to 1. A fixed parameter takes no random number."""
         free = [low < high for low, high in self.box]
         if self.law == "random":
             values = np.random.default_rng(_stream(seed, index, "parameters")).random(sum(free))
@@ -138,7 +138,7 @@ class Design:
 
 
 def boxed(law: Law = "random", /, **intervals: float | Sequence[float]) -> Design:
-    """A box: Experiment 4's, but for the intervals or fixed values that are given by name.
+    """Return a box: Experiment 4's, but for the intervals or fixed values that are given by name.
 
     Raises
     ------
@@ -154,7 +154,8 @@ def boxed(law: Law = "random", /, **intervals: float | Sequence[float]) -> Desig
 
 
 def around(point: Sequence[float], spread: float, law: Law = "random") -> Design:
-    """A box around seven numbers, brought to a20 = 1: `spread` times as wide as Experiment 4's; a02 and m₀ in range.
+    """Return a box around seven numbers, brought to a20 = 1: `spread` times as wide as Experiment 4's; a02 and m₀ in
+    range.
 
     Raises
     ------

@@ -36,7 +36,8 @@ def read_design(path: str | PathLike[str]) -> Design:
 
 
 def point_of(source: Any, folder: Path = Path()) -> tuple[float, ...]:
-    """Seven numbers: of a preset's name, of a `fit.json` (beside `folder` where its path is relative), or by name.
+    """Return the seven numbers of a law: of a preset's name, of a `fit.json` (beside `folder` where its path is
+    relative), or by name.
 
     Raises
     ------
@@ -70,7 +71,7 @@ def _design(content: Any, folder: Path) -> Design:
 
 
 def _kind(content: Any) -> str:
-    """Which of the three a file is; every key must be known."""
+    """Return which of the three a file is; every key must be known."""
     if not isinstance(content, Mapping):
         raise ValueError(f"expected the keys of a design ({', '.join(KEYS)}), got {quoted(content)}")
     kinds = [key for key in KEYS if key in content]
@@ -86,7 +87,7 @@ def _kind(content: Any) -> str:
 
 
 def _number(value: Any) -> Any:
-    """The value, but for numbers that YAML takes for text, such as 1e3."""
+    """Return the value, but for numbers that YAML takes for text, such as 1e3."""
     if isinstance(value, list):
         return [_number(each) for each in value]
     try:

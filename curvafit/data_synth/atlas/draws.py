@@ -52,7 +52,7 @@ def _made(store: Store, indices: Sequence[int]) -> list[Record]:
 
 
 def flows(settings: Settings, indices: Sequence[int]) -> Iterator[tuple[Draw, Flow]]:
-    """Parameters and flow of each of a store's draws, in order."""
+    """Yield parameters and flow of each of a store's draws, in order."""
     if not indices:
         return
     design = Design.from_dict(settings.design)
@@ -73,12 +73,12 @@ def flows(settings: Settings, indices: Sequence[int]) -> Iterator[tuple[Draw, Fl
 
 
 def device() -> str:
-    """Where this process makes its draws."""
+    """Return the device on which this process makes draws."""
     return "cuda" if torch.cuda.is_available() else "cpu"
 
 
 def versions() -> dict[str, str]:
-    """What a generated field's bits depend on: Python, libraries, processor."""
+    """Return the versions that a generated field's bits depend on: Python, libraries, processor."""
     names = ("curvafit", "torch", "numpy", "numba")
     chip = torch.cuda.get_device_name() if device() == "cuda" else binding.get_host_cpu_name()
     return {"python": platform.python_version(), "processor": chip} | {name: _version(name) for name in names}
@@ -101,7 +101,7 @@ def _record(index: int, draw: Draw, flow: Flow, seconds: float) -> Record:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Within it torch and numba have one thread: sums, and so voxels, do not depend on how many there are."""
+    """Give torch and numba one thread: sums, and so voxels, do not depend on the number of threads."""
     before = torch.get_num_threads(), threads.allowed()
     torch.set_num_threads(1)
     numba.set_num_threads(1)

@@ -48,7 +48,7 @@ class Record:
 
 
 def attributes_of(record: Record) -> dict[str, Any]:
-    """A record in JSON's types; numbers that are not finite become null."""
+    """Return a record in JSON's types; numbers that are not finite become null."""
     attributes = dataclasses.asdict(record) | {"coefficients": record.coefficients.as_dict()}
     attributes["viability"] = {name: _plain(value) for name, value in attributes["viability"].items()}
     return {name: _plain(value) for name, value in attributes.items()}
@@ -88,7 +88,7 @@ _SCHEMA: dict[str, Any] = {
 
 
 def record_of(attributes: dict[str, Any]) -> Record:
-    """The inverse of `attributes_of`; further attributes are left out.
+    """Return the record that `attributes_of` wrote; further attributes are left out.
 
     Raises
     ------
@@ -108,11 +108,11 @@ def record_of(attributes: dict[str, Any]) -> Record:
 
 
 def digest(attributes: dict[str, Any], field: np.ndarray | None) -> str:
-    """SHA-256 of a record as canonical JSON, and of the field's bytes."""
-    kept = {name: value for name, value in attributes.items() if name != "sha256"}
-    found = hashlib.sha256(json.dumps(kept, sort_keys=True).encode())
-    found.update(b"" if field is None else np.ascontiguousarray(field).tobytes())
-    return found.hexdigest()
+    """Return the SHA-256 of a record as canonical JSON, and of the field's bytes."""
+    content = {name: value for name, value in attributes.items() if name != "sha256"}
+    checksum = hashlib.sha256(json.dumps(content, sort_keys=True).encode())
+    checksum.update(b"" if field is None else np.ascontiguousarray(field).tobytes())
+    return checksum.hexdigest()
 
 
 def _plain(value: Any) -> Any:

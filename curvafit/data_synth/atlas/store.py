@@ -52,7 +52,7 @@ class Store:
 
     @property
     def wanted(self) -> int:
-        """How many viable shapes the store is to have."""
+        """Return how many viable shapes the store is to have."""
         attributes = _group_attributes(self.path)
         return 0 if attributes is None else int(attributes["wanted"])
 
@@ -67,11 +67,11 @@ class Store:
         return sorted(int(name) for name in names if name.isdigit() and self.has(int(name)))
 
     def has(self, index: int) -> bool:
-        """Whether a draw is there, complete."""
+        """Return whether a draw is there, complete."""
         return self._attributes(index) is not None
 
     def record(self, index: int) -> Record:
-        """The record of a draw.
+        """Return the record of a draw.
 
         Raises
         ------
@@ -85,7 +85,7 @@ class Store:
             raise self._damaged("record", index, error) from error
 
     def viable(self, index: int) -> bool:
-        """Whether a draw is recorded as a shape.
+        """Return whether a draw is recorded as a shape.
 
         Raises
         ------
@@ -95,7 +95,7 @@ class Store:
         return self._complete(index)["viability"]["viable"]
 
     def field(self, index: int) -> np.ndarray:
-        """The phase field of a viable draw, float32 (Z, Y, X).
+        """Return the phase field of a viable draw, float32 (Z, Y, X).
 
         Raises
         ------
@@ -114,7 +114,7 @@ class Store:
             raise self._damaged("field", index, error) from error
 
     def intact(self, index: int) -> bool:
-        """Whether a draw's record and field are, bit for bit, what was written.
+        """Return whether a draw's record and field are, bit for bit, what was written.
 
         Raises
         ------
@@ -154,8 +154,8 @@ class Store:
             return _publish(partial / place.name, place)
 
     def _damaged(self, what: str, index: int, error: Exception) -> ValueError:
-        said = f"got a damaged one ({quoted(str(error))}): `curvafit atlas verify` lists such draws"
-        return ValueError(f"expected a whole {what} of draw {index} in {self.path}, {said}")
+        state = f"got a damaged one ({quoted(str(error))}): `curvafit atlas verify` lists such draws"
+        return ValueError(f"expected a whole {what} of draw {index} in {self.path}, {state}")
 
     def _complete(self, index: int) -> dict:
         attributes = self._attributes(index)
@@ -167,7 +167,8 @@ class Store:
         return self.path / "draws" / f"{index:06d}"
 
     def _attributes(self, index: int) -> dict | None:
-        """A draw's attributes, None where anything of it is missing; a field's bytes are checked when it is read."""
+        """Return a draw's attributes, None where anything of it is missing; a field's bytes are checked when it is
+        read."""
         place = self._place(index)
         attributes = _group_attributes(place)
         if attributes is None or attributes.get("index") != index or "sha256" not in attributes:
@@ -204,25 +205,31 @@ def open_store(path: str | Path, settings: Settings | None = None) -> Store:
         raise ValueError(f"expected a store of shapes at {path}, got something else")
     if (version := attributes.get("version")) != VERSION:
         raise ValueError(f"expected a store of version {VERSION} at {path}, got version {quoted(version)}")
-    found = _settings(path, attributes)
-    if settings is not None and settings != found:
-        raise ValueError(f"expected the settings of {path}, got another {_difference(found, settings)}")
-    return Store(path, found)
+    stored = _settings(path, attributes)
+    if settings is not None and settings != stored:
+        raise ValueError(f"expected the settings of {path}, got another {_difference(stored, settings)}")
+    return Store(path, stored)
 
 
 def _settings(path: Path, attributes: dict[str, Any]) -> Settings:
-    """The settings in a store's header; its other entry is how many shapes are wanted."""
+    """Return the settings in a store's header; its other entry is how many shapes are wanted."""
     try:
-        stored: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in attributes["settings"].items()}
-        found = Settings(**stored)
-        Grid(found.shape, found.spacing)
-        sound = len(found.shape) == len(found.spacing) == 3 and {"name", "steps"} <= set(found.schedule)
-        if not (sound and found.epsilon > 0 and found.blur >= 0 and found.seed >= 0 and int(attributes["wanted"]) >= 0):
+        values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in attributes["settings"].items()}
+        settings = Settings(**values)
+        Grid(settings.shape, settings.spacing)
+        sound = len(settings.shape) == len(settings.spacing) == 3 and {"name", "steps"} <= set(settings.schedule)
+        if not (
+            sound
+            and settings.epsilon > 0
+            and settings.blur >= 0
+            and settings.seed >= 0
+            and int(attributes["wanted"]) >= 0
+        ):
             raise ValueError("a setting is missing or negative")
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        said = f"got one with a damaged header ({quoted(str(error))})"
-        raise ValueError(f"expected a whole store of shapes at {path}, {said}") from error
-    return found
+        state = f"got one with a damaged header ({quoted(str(error))})"
+        raise ValueError(f"expected a whole store of shapes at {path}, {state}") from error
+    return settings
 
 
 def _create(path: Path, settings: Settings) -> None:
@@ -279,19 +286,19 @@ def _publish(partial: Path, place: Path) -> bool:
 
 
 def _group_attributes(folder: Path) -> dict | None:
-    """The attributes of the Zarr group in a folder, None where there is no readable one."""
+    """Return the attributes of the Zarr group in a folder, None where there is no readable one."""
     try:
         text = parse_json((folder / "zarr.json").read_bytes(), "a Zarr group", folder)
     except (OSError, ValueError):
         return None
     known = isinstance(text, dict) and text.get("node_type") == "group"
-    return found if known and isinstance(found := text.get("attributes"), dict) else None
+    return attributes if known and isinstance(attributes := text.get("attributes"), dict) else None
 
 
-def _difference(found: Settings, asked: Settings) -> str:
-    """The first setting that differs, with both values."""
-    for name, value in dataclasses.asdict(found).items():
-        other = getattr(asked, name)
+def _difference(stored: Settings, wanted: Settings) -> str:
+    """Return the first setting that differs, with both values."""
+    for name, value in dataclasses.asdict(stored).items():
+        other = getattr(wanted, name)
         if other != value:
             return f"{name}: {other} for {value}"
     return "one"

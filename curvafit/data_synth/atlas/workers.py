@@ -39,7 +39,7 @@ class Workers(Protocol):
 
     @property
     def places(self) -> int:
-        """How many chunks may be asked for at once."""
+        """Return how many chunks may be asked for at once."""
         ...
 
     def submit(self, make: Make, path: Path, indices: Sequence[int]) -> None:
@@ -86,7 +86,8 @@ class Cluster:
 
     @property
     def places(self) -> int:
-        """Two chunks a thread, as many threads as there are now; one where all workers are gone, for those to come."""
+        """Return two chunks a thread, of as many threads as there are now; one where all workers are gone, for those to
+        come."""
         return max(1, 2 * sum(self._client.nthreads().values()))  # type: ignore
 
     def submit(self, make: Make, path: Path, indices: Sequence[int]) -> None:
@@ -112,7 +113,7 @@ def check_workers(count: int | None, scheduler: str | None) -> None:
 
 @contextmanager
 def cluster(count: int | None = None, scheduler: str | None = None, dashboard: int | None = None) -> Iterator[Workers]:
-    """Workers: of the scheduler at an address, or so many on this machine (as many as cores); 0 is this process.
+    """Start workers: of the scheduler at an address, or so many on this machine (as many as cores); 0 is this process.
 
     Those on this machine talk over the loopback alone; `dashboard` is the port of dask's own page there, none if not
     given.

@@ -19,7 +19,7 @@ class _Loader(yaml.SafeLoader):
 
 
 def parse_yaml(content: bytes, expected: str, place: object) -> Any:
-    """The value of a YAML text in UTF-8.
+    """Return the value of a YAML text in UTF-8.
 
     Parameters
     ----------
@@ -40,20 +40,20 @@ def parse_yaml(content: bytes, expected: str, place: object) -> Any:
         _size(node, {})
         return loader.construct_document(node)
     except UnicodeDecodeError:
-        said = "no text in UTF-8"
+        reason = "no text in UTF-8"
     except RecursionError:
-        said = "what is nested too deeply"
+        reason = "what is nested too deeply"
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         problem = str(getattr(error, "problem", None) or error)
-        said = f"{problem[:160]} in line {mark.line + 1}" if mark else problem[:160]
+        reason = f"{problem[:160]} in line {mark.line + 1}" if mark else problem[:160]
     except (ValueError, TypeError, LookupError, AttributeError, OverflowError) as error:  # a tag that its value is not
-        said = str(error)[:160]
-    raise ValueError(f"expected {expected}, got {place}: {' '.join(said.split())}")
+        reason = str(error)[:160]
+    raise ValueError(f"expected {expected}, got {place}: {' '.join(reason.split())}")
 
 
 def _size(node: yaml.Node, known: dict[int, float]) -> float:
-    """How many values a node holds when its aliases are written out; one within itself has no end."""
+    """Return how many values a node holds when its aliases are written out; one within itself has no end."""
     if id(node) in known:
         if known[id(node)] > _MOST:
             raise ValueError(f"more than {_MOST:,} values, with what its aliases repeat")

@@ -25,7 +25,8 @@ def bias(
     like: Float[Tensor, "b 1 z y x"], spacing: float | Sequence[float], strength: float, length: float,
     seeds: Sequence[int],
 ) -> Float[Tensor, "b 1 z y x"]:  # fmt: skip
-    """Uneven illumination: a smooth factor that goes from 1 - strength to 1 + strength, correlated by `length`.
+    """Return the factor of uneven illumination: a smooth factor that goes from 1 - strength to 1 + strength, correlated
+    by `length`.
 
     Raises
     ------
@@ -44,8 +45,9 @@ def stripes(
     like: Float[Tensor, "b 1 z y x"], spacing: float | Sequence[float], strength: float, width: float,
     seeds: Sequence[int], axis: int = 2,
 ) -> Float[Tensor, "b 1 z y x"]:  # fmt: skip
-    """Stripes along an axis (0, 1, 2 for z, y, x), as shadows in a light sheet or a milling curtain make: a factor of
-    mean 1 and standard deviation `strength`, not below 0, constant along the axis, correlated by `width` across it.
+    """Return the stripes along an axis (0, 1, 2 for z, y, x), as shadows in a light sheet or a milling curtain make: a
+    factor of mean 1 and standard deviation `strength`, not below 0, constant along the axis, correlated by `width`
+    across it.
 
     Raises
     ------
@@ -65,7 +67,8 @@ def rings(
     like: Float[Tensor, "b 1 z y x"], spacing: float | Sequence[float], strength: float, width: float,
     seeds: Sequence[int], centre: tuple[float, float] | None = None,
 ) -> Float[Tensor, "b 1 z y x"]:  # fmt: skip
-    """Rings about an axis along z, as defects of a CT detector leave: a term of mean 0 and deviation `strength`.
+    """Return the rings about an axis along z, as defects of a CT detector leave: a term of mean 0 and deviation
+    `strength`.
 
     A slice's rings are its own, since a detector's row makes a slice. Few are strong: the profile over the radius is
     g|g|/√3 of a normal g, correlated by `width`.
@@ -83,15 +86,15 @@ def rings(
     if not 0 <= strength < math.inf or not width > 0:
         raise ValueError(f"expected rings from 0 and a width above 0, got {strength} and {width}")
     steps = edges(spacing)
-    made = [_rings(like[k : k + 1], steps, width, seed, centre) for k, seed in enumerate(seeds_of(seeds, len(like)))]
-    return torch.cat(made) * strength
+    terms = [_rings(like[k : k + 1], steps, width, seed, centre) for k, seed in enumerate(seeds_of(seeds, len(like)))]
+    return torch.cat(terms) * strength
 
 
 def dropout(
     occupied: Float[Tensor, "b 1 z y x"], spacing: float | Sequence[float], share: float, length: float, loss: float,
     seeds: Sequence[int],
 ) -> Float[Tensor, "b 1 z y x"]:  # fmt: skip
-    """Stain lost along the structure: a smooth factor, 1 where it holds and down to 1 - loss in stretches.
+    """Return the factor of lost stain: smooth, 1 where the stain holds and down to 1 - loss in stretches.
 
     A random field of correlation `length` decides: where that is over a tube's radius, stretches of tube fade.
 
@@ -118,7 +121,7 @@ def clutter(
     occupied: Float[Tensor, "b 1 z y x"], spacing: float | Sequence[float], density: float, radius: float,
     seeds: Sequence[int],
 ) -> Float[Tensor, "b 1 z y x"]:  # fmt: skip
-    """Specks outside the structure: Gaussian blobs up to 1 high, 0 wherever a voxel is full.
+    """Return specks outside the structure: Gaussian blobs up to 1 high, 0 wherever a voxel is full.
 
     Their number is Poisson's, at `density` a unit of volume; half-widths (deviations) along each axis are uniform in
     (½, 1½) radius, heights in (½, 1).
@@ -159,7 +162,7 @@ def _rings(like: Tensor, steps: Sequence[float], width: float, seed: int, centre
 
 
 def _upper(values: Tensor, share: float) -> Tensor:
-    """The value that `share` of them exceed: with a share of 0 none does, with 1 all do."""
+    """Return the value that `share` of them exceed: with a share of 0 none does, with 1 all do."""
     count = values.numel()
     passed = round(share * count)
     if passed == 0 or passed == count:
@@ -185,6 +188,6 @@ def _specks(occupied: Tensor, steps: Sequence[float], density: float, radius: fl
 
 
 def _bells(count: int, step: float, place: Tensor, width: Tensor) -> Tensor:
-    """(specks, voxels)."""
+    """Return the profile of each speck along an axis, (specks, voxels)."""
     at = (torch.arange(count, device=place.device, dtype=place.dtype) + 0.5) * step
     return bell((at - place[:, None]) / width[:, None])

@@ -51,7 +51,7 @@ class Structure(NamedTuple):
 
 
 def like(scan: Field, mask: np.ndarray | None = None) -> Modality:
-    """A modality whose images look like a scan: its spacing, levels, textures, blur, noise and uneven light.
+    """Return a modality whose images look like a scan: its spacing, levels, textures, blur, noise and uneven light.
 
     Assumed: two classes; a Gaussian blur, one width in the plane and one along z; noise whose variance is a line over
     the mean (`noise_of`). Not seen: growth with depth, stripes, rings, lost stain and clutter, which stay 0. The blur
@@ -93,7 +93,8 @@ def like(scan: Field, mask: np.ndarray | None = None) -> Modality:
 
 
 def _imaging(scan: Field, structure: Structure, noise: NoiseEstimate) -> Imaging:
-    """Levels in photons where the variance grows with the mean; textures as they were before the blur."""
+    """Return the parameters of an image: levels in photons where the variance grows with the mean; textures as they
+    were before the blur."""
     unit = noise.gain or 1.0
     low = max(noise.level - noise.offset, 0.0) / unit
     high = max(noise.level + structure.contrast - noise.offset, 0.0) / unit
@@ -141,7 +142,7 @@ def _middle(scan: Field, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarra
 
 
 def bright(values: np.ndarray, steps: np.ndarray | Sequence[float]) -> np.ndarray:
-    """A guess at the structure's voxels in grey values (Z, Y, X) on voxels of edges `steps`.
+    """Return a guess at the structure's voxels in grey values (Z, Y, X) on voxels of edges `steps`.
 
     Those above half of the brightness of Otsu's voxels around them, each weighed by its own: an edge is then where it
     is whatever a structure's brightness. The threshold is sought on square roots, so that dim structures count.
@@ -159,7 +160,8 @@ def bright(values: np.ndarray, steps: np.ndarray | Sequence[float]) -> np.ndarra
 
 
 def _structure(values: np.ndarray, inside: np.ndarray, steps: np.ndarray, level: float) -> Structure:
-    """The blur (z, and y = x) whose image of the mask is nearest to the scan around it; the brightness inside."""
+    """Return the blur (z, and y = x) whose image of the mask is nearest to the scan around it; the brightness
+    inside."""
     finest = steps.min() / steps
     window = tuple(WINDOW * finest)
     signal, mask = (torch.from_numpy(each)[None, None].float() for each in (values - level, inside))
@@ -184,23 +186,23 @@ def _structure(values: np.ndarray, inside: np.ndarray, steps: np.ndarray, level:
 
 
 def _texture(relative: np.ndarray, inside: np.ndarray, steps: np.ndarray) -> tuple[float, float]:
-    """Deviation and length, in voxels of the finest edge, of a brightness that was averaged over a window of `WINDOW`:
-    by the covariance of its logarithm in the plane. The average lengthens the one, and along a tube it lessens the
-    other. What has lost its light is not looked at: a logarithm would see little else."""
-    used = inside & (relative > DIMMEST)
-    logs = np.log(np.where(used, relative, 1.0))
-    weight = used.astype(np.float32)
-    rest = (logs - logs[used].mean()) * weight
+    """Return the deviation and the length, in voxels of the finest edge, of a brightness that was averaged over a
+    window of `WINDOW`: by the covariance of its logarithm in the plane. The average lengthens the one, and along a tube
+    it lessens the other. What has lost its light is not looked at: a logarithm would see little else."""
+    bright_part = inside & (relative > DIMMEST)
+    logs = np.log(np.where(bright_part, relative, 1.0))
+    weight = bright_part.astype(np.float32)
+    rest = (logs - logs[bright_part].mean()) * weight
     first, second = (covariance(rest, weight, axis) for axis in (1, 2))
-    seen = np.concatenate([first, second])
+    covariances = np.concatenate([first, second])
     lags = np.concatenate(
         [np.arange(len(each)) * h / steps.min() for each, h in ((first, steps[1]), (second, steps[2]))]
     )
-    share = seen / max(seen[0], 1e-12)
+    share = covariances / max(covariances[0], 1e-12)
     misfit = [np.square(share - np.exp(-0.5 * (lags / length) ** 2)).sum() for length in LENGTHS]
-    found = float(LENGTHS[int(np.argmin(misfit))])
-    length = math.sqrt(max(found**2 - 2 * WINDOW**2, WINDOW**2))
-    return math.sqrt(math.expm1(float(seen[0]) * max(found / length, 1.0))), length
+    width = float(LENGTHS[int(np.argmin(misfit))])
+    length = math.sqrt(max(width**2 - 2 * WINDOW**2, WINDOW**2))
+    return math.sqrt(math.expm1(float(covariances[0]) * max(width / length, 1.0))), length
 
 
 def _around(value: Any, low: float, high: float) -> tuple[Any, Any]:

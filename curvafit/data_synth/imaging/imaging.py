@@ -22,7 +22,8 @@ def image(
     seeds: Sequence[int],
     epsilon: float = EPSILON,
 ) -> Float[torch.Tensor, "b 1 Z Y X"]:
-    """Images of phase fields, in float32 or the fields' own type: classes, blur, sampling, light, noise, in that order.
+    """Return images of phase fields, in float32 or the fields' own type: classes, blur, sampling, light, noise, in that
+    order.
 
     A sample is made by itself, from its field, its `Imaging` and its seed alone.
 
@@ -50,7 +51,7 @@ def image(
 def regrid(
     shapes: Float[torch.Tensor, "b 1 z y x"], spacing: float, imaging: Sequence[Imaging]
 ) -> Float[torch.Tensor, "b 1 Z Y X"]:
-    """The phase fields at the centres of their images' voxels, interpolated linearly: what labels are made of.
+    """Return the phase fields at the centres of their images' voxels, interpolated linearly: what labels are made of.
 
     Raises
     ------
@@ -64,7 +65,8 @@ def regrid(
 def visible(
     shapes: Float[torch.Tensor, "b 1 z y x"], spacing: float, imaging: Sequence[Imaging], epsilon: float = EPSILON
 ) -> Bool[torch.Tensor, "b 1 Z Y X"]:
-    """The images' voxels that a share of the structure's light reaches (`Imaging.visible`), evenly stained as it is.
+    """Return the images' voxels that a share of the structure's light reaches (`Imaging.visible`), evenly stained as it
+    is.
 
     Raises
     ------
@@ -76,20 +78,21 @@ def visible(
 
 
 def visible_share(imaging: Imaging) -> float:
-    """The share of the structure's light at which an annotator is taken to see it: where its level is midway from the
-    background's to its own in the logarithm, as contrast is seen. 1/2 at faint contrast, less where it is strong."""
+    """Return the share of the structure's light at which an annotator is taken to see it: where its level is midway
+    from the background's to its own in the logarithm, as contrast is seen. 1/2 at faint contrast, less where it is
+    strong."""
     below, above = imaging.contrast.background, imaging.contrast.foreground
     return 1 / (1 + math.sqrt(above / max(below, 1e-3 * above, 1e-12)))
 
 
 def field_shape(shape: Sequence[int], spacing: float, imaging: Imaging) -> tuple[int, int, int]:
-    """The least voxels (z, y, x) of edge `spacing` that an image of a shape is made from."""
+    """Return the least voxels (z, y, x) of edge `spacing` that an image of a shape is made from."""
     z, y, x = (math.ceil(n * h / spacing - 1e-6) for n, h in zip(shape, imaging.spacing, strict=True))
     return z, y, x
 
 
 def image_shape(shape: Sequence[int], spacing: float, imaging: Imaging) -> tuple[int, int, int]:
-    """Voxels (z, y, x) of the image of a field of `shape`."""
+    """Return voxels (z, y, x) of the image of a field of `shape`."""
     z, y, x = (sampled(n, spacing, h) for n, h in zip(shape, imaging.spacing, strict=True))
     return z, y, x
 
@@ -102,7 +105,7 @@ def _image(shape: torch.Tensor, spacing: float, how: Imaging, seeds: list[int], 
 
 
 def _lit(light: torch.Tensor, how: Imaging, seeds: list[int]) -> torch.Tensor:
-    """Light under uneven illumination."""
+    """Return the light under uneven illumination."""
     lamp = how.illumination
     if lamp.bias:
         light = light * degrade.bias(light, how.spacing, lamp.bias, lamp.bias_length, seeds)
@@ -112,7 +115,7 @@ def _lit(light: torch.Tensor, how: Imaging, seeds: list[int]) -> torch.Tensor:
 
 
 def _detected(light: torch.Tensor, how: Imaging, seeds: list[int]) -> torch.Tensor:
-    """The counts that a detector makes of light."""
+    """Return the counts that a detector makes of light."""
     detector, noise, contrast = how.detector, how.noise, how.contrast
     counts = degrade.poisson_gaussian(light, detector.gain, noise.gaussian, detector.offset, seeds, noise.width)
     if noise.rician:
@@ -133,7 +136,7 @@ def _window(how: Imaging) -> Triple:
 
 
 def _emitted(occupied: torch.Tensor, spacing: float, how: Imaging, seeds: list[int]) -> torch.Tensor:
-    """The light that the specimen sends out."""
+    """Return the light that the specimen sends out."""
     contrast, specimen = how.contrast, how.specimen
     inside = occupied
     if specimen.dropout:

@@ -52,7 +52,7 @@ class Modality:
         object.__setattr__(self, "ranges", ranges)
 
     def draw(self, seed: int) -> Imaging:
-        """One image's parameters; each is drawn from (seed, its own name)."""
+        """Return one image's parameters; the seed and a parameter's name alone decide what is drawn for it."""
         (seed,) = seeds_of([seed], 1)
         drawn = {}
         for name, (low, high) in self.ranges.items():
@@ -62,7 +62,7 @@ class Modality:
         return self.base.assign(drawn)
 
     def as_dict(self) -> dict[str, Any]:
-        """All fields in JSON's types."""
+        """Return all of the modality in JSON's types."""
         ends = {name: [np.asarray(end).tolist() for end in pair] for name, pair in self.ranges.items()}
         head = {"name": self.name, "about": self.about, "voxel": self.voxel}
         return head | {"base": self.base.as_dict(), "ranges": ends}

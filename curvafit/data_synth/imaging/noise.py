@@ -22,7 +22,7 @@ def poisson_gaussian(
     photons: Float[Tensor, "b 1 z y x"], gain: float, read_noise: float, offset: float, seeds: Sequence[int],
     width: float | Sequence[float] = 0.0,
 ) -> Float[Tensor, "b 1 z y x"]:  # fmt: skip
-    """Counts: offset + gain · Poisson(photons) + N(0, read_noise²). Its variance is a line over the mean.
+    """Return counts: offset + gain · Poisson(photons) + N(0, read_noise²). Its variance is a line over the mean.
 
     Parameters
     ----------
@@ -48,7 +48,8 @@ def poisson_gaussian(
 def poisson(
     photons: Float[Tensor, "b 1 z y x"], seeds: Sequence[int], width: float | Sequence[float] = 0.0
 ) -> Float[Tensor, "b 1 z y x"]:
-    """Numbers of photons: the Poisson quantiles of normal numbers (`poisson_quantile`), smoothed by `width` voxels.
+    """Return numbers of photons: the Poisson quantiles of normal numbers (`poisson_quantile`), smoothed by `width`
+    voxels.
 
     Raises
     ------
@@ -61,8 +62,8 @@ def poisson(
 
 
 def poisson_quantile(mean: Tensor, z: Tensor) -> Tensor:
-    """The quantile of Poisson's law that a standard normal number is of its own, so that one random number a voxel
-    makes a count.
+    """Return the quantile of Poisson's law that a standard normal number is of its own, so that one random number a
+    voxel makes a count.
 
     From a mean of `FEW` on by Giles's expansion Q̃_N3 ("Algorithm 955", ACM Trans. Math. Softw. 42, 2016), a count off
     in at most 0.5 % of draws; below by summing the probabilities, exact to `MOST` counts.
@@ -81,7 +82,7 @@ def poisson_quantile(mean: Tensor, z: Tensor) -> Tensor:
 def gaussian_noise(
     image: Float[Tensor, "b 1 z y x"], deviation: float, seeds: Sequence[int], width: float | Sequence[float] = 0.0
 ) -> Float[Tensor, "b 1 z y x"]:
-    """The image plus normal noise of a standard deviation, smoothed by `width` voxels at that deviation."""
+    """Return the image plus normal noise of a standard deviation, smoothed by `width` voxels at that deviation."""
     if not 0 <= deviation < math.inf:
         raise ValueError(f"expected a noise deviation from 0, got {deviation}")
     checked(image, "an image")
@@ -92,7 +93,8 @@ def gaussian_noise(
 def rician(
     image: Float[Tensor, "b 1 z y x"], deviation: float, seeds: Sequence[int], width: float | Sequence[float] = 0.0
 ) -> Float[Tensor, "b 1 z y x"]:
-    """Magnitude of a signal with normal noise in both channels: √((v + σ n₁)² + (σ n₂)²) (Gudbjartsson and Patz 1995).
+    """Return the magnitude of a signal with normal noise in both channels: √((v + σ n₁)² + (σ n₂)²) (Gudbjartsson and
+    Patz 1995).
 
     The mean square is v² + 2σ²; where there is no signal, the mean is σ √(π/2).
     """
@@ -107,14 +109,14 @@ def rician(
 
 
 def digitised(image: Float[Tensor, "b 1 z y x"], ceiling: float) -> Float[Tensor, "b 1 z y x"]:
-    """Whole counts from 0 to `ceiling`, where the instrument saturates."""
+    """Return whole counts from 0 to `ceiling`, where the instrument saturates."""
     if not ceiling > 0:
         raise ValueError(f"expected a ceiling above 0, got {ceiling}")
     return checked(image, "an image").round().clamp_(0, ceiling)
 
 
 def _few(mean: Tensor, z: Tensor) -> Tensor:
-    """How many of the sums P(X ≤ k) lie under the normal number's share."""
+    """Return how many of the sums P(X ≤ k) lie under the normal number's share."""
     share = torch.special.ndtr(z)
     term = torch.exp(-mean)
     total = term.clone()

@@ -49,7 +49,7 @@ class NoiseEstimate(NamedTuple):
 
 
 def background_of(values: np.ndarray, inside: np.ndarray, steps: np.ndarray) -> Background:
-    """The background's level and correlations, some voxels away from the structure.
+    """Return the background's level and correlations, some voxels away from the structure.
 
     Its covariance over the lag is the sum of a short part, noise smoothed by up to a voxel, and a long one, texture.
     """
@@ -75,7 +75,8 @@ def background_of(values: np.ndarray, inside: np.ndarray, steps: np.ndarray) -> 
 def noise_of(
     values: np.ndarray, inside: np.ndarray, ground: Background, steps: np.ndarray, high: float
 ) -> NoiseEstimate:
-    """The line of variance over mean through the residuals' bins and the background, if it rises by the structure.
+    """Return the line of variance over mean through the residuals' bins and the background, if it rises by the
+    structure.
 
     The line is gain · mean + rest. A negative rest is an offset, -rest / gain, a positive one read noise: of the two
     that a line cannot tell apart, the smaller. The offset is no brighter than the background's darkest voxels: fine
@@ -100,20 +101,21 @@ def noise_of(
 
 
 def covariance(rest: np.ndarray, weight: np.ndarray, axis: int) -> np.ndarray:
-    """At lags from 0, of pairs of which both are background."""
+    """Return the covariance at lags from 0, of pairs of which both are background."""
     a, w = np.moveaxis(rest, axis, 0), np.moveaxis(weight, axis, 0)
     lags = min(LAGS, len(a) // 3)
     sums = [(float((a[: len(a) - k] * a[k:]).sum()), float((w[: len(w) - k] * w[k:]).sum())) for k in range(lags + 1)]
     return np.array([product / max(pairs, 1.0) for product, pairs in sums])
 
 
-def _split(seen: np.ndarray) -> tuple[float, float, float, float]:
-    """Variance and width of the noise, variance and length of the texture, in voxels, by non-negative least squares."""
-    lag = np.arange(len(seen))
+def _split(covariances: np.ndarray) -> tuple[float, float, float, float]:
+    """Return the variance and width of the noise, variance and length of the texture, in voxels, by non-negative least
+    squares."""
+    lag = np.arange(len(covariances))
     short = [np.exp(-((lag / (2 * w)) ** 2)) if w else (lag == 0).astype(float) for w in GRAINS]
     long = [np.exp(-0.5 * (lag / length) ** 2) for length in LENGTHS]
     flat = np.ones(len(lag))
-    parts, _ = optimize.nnls(np.stack([*short, *long, flat], 1), seen)
+    parts, _ = optimize.nnls(np.stack([*short, *long, flat], 1), covariances)
     noise, texture = parts[: len(GRAINS)], parts[len(GRAINS) : -1]
     total, spread = float(noise.sum()), float(texture.sum())
     width = float(noise @ GRAINS / total) if total else 0.0
@@ -122,7 +124,7 @@ def _split(seen: np.ndarray) -> tuple[float, float, float, float]:
 
 
 def _bias(rest: np.ndarray, weight: np.ndarray, level: float, shape: tuple[int, ...]) -> float:
-    """Half the range of the background's slow variation, relative to its level."""
+    """Return half the range of the background's slow variation, relative to its level."""
     widths = [n / 8 for n in shape]
     slow = ndimage.gaussian_filter(rest, widths) / np.maximum(ndimage.gaussian_filter(weight, widths), 1e-3)
     low, high = np.quantile(slow, (0.01, 0.99))
@@ -132,7 +134,7 @@ def _bias(rest: np.ndarray, weight: np.ndarray, level: float, shape: tuple[int, 
 def _bins(
     values: np.ndarray, inside: np.ndarray, ground: Background, steps: np.ndarray
 ) -> list[tuple[float, float, int]]:
-    """Mean, variance of the noise and count, by bins of the mean over the structure."""
+    """Return the mean, the variance of the noise and count, by bins of the mean over the structure."""
     residual = ndimage.convolve(values, RESIDUAL)
     mean = ndimage.gaussian_filter(values, 1.5 * steps.min() / steps)
     top = values.max()
@@ -148,7 +150,7 @@ def _bins(
 
 
 def _variance(residual: np.ndarray) -> float:
-    """Of what is within four deviations, these being the median's."""
+    """Return the mean and the deviation of what lies within four deviations, by the median's."""
     square = np.square(residual)
     near = square < 16 * np.median(square) / 0.455
     return float(square[near].mean() if near.any() else square.mean())

@@ -24,7 +24,8 @@ EPSILON = WORKING_EPSILON / WORKING_SPACING
 
 
 def occupancy(field: Float[Tensor, "b 1 z y x"], epsilon: float = EPSILON) -> Float[Tensor, "b 1 z y x"]:
-    """Share of each cubic voxel that is inside: partial volume, from the sub-voxel distance that the profile holds.
+    """Return the share of each cubic voxel that is inside: partial volume, from the sub-voxel distance that the profile
+    holds.
 
     (d + ½) clipped to [0, 1], d = √2 ε artanh u in voxels: exact for a plane along an axis. A tilted plane's ramp is
     longer with softer ends; its second moment is the same 1/12, and the difference nowhere over 0.05.
@@ -47,7 +48,8 @@ def occupancy(field: Float[Tensor, "b 1 z y x"], epsilon: float = EPSILON) -> Fl
 def intensities(
     occupied: Float[Tensor, "b 1 z y x"], levels: Sequence[float], stain: Tensor | None = None
 ) -> Float[Tensor, "b 1 z y x"]:
-    """Two classes: the levels (background, structure) weighed by occupancy; `stain` (0 to 1) is the contrast left."""
+    """Return the light of two classes: levels (background, structure) weighed by occupancy; `stain` (0 to 1) is the
+    contrast left."""
     below, above = _levels(levels)
     checked(occupied, "an occupancy")
     share = occupied if stain is None else occupied * stain
@@ -58,8 +60,8 @@ def texture(
     like: Float[Tensor, "b 1 z y x"], spacing: float | Sequence[float], deviation: float, length: float,
     seeds: Sequence[int], purpose: str = "texture",
 ) -> Float[Tensor, "b 1 z y x"]:  # fmt: skip
-    """A positive random factor of mean 1: lognormal, of standard deviation `deviation`, its logarithm correlated by
-    `length` (`correlated`).
+    """Return a positive random factor of mean 1: lognormal, of standard deviation `deviation`, its logarithm correlated
+    by `length` (`correlated`).
 
     Raises
     ------
@@ -76,7 +78,7 @@ def texture(
 def blur(
     image: Float[Tensor, "b 1 z y x"], spacing: float | Sequence[float], widths: float | Sequence[float]
 ) -> Float[Tensor, "b 1 z y x"]:
-    """A Gaussian point-spread function of standard deviations `widths` along (z, y, x)."""
+    """Return the image under a Gaussian point-spread function of standard deviations `widths` along (z, y, x)."""
     checked(image, "an image")
     steps, σ = edges(spacing), triple(widths, "a blur")
     return along(image, *(gaussian(n, s / h, image) for n, s, h in zip(image.shape[2:], σ, steps, strict=True)))
@@ -86,7 +88,8 @@ def blur_with_depth(
     image: Float[Tensor, "b 1 z y x"], spacing: float | Sequence[float], widths: float | Sequence[float],
     growth: float, attenuation: float = 0.0,
 ) -> Float[Tensor, "b 1 z y x"]:  # fmt: skip
-    """A point-spread function that widens with depth, as scatter and aberrations make it: σ(z) = σ(0) (1 + growth z).
+    """Return the image under a point-spread function that widens with depth, as scatter and aberrations make it: σ(z) =
+    σ(0) (1 + growth z).
 
     Parameters
     ----------
@@ -117,7 +120,8 @@ def sample(
     image: Float[Tensor, "b 1 z y x"], spacing: float | Sequence[float], onto: float | Sequence[float],
     window: float | Sequence[float] = 0.0,
 ) -> Float[Tensor, "b 1 Z Y X"]:  # fmt: skip
-    """Values on a grid of voxels `onto`: means over a `window` (slice thickness, pixel) about each voxel's centre.
+    """Return values on a grid of voxels `onto`: means over a `window` (slice thickness, pixel) about each voxel's
+    centre.
 
     The corners of both grids' first voxels coincide, and voxels that do not fit into the box are left out. Along an
     axis whose window is narrower than an old voxel, the value is interpolated linearly.

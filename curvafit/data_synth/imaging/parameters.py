@@ -40,13 +40,13 @@ class Checked:
 
 @cache
 def _ranges(part: type) -> dict[str, tuple[Any, Range]]:
-    """The kind and the range of each parameter of a part."""
+    """Return the kind and the range of each parameter of a part."""
     hints = {name: get_args(hint) for name, hint in get_type_hints(part, include_extras=True).items()}
     return {name: (each[0], each[1]) for name, each in hints.items() if len(each) == 2 and isinstance(each[1], Range)}
 
 
 def _number(name: str, value: Any, kind: Any, allowed: Range) -> Any:
-    """The value as a float or a triple of floats; None where the kind allows it."""
+    """Return the value as a float or a triple of floats; None where the kind allows it."""
     if value is None and NoneType in get_args(kind):
         return None
     words = f"{name} as 3 numbers (z, y, x), each {allowed.words}" if kind is Triple else f"{name} as {allowed.words}"
@@ -259,7 +259,7 @@ class Imaging(Checked):
 
 
 def _leaves(content: Mapping[str, Any], part: str = "") -> Iterator[tuple[str, Any]]:
-    """Names, with their part's before a dot, and values of nested objects."""
+    """Yield names, with their part's before a dot, and values of nested objects."""
     for name, value in content.items():
         if isinstance(value, Mapping):
             yield from _leaves(value, f"{part}{name}.")

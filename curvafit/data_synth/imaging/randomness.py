@@ -15,13 +15,13 @@ from curvafit.priors.shapes import Float
 
 
 def stream(seed: int, purpose: str, device: torch.device | str = "cpu") -> torch.Generator:
-    """The generator of a sample for one purpose; another device draws other numbers."""
+    """Return the generator of a sample for one purpose; another device draws other numbers."""
     words = np.random.SeedSequence(seed, spawn_key=(zlib.crc32(purpose.encode()),))
     return torch.Generator(device).manual_seed(int(words.generate_state(1)[0]))
 
 
 def white(like: Float[Tensor, "b 1 z y x"], seeds: Sequence[int], purpose: str) -> Float[Tensor, "b 1 z y x"]:
-    """Independent standard normal numbers.
+    """Return independent standard normal numbers.
 
     Raises
     ------
@@ -34,7 +34,8 @@ def white(like: Float[Tensor, "b 1 z y x"], seeds: Sequence[int], purpose: str) 
 def correlated(
     like: Float[Tensor, "b 1 z y x"], lengths: Sequence[float], seeds: Sequence[int], purpose: str
 ) -> Float[Tensor, "b 1 z y x"]:
-    """A Gaussian random field of mean 0 and variance 1 whose correlation over a distance d is exp(-½ Σ (d/length)²).
+    """Return a Gaussian random field of mean 0 and variance 1 whose correlation over a distance d is exp(-½ Σ
+    (d/length)²).
 
     White noise on nodes, interpolated by Gaussians; each row's weights have a sum of squares of one, so that the
     variance is one everywhere, near the faces too.
@@ -53,7 +54,8 @@ def correlated(
 def grainy(
     like: Float[Tensor, "b 1 z y x"], widths: Sequence[float], seeds: Sequence[int], purpose: str
 ) -> Float[Tensor, "b 1 z y x"]:
-    """Standard normal numbers, smoothed by a Gaussian of deviations `widths` (voxels): `correlated` by √2 widths."""
+    """Return standard normal numbers, smoothed by a Gaussian of deviations `widths` (voxels): `correlated` by √2
+    widths."""
     if not any(widths):
         return white(like, seeds, purpose)
     maps = [gaussian(n, width, like) for n, width in zip(like.shape[2:], widths, strict=True)]
@@ -62,13 +64,13 @@ def grainy(
 
 
 def uniform(count: int, seed: int, purpose: str, like: Tensor) -> Tensor:
-    """`count` numbers in [0, 1) of a sample."""
+    """Return `count` numbers in [0, 1) of a sample."""
     generator = stream(seed, purpose, like.device)
     return torch.rand(count, generator=generator, device=like.device, dtype=like.dtype)
 
 
 def seeds_of(seeds: Sequence[int], count: int) -> list[int]:
-    """The seeds, if there is one a sample and all are whole numbers from 0.
+    """Return the seeds, if there is one a sample and all are whole numbers from 0.
 
     Raises
     ------
@@ -90,7 +92,8 @@ def _drawn(shape: tuple[int, ...], like: Tensor, seeds: Sequence[int], purpose: 
 
 
 def _interpolation(count: int, length: float, like: Tensor) -> Tensor | None:
-    """(count, nodes) weights; nodes are a deviation apart, at least a voxel, and go four deviations beyond the box."""
+    """Return (count, nodes) weights; nodes are a deviation apart, at least a voxel, and go four deviations beyond the
+    box."""
     if math.isinf(length):
         return torch.ones((count, 1), device=like.device, dtype=like.dtype)
     if length < 0.5:

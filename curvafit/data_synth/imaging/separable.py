@@ -35,7 +35,8 @@ def along(
 
 
 def gaussian(count: int, width: float | Tensor, like: Tensor) -> Tensor | None:
-    """The matrix (count, count) of a blur by a Gaussian of deviation `width` voxels, cut at four; `None` for width 0.
+    """Return the matrix (count, count) of a blur by a Gaussian of deviation `width` voxels, cut at four; `None` for
+    width 0.
 
     A tensor of widths (…, 1, 1) gives a matrix each, one of (count, 1) a width to each row.
     """
@@ -47,13 +48,14 @@ def gaussian(count: int, width: float | Tensor, like: Tensor) -> Tensor | None:
 
 
 def bell(far: Tensor) -> Tensor:
-    """exp(-½ far²), and 0 where far is over four. It is clipped first: arithmetic with denormal numbers is slow."""
+    """Return exp(-½ far²), and 0 where far is over four. It is clipped first: arithmetic with denormal numbers is
+    slow."""
     square = far.square().clamp_max_(CUT)
     return torch.exp(-0.5 * square).masked_fill_(square == CUT, 0)
 
 
 def sampling(count: int, spacing: float, onto: float, window: float, like: Tensor) -> Tensor | None:
-    """The matrix that samples voxels of edge `spacing` at voxels of edge `onto`, each the mean over a `window`.
+    """Return the matrix that samples voxels of edge `spacing` at voxels of edge `onto`, each the mean over a `window`.
 
     The corners of both grids' first voxels coincide. A window narrower than a voxel is as wide as one: the means are
     then linear interpolations. `None` where nothing changes.
@@ -70,12 +72,12 @@ def sampling(count: int, spacing: float, onto: float, window: float, like: Tenso
 
 
 def sampled(count: int, spacing: float, onto: float) -> int:
-    """How many voxels of edge `onto` fit into `count` of edge `spacing`; at least one."""
+    """Return how many voxels of edge `onto` fit into `count` of edge `spacing`; at least one."""
     return max(1, math.floor(count * spacing / onto + 1e-6))
 
 
 def checked(volume: Tensor, name: str = "a volume") -> Tensor:
-    """The volume, if it is `(B, 1, Z, Y, X)`, of a floating type and finite.
+    """Return the volume, if it is `(B, 1, Z, Y, X)`, of a floating type and finite.
 
     Raises
     ------
@@ -92,7 +94,7 @@ def checked(volume: Tensor, name: str = "a volume") -> Tensor:
 
 
 def triple(value: float | Sequence[float], name: str) -> Triple:
-    """Three numbers (z, y, x) from 0, or one for all."""
+    """Return three numbers (z, y, x) from 0, or one for all."""
     numbers = (value,) * 3 if isinstance(value, (int, float)) else tuple(value)
     if len(numbers) != 3 or not all(math.isfinite(h) and h >= 0 for h in numbers):
         raise ValueError(f"expected {name} of 3 numbers (z, y, x) from 0, got {value!r}")
@@ -100,7 +102,7 @@ def triple(value: float | Sequence[float], name: str) -> Triple:
 
 
 def edges(spacing: float | Sequence[float]) -> Triple:
-    """A spacing: three lengths above 0, or one for all."""
+    """Return a spacing: three lengths above 0, or one for all."""
     steps = triple(spacing, "a spacing")
     if not all(steps):
         raise ValueError(f"expected a spacing of 3 positive numbers (z, y, x), got {spacing!r}")

@@ -19,7 +19,7 @@ CENTRING = 2
 
 
 def centreline(skeleton: np.ndarray, distance: np.ndarray, grid: Grid, prune: float = 1.0) -> nx.MultiGraph:
-    """The graph of a skeleton of one-voxel wide lines (26 neighbours), with radii.
+    """Return the graph of a skeleton of one-voxel wide lines (26 neighbours), with radii.
 
     Voxels of three or more neighbours are junctions, touching ones a single one at their mean; voxels of one neighbour
     are ends. Lines are smoothed over some voxels, as steps from voxel to voxel would make tilted ones up to a tenth too
@@ -66,13 +66,14 @@ def centreline(skeleton: np.ndarray, distance: np.ndarray, grid: Grid, prune: fl
 
 
 def cycle_rank(graph: nx.MultiGraph) -> int:
-    """Independent cycles of edges, with the rings within junctions: the b1 of the skeleton, hence of its mask."""
+    """Return independent cycles of edges, with the rings within junctions: the b1 of the skeleton, hence of its
+    mask."""
     edges = graph.number_of_edges() - graph.number_of_nodes() + nx.number_connected_components(graph)
     return edges + sum(graph.nodes[node]["rings"] for node in graph)
 
 
 def _traced(skeleton: np.ndarray, distance: np.ndarray, grid: Grid) -> nx.MultiGraph:
-    """Nodes with `place` (voxels) and `radius`; edges with `line` (N, 3) in voxels from `start`, unwrapped."""
+    """Return nodes with `place` (voxels) and `radius`; edges with `line` (N, 3) in voxels from `start`, unwrapped."""
     places = np.argwhere(skeleton)
     number = np.full(skeleton.shape, -1, dtype=np.int64)
     number[skeleton] = np.arange(len(places))
@@ -84,27 +85,27 @@ def _traced(skeleton: np.ndarray, distance: np.ndarray, grid: Grid) -> nx.MultiG
         cloud = np.stack(_unwrapped([places[i] for i in members], grid))
         radius = max(float(distance[tuple(places[i])]) for i in members)
         graph.add_node(k, place=cloud.mean(0), radius=radius, rings=_rings(cloud, grid))
-    seen: set[int] = set()
+    visited: set[int] = set()
     for i, k in list(node.items()):
         for first in beside[i]:
             if first in node and (node[first] > k):
                 _join(graph, k, node[first], [places[i], places[first]], grid)
-            elif first not in node and first not in seen:
+            elif first not in node and first not in visited:
                 path = _walk(i, first, beside, node)
-                seen.update(path[1:-1])
+                visited.update(path[1:-1])
                 _join(graph, k, node[path[-1]], [places[j] for j in path], grid)
     for i in range(len(places)):
-        if i not in node and i not in seen:  # a line that closes on itself
+        if i not in node and i not in visited:  # a line that closes on itself
             node[i] = len(graph)
             path = _walk(i, beside[i][0], beside, node)
-            seen.update(path)
+            visited.update(path)
             graph.add_node(node[i], place=places[i].astype(float), radius=float(distance[tuple(places[i])]), rings=0)
             _join(graph, node[i], node[i], [places[j] for j in path], grid)
     return graph
 
 
 def _rings(cloud: np.ndarray, grid: Grid) -> int:
-    """Tunnels among the voxels of a junction, places (N, 3)."""
+    """Return the tunnels among the voxels of a junction, places (N, 3)."""
     if len(cloud) < 4:
         return 0
     low = cloud.min(0)
@@ -116,7 +117,7 @@ def _rings(cloud: np.ndarray, grid: Grid) -> int:
 
 
 def _neighbours(places: np.ndarray, number: np.ndarray, grid: Grid) -> list[list[int]]:
-    """The numbers of the voxels around each."""
+    """Return the numbers of the voxels around each."""
     beside: list[list[int]] = [[] for _ in places]
     for step in product((-1, 0, 1), repeat=3):
         if step == (0, 0, 0):
@@ -138,7 +139,7 @@ def _junctions(beside: list[list[int]]) -> Iterable[list[int]]:
 
 
 def _walk(start: int, first: int, beside: list[list[int]], node: dict[int, int]) -> list[int]:
-    """From a node's voxel along voxels of two neighbours to the next node's."""
+    """Return the path from a node's voxel along voxels of two neighbours to the next node's."""
     path = [start, first]
     while path[-1] not in node:
         one, other = beside[path[-1]]
@@ -156,7 +157,7 @@ def _join(graph: nx.MultiGraph, one: int, other: int, voxels: list[np.ndarray], 
 
 
 def _unwrapped(points: list[np.ndarray], grid: Grid) -> list[np.ndarray]:
-    """The points with whole boxes added so that each is nearest to the one before."""
+    """Return the points with whole boxes added so that each is nearest to the one before."""
     if not grid.periodic:
         return [np.asarray(point, dtype=float) for point in points]
     size, out = np.array(grid.shape), [np.asarray(points[0], dtype=float)]
@@ -232,7 +233,7 @@ def _centre(graph: nx.MultiGraph, distance: np.ndarray, grid: Grid) -> None:
 
 
 def _radii(distance: np.ndarray, line: np.ndarray, grid: Grid) -> np.ndarray:
-    """Radii (N,) at the points of a line (N, 3) in voxels."""
+    """Return radii (N,) at the points of a line (N, 3) in voxels."""
     spacing, low = np.array(grid.spacing), np.floor(line).astype(int)
     along = np.gradient(line, axis=0) * spacing
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
@@ -248,12 +249,12 @@ def _radii(distance: np.ndarray, line: np.ndarray, grid: Grid) -> np.ndarray:
 
 
 def _at(values: np.ndarray, points: np.ndarray, grid: Grid) -> np.ndarray:
-    """Linearly between voxels, points `(N, 3)` in voxels."""
+    """Return the values at points `(N, 3)` in voxels, interpolated linearly."""
     return ndimage.map_coordinates(values, points.T, order=1, mode="grid-wrap" if grid.periodic else "nearest")
 
 
 def _finished(traced: nx.MultiGraph, distance: np.ndarray, grid: Grid) -> nx.MultiGraph:
-    """Numbered anew, in spacing's unit."""
+    """Return the graph with its nodes numbered anew, in the spacing's unit."""
     spacing, graph = np.array(grid.spacing), nx.MultiGraph()
     number = {node: k for k, node in enumerate(sorted(traced))}
     for node, k in number.items():
@@ -277,7 +278,7 @@ def _finished(traced: nx.MultiGraph, distance: np.ndarray, grid: Grid) -> nx.Mul
 
 
 def _smoothed(line: np.ndarray) -> np.ndarray:
-    """Averaged twice along itself; it is continued through its ends, which stay."""
+    """Return the line averaged twice along itself; its ends stay, as it is continued through them."""
     for _ in range(2):
         before, after = 2 * line[0] - line[2:0:-1], 2 * line[-1] - line[-2:-4:-1]
         if len(before) < 2 or len(after) < 2:

@@ -90,8 +90,8 @@ def _lay_out(piece: nx.MultiGraph, rows: list[tuple[np.ndarray, float, int]], cu
 
 
 def _edges_from(piece: nx.MultiGraph, root: int) -> Iterator[tuple[int, int, np.ndarray, np.ndarray, bool]]:
-    """Edges with their points from the first node to the second: those of a tree of the widest from its root outwards,
-    then those that are cut."""
+    """Yield edges with their points from the first node to the second: those of a tree of the widest from its root
+    outwards, then those that are cut."""
     kept = {(*sorted(edge[:2]), edge[2]) for edge in nx.maximum_spanning_edges(piece, weight="radius", data=False)}
     tree = nx.Graph([(one, other, {"key": key}) for one, other, key in kept])
     tree.add_node(root)

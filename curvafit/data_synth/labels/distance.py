@@ -19,7 +19,7 @@ BEND = 4.0
 
 
 def field_distance(field: Tensor, grid: Grid, epsilon: float) -> np.ndarray:
-    """Distance of every voxel's centre to {u = 0}, positive inside, float32 (Z, Y, X) in spacing's unit.
+    """Return the distance of every voxel's centre to {u = 0}, positive inside, float32 (Z, Y, X) in spacing's unit.
 
     Within one and a half voxels of the surface it is the profile's √2 ε artanh(u) over its slope, however wide the
     profile: right to 0.02 voxels at less than a voxel from it where its radius of curvature is 5 voxels, to 0.08 where
@@ -50,8 +50,8 @@ def field_distance(field: Tensor, grid: Grid, epsilon: float) -> np.ndarray:
 
 @njit(cache=True)
 def _at_surface(near, edges, periodic):  # pragma: no cover
-    """Which voxels touch the other side; their offsets to the surface and its normals (…, 6); the distance of all
-    voxels within one of it, NaN elsewhere."""
+    """Return the voxels that touch the other side; their offsets to the surface and its normals (…, 6); the distance of
+    all voxels within one of it, NaN elsewhere."""
     shape, widest = near.shape, edges.max()
     shell = np.zeros(shape, dtype=np.bool_)
     feet = np.zeros((*shape, 6), dtype=np.float32)
@@ -95,8 +95,8 @@ def _at_surface(near, edges, periodic):  # pragma: no cover
 
 @njit(cache=True)
 def _along(squared, seed, edge, periodic):  # pragma: no cover
-    """One axis (the last) of the squared distance and of who is nearest: lower envelope of parabolas (Felzenszwalb and
-    Huttenlocher 2012); a periodic row is taken from half a row before it to half a row after it."""
+    """Take one axis (the last) of the squared distance and of the nearest seed: lower envelope of parabolas
+    (Felzenszwalb and Huttenlocher 2012); a periodic row is taken from half a row before it to half a row after it."""
     rows, columns, n = squared.shape
     before = n // 2 if periodic else 0
     count = n + 2 * before

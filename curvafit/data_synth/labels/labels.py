@@ -69,7 +69,7 @@ NAMES = tuple(field.name for field in fields(Labels) if field.name != "grid")
 
 
 def labels_of(field: Tensor | np.ndarray, grid: Grid, epsilon: float, which: Collection[str] | str = NAMES) -> Labels:
-    """The labels of a phase field `(Z, Y, X)`, positive inside; only those in `which` cost time.
+    """Return the labels of a phase field `(Z, Y, X)`, positive inside; only those in `which` cost time.
 
     A periodic grid's box repeats: distances, curvatures, radii, pieces and lines go on across its faces, and the Betti
     numbers are those on the torus. Of a crop (replicate) nothing is known beyond: a tube that is cut ends there.
@@ -84,25 +84,25 @@ def labels_of(field: Tensor | np.ndarray, grid: Grid, epsilon: float, which: Col
     if unknown := sorted(wanted - set(NAMES)):
         raise ValueError(f"expected labels of {', '.join(NAMES)}, got {', '.join(unknown)}")
     u = _checked(field, grid, epsilon)
-    found: dict[str, np.ndarray | tuple[int, int, int]] = {}
+    labels: dict[str, np.ndarray | tuple[int, int, int]] = {}
     mask = (u > 0).cpu().numpy()
     if wanted & {"distance", "skeleton", "instances", "radius"}:
-        found["distance"] = distance = field_distance(u, grid, epsilon)
+        labels["distance"] = distance = field_distance(u, grid, epsilon)
         if "skeleton" in wanted:
-            found["skeleton"] = skeleton_of(distance, grid)
+            labels["skeleton"] = skeleton_of(distance, grid)
         if "instances" in wanted:
-            found["instances"] = instances_of(distance, grid)
+            labels["instances"] = instances_of(distance, grid)
         if "radius" in wanted:
-            found["radius"] = _radius(distance, grid)
+            labels["radius"] = _radius(distance, grid)
     if wanted & {"kappa1", "kappa2"}:
-        found["kappa1"], found["kappa2"] = _curvatures(u, mask, grid, epsilon)
+        labels["kappa1"], labels["kappa2"] = _curvatures(u, mask, grid, epsilon)
     if "betti" in wanted:
-        found["betti"] = betti_numbers(mask, periodic=grid.periodic)
-    return Labels(grid, **{name: value for name, value in ({"mask": mask} | found).items() if name in wanted})  # type: ignore[arg-type]
+        labels["betti"] = betti_numbers(mask, periodic=grid.periodic)
+    return Labels(grid, **{name: value for name, value in ({"mask": mask} | labels).items() if name in wanted})  # type: ignore[arg-type]
 
 
 def instances_of(distance: np.ndarray, grid: Grid, neck: float = NECK) -> np.ndarray:
-    """The pieces of {distance > 0}: int32 `(Z, Y, X)`, 0 outside and 1, 2, … in the order of their first voxels.
+    """Return the pieces of {distance > 0}: int32 `(Z, Y, X)`, 0 outside and 1, 2, … in the order of their first voxels.
 
     Pieces are 26-connected, in a periodic box across its faces too. A piece is divided at necks: the watershed of the
     distance gives each of its maxima a basin, and basins are one again, widest neck first, unless the neck between them
@@ -133,7 +133,7 @@ def instances_of(distance: np.ndarray, grid: Grid, neck: float = NECK) -> np.nda
 
 
 def _necks(basins: np.ndarray, distance: np.ndarray, grid: Grid) -> list[tuple[float, int, int]]:
-    """Greatest distance at which two basins touch (by faces), widest first."""
+    """Return the greatest distance at which two basins touch (by faces), widest first."""
     pairs, widths = [], []
     for axis in range(3):
         next_basins, next_distance = np.roll(basins, -1, axis), np.roll(distance, -1, axis)
@@ -156,7 +156,7 @@ def _root(owner: np.ndarray, k: int) -> int:
 
 
 def _renumbered(labels: np.ndarray) -> np.ndarray:
-    """0 and 1, 2, … in the order of their first voxels."""
+    """Return the labels numbered 1, 2, … in the order of their first voxels; 0 stays."""
     values, first, index = np.unique(labels, return_index=True, return_inverse=True)
     rank = np.zeros(len(values), dtype=np.int32)
     named = np.flatnonzero(values > 0)
@@ -165,8 +165,8 @@ def _renumbered(labels: np.ndarray) -> np.ndarray:
 
 
 def _curvatures(u: Tensor, mask: np.ndarray, grid: Grid, epsilon: float) -> tuple[np.ndarray, np.ndarray]:
-    """κ1, κ2 of {u = 0} next to it: those of the level set through the voxel's centre, at distance d from the surface,
-    carried along the normal: κ / (1 + κ d)."""
+    """Return κ1, κ2 of {u = 0} beside the surface: those of the level set through the voxel's centre, at distance d
+    from the surface, carried along the normal: κ / (1 + κ d)."""
     near = jet(profile_distance(u, epsilon), grid)
     slope = near.gradient.square().sum(-4).sqrt()
     d = near.value / slope.clamp_min(LEAST_SLOPE)
@@ -176,7 +176,7 @@ def _curvatures(u: Tensor, mask: np.ndarray, grid: Grid, epsilon: float) -> tupl
 
 
 def _shell(mask: np.ndarray, grid: Grid) -> np.ndarray:
-    """Voxels with one of their six neighbours on the other side; those in the margin of a crop left out."""
+    """Return voxels with one of their six neighbours on the other side; those in the margin of a crop left out."""
     shell = np.zeros(mask.shape, dtype=bool)
     for axis in range(3):
         for step in (-1, 1):
@@ -192,7 +192,7 @@ def _shell(mask: np.ndarray, grid: Grid) -> np.ndarray:
 
 
 def _radius(distance: np.ndarray, grid: Grid) -> np.ndarray:
-    """Half the local thickness; a periodic box is continued as far as balls that reach into it need."""
+    """Return half the local thickness; a periodic box is continued as far as balls that reach into it need."""
     width = 2 * math.ceil(float(distance.max()) / min(grid.spacing)) + 4 if grid.periodic else 0
     margin = [min(n // 2, width) for n in grid.shape]
     padded = np.pad(distance > 0, [(m, m) for m in margin], mode="wrap")

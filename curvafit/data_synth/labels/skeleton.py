@@ -28,7 +28,8 @@ SIDES = _bits(_STEPS.sum(2) == 1) & EIGHTEEN
 
 
 def skeleton_of(distance: np.ndarray, grid: Grid) -> np.ndarray:
-    """One-voxel wide curves in the middle of {distance > 0}, bool (Z, Y, X), with its pieces, tunnels and cavities.
+    """Return one-voxel wide curves in the middle of {distance > 0}, bool (Z, Y, X), with its pieces, tunnels and
+    cavities.
 
     Lee's thinning (scikit-image) of the box continued beyond its faces (periodic, or by its outermost layers, so that
     what is cut by a face is followed up to it) says where the curves go. As what is cut off with that continuation may
@@ -87,16 +88,16 @@ def _thin(left, fixed, order, periodic):  # pragma: no cover
 
 @njit(cache=True)
 def _simple(around):  # pragma: no cover
-    """Whether the middle of 27 voxels can go, given those of the mask around it as bits: they are one 26-connected
-    piece, and what is outside and next to it is one 6-connected piece within its 18-neighbourhood (Bertrand and
-    Malandain 1994)."""
+    """Return whether the middle of 27 voxels can go, given those of the mask around it as bits: they are one
+    26-connected piece, and what is outside and next to it is one 6-connected piece within its 18-neighbourhood
+    (Bertrand and Malandain 1994)."""
     outside = ~around & EIGHTEEN
     return outside & FACES != 0 and _joined(around, around, CORNERS) and _joined(outside, outside & FACES, SIDES)
 
 
 @njit(cache=True)
 def _joined(bits, wanted, touching):  # pragma: no cover
-    """Whether all of the `wanted` ones among the bits are in one piece."""
+    """Return whether all of the `wanted` ones among the bits are in one piece."""
     piece, grown = 0, wanted & -wanted
     while grown != piece:
         piece = grown

@@ -71,9 +71,9 @@ class Recipe:
         instance(self.modality, Modality, "a Modality")
         if not callable(getattr(self.source, "shape", None)):
             raise ValueError(f"expected a source of shapes, got {quoted(self.source)}")
-        said = "3 whole numbers of voxels above 0 (z, y, x)"
+        words = "3 whole numbers of voxels above 0 (z, y, x)"
         shape = several(self.shape, "3 whole numbers of voxels")
-        shape = tuple(whole(n, said, 1, MOST, of=shape) for n in (shape if len(shape) == 3 else (None,)))
+        shape = tuple(whole(n, words, 1, MOST, of=shape) for n in (shape if len(shape) == 3 else (None,)))
         object.__setattr__(self, "shape", shape)
         object.__setattr__(self, "voxel", real(self.voxel, "a shape's voxel of positive length", SHORTEST, LONGEST))
         object.__setattr__(self, "seed", seed_of(self.seed))
@@ -83,11 +83,11 @@ class Recipe:
 
     @property
     def largest(self) -> tuple[int, int, int]:
-        """Voxels (z, y, x) of the largest shapes, of the thinnest structures."""
+        """Return voxels (z, y, x) of the largest shapes, of the thinnest structures."""
         return field_shape(self.shape, self.voxel * self.calibres[0], self.modality.base)
 
     def case(self, index: int) -> Case:
-        """Case number `index`, made on one thread.
+        """Return case number `index`, made on one thread.
 
         Raises
         ------
@@ -102,65 +102,68 @@ class Recipe:
         seed = _number(for_image)
         with one_thread():
             for _ in range(TRIES):
-                made = self.source.shape(voxels, index, rng)
-                u = torch.from_numpy(made.values)
-                made_of = imaged(u, made.epsilon, voxel, imaging, seed, self.shape)
-                grey, seen, mask = (each.numpy() for each in made_of)
-                if seen.min() <= 0 < seen.max() and mask.any() and not mask.all():
+                phase_field = self.source.shape(voxels, index, rng)
+                u = torch.from_numpy(phase_field.values)
+                parts = imaged(u, phase_field.epsilon, voxel, imaging, seed, self.shape)
+                grey, sampled, mask = (each.numpy() for each in parts)
+                if sampled.min() <= 0 < sampled.max() and mask.any() and not mask.all():
                     break
             else:
-                told = " x ".join(map(str, self.shape))
-                raise ValueError(f"expected structure and background on {told} voxels, got one {TRIES} times")
-        record = {"index": index, "source": made.origin, "imaging": imaging.as_dict(), "image_seed": seed}
+                edges = " x ".join(map(str, self.shape))
+                raise ValueError(f"expected structure and background on {edges} voxels, got one {TRIES} times")
+        record = {"index": index, "source": phase_field.origin, "imaging": imaging.as_dict(), "image_seed": seed}
         record |= {
             "voxel": voxel,
-            "volume_fraction": float((seen > 0).mean()),
+            "volume_fraction": float((sampled > 0).mean()),
             "mask_fraction": float(mask.mean()),
         }
-        return Case(_counts(grey, imaging), seen, mask, imaging.spacing, imaging.unit, made.epsilon * voxel, record)
+        return Case(
+            _counts(grey, imaging), sampled, mask, imaging.spacing, imaging.unit, phase_field.epsilon * voxel, record
+        )
 
     def as_dict(self) -> dict[str, Any]:
-        """All of it in JSON's types."""
+        """Return all of the recipe in JSON's types."""
         parts = {"source": self.source.as_dict(), "modality": self.modality.as_dict()}
-        told = {"shape": list(self.shape), "voxel": self.voxel, "seed": self.seed, "calibres": list(self.calibres)}
-        return parts | told
+        numbers = {"shape": list(self.shape), "voxel": self.voxel, "seed": self.seed, "calibres": list(self.calibres)}
+        return parts | numbers
 
     @staticmethod
-    def from_dict(kept: Mapping[str, Any]) -> Recipe:
-        """The inverse of `as_dict`."""
-        source, modality = source_of(kept["source"]), Modality.from_dict(kept["modality"])
-        z, y, x = kept["shape"]
-        low, high = kept["calibres"]
-        return Recipe(source, modality, (z, y, x), kept["voxel"], kept["seed"], (low, high))
+    def from_dict(content: Mapping[str, Any]) -> Recipe:
+        """Return what `as_dict` wrote."""
+        source, modality = source_of(content["source"]), Modality.from_dict(content["modality"])
+        z, y, x = content["shape"]
+        low, high = content["calibres"]
+        return Recipe(source, modality, (z, y, x), content["voxel"], content["seed"], (low, high))
 
 
 def imaged(
     field: torch.Tensor, epsilon: float, voxel: float, imaging: Imaging, seed: int, shape: Sequence[int]
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """The image of a phase field (Z, Y, X), the field on the image's voxels, and its mask there, all of `shape`.
+    """Return the image of a phase field (Z, Y, X), the field on the image's voxels, and its mask there, all of `shape`.
 
     `epsilon` is in the field's voxels, whose edge is `voxel`. A field of whole voxels may hold a few more than an image
     asks for. See `imaging.image` and `Imaging.visible`.
     """
     u, (z, y, x) = field[None, None], shape
-    grey, seen = image(u, voxel, [imaging], [seed], epsilon), regrid(u, voxel, [imaging])
-    mask = visible(u, voxel, [imaging], epsilon) if imaging.visible else seen > 0
-    grey, seen, mask = (each[0, 0, :z, :y, :x].contiguous() for each in (grey, seen, mask))
-    return grey, seen, mask
+    grey, sampled = image(u, voxel, [imaging], [seed], epsilon), regrid(u, voxel, [imaging])
+    mask = visible(u, voxel, [imaging], epsilon) if imaging.visible else sampled > 0
+    grey, sampled, mask = (each[0, 0, :z, :y, :x].contiguous() for each in (grey, sampled, mask))
+    return grey, sampled, mask
 
 
 def drawn_voxel(voxel: float, calibres: Sequence[float], rng: np.random.Generator) -> float:
-    """The edge of a shape's voxel times a factor, drawn evenly in the logarithm; none is drawn where there is one."""
+    """Return the edge of a shape's voxel times a factor, drawn evenly in the logarithm; none is drawn where there is
+    one."""
     low, high = calibres
     return voxel * (low if low == high else math.exp(rng.uniform(math.log(low), math.log(high))))
 
 
 def check_calibres(calibres: Sequence[float]) -> None:
     """Raise ValueError where these are not two positive factors, the lower first."""
-    said, pair = "calibres as two positive factors, the lower first", several(calibres, "two factors")
-    low, high = (real(n, said, *CALIBRES, of=pair) for n in (pair if len(pair) == 2 else (None, None)))
+    words, pair = "calibres as two positive factors, the lower first", several(calibres, "two factors")
+    low, high = (real(n, words, *CALIBRES, of=pair) for n in (pair if len(pair) == 2 else (None, None)))
     if low > high:
-        raise ValueError(f"expected {said}, got {quoted(pair)}")
+        raise ValueError(f"expected {words}, got {quoted(pair)}")
 
 
 def check_crop(within: float, shape: Sequence[int], voxel: float, modality: Modality) -> None:
@@ -170,15 +173,15 @@ def check_crop(within: float, shape: Sequence[int], voxel: float, modality: Moda
     if not 1 < math.prod(shape) <= MOST:
         raise ValueError(f"expected images of 2 to {MOST:.0e} voxels, got {' x '.join(map(str, shape))}")
     if (min if within == math.inf else max)(need) < FEWEST:
-        told, unit = " x ".join(map(str, need)), modality.base.unit
+        edges, unit = " x ".join(map(str, need)), modality.base.unit
         raise ValueError(
-            f"expected images that span {FEWEST} voxels of a shape or more, got {told}: is a voxel of {voxel:g} {unit} "
-            "meant?"
+            f"expected images that span {FEWEST} voxels of a shape or more, got {edges}: "
+            f"is a voxel of {voxel:g} {unit} meant?"
         )
     if math.prod(need) > MOST:
-        told, unit = " x ".join(map(str, need)), modality.base.unit
+        edges, unit = " x ".join(map(str, need)), modality.base.unit
         raise ValueError(
-            f"expected shapes of at most {MOST:.0e} voxels, got {told}: is a voxel of {voxel:g} {unit} meant?"
+            f"expected shapes of at most {MOST:.0e} voxels, got {edges}: is a voxel of {voxel:g} {unit} meant?"
         )
     if max(need) > within:
         images, crops = (" x ".join(map(str, each)) for each in (shape, need))
@@ -189,7 +192,7 @@ def check_crop(within: float, shape: Sequence[int], voxel: float, modality: Moda
 
 
 def _counts(grey: np.ndarray, imaging: Imaging) -> np.ndarray:
-    """Whole counts as uint16, where they fit in; else float32."""
+    """Return whole counts as uint16, where they fit in; else float32."""
     ceiling = imaging.detector.ceiling
     whole = ceiling is not None and ceiling <= np.iinfo(np.uint16).max
     return grey.astype(np.uint16 if whole else np.float32)

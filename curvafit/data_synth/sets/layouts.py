@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 
 class About(NamedTuple):
-    """What a list of cases says of all of them: the set's name, the channel's and the label's."""
+    """The names of a set, its channel and its label, in the list of cases."""
 
     name: str
     channel: str
@@ -27,7 +27,8 @@ _NNUNET = "imagesTr/{case}_0000.nii.gz", "labelsTr/{case}.nii.gz"
 
 
 def _nnunet(cases: Sequence[str], about: About) -> dict[str, Any]:
-    """With the cases by name: what else lies in the folders, such as a killed run's temporary files, does not count."""
+    """Return the list of the cases by name: what else lies in the folders, such as a killed run's temporary files, does
+    not count."""
     image, label = _NNUNET
     listed = {case: {"images": [image.format(case=case)], "label": label.format(case=case)} for case in cases}
     return {

@@ -15,7 +15,7 @@ _ORDERS = ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0))
 
 
 def turned(values: np.ndarray, symmetry: int) -> np.ndarray:
-    """A volume (…, Z, Y, X) under one of the cube's symmetries, 0 to 47; 0 leaves it as it is. A view.
+    """Return a volume (…, Z, Y, X) under one of the cube's symmetries, 0 to 47; 0 leaves it as it is. A view.
 
     Raises
     ------

@@ -72,7 +72,7 @@ def write_preview(folder: str | Path) -> Path:
 
 
 def _record(path: Path) -> dict[str, Any]:
-    """What a set keeps of a case."""
+    """Return the record of a case."""
     record = parse_json(path.read_bytes(), "a case's record", path)
     if wrong := violation(record, _SCHEMA):
         raise ValueError(f"expected a case's record with {wrong} in {path}")

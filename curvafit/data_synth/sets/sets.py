@@ -65,8 +65,8 @@ class Order:
         for part in self.parts:
             named(part, PARTS, f"labels among {', '.join(PARTS)}")
         if self.parts and min(self.recipe.shape) < 4:
-            told = " x ".join(map(str, self.recipe.shape))
-            raise ValueError(f"expected images of at least 4 voxels along each axis beside --labels, got {told}")
+            edges = " x ".join(map(str, self.recipe.shape))
+            raise ValueError(f"expected images of at least 4 voxels along each axis beside --labels, got {edges}")
 
     def as_dict(self) -> dict[str, Any]:
         return {"recipe": self.recipe.as_dict(), "layout": self.layout, "parts": list(self.parts)}
@@ -100,21 +100,21 @@ def build_set(
 
 def _filled(folder: Path, order: Order, count: int, progress: Progress, workers: Workers) -> Path:
     before = set(cases_of(folder))
-    done = set(before)
-    todo = iter([index for index in range(count) if index not in done])
-    asked, listed = 0, -LISTED_EVERY
+    cases = set(before)
+    todo = iter([index for index in range(count) if index not in cases])
+    pending, listed = 0, -LISTED_EVERY
     try:
         while True:
-            while asked < workers.places and (chunk := list(itertools.islice(todo, 1))):
+            while pending < workers.places and (chunk := list(itertools.islice(todo, 1))):
                 workers.submit(make_cases, folder, chunk)
-                asked += 1
-            if not asked:
+                pending += 1
+            if not pending:
                 return folder
-            done |= set(workers.done())
-            asked -= 1
-            progress(f"{min(len(done), count)} of {count} cases", min(len(done), count) / count)
+            cases |= set(workers.done())
+            pending -= 1
+            progress(f"{min(len(cases), count)} of {count} cases", min(len(cases), count) / count)
             if time.monotonic() > listed + LISTED_EVERY:
-                _list(folder, order, done)
+                _list(folder, order, cases)
                 listed = time.monotonic()
     finally:
         _list_what_is_there(folder, order, before)
@@ -139,7 +139,7 @@ def make_cases(folder: str | Path, indices: Sequence[int]) -> list[int]:
 
 
 def read_order(folder: str | Path) -> Order:
-    """What a set is to be.
+    """Return the order that a set was begun with.
 
     Raises
     ------
@@ -155,27 +155,27 @@ def read_order(folder: str | Path) -> Order:
         came = "none" if version is None else f"version {quoted(version)}: begin it anew in another folder"
         raise ValueError(f"expected a set of version {VERSION} in {folder}, got {came}")
     try:
-        kept = header["order"]
-        return Order(Recipe.from_dict(kept["recipe"]), kept["layout"], tuple(kept["parts"]))
+        content = header["order"]
+        return Order(Recipe.from_dict(content["recipe"]), content["layout"], tuple(content["parts"]))
     except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
-        said = quoted(str(error))
-        raise ValueError(f"expected a whole set in {folder}, got one with a damaged {HEADER} ({said})") from error
+        reason = quoted(str(error))
+        raise ValueError(f"expected a whole set in {folder}, got one with a damaged {HEADER} ({reason})") from error
 
 
 def cases_of(folder: Path) -> list[int]:
-    """The cases that are complete: a record is written last."""
+    """Return the indices of the complete cases: those with a record, which is written last."""
     names = (path.stem.removeprefix("case_") for path in (folder / RECORDS).glob("case_*.json"))
     return sorted(int(name) for name in names if name.isdigit())
 
 
 def case_name(index: int) -> str:
-    """What a case is called in file names."""
+    """Return the name of a case in files."""
     return f"case_{index:05d}"
 
 
 @contextmanager
 def _begun(folder: Path, order: Order) -> Iterator[None]:
-    """A set that is begun; where a case can't be had and none was, what was begun here is removed."""
+    """Begin a set; where the first case can't be had, remove what was begun."""
     new = [place for place in (folder, *folder.absolute().parents) if not place.exists()]
     anew = not (folder / HEADER).exists()
     _begin(folder, order)
@@ -200,18 +200,18 @@ def _begin(folder: Path, order: Order) -> None:
             raise ValueError(f"expected a new or empty folder, or a set to go on with, got {folder} with other things")
         header = {"format": FORMAT, "version": VERSION, "versions": versions(), "order": order.as_dict()}
         _write_json(folder / HEADER, header)
-    found, asked = read_order(folder).as_dict(), order.as_dict()
-    if found != asked:
-        name, was, now = _difference(found, asked)
-        told = f"got another {name}: {now} for {was}; choose another folder, or delete this one"
-        raise ValueError(f"expected what {folder} was begun with, {told}")
+    stored, wanted = read_order(folder).as_dict(), order.as_dict()
+    if stored != wanted:
+        name, was, now = _difference(stored, wanted)
+        state = f"got another {name}: {now} for {was}; choose another folder, or delete this one"
+        raise ValueError(f"expected what {folder} was begun with, {state}")
     (folder / RECORDS).mkdir(exist_ok=True)
 
 
-def _list(folder: Path, order: Order, done: set[int]) -> None:
+def _list(folder: Path, order: Order, cases: set[int]) -> None:
     """Write what the layout's readers want."""
-    about, cases = About(folder.resolve().name, order.recipe.modality.name), list(map(case_name, sorted(done)))
-    _write_json(folder / LIST, LAYOUTS[order.layout].listing(cases, about))
+    about, names = About(folder.resolve().name, order.recipe.modality.name), list(map(case_name, sorted(cases)))
+    _write_json(folder / LIST, LAYOUTS[order.layout].listing(names, about))
 
 
 def _list_what_is_there(folder: Path, order: Order, before: set[int]) -> None:
@@ -219,20 +219,20 @@ def _list_what_is_there(folder: Path, order: Order, before: set[int]) -> None:
 
     Cases that were there before this run stay.
     """
-    done = set(cases_of(folder))
+    cases = set(cases_of(folder))
     while True:
         try:
-            return _list(folder, order, done)
+            return _list(folder, order, cases)
         except OSError as error:
-            if error.errno not in (errno.ENOSPC, errno.EDQUOT) or done <= before:
+            if error.errno not in (errno.ENOSPC, errno.EDQUOT) or cases <= before:
                 raise
-            last = max(done - before)
+            last = max(cases - before)
             _remove_case(folder, order, case_name(last))
-            done.remove(last)
+            cases.remove(last)
 
 
 def _remove_case(folder: Path, order: Order, name: str) -> None:
-    """Its record first: what is left without one is no case."""
+    """Remove a case, its record first: files without a record are no case."""
     layout = LAYOUTS[order.layout]
     places = [
         folder / RECORDS / f"{name}.json",
@@ -243,7 +243,7 @@ def _remove_case(folder: Path, order: Order, name: str) -> None:
 
 
 def _write_case(folder: Path, order: Order, index: int, case: Case) -> None:
-    """Labels, image, record, in this order; all or none. With its record a case is complete, whoever made it."""
+    """Write labels, image and record of a case, in this order, all or none; with its record a case is complete."""
     layout, name = LAYOUTS[order.layout], case_name(index)
     record = folder / RECORDS / f"{name}.json"
     places = [folder / layout.label.format(case=name), folder / layout.image.format(case=name)]
@@ -265,25 +265,25 @@ def _write_case(folder: Path, order: Order, index: int, case: Case) -> None:
 
 
 def _write_parts(order: Order, case: Case, place: Callable[[str], Path], places: list[Path]) -> dict[str, Any]:
-    """The labels besides the mask; what is no volume goes into the record."""
+    """Return the labels besides the mask; what is no volume goes into the record."""
     if not order.parts:
         return {}
     grid, known = Grid(case.image.shape, case.spacing, "replicate"), {}  # type: ignore[arg-type]
-    asked = set(order.parts) - {"centreline"} | ({"skeleton", "distance"} if "centreline" in order.parts else set())
-    found = labels_of(case.field, grid, case.epsilon, asked) if asked else None
+    wanted = set(order.parts) - {"centreline"} | ({"skeleton", "distance"} if "centreline" in order.parts else set())
+    labels = labels_of(case.field, grid, case.epsilon, wanted) if wanted else None
     for part in order.parts:
         if part == "centreline":
-            graph = centreline(found.skeleton, found.distance, grid)  # type: ignore[union-attr,arg-type]
+            graph = centreline(labels.skeleton, labels.distance, grid)  # type: ignore[union-attr,arg-type]
             for suffix, write in ((".graphml", write_graphml), (".swc", write_swc)):
                 target = place(part)
                 target = target.with_name(target.name.partition(".")[0] + suffix)
                 places.append(target)
                 write(graph, target, case.unit)
         elif part == "betti":
-            known[part] = list(found.betti)  # type: ignore[union-attr,arg-type]
+            known[part] = list(labels.betti)  # type: ignore[union-attr,arg-type]
         else:
             places.append(place(part))
-            save(Field(getattr(found, part), case.spacing, case.unit), place(part))
+            save(Field(getattr(labels, part), case.spacing, case.unit), place(part))
     return known
 
 
@@ -295,10 +295,10 @@ def _write_json(path: Path, content: dict[str, Any]) -> None:
     write_content(path, json.dumps(content, indent=2) + "\n")
 
 
-def _difference(found: Any, asked: Any, name: str = "order") -> tuple[str, Any, Any]:
-    """The name of the first value that differs, and both."""
-    if isinstance(found, dict) and isinstance(asked, dict) and found.keys() == asked.keys():
-        for key in found:
-            if found[key] != asked[key]:
-                return _difference(found[key], asked[key], key)
-    return name, found, asked
+def _difference(stored: Any, wanted: Any, name: str = "order") -> tuple[str, Any, Any]:
+    """Return the name of the first value that differs, and both."""
+    if isinstance(stored, dict) and isinstance(wanted, dict) and stored.keys() == wanted.keys():
+        for key in stored:
+            if stored[key] != wanted[key]:
+                return _difference(stored[key], wanted[key], key)
+    return name, stored, wanted

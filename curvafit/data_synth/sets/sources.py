@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from os import PathLike
 from pathlib import Path
@@ -46,19 +46,19 @@ class PhaseField(NamedTuple):
 
 
 class ShapeSource(Protocol):
-    """Shapes without end, each of the random numbers it is given."""
+    """An endless source of shapes, each decided by the random numbers that it is given."""
 
     @property
     def within(self) -> float:
-        """The most voxels that a shape can have along an edge."""
+        """Return the most voxels that a shape can have along an edge."""
         ...
 
     def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> PhaseField:
-        """PhaseField number `index` of so many voxels (z, y, x)."""
+        """Return shape number `index` of so many voxels (z, y, x)."""
         ...
 
     def as_dict(self) -> dict[str, Any]:
-        """What a set records; `source_of` reads it back."""
+        """Return the source in JSON's types, for a set's record; `source_of` reads it."""
         ...
 
 
@@ -99,11 +99,11 @@ class Generated:
 
     @property
     def within(self) -> float:
-        """A shape is grown as large as it is asked for."""
+        """Return infinity: a shape is grown as large as it is wanted."""
         return math.inf
 
     def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> PhaseField:
-        """A well-formed shape, of the first of some seeds that gives one.
+        """Return a well-formed shape, of the first of some seeds that gives one.
 
         Raises
         ------
@@ -196,7 +196,7 @@ class Stored:
             object.__setattr__(self, "draws", len(_formed(self.paths)))
 
     def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> PhaseField:
-        """A crop of any of the stores' shapes that shows both structure and background.
+        """Return a crop of any of the stores' shapes that shows both structure and background.
 
         Raises
         ------
@@ -229,12 +229,12 @@ class Stored:
 
     @property
     def about(self) -> str:
-        """The source in a few words."""
+        """Return the source in a few words."""
         return f"{self.draws} shapes of {', '.join(path.name for path in self.paths)}"
 
     @property
     def within(self) -> int:
-        """The least edge of the stores' shapes, in voxels: what a crop must be within."""
+        """Return the least edge of the stores' shapes, in voxels: what a crop must be within."""
         return min(min(store.settings.shape) for store, _ in _formed(self.paths))
 
 
@@ -259,11 +259,11 @@ class Pool:
 
     @property
     def about(self) -> str:
-        """The source in a few words."""
+        """Return the source in a few words."""
         return f"{self.count} shapes of {', '.join(self.generated.names)}"
 
     def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> PhaseField:
-        """A crop of any of the pool's shapes that shows both structure and background.
+        """Return a crop of any of the pool's shapes that shows both structure and background.
 
         Raises
         ------
@@ -304,17 +304,14 @@ def voxel_of(laws: Iterable[Law], kind: Modality) -> float:
 
 
 def _point(texture: Texture, fraction: float | None) -> tuple[float, ...]:
-    """The seven numbers of a law; a mass that it does not state is that of the volume fraction."""
-    mass = texture.mass
-    if mass is None:
-        if fraction is None:
-            raise ValueError(f"expected a law with a mass, or a volume fraction beside it, got {texture.origin} alone")
-        mass = first_mass(fraction)
-    return (*map(float, texture.coefficients), mass)  # type: ignore[arg-type]
+    """Return the seven numbers of a law; a mass that it does not state is that of the volume fraction."""
+    if texture.mass is None and fraction is not None:
+        return replace(texture, mass=first_mass(fraction)).point
+    return texture.point
 
 
 def _two_phases(crop: Callable[[], _Crop], voxels: Sequence[int]) -> _Crop:
-    """The first crop that shows both structure and background."""
+    """Return the first crop that shows both structure and background."""
     for _ in range(CROPS):
         parts = crop()
         if parts[0].min() < 0 < parts[0].max():
@@ -330,11 +327,11 @@ def _pooled(generated: Generated, number: int, edge: int) -> PhaseField:
 
 @lru_cache(maxsize=16)
 def _formed(paths: tuple[Path, ...]) -> list[tuple[Store, int]]:
-    """The well-formed draws of some stores, each with its store."""
-    found = []
+    """Return the well-formed draws of some stores, each with its store."""
+    draws = []
     for store in map(open_store, paths):
-        own = [(store, index) for index in store.indices() if well_formed(store.record(index).viability)]
-        if not own:
+        formed = [(store, index) for index in store.indices() if well_formed(store.record(index).viability)]
+        if not formed:
             raise ValueError(f"expected a store with well-formed shapes, got none in {store.path}")
-        found += own
-    return found
+        draws += formed
+    return draws

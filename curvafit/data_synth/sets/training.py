@@ -126,28 +126,28 @@ class TextureDataset(IterableDataset):
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
 
     def __repr__(self) -> str:
-        """One line: where shapes come from, the kinds of image, their size, and the epoch's length."""
+        """Return one line: where the shapes come from, the kinds of image, their size, and the epoch's length."""
         kinds, size = ", ".join(kind.name for kind in self.modalities), " x ".join(map(str, self.size))
         return f"TextureDataset({self.source.about}; {kinds}; {size} voxels; {self.length} samples an epoch)"
 
     def __len__(self) -> int:
-        """Samples of an epoch that this rank gives."""
+        """Return the number of samples that this rank gives in an epoch."""
         return self.length // self._rank()[1]
 
     def __getstate__(self) -> dict[str, Any]:
-        """With the rank, which a spawned worker, outside the group, could not ask for."""
-        return self.__dict__ | {"_told": self._rank()}
+        """Return the state with the rank, which a spawned worker, outside the group, cannot ask for."""
+        return self.__dict__ | {"_group_rank": self._rank()}
 
     def _rank(self) -> tuple[int, int]:
-        found = _rank()
-        return self.__dict__.get("_told", found) if found == (0, 1) and get_worker_info() else found
+        live = _rank()
+        return self.__dict__.get("_group_rank", live) if live == (0, 1) and get_worker_info() else live
 
     def set_epoch(self, epoch: int) -> None:
-        """Which epoch comes next, from 0; workers that stay alive see it too."""
+        """Set the epoch that comes next, from 0; workers that stay alive see it too."""
         self._epoch.fill_(epoch)
 
     def __iter__(self) -> Iterator[Any]:
-        """This worker's part of this rank's part of the epoch."""
+        """Yield this worker's part of this rank's part of the epoch."""
         (rank, ranks), worker = self._rank(), get_worker_info()
         first, step = (0, 1) if worker is None else (worker.id, worker.num_workers)
         start = int(self._epoch) * self.length
@@ -155,12 +155,12 @@ class TextureDataset(IterableDataset):
             yield self[start + k * ranks + rank]
 
     def __getitem__(self, number: int) -> Any:
-        """Sample `number`, from 0."""
+        """Return sample `number`, from 0."""
         sample = self.sample(number)
         return sample if self.transform is None else self.transform(sample)
 
     def sample(self, number: int) -> Sample:
-        """Sample `number`, from 0, before the transform."""
+        """Return sample `number`, from 0, before the transform."""
         words = np.random.SeedSequence(self.seed, spawn_key=(number,))
         rng, (for_imaging, for_image, for_blend) = np.random.default_rng(words), map(int, words.generate_state(3))
         turn = int(rng.integers(len(self.modalities)))
@@ -182,7 +182,7 @@ class TextureDataset(IterableDataset):
     def _shape(
         self, voxels: Sequence[int], rng: np.random.Generator, seed: int
     ) -> tuple[Tensor, float, list[dict[str, Any]]]:
-        """A phase field (Z, Y, X): a crop of one shape, or of two that share the volume."""
+        """Return a phase field (Z, Y, X): a crop of one shape, or of two that share the volume."""
         blended = rng.random() < self.blend
         one, *more = (self.source.shape(voxels, 0, rng) for _ in range(1 + blended))
         u = torch.from_numpy(one.values)
@@ -193,7 +193,7 @@ class TextureDataset(IterableDataset):
         return u, one.epsilon, [shape.origin for shape in (one, *more)]
 
     def _pool(self, generated: Generated, count: int, rotate: bool) -> Pool:
-        """A pool of shapes as large as the largest crop."""
+        """Return a pool of shapes as large as the largest crop."""
         whole(count, "a pool of at least 1 shape", 1, MOST_POOLED)
         crops = zip(self.modalities, self.voxels, strict=True)
         largest = max(max(field_shape(self.size, edge * self.calibres[0], kind.base)) for kind, edge in crops)
@@ -211,12 +211,12 @@ class TextureDataset(IterableDataset):
 
 
 def as_dict(sample: Sample) -> dict[str, Tensor]:
-    """`image` and `label`, what a `DataLoader` batches."""
+    """Return `image` and `label`, what a `DataLoader` batches."""
     return {"image": sample.image, "label": sample.label}
 
 
 def as_monai(sample: Sample) -> dict[str, Any]:
-    """MONAI's dictionary: `image` and `label` as `MetaTensor` with an affine; array axes are z, y, x.
+    """Return MONAI's dictionary: `image` and `label` as `MetaTensor` with an affine; array axes are z, y, x.
 
     Raises
     ------
@@ -232,7 +232,7 @@ def as_monai(sample: Sample) -> dict[str, Any]:
 
 
 def as_subject(sample: Sample) -> Any:
-    """A TorchIO `Subject` with `image` and `label`; its array axes are x, y, z.
+    """Return a TorchIO `Subject` with `image` and `label`; its array axes are x, y, z.
 
     Raises
     ------
@@ -279,7 +279,7 @@ def _normalisation(normalise: str | Callable[[Tensor], Tensor] | None) -> Callab
 
 
 def _rank() -> tuple[int, int]:
-    """This process's rank in `torch.distributed`'s group and the group's size; 0 of 1 without one."""
+    """Return this process's rank in `torch.distributed`'s group and the group's size; 0 of 1 without one."""
     group = torch.distributed
     if group.is_available() and group.is_initialized():
         return group.get_rank(), group.get_world_size()
