@@ -81,6 +81,7 @@ _HOMES = {
 
 #: The function that draws each type with a picture, as `module:function`; see `curvafit.pictures`.
 _FIGURES = {
+    "Fit": "curvafit.drawing.figures:fit_figure",
     "Flow": "curvafit.drawing.figures:flow_figure",
 }
 
