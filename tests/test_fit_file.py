@@ -11,7 +11,7 @@ from broken_fits import BROKEN, broken
 from found import made_fit
 
 from curvafit.priors import read_fit
-from curvafit.priors.fit_schema import FIT_SCHEMA, violation
+from curvafit.priors.fit_schema import FIT_SCHEMA, WHOLE_FIT, violation
 from curvafit.priors.json_text import parse_json, quoted
 
 SENTENCE = r"\Aexpected [^\n]{1,600}\Z"
@@ -79,8 +79,9 @@ def test_the_schema_is_plain_data_in_the_words_that_both_checks_know() -> None:
         for inner in [*schema.get("properties", {}).values(), *([schema["items"]] if "items" in schema else [])]:
             walk(inner)
 
-    walk(FIT_SCHEMA)
-    assert json.loads(json.dumps(FIT_SCHEMA)) == FIT_SCHEMA
+    for schema in (FIT_SCHEMA, WHOLE_FIT):
+        walk(schema)
+        assert json.loads(json.dumps(schema)) == schema
 
 
 def test_a_quotation_is_short() -> None:

@@ -65,6 +65,20 @@ def test_the_warm_up_counts_training_steps_and_survives_a_restart():
     assert int(again.calls) == 6 and again(logits, target) is not None and int(again.calls) == 6
 
 
+def test_the_parts_of_the_sum_are_there_to_log():
+    base, prior = nn.BCEWithLogitsLoss(), CurvaturePrior("tubes", sigmoid=True)
+    logits, target = noise(1, 1, 8, 8, 8).requires_grad_(), torch.zeros(1, 1, 8, 8, 8)
+    loss = CombinedLoss(base, prior, 2.0, warmup=4)
+    assert loss.parts == {}
+    value = loss(logits, target)
+    parts = loss.parts
+    assert set(parts) == {"base", "prior", "weight"} and not any(part.requires_grad for part in parts.values())
+    torch.testing.assert_close(parts["base"], base(logits, target).detach())
+    torch.testing.assert_close(parts["prior"], prior(logits).detach())
+    assert float(parts["weight"]) == 0.5
+    torch.testing.assert_close(parts["base"] + parts["weight"] * parts["prior"], value.detach())
+
+
 def test_combined_loss_refuses_negative_numbers():
     for options in ({"weight": -1.0}, {"weight": None}, {"weight": float("inf")}, {"warmup": -1}, {"warmup": 0.5}):
         with pytest.raises(ValueError, match=r"expected a (finite weight|warm-up of whole calls) from 0, got"):

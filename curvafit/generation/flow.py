@@ -18,7 +18,7 @@ from curvafit.generation.parametrization import FORMS, DivergenceForm
 from curvafit.generation.result import RECORD_EVERY, Callback, Flow, History, State
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.schedule import schedule as named_schedule
-from curvafit.generation.setup import Place, base_of
+from curvafit.generation.setup import Execution, base_of
 from curvafit.priors.bounds import named, quoted, seed_of
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.law import Law, texture_of
@@ -107,14 +107,15 @@ def generate(
     texture = texture_of(law)
     mass = texture.mass if mass is None and volume_fraction is None else mass
     grid, seed = grid if isinstance(grid, Grid) else Grid(grid), seed_of(seed)  # type: ignore[arg-type]
-    place, plan = Place(backend, device, checkpoint, checkpoint_every, keep_checkpoint), named_schedule(schedule)
+    execution = Execution(backend, device, checkpoint, checkpoint_every, keep_checkpoint)
+    plan = named_schedule(schedule)
     cost = Cost(texture.coefficients, grid, epsilon, orientation, blur)
     orders = Orders(cost, plan, callbacks, snapshots, reject_early, volume_fraction)
     orders.check_memory(device)
     base = base_of(mass, volume_fraction, grid)
-    form = DivergenceForm.of(grid, cost.blur, base, place.blur)
-    moved = place.stepper(white_noise(grid, seed), form, cost, plan, "adam", None)
-    saved = place.saved(moved, cost, orders, seed=seed, mass=base)
+    form = DivergenceForm.of(grid, cost.blur, base, execution.blur)
+    moved = execution.stepper(white_noise(grid, seed), form, cost, plan, "adam", None)
+    saved = execution.saved(moved, cost, orders, seed=seed, mass=base)
     return run(moved, [orders], [seed], saved)[0]
 
 
@@ -146,9 +147,9 @@ def relax(
         If the field or the mask does not have the grid's shape, or is not finite; or as `generate`.
     """
     cost = Cost(texture_of(law).coefficients, grid, epsilon, orientation, blur)
-    place = Place(backend, device, checkpoint, checkpoint_every)
+    execution = Execution(backend, device, checkpoint, checkpoint_every)
     orders = Orders(cost, named_schedule(schedule), callbacks, snapshots)
-    return _from_field(field, cost, place, "h-1", "adam", frozen, orders)
+    return _from_field(field, cost, execution, "h-1", "adam", frozen, orders)
 
 
 def descend(
@@ -204,13 +205,13 @@ def descend(
         plan = Schedule("lbfgs", steps, 1.0, 1.0, "constant")
     width = min(grid.spacing) if blur is None and isinstance(grid, Grid) else blur
     cost = Cost(texture_of(law).coefficients, grid, epsilon, orientation, width, data)  # type: ignore[arg-type]
-    place = Place(backend, device, checkpoint, checkpoint_every)
+    execution = Execution(backend, device, checkpoint, checkpoint_every)
     orders = Orders(cost, plan, callbacks, snapshots)
-    return _from_field(field, cost, place, flow, optimiser, None, orders)
+    return _from_field(field, cost, execution, flow, optimiser, None, orders)
 
 
 def _from_field(
-    field: Tensor, cost: Cost, place: Place, flow: str, optimiser: str, frozen: Tensor | None, orders: Orders
+    field: Tensor, cost: Cost, execution: Execution, flow: str, optimiser: str, frozen: Tensor | None, orders: Orders
 ) -> Flow:
     grid, plan = cost.grid, orders.plan
     for name, values in (("field", field), ("frozen mask", frozen)):
@@ -219,11 +220,11 @@ def _from_field(
                 raise ValueError(f"expected a {name} of shape {grid.shape}, got {quoted(values)}")
             if tuple(values.shape) != grid.shape:
                 raise ValueError(f"expected a {name} of shape {grid.shape}, got {tuple(values.shape)}")
-    orders.check_memory(place.device)
+    orders.check_memory(execution.device)
     field = torch.as_tensor(field).detach().to("cpu", torch.float32).contiguous()
     if not bool(torch.isfinite(field).all()):
         raise ValueError("expected a finite field, got NaN or infinity in it")
-    form, start = FORMS[flow].at(field, grid, cost.blur, place.blur)
-    moved = place.stepper(start, form, cost, plan, optimiser, frozen)
-    saved = place.saved(moved, cost, orders, flow=flow, field=field, frozen=frozen)
+    form, start = FORMS[flow].at(field, grid, cost.blur, execution.blur)
+    moved = execution.stepper(start, form, cost, plan, optimiser, frozen)
+    saved = execution.saved(moved, cost, orders, flow=flow, field=field, frozen=frozen)
     return run(moved, [orders], [None], saved)[0]

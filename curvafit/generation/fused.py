@@ -11,7 +11,7 @@ from torch import Tensor
 
 from curvafit.generation.cost import Cost
 from curvafit.generation.parametrization import DivergenceForm
-from curvafit.generation.stepper import ADAM_EPS, Shape, Statistics, Stepper
+from curvafit.generation.stepper import ADAM_EPS, ShapeView, Statistics, Stepper
 from curvafit.priors import kernels
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
@@ -40,7 +40,7 @@ class FusedStepper(Stepper):
         self._seen = Statistics(0.0, 0.0, 0.0)
 
     @property
-    def shapes(self) -> Sequence[Shape]:
+    def shapes(self) -> Sequence[ShapeView]:
         return (self,)
 
     def step(self, rate: float | None) -> None:
@@ -102,7 +102,7 @@ class CudaStepper(Stepper):
         self._masses: list[float] | None = None
 
     @property
-    def shapes(self) -> Sequence[Shape]:
+    def shapes(self) -> Sequence[ShapeView]:
         return self._shapes
 
     def step(self, rate: float | None) -> None:

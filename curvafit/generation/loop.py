@@ -19,7 +19,7 @@ from curvafit.generation.cost import Cost
 from curvafit.generation.memory import FIELD, FLOW, check_memory
 from curvafit.generation.result import RECORD_EVERY, Callback, Flow, History, State
 from curvafit.generation.schedule import Schedule
-from curvafit.generation.stepper import Shape, Statistics, Stepper
+from curvafit.generation.stepper import ShapeView, Statistics, Stepper
 from curvafit.generation.viability import Viability, viability
 from curvafit.priors.bounds import quoted, several
 
@@ -127,7 +127,7 @@ def _content(moved: Stepper, lanes: list[_Lane], made: int) -> dict[str, Any]:
 class _Lane:
     """One shape on its way."""
 
-    def __init__(self, shape: Shape, orders: Orders, seed: int | None) -> None:
+    def __init__(self, shape: ShapeView, orders: Orders, seed: int | None) -> None:
         self._shape, self._orders, self._seed = shape, orders, seed
         self.rows: list[list[float]] = []
         self.kept: dict[int, Tensor] = {}

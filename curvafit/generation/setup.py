@@ -22,7 +22,7 @@ from curvafit.priors.grid import Grid
 
 
 @dataclass(frozen=True)
-class Place:
+class Execution:
     """How and where the steps are made, and where they are saved.
 
     Raises

@@ -31,7 +31,7 @@ class Statistics(NamedTuple):
     gradient_mean: float
 
 
-class Shape(Protocol):
+class ShapeView(Protocol):
     """What a stepper shows of a shape."""
 
     def statistics(self) -> Statistics:
@@ -58,7 +58,7 @@ class Stepper(Protocol):
     stalled: bool = False
 
     @property
-    def shapes(self) -> Sequence[Shape]:
+    def shapes(self) -> Sequence[ShapeView]:
         """The shapes, in order."""
         ...
 
@@ -115,7 +115,7 @@ class TorchStepper(Stepper):
         self._value, self._u, self._slope = 0.0, self._parameters, self._parameters
 
     @property
-    def shapes(self) -> Sequence[Shape]:
+    def shapes(self) -> Sequence[ShapeView]:
         return (self,)
 
     def _made(self, betas: tuple[float, float]) -> torch.optim.Optimizer:

@@ -25,6 +25,12 @@ class CombinedLoss(nn.Module):
         Calls over which the weight grows linearly to its full value; those without a gradient or in evaluation mode do
         not count. The count is a buffer, so that a resumed training goes on.
 
+    Attributes
+    ----------
+    parts
+        What the last call summed, to log: `base` and `prior` before weighting, and the `weight` of the prior in that
+        call; tensors without a gradient, still on their device. Empty before the first call.
+
     Raises
     ------
     ValueError
@@ -40,13 +46,16 @@ class CombinedLoss(nn.Module):
         self.weight = real(weight, "a finite weight from 0", 0)
         self.warmup = whole(warmup, "a warm-up of whole calls from 0", 0, 2**53)
         self.base, self.prior = base, prior
+        self.parts: dict[str, Tensor] = {}
         self.register_buffer("calls", torch.zeros((), dtype=torch.int64))
 
     def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-        """The sum; `mask` goes to the prior."""
+        """Return the sum; `mask` goes to the prior."""
         if self.training and torch.is_grad_enabled():
             self.calls += 1
-        strength = self.weight
+        weight = self.weight
         if self.warmup:
-            strength = strength * (self.calls / self.warmup).clamp(max=1)
-        return self.base(input, target) + strength * self.prior(input, target, mask)
+            weight = weight * (self.calls / self.warmup).clamp(max=1)
+        base, prior = self.base(input, target), self.prior(input, target, mask)
+        self.parts = {"base": base.detach(), "prior": prior.detach(), "weight": torch.as_tensor(weight)}
+        return base + weight * prior

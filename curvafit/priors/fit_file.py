@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from curvafit.priors.bounds import quoted
 from curvafit.priors.coefficients import NAMES, Coefficients
-from curvafit.priors.fit_schema import FORMAT, violation
+from curvafit.priors.fit_schema import FIT_SCHEMA, FORMAT, violation
 from curvafit.priors.json_text import parse_json
 from curvafit.units import METRES
 
@@ -50,28 +51,57 @@ class Prior(NamedTuple):
 
 
 def read_fit(path: str | PathLike[str]) -> Prior:
-    """Read a `fit.json`.
+    """Read the law of a `fit.json`.
 
     Raises
     ------
     FileNotFoundError, ValueError
         If there is no such file, or it is not a `fit.json` of this format (`fit_schema`).
     """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"expected a fit.json, found no file {path}")
-    expected = "a fit.json written by `curvafit infer`"
-    content = parse_json(path.read_bytes(), expected, path)
-    said = content.get("format", FORMAT) if isinstance(content, dict) else FORMAT
-    if said != FORMAT:
-        got = f"got {quoted(said)} in {path}: run `curvafit infer` again"
-        raise ValueError(f"expected a fit.json of format {FORMAT}, {got}")
-    if wrong := violation(content):
-        raise ValueError(f"expected {expected} with {wrong} in {path}")
-    working, physical = (
-        Coefficients(*(float(content[key][name]) for name in NAMES))
-        for key in ("coefficients", "coefficients_physical")
-    )
+    content = parse_fit(fit_bytes(path), path, FIT_SCHEMA)
+    working, physical = (six_of(content[key]) for key in ("coefficients", "coefficients_physical"))
     mass, epsilon, voxel = (float(content[key]) for key in ("mass", "epsilon_physical", "working_voxel"))
     filled = (content.get("morphometry") or {}).get("volume_fraction")
     return Prior(working, mass, physical, epsilon, voxel, content["length_unit"], filled)
+
+
+def fit_bytes(path: str | PathLike[str]) -> bytes:
+    """Return what a `fit.json` holds.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    """
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"expected a fit.json, found no file {path}")
+    return Path(path).read_bytes()
+
+
+def parse_fit(text: str | bytes, place: object, schema: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content of a `fit.json`, checked against a schema.
+
+    Parameters
+    ----------
+    place
+        Where the text stands, for the sentence of an error.
+
+    Raises
+    ------
+    ValueError
+        If it is no JSON, of another format, or breaks the schema.
+    """
+    expected = "a fit.json written by `curvafit infer`"
+    content = parse_json(text, expected, place)
+    stated = content.get("format", FORMAT) if isinstance(content, dict) else FORMAT
+    if stated != FORMAT:
+        got = f"got {quoted(stated)} in {place}: run `curvafit infer` again"
+        raise ValueError(f"expected a fit.json of format {FORMAT}, {got}")
+    if wrong := violation(content, schema):
+        raise ValueError(f"expected {expected} with {wrong} in {place}")
+    return content
+
+
+def six_of(values: Mapping[str, float]) -> Coefficients:
+    """Return coefficients from six numbers by name."""
+    return Coefficients(*(float(values[name]) for name in NAMES))

@@ -1,7 +1,8 @@
-"""What a `fit.json` must hold: a schema, and a check of it that the page of an atlas has in JavaScript too.
+"""What a `fit.json` holds: one schema for the law that is read from it, for the whole fit, and for an atlas's page.
 
-The schema is data in the words of JSON Schema. Both checks know `type`, `enum`, `required`, `properties`, `items`,
-`minItems`, `minimum`, `maximum` and their exclusive forms; `description` is what an error says was expected.
+The schema is data in the words of JSON Schema; the page receives it as JSON. Both checks, here and in JavaScript, know
+`type`, `enum`, `required`, `properties`, `items`, `minItems`, `minimum`, `maximum` and their exclusive forms;
+`description` is what an error says was expected.
 """
 
 from __future__ import annotations
@@ -32,20 +33,25 @@ _DIAGRAM = {
     "required": ["kappa1", "kappa2", "share"],
     "properties": {
         "seen_as": {"enum": ["field", "mask"], "description": "field or mask"},
+        "unit": _TEXT,
+        "spread": _SHARE,
+        "excluded": _SHARE,
         "kappa1": _CURVATURES,
         "kappa2": _CURVATURES,
         "share": {"type": "array", "items": _SHARE, "minItems": 1, "description": "a list of numbers"},
     },
     "description": "an object of columns, or null",
 }
+_MASS = {"type": "number", "exclusiveMinimum": -1, "exclusiveMaximum": 1, "description": "a number between -1 and 1"}
 _MATCH = {
     "type": "object",
     "required": ["id", "distance", "coefficients"],
-    "properties": {"id": _TEXT, "distance": _SHARE, "coefficients": _SIX},
+    "properties": {"id": _TEXT, "distance": _SHARE, "coefficients": _SIX, "mass": _MASS, "seed": _SHARE},
     "description": "an object",
 }
+_OR_NONE = {"type": ["number", "null"], "description": "a number, or null"}
+_LENGTH = {"type": ["number", "null"], "minimum": 0, "description": "a number from 0, or null"}
 _FILLED = {"type": ["number", "null"], "minimum": 0, "maximum": 1, "description": "a number from 0 to 1, or null"}
-_MASS = {"type": "number", "exclusiveMinimum": -1, "exclusiveMaximum": 1, "description": "a number between -1 and 1"}
 
 FIT_SCHEMA: dict[str, Any] = {
     "type": "object",
@@ -64,14 +70,34 @@ FIT_SCHEMA: dict[str, Any] = {
         "family": _TEXT,
         "coefficients": _SIX,
         "mass": _MASS,
+        "chosen": {"enum": ["match", "fit"], "description": "match or fit"},
+        "uncertainty": _SIX,
+        "scale": {"type": "array", "items": _POSITIVE, "minItems": 3, "description": "a list of 3 numbers"},
         "coefficients_physical": _SIX,
         "epsilon_physical": _POSITIVE,
         "working_voxel": _POSITIVE,
         "length_unit": {"enum": ["voxel", *METRES], "description": f"one of voxel, {', '.join(METRES)}"},
         "matches": {"type": "array", "items": _MATCH, "description": "a list"},
+        "refined": {"type": "object", "description": "an object"},
+        "distances": {
+            "type": "object",
+            "properties": dict.fromkeys(("match", "fit", "seed_noise"), _LENGTH),
+            "description": "an object of distances",
+        },
+        "status": _TEXT,
+        "notes": {"type": "array", "items": _TEXT, "description": "a list of texts"},
         "morphometry": {
             "type": ["object", "null"],
-            "properties": {"volume_fraction": _FILLED},
+            "properties": {
+                "volume_fraction": _FILLED,
+                "thickness_mean": _LENGTH,
+                "thickness_std": _LENGTH,
+                "spacing_mean": _LENGTH,
+                "connectivity_density": _OR_NONE,
+                "euler": _NUMBER,
+                "surface_to_volume": _LENGTH,
+                "unit": _TEXT,
+            },
             "description": "an object, or null",
         },
         "diagram": _DIAGRAM,
@@ -83,6 +109,19 @@ FIT_SCHEMA: dict[str, Any] = {
     },
     "description": "an object",
 }
+
+
+def _whole(schema: Mapping[str, Any], **others: Any) -> dict[str, Any]:
+    """Return an object's schema with all its properties required, some of them by another schema."""
+    return {**schema, "required": list(schema["properties"]), "properties": {**schema["properties"], **others}}
+
+
+#: A fit with all that an inference tells of it, as `Fit` writes and reads it; a law needs less (`FIT_SCHEMA`).
+WHOLE_FIT = _whole(
+    FIT_SCHEMA,
+    matches={**FIT_SCHEMA["properties"]["matches"], "items": _whole(_MATCH)},
+    morphometry=_whole({**FIT_SCHEMA["properties"]["morphometry"], "type": "object", "description": "an object"}),
+)
 
 _BOUNDS = {
     "minimum": lambda value, bound: value >= bound,

@@ -1,4 +1,4 @@
-// What a fit.json must hold: the check of `curvafit.priors.fit_schema`, with its data.
+// A check of a value against a schema, as `curvafit.priors.fit_schema` has it; the schema itself comes with the page's data.
 
 const BOUNDS = {
   minimum: (value, bound) => value >= bound,
