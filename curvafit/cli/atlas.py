@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from curvafit.cli import forecast
+from curvafit.cli.forecast import cores, say_forecast
 from curvafit.cli.support import (
     OverwriteOption,
     command_line,
@@ -68,6 +70,7 @@ def build_atlas(
         from curvafit.data_synth.atlas.workers import check_workers
         from curvafit.files import check_folder
         from curvafit.generation.memory import FLOW, check_memory
+        from curvafit.generation.schedule import schedule as named
 
         check_count(count, 1)
         check_workers(workers, scheduler)
@@ -77,6 +80,9 @@ def build_atlas(
         if store.exists():
             open_store(store, settings)
         check_folder(store.parent)
+        if scheduler is None and not store.exists():
+            steps = count * named(schedule).steps
+            say_forecast("atlas build", box, steps, forecast.FLOW, what="voxels a shape", workers=cores(workers))
         with _made(count, (workers, scheduler, dashboard)) as (crew, progress):
             build(store, count, box, seed, schedule, progress, design=law, workers=crew)
         say(str(store))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
+from curvafit.cli.forecast import FLOW, say_forecast
 from curvafit.cli.support import (
     OverwriteOption,
     command_line,
@@ -267,9 +268,17 @@ def _grown(law: _Law, boundary: str, options: dict[str, Any]) -> Flow:
 
     grid = Grid(law.box, boundary=boundary)  # type: ignore[arg-type]
     options |= {"volume_fraction": law.share, "epsilon": law.epsilon}
+    begun: list[int] = []
+
+    def forecast(step: int, total: int, state: object) -> None:
+        """Say at the first step, when nothing is left to be refused, how long the others take."""
+        if not begun:
+            begun.append(step)
+            say_forecast("generate", law.box, total - step, FLOW, device=options["device"])
+
     with flow_progress(options["schedule"].steps) as watch:
         try:
-            flow = make(law.coefficients, law.mass, grid, callbacks=[watch], keep_checkpoint=True, **options)
+            flow = make(law.coefficients, law.mass, grid, callbacks=[forecast, watch], keep_checkpoint=True, **options)
         except KeyboardInterrupt as signal:
             if options["checkpoint"] is None or not options["checkpoint"].exists():
                 raise

@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from curvafit.cli import forecast
 from curvafit.cli.atlas import DashboardOption, SchedulerOption, WorkersOption
+from curvafit.cli.forecast import cores, say_forecast
 from curvafit.cli.reading import reading_of
 from curvafit.cli.support import error_console, kept, numbers, plainly, say, say_notes, stages, whole_triple
 
@@ -139,11 +141,15 @@ def _build(out: Path, order: Order, count: int, how: tuple[int | None, str | Non
     from curvafit.data_synth.sets.sets import build_set, cases_of
     from curvafit.files import check_folder
     from curvafit.generation.memory import FLOW, check_memory
+    from curvafit.generation.schedule import schedule
 
     check_folder(out)
     _, scheduler, _ = how
     if scheduler is None and order.recipe.source.within == math.inf:
         check_memory(order.recipe.largest, FLOW, "a shape")
+        steps = (count - len(cases_of(out))) * schedule("fast").steps
+        size, share = order.recipe.largest, cores(how[0])
+        say_forecast("synth", size, steps, forecast.FLOW, what="voxels a shape", workers=share)
     with kept(), stages() as progress:
         progress("starting workers", 0.0)
         with cluster(*how) as crew:

@@ -78,6 +78,7 @@ def infer(
     label: int | None = None,
     crop: Crop | None = None,
     seed: int = 0,
+    watch: Callable[[Prepared], None] | None = None,
     progress: Progress | None = None,
     **reading: Any,
 ) -> Inference:
@@ -97,6 +98,8 @@ def infer(
         What is inside: see `curvafit.inference.prepare.prepare`.
     label, crop
         The voxels of one value as a mask; a box of voxels, of the scan and of `roi`: see `curvafit.load`.
+    watch
+        Called with the `Prepared` scan before the long part begins; what it raises ends the inference.
     progress
         Called with a sentence and the share done.
     reading
@@ -118,6 +121,8 @@ def infer(
     region = None if roi is None else field_of(roi)
     region = region if region is None or crop is None else region.crop(crop)
     prepared = prepare(volume, kind=kind, periodic=periodic, threshold=threshold, dark=dark, roi=region)
+    if watch is not None:
+        watch(prepared)
     say("measuring curvature", 0.05)
     seen = scan_diagram(prepared)
     seen_as = "field" if prepared.kind == "field" else "mask"
