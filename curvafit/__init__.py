@@ -79,4 +79,10 @@ _HOMES = {
     "wasserstein": "curvafit.geometry.transport",
 }
 
+#: The function that draws each type with a picture, as `module:function`; see `curvafit.pictures`.
+_FIGURES = {
+    "Field": "curvafit.drawing.sections:field_figure",
+    "Segmentation": "curvafit.segmentation.mask_files:segmentation_figure",
+}
+
 offer(__name__, _HOMES)

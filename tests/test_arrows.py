@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).resolve().parent.parent / "curvafit"
 WINGS = ("priors", "generation", "data_synth")
 #: The house from the ground up. A folder (or a file at the root) imports from floors below its own.
 FLOORS = (
-    ("faces", "units", "messages", "progress", "interrupts", "machine"),
+    ("faces", "units", "messages", "progress", "interrupts", "machine", "pictures"),
     ("priors", "files"),
     ("generation", "volumes"),
     ("geometry",),
@@ -24,7 +24,7 @@ FLOORS = (
 )
 #: Arrows that run down, and still may not be.
 FORBIDDEN = {
-    "priors": {"faces", "messages", "progress", "interrupts", "machine"},
+    "priors": {"faces", "messages", "progress", "interrupts", "machine", "pictures"},
     "geometry": {"generation"},
     "segmentation": {"inference"},
     "data_synth": {"inference"},

@@ -173,15 +173,8 @@ def reconstruct(
 
             return fill(volume, prior, epsilon=epsilon, steps=steps, progress=progress, **options)  # type: ignore[arg-type]
 
-        _run(
-            slices,
-            out,
-            prior,
-            reading,
-            made,
-            {"job": "reconstruct", "steps": steps, "epsilon": epsilon, **options},
-            overwrite,
-        )
+        told = {"job": "reconstruct", "steps": steps, "epsilon": epsilon, **options}
+        _run(slices, out, prior, reading, made, told, overwrite)
 
 
 def _run(
