@@ -138,11 +138,13 @@ def synth(
 def _build(out: Path, order: Order, count: int, how: tuple[int | None, str | None, int | None]) -> None:
     from curvafit.data_synth.atlas.workers import cluster
     from curvafit.data_synth.sets.picture import write_preview
-    from curvafit.data_synth.sets.sets import build_set, cases_of
+    from curvafit.data_synth.sets.sets import MOST, build_set, cases_of
     from curvafit.files import check_folder
     from curvafit.generation.memory import FLOW, check_memory
     from curvafit.generation.schedule import schedule
+    from curvafit.priors.bounds import whole
 
+    whole(count, "a count of at least 1 case", 1, MOST)
     check_folder(out)
     _, scheduler, _ = how
     if scheduler is None and order.recipe.source.within == math.inf:
