@@ -82,9 +82,11 @@ _HOMES = {
 #: The function that draws each type with a picture, as `module:function`; see `curvafit.pictures`.
 _FIGURES = {
     "Diagram": "curvafit.drawing.plot:diagram_figure",
+    "Field": "curvafit.drawing.sections:field_figure",
     "Fit": "curvafit.drawing.figures:fit_figure",
     "Flow": "curvafit.drawing.figures:flow_figure",
     "Inference": "curvafit.report.pictures:inference_figure",
+    "Segmentation": "curvafit.segmentation.mask_files:segmentation_figure",
 }
 
 offer(__name__, _HOMES)

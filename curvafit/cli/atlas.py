@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from curvafit.cli import forecast
+from curvafit.cli.forecast import cores, say_forecast
 from curvafit.cli.support import (
     OverwriteOption,
     command_line,
@@ -60,6 +62,7 @@ def build_atlas(
         from curvafit.data_synth.atlas.build import build, check_count, settings_of
         from curvafit.data_synth.atlas.store import open_store
         from curvafit.files import check_folder
+        from curvafit.generation.schedule import schedule as named
 
         check_count(count, 1)
         crew = Crew(workers, scheduler, dashboard)
@@ -68,6 +71,9 @@ def build_atlas(
         if store.exists():
             open_store(store, settings)
         check_folder(store.parent)
+        if scheduler is None and not store.exists():
+            steps = count * named(schedule).steps
+            say_forecast("atlas build", box, steps, forecast.FLOW, what="voxels a shape", workers=cores(workers))
         with crew.at_work() as (makers, progress):
             build(store, count, box, seed, schedule, progress, design=law, workers=makers)
         say(str(store))

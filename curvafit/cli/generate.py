@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from curvafit.cli.forecast import FLOW, say_forecast
 from curvafit.cli.support import (
     OverwriteOption,
     command_line,
@@ -253,9 +254,17 @@ def _grown(options: dict[str, Any]) -> Flow:
     """The flow, with progress; leaves with exit code 1 where it has no surface, or failed."""
     from curvafit.generation.flow import generate as make
 
+    begun: list[int] = []
+
+    def forecast(step: int, total: int, state: object) -> None:
+        """Say at the first step, when nothing is left to be refused, how long the others take."""
+        if not begun:
+            begun.append(step)
+            say_forecast("generate", options["grid"].shape, total - step, FLOW, device=options["device"])
+
     with flow_progress(options["schedule"].steps) as watch:
         try:
-            flow = make(**options, callbacks=[watch], keep_checkpoint=True)
+            flow = make(**options, callbacks=[forecast, watch], keep_checkpoint=True)
         except KeyboardInterrupt as signal:
             if options["checkpoint"] is None or not options["checkpoint"].exists():
                 raise

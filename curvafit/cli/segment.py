@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from curvafit.cli.forecast import SEGMENTATION, say_forecast
 from curvafit.cli.reading import (
     Channel,
     Crop,
@@ -172,7 +173,8 @@ def reconstruct(
 
             return fill(volume, prior, epsilon=epsilon, steps=steps, progress=progress, **options)  # type: ignore[arg-type]
 
-        _run(slices, out, prior, reading, made, {"job": "reconstruct", "steps": steps, **options}, overwrite)
+        told = {"job": "reconstruct", "steps": steps, "epsilon": epsilon, **options}
+        _run(slices, out, prior, reading, made, told, overwrite)
 
 
 def _run(
@@ -187,6 +189,7 @@ def _run(
     """Refuse, read, compute, write, say."""
     from curvafit.priors.law import texture_of
     from curvafit.segmentation.mask_files import check_mask_target, write_mask
+    from curvafit.segmentation.working import WorkingGrid
     from curvafit.volumes.scan import load
 
     law = prior if prior.endswith(".json") else None  # or a preset's name
@@ -197,6 +200,8 @@ def _run(
         progress("reading", 0.0)
         volume = load(source, **reading)
         check_mask_target(out, volume.unit, overwrite=overwrite)
+        working = WorkingGrid.of(volume, told["epsilon"])
+        say_forecast(told["job"], working.grid.shape, told["steps"], SEGMENTATION, what="working voxels")
         found = make(volume, progress)
         progress("writing", 1.0)
         asked = {"command": command_line(), "prior": prior, **told}

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from curvafit.cli import forecast
+from curvafit.cli.forecast import cores, say_forecast
 from curvafit.cli.reading import reading_of
 from curvafit.cli.support import error_console, numbers, plainly, say, say_notes, whole_triple
 from curvafit.cli.workers import Crew, DashboardOption, SchedulerOption, WorkersOption
@@ -152,12 +154,18 @@ def synth(
 
 def _build(out: Path, order: Order, count: int, crew: Crew) -> None:
     from curvafit.data_synth.sets.picture import write_preview
-    from curvafit.data_synth.sets.sets import build_set, cases_of
+    from curvafit.data_synth.sets.sets import MOST, build_set, cases_of
     from curvafit.files import check_folder
+    from curvafit.generation.schedule import schedule
+    from curvafit.priors.bounds import whole
 
+    whole(count, "a count of at least 1 case", 1, MOST)
     check_folder(out)
-    if order.recipe.source.within == math.inf:
+    if crew.scheduler is None and order.recipe.source.within == math.inf:
         crew.check(order.recipe.largest)
+        steps = (count - len(cases_of(out))) * schedule("fast").steps
+        size, share = order.recipe.largest, cores(crew.workers)
+        say_forecast("synth", size, steps, forecast.FLOW, what="voxels a shape", workers=share)
     with crew.at_work() as (makers, progress):
         build_set(out, order, count, progress, workers=makers)
     preview = write_preview(out)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import platform
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -95,6 +96,7 @@ def infer(
     label: int | None = None,
     crop: Crop | None = None,
     seed: int = 0,
+    watch: Callable[[Prepared], None] | None = None,
     progress: Progress = silent,
     **reading: Any,
 ) -> Inference:
@@ -114,6 +116,8 @@ def infer(
         What is inside: see `curvafit.inference.prepare.prepare`.
     label, crop
         The voxels of one value as a mask; a box of voxels, of the scan and of `roi`: see `curvafit.load`.
+    watch
+        Called with the `Prepared` scan before the long part begins; what it raises ends the inference.
     progress
         Called with a sentence and the share done.
     reading
@@ -134,6 +138,8 @@ def infer(
     region = None if roi is None else field_of(roi)
     region = region if region is None or crop is None else region.crop(crop)
     prepared = prepare(volume, kind=kind, periodic=periodic, threshold=threshold, dark=dark, roi=region)
+    if watch is not None:
+        watch(prepared)
     progress("measuring curvature", 0.05)
     seen = scan_diagram(prepared)
     seen_as = "field" if prepared.kind == "field" else "mask"

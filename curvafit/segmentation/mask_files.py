@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from curvafit.drawing.plot import CONTOUR, DPI
+from curvafit.drawing.plot import DPI
+from curvafit.drawing.sections import section_figure
 from curvafit.drawing.shape_files import beside, check_outputs
 from curvafit.files import move_together, staged
 from curvafit.segmentation.segment import Segmentation
@@ -21,7 +21,7 @@ from curvafit.volumes.formats import pick_writer
 from curvafit.volumes.formats.nifti import write_nifti_like
 from curvafit.volumes.scan import Field, save
 
-__all__ = ["FORMAT", "check_mask_target", "write_mask"]
+__all__ = ["FORMAT", "check_mask_target", "segmentation_figure", "write_mask"]
 
 #: What a record beside a mask says that it is.
 FORMAT = "curvafit-mask-1"
@@ -86,11 +86,23 @@ def write_mask(
         else:
             save(Field(mask, scan.spacing, scan.unit, scan.affine), made, kind=FORMAT)
         picture, note = beside(made, ".png"), beside(made, ".json")
-        _sections(scan, found).savefig(picture, dpi=DPI)
+        rows = [(scan.values, None), (scan.values, found.mask.values)]
+        section_figure(rows, scan.spacing).savefig(picture, dpi=DPI)
         parts = (made, picture, note)
         told = {**_record(found, scan, record or {}), "files": [part.name for part in parts]}
         note.write_text(json.dumps(told, indent=2) + "\n", encoding="utf-8")
         return move_together(parts, target.parent)  # type: ignore[return-value]
+
+
+def segmentation_figure(found: Segmentation) -> Figure:
+    """Return a figure of the phase field's middle slices with the mask's outline.
+
+    Raises
+    ------
+    ValueError
+        If the phase field is not finite.
+    """
+    return section_figure([(found.phase.values, found.mask.values)], found.phase.spacing)
 
 
 def _record(found: Segmentation, scan: Field, more: dict[str, Any]) -> dict[str, Any]:
@@ -111,30 +123,3 @@ def _record(found: Segmentation, scan: Field, more: dict[str, Any]) -> dict[str,
         "torch": version("torch"),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }
-
-
-def _sections(scan: Field, found: Segmentation) -> Figure:
-    """The three middle slices: as they were above, with the mask's outline below."""
-    grey, mask = scan.values.astype(np.float32), found.mask.values
-    lowest, highest = np.percentile(grey, (0.5, 99.5))
-    figure = Figure(figsize=(7.2, 5.0), facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(2, 3)
-    names = ("z", "y", "x")
-    for axis in range(3):
-        rows, columns = (k for k in range(3) if k != axis)
-        middle = grey.shape[axis] // 2
-        plane, outline = np.take(grey, middle, axis), np.take(mask, middle, axis)
-        ratio = scan.spacing[rows] / scan.spacing[columns]
-        for row in (0, 1):
-            shown = axes[row, axis]
-            shown.imshow(
-                plane, cmap="gray", vmin=lowest, vmax=max(highest, lowest + 1e-6), aspect=ratio, interpolation="nearest"
-            )
-            shown.set(xticks=[], yticks=[])
-        if outline.any() and not outline.all():
-            axes[1, axis].contour(outline, [0.5], colors=CONTOUR, linewidths=1.0)
-        axes[0, axis].set_title(f"{names[axis]} = {middle}", fontsize=9)
-        axes[1, axis].set_xlabel(names[columns])
-        axes[1, axis].set_ylabel(names[rows], rotation=0, labelpad=6)
-    return figure

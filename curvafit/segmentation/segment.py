@@ -12,6 +12,7 @@ from torch import Tensor
 
 from curvafit.generation import data
 from curvafit.generation.flow import Flow, descend
+from curvafit.pictures import Pictured
 from curvafit.priors import kernels
 from curvafit.priors.bounds import real, whole
 from curvafit.priors.coefficients import Coefficients
@@ -41,8 +42,8 @@ WEIGHTS = (1e-9, 1e9)
 SETTLED = 0.001
 
 
-@dataclass(frozen=True, eq=False)
-class Segmentation:
+@dataclass(frozen=True, repr=False, eq=False)
+class Segmentation(Pictured):
     """A mask, and how it came about.
 
     Attributes

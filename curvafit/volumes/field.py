@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from curvafit.messages import one_line
+from curvafit.pictures import Pictured
 from curvafit.priors.bounds import SEEDS, quoted, whole
 from curvafit.volumes.formats.base import ScanError, normalise_unit
 from curvafit.volumes.formats.part import Crop, box_of, fitted
@@ -16,8 +17,8 @@ from curvafit.volumes.formats.part import Crop, box_of, fitted
 __all__ = ["Field", "ScanError", "positive_triple", "voxels_of"]
 
 
-@dataclass(frozen=True, eq=False)
-class Field:
+@dataclass(frozen=True, repr=False, eq=False)
+class Field(Pictured):
     """A volume and its place in the world.
 
     Parameters

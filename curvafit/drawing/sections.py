@@ -1,0 +1,75 @@
+"""The three middle slices of a volume, with a mask's outline where there is one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from curvafit.drawing.plot import CONTOUR
+from curvafit.volumes.field import Field
+
+#: Shares of the voxels that are drawn black and white, in percent.
+TAILS = (0.5, 99.5)
+
+
+def field_figure(field: Field) -> Figure:
+    """Return a figure of a field's middle slices.
+
+    Raises
+    ------
+    ValueError
+        If the field has no voxels, or a value is not finite.
+    """
+    return section_figure([(field.values, None)], field.spacing)
+
+
+def section_figure(rows: Sequence[tuple[np.ndarray, np.ndarray | None]], spacing: Sequence[float]) -> Figure:
+    """Return a figure of the middle slices across z, y and x.
+
+    Parameters
+    ----------
+    rows
+        Values (Z, Y, X) for each row of pictures, and the mask that is outlined over them, or None.
+    spacing
+        Voxel edges (z, y, x).
+
+    Raises
+    ------
+    ValueError
+        If there are no voxels, or a value is not finite.
+    """
+    figure = Figure(figsize=(7.2, 2.5 * len(rows)), facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(len(rows), 3, squeeze=False)
+    for row, (values, mask) in zip(axes, rows, strict=True):
+        if not values.size or not np.isfinite(values).all():
+            raise ValueError("expected a volume of finite values to draw, got one with others or none")
+        levels = np.percentile(values.astype(np.float32), TAILS)
+        for axis in range(3):
+            _section_on(row[axis], values, mask, axis, (levels[0], levels[1]), spacing)
+    for axis, name in enumerate("zyx"):
+        rows_name, columns_name = (other for other in "zyx" if other != name)
+        axes[0, axis].set_title(f"{name} = {rows[0][0].shape[axis] // 2}", fontsize=9)
+        axes[-1, axis].set_xlabel(columns_name)
+        axes[-1, axis].set_ylabel(rows_name, rotation=0, labelpad=6)
+    return figure
+
+
+def _section_on(
+    axes, values: np.ndarray, mask: np.ndarray | None, axis: int, levels: tuple[float, float], spacing: Sequence[float]
+) -> None:
+    """Draw the middle slice across one axis."""
+    rows, columns = (spacing[other] for other in range(3) if other != axis)
+    middle, (low, high) = values.shape[axis] // 2, levels
+    plane = np.take(values, middle, axis).astype(np.float32)
+    high = max(high, low + 1e-6)
+    axes.imshow(plane, cmap="gray", vmin=low, vmax=high, aspect=rows / columns, interpolation="nearest")
+    axes.set(xticks=[], yticks=[])
+    if mask is None:
+        return
+    outline = np.take(mask, middle, axis)
+    if outline.any() and not outline.all() and min(outline.shape) > 1:
+        axes.contour(outline, [0.5], colors=CONTOUR, linewidths=1.0)

@@ -1,0 +1,57 @@
+"""The middle slices that a Field, a Segmentation and a mask's picture show."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+import curvafit
+from curvafit import Field, segment
+from curvafit.drawing.sections import section_figure
+
+VALUES = np.arange(5 * 6 * 7, dtype=np.float32).reshape(5, 6, 7)
+
+
+def images(figure: Figure) -> list[np.ndarray]:
+    """What the axes show, in their order."""
+    return [np.asarray(axes.images[0].get_array()) for axes in figure.axes]
+
+
+def test_the_three_middle_slices_are_drawn_in_proportion() -> None:
+    figure = Field(VALUES, (3.0, 2.0, 1.0), "um").plot()
+    for shown, plane in zip(images(figure), (VALUES[2], VALUES[:, 3], VALUES[:, :, 3]), strict=True):
+        assert np.array_equal(shown, plane)
+    assert [axes.get_aspect() for axes in figure.axes] == [2.0, 3.0, 1.5]
+    assert [axes.get_title() for axes in figure.axes] == ["z = 2", "y = 3", "x = 3"]
+
+
+def test_a_notebook_shows_a_line_and_a_small_picture() -> None:
+    picture = r'<img src="data:image/png;base64,[\w+/=]{100,}" width="320"'
+    for field in (Field(VALUES), Field(VALUES > 9), Field(VALUES[:1])):
+        assert re.search(picture, field._repr_html_())
+    shown = Field(np.full((4, 4, 4), np.nan))._repr_html_()
+    assert "<img" not in shown and "4 x 4 x 4 voxels" in shown
+    with pytest.raises(ValueError, match="expected a volume of finite values to draw"):
+        Field(np.zeros((0, 4, 4))).plot()
+
+
+def test_a_segmentation_shows_its_outline() -> None:
+    scan = np.where(np.indices((8, 9, 10)).sum(0) > 12, 1.0, 0.0).astype(np.float32)
+    found = segment(scan, "tubes", steps=2)
+    figure = found.plot()
+    assert np.array_equal(images(figure)[0], found.phase.values[4])
+    assert all(len(axes.collections) == 1 for axes in figure.axes)
+    assert "<img" in found._repr_html_()
+
+
+def test_each_row_has_its_values_and_its_outline() -> None:
+    figure = section_figure([(VALUES, None), (VALUES, VALUES > 100)], (1, 1, 1))
+    assert [len(axes.collections) for axes in figure.axes[:3]] == [0, 0, 0]
+    assert sum(len(axes.collections) for axes in figure.axes[3:]) >= 1
+
+
+def test_what_draws_them_is_named_at_the_door() -> None:
+    assert {"Field", "Segmentation"} <= curvafit._FIGURES.keys()
