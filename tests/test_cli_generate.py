@@ -148,6 +148,15 @@ def test_every_option_reaches_the_generator(tmp_path: Path, handed: dict[str, An
     assert (handed["epsilon"], handed["device"]) == (0.03, "cpu")
 
 
+@pytest.mark.parametrize("option", ["--preset", "--prior"])
+def test_either_option_takes_a_preset_or_a_fit(tmp_path: Path, handed: dict[str, Any], option: str) -> None:
+    (tmp_path / "fit.json").write_text(made_fit().to_json())
+    call("generate", option, "sponge", "-o", tmp_path / "out.npy")
+    assert (handed["law"], handed["mass"]) == preset("sponge")[:2]
+    call("generate", option, tmp_path / "fit.json", "-o", tmp_path / "out.npy")
+    assert (handed["law"], handed["mass"]) == (made_fit().coefficients, made_fit().mass)
+
+
 def test_maps_take_the_place_of_numbers(tmp_path: Path, handed: dict[str, Any]) -> None:
     slope = np.linspace(0.1, 0.9, 5 * 6 * 7, dtype=np.float32).reshape(5, 6, 7)
     np.savez(tmp_path / "maps.npz", a00=900 * slope, mass=-slope, a11=1.5)

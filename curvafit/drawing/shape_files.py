@@ -199,15 +199,15 @@ def write_shape(
     """
     target = check_target(path, output, steps=flow.snapshots, overwrite=overwrite)
     with staged(target) as work:
-        made = write_field(flow.field, flow.grid, work / target.name, output)
-        picture, note = beside(made, ".png"), beside(made, ".json")
+        shape = write_field(flow.field, flow.grid, work / target.name, output)
+        picture, note = beside(shape, ".png"), beside(shape, ".json")
         surface_picture(flow.field.numpy(), picture)
-        parts = [made, picture, note]
+        parts = [shape, picture, note]
         for step, field in flow.snapshots.items():
             with suppress(NoSurface):
-                parts.append(write_field(field, flow.grid, step_path(made, step), output))
-        told = {"format": FORMAT, **(record or {}), "files": [part.name for part in parts]}
-        note.write_text(json.dumps(told, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+                parts.append(write_field(field, flow.grid, step_path(shape, step), output))
+        content = {"format": FORMAT, **(record or {}), "files": [part.name for part in parts]}
+        note.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         return move_together(parts, target.parent)
 
 

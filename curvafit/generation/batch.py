@@ -67,15 +67,15 @@ def generate_batch(
     together = whole(together, "at least one shape at a time", 1, 10**6)
     jobs, plan = _jobs(laws, masses, seeds), named_schedule(schedule)
     grid = grid if isinstance(grid, Grid) else Grid(grid)  # type: ignore[arg-type]
-    told = {
+    options = {
         "schedule": plan, "epsilon": epsilon, "blur": blur, "orientation": orientation,
         "snapshots": snapshots, "reject_early": reject_early, "backend": backend, "device": device,
     }  # fmt: skip
     named(backend, ("auto", "torch", "fused"), "a backend 'auto', 'torch' or 'fused'")
     if kind_of(device) == "cuda" and backend != "torch" and kernels.fused(device):
         groups = [jobs[first : first + together] for first in range(0, len(jobs), together)]
-        return (flow for group in groups for flow in _together(group, grid, told))
-    return (generate(job.coefficients, job.mass, grid, seed=job.seed, **told) for job in jobs)
+        return (flow for group in groups for flow in _joint_flows(group, grid, options))
+    return (generate(job.coefficients, job.mass, grid, seed=job.seed, **options) for job in jobs)
 
 
 class _Job(NamedTuple):
@@ -93,23 +93,23 @@ def _jobs(laws, masses, seeds) -> list[_Job]:
     ]
     lengths = {len(column) for column in columns} - {1}
     if len(lengths) > 1 or 0 in lengths:
-        found = ", ".join(str(len(column)) for column in columns)
-        raise ValueError(f"expected laws, masses and seeds of one length, or one for all, got {found}")
+        counts = ", ".join(str(len(column)) for column in columns)
+        raise ValueError(f"expected laws, masses and seeds of one length, or one for all, got {counts}")
     count = max(lengths, default=1)
     rows = zip(*([*column] * (count // len(column)) for column in columns), strict=True)
     return [_Job(law.coefficients, law.mass if mass is None else mass, seed) for law, mass, seed in rows]
 
 
-def _together(jobs: list[_Job], grid: Grid, told: dict[str, Any]) -> list[Flow]:
+def _joint_flows(jobs: list[_Job], grid: Grid, options: dict[str, Any]) -> list[Flow]:
     """Shapes that share a device's steps."""
-    plan = told["schedule"]
-    check_memory((len(jobs), *grid.shape), DEVICE, "a batch", told["device"])
-    costs = [Cost(job.coefficients, grid, told["epsilon"], told["orientation"], told["blur"]) for job in jobs]
+    plan = options["schedule"]
+    check_memory((len(jobs), *grid.shape), DEVICE, "a batch", options["device"])
+    costs = [Cost(job.coefficients, grid, options["epsilon"], options["orientation"], options["blur"]) for job in jobs]
     forms = [
-        DivergenceForm.of(grid, told["blur"], base_of(job.mass, None, grid), kernels.gaussian_blur) for job in jobs
+        DivergenceForm.of(grid, options["blur"], base_of(job.mass, None, grid), kernels.gaussian_blur) for job in jobs
     ]
     starts = [white_noise(grid, job.seed) for job in jobs]
     each = [job.coefficients for job in jobs]
-    moved = CudaStepper(starts, [form.base for form in forms], costs[0], each, plan.betas, None, told["device"])
-    shared = {name: told[name] for name in ("snapshots", "reject_early")}
-    return run(moved, [Orders(cost, plan, **shared) for cost in costs], [job.seed for job in jobs])
+    stepper = CudaStepper(starts, [form.base for form in forms], costs[0], each, plan.betas, None, options["device"])
+    shared = {name: options[name] for name in ("snapshots", "reject_early")}
+    return run(stepper, [Orders(cost, plan, **shared) for cost in costs], [job.seed for job in jobs])

@@ -93,13 +93,13 @@ class Checkpoint:
         if head != _HEAD + hashlib.sha256(payload).hexdigest().encode():
             what = "one that is damaged" if head.startswith(_HEAD) else "a file that is something else"
             raise ValueError(f"expected a checkpoint of a flow, got {what}: {self.path}; delete it to begin anew")
-        found = torch.load(io.BytesIO(payload), weights_only=True)
-        theirs = found["run"]
-        names = [name for name in {**theirs, **self._run} if theirs.get(name) != self._run.get(name)]
+        record = torch.load(io.BytesIO(payload), weights_only=True)
+        other = record["run"]
+        names = [name for name in {**other, **self._run} if other.get(name) != self._run.get(name)]
         if names:
-            parts = (f"{name} {theirs.get(name)} instead of {self._run.get(name)}" for name in names)
+            parts = (f"{name} {other.get(name)} instead of {self._run.get(name)}" for name in names)
             raise ValueError(f"expected a checkpoint of this run, got one with {'; '.join(parts)}: {self.path}")
-        return found["content"]
+        return record["content"]
 
     def due(self) -> bool:
         """Whether it is time to save."""

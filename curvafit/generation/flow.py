@@ -114,9 +114,9 @@ def generate(
     orders.check_memory(device)
     base = base_of(mass, volume_fraction, grid)
     form = DivergenceForm.of(grid, cost.blur, base, execution.blur)
-    moved = execution.stepper(white_noise(grid, seed), form, cost, plan, "adam", None)
-    saved = execution.saved(moved, cost, orders, seed=seed, mass=base)
-    return run(moved, [orders], [seed], saved)[0]
+    stepper = execution.stepper(white_noise(grid, seed), form, cost, plan, "adam", None)
+    checkpoint_file = execution.checkpoint_file(stepper, cost, orders, seed=seed, mass=base)
+    return run(stepper, [orders], [seed], checkpoint_file)[0]
 
 
 def relax(
@@ -225,6 +225,6 @@ def _from_field(
     if not bool(torch.isfinite(field).all()):
         raise ValueError("expected a finite field, got NaN or infinity in it")
     form, start = FORMS[flow].at(field, grid, cost.blur, execution.blur)
-    moved = execution.stepper(start, form, cost, plan, optimiser, frozen)
-    saved = execution.saved(moved, cost, orders, flow=flow, field=field, frozen=frozen)
-    return run(moved, [orders], [None], saved)[0]
+    stepper = execution.stepper(start, form, cost, plan, optimiser, frozen)
+    checkpoint_file = execution.checkpoint_file(stepper, cost, orders, flow=flow, field=field, frozen=frozen)
+    return run(stepper, [orders], [None], checkpoint_file)[0]

@@ -36,8 +36,8 @@ def correction(u: Tensor, share: float, mass: float, steps: int) -> float:
     """What to add to the mass of a flow of so many steps, on its way: a sharp shape gains half of it in volume."""
     missing = share - float(np.count_nonzero(u.numpy() > 0)) / u.numel()
     gain, sharp = min(GAIN, GAIN * GAIN_STEPS / steps), first_mass(share)
-    wanted = min(max(mass + gain * 2 * missing, sharp - REACH), sharp + REACH)
-    return min(max(wanted, -BOUND), BOUND) - mass
+    target = min(max(mass + gain * 2 * missing, sharp - REACH), sharp + REACH)
+    return min(max(target, -BOUND), BOUND) - mass
 
 
 def last_shift(u: Tensor, share: float) -> float:

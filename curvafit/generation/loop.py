@@ -61,67 +61,67 @@ class Orders:
     def check_memory(self, device: torch.device | str) -> None:
         """Raise ValueError where a flow does not fit into a device's memory, or its snapshots into the machine's."""
         check_memory(self.cost.grid.shape, FLOW, "a box", device)
-        kept = len(set(self.snapshots))
-        check_memory(self.cost.grid.shape, FIELD * kept, f"a box with {kept} snapshots")
+        snapshots = len(set(self.snapshots))
+        check_memory(self.cost.grid.shape, FIELD * snapshots, f"a box with {snapshots} snapshots")
 
-    def next_mark(self, made: int) -> int:
+    def next_mark(self, steps: int) -> int:
         """The number of steps after which to look again."""
-        regular = made + RECORD_EVERY - made % RECORD_EVERY
+        regular = steps + RECORD_EVERY - steps % RECORD_EVERY
         checks = self.plan.checks if self.reject_early else ()
-        return min(mark for mark in (regular, self.plan.steps, *self.snapshots, *checks) if mark > made)
+        return min(mark for mark in (regular, self.plan.steps, *self.snapshots, *checks) if mark > steps)
 
 
 def run(
-    moved: Stepper, orders: Sequence[Orders], seeds: Sequence[int | None], checkpoint: Checkpoint | None = None
+    stepper: Stepper, orders: Sequence[Orders], seeds: Sequence[int | None], checkpoint: Checkpoint | None = None
 ) -> list[Flow]:
     """Step shapes that share a stepper until the plan, which they share too, is done, or none is left.
 
     A shape stops earlier where its energy is not finite, or a callback or a check says so; all of them, where the
     optimiser stalls. The checkpoint is closed at the end, but saved where a callback stopped the flow.
     """
-    lanes = [_Lane(*each) for each in zip(moved.shapes, orders, seeds, strict=True)]
+    lanes = [_Lane(*each) for each in zip(stepper.shapes, orders, seeds, strict=True)]
     with nullcontext() if checkpoint is None else checkpoint.held():
-        _stepped(moved, lanes, orders, checkpoint)
+        _advance(stepper, lanes, orders, checkpoint)
     return [lane.end() for lane in lanes]
 
 
-def _stepped(moved: Stepper, lanes: list[_Lane], orders: Sequence[Orders], checkpoint: Checkpoint | None) -> None:
+def _advance(stepper: Stepper, lanes: list[_Lane], orders: Sequence[Orders], checkpoint: Checkpoint | None) -> None:
     """Step until the plan is done or no lane is left."""
-    plan, made = orders[0].plan, _resumed(moved, lanes, checkpoint)
+    plan, steps = orders[0].plan, _resume(stepper, lanes, checkpoint)
     while True:
-        last = made == plan.steps or moved.stalled
-        moved.step(None if last else plan.rate(made))
+        last = steps == plan.steps or stepper.stalled
+        stepper.step(None if last else plan.rate(steps))
         settled = [lane.settle() for lane in lanes] if last else []
         if any(settled):
-            moved.step(None)
+            stepper.step(None)
         for lane in lanes:
-            lane.look(made, last, moved.stalled)
+            lane.look(steps, last, stepper.stalled)
         if last or all(lane.stop for lane in lanes):
             break
-        mark = min(each.next_mark(made) for each in orders)
-        made += 1 + moved.run([plan.rate(step) for step in range(made + 1, mark)])
+        mark = min(each.next_mark(steps) for each in orders)
+        steps += 1 + stepper.run([plan.rate(step) for step in range(steps + 1, mark)])
         if checkpoint is not None and checkpoint.due():
-            checkpoint.save(_content(moved, lanes, made))
+            checkpoint.save(_content(stepper, lanes, steps))
     if checkpoint is not None:
         if any(lane.asked for lane in lanes) and not last:
-            checkpoint.save(_content(moved, lanes, made + 1))
+            checkpoint.save(_content(stepper, lanes, steps + 1))
         else:
             checkpoint.close()
 
 
-def _resumed(moved: Stepper, lanes: list[_Lane], checkpoint: Checkpoint | None) -> int:
+def _resume(stepper: Stepper, lanes: list[_Lane], checkpoint: Checkpoint | None) -> int:
     """The number of steps made: none, or those of the checkpoint's state, from which all goes on."""
-    found = checkpoint.load() if checkpoint else None
-    if found is None:
+    content = checkpoint.load() if checkpoint else None
+    if content is None:
         return 0
-    moved.restore(found["stepper"])
-    for lane, (rows, kept) in zip(lanes, found["lanes"], strict=True):
-        lane.rows, lane.kept = rows, kept
-    return found["made"]
+    stepper.restore(content["stepper"])
+    for lane, (rows, snapshots) in zip(lanes, content["lanes"], strict=True):
+        lane.rows, lane.snapshots = rows, snapshots
+    return content["made"]
 
 
-def _content(moved: Stepper, lanes: list[_Lane], made: int) -> dict[str, Any]:
-    return {"made": made, "lanes": [(lane.rows, lane.kept) for lane in lanes], "stepper": moved.state()}
+def _content(stepper: Stepper, lanes: list[_Lane], steps: int) -> dict[str, Any]:
+    return {"made": steps, "lanes": [(lane.rows, lane.snapshots) for lane in lanes], "stepper": stepper.state()}
 
 
 class _Lane:
@@ -130,7 +130,7 @@ class _Lane:
     def __init__(self, shape: ShapeView, orders: Orders, seed: int | None) -> None:
         self._shape, self._orders, self._seed = shape, orders, seed
         self.rows: list[list[float]] = []
-        self.kept: dict[int, Tensor] = {}
+        self.snapshots: dict[int, Tensor] = {}
         #: Why it stopped before the plan's end, and whether a callback asked for it.
         self.stop, self.asked = "", False
         self._missed, self._failure, self._stalled = "", "", False
@@ -149,18 +149,18 @@ class _Lane:
         self._missed = f"; volume fraction {float((u > 0).double().mean()):.4f} instead of {share:.4f}"
         return False
 
-    def look(self, made: int, last: bool, stalled: bool) -> None:
+    def look(self, steps: int, last: bool, stalled: bool) -> None:
         """Do what is to be done after so many steps."""
         if self.stop:
             return
         orders, shape, total = self._orders, self._shape, self._orders.plan.steps
-        if made in orders.snapshots:
-            self.kept[made] = shape.field()
-        if last or made % RECORD_EVERY == 0:
-            self._record(made, last)
-        if not self.stop and orders.reject_early and made in orders.plan.checks:
+        if steps in orders.snapshots:
+            self.snapshots[steps] = shape.field()
+        if last or steps % RECORD_EVERY == 0:
+            self._record(steps, last)
+        if not self.stop and orders.reject_early and steps in orders.plan.checks:
             failed = self._viability(shape.field())
-            self.stop = "" if failed.viable else f"stopped after {made} of {total} steps: {failed.reason}"
+            self.stop = "" if failed.viable else f"stopped after {steps} of {total} steps: {failed.reason}"
         if last or self.stop:
             self._field, self._mass, self._stalled = shape.field(), shape.mass(), stalled
 
@@ -173,26 +173,26 @@ class _Lane:
         history = History(*np.array(self.rows, dtype=np.float64).T)
         status = self._status(end, history)
         return Flow(
-            self._field, history, status, cost.grid, end, orders.plan, self._seed, self._mass, self.kept,
+            self._field, history, status, cost.grid, end, orders.plan, self._seed, self._mass, self.snapshots,
             cost.coefficients, cost.epsilon,
         )  # fmt: skip
 
-    def _record(self, made: int, last: bool) -> None:
+    def _record(self, steps: int, last: bool) -> None:
         """The history's newest row, the guard against NaN, the callbacks, and the next mass."""
         orders, shape, total = self._orders, self._shape, self._orders.plan.steps
         statistics, mass = shape.statistics(), shape.mass()
-        self.rows.append([made, *statistics, mass])
+        self.rows.append([steps, *statistics, mass])
         if what := _not_finite(statistics, mass):
-            self.stop = f"stopped after {made} of {total} steps: {what} is not finite"
+            self.stop = f"stopped after {steps} of {total} steps: {what} is not finite"
             self._failure = f"{what} is not finite"
             return
         if orders.callbacks:
             state = State(shape.field(), *statistics, mass)
-            answers = [bool(callback(made, total, state)) for callback in orders.callbacks]
+            answers = [bool(callback(steps, total, state)) for callback in orders.callbacks]
             if any(answers):
-                self.stop, self.asked = f"stopped by a callback after {made} of {total} steps", True
+                self.stop, self.asked = f"stopped by a callback after {steps} of {total} steps", True
         share = orders.volume_fraction
-        if share is not None and not last and made >= fraction.BEGIN * total:
+        if share is not None and not last and steps >= fraction.BEGIN * total:
             shape.shift(fraction.correction(shape.field(), share, mass, total))
 
     def _viability(self, u: Tensor) -> Viability:
@@ -201,16 +201,16 @@ class _Lane:
     def _status(self, end: Viability, history: History) -> str:
         if self.stop:
             return self.stop
-        made = int(history.step[-1])
+        steps = int(history.step[-1])
         if not end.viable:
-            return f"no shape after {made} steps: {end.reason}{self._missed}"
+            return f"no shape after {steps} steps: {end.reason}{self._missed}"
         if self._stalled:
-            return f"stopped after {made} steps: the line search finds no lower energy{self._missed}"
-        before = history.energy[np.searchsorted(history.step, 0.9 * made, side="right") - 1]
+            return f"stopped after {steps} steps: the line search finds no lower energy{self._missed}"
+        before = history.energy[np.searchsorted(history.step, 0.9 * steps, side="right") - 1]
         fall = (before - history.energy[-1]) / max(abs(before), 1e-30)
         word, way = "converged" if abs(fall) < SETTLED else "still moving", "rose" if fall < 0 else "fell"
         return (
-            f"{word} after {made} steps: the energy {way} by {100 * abs(fall):.2f} % over the last tenth{self._missed}"
+            f"{word} after {steps} steps: the energy {way} by {100 * abs(fall):.2f} % over the last tenth{self._missed}"
         )
 
 

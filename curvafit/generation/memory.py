@@ -25,9 +25,10 @@ def check_memory(voxels: Sequence[int], each: int, what: str, device: torch.devi
     """Raise ValueError where so many voxels (z, y, x), of `each` bytes, are more than the machine or device holds."""
     need, there = math.prod(map(int, voxels)) * each, memory(device)
     if need > there:
-        told = " x ".join(map(str, voxels))
-        has = f"where there are {_said(there)}" if there < sys.maxsize else "more than any machine has"
-        raise ValueError(f"expected {what} that fits into memory, got {told} voxels: at least {_said(need)}, {has}")
+        size = " x ".join(map(str, voxels))
+        has = f"where there are {_gibibytes(there)}" if there < sys.maxsize else "more than any machine has"
+        least = f"at least {_gibibytes(need)}, {has}"
+        raise ValueError(f"expected {what} that fits into memory, got {size} voxels: {least}")
 
 
 def memory(device: torch.device | str = "cpu") -> int:
@@ -37,5 +38,5 @@ def memory(device: torch.device | str = "cpu") -> int:
     return installed()
 
 
-def _said(size: int) -> str:
+def _gibibytes(size: int) -> str:
     return f"{size / 2**30:.3g} GiB"

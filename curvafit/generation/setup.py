@@ -72,13 +72,13 @@ class Execution:
         lowered, more = (cost.coefficients, cost.epsilon), {"fused": not plain, "data": cost.data}
         return kind(start, form, *lowered, betas, frozen, self.device, cost.orientation, **more)
 
-    def saved(self, moved: Stepper, cost: Cost, orders: Orders, **more: object) -> Checkpoint | None:
+    def checkpoint_file(self, stepper: Stepper, cost: Cost, orders: Orders, **more: object) -> Checkpoint | None:
         """The checkpoint of a run, where one is asked for."""
         if self.checkpoint is None:
             return None
-        mine = {"schedule": orders.plan, "volume_fraction": orders.volume_fraction, "snapshots": [*orders.snapshots]}
-        where = {"stepper": type(moved).__name__, "backend": self.backend, "device": self.device}
-        return Checkpoint(self.checkpoint, self.every, identity(**vars(cost), **mine, **where, **more), self.keep)
+        job = {"schedule": orders.plan, "volume_fraction": orders.volume_fraction, "snapshots": [*orders.snapshots]}
+        where = {"stepper": type(stepper).__name__, "backend": self.backend, "device": self.device}
+        return Checkpoint(self.checkpoint, self.every, identity(**vars(cost), **job, **where, **more), self.keep)
 
 
 def kind_of(device: torch.device | str) -> str:

@@ -68,9 +68,9 @@ class Stepper(Protocol):
 
     def run(self, rates: Sequence[float]) -> int:
         """Steps that nobody looks at; returns how many were made: all, if it does not stall."""
-        for made, rate in enumerate(rates):
+        for count, rate in enumerate(rates):
             if self.stalled:
-                return made
+                return count
             self.step(rate)
         return len(rates)
 
@@ -111,14 +111,14 @@ class TorchStepper(Stepper):
         self._slope_of = kernels.energy_gradient if fused else kernels.plain_energy_gradient
         self._free = None if frozen is None else ~torch.as_tensor(frozen, dtype=torch.bool, device=device)
         self._parameters = start.to(device).clone()
-        self._optimiser = self._made(betas)
+        self._optimiser = self._optimiser_of(betas)
         self._value, self._u, self._slope = 0.0, self._parameters, self._parameters
 
     @property
     def shapes(self) -> Sequence[ShapeView]:
         return (self,)
 
-    def _made(self, betas: tuple[float, float]) -> torch.optim.Optimizer:
+    def _optimiser_of(self, betas: tuple[float, float]) -> torch.optim.Optimizer:
         return torch.optim.Adam([self._parameters], betas=betas, eps=ADAM_EPS)
 
     def _evaluate(self) -> tuple[float, Tensor, Tensor]:
@@ -171,7 +171,7 @@ class LbfgsStepper(TorchStepper):
     minimum, where rounding hides the decrease: the parameters then stay, and the stepper is stalled.
     """
 
-    def _made(self, betas: tuple[float, float]) -> torch.optim.Optimizer:
+    def _optimiser_of(self, betas: tuple[float, float]) -> torch.optim.Optimizer:
         self._known: tuple[Tensor, tuple[float, Tensor, Tensor]] | None = None
         return torch.optim.LBFGS(
             [self._parameters],

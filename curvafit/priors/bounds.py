@@ -90,12 +90,12 @@ def several(values: Any, name: str) -> tuple[Any, ...]:
         If it is none.
     """
     try:
-        found = None if isinstance(values, (str, bytes)) else tuple(values)
+        parts = None if isinstance(values, (str, bytes)) else tuple(values)
     except TypeError:
-        found = None
-    if found is None:
+        parts = None
+    if parts is None:
         raise ValueError(f"expected a sequence of {name}, got {quoted(values)}")
-    return found
+    return parts
 
 
 def instance(value: Any, kinds: type | tuple[type, ...], said: str) -> None:

@@ -141,12 +141,12 @@ def violation(value: Any, schema: Mapping[str, Any] = FIT_SCHEMA, name: str = "t
             if key not in value:
                 return f"{prefix}{key}, got none"
         for key, inner in schema.get("properties", {}).items():
-            if key in value and (found := violation(value[key], inner, prefix + key)):
-                return found
+            if key in value and (wrong := violation(value[key], inner, prefix + key)):
+                return wrong
     if isinstance(value, list) and "items" in schema:
         for k, each in enumerate(value):
-            if found := violation(each, schema["items"], f"{name}[{k}]"):
-                return found
+            if wrong := violation(each, schema["items"], f"{name}[{k}]"):
+                return wrong
     return None
 
 

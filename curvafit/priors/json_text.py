@@ -38,14 +38,14 @@ def parse_json(content: str | bytes, expected: str, place: object) -> Any:
             object_pairs_hook=_single,
         )
     except UnicodeDecodeError:
-        said = "which is no text in UTF-8"
+        fault = "which is no text in UTF-8"
     except json.JSONDecodeError as error:
-        said = f"which is no JSON ({error.msg} in line {error.lineno})"
+        fault = f"which is no JSON ({error.msg} in line {error.lineno})"
     except RecursionError:
-        said = "which is nested too deeply"
+        fault = "which is nested too deeply"
     except ValueError as error:
-        said = f"which holds {error}"
-    raise ValueError(f"expected {expected}, got {place}, {said}")
+        fault = f"which holds {error}"
+    raise ValueError(f"expected {expected}, got {place}, {fault}")
 
 
 def repeated(names: Sequence[Any]) -> Any:

@@ -72,18 +72,18 @@ def curvature_prior(
     check_numbers(coefficients, epsilon)
     check_lengths(epsilon, blur, max(n * h for n, h in zip(shape, spacing, strict=True)))
     unit = epsilon / WORKING_EPSILON
-    u, kept = 2 * probability - 1, _window(probability, mask, border)
+    u, weights = 2 * probability - 1, _window(probability, mask, border)
     for axis, n in enumerate(times):
-        u, kept = refined(u, axis, n), kept.repeat_interleave(n, axis - 3) if n > 1 else kept
+        u, weights = refined(u, axis, n), weights.repeat_interleave(n, axis - 3) if n > 1 else weights
     grid = Grid(tuple(u.shape[1:]), tuple(h / n / unit for h, n in zip(spacing, times, strict=True)), "replicate")  # type: ignore[arg-type]
     if blur:
         u = gaussian_blur(u, grid, blur / unit)
-    total = energies(u, coefficients.in_unit(unit), grid, WORKING_EPSILON, kept)
+    total = energies(u, coefficients.in_unit(unit), grid, WORKING_EPSILON, weights)
     if normalize == "voxel":
-        volume = kept.sum((-3, -2, -1)) * (grid.voxel_volume / WORKING_EPSILON**3)
+        volume = weights.sum((-3, -2, -1)) * (grid.voxel_volume / WORKING_EPSILON**3)
         return total / volume.clamp_min(torch.finfo(volume.dtype).tiny)
     if normalize == "area":
-        return total / (areas(u, grid, WORKING_EPSILON, kept) / WORKING_EPSILON**2 + 1)
+        return total / (areas(u, grid, WORKING_EPSILON, weights) / WORKING_EPSILON**2 + 1)
     return total
 
 

@@ -111,14 +111,14 @@ class CurvaturePrior(nn.Module):
         self.epsilon = real(given, "epsilon > 0 in spacing's unit", math.ulp(0), COARSEST * min(self.spacing))
         self.blur = real(blur, "blur >= 0 in spacing's unit", 0, COARSEST * min(self.spacing))
         self.border = whole(border, "a border of whole voxels from 0", 0, _MOST_BORDER)
-        self._said: set[str] = set()
+        self._warned: set[str] = set()
         self.shape = None if shape is None else Grid(shape, self.spacing).shape  # type: ignore[arg-type]
         self.weight = _weights(weight)
         edge = min(self.spacing)
         self.coefficients = tuple(_numbers(each, edge, unit, self.epsilon) for each in textures_of(law))
         for law in self.coefficients:
             check_numbers(law, self.epsilon)
-        _tell(self.spacing, self.epsilon)
+        _warn_of_interpolation(self.spacing, self.epsilon)
 
     def extra_repr(self) -> str:
         return f"spacing={self.spacing}, epsilon={self.epsilon:g}, weight={self.weight}, border={self.border}"
@@ -126,7 +126,7 @@ class CurvaturePrior(nn.Module):
     def forward(self, input: Tensor, target: Tensor | None = None, mask: Tensor | None = None) -> Tensor:
         input, target, mask = plain(input), plain(target), plain(mask)
         with torch.autocast(input.device.type, enabled=False):
-            probability, kept = self._probability(input), self._kept(input, target, mask)
+            probability, voxels = self._probability(input), self._voxel_weights(input, target, mask)
             classes = probability.shape[1]
             laws, weights = _each(self.coefficients, classes, "coefficients"), _each(self.weight, classes, "weight")
             spacing = self._spacing(input)
@@ -141,7 +141,7 @@ class CurvaturePrior(nn.Module):
                     law,
                     spacing,
                     self.epsilon,
-                    mask=None if kept is None else kept[:, min(channel, kept.shape[1] - 1)],
+                    mask=None if voxels is None else voxels[:, min(channel, voxels.shape[1] - 1)],
                     normalize=None if self.reduction == "sum" else self.normalize,
                     border=self.border,
                     blur=self.blur,
@@ -190,7 +190,7 @@ class CurvaturePrior(nn.Module):
         if self.sigmoid:
             values = values.sigmoid()
         elif not self.softmax or input.shape[1] == 1:
-            self._look(values)
+            self._check_range(values)
         if input.shape[1] == 1:
             unfit = {"softmax=True": self.softmax, "include_background=False": not self.include_background}
             for name in (name for name, given in unfit.items() if given):
@@ -200,7 +200,7 @@ class CurvaturePrior(nn.Module):
             values = values.softmax(1)
         return values if self.include_background else values[:, 1:]
 
-    def _kept(self, input: Tensor, target: Tensor | None, mask: Tensor | None) -> Tensor | None:
+    def _voxel_weights(self, input: Tensor, target: Tensor | None, mask: Tensor | None) -> Tensor | None:
         """(B or 1, classes that count or 1, D, H, W): the mask, without what is ignored."""
         batch, classes = input.shape[:2]
         space = tuple(input.shape[2:])
@@ -240,20 +240,20 @@ class CurvaturePrior(nn.Module):
         times = RESOLVED * max(self._spacing(input)) / self.epsilon
         if times <= MOST + 1e-3 and min(space) >= max(4, 2 * self.border + 1):
             return False
-        self._say(str(space), f"a level of {space} voxels is too coarse for ε = {self.epsilon:g}: it counts nothing")
+        self._warn(str(space), f"a level of {space} voxels is too coarse for ε = {self.epsilon:g}: it counts nothing")
         return True
 
-    def _look(self, probability: Tensor) -> None:
-        if torch.compiler.is_compiling() or "range" in self._said:
+    def _check_range(self, probability: Tensor) -> None:
+        if torch.compiler.is_compiling() or "range" in self._warned:
             return
         low, high = (seen(value) for value in probability.detach().aminmax())
         if low is not None and high is not None and not (low >= -1e-3 and high <= 1 + 1e-3):
-            self._say("range", f"expected probabilities, got {low:g} to {high:g}: is sigmoid or softmax missing?")
+            self._warn("range", f"expected probabilities, got {low:g} to {high:g}: is sigmoid or softmax missing?")
 
-    def _say(self, what: str, message: str) -> None:
+    def _warn(self, what: str, message: str) -> None:
         """A warning, once."""
-        if not torch.compiler.is_compiling() and what not in self._said:
-            self._said.add(what)
+        if not torch.compiler.is_compiling() and what not in self._warned:
+            self._warned.add(what)
             warnings.warn(message, stacklevel=3)
 
 
@@ -293,7 +293,7 @@ def _each(values: tuple, classes: int, name: str) -> tuple:
     return values * classes if len(values) == 1 else values
 
 
-def _tell(spacing: tuple[float, float, float], epsilon: float) -> None:
+def _warn_of_interpolation(spacing: tuple[float, float, float], epsilon: float) -> None:
     """Say once which axes are interpolated."""
     times = upsampling(spacing, epsilon)
     if max(times) > 1:
