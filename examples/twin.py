@@ -25,7 +25,7 @@ from curvafit.priors.grid import Grid
 from curvafit.volumes.scan import Field
 
 PRESET = "sponge"
-#: A typical micro-CT image of the modality's ranges: levels, blur in µm, light and rings in shares, noise in grey levels.
+#: A typical micro-CT image: levels of grey, blur in µm, uneven light and rings as shares, noise in grey levels.
 IMAGING = {
     "contrast.background": 45.0,
     "contrast.foreground": 112.0,
