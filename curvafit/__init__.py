@@ -6,7 +6,7 @@ curvatures at constant volume.
 Infer       `infer(scan)` gives the parameters of a scanned volume, with `.fit`, `.plot()` and a report.
 Synthesise  `generate(law)` grows a shape of a texture; `generate_batch` grows several at once.
 Prior       `segment(scan, prior=law)` and `reconstruct(labels, prior=law)` give a mask; `curvafit.priors` has the loss.
-Files       `load(path)` and `save(path, field)` read and write volumes with their spacing and unit.
+Files       `load(path)` and `save(volume, path)` read and write volumes with their spacing and unit.
 Measures    `diagram(u, grid, epsilon)` and `wasserstein(a, b)`; more in `curvafit.geometry`.
 
 A law is `Coefficients`, the name of a preset (`preset`), or the path of a `fit.json`. The public names are loaded when

@@ -25,13 +25,22 @@ from curvafit.priors.grid import Grid
 from curvafit.volumes.scan import Field
 
 PRESET = "sponge"
+#: A typical micro-CT image: levels of grey, blur in µm, uneven light and rings as shares, noise in grey levels.
+IMAGING = {
+    "contrast.background": 45.0,
+    "contrast.foreground": 112.0,
+    "optics.blur": (12.0, 12.0, 12.0),
+    "illumination.bias": 0.03,
+    "detector.rings": 0.06,
+    "noise.gaussian": 8.0,
+}
 
 
 def scan(edge: int) -> Field:
     """Return the micro-CT image of the preset's shape, by the voxel that the modality gives it."""
     truth = preset(PRESET)
     flow = generate(truth.coefficients, truth.mass, Grid((edge, edge, edge)), seed=0)
-    imaging = MICRO_CT.draw(0)
+    imaging = MICRO_CT.base.assign(IMAGING)
     values = image(flow.field[None, None], MICRO_CT.voxel, [imaging], [0])[0, 0].numpy()
     return Field(values, imaging.spacing, imaging.unit)
 

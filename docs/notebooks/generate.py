@@ -17,7 +17,6 @@
 # %%
 # %matplotlib inline
 import curvafit
-from curvafit.drawing import diagram_figure, surface_figure
 from curvafit.inference import load_atlas, nearest
 
 flows = {}
@@ -27,10 +26,10 @@ for name in ("tubes", "sponge", "bilayers"):
         print(name, seed, flows[name, seed].status)
 
 # %%
-surface_figure(flows["tubes", 0].field.numpy(), width=420, title="tubes")
+flows["tubes", 0].plot()
 
 # %%
-surface_figure(flows["bilayers", 0].field.numpy(), width=420, title="bilayers")
+flows["bilayers", 0].plot()
 
 # %% [markdown]
 # A shape's curvature diagram is the distribution of its surface over the two principal curvatures, κ₁ ≥ κ₂. Tubes have
@@ -38,7 +37,7 @@ surface_figure(flows["bilayers", 0].field.numpy(), width=420, title="bilayers")
 
 # %%
 diagrams = {key: curvafit.diagram(flow.field, flow.grid, 0.02) for key, flow in flows.items()}
-diagram_figure(diagrams["tubes", 0], title="tubes")
+diagrams["tubes", 0].plot()
 
 # %% [markdown]
 # The distance of two diagrams is the Wasserstein distance, in 1 / working unit (a working unit is 100 voxels).

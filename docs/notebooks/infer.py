@@ -17,11 +17,9 @@
 # %%
 # %matplotlib inline
 import curvafit
-from curvafit.drawing import diagram_figure, surface_figure
-from curvafit.volumes import Field
 
 truth = curvafit.preset("sponge")
-flow = curvafit.generate(truth.coefficients, truth.mass, 40, seed=0)
+flow = curvafit.generate("sponge", grid=40, seed=0)
 print(flow.status)
 
 # %% [markdown]
@@ -29,7 +27,7 @@ print(flow.status)
 # a smooth step between. `kind="field"` says so, and `periodic=True` that the box repeats. A scan needs neither.
 
 # %%
-scan = Field(flow.field.numpy(), (20.0, 20.0, 20.0), "um")
+scan = curvafit.Field(flow.field.numpy(), (20.0, 20.0, 20.0), "um")
 inference = curvafit.infer(scan, kind="field", periodic=True, seed=1)
 fit = inference.fit
 print(fit.status)
@@ -52,17 +50,14 @@ print(fit.coefficients_physical)
 print(f"ε = {fit.epsilon_physical:g} {fit.length_unit}")
 
 # %% [markdown]
-# The surface of the scan, and that of its twin: another shape, grown from other noise with the inferred parameters.
+# The scan, and its twin: another shape, grown from other noise with the inferred parameters.
 
 # %%
-surface_figure(scan.values, width=420, title="the scan")
-
-# %%
-surface_figure(inference.best, width=420, title="its twin")
+inference.plot()
 
 # %% [markdown]
 # The curvature diagram of the scan: how much of its surface has the principal curvatures κ₁ and κ₂. Inference compares
 # these diagrams.
 
 # %%
-diagram_figure(inference.diagram, title="the scan's curvature diagram")
+inference.diagram.plot()
