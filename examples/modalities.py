@@ -25,7 +25,7 @@ SHAPES = {"micro-ct": "trabec", "em-membrane": "bilayers"}
 #: Of those that are not named.
 SHAPE = "tubes"
 #: What is drawn of each image; the projection is of a quarter of the depth, the minimum where structures are dark.
-ROWS = ("across z", "its outline", "along z", "projection")
+ROWS = ("across z", "outline", "along z", "projection")
 
 
 def main() -> None:
