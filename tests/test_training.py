@@ -199,6 +199,18 @@ def test_torchio_s_form(store):
     assert (subject.label.data[0].permute(2, 1, 0) == sample.label[0]).all()
 
 
+@pytest.mark.parametrize("size", [16.5, "16", (8, 8), (8, 8, 0)])
+def test_a_size_that_is_none_is_refused(store, size):
+    with pytest.raises(ValueError, match="expected (a sequence of )?3 whole numbers of voxels"):
+        TextureDataset(store, QUIET, size)
+
+
+@pytest.mark.parametrize(("name", "value"), [("voxel", 0), ("voxel", -1), ("seed", -1), ("seed", 0.5)])
+def test_a_voxel_or_a_seed_that_is_none_is_refused(store, name, value):
+    with pytest.raises(ValueError, match="expected a (shape's voxel of positive length|seed that is a whole number)"):
+        TextureDataset(store, QUIET, SHAPE, **{name: value})
+
+
 def test_bad_input(store, tmp_path):
     with pytest.raises(ValueError, match="expected crops within the 24 voxels of the stored shapes, but 25 x 8 x 8"):
         TextureDataset(store, QUIET, (25, 8, 8))
@@ -206,7 +218,7 @@ def test_bad_input(store, tmp_path):
         TextureDataset(tmp_path / "missing.zarr", QUIET, SHAPE)
     with pytest.raises(ValueError, match="expected at least one source and one modality, got 1 and 0"):
         TextureDataset(store, [], SHAPE)
-    with pytest.raises(ValueError, match="expected 3 edges and a length above 0, and a blend in"):
+    with pytest.raises(ValueError, match="expected a length above 0 and a blend in"):
         TextureDataset(store, QUIET, SHAPE, blend=1.5)
-    with pytest.raises(ValueError, match="expected 3 edges and a length above 0"):
+    with pytest.raises(ValueError, match="expected a length above 0"):
         TextureDataset(store, QUIET, SHAPE, length=0)
