@@ -19,7 +19,7 @@ from curvafit.data_synth.imaging.modality import Modality
 from curvafit.data_synth.imaging.randomness import correlated
 from curvafit.data_synth.sets.case import check_calibres, check_crop, drawn_voxel, edges_of, imaged
 from curvafit.data_synth.sets.sources import LAWS, Generated, Pool, Stored, voxel_of
-from curvafit.priors.bounds import LONGEST, SHORTEST, named, real, seed_of, whole
+from curvafit.priors.bounds import LONGEST, SHORTEST, named, real, seed_of, several, whole
 from curvafit.priors.law import Law
 
 #: Length over which one texture gives way to another, as a share of the crop's longest edge.
@@ -112,7 +112,7 @@ class TextureDataset(IterableDataset):
         self.size = edges_of((size,) * 3 if isinstance(size, (int, Real)) else size)
         self.length, self.seed, self.blend = int(length), seed_of(seed), blend
         self.calibres, self.normalise, self.transform = calibres, _normalisation(normalise), transform
-        sources: list[Any] = [source] if isinstance(source, LAWS) else list(source)  # type: ignore[arg-type]
+        sources: list[Any] = [source] if isinstance(source, LAWS) else list(several(source, "laws or stores"))
         self._check(sources)
         stores = all(map(_is_store, sources))
         edge = None if voxel is None else real(voxel, "a shape's voxel of positive length", SHORTEST, LONGEST)
