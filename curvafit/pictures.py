@@ -31,7 +31,9 @@ class Pictured:
         ValueError
             If there is nothing to draw: no surface, or a field that is not finite.
         """
-        module, _, function = sys.modules[__name__.partition(".")[0]]._FIGURES[type(self).__name__].partition(":")
+        figures = sys.modules[__name__.partition(".")[0]]._FIGURES
+        place = next(figures[each.__name__] for each in type(self).__mro__ if each.__name__ in figures)
+        module, _, function = place.partition(":")
         return getattr(import_module(module), function)(self, **options)
 
     def _repr_html_(self) -> str:

@@ -257,6 +257,7 @@ def test_places_that_cannot_be_written_are_refused_first(name, said, oblique, tm
         (("segment", "g.npy", "--prior", "tubes"), "link.npy"),
         (("segment", "g.npy", "--prior", "tubes", "--probability", "p.npy"), "p.npy"),
         (("segment", "g.npy", "--prior", "mine.json"), "mine.npy"),
+        (("segment", "g.npy", "--prior", "law.npy"), "law.npy"),
         (("segment", "slices", "--prior", "tubes"), "slices/1.tif"),
         (("reconstruct", "g.npy", "--every", "4", "--prior", "tubes"), "sub/../g.npy"),
         (("reconstruct", "h.h5::g.npy", "--every", "4", "--prior", "tubes"), "hard.npy"),
@@ -266,7 +267,7 @@ def test_no_input_is_written_over(arguments, target, tmp_path, monkeypatch) -> N
     monkeypatch.chdir(tmp_path)
     for folder in ("sub", "slices"):
         (tmp_path / folder).mkdir()
-    for name in ("g.npy", "p.npy", "h.h5", "slices/1.tif"):
+    for name in ("g.npy", "p.npy", "law.npy", "h.h5", "slices/1.tif"):
         (tmp_path / name).write_text(name)
     (tmp_path / "mine.json").write_text('{"format": "curvafit-mask-1"}')
     (tmp_path / "link.npy").symlink_to("g.npy")

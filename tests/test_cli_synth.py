@@ -62,6 +62,7 @@ def test_a_set_of_inferred_shapes_like_a_scan(tmp_path, store):
     quick = ["--count", "1", "--shape", "8,16,16", "--workers", "0"]
     out, scan = tmp_path / "set", tmp_path / "scan.nii.gz"
     told = ["--like", scan, "--like-mask", tmp_path / "mask.nii.gz", "--label", "1", "--visible", "auto"]
+    told += ["--voxel", "1", "--unit", "um"]  # of the shape's voxel alone: the scan stays in mm
     result = call("synth", "-o", out, "--prior", tmp_path / "fit.json", *told, *quick)
     assert result.exit_code == 0, (result.output, result.exception)
     image = load(out / "imagesTr" / "case_00000_0000.nii.gz")

@@ -48,6 +48,15 @@ def test_a_fit_without_a_diagram_and_with_a_phase_that_is_missing(fit: Fit) -> N
     assert back.morphometry.volume_fraction == 1.0 and back.distances == fit.distances
 
 
+def test_texts_come_back_as_they_are(fit: Fit) -> None:
+    odd = dataclasses.replace(fit, status="grown [  3  ]", notes=("scan [ 1, 2 ].tif",))
+    assert fields(Fit.from_json(odd.to_json())) == fields(odd)
+
+
+def test_a_fit_can_be_a_key(fit: Fit) -> None:
+    assert fit == fit and len({fit, fit}) == 1
+
+
 def test_a_distance_that_is_unknown_comes_back() -> None:
     lost = made_fit("match", lost=True)
     assert lost.distances["fit"] is None and Fit.from_json(lost.to_json()).distances == lost.distances

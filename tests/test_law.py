@@ -8,6 +8,7 @@ import pytest
 import torch
 from found import made_fit
 
+from curvafit.inference.infer import Inference
 from curvafit.priors import PRESETS, Coefficients, CurvaturePrior, Law, Texture, preset, read_fit, texture_of
 from curvafit.priors.law import textures_of
 
@@ -47,6 +48,12 @@ def test_a_fit_its_file_and_what_was_read_from_it_are_one_law(fit_path) -> None:
         assert (texture.epsilon, texture.unit) == (prior.epsilon, prior.unit)
         assert texture.in_unit(None, 3.0) == texture.in_unit(prior.unit, 5.0) == prior.physical
     assert texture_of(fit_path).origin == f"prior {fit_path}"
+
+
+def test_an_inference_is_the_law_of_its_fit() -> None:
+    nothing = dict.fromkeys(field.name for field in dataclasses.fields(Inference))
+    inference = Inference(**nothing | {"fit": made_fit()})  # type: ignore[arg-type]
+    assert texture_of(inference) == texture_of(made_fit())
 
 
 def test_a_fit_in_a_file_of_another_name_is_read(fit_path) -> None:

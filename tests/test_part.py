@@ -198,6 +198,8 @@ def test_a_crop_is_what_python_s_slices_are_or_refused(ends) -> None:
     text = ",".join(":".join("" if edge is None else str(edge) for edge in pair) for pair in ends)
     slices = tuple(slice(*pair) for pair in ends)
     assert box_of(text) == slices == box_of(slices)
+    of_numpy = tuple(slice(*(None if edge is None else np.int64(edge) for edge in pair)) for pair in ends)
+    assert box_of(of_numpy) == slices
     try:
         part = Field(VALUES).crop(text)
     except ScanError as error:

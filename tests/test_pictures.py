@@ -6,6 +6,7 @@ import dataclasses
 import importlib
 import re
 
+import numpy as np
 import pytest
 import torch
 from matplotlib.figure import Figure
@@ -13,7 +14,7 @@ from matplotlib.figure import Figure
 import curvafit
 from curvafit.generation import Schedule, generate
 from curvafit.pictures import Pictured
-from curvafit.priors import WORKING_EPSILON, preset
+from curvafit.priors import WORKING_EPSILON, Grid, preset
 
 BRIEF = Schedule("brief", 60, 1e-2, 1e-3, "constant")
 
@@ -45,6 +46,20 @@ def test_a_flow_says_what_it_lowered(flow) -> None:
 
 def test_a_flow_is_compared_without_complaint(flow) -> None:
     assert flow == flow and flow != dataclasses.replace(flow) and len({flow, flow}) == 1
+    history = dataclasses.replace(flow.history)
+    assert history != flow.history and history == history
+
+
+def test_a_flow_says_every_edge_of_its_voxels(flow) -> None:
+    long = dataclasses.replace(flow, grid=Grid((16, 16, 16), (0.01, 0.02, 0.03)))
+    assert "voxels of 0.01 x 0.02 x 0.03," in repr(long)
+
+
+def test_a_type_of_one_s_own_keeps_the_picture() -> None:
+    class Own(curvafit.Field):
+        pass
+
+    assert "<img" in Own(np.arange(27.0).reshape(3, 3, 3))._repr_html_()
 
 
 def test_a_picture_of_a_shape_and_none_of_what_is_not_finite(flow) -> None:

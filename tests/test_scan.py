@@ -144,6 +144,9 @@ def test_bad_names_are_refused(tmp_path: Path) -> None:
         load(tmp_path)
     with pytest.raises(ScanError, match="expected a unit of voxel, nm, um, mm or m, got 'furlong'"):
         Field(ramp(), unit="furlong")
+    for kind in (str, complex, object):
+        with pytest.raises(ValueError, match="expected real numbers, got values of type"):
+            Field(ramp().astype(kind))
     with pytest.raises(ScanError, match="expected a channel from 0 to 2 of .*, which holds 3 channels, got none"):
         tifffile.imwrite(tmp_path / "scan.tif", np.zeros((5, 6, 3), np.uint8), photometric="rgb")
         load(tmp_path / "scan.tif")

@@ -17,7 +17,7 @@ from curvafit.priors.coefficients import Coefficients, preset
 from curvafit.segmentation.evidence import interpolated_distance, of_intensities, of_probability
 from curvafit.segmentation.segment import reconstruct, segment
 from curvafit.segmentation.working import WorkingGrid, law_of
-from curvafit.volumes.scan import Field
+from curvafit.volumes.scan import Field, save
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 
@@ -159,6 +159,17 @@ def test_noisy_tubes_come_out_better_than_from_a_threshold_at_any_smoothing() ->
     assert np.array_equal(found.mask.affine, scan.affine)  # type: ignore[arg-type]
     assert found.mask.values.dtype == bool and np.array_equal(found.mask.values, found.phase.values > 0)
     assert "settled" in found.status and found.weight == pytest.approx(1, rel=1e-6)
+
+
+def test_a_probability_s_file_is_read_as_the_scan_s(tmp_path: Path) -> None:
+    inside = np.linalg.norm(np.indices((12, 12, 12)) - 5.5, axis=0) < 4
+    affine = np.diag([0.5, 0.5, 0.5, 1.0])
+    scan, likely = (
+        save(Field(values, 0.5, "mm", affine), tmp_path / name)
+        for values, name in ((noisy(inside, 10).values, "scan.nii"), (inside.astype(np.float32), "map.nii"))
+    )
+    found = segment(scan, WILLMORE, probability=likely, steps=2, spacing=0.25, unit="um")
+    assert found.mask.spacing == (0.25, 0.25, 0.25) and found.mask.unit == "um"
 
 
 def test_a_probability_map_is_regularised() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import pickle
 from collections.abc import Iterable
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from exact_store import exact_store
+from found import made_fit
 from torch.utils.data import DataLoader
 
 from curvafit.data_synth.atlas.store import open_store
@@ -19,6 +21,7 @@ from curvafit.data_synth.imaging.modality import Modality
 from curvafit.data_synth.imaging.parameters import Contrast, Imaging, Noise, Optics
 from curvafit.data_synth.sets import training
 from curvafit.data_synth.sets.moves import cropped, rotated, turned
+from curvafit.data_synth.sets.sources import voxel_of
 from curvafit.data_synth.sets.training import Sample, TextureDataset, as_dict, as_monai, as_subject
 from curvafit.priors import preset
 
@@ -188,6 +191,16 @@ def test_shapes_of_laws(tmp_path):
         TextureDataset(tubes.coefficients, QUIET, 12)
     with pytest.raises(ValueError, match="expected a preset among"):
         TextureDataset("tubez", QUIET, 12)
+    with pytest.raises(ValueError, match="expected a sequence of laws or stores, got 3"):
+        TextureDataset(3, QUIET, 12)  # type: ignore[arg-type]
+
+
+def test_a_fit_in_voxels_tells_no_edge_of_images_in_a_unit():
+    in_um = dataclasses.replace(made_fit(), length_unit="um", working_voxel=0.25)
+    in_voxels = dataclasses.replace(in_um, length_unit="voxel")
+    kind, of_voxels = Modality("um", "", 0.5, Imaging()), Modality("voxel", "", 0.5, Imaging(unit="voxel"))
+    assert (kind.base.unit, of_voxels.base.unit) == ("um", "voxel")
+    assert (voxel_of([in_um], kind), voxel_of([in_voxels], kind), voxel_of([in_voxels], of_voxels)) == (0.25, 0.5, 0.25)
 
 
 def test_torchio_s_form(store):
@@ -199,6 +212,18 @@ def test_torchio_s_form(store):
     assert (subject.label.data[0].permute(2, 1, 0) == sample.label[0]).all()
 
 
+@pytest.mark.parametrize("size", [16.5, "16", (8, 8), (8, 8, 0)])
+def test_a_size_that_is_none_is_refused(store, size):
+    with pytest.raises(ValueError, match="expected (a sequence of )?3 whole numbers of voxels"):
+        TextureDataset(store, QUIET, size)
+
+
+@pytest.mark.parametrize(("name", "value"), [("voxel", 0), ("voxel", -1), ("seed", -1), ("seed", 0.5)])
+def test_a_voxel_or_a_seed_that_is_none_is_refused(store, name, value):
+    with pytest.raises(ValueError, match="expected a (shape's voxel of positive length|seed that is a whole number)"):
+        TextureDataset(store, QUIET, SHAPE, **{name: value})
+
+
 def test_bad_input(store, tmp_path):
     with pytest.raises(ValueError, match="expected crops within the 24 voxels of the stored shapes, but 25 x 8 x 8"):
         TextureDataset(store, QUIET, (25, 8, 8))
@@ -206,7 +231,7 @@ def test_bad_input(store, tmp_path):
         TextureDataset(tmp_path / "missing.zarr", QUIET, SHAPE)
     with pytest.raises(ValueError, match="expected at least one source and one modality, got 1 and 0"):
         TextureDataset(store, [], SHAPE)
-    with pytest.raises(ValueError, match="expected 3 edges and a length above 0, and a blend in"):
+    with pytest.raises(ValueError, match="expected a length above 0 and a blend in"):
         TextureDataset(store, QUIET, SHAPE, blend=1.5)
-    with pytest.raises(ValueError, match="expected 3 edges and a length above 0"):
+    with pytest.raises(ValueError, match="expected a length above 0"):
         TextureDataset(store, QUIET, SHAPE, length=0)

@@ -187,12 +187,13 @@ def _run(
     overwrite: bool,
 ) -> None:
     """Refuse, read, compute, write, say."""
+    from curvafit.priors.coefficients import PRESETS
     from curvafit.priors.law import texture_of
     from curvafit.segmentation.mask_files import check_mask_target, write_mask
     from curvafit.segmentation.working import WorkingGrid
     from curvafit.volumes.scan import load
 
-    law = prior if prior.endswith(".json") else None  # or a preset's name
+    law = None if prior in PRESETS else prior
     inputs = [each for each in (source, law, told.get("probability")) if each is not None]
     check_mask_target(out, inputs=inputs, overwrite=overwrite)
     texture_of(prior)

@@ -139,7 +139,8 @@ def synth(
             raise ValueError("expected --unit beside --spacing or --voxel, got neither")
         stated = [] if laws is None else laws.split(",")
         source = _source(stated, atlas, volume_fraction)
-        reading = reading_of(spacing=spacing, unit=unit, crop=crop, channel=channel, label=label, strict=strict)
+        placed = {"spacing": spacing, "unit": None if spacing is None else unit}  # a unit alone is that of --voxel
+        reading = reading_of(**placed, crop=crop, channel=channel, label=label, strict=strict)
         kind = _modality(modality, like, like_mask, visible, reading)
         from curvafit.data_synth.sets.case import Recipe
         from curvafit.data_synth.sets.sets import Order
@@ -201,7 +202,7 @@ def _modality(
     if (name is None) == (like is None):
         raise ValueError(f"expected either --modality or --like, got {'neither' if name is None else 'both'}")
     if like is None:
-        lone = [key for key, value in reading.items() if value is not None and value is not False and key != "unit"]
+        lone = [key for key, value in reading.items() if value is not None and value is not False]
         if lone or mask is not None:
             raise ValueError(f"expected --like beside {f'--{lone[0]}' if lone else '--like-mask'}, got none")
         from curvafit.data_synth.imaging.modalities import modality

@@ -25,7 +25,7 @@ class Data(Protocol):
         ...
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _OfVoxels:
     """What has a number r a voxel."""
 
@@ -43,7 +43,7 @@ class _OfVoxels:
         return type(self)(self.ratio.to(device))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Evidence(_OfVoxels):
     """D(u) = V Σ r (½ - q(u)), q(u) = (3u - u³) / 4 on [-1, 1] and ±½ beyond.
 
@@ -70,7 +70,7 @@ class Evidence(_OfVoxels):
         return value, r * (v2 - 1) * (0.75 * grid.voxel_volume)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Hinge(_OfVoxels):
     """D(u) = V Σ |r| (1 - sign(r) u)₊² / 4: holds u at ±1 or beyond on the side that r says.
 

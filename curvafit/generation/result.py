@@ -19,7 +19,7 @@ from curvafit.priors.grid import Grid
 RECORD_EVERY = 10
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class History:
     """Figures every `RECORD_EVERY` steps and at the end, arrays `(N,)`: the number of steps made, F_ε, max and mean of
     |∂F_ε/∂A| over free voxels, the mean of u. (For the L² flows the gradient is that of v.)"""
@@ -31,7 +31,7 @@ class History:
     mass: np.ndarray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class State:
     """What a callback sees: the figures of the history's newest entry, and the field, `(Z, Y, X)`."""
 
@@ -83,9 +83,10 @@ class Flow(Pictured):
     epsilon: float | Tensor
 
     def __repr__(self) -> str:
-        voxels, energy = " x ".join(map(str, self.grid.shape)), self.history.energy[-1]
-        viable = "viable" if self.viability.viable else "not viable"
-        return f"Flow({voxels} voxels of {self.grid.spacing[0]:g}, energy {energy:.4g}, {viable}: {self.status})"
+        cube, energy = len(set(self.grid.spacing)) == 1, self.history.energy[-1]
+        edges = " x ".join(f"{h:g}" for h in self.grid.spacing[: 1 if cube else 3])
+        voxels = f"{' x '.join(map(str, self.grid.shape))} voxels of {edges}"
+        return f"Flow({voxels}, energy {energy:.4g}, {'' if self.viability.viable else 'not '}viable: {self.status})"
 
     @property
     def finite(self) -> bool:

@@ -26,7 +26,7 @@ VERSION = 1
 VIEWS = ("field", "mask")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Atlas:
     """N generated shapes: parameters in working units, and their geometric diagrams, binned.
 

@@ -25,7 +25,7 @@ from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
 _SEEN = {"field": "a phase field", "mask": "a mask", "image": "an image"}
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class Fit(Pictured):
     """The parameters of a scan, in working and in physical units.
 
@@ -131,7 +131,7 @@ class Fit(Pictured):
         if wrong := violation(content, WHOLE_FIT):
             raise ValueError(f"expected {wrong} in a fit")
         text = json.dumps(content, indent=2, allow_nan=False)
-        return re.sub(r"\[\s+([-+.\de,\s]+?)\s+\]", lambda numbers: f"[{' '.join(numbers[1].split())}]", text)
+        return re.sub(r"\[\n\s+([-+.\de,\s]+?)\n\s+\]", lambda numbers: f"[{' '.join(numbers[1].split())}]", text)
 
     @classmethod
     def from_json(cls, text: str | bytes) -> Fit:

@@ -21,7 +21,7 @@ Kind = Literal["field", "mask", "image"]
 _NOISE = 0.045
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Level:
     """A scan whose structure is where `values` (float32) > 0, and the grey level that was subtracted."""
 

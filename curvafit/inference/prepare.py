@@ -40,7 +40,7 @@ LARGEST_SCAN = 512
 FEWEST = 32
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Prepared:
     """A scan on the working grid.
 

@@ -18,7 +18,7 @@ from curvafit.priors.grid import WORKING_SPACING
 
 @runtime_checkable
 class Inferred(Protocol):
-    """A result that holds a prior, such as the `Fit` of an inference."""
+    """A result that holds a prior: an inference, or its `Fit`."""
 
     def to_prior(self) -> Prior:
         """Return the coefficients and the mass, and what ties these to the scan."""

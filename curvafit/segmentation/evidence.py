@@ -30,7 +30,7 @@ ASTRAY = 0.1
 FAINT = 1.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class VoxelEvidence:
     """What each voxel says, and a first guess.
 

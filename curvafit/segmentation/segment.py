@@ -99,7 +99,7 @@ def segment(
         edge is 0.01; or the path of a `fit.json`, whose unit is converted.
     probability
         Instead of grey levels, and of `threshold` and `dark`: the probability of the inside, in [0, 1], of the scan's
-        shape, and at its place where both files tell one.
+        shape, and at its place where both files tell one; a file's map has the scan's `spacing` and `unit`.
     weight
         λ, in nats per unit of F_ε; 2 / (a20 + a02) if not given. The data count in nats, so by their noise; the
         Willmore energy counts as it is; and others as what small bumps on a plane cost, which is (a20 + a02) / 2 times
@@ -135,7 +135,8 @@ def segment(
     elif dark or threshold != "otsu":
         raise ScanError("expected neither a threshold nor dark with a probability map, which says what is inside")
     else:
-        found = of_probability(cropped_map(field_of(probability), crop), scan)
+        placed = {} if isinstance(probability, Field) else {name: reading.get(name) for name in ("spacing", "unit")}
+        found = of_probability(cropped_map(field_of(probability, **placed), crop), scan)
     start = _started(found.level, place)
     stiffness = float(law.a20 + law.a02) / 2
     if stiffness <= 0:

@@ -40,7 +40,7 @@ class Field(Pictured):
     Raises
     ------
     ValueError
-        If values are not a 3D array, spacing is not 3 positive numbers or the unit has no known name.
+        If values are not a 3D array of real numbers, spacing is not 3 positive numbers or the unit has no known name.
     """
 
     values: np.ndarray
@@ -53,6 +53,8 @@ class Field(Pictured):
     def __post_init__(self) -> None:
         if np.ndim(self.values) != 3:
             raise ScanError(f"expected a 3D volume, got an array of shape {np.shape(self.values)}")
+        if (kind := np.asarray(self.values).dtype).kind not in "biuf":
+            raise ScanError(f"expected real numbers, got values of type {kind}")
         spacing = positive_triple(self.spacing)
         unit, factor = normalise_unit(self.unit)
         object.__setattr__(self, "values", np.asarray(self.values))

@@ -71,10 +71,7 @@ class Recipe:
         instance(self.modality, Modality, "a Modality")
         if not callable(getattr(self.source, "shape", None)):
             raise ValueError(f"expected a source of shapes, got {quoted(self.source)}")
-        words = "3 whole numbers of voxels above 0 (z, y, x)"
-        shape = several(self.shape, "3 whole numbers of voxels")
-        shape = tuple(whole(n, words, 1, MOST, of=shape) for n in (shape if len(shape) == 3 else (None,)))
-        object.__setattr__(self, "shape", shape)
+        object.__setattr__(self, "shape", edges_of(self.shape))
         object.__setattr__(self, "voxel", real(self.voxel, "a shape's voxel of positive length", SHORTEST, LONGEST))
         object.__setattr__(self, "seed", seed_of(self.seed))
         check_calibres(self.calibres)
@@ -149,6 +146,13 @@ def imaged(
     mask = visible(u, voxel, [imaging], epsilon) if imaging.visible else sampled > 0
     grey, sampled, mask = (each[0, 0, :z, :y, :x].contiguous() for each in (grey, sampled, mask))
     return grey, sampled, mask
+
+
+def edges_of(shape: Sequence[int]) -> tuple[int, int, int]:
+    """Return the voxels (z, y, x) of an image as whole numbers above 0, or raise ValueError."""
+    words, edges = "3 whole numbers of voxels above 0 (z, y, x)", several(shape, "3 whole numbers of voxels")
+    z, y, x = (whole(n, words, 1, MOST, of=edges) for n in (edges if len(edges) == 3 else (None,) * 3))
+    return z, y, x
 
 
 def drawn_voxel(voxel: float, calibres: Sequence[float], rng: np.random.Generator) -> float:

@@ -25,6 +25,7 @@ from curvafit.priors.bounds import several
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.priors.law import Law, Texture, textures_of
+from curvafit.units import METRES
 from curvafit.volumes.formats.base import convert_length
 
 #: Seeds that a shape gets to become well-formed.
@@ -291,13 +292,17 @@ def source_of(content: dict[str, Any]) -> ShapeSource:
 def voxel_of(laws: Iterable[Law], kind: Modality) -> float:
     """Return the edge of a shape's voxel in a modality's unit: that of a law that is a fit, else the modality's own.
 
+    A fit in voxels tells no edge of images in a unit of length.
+
     Raises
     ------
     FileNotFoundError, ValueError
         If a law cannot be read (`texture_of`), or the laws are several fits of different edges.
     """
+    unit = kind.base.unit
     fits = [each.prior for each in textures_of(laws) if each.prior is not None]
-    edges = {convert_length(fit.working_voxel, fit.unit, kind.base.unit) for fit in fits}
+    known = [fit for fit in fits if fit.unit in METRES or fit.unit == unit]
+    edges = {convert_length(fit.working_voxel, fit.unit, unit) for fit in known}
     if len(edges) > 1:
         raise ValueError(f"expected fits of one voxel's edge, or a voxel beside them, got edges of {sorted(edges)}")
     return edges.pop() if edges else kind.voxel

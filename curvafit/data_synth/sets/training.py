@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from numbers import Real
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,9 +17,9 @@ from curvafit.data_synth.imaging.imaging import field_shape
 from curvafit.data_synth.imaging.modalities import modality
 from curvafit.data_synth.imaging.modality import Modality
 from curvafit.data_synth.imaging.randomness import correlated
-from curvafit.data_synth.sets.case import check_calibres, check_crop, drawn_voxel, imaged
+from curvafit.data_synth.sets.case import check_calibres, check_crop, drawn_voxel, edges_of, imaged
 from curvafit.data_synth.sets.sources import LAWS, Generated, Pool, Stored, voxel_of
-from curvafit.priors.bounds import named, whole
+from curvafit.priors.bounds import LONGEST, SHORTEST, named, real, seed_of, several, whole
 from curvafit.priors.law import Law
 
 #: Length over which one texture gives way to another, as a share of the crop's longest edge.
@@ -108,13 +109,14 @@ class TextureDataset(IterableDataset):
     ) -> None:
         kinds = [modalities] if isinstance(modalities, (str, Modality)) else list(modalities)
         self.modalities = [modality(kind) if isinstance(kind, str) else kind for kind in kinds]
-        self.size = (size,) * 3 if isinstance(size, int) else tuple(map(int, size))
-        self.length, self.seed, self.blend = int(length), int(seed), blend
+        self.size = edges_of((size,) * 3 if isinstance(size, (int, Real)) else size)
+        self.length, self.seed, self.blend = int(length), seed_of(seed), blend
         self.calibres, self.normalise, self.transform = calibres, _normalisation(normalise), transform
-        sources: list[Any] = [source] if isinstance(source, LAWS) else list(source)  # type: ignore[arg-type]
+        sources: list[Any] = [source] if isinstance(source, LAWS) else list(several(source, "laws or stores"))
         self._check(sources)
         stores = all(map(_is_store, sources))
-        self.voxels = [voxel or voxel_of([] if stores else sources, kind) for kind in self.modalities]
+        edge = None if voxel is None else real(voxel, "a shape's voxel of positive length", SHORTEST, LONGEST)
+        self.voxels = [edge or voxel_of([] if stores else sources, kind) for kind in self.modalities]
         if stores:
             if volume_fraction is not None:
                 raise ValueError("expected a volume fraction beside laws, got stores of shapes")
@@ -204,9 +206,8 @@ class TextureDataset(IterableDataset):
             raise ValueError(
                 f"expected at least one source and one modality, got {len(sources)} and {len(self.modalities)}"
             )
-        if len(self.size) != 3 or min(self.size) < 1 or self.length < 1 or not 0 <= self.blend <= 1:
-            values = f"{self.size}, {self.length}, {self.blend}"
-            raise ValueError(f"expected 3 edges and a length above 0, and a blend in [0, 1], got {values}")
+        if self.length < 1 or not 0 <= self.blend <= 1:
+            raise ValueError(f"expected a length above 0 and a blend in [0, 1], got {self.length} and {self.blend}")
         check_calibres(self.calibres)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -175,4 +176,4 @@ def _sequence(crop: Any) -> Sequence[Any]:
 def _is_plain(edge: slice) -> bool:
     """Whether a slice has whole ends, or none, and no step."""
     ends = (end for end in (edge.start, edge.stop) if end is not None)
-    return edge.step in (None, 1) and all(isinstance(end, int) and not isinstance(end, bool) for end in ends)
+    return edge.step in (None, 1) and all(isinstance(end, Integral) and not isinstance(end, bool) for end in ends)
