@@ -194,7 +194,7 @@ def test_a_scan_without_a_diagram_is_placed_by_its_matches_or_refused(opened: Op
         ("{}", "expected a fit.json with format, got none in odd.json"),
         (made_fit().to_json().replace("curvafit-fit-1", "fit-0"), "format as curvafit-fit-1"),
         *((broken(*change), f"expected a fit.json with {said}") for *change, said in BROKEN),
-        ("κ", "which is no JSON"),
+        ("κ", "which is not JSON"),
         (
             scan_fit(atlas, 1).to_json().replace('"kappa1"', '"kappa"'),
             "expected a fit.json with diagram.kappa1, got none",

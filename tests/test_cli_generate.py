@@ -151,8 +151,10 @@ def test_every_option_reaches_the_generator(tmp_path: Path, handed: dict[str, An
 @pytest.mark.parametrize("option", ["--preset", "--prior"])
 def test_either_option_takes_a_preset_or_a_fit(tmp_path: Path, handed: dict[str, Any], option: str) -> None:
     (tmp_path / "fit.json").write_text(made_fit().to_json())
-    call("generate", option, "sponge", "-o", tmp_path / "out.npy")
-    assert (handed["law"], handed["mass"]) == preset("sponge")[:2]
+    for name in ("bilinear-sponges", "Bilinear Sponges"):
+        handed.clear()
+        call("generate", option, name, "-o", tmp_path / "out.npy")
+        assert (handed["law"], handed["mass"]) == preset("bilinear-sponges")[:2]
     call("generate", option, tmp_path / "fit.json", "-o", tmp_path / "out.npy")
     assert (handed["law"], handed["mass"]) == (made_fit().coefficients, made_fit().mass)
 

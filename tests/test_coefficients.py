@@ -9,7 +9,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from curvafit.priors.coefficients import PRESETS, Coefficients, preset
+from curvafit.priors.coefficients import PRESETS, Coefficients, preset, preset_name
+from curvafit.priors.law import texture_of
 
 finite = st.floats(-50, 50, allow_subnormal=False)
 positive = st.floats(0.1, 50)
@@ -87,6 +88,17 @@ def test_presets_are_the_published_values() -> None:
     assert all(-1 < shape.mass < 0 and shape.source for shape in PRESETS.values())
     with pytest.raises(ValueError, match=r"expected a preset among .*tubes.*, got 'tube'"):
         preset("tube")
+
+
+@pytest.mark.parametrize("text", ["bilinear-tubes", "Bilinear_Tubes", "BILINEAR TUBES", " bilinear tubes "])
+def test_a_preset_is_known_by_any_spelling_of_its_name(text: str) -> None:
+    assert preset(text) is PRESETS["bilinear-tubes"]
+    assert texture_of(text).origin == "preset bilinear-tubes"
+
+
+def test_every_name_of_a_preset_spells_that_preset() -> None:
+    assert [preset_name(name.upper().replace("-", "_")) for name in PRESETS] == list(PRESETS)
+    assert [preset_name(text) for text in ("bilineartubes", "", None, 3)] == [None] * 4
 
 
 def test_presets_against_the_gallerys_file_names(data) -> None:

@@ -131,7 +131,7 @@ def test_it_can_be_copied():
         ({"epsilon": -1.0}, "expected epsilon > 0"),
         ({"border": 0.5}, "expected a border of whole voxels"),
         ({"weight": -1}, "expected a weight from 0"),
-        ({"weight": None}, "expected a weight from 0 to 1e.09, or one a class, got None"),
+        ({"weight": None}, "expected a weight from 0 to 1e.09, or one for each class, got None"),
         ({"shape": (8, 8)}, "expected a shape of 3 whole numbers"),
     ],
 )
@@ -147,7 +147,7 @@ def test_wrong_laws_are_said(tmp_path):
         CurvaturePrior(tmp_path / "fit.json")
     with pytest.raises(ValueError, match="expected coefficients that are numbers"):
         CurvaturePrior(Coefficients(torch.ones(2), 1, 1))
-    with pytest.raises(ValueError, match="expected one coefficients or 1, one a class that counts, got 2"):
+    with pytest.raises(ValueError, match=r"expected one law, or one for each class that counts \(1 in all\), got 2"):
         CurvaturePrior(("tubes", "sponge"))(torch.rand(1, 1, 8, 8, 8))
 
 
@@ -169,7 +169,7 @@ def test_flat_input_is_refused(shape, message):
 def test_wrong_targets_and_masks_are_said():
     p, prior = torch.rand(2, 2, 8, 8, 8), CurvaturePrior("tubes", ignore_index=2)
     for target in (None, torch.ones(2, 2, 8, 8, 8)):
-        with pytest.raises(ValueError, match="expected a target .* with labels 2 to ignore"):
+        with pytest.raises(ValueError, match="expected a target .* with label 2 on ignored voxels"):
             prior(p, target)
     with pytest.raises(ValueError, match="expected a target of shape"):
         prior(p, torch.ones(2, 1, 8, 8, 4))

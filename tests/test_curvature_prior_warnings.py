@@ -38,7 +38,7 @@ def test_an_epsilon_far_from_the_fit_s_is_said(tmp_path, factor):
     for good in (1.01, 3.9):
         CurvaturePrior(path, spacing=good * 2e-3, unit="mm")
         CurvaturePrior(path, spacing=2 / good)
-    with pytest.warns(UserWarning, match=r"ε is .* mm here and was 0.004 mm in the fit: give spacing and its unit"):
+    with pytest.warns(UserWarning, match=r"ε is .* mm here and was 0.004 mm in the fit: state spacing and its unit"):
         CurvaturePrior(path, spacing=factor * 2e-3, unit="mm")
 
 
@@ -126,7 +126,7 @@ def test_a_look_without_gradients_leaves_later_ones_alone():
 def test_a_level_too_coarse_is_zero(shape, options):
     whole = {"shape": (32, 32, 32)} | options
     prior, value = CurvaturePrior(("tubes", LAW), reduction="none", **whole), torch.rand(2, 2, *shape)
-    with pytest.warns(UserWarning, match="a level of .* voxels is too coarse for ε = 2: it counts nothing"):
+    with pytest.warns(UserWarning, match="a level of .* voxels is too coarse for ε = 2, so its loss is 0"):
         found = prior(value.requires_grad_())
     assert found.shape == (2, 2, 1, 1, 1) and not bool(found.any())
     found.sum().backward()

@@ -33,15 +33,15 @@ def test_one_thing_wrong_is_named(tmp_path: Path, where: str, text: str | None, 
 @pytest.mark.parametrize(
     ("where", "text", "said"),
     [
-        ("mass", "NaN", "NaN, which is no finite number"),
-        ("coefficients.a00", "-Infinity", "-Infinity, which is no finite number"),
-        ("epsilon_physical", "1e999", "'1e999', which is no finite number"),
+        ("mass", "NaN", "NaN, which is not a finite number"),
+        ("coefficients.a00", "-Infinity", "-Infinity, which is not a finite number"),
+        ("epsilon_physical", "1e999", "'1e999', which is not a finite number"),
         ("working_voxel", "1" * 400, "a number of 400 digits"),
         ("provenance", "1" * 5000, "a number of 5000 digits"),
         ("provenance", "[" * 100_000 + "]" * 100_000, "nested too deeply"),
         ("provenance", '{"a":' * 100_000, "nested too deeply"),
         ("provenance", '{"a": 1, "a": 2}', "the key 'a' twice"),
-        ("provenance", "{", "which is no JSON"),
+        ("provenance", "{", "which is not JSON"),
     ],
 )
 def test_numbers_that_are_none_and_texts_that_are_bombs(tmp_path: Path, where: str, text: str, said: str) -> None:
@@ -50,8 +50,8 @@ def test_numbers_that_are_none_and_texts_that_are_bombs(tmp_path: Path, where: s
 
 def test_bytes_that_are_no_utf8_and_a_byte_order_mark(tmp_path: Path) -> None:
     text = made_fit().to_json()
-    assert "no text in UTF-8" in refused(tmp_path / "fit.json", text.replace("tubes", "tübes").encode("latin-1"))
-    assert "no text in UTF-8" in refused(tmp_path / "fit.json", text.encode("utf-16"))
+    assert "not text in UTF-8" in refused(tmp_path / "fit.json", text.replace("tubes", "tübes").encode("latin-1"))
+    assert "not text in UTF-8" in refused(tmp_path / "fit.json", text.encode("utf-16"))
     (tmp_path / "fit.json").write_bytes(b"\xef\xbb\xbf" + text.encode())
     assert read_fit(tmp_path / "fit.json").mass == made_fit().mass
 
@@ -96,5 +96,5 @@ def test_a_quotation_is_short() -> None:
 
 def test_json_is_read_in_bytes_or_text() -> None:
     assert parse_json(b'\xef\xbb\xbf{"a": [1, 2.5, null]}', "JSON", "here") == {"a": [1, 2.5, None]}
-    with pytest.raises(ValueError, match=r"expected a header, got here, which is no JSON \(.* in line 2\)"):
+    with pytest.raises(ValueError, match=r"expected a header, got here, which is not JSON \(.* in line 2\)"):
         parse_json("{\n,", "a header", "here")

@@ -87,7 +87,7 @@ def test_units_that_cannot_be_compared_are_refused() -> None:
 
 
 def test_coefficients_that_vary_have_no_unit_to_go_to() -> None:
-    with pytest.raises(ValueError, match="expected coefficients that are numbers, got some that vary"):
+    with pytest.raises(ValueError, match="expected coefficients that are numbers, got coefficients that vary in space"):
         texture_of(Coefficients(torch.ones(4, 4, 4), 0, 1)).in_unit("mm", 1.0)
 
 

@@ -31,7 +31,8 @@ def test_the_command_prints_lines_that_a_shell_takes(tmp_path):
         assert folder.split(os.pathsep) == [str(FOLDER), *([before] if before else [])]
         assert rest == ["tubes", "0.01", "0.5", "50"]
         assert "unset CURVAFIT_SHARE" in script
-    shared = call("nnunet", "--prior", "tubes").stdout.splitlines()
+    shared = call("nnunet", "--prior", "Bilinear_Tubes").stdout.splitlines()
+    assert "export CURVAFIT_PRIOR=bilinear-tubes" in shared
     assert "export CURVAFIT_SHARE=0.1" in shared and "unset CURVAFIT_WEIGHT" in shared
 
 

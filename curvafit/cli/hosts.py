@@ -33,13 +33,15 @@ def nnunet(
     nnU-Net takes lengths for mm: a fit in another physical unit is converted.
     """
     with plainly():
-        from curvafit.priors import PRESETS, read_fit
+        from curvafit.priors.coefficients import PRESETS, preset_name
+        from curvafit.priors.fit_file import read_fit
 
-        if prior not in PRESETS:
+        name = preset_name(prior)
+        if name is None:
             if not prior.endswith(".json"):
                 raise ValueError(f"expected --prior to be a fit.json or a preset ({', '.join(PRESETS)}), got {prior!r}")
             read_fit(prior).in_unit("mm")
-            prior = str(Path(prior).resolve())
+        prior = name or str(Path(prior).resolve())
         if share is not None and weight is not None:
             raise ValueError("expected either --share or --weight, got both")
         share = 0.1 if share is None and weight is None else share

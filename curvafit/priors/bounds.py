@@ -1,10 +1,11 @@
-"""What numbers that are given must be, whole or real and within which bounds; and how a message quotes what came."""
+"""Checks of arguments (numbers within bounds, names, sequences), and short quotes of values for messages."""
 
 from __future__ import annotations
 
 import contextlib
 import math
 import operator
+import re
 import reprlib
 from collections.abc import Iterable
 from typing import Any
@@ -21,73 +22,78 @@ _SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother, _SHORT.maxlong = 3, SHOWN, S
 
 
 def quoted(value: Any) -> str:
-    """A value as a message shows it: on one line, and no longer than fits on it, however much it holds."""
+    """Return a value as a message shows it: on one line, cut to `SHOWN` characters."""
     text = " ".join(_SHORT.repr(value).split())
     return text if len(text) <= SHOWN else f"{text[: SHOWN - 2]} …"
 
 
-def whole(value: Any, said: str, least: int, most: int, *, of: Any = None) -> int:
-    """A whole number from `least` to `most`, of Python's or NumPy's types.
+def whole(value: Any, expected: str, least: int, most: int, *, of: Any = None) -> int:
+    """Return a whole number from `least` to `most` as an int; Python's and NumPy's types are accepted.
 
     Parameters
     ----------
-    said
-        What was expected, for the message: its kind, and where it starts; the other bound is added where it counts.
+    expected
+        What the message says was expected: the kind of number and the least one. The message adds `most` where the
+        number is above it.
     of
-        What came, where the value is a part of it.
+        The argument that the message quotes, where the value is a part of one.
 
     Raises
     ------
     ValueError
-        If it is none: a truth value, text and 64.0 are no whole numbers.
+        If the value is not such a number: truth values, text and 64.0 are refused.
     """
     try:
         number = None if isinstance(value, bool) else operator.index(value)
     except TypeError:
         number = None
     if number is None or not least <= number <= most:
-        raise ValueError(f"expected {said}{_beyond(number, 0, most)}, got {quoted(value if of is None else of)}")
+        raise ValueError(f"expected {expected}{_beyond(number, 0, most)}, got {quoted(value if of is None else of)}")
     return number
 
 
-def real(value: Any, said: str, least: float = -math.inf, most: float = math.inf, *, of: Any = None) -> float:
-    """A finite number from `least` to `most`, of any numeric type; the other parameters are `whole`'s.
+def real(value: Any, expected: str, least: float = -math.inf, most: float = math.inf, *, of: Any = None) -> float:
+    """Return a finite number from `least` to `most` as a float; any numeric type is accepted.
+
+    The other parameters are those of `whole`.
 
     Raises
     ------
     ValueError
-        If it is none: truth values and text are no numbers.
+        If the value is not such a number: truth values and text are refused.
     """
     number = math.nan
     if not isinstance(value, (bool, str, bytes)) and not getattr(value, "shape", ()):
         with contextlib.suppress(TypeError, ValueError, OverflowError, RuntimeError):
             number = float(value)
     if not (math.isfinite(number) and least <= number <= most):
-        raise ValueError(f"expected {said}{_beyond(number, least, most)}, got {quoted(value if of is None else of)}")
+        raise ValueError(
+            f"expected {expected}{_beyond(number, least, most)}, got {quoted(value if of is None else of)}"
+        )
     return number
 
 
-def inside(value: Any, said: str, low: float, high: float) -> float:
-    """A number between two others, neither of them; as `real`.
+def inside(value: Any, expected: str, low: float, high: float) -> float:
+    """Return a number above `low` and below `high`, as `real` does.
 
     Raises
     ------
     ValueError
-        If it is none.
+        If the value is not such a number.
     """
-    number = real(value, said)
+    number = real(value, expected)
     if not low < number < high:
-        raise ValueError(f"expected {said}, got {quoted(value)}")
+        raise ValueError(f"expected {expected}, got {quoted(value)}")
     return number
 
 
 def several(values: Any, name: str) -> tuple[Any, ...]:
-    """The values of a sequence, of any type but text.
+    """Return the values of a sequence of any type but text.
 
     Raises
     ------
     ValueError
-        If it is none.
+        If the argument is not a sequence.
     """
     try:
         parts = None if isinstance(values, (str, bytes)) else tuple(values)
@@ -98,31 +104,36 @@ def several(values: Any, name: str) -> tuple[Any, ...]:
     return parts
 
 
-def instance(value: Any, kinds: type | tuple[type, ...], said: str) -> None:
-    """Raise ValueError where a value is of another kind than it must be; `said` is what was expected."""
+def instance(value: Any, kinds: type | tuple[type, ...], expected: str) -> None:
+    """Raise ValueError where a value is not an instance of `kinds`; the message says what was `expected`."""
     if not isinstance(value, kinds):
-        raise ValueError(f"expected {said}, got {quoted(value)}")
+        raise ValueError(f"expected {expected}, got {quoted(value)}")
 
 
-def named(value: Any, names: Iterable[str], said: str) -> None:
-    """Raise ValueError where a value is none of some names; `said` is what was expected."""
+def named(value: Any, names: Iterable[str], expected: str) -> None:
+    """Raise ValueError where a value is not among `names`; the message says what was `expected`."""
     if not isinstance(value, str) or value not in names:
-        raise ValueError(f"expected {said}, got {quoted(value)}")
+        raise ValueError(f"expected {expected}, got {quoted(value)}")
+
+
+def plain_name(name: str) -> str:
+    """Return a name in small letters, with `-` for spaces and underscores: `Bilinear_Tubes` is `bilinear-tubes`."""
+    return re.sub(r"[\s_-]+", "-", name.strip().casefold())
 
 
 def seed_of(value: Any) -> int:
-    """A seed: a whole number from 0 that 64 bits hold.
+    """Return a seed, a whole number from 0 that a signed 64-bit number holds.
 
     Raises
     ------
     ValueError
-        If it is none.
+        If the value is not such a number.
     """
     return whole(value, "a seed that is a whole number from 0", 0, SEEDS - 1)
 
 
 def _beyond(number: float | None, least: float, most: float) -> str:
-    """The bound that a number of the right kind and sign is beyond."""
+    """Return the words for the bound that a number exceeds; empty where its kind or its sign is wrong."""
     if number is None or not -math.inf < number < math.inf or (number <= most and not 0 < number < least):
         return ""
     return f", at most {most:g}" if number > most else f", at least {least:g}"

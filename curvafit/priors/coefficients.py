@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from curvafit.priors.bounds import LONGEST, SHORTEST, quoted, real
+from curvafit.priors.bounds import LONGEST, SHORTEST, plain_name, quoted, real
 
 #: Names in the paper's order: κ1², κ1κ2, κ2², κ1, κ2, 1.
 NAMES = ("a20", "a11", "a02", "a10", "a01", "a00")
@@ -25,13 +25,18 @@ STRONGEST = 1e6
 class Coefficients:
     """p(κ1, κ2) = a20 κ1² + a11 κ1κ2 + a02 κ2² + a10 κ1 + a01 κ2 + a00 with κ1 ≥ κ2 (eq. `F`).
 
-    Numbers, or tensors that broadcast with the voxels (coefficients that vary in space or over a batch). Lengths are
-    in whatever unit the grid's spacing is in; the published values are in working units (spacing 0.01).
+    The values are numbers, or tensors that broadcast with the voxels (coefficients that vary in space or over a batch).
+    Lengths are in the unit of the grid's spacing; the published values are in working units (spacing 0.01).
 
     Warns
     -----
     UserWarning
-        Outside a20 > 0, a02 > 0, where the quadratic part of F_ε is not bounded below.
+        If a20 ≤ 0 or a02 ≤ 0, where the quadratic part of F_ε is not bounded below.
+
+    Raises
+    ------
+    ValueError
+        If a coefficient is not finite.
     """
 
     a20: float | Tensor
@@ -47,7 +52,7 @@ class Coefficients:
             if not isinstance(value, Tensor):
                 object.__setattr__(self, name, real(value, f"a finite coefficient {name}"))
             elif value.is_complex() or not bool(torch.isfinite(value).all()):
-                got = "numbers that are not" if value.dim() > 0 else quoted(value.item())
+                got = "values that are not finite" if value.dim() > 0 else quoted(value.item())
                 raise ValueError(f"expected a finite coefficient {name}, got {got}")
         least = [float(torch.as_tensor(a, dtype=torch.float64).detach().min()) for a in (self.a20, self.a02)]
         if min(least) <= 0:
@@ -60,34 +65,42 @@ class Coefficients:
         return (getattr(self, name) for name in NAMES)
 
     def tensor(self, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None) -> Tensor:
-        """The six values stacked along a first axis, `(6,)` or `(6, *their shape)`; keeps their gradients."""
+        """Return the six values stacked along a first axis, `(6,)` or `(6, *shape)`, with their gradients."""
         parts = [torch.as_tensor(value, dtype=dtype, device=device) for value in self]
         return torch.stack(torch.broadcast_tensors(*parts))
 
     def polynomial(self, kappa1, kappa2):
-        """p(κ1, κ2), elementwise."""
+        """Return p(κ1, κ2), elementwise."""
         quadratic = self.a20 * kappa1**2 + self.a11 * kappa1 * kappa2 + self.a02 * kappa2**2
         return quadratic + self.a10 * kappa1 + self.a01 * kappa2 + self.a00
 
     def scaled(self, factor: float) -> Coefficients:
-        """All six times a positive factor: the same minimisers."""
+        """Return all six coefficients times a positive factor, which has the same minimisers."""
         return Coefficients(*(factor * value for value in self))
 
     def in_unit(self, unit: float) -> Coefficients:
-        """The same energy with lengths measured in multiples of `unit` (old lengths): quadratic part kept,
-        linear × unit, constant × unit². Working units to physical ones is `in_unit(0.01 / working voxel)`."""
+        """Return the coefficients of the same energy with lengths measured in multiples of `unit`, a length in the old
+        unit: the linear part is multiplied by `unit`, the constant one by its square.
+
+        Working units become physical ones by `in_unit(0.01 / working voxel)`.
+
+        Raises
+        ------
+        ValueError
+            If the unit is not a positive number.
+        """
         unit = real(unit, "a positive length unit", SHORTEST, LONGEST)
         a20, a11, a02, a10, a01, a00 = self
         return Coefficients(a20, a11, a02, a10 * unit, a01 * unit, a00 * unit**2)
 
     def mirrored(self) -> Coefficients:
-        """a' with F_ε[-u; a] = F_ε[u; a']: inside and outside exchange, (κ1, κ2) becomes (-κ2, -κ1)."""
+        """Return a' with F_ε[-u; a] = F_ε[u; a']: inside and outside change places, (κ1, κ2) becomes (-κ2, -κ1)."""
         a20, a11, a02, a10, a01, a00 = self
         return Coefficients(a02, a11, a20, -a01, -a10, a00)
 
     @classmethod
     def from_b(cls, h2, H0, k1, alpha, kappa1, beta, kappa2) -> Coefficients:
-        """h2 (H - H0)² + k1 K + α (κ1 - κ1⁰)² + β (κ2 - κ2⁰)², expanded (eq. `redundant`)."""
+        """Expand h2 (H - H0)² + k1 K + α (κ1 - κ1⁰)² + β (κ2 - κ2⁰)² (eq. `redundant`)."""
         return cls(
             h2 + alpha,
             2 * h2 + k1,
@@ -99,16 +112,16 @@ class Coefficients:
 
     @classmethod
     def helfrich(cls, bending: float, gaussian: float = 0.0, spontaneous: float = 0.0) -> Coefficients:
-        """χ_b/2 (H - H0)² + χ_G K (eq. `Helfrich`), H = κ1 + κ2."""
+        """Return Helfrich's χ_b/2 (H - H0)² + χ_G K with H = κ1 + κ2 (eq. `Helfrich`)."""
         return cls.from_b(bending / 2, spontaneous, gaussian, 0, 0, 0, 0)
 
     @classmethod
     def willmore(cls) -> Coefficients:
-        """H² (eq. `Willmore`)."""
+        """Return Willmore's H² (eq. `Willmore`)."""
         return cls(1, 2, 1)
 
     def as_dict(self) -> dict[str, float]:
-        """Names to numbers; for coefficients that do not vary."""
+        """Return a dictionary from names to numbers, for coefficients that do not vary."""
         return {name: float(value) for name, value in dataclasses.asdict(self).items()}
 
 
@@ -121,7 +134,7 @@ def check_strength(name: str, value: float | Tensor, power: int, epsilon: float 
 
 
 class Preset(NamedTuple):
-    """Coefficients (working units) and mass m₀ of a published shape, with where they were published."""
+    """Coefficients (in working units) and mass m₀ of a published shape, and the source that published them."""
 
     coefficients: Coefficients
     mass: float
@@ -155,20 +168,29 @@ _PUBLISHED: dict[str, tuple[tuple[float, ...], float, str]] = {
     "spatial-4": ((2, 2, 11, -180, -90, 4050), -0.7, _TABLE_4),
 }
 
-#: Every published parameter by name.
+#: The published shapes by name.
 PRESETS: dict[str, Preset] = {
     name: Preset(Coefficients(*values), mass, source) for name, (values, mass, source) in _PUBLISHED.items()
 }
 
 
 def preset(name: str) -> Preset:
-    """A published shape's parameters.
+    """Return the parameters of a published shape.
+
+    Capitals do not matter, and spaces, underscores and hyphens are alike: `Bilinear_Tubes` is `bilinear-tubes`.
 
     Raises
     ------
     ValueError
         If the name is not one of `PRESETS`.
     """
-    if not isinstance(name, str) or name not in PRESETS:
+    key = preset_name(name)
+    if key is None:
         raise ValueError(f"expected a preset among {', '.join(PRESETS)}, got {quoted(name)}")
-    return PRESETS[name]
+    return PRESETS[key]
+
+
+def preset_name(name: object) -> str | None:
+    """Return the name in `PRESETS` that a text spells (see `preset`), None where there is no such name."""
+    key = plain_name(name) if isinstance(name, str) else None
+    return key if key in PRESETS else None

@@ -11,7 +11,7 @@ from curvafit.priors.bounds import real, whole
 
 
 class CombinedLoss(nn.Module):
-    """base(input, target) + weight × prior(input, target), the second faded in over the first calls.
+    """base(input, target) + weight × prior(input, target), where the prior's weight grows over the first calls.
 
     Parameters
     ----------
@@ -22,19 +22,19 @@ class CombinedLoss(nn.Module):
     weight
         See `CurvaturePrior.suggest_weight`.
     warmup
-        Calls over which the weight grows linearly to its full value; those without a gradient or in evaluation mode do
-        not count. The count is a buffer, so that a resumed training goes on.
+        Number of calls over which the weight grows linearly to its full value. Calls in evaluation mode or without a
+        gradient do not count. The count is a buffer, so that a resumed training goes on from it.
 
     Attributes
     ----------
     parts
-        What the last call summed, to log: `base` and `prior` before weighting, and the `weight` of the prior in that
-        call; tensors without a gradient, still on their device. Empty before the first call.
+        The terms of the last call, to log: `base`, `prior` before weighting, and the prior's `weight`, as tensors
+        without a gradient on the device of the loss. Empty before the first call.
 
     Raises
     ------
     ValueError
-        If the weight is not a finite number from 0, or the warm-up not a whole one.
+        If the weight is not a finite number from 0, or the warm-up is not a whole number from 0.
     """
 
     calls: Tensor
@@ -44,13 +44,13 @@ class CombinedLoss(nn.Module):
     ) -> None:
         super().__init__()
         self.weight = real(weight, "a finite weight from 0", 0)
-        self.warmup = whole(warmup, "a warm-up of whole calls from 0", 0, 2**53)
+        self.warmup = whole(warmup, "a warm-up of a whole number of calls from 0", 0, 2**53)
         self.base, self.prior = base, prior
         self.parts: dict[str, Tensor] = {}
         self.register_buffer("calls", torch.zeros((), dtype=torch.int64))
 
     def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-        """Return the sum; `mask` goes to the prior."""
+        """Return the weighted sum; `mask` is passed to the prior."""
         if self.training and torch.is_grad_enabled():
             self.calls += 1
         weight = self.weight

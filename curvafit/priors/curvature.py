@@ -19,7 +19,7 @@ from curvafit.priors.stencils import gradient, hessian
 XI = 1e-6
 #: Least value under the square root.
 ROOT_FLOOR = 1e-6
-#: What sixteen roundings of float32 leave undecided of the squares whose difference the root is taken of, as a share.
+#: Share of the squares in the root's difference that sixteen roundings of float32 leave undecided.
 ROOT_ROUNDING = 2.0**-19
 
 
@@ -32,7 +32,7 @@ class Jet(NamedTuple):
 
 
 class SecondForm(NamedTuple):
-    """What F_ε needs of M_ε: Tr M, |M|², √(2|M|² - (Tr M)²)⁺, and |∇u|."""
+    """Invariants of M_ε that F_ε needs: Tr M, |M|², √(2|M|² - (Tr M)²)⁺, and |∇u|."""
 
     trace: Tensor
     norm2: Tensor
@@ -41,7 +41,7 @@ class SecondForm(NamedTuple):
 
 
 class Curvatures(NamedTuple):
-    """Principal curvatures κ1 ≥ κ2, their sum H, and K (equal to κ1κ2 but for the diffuse one, where κ1κ2 ≤ K)."""
+    """Principal curvatures κ1 ≥ κ2, their sum H, and K (κ1κ2 for geometric curvatures; κ1κ2 ≤ K for diffuse ones)."""
 
     kappa1: Tensor
     kappa2: Tensor
@@ -50,12 +50,14 @@ class Curvatures(NamedTuple):
 
 
 def jet(u: Tensor, grid: Grid) -> Jet:
-    """The field with its central differences."""
+    """Return a field with its central differences."""
     return Jet(u, gradient(u, grid), hessian(u, grid))
 
 
 def second_form(field: Jet, epsilon: float | Tensor, xi: float = XI) -> SecondForm:
-    """M_ε = -ε Hess u + W'(u)/ε n⊗n (eq. `Meps`), with n⊗n = ∇u⊗∇u / (|∇u|² + ξ²); ε broadcasts with the field.
+    """Return the invariants of M_ε = -ε Hess u + W'(u)/ε n⊗n (eq. `Meps`), where n⊗n = ∇u⊗∇u / (|∇u|² + ξ²).
+
+    ε is a number or a tensor that broadcasts with the field.
 
     The root's derivative at umbilics is a choice: see `positive_root`.
     """
@@ -72,28 +74,28 @@ def second_form(field: Jet, epsilon: float | Tensor, xi: float = XI) -> SecondFo
 
 
 def positive_root(square: Tensor, squares: Tensor) -> Tensor:
-    """√(x⁺) of a difference x of squares, where its derivative is unbounded: there it is taken as 0.
+    """Return √(x⁺) of a difference x of squares; its derivative is taken as 0 where it is unbounded.
 
     x = 0 at umbilics, κ1 = κ2, where √(x⁺) = ε|∇u| |κ1 - κ2| has the tip of a cone in the directions that part the two
     curvatures. Its subdifferential there holds slopes of either sign, and the element of least norm is 0: a step along
-    it prefers no direction. So is the derivative taken wherever x cannot be told from 0: up to `ROOT_FLOOR`, under
-    which the root is constant, and up to the share `ROOT_ROUNDING` of the squares that float32 rounds. The last holds
-    for float64 too, so that both have one gradient; the root itself is exact there. (The paper's smooth positive part,
-    1e-6 wide, ends about the floor; its slope was that of neither side.)
+    it prefers no direction. The derivative is 0 wherever x cannot be distinguished from 0: up to `ROOT_FLOOR`, below
+    which the root is constant, and up to the share `ROOT_ROUNDING` of the squares that float32 rounds. That share
+    holds for float64 too, so that both types have one gradient; the root itself is exact there. (The paper's smooth
+    positive part, 1e-6 wide, ends about the floor; its slope was that of neither side.)
 
     Parameters
     ----------
     square
         x = 2|M|² - (Tr M)².
     squares
-        What |M|² adds up before anything cancels.
+        The sum of the terms of |M|² before any of them cancels.
     """
     resolved = square > (ROOT_ROUNDING * squares).clamp_min(ROOT_FLOOR)
     return torch.where(resolved, square, square.detach().clamp_min(ROOT_FLOOR)).sqrt()
 
 
 def diffuse_curvatures(field: Jet, epsilon: float | Tensor) -> Curvatures:
-    """κ1, κ2 = (Tr M ± √(2|M|² - (Tr M)²)⁺) / 2ε|∇u|, H and K (eqs. `Heps`, `Keps`, `kepsa`, `kepsb`)."""
+    """Return κ1, κ2 = (Tr M ± √(2|M|² - (Tr M)²)⁺) / 2ε|∇u|, H and K (eqs. `Heps`, `Keps`, `kepsa`, `kepsb`)."""
     trace, norm2, root, slope = second_form(field, epsilon)
     width = 2 * epsilon * slope
     gauss = (trace**2 - norm2) / (2 * (epsilon * slope) ** 2)
@@ -101,7 +103,7 @@ def diffuse_curvatures(field: Jet, epsilon: float | Tensor) -> Curvatures:
 
 
 def geometric_curvatures(field: Jet, xi: float = XI) -> Curvatures:
-    """Eigenvalues of -P (Hess u) P / |∇u|, P = I - n⊗n: the level sets' shape operator, whatever the profile.
+    """Return the eigenvalues of the level sets' shape operator -P (Hess u) P / |∇u|, P = I - n⊗n, for any profile.
 
     H = -(Δu - nᵀHess u n) / |∇u| and K = ∇uᵀ adj(Hess u) ∇u / |∇u|⁴ (Goldman 2005).
     """
@@ -114,7 +116,7 @@ def geometric_curvatures(field: Jet, xi: float = XI) -> Curvatures:
 
 
 def _invariants(field: Jet) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """|∇u|², Δu, |Hess u|², ∇uᵀ Hess u ∇u."""
+    """Return |∇u|², Δu, |Hess u|² and ∇uᵀ Hess u ∇u."""
     gz, gy, gx = field.gradient.unbind(-4)
     zz, yy, xx, zy, zx, yx = field.hessian.unbind(-4)
     slope2 = gz**2 + gy**2 + gx**2
@@ -124,7 +126,7 @@ def _invariants(field: Jet) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 def _adjugate_form(field: Jet) -> Tensor:
-    """∇uᵀ adj(Hess u) ∇u."""
+    """Return ∇uᵀ adj(Hess u) ∇u."""
     gz, gy, gx = field.gradient.unbind(-4)
     zz, yy, xx, zy, zx, yx = field.hessian.unbind(-4)
     diagonal = gz**2 * (yy * xx - yx**2) + gy**2 * (zz * xx - zx**2) + gx**2 * (zz * yy - zy**2)

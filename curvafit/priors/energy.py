@@ -28,20 +28,20 @@ def energy(
     orientation: Float[Tensor, "3 3"] | None = None,
     mask: Tensor | None = None,
 ) -> Float[Tensor, "*batch"]:
-    """F_ε(u) (eq. `Feps`), differentiable in the field and in the coefficients.
+    """Return F_ε(u) (eq. `Feps`), differentiable in the field and in the coefficients.
 
     Parameters
     ----------
     u
         Phase field, about +1 inside and -1 outside.
     coefficients
-        Numbers, or tensors that broadcast with `u` (`(batch, 1, 1, 1)` for one set a field).
+        Numbers, or tensors that broadcast with `u` (`(batch, 1, 1, 1)` for one set per field).
     grid, epsilon
         The sampling, and the interface parameter in spacing's unit: a number, or a tensor that broadcasts with `u`.
     orientation
         Q of a further term ε ∫ ∇uᵀQ∇u, symmetric, axes z, y, x; see `orientation`.
     mask
-        What the energy's density is multiplied by before it is summed; broadcasts with `u`.
+        Weights of the energy's density, which broadcast with `u`.
 
     Raises
     ------
@@ -60,29 +60,30 @@ def energy(
 
 
 def orientation(direction: Sequence[int | float] | Tensor, strength: int | float) -> Float[Tensor, "3 3"]:
-    """Q = μ θθᵀ, which holds normals off the direction θ: tubes lie along θ, layers contain it (paper, "Extensions").
+    """Return Q = μ θθᵀ, which turns normals away from θ: tubes run along θ and layers contain it (paper, "Extensions").
 
     Parameters
     ----------
     direction
         θ along (z, y, x), of any length above 0.
     strength
-        μ; a negative one draws the normals towards θ.
+        μ; where it is negative, normals turn towards θ.
 
     Returns
     -------
     Tensor
-        Symmetric `(3, 3)`, float64. Sums of such are orientations too.
+        Symmetric `(3, 3)`, float64. A sum of orientations is an orientation too.
 
     Raises
     ------
     ValueError
         If the direction is not three finite numbers that are not all 0, or the strength is not finite.
     """
-    said = "a direction of 3 finite numbers (z, y, x), not all 0"
-    θ = torch.tensor([real(part, said, of=direction) for part in several(direction, "3 numbers")], dtype=torch.float64)
+    expected = "a direction of 3 finite numbers (z, y, x), not all 0"
+    parts = [real(part, expected, of=direction) for part in several(direction, "3 numbers")]
+    θ = torch.tensor(parts, dtype=torch.float64)
     if tuple(θ.shape) != (3,) or not bool(torch.isfinite(θ).all()) or not bool(θ.any()):
-        raise ValueError(f"expected {said}, got {quoted(direction)}")
+        raise ValueError(f"expected {expected}, got {quoted(direction)}")
     strength = real(strength, "a finite strength")
     θ = θ * 2.0 ** -math.frexp(float(θ.abs().max()))[1]  # exact, and its square is finite
     θ = θ / θ.norm()
@@ -90,7 +91,13 @@ def orientation(direction: Sequence[int | float] | Tensor, strength: int | float
 
 
 def orientation_form(slope: Float[Tensor, "*batch 3 z y x"], orientation: Float[Tensor, "3 3"]) -> Tensor:
-    """∇uᵀQ∇u in every voxel: (θ·∇u)² μ for Q = μ θθᵀ (paper, "Extensions")."""
+    """Return ∇uᵀQ∇u in every voxel, which is μ (θ·∇u)² for Q = μ θθᵀ (paper, "Extensions").
+
+    Raises
+    ------
+    ValueError
+        If the orientation is not symmetric.
+    """
     Q = orientation.to(slope)
     if tuple(Q.shape) != (3, 3) or not torch.equal(Q, Q.T):
         raise ValueError(f"expected a symmetric orientation of shape (3, 3) (z, y, x), got {orientation.tolist()}")
@@ -98,7 +105,7 @@ def orientation_form(slope: Float[Tensor, "*batch 3 z y x"], orientation: Float[
 
 
 def energy_terms(field: Jet, epsilon: float | Tensor) -> Float[Tensor, "*batch 6 z y x"]:
-    """Densities of the six terms that a20, a11, a02, a10, a01, a00 multiply in F_ε, which is linear in them."""
+    """Return the densities of the six terms of F_ε, those that a20, a11, a02, a10, a01 and a00 multiply."""
     ε = epsilon
     trace, norm2, root, slope = second_form(field, ε)
     slope2 = field.gradient.square().sum(-4)
@@ -115,13 +122,13 @@ def energy_terms(field: Jet, epsilon: float | Tensor) -> Float[Tensor, "*batch 6
 
 
 def unsimplified_energy(u: Tensor, coefficients: Coefficients, grid: Grid, epsilon: float) -> Tensor:
-    """𝓔̃_ε: F_ε before the positive part of |M|² outside the square root was dropped (eq. `tildeEeps`)."""
+    """Return 𝓔̃_ε: F_ε with the positive part of 2|M|² - (Tr M)² in its quadratic terms too (eq. `tildeEeps`)."""
     density = unsimplified_density(jet(u, grid), coefficients, epsilon)
     return density.sum((-3, -2, -1)) * grid.voxel_volume
 
 
 def unsimplified_density(field: Jet, coefficients: Coefficients, epsilon: float) -> Tensor:
-    """The integrand of 𝓔̃_ε."""
+    """Return the integrand of 𝓔̃_ε."""
     trace, norm2, root, slope = second_form(field, epsilon)
     a20, a11, a02, a10, a01, a00 = coefficients
     slope2 = field.gradient.square().sum(-4)
@@ -132,37 +139,37 @@ def unsimplified_density(field: Jet, coefficients: Coefficients, epsilon: float)
 
 
 def curvature_integral(u: Tensor, coefficients: Coefficients, grid: Grid, epsilon: float) -> Tensor:
-    """𝓔_ε(u) = ∫ p(κ1_ε, κ2_ε) ε|∇u|² dx: the form that the other two expand (eq. `Eeps`)."""
+    """Return 𝓔_ε(u) = ∫ p(κ1_ε, κ2_ε) ε|∇u|² dx (eq. `Eeps`), which 𝓔̃_ε and F_ε expand."""
     density = curvature_density(jet(u, grid), coefficients, epsilon)
     return density.sum((-3, -2, -1)) * grid.voxel_volume
 
 
 def curvature_density(field: Jet, coefficients: Coefficients, epsilon: float) -> Tensor:
-    """The integrand of 𝓔_ε; zero where ∇u is."""
+    """Return the integrand of 𝓔_ε, which is zero where ∇u is zero."""
     curvatures = diffuse_curvatures(field, epsilon)
     slope2 = field.gradient.square().sum(-4)
     return coefficients.polynomial(curvatures.kappa1, curvatures.kappa2) * epsilon * slope2
 
 
 def cahn_hilliard_area(u: Tensor, grid: Grid, epsilon: float | Tensor) -> Tensor:
-    """𝓐_ε(u) = ∫ ε/2 |∇u|² + W(u)/ε, about σ × area (eq. `CH_eps`)."""
+    """Return 𝓐_ε(u) = ∫ ε/2 |∇u|² + W(u)/ε, about σ × area (eq. `CH_eps`)."""
     gradient_part, well_part = cahn_hilliard_parts(u, grid, epsilon)
     return (gradient_part + well_part).sum((-3, -2, -1)) * grid.voxel_volume
 
 
 def discrepancy_ratio(u: Tensor, grid: Grid, epsilon: float | Tensor) -> Tensor:
-    """∫|ε/2 |∇u|² - W(u)/ε| over 𝓐_ε, in [0, 1]: zero for the optimal profile (paper, Experiment 4)."""
+    """Return ∫|ε/2 |∇u|² - W(u)/ε| / 𝓐_ε, from 0 (the optimal profile) to 1 (paper, Experiment 4)."""
     gradient_part, well_part = cahn_hilliard_parts(u, grid, epsilon)
     space = (-3, -2, -1)
     return (gradient_part - well_part).abs().sum(space) / (gradient_part + well_part).sum(space)
 
 
 def cahn_hilliard_parts(u: Tensor, grid: Grid, epsilon: float | Tensor) -> tuple[Tensor, Tensor]:
-    """ε/2 |∇u|² and W(u)/ε in every voxel."""
+    """Return ε/2 |∇u|² and W(u)/ε in every voxel."""
     ε, slope2 = _like(epsilon, u), gradient(u, grid).square().sum(-4)
     return ε / 2 * slope2, double_well(u) / ε
 
 
 def _like(value: float | Tensor, u: Tensor) -> float | Tensor:
-    """A number as it is, a tensor in the field's type and on its device."""
+    """Return a number unchanged, or a tensor in the field's type and on the field's device."""
     return value.to(u) if isinstance(value, Tensor) else value

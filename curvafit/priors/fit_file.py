@@ -1,4 +1,4 @@
-"""The `fit.json` that an inference writes, as far as a generator or a loss needs it."""
+"""The law in a `fit.json`: the part of an inference's file that a generator or a loss needs."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from curvafit.units import METRES
 
 
 class Prior(NamedTuple):
-    """What a `fit.json` says: coefficients and mass in working units, and what ties these to the scan.
+    """The law of a `fit.json`: coefficients and mass in working units, and the lengths that relate them to the scan.
 
     Attributes
     ----------
     physical, epsilon
         The same coefficients, and ε, with lengths in `unit`.
     working_voxel
-        Edge of a working voxel in `unit`.
+        Edge of a working voxel, in `unit`.
     volume_fraction
-        Of the scan's structure, None where the file does not tell.
+        Share of the scan's volume inside the structure; None where the file does not have it.
     """
 
     coefficients: Coefficients
@@ -36,7 +36,7 @@ class Prior(NamedTuple):
     volume_fraction: float | None = None
 
     def in_unit(self, unit: str | None) -> Coefficients:
-        """The coefficients with lengths in another unit, or in their own where none is named.
+        """Return the coefficients with lengths in another unit, or in the fit's where `unit` is None.
 
         Raises
         ------
@@ -66,7 +66,7 @@ def read_fit(path: str | PathLike[str]) -> Prior:
 
 
 def fit_bytes(path: str | PathLike[str]) -> bytes:
-    """Return what a `fit.json` holds.
+    """Return the content of a `fit.json` as bytes.
 
     Raises
     ------
@@ -79,29 +79,29 @@ def fit_bytes(path: str | PathLike[str]) -> bytes:
 
 
 def parse_fit(text: str | bytes, place: object, schema: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of a `fit.json`, checked against a schema.
+    """Parse a `fit.json` and check it against a schema.
 
     Parameters
     ----------
     place
-        Where the text stands, for the sentence of an error.
+        Name of the text's file, for messages.
 
     Raises
     ------
     ValueError
-        If it is no JSON, of another format, or breaks the schema.
+        If the text is not JSON, has another format, or violates the schema.
     """
     expected = "a fit.json written by `curvafit infer`"
     content = parse_json(text, expected, place)
-    stated = content.get("format", FORMAT) if isinstance(content, dict) else FORMAT
-    if stated != FORMAT:
-        got = f"got {quoted(stated)} in {place}: run `curvafit infer` again"
+    version = content.get("format", FORMAT) if isinstance(content, dict) else FORMAT
+    if version != FORMAT:
+        got = f"got {quoted(version)} in {place}: run `curvafit infer` again"
         raise ValueError(f"expected a fit.json of format {FORMAT}, {got}")
-    if wrong := violation(content, schema):
-        raise ValueError(f"expected {expected} with {wrong} in {place}")
+    if fault := violation(content, schema):
+        raise ValueError(f"expected {expected} with {fault} in {place}")
     return content
 
 
 def six_of(values: Mapping[str, float]) -> Coefficients:
-    """Return coefficients from six numbers by name."""
+    """Return coefficients made of six numbers by name."""
     return Coefficients(*(float(values[name]) for name in NAMES))

@@ -1,8 +1,8 @@
-"""What a `fit.json` holds: one schema for the law that is read from it, for the whole fit, and for an atlas's page.
+"""The schema of a `fit.json`, for the law that is read from it, for the whole fit, and for an atlas's page.
 
 The schema is data in the words of JSON Schema; the page receives it as JSON. Both checks, here and in JavaScript, know
 `type`, `enum`, `required`, `properties`, `items`, `minItems`, `minimum`, `maximum` and their exclusive forms;
-`description` is what an error says was expected.
+a message says that the `description` was expected.
 """
 
 from __future__ import annotations
@@ -112,11 +112,11 @@ FIT_SCHEMA: dict[str, Any] = {
 
 
 def _whole(schema: Mapping[str, Any], **others: Any) -> dict[str, Any]:
-    """Return an object's schema with all its properties required, some of them by another schema."""
+    """Return an object's schema in which all properties are required and `others` replace some of them."""
     return {**schema, "required": list(schema["properties"]), "properties": {**schema["properties"], **others}}
 
 
-#: A fit with all that an inference tells of it, as `Fit` writes and reads it; a law needs less (`FIT_SCHEMA`).
+#: The whole fit of an inference, as `Fit` writes and reads it; a law needs less (`FIT_SCHEMA`).
 WHOLE_FIT = _whole(
     FIT_SCHEMA,
     matches={**FIT_SCHEMA["properties"]["matches"], "items": _whole(_MATCH)},
@@ -132,7 +132,7 @@ _BOUNDS = {
 
 
 def violation(value: Any, schema: Mapping[str, Any] = FIT_SCHEMA, name: str = "the content") -> str | None:
-    """The first thing in a value that breaks a schema, as in `"mass as a positive number, got 0"`; None if nothing."""
+    """Return the first fault of a value under a schema, such as `"mass as a positive number, got 0"`, or None."""
     if not _fits(value, schema):
         return f"{name} as {schema['description']}, got {quoted(value)}"
     prefix = "" if name == "the content" else f"{name}."
@@ -141,21 +141,21 @@ def violation(value: Any, schema: Mapping[str, Any] = FIT_SCHEMA, name: str = "t
             if key not in value:
                 return f"{prefix}{key}, got none"
         for key, inner in schema.get("properties", {}).items():
-            if key in value and (wrong := violation(value[key], inner, prefix + key)):
-                return wrong
+            if key in value and (fault := violation(value[key], inner, prefix + key)):
+                return fault
     if isinstance(value, list) and "items" in schema:
-        for k, each in enumerate(value):
-            if wrong := violation(each, schema["items"], f"{name}[{k}]"):
-                return wrong
+        for k, item in enumerate(value):
+            if fault := violation(item, schema["items"], f"{name}[{k}]"):
+                return fault
     return None
 
 
 def _fits(value: Any, schema: Mapping[str, Any]) -> bool:
-    """Whether a value alone, without what is in it, is as its schema says."""
+    """Return whether a value, apart from its items and properties, follows its schema."""
     if "enum" in schema:
         return isinstance(value, str) and value in schema["enum"]
-    kind, known = _type(value), schema["type"]
-    if kind not in ([known] if isinstance(known, str) else known):
+    kind, kinds = _type(value), schema["type"]
+    if kind not in ([kinds] if isinstance(kinds, str) else kinds):
         return False
     if kind == "number":
         return all(fits(value, schema[bound]) for bound, fits in _BOUNDS.items() if bound in schema)
@@ -163,7 +163,7 @@ def _fits(value: Any, schema: Mapping[str, Any]) -> bool:
 
 
 def _type(value: Any) -> str | None:
-    """JSON's name of a value's type; None for what JSON has not, numbers that are not finite among it."""
+    """Return JSON's name of a value's type; None where JSON has no such type or the number is not finite."""
     if isinstance(value, bool):
         return "boolean"
     if isinstance(value, (int, float)):

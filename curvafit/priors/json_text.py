@@ -1,4 +1,4 @@
-"""JSON read safely, and values quoted briefly: what every header, record and fit of the package goes through."""
+"""Safe reading of JSON, for every header, record and fit of the package."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from typing import Any
 
 from curvafit.priors.bounds import quoted
 
-#: Digits beyond which a whole number is no number of ours.
+#: The most digits of a whole number.
 DIGITS = 40
 
 
 def parse_json(content: str | bytes, expected: str, place: object) -> Any:
-    """The value of a JSON text, in UTF-8, with or without a byte order mark.
+    """Return the value of a JSON text, in UTF-8, with or without a byte order mark.
 
     Parameters
     ----------
     expected, place
-        What the text should be and where it stands, for the sentence of an error.
+        What the text should be, and the name of its file, for messages.
 
     Raises
     ------
     ValueError
-        If it is no JSON, nested too deeply, names a key twice, or holds a number that is not finite or has more than 40
-        digits.
+        If the text is not JSON, is nested too deeply, repeats a key, or has a number that is not finite or has more
+        than 40 digits.
     """
     try:
         text = content.decode() if isinstance(content, bytes) else content
@@ -38,9 +38,9 @@ def parse_json(content: str | bytes, expected: str, place: object) -> Any:
             object_pairs_hook=_single,
         )
     except UnicodeDecodeError:
-        fault = "which is no text in UTF-8"
+        fault = "which is not text in UTF-8"
     except json.JSONDecodeError as error:
-        fault = f"which is no JSON ({error.msg} in line {error.lineno})"
+        fault = f"which is not JSON ({error.msg} in line {error.lineno})"
     except RecursionError:
         fault = "which is nested too deeply"
     except ValueError as error:
@@ -49,30 +49,34 @@ def parse_json(content: str | bytes, expected: str, place: object) -> Any:
 
 
 def repeated(names: Sequence[Any]) -> Any:
-    """The first name that stands twice, None where there is none."""
+    """Return the first name that occurs more than once, None where there is none."""
     if len(set(names)) == len(names):
         return None
     return next(name for name, count in Counter(names).items() if count > 1)
 
 
 def _whole(text: str) -> int:
+    """Return a whole number of at most `DIGITS` digits."""
     if len(text) > DIGITS:
         raise ValueError(f"a number of {len(text)} digits")
     return int(text)
 
 
 def _finite(text: str) -> float:
+    """Return a finite number."""
     value = float(text)
     if not math.isfinite(value):
-        raise ValueError(f"{quoted(text)}, which is no finite number")
+        raise ValueError(f"{quoted(text)}, which is not a finite number")
     return value
 
 
 def _constant(name: str) -> float:
-    raise ValueError(f"{name}, which is no finite number")
+    """Raise ValueError for NaN and the infinities."""
+    raise ValueError(f"{name}, which is not a finite number")
 
 
 def _single(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return a dictionary of pairs whose keys all differ."""
     if (name := repeated([name for name, _ in pairs])) is not None:
         raise ValueError(f"the key {quoted(name)} twice")
     return dict(pairs)

@@ -1,4 +1,4 @@
-"""A law, however it is stated: six coefficients, and what is known beside them."""
+"""A law in any of its forms, and the texture that it describes: six coefficients, the mass, and the fit's units."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Protocol, runtime_checkable
 from torch import Tensor
 
 from curvafit.priors.bounds import quoted
-from curvafit.priors.coefficients import PRESETS, Coefficients, Preset
+from curvafit.priors.coefficients import PRESETS, Coefficients, Preset, preset_name
 from curvafit.priors.fit_file import Prior, read_fit
 from curvafit.priors.grid import WORKING_SPACING
 
@@ -21,23 +21,23 @@ class Inferred(Protocol):
     """A result that holds a prior: an inference, or its `Fit`."""
 
     def to_prior(self) -> Prior:
-        """Return the coefficients and the mass, and what ties these to the scan."""
+        """Return coefficients and mass, with the lengths that relate them to the scan."""
         ...
 
 
-#: What states a law: coefficients, a preset or its name, the path of a `fit.json`, or what was read from one.
+#: A law: coefficients, a preset or its name, the path of a `fit.json`, or what `read_fit` returns for one, or a fit.
 Law = Coefficients | Preset | str | PathLike[str] | Prior | Inferred
-_STATED = (Coefficients, Preset, str, PathLike, Prior, Inferred)
+_LAWS = (Coefficients, Preset, str, PathLike, Prior, Inferred)
 
 
 @dataclass(frozen=True)
 class Texture:
-    """What a law says.
+    """Coefficients and mass of a law.
 
     Attributes
     ----------
     coefficients
-        In working units; bare `Coefficients` are in the unit of the grid or scan that they are used with.
+        In working units, or, where the law is `Coefficients`, in the unit of the grid or scan that uses them.
     mass
         m₀ of a preset or a fit, None for bare coefficients.
     origin
@@ -45,7 +45,7 @@ class Texture:
     working
         Whether the coefficients are in working units.
     prior
-        What a `fit.json` says beside them; None for other laws.
+        The content of a `fit.json`; None for other laws.
     """
 
     coefficients: Coefficients
@@ -56,17 +56,17 @@ class Texture:
 
     @property
     def epsilon(self) -> float | None:
-        """ε of the fit in `unit`, None where the law is no fit."""
+        """ε of the fit in `unit`; None where the law is not a fit."""
         return None if self.prior is None else self.prior.epsilon
 
     @property
     def unit(self) -> str | None:
-        """The unit of a fit's lengths, None where the law is no fit."""
+        """The unit of the fit's lengths; None where the law is not a fit."""
         return None if self.prior is None else self.prior.unit
 
     @property
     def point(self) -> tuple[float, ...]:
-        """The six coefficients and the mass: seven numbers.
+        """The six coefficients and the mass, as seven numbers.
 
         Raises
         ------
@@ -80,8 +80,8 @@ class Texture:
     def in_unit(self, unit: str | None, edge: float) -> Coefficients:
         """Return the coefficients with lengths in the unit of a scan or a training patch.
 
-        A fit is converted to `unit`, or stays in its own where none is named. A preset takes a voxel's edge for its
-        working voxel. Bare coefficients stay as they are.
+        A fit is converted to `unit`, or stays in the fit's unit where `unit` is None. A preset's working voxel is
+        taken to be `edge` long. `Coefficients` stay as they are.
 
         Parameters
         ----------
@@ -101,26 +101,27 @@ class Texture:
         return numbers.in_unit(WORKING_SPACING / edge) if self.working else numbers
 
     def _numbers(self) -> Coefficients:
+        """Return the coefficients; raise ValueError where they vary in space."""
         if any(isinstance(value, Tensor) and value.dim() > 0 for value in self.coefficients):
-            raise ValueError("expected coefficients that are numbers, got some that vary")
+            raise ValueError("expected coefficients that are numbers, got coefficients that vary in space")
         return self.coefficients
 
 
 def texture_of(law: Law) -> Texture:
-    """Return what a law says: the one reading of every argument and option that takes a law.
+    """Return the texture of a law; every argument and option that takes a law is read here.
 
     Raises
     ------
     FileNotFoundError, ValueError
-        If there is no preset of that name, no such file, the file is no `fit.json` (`read_fit`), or the value is none
-        of what states a law.
+        If there is no preset of that name and no such file, the file is not a `fit.json` (`read_fit`), or the value is
+        not a law.
     """
     if isinstance(law, Coefficients):
         return Texture(law, None, "coefficients", working=False)
     if isinstance(law, Preset):
         return Texture(law.coefficients, law.mass, f"preset of {law.source}")
-    if isinstance(law, str) and law in PRESETS:
-        return Texture(PRESETS[law].coefficients, PRESETS[law].mass, f"preset {law}")
+    if (name := preset_name(law)) is not None:
+        return Texture(PRESETS[name].coefficients, PRESETS[name].mass, f"preset {name}")
     if isinstance(law, str) and not (law.endswith(".json") or os.path.isfile(law)):
         raise ValueError(f"expected a preset among {', '.join(PRESETS)}, or a fit.json, got {quoted(law)}")
     if isinstance(law, (str, PathLike)):
@@ -129,21 +130,21 @@ def texture_of(law: Law) -> Texture:
         return _fitted(law, "prior")
     if isinstance(law, Inferred):
         return _fitted(law.to_prior(), "prior")
-    known = "Coefficients, a preset or its name, a fit.json or a fit"
-    raise ValueError(f"expected a law ({known}), got {quoted(law)}")
+    raise ValueError(f"expected a law (Coefficients, a preset or its name, a fit.json or a fit), got {quoted(law)}")
 
 
 def textures_of(laws: Law | Iterable[Law]) -> tuple[Texture, ...]:
-    """Return what one law says, or each of several.
+    """Return the textures of one law or of several.
 
     Raises
     ------
     FileNotFoundError, ValueError
-        As `texture_of`.
+        As `texture_of` does.
     """
-    one = isinstance(laws, _STATED) or not isinstance(laws, Iterable)
-    return (texture_of(laws),) if one else tuple(map(texture_of, laws))  # type: ignore[arg-type]
+    single = isinstance(laws, _LAWS) or not isinstance(laws, Iterable)
+    return (texture_of(laws),) if single else tuple(map(texture_of, laws))  # type: ignore[arg-type]
 
 
 def _fitted(prior: Prior, origin: str) -> Texture:
+    """Return the texture of a fit."""
     return Texture(prior.coefficients, prior.mass, origin, prior=prior)

@@ -1,4 +1,4 @@
-"""F_ε of predicted probabilities in a window of a larger volume: the function behind the training loss."""
+"""The training loss as a function: F_ε of predicted probabilities in a window of a larger volume."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from curvafit.priors.stencils import gaussian_blur
 
 #: Voxels that ε spans: an axis with fewer, by more than a tenth, is interpolated.
 RESOLVED = 2
-#: How many times an axis is refined at most.
+#: The most that an axis is refined, as a factor.
 MOST = 16
-#: Voxels that ε spans at most, of the smallest edge: no window has more.
+#: The most voxels of the smallest edge that ε spans: no window has more.
 COARSEST = 10_000
 
 
@@ -36,37 +36,39 @@ def curvature_prior(
     border: int = 1,
     blur: float = 0.0,
 ) -> Float[Tensor, " batch"]:
-    """F_ε(2p - 1) of probabilities in a window of a larger volume (eq. `Feps`), by fused kernels in float32.
+    """Return F_ε(2p - 1) of probabilities in a window of a larger volume (eq. `Feps`), by fused kernels in float32.
 
     Parameters
     ----------
     probability
-        In [0, 1], float32 or float64 (the definition, for tests).
+        Values in [0, 1]; float32, or float64, which takes the definition in plain torch.
     law
-        Coefficients in spacing's unit, or another law, as `CurvaturePrior` takes it.
+        Coefficients in spacing's unit, or another law, as in `CurvaturePrior`.
     epsilon, blur
-        ε, and the standard deviation of a Gaussian that is applied first, in spacing's unit.
+        ε, and the standard deviation of a Gaussian blur of the field before the energy, in spacing's unit.
     spacing
-        Voxel edges (z, y, x). An axis with fewer than two voxels to ε is interpolated (cubic) until it has two;
-        up to a tenth less is left as it is.
+        Voxel edges (z, y, x). An axis on which ε spans fewer than two voxels, by more than a tenth, is refined by cubic
+        interpolation until it spans two.
     mask
         Weights of the energy's density.
     normalize
         `"voxel"`: the mean density over the mask, in units of ε (F_ε ε³ / volume). `"area"`: per interface
-        area in units of ε (F_ε ε² / (∫ ε|∇u|² + ε²)), that is the mean of p(κ1, κ2) ε². None: F_ε itself.
+        area in units of ε (F_ε ε² / (∫ ε|∇u|² + ε²)), which is the mean of p(κ1, κ2) ε². None: F_ε itself.
     border
-        Voxels at each side of the window, whose density is left out.
+        Number of voxels at each side of the window whose density does not count.
 
     Raises
     ------
     ValueError
         If the window is too small for its border, ε or the blur is longer than the window's longest side, a coefficient
-        is over `STRONGEST` with lengths in units of ε, or as `upsampling`.
+        is over `STRONGEST` with lengths in units of ε, or as `upsampling` does.
     """
     shape = tuple(probability.shape[1:])
     if min(shape) < max(4, 2 * border + 1):
         least = max(4, 2 * border + 1)
-        raise ValueError(f"expected a volume of at least {least} voxels along each axis, got {shape}: it has no inside")
+        raise ValueError(
+            f"expected a volume of at least {least} voxels along each axis, got {shape}, which has no interior"
+        )
     times = upsampling(spacing, epsilon)
     coefficients = texture_of(law).in_unit(None, min(spacing))
     check_numbers(coefficients, epsilon)
@@ -88,7 +90,7 @@ def curvature_prior(
 
 
 def upsampling(spacing: Sequence[float], epsilon: float) -> tuple[int, int, int]:
-    """How many times each axis is refined for ε to span two voxels; not at all where it lacks a tenth of that.
+    """Return how many times finer each axis must be for ε to span two voxels; 1 where ε lacks at most a tenth of that.
 
     Raises
     ------
@@ -106,30 +108,30 @@ def upsampling(spacing: Sequence[float], epsilon: float) -> tuple[int, int, int]
         least = RESOLVED * max(spacing) / MOST
         raise ValueError(
             f"expected an ε of at least {least:g} for voxels of {tuple(spacing)}, got {epsilon:g}, for which an axis "
-            f"is refined {max(times)}-fold: give ε in spacing's unit, or coarser"
+            f"is refined {max(times)}-fold: state ε in spacing's unit, or a larger ε"
         )
     return times  # type: ignore[return-value]
 
 
 def check_numbers(coefficients: Coefficients, epsilon: float) -> None:
-    """Refuse coefficients whose products with ε and with differences float32 does not hold.
+    """Refuse coefficients that are too large for float32, given ε.
 
     Raises
     ------
     ValueError
-        If one is over `STRONGEST` with lengths in units of ε.
+        If a coefficient is over `STRONGEST` with lengths in units of ε.
     """
     for name, value in zip(NAMES, coefficients, strict=True):
         check_strength(name, value, POWERS[name], epsilon)
 
 
 def check_lengths(epsilon: float, blur: float, longest: float) -> None:
-    """Refuse lengths beyond a window: a surface as thick as it, or a field blurred to its mean, costs nothing.
+    """Refuse an ε or a blur that is longer than the window, where the energy of any field is about 0.
 
     Raises
     ------
     ValueError
-        If ε or the blur is over the window's longest side.
+        If ε or the blur is longer than the window's longest side.
     """
     for name, length in (("an ε", epsilon), ("a blur", blur)):
         if not 0 <= length <= longest:
@@ -137,7 +139,7 @@ def check_lengths(epsilon: float, blur: float, longest: float) -> None:
 
 
 def _window(probability: Tensor, mask: Tensor | None, border: int) -> Tensor:
-    """The mask, zero at the border; `(1 or batch, z, y, x)`."""
+    """Return the mask `(1 or batch, z, y, x)` with zeros at the border."""
     inside = probability.new_zeros(probability.shape[1:])
     z, y, x = (slice(border, n - border) for n in inside.shape)
     inside[z, y, x] = 1

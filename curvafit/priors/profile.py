@@ -1,4 +1,4 @@
-"""The double well, its optimal profile, and the ways between mask, signed distance and phase field."""
+"""The double well, its optimal profile, and the maps between mask, signed distance and phase field."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from curvafit.priors.stencils import gaussian_blur
 #: σ = ∫ √(2W) over [-1, 1] = 4 / (3√2): what a unit of area costs in the limit ε → 0.
 SIGMA = 4 / (3 * math.sqrt(2))
 
-#: Deviation, in voxels, of the Gaussian that takes a mask's stairs away.
+#: Deviation, in voxels, of the Gaussian that smooths a mask's stairs.
 STAIRS = 2.0
-#: Voxels that this made cross the surface are pulled back: how often, how strongly, how widely (voxels).
+#: Number, strength and width (in voxels) of the corrections of voxels that the smoothing moved across the surface.
 SWEEPS, PULL, PULL_WIDTH = 8, 8.0, 1.5
 
 
 def double_well(u: Tensor) -> Tensor:
-    """W(u) = (1 - u²)² / 4."""
+    """Return W(u) = (1 - u²)² / 4."""
     return (1 - u**2) ** 2 / 4
 
 
 def double_well_derivative(u: Tensor) -> Tensor:
-    """W'(u) = u³ - u."""
+    """Return W'(u) = u³ - u."""
     return u**3 - u
 
 
 def optimal_profile(distance: Tensor, epsilon: float) -> Tensor:
-    """tanh(d / √2 ε) of a signed distance, positive inside (eq. `tanh_profile`)."""
+    """Return tanh(d / √2 ε) of a signed distance d, positive inside (eq. `tanh_profile`)."""
     return torch.tanh(distance / (math.sqrt(2) * epsilon))
 
 
 def profile_distance(u: Tensor, epsilon: float, limit: float = 3.0) -> Tensor:
-    """The signed distance √2 ε artanh(u) that `optimal_profile` maps to `u`, clipped to ±`limit`·√2 ε."""
+    """Return the signed distance √2 ε artanh(u), which `optimal_profile` maps to `u`, clipped to ±`limit`·√2 ε."""
     bound = math.tanh(limit)
     return math.sqrt(2) * epsilon * torch.atanh(u.clamp(-bound, bound))
 
@@ -44,15 +44,15 @@ def profile_distance(u: Tensor, epsilon: float, limit: float = 3.0) -> Tensor:
 def signed_distance(
     mask: Bool[Tensor, "*batch z y x"], grid: Grid, limit: float | None = None
 ) -> Float[Tensor, "*batch z y x"]:
-    """Distance of every voxel's centre to the faces that bound `mask`, positive inside, in spacing's unit.
+    """Return the signed distance of every voxel's centre to the faces of `mask`, positive inside, in spacing's unit.
 
-    Exact for the voxelised set (its faces, edges and corners) on anisotropic and periodic grids. Cost grows with
-    `limit`, beyond which distances are cut; without it the whole box is searched.
+    The distance is exact for the set of voxels (faces, edges and corners) on anisotropic and periodic grids. It is cut
+    at `limit`, with which the cost grows; where `limit` is None the whole box is searched.
 
     Raises
     ------
     ValueError
-        If the mask is empty or full: there is no surface to measure from.
+        If the mask is empty or full, and so has no surface.
     """
     inside = mask.bool()
     if not inside.flatten(-3).any(-1).all() or inside.flatten(-3).all(-1).any():
@@ -62,18 +62,18 @@ def signed_distance(
 
 
 def phase_field(mask: Bool[Tensor, "*batch z y x"], grid: Grid, epsilon: float) -> Float[Tensor, "*batch z y x"]:
-    """A mask's phase field: the optimal profile of its signed distance, rid of the voxels' stairs.
+    """Return a mask's phase field: the optimal profile of the signed distance, without the voxels' stairs.
 
-    The stairs are smoothed away by 1 - (1 - G)² = 2G - G∗G, G a Gaussian of `STAIRS` voxels along each axis. Its second
-    moments vanish, so that planes stay exact and a sphere or cylinder of radius R moves by O(σ⁴/R³), not by σ²/R.
-    Voxels whose sign that changed (thin places) are then pulled back, a few times, by a smooth amount. What is right is
-    the zero level: across tilted faces, whose voxels overhang, distances are up to a fifth short, about as much as the
+    The stairs are smoothed by 1 - (1 - G)² = 2G - G∗G, where G is a Gaussian of `STAIRS` voxels along each axis. The
+    second moments of 2G - G∗G vanish, so that planes stay exact and a sphere or cylinder of radius R moves by O(σ⁴/R³),
+    not by σ²/R. Smooth corrections then restore voxels whose sign changed, at thin places. Only the zero level is
+    accurate: across tilted faces, whose voxels overhang, distances are up to a fifth short, about as much as the
     profiles of generated shapes are wider than tanh.
 
     Raises
     ------
     ValueError
-        As `signed_distance` does.
+        If the mask is empty or full.
     """
     reach = 6 * epsilon + math.ceil(4 * STAIRS) * max(grid.spacing)
     distance = _without_stairs(signed_distance(mask, grid, limit=reach), grid)
@@ -81,24 +81,25 @@ def phase_field(mask: Bool[Tensor, "*batch z y x"], grid: Grid, epsilon: float) 
 
 
 def _without_stairs(distance: Tensor, grid: Grid) -> Tensor:
+    """Return the distance blurred by 2G - G∗G."""
     voxels = Grid(grid.shape, (1.0, 1.0, 1.0), grid.boundary)
     once = gaussian_blur(distance, voxels, STAIRS)
     return 2 * once - gaussian_blur(once, voxels, STAIRS)
 
 
 def _with_signs(distance: Tensor, mask: Tensor, grid: Grid) -> Tensor:
-    """Add Gaussians where the sign is not the mask's; a lone voxel's wrong value is lowered by a seventh a sweep."""
+    """Add Gaussians where the sign differs from the mask's; a sweep lowers a single voxel's error by a seventh."""
     voxels = Grid(grid.shape, (1.0, 1.0, 1.0), grid.boundary)
     for _ in range(SWEEPS):
-        wrong = torch.where(mask, distance.clamp_max(0), distance.clamp_min(0))
-        if not bool(wrong.any()):
+        error = torch.where(mask, distance.clamp_max(0), distance.clamp_min(0))
+        if not bool(error.any()):
             break
-        distance = distance - PULL * gaussian_blur(wrong, voxels, PULL_WIDTH)
+        distance = distance - PULL * gaussian_blur(error, voxels, PULL_WIDTH)
     return distance
 
 
 def _distance_to(target: Tensor, grid: Grid, reach: float) -> Tensor:
-    """Distance to the boxes of `target`'s voxels: a min-plus transform with (|k| - ½)₊ Δx, one axis at a time."""
+    """Return the distance to the voxels of `target`, by a min-plus transform with (|k| - ½)₊ Δx along each axis."""
     dtype = torch.float64 if torch.get_default_dtype() == torch.float64 else torch.float32
     squared = torch.where(target, 0.0, math.inf).to(dtype)
     for axis, h in enumerate(grid.spacing):
@@ -114,7 +115,7 @@ def _distance_to(target: Tensor, grid: Grid, reach: float) -> Tensor:
 
 
 def _lower(squared: Tensor, source: Tensor, cost: float, offset: int, dim: int, periodic: bool) -> None:
-    """squared[i] = min(squared[i], source[i + offset] + cost), in place."""
+    """Set squared[i] = min(squared[i], source[i + offset] + cost), in place."""
     if periodic:
         torch.minimum(squared, source.roll(-offset, dim) + cost, out=squared)
         return

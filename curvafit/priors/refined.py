@@ -9,10 +9,10 @@ from torch import Tensor
 
 
 def refined(u: Tensor, axis: int, times: int) -> Tensor:
-    """`u (..., Z, Y, X)` with every voxel along `axis` (0 to 2) split into `times`; differentiable.
+    """Return `u (..., Z, Y, X)` with every voxel along `axis` (0 to 2) split into `times`; differentiable.
 
-    Keys' cubic convolution (a = -1/2): third-order accurate, exact for parabolas; the field goes on beyond its ends
-    with the last value.
+    The interpolation is Keys' cubic convolution (a = -1/2), third-order accurate and exact for parabolas. Beyond its
+    ends the field continues with the last value.
     """
     if times == 1:
         return u
@@ -22,9 +22,9 @@ def refined(u: Tensor, axis: int, times: int) -> Tensor:
 
 
 @lru_cache(maxsize=32)
-@torch.inference_mode(False)  # what is kept must serve a later backward pass
+@torch.inference_mode(False)  # cached weights must serve a later backward pass
 def _weights(n: int, times: int) -> Tensor:
-    """`(n, n · times)`: a column for each new sample."""
+    """Return interpolation weights `(n, n · times)`, a column for each new sample."""
     place = (torch.arange(n * times, dtype=torch.float64) + 0.5) / times - 0.5
     first = place.floor()
     t = place - first

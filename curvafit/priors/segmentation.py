@@ -1,4 +1,4 @@
-"""F_ε as a training loss: what a predicted segmentation's surfaces cost."""
+"""F_ε as a training loss of a predicted segmentation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
 from curvafit.priors.law import Law, Texture, textures_of
 from curvafit.priors.loss import COARSEST, MOST, RESOLVED, check_numbers, curvature_prior, upsampling
-from curvafit.priors.values import plain, seen
+from curvafit.priors.values import number_of, plain
 from curvafit.units import METRES
 
 #: The most that a weight or a mask's value may be: float32 holds its products.
@@ -27,55 +27,59 @@ _REDUCTIONS, _NORMALIZATIONS = ("mean", "sum", "none"), ("voxel", "area")
 class CurvaturePrior(nn.Module):
     """The energy F_ε of a segmentation, as a loss with the keywords of MONAI's.
 
-    `forward(input, target=None, mask=None)`: `input` is `(B, N, D, H, W)`, N classes or one; a scalar comes back, or
-    `(B, N, 1, 1, 1)` with `reduction="none"`. Everything is computed in float32 whatever autocast says (float64 input
-    stays). The target says only which voxels to ignore, the mask (from 0, of that shape or with one for B or N) how
-    much each counts. Deterministic; a constant or saturated input has a finite value and gradient. First derivatives
-    go in reverse and forward mode and through `torch.func`, batches of batches too; second ones are for float64 alone:
-    in float32 they raise a RuntimeError.
+    `forward(input, target=None, mask=None)` takes an `input` `(B, N, D, H, W)` of N classes and returns a scalar, or
+    `(B, N, 1, 1, 1)` with `reduction="none"`. It computes in float32 under autocast too; float64 input stays float64.
+    The target states only which voxels to ignore. The mask holds weights of voxels from 0, in the input's shape or with
+    1 for B or N. The loss is deterministic, and a constant or saturated input has a finite value and gradient. First
+    derivatives work in reverse and forward mode and through `torch.func`, also over batches of batches. Second
+    derivatives need float64; in float32 they raise a RuntimeError.
 
     Parameters
     ----------
     law
-        `Coefficients` with lengths in spacing's unit; a preset or its name, in working units of which the
-        smallest voxel edge is 0.01; the path of a `fit.json`, or a fit. Or a sequence of laws, one a class.
+        `Coefficients` with lengths in spacing's unit; a preset or its name, in working units, where the smallest voxel
+        edge is 0.01; the path of a `fit.json`, or a fit. Or a sequence of laws, one for each class.
     sigmoid, softmax
-        The input is logits: apply this first. Without either it is probabilities; others are warned of.
+        Whether the input is logits, to which this function is applied first. Without either the input is
+        probabilities; a warning says where it has other values.
     include_background
-        False leaves channel 0 out.
+        Whether channel 0 counts.
     to_onehot_y
-        The target is class numbers `(B, 1, D, H, W)`.
+        Whether the target is class numbers `(B, 1, D, H, W)`.
     reduction
-        `"mean"` over batch and classes; `"sum"` of the energies F_ε themselves, not normalised, so that windows which
-        overlap by 2·border voxels add up to the interior of the whole (border 2 where an axis is interpolated);
+        `"mean"` over batch and classes; `"sum"` of the energies F_ε, which are not normalised then, so that windows
+        that overlap by 2·border voxels add up to the interior of the whole (border 2 where an axis is interpolated);
         `"none"`.
     ignore_index
-        Voxels where the target has this value count nothing.
+        Voxels where the target has this value do not count.
     spacing
-        Voxel edges (z, y, x), or one for all.
+        Voxel edges (z, y, x), or one edge for all axes.
     unit
-        Spacing's unit (nm, um, mm or m) where it is not that of the `fit.json`, which is then converted. An ε four
-        times off the fit's is warned of.
+        Spacing's unit (nm, um, mm or m) where the `fit.json` has another one; the fit is then converted. A warning says
+        where ε differs from the fit's by more than a factor of four.
     epsilon
-        ε in that unit; twice the smallest edge if not given. Structures thinner than two smallest edges do not
-        survive it. An axis on which ε spans fewer than two voxels, by more than a tenth, is interpolated: a warning
-        says so. More than 16-fold is refused, as is an ε longer than the window.
+        ε in spacing's unit; twice the smallest edge by default. Structures thinner than twice the smallest edge do not
+        survive. An axis on which ε spans fewer than two voxels, by more than a tenth, is interpolated, and a warning
+        says so. A refinement of more than 16-fold is refused, and so is an ε longer than the window.
     weight
-        A factor, or one a class; classes of weight 0 are not computed.
+        A factor, or one for each class; classes of weight 0 are not computed.
     normalize
-        `"voxel"`: mean density in units of ε; patches of all sizes compare. `"area"`: per area of interface.
+        `"voxel"`: the mean density in units of ε, which compares patches of all sizes. `"area"`: the energy per area of
+        interface.
     border
-        Voxels at each face of the input that do not count, since their neighbours are unknown.
+        Number of voxels at each face of the input that do not count, since their neighbours are unknown.
     blur
-        Standard deviation, in spacing's unit, of a Gaussian applied to the probabilities; none by default.
+        Standard deviation, in spacing's unit, of a Gaussian blur of the probabilities; none by default.
     shape
         Voxels (D, H, W) of a whole patch. An input of another shape is then the same patch on a coarser grid, as in
-        deep supervision: the spacing follows. A level under 4 voxels, or 16 times too coarse for ε, is zero.
+        deep supervision, with a larger spacing. The loss is zero on a level that has no interior or would need a
+        refinement of more than 16-fold.
 
     Raises
     ------
     ValueError
-        If an argument is out of range, or in `forward` a shape does not fit, or ε or the blur in the window.
+        If an argument is out of range; in `forward`, if a shape does not match, or ε or the blur is longer than the
+        window.
     """
 
     def __init__(
@@ -101,14 +105,14 @@ class CurvaturePrior(nn.Module):
         if sigmoid and softmax:
             raise ValueError("expected sigmoid or softmax, got both")
         if reduction not in _REDUCTIONS or normalize not in _NORMALIZATIONS:
-            known = f"a reduction among {_REDUCTIONS} and normalize among {_NORMALIZATIONS}"
-            raise ValueError(f"expected {known}, got {reduction!r} and {normalize!r}")
+            expected = f"a reduction among {_REDUCTIONS} and normalize among {_NORMALIZATIONS}"
+            raise ValueError(f"expected {expected}, got {reduction!r} and {normalize!r}")
         self.sigmoid, self.softmax, self.reduction = sigmoid, softmax, reduction
         self.normalize: Literal["voxel", "area"] = normalize
         self.include_background, self.to_onehot_y, self.ignore_index = include_background, to_onehot_y, ignore_index
         self.spacing = _edges(spacing)
-        given = RESOLVED * min(self.spacing) if epsilon is None else epsilon
-        self.epsilon = real(given, "epsilon > 0 in spacing's unit", math.ulp(0), COARSEST * min(self.spacing))
+        width = RESOLVED * min(self.spacing) if epsilon is None else epsilon
+        self.epsilon = real(width, "epsilon > 0 in spacing's unit", math.ulp(0), COARSEST * min(self.spacing))
         self.blur = real(blur, "blur >= 0 in spacing's unit", 0, COARSEST * min(self.spacing))
         self.border = whole(border, "a border of whole voxels from 0", 0, _MOST_BORDER)
         self._warned: set[str] = set()
@@ -121,14 +125,16 @@ class CurvaturePrior(nn.Module):
         _warn_of_interpolation(self.spacing, self.epsilon)
 
     def extra_repr(self) -> str:
+        """Return the settings that `repr` shows."""
         return f"spacing={self.spacing}, epsilon={self.epsilon:g}, weight={self.weight}, border={self.border}"
 
     def forward(self, input: Tensor, target: Tensor | None = None, mask: Tensor | None = None) -> Tensor:
+        """Return the loss of a batch; see the class."""
         input, target, mask = plain(input), plain(target), plain(mask)
         with torch.autocast(input.device.type, enabled=False):
             probability, voxels = self._probability(input), self._voxel_weights(input, target, mask)
             classes = probability.shape[1]
-            laws, weights = _each(self.coefficients, classes, "coefficients"), _each(self.weight, classes, "weight")
+            laws, weights = _each(self.coefficients, classes, "one law"), _each(self.weight, classes, "one weight")
             spacing = self._spacing(input)
             skipped, columns = self._skips(input), []
             for channel, (law, weight) in enumerate(zip(laws, weights, strict=True)):
@@ -155,21 +161,22 @@ class CurvaturePrior(nn.Module):
     def suggest_weight(
         self, loss_fn: Callable[[Tensor, Tensor], Tensor], batch: tuple[Tensor, Tensor], share: float = 1.0
     ) -> float:
-        """The factor that gives this loss `share` times the gradient of another, as norms over the input.
+        """Return the factor that gives this loss `share` times the gradient of another loss, as norms over the input.
 
         Parameters
         ----------
         loss_fn
-            Called with the batch; its value is summed.
+            The other loss, a function of output and target; its values are summed.
         batch
             A network's output and its target, as in training.
         share
-            Tubes two voxels thick survive 0.1 at the default ε with `trabec` and `tubes`; 1 takes them, `pearls` both.
+            At the default ε, tubes two voxels thick survive a share of 0.1 with `trabec` and `tubes`, but not with
+            `pearls`; a share of 1 removes them.
 
         Raises
         ------
         ValueError
-            If either gradient is zero or not finite: take a batch whose prediction has a surface.
+            If either gradient is zero or not finite, as on a batch whose prediction has no surface.
         """
         output, target = batch
         leaf = output.detach().float().requires_grad_()
@@ -183,7 +190,7 @@ class CurvaturePrior(nn.Module):
         return share * sizes[0] / sizes[1]
 
     def _probability(self, input: Tensor) -> Tensor:
-        """(B, classes that count, D, H, W) in float32 or float64."""
+        """Return probabilities (B, classes that count, D, H, W) in float32 or float64."""
         if input.dim() != 5 or not input.is_floating_point() or 0 in input.shape:
             raise ValueError(f"expected an input of floats (B, N, D, H, W), got {input.dtype} {tuple(input.shape)}")
         values = input if input.dtype == torch.float64 else input.float()
@@ -192,8 +199,8 @@ class CurvaturePrior(nn.Module):
         elif not self.softmax or input.shape[1] == 1:
             self._check_range(values)
         if input.shape[1] == 1:
-            unfit = {"softmax=True": self.softmax, "include_background=False": not self.include_background}
-            for name in (name for name, given in unfit.items() if given):
+            options = {"softmax=True": self.softmax, "include_background=False": not self.include_background}
+            for name in (name for name, active in options.items() if active):
                 warnings.warn(f"single channel prediction, `{name}` ignored.", stacklevel=3)
             return values
         if self.softmax:
@@ -201,7 +208,7 @@ class CurvaturePrior(nn.Module):
         return values if self.include_background else values[:, 1:]
 
     def _voxel_weights(self, input: Tensor, target: Tensor | None, mask: Tensor | None) -> Tensor | None:
-        """(B or 1, classes that count or 1, D, H, W): the mask, without what is ignored."""
+        """Return the mask (B or 1, classes that count or 1, D, H, W) with zeros on ignored voxels, or None."""
         batch, classes = input.shape[:2]
         space = tuple(input.shape[2:])
         if mask is not None:
@@ -209,7 +216,7 @@ class CurvaturePrior(nn.Module):
             if not fits or tuple(mask.shape[2:]) != space:
                 expected = f"({batch} or 1, {classes} or 1, {', '.join(map(str, space))})"
                 raise ValueError(f"expected a mask of shape {expected}, got {tuple(mask.shape)}")
-            if seen(((mask >= 0) & (mask <= HEAVIEST)).all()) == 0:
+            if number_of(((mask >= 0) & (mask <= HEAVIEST)).all()) == 0:
                 raise ValueError(f"expected a mask of finite numbers from 0, at most {HEAVIEST:g}, got others")
             if mask.shape[1] > 1 and not self.include_background:
                 mask = mask[:, 1:]
@@ -221,53 +228,58 @@ class CurvaturePrior(nn.Module):
             return mask
         if target is None or target.shape[1] != 1:
             got = "none" if target is None else f"shape {tuple(target.shape)}"
-            raise ValueError(f"expected a target (B, 1, D, H, W) with labels {self.ignore_index} to ignore, got {got}")
-        known = target != self.ignore_index
-        return known if mask is None else mask * known
+            raise ValueError(
+                f"expected a target (B, 1, D, H, W) with label {self.ignore_index} on ignored voxels, got {got}"
+            )
+        valid = target != self.ignore_index
+        return valid if mask is None else mask * valid
 
     def _spacing(self, input: Tensor) -> tuple[float, float, float]:
-        """The voxel edges of this input: coarser than the patch's where it has fewer voxels."""
+        """Return the voxel edges of an input, which are larger than the patch's where the input has fewer voxels."""
         if self.shape is None:
             return self.spacing
         pairs = zip(self.spacing, self.shape, input.shape[2:], strict=True)
         return tuple(h * whole / n for h, whole, n in pairs)  # type: ignore[return-value]
 
     def _skips(self, input: Tensor) -> bool:
-        """Whether this is a level of deep supervision that has no inside or is too coarse for ε."""
+        """Return whether an input is a level of deep supervision that has no interior or is too coarse for ε."""
         space = tuple(input.shape[2:])
         if self.shape is None or space == self.shape:
             return False
         times = RESOLVED * max(self._spacing(input)) / self.epsilon
         if times <= MOST + 1e-3 and min(space) >= max(4, 2 * self.border + 1):
             return False
-        self._warn(str(space), f"a level of {space} voxels is too coarse for ε = {self.epsilon:g}: it counts nothing")
+        self._warn(str(space), f"a level of {space} voxels is too coarse for ε = {self.epsilon:g}, so its loss is 0")
         return True
 
     def _check_range(self, probability: Tensor) -> None:
+        """Warn once where probabilities are outside [0, 1]."""
         if torch.compiler.is_compiling() or "range" in self._warned:
             return
-        low, high = (seen(value) for value in probability.detach().aminmax())
+        low, high = (number_of(value) for value in probability.detach().aminmax())
         if low is not None and high is not None and not (low >= -1e-3 and high <= 1 + 1e-3):
             self._warn("range", f"expected probabilities, got {low:g} to {high:g}: is sigmoid or softmax missing?")
 
-    def _warn(self, what: str, message: str) -> None:
-        """A warning, once."""
-        if not torch.compiler.is_compiling() and what not in self._warned:
-            self._warned.add(what)
+    def _warn(self, subject: str, message: str) -> None:
+        """Warn once of each subject."""
+        if not torch.compiler.is_compiling() and subject not in self._warned:
+            self._warned.add(subject)
             warnings.warn(message, stacklevel=3)
 
 
 def _edges(spacing: float | Sequence[float]) -> tuple[float, float, float]:
+    """Return three voxel edges."""
     return Grid((4, 4, 4), spacing).spacing  # type: ignore[arg-type]
 
 
 def _weights(weight: float | Sequence[float]) -> tuple[float, ...]:
+    """Return one weight, or the weights of all classes."""
     try:
         values = tuple(torch.as_tensor(weight, dtype=torch.float64).flatten().tolist())
     except (TypeError, ValueError, RuntimeError, OverflowError):
         values = ()
     if not values or not all(0 <= value <= HEAVIEST for value in values):
-        raise ValueError(f"expected a weight from 0 to {HEAVIEST:g}, or one a class, got {quoted(weight)}")
+        raise ValueError(f"expected a weight from 0 to {HEAVIEST:g}, or one for each class, got {quoted(weight)}")
     return values
 
 
@@ -278,23 +290,24 @@ def _numbers(texture: Texture, edge: float, unit: str | None, epsilon: float) ->
         if unit is not None and unit not in METRES:
             raise ValueError(f"expected a unit among {', '.join(METRES)}, got {quoted(unit)}")
         return numbers
-    fitted, own = texture.prior.epsilon, texture.prior.unit
-    unit = unit or own
-    fitted *= 1 if unit == own else METRES[own] / METRES[unit]
-    if not 1 / 4 <= epsilon / fitted <= 4:
-        both = f"ε is {epsilon:g} {unit} here and was {fitted:g} {unit} in the fit"
-        warnings.warn(f"{both}: give spacing and its unit, if these are not meant", stacklevel=4)
+    width, fit_unit = texture.prior.epsilon, texture.prior.unit
+    unit = unit or fit_unit
+    width *= 1 if unit == fit_unit else METRES[fit_unit] / METRES[unit]
+    if not 1 / 4 <= epsilon / width <= 4:
+        widths = f"ε is {epsilon:g} {unit} here and was {width:g} {unit} in the fit"
+        warnings.warn(f"{widths}: state spacing and its unit if the two should be alike", stacklevel=4)
     return numbers
 
 
 def _each(values: tuple, classes: int, name: str) -> tuple:
+    """Return one value for each class."""
     if len(values) not in (1, classes):
-        raise ValueError(f"expected one {name} or {classes}, one a class that counts, got {len(values)}")
+        raise ValueError(f"expected {name}, or one for each class that counts ({classes} in all), got {len(values)}")
     return values * classes if len(values) == 1 else values
 
 
 def _warn_of_interpolation(spacing: tuple[float, float, float], epsilon: float) -> None:
-    """Say once which axes are interpolated."""
+    """Warn of the axes that are interpolated."""
     times = upsampling(spacing, epsilon)
     if max(times) > 1:
         axes = ", ".join(f"{axis} {n}-fold" for axis, n in zip("zyx", times, strict=True) if n > 1)

@@ -4,7 +4,7 @@ Fields are `(..., Z, Y, X)` tensors of any floating type on any device. Vectors 
 the space axes, Hessians an axis of 6 (zz, yy, xx, zy, zx, yx).
 
 Beyond the box a field continues periodically or as its mirror image. The transpose of a difference is then the same
-difference gathered from a continuation too: periodic, or mirrored with a sign along the axes that are differenced once.
+difference of another continuation: periodic, or mirrored with a sign along the axes that are differenced once.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torch import Tensor
 from curvafit.priors.grid import Grid
 from curvafit.priors.shapes import Float
 
-#: Voxels that a blur's standard deviation spans at most: eighty thousand weights.
+#: The most voxels that a blur's standard deviation spans: eighty thousand weights.
 WIDEST = 10_000
 #: Axis pairs of the six Hessian components, in storage order.
 HESSIAN_AXES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
@@ -42,13 +42,13 @@ def pad(u: Float[Tensor, "*batch z y x"], grid: Grid, width: int = 1, odd: tuple
 
 
 def gradient(u: Float[Tensor, "*batch z y x"], grid: Grid) -> Float[Tensor, "*batch 3 z y x"]:
-    """Central differences [-1, 0, 1] / 2Δx."""
+    """Return central differences [-1, 0, 1] / 2Δx."""
     v = pad(_checked(u, grid), grid)
     return torch.stack([_central(v, axis) / (2 * h) for axis, h in enumerate(grid.spacing)], -4)
 
 
 def gradient_adjoint(p: Float[Tensor, "*batch 3 z y x"], grid: Grid) -> Float[Tensor, "*batch z y x"]:
-    """Transpose of `gradient`: ⟨∇u, p⟩ = ⟨u, ∇ᵀp⟩ as plain sums over voxels."""
+    """Apply the transpose of `gradient`: ⟨∇u, p⟩ = ⟨u, ∇ᵀp⟩ as plain sums over voxels."""
     _checked(p, grid)
     return sum(
         -_central(pad(p.select(-4, axis), grid, odd=(axis,)), axis) / (2 * h) for axis, h in enumerate(grid.spacing)
@@ -56,18 +56,18 @@ def gradient_adjoint(p: Float[Tensor, "*batch 3 z y x"], grid: Grid) -> Float[Te
 
 
 def divergence(vector: Float[Tensor, "*batch 3 z y x"], grid: Grid) -> Float[Tensor, "*batch z y x"]:
-    """div = -∇ᵀ under either boundary, so that ∫ div A = 0 exactly (no flux through the box)."""
+    """Return div A = -∇ᵀA under either boundary, so that ∫ div A = 0 exactly (no flux through the box)."""
     return -gradient_adjoint(vector, grid)
 
 
 def hessian(u: Float[Tensor, "*batch z y x"], grid: Grid) -> Float[Tensor, "*batch 6 z y x"]:
-    """Second differences: [1, -2, 1] on the diagonal, the 4-point cross off it (19 points in all)."""
+    """Return second differences: [1, -2, 1] on the diagonal, the 4-point cross off the diagonal (19 points in all)."""
     v = pad(_checked(u, grid), grid)
     return torch.stack([_second(v, i, j) / _area(grid, i, j) for i, j in HESSIAN_AXES], -4)
 
 
 def hessian_adjoint(p: Float[Tensor, "*batch 6 z y x"], grid: Grid) -> Float[Tensor, "*batch z y x"]:
-    """Transpose of `hessian`: ⟨Hess u, p⟩ = ⟨u, Hessᵀp⟩ over the six stored components."""
+    """Apply the transpose of `hessian`: ⟨Hess u, p⟩ = ⟨u, Hessᵀp⟩ over the six stored components."""
     _checked(p, grid)
     return sum(
         _second(pad(p.select(-4, c), grid, odd=() if i == j else (i, j)), i, j) / _area(grid, i, j)
@@ -76,14 +76,14 @@ def hessian_adjoint(p: Float[Tensor, "*batch 6 z y x"], grid: Grid) -> Float[Ten
 
 
 def gaussian_blur(u: Float[Tensor, "*batch z y x"], grid: Grid, width: float) -> Float[Tensor, "*batch z y x"]:
-    """k ∗ u with a separable Gaussian of standard deviation `width` (in spacing's unit), cut at four deviations.
+    """Return k ∗ u, k a separable Gaussian of standard deviation `width` (in spacing's unit), cut at four deviations.
 
     The continuation beyond the box is a reflection group's, so the blur is its own adjoint under both boundaries.
 
     Raises
     ------
     ValueError
-        If the field's shape is not the grid's, or as `check_blur`.
+        If the field's shape is not the grid's, or as `check_blur` does.
     """
     _checked(u, grid)
     check_blur(grid, width)
@@ -100,7 +100,7 @@ def gaussian_blur(u: Float[Tensor, "*batch z y x"], grid: Grid, width: float) ->
 
 
 def check_blur(grid: Grid, width: float) -> None:
-    """Refuse a blur that is wider than the box, of which it would leave the mean.
+    """Refuse a blur that is wider than the box, which would leave only the field's mean.
 
     Raises
     ------
@@ -113,12 +113,12 @@ def check_blur(grid: Grid, width: float) -> None:
 
 @lru_cache(maxsize=64)
 def gaussian_taps(deviation: float) -> tuple[float, ...]:
-    """Weights of the one-dimensional blur, 2⌈4σ⌉ + 1 of them, summing to one; `deviation` in voxels.
+    """Return the 2⌈4σ⌉ + 1 weights of the one-dimensional blur, whose sum is one; the deviation σ is in voxels.
 
     Raises
     ------
     ValueError
-        If the deviation is not above 0, or spans more than `WIDEST` voxels.
+        If the deviation is not above 0 or spans more than `WIDEST` voxels.
     """
     if not 0 < deviation <= WIDEST:
         raise ValueError(f"expected a blur width above 0 and of at most {WIDEST} voxels, got {deviation:g}")
@@ -128,6 +128,7 @@ def gaussian_taps(deviation: float) -> tuple[float, ...]:
 
 
 def _pad_axis(v: Tensor, grid: Grid, axis: int, width: int) -> Tensor:
+    """Continue a field by `width` voxels, any number, at both ends of an axis."""
     dim, n = axis - 3, grid.shape[axis]
     index = torch.arange(-width, n + width, device=v.device)
     if grid.periodic:
@@ -139,10 +140,12 @@ def _pad_axis(v: Tensor, grid: Grid, axis: int, width: int) -> Tensor:
 
 
 def _central(v: Tensor, axis: int) -> Tensor:
+    """Return the difference of both neighbours along an axis."""
     return _shift(v, {axis: 1}) - _shift(v, {axis: -1})
 
 
 def _second(v: Tensor, i: int, j: int) -> Tensor:
+    """Return the second difference along axes i and j."""
     if i == j:
         return _shift(v, {i: 1}) - 2 * _shift(v, {}) + _shift(v, {i: -1})
     same = _shift(v, {i: 1, j: 1}) + _shift(v, {i: -1, j: -1})
@@ -150,16 +153,19 @@ def _second(v: Tensor, i: int, j: int) -> Tensor:
 
 
 def _shift(v: Tensor, offset: dict[int, int]) -> Tensor:
+    """Return the box within a field padded by one voxel, shifted by offsets along axes."""
     for axis in range(3):
         v = v.narrow(axis - 3, 1 + offset.get(axis, 0), v.shape[axis - 3] - 2)
     return v
 
 
 def _area(grid: Grid, i: int, j: int) -> float:
+    """Return the product of a voxel's edges along axes i and j."""
     return grid.spacing[i] * grid.spacing[j]
 
 
 def _checked(u: Tensor, grid: Grid) -> Tensor:
+    """Return a field; raise ValueError where its shape is not the grid's."""
     if tuple(u.shape[-3:]) != grid.shape:
         raise ValueError(f"expected a field whose last axes are {grid.shape}, got {tuple(u.shape)}")
     return u

@@ -1,4 +1,4 @@
-"""What a loss asks of the tensors that it is given: their plain form, and single numbers where there are any."""
+"""Tensors as a loss reads them: without subclasses, and as single numbers where tracing permits."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-_Given = TypeVar("_Given", bound=Tensor | None)
+_Values = TypeVar("_Values", bound=Tensor | None)
 
 
-def plain(values: _Given) -> _Given:
-    """Without what subclasses (MONAI's `MetaTensor`) add."""
+def plain(values: _Values) -> _Values:
+    """Return a tensor without its subclass (MONAI's `MetaTensor`)."""
     return values if values is None or type(values) is Tensor else values.as_subclass(Tensor)  # type: ignore[return-value]
 
 
-def seen(value: Tensor) -> float | None:
-    """A tensor's one number; None where none is to be seen: when compiled, and under `torch.func.vmap`."""
+def number_of(value: Tensor) -> float | None:
+    """Return a tensor's single number, or None where it has none yet: in compiled code and under `torch.func.vmap`."""
     if torch.compiler.is_compiling():
         return None
     try:

@@ -100,7 +100,7 @@ async function read(file) {
     try {
       fit = JSON.parse(text);
     } catch {
-      throw new Error(`expected a fit.json, got ${file.name}, which is no JSON`);
+      throw new Error(`expected a fit.json, got ${file.name}, which is not JSON`);
     }
     state.scans.push(placed(fit, file.name));
     $("message").hidden = true;

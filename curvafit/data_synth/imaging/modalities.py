@@ -4,8 +4,6 @@ Widths of optical point-spread functions: 0.2 λ / NA across (Zhang, Zerubia and
 0.37 λ / (n - √(n² - NA²)) along the axis, as deviations; a specimen's aberrations make them up to twice as wide.
 """
 
-import re
-
 from curvafit.data_synth.imaging.modality import Modality
 from curvafit.data_synth.imaging.parameters import (
     Contrast,
@@ -16,7 +14,7 @@ from curvafit.data_synth.imaging.parameters import (
     Optics,
     Specimen,
 )
-from curvafit.priors.bounds import quoted
+from curvafit.priors.bounds import plain_name, quoted
 
 CONFOCAL = Modality(
     "confocal",
@@ -289,7 +287,7 @@ def modality(name: str) -> Modality:
     ValueError
         If there is no such preset.
     """
-    plain = re.sub(r"[\s_]+", "-", str(name).strip().casefold())
+    plain = plain_name(str(name))
     if plain not in MODALITIES:
         raise ValueError(f"expected a modality among {', '.join(MODALITIES)}, got {quoted(name)}")
     return MODALITIES[plain]
