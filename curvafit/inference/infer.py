@@ -30,6 +30,7 @@ from curvafit.inference.refinement import Refinement
 from curvafit.pictures import Pictured
 from curvafit.priors.bounds import SEEDS, instance, whole
 from curvafit.priors.coefficients import Coefficients
+from curvafit.priors.fit_file import Prior
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.profile import phase_field
 from curvafit.progress import Progress, silent
@@ -82,6 +83,10 @@ class Inference(Pictured):
     def best(self) -> np.ndarray | None:
         """Return the regenerated shape of the better supported parameters."""
         return self.regenerated if self.fit.chosen == "fit" else self.matched
+
+    def to_prior(self) -> Prior:
+        """Return the prior of the fit: an inference is a law, as its fit is."""
+        return self.fit.to_prior()
 
 
 def infer(
