@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calling import call
+from calling import call, refused
 
 from curvafit.volumes import save
 
@@ -49,3 +49,15 @@ def test_generate_says_it_once_and_not_where_it_refuses(tmp_path: Path, monkeypa
     some = ("generate", "--preset", "tubes", "--shape", 12, "--steps", 3, "-o", tmp_path / "out.npy")
     assert call(*some).stderr.count("generate: 12 x 12 x 12 voxels, about") == 1
     assert "about" not in call(*some, "--epsilon", "7").stderr
+
+
+def test_synth_refuses_a_folder_with_other_things_before_it_forecasts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(forecast, "SHORT", 0)
+    monkeypatch.setattr(forecast, "step_time", lambda device: 1e-8)
+    (tmp_path / "notes.txt").write_text("mine")
+    some = ("synth", "--preset", "tubes", "--modality", "confocal", "--shape", 8, "--count", 1, "--workers", 0)
+    result = call(*some, "-o", tmp_path)
+    refused(result, "expected a new or empty folder, or a set to go on with")
+    assert "about" not in result.stderr

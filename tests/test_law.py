@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 import torch
-from found import made_fit
+from found import made_fit, made_inference
 
 from curvafit.inference.infer import Inference
 from curvafit.priors import PRESETS, Coefficients, CurvaturePrior, Law, Texture, preset, read_fit, texture_of
@@ -40,9 +40,9 @@ def test_a_fit_is_what_is_read_from_its_file(fit_path) -> None:
     assert made_fit().to_prior() == read_fit(fit_path)
 
 
-def test_a_fit_its_file_and_what_was_read_from_it_are_one_law(fit_path) -> None:
+def test_a_fit_its_file_its_prior_and_its_inference_are_one_law(fit_path) -> None:
     prior = read_fit(fit_path)
-    stated: list[Law] = [fit_path, str(fit_path), prior, made_fit()]
+    stated: list[Law] = [fit_path, str(fit_path), prior, made_fit(), made_inference()]
     for texture in map(texture_of, stated):
         assert (texture.coefficients, texture.mass) == (prior.coefficients, prior.mass)
         assert (texture.epsilon, texture.unit) == (prior.epsilon, prior.unit)

@@ -155,13 +155,14 @@ def synth(
 
 def _build(out: Path, order: Order, count: int, crew: Crew) -> None:
     from curvafit.data_synth.sets.picture import write_preview
-    from curvafit.data_synth.sets.sets import MOST, build_set, cases_of
+    from curvafit.data_synth.sets.sets import MOST, build_set, cases_of, check_set
     from curvafit.files import check_folder
     from curvafit.generation.schedule import schedule
     from curvafit.priors.bounds import whole
 
     whole(count, "a count of at least 1 case", 1, MOST)
     check_folder(out)
+    check_set(out, order)
     if crew.scheduler is None and order.recipe.source.within == math.inf:
         crew.check(order.recipe.largest)
         steps = (count - len(cases_of(out))) * schedule("fast").steps

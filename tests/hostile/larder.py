@@ -45,6 +45,7 @@ def fill(folder: Path) -> None:
     _command(folder, *(part.replace("{store}", str(folder / "store.zarr")) for part in SYNTH), "--count", "3")
     _command(folder, "generate", *QUICK, "-o", "shape.nii.gz")
     _command(folder, "generate", *LONG, "-o", "long.npy")
+    _write_channels(folder)
     _checkpoint(folder)
     cache = Path(os.environ["CURVAFIT_CACHE"])
     cache.mkdir(parents=True, exist_ok=True)
@@ -94,6 +95,20 @@ def _write_scans(folder: Path) -> None:
         image = nibabel.Nifti1Image(values.T, np.diag([0.0195] * 3 + [1.0]))
         image.header.set_xyzt_units("mm")
         nibabel.save(image, folder / f"{name}.nii.gz")
+
+
+def _write_channels(folder: Path) -> None:
+    """Labels 0, 1 and 2, and files of two channels."""
+    import nibabel
+
+    phase, grey = np.load(folder / "long.npy"), nibabel.load(folder / "scan.nii.gz")
+    labels = (phase > 0) + (phase > 0.9).astype(np.uint8)
+    np.save(folder / "labels.npy", labels)
+    np.save(folder / "long-channels.npy", np.stack((phase, -phase)))
+    values = np.asarray(grey.dataobj)  # type: ignore[attr-defined]
+    image = nibabel.Nifti1Image(np.stack((values, 255 - values), axis=-1), grey.affine)  # type: ignore[attr-defined]
+    image.header.set_xyzt_units("mm")
+    nibabel.save(image, folder / "channels.nii.gz")
 
 
 def _command(folder: Path, *arguments: str) -> None:

@@ -25,6 +25,18 @@ VALUES: dict[str, str] = {
     "long-word": "w" * 5000, "low-surrogate": "\udcff", "backslash": "\\", "quotes": "'\"",
 }  # fmt: skip
 
+#: Values that one option can mean, or nearly: all of them are tried.
+OWN: dict[str, dict[str, str]] = {
+    "channel": {"first": "0", "second": "1", "third": "2", "last": "-1", "name": "red", "range": "0:1"},
+    "label": {"background": "0", "structure": "1", "other": "2", "missing": "7", "several": "1,2", "decimal": "1.0"},
+    "crop": {
+        "all": ":,:,:", "most": "0:16,0:16,0:16", "tail": "2:,2:,2:", "ends": "-12:,-12:,:-1", "signs": " : , : , : ",
+        "plane": "3:4,:,:", "nothing": "4:4,:,:", "backwards": "9:2,:,:", "beyond": ":,:,0:900", "before": "-900:,:,:",
+        "step": "::2,:,:", "flat": "0:8,0:8", "four": ":,:,:,:", "point": "4,4,4", "decimal": "0.5:9,:,:",
+        "long": f"0:{10**400},:,:", "semicolons": "0:8;0:8;0:8", "words": "a:b,c:d,e:f",
+    },
+}  # fmt: skip
+
 #: Numbers that are only very long, not wrong: what asks for that much work is no fault.
 _LARGE = re.compile(r"^\s*\+?(\d{5,}|[1-9]\d*e[1-9]\d*|inf)\s*$")
 
@@ -63,17 +75,23 @@ COMMANDS: dict[str, Command] = {
     "generate-preset": Command(("generate", *_SMALL, "-o", "out.npy"), "preset prior maps", each=5),
     "segment": Command(
         ("segment", "scan.nii.gz", *_PRIOR),
-        "weight threshold epsilon steps spacing unit key prior raw-shape dtype probability",
+        "weight threshold epsilon steps spacing unit key prior raw-shape dtype probability channel label crop",
         "steps",
         taking("scan.nii.gz"),
         each=6,
     ),
+    "segment-channels": Command(
+        ("segment", "channels.nii.gz", "--channel", "0", *_PRIOR), "channel crop", setup=taking("channels.nii.gz")
+    ),
     "reconstruct": Command(
         ("reconstruct", "mask.nii.gz", "--every", "4", *_PRIOR),
-        "every first slices axis epsilon steps spacing unit",
+        "every first slices axis epsilon steps spacing unit channel label crop",
         "steps",
         taking("mask.nii.gz"),
         each=5,
+    ),
+    "reconstruct-labels": Command(
+        ("reconstruct", "labels.npy", "--every", "4", *_PRIOR), "label crop", setup=taking("labels.npy")
     ),
     "reconstruct-slices": Command(
         ("reconstruct", "mask.nii.gz", *_PRIOR), "slices", setup=taking("mask.nii.gz"), each=5
@@ -86,9 +104,21 @@ COMMANDS: dict[str, Command] = {
     ),
     "infer": Command(
         ("infer", "long.npy", "--atlas", "{larder}/atlas.npz", "--kind", "field", "--periodic", "-o", "found"),
-        "spacing unit threshold label raw-shape dtype key seed kind atlas roi",
+        "spacing unit threshold label raw-shape dtype key seed kind atlas roi channel crop",
         setup=taking("long.npy"),
         each=3,
+    ),
+    "infer-channels": Command(
+        ("infer", "long-channels.npy", "--atlas", "{larder}/atlas.npz", "--kind", "field", "--periodic", "-o", "found"),
+        "channel",
+        setup=taking("long-channels.npy"),
+        each=2,
+    ),
+    "infer-labels": Command(
+        ("infer", "labels.npy", "--atlas", "{larder}/atlas.npz", "--kind", "mask", "--periodic", "-o", "found"),
+        "label",
+        setup=taking("labels.npy"),
+        each=2,
     ),
     "build": Command(
         ("atlas", "build", "out.zarr", "--count", "1", "--shape", "16", "--around", "tubes", "--workers", "0"),
@@ -116,7 +146,12 @@ COMMANDS: dict[str, Command] = {
     "synth-like": Command(
         ("synth", "-o", "set", "--atlas", "{larder}/store.zarr", "--like", "{larder}/scan.nii.gz", "--shape", "6",
          "--count", "1", "--workers", "0"),
-        "spacing unit like like-mask visible", stays=("set", "set/*"), each=3,
+        "spacing unit like like-mask visible channel label crop", stays=("set", "set/*"), each=3,
+    ),
+    "synth-channels": Command(
+        ("synth", "-o", "set", "--atlas", "{larder}/store.zarr", "--like", "{larder}/channels.nii.gz", "--channel",
+         "0", "--like-mask", "{larder}/mask.nii.gz", "--label", "1", "--shape", "6", "--count", "1", "--workers", "0"),
+        "channel label crop", stays=("set", "set/*"), each=2,
     ),
     "synth-grown": Command(
         ("synth", "-o", "set", "--modality", "confocal", "--shape", "8", "--count", "1", "--workers", "0"),
@@ -130,9 +165,9 @@ def cases(seed: int) -> Iterator[Case]:
     """Each option of each command with some values, drawn by the seed; and commands without sense."""
     for name, each in COMMANDS.items():
         for option in each.options.split():
-            rng = dice(seed, f"{name} {option}")
-            for value in rng.sample(sorted(VALUES), len(VALUES))[: each.each]:
-                text = VALUES[value]
+            rng, own = dice(seed, f"{name} {option}"), OWN.get(option, {})
+            drawn = rng.sample(sorted(VALUES), len(VALUES))[: each.each]
+            for value, text in (own | {value: VALUES[value] for value in drawn}).items():
                 if option in each.work.split() and _LARGE.match(text):
                     continue
                 command = (*_without(each.arguments, option), f"--{option}={text}")
@@ -157,7 +192,7 @@ def _without(arguments: tuple[str, ...], option: str) -> tuple[str, ...]:
 
 
 def _short(name: str) -> bool:
-    return name not in ("infer", "build", "synth-like", "synth-grown")
+    return name not in ("build", "synth-grown") and not name.startswith(("infer", "synth-like", "synth-channels"))
 
 
 _SENSELESS: dict[str, tuple[str, ...]] = {

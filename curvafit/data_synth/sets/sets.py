@@ -193,19 +193,27 @@ def _begun(folder: Path, order: Order) -> Iterator[None]:
 
 
 def _begin(folder: Path, order: Order) -> None:
+    if not (folder / HEADER).exists():
+        check_set(folder, order)
+        header = {"format": FORMAT, "version": VERSION, "versions": versions(), "order": order.as_dict()}
+        _write_json(folder / HEADER, header)
+    check_set(folder, order)  # another process may have begun it
+    (folder / RECORDS).mkdir(exist_ok=True)
+
+
+def check_set(folder: Path, order: Order) -> None:
+    """Raise ValueError where a folder holds other things than a set of this order: it may be new, or empty."""
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"expected a folder for the set, got the file {folder}")
     if not (folder / HEADER).exists():
         if folder.is_dir() and any(folder.iterdir()):
             raise ValueError(f"expected a new or empty folder, or a set to go on with, got {folder} with other things")
-        header = {"format": FORMAT, "version": VERSION, "versions": versions(), "order": order.as_dict()}
-        _write_json(folder / HEADER, header)
+        return
     stored, wanted = read_order(folder).as_dict(), order.as_dict()
     if stored != wanted:
         name, was, now = _difference(stored, wanted)
         state = f"got another {name}: {now} for {was}; choose another folder, or delete this one"
         raise ValueError(f"expected what {folder} was begun with, {state}")
-    (folder / RECORDS).mkdir(exist_ok=True)
 
 
 def _list(folder: Path, order: Order, cases: set[int]) -> None:
