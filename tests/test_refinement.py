@@ -14,6 +14,7 @@ from curvafit.generation.flow import generate
 from curvafit.generation.schedule import schedule
 from curvafit.inference.fixed_point import ShortFlow, _minimiser, _parameters, fixed_point, sharpened
 from curvafit.inference.refine import refine
+from curvafit.interrupts import Terminated
 from curvafit.priors.coefficients import Coefficients, preset
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.profile import phase_field
@@ -135,6 +136,19 @@ def test_a_fit_in_float64_leaves_jax_as_it_is() -> None:
         assert bowl.precisions == {before}
         assert np.array_equal(bowl.asked[0], np.full(5, start))
         np.testing.assert_allclose(end.free, 0.3, rtol=0, atol=1e-4)
+
+
+def test_an_interrupt_amid_the_fit_is_not_told_as_an_error_of_jax(monkeypatch: pytest.MonkeyPatch) -> None:
+    bowl = Bowl()
+
+    def stop(free: np.ndarray) -> np.ndarray:
+        if len(bowl.asked) == 2:
+            raise Terminated(15)
+        return Bowl.residual(bowl, free)
+
+    monkeypatch.setattr(bowl, "residual", stop)
+    with pytest.raises(Terminated):
+        _minimiser(bowl)(np.full(5, 0.1), 20)  # type: ignore[arg-type]
 
 
 def test_a_crop_without_an_inside_is_one_sentence() -> None:

@@ -232,19 +232,23 @@ def _minimiser(flow: ShortFlow) -> Callable[[np.ndarray, int], _End]:
     import optimistix
 
     visited: list[np.ndarray] = []
+    failures: list[BaseException] = []
 
     def value(free: np.ndarray) -> np.ndarray:
         visited.append(free)
         return flow.residual(free) / _UNIT
 
+    def jacobian(free: np.ndarray) -> np.ndarray:
+        return flow.jacobian(free) / _UNIT
+
     @jax.custom_jvp
     def residual(free):
-        return called(value, (flow.size,), free)
+        return called(value, (flow.size,), free, failures)
 
     @residual.defjvp
     def residual_jvp(primals, tangents):
         (free,), (change,) = primals, tangents
-        slope = called(lambda free: flow.jacobian(free) / _UNIT, (flow.size, len(_SIZES)), free)
+        slope = called(jacobian, (flow.size, len(_SIZES)), free, failures)
         return residual(free), slope @ change
 
     def misfit(free, args):
@@ -254,7 +258,11 @@ def _minimiser(flow: ShortFlow) -> Callable[[np.ndarray, int], _End]:
         visited[:] = [np.array(begin, dtype=np.float64)]
         with double_precision_on_cpu():
             solver = optimistix.LevenbergMarquardt(rtol=1e-3, atol=1e-3)
-            optimistix.least_squares(misfit, solver, jnp.asarray(begin), max_steps=steps, throw=False)
+            try:
+                optimistix.least_squares(misfit, solver, jnp.asarray(begin), max_steps=steps, throw=False)
+            finally:
+                if failures:
+                    raise failures.pop() from None
         best = min(visited, key=lambda free: float(np.linalg.norm(flow.residual(free))))
         return _End(best, float(np.linalg.norm(flow.residual(best))), flow.jacobian(best))
 

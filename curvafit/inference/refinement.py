@@ -101,16 +101,22 @@ def double_precision_on_cpu():
         yield
 
 
-def called(function: Callable[[np.ndarray], np.ndarray], shape: tuple[int, ...], values):
+def called(function: Callable[[np.ndarray], np.ndarray], shape: tuple[int, ...], values, failures: list[BaseException]):
     """Call a NumPy function of a vector from within JAX, both in float64.
 
     JAX calls it in a thread where arrays may be rounded to float32, so the numbers go in and out as pairs of words.
+    What the function raises, an interrupt too, goes into `failures`, for the caller to raise: JAX tells an error of its
+    own instead.
     """
     import jax
 
     def of_words(pairs):
         free = np.array(pairs, dtype=np.uint32).view(np.float64).reshape(-1)
-        return np.array(function(free), dtype=np.float64, order="C").view(np.uint32).reshape(*shape, 2)
+        try:
+            return np.array(function(free), dtype=np.float64, order="C").view(np.uint32).reshape(*shape, 2)
+        except BaseException as error:
+            failures.append(error)
+            raise
 
     pairs = jax.lax.bitcast_convert_type(values, np.uint32)
     words = jax.pure_callback(of_words, jax.ShapeDtypeStruct((*shape, 2), np.uint32), pairs)

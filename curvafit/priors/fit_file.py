@@ -46,7 +46,10 @@ class Prior(NamedTuple):
         if unit is None or unit == self.unit:
             return self.physical
         if unit not in METRES or self.unit not in METRES:
-            raise ValueError(f"expected two units among {', '.join(METRES)}, got {unit} and the fit's {self.unit}")
+            mend = ": run `curvafit infer` again with --spacing and --unit" if self.unit not in METRES else ""
+            raise ValueError(
+                f"expected two units among {', '.join(METRES)}, got {unit} and the fit's {self.unit}{mend}"
+            )
         return self.physical.in_unit(METRES[unit] / METRES[self.unit])
 
 

@@ -14,6 +14,7 @@ from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.law import Law, texture_of
 from curvafit.priors.loss import RESOLVED, upsampling
 from curvafit.priors.refined import refined
+from curvafit.units import METRES
 from curvafit.volumes.scan import Field, ScanError
 
 __all__ = ["Law", "WorkingGrid", "law_of"]
@@ -37,7 +38,8 @@ def law_of(prior: Law, scan: Field) -> tuple[Coefficients, tuple[str, ...]]:
     try:
         law = texture.in_unit(scan.unit, min(scan.spacing))
     except ValueError as reason:
-        raise ScanError(f"{reason}: give --spacing and --unit") from None
+        mend = ": give --spacing and --unit" if texture.unit in METRES else ""
+        raise ScanError(f"{reason}{mend}") from None
     moved = f"The prior's lengths, in {texture.unit}, are taken to {scan.unit}."
     return law, () if texture.unit == scan.unit else (moved,)
 

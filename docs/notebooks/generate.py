@@ -12,7 +12,7 @@
 # # Shapes, and how far apart they are
 #
 # Two shapes each of three textures, at 40³ voxels, and the distances between their curvature diagrams. Shapes of one
-# texture are nearer to each other than to the others. Download: [generate.py](generate.py).
+# texture are nearer to each other than to the others.
 
 # %%
 # %matplotlib inline

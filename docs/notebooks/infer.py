@@ -12,7 +12,7 @@
 # # From a volume to its parameters
 #
 # A shape of known parameters stands in for a scan: so the answer can be checked. It is small (40³ voxels), to run in
-# seconds; take 100³ for figures to rely on. Download: [infer.py](infer.py).
+# seconds; take 100³ for figures to rely on.
 
 # %%
 # %matplotlib inline

@@ -132,7 +132,10 @@ class Generated:
                 origin = {"name": self.names[turn], "parameters": point, **grown}
                 return PhaseField(flow.field.numpy(), WORKING_EPSILON / WORKING_SPACING, origin)
             status = flow.status
-        raise ValueError(f"expected {self.names[turn]} to grow from one of {TRIES} seeds, got none: {status}")
+        raise ValueError(
+            f"expected {self.names[turn]} to grow from one of {TRIES} seeds, got none: {status}; "
+            "try another volume fraction or law"
+        )
 
     @staticmethod
     def of(laws: Iterable[Law], fraction: float | None = None) -> Generated:
