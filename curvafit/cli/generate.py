@@ -134,9 +134,9 @@ def generate(
         options["snapshots"] = () if snapshots is None else (*map(plan.among, whole_numbers(snapshots, "--snapshots")),)
         options["orientation"] = Q = None if orientation is None else _orientation(orientation)
         law_file = None if texture.prior is None else prior or preset
-        read = [str(each) for each in (law_file, maps) if each is not None]
+        inputs = [str(path) for path in (law_file, maps) if path is not None]
         _check(out, saving["checkpoint"], cap)
-        check_target(out, how, steps=options["snapshots"], inputs=read, overwrite=overwrite)
+        check_target(out, how, steps=options["snapshots"], inputs=inputs, overwrite=overwrite)
         flow = _flow({**options, "device": device_of(device)})
         more = {"orientation": Q if Q is None else Q.tolist(), "maps": maps if maps is None else str(maps)}
         more |= {"origin": texture.origin, "wanted_volume_fraction": volume_fraction, "command": command_line()}

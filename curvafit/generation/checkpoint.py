@@ -49,7 +49,7 @@ class Checkpoint:
         if not every >= 0:
             raise ValueError(f"expected seconds between checkpoints, at least 0, got {every}")
         self.path, self._every, self._run, self._keep = place_of(path), every, run, keep
-        self._saved = time.monotonic()
+        self._last_save = time.monotonic()
 
     @contextmanager
     def held(self) -> Iterator[None]:
@@ -105,7 +105,7 @@ class Checkpoint:
 
     def due(self) -> bool:
         """Return whether it is time to save."""
-        return time.monotonic() - self._saved >= self._every
+        return time.monotonic() - self._last_save >= self._every
 
     def save(self, content: dict[str, Any]) -> None:
         """Replace the file's content, which consists of tensors, numbers, lists and dictionaries."""
@@ -114,7 +114,7 @@ class Checkpoint:
         payload = buffer.getbuffer()
         head = _HEAD + hashlib.sha256(payload).hexdigest().encode() + b"\n"
         write_content(self.path, head, payload)
-        self._saved = time.monotonic()
+        self._last_save = time.monotonic()
 
     def close(self) -> None:
         """Remove the file at the end of a run, unless `keep` was set."""

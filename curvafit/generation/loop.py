@@ -135,7 +135,7 @@ class _Lane:
         self.snapshots: dict[int, Tensor] = {}
         #: The reason for a stop before the plan's end, and whether a callback is the reason.
         self.stop, self.asked = "", False
-        self._missed, self._failure, self._stalled = "", "", False
+        self._shortfall, self._failure, self._stalled = "", "", False
         self._field, self._mass = None, math.nan
 
     def settle(self) -> bool:
@@ -148,7 +148,7 @@ class _Lane:
         if end.viable and abs(shift) <= fraction.LAST:
             self._shape.shift(shift)
             return True
-        self._missed = f"; volume fraction {float((u > 0).double().mean()):.4f} instead of {share:.4f}"
+        self._shortfall = f"; volume fraction {float((u > 0).double().mean()):.4f} instead of {share:.4f}"
         return False
 
     def look(self, steps: int, last: bool, stalled: bool) -> None:
@@ -207,15 +207,14 @@ class _Lane:
             return self.stop
         steps = int(history.step[-1])
         if not end.viable:
-            return f"no shape after {steps} steps: {end.reason}{self._missed}"
+            return f"no shape after {steps} steps: {end.reason}{self._shortfall}"
         if self._stalled:
-            return f"stopped after {steps} steps: the line search finds no lower energy{self._missed}"
+            return f"stopped after {steps} steps: the line search finds no lower energy{self._shortfall}"
         before = history.energy[np.searchsorted(history.step, 0.9 * steps, side="right") - 1]
         fall = (before - history.energy[-1]) / max(abs(before), 1e-30)
         word, way = "converged" if abs(fall) < SETTLED else "still moving", "rose" if fall < 0 else "fell"
-        return (
-            f"{word} after {steps} steps: the energy {way} by {100 * abs(fall):.2f} % over the last tenth{self._missed}"
-        )
+        change = f"the energy {way} by {100 * abs(fall):.2f} % over the last tenth"
+        return f"{word} after {steps} steps: {change}{self._shortfall}"
 
 
 def _not_finite(statistics: Statistics, mass: float) -> str:
