@@ -106,7 +106,10 @@ def test_wrong_seeds_are_refused(seed: Any) -> None:
         ({"orientation": orientation((0, 0, 1), 1e30)}, r"expected \|the orientation\| epsilon² of at most 1e\+06"),
         ({"orientation": [[1]]}, "expected a symmetric orientation of shape"),
         ({"grid": Grid(8, 1e-10)}, "expected voxel edges from 1e-08 to 100000 for a flow"),  # type: ignore[arg-type]
-        ({"grid": (10**5,) * 3}, "expected a box that fits into memory, got 100000 x 100000 x 100000 voxels: at least"),
+        (
+            {"grid": (10**5,) * 3},
+            "expected a box that fits into memory, got 100000 x 100000 x 100000 voxels, which need at least",
+        ),
         ({"snapshots": 5}, "expected a sequence of snapshots, got 5"),
         ({"snapshots": [1.5]}, "expected snapshots at 0 to 2 steps, got 1.5"),
         ({"callbacks": [3]}, "expected callbacks that can be called, got 3"),
@@ -187,5 +190,7 @@ def test_memory_is_told_before_it_is_taken() -> None:
     room = memory()
     assert room > 2**28
     check_memory((1, 1, room), 1, "a line")
-    with pytest.raises(ValueError, match="expected a line that fits into memory, got .* voxels: at least .* GiB"):
+    with pytest.raises(
+        ValueError, match="expected a line that fits into memory, got .* voxels, which need at least .* GiB"
+    ):
         check_memory((1, 2, room), 1, "a line")

@@ -151,12 +151,12 @@ def test_another_runs_checkpoint_is_refused(tmp_path):
     flipped = bytearray(kept)
     flipped[-2000] ^= 1
     for content, said in (
-        (kept[:500], "one that is damaged"),
-        (bytes(flipped), "one that is damaged"),
-        (kept + b"0", "one that is damaged"),
-        (b".....\n", "a file that is something else"),
-        (b"", "a file that is something else"),
-        (b"\x80\x02c", "a file that is something else"),
+        (kept[:500], "a damaged one"),
+        (bytes(flipped), "a damaged one"),
+        (kept + b"0", "a damaged one"),
+        (b".....\n", "another kind of file"),
+        (b"", "another kind of file"),
+        (b"\x80\x02c", "another kind of file"),
     ):
         path.write_bytes(content)
         with pytest.raises(ValueError, match=said):
@@ -227,7 +227,7 @@ def test_links_are_followed_and_stay(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
     for name in ("pipe", "loop", "there"):
-        with pytest.raises(ValueError, match="expected a file for the checkpoint, got .* which is something else"):
+        with pytest.raises(ValueError, match="expected a file for the checkpoint, got .* which is not a regular file"):
             Checkpoint(tmp_path / name, 0, {})
 
 
@@ -236,7 +236,9 @@ def test_two_runs_do_not_share_a_file(tmp_path):
     path = tmp_path / "run"
 
     def other(step, total, state):
-        with pytest.raises(ValueError, match="expected a checkpoint that no other run uses, got .*run, which one does"):
+        with pytest.raises(
+            ValueError, match="expected a checkpoint that no other run uses, got .*run, which is in use"
+        ):
             generate(TUBES, MASS, GRID, schedule=PLAN, checkpoint=path)
 
     generate(TUBES, MASS, GRID, schedule=PLAN, checkpoint=path, callbacks=[other])

@@ -76,7 +76,7 @@ def test_other_files_are_left_alone(tmp_path: Path) -> None:
     refused(call("generate", *QUICK, "-o", tmp_path / "scan.npy"), "expected a name that is free, got")
     for name in ("out.json", "out.png"):
         options = ["--checkpoint", tmp_path / name, "-o", tmp_path / "out.npy"]
-        refused(call("generate", *QUICK, *options), "expected a file of its own for the checkpoint")
+        refused(call("generate", *QUICK, *options), "expected a checkpoint that is not an output")
     assert [path.name for path in tmp_path.iterdir()] == ["scan.png"]
 
 

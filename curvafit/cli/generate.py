@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     #: Parameters that vary in space, by name; see `volumes.parameter_maps`.
     Maps3D = dict[str, float | Tensor]
 
-#: Voxels along an edge, if nothing says otherwise.
+#: Number of voxels along an edge by default.
 EDGE = 100
 
 EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
@@ -61,23 +61,23 @@ Target = Annotated[
     _out("-o", "--output", help="Volume (.nii.gz .nii .tif .npy .mrc .zarr) or surface (.stl .ply .vtp) to write."),
 ]
 Preset = Annotated[str | None, _what(help="A published shape; see `curvafit presets`.")]
-Six = Annotated[str | None, _what(help="a20,a11,a02,a10,a01,a00 in working units; needs a mass.")]
+Six = Annotated[str | None, _what(help="a20,a11,a02,a10,a01,a00 in working units; needs --mass or --volume-fraction.")]
 Prior = Annotated[str | None, _what(help="fit.json of `curvafit infer`, or a preset's name.")]
 Mass = Annotated[float | None, _what(help="Mean of the field, in (-1, 1).")]
 Share = Annotated[float | None, _what(help="Share of the volume inside, in (0, 1), instead of a mass.")]
-Orientation = Annotated[str | None, _what(help="θz,θy,θx,μ: tubes and layers lie along θ, the more the larger μ.")]
+Orientation = Annotated[str | None, _what(help="θz,θy,θx,μ: tubes and layers lie along θ, more so with a larger μ.")]
 Maps = Annotated[
     Path | None,
     _what(help="Parameters that vary in space: an .npz of volumes a20 … a00, mass, epsilon, or a folder of them."),
 ]
 Shape = Annotated[str | None, _what(help=f"Voxels: N or Z,Y,X; {EDGE} or the maps' by default.")]
-Boundary = Annotated[str, _what(help="periodic, or replicate (walls that the shape meets squarely).")]
+Boundary = Annotated[str, _what(help="periodic, or replicate (walls that the shape meets at right angles).")]
 Epsilon = Annotated[float | None, _what(help="Interface width in working units; 0.02 (two voxels) by default.")]
-Seed = Annotated[int, _what(help="Of the noise that the shape grows from.")]
+Seed = Annotated[int, _what(help="Seed of the noise that the shape grows from.")]
 Plan = Annotated[str, _how(help="fast (1000 steps) or paper (8000).")]
-Steps = Annotated[int | None, _how(help="Another number of steps.")]
+Steps = Annotated[int | None, _how(help="Number of steps, instead of the schedule's.")]
 Device = Annotated[str, _how(help="cpu, cuda, cuda:1 …")]
-Checkpoint = Annotated[Path | None, _how(help="File to save the run to, and to go on from if it is there.")]
+Checkpoint = Annotated[Path | None, _how(help="File to save the run in; the run goes on from it if it exists.")]
 Every = Annotated[float | None, _how(help="Seconds between two checkpoints; 60 by default.")]
 Spacing = Annotated[str | None, _out(help="Edge of a voxel (a cube), in --unit; by default 1, or the prior's.")]
 Unit = Annotated[str | None, _out(help="nm, um, mm or m; needs --spacing.")]
@@ -134,10 +134,10 @@ def generate(
         options["snapshots"] = () if snapshots is None else (*map(plan.among, whole_numbers(snapshots, "--snapshots")),)
         options["orientation"] = Q = None if orientation is None else _orientation(orientation)
         law_file = None if texture.prior is None else prior or preset
-        read = [str(each) for each in (law_file, maps) if each is not None]
+        inputs = [str(path) for path in (law_file, maps) if path is not None]
         _check(out, saving["checkpoint"], cap)
-        check_target(out, how, steps=options["snapshots"], inputs=read, overwrite=overwrite)
-        flow = _grown({**options, "device": device_of(device)})
+        check_target(out, how, steps=options["snapshots"], inputs=inputs, overwrite=overwrite)
+        flow = _flow({**options, "device": device_of(device)})
         more = {"orientation": Q if Q is None else Q.tolist(), "maps": maps if maps is None else str(maps)}
         more |= {"origin": texture.origin, "wanted_volume_fraction": volume_fraction, "command": command_line()}
         from curvafit.drawing.shape_files import shape_record
@@ -160,16 +160,16 @@ def presets() -> None:
 
 
 def _texture(preset: str | None, six: str | None, prior: str | None, maps: Maps3D) -> Texture:
-    """Return the one law that the options state; maps may state all six coefficients."""
+    """Return the texture of the one law among the options, or of six maps of coefficients."""
     from curvafit.priors.coefficients import NAMES, Coefficients
     from curvafit.priors.law import Texture, texture_of
 
-    stated = [value for value in (preset, six, prior) if value is not None]
-    if len(stated) > 1 or (not stated and not set(NAMES) <= maps.keys()):
-        raise ValueError(f"expected one of --preset, --coefficients and --prior, got {len(stated)} of them")
-    if not stated:
+    laws = [value for value in (preset, six, prior) if value is not None]
+    if len(laws) > 1 or (not laws and not set(NAMES) <= maps.keys()):
+        raise ValueError(f"expected one of --preset, --coefficients and --prior, got {len(laws)} of them")
+    if not laws:
         return Texture(Coefficients(1, 0, 1), None, "maps")
-    return texture_of(stated[0] if six is None else Coefficients(*numbers(six, "--coefficients", 6)))
+    return texture_of(laws[0] if six is None else Coefficients(*numbers(six, "--coefficients", 6)))
 
 
 def _parameters(
@@ -179,7 +179,7 @@ def _parameters(
     share: float | None,
     epsilon: float | None,
 ) -> dict[str, Any]:
-    """Return the law, the mass or the share, and ε as `generate` takes them; maps take the place of single ones."""
+    """Return the law, the mass or the share, and ε as `generate` takes them, with maps in place of numbers."""
     from curvafit.priors.coefficients import NAMES
     from curvafit.priors.grid import WORKING_EPSILON
 
@@ -199,6 +199,7 @@ def _parameters(
 
 
 def _checkpoint(file: Path | None, every: float | None) -> dict[str, Any]:
+    """Return the options of the checkpoint as `generate` takes them."""
     if file is None and every is not None:
         raise ValueError(f"expected --checkpoint beside --checkpoint-every, got {every:g} alone")
     from curvafit.generation.checkpoint import place_of
@@ -210,11 +211,12 @@ def _checkpoint(file: Path | None, every: float | None) -> dict[str, Any]:
 def _output(
     texture: Texture, grid: Grid, spacing: str | None, unit: str | None, tile: str | None, cap: bool | None
 ) -> Output:
-    """How to write: the voxel of the options, else the fit's."""
+    """Return how to write the shape, with the voxel of the options, else the fit's."""
     if unit is not None and spacing is None:
         raise ValueError("expected --spacing beside --unit, got none")
-    own, own_unit = (1.0, "voxel") if texture.prior is None else (texture.prior.working_voxel, texture.prior.unit)
-    edges = (own,) * 3 if spacing is None else triple(spacing, "--spacing")
+    prior = texture.prior
+    edge, fit_unit = (1.0, "voxel") if prior is None else (prior.working_voxel, prior.unit)
+    edges = (edge,) * 3 if spacing is None else triple(spacing, "--spacing")
     if len(set(edges)) > 1:
         raise ValueError(f"expected --spacing of cubic voxels, one number, got {spacing!r}")
     if tile is not None and not grid.periodic:
@@ -222,12 +224,13 @@ def _output(
     from curvafit.drawing.shape_files import Output
 
     repeats = (1, 1, 1) if tile is None else whole_triple(tile, "--tile")
-    how = Output(edges[0], unit or own_unit, repeats, cap is not False)
+    how = Output(edges[0], unit or fit_unit, repeats, cap is not False)
     how.shape(grid)
     return how
 
 
 def _orientation(text: str) -> Tensor:
+    """Return the orientation of an option."""
     from curvafit.priors.energy import orientation
 
     *direction, strength = numbers(text, "--orientation", 4)
@@ -235,7 +238,7 @@ def _orientation(text: str) -> Tensor:
 
 
 def _check(out: Path, checkpoint: Path | None, cap: bool | None) -> None:
-    """Refuse a checkpoint that has no place of its own, and what only a surface has where none is written."""
+    """Refuse a checkpoint at the place of an output, and options of a surface where a volume is written."""
     from curvafit.drawing.shape_files import beside
     from curvafit.files import check_folder
     from curvafit.geometry.mesh_files import SUFFIXES
@@ -245,21 +248,21 @@ def _check(out: Path, checkpoint: Path | None, cap: bool | None) -> None:
         raise ValueError(f"expected {option} beside a surface ({', '.join(SUFFIXES)}), got {out.name!r}")
     if checkpoint is not None:
         check_folder(checkpoint.parent)
-        taken = (out, beside(out, ".json"), beside(out, ".png"))
-        if checkpoint in [path.resolve() for path in taken]:
-            raise ValueError(f"expected a file of its own for the checkpoint, got {checkpoint}")
+        outputs = (out, beside(out, ".json"), beside(out, ".png"))
+        if checkpoint in [path.resolve() for path in outputs]:
+            raise ValueError(f"expected a checkpoint that is not an output, got {checkpoint}")
 
 
-def _grown(options: dict[str, Any]) -> Flow:
-    """The flow, with progress; leaves with exit code 1 where it has no surface, or failed."""
+def _flow(options: dict[str, Any]) -> Flow:
+    """Run the flow with progress; exit with code 1 where it failed or has no surface."""
     from curvafit.generation.flow import generate as make
 
-    begun: list[int] = []
+    starts: list[int] = []
 
     def forecast(step: int, total: int, state: object) -> None:
-        """Say at the first step, when nothing is left to be refused, how long the others take."""
-        if not begun:
-            begun.append(step)
+        """Say at the first step, after every check, how long the other steps take."""
+        if not starts:
+            starts.append(step)
             say_forecast("generate", options["grid"].shape, total - step, FLOW, device=options["device"])
 
     with flow_progress(options["schedule"].steps) as watch:
@@ -268,8 +271,7 @@ def _grown(options: dict[str, Any]) -> Flow:
         except KeyboardInterrupt as signal:
             if options["checkpoint"] is None or not options["checkpoint"].exists():
                 raise
-            said = f"interrupted: the same command goes on from {options['checkpoint']}"
-            say(said, to=error_console())
+            say(f"interrupted: the same command goes on from {options['checkpoint']}", to=error_console())
             raise typer.Exit(exit_code(signal)) from None
     if not (flow.finite and flow.viability.lowest < 0 < flow.viability.highest):
         _discard(options["checkpoint"])
@@ -279,13 +281,13 @@ def _grown(options: dict[str, Any]) -> Flow:
 
 
 def _discard(checkpoint: Path | None) -> None:
-    """Once nothing is left to be saved: the flow kept the file until then."""
+    """Remove the checkpoint, which the flow leaves until the results are written."""
     if checkpoint is not None:
         checkpoint.unlink(missing_ok=True)
 
 
 def _write(flow: Flow, out: Path, how: Output, record: dict[str, Any], overwrite: bool) -> None:
-    """Write everything, and print what and where."""
+    """Write the files, and print the flow's status and the paths."""
     from curvafit.drawing.shape_files import step_path, write_shape
 
     notes = [] if flow.viability.viable else [flow.status]

@@ -1,4 +1,4 @@
-"""The making: flows that lower the cost."""
+"""Generation: flows that lower the energy of a phase field."""
 
 if __name__ != "curvafit.generation":
     raise ImportError(

@@ -1,4 +1,4 @@
-"""Many shapes: over parameters and seeds, one after another or, on an NVIDIA device, together."""
+"""Batches of shapes over laws, masses and seeds: one after another or, on an NVIDIA device, together."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.law import Law, textures_of
 from curvafit.priors.shapes import Float
 
-#: Shapes that a device makes together, if not said otherwise.
+#: Shapes that a device makes together by default.
 TOGETHER = 64
 
 
@@ -47,22 +47,23 @@ def generate_batch(
     backend: Backend = "auto",
     device: torch.device | str = "cpu",
 ) -> Iterator[Flow]:
-    """Make shapes, as `generate` makes each, and give them out as they are done, in order.
+    """Make shapes as `generate` does, and yield each flow when it is done, in order.
 
     Parameters
     ----------
     laws, masses, seeds
-        One for all shapes, or a sequence of one a shape; all sequences have one length. No masses are the laws' own. (A
-        mass that is a tensor varies in space, for all shapes.)
+        A law, a mass and a seed for all shapes, or sequences of one length with one for each shape. None takes the
+        laws' masses. A mass that is a tensor varies in space, for all shapes.
     together
-        How many shapes an NVIDIA device makes at once, each some 70 bytes a voxel. A processor makes one at a time.
+        How many shapes an NVIDIA device makes at once; each takes some 70 bytes for each voxel. A processor makes one
+        shape at a time.
 
-    The other arguments are `generate`'s, for all shapes.
+    The other arguments are those of `generate`, for all shapes.
 
     Raises
     ------
     ValueError
-        If the sequences differ in length, at once; or as `generate`, where a shape's turn comes.
+        At once if the sequences differ in length; otherwise as `generate` does, when the shape is made.
     """
     together = whole(together, "at least one shape at a time", 1, 10**6)
     jobs, plan = _jobs(laws, masses, seeds), named_schedule(schedule)
@@ -79,13 +80,15 @@ def generate_batch(
 
 
 class _Job(NamedTuple):
+    """Parameters of one shape."""
+
     coefficients: Coefficients
     mass: float | Tensor | None
     seed: int
 
 
 def _jobs(laws, masses, seeds) -> list[_Job]:
-    """One a shape."""
+    """Return one job for each shape."""
     columns = [
         textures_of(laws),
         [masses] if masses is None or isinstance(masses, (Real, Tensor)) else several(masses, "masses"),
@@ -101,7 +104,7 @@ def _jobs(laws, masses, seeds) -> list[_Job]:
 
 
 def _joint_flows(jobs: list[_Job], grid: Grid, options: dict[str, Any]) -> list[Flow]:
-    """Shapes that share a device's steps."""
+    """Make shapes together, in the same steps of a device."""
     plan = options["schedule"]
     check_memory((len(jobs), *grid.shape), DEVICE, "a batch", options["device"])
     costs = [Cost(job.coefficients, grid, options["epsilon"], options["orientation"], options["blur"]) for job in jobs]
@@ -109,7 +112,8 @@ def _joint_flows(jobs: list[_Job], grid: Grid, options: dict[str, Any]) -> list[
         DivergenceForm.of(grid, options["blur"], base_of(job.mass, None, grid), kernels.gaussian_blur) for job in jobs
     ]
     starts = [white_noise(grid, job.seed) for job in jobs]
-    each = [job.coefficients for job in jobs]
-    stepper = CudaStepper(starts, [form.base for form in forms], costs[0], each, plan.betas, None, options["device"])
+    coefficients = [job.coefficients for job in jobs]
+    bases = [form.base for form in forms]
+    stepper = CudaStepper(starts, bases, costs[0], coefficients, plan.betas, None, options["device"])
     shared = {name: options[name] for name in ("snapshots", "reject_early")}
     return run(stepper, [Orders(cost, plan, **shared) for cost in costs], [job.seed for job in jobs])

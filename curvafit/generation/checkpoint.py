@@ -1,4 +1,4 @@
-"""Runs that survive a kill: what determines the rest of a flow, in a file that is always whole."""
+"""Checkpoints: the state of a flow in a file that is always complete, so that a run survives a kill."""
 
 from __future__ import annotations
 
@@ -20,45 +20,45 @@ from curvafit.files import sweep, write_content
 from curvafit.interrupts import undisturbed
 from curvafit.priors.coefficients import Coefficients
 
-#: First line of a checkpoint, before the SHA-256 of what follows.
+#: First words of a checkpoint, before the SHA-256 of its content.
 _HEAD = b"curvafit checkpoint 2 "
 
 
 class Checkpoint:
-    """The file of one run: written to memory, then to the disk under another name, then renamed.
+    """The file of one run, which is written under another name and then renamed.
 
     Parameters
     ----------
     path
-        Where; a link stays, and leads there. Its folder is made; beside it stands `.NAME.curvafit-lock` while a run
-        holds it.
+        Path of the file; a link is followed and stays. The folder is created. While a run uses the file, a lock
+        `.NAME.curvafit-lock` lies beside it.
     every
-        Seconds between two saves, at least; 0 saves after every step.
+        The least number of seconds between two saves; 0 saves after every step.
     run
-        What identifies the run, by name; see `identity`.
+        The run's parameters by name; see `identity`.
     keep
-        Whether the file stays when the run is done.
+        Whether the file stays at the end of the run.
 
     Raises
     ------
     ValueError
-        If the seconds are negative, or the path is no file's.
+        If the seconds are negative, or the path is not that of a regular file.
     """
 
     def __init__(self, path: str | Path, every: float, run: dict[str, str], keep: bool = False) -> None:
         if not every >= 0:
             raise ValueError(f"expected seconds between checkpoints, at least 0, got {every}")
         self.path, self._every, self._run, self._keep = place_of(path), every, run, keep
-        self._saved = time.monotonic()
+        self._last_save = time.monotonic()
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Keep other runs off the file.
+        """Lock the file against other runs.
 
         Raises
         ------
         ValueError
-            If another run holds it.
+            If another run uses the file.
         """
         self.path.parent.mkdir(parents=True, exist_ok=True)
         place = self.path.with_name(f".{self.path.name}.curvafit-lock")
@@ -67,8 +67,8 @@ class Checkpoint:
             lock.acquire(timeout=0)
         except Timeout:
             raise ValueError(
-                f"expected a checkpoint that no other run uses, got {self.path}, which one does: wait for it, or name "
-                "another file"
+                f"expected a checkpoint that no other run uses, got {self.path}, which is in use: wait for that run to "
+                "end, or name another file"
             ) from None
         try:
             sweep(self.path)
@@ -76,23 +76,25 @@ class Checkpoint:
         finally:
             with undisturbed():
                 with suppress(PermissionError):  # Windows deletes no file that is open
-                    place.unlink(missing_ok=True)  # while it is held: whoever waits for it sees that it has gone
+                    place.unlink(
+                        missing_ok=True
+                    )  # before the release: a process that waits for the lock then sees that it is gone
                 lock.release()
 
     def load(self) -> dict[str, Any] | None:
-        """What was saved last, or None where there is no file.
+        """Return the content that was saved last, or None where there is no file.
 
         Raises
         ------
         ValueError
-            If the file is not a whole checkpoint or is another run's.
+            If the file is damaged or not a checkpoint, or belongs to another run.
         """
         if not self.path.exists():
             return None
         head, _, payload = self.path.read_bytes().partition(b"\n")
         if head != _HEAD + hashlib.sha256(payload).hexdigest().encode():
-            what = "one that is damaged" if head.startswith(_HEAD) else "a file that is something else"
-            raise ValueError(f"expected a checkpoint of a flow, got {what}: {self.path}; delete it to begin anew")
+            fault = "a damaged one" if head.startswith(_HEAD) else "another kind of file"
+            raise ValueError(f"expected a checkpoint of a flow, got {fault}: delete {self.path} to start again")
         record = torch.load(io.BytesIO(payload), weights_only=True)
         other = record["run"]
         names = [name for name in {**other, **self._run} if other.get(name) != self._run.get(name)]
@@ -102,54 +104,55 @@ class Checkpoint:
         return record["content"]
 
     def due(self) -> bool:
-        """Whether it is time to save."""
-        return time.monotonic() - self._saved >= self._every
+        """Return whether it is time to save."""
+        return time.monotonic() - self._last_save >= self._every
 
     def save(self, content: dict[str, Any]) -> None:
-        """Replace the file by one with this content: tensors, numbers, lists and dictionaries."""
+        """Replace the file's content, which consists of tensors, numbers, lists and dictionaries."""
         buffer = io.BytesIO()
         torch.save({"run": self._run, "content": content}, buffer)
         payload = buffer.getbuffer()
         head = _HEAD + hashlib.sha256(payload).hexdigest().encode() + b"\n"
         write_content(self.path, head, payload)
-        self._saved = time.monotonic()
+        self._last_save = time.monotonic()
 
     def close(self) -> None:
-        """The run is done: remove the file, unless it is to be kept."""
+        """Remove the file at the end of a run, unless `keep` was set."""
         if not self._keep:
             self.path.unlink(missing_ok=True)
 
 
 def place_of(path: str | Path) -> Path:
-    """The file that a checkpoint's path leads to.
+    """Return the file to which a checkpoint's path leads.
 
     Raises
     ------
     ValueError
-        If it leads to a folder, a device or a pipe, or in a circle.
+        If the path leads to a folder, a device or a pipe, or is a loop of links.
     """
     try:
         place = Path(path).resolve()
-        taken = place.exists() and not place.is_file()
+        regular = place.is_file() or not place.exists()
     except (OSError, RuntimeError):
-        taken = True
-    if taken or (Path(path).is_symlink() and place.is_symlink()):
-        raise ValueError(f"expected a file for the checkpoint, got {path}, which is something else")
+        regular = False
+    if not regular or (Path(path).is_symlink() and place.is_symlink()):
+        raise ValueError(f"expected a file for the checkpoint, got {path}, which is not a regular file")
     return place
 
 
 def identity(**parts: object) -> dict[str, str]:
-    """What makes two runs the same, as text by name: the parts given, tensors by their digest, and the versions."""
+    """Return the texts by name that two runs must share: their parts (tensors as digests) and the versions."""
     texts = {name: _text(value) for name, value in parts.items()}
     return {**texts, "curvafit": version("curvafit"), "torch": version("torch")}
 
 
 def _text(value: object) -> str:
+    """Return a text that identifies a value."""
     if isinstance(value, Coefficients):
-        return f"({', '.join(_text(each) for each in value)})"
+        return f"({', '.join(map(_text, value))})"
     if isinstance(value, Tensor):
         values = value.detach().cpu().contiguous().numpy()
         return f"{values.dtype} {values.shape} {hashlib.sha256(values.tobytes()).hexdigest()[:16]}"
-    if dataclasses.is_dataclass(value) and any(isinstance(each, Tensor) for each in vars(value).values()):
+    if dataclasses.is_dataclass(value) and any(isinstance(part, Tensor) for part in vars(value).values()):
         return f"{type(value).__name__}({', '.join(map(_text, vars(value).values()))})"
     return str(value)

@@ -1,4 +1,4 @@
-"""What a flow lowers."""
+"""The functional that a flow lowers."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from curvafit.priors.bounds import instance, quoted, real
 from curvafit.priors.coefficients import NAMES, POWERS, Coefficients, check_strength
 from curvafit.priors.grid import Grid
 
-#: Voxels that ε spans at least: published are two; below a tenth no voxel sees the interface.
+#: The least that ε is, in voxels: two are published; below a tenth no voxel lies on the interface.
 FINEST = 0.1
-#: Edges of a voxel whose squared second differences float32 holds, and beside whose inverse ξ = 1e-6 (`curvature.XI`)
-#: is little.
+#: Bounds of a voxel's edge: float32 holds the squares of second differences, and ξ = 1e-6 (`curvature.XI`) is small
+#: beside the inverse of an edge.
 VOXELS = (1e-8, 1e5)
 
 
 @dataclass(frozen=True)
 class Cost:
-    """What is lowered, and the blur that comes before it; see `generate` for each.
+    """The functional that a flow lowers, and the blur of the field; see `generate` for the parameters.
 
     Raises
     ------
     ValueError
-        If ε is less than a tenth of a voxel or more than the box, the blur negative or more than the box, a coefficient
-        or the orientation over a million with lengths in units of ε, a voxel's edge out of float32's reach, or a tensor
-        does not broadcast with the voxels.
+        If ε is below a tenth of a voxel or longer than the box, the blur is negative or longer than the box, a
+        coefficient or the orientation is over `STRONGEST` with lengths in units of ε, a voxel's edge is outside
+        `VOXELS`, or a tensor does not broadcast with the voxels.
     """
 
     coefficients: Coefficients
@@ -48,27 +48,27 @@ class Cost:
         self._check_strengths()
 
     def _check_lengths(self) -> None:
-        """ε and the blur, as numbers, and both and the voxels in range."""
+        """Convert ε and the blur to numbers; raise ValueError where they or the voxels' edges are out of range."""
         edges, box = self.grid.spacing, self.grid.longest
         if not VOXELS[0] <= min(edges) <= max(edges) <= VOXELS[1]:
             raise ValueError(f"expected voxel edges from {VOXELS[0]:g} to {VOXELS[1]:g} for a flow, got {edges}")
-        said = "epsilon > 0 and blur >= 0 in the spacing's unit"
+        expected = "epsilon > 0 and blur >= 0 in the spacing's unit"
         if not isinstance(self.epsilon, Tensor):
-            object.__setattr__(self, "epsilon", real(self.epsilon, said, math.ulp(0)))
-        object.__setattr__(self, "blur", real(self.blur, said, 0))
+            object.__setattr__(self, "epsilon", real(self.epsilon, expected, math.ulp(0)))
+        object.__setattr__(self, "blur", real(self.blur, expected, 0))
         lengths = torch.as_tensor(self.epsilon, dtype=torch.float64)
         low, high = float(lengths.min()), float(lengths.max())
         if not (low > 0 and math.isfinite(high)):
-            raise ValueError(f"expected {said}, got {low} to {high} and {self.blur}")
+            raise ValueError(f"expected {expected}, got {low} to {high} and {self.blur}")
         if not FINEST * min(edges) <= low <= high <= box:
             got = f"{low:g}" if low == high else f"{low:g} to {high:g}"
             least = f"{FINEST:g} of a voxel ({FINEST * min(edges):.3g})"
-            raise ValueError(f"expected an epsilon from {least} to the box ({box:.3g}), got {got}")
+            raise ValueError(f"expected an epsilon from {least} to the box's side ({box:.3g}), got {got}")
         if self.blur > box:
             raise ValueError(f"expected a blur within the box ({box:.3g}), got {self.blur:g}")
 
     def _check_tensors(self) -> None:
-        """Whether what varies broadcasts with the voxels, and the orientation is one."""
+        """Raise ValueError where a tensor does not broadcast with the voxels, or data or orientation do not fit."""
         for name, value in zip(("epsilon", *NAMES), (self.epsilon, *self.coefficients), strict=True):
             if isinstance(value, Tensor):
                 check_shape(name, value, self.grid)
@@ -84,12 +84,12 @@ class Cost:
             raise ValueError(f"expected a symmetric orientation of shape (3, 3) (z, y, x), got {quoted(_plain(Q))}")
 
     def _check_strengths(self) -> None:
-        """Coefficients and orientation, which is of a00's unit, with lengths in units of ε."""
+        """Raise ValueError where a coefficient, or the orientation (in the unit of a00), is too large, given ε."""
         ε = torch.as_tensor(self.epsilon, dtype=torch.float64)
-        named = {name: (value, POWERS[name]) for name, value in zip(NAMES, self.coefficients, strict=True)}
+        strengths = {name: (value, POWERS[name]) for name, value in zip(NAMES, self.coefficients, strict=True)}
         if self.orientation is not None:
-            named["the orientation"] = self.orientation, 2
-        for name, (value, power) in named.items():
+            strengths["the orientation"] = self.orientation, 2
+        for name, (value, power) in strengths.items():
             check_strength(name, torch.as_tensor(value, dtype=torch.float64).detach().abs().max(), power, ε.max())
 
 
@@ -104,4 +104,5 @@ def check_shape(name: str, value: Tensor, grid: Grid) -> None:
 
 
 def _plain(value: Any) -> Any:
+    """Return a tensor's values as lists, other values unchanged."""
     return value.tolist() if isinstance(value, Tensor) else value

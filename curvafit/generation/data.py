@@ -1,4 +1,4 @@
-"""What a flow is told of the field beside F_ε: which side of the surface a voxel is likely to be on."""
+"""Data terms of a flow: the side of the surface on which each voxel is likely to be."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ class Data(Protocol):
     """A term D(u) that is lowered together with F_ε."""
 
     def slope(self, u: Float[Tensor, "z y x"], grid: Grid, /) -> tuple[float, Float[Tensor, "z y x"]]:
-        """D(u), a sum over voxels times the voxel's volume, and its gradient with respect to every voxel."""
+        """Return D(u), a sum over voxels times the voxel's volume, and its gradient with respect to every voxel."""
         ...
 
     def to(self, device: torch.device | str, /) -> Data:
-        """The same on a device."""
+        """Return the same term on a device."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class _OfVoxels:
-    """What has a number r a voxel."""
+    """A data term with one number r for each voxel."""
 
     ratio: Float[Tensor, "z y x"]
 
@@ -35,11 +35,11 @@ class _OfVoxels:
         if not isinstance(self.ratio, Tensor):
             raise ValueError(f"expected finite evidence (Z, Y, X), got {quoted(self.ratio)}")
         if self.ratio.dim() != 3 or not self.ratio.numel() or not bool(torch.isfinite(self.ratio).all()):
-            got = f"one of shape {tuple(self.ratio.shape)} or not finite"
+            got = f"values of shape {tuple(self.ratio.shape)}, or values that are not finite"
             raise ValueError(f"expected finite evidence (Z, Y, X), got {got}")
 
     def to(self, device: torch.device | str, /) -> Self:
-        """The same on a device."""
+        """Return the same term on a device."""
         return type(self)(self.ratio.to(device))
 
 
@@ -47,9 +47,9 @@ class _OfVoxels:
 class Evidence(_OfVoxels):
     """D(u) = V Σ r (½ - q(u)), q(u) = (3u - u³) / 4 on [-1, 1] and ±½ beyond.
 
-    r is what a voxel says for the inside (positive) or the outside, V the voxel's volume. Where u is ±1 this is the
-    cost of the mask u > 0, up to a constant. It is C¹ and acts on the interface alone: q'(±1) = 0, so that noise, whose
-    sign changes from voxel to voxel, does not pull the phases to grey values between.
+    r is a voxel's evidence for the inside (where positive) or for the outside, and V is the voxel's volume. Where u is
+    ±1, D is the cost of the mask u > 0, up to a constant. D is C¹ and acts on the interface alone: q'(±1) = 0, so that
+    noise, whose sign changes from voxel to voxel, does not pull the phases to values between ±1.
 
     Parameters
     ----------
@@ -59,11 +59,11 @@ class Evidence(_OfVoxels):
     Raises
     ------
     ValueError
-        If it is not a finite 3D tensor.
+        If the ratio is not a finite 3D tensor.
     """
 
     def slope(self, u: Float[Tensor, "z y x"], grid: Grid, /) -> tuple[float, Float[Tensor, "z y x"]]:
-        """D(u) and its gradient."""
+        """Return D(u) and the gradient of D."""
         r, v = self.ratio.to(u.dtype), u.clamp(-1, 1)
         v2 = v * v
         value = float((r * (0.5 - v * (3 - v2) / 4)).sum(dtype=torch.float64)) * grid.voxel_volume
@@ -72,9 +72,10 @@ class Evidence(_OfVoxels):
 
 @dataclass(frozen=True, eq=False)
 class Hinge(_OfVoxels):
-    """D(u) = V Σ |r| (1 - sign(r) u)₊² / 4: holds u at ±1 or beyond on the side that r says.
+    """D(u) = V Σ |r| (1 - sign(r) u)₊² / 4, which holds u at ±1 or beyond on the side of r's sign.
 
-    For voxels that are known: no force where they are right, a spring where they are not; wrong by 2 costs |r|.
+    The term is for voxels whose side is known: no force where u is on that side, a spring where it is not. An error of
+    2 costs |r| times the voxel's volume.
 
     Parameters
     ----------
@@ -84,11 +85,11 @@ class Hinge(_OfVoxels):
     Raises
     ------
     ValueError
-        If it is not a finite 3D tensor.
+        If the ratio is not a finite 3D tensor.
     """
 
     def slope(self, u: Float[Tensor, "z y x"], grid: Grid, /) -> tuple[float, Float[Tensor, "z y x"]]:
-        """D(u) and its gradient."""
+        """Return D(u) and the gradient of D."""
         r = self.ratio.to(u.dtype)
         short, size = (1 - r.sign() * u).clamp_min(0), r.abs()
         value = float((size * short * short).sum(dtype=torch.float64)) * grid.voxel_volume / 4

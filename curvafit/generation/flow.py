@@ -28,7 +28,7 @@ __all__ = ["RECORD_EVERY", "WORKING_BLUR", "Flow", "History", "State", "descend"
 
 #: Standard deviation of the published blur, in working units (two voxels).
 WORKING_BLUR = 0.02
-#: Seconds between two checkpoints, if not said otherwise.
+#: Seconds between two checkpoints by default.
 CHECKPOINT_EVERY = 60.0
 
 Backend = Literal["auto", "torch", "fused"]
@@ -60,43 +60,45 @@ def generate(
     ----------
     law
         `Coefficients`: numbers, or tensors that broadcast with the voxels `(Z, Y, X)` and vary in space. Or a preset or
-        its name, the path of a `fit.json`, or a fit, all in working units.
+        a preset's name, the path of a `fit.json`, or a fit, all in working units.
     mass
-        m₀, the mean of u, in (-1, 1); exact to 1e-6 at every step. A tensor is m(x): u = k ∗ (div A + m). None takes
-        the law's own mass, or leaves it to the volume fraction.
+        m₀, the mean of u, in (-1, 1), exact to 1e-6 at every step. A tensor is m(x): u = k ∗ (div A + m). None takes
+        the law's mass, or the mass that the volume fraction needs.
     grid, epsilon, blur
-        The sampling, or voxels along (z, y, x), or along each, of a periodic box in working units; ε, a number or a
-        tensor that broadcasts with the voxels, and the blur's standard deviation, in spacing's unit.
+        The sampling, or the number of voxels along (z, y, x), or along each axis, of a periodic box in working units.
+        ε is a number or a tensor that broadcasts with the voxels; ε and the blur's standard deviation are in spacing's
+        unit.
     volume_fraction
-        Instead of a mass: the share of voxels with u > 0. The mass is steered there while the flow runs, and a last
-        small constant makes the share exact; where that fails, `status` says so. The mass is then `Flow.mass`.
+        Share of voxels with u > 0, instead of a mass. Corrections of the mass approach the share while the flow runs,
+        and a small constant makes it exact at the end; where that fails, `status` says so. `Flow.mass` is the mass.
     schedule
         `"fast"`, `"paper"`, or a `Schedule`.
     seed
-        Of the start. The same seed, grid and number of threads make the same field, bit for bit.
+        Seed of the start. The same seed, grid and number of threads make the same field, bit for bit.
     orientation
         Q of a further term ε ∫ ∇uᵀQ∇u, symmetric, axes z, y, x; see `priors.energy.orientation`.
     snapshots
-        Numbers of steps after which the field is kept in `Flow.snapshots`.
+        Numbers of steps after which `Flow.snapshots` keeps the field.
     callbacks
         See `Callback`.
     reject_early
         Stop as soon as a viability check fails (see `Schedule.checks`) instead of after the last step.
     checkpoint, checkpoint_every
-        A file that the run is saved to every so many seconds, and resumed from if it is there: the end is then the
-        same, bit for bit on one machine and number of threads. It is removed at the end, but kept where a callback
-        stopped the flow.
+        A file in which the run is saved at intervals of that many seconds, and from which it resumes where the file
+        exists: the result is the same bit for bit on one machine and number of threads. The file is removed at the end,
+        but stays where a callback stopped the flow.
     keep_checkpoint
-        Leave the file at the end too, for the caller to remove once the result is safe.
+        Whether the file stays at the end too, for the caller to remove once the result is safe.
     backend
-        `"auto"` takes a fused step where there is one; `"torch"` and `"fused"` insist.
+        `"auto"` takes a fused step where there is one, else plain torch; `"torch"` and `"fused"` take only that step.
     device
         Where torch runs.
 
     Returns
     -------
     Flow
-        With `viability.viable` False, and the reason in `status`, where no shape came out or the energy ran away.
+        Its `viability.viable` is False, and its `status` holds the reason, where the field is not a shape or the energy
+        diverged.
 
     Raises
     ------
@@ -136,15 +138,16 @@ def relax(
     backend: Backend = "auto",
     device: torch.device | str = "cpu",
 ) -> Flow:
-    """The same flow, started at a field v₀: A = 0, u = k ∗ (div A + v₀), so that its mass is kept.
+    """Lower F_ε from a field v₀ at constant mass: the flow of `generate` with u = k ∗ (div A + v₀), from A = 0.
 
-    `frozen` voxels (True) keep their A; the other arguments are `generate`'s. u starts at k ∗ v₀, not at v₀: sharpen
-    v₀ first where the interface's width matters.
+    Voxels where `frozen` is True keep their A; the other arguments are those of `generate`. u starts at k ∗ v₀, not at
+    v₀: sharpen v₀ first where the interface's width matters.
 
     Raises
     ------
     ValueError
-        If the field or the mask does not have the grid's shape, or is not finite; or as `generate`.
+        If the field or the mask does not have the grid's shape, or the field is not finite; otherwise as `generate`
+        does.
     """
     cost = Cost(texture_of(law).coefficients, grid, epsilon, orientation, blur)
     execution = Execution(backend, device, checkpoint, checkpoint_every)
@@ -174,30 +177,32 @@ def descend(
 ) -> Flow:
     """Lower F_ε, or F_ε + D, from a field v₀ to a minimum near it (paper, Algorithm 2: the L² flow under L-BFGS).
 
-    The other arguments are `generate`'s. u starts at k ∗ v₀.
+    u starts at k ∗ v₀. The other arguments are those of `generate`.
 
     Parameters
     ----------
     field
         v₀, `(Z, Y, X)`.
     flow
-        `"l2"`: u = k ∗ v, v free. Algorithm 2 blurs u at each iteration; we read it as this map, whose energy is one
-        function of v. `"mass"`: u = k ∗ (v - mean v) + m₀, the L² flow at constant mass. `"h-1"`: as `relax`.
+        `"l2"`: u = k ∗ v with v free. Algorithm 2 blurs u at each iteration; here the blur is part of this map, so that
+        the energy is one function of v. `"mass"`: u = k ∗ (v - mean v) + m₀, the L² flow at constant mass. `"h-1"`: the
+        flow of `relax`.
     optimiser
-        `"lbfgs"` (history 10, lengths from 1 by a strong Wolfe line search) or `"adam"`.
+        `"lbfgs"` (a history of 10, and a strong Wolfe line search from length 1) or `"adam"`.
     steps
-        How many; one of L-BFGS is one iteration with its line search. It stops before where that finds nothing lower.
+        Number of steps. A step of L-BFGS is one iteration with its line search, and the flow stops earlier where the
+        line search finds no lower energy.
     schedule
-        Step lengths of Adam; its number of steps is replaced.
+        Step lengths of Adam; `steps` replaces the schedule's number of steps.
     blur
-        Standard deviation of k; None is a voxel's shortest edge, as published.
+        Standard deviation of k; None takes a voxel's shortest edge, as published.
     data
-        A term D(u) that is lowered too, as `generation.data.Evidence`; the history's energies include it.
+        A term D(u) that is added to F_ε, such as `generation.data.Evidence`; the history's energies include it.
 
     Raises
     ------
     ValueError
-        As `relax`, or if the flow or the optimiser has another name.
+        If the flow or the optimiser has another name; otherwise as `relax` does.
     """
     named(flow, FORMS, f"a flow among {', '.join(FORMS)}")
     plan = named_schedule(schedule, steps)
@@ -213,6 +218,7 @@ def descend(
 def _from_field(
     field: Tensor, cost: Cost, execution: Execution, flow: str, optimiser: str, frozen: Tensor | None, orders: Orders
 ) -> Flow:
+    """Check a field and a frozen mask, and run a flow from the field."""
     grid, plan = cost.grid, orders.plan
     for name, values in (("field", field), ("frozen mask", frozen)):
         if name == "field" or values is not None:
@@ -223,7 +229,7 @@ def _from_field(
     orders.check_memory(execution.device)
     field = torch.as_tensor(field).detach().to("cpu", torch.float32).contiguous()
     if not bool(torch.isfinite(field).all()):
-        raise ValueError("expected a finite field, got NaN or infinity in it")
+        raise ValueError("expected a finite field, got NaN or infinity")
     form, start = FORMS[flow].at(field, grid, cost.blur, execution.blur)
     stepper = execution.stepper(start, form, cost, plan, optimiser, frozen)
     checkpoint_file = execution.checkpoint_file(stepper, cost, orders, flow=flow, field=field, frozen=frozen)

@@ -1,4 +1,4 @@
-"""Algorithm 1's step, written by hand: for processors, and for many shapes at once on NVIDIA devices."""
+"""Algorithm 1's step in fused kernels: for processors, and for many shapes at once on NVIDIA devices."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from curvafit.priors.grid import Grid
 
 
 class FusedStepper(Stepper):
-    """The step on processors. A step of None still advances Adam's moments."""
+    """The step on processors; a step of None advances Adam's moments all the same."""
 
     def __init__(
         self,
@@ -32,22 +32,22 @@ class FusedStepper(Stepper):
 
         base = form.base.numpy() if isinstance(form.base, Tensor) else form.base
         a, epsilon, Q = kernels.on_processor(cost.coefficients, cost.grid, cost.epsilon, cost.orientation)
-        held = None if frozen is None else torch.as_tensor(frozen).numpy()
+        fixed = None if frozen is None else torch.as_tensor(frozen).numpy()
         self._flow = FusedFlow(
-            start.numpy(), base, a, cost.grid, epsilon, cost.blur, held,
+            start.numpy(), base, a, cost.grid, epsilon, cost.blur, fixed,
             betas=betas, adam_eps=ADAM_EPS, orientation=Q,
         )  # fmt: skip
-        self._seen = Statistics(0.0, 0.0, 0.0)
+        self._statistics = Statistics(0.0, 0.0, 0.0)
 
     @property
     def shapes(self) -> Sequence[ShapeView]:
         return (self,)
 
     def step(self, rate: float | None) -> None:
-        self._seen = Statistics(self._flow.evaluate(), *self._flow.update(rate or 0.0))
+        self._statistics = Statistics(self._flow.evaluate(), *self._flow.update(rate or 0.0))
 
     def statistics(self) -> Statistics:
-        return self._seen
+        return self._statistics
 
     def field(self) -> Tensor:
         return torch.from_numpy(self._flow.field.copy())
@@ -67,16 +67,16 @@ class FusedStepper(Stepper):
 
 
 class CudaStepper(Stepper):
-    """The step on NVIDIA devices, of shapes that share all but their starts, masses and coefficients.
+    """The step on NVIDIA devices, for shapes that differ only in their starts, masses and coefficients.
 
     Parameters
     ----------
     starts, bases
-        A `(3, Z, Y, X)` and k ∗ base of each shape.
+        A `(3, Z, Y, X)` and k ∗ base, for each shape.
     cost, coefficients
-        What is lowered, the same for all but for the coefficients, which are one set a shape.
+        The functional, which all shapes share but for the coefficients, and one set of these for each shape.
     betas, frozen, device
-        As in `relax`, the same for all.
+        As in `relax`, for all shapes.
     """
 
     def __init__(
@@ -91,14 +91,15 @@ class CudaStepper(Stepper):
     ) -> None:
         from curvafit.priors.kernels.cuda import CudaFlow
 
-        base = torch.stack(torch.broadcast_tensors(*(torch.as_tensor(each, dtype=torch.float32) for each in bases)))
+        fields = (torch.as_tensor(base, dtype=torch.float32) for base in bases)
+        base = torch.stack(torch.broadcast_tensors(*fields))
         self._flow = CudaFlow(
             torch.stack(list(starts)), base, together(coefficients, cost.grid), cost.grid, cost.epsilon, cost.blur,
             frozen,
             orientation=cost.orientation, betas=betas, adam_eps=ADAM_EPS, device=device,
         )  # fmt: skip
         self._shapes = tuple(_CudaShape(self, k) for k in range(len(starts)))
-        self._seen: list[Statistics] | None = None
+        self._statistics: list[Statistics] | None = None
         self._masses: list[float] | None = None
 
     @property
@@ -106,7 +107,7 @@ class CudaStepper(Stepper):
         return self._shapes
 
     def step(self, rate: float | None) -> None:
-        self._seen = self._masses = None
+        self._statistics = self._masses = None
         if rate is None:
             self._flow.observe()
         else:
@@ -116,25 +117,25 @@ class CudaStepper(Stepper):
         self._flow.run(rates)
         return len(rates)
 
-    def seen(self) -> list[Statistics]:
-        """What the last `step` saw of each shape."""
-        if self._seen is None:
-            figures = (each.tolist() for each in self._flow.statistics())
-            self._seen = [Statistics(*row) for row in zip(*figures, strict=True)]
-        return self._seen
+    def statistics(self) -> list[Statistics]:
+        """Return the statistics of each shape before the last `step` moved it."""
+        if self._statistics is None:
+            columns = (column.tolist() for column in self._flow.statistics())
+            self._statistics = [Statistics(*row) for row in zip(*columns, strict=True)]
+        return self._statistics
 
     def masses(self) -> list[float]:
-        """The mean of each field."""
+        """Return the mean of each field."""
         if self._masses is None:
             self._masses = self._flow.field.mean((1, 2, 3), dtype=torch.float64).tolist()
         return self._masses
 
     def u(self, k: int) -> Tensor:
-        """The field of one shape."""
+        """Return the field of shape `k`."""
         return self._flow.field[k].cpu()
 
     def shift(self, k: int, amount: float) -> None:
-        """Add a constant to the field of one shape from the next step on."""
+        """Add a constant to the field of shape `k` from the next step on."""
         self._flow.shift(k, amount)
 
     def state(self) -> dict[str, Any]:
@@ -147,21 +148,21 @@ class CudaStepper(Stepper):
 
 
 def together(coefficients: Sequence[Coefficients], grid: Grid) -> Tensor:
-    """One set a shape: `(B, 6)`, or `(B, 6, Z, Y, X)` where any of them varies."""
-    a = [kernels.stacked(each, grid) for each in coefficients]
-    if any(each.dim() > 1 for each in a):
-        a = [each.reshape(6, 1, 1, 1) if each.dim() == 1 else each for each in a]
-    return torch.stack(torch.broadcast_tensors(*a))
+    """Stack the coefficients of all shapes: `(B, 6)`, or `(B, 6, Z, Y, X)` where any of them varies in space."""
+    sets = [kernels.stacked(a, grid) for a in coefficients]
+    if any(a.dim() > 1 for a in sets):
+        sets = [a.reshape(6, 1, 1, 1) if a.dim() == 1 else a for a in sets]
+    return torch.stack(torch.broadcast_tensors(*sets))
 
 
 class _CudaShape:
-    """One of a stepper's shapes."""
+    """One shape of a `CudaStepper`."""
 
     def __init__(self, stepper: CudaStepper, k: int) -> None:
         self._stepper, self._k = stepper, k
 
     def statistics(self) -> Statistics:
-        return self._stepper.seen()[self._k]
+        return self._stepper.statistics()[self._k]
 
     def field(self) -> Tensor:
         return self._stepper.u(self._k)

@@ -14,15 +14,15 @@ AMPLITUDE = 0.4
 
 
 def white_noise(grid: Grid, seed: int, amplitude: float = AMPLITUDE) -> Float[torch.Tensor, "3 z y x"]:
-    """A₀: independent and uniform on [0, amplitude) in every voxel and component, float32, on the processor.
+    """Return A₀, independent and uniform on [0, amplitude) in every voxel and component; float32, on the processor.
 
-    The same numbers for the same seed and shape, whatever was drawn before. In a box with walls the mean is taken off:
-    a constant A has no divergence in a periodic box, but pours through walls.
+    The same seed and shape make the same numbers, whatever was drawn before. In a box with walls the mean is
+    subtracted: a constant A has no divergence in a periodic box, but has a flux through walls.
 
     Raises
     ------
     ValueError
-        If the seed is not a whole number from 0, or there are more voxels than memory holds.
+        If the seed is not a whole number from 0, or the box does not fit into memory.
     """
     instance(grid, Grid, "a Grid")
     amplitude = real(amplitude, "a finite amplitude")

@@ -1,4 +1,4 @@
-"""The one loop of all flows: step, look, until a reason to stop. Shapes that share a stepper share the loop."""
+"""The loop of all flows: step and record until a reason to stop. Shapes that share a stepper share the loop."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ from curvafit.generation.stepper import ShapeView, Statistics, Stepper
 from curvafit.generation.viability import Viability, viability
 from curvafit.priors.bounds import quoted, several
 
-#: A flow whose energy falls by less than this share over its last tenth is called converged.
+#: A flow is called converged where its energy changes by less than this share over the last tenth of the steps.
 SETTLED = 0.01
 
 
 @dataclass(frozen=True)
 class Orders:
-    """What a flow is asked to do, beside lowering the energy.
+    """The task of a flow: the functional, the steps, and the options of `generate`.
 
     Parameters
     ----------
     cost, plan
-        What is lowered, and the steps.
+        The functional and the steps.
     callbacks, reject_early, snapshots, volume_fraction
         As in `generate`.
 
     Raises
     ------
     ValueError
-        If a snapshot is not among the plan's steps, or a callback is not one.
+        If a snapshot is not among the plan's steps, or a callback cannot be called.
     """
 
     cost: Cost
@@ -54,18 +54,18 @@ class Orders:
     def __post_init__(self) -> None:
         for name in ("snapshots", "callbacks"):
             object.__setattr__(self, name, several(getattr(self, name), name))
-        if wrong := [each for each in self.callbacks if not callable(each)]:
-            raise ValueError(f"expected callbacks that can be called, got {quoted(wrong[0])}")
+        if faults := [callback for callback in self.callbacks if not callable(callback)]:
+            raise ValueError(f"expected callbacks that can be called, got {quoted(faults[0])}")
         object.__setattr__(self, "snapshots", tuple(map(self.plan.among, self.snapshots)))
 
     def check_memory(self, device: torch.device | str) -> None:
-        """Raise ValueError where a flow does not fit into a device's memory, or its snapshots into the machine's."""
+        """Raise ValueError where a flow does not fit into the device's memory, or its snapshots into the machine's."""
         check_memory(self.cost.grid.shape, FLOW, "a box", device)
         snapshots = len(set(self.snapshots))
         check_memory(self.cost.grid.shape, FIELD * snapshots, f"a box with {snapshots} snapshots")
 
     def next_mark(self, steps: int) -> int:
-        """The number of steps after which to look again."""
+        """Return the number of steps after which the next record, snapshot or check is due."""
         regular = steps + RECORD_EVERY - steps % RECORD_EVERY
         checks = self.plan.checks if self.reject_early else ()
         return min(mark for mark in (regular, self.plan.steps, *self.snapshots, *checks) if mark > steps)
@@ -74,31 +74,32 @@ class Orders:
 def run(
     stepper: Stepper, orders: Sequence[Orders], seeds: Sequence[int | None], checkpoint: Checkpoint | None = None
 ) -> list[Flow]:
-    """Step shapes that share a stepper until the plan, which they share too, is done, or none is left.
+    """Step shapes that share a stepper and a plan until the plan ends or no shape is left.
 
-    A shape stops earlier where its energy is not finite, or a callback or a check says so; all of them, where the
-    optimiser stalls. The checkpoint is closed at the end, but saved where a callback stopped the flow.
+    A shape stops earlier where its energy, gradient or field is not finite, or where a callback or a check stops it.
+    All shapes stop where the optimiser stalls. At the end the checkpoint is closed, but saved where a callback stopped
+    the flow.
     """
-    lanes = [_Lane(*each) for each in zip(stepper.shapes, orders, seeds, strict=True)]
+    lanes = [_Lane(*lane) for lane in zip(stepper.shapes, orders, seeds, strict=True)]
     with nullcontext() if checkpoint is None else checkpoint.held():
         _advance(stepper, lanes, orders, checkpoint)
     return [lane.end() for lane in lanes]
 
 
 def _advance(stepper: Stepper, lanes: list[_Lane], orders: Sequence[Orders], checkpoint: Checkpoint | None) -> None:
-    """Step until the plan is done or no lane is left."""
+    """Step until the plan ends or every lane has stopped."""
     plan, steps = orders[0].plan, _resume(stepper, lanes, checkpoint)
     while True:
         last = steps == plan.steps or stepper.stalled
         stepper.step(None if last else plan.rate(steps))
-        settled = [lane.settle() for lane in lanes] if last else []
-        if any(settled):
+        shifts = [lane.settle() for lane in lanes] if last else []
+        if any(shifts):
             stepper.step(None)
         for lane in lanes:
             lane.look(steps, last, stepper.stalled)
         if last or all(lane.stop for lane in lanes):
             break
-        mark = min(each.next_mark(steps) for each in orders)
+        mark = min(order.next_mark(steps) for order in orders)
         steps += 1 + stepper.run([plan.rate(step) for step in range(steps + 1, mark)])
         if checkpoint is not None and checkpoint.due():
             checkpoint.save(_content(stepper, lanes, steps))
@@ -110,7 +111,7 @@ def _advance(stepper: Stepper, lanes: list[_Lane], orders: Sequence[Orders], che
 
 
 def _resume(stepper: Stepper, lanes: list[_Lane], checkpoint: Checkpoint | None) -> int:
-    """The number of steps made: none, or those of the checkpoint's state, from which all goes on."""
+    """Restore the checkpoint's state, where there is one, and return its number of steps, else 0."""
     content = checkpoint.load() if checkpoint else None
     if content is None:
         return 0
@@ -121,23 +122,24 @@ def _resume(stepper: Stepper, lanes: list[_Lane], checkpoint: Checkpoint | None)
 
 
 def _content(stepper: Stepper, lanes: list[_Lane], steps: int) -> dict[str, Any]:
+    """Return the content of a checkpoint."""
     return {"made": steps, "lanes": [(lane.rows, lane.snapshots) for lane in lanes], "stepper": stepper.state()}
 
 
 class _Lane:
-    """One shape on its way."""
+    """The run of one shape: its records, its snapshots, and the reason why it stopped."""
 
     def __init__(self, shape: ShapeView, orders: Orders, seed: int | None) -> None:
         self._shape, self._orders, self._seed = shape, orders, seed
         self.rows: list[list[float]] = []
         self.snapshots: dict[int, Tensor] = {}
-        #: Why it stopped before the plan's end, and whether a callback asked for it.
+        #: The reason for a stop before the plan's end, and whether a callback is the reason.
         self.stop, self.asked = "", False
-        self._missed, self._failure, self._stalled = "", "", False
+        self._shortfall, self._failure, self._stalled = "", "", False
         self._field, self._mass = None, math.nan
 
     def settle(self) -> bool:
-        """Make the share of volume exact at the end, where a small constant does it; whether one was added."""
+        """Make the share of volume exact at the end where a small constant does, and return whether one was added."""
         share = self._orders.volume_fraction
         if share is None or self.stop:
             return False
@@ -146,11 +148,11 @@ class _Lane:
         if end.viable and abs(shift) <= fraction.LAST:
             self._shape.shift(shift)
             return True
-        self._missed = f"; volume fraction {float((u > 0).double().mean()):.4f} instead of {share:.4f}"
+        self._shortfall = f"; volume fraction {float((u > 0).double().mean()):.4f} instead of {share:.4f}"
         return False
 
     def look(self, steps: int, last: bool, stalled: bool) -> None:
-        """Do what is to be done after so many steps."""
+        """Take the snapshot, the record and the check that are due after `steps` steps, and the end's field."""
         if self.stop:
             return
         orders, shape, total = self._orders, self._shape, self._orders.plan.steps
@@ -159,13 +161,13 @@ class _Lane:
         if last or steps % RECORD_EVERY == 0:
             self._record(steps, last)
         if not self.stop and orders.reject_early and steps in orders.plan.checks:
-            failed = self._viability(shape.field())
-            self.stop = "" if failed.viable else f"stopped after {steps} of {total} steps: {failed.reason}"
+            check = self._viability(shape.field())
+            self.stop = "" if check.viable else f"stopped after {steps} of {total} steps: {check.reason}"
         if last or self.stop:
             self._field, self._mass, self._stalled = shape.field(), shape.mass(), stalled
 
     def end(self) -> Flow:
-        """What came out."""
+        """Return the flow at its end."""
         assert self._field is not None
         orders, cost, end = self._orders, self._orders.cost, self._viability(self._field)
         if self._failure:
@@ -178,13 +180,13 @@ class _Lane:
         )  # fmt: skip
 
     def _record(self, steps: int, last: bool) -> None:
-        """The history's newest row, the guard against NaN, the callbacks, and the next mass."""
+        """Add a row to the history, stop where a figure is not finite, call the callbacks, and correct the mass."""
         orders, shape, total = self._orders, self._shape, self._orders.plan.steps
         statistics, mass = shape.statistics(), shape.mass()
         self.rows.append([steps, *statistics, mass])
-        if what := _not_finite(statistics, mass):
-            self.stop = f"stopped after {steps} of {total} steps: {what} is not finite"
-            self._failure = f"{what} is not finite"
+        if subject := _not_finite(statistics, mass):
+            self._failure = f"{subject} is not finite"
+            self.stop = f"stopped after {steps} of {total} steps: {self._failure}"
             return
         if orders.callbacks:
             state = State(shape.field(), *statistics, mass)
@@ -196,25 +198,26 @@ class _Lane:
             shape.shift(fraction.correction(shape.field(), share, mass, total))
 
     def _viability(self, u: Tensor) -> Viability:
+        """Return the viability of a field."""
         return viability(u, self._orders.cost.grid, self._orders.cost.epsilon)
 
     def _status(self, end: Viability, history: History) -> str:
+        """Return the sentence that says how the flow ended."""
         if self.stop:
             return self.stop
         steps = int(history.step[-1])
         if not end.viable:
-            return f"no shape after {steps} steps: {end.reason}{self._missed}"
+            return f"no shape after {steps} steps: {end.reason}{self._shortfall}"
         if self._stalled:
-            return f"stopped after {steps} steps: the line search finds no lower energy{self._missed}"
+            return f"stopped after {steps} steps: the line search finds no lower energy{self._shortfall}"
         before = history.energy[np.searchsorted(history.step, 0.9 * steps, side="right") - 1]
         fall = (before - history.energy[-1]) / max(abs(before), 1e-30)
         word, way = "converged" if abs(fall) < SETTLED else "still moving", "rose" if fall < 0 else "fell"
-        return (
-            f"{word} after {steps} steps: the energy {way} by {100 * abs(fall):.2f} % over the last tenth{self._missed}"
-        )
+        change = f"the energy {way} by {100 * abs(fall):.2f} % over the last tenth"
+        return f"{word} after {steps} steps: {change}{self._shortfall}"
 
 
 def _not_finite(statistics: Statistics, mass: float) -> str:
-    """What of a flow's figures is infinite or NaN, as a sentence's subject."""
+    """Return the name of the first of a flow's figures that is infinite or NaN; empty where all are finite."""
     figures = {"the energy": [statistics.energy], "the gradient": statistics[1:], "the field": [mass]}
     return next((name for name, values in figures.items() if not all(map(math.isfinite, values))), "")

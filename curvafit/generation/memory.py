@@ -1,4 +1,4 @@
-"""What fits into memory: asked before anything is allocated, by one estimate of what a job holds at least."""
+"""Checks of memory before anything is allocated, by the least number of bytes that a job holds."""
 
 from __future__ import annotations
 
@@ -10,33 +10,34 @@ import torch
 
 from curvafit.machine import memory as installed
 
-#: Bytes a voxel that a flow holds at least: A, Adam's two moments and the start, three float32 numbers each; u, its
-#: gradient, and what is between two passes of the blur.
+#: The least number of bytes for each voxel of a flow: A, Adam's two moments and the start, three float32 numbers each;
+#: u, the gradient, and the field between two passes of the blur.
 FLOW = 60
-#: Those of a flow on an NVIDIA device.
+#: Bytes for each voxel of a flow on an NVIDIA device.
 DEVICE = 70
-#: Those of a field that is written: itself and its copy in the file's layout.
+#: Bytes for each voxel of a field that is written: the field and a copy in the file's layout.
 FILE = 8
-#: Those of a field that is kept.
+#: Bytes for each voxel of a field.
 FIELD = 4
 
 
 def check_memory(voxels: Sequence[int], each: int, what: str, device: torch.device | str = "cpu") -> None:
-    """Raise ValueError where so many voxels (z, y, x), of `each` bytes, are more than the machine or device holds."""
-    need, there = math.prod(map(int, voxels)) * each, memory(device)
-    if need > there:
+    """Raise ValueError where voxels along axes, of `each` bytes, need more memory than a device or this machine has."""
+    need, capacity = math.prod(map(int, voxels)) * each, memory(device)
+    if need > capacity:
         size = " x ".join(map(str, voxels))
-        has = f"where there are {_gibibytes(there)}" if there < sys.maxsize else "more than any machine has"
-        least = f"at least {_gibibytes(need)}, {has}"
-        raise ValueError(f"expected {what} that fits into memory, got {size} voxels: {least}")
+        limit = f"where there are {_gibibytes(capacity)}" if capacity < sys.maxsize else "more than any machine has"
+        least = f"which need at least {_gibibytes(need)}, {limit}"
+        raise ValueError(f"expected {what} that fits into memory, got {size} voxels, {least}")
 
 
 def memory(device: torch.device | str = "cpu") -> int:
-    """Bytes of memory that a device has, or this machine; as many as can be counted where that is not known."""
+    """Return the bytes of memory of a device or of this machine; `sys.maxsize` where the number is unknown."""
     if torch.device(device).type == "cuda" and torch.cuda.is_available():
         return torch.cuda.get_device_properties(device).total_memory
     return installed()
 
 
 def _gibibytes(size: int) -> str:
+    """Return a number of bytes in GiB."""
     return f"{size / 2**30:.3g} GiB"

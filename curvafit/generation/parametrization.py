@@ -1,4 +1,4 @@
-"""What a flow moves, in place of the field itself: linear maps from parameters to fields, each beside its adjoint."""
+"""Affine maps from the parameters that a flow moves to fields, each beside its adjoint."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from curvafit.priors.grid import Grid
 from curvafit.priors.shapes import Float
 from curvafit.priors.stencils import divergence, gaussian_blur, gradient
 
-#: k ∗ field, given its grid and standard deviation.
+#: A function of field, grid and standard deviation that returns k ∗ field.
 Blur = Callable[[Tensor, Grid, float], Tensor]
 
 
@@ -22,33 +22,35 @@ class Form(Protocol):
     """A field as an affine function of parameters."""
 
     @property
-    def grid(self) -> Grid: ...
+    def grid(self) -> Grid:
+        """The sampling of the field."""
+        ...
 
     def field(self, parameters: Tensor, /) -> Tensor:
-        """u, `(Z, Y, X)`."""
+        """Return u, `(Z, Y, X)`."""
         ...
 
     def pullback(self, slope: Tensor, /) -> Tensor:
-        """The gradient with respect to the parameters, of one with respect to u."""
+        """Return the gradient with respect to the parameters for a gradient `slope` with respect to u."""
         ...
 
     def to(self, device: torch.device | str) -> Form:
-        """The same on a device."""
+        """Return the same form on a device."""
         ...
 
 
 @dataclass(frozen=True)
 class DivergenceForm:
-    """u = k ∗ (div A + base): the mass is the base's, whatever A (paper, Algorithm 1; H⁻¹ flow).
+    """u = k ∗ (div A + base), whose mass is the base's for every A (paper, Algorithm 1; H⁻¹ flow).
 
     Parameters
     ----------
     grid, width
         The sampling, and the standard deviation of k in spacing's unit.
     base
-        k ∗ base: the mass m₀, or a field `(Z, Y, X)` already blurred.
+        k ∗ base: the mass m₀, or a blurred field `(Z, Y, X)`.
     blur
-        How to blur; plain torch, if not said otherwise.
+        The function that blurs, plain torch by default.
     """
 
     grid: Grid
@@ -60,38 +62,38 @@ class DivergenceForm:
     def of(
         cls, grid: Grid, width: float, base: float | Float[Tensor, "z y x"], blur: Blur = gaussian_blur
     ) -> DivergenceForm:
-        """From a base that is not blurred yet."""
+        """Return the form of a base that is not blurred yet."""
         return cls(grid, width, blur(base, grid, width) if isinstance(base, Tensor) else float(base), blur)
 
     @classmethod
     def at(cls, field: Tensor, grid: Grid, width: float, blur: Blur) -> tuple[DivergenceForm, Tensor]:
-        """The form and its start A = 0 for u = k ∗ field."""
+        """Return the form for which u = k ∗ field at A = 0, and that start."""
         return cls.of(grid, width, field, blur), field.new_zeros((3, *grid.shape))
 
     def field(self, vector: Float[Tensor, "3 z y x"]) -> Float[Tensor, "z y x"]:
-        """u of A."""
+        """Return u for A."""
         return self.blur(divergence(vector, self.grid), self.grid, self.width) + self.base
 
     def pullback(self, slope: Float[Tensor, "z y x"]) -> Float[Tensor, "3 z y x"]:
-        """-∇(k ∗ slope): the blur is its own adjoint, and div = -∇ᵀ."""
+        """Return -∇(k ∗ slope), as the blur is its own adjoint and div = -∇ᵀ."""
         return -gradient(self.blur(slope, self.grid, self.width), self.grid)
 
     def to(self, device: torch.device | str) -> DivergenceForm:
-        """The same on a device."""
+        """Return the same form on a device."""
         return dataclasses.replace(self, base=self.base.to(device)) if isinstance(self.base, Tensor) else self
 
     @property
     def mass(self) -> float:
-        """The mean that u keeps."""
+        """The constant mean of u."""
         return float(self.base.double().mean()) if isinstance(self.base, torch.Tensor) else self.base
 
 
 @dataclass(frozen=True)
 class DirectForm:
-    """u = k ∗ v: nothing is kept (paper, Algorithm 2; L² flow).
+    """u = k ∗ v, whose mass may change (paper, Algorithm 2; L² flow).
 
     Algorithm 2 blurs u anew at each iteration, then steps along the gradient there; here the blur is part of the map,
-    so that what is minimised, F_ε(k ∗ v), is one function, as a line search needs.
+    so that F_ε(k ∗ v) is one function, as a line search needs.
     """
 
     grid: Grid
@@ -100,19 +102,19 @@ class DirectForm:
 
     @classmethod
     def at(cls, field: Tensor, grid: Grid, width: float, blur: Blur) -> tuple[DirectForm, Tensor]:
-        """The form and its start v = field."""
+        """Return the form and the start v = field."""
         return cls(grid, width, blur), field
 
     def field(self, values: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]:
-        """u of v."""
+        """Return u for v."""
         return self.blur(values, self.grid, self.width)
 
     def pullback(self, slope: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]:
-        """k ∗ slope."""
+        """Return k ∗ slope."""
         return self.blur(slope, self.grid, self.width)
 
     def to(self, device: torch.device | str) -> DirectForm:
-        """Itself: it holds no tensor."""
+        """Return the form itself, which holds no tensor."""
         return self
 
 
@@ -127,23 +129,24 @@ class MassProjectedForm:
 
     @classmethod
     def at(cls, field: Tensor, grid: Grid, width: float, blur: Blur) -> tuple[MassProjectedForm, Tensor]:
-        """The form and its start v = field, whose mass is kept."""
+        """Return the form with the mass of a field, and the start v = field."""
         return cls(grid, width, float(field.mean(dtype=torch.float64)), blur), field
 
     def field(self, values: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]:
-        """u of v."""
+        """Return u for v."""
         return self.blur(_centred(values), self.grid, self.width) + self.mass
 
     def pullback(self, slope: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]:
-        """k ∗ slope, less its mean."""
+        """Return k ∗ slope minus the mean."""
         return _centred(self.blur(slope, self.grid, self.width))
 
     def to(self, device: torch.device | str) -> MassProjectedForm:
-        """Itself: it holds no tensor."""
+        """Return the form itself, which holds no tensor."""
         return self
 
 
 def _centred(values: Tensor) -> Tensor:
+    """Subtract the mean."""
     return values - values.mean(dtype=torch.float64).to(values.dtype)
 
 

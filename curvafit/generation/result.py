@@ -1,4 +1,4 @@
-"""What a flow gives back, and what it shows on its way."""
+"""The result of a flow, and the state that callbacks see while it runs."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ RECORD_EVERY = 10
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """Figures every `RECORD_EVERY` steps and at the end, arrays `(N,)`: the number of steps made, F_ε, max and mean of
-    |∂F_ε/∂A| over free voxels, the mean of u. (For the L² flows the gradient is that of v.)"""
+    """Figures every `RECORD_EVERY` steps and at the end, in arrays `(N,)`: the number of steps, F_ε, maximum and mean
+    of |∂F_ε/∂A| over free voxels, and the mean of u. (In L² flows the gradient is with respect to v.)"""
 
     step: np.ndarray
     energy: np.ndarray
@@ -33,7 +33,7 @@ class History:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """What a callback sees: the figures of the history's newest entry, and the field, `(Z, Y, X)`."""
+    """The argument of a callback: the figures of the history's newest entry, and the field, `(Z, Y, X)`."""
 
     field: Tensor
     energy: float
@@ -43,31 +43,33 @@ class State:
 
 
 class Callback(Protocol):
+    """A function that a flow calls every `RECORD_EVERY` steps and at the end."""
+
     def __call__(self, step: int, total: int, state: State, /) -> bool | None:
-        """Called every `RECORD_EVERY` steps with the number made, and at the end; returning True stops the flow."""
+        """Receive the number of steps so far, the total and the state; return True to stop the flow."""
         ...
 
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Flow(Pictured):
-    """The end of a flow: the field, how it came there, and whether it is a shape.
+    """The result of a flow: the field, the history, and whether the field is a shape.
 
     Attributes
     ----------
     field
         u, float32 `(Z, Y, X)`.
     history
-        Figures on the way.
+        Figures at regular steps.
     status
-        A sentence.
+        A sentence that says how the flow ended.
     coefficients, epsilon
-        What was lowered: numbers, or tensors that vary in space, in the unit of the grid's spacing.
+        Parameters of the energy: numbers, or tensors that vary in space, in the unit of the grid's spacing.
     seed
-        None where the flow started from a given field.
+        Seed of the start; None where the flow started from a field.
     mass
         The mean of the field.
     snapshots
-        The fields that were asked for, by the number of steps.
+        Fields by the number of steps after which they were taken.
     """
 
     field: Tensor
@@ -83,6 +85,7 @@ class Flow(Pictured):
     epsilon: float | Tensor
 
     def __repr__(self) -> str:
+        """Return one line with voxels, energy, viability and status."""
         cube, energy = len(set(self.grid.spacing)) == 1, self.history.energy[-1]
         edges = " x ".join(f"{h:g}" for h in self.grid.spacing[: 1 if cube else 3])
         voxels = f"{' x '.join(map(str, self.grid.shape))} voxels of {edges}"
@@ -90,7 +93,7 @@ class Flow(Pictured):
 
     @property
     def finite(self) -> bool:
-        """Whether energy, gradient and field stayed finite; the field is no shape where they did not."""
+        """Whether energy, gradient and field stayed finite; where they did not, the field is not a shape."""
         rows = [self.history.energy, self.history.gradient_max, self.history.gradient_mean, self.history.mass]
         extent = [self.viability.highest, self.viability.lowest]
         return bool(np.isfinite(np.concatenate([*rows, extent])).all())

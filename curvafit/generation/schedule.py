@@ -1,4 +1,4 @@
-"""Step schedules of the flow: data beside the one formula that reads them."""
+"""Step schedules of flows, as data, and the formula of step lengths."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from curvafit.priors.bounds import inside, instance, named, real, whole
 
 #: The most steps that a flow may have, and the longest one.
 MOST_STEPS, LONGEST_STEP = 10**7, 1e6
-#: Steps after which the paper's runs were looked at (Experiment 4).
+#: Steps after which the paper checked its runs (Experiment 4).
 _PAPER_CHECKS = (500, 1000, 5000)
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """How many steps, and how long each is.
+    """The number of a flow's steps, and their lengths.
 
     Parameters
     ----------
     name
-        Recorded with every shape: a schedule can change which shape comes out.
+        A name for the records of shapes, as the schedule influences the shape.
     steps
-        How many; 1 to 10 million.
+        Number of steps, 1 to 10 million.
     start, stop
         First and last step length (Adam's learning rate), above 0 and at most 1e6.
     shape
-        `"constant"` (at `start`) or `"cosine"` (half a period from `start` to `stop`).
+        `"constant"` (all steps as long as `start`) or `"cosine"` (half a period from `start` to `stop`).
     momentum, memory
-        Adam's decay rates of the gradient and of its square. Long momentum keeps long steps smooth; short memory
+        Adam's decay rates of the gradient and of the gradient's square. Long momentum smooths long steps; short memory
         forgets the steep noise of the start.
 
     Raises
@@ -59,17 +59,17 @@ class Schedule:
             object.__setattr__(self, name, inside(getattr(self, name), f"{name} in [0, 1)", -math.ulp(0), 1))
 
     def among(self, step: int) -> int:
-        """A number of steps after which there is a snapshot.
+        """Return a snapshot's number of steps.
 
         Raises
         ------
         ValueError
-            If it is no whole number from 0 to the number of steps.
+            If it is not a whole number from 0 to the schedule's number of steps.
         """
         return whole(step, f"snapshots at 0 to {self.steps} steps", 0, self.steps)
 
     def rate(self, step: int) -> float:
-        """Length of step 0 … steps - 1."""
+        """Return the length of a step, numbered from 0 to steps - 1."""
         if self.shape == "constant" or self.steps == 1:
             return self.start
         phase = math.pi * step / (self.steps - 1)
@@ -77,18 +77,18 @@ class Schedule:
 
     @property
     def betas(self) -> tuple[float, float]:
-        """Adam's decay rates of the gradient and of its square."""
+        """Adam's decay rates: momentum and memory."""
         return self.momentum, self.memory
 
     @property
     def checks(self) -> tuple[int, ...]:
-        """Numbers of steps after which viability is asked, before the end."""
+        """Numbers of steps before the end after which viability is checked."""
         marks = _PAPER_CHECKS if self.shape == "constant" else (self.steps // 2,)
         return tuple(mark for mark in marks if 0 < mark < self.steps)
 
 
-#: `paper` is the published one; `fast` makes textures like its in an eighth of the steps: `benchmarks.texture` shows
-#: how near, preset by preset.
+#: `paper` is the published schedule; `fast` makes similar textures in an eighth of the steps: `benchmarks.texture`
+#: compares the two for each preset.
 SCHEDULES: dict[str, Schedule] = {
     "paper": Schedule("paper", 8000, 1e-3, 1e-3, "constant"),
     "fast": Schedule("fast", 1000, 2e-2, 1e-4, "cosine", momentum=0.97, memory=0.97),
@@ -96,7 +96,7 @@ SCHEDULES: dict[str, Schedule] = {
 
 
 def schedule(name: str | Schedule, steps: int | None = None) -> Schedule:
-    """A named schedule, or the one given; with another number of steps where `steps` is.
+    """Return the schedule of a name, or a `Schedule` itself, with `steps` steps where that is not None.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""From what a flow is told to what steps it."""
+"""Steppers, checkpoints and bases from the arguments of a flow."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from curvafit.priors.grid import Grid
 
 @dataclass(frozen=True)
 class Execution:
-    """How and where the steps are made, and where they are saved.
+    """Backend, device and checkpoint of a flow.
 
     Raises
     ------
@@ -46,18 +46,18 @@ class Execution:
 
     @property
     def blur(self) -> Blur:
-        """The blur of forms."""
+        """The function that blurs in forms."""
         return stencils.gaussian_blur if self.backend == "torch" else kernels.gaussian_blur
 
     def stepper(
         self, start: Tensor, form: Form, cost: Cost, plan: Schedule, optimiser: str, frozen: Tensor | None
     ) -> Stepper:
-        """The stepper of one shape: fused where there is a kernel, unless plain torch is asked for.
+        """Return the stepper of one shape: fused where there is a kernel, unless the backend is plain torch.
 
         Raises
         ------
         ValueError
-            If the optimiser is unknown, or a fused kernel is asked for and there is none.
+            If the optimiser is unknown, or the backend is `"fused"` and there is no fused kernel.
         """
         named(optimiser, ("adam", "lbfgs"), "an optimiser 'adam' or 'lbfgs'")
         able, betas = kernels.fused(self.device), plan.betas
@@ -69,20 +69,21 @@ class Execution:
                 return CudaStepper([start], [form.base], cost, [cost.coefficients], betas, frozen, self.device)
             return FusedStepper(start, form, cost, betas, frozen)
         kind = LbfgsStepper if optimiser == "lbfgs" else TorchStepper
-        lowered, more = (cost.coefficients, cost.epsilon), {"fused": not plain, "data": cost.data}
-        return kind(start, form, *lowered, betas, frozen, self.device, cost.orientation, **more)
+        options = {"fused": not plain, "data": cost.data}
+        a, ε, Q = cost.coefficients, cost.epsilon, cost.orientation
+        return kind(start, form, a, ε, betas, frozen, self.device, Q, **options)
 
-    def checkpoint_file(self, stepper: Stepper, cost: Cost, orders: Orders, **more: object) -> Checkpoint | None:
-        """The checkpoint of a run, where one is asked for."""
+    def checkpoint_file(self, stepper: Stepper, cost: Cost, orders: Orders, **start: object) -> Checkpoint | None:
+        """Return the checkpoint of a run, or None where the run has none."""
         if self.checkpoint is None:
             return None
         job = {"schedule": orders.plan, "volume_fraction": orders.volume_fraction, "snapshots": [*orders.snapshots]}
-        where = {"stepper": type(stepper).__name__, "backend": self.backend, "device": self.device}
-        return Checkpoint(self.checkpoint, self.every, identity(**vars(cost), **job, **where, **more), self.keep)
+        place = {"stepper": type(stepper).__name__, "backend": self.backend, "device": self.device}
+        return Checkpoint(self.checkpoint, self.every, identity(**vars(cost), **job, **place, **start), self.keep)
 
 
 def kind_of(device: torch.device | str) -> str:
-    """`"cpu"`, `"cuda"`, …
+    """Return the kind of a device: `"cpu"`, `"cuda"`, …
 
     Raises
     ------
@@ -96,22 +97,22 @@ def kind_of(device: torch.device | str) -> str:
 
 
 def check_device(device: torch.device | str) -> None:
-    """Raise ValueError where torch can't compute on a device."""
+    """Raise ValueError where torch cannot compute on a device."""
     try:
-        known = device is not None and torch.zeros(1, device=device).add(1).item() == 1
+        usable = device is not None and torch.zeros(1, device=device).add(1).item() == 1
     except (RuntimeError, TypeError, ValueError, AssertionError):
-        known = False
-    if not known:
+        usable = False
+    if not usable:
         raise ValueError(f"expected a device that torch computes on, such as 'cpu' or 'cuda', got {quoted(device)}")
 
 
 def base_of(mass: float | Tensor | None, share: float | None, grid: Grid) -> float | Tensor:
-    """The base of div A: the mass, a field of it `(Z, Y, X)`, or a first estimate for a share of volume.
+    """Return the base of div A: the mass, a field of masses `(Z, Y, X)`, or a first estimate for a share of volume.
 
     Raises
     ------
     ValueError
-        If not exactly one of the two is given, or it is out of range or shape.
+        If mass and share are both None or both set, or the one that is set is out of range or has another shape.
     """
     if (mass is None) == (share is None):
         raise ValueError(f"expected either a mass or a volume fraction, got {'neither' if mass is None else 'both'}")

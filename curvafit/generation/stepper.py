@@ -1,4 +1,4 @@
-"""Making the steps of a flow: what any stepper does, and torch's optimisers on any form, device and cost."""
+"""Steppers of flows: their interface, and torch's optimisers on any form, device and cost."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from curvafit.generation.parametrization import Form
 from curvafit.priors import kernels
 from curvafit.priors.coefficients import Coefficients
 
-#: The number that Adam adds to its root, as published; not the usual 1e-8, and it matters.
+#: The number that Adam adds to the root, as published instead of the usual 1e-8; shapes depend on it.
 ADAM_EPS = 1e-2
-#: Pairs of steps and slopes that L-BFGS remembers, as published.
+#: Number of steps and slopes that L-BFGS stores, as published.
 LBFGS_HISTORY = 10
-#: Most evaluations in a line search, as published.
+#: The most evaluations in a line search, as published.
 LINE_SEARCH = 20
-#: The most that any parameter moves where the first line search begins.
+#: The greatest change of a parameter at the first point of the first line search.
 FIRST_MOVE = 1e-2
 
 
 class Statistics(NamedTuple):
-    """F_ε, and max and mean of its gradient's modulus over the parameters that are free."""
+    """F_ε, and maximum and mean of the modulus of its gradient over free parameters."""
 
     energy: float
     gradient_max: float
@@ -32,18 +32,18 @@ class Statistics(NamedTuple):
 
 
 class ShapeView(Protocol):
-    """What a stepper shows of a shape."""
+    """A shape of a stepper, as the loop reads it."""
 
     def statistics(self) -> Statistics:
-        """What the last `step` saw, before it moved."""
+        """Return the statistics before the last `step` moved the shape."""
         ...
 
     def field(self) -> Tensor:
-        """The u last computed, float32 `(Z, Y, X)` on the processor: no step overwrites it."""
+        """Return the last u, float32 `(Z, Y, X)` on the processor, in a tensor that no step overwrites."""
         ...
 
     def mass(self) -> float:
-        """Its mean, in float64."""
+        """Return the mean of the last u, computed in float64."""
         ...
 
     def shift(self, amount: float) -> None:
@@ -52,9 +52,9 @@ class ShapeView(Protocol):
 
 
 class Stepper(Protocol):
-    """The state of the flows of one shape or more, stepped in place."""
+    """The state of the flows of one or more shapes, stepped in place."""
 
-    #: Whether the optimiser found no lower point: it stays where it is.
+    #: Whether the optimiser found no lower point and therefore stopped.
     stalled: bool = False
 
     @property
@@ -63,11 +63,11 @@ class Stepper(Protocol):
         ...
 
     def step(self, rate: float | None) -> None:
-        """Compute u and the gradient, then step by `rate`; for None the parameters stay, and no step may follow."""
+        """Compute u and the gradient, then step by `rate`; None leaves the parameters, and no rate may follow it."""
         ...
 
     def run(self, rates: Sequence[float]) -> int:
-        """Steps that nobody looks at; returns how many were made: all, if it does not stall."""
+        """Make steps without statistics, and return their number, which is smaller than that of rates after a stall."""
         for count, rate in enumerate(rates):
             if self.stalled:
                 return count
@@ -75,18 +75,18 @@ class Stepper(Protocol):
         return len(rates)
 
     def state(self) -> dict[str, Any]:
-        """Tensors, numbers, and lists and dictionaries of such, that determine all steps to come."""
+        """Return tensors and numbers, in lists and dictionaries, that determine all later steps."""
         ...
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from such a state."""
+        """Continue from a state that `state` returned."""
         ...
 
 
 class TorchStepper(Stepper):
     """`torch.optim.Adam` on the parameters of a form.
 
-    `fused` takes the energy's gradient from a fused kernel where there is one, else from autograd: the definition.
+    With `fused` the energy's gradient comes from a fused kernel where there is one, else from autograd, the definition.
     """
 
     def __init__(
@@ -102,12 +102,17 @@ class TorchStepper(Stepper):
         fused: bool = False,
         data: Data | None = None,
     ) -> None:
-        def here(value):
+        def on_device(value):
             return value.to(device, torch.float32) if isinstance(value, Tensor) and value.dim() > 0 else value
 
         self._form, self._offset = form.to(device), 0.0
         self._data = None if data is None else data.to(device)
-        self._cost = (Coefficients(*map(here, coefficients)), form.grid, here(epsilon), here(orientation))
+        self._cost = (
+            Coefficients(*map(on_device, coefficients)),
+            form.grid,
+            on_device(epsilon),
+            on_device(orientation),
+        )
         self._slope_of = kernels.energy_gradient if fused else kernels.plain_energy_gradient
         self._free = None if frozen is None else ~torch.as_tensor(frozen, dtype=torch.bool, device=device)
         self._parameters = start.to(device).clone()
@@ -119,15 +124,16 @@ class TorchStepper(Stepper):
         return (self,)
 
     def _optimiser_of(self, betas: tuple[float, float]) -> torch.optim.Optimizer:
+        """Return the optimiser of the parameters."""
         return torch.optim.Adam([self._parameters], betas=betas, eps=ADAM_EPS)
 
     def _evaluate(self) -> tuple[float, Tensor, Tensor]:
-        """What is lowered, u, and the gradient with respect to the parameters, where they are now."""
+        """Return the energy, u, and the gradient with respect to the parameters."""
         u = self._form.field(self._parameters) + self._offset
         value, slope = self._slope_of(u, *self._cost)
         if self._data is not None:
-            more, pull = self._data.slope(u, self._form.grid)
-            value, slope = value + more, slope + pull
+            data_value, data_slope = self._data.slope(u, self._form.grid)
+            value, slope = value + data_value, slope + data_slope
         slope = self._form.pullback(slope)
         return value, u, slope if self._free is None else slope * self._free
 
@@ -154,8 +160,8 @@ class TorchStepper(Stepper):
 
     def state(self) -> dict[str, Any]:
         state = self._optimiser.state_dict()["state"]
-        mine = {"parameters": self._parameters, "offset": self._offset, "stalled": self.stalled}
-        return {**mine, "optimiser": state}
+        point = {"parameters": self._parameters, "offset": self._offset, "stalled": self.stalled}
+        return {**point, "optimiser": state}
 
     def restore(self, state: dict[str, Any]) -> None:
         self._parameters.copy_(state["parameters"])
@@ -165,14 +171,14 @@ class TorchStepper(Stepper):
 
 
 class LbfgsStepper(TorchStepper):
-    """`torch.optim.LBFGS` on the parameters of a form: a step is one iteration, with its strong Wolfe line search.
+    """`torch.optim.LBFGS` on the parameters of a form: a step is one iteration with a strong Wolfe line search.
 
-    The last point evaluated is kept, since the next iteration begins there. In float32 a line search fails, near the
-    minimum, where rounding hides the decrease: the parameters then stay, and the stepper is stalled.
+    The last evaluation is cached, since the next iteration begins at that point. Near the minimum a line search fails
+    in float32, where rounding hides the decrease: the parameters then stay, and the stepper is stalled.
     """
 
     def _optimiser_of(self, betas: tuple[float, float]) -> torch.optim.Optimizer:
-        self._known: tuple[Tensor, tuple[float, Tensor, Tensor]] | None = None
+        self._cached: tuple[Tensor, tuple[float, Tensor, Tensor]] | None = None
         return torch.optim.LBFGS(
             [self._parameters],
             max_iter=1,
@@ -184,9 +190,9 @@ class LbfgsStepper(TorchStepper):
         )
 
     def _evaluate(self) -> tuple[float, Tensor, Tensor]:
-        if self._known is None or not torch.equal(self._known[0], self._parameters):
-            self._known = self._parameters.clone(), super()._evaluate()
-        return self._known[1]
+        if self._cached is None or not torch.equal(self._cached[0], self._parameters):
+            self._cached = self._parameters.clone(), super()._evaluate()
+        return self._cached[1]
 
     def step(self, rate: float | None) -> None:
         self._value, self._u, self._slope = self._evaluate()
@@ -199,14 +205,15 @@ class LbfgsStepper(TorchStepper):
         self.stalled = torch.equal(before, self._parameters)
 
     def _first_length(self) -> float:
-        """What undoes torch's guess of the first length, min(1, 1 / Σ|slope|), which float32 loses on large grids."""
+        """Return a factor that replaces torch's first length, min(1, 1 / Σ|slope|), lost by float32 on large grids."""
         size = self._slope.abs()
         return FIRST_MOVE / max(float(size.max()), 1e-30) * max(1.0, float(size.sum(dtype=torch.float64)))
 
     def _closure(self) -> float:
+        """Return the energy and set the parameters' gradient, as torch's line search asks."""
         value, _, self._parameters.grad = self._evaluate()
         return value
 
     def shift(self, amount: float) -> None:
         super().shift(amount)
-        self._known = None
+        self._cached = None

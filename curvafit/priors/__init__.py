@@ -1,4 +1,4 @@
-"""The score: what a phase field costs. Needs torch and numpy only."""
+"""Priors: the energy of a phase field, laws and the training loss. The folder needs torch and numpy only."""
 
 if __name__ != "curvafit.priors":
     raise ImportError("import curvafit.priors, not priors: the folder at the project's root is a link into the package")

@@ -119,7 +119,7 @@ class CurvaturePrior(nn.Module):
         self.shape = None if shape is None else Grid(shape, self.spacing).shape  # type: ignore[arg-type]
         self.weight = _weights(weight)
         edge = min(self.spacing)
-        self.coefficients = tuple(_numbers(each, edge, unit, self.epsilon) for each in textures_of(law))
+        self.coefficients = tuple(_numbers(texture, edge, unit, self.epsilon) for texture in textures_of(law))
         for law in self.coefficients:
             check_numbers(law, self.epsilon)
         _warn_of_interpolation(self.spacing, self.epsilon)
@@ -261,7 +261,7 @@ class CurvaturePrior(nn.Module):
             self._warn("range", f"expected probabilities, got {low:g} to {high:g}: is sigmoid or softmax missing?")
 
     def _warn(self, subject: str, message: str) -> None:
-        """Warn once of each subject."""
+        """Warn once about each subject."""
         if not torch.compiler.is_compiling() and subject not in self._warned:
             self._warned.add(subject)
             warnings.warn(message, stacklevel=3)
@@ -307,7 +307,7 @@ def _each(values: tuple, classes: int, name: str) -> tuple:
 
 
 def _warn_of_interpolation(spacing: tuple[float, float, float], epsilon: float) -> None:
-    """Warn of the axes that are interpolated."""
+    """Warn about the axes that are interpolated."""
     times = upsampling(spacing, epsilon)
     if max(times) > 1:
         axes = ", ".join(f"{axis} {n}-fold" for axis, n in zip("zyx", times, strict=True) if n > 1)

@@ -1,4 +1,4 @@
-"""The energy and the flow's step, fused; chosen by device and falling back on plain torch, never by the caller."""
+"""The fused energy and blur, which the device chooses, not the caller; plain torch where there is no kernel."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from curvafit.priors.grid import Grid
 
 
 def fused(device: torch.device | str) -> bool:
-    """Whether there is a fused kernel for float32 fields on this device."""
+    """Return whether there is a fused kernel for float32 fields on a device."""
     kind = torch.device(device).type
     if kind == "cuda":
         from curvafit.priors.kernels import cuda
@@ -27,7 +27,7 @@ def fused(device: torch.device | str) -> bool:
 def on_processor(
     coefficients: Coefficients, grid: Grid, epsilon: float | Tensor, orientation: Tensor | None
 ) -> tuple[list[float | np.ndarray], float | np.ndarray, np.ndarray | None]:
-    """A cost as `cpu` takes it: numbers, or arrays `(Z, Y, X)` where they vary."""
+    """Return a cost as `cpu` takes it: numbers, or arrays `(Z, Y, X)` where they vary in space."""
 
     def number(value: float | Tensor) -> float | np.ndarray:
         if not isinstance(value, Tensor) or value.dim() == 0:
@@ -39,7 +39,7 @@ def on_processor(
 
 
 def stacked(coefficients: Coefficients, grid: Grid) -> Tensor:
-    """The coefficients as `cuda` takes them: `(6,)`, or `(6, Z, Y, X)` where any of them varies; float64."""
+    """Return coefficients as `cuda` takes them, in float64: `(6,)`, or `(6, Z, Y, X)` where any varies in space."""
     a = coefficients.tensor()
     return a if a.dim() == 1 else a.reshape(6, *(1,) * (4 - a.dim()), *a.shape[1:]).expand(6, *grid.shape)
 
@@ -52,7 +52,7 @@ def energy_gradient(
     orientation: Tensor | None = None,
     mask: Tensor | None = None,
 ) -> tuple[float, Tensor]:
-    """`energy` of a field `(Z, Y, X)` and its gradient with respect to every voxel, on the field's device, in its type.
+    """Return `energy` of a field `(Z, Y, X)` and its gradient with respect to every voxel, in the field's type.
 
     Raises
     ------
@@ -82,7 +82,7 @@ def plain_energy_gradient(
     orientation: Tensor | None = None,
     mask: Tensor | None = None,
 ) -> tuple[float, Tensor]:
-    """The same by autograd: the definition."""
+    """Return the energy and its gradient by autograd, the definition."""
     free = u.detach().requires_grad_()
     with torch.enable_grad():
         value = energy(free, coefficients, grid, epsilon, orientation, mask)
@@ -91,12 +91,12 @@ def plain_energy_gradient(
 
 
 def gaussian_blur(u: Tensor, grid: Grid, width: float) -> Tensor:
-    """`stencils.gaussian_blur` of a field `(Z, Y, X)` that needs no gradient.
+    """Return `stencils.gaussian_blur` of a field `(Z, Y, X)` that needs no gradient.
 
     Raises
     ------
     ValueError
-        If the field's shape is not the grid's, or as `stencils.check_blur`.
+        If the field's shape is not the grid's, or as `stencils.check_blur` does.
     """
     stencils.check_blur(grid, width)
     if u.dtype == torch.float32 and u.dim() == 3 and u.device.type == "cpu" and importlib.util.find_spec("numba"):

@@ -28,7 +28,7 @@ _LINE = 16
 
 
 def energy_gradient(u: np.ndarray, a, grid: Grid, epsilon, orientation=None, mask=None) -> tuple[float, np.ndarray]:
-    """F_ε(u) and its gradient with respect to every voxel (the voxel's volume included).
+    """Return F_ε(u) and its gradient with respect to every voxel, in which the voxel's volume is a factor.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ def energy_gradient(u: np.ndarray, a, grid: Grid, epsilon, orientation=None, mas
     orientation
         Q of a further term ε ∫ ∇uᵀQ∇u, symmetric, axes z, y, x, or None.
     mask
-        What the energy's density is multiplied by, `(Z, Y, X)`, or None.
+        Weights of the energy's density, `(Z, Y, X)`, or None.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def energy_gradient(u: np.ndarray, a, grid: Grid, epsilon, orientation=None, mas
 
 
 def gaussian_blur(u: np.ndarray, grid: Grid, width: float) -> np.ndarray:
-    """k ∗ u in float32, as `stencils.gaussian_blur`.
+    """Return k ∗ u in float32, as `stencils.gaussian_blur` does.
 
     Raises
     ------
@@ -77,13 +77,13 @@ class FusedFlow:
     start
         A at the first step, `(3, Z, Y, X)`, components z, y, x; None for zeros, to be filled in place through `vector`.
     base
-        k ∗ base: the mass m₀, or a field `(Z, Y, X)` that has been blurred already.
+        k ∗ base: the mass m₀, or a blurred field `(Z, Y, X)`.
     a, grid, epsilon, orientation
         The cost, as `energy_gradient` takes it.
     width
         The blur's standard deviation in spacing's unit.
     frozen
-        Voxels `(Z, Y, X)` whose A is held, or None.
+        Voxels `(Z, Y, X)` whose A is constant, or None.
     betas, adam_eps
         Adam's decay rates and the number added to its root (`torch.optim.Adam`'s betas and eps).
     """
@@ -117,7 +117,7 @@ class FusedFlow:
 
     @property
     def field(self) -> np.ndarray:
-        """The phase field last computed, `(Z, Y, X)`: a view that the next step overwrites."""
+        """The last phase field, `(Z, Y, X)`: a view that the next step overwrites."""
         return _inner(self._field, self.grid)
 
     @property
@@ -127,13 +127,13 @@ class FusedFlow:
         return self._vector[SLACK:-SLACK].reshape(3, *self.grid.shape)
 
     def state(self) -> dict[str, Any]:
-        """Copies of all that determines the steps to come: A, Adam's moments, the mass, and the steps taken."""
+        """Copy the state that determines all later steps: A, Adam's moments, the mass, and the number of steps."""
         moments = {"vector": self._vector, "first": self._first, "second": self._second}
         arrays = {name: values[SLACK:-SLACK].reshape(3, *self.grid.shape).copy() for name, values in moments.items()}
         return {**arrays, "mass": self._mass, "taken": self.taken}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from such a state, of a flow with the same parameters."""
+        """Continue from a state of a flow with the same parameters."""
         for name, values in (("vector", self._vector), ("first", self._first), ("second", self._second)):
             values[SLACK:-SLACK] = np.asarray(state[name], np.float32).ravel()
         self._mass, self.taken, self._ahead = state["mass"], state["taken"], False
@@ -143,7 +143,7 @@ class FusedFlow:
         self._mass += amount
 
     def evaluate(self) -> float:
-        """Compute u and the gradient of F_ε with respect to it; returns F_ε."""
+        """Compute u and the gradient of F_ε with respect to u; return F_ε."""
         if not self._ahead:
             self.blur_divergence()
         self._ahead = False
@@ -151,29 +151,31 @@ class FusedFlow:
         return self.energy_gradient()
 
     def update(self, rate: float) -> tuple[float, float]:
-        """One Adam step of length `rate` along the gradient just evaluated; returns max and mean of |∂F_ε/∂A|."""
+        """Make an Adam step of length `rate` along the last gradient; return maximum and mean of |∂F_ε/∂A|."""
         self.blur_gradient_along_z()
         return self.blur_adam(rate)
 
     def blur_divergence(self) -> None:
-        """Before the first step: div A, blurred along y and x."""
+        """Compute div A blurred along y and x, before the first step."""
         self._adam_step(False, np.zeros(6, np.float32))
 
     def blur_along_z(self) -> None:
-        """First part of a step: the blur along z, and the base added."""
+        """Blur along z and add the base, the first part of a step."""
         self._blur.along_z(self._gradient, self._field, self._mass, self._base)
 
     def energy_gradient(self) -> float:
-        """Second part: F_ε and its gradient with respect to u."""
+        """Compute F_ε and its gradient with respect to u, the second part of a step."""
         return self._density(self._field, self._gradient)
 
     def blur_gradient_along_z(self) -> None:
-        """Third part: the gradient's blur along z."""
+        """Blur the gradient along z, the third part of a step."""
         self._blur.along_z(self._gradient, self._between, 0.0, _NO_FIELD)
 
     def blur_adam(self, rate: float) -> tuple[float, float]:
-        """Last part: the gradient's blur along y and x, -∇ of it, Adam; and where the gradient was, the next step's div
-        A, blurred along y and x."""
+        """Blur the gradient along y and x, apply -∇ and Adam, the last part of a step.
+
+        The next step's div A, blurred along y and x, takes the gradient's place.
+        """
         self.taken, self._ahead = self.taken + 1, True
         β1, β2 = self._betas
         length, spread = rate / (1 - β1**self.taken), 1 / math.sqrt(1 - β2**self.taken)

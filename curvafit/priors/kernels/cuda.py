@@ -51,8 +51,11 @@ _PLANES = 32
 
 
 class Tuning(NamedTuple):
-    """Work of one program: outputs of a thread along the blurred axis, and in `gather` and `blur_z_adam`; planes of
-    `density`, and cells of a thread in the blurs (None: by size); threads."""
+    """Sizes of one program.
+
+    `rows` and `last_rows` are a thread's outputs along the blurred axis, and in `gather` and `blur_z_adam`; `planes`
+    are those of `density`, `width` is the cells of a thread in the blurs (None: by size), `lanes` the threads.
+    """
 
     rows: int = 8
     last_rows: int = 4
@@ -70,8 +73,8 @@ class Statistics(NamedTuple):
 
 
 class State(NamedTuple):
-    """What a run can go on from: A, Adam's moments (each `(B, 3, Z, Y, X)`), what has been added to u by `shift`,
-    `(B,)` in float64, and the number of steps made."""
+    """The state from which a run can go on: A and Adam's moments, each `(B, 3, Z, Y, X)`, the sums of the shifts of u,
+    `(B,)` in float64, and the number of steps."""
 
     vector: Tensor
     first: Tensor
@@ -81,7 +84,7 @@ class State(NamedTuple):
 
 
 class Launch(NamedTuple):
-    """A kernel's name in `passes`, how many programs (shapes last), its arguments, constants, and threads."""
+    """A kernel's name in `passes`, the number of programs (shapes last), the arguments, constants and threads."""
 
     kernel: str
     programs: tuple[int, int]
@@ -97,7 +100,7 @@ class Launch(NamedTuple):
 
 
 def available(device: torch.device | str) -> bool:
-    """Whether kernels can be built for and run on this device."""
+    """Return whether kernels can be built for a device and run there."""
     if torch.device(device).type != "cuda" or importlib.util.find_spec("triton") is None:
         return False
     return torch.cuda.is_available() and torch.cuda.get_device_capability(device) >= (8, 0)
@@ -113,7 +116,7 @@ def energy_gradient(
     *,
     tuning: Tuning | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """F_ε of fields and its gradient with respect to every voxel (the voxel's volume included).
+    """Return F_ε of fields and its gradient with respect to every voxel, in which the voxel's volume is a factor.
 
     Parameters
     ----------
@@ -122,7 +125,7 @@ def energy_gradient(
     a, epsilon, orientation
         As for `CudaFlow`.
     mask
-        What the energy's density is multiplied by, `(Z, Y, X)` or `(B, Z, Y, X)`, or None.
+        Weights of the energy's density, `(Z, Y, X)` or `(B, Z, Y, X)`, or None.
 
     Returns
     -------
@@ -155,14 +158,14 @@ class CudaFlow:
     start
         A at the first step, `(3, Z, Y, X)` or `(B, 3, Z, Y, X)`, components z, y, x.
     base
-        k ∗ base: the mass m₀, one or `(B,)`; or a field that has been blurred already, `(Z, Y, X)` or `(B, Z, Y, X)`.
+        k ∗ base: the mass m₀, a number or `(B,)`; or a blurred field, `(Z, Y, X)` or `(B, Z, Y, X)`.
     a
-        The six numbers (a20, a11, a02, a10, a01, a00), `(6,)` or `(B, 6)`; or such for every voxel,
+        The six numbers (a20, a11, a02, a10, a01, a00), `(6,)` or `(B, 6)`; or six numbers for every voxel,
         `(6, Z, Y, X)` or `(B, 6, Z, Y, X)`.
     grid, epsilon, width
         The sampling (either boundary); ε, a number or a field; the blur's standard deviation in spacing's unit.
     frozen
-        Voxels `(Z, Y, X)` whose A is held in all shapes, or None.
+        Voxels `(Z, Y, X)` whose A is constant in all shapes, or None.
     orientation
         Q of a further term ε ∇uᵀQ∇u, `(3, 3)`, symmetric, axes z, y, x; or None.
     betas, adam_eps
@@ -171,7 +174,7 @@ class CudaFlow:
     Raises
     ------
     ValueError
-        If a shape does not fit, or the blur or the grid is wider than the kernels go (then plain torch must do).
+        If a shape does not fit, or the blur or the grid is too wide for the kernels (plain torch has no such limit).
     """
 
     def __init__(
@@ -220,16 +223,16 @@ class CudaFlow:
 
     @property
     def field(self) -> Tensor:
-        """The u last computed, `(B, Z, Y, X)` on the device: later steps overwrite it."""
+        """The last u, `(B, Z, Y, X)` on the device, which later steps overwrite."""
         return self._field
 
     @property
     def vector(self) -> Tensor:
-        """A, `(B, 3, Z, Y, X)` on the device: later steps overwrite it."""
+        """A, `(B, 3, Z, Y, X)` on the device, which later steps overwrite."""
         return self._vector
 
     def run(self, rates: Sequence[float], observe: bool = False) -> None:
-        """Make steps of these lengths; with `observe`, the last one leaves its field's statistics (before it moves)."""
+        """Make steps of lengths `rates`; with `observe`, the last one leaves statistics from before its move."""
         rates = [float(rate) for rate in rates]
         for begin in range(0, len(rates), _TABLE):
             part = rates[begin : begin + _TABLE]
@@ -243,22 +246,22 @@ class CudaFlow:
             self.taken += len(part)
 
     def observe(self) -> Statistics:
-        """Compute u and what belongs to it, and stay."""
+        """Compute u and its statistics, and leave A as it is."""
         self._replay(1, False, True)
         return self.statistics()
 
     def statistics(self) -> Statistics:
-        """Of the field last observed."""
+        """Return statistics of the field that was observed last."""
         mean = self._sums.double().sum(-1) / max(1, self._free)
         return Statistics(self._density.energy(), self._highest.double().amax(-1), mean)
 
     def state(self) -> State:
-        """A copy of all that later steps depend on."""
+        """Copy the state on which later steps depend."""
         vector, first, second, shifts = (mine.clone() for mine in self._state())
         return State(vector, first, second, shifts, self.taken)
 
     def restore(self, state: State) -> None:
-        """Go on from a state; the field is the former one until the next step."""
+        """Continue from a state; `field` stays as it was until the next step."""
         for mine, saved in zip(self._state(), state[:-1], strict=True):
             mine.copy_(saved)
         self.taken = int(state.taken)
@@ -270,7 +273,7 @@ class CudaFlow:
         self._set_numbers()
 
     def launches(self, move: bool = True, observe: bool = False) -> tuple[Launch, ...]:
-        """One step, in order."""
+        """Return the launches of one step, in order."""
         layout, taps, scratch = self._layout, self._taps, self._scratch
         return (
             self._divergence(),

@@ -20,25 +20,25 @@ def energies(
     epsilon: float,
     mask: Float[Tensor, "#batch z y x"],
 ) -> Float[Tensor, " batch"]:
-    """`energy` of every field, its density multiplied by a mask.
+    """Return `energy` of every field, with its density multiplied by a mask.
 
-    Float32 takes the fused kernel where there is one: its gradient comes with its value, so that a derivative, in
-    reverse or forward mode, is a multiplication, once; a second derivative raises a RuntimeError. Other fields take the
-    definition.
+    Float32 takes the fused kernel where there is one. The kernel returns the gradient with the value, so that a first
+    derivative, in reverse or forward mode, is a multiplication; a second derivative raises a RuntimeError. Other fields
+    take the definition.
 
     Parameters
     ----------
     coefficients
         Numbers.
     grid, epsilon
-        A grid with mirrors; ε in its spacing's unit.
+        A grid with the boundary `"replicate"`; ε in spacing's unit.
     mask
-        Gets no gradient.
+        Weights, which receive no gradient.
 
     Raises
     ------
     ValueError
-        If the mask asks for a gradient.
+        If the mask requires a gradient.
     """
     _check_mask(mask)
     if u.dtype != torch.float32 or not kernels.fused(u.device):
@@ -49,7 +49,7 @@ def energies(
 def areas(
     u: Float[Tensor, "batch z y x"], grid: Grid, epsilon: float, mask: Float[Tensor, "#batch z y x"]
 ) -> Float[Tensor, " batch"]:
-    """∫ ε|∇u|², about σ × area, of every field, likewise: the term of F_ε that a00 multiplies."""
+    """Return ∫ ε|∇u|² of every field, the term of F_ε that a00 multiplies, about σ × area, as `energies` does."""
     _check_mask(mask)
     if u.dtype != torch.float32 or not kernels.fused(u.device):
         slope2 = gradient(u, grid).square().sum(-4)

@@ -555,7 +555,7 @@ def _energy_gradient_chunk(
 def energy_gradient(
     u, out, energies, rings, sums, inside, k, ratios, orient, local, places, index, block, tile, Z, Y, X
 ):
-    """Energies of the planes, tile of rows by tile, and the gradient."""
+    """Compute the energies of tiles of rows in planes, and the gradient."""
     chunks = rings.shape[0]
     for chunk in prange(chunks):
         first, last = chunk * Z // chunks, (chunk + 1) * Z // chunks

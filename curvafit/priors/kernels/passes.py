@@ -35,7 +35,7 @@ def divergence_blur_z(
     TAPS: tl.constexpr, SLOPES: tl.constexpr, RADIUS: tl.constexpr, PERIODIC: tl.constexpr,
     ROWS: tl.constexpr, LANES: tl.constexpr, WIDTH: tl.constexpr,
 ):  # fmt: skip
-    """div A blurred along z. SLOPES are the taps after a central difference, one longer at either end than TAPS, which
+    """Blur div A along z. SLOPES are the taps after a central difference, one longer at either end than TAPS, which
     has a zero there; both have 2 RADIUS + 1 entries."""
     X = G * WIDTH
     plane = Y * X
@@ -152,7 +152,7 @@ def density(
     PERIODIC: tl.constexpr, ENERGY: tl.constexpr, ORIENTED: tl.constexpr, VARIES: tl.constexpr, MASKED: tl.constexpr,
     LANES: tl.constexpr,
 ):  # fmt: skip
-    """Partial derivatives of F_ε's density, summed along z as far as the transposed stencils allow: `VOLUMES` of them.
+    """Compute the `VOLUMES` partial derivatives of F_ε's density, with the sums of transposed stencils along z.
 
     A program takes `planes` planes of a column of cells, and those on either side once more. `weights` are the
     density's six, a shape or (VARIES) a voxel, the latter with ε; Q is the orientation, times the voxel's volume. What
@@ -287,7 +287,7 @@ def gather(
     parts, out, taken, Z, Y, X, apart,
     PERIODIC: tl.constexpr, ROWS: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
-    """F_ε's gradient from what `density` left: the transposed stencils within planes. Counts the step in `taken`."""
+    """Apply the transposed stencils within planes to `density`'s sums for F_ε's gradient; count the step in `taken`."""
     if (tl.program_id(0) == 0) & (tl.program_id(1) == 0):
         tl.store(taken, tl.load(taken) + 1)
     plane = Y * X
@@ -332,7 +332,7 @@ def blur_z_adam(
     HELD: tl.constexpr, MOVE: tl.constexpr, OBSERVE: tl.constexpr,
     ROWS: tl.constexpr, LANES: tl.constexpr, WIDTH: tl.constexpr,
 ):  # fmt: skip
-    """The blur along z of a gradient already blurred in planes, -∇ of that (the transpose of `divergence_blur_z`), and
+    """Blur a gradient along z that is blurred in planes, apply -∇ (the transpose of `divergence_blur_z`), and step by
     Adam with the row of `table` that `taken` names: step length and factor of the root, bias corrections included.
 
     MOVE: take the step. OBSERVE: leave maximum and sum of the slopes' moduli. The shapes of g stand `apart` groups

@@ -1,4 +1,4 @@
-"""numba's threads: started without a trace, and how many of them a loop gets."""
+"""numba's threads: their start, which leaves the process's settings unchanged, and their number."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from numba import get_num_threads, set_num_threads
 def start() -> None:
     """Start numba's threads, which its first parallel loop would do too, once in a process.
 
-    With OpenMP that sets the number of threads of the thread that starts them to the number of cores, and lets parallel
-    loops nest; torch's loops go by the same settings. So a thread does it that ends with it. It also settles how
-    `multiprocessing` starts processes, which a program may choose once, and later than here: that is left open again.
+    With OpenMP the start sets the starting thread's number of threads to the number of cores and lets parallel loops
+    nest, and torch's loops follow these settings. A thread that ends at once therefore makes the start. The start also
+    fixes the start method of `multiprocessing`, which a program may choose once and later; it is reset here.
     """
     chosen = multiprocessing.get_start_method(allow_none=True)
     with ThreadPoolExecutor(1, "curvafit-start") as elsewhere:
@@ -26,14 +26,14 @@ def start() -> None:
 
 
 def allowed() -> int:
-    """How many threads numba's loops may take."""
+    """Return how many threads numba's loops may take."""
     start()
     return get_num_threads()
 
 
 @contextmanager
 def limited(threads: int) -> Iterator[None]:
-    """Run numba's loops on so many threads at most."""
+    """Run numba's loops on at most `threads` threads."""
     before = allowed()
     set_num_threads(min(threads, before))
     try:
