@@ -1,4 +1,4 @@
-"""Which chunks of a Zarr array are stored: Zarr gives those that are not its fill value, and says nothing."""
+"""Chunks of a Zarr array that are not stored: Zarr fills them with the fill value without a word."""
 
 from __future__ import annotations
 
@@ -15,18 +15,12 @@ from curvafit.volumes.formats.base import Damaged, ScanError
 
 #: Chunks of an array at most; more would take hours to look for.
 _MOST = 10_000_000
-#: What a shard's index says of a chunk that is not in it.
+#: Entry of a shard's index for a chunk that is not in the shard.
 _ABSENT = np.uint64(2**64 - 1)
 
 
 def check_store(folder: Path) -> None:
-    """Refuse a store in which something is neither file nor folder, or a link leads back to a folder above itself.
-
-    Raises
-    ------
-    ScanError
-        If there is such a thing.
-    """
+    """Raise ScanError where something in a store is neither file nor folder, or a link leads to a folder above it."""
     for place, folders, files in os.walk(folder):
         for name in folders:
             path = Path(place, name)
@@ -39,7 +33,7 @@ def check_store(folder: Path) -> None:
 
 
 def missing_chunks(array: Any, folder: Path) -> tuple[str, ...]:
-    """A sentence on the chunks of an array in a folder that are not stored, those within shards among them.
+    """Return a sentence on the chunks of an array that are not stored, within shards too, or none.
 
     Raises
     ------
@@ -66,21 +60,23 @@ def missing_chunks(array: Any, folder: Path) -> tuple[str, ...]:
 
 
 def _check_blosc(chunk: Path) -> None:
-    """Compare a chunk's size with the one in its header, which Blosc itself does not."""
+    """Raise Damaged where a chunk's size is not the one in its header; Blosc does not compare them."""
     with chunk.open("rb") as stream:
-        told = int.from_bytes(stream.read(16)[12:], "little")
-    if told != (held := chunk.stat().st_size):
-        raise Damaged(f"{told} bytes by the header of chunk {chunk.name}, {held} in the file")
+        stated = int.from_bytes(stream.read(16)[12:], "little")
+    if stated != (size := chunk.stat().st_size):
+        raise Damaged(f"{stated} bytes by the header of chunk {chunk.name}, {size} in the file")
 
 
 def _counts(shape: Sequence[int], edges: Sequence[int]) -> list[int]:
-    """How many pieces of these edges cover each axis."""
+    """Return how many pieces of these edges cover each axis."""
     return [-(-n // edge) if edge else 0 for n, edge in zip(shape, edges, strict=True)]
 
 
 def _missing_within(array: Any, shard: Path, inside: Sequence[int]) -> int:
-    """Chunks that a shard's index lacks among those `inside` the array; 0 where it is no index of the usual kind
-    (little-endian, then a CRC32C)."""
+    """Count the chunks `inside` the array that a shard's index lacks.
+
+    An index of another kind than the usual one (little-endian, then a CRC32C) counts 0.
+    """
     codec: Any = next((each for each in array.metadata.codecs if hasattr(each, "index_codecs")), None)
     if [type(each).__name__ for each in getattr(codec, "index_codecs", ())] != ["BytesCodec", "Crc32cCodec"]:
         return 0

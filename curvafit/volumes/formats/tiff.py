@@ -1,4 +1,4 @@
-"""TIFF: a file or a folder of slices; spacing from ImageJ's, OME's or tifffile's description, or from the tags."""
+"""TIFF, as a file or a folder of slices; the spacing is in ImageJ's, OME's or tifffile's description, or in tags."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from curvafit.volumes.formats.streams import check_array, check_regular
 SLICES = (".tif", ".tiff")
 #: Bytes beyond which ImageJ's TIFF cannot point.
 _IMAGEJ_LIMIT = 2**32 - 2**25
-#: Voxels a unit that TIFF's resolution can state.
+#: Most voxels per unit that TIFF's resolution can state.
 _RESOLUTION_LIMIT = 2**31
-#: What tifffile says where it goes on without a part of a file.
+#: Words of tifffile's messages where it skips a part of a file.
 _LOST = (
     "invalid page offset",
     "invalid offset",
@@ -33,13 +33,13 @@ _LOST = (
     "raised",
 )
 _TAG_UNITS = {2: "inch", 3: "cm"}
-#: Resolutions that programs write when they know none (dots an inch; 25.4 is a dot a millimetre).
+#: Resolutions that programs write when they know none (dots per inch; 25.4 is one dot per millimetre).
 _SCREEN = (1, 25.4, 72, 96, 100, 150, 200, 300, 600)
 
 
 def read_tiff(path: Path, **_: object) -> Raw:
-    """The first series of a file, if every strip and page that it speaks of is there."""
-    with complaints("tifffile") as said, tifffile.TiffFile(path) as file:
+    """Read the first series of a file, or raise Damaged where one of its strips or pages is missing."""
+    with complaints("tifffile") as messages, tifffile.TiffFile(path) as file:
         series = file.series[0]
         check_array(series.shape, series.dtype or np.dtype("V1"), path)
         _check_pages(file, series)
@@ -47,8 +47,8 @@ def read_tiff(path: Path, **_: object) -> Raw:
         spacing, unit, guesses = _spacing(file)
         channels, guess = _channel_axis(series)
         count = len(file.series)
-    tags = [text for text in said if text.startswith("<TiffTag")]
-    if lost := [text for text in said if text not in tags and any(mark in text.lower() for mark in _LOST)]:
+    tags = [text for text in messages if text.startswith("<TiffTag")]
+    if lost := [text for text in messages if text not in tags and any(mark in text.lower() for mark in _LOST)]:
         raise Damaged(lost[0])
     notes = (f"The file holds {count} images: the first is used.",) if count > 1 else ()
     notes += (f"{len(tags)} of the file's tags cannot be read: what they state is not known.",) if tags else ()
@@ -56,7 +56,7 @@ def read_tiff(path: Path, **_: object) -> Raw:
 
 
 def _channel_axis(series: tifffile.TiffPageSeries) -> tuple[int | None, tuple[str, ...]]:
-    """The axis of colours or channels; where only two others are left, channels that are no colours are taken for z."""
+    """Return the axis of colours or channels; channels that leave only two other axes, and are not colours, are z."""
     named = [axis for axis, name in enumerate(series.axes) if name in "SC" and series.shape[axis] != 1]
     axis = named[-1] if named else None
     if axis is None or series.axes[axis] == "S" or sum(n != 1 for n in series.shape) != 3:
@@ -65,7 +65,7 @@ def _channel_axis(series: tifffile.TiffPageSeries) -> tuple[int | None, tuple[st
 
 
 def read_slices(path: Path, **_: object) -> Raw:
-    """A folder of 2D slices in the natural order of their names; in-plane size from the first slice's tags."""
+    """Read a folder of 2D slices in the natural order of their names, with the pixel size of the first slice."""
     names = sorted((p for p in path.iterdir() if p.suffix.lower() in SLICES), key=lambda p: natural_key(p.name))
     first, slices = None, []
     for name in names:
@@ -82,7 +82,7 @@ def read_slices(path: Path, **_: object) -> Raw:
 
 
 def _plane(raw: Raw) -> np.ndarray:
-    """A slice (Y, X), or (Y, X, channels)."""
+    """Return a slice (Y, X), or (Y, X, channels)."""
     if raw.channels is None:
         return np.squeeze(raw.values)
     values = np.moveaxis(raw.values, raw.channels, -1)
@@ -90,7 +90,7 @@ def _plane(raw: Raw) -> np.ndarray:
 
 
 def _skipped(names: Sequence[str]) -> tuple[str, ...]:
-    """A sentence on the numbers that a folder's names skip, where all but their last number is alike."""
+    """Return a sentence on the numbers that the names of slices skip, if they differ only in their last number."""
     parts = [re.fullmatch(r"(.*?)(\d{1,15})(\D*)", name) for name in names]
     if len(names) < 3 or None in parts or len({(part[1], part[3]) for part in parts if part}) > 1:
         return ()
@@ -103,7 +103,7 @@ def _skipped(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def _check_pages(file: tifffile.TiffFile, series: tifffile.TiffPageSeries) -> None:
-    """Refuse what tifffile would fill with zeros: pages, strips and tiles that are not there, or beyond the end."""
+    """Raise Damaged where pages, strips or tiles are missing or beyond the end: tifffile fills them with zeros."""
     metadata = file.imagej_metadata or {}
     if file.is_imagej and int(metadata.get("images", 1)) > math.prod(series.shape[:-2]):
         raise Damaged(f"{metadata['images']} images by its description, {math.prod(series.shape[:-2])} in the file")
@@ -123,7 +123,7 @@ def _check_pages(file: tifffile.TiffFile, series: tifffile.TiffPageSeries) -> No
 
 
 def write_tiff(field: Any, path: Path) -> None:
-    """ImageJ's metadata where it knows the type of the values and can hold as many, else OME's."""
+    """Write a TIFF with ImageJ's metadata, or with OME's where ImageJ lacks the type or cannot hold the size."""
     values, (z, y, x) = _stored(field), field.spacing
     fits = values.nbytes < _IMAGEJ_LIMIT and max(1 / x, 1 / y) < _RESOLUTION_LIMIT
     if values.dtype in (np.uint8, np.uint16, np.float32) and fits:
@@ -138,7 +138,7 @@ def write_tiff(field: Any, path: Path) -> None:
 
 
 def write_ome_tiff(field: Any, path: Path) -> None:
-    """OME's metadata."""
+    """Write a TIFF with OME's metadata."""
     sizes = {f"PhysicalSize{axis}": h for axis, h in zip("ZYX", field.spacing, strict=True)}
     units = {f"PhysicalSize{axis}Unit": {"um": "µm", "voxel": "pixel"}.get(field.unit, field.unit) for axis in "ZYX"}
     metadata = {"axes": "ZYX", **sizes, **units}
@@ -146,12 +146,12 @@ def write_ome_tiff(field: Any, path: Path) -> None:
 
 
 def _stored(field: Any) -> np.ndarray:
-    """The values as a TIFF holds them: bytes for a mask."""
+    """Return the values as a TIFF holds them: bytes for a mask."""
     return field.values.view(np.uint8) if field.values.dtype == bool else field.values
 
 
 def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
-    """Sorts slice2 before slice10."""
+    """Return a key that sorts slice2 before slice10."""
     return tuple((0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", name.casefold()))
 
 
@@ -170,7 +170,7 @@ def _spacing(file: tifffile.TiffFile) -> tuple[tuple[float, ...] | None, str | N
 
 
 def _from_description(described: dict[str, Any]) -> tuple[tuple[float, ...] | None, str | None, tuple[str, ...]]:
-    """tifffile's own JSON, which has no rule for `spacing`: three numbers, or one that counts for all axes."""
+    """Return spacing, unit and a note of tifffile's JSON, where `spacing` is three numbers, or one for all axes."""
     sizes = tuple(float(h) for h in np.atleast_1d(described["spacing"]))
     unit = described.get("unit")
     if len(sizes) == 3:
@@ -195,9 +195,10 @@ def _from_ome(text: str) -> tuple[tuple[float, ...] | None, str | None]:
 def _from_imagej(
     file: tifffile.TiffFile, described: dict[str, Any]
 ) -> tuple[tuple[float, ...] | None, str | None, tuple[str, ...]]:
-    """ImageJ: `spacing` is the distance of slices, the resolution tags count pixels per `unit`.
+    """Return spacing, unit and a note of ImageJ's description.
 
-    Without a unit only the proportions mean anything: lengths are then in pixels along x.
+    `spacing` is the distance of slices, and the resolution tags count pixels per `unit`. Without a unit only the
+    proportions have a meaning: lengths are then in pixels along x.
     """
     y, x = _pixels_per_unit(file)
     unit = described.get("unit")
@@ -210,7 +211,7 @@ def _from_imagej(
 
 
 def _from_tags(file: tifffile.TiffFile) -> tuple[tuple[float, ...] | None, str | None, tuple[str, ...]]:
-    """Resolution tags alone: used where they are no printer's default; the distance of slices is then a guess."""
+    """Return spacing and unit of the resolution tags, unless they are a default; the distance of slices is a guess."""
     y, x = _pixels_per_unit(file)
     tag = file.pages[0].tags.get("ResolutionUnit")  # type: ignore[union-attr]
     unit = _TAG_UNITS.get(int(tag.value)) if tag is not None else None
