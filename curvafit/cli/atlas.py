@@ -95,10 +95,10 @@ def extend_atlas(
         check_count(count, 0)
         crew = Crew(workers, scheduler, dashboard)
         crew.check()
-        wanted = open_store(store).wanted + count
+        target = open_store(store).wanted + count
 
         def again() -> str:
-            return "`--count 0`" if open_store(store).wanted == wanted else "the same command"
+            return "`--count 0`" if open_store(store).wanted == target else "the same command"
 
         with crew.at_work(again) as (makers, progress):
             extend(store, count, progress, workers=makers)

@@ -205,10 +205,10 @@ def _run(
         result = compute(volume, progress)
         progress("writing", 1.0)
         content = {"command": command_line(), "prior": prior, **record}
-        placed = ("spacing", "crop", "channel")
-        own = source if all(reading[name] is None for name in placed) else None
+        place = ("spacing", "crop", "channel")
+        like = source if all(reading[name] is None for name in place) else None
         more = {"record": content, "overwrite": overwrite}
-        files = write_mask(result, volume, out, like=own, unit=reading["unit"], **more)
+        files = write_mask(result, volume, out, like=like, unit=reading["unit"], **more)
     for note in result.notes:
         say(note)
     say(f"{result.status[0].upper()}{result.status[1:]}.", style="bold")

@@ -135,8 +135,8 @@ def synth(
         crew.check()
         if unit is not None and spacing is None and voxel is None:
             raise ValueError("expected --unit beside --spacing or --voxel, got neither")
-        stated = [] if laws is None else laws.split(",")
-        source = _source(stated, atlas, volume_fraction)
+        names = [] if laws is None else laws.split(",")
+        source = _source(names, atlas, volume_fraction)
         reading = reading_of(spacing=spacing, unit=unit, crop=crop, channel=channel, label=label, strict=strict)
         kind = _modality(modality, like, like_mask, visible, reading)
         from curvafit.data_synth.sets.case import Recipe
@@ -144,7 +144,7 @@ def synth(
         from curvafit.data_synth.sets.sources import voxel_of
         from curvafit.volumes.formats.base import convert_length
 
-        edge = voxel_of(stated, kind) if voxel is None else convert_length(voxel, unit, kind.base.unit)
+        edge = voxel_of(names, kind) if voxel is None else convert_length(voxel, unit, kind.base.unit)
         low, high = numbers(calibres, "--calibres", 2)
         recipe = Recipe(source, kind, box, edge, seed, (low, high))
         _build(out, Order(recipe, layout, tuple(labels.split(",")) if labels else ()), count, crew)
@@ -202,9 +202,9 @@ def _modality(
     if (name is None) == (like is None):
         raise ValueError(f"expected either --modality or --like, got {'neither' if name is None else 'both'}")
     if like is None:
-        lone = [key for key, value in reading.items() if value is not None and value is not False and key != "unit"]
-        if lone or mask is not None:
-            raise ValueError(f"expected --like beside {f'--{lone[0]}' if lone else '--like-mask'}, got none")
+        extras = [key for key, value in reading.items() if value is not None and value is not False and key != "unit"]
+        if extras or mask is not None:
+            raise ValueError(f"expected --like beside {f'--{extras[0]}' if extras else '--like-mask'}, got none")
         from curvafit.data_synth.imaging.modalities import modality
 
         return _visible(modality(str(name)), visible)

@@ -290,8 +290,8 @@ def _verdict(
     noise = noises["fit"] or noises["match"] or 0.0
     both = f"regenerated, the fit lies {fit:.1f} from the scan, the match {match:.1f}, two seeds {noise:.1f} apart"
     if fit <= match + noise:
-        how = "clearly" if fit < match - noise else "within seed noise"
-        return "fit", f"The refined parameters are supported ({how}): {both}. {refined.status}"
+        margin = "clearly" if fit < match - noise else "within seed noise"
+        return "fit", f"The refined parameters are supported ({margin}): {both}. {refined.status}"
     return "match", f"The nearest match is better supported: {both}. {refined.status}"
 
 

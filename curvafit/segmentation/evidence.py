@@ -139,9 +139,9 @@ def interpolated_distance(
     between slices, a full one plus this gap.
     """
     gap = float(np.diff(places).max()) * spacing[0]
-    known = np.stack([_plane_distance(mask, spacing[1:], gap) for mask in slices])
+    distances = np.stack([_plane_distance(mask, spacing[1:], gap) for mask in slices])
     where = np.arange(length).clip(places[0], places[-1])
-    return CubicSpline(places, known, bc_type="natural")(where).astype(np.float32)
+    return CubicSpline(places, distances, bc_type="natural")(where).astype(np.float32)
 
 
 def _plane_distance(mask: np.ndarray, spacing: Sequence[float], gap: float) -> np.ndarray:

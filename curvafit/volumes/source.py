@@ -204,21 +204,21 @@ def _placed(raw: Raw, source: str, spacing: Sequence[float] | float | None, unit
     """Return the values in native byte order, with the spacing and unit of the caller or, by default, of the file."""
     notes = [*raw.gaps, *raw.notes, *(() if spacing is not None or unit is not None else raw.guesses)]
     file_unit, factor = ("voxel", 1.0) if spacing is not None and unit is not None else normalise_unit(raw.unit)
-    stated = None if raw.spacing is None else _scaled(raw.spacing, factor)
+    native = None if raw.spacing is None else _scaled(raw.spacing, factor)
     affine = None if raw.affine is None else np.diag([factor, factor, factor, 1.0]) @ raw.affine
-    chosen_unit, chosen_factor = (file_unit, 1.0) if unit is None else normalise_unit(unit)
-    chosen = positive_triple(1.0 if stated is None and spacing is None else stated if spacing is None else spacing)
-    if stated is None and spacing is None:
-        counted = "counted in voxels" if chosen_unit == "voxel" else f"those of voxels of 1 {chosen_unit}"
+    target_unit, target_factor = (file_unit, 1.0) if unit is None else normalise_unit(unit)
+    edges = positive_triple(1.0 if native is None and spacing is None else native if spacing is None else spacing)
+    if native is None and spacing is None:
+        counted = "counted in voxels" if target_unit == "voxel" else f"those of voxels of 1 {target_unit}"
         notes.append(f"The file states no spacing: lengths are {counted}.")
-    if affine is not None and stated != chosen:
+    if affine is not None and native != edges:
         lengths = np.linalg.norm(affine[:3, :3], axis=0)
-        affine[:3, :3] *= np.array(chosen)[::-1] / np.where(lengths > 0, lengths, 1)
+        affine[:3, :3] *= np.array(edges)[::-1] / np.where(lengths > 0, lengths, 1)
     if unit is not None:
-        chosen = (chosen[0] * chosen_factor, chosen[1] * chosen_factor, chosen[2] * chosen_factor)
-        affine = None if affine is None else np.diag([chosen_factor] * 3 + [1.0]) @ affine
+        edges = (edges[0] * target_factor, edges[1] * target_factor, edges[2] * target_factor)
+        affine = None if affine is None else np.diag([target_factor] * 3 + [1.0]) @ affine
     values = np.ascontiguousarray(raw.values, dtype=raw.values.dtype.newbyteorder("="))
-    return Field(values, chosen, chosen_unit, affine, source, tuple(notes))
+    return Field(values, edges, target_unit, affine, source, tuple(notes))
 
 
 def _scaled(spacing: tuple[object, ...], factor: float) -> tuple[object, ...]:

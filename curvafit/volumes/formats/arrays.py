@@ -109,19 +109,19 @@ def read_hdf5(path: Path, *, key: str | None = None, part: Part | None = None, *
 
 def _gaps(dataset: Any, path: Path) -> Iterator[str]:
     """Yield sentences on the parts of a dataset that are not in the file, which HDF5 fills in without a word."""
-    filled = f"their voxels have the fill value {dataset.fillvalue}."
+    fill = f"their voxels have the fill value {dataset.fillvalue}."
     if dataset.is_virtual:
-        names = {source.file_name for source in dataset.virtual_sources()} - {"."}
-        lost = sorted(name for name in names if not check_regular(path.parent / name).exists())
-        if lost:
-            yield f"{len(lost)} of its {len(names)} source files are not there, {lost[0][:80]} among them; {filled}"
+        files = {source.file_name for source in dataset.virtual_sources()} - {"."}
+        missing = sorted(name for name in files if not check_regular(path.parent / name).exists())
+        if missing:
+            yield f"{len(missing)} of its {len(files)} source files are not there, {missing[0][:80]} among them; {fill}"
     elif dataset.chunks:
         count = math.prod(-(-n // chunk) for n, chunk in zip(dataset.shape, dataset.chunks, strict=True))
-        lost = count - dataset.id.get_num_chunks()
-        if lost > 0:
-            yield f"{lost} of {count} chunks are not stored: {filled}"
+        missing = count - dataset.id.get_num_chunks()
+        if missing > 0:
+            yield f"{missing} of {count} chunks are not stored: {fill}"
     elif dataset.size and not dataset.id.get_storage_size():
-        yield f"No values are stored: {filled}"
+        yield f"No values are stored: {fill}"
 
 
 def read_raw(
@@ -146,8 +146,8 @@ def read_raw(
     except TypeError:
         raise ScanError(f"expected a dtype such as {_RAW_TYPES}, got {quoted(dtype)}") from None
     if size != math.prod(shape) * kind.itemsize:
-        wanted = math.prod(shape) * kind.itemsize
-        raise ScanError(f"expected {wanted} bytes for shape {shape} of {kind}, got {size} in {path}")
+        nbytes = math.prod(shape) * kind.itemsize
+        raise ScanError(f"expected {nbytes} bytes for shape {shape} of {kind}, got {size} in {path}")
     if part is None:
         return Raw(np.fromfile(path, dtype=kind).reshape(shape))
     return part_of(mapped(path, 0, shape, kind), part, path)

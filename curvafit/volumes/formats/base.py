@@ -124,10 +124,10 @@ def pick_key(keys: list[str], key: str | None, path: object) -> str:
 
 def stated(attributes: Mapping[str, Any], ndim: int) -> tuple[tuple[Any, ...] | None, Any]:
     """Return spacing and unit of an array's attributes, unchecked; one number counts for all axes."""
-    for name, known in (("element_size_um", "um"), ("spacing", None), ("voxel_size", None)):
+    for name, fixed_unit in (("element_size_um", "um"), ("spacing", None), ("voxel_size", None)):
         if name in attributes:
             sizes = _listed(attributes[name])
-            unit = known or (_listed(attributes.get("unit", attributes.get("units"))) or (None,))[0]
+            unit = fixed_unit or (_listed(attributes.get("unit", attributes.get("units"))) or (None,))[0]
             return sizes * ndim if len(sizes) == 1 else sizes, unit
     return None, None
 

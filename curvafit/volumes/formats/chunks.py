@@ -44,27 +44,27 @@ def missing_chunks(array: Any, folder: Path) -> tuple[str, ...]:
     counts, chunks = _counts(array.shape, outer), math.prod(_counts(array.shape, array.chunks))
     if chunks > _MOST:
         raise ScanError(f"expected at most {_MOST:,} chunks in a Zarr array, got {chunks:,} in {folder}")
-    lost, blosc = 0, "blosc" in type(array.compressors[-1] if array.compressors else None).__name__.lower()
+    missing, blosc = 0, "blosc" in type(array.compressors[-1] if array.compressors else None).__name__.lower()
     for place in itertools.product(*map(range, counts)):
         path = folder / array.metadata.encode_chunk_key(place)
         rest = [min(edge, n - k * edge) for n, edge, k in zip(array.shape, outer, place, strict=True)]
         inside = _counts(rest, array.chunks)
         if not path.is_file():
-            lost += math.prod(inside)
+            missing += math.prod(inside)
         elif array.shards:
-            lost += _missing_within(array, path, inside)
+            missing += _missing_within(array, path, inside)
         elif blosc:
             _check_blosc(path)
     fill = f"their voxels have the fill value {array.fill_value}."
-    return (f"{lost} of {chunks} chunks are not stored: {fill}",) if lost else ()
+    return (f"{missing} of {chunks} chunks are not stored: {fill}",) if missing else ()
 
 
 def _check_blosc(chunk: Path) -> None:
     """Raise Damaged where a chunk's size is not the one in its header; Blosc does not compare them."""
     with chunk.open("rb") as stream:
-        stated = int.from_bytes(stream.read(16)[12:], "little")
-    if stated != (size := chunk.stat().st_size):
-        raise Damaged(f"{stated} bytes by the header of chunk {chunk.name}, {size} in the file")
+        nbytes = int.from_bytes(stream.read(16)[12:], "little")
+    if nbytes != (size := chunk.stat().st_size):
+        raise Damaged(f"{nbytes} bytes by the header of chunk {chunk.name}, {size} in the file")
 
 
 def _counts(shape: Sequence[int], edges: Sequence[int]) -> list[int]:

@@ -60,11 +60,11 @@ def nrrd_values(nrrd: Any, header: dict[str, Any], file: IO[bytes], path: Path) 
         raise Damaged(f"{len(header['sizes'])} sizes for {header['dimension']} axes")
     shape, dtype = [int(n) for n in header["sizes"]][::-1], _nrrd_type(header)
     check_array(shape, dtype, path)
-    named = header.get("data file", header.get("datafile"))
-    if named is None:
+    name = header.get("data file", header.get("datafile"))
+    if name is None:
         return _nrrd_body(nrrd, header, file, path, (shape, dtype))
-    with check_regular(path.parent / str(named)).open("rb") as other:
-        return _nrrd_body(nrrd, header, other, path, (shape, dtype))
+    with check_regular(path.parent / str(name)).open("rb") as data_file:
+        return _nrrd_body(nrrd, header, data_file, path, (shape, dtype))
 
 
 def _nrrd_body(nrrd: Any, header: dict[str, Any], file: IO[bytes], path: Path, kind: tuple[Any, Any]) -> np.ndarray:
@@ -76,12 +76,12 @@ def _nrrd_body(nrrd: Any, header: dict[str, Any], file: IO[bytes], path: Path, k
         return nrrd.read_data(header, file, str(path), index_order="C")
     for _ in range(int(header.get("line skip", header.get("lineskip", 0)))):
         file.readline()
-    skipped = int(header.get("byte skip", header.get("byteskip", 0)))
+    byte_skip = int(header.get("byte skip", header.get("byteskip", 0)))
     stream = decompressed(file, _NRRD_ENCODINGS[encoding])
-    if skipped < 0:
+    if byte_skip < 0:
         stream.seek(-math.prod(shape) * dtype.itemsize, 2)
     else:
-        skip(stream, skipped)
+        skip(stream, byte_skip)
     return read_numbers(stream, shape, dtype, path)
 
 
@@ -154,13 +154,13 @@ def _meta_values(header: dict[str, str], file: IO[bytes], path: Path) -> np.ndar
     check_array(shape, dtype, path)
     if not _meta_truth(header.get("BinaryData", "True")):
         return None
-    packed, skipped = _meta_truth(header.get("CompressedData", "False")), int(header.get("HeaderSize", 0))
+    compression, header_size = _meta_truth(header.get("CompressedData", "False")), int(header.get("HeaderSize", 0))
     size = os.fstat(file.fileno()).st_size
-    file.seek(max(0, size - math.prod(shape) * dtype.itemsize) if skipped < 0 else file.tell() + skipped)
+    file.seek(max(0, size - math.prod(shape) * dtype.itemsize) if header_size < 0 else file.tell() + header_size)
     rest = size - file.tell()
-    if packed and int(header.get("CompressedDataSize", rest)) != rest:
+    if compression and int(header.get("CompressedDataSize", rest)) != rest:
         raise Damaged(f"{header['CompressedDataSize']} compressed bytes by its header, {rest} in the file")
-    return read_numbers(decompressed(file, "zlib" if packed else "raw"), shape, dtype, path)
+    return read_numbers(decompressed(file, "zlib" if compression else "raw"), shape, dtype, path)
 
 
 def _meta_truth(text: str) -> bool:

@@ -60,19 +60,19 @@ def read_itk(path: Path, **_: object) -> Raw:
     axes = len(header["DimSize"].split())
     spacing = meta_numbers(header, "ElementSpacing", "ElementSize")
     spacing = np.ones(axes) if spacing is None else spacing
-    turned = meta_numbers(header, "TransformMatrix", "Rotation", "Orientation")
+    matrix = meta_numbers(header, "TransformMatrix", "Rotation", "Orientation")
     origin = meta_numbers(header, "Offset", "Position", "Origin")
-    directions = np.eye(axes) if turned is None else turned.reshape(axes, axes).T
+    directions = np.eye(axes) if matrix is None else matrix.reshape(axes, axes).T
     return _in_millimetres(values, spacing, directions, np.zeros(axes) if origin is None else origin)
 
 
 def _itk_image(itk: Any, path: Path) -> Raw:
-    shown = itk.ProcessObject.GetGlobalWarningDisplay()
+    display = itk.ProcessObject.GetGlobalWarningDisplay()
     itk.ProcessObject.SetGlobalWarningDisplay(False)
     try:
         image = itk.ReadImage(str(path))
     finally:
-        itk.ProcessObject.SetGlobalWarningDisplay(shown)
+        itk.ProcessObject.SetGlobalWarningDisplay(display)
     spacing, axes = np.array(image.GetSpacing()), image.GetDimension()
     directions = np.array(image.GetDirection()).reshape(axes, axes)
     return _in_millimetres(itk.GetArrayFromImage(image), spacing, directions, np.array(image.GetOrigin()))
@@ -132,8 +132,8 @@ def read_dicom(path: Path, *, key: str | None = None, **_: object) -> Raw:
     with complaints("pydicom"):
         images = [image for file in files if (image := _image(pydicom, file)) is not None]
     series = sorted({str(image.get("SeriesInstanceUID", "")) for image in images})
-    chosen = pick_key(series, key, path)
-    slices = [image for image in images if str(image.get("SeriesInstanceUID", "")) == chosen]
+    uid = pick_key(series, key, path)
+    slices = [image for image in images if str(image.get("SeriesInstanceUID", "")) == uid]
     rows, columns = np.array(slices[0].ImageOrientationPatient, dtype=float).reshape(2, 3)
     normal = np.cross(rows, columns)
     slices.sort(key=lambda image: float(np.dot(normal, np.array(image.ImagePositionPatient, dtype=float))))

@@ -138,13 +138,13 @@ def _arrays(group: Any, prefix: str = "") -> dict[str, Any]:
 
 def _multiscales(attributes: Mapping[str, Any]) -> dict[str, _Place]:
     """Return the scale of the axes, the unit of the last one and the axis of channels of each level, by its path."""
-    described = attributes.get("ome", attributes).get("multiscales") or []
+    images = attributes.get("ome", attributes).get("multiscales") or []
     places: dict[str, _Place] = {}
-    for image in described[:1]:
+    for image in images[:1]:
         axes = [axis if isinstance(axis, dict) else {"name": axis} for axis in image.get("axes", [])]
         unit = axes[-1].get("unit") if axes else None
-        named = [k for k, axis in enumerate(axes) if axis.get("type", axis.get("name")) in ("channel", "c")]
-        channels = named[0] if named else None
+        channel_axes = [k for k, axis in enumerate(axes) if axis.get("type", axis.get("name")) in ("channel", "c")]
+        channels = channel_axes[0] if channel_axes else None
         for level in image.get("datasets", []):
             scales = [t["scale"] for t in level.get("coordinateTransformations", []) if t.get("type") == "scale"]
             places[level["path"]] = (tuple(float(h) for h in scales[0]) if scales else None, unit, channels)

@@ -59,18 +59,18 @@ def _values(image: Any, path: Path, part: Part | None) -> Raw:
 
     From a file that is not compressed only the part is read.
     """
-    stored, packed = image.dataobj, path.name.lower().endswith(".gz")
-    shape = stored.shape[::-1]
+    proxy, compression = image.dataobj, path.name.lower().endswith(".gz")
+    shape = proxy.shape[::-1]
     long = [axis for axis, n in enumerate(shape[:-3]) if n != 1]
     channels = long[0] if len(long) == 1 else None
-    if part is not None and not packed:
-        raw = part_of(mapped(path, stored.offset, shape, stored.dtype), part, path, channels)
+    if part is not None and not compression:
+        raw = part_of(mapped(path, proxy.offset, shape, proxy.dtype), part, path, channels)
     else:
-        with gzip.open(path) if packed else path.open("rb") as stream:
-            stream.seek(stored.offset)
-            raw = Raw(read_numbers(stream, shape, stored.dtype, path), channels=channels)
-    scaled = apply_read_scaling(raw.values, np.asanyarray(stored.slope), np.asanyarray(stored.inter))
-    return raw._replace(values=scaled)
+        with gzip.open(path) if compression else path.open("rb") as stream:
+            stream.seek(proxy.offset)
+            raw = Raw(read_numbers(stream, shape, proxy.dtype, path), channels=channels)
+    values = apply_read_scaling(raw.values, np.asanyarray(proxy.slope), np.asanyarray(proxy.inter))
+    return raw._replace(values=values)
 
 
 def write_nifti(field: Any, path: Path) -> None:

@@ -57,9 +57,9 @@ def mapped(path: Path, start: int, shape: Sequence[int], dtype: np.dtype) -> np.
         If the file is shorter or longer.
     """
     check_array([0], dtype, path)
-    stated, size = math.prod(shape) * dtype.itemsize, path.stat().st_size - start
-    if stated != size:
-        raise Damaged(f"{stated} bytes of values by its header, {size} in the file")
+    nbytes, size = math.prod(shape) * dtype.itemsize, path.stat().st_size - start
+    if nbytes != size:
+        raise Damaged(f"{nbytes} bytes of values by its header, {size} in the file")
     return np.memmap(path, dtype, "r", start, tuple(shape)) if size else np.empty(tuple(shape), dtype)
 
 

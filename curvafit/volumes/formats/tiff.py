@@ -48,8 +48,8 @@ def read_tiff(path: Path, **_: object) -> Raw:
         channels, guess = _channel_axis(series)
         count = len(file.series)
     tags = [text for text in messages if text.startswith("<TiffTag")]
-    if lost := [text for text in messages if text not in tags and any(mark in text.lower() for mark in _LOST)]:
-        raise Damaged(lost[0])
+    if losses := [text for text in messages if text not in tags and any(mark in text.lower() for mark in _LOST)]:
+        raise Damaged(losses[0])
     notes = (f"The file holds {count} images: the first is used.",) if count > 1 else ()
     notes += (f"{len(tags)} of the file's tags cannot be read: what they state is not known.",) if tags else ()
     return Raw(values, spacing, unit, notes=(*notes, *guess), guesses=guesses, channels=channels)
@@ -57,8 +57,8 @@ def read_tiff(path: Path, **_: object) -> Raw:
 
 def _channel_axis(series: tifffile.TiffPageSeries) -> tuple[int | None, tuple[str, ...]]:
     """Return the axis of colours or channels; channels that leave only two other axes, and are not colours, are z."""
-    named = [axis for axis, name in enumerate(series.axes) if name in "SC" and series.shape[axis] != 1]
-    axis = named[-1] if named else None
+    channel_axes = [axis for axis, name in enumerate(series.axes) if name in "SC" and series.shape[axis] != 1]
+    axis = channel_axes[-1] if channel_axes else None
     if axis is None or series.axes[axis] == "S" or sum(n != 1 for n in series.shape) != 3:
         return axis, ()
     return None, (f"The file calls an axis of {series.shape[axis]} channels: it is taken for slices.",)
@@ -108,9 +108,9 @@ def _check_pages(file: tifffile.TiffFile, series: tifffile.TiffPageSeries) -> No
     if file.is_imagej and int(metadata.get("images", 1)) > math.prod(series.shape[:-2]):
         raise Damaged(f"{metadata['images']} images by its description, {math.prod(series.shape[:-2])} in the file")
     if series.dataoffset is not None:  # all values in one piece, whatever its pages are
-        wanted = math.prod(series.shape) * np.dtype(series.dtype).itemsize
-        if series.dataoffset + wanted > file.filehandle.size:
-            raise Damaged(f"{wanted} bytes of values by its header, fewer in the file")
+        nbytes = math.prod(series.shape) * np.dtype(series.dtype).itemsize
+        if series.dataoffset + nbytes > file.filehandle.size:
+            raise Damaged(f"{nbytes} bytes of values by its header, fewer in the file")
         return
     for number, page in enumerate(series.pages):
         if page is None:
@@ -158,21 +158,21 @@ def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
 def _spacing(file: tifffile.TiffFile) -> tuple[tuple[float, ...] | None, str | None, tuple[str, ...]]:
     if file.is_ome and file.ome_metadata:
         return (*_from_ome(file.ome_metadata), ())
-    described: dict[str, Any] = dict(file.imagej_metadata or (file.shaped_metadata or ({},))[0])
-    if "curvafit_spacing" in described:
-        return tuple(float(h) for h in described["curvafit_spacing"].split(",")), described["curvafit_unit"], ()
-    if "PhysicalSizeX" in described:
-        sizes = tuple(float(described.get(f"PhysicalSize{axis}", described["PhysicalSizeX"])) for axis in "ZYX")
-        return sizes, described.get("unit", described.get("PhysicalSizeXUnit", "um")), ()
+    description: dict[str, Any] = dict(file.imagej_metadata or (file.shaped_metadata or ({},))[0])
+    if "curvafit_spacing" in description:
+        return tuple(float(h) for h in description["curvafit_spacing"].split(",")), description["curvafit_unit"], ()
+    if "PhysicalSizeX" in description:
+        sizes = tuple(float(description.get(f"PhysicalSize{axis}", description["PhysicalSizeX"])) for axis in "ZYX")
+        return sizes, description.get("unit", description.get("PhysicalSizeXUnit", "um")), ()
     if file.is_imagej:
-        return _from_imagej(file, described)
-    return _from_description(described) if "spacing" in described else _from_tags(file)
+        return _from_imagej(file, description)
+    return _from_description(description) if "spacing" in description else _from_tags(file)
 
 
-def _from_description(described: dict[str, Any]) -> tuple[tuple[float, ...] | None, str | None, tuple[str, ...]]:
+def _from_description(description: dict[str, Any]) -> tuple[tuple[float, ...] | None, str | None, tuple[str, ...]]:
     """Return spacing, unit and a note of tifffile's JSON, where `spacing` is three numbers, or one for all axes."""
-    sizes = tuple(float(h) for h in np.atleast_1d(described["spacing"]))
-    unit = described.get("unit")
+    sizes = tuple(float(h) for h in np.atleast_1d(description["spacing"]))
+    unit = description.get("unit")
     if len(sizes) == 3:
         return sizes, unit, ()
     note = f"The file states one voxel size, {sizes[0]:g} {unit or ''}".rstrip() + ": it is taken for all three axes."
@@ -193,7 +193,7 @@ def _from_ome(text: str) -> tuple[tuple[float, ...] | None, str | None]:
 
 
 def _from_imagej(
-    file: tifffile.TiffFile, described: dict[str, Any]
+    file: tifffile.TiffFile, description: dict[str, Any]
 ) -> tuple[tuple[float, ...] | None, str | None, tuple[str, ...]]:
     """Return spacing, unit and a note of ImageJ's description.
 
@@ -201,12 +201,12 @@ def _from_imagej(
     proportions have a meaning: lengths are then in pixels along x.
     """
     y, x = _pixels_per_unit(file)
-    unit = described.get("unit")
+    unit = description.get("unit")
     if normalise_unit(unit)[0] == "voxel":
-        sizes = (abs(float(described.get("spacing", 1 / x))) * x, x / y, 1.0)
+        sizes = (abs(float(description.get("spacing", 1 / x))) * x, x / y, 1.0)
         return (None if np.allclose(sizes, 1) else sizes), None, ()
-    z = abs(float(described.get("spacing", 1 / x)))
-    notes = () if "spacing" in described else ("The file states no distance of slices: it is taken as the pixel's.",)
+    z = abs(float(description.get("spacing", 1 / x)))
+    notes = () if "spacing" in description else ("The file states no distance of slices: it is taken as the pixel's.",)
     return (z, 1 / y, 1 / x), unit, notes
 
 
