@@ -1,4 +1,4 @@
-"""The program: `curvafit`, or `python -m curvafit`. It listens to signals before anything that takes long is loaded."""
+"""The program `curvafit`, or `python -m curvafit`, which listens to signals before its long imports."""
 
 import warnings
 
@@ -6,8 +6,8 @@ from curvafit.interrupts import exit_code, leave, listen
 
 
 def main() -> None:
-    """The entry point."""
-    # What Zarr was about to read where a signal came: nothing that a user could do anything about.
+    """Run the program."""
+    # A signal leaves coroutines of Zarr that were about to read: no matter for a user.
     warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)
     try:
         listen()

@@ -1,4 +1,4 @@
-"""The face of a package: the names that it offers, loaded when they are first asked for."""
+"""The face of a package: its public names, loaded at their first use."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 
 def offer(package: str, homes: Mapping[str, str]) -> None:
-    """Let a package offer names that live in modules; nothing is imported before a name is asked for.
+    """Let a package offer names of its modules; a module is imported at the first use of a name.
 
     Parameters
     ----------

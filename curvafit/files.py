@@ -1,4 +1,4 @@
-"""Files and folders that are whole or not there, and that never take the place of anybody else's."""
+"""Writing of files and folders that are whole or absent, and that never replace those of another origin."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pathlib import Path
 
 from curvafit.interrupts import undisturbed
 
-#: Key of a Zarr group's attributes under which its kind stands.
+#: Key, in a Zarr group's attributes, of the kind of a group.
 MARK = "curvafit"
 #: Bytes of a file in which its mark must stand.
 _HEAD = 4096
@@ -25,7 +25,7 @@ _HEAD = 4096
 
 
 def write_atomically(target: Path, write: Callable[[Path], object]) -> Path:
-    """Call `write` with a temporary name beside `target` (same suffix), then move what it made to `target`."""
+    """Call `write` with a temporary name beside `target`, of the same suffix, and move the result to `target`."""
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = target.with_name(f".{_some()}.{target.name}")
     try:
@@ -37,7 +37,7 @@ def write_atomically(target: Path, write: Callable[[Path], object]) -> Path:
 
 
 def write_content(target: Path, *contents: str | bytes | memoryview) -> Path:
-    """Write texts, in UTF-8, or bytes to a file, whole or not at all, and to the disk before it gets its name."""
+    """Write texts, in UTF-8, or bytes to a file, whole or not at all; they are on the disk before the name is."""
 
     def write(temporary: Path) -> None:
         with temporary.open("wb") as file:
@@ -50,16 +50,16 @@ def write_content(target: Path, *contents: str | bytes | memoryview) -> Path:
 
 
 def sweep(target: Path) -> None:
-    """Delete what `write_atomically` left of a file where the process was killed; for whoever alone writes it."""
+    """Delete temporary files of a killed `write_atomically`; for the only process that writes this target."""
     name = re.compile(rf"\.[0-9a-f]{{8}}\.{re.escape(target.name)}")
-    for left in target.parent.iterdir():
-        if name.fullmatch(left.name):
-            remove(left)
+    for path in target.parent.iterdir():
+        if name.fullmatch(path.name):
+            remove(path)
 
 
 @contextmanager
 def staged(target: Path) -> Iterator[Path]:
-    """A temporary folder beside `target`, whose parent is made; it goes at the end, with what was not moved out."""
+    """Make a temporary folder beside `target`, and its parents; the folder and its content are deleted at the end."""
     target.parent.mkdir(parents=True, exist_ok=True)
     work = target.parent / f".{target.name[:200]}.{_some()}"
     try:
@@ -70,20 +70,20 @@ def staged(target: Path) -> Iterator[Path]:
             shutil.rmtree(work, ignore_errors=True)
 
 
-def move_together(made: Iterable[Path], folder: Path) -> tuple[Path, ...]:
+def move_together(parts: Iterable[Path], folder: Path) -> tuple[Path, ...]:
     """Move finished files, or folders, into a folder on the same disk; a signal waits until all are there."""
     with undisturbed():
-        return tuple(move_into_place(part, folder / part.name) for part in made)
+        return tuple(move_into_place(part, folder / part.name) for part in parts)
 
 
-def move_into_place(made: Path, target: Path) -> Path:
-    """Rename a finished file or folder to `target`, on the same disk; what stood there goes once the new one is in."""
+def move_into_place(temporary: Path, target: Path) -> Path:
+    """Rename a finished file or folder to `target`, on the same disk, and delete the old one after that."""
     aside = target.with_name(f".{_some()}.old.{target.name}")
     with undisturbed():
         if target.is_dir():
             os.replace(target, aside)
         try:
-            os.replace(made, target)
+            os.replace(temporary, target)
         except OSError:
             if aside.exists():
                 os.replace(aside, target)
@@ -93,50 +93,50 @@ def move_into_place(made: Path, target: Path) -> Path:
 
 
 def remove(path: Path) -> None:
-    """Delete a file, a link, or a folder with all in it; none is fine."""
+    """Delete a file, a link, or a folder with its content, if there is one."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
 
 
-# ---- nobody else's ---------------------------------------------------------------------------------------------------
+# ---- never another's -------------------------------------------------------------------------------------------------
 
 
 def check_folder(path: str | Path) -> Path:
-    """The path, if it is a folder that can be written to, or can be made.
+    """Return the path of a folder that can be written to, or made.
 
     Raises
     ------
     ValueError
-        If a file is in the way, or the nearest folder there is cannot be written to.
+        If a part of the path is a file, or the nearest folder that exists cannot be written to.
     """
     folder = Path(path)
-    there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
-    if not there.is_dir():
-        raise ValueError(f"expected a folder to write to, got {folder}, where {there} is a file")
-    if not os.access(there, os.W_OK | os.X_OK) or not _takes_files(there):
-        raise ValueError(f"expected a folder that can be written to, got {there}")
+    nearest = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    if not nearest.is_dir():
+        raise ValueError(f"expected a folder to write to, got {folder}, where {nearest} is a file")
+    if not os.access(nearest, os.W_OK | os.X_OK) or not _takes_files(nearest):
+        raise ValueError(f"expected a folder that can be written to, got {nearest}")
     return folder
 
 
 def check_free(
     targets: Iterable[Path], ours: Callable[[Path], bool], inputs: Iterable[str | Path] = (), overwrite: bool = False
 ) -> None:
-    """Raise ValueError where writing to a target would take away what this program did not write there before.
+    """Raise ValueError where writing to a target would replace what this program did not write.
 
     Parameters
     ----------
     targets
-        Files or folders that are to be written, or replaced.
+        Files or folders to write or to replace.
     ours
-        Whether what stands at a target may go: it bears this program's mark, and the kind's; or, where a folder is to
-        be written, is an empty one.
+        Returns whether a target that exists may be replaced: a file or folder with this program's mark of the same
+        kind, or an empty folder.
     inputs
-        Files or folders that are read, as `file.h5::key` too: no target may be one of them, lie in one or hold one,
-        whatever `overwrite` says.
+        Files or folders that are read, also as `file.h5::key`: no target may be an input, lie in one or contain one,
+        with or without `overwrite`.
     overwrite
-        Whether anything else may go, too.
+        Whether any other file or folder may be replaced.
     """
     sources = [source for each in inputs if (source := Path(str(each).partition("::")[0])).exists()]
     for target in targets:
@@ -155,12 +155,12 @@ def check_free(
 
 
 def is_empty(folder: Path) -> bool:
-    """Whether there is a folder, and no link to one, with nothing in it."""
+    """Return whether a path is an empty folder, and not a link to one."""
     return folder.is_dir() and not folder.is_symlink() and not any(folder.iterdir())
 
 
 def own_record(path: Path, kind: str) -> dict:
-    """The record of this kind in a JSON file: its `format` is `kind`; empty where there is none."""
+    """Return the record in a JSON file whose `format` is `kind`; an empty one where there is none."""
     try:
         content = json.loads(path.read_bytes()) if path.is_file() else None
     except (OSError, ValueError, RecursionError):
@@ -169,7 +169,7 @@ def own_record(path: Path, kind: str) -> dict:
 
 
 def bears(path: Path, mark: str) -> bool:
-    """Whether a file has a mark among its first bytes."""
+    """Return whether a file has a mark among its first bytes."""
     try:
         with path.open("rb") if path.is_file() else io.BytesIO() as file:
             return mark.encode() in file.read(_HEAD)
@@ -178,12 +178,12 @@ def bears(path: Path, mark: str) -> bool:
 
 
 def _some() -> str:
-    """Eight digits that no other temporary name has."""
+    """Return eight digits that no other temporary name has."""
     return uuid.uuid4().hex[:8]
 
 
 def _takes_files(folder: Path) -> bool:
-    """Whether a file can be made there: permissions alone do not tell of a disk that is read-only."""
+    """Return whether a file can be made in a folder: permissions do not tell of a read-only disk."""
     try:
         with tempfile.TemporaryFile(dir=folder):
             return True

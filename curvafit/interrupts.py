@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and a closed terminal: exceptions that clean up on their way, but never amid a change of files.
+"""Ctrl-C, SIGTERM and a closed terminal as exceptions, which clean up on their way and wait while files change.
 
 The program listens from its first line (`listen`); the library changes no signal's handler.
 """
@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-#: What ends the program besides Ctrl-C, where the platform has it.
+#: Signals that end the program besides Ctrl-C, where the platform has them.
 _ENDS = ("SIGTERM", "SIGHUP")
 
 
@@ -23,20 +23,20 @@ class Terminated(KeyboardInterrupt):
         self.code = 128 + number
 
 
-class _Held:
-    """How many changes of files are under way in the main thread, and the signal that waits for their end."""
+class _Pending:
+    """The number of file changes under way in the main thread, and the signal that waits for their end."""
 
     depth = 0
     waiting: int | None = None
 
 
 def exit_code(error: KeyboardInterrupt) -> int:
-    """130 for Ctrl-C, 128 + its number for another signal."""
+    """Return the exit code of a signal: 130 for Ctrl-C, 128 and its number for another."""
     return error.code if isinstance(error, Terminated) else 130
 
 
 def listen() -> None:
-    """Turn signals into exceptions of the main thread, which wait while files change; ignored ones stay ignored."""
+    """Turn signals into exceptions of the main thread, which wait while files change; ignored signals stay ignored."""
     for name in ("SIGINT", *_ENDS):
         number = getattr(signal, name, None)
         if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
@@ -44,7 +44,7 @@ def listen() -> None:
 
 
 def leave() -> None:
-    """Ignore these signals: the program's work is done, and it is at its exit."""
+    """Ignore the signals that `listen` listens to, at the program's exit."""
     for name in ("SIGINT", *_ENDS):
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)
@@ -52,23 +52,23 @@ def leave() -> None:
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """Hold signals back that `listen` listens to, until the block is done: for changes that are all or nothing."""
+    """Hold back the signals that `listen` listens to until the block ends, for changes that are all or nothing."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    _Held.depth += 1
+    _Pending.depth += 1
     try:
         yield
     finally:
-        _Held.depth -= 1
-        if _Held.depth == 0 and _Held.waiting is not None:
-            number, _Held.waiting = _Held.waiting, None
+        _Pending.depth -= 1
+        if _Pending.depth == 0 and _Pending.waiting is not None:
+            number, _Pending.waiting = _Pending.waiting, None
             raise _exception(number)
 
 
 def _arrive(number: int, frame: FrameType | None) -> None:
-    if _Held.depth:
-        _Held.waiting = number
+    if _Pending.depth:
+        _Pending.waiting = number
     else:
         raise _exception(number)
 

@@ -1,4 +1,4 @@
-"""What the machine has."""
+"""The machine's memory."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def memory() -> int:
-    """Bytes of memory that this machine has, or a container may use; `sys.maxsize` where neither is known."""
+    """Return the bytes of memory of this machine, or of its container; `sys.maxsize` where neither is known."""
     return min(_installed(), _allowed())
 
 
@@ -20,7 +20,7 @@ def _installed() -> int:
 
 
 def _allowed() -> int:
-    """What a container may use."""
+    """Return the bytes that a container may use."""
     try:
         return int(Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii"))
     except (OSError, ValueError):

@@ -1,7 +1,7 @@
-"""What a result shows of itself. The function that draws it lives in a room above its own: the package's face names it.
+"""Pictures of results, drawn by functions in rooms above those of the results.
 
-`_FIGURES` in `curvafit/__init__.py` holds the place of a function for each type by name. It is loaded when a picture is
-first asked for, so that the rooms below neither import matplotlib nor the room that draws.
+`_FIGURES` in `curvafit/__init__.py` names the function of each type. The first picture imports the function, so that
+the rooms below import neither matplotlib nor the room that draws.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ SMALL = 320
 
 
 class Pictured:
-    """A result that can be looked at: `.plot()` gives a figure, a notebook shows a small one."""
+    """A result with a picture: `.plot()` returns a figure, and a notebook shows a small one."""
 
     def plot(self, **options: Any) -> Figure:
         """Return a matplotlib `Figure`; the options are those of the function that draws this type.

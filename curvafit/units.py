@@ -1,4 +1,4 @@
-"""Units of length, and numbers in words: lengths with a fitting unit, numbers with a fitting number of digits."""
+"""Units of length and numbers as text, with a fitting unit and a fitting number of digits."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import math
 
 #: Metres in each unit of length that files name, small to large.
 METRES = {"nm": 1e-9, "um": 1e-6, "mm": 1e-3, "m": 1.0}
-#: The page where words with a special meaning stand, each under its own anchor.
+#: The page that explains words with a special meaning, each under its own anchor.
 GLOSSARY = "https://curvafit.readthedocs.io/en/latest/glossary/"
-#: A space that no line breaks at.
+#: A space at which no line breaks.
 _GLUE = "\u00a0"
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """A number to so many significant digits, without an exponent where it reads well; a dash for none."""
+    """Return a number to some significant digits, without an exponent where possible; a dash for None or NaN."""
     if value is None or math.isnan(value):
         return "–"
     if value == 0 or math.isinf(value):
@@ -26,11 +26,12 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def percent(share: float) -> str:
+    """Return a share in percent."""
     return f"{number(100 * share, 2)}{_GLUE}%"
 
 
 def length(value: float, unit: str, digits: int = 2) -> str:
-    """A length in the unit in which it is 1 to 1000."""
+    """Return a length in the unit in which it is 1 to 1000."""
     if unit not in METRES or not math.isfinite(value) or value <= 0:
         return f"{number(value, digits)}{_GLUE}{unit_name(unit, value)}"
     metres = value * METRES[unit]
@@ -40,7 +41,7 @@ def length(value: float, unit: str, digits: int = 2) -> str:
 
 
 def density(value: float, unit: str, power: int, digits: int = 3) -> str:
-    """A number per unit of length to a power; another unit where it would be tiny or huge."""
+    """Return a number per unit of length to a power, in another unit where it would be tiny or huge."""
     names = [unit, *(name for name in ("mm", "um", "nm", "m") if unit in METRES and name != unit)]
     scaled = {name: value * (METRES[name] / METRES[unit]) ** power if name != unit else value for name in names}
     best = next((name for name in names if 0.1 <= abs(scaled[name]) < 1e4), unit)
@@ -48,12 +49,12 @@ def density(value: float, unit: str, power: int, digits: int = 3) -> str:
 
 
 def per_unit(unit: str, power: int) -> str:
-    """1/µm, 1/µm², 1/µm³."""
+    """Return one over a unit to a power: 1/µm, 1/µm² or 1/µm³."""
     return f"1/{unit_name(unit)}{ {1: '', 2: '²', 3: '³'}[power] }"
 
 
 def unit_name(unit: str, count: float = 1) -> str:
-    """How a unit is written: µm for `um`, voxels for several."""
+    """Return a unit as written in text: µm for `um`, voxels for several."""
     if unit == "um":
         return "µm"
     return "voxels" if unit == "voxel" and count != 1 else unit

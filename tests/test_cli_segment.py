@@ -115,7 +115,7 @@ def test_other_formats_and_a_fit_in_another_unit(tmp_path: Path) -> None:
     prior.write_text(made_fit().to_json())
     result = call("segment", path, "--prior", prior, "--dark", "--threshold", 150, "--steps", 2, "-o", target)
     assert result.exit_code == 0, (result.output, result.exception)
-    assert "in mm, are taken to um" in result.stdout
+    assert "in mm, are converted to um" in result.stdout
     made = load(target)
     assert made.unit == "um" and made.spacing == pytest.approx((19.5,) * 3)
     assert made.values.mean() > 0.5

@@ -258,7 +258,7 @@ def test_labels_count_as_inside_and_what_is_extrapolated_is_said() -> None:
     found = reconstruct(Field(labels), WILLMORE, every=8.0, first=2, steps=1)  # type: ignore[arg-type]
     plain = reconstruct(Field(truth), WILLMORE, known=[2, 10, 18, 26], steps=1)
     assert np.array_equal(found.mask.values, plain.mask.values) and found.notes == plain.notes
-    assert "The 2 before the first and 5 beyond the last are extrapolated." in found.notes
+    assert "The 2 before the first and the 5 beyond the last are extrapolated." in found.notes
     assert "after 1 step:" in found.status
     whole = reconstruct(Field(truth), WILLMORE, known=[0, 15, 31], steps=1)
     assert not any("extrapolated" in note for note in whole.notes)

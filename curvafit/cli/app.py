@@ -1,7 +1,7 @@
-"""The command line, assembled: a module for each command parses, calls and prints.
+"""The command line: a module for each command parses, calls and prints.
 
-Wrong input is one sentence on the error stream and exit code 2. What a command needs is imported when it runs, so that
-help is quick.
+Wrong input gives one sentence on the error stream and exit code 2. A command imports its libraries when it runs, so
+that help is quick.
 """
 
 from __future__ import annotations
@@ -47,12 +47,12 @@ app.add_typer(atlas_app, name="atlas")
 
 
 def main() -> None:
-    """The entry point."""
+    """Run the command line."""
     app(prog_name="curvafit")
 
 
-def _show_version(wanted: bool) -> None:
-    if wanted:
+def _show_version(version_only: bool) -> None:
+    if version_only:
         from importlib.metadata import version
 
         say(f"curvafit {version('curvafit')}")

@@ -39,8 +39,8 @@ _Store = Annotated[Path, typer.Argument(help="Folder of the Zarr store.")]
     "curvafit atlas build box.zarr --design box.yaml --scheduler tcp://node1:8786",
 )
 def build_atlas(
-    store: Annotated[Path, typer.Argument(help="Folder of the Zarr store; resumed where it exists.")],
-    count: Annotated[int, typer.Option(help="Number of viable shapes that the store has at the end.")] = 1000,
+    store: Annotated[Path, typer.Argument(help="Folder of the Zarr store; a store that exists is resumed.")],
+    count: Annotated[int, typer.Option(help="Number of viable shapes in the store at the end.")] = 1000,
     shape: Annotated[str, typer.Option(help="Voxels of a shape: N or Z,Y,X.")] = "64",
     seed: Annotated[int, typer.Option(help="Seed of the design.")] = 0,
     design: Annotated[
@@ -55,7 +55,7 @@ def build_atlas(
     scheduler: SchedulerOption = None,
     dashboard: DashboardOption = None,
 ) -> None:
-    """Generate shapes into a store, until enough are viable. A build that was killed goes on where it stopped."""
+    """Generate shapes into a store until enough are viable. The same command resumes a build that was stopped."""
     with plainly():
         box = whole_triple(shape, "--shape")
         law = _design(design, around, spread)
@@ -82,12 +82,12 @@ def build_atlas(
 @atlas_app.command("extend", epilog="[bold]Example[/bold]\n\ncurvafit atlas extend store.zarr --count 500")
 def extend_atlas(
     store: _Store,
-    count: Annotated[int, typer.Option(help="Viable shapes to add; 0 goes on with what was stopped.")] = 100,
+    count: Annotated[int, typer.Option(help="Number of viable shapes to add; 0 resumes what was stopped.")] = 100,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
     dashboard: DashboardOption = None,
 ) -> None:
-    """Add shapes to a store, of its own design and settings."""
+    """Add shapes to a store, with the design and the settings of the store."""
     with plainly():
         from curvafit.data_synth.atlas.build import check_count, extend
         from curvafit.data_synth.atlas.store import open_store
@@ -95,10 +95,10 @@ def extend_atlas(
         check_count(count, 0)
         crew = Crew(workers, scheduler, dashboard)
         crew.check()
-        wanted = open_store(store).wanted + count
+        target = open_store(store).wanted + count
 
         def again() -> str:
-            return "`--count 0`" if open_store(store).wanted == wanted else "the same command"
+            return "`--count 0`" if open_store(store).wanted == target else "the same command"
 
         with crew.at_work(again) as (makers, progress):
             extend(store, count, progress, workers=makers)
@@ -107,7 +107,7 @@ def extend_atlas(
 
 @atlas_app.command("info", epilog="[bold]Example[/bold]\n\ncurvafit atlas info store.zarr")
 def atlas_info(store: _Store) -> None:
-    """Show what a store holds, and how it was made."""
+    """Show the content of a store, and how it was made."""
     with plainly():
         from curvafit.data_synth.atlas.census import census
         from curvafit.data_synth.atlas.store import open_store
@@ -119,8 +119,8 @@ def atlas_info(store: _Store) -> None:
 @atlas_app.command("verify", epilog="[bold]Example[/bold]\n\ncurvafit atlas verify store.zarr --regenerate 5")
 def verify_atlas(
     store: _Store,
-    regenerate: Annotated[int, typer.Option(help="Number of draws to generate again and compare.")] = 3,
-    seed: Annotated[int, typer.Option(help="Seed of the choice of these draws.")] = 0,
+    regenerate: Annotated[int, typer.Option(help="Number of draws to generate again and to compare.")] = 3,
+    seed: Annotated[int, typer.Option(help="Seed that chooses these draws.")] = 0,
 ) -> None:
     """Check every draw of a store; exit with code 1 where one is lost, torn, doubled or differs from its record."""
     with plainly():
@@ -168,7 +168,7 @@ def map_atlas(
     device: Annotated[str, typer.Option(help="Device for the distances: cpu, cuda, cuda:1 …")] = "cpu",
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Lay a store's shapes out on a map: a picture, and a page to explore them in and to place scans on."""
+    """Draw a map of a store's shapes: a picture, and a page to explore the shapes and to place scans."""
     with plainly():
         with kept(), stages() as progress:
             from curvafit.atlas_map.map_files import check_map, write_map
@@ -181,12 +181,12 @@ def map_atlas(
 
 
 def _design(name: str, around: str | None, spread: float | None) -> Design:
-    """The design that the options name."""
+    """Return the design that the options name."""
     from curvafit.data_synth.atlas import design, design_file
 
     if around is not None:
         if name not in ("random", "sobol"):
-            raise ValueError(f"expected either --around or a design's file, got {around} and {name}")
+            raise ValueError(f"expected either --around or the file of a design, got {around} and {name}")
         share = design_file.SPREAD if spread is None else spread
         return design.around(design_file.point_of(around), share, name)  # type: ignore[arg-type]
     if spread is not None:

@@ -1,8 +1,8 @@
-"""How long a command will take, and how much memory: one line before the work begins.
+"""The forecast of a command's time and memory: one line before the work begins.
 
-A command's time is that of its flows: their steps and voxels are counted, and a step is timed on this machine, which
-takes some 0.1 s on a small box. Its memory is what the process holds once its libraries are loaded, and so many bytes a
-voxel: measured once, at 128³ voxels (of `infer` at 40³ and 64³), and written here.
+The time of a command is the time of its flows: steps times voxels times the time of a step, which is measured on this
+machine, in some 0.1 s on a small box. The memory is that of the process with its libraries, and a number of bytes per
+voxel, measured once at 128³ voxels (for `infer` at 40³ and 64³).
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from typing import NamedTuple
 from curvafit.cli.support import error_console, say
 from curvafit.units import number
 
-#: Work below which nothing is said, in steps times voxels: some seconds.
+#: Least work, in steps times voxels, that has a forecast: some seconds.
 SHORT = 2e8
-#: Edge of the box in which a step is timed, and the numbers of steps whose difference is taken.
+#: Edge of the box in which a step is timed, and the two numbers of steps whose difference is timed.
 EDGE, STEPS = 64, (2, 12)
-#: Between what the count of steps says and what a job takes: others share the machine, some flows end early.
+#: Least and greatest time of a job over that of its steps: others share the machine, and some flows end early.
 RANGE = (0.7, 2.0)
 
 
 class Cost(NamedTuple):
-    """What a kind of job holds, in bytes: before the first voxel, and for each."""
+    """The memory of a kind of job in bytes: a base, and a number per voxel."""
 
     base: float
     voxel: float
@@ -39,18 +39,18 @@ INFERENCE = Cost(0.75e9, 1300)
 def say_forecast(
     name: str, shape: Sequence[int], steps: float, cost: Cost, *, what: str = "voxels", workers: int = 1, device="cpu"
 ) -> None:
-    """Say on the error stream how long a command will take and how much memory, where that is long.
+    """Print the time and memory of a long command on the error stream; a short one has no forecast.
 
     Parameters
     ----------
     name
-        Of the command.
+        Name of the command.
     shape, what
-        Voxels (z, y, x) of a flow, and what they are called.
+        Voxels (z, y, x) of a flow, and their name in the line.
     steps
-        Of all flows together.
+        Steps of all flows together.
     workers
-        Processes that share them, each with its own memory.
+        Processes that share the flows, each with its own memory.
     """
     voxels = math.prod(shape)
     if steps * voxels < SHORT:
@@ -62,7 +62,7 @@ def say_forecast(
 
 
 def step_time(device: str = "cpu") -> float:
-    """Return the seconds that a flow's step takes for each voxel on this machine, timed now."""
+    """Return the seconds per voxel of a flow's step, measured now on this machine."""
     from curvafit.generation.flow import generate
     from curvafit.generation.schedule import schedule
     from curvafit.priors.coefficients import preset
@@ -77,12 +77,12 @@ def step_time(device: str = "cpu") -> float:
 
 
 def cores(workers: int | None) -> int:
-    """Return how many processes a command starts that was given so many, or none."""
+    """Return the number of processes of a command: the option, at least 1, or by default one per core."""
     return max(1, (os.cpu_count() or 1) if workers is None else workers)
 
 
 def _span(seconds: float) -> str:
-    """A range of time in one unit: `"2 to 4 min"`."""
+    """Return a range of time in one unit, as `"2 to 4 min"`."""
     low, high = (share * seconds for share in RANGE)
     size, unit = next(((s, u) for s, u in ((3600, "h"), (60, "min")) if high >= 2 * s), (1, "s"))
     return f"{number(max(low / size, 1 if size == 1 else 0), 1)} to {number(max(high / size, 2), 1)} {unit}"

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from curvafit.inference.infer import Inference
     from curvafit.inference.prepare import Prepared
 
-#: Flows that the refinement of parameters takes as long as: 6 to 16, measured on tubes of 64³ and 40³ voxels.
+#: Time of the refinement in flows: 6 to 16, measured on tubes of 64³ and 40³ voxels.
 REFINEMENT = 10
 
 EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
@@ -53,12 +53,12 @@ EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
 def infer(
     scan: Volume,
     out: Annotated[Path, typer.Option("-o", "--output", help="Folder for fit.json, report.html, regenerated.nii.gz.")],
-    kind: Annotated[str, typer.Option(help="auto, field, mask or image.")] = "auto",
+    kind: Annotated[str, typer.Option(help="Kind of volume: auto, field, mask or image.")] = "auto",
     periodic: Annotated[bool, typer.Option("--periodic", help="The box repeats (generated fields).")] = False,
-    atlas: Annotated[Path | None, typer.Option(help="Another atlas (.npz) than the packaged one.")] = None,
-    threshold: Annotated[str, typer.Option(help="Grey level, or otsu.")] = "otsu",
+    atlas: Annotated[Path | None, typer.Option(help="Atlas (.npz) instead of the packaged one.")] = None,
+    threshold: Annotated[str, typer.Option(help="Grey level between the phases, or otsu.")] = "otsu",
     dark: Annotated[bool, typer.Option("--dark", help="The structure is the dark phase.")] = False,
-    roi: Annotated[Path | None, typer.Option(help="Mask of what counts, of the scan's shape.")] = None,
+    roi: Annotated[Path | None, typer.Option(help="Mask of the region to measure, of the scan's shape.")] = None,
     spacing: Spacing = None,
     unit: Unit = None,
     channel: Channel = None,
@@ -68,7 +68,7 @@ def infer(
     dtype: Dtype = None,
     key: Key = None,
     strict: Strict = False,
-    seed: Annotated[int, typer.Option(help="Seed of the shapes that are regrown for comparison.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the shapes that are generated for comparison.")] = 0,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Infer the parameters of a scanned volume, and write a report."""
@@ -92,22 +92,22 @@ def infer(
 
 
 def _inferred(scan: str, out: Path, options: dict[str, Any], overwrite: bool) -> tuple[Inference, Path]:
-    """Return the inference and the path of its report; the progress is shown."""
+    """Return the inference and the path of its report, and show the progress."""
     with stages() as progress:
-        from curvafit.inference.infer import infer as find
+        from curvafit.inference.infer import infer as infer_scan
         from curvafit.report.page import check_report, with_command, write_inference
 
         inputs = [each for each in (scan, options["roi"], options["atlas"]) if each is not None]
         check_report(out, inputs, overwrite)
 
-        inference = find(scan, progress=progress, watch=_say_forecast, **options)
+        inference = infer_scan(scan, progress=progress, watch=_say_forecast, **options)
         progress("drawing the report", 1.0)
         say_notes(inference.scan.notes)
         return inference, write_inference(with_command(inference, command_line()), out, overwrite=overwrite)
 
 
 def _say_forecast(prepared: Prepared) -> None:
-    """Say how long the rest takes: five flows of the size of shapes for comparison, and the refinement's."""
+    """Print the forecast of an inference: five flows of shapes for comparison, and the refinement."""
     from curvafit.generation.schedule import schedule
     from curvafit.inference.infer import REGENERATED_EDGE
 
@@ -118,7 +118,7 @@ def _say_forecast(prepared: Prepared) -> None:
 
 
 def _show(inference: Inference) -> None:
-    """Print the sentence, the verdict and a small table."""
+    """Print the description, the verdict and a small table."""
     from curvafit.report.page import parameter_table
     from curvafit.report.wording import describe
     from curvafit.units import length, number

@@ -1,4 +1,4 @@
-"""The options that say how a volume file is read, the same at every command that reads one."""
+"""The options of reading a volume file, the same for every command."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ _read = partial(typer.Option, rich_help_panel="How to read the file")
 Volume = Annotated[
     str, typer.Argument(help="NIfTI, TIFF (or folder of slices), NPY, NPZ, HDF5 (file.h5::key), RAW, Zarr …")
 ]
-Spacing = Annotated[str | None, _read(help="Voxel edges z,y,x, or one for all; overrides the file.")]
-Unit = Annotated[str | None, _read(help="nm, um, mm or m; overrides the file.")]
-Channel = Annotated[int | None, _read(help="Which channel, counted from 0, of a file of several (colours, times).")]
-Label = Annotated[int | None, _read(help="The structure is where the volume has this value.")]
+Spacing = Annotated[str | None, _read(help="Voxel edges Z,Y,X, or one number for all; overrides the file.")]
+Unit = Annotated[str | None, _read(help="Unit of lengths: nm, um, mm or m; overrides the file.")]
+Channel = Annotated[int | None, _read(help="Channel to read, counted from 0, of several (colours, times).")]
+Label = Annotated[int | None, _read(help="Label of the structure: the voxels with this value.")]
 Crop = Annotated[str | None, _read(help="Box of voxels: z0:z1,y0:y1,x0:x1, counted from 0; : is all of an axis.")]
-RawShape = Annotated[str | None, _read(help="Z,Y,X of a RAW file.")]
-Dtype = Annotated[str | None, _read(help="Type of a RAW file: u1, u2, f4 …")]
-Key = Annotated[str | None, _read(help="Array within an NPZ, HDF5 or Zarr file.")]
-Strict = Annotated[bool, _read("--strict", help="Refuse a volume of which chunks or slices are missing.")]
+RawShape = Annotated[str | None, _read(help="Voxels Z,Y,X of a RAW file.")]
+Dtype = Annotated[str | None, _read(help="Type of the numbers in a RAW file: u1, u2, f4 …")]
+Key = Annotated[str | None, _read(help="Name of the array in an NPZ, HDF5 or Zarr file.")]
+Strict = Annotated[bool, _read("--strict", help="Refuse a volume with missing chunks or slices.")]
 
 
 def reading_of(
@@ -33,7 +33,7 @@ def reading_of(
     Raises
     ------
     ValueError
-        If one is not what its help says.
+        If an option does not have the form that its help states.
     """
     if unit is not None:
         from curvafit.volumes.formats import normalise_unit

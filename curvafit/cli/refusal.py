@@ -1,4 +1,4 @@
-"""How the command line refuses: one sentence on the error stream and exit code 2, whoever found the mistake."""
+"""Refusals of the command line: one sentence on the error stream and exit code 2."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from typer.core import TyperGroup
 from curvafit.interrupts import exit_code
 from curvafit.messages import one_line
 
-#: Characters of a sentence: a quotation that makes it longer is cut in its middle.
+#: Most characters of a sentence; a longer one is cut in its middle.
 LONGEST = 700
-#: What typer raises where an option does not parse; its name, and where it is from, change with typer's versions.
+#: The exception of an option that typer cannot parse; its name and module change with typer's versions.
 _Refusal: type[Exception] = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
 
 
 class Commands(TyperGroup):
-    """A group whose mistakes in use are one line, as all others."""
+    """A group of commands whose usage errors are one line, as all other errors."""
 
     def main(self, *args: Any, standalone_mode: bool = True, **more: Any) -> Any:
-        """Run a command and leave, as `click.Group.main`."""
+        """Run a command and exit, as `click.Group.main` does."""
         if not standalone_mode:
             return super().main(*args, standalone_mode=False, **more)
         try:
@@ -39,7 +39,7 @@ class Commands(TyperGroup):
 
 
 def sentence(text: str, start: str = "error") -> str:
-    """A message on one line, of a sane length, in signs that show: others are escaped."""
+    """Return a message on one line of limited length, in signs that show; others are escaped."""
     line = one_line(" ".join(text.split()))
     if len(line) > LONGEST:
         line = f"{line[: LONGEST * 2 // 3]} … {line[-LONGEST // 3 :]}"
@@ -47,16 +47,16 @@ def sentence(text: str, start: str = "error") -> str:
 
 
 def writable(text: str, console: Console) -> str:
-    """Text in signs that a stream's encoding has: others are escaped."""
+    """Return a text in signs that a stream can encode; others are escaped."""
     return text.encode(console.encoding, "backslashreplace").decode(console.encoding)
 
 
 def _leave(error: Any) -> NoReturn:
-    """Say what typer found, and the command whose help tells more."""
+    """Print the usage error of typer with the command whose help tells more, and exit with code 2."""
     text = error.format_message().rstrip(".")
     context = getattr(error, "ctx", None)
     more = "" if context is None else f" (see {' '.join(['curvafit', *context.command_path.split()[1:], '--help'])})"
     console = Console(stderr=True, highlight=False)
-    told = writable(sentence(f"{text[:1].lower()}{text[1:]}{more}"), console)
-    console.print(told, markup=False, soft_wrap=True)
+    line = writable(sentence(f"{text[:1].lower()}{text[1:]}{more}"), console)
+    console.print(line, markup=False, soft_wrap=True)
     sys.exit(2)

@@ -11,38 +11,39 @@ import typer
 
 from curvafit.cli.support import OverwriteOption, error_console, output, plainly, say
 
-#: The sample that needs no network, and what the list says of it.
+#: The sample that needs no network, and its line in the list.
 SYNTHETIC = "synthetic"
-_SYNTHETIC_SAYS = ("a generated trabecular shape, imaged with blur and noise", "MIT", "made on the spot")
+_SYNTHETIC_ABOUT = ("a generated trabecular shape, imaged with blur and noise", "MIT", "made on the spot")
 
-samples_app = typer.Typer(help="Volumes to try things on, with their licences.", invoke_without_command=True)
+samples_app = typer.Typer(help="Sample volumes, with their licences.", invoke_without_command=True)
 
 
 @samples_app.callback()
 def list_samples(context: typer.Context) -> None:
-    """Volumes to try things on. Without a command: list them."""
+    """List sample volumes, or fetch one with `get`."""
     if context.invoked_subcommand is None:
         with plainly():
             from curvafit.data_synth.samples import samples
 
             rows = [(each.name, each.description, each.licence, each.source) for each in samples()]
-            output(("name", "what", "licence", "source"), [*rows, (SYNTHETIC, *_SYNTHETIC_SAYS)])
+            output(("name", "what", "licence", "source"), [*rows, (SYNTHETIC, *_SYNTHETIC_ABOUT)])
 
 
 @samples_app.command("get", epilog="[bold]Example[/bold]\n\ncurvafit infer $(curvafit samples get bone) -o bone")
 def get_sample(
-    name: Annotated[str, typer.Argument(help="See `curvafit samples`.")],
+    name: Annotated[str, typer.Argument(help="Name of the sample; `curvafit samples` lists the names.")],
     out: Annotated[
-        Path | None, typer.Option("-o", "--output", help="Copy it here; else it stays in the cache.")
+        Path | None,
+        typer.Option("-o", "--output", help="Copy the sample here; by default it stays in the cache."),
     ] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Fetch a sample (once), check it, and print its path."""
+    """Download a sample once, check it, and print its path."""
     with plainly():
         from curvafit.data_synth.samples import fetch, samples
 
         about = {each.name: (each.description, each.licence, each.source) for each in samples()}
-        about[SYNTHETIC] = _SYNTHETIC_SAYS
+        about[SYNTHETIC] = _SYNTHETIC_ABOUT
         if name not in about:
             raise ValueError(f"expected a sample named {', '.join(about)}, got {name!r}")
         what, licence, source = about[name]
@@ -52,7 +53,7 @@ def get_sample(
 
 
 def _synthetic() -> Path:
-    """The synthetic scan, made once."""
+    """Return the path of the synthetic scan, which is made once."""
     from curvafit.data_synth.samples import cache_folder, synthetic_scan
 
     path = cache_folder() / "synthetic.nii.gz"
@@ -60,7 +61,7 @@ def _synthetic() -> Path:
 
 
 def _copied(path: Path, target: Path, overwrite: bool) -> Path:
-    """A copy under the name asked for, which must end as the file does."""
+    """Copy a sample to a target, whose suffix must be the sample's."""
     from curvafit.files import check_free, write_atomically
 
     target = target / path.name if target.is_dir() else target

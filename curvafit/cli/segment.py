@@ -1,4 +1,4 @@
-"""The commands that segment without a network: segment and reconstruct."""
+"""The commands that segment without a neural network: segment and reconstruct."""
 
 from __future__ import annotations
 
@@ -56,17 +56,17 @@ _what = partial(typer.Option, rich_help_panel="What to do")
 
 Target = Annotated[Path, typer.Option("-o", "--output", help="Mask to write: .nii.gz .nii .tif .npy .mrc .zarr.")]
 Prior = Annotated[str, _what(help="fit.json of `curvafit infer`, or a preset's name (see `curvafit presets`).")]
-Probability = Annotated[Path | None, _what(help="Volume of probabilities of the inside, instead of grey levels.")]
-Weight = Annotated[float | None, _what(help="Nats that a unit of the energy costs; 2 / (a20 + a02) by default.")]
+Probability = Annotated[Path | None, _what(help="Probability of the inside, a volume, instead of grey levels.")]
+Weight = Annotated[float | None, _what(help="Cost of a unit of the energy, in nats; by default 2 / (a20 + a02).")]
 Threshold = Annotated[str, _what(help="Grey level between the phases, or otsu.")]
 Dark = Annotated[bool, _what("--dark", help="The structure is the dark phase.")]
-Epsilon = Annotated[float | None, _what(help="ε in the scan's unit; twice the smallest voxel edge by default.")]
+Epsilon = Annotated[float | None, _what(help="ε in the scan's unit; by default twice the smallest voxel edge.")]
 Steps = Annotated[int, _what(help="Steps of the flow.", min=1)]
-Every = Annotated[int | None, _what(help="Every so many slices are known.")]
-First = Annotated[int | None, _what(help="The first of them, beside --every; 0 by default.")]
-Axis = Annotated[str, _what(help="What slices are counted along: z, y or x (first, second, last axis of an array).")]
+Every = Annotated[int | None, _what(help="Distance of known slices: with 8, every eighth slice is known.")]
+First = Annotated[int | None, _what(help="Number of the first known slice, with --every; by default 0.")]
+Axis = Annotated[str, _what(help="Axis across the slices: z, y or x (first, second, last axis of an array).")]
 
-#: Steps of the flow; `segment.STEPS`, which help must not import.
+#: Steps of the flow, as in `curvafit.segmentation.segment`, which help must not import.
 STEPS = 150
 
 
@@ -91,7 +91,7 @@ def segment(
     strict: Strict = False,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Find the structure of a noisy scan under a curvature prior, with a picture (.png) and a record (.json)."""
+    """Find the structure of a noisy scan under a curvature prior; write its mask, a picture and a record."""
     with plainly():
         reading = reading_of(
             spacing=spacing,
@@ -108,21 +108,21 @@ def segment(
         if probability is None:
             options |= {"threshold": threshold_of(threshold), "dark": dark}
         elif dark or threshold.lower() != "otsu":
-            given = "--dark" if dark else f"--threshold {threshold}"
-            raise ValueError(f"expected neither --threshold nor --dark with --probability, got {given}")
+            extra = "--dark" if dark else f"--threshold {threshold}"
+            raise ValueError(f"expected neither --threshold nor --dark with --probability, got {extra}")
 
-        def made(volume: Field, progress: Callable[[str, float], None]) -> Segmentation:
+        def compute(volume: Field, progress: Callable[[str, float], None]) -> Segmentation:
             from curvafit.segmentation.evidence import cropped_map
-            from curvafit.segmentation.segment import segment as find
+            from curvafit.segmentation.segment import segment as segment_scan
             from curvafit.volumes.scan import load
 
             alike = {name: reading[name] for name in ("spacing", "unit", "strict")}
-            likely = None if probability is None else cropped_map(load(probability, **alike), reading["crop"])
-            say_notes(() if likely is None else likely.notes)
-            return find(volume, prior, probability=likely, steps=steps, progress=progress, **options)
+            chances = None if probability is None else cropped_map(load(probability, **alike), reading["crop"])
+            say_notes(() if chances is None else chances.notes)
+            return segment_scan(volume, prior, probability=chances, steps=steps, progress=progress, **options)
 
         more = {"probability": None if probability is None else str(probability), **options}
-        _run(scan, out, prior, reading, made, {"job": "segment", "steps": steps, **more}, overwrite)
+        _run(scan, out, prior, reading, compute, {"job": "segment", "steps": steps, **more}, overwrite)
 
 
 def reconstruct(
@@ -146,7 +146,7 @@ def reconstruct(
     strict: Strict = False,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Fill a mask of which only some slices are known, with a picture (.png) and a record (.json)."""
+    """Fill a mask between known slices under a curvature prior; write the mask, a picture and a record."""
     with plainly():
         reading = reading_of(
             spacing=spacing,
@@ -168,13 +168,13 @@ def reconstruct(
             raise ValueError(f"expected --first beside --every, got {first} beside --slices")
         options = {"every": every, "first": first or 0, "known": numbers, "axis": "zyx".index(axis.lower())}
 
-        def made(volume: Field, progress: Callable[[str, float], None]) -> Segmentation:
+        def compute(volume: Field, progress: Callable[[str, float], None]) -> Segmentation:
             from curvafit.segmentation.segment import reconstruct as fill
 
             return fill(volume, prior, epsilon=epsilon, steps=steps, progress=progress, **options)  # type: ignore[arg-type]
 
-        told = {"job": "reconstruct", "steps": steps, "epsilon": epsilon, **options}
-        _run(slices, out, prior, reading, made, told, overwrite)
+        record = {"job": "reconstruct", "steps": steps, "epsilon": epsilon, **options}
+        _run(slices, out, prior, reading, compute, record, overwrite)
 
 
 def _run(
@@ -182,11 +182,11 @@ def _run(
     out: Path,
     prior: str,
     reading: dict[str, Any],
-    make: Callable[[Field, Callable[[str, float], None]], Segmentation],
-    told: dict[str, Any],
+    compute: Callable[[Field, Callable[[str, float], None]], Segmentation],
+    record: dict[str, Any],
     overwrite: bool,
 ) -> None:
-    """Refuse, read, compute, write, say."""
+    """Check, read, compute, write and print."""
     from curvafit.priors.coefficients import PRESETS
     from curvafit.priors.law import texture_of
     from curvafit.segmentation.mask_files import check_mask_target, write_mask
@@ -194,24 +194,24 @@ def _run(
     from curvafit.volumes.scan import load
 
     law = None if prior in PRESETS else prior
-    inputs = [each for each in (source, law, told.get("probability")) if each is not None]
+    inputs = [each for each in (source, law, record.get("probability")) if each is not None]
     check_mask_target(out, inputs=inputs, overwrite=overwrite)
     texture_of(prior)
     with stages() as progress:
         progress("reading", 0.0)
         volume = load(source, **reading)
         check_mask_target(out, volume.unit, overwrite=overwrite)
-        working = WorkingGrid.of(volume, told["epsilon"])
-        say_forecast(told["job"], working.grid.shape, told["steps"], SEGMENTATION, what="working voxels")
-        found = make(volume, progress)
+        working = WorkingGrid.of(volume, record["epsilon"])
+        say_forecast(record["job"], working.grid.shape, record["steps"], SEGMENTATION, what="working voxels")
+        result = compute(volume, progress)
         progress("writing", 1.0)
-        asked = {"command": command_line(), "prior": prior, **told}
-        placed = ("spacing", "crop", "channel")
-        own = source if all(reading[name] is None for name in placed) else None
-        more = {"record": asked, "overwrite": overwrite}
-        files = write_mask(found, volume, out, like=own, unit=reading["unit"], **more)
-    for note in found.notes:
+        content = {"command": command_line(), "prior": prior, **record}
+        place = ("spacing", "crop", "channel")
+        like = source if all(reading[name] is None for name in place) else None
+        more = {"record": content, "overwrite": overwrite}
+        files = write_mask(result, volume, out, like=like, unit=reading["unit"], **more)
+    for note in result.notes:
         say(note)
-    say(f"{found.status[0].upper()}{found.status[1:]}.", style="bold")
+    say(f"{result.status[0].upper()}{result.status[1:]}.", style="bold")
     for path in files:
         say(str(path))

@@ -22,11 +22,11 @@ from rich.text import Text
 from curvafit.cli.refusal import sentence, writable
 from curvafit.interrupts import Terminated, exit_code
 
-#: Whether what other programs, or other commands, wrote may be replaced.
+#: Whether files of other programs, or of other commands, may be replaced.
 OverwriteOption = Annotated[
-    bool, typer.Option("--overwrite", help="Replace files or folders of these names whatever they are.")
+    bool, typer.Option("--overwrite", help="Replace files or folders of the output's names, whatever wrote them.")
 ]
-#: Set to anything, an error keeps its traceback.
+#: The environment variable that lets an error keep its traceback.
 DEBUG = "CURVAFIT_DEBUG"
 #: Signs that look better on a page than in a terminal, where they are copied and some encodings lack them.
 _PLAIN = str.maketrans({"\u2212": "-", "\u2013": "-", "\u202f": " ", "\u00a0": " "})
@@ -34,10 +34,9 @@ _PLAIN = str.maketrans({"\u2212": "-", "\u2013": "-", "\u202f": " ", "\u00a0": "
 
 @contextmanager
 def plainly() -> Iterator[None]:
-    """Turn an expected exception into its sentence and exit code 2, Ctrl-C into 130, another signal into 128 and its
-    number.
+    """Turn an expected exception into its sentence and exit code 2, and a signal into the exit code of `exit_code`.
 
-    Warnings become notes, which are said at the end: where nothing comes of a command, why is all there is to say.
+    Warnings become notes, printed at the end of a command that succeeds; one that fails prints its error alone.
     """
     notes: dict[str, None] = {}
     try:
@@ -60,7 +59,7 @@ def plainly() -> Iterator[None]:
 
 @contextmanager
 def kept(again: Callable[[], str] = lambda: "the same command") -> Iterator[None]:
-    """Ctrl-C, or another signal, says that nothing is lost, and what goes on."""
+    """On a signal, print that nothing is lost and which command resumes the work."""
     try:
         yield
     except KeyboardInterrupt as signal:
@@ -73,7 +72,7 @@ def _ended(signal: KeyboardInterrupt) -> str:
 
 
 def _expected(error: Exception) -> bool:
-    """Whether an exception tells of the input or the machine rather than of a mistake of ours."""
+    """Return whether an exception tells of the input or the machine rather than of a fault of the program."""
     if isinstance(error, ImportError):
         return not (error.name or "").startswith("curvafit")
     return not isinstance(error, RuntimeError) or "memory" in str(error).lower()
@@ -98,7 +97,7 @@ def _say_notes(notes: Iterable[str]) -> None:
 
 
 def command_line() -> str:
-    """The command as it was given."""
+    """Return the command as typed."""
     return shlex.join(["curvafit", *sys.argv[1:]])
 
 
@@ -106,7 +105,7 @@ def command_line() -> str:
 
 
 def numbers(text: str, option: str, count: int) -> tuple[float, ...]:
-    """So many finite numbers between commas."""
+    """Return a text as `count` finite numbers between commas."""
     try:
         values = tuple(float(part) for part in text.split(","))
     except ValueError:
@@ -118,7 +117,7 @@ def numbers(text: str, option: str, count: int) -> tuple[float, ...]:
 
 
 def triple(text: str, option: str) -> tuple[float, float, float]:
-    """One positive number for all axes, or three."""
+    """Return a text as three positive numbers; one counts for all axes."""
     values = numbers(text, option, 1) * 3 if "," not in text else numbers(text, option, 3)
     if min(values) <= 0:
         raise ValueError(f"expected {option} as positive numbers, got {text!r}")
@@ -126,7 +125,7 @@ def triple(text: str, option: str) -> tuple[float, float, float]:
 
 
 def whole_triple(text: str, option: str) -> tuple[int, int, int]:
-    """One positive whole number for all axes, or three."""
+    """Return a text as three positive whole numbers; one counts for all axes."""
     values = triple(text, option)
     if any(value != int(value) for value in values):
         raise ValueError(f"expected {option} as whole numbers, got {text!r}")
@@ -134,7 +133,7 @@ def whole_triple(text: str, option: str) -> tuple[int, int, int]:
 
 
 def whole_numbers(text: str, option: str) -> tuple[int, ...]:
-    """Some whole numbers from 0."""
+    """Return a text as whole numbers from 0."""
     values = numbers(text, option, text.count(",") + 1)
     if min(values) < 0 or any(value != int(value) for value in values):
         raise ValueError(f"expected {option} as whole numbers from 0, got {text!r}")
@@ -142,22 +141,22 @@ def whole_numbers(text: str, option: str) -> tuple[int, ...]:
 
 
 def device_of(text: str) -> str:
-    """A device of this machine, as torch names it."""
+    """Return the name of a device, or raise ValueError where this machine does not have it."""
     import torch
 
     try:
         kind = torch.device(text).type
     except RuntimeError:
         kind = ""
-    there = {"cpu": True, "cuda": torch.cuda.is_available()}
-    if not there.get(kind):
-        names = ", ".join(name for name, able in there.items() if able)
+    devices = {"cpu": True, "cuda": torch.cuda.is_available()}
+    if not devices.get(kind):
+        names = ", ".join(name for name, available in devices.items() if available)
         raise ValueError(f"expected --device to be one of this machine's ({names}), got {text!r}")
     return text
 
 
 def threshold_of(text: str) -> float | str:
-    """A grey level, or `"otsu"`."""
+    """Return a text as a grey level, or `"otsu"`."""
     return text.lower() if text.lower() == "otsu" else numbers(text, "--threshold", 1)[0]
 
 
@@ -165,24 +164,24 @@ def threshold_of(text: str) -> float | str:
 
 
 def error_console() -> Console:
-    """The error stream."""
+    """Return a console on the error stream."""
     return Console(stderr=True, highlight=False)
 
 
 def say(text: str, *, to: Console | None = None, style: str | None = None) -> None:
-    """One line as it is: no markup, no wrapping, so that paths can be copied."""
+    """Print one line without markup or wrapping, so that paths can be copied."""
     console = to or Console(highlight=False)
     console.print(writable(text.translate(_PLAIN), console), style=style, markup=False, soft_wrap=True)
 
 
 def say_notes(notes: Iterable[str]) -> None:
-    """Sentences on what was assumed of a file, on the error stream."""
+    """Print sentences on assumptions about a file on the error stream."""
     for note in notes:
         say(f"note: {note}", to=error_console())
 
 
 def output(heads: Sequence[str], rows: Iterable[Sequence[str]], right: Iterable[int] = ()) -> None:
-    """A table without a frame; the columns in `right` are aligned to the right."""
+    """Print a table without a frame; the columns in `right` are aligned to the right."""
     table = Table(box=None, pad_edge=False, header_style="bold")
     rights = set(right)
     for k, head in enumerate(heads):
@@ -195,10 +194,10 @@ def output(heads: Sequence[str], rows: Iterable[Sequence[str]], right: Iterable[
 
 @contextmanager
 def stages() -> Iterator[Callable[[str, float], None]]:
-    """A progress bar for a job that names its stages: call it with a sentence and the share done.
+    """Show a progress bar for a job that names its stages; call it with a sentence and the share done.
 
-    Where the error stream is no terminal, each new sentence is a line; one that only counts on, a line every 5 %. A
-    line waits for the next, so that a job that fails at its start says why in one.
+    Without a terminal each new sentence is a line, and one that differs only in its numbers is a line every 5 %. A line
+    at share 0 waits for the next line, so that a job that fails at its start prints its error alone.
     """
     console = error_console()
     if not console.is_terminal:
@@ -227,7 +226,7 @@ def stages() -> Iterator[Callable[[str, float], None]]:
 
 @contextmanager
 def flow_progress(steps: int) -> Iterator[Callable[..., None]]:
-    """A progress bar that is a flow's callback."""
+    """Show a progress bar that is a flow's callback."""
     columns = TextColumn("growing"), BarColumn(), TextColumn("{task.completed:.0f} of {task.total:.0f} steps")
     console = error_console()
     quiet = not console.is_terminal

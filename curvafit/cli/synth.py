@@ -32,13 +32,13 @@ EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
 )
 
 _what = partial(typer.Option, rich_help_panel="Shapes: one of these")
-_seen = partial(typer.Option, rich_help_panel="Images")
+_image = partial(typer.Option, rich_help_panel="Images")
 _out = partial(typer.Option, rich_help_panel="Output")
 
-Target = Annotated[Path, _out("-o", "--output", help="Folder of the set; a set that was begun goes on.")]
-Count = Annotated[int, _out(help="Number of cases that the set has at the end.")]
+Target = Annotated[Path, _out("-o", "--output", help="Folder of the set; a set that exists is resumed.")]
+Count = Annotated[int, _out(help="Number of cases in the set at the end.")]
 Shape = Annotated[str, _out(help="Voxels of an image: N or Z,Y,X.")]
-Layout = Annotated[str, _out(help="nnunet (v2, raw), monai (decathlon's list) or zarr.")]
+Layout = Annotated[str, _out(help="Layout of the files: nnunet (v2, raw), monai (decathlon's list) or zarr.")]
 Parts = Annotated[
     str | None,
     _out(
@@ -46,60 +46,58 @@ Parts = Annotated[
         help="Labels besides masks: distance, skeleton, instances, kappa1, kappa2, radius, betti, centreline.",
     ),
 ]
-Seed = Annotated[int, _out(help="Seed of shapes and images: the same seed makes the same voxels.")]
+Seed = Annotated[int, _out(help="Seed of shapes and images; the same seed gives the same voxels.")]
 Laws = Annotated[
     str | None,
     _what(
         "--prior",
         "--preset",
         "--presets",
-        help="Laws to grow shapes of: published shapes by name (`curvafit presets`) or fit.json files of `curvafit "
+        help="Laws of the shapes to generate: presets by name (see `curvafit presets`) or fit.json files of `curvafit "
         "infer`, several between commas.",
     ),
 ]
 Atlas = Annotated[
     Path | None,
-    _what(help="Store of `curvafit atlas build`, whose shapes are cropped; or an atlas (.npz), whose are grown anew."),
+    _what(help="Store of `curvafit atlas build`, to crop its shapes; or atlas (.npz), to generate shapes of its laws."),
 ]
 Calibres = Annotated[
     str,
-    _seen(
-        help="LOW,HIGH: each case draws a factor in between, by which its structure is thicker than --voxel makes it."
-    ),
+    _image(help="LOW,HIGH: each case draws a factor in between, and its structure is thicker than with --voxel by it."),
 ]
 Filled = Annotated[
     float | None,
     _what(
         "--volume-fraction",
-        help="Share of the volume that grown shapes fill; by default that of the scan of a fit.json.",
+        help="Share of the volume that generated shapes fill; by default that of the scan of a fit.json.",
     ),
 ]
 Kind = Annotated[
     str | None,
-    _seen("--modality", help="Kind of image: confocal, two-photon, light-sheet, micro-ct, mra, em-membrane."),
+    _image("--modality", help="Kind of image: confocal, two-photon, light-sheet, micro-ct, mra, em-membrane."),
 ]
-Like = Annotated[str | None, _seen(help="Scan to take noise, blur, contrast and spacing from, instead of --modality.")]
+Like = Annotated[str | None, _image(help="Scan to take noise, blur, contrast and spacing from, instead of --modality.")]
 Voxel = Annotated[
     float | None,
-    _seen(
-        help="Edge of a shape's voxel, in --unit: how thick structures are; by default that of the fit.json, else "
-        "the modality's."
+    _image(
+        help="Edge of a shape's voxel, in --unit, which makes structures thick or thin; by default that of the "
+        "fit.json, or of the modality."
     ),
 ]
-Like_mask = Annotated[str | None, _seen(help="Mask of the structure in --like, for nearer estimates.")]
+Like_mask = Annotated[str | None, _image(help="Mask of the structure in --like, for better estimates.")]
 Visible = Annotated[
     str | None,
-    _seen(
-        help="Masks of what an image shows, as annotators draw: where this share of the structure's light arrives; "
+    _image(
+        help="Masks as annotators draw them: the voxels where this share of the structure's light arrives; "
         "auto: midway in the logarithm of the levels. By default masks hold the structure itself."
     ),
 ]
-Spacing = Annotated[str | None, _seen(help="Voxel edges of --like, where the file states none: Z,Y,X or one number.")]
-Unit = Annotated[str | None, _seen(help="Unit of --spacing and --voxel: nm, um, mm or m.")]
-Channel = Annotated[int | None, _seen(help="Which channel of --like, counted from 0, where its file has several.")]
-Label = Annotated[int | None, _seen(help="The structure is where --like-mask has this value.")]
-Crop = Annotated[str | None, _seen(help="Box of voxels of --like and --like-mask: z0:z1,y0:y1,x0:x1; : is all.")]
-Strict = Annotated[bool, _seen("--strict", help="Refuse a scan for --like of which chunks or slices are missing.")]
+Spacing = Annotated[str | None, _image(help="Voxel edges of --like, Z,Y,X or one number for all; overrides the file.")]
+Unit = Annotated[str | None, _image(help="Unit of --spacing and --voxel: nm, um, mm or m.")]
+Channel = Annotated[int | None, _image(help="Channel of --like to read, counted from 0, where the file has several.")]
+Label = Annotated[int | None, _image(help="Label of the structure: the voxels of --like-mask with this value.")]
+Crop = Annotated[str | None, _image(help="Box of voxels of --like and --like-mask: z0:z1,y0:y1,x0:x1; : is all.")]
+Strict = Annotated[bool, _image("--strict", help="Refuse a scan with missing chunks or slices for --like.")]
 
 
 def synth(
@@ -137,8 +135,8 @@ def synth(
         crew.check()
         if unit is not None and spacing is None and voxel is None:
             raise ValueError("expected --unit beside --spacing or --voxel, got neither")
-        stated = [] if laws is None else laws.split(",")
-        source = _source(stated, atlas, volume_fraction)
+        names = [] if laws is None else laws.split(",")
+        source = _source(names, atlas, volume_fraction)
         placed = {"spacing": spacing, "unit": None if spacing is None else unit}  # a unit alone is that of --voxel
         reading = reading_of(**placed, crop=crop, channel=channel, label=label, strict=strict)
         kind = _modality(modality, like, like_mask, visible, reading)
@@ -147,7 +145,7 @@ def synth(
         from curvafit.data_synth.sets.sources import voxel_of
         from curvafit.volumes.formats.base import convert_length
 
-        edge = voxel_of(stated, kind) if voxel is None else convert_length(voxel, unit, kind.base.unit)
+        edge = voxel_of(names, kind) if voxel is None else convert_length(voxel, unit, kind.base.unit)
         low, high = numbers(calibres, "--calibres", 2)
         recipe = Recipe(source, kind, box, edge, seed, (low, high))
         _build(out, Order(recipe, layout, tuple(labels.split(",")) if labels else ()), count, crew)
@@ -171,14 +169,14 @@ def _build(out: Path, order: Order, count: int, crew: Crew) -> None:
     with crew.at_work() as (makers, progress):
         build_set(out, order, count, progress, workers=makers)
     preview = write_preview(out)
-    if (held := len(cases_of(out))) > count:
-        say(f"note: {out} holds {held} cases, more than --count {count}: all are listed", to=error_console())
+    if (total := len(cases_of(out))) > count:
+        say(f"note: {out} holds {total} cases, more than --count {count}: all are listed", to=error_console())
     say(str(out / "dataset.json"))
     say(str(preview))
 
 
 def _source(laws: list[str], atlas: Path | None, filled: float | None) -> ShapeSource:
-    """Where shapes come from."""
+    """Return the source of shapes that the options name."""
     if bool(laws) == (atlas is not None):
         raise ValueError(f"expected either --prior (or --preset) or --atlas, got {'both' if laws else 'neither'}")
     from curvafit.data_synth.sets.sources import Generated, Stored
@@ -191,21 +189,23 @@ def _source(laws: list[str], atlas: Path | None, filled: float | None) -> ShapeS
         return Stored((atlas.resolve(),))
     from curvafit.inference.atlas import load_atlas
 
-    held = load_atlas(atlas)
-    points = tuple((*map(float, row), float(mass)) for row, mass in zip(held.coefficients, held.masses, strict=True))
-    return Generated(points, held.ids, fraction=filled)
+    shapes = load_atlas(atlas)
+    points = tuple(
+        (*map(float, row), float(mass)) for row, mass in zip(shapes.coefficients, shapes.masses, strict=True)
+    )
+    return Generated(points, shapes.ids, fraction=filled)
 
 
 def _modality(
     name: str | None, like: str | None, mask: str | None, visible: str | None, reading: dict[str, Any]
 ) -> Modality:
-    """The named kind of image, or one like a scan; with the share of light that its masks ask for."""
+    """Return the named kind of image, or one like a scan, with the share of light in masks."""
     if (name is None) == (like is None):
         raise ValueError(f"expected either --modality or --like, got {'neither' if name is None else 'both'}")
     if like is None:
-        lone = [key for key, value in reading.items() if value is not None and value is not False]
-        if lone or mask is not None:
-            raise ValueError(f"expected --like beside {f'--{lone[0]}' if lone else '--like-mask'}, got none")
+        extras = [key for key, value in reading.items() if value is not None and value is not False]
+        if extras or mask is not None:
+            raise ValueError(f"expected --like beside {f'--{extras[0]}' if extras else '--like-mask'}, got none")
         from curvafit.data_synth.imaging.modalities import modality
 
         return _visible(modality(str(name)), visible)
@@ -216,8 +216,8 @@ def _modality(
         raise ValueError("expected --like-mask beside --label, which is a value of that mask, got none")
     scan = load(like, **{**reading, "label": None})
     say_notes(scan.notes)
-    masked = None if mask is None else _mask(load(mask, **{**reading, "channel": None}).values)
-    return _visible(estimate.like(scan, masked), visible)
+    inside = None if mask is None else _mask(load(mask, **{**reading, "channel": None}).values)
+    return _visible(estimate.like(scan, inside), visible)
 
 
 def _mask(values: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The options that say who makes draws and cases, and the workers that they name."""
+"""The options of the workers that make draws and cases."""
 
 from __future__ import annotations
 
@@ -17,13 +17,15 @@ if TYPE_CHECKING:
     from curvafit.progress import Progress
 
 WorkersOption = Annotated[
-    int | None, typer.Option(help="Worker processes on this machine; by default one a core, 0 for this process alone.")
+    int | None,
+    typer.Option(help="Worker processes on this machine; by default one per core, 0 for this process alone."),
 ]
 SchedulerOption = Annotated[
     str | None, typer.Option(help="Address of a running dask scheduler, tcp://HOST:PORT, instead of --workers.")
 ]
 DashboardOption = Annotated[
-    int | None, typer.Option(help="Port of dask's page on 127.0.0.1, for workers on this machine; none by default.")
+    int | None,
+    typer.Option(help="Port of dask's dashboard on 127.0.0.1, for workers on this machine; by default none."),
 ]
 
 
@@ -35,7 +37,7 @@ class Crew(NamedTuple):
     dashboard: int | None
 
     def check(self, shape: Sequence[int] | None = None) -> None:
-        """Raise ValueError where the options contradict, or a shape of so many voxels does not fit into this memory."""
+        """Raise ValueError where the options contradict each other, or a shape does not fit into memory."""
         from curvafit.data_synth.atlas.workers import check_workers
         from curvafit.generation.memory import FLOW, check_memory
 
@@ -45,7 +47,7 @@ class Crew(NamedTuple):
 
     @contextmanager
     def at_work(self, again: Callable[[], str] = lambda: "the same command") -> Iterator[tuple[Workers, Progress]]:
-        """Start the workers, and a progress bar for them; `again` is what goes on after an interrupt."""
+        """Start the workers and their progress bar; `again` returns the command that resumes after an interrupt."""
         from curvafit.data_synth.atlas.workers import cluster
 
         with kept(again), stages() as progress:

@@ -69,9 +69,8 @@ class Execution:
                 return CudaStepper([start], [form.base], cost, [cost.coefficients], betas, frozen, self.device)
             return FusedStepper(start, form, cost, betas, frozen)
         kind = LbfgsStepper if optimiser == "lbfgs" else TorchStepper
-        options = {"fused": not plain, "data": cost.data}
-        a, ε, Q = cost.coefficients, cost.epsilon, cost.orientation
-        return kind(start, form, a, ε, betas, frozen, self.device, Q, **options)
+        options = {"orientation": cost.orientation, "fused": not plain, "data": cost.data}
+        return kind(start, form, cost.coefficients, cost.epsilon, betas, frozen, self.device, **options)
 
     def checkpoint_file(self, stepper: Stepper, cost: Cost, orders: Orders, **start: object) -> Checkpoint | None:
         """Return the checkpoint of a run, or None where the run has none."""

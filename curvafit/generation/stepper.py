@@ -98,6 +98,7 @@ class TorchStepper(Stepper):
         betas: tuple[float, float],
         frozen: Tensor | None,
         device: torch.device | str,
+        *,
         orientation: Tensor | None = None,
         fused: bool = False,
         data: Data | None = None,

@@ -1,4 +1,4 @@
-"""The main job: a scan in, its parameters out. Each step is another module's; the order is here."""
+"""The main job: a scan in, its parameters out. This module holds the order of the steps; others hold the steps."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from curvafit.volumes.source import Source, field_of
 
 #: Longest edge, in working voxels, of the boxes in which shapes are regenerated for comparison.
 REGENERATED_EDGE = 100
-#: How many of the nearest shapes are kept, and how many of them refinement starts from.
+#: Number of nearest shapes, and of those from which refinement starts.
 MATCHES, STARTS = 5, 3
 #: The distances of a fit that an inference shows, by the names that people read.
 _DISTANCES = (("match", "match"), ("fit", "fit"), ("two seeds", "seed_noise"))
@@ -50,18 +50,18 @@ _ARTICLES = {"field": "a phase field", "mask": "a mask", "image": "an image"}
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Inference(Pictured):
-    """An inference with all that its report shows.
+    """An inference: a fit, and the fields and diagrams of its report.
 
     Attributes
     ----------
     scan, prepared
-        The scan as it was read, and as it was prepared for measurement.
+        The scan as read, and as prepared for measurement.
     diagram, match_diagram, fit_diagram
         Curvature diagrams of the scan, the regenerated match and the regenerated fit.
     matched, regenerated
         Phase fields `(Z, Y, X)` of the regenerated match and fit, None where no shape grew.
     fit
-        The parameters with their account.
+        The parameters with their uncertainties, distances and status.
     """
 
     scan: Field
@@ -114,24 +114,24 @@ def infer(
     kind
         `"field"`, `"mask"`, `"image"`, or `"auto"`: two values are a mask, plateaus near ±1 a phase field.
     periodic
-        Whether the box repeats; true of generated fields, of scans hardly ever.
+        Whether the box repeats, as generated fields do and scans hardly ever.
     atlas
-        The shapes to match against; the packaged ones by default.
+        The shapes to match against; by default the packaged ones.
     threshold, dark, roi
-        What is inside: see `curvafit.inference.prepare.prepare`.
+        How the structure is told from the background: see `curvafit.inference.prepare.prepare`.
     label, crop
         The voxels of one value as a mask; a box of voxels, of the scan and of `roi`: see `curvafit.load`.
     watch
-        Called with the `Prepared` scan before the long part begins; what it raises ends the inference.
+        Called with the `Prepared` scan before the long part begins; an exception of it ends the inference.
     progress
         Called with a sentence and the share done.
     reading
-        How a file is read, or an array placed: spacing, unit and the others of `curvafit.load`.
+        Options of reading a file, or the place of an array: spacing, unit and the others of `curvafit.load`.
 
     Raises
     ------
     ValueError, FileNotFoundError
-        One sentence on a volume that cannot be measured.
+        If the volume cannot be read or measured, or an argument is out of range.
     """
     check_options(kind, threshold, label)
     if atlas is not None:
@@ -146,24 +146,24 @@ def infer(
     if watch is not None:
         watch(prepared)
     progress("measuring curvature", 0.05)
-    seen = scan_diagram(prepared)
+    measured = scan_diagram(prepared)
     seen_as = "field" if prepared.kind == "field" else "mask"
     progress("searching the atlas", 0.1)
-    matches = nearest(seen, atlas, seen_as=seen_as, count=MATCHES)
+    matches = nearest(measured, atlas, seen_as=seen_as, count=MATCHES)
     progress("refining the parameters", 0.2)
     refined = _refined(prepared, matches, seed, progress)
     progress("regenerating", 0.6)
     refined = _with_mass(refined, prepared, seed)
     twins = _regenerate(prepared, matches[0], refined, seed, progress)
-    fit = _fit(prepared, seen, matches, refined, twins, _provenance(volume, atlas, seed))
+    fit = _fit(prepared, measured, matches, refined, twins, _provenance(volume, atlas, seed))
     progress("done", 1.0)
-    of_match, of_fit = twins["match"][0], twins["fit"][0]
-    return Inference(volume, prepared, seen, of_match.diagram, of_fit.diagram, of_match.phase, of_fit.phase, fit)
+    match, refit = twins["match"][0], twins["fit"][0]
+    return Inference(volume, prepared, measured, match.diagram, refit.diagram, match.phase, refit.phase, fit)
 
 
 @dataclass(frozen=True)
 class _Twin:
-    """A regenerated shape as the query would be seen, or the reason why there is none."""
+    """A regenerated shape, measured as the scan is, or the flow that grew none."""
 
     flow: Flow
     phase: np.ndarray | None
@@ -188,10 +188,10 @@ def _refined(prepared: Prepared, matches: tuple[Match, ...], seed: int, progress
 
 
 def _with_mass(refined: Refinement, prepared: Prepared, seed: int) -> Refinement:
-    """Return the mass that gives a regenerated shape the scan's volume fraction, to first order; a field's own is its
-    mean.
+    """Return a refinement whose mass gives a regenerated shape the scan's volume fraction, to first order.
 
-    A mask does not tell its mass: the phases of a minimiser stop short of ±1 by an amount that curvature decides.
+    The mass of a phase field is its mean and stays. A mask does not state a mass: the phases of a minimiser stop short
+    of ±1 by an amount that depends on curvature.
     """
     if prepared.kind == "field":
         return refined
@@ -204,7 +204,7 @@ def _with_mass(refined: Refinement, prepared: Prepared, seed: int) -> Refinement
 
 
 def _twin_grid(prepared: Prepared) -> Grid:
-    """Return a periodic box of the main window's size, for shapes to compare with."""
+    """Return a periodic box of the main window's size, for the regenerated shapes."""
     z, y, x = (min(edge.stop - edge.start, REGENERATED_EDGE) for edge in prepared.windows[0])
     return Grid((z, y, x), prepared.grid.spacing, "periodic")
 
@@ -212,7 +212,7 @@ def _twin_grid(prepared: Prepared) -> Grid:
 def _regenerate(
     prepared: Prepared, match: Match, refined: Refinement, seed: int, progress: Progress
 ) -> dict[str, tuple[_Twin, _Twin]]:
-    """Regrow two seeds each of the nearest match and of the refined parameters."""
+    """Regenerate the nearest match and the refined parameters, with two seeds each."""
     grid = _twin_grid(prepared)
     twins = {}
     for step, (name, source) in enumerate((("match", match), ("fit", refined))):
@@ -234,13 +234,13 @@ def _twin(coefficients: Coefficients, mass: float, grid: Grid, seed: int, kind: 
 
 def _fit(
     prepared: Prepared,
-    seen: Diagram,
+    measured: Diagram,
     matches: tuple[Match, ...],
     refined: Refinement,
     twins: dict[str, tuple[_Twin, _Twin]],
     provenance: dict[str, Any],
 ) -> Fit:
-    distances = {name: _distance(seen, pair) for name, pair in twins.items()}
+    distances = {name: _distance(measured, pair) for name, pair in twins.items()}
     noises = {name: _noise(pair) for name, pair in twins.items()}
     chosen, status = _verdict(distances, noises, refined, twins)
     distances["seed_noise"] = noises[chosen]
@@ -248,7 +248,7 @@ def _fit(
     grid = prepared.grid
     return Fit(
         kind=prepared.kind,
-        family=family_of(seen, prepared.thickness / 2 * grid.spacing[0]),
+        family=family_of(measured, prepared.thickness / 2 * grid.spacing[0]),
         coefficients=better.coefficients,
         mass=float(better.mass),
         chosen=chosen,
@@ -263,13 +263,13 @@ def _fit(
         morphometry=morphometry(prepared.mask, prepared.working_voxel, prepared.unit, periodic=grid.periodic),
         notes=prepared.notes,
         provenance=provenance,
-        diagram=seen.thinned(BIN_WIDTH, TAIL_SHARE),
+        diagram=measured.thinned(BIN_WIDTH, TAIL_SHARE),
     )
 
 
-def _distance(seen: Diagram, pair: tuple[_Twin, _Twin]) -> float | None:
+def _distance(measured: Diagram, pair: tuple[_Twin, _Twin]) -> float | None:
     diagrams = [twin.diagram for twin in pair if twin.diagram is not None]
-    return float(one_to_many(seen, diagrams).mean()) if diagrams else None
+    return float(one_to_many(measured, diagrams).mean()) if diagrams else None
 
 
 def _noise(pair: tuple[_Twin, _Twin]) -> float | None:
@@ -280,7 +280,7 @@ def _noise(pair: tuple[_Twin, _Twin]) -> float | None:
 def _verdict(
     distances: dict[str, float | None], noises: dict[str, float | None], refined: Refinement, twins: dict
 ) -> tuple[str, str]:
-    """Return which of match and fit is better supported, in a word and in a sentence."""
+    """Return which of match and fit is better supported, as a word and as a sentence."""
     match, fit = distances["match"], distances["fit"]
     if fit is None:
         reason = twins["fit"][0].flow.viability.reason
@@ -290,8 +290,8 @@ def _verdict(
     noise = noises["fit"] or noises["match"] or 0.0
     both = f"regenerated, the fit lies {fit:.1f} from the scan, the match {match:.1f}, two seeds {noise:.1f} apart"
     if fit <= match + noise:
-        how = "clearly" if fit < match - noise else "within seed noise"
-        return "fit", f"The refined parameters are supported ({how}): {both}. {refined.status}"
+        margin = "clearly" if fit < match - noise else "within seed noise"
+        return "fit", f"The refined parameters are supported ({margin}): {both}. {refined.status}"
     return "match", f"The nearest match is better supported: {both}. {refined.status}"
 
 

@@ -1,4 +1,4 @@
-"""What a scan, a probability map or a few slices say of the inside, and where a surface may start from."""
+"""Evidence of the inside in a scan, a probability map or a few slices, and a first guess of the surface."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ from curvafit.volumes.formats.part import Crop
 
 __all__ = ["VoxelEvidence", "cropped_map", "interpolated_distance", "of_intensities", "of_probability"]
 
-#: Where Otsu's threshold is to be found, grey levels beyond these percentiles count as these.
+#: Percentiles to which grey levels are clipped for Otsu's threshold.
 TAILS = (0.1, 99.9)
-#: Contrast between the classes that a smoothed scan's noise may have, as a share; its deviation in voxels, from and to.
+#: Most noise of a smoothed scan, as a share of the contrast; least and greatest deviation of the smoothing, in voxels.
 QUIET, WIDTHS = 1 / 16, (0.7, 3.0)
-#: The least noise that is believed, as a share of the contrast, and the most that a probability is.
+#: Least noise, as a share of the contrast; least distance of a probability from 0 and 1.
 LEAST_NOISE, CERTAIN = 0.05, 1e-4
-#: Voxels between what is the same place in two files.
+#: Voxels by which the same place may differ in two files.
 ASTRAY = 0.1
-#: Classes that Otsu's threshold found with less contrast than so many times the noise may be the noise's own.
+#: Contrast, in units of the noise, below which the classes of Otsu's threshold may be noise.
 FAINT = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class VoxelEvidence:
-    """What each voxel says, and a first guess.
+    """Evidence of each voxel, and a first guess.
 
     Attributes
     ----------
     ratio
         float32 (Z, Y, X): log-likelihood ratio of inside to outside, in nats.
     level
-        float32, same shape: smooth, positive where the first guess is inside.
+        float32 (Z, Y, X): smooth, positive inside the first guess.
     note
-        A sentence on what was found.
+        A sentence on the classes.
     """
 
     ratio: np.ndarray
@@ -50,18 +50,18 @@ class VoxelEvidence:
 
 
 def of_intensities(scan: Field, threshold: float | str = "otsu", dark: bool = False) -> VoxelEvidence:
-    """Two classes of grey levels with one Gaussian noise: r = (g - t) (c₁ - c₀) / σ².
+    """Return the evidence of two classes of grey levels with one Gaussian noise: r = (g - t) (c₁ - c₀) / σ².
 
-    The scan is smoothed and split by Otsu's threshold; c₀, c₁ and σ are the raw levels' means and pooled deviation on
-    either side, t is half way between the means. It is then smoothed anew, as far as the noise asks for. A structure of
-    less than 0.1 % of the volume asks for a threshold: Otsu's takes it for a tail of the noise.
+    Otsu's threshold splits the smoothed scan; c₀, c₁ and σ are means and pooled deviation of the raw levels on either
+    side, and t is half way between the means. The scan is then smoothed again, by a width that depends on the noise. A
+    structure of less than 0.1 % of the volume needs a threshold: Otsu's takes such a structure for a tail of the noise.
 
     Parameters
     ----------
     threshold
-        t, instead; or `"otsu"`.
+        t, or `"otsu"`.
     dark
-        The inside is the dark phase.
+        Whether the inside is the dark phase.
 
     Raises
     ------
@@ -73,29 +73,29 @@ def of_intensities(scan: Field, threshold: float | str = "otsu", dark: bool = Fa
         raise ScanError(f"expected finite values, got {np.count_nonzero(~np.isfinite(values))} that are not")
     if isinstance(threshold, str) and threshold != "otsu":
         raise ScanError(f"expected a threshold that is a number or 'otsu', got {threshold!r}")
-    found = threshold == "otsu"
-    if found and not np.all((values == values.min()) | (values == values.max())):  # a mask's rarer value is no tail
+    automatic = threshold == "otsu"
+    if automatic and not np.all((values == values.min()) | (values == values.max())):  # a mask's rarer value is no tail
         values = np.clip(values, *np.percentile(values, TAILS))
     smooth = _smoothed(values, scan, WIDTHS[0] + 0.3)
     means, noise = _classes(values, smooth, threshold)
     smooth = _smoothed(values, scan, _width(noise / (means[1] - means[0])))
     means, noise = _classes(values, smooth, threshold)
     contrast = means[1] - means[0]
-    middle, sign = sum(means) / 2 if found else float(threshold), -1 if dark else 1
+    middle, sign = sum(means) / 2 if automatic else float(threshold), -1 if dark else 1
     noise = max(noise, LEAST_NOISE * contrast)
-    said = f"classes at {means[0]:.4g} and {means[1]:.4g}, noise {noise:.3g}, split at {middle:.4g}"
-    if found and contrast < FAINT * noise:
-        said += "; they differ by less than the noise, as where the structure is rare: better give a threshold"
-    return VoxelEvidence(sign * (values - middle) * np.float32(contrast / noise**2), sign * (smooth - middle), said)
+    note = f"classes at {means[0]:.4g} and {means[1]:.4g}, noise {noise:.3g}, split at {middle:.4g}"
+    if automatic and contrast < FAINT * noise:
+        note += "; they differ by less than the noise, as where the structure is rare: better give a threshold"
+    return VoxelEvidence(sign * (values - middle) * np.float32(contrast / noise**2), sign * (smooth - middle), note)
 
 
 def of_probability(probability: Field, scan: Field) -> VoxelEvidence:
-    """r = log p / (1 - p) of a map (Z, Y, X) in [0, 1].
+    """Return the evidence of a probability map (Z, Y, X) in [0, 1]: r = log p / (1 - p).
 
     Raises
     ------
     ScanError
-        If its shape or place is not the scan's or it leaves [0, 1].
+        If the map's shape or place is not the scan's, or a value lies outside [0, 1].
     """
     if probability.shape != scan.shape:
         raise ScanError(f"expected a probability map of the scan's shape {scan.shape}, got {probability.shape}")
@@ -105,12 +105,12 @@ def of_probability(probability: Field, scan: Field) -> VoxelEvidence:
     if not 0 <= lowest <= highest <= 1:
         raise ScanError(f"expected probabilities in [0, 1], got {lowest:g} to {highest:g}")
     p = values.clip(CERTAIN, 1 - CERTAIN)
-    said = f"probabilities from {lowest:.3g} to {highest:.3g}"
-    return VoxelEvidence(np.log(p / (1 - p)), _smoothed(values, scan, WIDTHS[0]) - 0.5, said)
+    note = f"probabilities from {lowest:.3g} to {highest:.3g}"
+    return VoxelEvidence(np.log(p / (1 - p)), _smoothed(values, scan, WIDTHS[0]) - 0.5, note)
 
 
 def cropped_map(probability: Field, crop: Crop | None) -> Field:
-    """Return a map's part that belongs to the same crop of its scan; a map without a place stays one without."""
+    """Return the part of a map for a crop of its scan; a map without an affine stays without one."""
     if crop is None:
         return probability
     part = probability.crop(crop)
@@ -118,7 +118,7 @@ def cropped_map(probability: Field, crop: Crop | None) -> Field:
 
 
 def _check_place(other: Field, scan: Field) -> None:
-    """Raise if the affines, where both have one, part by more than `ASTRAY` at a corner."""
+    """Raise ScanError where the two affines, if both exist, differ by more than `ASTRAY` at a corner."""
     if scan.affine is None or other.affine is None:
         return
     factor = METRES[other.unit] / METRES[scan.unit] if {other.unit, scan.unit} <= METRES.keys() else 1.0
@@ -132,15 +132,16 @@ def _check_place(other: Field, scan: Field) -> None:
 def interpolated_distance(
     slices: np.ndarray, places: Sequence[int], length: int, spacing: Sequence[float]
 ) -> np.ndarray:
-    """Signed distance (length, Y, X) between known masks (N, Y, X) at `places` along the first axis.
+    """Return the signed distance (length, Y, X) between known masks (N, Y, X) at `places` along the first axis.
 
-    Each mask's own distance within its plane, positive inside; between them the natural cubic spline (a line between
-    two), beyond the first and last the nearest. An empty mask is outside by the largest gap between slices.
+    At a mask it is the distance within the plane, positive inside; between masks the natural cubic spline (a line for
+    two masks); before the first and beyond the last the value of the nearest. An empty mask has minus the largest gap
+    between slices, a full one plus this gap.
     """
     gap = float(np.diff(places).max()) * spacing[0]
-    known = np.stack([_plane_distance(mask, spacing[1:], gap) for mask in slices])
+    distances = np.stack([_plane_distance(mask, spacing[1:], gap) for mask in slices])
     where = np.arange(length).clip(places[0], places[-1])
-    return CubicSpline(places, known, bc_type="natural")(where).astype(np.float32)
+    return CubicSpline(places, distances, bc_type="natural")(where).astype(np.float32)
 
 
 def _plane_distance(mask: np.ndarray, spacing: Sequence[float], gap: float) -> np.ndarray:
@@ -152,13 +153,13 @@ def _plane_distance(mask: np.ndarray, spacing: Sequence[float], gap: float) -> n
 
 
 def _smoothed(values: np.ndarray, scan: Field, width: float) -> np.ndarray:
-    """By so many voxels of the finest axis, truncated at three deviations."""
+    """Return the values after a Gaussian of a width in voxels of the finest axis, truncated at three deviations."""
     finest = min(scan.spacing)
     return ndimage.gaussian_filter(values, [width * finest / h for h in scan.spacing], mode="nearest", truncate=3.0)
 
 
 def _width(noise: float) -> float:
-    """Deviation in voxels of the Gaussian that lowers white noise to `QUIET`: by (4π)^¾ w^1.5."""
+    """Return the deviation w, in voxels, of the Gaussian that lowers white noise to `QUIET`: by (4π)^¾ w^1.5."""
     return float(np.clip((noise / QUIET / (4 * math.pi) ** 0.75) ** (2 / 3), *WIDTHS))
 
 

@@ -1,4 +1,4 @@
-"""A segmentation on disk: the mask as the scan's file has it, a picture and a record of what made it."""
+"""A segmentation on disk: the mask with the header of the scan's file, a picture and a record."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from curvafit.volumes.scan import Field, save
 
 __all__ = ["FORMAT", "check_mask_target", "segmentation_figure", "write_mask"]
 
-#: What a record beside a mask says that it is.
+#: `format` of the record beside a mask.
 FORMAT = "curvafit-mask-1"
 
 _NIFTI = (".nii", ".nii.gz")
@@ -32,16 +32,16 @@ _NIFTI = (".nii", ".nii.gz")
 def check_mask_target(
     path: str | Path, unit: str | None = None, inputs: Iterable[str | Path] = (), overwrite: bool = False
 ) -> Path:
-    """The path, if a mask in `unit` can be written there; asked before the work is done.
+    """Return the path, or raise ValueError where a mask in `unit` cannot be written there; called before the work.
 
-    `inputs` are the files, or folders, that are read: none may be written over. `overwrite` tells whether other files
-    that no such command wrote may be.
+    `inputs` are the files, or folders, that are read: none may be overwritten. `overwrite` says whether files of other
+    origin may be replaced.
 
     Raises
     ------
     ValueError
-        If the suffix is no volume's, its format needs a unit, the place cannot be written to, or an input or another
-        file stands where the mask, the record or the picture goes.
+        If the suffix is not a volume's, its format needs a unit, the folder cannot be written to, or the mask, the
+        record or the picture would replace an input or another file.
     """
     target = Path(path)
     pick_writer(target, unit or "mm")
@@ -49,7 +49,7 @@ def check_mask_target(
 
 
 def write_mask(
-    found: Segmentation,
+    segmentation: Segmentation,
     scan: Field,
     path: str | Path,
     *,
@@ -63,38 +63,38 @@ def write_mask(
     Parameters
     ----------
     scan
-        What was segmented: the picture's grey levels.
+        The scan, for the picture's grey levels.
     like
-        The scan's own file: where it and the target are NIfTI, the header is kept, all but the values' type and range.
+        The scan's file. If this file and the target are NIfTI, the mask gets the same header but for type and range.
     unit
-        What the lengths in `like` are said to be in, if not what its header says.
+        The unit of the lengths in `like`, by default the one of its header.
     record
-        What to add to the record.
+        Entries to add to the record.
     overwrite
-        Whether files that no such call wrote may be replaced.
+        Whether files of other origin may be replaced.
 
     Returns
     -------
-    The paths of mask, picture (`.png`) and record (`.json`). All three are made in a temporary folder, then moved.
+    The paths of mask, picture (`.png`) and record (`.json`), which appear together once all three are whole.
     """
     target = check_mask_target(path, scan.unit, () if like is None else (like,), overwrite)
-    mask = found.mask.values.astype(np.uint8)
+    mask = segmentation.mask.values.astype(np.uint8)
     with staged(target) as work:
-        made = work / target.name
+        temporary = work / target.name
         if like is not None and all(str(each).lower().endswith(_NIFTI) for each in (like, target)):
-            write_nifti_like(mask, Path(like), made, unit)
+            write_nifti_like(mask, Path(like), temporary, unit)
         else:
-            save(Field(mask, scan.spacing, scan.unit, scan.affine), made, kind=FORMAT)
-        picture, note = beside(made, ".png"), beside(made, ".json")
-        rows = [(scan.values, None), (scan.values, found.mask.values)]
+            save(Field(mask, scan.spacing, scan.unit, scan.affine), temporary, kind=FORMAT)
+        picture, note = beside(temporary, ".png"), beside(temporary, ".json")
+        rows = [(scan.values, None), (scan.values, segmentation.mask.values)]
         section_figure(rows, scan.spacing).savefig(picture, dpi=DPI)
-        parts = (made, picture, note)
-        told = {**_record(found, scan, record or {}), "files": [part.name for part in parts]}
-        note.write_text(json.dumps(told, indent=2) + "\n", encoding="utf-8")
+        parts = (temporary, picture, note)
+        content = {**_record(segmentation, scan, record or {}), "files": [part.name for part in parts]}
+        note.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
         return move_together(parts, target.parent)  # type: ignore[return-value]
 
 
-def segmentation_figure(found: Segmentation) -> Figure:
+def segmentation_figure(segmentation: Segmentation) -> Figure:
     """Return a figure of the phase field's middle slices with the mask's outline.
 
     Raises
@@ -102,23 +102,23 @@ def segmentation_figure(found: Segmentation) -> Figure:
     ValueError
         If the phase field is not finite.
     """
-    return section_figure([(found.phase.values, found.mask.values)], found.phase.spacing)
+    return section_figure([(segmentation.phase.values, segmentation.mask.values)], segmentation.phase.spacing)
 
 
-def _record(found: Segmentation, scan: Field, more: dict[str, Any]) -> dict[str, Any]:
+def _record(segmentation: Segmentation, scan: Field, more: dict[str, Any]) -> dict[str, Any]:
     return {
         "format": FORMAT,
-        "status": found.status,
+        "status": segmentation.status,
         **more,
         "scan": scan.source,
         "shape": list(scan.shape),
         "spacing": list(scan.spacing),
         "unit": scan.unit,
-        "coefficients": found.coefficients.as_dict(),
-        "epsilon": found.epsilon,
-        "weight": found.weight,
-        "volume_fraction": float(found.mask.values.mean()),
-        "notes": list(found.notes),
+        "coefficients": segmentation.coefficients.as_dict(),
+        "epsilon": segmentation.epsilon,
+        "weight": segmentation.weight,
+        "volume_fraction": float(segmentation.mask.values.mean()),
+        "notes": list(segmentation.notes),
         "curvafit": version("curvafit"),
         "torch": version("torch"),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),

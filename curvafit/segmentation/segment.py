@@ -27,37 +27,37 @@ from curvafit.volumes.source import Source, field_of
 
 __all__ = ["STEPS", "Segmentation", "reconstruct", "segment"]
 
-#: Steps of Adam, if not said otherwise.
+#: Default steps of Adam.
 STEPS = 150
-#: Nats that a unit of the Willmore energy costs: best, or nearly, from little noise to much on bone and tubes.
+#: Cost in nats of a unit of the Willmore energy: best, or nearly, on bone and tubes from little noise to much.
 NATS = 1.0
-#: The spring that holds known slices, in working units; ten times less lets go of them, ten times more stalls.
+#: Stiffness of the spring on known slices, in working units: a tenth of it loses them, ten times as much stalls.
 STIFFNESS = 1e6
 
-#: Values that known slices may have; more are grey levels.
+#: Most values of known slices; more are grey levels.
 LABELS = 256
 #: Least and greatest weight.
 WEIGHTS = (1e-9, 1e9)
-#: A flow whose last ten steps lower the energy by less than this share has settled.
+#: A flow has settled where its last ten steps lower the energy by less than this share.
 SETTLED = 0.001
 
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Segmentation(Pictured):
-    """A mask, and how it came about.
+    """A mask, with its phase field, its energy and its status.
 
     Attributes
     ----------
     mask, phase
-        On the scan's own grid, with its spacing, unit and affine: bool, and the phase field u, float32.
+        The mask, bool, and the phase field u, float32, with the scan's grid, spacing, unit and affine.
     weight
-        λ, in nats per unit of F_ε; None where the data were known slices.
+        λ, in nats per unit of F_ε; None for a reconstruction from known slices.
     coefficients, epsilon
-        Of F_ε, with lengths in the scan's unit.
+        The coefficients of F_ε and ε, with lengths in the scan's unit.
     status
-        A sentence: whether the flow settled, and what is inside.
+        A sentence: whether the flow settled, and which share of the volume is inside.
     notes
-        Sentences on what was found and assumed.
+        Sentences on the evidence and on assumptions.
     """
 
     mask: Field
@@ -98,24 +98,24 @@ def segment(
         `Coefficients` with lengths in the scan's unit; or a preset's name, in working units of which the smallest voxel
         edge is 0.01; or the path of a `fit.json`, whose unit is converted.
     probability
-        Instead of grey levels, and of `threshold` and `dark`: the probability of the inside, in [0, 1], of the scan's
-        shape, and at its place where both files tell one; a file's map has the scan's `spacing` and `unit`.
+        The probability of the inside, in [0, 1], in place of grey levels, `threshold` and `dark`: a volume of the
+        scan's shape, at the scan's place where both files state one. A file's map has the scan's `spacing` and `unit`.
     weight
-        λ, in nats per unit of F_ε; 2 / (a20 + a02) if not given. The data count in nats, so by their noise; the
-        Willmore energy counts as it is; and others as what small bumps on a plane cost, which is (a20 + a02) / 2 times
-        their Willmore energy (linear terms aside, since ∫κ1κ2 = 0).
+        λ, in nats per unit of F_ε; by default 2 / (a20 + a02). Small bumps on a plane cost (a20 + a02) / 2 times their
+        Willmore energy (linear terms aside, since ∫κ1κ2 = 0): with the default, every prior counts as strongly as the
+        Willmore energy, and the data count by their noise.
     threshold, dark
         The grey level between the phases, or `"otsu"`; whether the structure is the dark one.
     epsilon
-        ε in the scan's unit; twice the smallest voxel edge if not given. What is thinner does not survive.
+        ε in the scan's unit; by default twice the smallest voxel edge. Thinner structures do not survive.
     steps
-        Of Adam.
+        Steps of Adam.
     crop
         A box of voxels, of the scan and of the probability map: see `curvafit.load`.
     progress
         Called with a sentence and the share done.
     reading
-        How a file is read, or an array placed: spacing, unit and the others of `curvafit.load`.
+        Options of reading a file, or the place of an array: spacing, unit and the others of `curvafit.load`.
 
     Raises
     ------
@@ -131,22 +131,22 @@ def segment(
     if not (isinstance(threshold, str) and threshold == "otsu"):
         real(threshold, "a threshold that is a number or 'otsu'")
     if probability is None:
-        found = of_intensities(scan, threshold, dark)
+        evidence = of_intensities(scan, threshold, dark)
     elif dark or threshold != "otsu":
         raise ScanError("expected neither a threshold nor dark with a probability map, which says what is inside")
     else:
         placed = {} if isinstance(probability, Field) else {name: reading.get(name) for name in ("spacing", "unit")}
-        found = of_probability(cropped_map(field_of(probability, **placed), crop), scan)
-    start = _started(found.level, place)
+        evidence = of_probability(cropped_map(field_of(probability, **placed), crop), scan)
+    start = _started(evidence.level, place)
     stiffness = float(law.a20 + law.a02) / 2
     if stiffness <= 0:
         raise ScanError(f"expected coefficients with a20 + a02 > 0, got {2 * stiffness:g}: surfaces would crumple")
     λ = NATS / stiffness if weight is None else float(weight)
-    ratio = place.spread(found.ratio) / (λ * stiffness * place.grid.voxel_volume)
+    ratio = place.spread(evidence.ratio) / (λ * stiffness * place.grid.voxel_volume)
     flow = _lowered(start, law.scaled(1 / stiffness), data.Evidence(ratio), place, steps, progress)
-    notes = (*notes, f"{found.note[0].upper()}{found.note[1:]}.", *place.notes)
+    notes = (*notes, f"{evidence.note[0].upper()}{evidence.note[1:]}.", *place.notes)
     u = place.back(flow.field)
-    return _result(scan, u > 0, u, law, place, λ, notes, flow)
+    return _result(scan, u > 0, u, law, place, weight=λ, notes=notes, flow=flow)
 
 
 def reconstruct(
@@ -162,27 +162,28 @@ def reconstruct(
     progress: Progress = silent,
     **reading: Any,
 ) -> Segmentation:
-    """Fill a volume of which some slices are known: lower F_ε while these hold, from interpolated signed distances.
+    """Fill a volume between known slices: lower F_ε from interpolated signed distances, with these slices held.
 
     Parameters
     ----------
     slices
         A mask, or labels, of the whole volume's shape, positive inside, as a path, a `Field`, an array or a tensor;
-        only its known slices count, and are kept as they are.
+        only the known slices count, and they stay unchanged.
     prior, epsilon, steps, progress, reading
         As in `segment`.
     every, first
-        Known are `first`, `first + every`, … along `axis`. Before the first and beyond the last known slice these are
-        continued.
+        Slices `first`, `first + every`, … along `axis` are known. The volume is extrapolated before the first known
+        slice and beyond the last.
     known
-        Instead: their numbers, two or more.
+        The numbers of the known slices, two or more, in place of `every` and `first`.
     axis
-        0, 1 or 2 of the array: z, y or x.
+        The axis of the array, 0, 1 or 2, that is z, y or x.
 
     Raises
     ------
     ValueError
-        As `segment`, or if fewer than two slices are known, they are all empty or all full, or no labels.
+        As `segment`, or if fewer than two slices are known, or the known slices are all empty, all full, or grey
+        levels.
     FileNotFoundError
         If there is no such `fit.json`.
     """
@@ -191,32 +192,32 @@ def reconstruct(
     place = WorkingGrid.of(slices, epsilon)
     axis = whole(axis, "an axis 0, 1 or 2 (z, y, x)", 0, 2)
     places = _places(slices.shape[axis], every, first, known)
-    there = _labels(np.moveaxis(slices.values, axis, 0)[places]) > 0
-    if there.all() or not there.any():
+    inside = _labels(np.moveaxis(slices.values, axis, 0)[places]) > 0
+    if inside.all() or not inside.any():
         raise ScanError(
-            f"expected known slices with voxels inside and outside, got {'full' if there.all() else 'empty'} ones"
+            f"expected known slices with voxels inside and outside, got {'full' if inside.all() else 'empty'} ones"
         )
     order = (axis, *(k for k in range(3) if k != axis))
     edges = [slices.spacing[k] for k in order]
-    distance = np.moveaxis(interpolated_distance(there, places, slices.shape[axis], edges), 0, axis)
+    distance = np.moveaxis(interpolated_distance(inside, places, slices.shape[axis], edges), 0, axis)
     start = optimal_profile(place.finer(distance), place.epsilon)
-    held = np.zeros(slices.shape, dtype=np.float32)
-    np.moveaxis(held, axis, 0)[places] = np.where(there, STIFFNESS, -STIFFNESS)
-    spring = data.Hinge(place.spread(held, centre=axis))
+    pull = np.zeros(slices.shape, dtype=np.float32)
+    np.moveaxis(pull, axis, 0)[places] = np.where(inside, STIFFNESS, -STIFFNESS)
+    spring = data.Hinge(place.spread(pull, centre=axis))
     flow = _lowered(start, law.scaled(1 / _force(law, place, start)), spring, place, steps, progress)
     u = place.back(flow.field)
     mask = u > 0
-    np.moveaxis(mask, axis, 0)[places] = there
+    np.moveaxis(mask, axis, 0)[places] = inside
     notes = (*notes, *_known(places, slices.shape[axis]), *place.notes)
-    return _result(slices, mask, u, law, place, None, notes, flow)
+    return _result(slices, mask, u, law, place, weight=None, notes=notes, flow=flow)
 
 
 def _places(length: int, every: int | None, first: int, known: Sequence[int] | None) -> list[int]:
     if (every is None) == (known is None):
         raise ScanError("expected either every how many slices are known, or their numbers")
-    given = [real(n, "whole numbers of slices") for n in ((every, first) if known is None else known)]
-    if not all(math.isfinite(number) and number == int(number) for number in given):  # type: ignore[arg-type, operator]
-        raise ScanError(f"expected whole numbers of slices, got {', '.join(map(str, given))}")
+    numbers = [real(n, "whole numbers of slices") for n in ((every, first) if known is None else known)]
+    if not all(math.isfinite(number) and number == int(number) for number in numbers):  # type: ignore[arg-type, operator]
+        raise ScanError(f"expected whole numbers of slices, got {', '.join(map(str, numbers))}")
     if every is not None and (every < 1 or first < 0):
         raise ScanError(f"expected every from 1 and first from 0, got {every} and {first}")
     places = sorted({int(n) for n in (known if known is not None else range(int(first), length, int(every or 1)))})
@@ -226,14 +227,14 @@ def _places(length: int, every: int | None, first: int, known: Sequence[int] | N
 
 
 def _known(places: list[int], length: int) -> tuple[str, ...]:
-    """What is known and what is not even between, in sentences."""
+    """Return sentences on the number of known slices, and of slices that are extrapolated."""
     before, beyond = places[0], length - 1 - places[-1]
-    outer = f"The {before} before the first and {beyond} beyond the last are extrapolated."
+    outer = f"The {before} before the first and the {beyond} beyond the last are extrapolated."
     return f"{len(places)} of {length} slices are known.", *((outer,) if before or beyond else ())
 
 
 def _labels(values: np.ndarray) -> np.ndarray:
-    """The values, if they are not grey levels."""
+    """Return the values, or raise ScanError where they are grey levels."""
     if values.dtype.kind == "f" and not np.array_equal(values, np.round(values)):
         raise ScanError("expected known slices with a mask or labels, got values that are not whole numbers")
     if values.dtype.itemsize > 1 and (count := len(np.unique(values))) > LABELS:
@@ -242,7 +243,7 @@ def _labels(values: np.ndarray) -> np.ndarray:
 
 
 def _started(level: np.ndarray, place: WorkingGrid) -> Tensor:
-    """The phase field of where a smooth volume is positive."""
+    """Return the phase field of the set where a smooth volume is positive."""
     inside = place.finer(level) > 0
     if not inside.any() or inside.all():
         raise ScanError(
@@ -252,7 +253,7 @@ def _started(level: np.ndarray, place: WorkingGrid) -> Tensor:
 
 
 def _force(law: Coefficients, place: WorkingGrid, u: Tensor) -> float:
-    """Root mean square of ∂F_ε/∂u, over that of the Willmore energy: what makes Adam's steps and springs comparable."""
+    """Return the root mean square of ∂F_ε/∂u over that of the Willmore energy, the scale of steps and springs."""
     sizes = []
     for each in (law.in_unit(place.unit), Coefficients.willmore()):
         _, slope = kernels.energy_gradient(u, each, place.grid, WORKING_EPSILON)
@@ -289,6 +290,7 @@ def _result(
     u: np.ndarray,
     law: Coefficients,
     place: WorkingGrid,
+    *,
     weight: float | None,
     notes: tuple[str, ...],
     flow: Flow,
@@ -296,10 +298,10 @@ def _result(
     share, energy = float(mask.mean()), flow.history.energy
     fall = (energy[-2] - energy[-1]) / max(abs(energy[-1]), 1e-30) if len(energy) > 1 else 1.0
     count, word = int(flow.history.step[-1]), "settled" if abs(fall) < SETTLED else "still moving"
-    made = f"{count} step" if count == 1 else f"{count} steps"
-    status = f"{word} after {made}: {100 * share:.2f} % of the volume is inside"
+    length = f"{count} step" if count == 1 else f"{count} steps"
+    status = f"{word} after {length}: {100 * share:.2f} % of the volume is inside"
     if share in (0.0, 1.0):
-        status = f"no surface is left after {made}: the prior is too strong for the data, lower its weight"
+        status = f"no surface is left after {length}: the prior is too strong for the data, lower its weight"
     whole = {"notes": (), "source": scan.source}
     return Segmentation(
         replace(scan, values=mask, **whole),

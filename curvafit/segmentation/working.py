@@ -1,4 +1,4 @@
-"""From a scan's grid and unit to those a flow runs in, and back; and a prior in the scan's unit."""
+"""The grid and unit of a flow for a scan, the way there and back, and a prior in the scan's unit."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["Law", "WorkingGrid", "law_of"]
 
 
 def law_of(prior: Law, scan: Field) -> tuple[Coefficients, tuple[str, ...]]:
-    """Coefficients with lengths in the scan's unit, and sentences on where they are from.
+    """Return a law's coefficients with lengths in the scan's unit, and sentences on their origin.
 
     Raises
     ------
@@ -33,27 +33,27 @@ def law_of(prior: Law, scan: Field) -> tuple[Coefficients, tuple[str, ...]]:
     instance(scan, Field, "a scan as Field")
     texture = texture_of(prior)
     if texture.prior is None:
-        said = f"The {texture.origin}, at a working voxel of one scan voxel."
-        return texture.in_unit(scan.unit, min(scan.spacing)), (said,) if texture.working else ()
+        note = f"The {texture.origin}, at a working voxel of one scan voxel."
+        return texture.in_unit(scan.unit, min(scan.spacing)), (note,) if texture.working else ()
     try:
         law = texture.in_unit(scan.unit, min(scan.spacing))
     except ValueError as reason:
         mend = ": give --spacing and --unit" if texture.unit in METRES else ""
         raise ScanError(f"{reason}{mend}") from None
-    moved = f"The prior's lengths, in {texture.unit}, are taken to {scan.unit}."
-    return law, () if texture.unit == scan.unit else (moved,)
+    note = f"The prior's lengths, in {texture.unit}, are converted to {scan.unit}."
+    return law, () if texture.unit == scan.unit else (note,)
 
 
 @dataclass(frozen=True)
 class WorkingGrid:
-    """Where a flow runs: working units, and axes refined until ε spans two voxels.
+    """The grid of a flow: working units, and axes refined until ε spans two voxels.
 
     Attributes
     ----------
     grid
-        Working units; the boundary replicates.
+        The grid in working units; the boundary replicates.
     times
-        How many parts a scan voxel has along each axis.
+        The number of parts of a scan voxel along each axis.
     unit, epsilon
         A working length of 1, and ε, in the scan's unit.
     """
@@ -65,15 +65,15 @@ class WorkingGrid:
 
     @classmethod
     def of(cls, scan: Field, epsilon: float | None) -> WorkingGrid:
-        """The place for a scan; ε is twice the smallest voxel edge if not given.
+        """Return the working grid of a scan; ε is twice the smallest voxel edge by default.
 
         Raises
         ------
         ScanError
             If ε is not positive or the scan is too small.
         """
-        said = f"a positive epsilon in {scan.unit}"
-        ε = RESOLVED * min(scan.spacing) if epsilon is None else real(epsilon, said, SHORTEST, LONGEST)
+        form = f"a positive epsilon in {scan.unit}"
+        ε = RESOLVED * min(scan.spacing) if epsilon is None else real(epsilon, form, SHORTEST, LONGEST)
         if min(scan.shape) < 4:
             raise ScanError(f"expected at least 4 voxels along each axis, got {scan.shape}")
         times, unit = upsampling(scan.spacing, ε), ε / WORKING_EPSILON
@@ -83,21 +83,21 @@ class WorkingGrid:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Which axes are refined, in a sentence."""
+        """Return a sentence on the axes that are refined, or none."""
         if max(self.times) == 1:
             return ()
         axes = ", ".join(f"{axis} {n}-fold" for axis, n in zip("zyx", self.times, strict=True) if n > 1)
         return (f"ε spans fewer than 2 voxels on some axes: the flow ran on a grid refined {axes}.",)
 
     def finer(self, values: np.ndarray) -> Tensor:
-        """A smooth volume on the flow's grid."""
+        """Return a smooth volume interpolated to the flow's grid."""
         u = torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
         for axis, n in enumerate(self.times):
             u = refined(u, axis, n)
         return u
 
     def spread(self, values: np.ndarray, centre: int | None = None) -> Tensor:
-        """What voxels say, shared among their parts; along the axis `centre` by the middle one or two alone."""
+        """Return the evidence of voxels shared among their parts; along axis `centre` only the middle parts get it."""
         u = torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
         for axis, n in enumerate(self.times):
             share = torch.full((n,), 1 / n)
@@ -108,7 +108,7 @@ class WorkingGrid:
         return u
 
     def back(self, u: Tensor) -> np.ndarray:
-        """The mean of each scan voxel's parts."""
+        """Return the mean of each scan voxel's parts."""
         for axis, n in enumerate(self.times):
             u = u.unflatten(axis, (-1, n)).mean(axis + 1)
         return u.numpy()

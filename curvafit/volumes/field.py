@@ -19,7 +19,7 @@ __all__ = ["Field", "ScanError", "positive_triple", "voxels_of"]
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Field(Pictured):
-    """A volume and its place in the world.
+    """A volume and its place in the world: values with spacing, unit and affine.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class Field(Pictured):
         4x4 map from voxel index (x, y, z, 1) to position in `unit`, NIfTI's convention; its columns are as long as
         the spacing. None where the file has none.
     source
-        Where it came from.
+        Where the volume came from: the path of its file.
     notes
         Sentences on what was assumed while reading.
 
@@ -77,7 +77,7 @@ class Field(Pictured):
         return self.values.shape  # type: ignore[return-value]
 
     def crop(self, crop: Crop) -> Field:
-        """Return a box of voxels, whose affine says where it was.
+        """Return a box of voxels; its affine says where the box lies in the volume.
 
         Parameters
         ----------
@@ -88,20 +88,20 @@ class Field(Pictured):
         Raises
         ------
         ScanError
-            If it is no box, or leaves the volume.
+            If the crop is not a box, or leaves the volume.
         """
         box = fitted(box_of(crop), self.shape, self.source or "the volume")
         return replace(self, values=self.values[box]).moved([edge.start for edge in box])
 
     def label(self, label: int) -> Field:
-        """Return the mask of the voxels that have a value.
+        """Return the mask of the voxels with this value.
 
         Raises
         ------
         ScanError
-            If there are none, or no others.
+            If no voxel has this value, or all have it.
         ValueError
-            If the label is no whole number.
+            If the label is not a whole number.
         """
         label = whole(label, "a label that is a whole number", -SEEDS, SEEDS)
         mask = self.values == label
@@ -113,7 +113,7 @@ class Field(Pictured):
         return replace(self, values=mask, notes=(*self.notes, f"The structure is label {label}."))
 
     def moved(self, start: Sequence[int]) -> Field:
-        """Return the same values, placed where this field's voxel `start` (z, y, x) is."""
+        """Return the same values, with their first voxel at this field's voxel `start` (z, y, x)."""
         affine = np.diag([*self.spacing[::-1], 1.0]) if self.affine is None else self.affine.copy()
         affine[:3, 3] += affine[:3, :3] @ np.array(start[::-1], dtype=np.float64)
         ends = (f"{first}:{first + n}" for first, n in zip(start, self.shape, strict=True))
@@ -121,19 +121,19 @@ class Field(Pictured):
 
 
 def voxels_of(field: Field) -> str:
-    """Return how many voxels a field has, and of which size, in words."""
+    """Return the number and the size of a field's voxels in words."""
     cube = len(set(field.spacing)) == 1
     edges = " x ".join(f"{h:.4g}" for h in field.spacing[: 1 if cube else 3])
     return f"{' x '.join(map(str, field.shape))} voxels of {edges} {field.unit}"
 
 
 def positive_triple(spacing: object) -> tuple[float, float, float]:
-    """Return a spacing as three numbers, one number counting for all axes.
+    """Return a spacing as three numbers; one number counts for all axes.
 
     Raises
     ------
     ScanError
-        If it is not one or three positive numbers.
+        If the spacing is not one or three positive numbers.
     """
     try:
         triple = (float(spacing),) * 3 if isinstance(spacing, (int, float)) else tuple(float(h) for h in spacing)  # type: ignore[union-attr]

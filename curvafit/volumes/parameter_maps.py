@@ -1,4 +1,4 @@
-"""Parameters that vary in space, read from files: one volume a parameter, by name."""
+"""Parameters that vary in space, read from files: one volume for each parameter."""
 
 from __future__ import annotations
 
@@ -18,32 +18,33 @@ PARAMETERS = (*NAMES, "mass", "epsilon")
 
 
 def read_maps(path: str | Path, shape: tuple[int, int, int] | None = None) -> dict[str, float | Tensor]:
-    """Maps `(Z, Y, X)` float32 by parameter, or numbers.
+    """Return the map `(Z, Y, X)`, float32, or the number of each parameter.
 
     Parameters
     ----------
     path
-        An NPZ file whose arrays bear the names of `PARAMETERS`, or a folder of volumes named so (`a20.nii.gz`,
+        An NPZ file of arrays named as in `PARAMETERS`, or a folder of volumes with these names (`a20.nii.gz`,
         `mass.tif` …). An array of one number holds everywhere.
     shape
-        Voxels of every map; that of the first one by default.
+        Voxels of every map (z, y, x); by default the shape of the first map.
 
     Raises
     ------
     FileNotFoundError
         If there is no such file or folder.
     ValueError
-        If a name is no parameter's, nothing is in it, a map has another shape or numbers that are not finite.
+        If a name is not in `PARAMETERS`, the file or folder is empty, or a map has another shape or values that are
+        not finite.
     """
     place = Path(path)
     if not place.exists():
         raise FileNotFoundError(f"expected a file or folder of maps, got no such file: {place}")
-    found = _from_folder(place) if place.is_dir() else _from_npz(place)
-    unknown = sorted(found.keys() - set(PARAMETERS))
-    if unknown or not found:
+    arrays = _from_folder(place) if place.is_dir() else _from_npz(place)
+    unknown = sorted(arrays.keys() - set(PARAMETERS))
+    if unknown or not arrays:
         listed = ", ".join(unknown) or "none"
         raise ValueError(f"expected maps named {', '.join(PARAMETERS)}, got {listed} in {place}")
-    for name, values in found.items():
+    for name, values in arrays.items():
         numbers = values.dtype.kind in "iuf"
         if not numbers or not np.isfinite(values).all() or np.abs(values).max(initial=0) > np.finfo(np.float32).max:
             raise ValueError(f"expected finite numbers in the map {name}, got others in {place}")
@@ -53,12 +54,12 @@ def read_maps(path: str | Path, shape: tuple[int, int, int] | None = None) -> di
                 raise ValueError(f"expected the map {name} of shape {shape}, got {values.shape} in {place}")
     return {
         name: float(values.reshape(())) if values.size == 1 else torch.from_numpy(values.astype(np.float32))
-        for name, values in found.items()
+        for name, values in arrays.items()
     }
 
 
 def map_shape(maps: Mapping[str, float | Tensor]) -> tuple[int, int, int] | None:
-    """The common shape of the maps, None where all are numbers."""
+    """Return the common shape of the maps, None where all are numbers."""
     shapes = [tuple(values.shape) for values in maps.values() if isinstance(values, Tensor)]
     return shapes[0] if shapes else None  # type: ignore[return-value]
 
@@ -71,12 +72,12 @@ def _from_npz(path: Path) -> dict[str, np.ndarray]:
 
 
 def _from_folder(path: Path) -> dict[str, np.ndarray]:
-    known = tuple(READERS)
-    files = [p for p in sorted(path.iterdir()) if p.name.lower().endswith(known) and not p.name.startswith(".")]
-    found: dict[str, np.ndarray] = {}
+    suffixes = tuple(READERS)
+    files = [p for p in sorted(path.iterdir()) if p.name.lower().endswith(suffixes) and not p.name.startswith(".")]
+    arrays: dict[str, np.ndarray] = {}
     for file in files:
         name = file.name.split(".")[0]
-        if name in found:
+        if name in arrays:
             raise ScanError(f"expected one map {name}, got two in {path}")
-        found[name] = read_values(file) if name in PARAMETERS else np.empty(0)
-    return found
+        arrays[name] = read_values(file) if name in PARAMETERS else np.empty(0)
+    return arrays

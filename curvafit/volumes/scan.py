@@ -1,4 +1,4 @@
-"""Volume files to `Field` and back."""
+"""Writing a `Field` to a volume file; reading is in `curvafit.volumes.source`."""
 
 from __future__ import annotations
 
@@ -30,26 +30,30 @@ def save(
 ) -> Path:
     """Write a volume as NIfTI, TIFF, NPY, MRC or Zarr, by suffix.
 
-    A file of that name is replaced once the new one is whole; a folder only if it is empty or a Zarr store that `save`
-    wrote with the same `kind`, or with `overwrite`.
+    A file of that name is replaced once the new one is whole. A folder is replaced only if it is empty, if it is a Zarr
+    store that `save` wrote with the same `kind`, or with `overwrite`.
 
-    NIfTI keeps the affine (qform and sform) and the unit; TIFF (ImageJ's or OME's metadata), MRC (in Å) and Zarr
-    (OME-NGFF 0.5, with halved copies of a large volume) spacing and unit; NPY the values only.
+    NIfTI keeps the affine (qform and sform) and the unit. TIFF (ImageJ's or OME's metadata), MRC (in Å) and Zarr
+    (OME-NGFF 0.5, with halved copies of a large volume) keep spacing and unit. NPY keeps the values only.
 
     Parameters
     ----------
     source
         A `Field`, an array or tensor (Z, Y, X), or the path of another volume file.
     spacing, unit
-        Of an array, or in place of what another file says: see `field_of`.
+        Spacing and unit of an array, or in place of those of another file: see `field_of`.
+    kind
+        The mark of a Zarr store: what the store is for.
+    overwrite
+        Whether any other folder of that name may be replaced.
 
     Raises
     ------
     ScanError
-        If the suffix is unknown, the format cannot hold the values' type, or it needs a unit and there is none; or if
-        the source is no volume.
+        If the suffix is unknown, the format cannot hold the values' type, the format needs a unit and the volume has
+        none, or the source is not a volume.
     ValueError
-        If another folder stands there.
+        If another folder has that name.
     """
     field = field_of(source, spacing=spacing, unit=unit)
     target = Path(path)

@@ -1,4 +1,4 @@
-"""Where a volume comes from: the path of a file, an array, or a `Field` that is there already."""
+"""Sources of a volume: the path of a file, an array, or a `Field`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from curvafit.volumes.formats.part import Crop, Part, box_of, selected
 
 __all__ = ["Source", "field_of", "load", "read_values"]
 
-#: What a volume may be given as.
+#: A volume as a caller gives it.
 Source = str | os.PathLike[str] | Field | np.ndarray | torch.Tensor
 
 
@@ -33,26 +33,26 @@ def field_of(
     crop: Crop | None = None,
     **reading: Any,
 ) -> Field:
-    """Return a volume as a `Field`, whatever it is given as.
+    """Return the `Field` of any source of a volume.
 
     Parameters
     ----------
     source
         The path of a file, which is read; a `Field`, which is taken as it is; or an array or tensor (Z, Y, X).
     spacing, unit
-        Voxel edges (z, y, x), or one for all, and their unit: of a file, in place of what it says; of an array, a voxel
-        by default. A `Field` has its own.
+        Voxel edges (z, y, x), or one for all, and their unit. For a file, they replace what the file says; for an array
+        the default is one voxel. A `Field` has its own.
     label, crop
-        The voxels of one value as a mask; a box of voxels: of any source, see `Field.label` and `Field.crop`.
+        The voxels of one value, as a mask; a box of voxels: see `Field.label` and `Field.crop`.
     reading
-        How to read a file: see `load`.
+        Options of reading a file: see `load`.
 
     Raises
     ------
     FileNotFoundError
         If there is no such file.
     ScanError
-        A `ValueError`: the source is none of these, an option beside it counts for nothing, or `load` refuses the file.
+        A `ValueError`: if the source is none of these, an option does not apply to it, or `load` refuses the file.
     """
     if isinstance(source, str | os.PathLike):
         return load(source, spacing=spacing, unit=unit, label=label, crop=crop, **reading)
@@ -60,7 +60,7 @@ def field_of(
 
 
 def _field_of(source: Any, spacing: Sequence[float] | float | None, unit: str | None, reading: dict[str, Any]) -> Field:
-    """Return what is in memory as a `Field`."""
+    """Return the `Field` of a volume in memory."""
     if isinstance(source, Field):
         _refuse({"spacing": spacing, "unit": unit}, "a file or an array", "a Field, which has its own")
         _refuse(reading, "the path of a file", "a Field, which is read already")
@@ -93,29 +93,30 @@ def load(
         NIfTI, TIFF, NPY, NPZ, HDF5, RAW, Zarr; with `curvafit[io]` also NRRD, MHA/MHD, MRC and DICOM folders.
         `file.h5::key` names an array within a file; `key` does the same.
     spacing, unit
-        Override what the file says: voxel edges (z, y, x), or one for all; nm, um, mm or m. A `unit` alone renames
-        the file's numbers, it does not convert them.
+        Voxel edges (z, y, x), or one for all, and nm, um, mm or m, in place of what the file says. A `unit` alone
+        renames the file's numbers; it does not convert them.
     channel
-        Which channel, counted from 0, of a file of several: colours, times and components of vectors are channels too.
+        The channel to read, counted from 0, from a file of several. Colours, times and components of vectors are
+        channels too.
     label
         The voxels that have this value, as a mask.
     crop
-        A box of voxels, `"z0:z1,y0:y1,x0:x1"` or three slices: the affine says where it was. Of Zarr, HDF5, NPY, RAW
-        and NIfTI without compression no more is read.
+        A box of voxels, `"z0:z1,y0:y1,x0:x1"` or three slices; the affine says where the box lies. From Zarr, HDF5,
+        NPY, RAW and uncompressed NIfTI only the box is read.
     raw_shape, dtype
-        Voxels (z, y, x) and numpy type of a RAW file, which cannot tell them.
+        Voxels (z, y, x) and numpy type of a RAW file, which does not state them.
     strict
-        Refuse a volume of which parts are not stored, which a note tells of otherwise: chunks of Zarr or HDF5, which
-        then have the fill value; slices that a folder's numbers skip.
+        Refuse a volume with parts that are not stored: chunks of Zarr or HDF5, which otherwise get the fill value, or
+        slices that a folder's numbers skip. Without `strict` a note tells of such parts.
 
     Raises
     ------
     FileNotFoundError
         If there is no such file.
     ScanError
-        A `ValueError`: unknown suffix, a damaged or truncated file, a missing key, a volume that is not 3D,
-        not finite, constant or larger than memory, a spacing that is not positive; a channel, label or crop that is
-        not there.
+        A `ValueError`: if the suffix is unknown, the file is damaged or truncated, the key is missing, the volume is
+        not 3D, not finite, constant or larger than memory, the spacing is not positive, or the file has no such
+        channel, label or crop.
     """
     location, key = _split_key(os.fspath(path), key)
     part = Part(channel, box_of(crop))
@@ -129,9 +130,9 @@ def load(
 
 
 def read_values(path: str | os.PathLike[str]) -> np.ndarray:
-    """The array in a volume file, z first, whatever it holds; axes of one before the last three are left out.
+    """Return the array in a volume file, z first, without axes of length one before the last three.
 
-    Parts that are not stored are a warning.
+    Values are not checked; a warning tells of parts that are not stored.
 
     Raises
     ------
@@ -150,16 +151,16 @@ def read_values(path: str | os.PathLike[str]) -> np.ndarray:
 
 
 def _part(field: Field, label: int | None, crop: Crop | None = None) -> Field:
-    """Return the part of a field that is asked for."""
+    """Return the part of a field that a label and a crop choose."""
     field = field if crop is None else field.crop(crop)
     return field if label is None else field.label(label)
 
 
 def _refuse(options: dict[str, Any], expected: str, got: str) -> None:
-    """Refuse an option that would count for nothing."""
-    given = next((name for name, value in options.items() if value is not None and value is not False), None)
-    if given is not None:
-        raise ScanError(f"expected {given} only with {expected}, got it with {got}")
+    """Raise ScanError where an option would have no effect."""
+    idle = next((name for name, value in options.items() if value is not None and value is not False), None)
+    if idle is not None:
+        raise ScanError(f"expected {idle} only with {expected}, got it with {got}")
 
 
 def _array(source: np.ndarray | torch.Tensor) -> np.ndarray:
@@ -190,7 +191,7 @@ def _check_values(values: np.ndarray, path: Path) -> None:
 
 
 def _check_finite(values: np.ndarray, place: object) -> tuple[float, float]:
-    """Return the lowest and highest of some values, if all are finite."""
+    """Return the lowest and the highest value, or raise ScanError where one is not finite."""
     lowest, highest = values.min(), values.max()
     if values.dtype.kind == "f" and not (math.isfinite(lowest) and math.isfinite(highest)):
         what = "NaN" if math.isnan(lowest) else "infinite"
@@ -200,26 +201,26 @@ def _check_finite(values: np.ndarray, place: object) -> tuple[float, float]:
 
 
 def _placed(raw: Raw, source: str, spacing: Sequence[float] | float | None, unit: str | None) -> Field:
-    """Native values with the file's spacing and unit, or the caller's."""
+    """Return the values in native byte order, with the spacing and unit of the caller or, by default, of the file."""
     notes = [*raw.gaps, *raw.notes, *(() if spacing is not None or unit is not None else raw.guesses)]
     file_unit, factor = ("voxel", 1.0) if spacing is not None and unit is not None else normalise_unit(raw.unit)
-    stated = None if raw.spacing is None else _scaled(raw.spacing, factor)
+    native = None if raw.spacing is None else _scaled(raw.spacing, factor)
     affine = None if raw.affine is None else np.diag([factor, factor, factor, 1.0]) @ raw.affine
-    chosen_unit, chosen_factor = (file_unit, 1.0) if unit is None else normalise_unit(unit)
-    chosen = positive_triple(1.0 if stated is None and spacing is None else stated if spacing is None else spacing)
-    if stated is None and spacing is None:
-        counted = "counted in voxels" if chosen_unit == "voxel" else f"those of voxels of 1 {chosen_unit}"
+    target_unit, target_factor = (file_unit, 1.0) if unit is None else normalise_unit(unit)
+    edges = positive_triple(1.0 if native is None and spacing is None else native if spacing is None else spacing)
+    if native is None and spacing is None:
+        counted = "counted in voxels" if target_unit == "voxel" else f"those of voxels of 1 {target_unit}"
         notes.append(f"The file states no spacing: lengths are {counted}.")
-    if affine is not None and stated != chosen:
+    if affine is not None and native != edges:
         lengths = np.linalg.norm(affine[:3, :3], axis=0)
-        affine[:3, :3] *= np.array(chosen)[::-1] / np.where(lengths > 0, lengths, 1)
+        affine[:3, :3] *= np.array(edges)[::-1] / np.where(lengths > 0, lengths, 1)
     if unit is not None:
-        chosen = (chosen[0] * chosen_factor, chosen[1] * chosen_factor, chosen[2] * chosen_factor)
-        affine = None if affine is None else np.diag([chosen_factor] * 3 + [1.0]) @ affine
+        edges = (edges[0] * target_factor, edges[1] * target_factor, edges[2] * target_factor)
+        affine = None if affine is None else np.diag([target_factor] * 3 + [1.0]) @ affine
     values = np.ascontiguousarray(raw.values, dtype=raw.values.dtype.newbyteorder("="))
-    return Field(values, chosen, chosen_unit, affine, source, tuple(notes))
+    return Field(values, edges, target_unit, affine, source, tuple(notes))
 
 
 def _scaled(spacing: tuple[object, ...], factor: float) -> tuple[object, ...]:
-    """A file's spacing times a factor, as it stands where it is no numbers."""
+    """Return a file's spacing times a factor; entries that are not numbers stay as they are."""
     return tuple(h * factor if isinstance(h, (int, float)) else h for h in spacing)

@@ -1,4 +1,4 @@
-"""One module a file format; `curvafit.volumes.source` chooses among them by suffix."""
+"""File formats, a module each; the suffix of a file chooses its reader and its writer."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ READERS: dict[str, Callable[..., Raw]] = {
     **dict.fromkeys((".mrc", ".map", ".rec"), read_mrc),
 }
 
-#: Readers of what can hold several arrays, by key.
+#: Readers of formats that can hold several arrays, by key.
 KEYED = (read_npz, read_hdf5, read_zarr, read_dicom)
 
 #: Suffix -> writer(field, path).
@@ -58,12 +58,12 @@ WRITERS: dict[str, Callable[[Any, Path], None]] = {
 
 
 def pick_reader(path: Path, shape_given: bool = False) -> Callable[..., Raw]:
-    """The reader of a file by its suffix, of a folder by what lies in it.
+    """Return the reader of a file by its suffix, or of a folder by its content.
 
     Raises
     ------
     ScanError
-        If the suffix is unknown (and no shape makes it a RAW file) or the folder holds no slices.
+        If the suffix is unknown and the caller gives no shape of a RAW file, or the folder holds no slices.
     """
     if path.is_dir():
         return _pick_folder(path)
@@ -76,7 +76,7 @@ def pick_reader(path: Path, shape_given: bool = False) -> Callable[..., Raw]:
 
 
 def pick_writer(path: Path, unit: str) -> Callable[[Any, Path], None]:
-    """The writer of a file by its suffix, if it can hold lengths in `unit`.
+    """Return the writer of a file by its suffix, if the format can hold lengths in `unit`.
 
     Raises
     ------

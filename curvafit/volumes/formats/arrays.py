@@ -1,4 +1,4 @@
-"""NPY, NPZ, HDF5 and RAW."""
+"""NPY, NPZ, HDF5 and RAW files."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _RAW_TYPES = "uint8, int8, uint16, int16, uint32, int32, float32, float64 (or wi
 
 
 def read_npy(path: Path, *, part: Part | None = None, **_: object) -> Raw:
-    """The numbers of a file; those of a part alone where one is asked for."""
+    """Read the numbers of an NPY file, or of a part of it."""
     with path.open("rb") as stream:
         if part is None:
             return Raw(_array(stream, path, path.stat().st_size))
@@ -34,23 +34,25 @@ def read_npy(path: Path, *, part: Part | None = None, **_: object) -> Raw:
 
 
 def write_npy(field: Any, path: Path) -> None:
+    """Write the values alone: NPY holds neither spacing nor unit."""
     with path.open("wb") as stream:
         np.save(stream, field.values)
 
 
 def read_npz(path: Path, *, key: str | None = None, **_: object) -> Raw:
+    """Read the array of an NPZ file that a key names."""
     with path.open("rb") as stream, zipfile.ZipFile(stream) as archive:
         members = _members(archive)
         return Raw(_member(archive, members[pick_key(list(members), key, path)]))
 
 
 def read_archive(source: Path | IO[bytes]) -> dict[str, np.ndarray]:
-    """All arrays of an NPZ file by name, each read to its end, where its checksum is.
+    """Return all arrays of an NPZ file by name; each is read to its end, where its checksum is.
 
     Raises
     ------
     OSError, ValueError
-        If the file cannot be read, or is damaged or something else.
+        If the file cannot be read, is damaged, or is not an NPZ file.
     """
     try:
         with zipfile.ZipFile(check_regular(source) if isinstance(source, Path) else source) as archive:
@@ -62,7 +64,7 @@ def read_archive(source: Path | IO[bytes]) -> dict[str, np.ndarray]:
 
 
 def _members(archive: zipfile.ZipFile) -> dict[str, str]:
-    """Names of the arrays in an NPZ file, and of the members that hold them."""
+    """Return the member of an NPZ file that holds each array, by the array's name."""
     return {name.removesuffix(".npy"): name for name in archive.namelist() if name.endswith(".npy")}
 
 
@@ -72,14 +74,14 @@ def _member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
 
 
 def _array(stream: IO[bytes], place: object, size: int) -> np.ndarray:
-    """The numbers of an NPY stream of so many bytes, which must end with them."""
+    """Return the numbers of an NPY stream of `size` bytes; the stream must end with them."""
     shape, fortran, dtype = _npy_header(stream, size)
     values = read_numbers(stream, shape[::-1] if fortran else shape, dtype, place)
     return values.T if fortran else values
 
 
 def _npy_header(stream: IO[bytes], size: int) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Shape, whether the first axis is the fastest, and type, of an NPY stream of so many bytes."""
+    """Return shape, whether the first axis is the fastest, and type, of an NPY stream of `size` bytes."""
     version = np.lib.format.read_magic(stream)
     if version not in _NPY_HEADERS:
         raise Damaged(f"NPY of version {version} holds no plain numbers")
@@ -90,7 +92,7 @@ def _npy_header(stream: IO[bytes], size: int) -> tuple[tuple[int, ...], bool, np
 
 
 def read_hdf5(path: Path, *, key: str | None = None, part: Part | None = None, **_: object) -> Raw:
-    """A dataset, with its attribute `element_size_um` or `spacing` and `unit` where it has one."""
+    """Read a dataset, with the spacing and unit of its attributes (`element_size_um`, or `spacing` and `unit`)."""
     with h5py.File(path, "r") as file:
         keys: list[str] = []
         file.visititems(lambda name, item: keys.append(name) if isinstance(item, h5py.Dataset) else None)
@@ -106,20 +108,20 @@ def read_hdf5(path: Path, *, key: str | None = None, part: Part | None = None, *
 
 
 def _gaps(dataset: Any, path: Path) -> Iterator[str]:
-    """What of a dataset is not in the file, in sentences: HDF5 fills it in and says nothing."""
-    filled = f"their voxels have the fill value {dataset.fillvalue}."
+    """Yield sentences on the parts of a dataset that are not in the file, which HDF5 fills in without a word."""
+    fill = f"their voxels have the fill value {dataset.fillvalue}."
     if dataset.is_virtual:
-        names = {source.file_name for source in dataset.virtual_sources()} - {"."}
-        lost = sorted(name for name in names if not check_regular(path.parent / name).exists())
-        if lost:
-            yield f"{len(lost)} of its {len(names)} source files are not there, {lost[0][:80]} among them; {filled}"
+        files = {source.file_name for source in dataset.virtual_sources()} - {"."}
+        missing = sorted(name for name in files if not check_regular(path.parent / name).exists())
+        if missing:
+            yield f"{len(missing)} of its {len(files)} source files are not there, {missing[0][:80]} among them; {fill}"
     elif dataset.chunks:
         count = math.prod(-(-n // chunk) for n, chunk in zip(dataset.shape, dataset.chunks, strict=True))
-        lost = count - dataset.id.get_num_chunks()
-        if lost > 0:
-            yield f"{lost} of {count} chunks are not stored: {filled}"
+        missing = count - dataset.id.get_num_chunks()
+        if missing > 0:
+            yield f"{missing} of {count} chunks are not stored: {fill}"
     elif dataset.size and not dataset.id.get_storage_size():
-        yield f"No values are stored: {filled}"
+        yield f"No values are stored: {fill}"
 
 
 def read_raw(
@@ -130,7 +132,7 @@ def read_raw(
     part: Part | None = None,
     **_: object,
 ) -> Raw:
-    """Bare numbers, x fastest: shape and type come from the caller (a byte a voxel needs no type)."""
+    """Read bare numbers, x fastest; shape and type come from the caller (one byte per voxel needs no type)."""
     if raw_shape is None:
         raise ScanError(f"expected --raw-shape Z,Y,X for the bare numbers in {path}, got none")
     shape = tuple(int(n) for n in raw_shape)
@@ -144,8 +146,8 @@ def read_raw(
     except TypeError:
         raise ScanError(f"expected a dtype such as {_RAW_TYPES}, got {quoted(dtype)}") from None
     if size != math.prod(shape) * kind.itemsize:
-        wanted = math.prod(shape) * kind.itemsize
-        raise ScanError(f"expected {wanted} bytes for shape {shape} of {kind}, got {size} in {path}")
+        nbytes = math.prod(shape) * kind.itemsize
+        raise ScanError(f"expected {nbytes} bytes for shape {shape} of {kind}, got {size} in {path}")
     if part is None:
         return Raw(np.fromfile(path, dtype=kind).reshape(shape))
     return part_of(mapped(path, 0, shape, kind), part, path)

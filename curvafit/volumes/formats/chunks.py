@@ -1,4 +1,4 @@
-"""Which chunks of a Zarr array are stored: Zarr gives those that are not its fill value, and says nothing."""
+"""Chunks of a Zarr array that are not stored: Zarr fills them with the fill value without a word."""
 
 from __future__ import annotations
 
@@ -15,18 +15,12 @@ from curvafit.volumes.formats.base import Damaged, ScanError
 
 #: Chunks of an array at most; more would take hours to look for.
 _MOST = 10_000_000
-#: What a shard's index says of a chunk that is not in it.
+#: Entry of a shard's index for a chunk that is not in the shard.
 _ABSENT = np.uint64(2**64 - 1)
 
 
 def check_store(folder: Path) -> None:
-    """Refuse a store in which something is neither file nor folder, or a link leads back to a folder above itself.
-
-    Raises
-    ------
-    ScanError
-        If there is such a thing.
-    """
+    """Raise ScanError where something in a store is neither file nor folder, or a link leads to a folder above it."""
     for place, folders, files in os.walk(folder):
         for name in folders:
             path = Path(place, name)
@@ -39,7 +33,7 @@ def check_store(folder: Path) -> None:
 
 
 def missing_chunks(array: Any, folder: Path) -> tuple[str, ...]:
-    """A sentence on the chunks of an array in a folder that are not stored, those within shards among them.
+    """Return a sentence on the chunks of an array that are not stored, within shards too, or none.
 
     Raises
     ------
@@ -50,37 +44,39 @@ def missing_chunks(array: Any, folder: Path) -> tuple[str, ...]:
     counts, chunks = _counts(array.shape, outer), math.prod(_counts(array.shape, array.chunks))
     if chunks > _MOST:
         raise ScanError(f"expected at most {_MOST:,} chunks in a Zarr array, got {chunks:,} in {folder}")
-    lost, blosc = 0, "blosc" in type(array.compressors[-1] if array.compressors else None).__name__.lower()
+    missing, blosc = 0, "blosc" in type(array.compressors[-1] if array.compressors else None).__name__.lower()
     for place in itertools.product(*map(range, counts)):
         path = folder / array.metadata.encode_chunk_key(place)
         rest = [min(edge, n - k * edge) for n, edge, k in zip(array.shape, outer, place, strict=True)]
         inside = _counts(rest, array.chunks)
         if not path.is_file():
-            lost += math.prod(inside)
+            missing += math.prod(inside)
         elif array.shards:
-            lost += _missing_within(array, path, inside)
+            missing += _missing_within(array, path, inside)
         elif blosc:
             _check_blosc(path)
     fill = f"their voxels have the fill value {array.fill_value}."
-    return (f"{lost} of {chunks} chunks are not stored: {fill}",) if lost else ()
+    return (f"{missing} of {chunks} chunks are not stored: {fill}",) if missing else ()
 
 
 def _check_blosc(chunk: Path) -> None:
-    """Compare a chunk's size with the one in its header, which Blosc itself does not."""
+    """Raise Damaged where a chunk's size is not the one in its header; Blosc does not compare them."""
     with chunk.open("rb") as stream:
-        told = int.from_bytes(stream.read(16)[12:], "little")
-    if told != (held := chunk.stat().st_size):
-        raise Damaged(f"{told} bytes by the header of chunk {chunk.name}, {held} in the file")
+        nbytes = int.from_bytes(stream.read(16)[12:], "little")
+    if nbytes != (size := chunk.stat().st_size):
+        raise Damaged(f"{nbytes} bytes by the header of chunk {chunk.name}, {size} in the file")
 
 
 def _counts(shape: Sequence[int], edges: Sequence[int]) -> list[int]:
-    """How many pieces of these edges cover each axis."""
+    """Return how many pieces of these edges cover each axis."""
     return [-(-n // edge) if edge else 0 for n, edge in zip(shape, edges, strict=True)]
 
 
 def _missing_within(array: Any, shard: Path, inside: Sequence[int]) -> int:
-    """Chunks that a shard's index lacks among those `inside` the array; 0 where it is no index of the usual kind
-    (little-endian, then a CRC32C)."""
+    """Count the chunks `inside` the array that a shard's index lacks.
+
+    An index of another kind than the usual one (little-endian, then a CRC32C) counts 0.
+    """
     codec: Any = next((each for each in array.metadata.codecs if hasattr(each, "index_codecs")), None)
     if [type(each).__name__ for each in getattr(codec, "index_codecs", ())] != ["BytesCodec", "Crc32cCodec"]:
         return 0

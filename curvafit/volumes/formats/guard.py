@@ -1,4 +1,4 @@
-"""One way into all readers: whatever is wrong with a file becomes one sentence, and no library speaks for itself."""
+"""The one way into all readers: any fault of a file becomes one sentence, and libraries print nothing."""
 
 from __future__ import annotations
 
@@ -20,16 +20,17 @@ def read_file(
     dtype: str | None = None,
     part: Part | None = None,
 ) -> Raw:
-    """Return what the reader of a file, chosen by its suffix or by what lies in it, gives.
+    """Return the content of a file or a folder, by the reader that `pick_reader` chooses.
 
-    Of some formats a part is read alone: see `Raw.whole`.
+    From some formats only the part is read: see `Raw.whole`.
 
     Raises
     ------
     FileNotFoundError
         If there is no such file.
     ScanError
-        If it is neither a file nor a folder, of an unknown suffix, damaged, or has no keys and one is asked for.
+        If the path is neither a file nor a folder, the suffix is unknown, the file is damaged, or a key is given for a
+        format without keys.
     """
     if not path.exists():
         raise FileNotFoundError(one_line(f"expected a volume file, got no such file: {path}"))
@@ -40,7 +41,7 @@ def read_file(
 
 
 def guarded(reader: Callable[..., Raw], path: Path, **options: object) -> Raw:
-    """A library's own exceptions become one sentence; ours pass.
+    """Return what a reader returns, and turn a library's own exceptions into one sentence.
 
     Raises
     ------
@@ -55,10 +56,8 @@ def guarded(reader: Callable[..., Raw], path: Path, **options: object) -> Raw:
     except MemoryError as reason:
         raise ScanError(f"expected a volume that fits into memory, got {path}, which does not") from reason
     except Damaged as reason:
-        said = str(reason)
-        cause = reason
+        cause, text = reason, str(reason)
     except Exception as reason:  # every library has its own way to say that a file is damaged
-        said = f"{type(reason).__name__}: {reason}"
-        cause = reason
-    said = " ".join(said[:2000].split())[:200]
-    raise ScanError(f"expected a whole, readable file, got {path} that cannot be read ({said})") from cause
+        cause, text = reason, f"{type(reason).__name__}: {reason}"
+    text = " ".join(text[:2000].split())[:200]
+    raise ScanError(f"expected a whole, readable file, got {path} that cannot be read ({text})") from cause

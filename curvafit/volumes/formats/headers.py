@@ -1,4 +1,4 @@
-"""NRRD's and MetaImage's headers, which say how many bytes of values there should be, and where."""
+"""Headers of NRRD and MetaImage, which say where the values are and how many bytes they take."""
 
 from __future__ import annotations
 
@@ -39,36 +39,36 @@ _META_TYPES = {
     "MET_FLOAT": "f4",
     "MET_DOUBLE": "f8",
 }
-#: MetaImage's lines of a number for each axis (1), or for each pair of axes (2).
+#: MetaImage's lines with one number per axis (1), or per pair of axes (2).
 _META_COUNTS = {
     **dict.fromkeys(("ElementSpacing", "ElementSize", "Offset", "Position", "Origin", "CenterOfRotation"), 1),
     **dict.fromkeys(("TransformMatrix", "Rotation", "Orientation"), 2),
 }
-#: Bytes of a MetaImage's header at most.
+#: Most bytes of a MetaImage's header.
 _HEADER = 1 << 16
 
 
 def nrrd_values(nrrd: Any, header: dict[str, Any], file: IO[bytes], path: Path) -> np.ndarray:
-    """The values, z first, of an NRRD file that is read to the end of its header, or of the file that this names.
+    """Return the values, z first, of an NRRD file that is read to the end of its header, or of the file it names.
 
     Raises
     ------
     ScanError, Damaged
-        If the values are not as many as the header says, or of a type or encoding that is not read.
+        If the number of values is not the header's, or their type or encoding is not supported.
     """
     if header["dimension"] != len(header["sizes"]):
         raise Damaged(f"{len(header['sizes'])} sizes for {header['dimension']} axes")
     shape, dtype = [int(n) for n in header["sizes"]][::-1], _nrrd_type(header)
     check_array(shape, dtype, path)
-    named = header.get("data file", header.get("datafile"))
-    if named is None:
+    name = header.get("data file", header.get("datafile"))
+    if name is None:
         return _nrrd_body(nrrd, header, file, path, (shape, dtype))
-    with check_regular(path.parent / str(named)).open("rb") as other:
-        return _nrrd_body(nrrd, header, other, path, (shape, dtype))
+    with check_regular(path.parent / str(name)).open("rb") as data_file:
+        return _nrrd_body(nrrd, header, data_file, path, (shape, dtype))
 
 
 def _nrrd_body(nrrd: Any, header: dict[str, Any], file: IO[bytes], path: Path, kind: tuple[Any, Any]) -> np.ndarray:
-    """The values from where the file stands, after the lines and bytes that the header skips."""
+    """Return the values from the file's position on, after the lines and bytes that the header skips."""
     (shape, dtype), encoding = kind, str(header.get("encoding")).lower()
     if encoding not in _NRRD_ENCODINGS:
         if math.prod(shape) > path.stat().st_size and "data file" not in header:
@@ -76,12 +76,12 @@ def _nrrd_body(nrrd: Any, header: dict[str, Any], file: IO[bytes], path: Path, k
         return nrrd.read_data(header, file, str(path), index_order="C")
     for _ in range(int(header.get("line skip", header.get("lineskip", 0)))):
         file.readline()
-    skipped = int(header.get("byte skip", header.get("byteskip", 0)))
+    byte_skip = int(header.get("byte skip", header.get("byteskip", 0)))
     stream = decompressed(file, _NRRD_ENCODINGS[encoding])
-    if skipped < 0:
+    if byte_skip < 0:
         stream.seek(-math.prod(shape) * dtype.itemsize, 2)
     else:
-        skip(stream, skipped)
+        skip(stream, byte_skip)
     return read_numbers(stream, shape, dtype, path)
 
 
@@ -94,12 +94,12 @@ def _nrrd_type(header: dict[str, Any]) -> np.dtype:
 
 
 def read_meta(path: Path) -> tuple[dict[str, str], np.ndarray | None]:
-    """The header of a MetaImage and its values, z first; None where they are text or in several files.
+    """Return the header of a MetaImage and its values, z first; None for values in text or in several files.
 
     Raises
     ------
     ScanError, Damaged, OSError, zlib.error
-        If the header is damaged, or the values are not as many as it says or damaged.
+        If the header or the values are damaged, or the number of values is not the header's.
     """
     with path.open("rb") as file:
         header = _meta_header(file)
@@ -117,21 +117,21 @@ def read_meta(path: Path) -> tuple[dict[str, str], np.ndarray | None]:
 
 
 def meta_numbers(header: dict[str, str], *names: str) -> np.ndarray | None:
-    """The numbers of the first of these lines that a MetaImage's header has."""
+    """Return the numbers of the first of these lines in a MetaImage's header, None without any."""
     return next((np.array(header[name].split(), dtype=np.float64) for name in names if name in header), None)
 
 
 def _meta_header(file: IO[bytes]) -> dict[str, str]:
-    """The lines `name = value` up to the one that says where the values are."""
-    found: dict[str, str] = {}
-    while "ElementDataFile" not in found and file.tell() < _HEADER and (line := file.readline(_HEADER)):
+    """Return the lines `name = value` up to the one that says where the values are."""
+    header: dict[str, str] = {}
+    while "ElementDataFile" not in header and file.tell() < _HEADER and (line := file.readline(_HEADER)):
         name, _, value = line.decode("latin-1").partition("=")
-        found[name.strip()] = value.strip()
-    return found
+        header[name.strip()] = value.strip()
+    return header
 
 
 def _meta_shape(header: dict[str, str]) -> list[int]:
-    """The size along each axis, if the other lines speak of as many axes."""
+    """Return the size along each axis, or raise Damaged where another line has another number of axes."""
     shape = [int(n) for n in header.get("DimSize", "").split()]
     if header.get("ObjectType", "Image") != "Image" or str(len(shape)) != header.get("NDims") or min(shape) < 1:
         raise Damaged(f"an image of {header.get('NDims', 'no')[:20]} axes with the sizes {shape[:9]}")
@@ -143,7 +143,7 @@ def _meta_shape(header: dict[str, str]) -> list[int]:
 
 
 def _meta_values(header: dict[str, str], file: IO[bytes], path: Path) -> np.ndarray | None:
-    """The values from where the file stands, to its end; None where they are text."""
+    """Return the values from the file's position to its end; None where they are text."""
     kind = header.get("ElementType", "")
     if kind not in _META_TYPES:
         raise ScanError(f"expected an element type among {', '.join(_META_TYPES)}, got {kind[:40]!r} in {path}")
@@ -154,13 +154,13 @@ def _meta_values(header: dict[str, str], file: IO[bytes], path: Path) -> np.ndar
     check_array(shape, dtype, path)
     if not _meta_truth(header.get("BinaryData", "True")):
         return None
-    packed, skipped = _meta_truth(header.get("CompressedData", "False")), int(header.get("HeaderSize", 0))
-    held = os.fstat(file.fileno()).st_size
-    file.seek(max(0, held - math.prod(shape) * dtype.itemsize) if skipped < 0 else file.tell() + skipped)
-    left = held - file.tell()
-    if packed and int(header.get("CompressedDataSize", left)) != left:
-        raise Damaged(f"{header['CompressedDataSize']} compressed bytes by its header, {left} in the file")
-    return read_numbers(decompressed(file, "zlib" if packed else "raw"), shape, dtype, path)
+    compression, header_size = _meta_truth(header.get("CompressedData", "False")), int(header.get("HeaderSize", 0))
+    size = os.fstat(file.fileno()).st_size
+    file.seek(max(0, size - math.prod(shape) * dtype.itemsize) if header_size < 0 else file.tell() + header_size)
+    rest = size - file.tell()
+    if compression and int(header.get("CompressedDataSize", rest)) != rest:
+        raise Damaged(f"{header['CompressedDataSize']} compressed bytes by its header, {rest} in the file")
+    return read_numbers(decompressed(file, "zlib" if compression else "raw"), shape, dtype, path)
 
 
 def _meta_truth(text: str) -> bool:

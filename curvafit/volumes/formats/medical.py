@@ -18,6 +18,7 @@ _LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
 def read_nrrd(path: Path, **_: object) -> Raw:
+    """Read an NRRD file; lengths along space directions without a unit are in mm."""
     nrrd = extra("nrrd", "NRRD files")
     with path.open("rb") as file:
         header = nrrd.read_header(file)
@@ -40,7 +41,7 @@ def read_nrrd(path: Path, **_: object) -> Raw:
 
 
 def _channel_axis(header: dict[str, Any]) -> int | None:
-    """The axis, of the values with z first, that an NRRD header says is none of space."""
+    """Return the one axis, of the values with z first, that is not an axis of space; None without one."""
     axes = int(header["dimension"])
     if "space directions" in header:
         directions = np.asarray(header["space directions"], dtype=np.float64)
@@ -51,7 +52,7 @@ def _channel_axis(header: dict[str, Any]) -> int | None:
 
 
 def read_itk(path: Path, **_: object) -> Raw:
-    """MetaImage, whose unit is the millimetre; ITK reads what is text or in several files."""
+    """Read a MetaImage, whose unit is the millimetre; ITK reads values in text or in several files."""
     itk = extra("SimpleITK", "MHA and MHD files")
     header, values = read_meta(path)
     if values is None:
@@ -59,28 +60,28 @@ def read_itk(path: Path, **_: object) -> Raw:
     axes = len(header["DimSize"].split())
     spacing = meta_numbers(header, "ElementSpacing", "ElementSize")
     spacing = np.ones(axes) if spacing is None else spacing
-    turned = meta_numbers(header, "TransformMatrix", "Rotation", "Orientation")
+    matrix = meta_numbers(header, "TransformMatrix", "Rotation", "Orientation")
     origin = meta_numbers(header, "Offset", "Position", "Origin")
-    directions = np.eye(axes) if turned is None else turned.reshape(axes, axes).T
+    directions = np.eye(axes) if matrix is None else matrix.reshape(axes, axes).T
     return _in_millimetres(values, spacing, directions, np.zeros(axes) if origin is None else origin)
 
 
 def _itk_image(itk: Any, path: Path) -> Raw:
-    shown = itk.ProcessObject.GetGlobalWarningDisplay()
+    display = itk.ProcessObject.GetGlobalWarningDisplay()
     itk.ProcessObject.SetGlobalWarningDisplay(False)
     try:
         image = itk.ReadImage(str(path))
     finally:
-        itk.ProcessObject.SetGlobalWarningDisplay(shown)
+        itk.ProcessObject.SetGlobalWarningDisplay(display)
     spacing, axes = np.array(image.GetSpacing()), image.GetDimension()
     directions = np.array(image.GetDirection()).reshape(axes, axes)
     return _in_millimetres(itk.GetArrayFromImage(image), spacing, directions, np.array(image.GetOrigin()))
 
 
 def _in_millimetres(values: np.ndarray, spacing: np.ndarray, directions: np.ndarray, origin: np.ndarray) -> Raw:
-    """Values with ITK's account of their place; an affine where they have three axes, or a fourth of channels.
+    """Return values placed as ITK places them, with an affine where three axes, or three and channels, have a place.
 
-    Channels are the last axis where ITK does not count it, else the first.
+    The axis of channels is the last one where ITK does not count it, otherwise the first of four.
     """
     affine, axes = None, len(spacing)
     if axes in (3, 4):
@@ -93,7 +94,7 @@ def _in_millimetres(values: np.ndarray, spacing: np.ndarray, directions: np.ndar
 
 
 def read_mrc(path: Path, **_: object) -> Raw:
-    """MRC and CCP4 maps; voxel sizes in Å."""
+    """Read an MRC file or a CCP4 map, whose voxel sizes are in Å."""
     mrcfile = extra("mrcfile", "MRC files")
     with mrcfile.open(path, mode="r", header_only=True) as file:
         header, size = file.header, file.voxel_size
@@ -107,17 +108,17 @@ def read_mrc(path: Path, **_: object) -> Raw:
 
 
 def check_mrc(unit: str) -> None:
-    """Refuse what `write_mrc` cannot write: lengths without a unit, or anything where its library is missing."""
+    """Raise ScanError where `write_mrc` cannot write: lengths have no unit, or its library is missing."""
     extra("mrcfile", "MRC files")
     if unit == "voxel":
         raise ScanError("expected a unit of nm, um, mm or m for an MRC file, which holds voxel sizes in Å, got none")
 
 
 def write_mrc(field: Any, path: Path) -> None:
-    """The volume with its voxel sizes in Å; float64 becomes float32, bool int8 and uint8 uint16."""
+    """Write a volume with its voxel sizes in Å; float64 becomes float32, bool int8 and uint8 uint16."""
     check_mrc(field.unit)
-    kept = {"bool": "int8", "float64": "float32", "uint8": "uint16"}.get(field.values.dtype.name)
-    values = field.values if kept is None else field.values.astype(kept)
+    kind = {"bool": "int8", "float64": "float32", "uint8": "uint16"}.get(field.values.dtype.name)
+    values = field.values if kind is None else field.values.astype(kind)
     if values.dtype.name not in ("int8", "int16", "uint16", "float16", "float32"):
         raise ScanError(f"expected whole numbers of at most 16 bits or floats for an MRC file, got {values.dtype}")
     with extra("mrcfile", "MRC files").new(path, values, overwrite=True) as file:
@@ -125,14 +126,14 @@ def write_mrc(field: Any, path: Path) -> None:
 
 
 def read_dicom(path: Path, *, key: str | None = None, **_: object) -> Raw:
-    """A folder of one series' slices, in the order of their positions; `key` picks a series by its UID."""
+    """Read a folder of slices in the order of their positions; `key` is the UID of one series of several."""
     pydicom = extra("pydicom", "DICOM folders")
     files = sorted(p for p in path.iterdir() if p.is_file() and (is_dicom(p) or p.suffix.lower() in _DICOM))
     with complaints("pydicom"):
         images = [image for file in files if (image := _image(pydicom, file)) is not None]
     series = sorted({str(image.get("SeriesInstanceUID", "")) for image in images})
-    chosen = pick_key(series, key, path)
-    slices = [image for image in images if str(image.get("SeriesInstanceUID", "")) == chosen]
+    uid = pick_key(series, key, path)
+    slices = [image for image in images if str(image.get("SeriesInstanceUID", "")) == uid]
     rows, columns = np.array(slices[0].ImageOrientationPatient, dtype=float).reshape(2, 3)
     normal = np.cross(rows, columns)
     slices.sort(key=lambda image: float(np.dot(normal, np.array(image.ImagePositionPatient, dtype=float))))
@@ -147,9 +148,9 @@ def read_dicom(path: Path, *, key: str | None = None, **_: object) -> Raw:
 
 
 def _image(pydicom: Any, file: Path) -> Any:
-    """A slice with its pixels; None for what is no image, such as a folder's index or a report."""
+    """Return a slice with its pixels, None for another kind of file such as a folder's index or a report."""
     if not is_dicom(file):
-        raise Damaged(f"{file.name} is no DICOM file")
+        raise Damaged(f"{file.name} is not a DICOM file")
     image = pydicom.dcmread(file)
     if "PixelData" in image:
         return image
@@ -160,7 +161,7 @@ def _image(pydicom: Any, file: Path) -> Any:
 
 
 def is_dicom(path: Path) -> bool:
-    """Whether a file bears DICOM's mark at byte 128."""
+    """Return whether a file has DICOM's mark at byte 128."""
     with path.open("rb") as stream:
         return stream.read(132)[128:] == b"DICM"
 
@@ -177,6 +178,6 @@ def _slice_distance(slices: list[Any], normal: np.ndarray, path: Path) -> tuple[
         raise ScanError(f"expected a DICOM series of several slices, got {len(slices)} in {path}")
     steps = np.diff(positions @ normal)
     if steps.min() <= 0 or np.ptp(steps) > 0.05 * steps.mean():
-        steps_said = f"steps of {steps.min():.4g} to {steps.max():.4g} mm"
-        raise ScanError(f"expected evenly spaced DICOM slices, got {steps_said} in {path}")
+        range_text = f"steps of {steps.min():.4g} to {steps.max():.4g} mm"
+        raise ScanError(f"expected evenly spaced DICOM slices, got {range_text} in {path}")
     return float(steps.mean()), positions[0]

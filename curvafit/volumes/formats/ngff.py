@@ -1,4 +1,4 @@
-"""Zarr: bare arrays and groups are read; OME-NGFF 0.5 (OME-Zarr) is read and written."""
+"""Zarr: reading of bare arrays, groups and OME-Zarr; writing of OME-NGFF 0.5."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ CHUNK = 64
 _WRITTEN = re.compile(r"(\d+/)?zarr\.json|\d+/c(/\d+)*")
 #: Spacing along all axes, unit and axis of channels of an array, each where it is known.
 _Place = tuple[tuple[Any, ...] | None, Any, int | None]
-#: Our unit -> OME-NGFF's; a voxel has none.
+#: Our unit -> OME-NGFF's, which has none for the voxel.
 _UNITS = {"nm": "nanometer", "um": "micrometer", "mm": "millimeter", "m": "meter"}
 
 
 def read_zarr(path: Path, *, key: str | None = None, part: Part | None = None, **_: object) -> Raw:
-    """An array, or one of a group; spacing and unit from its attributes or from OME-Zarr's multiscales."""
+    """Read an array, or one array of a group, with spacing and unit of its attributes or of OME-Zarr's multiscales."""
     check_store(path)
     node: Any = zarr.open(path, mode="r")
     if isinstance(node, zarr.Array):
@@ -45,14 +45,14 @@ def read_zarr(path: Path, *, key: str | None = None, part: Part | None = None, *
 
 
 def _raw(array: Any, folder: Path, place: _Place, part: Part | None) -> Raw:
-    """The values of an array in a folder, with what of them is not stored."""
+    """Return the values of an array in a folder, with sentences on chunks that are not stored."""
     spacing, unit, channels = place
     gaps = missing_chunks(array, folder)
     return part_of(array, part, folder, channels)._replace(spacing=spacing, unit=unit, gaps=gaps)
 
 
 def write_zarr(field: Any, path: Path) -> None:
-    """A group of one image, OME-NGFF 0.5: the volume as `0`, halved copies as `1`, `2` … until one chunk holds it."""
+    """Write an OME-NGFF 0.5 group of one image: the volume as `0`, halved copies as `1`, `2` … down to one chunk."""
     levels = list(_halvings(np.asarray(field.values)))
     kind = {"type": "space", **({"unit": _UNITS[field.unit]} if field.unit in _UNITS else {})}
     image = {
@@ -84,12 +84,12 @@ def _write_level(group: Any, name: str, values: np.ndarray) -> None:
 
 @undisturbed()
 def mark(folder: Path, kind: str) -> None:
-    """State in a group's attributes that this program wrote it, and what for."""
+    """Mark a group, in its attributes, as written by this program, with its kind."""
     zarr.open_group(folder, mode="r+").attrs[MARK] = {"kind": kind}
 
 
 def is_ours(folder: Path, kind: str) -> bool:
-    """Whether a folder is empty, or a group that `write_zarr` wrote, marked with this kind, with nothing else in it."""
+    """Return whether a folder is empty, or a group of `write_zarr` with the mark of this kind and nothing else."""
     if folder.is_symlink() or is_empty(folder):
         return not folder.is_symlink()
     try:
@@ -103,10 +103,10 @@ def is_ours(folder: Path, kind: str) -> bool:
 
 
 def _halvings(values: np.ndarray) -> Iterator[tuple[np.ndarray, float]]:
-    """The volume and its halved copies, each with its first voxel's centre in voxels of the whole one.
+    """Yield the volume and its halved copies, each with the centre of its first voxel in voxels of the volume.
 
-    Numbers with a fraction are averaged over 2³ voxels (the last ones again where the count is odd); of others, which
-    may be labels, every second is taken.
+    Floats are means of 2³ voxels (the last voxels count twice where the number is odd). Whole numbers, which may be
+    labels, are every second value.
     """
     first = 0.0
     yield values, first
@@ -122,7 +122,7 @@ def _halvings(values: np.ndarray) -> Iterator[tuple[np.ndarray, float]]:
 
 
 def _placed(spacing: tuple[float, float, float], factor: int, first: float) -> list[dict[str, Any]]:
-    """Scale, and where the first centre is not at the origin a translation, in the axes' unit."""
+    """Return the scale and, where the first centre is off the origin, the translation, in the axes' unit."""
     transforms: list[dict[str, Any]] = [{"type": "scale", "scale": [factor * h for h in spacing]}]
     if first:
         transforms.append({"type": "translation", "translation": [first * h for h in spacing]})
@@ -130,22 +130,22 @@ def _placed(spacing: tuple[float, float, float], factor: int, first: float) -> l
 
 
 def _arrays(group: Any, prefix: str = "") -> dict[str, Any]:
-    found = {prefix + name: array for name, array in group.arrays()}
+    arrays = {prefix + name: array for name, array in group.arrays()}
     for name, inner in group.groups():
-        found.update(_arrays(inner, f"{prefix}{name}/"))
-    return found
+        arrays.update(_arrays(inner, f"{prefix}{name}/"))
+    return arrays
 
 
 def _multiscales(attributes: Mapping[str, Any]) -> dict[str, _Place]:
-    """OME-Zarr: path of each level -> (scale of its axes, unit of the last one, axis of channels)."""
-    described = attributes.get("ome", attributes).get("multiscales") or []
-    found: dict[str, _Place] = {}
-    for image in described[:1]:
+    """Return the scale of the axes, the unit of the last one and the axis of channels of each level, by its path."""
+    images = attributes.get("ome", attributes).get("multiscales") or []
+    places: dict[str, _Place] = {}
+    for image in images[:1]:
         axes = [axis if isinstance(axis, dict) else {"name": axis} for axis in image.get("axes", [])]
         unit = axes[-1].get("unit") if axes else None
-        named = [k for k, axis in enumerate(axes) if axis.get("type", axis.get("name")) in ("channel", "c")]
-        channels = named[0] if named else None
+        channel_axes = [k for k, axis in enumerate(axes) if axis.get("type", axis.get("name")) in ("channel", "c")]
+        channels = channel_axes[0] if channel_axes else None
         for level in image.get("datasets", []):
             scales = [t["scale"] for t in level.get("coordinateTransformations", []) if t.get("type") == "scale"]
-            found[level["path"]] = (tuple(float(h) for h in scales[0]) if scales else None, unit, channels)
-    return found
+            places[level["path"]] = (tuple(float(h) for h in scales[0]) if scales else None, unit, channels)
+    return places

@@ -1,4 +1,4 @@
-"""NIfTI: x,y,z in the file, z,y,x here; zooms, units and affine both ways."""
+"""NIfTI: x, y, z in the file, z, y, x here; zooms, units and affines are read and written."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ _TO_FILE = {
 
 
 def read_nifti(path: Path, *, part: Part | None = None, **_: object) -> Raw:
-    """Values, zooms, unit and affine. Without a unit, zooms other than 1 are taken for mm, as NIfTI's readers do."""
-    with complaints("nibabel.global") as said:
+    """Read values, zooms, unit and affine; zooms other than 1 without a unit are in mm, as for NIfTI's readers."""
+    with complaints("nibabel.global") as repairs:
         image: Any = nibabel.load(path)
         raw = _values(image, path, part)
     zooms = tuple(float(f"{h:.7g}") for h in image.header.get_zooms())[:3]  # stored as float32
@@ -37,10 +37,10 @@ def read_nifti(path: Path, *, part: Part | None = None, **_: object) -> Raw:
     unit = image.header.get_xyzt_units()[0]
     affine = np.array(image.affine, dtype=np.float64)
     spacing: tuple[float, ...] | None = (1.0,) * (raw.values.ndim - 3) + zooms[::-1]
-    guesses = [f"The file's header is mended: {text}." for text in dict.fromkeys(said)]
-    wrote = _own_unit(image.header)
-    if wrote:
-        unit, factor = wrote
+    guesses = [f"The file's header is mended: {text}." for text in dict.fromkeys(repairs)]
+    own = _own_unit(image.header)
+    if own:
+        unit, factor = own
         affine[:3] *= factor
         spacing = (1.0,) * (raw.values.ndim - 3) + tuple(h * factor for h in zooms[::-1])
     elif unit == "unknown" and all(h == 1 for h in zooms):
@@ -55,26 +55,26 @@ def read_nifti(path: Path, *, part: Part | None = None, **_: object) -> Raw:
 
 
 def _values(image: Any, path: Path, part: Part | None) -> Raw:
-    """The scaled values, z first, of a file that ends with them and whose checksum, if it is compressed, holds.
+    """Return the scaled values, z first; the file must end with them, and the checksum of a compressed file hold.
 
-    Of one that is not compressed a part is read alone.
+    From a file that is not compressed only the part is read.
     """
-    stored, packed = image.dataobj, path.name.lower().endswith(".gz")
-    shape = stored.shape[::-1]
+    proxy, compression = image.dataobj, path.name.lower().endswith(".gz")
+    shape = proxy.shape[::-1]
     long = [axis for axis, n in enumerate(shape[:-3]) if n != 1]
     channels = long[0] if len(long) == 1 else None
-    if part is not None and not packed:
-        raw = part_of(mapped(path, stored.offset, shape, stored.dtype), part, path, channels)
+    if part is not None and not compression:
+        raw = part_of(mapped(path, proxy.offset, shape, proxy.dtype), part, path, channels)
     else:
-        with gzip.open(path) if packed else path.open("rb") as stream:
-            stream.seek(stored.offset)
-            raw = Raw(read_numbers(stream, shape, stored.dtype, path), channels=channels)
-    scaled = apply_read_scaling(raw.values, np.asanyarray(stored.slope), np.asanyarray(stored.inter))
-    return raw._replace(values=scaled)
+        with gzip.open(path) if compression else path.open("rb") as stream:
+            stream.seek(proxy.offset)
+            raw = Raw(read_numbers(stream, shape, proxy.dtype, path), channels=channels)
+    values = apply_read_scaling(raw.values, np.asanyarray(proxy.slope), np.asanyarray(proxy.inter))
+    return raw._replace(values=values)
 
 
 def write_nifti(field: Any, path: Path) -> None:
-    """`field` with qform and sform set to its affine (or to its spacing) and the unit named."""
+    """Write a field with its unit, and with its affine, or its spacing without one, as qform and sform."""
     values = field.values.view(np.uint8) if field.values.dtype == bool else field.values
     if values.dtype == np.float16:
         values = values.astype(np.float32)
@@ -92,15 +92,15 @@ def write_nifti(field: Any, path: Path) -> None:
 
 
 def write_nifti_like(values: np.ndarray, like: Path, path: Path, unit: str | None = None) -> None:
-    """`values` (Z, Y, X) with the header of another NIfTI file of that shape: its affines, codes and zooms to the bit.
+    """Write values (Z, Y, X) with the header of another NIfTI file of that shape: affines, codes and zooms to the bit.
 
-    Only what tells of its values (type, scale, range, intent) is set anew, and the unit, if one is named: what the
-    numbers of that file then are. NIfTI has neither nm nor cm, which alone are converted.
+    Only type, scale, range and intent of the values are new, and the unit, if one is given: it renames the numbers of
+    the header. NIfTI has neither nm nor cm: only these are converted.
 
     Raises
     ------
     ScanError
-        If the other file has another number of voxels.
+        If the other file has a different number of voxels.
     """
     with complaints("nibabel.global"):
         image: Any = nibabel.load(like)
@@ -117,16 +117,16 @@ def write_nifti_like(values: np.ndarray, like: Path, path: Path, unit: str | Non
 
 
 def _own_unit(header: Any) -> tuple[str, float] | None:
-    """The unit that `write_nifti` left in the description because NIfTI has no code for it, and the factor to it."""
-    wrote = re.match(r"curvafit unit=(\w+)", bytes(header["descrip"]).decode("latin-1"))
-    if wrote is None:
+    """Return a unit without a code in NIfTI, which `write_nifti` put into the description, and the factor to it."""
+    match = re.match(r"curvafit unit=(\w+)", bytes(header["descrip"]).decode("latin-1"))
+    if match is None:
         return None
-    unit, _ = normalise_unit(wrote[1])
+    unit, _ = normalise_unit(match[1])
     return unit, 1 / _TO_FILE[unit][1]
 
 
 def _rename(header: Any, unit: str) -> None:
-    """Name the unit of lengths that `read_nifti` would give."""
+    """Rename the unit of the lengths that `read_nifti` reads from a header."""
     name, factor = normalise_unit(unit)
     code, into = _TO_FILE[name]
     own = _own_unit(header)

@@ -1,4 +1,4 @@
-"""Which part of a file's array is wanted: one channel of several, and a box of voxels."""
+"""A part of a file's array: one channel of several, and a box of voxels."""
 
 from __future__ import annotations
 
@@ -21,38 +21,38 @@ Box = tuple[slice, slice, slice]
 #: A box as a caller gives it: `"z0:z1,y0:y1,x0:x1"`, or three slices.
 Crop = str | Sequence[slice]
 
-_SAID = 'a crop as "z0:z1,y0:y1,x0:x1" or three slices'
+_FORM = 'a crop as "z0:z1,y0:y1,x0:x1" or three slices'
 
 
 @dataclass(frozen=True)
 class Part:
-    """A channel, counted from 0, and a box; None for what is not given."""
+    """A channel, counted from 0, and a box; None stands for all."""
 
     channel: int | None = None
     crop: Box | None = None
 
     @property
     def whole(self) -> bool:
-        """Whether nothing is left out."""
+        """Return whether the part is the whole array."""
         return self.channel is None and self.crop is None
 
     def index(
         self, shape: Sequence[int], channels: int | None, place: object
     ) -> tuple[tuple[slice, ...], tuple[int, ...]]:
-        """Return the slices, one for each axis, that take this part of an array in a file, and the axes z, y and x.
+        """Return the slices, one per axis, that take this part of an array in a file, and the axes z, y and x.
 
         Parameters
         ----------
         shape
-            Of the whole array, z before y before x.
+            Shape of the whole array, z before y before x.
         channels
-            The axis of channels, if the file says which it is. Of four axes without a name, it is the first or the
-            last, whichever is shorter.
+            The axis of channels, if the file names it. Among four axes without names, it is the shorter one of the
+            first and the last.
 
         Raises
         ------
         ScanError
-            If what is left has not three axes, or the channel or the box is not there.
+            If the part does not have three axes, or the array has no such channel or box.
         """
         long = [axis for axis, n in enumerate(shape) if n != 1]
         channels = self._channel_axis(shape, channels, long, place)
@@ -72,7 +72,7 @@ class Part:
     def _channel_axis(
         self, shape: Sequence[int], channels: int | None, long: Sequence[int], place: object
     ) -> int | None:
-        """Return the axis that a channel is taken from, None where there is none."""
+        """Return the axis of channels, None where there is none."""
         if self.channel is None:
             if channels in long:
                 count = shape[channels]  # type: ignore[index]
@@ -91,12 +91,12 @@ class Part:
 
 
 def part_of(array: Any, part: Part | None, place: object, channels: int | None = None) -> Raw:
-    """Read a part, or all, of an array that is not in memory: a dataset, a mapped file.
+    """Read an array that is not in memory (a dataset, a mapped file), or a part of it.
 
     Raises
     ------
     ScanError
-        If the part is not there, has no numbers or fits into no memory.
+        If the array has no such part, the values are not numbers, or the part does not fit into memory.
     """
     if part is None:
         check_array(array.shape, array.dtype, place)
@@ -107,12 +107,12 @@ def part_of(array: Any, part: Part | None, place: object, channels: int | None =
 
 
 def selected(raw: Raw, part: Part, place: object) -> tuple[Raw, tuple[int, ...]]:
-    """Return the part of what a file holds, with three axes and their spacing, and the voxel (z, y, x) it starts at.
+    """Return a part of a file's content, with three axes and their spacing, and its first voxel (z, y, x).
 
     Raises
     ------
     ScanError
-        If there are no numbers, the part is not there, or what is left has not three axes.
+        If the values are not numbers, there is no such part, or the part does not have three axes.
     """
     if raw.values.dtype.kind not in "biuf":
         raise ScanError(f"expected numbers, got values of type {raw.values.dtype} in {place}")
@@ -132,18 +132,18 @@ def box_of(crop: Crop | None) -> Box | None:
     Raises
     ------
     ScanError
-        If it is no such text, or not three slices of whole numbers without a step.
+        If the crop is neither such a text nor three slices of whole numbers without a step.
     """
     if crop is None:
         return None
     parts: list[Any] = list(map(_slice, crop.split(","))) if isinstance(crop, str) else [*_sequence(crop)]
     if len(parts) != 3 or not all(isinstance(part, slice) and _is_plain(part) for part in parts):
-        raise ScanError(f"expected {_SAID}, got {quoted(crop)}")
+        raise ScanError(f"expected {_FORM}, got {quoted(crop)}")
     return parts[0], parts[1], parts[2]
 
 
 def fitted(box: Box | None, shape: Sequence[int], place: object) -> Box:
-    """Return a box in a volume of a shape (z, y, x) with its first and last voxels counted from the start.
+    """Return a box in a volume of a shape (z, y, x), with all its ends counted from the first voxel.
 
     Raises
     ------
@@ -164,7 +164,7 @@ def fitted(box: Box | None, shape: Sequence[int], place: object) -> Box:
 
 
 def _slice(text: str) -> slice | None:
-    """Return the slice that `"3:7"`, `":7"` or `":"` is."""
+    """Return the slice of a text such as `"3:7"`, `":7"` or `":"`, None for another text."""
     match = re.fullmatch(r"\s*(-?\d{1,18})?\s*:\s*(-?\d{1,18})?\s*", text)
     return slice(*(None if edge is None else int(edge) for edge in match.groups())) if match else None
 
@@ -174,6 +174,6 @@ def _sequence(crop: Any) -> Sequence[Any]:
 
 
 def _is_plain(edge: slice) -> bool:
-    """Whether a slice has whole ends, or none, and no step."""
+    """Return whether a slice has whole numbers, or nothing, as ends, and no step."""
     ends = (end for end in (edge.start, edge.stop) if end is not None)
     return edge.step in (None, 1) and all(isinstance(end, Integral) and not isinstance(end, bool) for end in ends)

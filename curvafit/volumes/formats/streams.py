@@ -1,4 +1,4 @@
-"""Reading the numbers of a file to its last byte: their count is checked, and with it what a compressed stream says."""
+"""Reading the numbers of a file to its last byte, which checks their count and the checksum of a compressed stream."""
 
 from __future__ import annotations
 
@@ -17,76 +17,77 @@ import numpy as np
 from curvafit.machine import memory
 from curvafit.volumes.formats.base import Damaged, ScanError
 
-#: Bytes that are read at once.
+#: Bytes of one read.
 _PIECE = 1 << 22
-#: What a compressed file begins with -> what opens it.
+#: First bytes of a compressed file -> its encoding.
 _COMPRESSED = {b"\x1f\x8b": "gzip", b"BZh": "bzip2"}
 
 
 def read_numbers(stream: Any, shape: Sequence[int], dtype: np.dtype, place: object) -> np.ndarray:
-    """Read an array, last axis fastest, and make sure that the stream ends with it.
+    """Return the array of a stream, last axis fastest; the stream must end with it.
 
-    At its end a gzip, bzip2 or zip stream compares its checksum, which no reader of the first bytes alone would reach.
+    A gzip, bzip2 or zip stream compares its checksum only at its end.
 
     Raises
     ------
     ScanError
-        If the array fits into no memory.
+        If the array does not fit into memory.
     Damaged, OSError, EOFError, zlib.error, zipfile.BadZipFile
         If the stream is shorter, longer or damaged.
     """
     check_array(shape, dtype, place)
     values = np.empty(math.prod(shape), dtype)
-    room, done = values.view(np.uint8).data if values.nbytes else memoryview(b""), 0
-    while done < values.nbytes and (count := stream.readinto(room[done : done + _PIECE])):
-        done += count
-    if done < values.nbytes or stream.read(1):
-        held = done if done < values.nbytes else "more"
-        raise Damaged(f"{values.nbytes} bytes of values by its header, {held} in the file")
+    buffer, size = values.view(np.uint8).data if values.nbytes else memoryview(b""), 0
+    while size < values.nbytes and (count := stream.readinto(buffer[size : size + _PIECE])):
+        size += count
+    if size < values.nbytes or stream.read(1):
+        content = size if size < values.nbytes else "more"
+        raise Damaged(f"{values.nbytes} bytes of values by its header, {content} in the file")
     return values.reshape(tuple(shape))
 
 
 def mapped(path: Path, start: int, shape: Sequence[int], dtype: np.dtype) -> np.ndarray:
-    """Return the array, last axis fastest, that a file holds from a byte to its end, without reading it.
+    """Return the array, last axis fastest, from a byte of a file to its end, mapped rather than read.
 
     Raises
     ------
     ScanError
-        If its type is none of numbers.
+        If the values are not numbers.
     Damaged
         If the file is shorter or longer.
     """
     check_array([0], dtype, path)
-    wanted, held = math.prod(shape) * dtype.itemsize, path.stat().st_size - start
-    if wanted != held:
-        raise Damaged(f"{wanted} bytes of values by its header, {held} in the file")
-    return np.memmap(path, dtype, "r", start, tuple(shape)) if wanted else np.empty(tuple(shape), dtype)
+    nbytes, size = math.prod(shape) * dtype.itemsize, path.stat().st_size - start
+    if nbytes != size:
+        raise Damaged(f"{nbytes} bytes of values by its header, {size} in the file")
+    return np.memmap(path, dtype, "r", start, tuple(shape)) if size else np.empty(tuple(shape), dtype)
 
 
 def check_array(shape: Sequence[int], dtype: np.dtype, place: object) -> None:
-    """Refuse an array of a header before there is room made for it.
+    """Raise ScanError where the array of a header cannot be read, before memory is allocated.
 
     Raises
     ------
     ScanError
-        If the type is of objects or records, an axis is negative or the array larger than the machine's memory.
+        If the type is one of objects or records, an axis is negative, or the array is larger than the machine's
+        memory.
     """
     if dtype.kind in "OV":
         raise ScanError(f"expected numbers, got values of type {str(dtype)[:80]} in {place}")
-    wanted = math.prod(int(n) for n in shape) * dtype.itemsize
+    size = math.prod(int(n) for n in shape) * dtype.itemsize
     if min(shape, default=1) < 0:
         raise ScanError(f"expected a shape of positive whole numbers, got {tuple(shape)} in {place}")
-    if wanted > memory():
-        raise ScanError(f"expected a volume that fits into memory, got {wanted:.3g} bytes by the header of {place}")
+    if size > memory():
+        raise ScanError(f"expected a volume that fits into memory, got {size:.3g} bytes by the header of {place}")
 
 
 def check_regular(path: Path) -> Path:
-    """The path, if it is of a file or a folder: what else there is may never end.
+    """Return the path of a file or a folder, or raise ScanError: reading anything else may never end.
 
     Raises
     ------
     ScanError
-        If it is a pipe, a socket or a device.
+        If the path is a pipe, a socket or a device.
     """
     if path.exists() and not path.is_file() and not path.is_dir():
         raise ScanError(f"expected a file or a folder, got {path}, which is neither")
@@ -95,7 +96,7 @@ def check_regular(path: Path) -> Path:
 
 @contextmanager
 def opened(path: Path) -> Iterator[Any]:
-    """A file's stream of bytes, decompressed where it begins as gzip's or bzip2's do."""
+    """Open a file as a stream of bytes, decompressed if its first bytes are those of gzip or bzip2."""
     with path.open("rb") as file:
         start = file.read(3)
         file.seek(0)
@@ -104,13 +105,13 @@ def opened(path: Path) -> Iterator[Any]:
 
 
 def skip(stream: Any, count: int) -> None:
-    """Read and forget so many bytes, which fewer end quietly."""
+    """Read and forget `count` bytes, or all where there are fewer."""
     while count > 0 and (piece := stream.read(min(count, _PIECE))):
         count -= len(piece)
 
 
 def decompressed(stream: IO[bytes], encoding: str) -> Any:
-    """The bytes of the rest of a stream in `"gzip"`, `"bzip2"`, `"zlib"` or `"raw"`."""
+    """Return a stream of the decompressed rest of one in `"gzip"`, `"bzip2"`, `"zlib"` or `"raw"`."""
     if encoding == "zlib":
         return io.BufferedReader(_Inflated(stream))
     several: dict[str, Any] = {"gzip": lambda: gzip.GzipFile(fileobj=stream), "bzip2": lambda: bz2.BZ2File(stream)}
@@ -118,7 +119,7 @@ def decompressed(stream: IO[bytes], encoding: str) -> Any:
 
 
 class _Inflated(io.RawIOBase):
-    """The bytes of one zlib stream; at its end its checksum counts, and nothing may follow."""
+    """The bytes of one zlib stream, whose checksum is compared at its end; nothing may follow."""
 
     def __init__(self, stream: IO[bytes]) -> None:
         self._stream, self._inflate = stream, zlib.decompressobj()
@@ -128,16 +129,16 @@ class _Inflated(io.RawIOBase):
 
     def readinto(self, room: Any, /) -> int:
         while not self._inflate.eof:
-            if piece := self._inflate.decompress(self._given(), len(room)):
+            if piece := self._inflate.decompress(self._input(), len(room)):
                 room[: len(piece)] = piece
                 return len(piece)
         if self._inflate.unused_data or self._stream.read(1):
             raise Damaged("bytes follow the compressed stream")
         return 0
 
-    def _given(self) -> bytes:
-        """What is to be decompressed next."""
-        given = self._inflate.unconsumed_tail or self._stream.read(1 << 16)
-        if not given:
+    def _input(self) -> bytes:
+        """Return the next compressed bytes."""
+        compressed = self._inflate.unconsumed_tail or self._stream.read(1 << 16)
+        if not compressed:
             raise Damaged("the compressed stream ends too early")
-        return given
+        return compressed

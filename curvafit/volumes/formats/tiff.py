@@ -1,4 +1,4 @@
-"""TIFF: a file or a folder of slices; spacing from ImageJ's, OME's or tifffile's description, or from the tags."""
+"""TIFF, as a file or a folder of slices; the spacing is in ImageJ's, OME's or tifffile's description, or in tags."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from curvafit.volumes.formats.streams import check_array, check_regular
 SLICES = (".tif", ".tiff")
 #: Bytes beyond which ImageJ's TIFF cannot point.
 _IMAGEJ_LIMIT = 2**32 - 2**25
-#: Voxels a unit that TIFF's resolution can state.
+#: Most voxels per unit that TIFF's resolution can state.
 _RESOLUTION_LIMIT = 2**31
-#: What tifffile says where it goes on without a part of a file.
+#: Words of tifffile's messages where it skips a part of a file.
 _LOST = (
     "invalid page offset",
     "invalid offset",
@@ -33,13 +33,13 @@ _LOST = (
     "raised",
 )
 _TAG_UNITS = {2: "inch", 3: "cm"}
-#: Resolutions that programs write when they know none (dots an inch; 25.4 is a dot a millimetre).
+#: Resolutions that programs write when they know none (dots per inch; 25.4 is one dot per millimetre).
 _SCREEN = (1, 25.4, 72, 96, 100, 150, 200, 300, 600)
 
 
 def read_tiff(path: Path, **_: object) -> Raw:
-    """The first series of a file, if every strip and page that it speaks of is there."""
-    with complaints("tifffile") as said, tifffile.TiffFile(path) as file:
+    """Read the first series of a file, or raise Damaged where one of its strips or pages is missing."""
+    with complaints("tifffile") as messages, tifffile.TiffFile(path) as file:
         series = file.series[0]
         check_array(series.shape, series.dtype or np.dtype("V1"), path)
         _check_pages(file, series)
@@ -47,25 +47,25 @@ def read_tiff(path: Path, **_: object) -> Raw:
         spacing, unit, guesses = _spacing(file)
         channels, guess = _channel_axis(series)
         count = len(file.series)
-    tags = [text for text in said if text.startswith("<TiffTag")]
-    if lost := [text for text in said if text not in tags and any(mark in text.lower() for mark in _LOST)]:
-        raise Damaged(lost[0])
+    tags = [text for text in messages if text.startswith("<TiffTag")]
+    if losses := [text for text in messages if text not in tags and any(mark in text.lower() for mark in _LOST)]:
+        raise Damaged(losses[0])
     notes = (f"The file holds {count} images: the first is used.",) if count > 1 else ()
     notes += (f"{len(tags)} of the file's tags cannot be read: what they state is not known.",) if tags else ()
     return Raw(values, spacing, unit, notes=(*notes, *guess), guesses=guesses, channels=channels)
 
 
 def _channel_axis(series: tifffile.TiffPageSeries) -> tuple[int | None, tuple[str, ...]]:
-    """The axis of colours or channels; where only two others are left, channels that are no colours are taken for z."""
-    named = [axis for axis, name in enumerate(series.axes) if name in "SC" and series.shape[axis] != 1]
-    axis = named[-1] if named else None
+    """Return the axis of colours or channels; channels that leave only two other axes, and are not colours, are z."""
+    channel_axes = [axis for axis, name in enumerate(series.axes) if name in "SC" and series.shape[axis] != 1]
+    axis = channel_axes[-1] if channel_axes else None
     if axis is None or series.axes[axis] == "S" or sum(n != 1 for n in series.shape) != 3:
         return axis, ()
     return None, (f"The file calls an axis of {series.shape[axis]} channels: it is taken for slices.",)
 
 
 def read_slices(path: Path, **_: object) -> Raw:
-    """A folder of 2D slices in the natural order of their names; in-plane size from the first slice's tags."""
+    """Read a folder of 2D slices in the natural order of their names, with the pixel size of the first slice."""
     names = sorted((p for p in path.iterdir() if p.suffix.lower() in SLICES), key=lambda p: natural_key(p.name))
     first, slices = None, []
     for name in names:
@@ -82,7 +82,7 @@ def read_slices(path: Path, **_: object) -> Raw:
 
 
 def _plane(raw: Raw) -> np.ndarray:
-    """A slice (Y, X), or (Y, X, channels)."""
+    """Return a slice (Y, X), or (Y, X, channels)."""
     if raw.channels is None:
         return np.squeeze(raw.values)
     values = np.moveaxis(raw.values, raw.channels, -1)
@@ -90,7 +90,7 @@ def _plane(raw: Raw) -> np.ndarray:
 
 
 def _skipped(names: Sequence[str]) -> tuple[str, ...]:
-    """A sentence on the numbers that a folder's names skip, where all but their last number is alike."""
+    """Return a sentence on the numbers that the names of slices skip, if they differ only in their last number."""
     parts = [re.fullmatch(r"(.*?)(\d{1,15})(\D*)", name) for name in names]
     if len(names) < 3 or None in parts or len({(part[1], part[3]) for part in parts if part}) > 1:
         return ()
@@ -103,14 +103,14 @@ def _skipped(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def _check_pages(file: tifffile.TiffFile, series: tifffile.TiffPageSeries) -> None:
-    """Refuse what tifffile would fill with zeros: pages, strips and tiles that are not there, or beyond the end."""
+    """Raise Damaged where pages, strips or tiles are missing or beyond the end: tifffile fills them with zeros."""
     metadata = file.imagej_metadata or {}
     if file.is_imagej and int(metadata.get("images", 1)) > math.prod(series.shape[:-2]):
         raise Damaged(f"{metadata['images']} images by its description, {math.prod(series.shape[:-2])} in the file")
     if series.dataoffset is not None:  # all values in one piece, whatever its pages are
-        wanted = math.prod(series.shape) * np.dtype(series.dtype).itemsize
-        if series.dataoffset + wanted > file.filehandle.size:
-            raise Damaged(f"{wanted} bytes of values by its header, fewer in the file")
+        nbytes = math.prod(series.shape) * np.dtype(series.dtype).itemsize
+        if series.dataoffset + nbytes > file.filehandle.size:
+            raise Damaged(f"{nbytes} bytes of values by its header, fewer in the file")
         return
     for number, page in enumerate(series.pages):
         if page is None:
@@ -123,7 +123,7 @@ def _check_pages(file: tifffile.TiffFile, series: tifffile.TiffPageSeries) -> No
 
 
 def write_tiff(field: Any, path: Path) -> None:
-    """ImageJ's metadata where it knows the type of the values and can hold as many, else OME's."""
+    """Write a TIFF with ImageJ's metadata, or with OME's where ImageJ lacks the type or cannot hold the size."""
     values, (z, y, x) = _stored(field), field.spacing
     fits = values.nbytes < _IMAGEJ_LIMIT and max(1 / x, 1 / y) < _RESOLUTION_LIMIT
     if values.dtype in (np.uint8, np.uint16, np.float32) and fits:
@@ -138,7 +138,7 @@ def write_tiff(field: Any, path: Path) -> None:
 
 
 def write_ome_tiff(field: Any, path: Path) -> None:
-    """OME's metadata."""
+    """Write a TIFF with OME's metadata."""
     sizes = {f"PhysicalSize{axis}": h for axis, h in zip("ZYX", field.spacing, strict=True)}
     units = {f"PhysicalSize{axis}Unit": {"um": "µm", "voxel": "pixel"}.get(field.unit, field.unit) for axis in "ZYX"}
     metadata = {"axes": "ZYX", **sizes, **units}
@@ -146,33 +146,33 @@ def write_ome_tiff(field: Any, path: Path) -> None:
 
 
 def _stored(field: Any) -> np.ndarray:
-    """The values as a TIFF holds them: bytes for a mask."""
+    """Return the values as a TIFF holds them: bytes for a mask."""
     return field.values.view(np.uint8) if field.values.dtype == bool else field.values
 
 
 def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
-    """Sorts slice2 before slice10."""
+    """Return a key that sorts slice2 before slice10."""
     return tuple((0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", name.casefold()))
 
 
 def _spacing(file: tifffile.TiffFile) -> tuple[tuple[float, ...] | None, str | None, tuple[str, ...]]:
     if file.is_ome and file.ome_metadata:
         return (*_from_ome(file.ome_metadata), ())
-    described: dict[str, Any] = dict(file.imagej_metadata or (file.shaped_metadata or ({},))[0])
-    if "curvafit_spacing" in described:
-        return tuple(float(h) for h in described["curvafit_spacing"].split(",")), described["curvafit_unit"], ()
-    if "PhysicalSizeX" in described:
-        sizes = tuple(float(described.get(f"PhysicalSize{axis}", described["PhysicalSizeX"])) for axis in "ZYX")
-        return sizes, described.get("unit", described.get("PhysicalSizeXUnit", "um")), ()
+    description: dict[str, Any] = dict(file.imagej_metadata or (file.shaped_metadata or ({},))[0])
+    if "curvafit_spacing" in description:
+        return tuple(float(h) for h in description["curvafit_spacing"].split(",")), description["curvafit_unit"], ()
+    if "PhysicalSizeX" in description:
+        sizes = tuple(float(description.get(f"PhysicalSize{axis}", description["PhysicalSizeX"])) for axis in "ZYX")
+        return sizes, description.get("unit", description.get("PhysicalSizeXUnit", "um")), ()
     if file.is_imagej:
-        return _from_imagej(file, described)
-    return _from_description(described) if "spacing" in described else _from_tags(file)
+        return _from_imagej(file, description)
+    return _from_description(description) if "spacing" in description else _from_tags(file)
 
 
-def _from_description(described: dict[str, Any]) -> tuple[tuple[float, ...] | None, str | None, tuple[str, ...]]:
-    """tifffile's own JSON, which has no rule for `spacing`: three numbers, or one that counts for all axes."""
-    sizes = tuple(float(h) for h in np.atleast_1d(described["spacing"]))
-    unit = described.get("unit")
+def _from_description(description: dict[str, Any]) -> tuple[tuple[float, ...] | None, str | None, tuple[str, ...]]:
+    """Return spacing, unit and a note of tifffile's JSON, where `spacing` is three numbers, or one for all axes."""
+    sizes = tuple(float(h) for h in np.atleast_1d(description["spacing"]))
+    unit = description.get("unit")
     if len(sizes) == 3:
         return sizes, unit, ()
     note = f"The file states one voxel size, {sizes[0]:g} {unit or ''}".rstrip() + ": it is taken for all three axes."
@@ -193,24 +193,25 @@ def _from_ome(text: str) -> tuple[tuple[float, ...] | None, str | None]:
 
 
 def _from_imagej(
-    file: tifffile.TiffFile, described: dict[str, Any]
+    file: tifffile.TiffFile, description: dict[str, Any]
 ) -> tuple[tuple[float, ...] | None, str | None, tuple[str, ...]]:
-    """ImageJ: `spacing` is the distance of slices, the resolution tags count pixels per `unit`.
+    """Return spacing, unit and a note of ImageJ's description.
 
-    Without a unit only the proportions mean anything: lengths are then in pixels along x.
+    `spacing` is the distance of slices, and the resolution tags count pixels per `unit`. Without a unit only the
+    proportions have a meaning: lengths are then in pixels along x.
     """
     y, x = _pixels_per_unit(file)
-    unit = described.get("unit")
+    unit = description.get("unit")
     if normalise_unit(unit)[0] == "voxel":
-        sizes = (abs(float(described.get("spacing", 1 / x))) * x, x / y, 1.0)
+        sizes = (abs(float(description.get("spacing", 1 / x))) * x, x / y, 1.0)
         return (None if np.allclose(sizes, 1) else sizes), None, ()
-    z = abs(float(described.get("spacing", 1 / x)))
-    notes = () if "spacing" in described else ("The file states no distance of slices: it is taken as the pixel's.",)
+    z = abs(float(description.get("spacing", 1 / x)))
+    notes = () if "spacing" in description else ("The file states no distance of slices: it is taken as the pixel's.",)
     return (z, 1 / y, 1 / x), unit, notes
 
 
 def _from_tags(file: tifffile.TiffFile) -> tuple[tuple[float, ...] | None, str | None, tuple[str, ...]]:
-    """Resolution tags alone: used where they are no printer's default; the distance of slices is then a guess."""
+    """Return spacing and unit of the resolution tags, unless they are a default; the distance of slices is a guess."""
     y, x = _pixels_per_unit(file)
     tag = file.pages[0].tags.get("ResolutionUnit")  # type: ignore[union-attr]
     unit = _TAG_UNITS.get(int(tag.value)) if tag is not None else None
