@@ -102,7 +102,7 @@ def _write_channels(folder: Path) -> None:
     import nibabel
 
     phase, grey = np.load(folder / "long.npy"), nibabel.load(folder / "scan.nii.gz")
-    labels = (phase > 0) + (phase > 0.9).astype(np.uint8)
+    labels = (phase > 0) + (phase > np.quantile(phase, 0.95)).astype(np.uint8)
     np.save(folder / "labels.npy", labels)
     np.save(folder / "long-channels.npy", np.stack((phase, -phase)))
     values = np.asarray(grey.dataobj)  # type: ignore[attr-defined]
