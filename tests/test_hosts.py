@@ -81,7 +81,9 @@ def test_the_parts_of_the_sum_are_there_to_log():
 
 def test_combined_loss_refuses_negative_numbers():
     for options in ({"weight": -1.0}, {"weight": None}, {"weight": float("inf")}, {"warmup": -1}, {"warmup": 0.5}):
-        with pytest.raises(ValueError, match=r"expected a (finite weight|warm-up of whole calls) from 0, got"):
+        with pytest.raises(
+            ValueError, match=r"expected a (finite weight|warm-up of a whole number of calls) from 0, got"
+        ):
             CombinedLoss(nn.BCEWithLogitsLoss(), CurvaturePrior("tubes"), **options)
 
 
