@@ -3,11 +3,11 @@
 A texture is six coefficients and a mass: shapes that minimise the integral of a quadratic polynomial of the principal
 curvatures at constant volume.
 
-Infer       `infer(scan)` gives the parameters of a scanned volume, with `.fit`, `.plot()` and a report.
-Synthesise  `generate(law)` grows a shape of a texture; `generate_batch` grows several at once.
-Prior       `segment(scan, prior=law)` and `reconstruct(labels, prior=law)` give a mask; `curvafit.priors` has the loss.
-Files       `load(path)` and `save(volume, path)` read and write volumes with their spacing and unit.
-Measures    `diagram(u, grid, epsilon)` and `wasserstein(a, b)`; more in `curvafit.geometry`.
+- Infer: `infer(scan)` gives the parameters of a scanned volume, with `.fit`, `.plot()` and a report.
+- Synthesise: `generate(law)` grows a shape of a texture; `generate_batch` grows several at once.
+- Prior: `segment(scan, law)` and `reconstruct(labels, law)` give a mask; `curvafit.priors` has the loss for networks.
+- Files: `load(path)` and `save(volume, path)` read and write volumes with their spacing and unit.
+- Measures: `diagram(u, grid, epsilon)` and `wasserstein(a, b)`; more in `curvafit.geometry`.
 
 A law is `Coefficients`, the name of a preset (`preset`), or the path of a `fit.json`. The public names are loaded when
 they are first used: importing the package imports nothing.

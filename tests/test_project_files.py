@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 import tomllib
 from pathlib import Path
@@ -82,3 +83,17 @@ def test_links_of_the_first_pages_lead_somewhere() -> None:
         links = re.findall(r"\]\(([^)#\s]+)", (ROOT / page).read_text(encoding="utf-8"))
         assert [link for link in links if "://" not in link and not (ROOT / link).exists()] == []
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) < 130
+
+
+def test_a_function_named_as_its_module_stands_on_the_page_of_its_room() -> None:
+    """The page of a room lists its names by itself but for these, which it takes for the modules."""
+    for page in (ROOT / "docs" / "api").glob("*.md"):
+        room = f"curvafit.{page.stem}"
+        if page.stem not in ("index", "curvafit"):
+            names = importlib.import_module(room).__all__
+            twins = {
+                f"::: {room}.{name}.{name}"
+                for name in names
+                if (ROOT / "curvafit" / page.stem / f"{name}.py").is_file()
+            }
+            assert twins <= set(page.read_text(encoding="utf-8").splitlines()), page.name

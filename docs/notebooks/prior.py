@@ -12,8 +12,8 @@
 # # The energy as a training loss
 #
 # A very small network learns to find tubes in noise from a few annotated slices: with Dice and cross-entropy, and with
-# the curvature prior beside them. It shows how the parts go together;the page Benchmarks says what
-# the prior does to real data.
+# the curvature prior beside them. It shows how the parts go together; the page
+# Benchmarks says what the prior does to real data.
 
 # %%
 # %matplotlib inline
