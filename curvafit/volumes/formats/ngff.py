@@ -15,7 +15,7 @@ from curvafit.files import MARK, is_empty
 from curvafit.interrupts import undisturbed
 from curvafit.volumes.formats.base import Raw, pick_key, stated
 from curvafit.volumes.formats.chunks import check_store, missing_chunks
-from curvafit.volumes.formats.part import Part, part_of
+from curvafit.volumes.formats.part import Part, fitting, part_of
 
 #: Edge of a chunk, and of the largest volume that is not halved any more, in voxels.
 CHUNK = 64
@@ -47,6 +47,7 @@ def read_zarr(path: Path, *, key: str | None = None, part: Part | None = None, *
 def _raw(array: Any, folder: Path, place: _Place, part: Part | None) -> Raw:
     """Return the values of an array in a folder, with sentences on chunks that are not stored."""
     spacing, unit, channels = place
+    fitting(array, part, folder, channels)  # before chunks are counted: a header may claim any number of them
     gaps = missing_chunks(array, folder)
     return part_of(array, part, folder, channels)._replace(spacing=spacing, unit=unit, gaps=gaps)
 

@@ -96,14 +96,28 @@ def part_of(array: Any, part: Part | None, place: object, channels: int | None =
     Raises
     ------
     ScanError
+        As `fitting`.
+    """
+    index = fitting(array, part, place, channels)
+    if part is None:
+        return Raw(np.asarray(array[index]), channels=channels)
+    return Raw(np.array(array[index]), channels=channels, whole=tuple(array.shape))
+
+
+def fitting(array: Any, part: Part | None, place: object, channels: int | None = None) -> Any:
+    """Return the index of a part of an array, or of all of it, once it is sure to fit into memory.
+
+    Raises
+    ------
+    ScanError
         If the array has no such part, the values are not numbers, or the part does not fit into memory.
     """
     if part is None:
         check_array(array.shape, array.dtype, place)
-        return Raw(np.asarray(array[...]), channels=channels)
+        return ...
     index, _ = part.index(array.shape, channels, place)
     check_array([edge.stop - edge.start for edge in index], array.dtype, place)
-    return Raw(np.array(array[index]), channels=channels, whole=tuple(array.shape))
+    return index
 
 
 def selected(raw: Raw, part: Part, place: object) -> tuple[Raw, tuple[int, ...]]:
