@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from curvafit.data_synth.atlas.design import INTERVALS, boxed
+from curvafit.data_synth.atlas.design import INTERVALS, Design, boxed
 
 #: (a20 … a00, m₀, noise seed) of draw 0 of seed 0.
 FIRST_DRAW = (
@@ -40,6 +40,15 @@ def test_each_parameter_is_uniform_on_its_interval(name):
     values = np.array([mass if name == "mass" else getattr(coefficients, name) for coefficients, mass, _ in draws])
     assert low < values.min() and values.max() < high
     assert kstest(values, "uniform", (low, high - low)).pvalue > 0.01
+
+
+def test_a_parameter_in_log_is_uniform_in_its_logarithm():
+    design = boxed("sobol", ["a02"])
+    values = np.array([design.draw(5, index).coefficients.a02 for index in range(1024)])
+    low, high = INTERVALS["a02"]
+    assert kstest(np.log(values), "uniform", (np.log(low), np.log(high / low))).pvalue > 0.01
+    assert Design.from_dict(design.as_dict()) == design
+    assert "log" not in boxed().as_dict(), "stores made before hold no such key"
 
 
 def test_parameters_and_noise_seeds_are_uncorrelated():

@@ -50,6 +50,10 @@ def test_a_box_in_yaml_changes_some_intervals_and_fixes_others(tmp_path):
     assert a11.min() > 1 and a11.max() < 2 and a00.min() < -2000 and a00.max() > 2000
 
 
+def test_a_box_in_yaml_holds_some_parameters_in_logarithms(tmp_path):
+    assert read_design(written(tmp_path, "log: [a02]\nbox: {a11: 2}\n")) == boxed("random", ["a02"], a11=2)
+
+
 def test_numbers_that_yaml_takes_for_text_are_numbers(tmp_path):
     plain = read_design(written(tmp_path, "box: {a00: [-1000, 1000], a02: 0.06}"))
     assert read_design(written(tmp_path, "box: {a00: [-1e3, 1e3], a02: 6e-2}")) == plain
@@ -84,7 +88,7 @@ BOMB = "a0: &a0 [1]\n" + "".join(f"a{k + 1}: &a{k + 1} [{', '.join([f'*a{k}'] * 
     [
         ("box: {a11: [1, 2]", "expected a design in YAML, got"),
         ("- 1", "expected the keys of a design"),
-        ("bxo: {a11: 3}", "expected keys among around, box, law, list, spread, got 'bxo'"),
+        ("bxo: {a11: 3}", "expected keys among around, box, law, list, log, spread, got 'bxo'"),
         ("law: sobol", "expected one of the keys box, around, list, got none"),
         ("box: {}\nlist: []", "got box and list"),
         ("list: []\nlaw: sobol", "expected no key 'law' beside 'list'"),
@@ -95,6 +99,10 @@ BOMB = "a0: &a0 [1]\n" + "".join(f"a{k + 1}: &a{k + 1} [{', '.join([f'*a{k}'] * 
         ("box: {a11: [2, 1]}", "expected an interval of a11 from low to high"),
         ("box: {a11: [1, two]}", "expected a11 as a number or two of them"),
         ("box: {a11: .nan}", "expected finite parameters"),
+        ("log: [a11]\nbox: {}", "expected in log parameters whose interval is above 0, got 'a11'"),
+        ("log: [[a02]]\nbox: {}", r"expected in log parameters whose interval is above 0, got \['a02'\]"),
+        ("log: a02\nbox: {}", "expected a list of parameters in log, got 'a02'"),
+        ("log: [a02]\naround: tubes", "expected no key 'log' beside 'around'"),
         ("box: {mass: [-2, 0]}", r"expected masses in \(-1, 1\), got -2"),
         ("law: even\nbox: {}", "expected a law random or sobol, got 'even'"),
         ("box: {a11: 1, a11: 2}", "expected a design in YAML, got .*: the key 'a11' twice in line 1"),

@@ -51,6 +51,8 @@ class Design:
         Intervals of (a20, a11, a02, a10, a01, a00, m₀) in working units; of no width where a parameter is fixed.
     points
         Points of seven numbers, for `"list"`.
+    log
+        Names of the parameters whose logarithm the box holds uniformly; their intervals are above 0.
 
     Raises
     ------
@@ -62,6 +64,7 @@ class Design:
     law: Law
     box: tuple[tuple[float, float], ...] = ()
     points: tuple[tuple[float, ...], ...] = ()
+    log: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         named(self.law, get_args(Law), f"a law among {', '.join(get_args(Law))}")
@@ -78,6 +81,7 @@ class Design:
         for name, interval in zip(PARAMETERS, self.box, strict=False):
             if interval[0] > interval[1]:
                 raise ValueError(f"expected an interval of {name} from low to high, got {list(interval)}")
+        object.__setattr__(self, "log", _logarithmic(self.log, self.box))
         for row in rows:
             if not -1 < row[-1] < 1:
                 raise ValueError(f"expected masses in (-1, 1), got {row[-1]}")
@@ -96,14 +100,14 @@ class Design:
         if self.law == "list":
             values = self.points[index % len(self.points)]
         else:
-            shares = zip(self.box, self._shares(seed, index), strict=True)
-            values = [low + (high - low) * share for (low, high), share in shares]
+            values = list(map(self._value, PARAMETERS, self.box, self._shares(seed, index)))
         return Draw(Coefficients(*map(float, values[:-1])), float(values[-1]), start)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the design in JSON's types, for a store's record."""
         rows = {"points": self.points} if self.law == "list" else {"box": self.box}
-        return {"law": self.law} | {name: [list(row) for row in value] for name, value in rows.items()}
+        log = {"log": list(self.log)} if self.log else {}
+        return {"law": self.law} | {name: [list(row) for row in value] for name, value in rows.items()} | log
 
     @staticmethod
     def from_dict(content: Mapping[str, Any]) -> Design:
@@ -123,7 +127,12 @@ class Design:
             box, points, sound = (), (), False
         if not sound or "law" not in content:
             raise ValueError(f"expected a design's law and box or points, got {quoted(content)}")
-        return Design(content["law"], box, points)
+        return Design(content["law"], box, points, content.get("log", ()))
+
+    def _value(self, name: str, interval: tuple[float, float], share: float) -> float:
+        """Return the value of a parameter that lies a share into an interval."""
+        low, high = interval
+        return low * (high / low) ** share if name in self.log else low + (high - low) * share
 
     def _shares(self, seed: int, index: int) -> list[float]:
         """Return how far into each interval the draw lies, 0 to 1. A fixed parameter takes no random number."""
@@ -137,8 +146,9 @@ class Design:
         return [next(shares) if moves else 0.0 for moves in free]
 
 
-def boxed(law: Law = "random", /, **intervals: float | Sequence[float]) -> Design:
-    """Return a box: Experiment 4's, but for the intervals or fixed values that are given by name.
+def boxed(law: Law = "random", log: Sequence[str] = (), /, **intervals: float | Sequence[float]) -> Design:
+    """Return a box: Experiment 4's, but for the intervals or fixed values that are given by name; uniform in the
+    logarithm of the parameters in `log`.
 
     Raises
     ------
@@ -150,7 +160,7 @@ def boxed(law: Law = "random", /, **intervals: float | Sequence[float]) -> Desig
         raise ValueError(f"expected parameters among {', '.join(PARAMETERS)}, got {', '.join(sorted(unknown))}")
     asked = {name: _interval(name, value) for name, value in intervals.items()}
     whole: dict[str, tuple[float, float]] = {"a20": (1.0, 1.0), **INTERVALS, **asked}
-    return Design(law, tuple(whole[name] for name in PARAMETERS))
+    return Design(law, tuple(whole[name] for name in PARAMETERS), log=log)  # type: ignore[arg-type]
 
 
 def around(point: Sequence[float], spread: float, law: Law = "random") -> Design:
@@ -173,6 +183,16 @@ def around(point: Sequence[float], spread: float, law: Law = "random") -> Design
     box["a02"] = (max(box["a02"][0], least), max(box["a02"][1], least))
     box["mass"] = (max(box["mass"][0], -0.99), min(box["mass"][1], 0.99))
     return boxed(law, **box)
+
+
+def _logarithmic(names: Sequence[str], box: Sequence[tuple[float, float]]) -> tuple[str, ...]:
+    """Check the names of the parameters that a box holds in logarithms."""
+    names = several(names, "names of parameters in log")
+    positive = [name for name, (low, _) in zip(PARAMETERS, box, strict=False) if low > 0]
+    for name in names:
+        if name not in positive:
+            raise ValueError(f"expected in log parameters whose interval is above 0, got {quoted(name)}")
+    return tuple(names)
 
 
 def _near(centre: float, half: float) -> tuple[float, float]:

@@ -13,7 +13,7 @@ from curvafit.priors.bounds import quoted, real
 from curvafit.priors.law import texture_of
 
 #: The kinds of design, and the keys that may stand beside each.
-KEYS = {"box": {"law"}, "around": {"law", "spread"}, "list": set()}
+KEYS = {"box": {"law", "log"}, "around": {"law", "spread"}, "list": set()}
 #: Share of Experiment 4's intervals that the surroundings of a point span.
 SPREAD = 0.1
 
@@ -67,7 +67,10 @@ def _design(content: Any, folder: Path) -> Design:
         return around(point_of(content["around"], folder), _spread(content.get("spread", SPREAD)), law)
     if not isinstance(content["box"], Mapping):
         raise ValueError(f"expected a box of names and intervals, got {quoted(content['box'])}")
-    return boxed(law, **{str(name): _number(value) for name, value in content["box"].items()})
+    log = content.get("log", [])
+    if not isinstance(log, list):
+        raise ValueError(f"expected a list of parameters in log, got {quoted(log)}")
+    return boxed(law, log, **{str(name): _number(value) for name, value in content["box"].items()})
 
 
 def _kind(content: Any) -> str:
