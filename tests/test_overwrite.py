@@ -165,6 +165,16 @@ def test_a_store_may_begin_in_an_empty_folder(tmp_path: Path) -> None:
     assert open_store(tmp_path / "s.zarr").indices() == []
 
 
+def test_a_store_records_the_number_of_steps_that_was_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plans = []
+    monkeypatch.setattr("curvafit.data_synth.atlas.build.build", lambda *settings, **_: plans.append(settings[4]))
+    told = ["atlas", "build", tmp_path / "s.zarr", "--count", 1, "--shape", 12, "--workers", 0, "--schedule", "paper"]
+    assert call(*told, "--steps", 700).exit_code == 0
+    assert [(plan.name, plan.steps) for plan in plans] == [("paper", 700)]
+
+
 def test_a_sample_is_copied_over_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sample = tmp_path / "cache" / "synthetic.nii.gz"
     sample.parent.mkdir()

@@ -51,6 +51,7 @@ def build_atlas(
     ] = None,
     spread: Annotated[float | None, typer.Option(help="With --around: share of the random law's intervals.")] = None,
     schedule: Annotated[str, typer.Option(help="Schedule of the flow: fast or paper.")] = "fast",
+    steps: Annotated[int | None, typer.Option(help="Number of steps, instead of the schedule's.")] = None,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
     dashboard: DashboardOption = None,
@@ -67,15 +68,17 @@ def build_atlas(
         check_count(count, 1)
         crew = Crew(workers, scheduler, dashboard)
         crew.check(box)
-        settings = settings_of(box, seed, schedule, law)
+        plan = named(schedule, steps)
+        settings = settings_of(box, seed, plan, law)
         if store.exists():
             open_store(store, settings)
         check_folder(store.parent)
         if scheduler is None and not store.exists():
-            steps = count * named(schedule).steps
-            say_forecast("atlas build", box, steps, forecast.FLOW, what="voxels a shape", workers=cores(workers))
+            say_forecast(
+                "atlas build", box, count * plan.steps, forecast.FLOW, what="voxels a shape", workers=cores(workers)
+            )
         with crew.at_work() as (makers, progress):
-            build(store, count, box, seed, schedule, progress, design=law, workers=makers)
+            build(store, count, box, seed, plan, progress, design=law, workers=makers)
         say(str(store))
 
 

@@ -122,7 +122,7 @@ COMMANDS: dict[str, Command] = {
     ),
     "build": Command(
         ("atlas", "build", "out.zarr", "--count", "1", "--shape", "16", "--around", "tubes", "--workers", "0"),
-        "count shape seed design around spread schedule workers scheduler",
+        "count shape seed design around spread schedule steps workers scheduler",
         "count workers shape",
         stays=("out.zarr", "out.zarr/*"),
         each=6,
