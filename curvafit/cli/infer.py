@@ -9,19 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from curvafit.cli.forecast import INFERENCE, say_forecast
-from curvafit.cli.reading import (
-    Channel,
-    Crop,
-    Dtype,
-    Key,
-    Label,
-    RawShape,
-    Spacing,
-    Strict,
-    Unit,
-    Volume,
-    reading_of,
-)
+from curvafit.cli.reading import Reading, Volume, reads_volume
 from curvafit.cli.support import (
     OverwriteOption,
     command_line,
@@ -50,6 +38,7 @@ EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
 )
 
 
+@reads_volume
 def infer(
     scan: Volume,
     out: Annotated[Path, typer.Option("-o", "--output", help="Folder for fit.json, report.html, regenerated.nii.gz.")],
@@ -59,31 +48,13 @@ def infer(
     threshold: Annotated[str, typer.Option(help="Grey level between the phases, or otsu.")] = "otsu",
     dark: Annotated[bool, typer.Option("--dark", help="The structure is the dark phase.")] = False,
     roi: Annotated[Path | None, typer.Option(help="Mask of the region to measure, of the scan's shape.")] = None,
-    spacing: Spacing = None,
-    unit: Unit = None,
-    channel: Channel = None,
-    label: Label = None,
-    crop: Crop = None,
-    raw_shape: RawShape = None,
-    dtype: Dtype = None,
-    key: Key = None,
-    strict: Strict = False,
+    *,
+    reading: Reading,
     seed: Annotated[int, typer.Option(help="Seed of the shapes that are generated for comparison.")] = 0,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Infer the parameters of a scanned volume, and write a report."""
     with plainly():
-        reading = reading_of(
-            spacing=spacing,
-            unit=unit,
-            channel=channel,
-            label=label,
-            crop=crop,
-            raw_shape=raw_shape,
-            dtype=dtype,
-            key=key,
-            strict=strict,
-        )
         level = threshold_of(threshold)
         what = {"kind": kind, "periodic": periodic, "threshold": level, "dark": dark, "roi": roi}
         inference, report = _inferred(scan, out, {**what, "atlas": atlas, "seed": seed, **reading}, overwrite)

@@ -10,19 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from curvafit.cli.forecast import SEGMENTATION, say_forecast
-from curvafit.cli.reading import (
-    Channel,
-    Crop,
-    Dtype,
-    Key,
-    Label,
-    RawShape,
-    Spacing,
-    Strict,
-    Unit,
-    Volume,
-    reading_of,
-)
+from curvafit.cli.reading import Reading, Volume, reads_volume
 from curvafit.cli.support import (
     OverwriteOption,
     command_line,
@@ -35,6 +23,7 @@ from curvafit.cli.support import (
 )
 
 if TYPE_CHECKING:
+    from curvafit.progress import Progress
     from curvafit.segmentation.segment import Segmentation
     from curvafit.volumes.scan import Field
 
@@ -70,6 +59,7 @@ Axis = Annotated[str, _what(help="Axis across the slices: z, y or x (first, seco
 STEPS = 150
 
 
+@reads_volume
 def segment(
     scan: Volume,
     out: Target,
@@ -80,30 +70,12 @@ def segment(
     dark: Dark = False,
     epsilon: Epsilon = None,
     steps: Steps = STEPS,
-    spacing: Spacing = None,
-    unit: Unit = None,
-    channel: Channel = None,
-    label: Label = None,
-    crop: Crop = None,
-    raw_shape: RawShape = None,
-    dtype: Dtype = None,
-    key: Key = None,
-    strict: Strict = False,
+    *,
+    reading: Reading,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Find the structure of a noisy scan under a curvature prior; write its mask, a picture and a record."""
     with plainly():
-        reading = reading_of(
-            spacing=spacing,
-            unit=unit,
-            channel=channel,
-            label=label,
-            crop=crop,
-            raw_shape=raw_shape,
-            dtype=dtype,
-            key=key,
-            strict=strict,
-        )
         options: dict[str, Any] = {"weight": weight, "epsilon": epsilon}
         if probability is None:
             options |= {"threshold": threshold_of(threshold), "dark": dark}
@@ -111,7 +83,7 @@ def segment(
             extra = "--dark" if dark else f"--threshold {threshold}"
             raise ValueError(f"expected neither --threshold nor --dark with --probability, got {extra}")
 
-        def compute(volume: Field, progress: Callable[[str, float], None]) -> Segmentation:
+        def compute(volume: Field, progress: Progress) -> Segmentation:
             from curvafit.segmentation.evidence import cropped_map
             from curvafit.segmentation.segment import segment as segment_scan
             from curvafit.volumes.scan import load
@@ -125,6 +97,7 @@ def segment(
         _run(scan, out, prior, reading, compute, {"job": "segment", "steps": steps, **more}, overwrite)
 
 
+@reads_volume
 def reconstruct(
     slices: Volume,
     out: Target,
@@ -135,30 +108,12 @@ def reconstruct(
     axis: Axis = "z",
     epsilon: Epsilon = None,
     steps: Steps = STEPS,
-    spacing: Spacing = None,
-    unit: Unit = None,
-    channel: Channel = None,
-    label: Label = None,
-    crop: Crop = None,
-    raw_shape: RawShape = None,
-    dtype: Dtype = None,
-    key: Key = None,
-    strict: Strict = False,
+    *,
+    reading: Reading,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Fill a mask between known slices under a curvature prior; write the mask, a picture and a record."""
     with plainly():
-        reading = reading_of(
-            spacing=spacing,
-            unit=unit,
-            channel=channel,
-            label=label,
-            crop=crop,
-            raw_shape=raw_shape,
-            dtype=dtype,
-            key=key,
-            strict=strict,
-        )
         if axis.lower() not in ("z", "y", "x"):
             raise ValueError(f"expected --axis z, y or x, got {axis!r}")
         if (every is None) == (known is None):
@@ -168,7 +123,7 @@ def reconstruct(
             raise ValueError(f"expected --first beside --every, got {first} beside --slices")
         options = {"every": every, "first": first or 0, "known": numbers, "axis": "zyx".index(axis.lower())}
 
-        def compute(volume: Field, progress: Callable[[str, float], None]) -> Segmentation:
+        def compute(volume: Field, progress: Progress) -> Segmentation:
             from curvafit.segmentation.segment import reconstruct as fill
 
             return fill(volume, prior, epsilon=epsilon, steps=steps, progress=progress, **options)  # type: ignore[arg-type]
@@ -182,21 +137,19 @@ def _run(
     out: Path,
     prior: str,
     reading: dict[str, Any],
-    compute: Callable[[Field, Callable[[str, float], None]], Segmentation],
+    compute: Callable[[Field, Progress], Segmentation],
     record: dict[str, Any],
     overwrite: bool,
 ) -> None:
     """Check, read, compute, write and print."""
-    from curvafit.priors.coefficients import PRESETS
     from curvafit.priors.law import texture_of
     from curvafit.segmentation.mask_files import check_mask_target, write_mask
     from curvafit.segmentation.working import WorkingGrid
     from curvafit.volumes.scan import load
 
-    law = None if prior in PRESETS else prior
-    inputs = [each for each in (source, law, record.get("probability")) if each is not None]
+    law_file = None if texture_of(prior).prior is None else prior
+    inputs = [each for each in (source, law_file, record.get("probability")) if each is not None]
     check_mask_target(out, inputs=inputs, overwrite=overwrite)
-    texture_of(prior)
     with stages() as progress:
         progress("reading", 0.0)
         volume = load(source, **reading)

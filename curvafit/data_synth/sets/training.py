@@ -26,8 +26,6 @@ from curvafit.priors.law import Law
 BLEND_LENGTH = 0.5
 #: How sharply: a standard normal field times this, through the logistic function, is the share of the first texture.
 BLEND_STEEPNESS = 4.0
-
-
 #: Percentiles that `percentile` makes 0 and 1, beyond which it cuts.
 PERCENTILES = (0.5, 99.5)
 #: Shapes that a pool may have.

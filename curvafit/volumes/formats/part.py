@@ -14,7 +14,7 @@ from curvafit.priors.bounds import SEEDS, quoted, whole
 from curvafit.volumes.formats.base import Raw, ScanError
 from curvafit.volumes.formats.streams import check_array
 
-__all__ = ["Box", "Crop", "Part", "box_of", "fitted", "part_of", "selected"]
+__all__ = ["Box", "Crop", "Part", "box_of", "fitted", "fitting", "part_of", "selected"]
 
 #: A box of voxels along (z, y, x).
 Box = tuple[slice, slice, slice]
