@@ -142,14 +142,16 @@ def _run(
     overwrite: bool,
 ) -> None:
     """Check, read, compute, write and print."""
+    from curvafit.priors.coefficients import preset_name
     from curvafit.priors.law import texture_of
     from curvafit.segmentation.mask_files import check_mask_target, write_mask
     from curvafit.segmentation.working import WorkingGrid
     from curvafit.volumes.scan import load
 
-    law_file = None if texture_of(prior).prior is None else prior
+    law_file = None if preset_name(prior) else prior
     inputs = [each for each in (source, law_file, record.get("probability")) if each is not None]
     check_mask_target(out, inputs=inputs, overwrite=overwrite)
+    texture_of(prior)
     with stages() as progress:
         progress("reading", 0.0)
         volume = load(source, **reading)
