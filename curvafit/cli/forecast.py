@@ -2,7 +2,7 @@
 
 The time of a command is the time of its flows: steps times voxels times the time of a step, which is measured on this
 machine, in some 0.1 s on a small box. The memory is that of the process with its libraries, and a number of bytes per
-voxel, measured once at 128³ voxels (for `infer` at 40³ and 64³).
+voxel: of a flow, what its arrays and its file take; of the others, measured once at 128³ (`infer` at 40³ and 64³).
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from curvafit.cli.support import error_console, say
+from curvafit.generation import memory
 from curvafit.units import number
 
 #: Least work, in steps times voxels, that has a forecast: some seconds.
@@ -30,7 +31,7 @@ class Cost(NamedTuple):
     voxel: float
 
 
-FLOW = Cost(0.4e9, 70)
+FLOW = Cost(0.4e9, memory.FLOW + memory.FILE)
 SEGMENTATION = Cost(0.6e9, 130)
 INFERENCE = Cost(0.75e9, 1300)
 
