@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from curvafit.segmentation.segment import Segmentation, reconstruct, segment
     from curvafit.volumes.scan import Field, load, save
 
-    __version__: str
+__version__ = "0.1.0"
 
 __all__ = [
     "Coefficients",

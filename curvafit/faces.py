@@ -32,10 +32,6 @@ class _Face(ModuleType):
 
     def __getattr__(self, name: str) -> Any:
         homes = self.__dict__["_homes"]
-        if name == "__version__" and name in self.__all__:
-            from importlib.metadata import version
-
-            return version(self.__name__)
         if name not in homes:
             raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")
         value = getattr(import_module(homes[name]), name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 #: Metres in each unit of length that files name, small to large.
 METRES = {"nm": 1e-9, "um": 1e-6, "mm": 1e-3, "m": 1.0}
@@ -23,6 +24,12 @@ def number(value: float | None, digits: int = 3) -> str:
     if -4 <= power <= 6:
         rounded = f"{float(rounded):,.{max(0, digits - 1 - power)}f}".replace(",", "\u202f")
     return rounded.replace("-", "−")
+
+
+def sampling(shape: Sequence[int], spacing: Sequence[float], unit: str = "") -> str:
+    """Return the number and the size of voxels (z, y, x); one edge stands for three that are equal."""
+    edges = " x ".join(f"{h:.4g}" for h in spacing[: 1 if len(set(spacing)) == 1 else 3])
+    return f"{' x '.join(map(str, shape))} voxels of {edges} {unit}".rstrip()
 
 
 def percent(share: float) -> str:

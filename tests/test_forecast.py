@@ -6,10 +6,12 @@ import re
 from importlib import import_module
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 from calling import call, refused
 
+from curvafit.cli.workers import Crew
 from curvafit.volumes import save
 
 forecast = import_module("curvafit.cli.forecast")
@@ -61,3 +63,15 @@ def test_synth_refuses_a_folder_with_other_things_before_it_forecasts(
     result = call(*some, "-o", tmp_path)
     refused(result, "expected a new or empty folder, or a set to go on with")
     assert "about" not in result.stderr
+
+
+def test_workers_on_this_machine_share_the_flows(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    """Each has one thread, on which the step is timed; those of a scheduler are unknown."""
+    threads = []
+    monkeypatch.setattr(forecast, "step_time", lambda device: threads.append(numba.get_num_threads()) or 1e-8)
+    before = numba.get_num_threads()
+    Crew(4, None, None).say_forecast("synth", (100, 100, 100), 20_000)
+    assert "synth: 100 x 100 x 100 voxels a shape, about 40 to 100 s and 1.9 GB" in capsys.readouterr().err
+    assert threads == [1] and numba.get_num_threads() == before
+    Crew(None, "tcp://there:1", None).say_forecast("synth", (100, 100, 100), 20_000)
+    assert capsys.readouterr().err == "" and threads == [1]

@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from curvafit.cli import forecast
-from curvafit.cli.forecast import cores, say_forecast
 from curvafit.cli.support import (
     OverwriteOption,
     command_line,
@@ -73,10 +71,8 @@ def build_atlas(
         if store.exists():
             open_store(store, settings)
         check_folder(store.parent)
-        if scheduler is None and not store.exists():
-            say_forecast(
-                "atlas build", box, count * plan.steps, forecast.FLOW, what="voxels a shape", workers=cores(workers)
-            )
+        if not store.exists():
+            crew.say_forecast("atlas build", box, count * plan.steps)
         with crew.at_work() as (makers, progress):
             build(store, count, box, seed, plan, progress, design=law, workers=makers)
         say(str(store))

@@ -2,18 +2,18 @@
 
 The time of a command is the time of its flows: steps times voxels times the time of a step, which is measured on this
 machine, in some 0.1 s on a small box. The memory is that of the process with its libraries, and a number of bytes per
-voxel, measured once at 128³ voxels (for `infer` at 40³ and 64³).
+voxel: of a flow, what its arrays and its file take; of the others, measured once at 128³ (`infer` at 40³ and 64³).
 """
 
 from __future__ import annotations
 
 import math
-import os
 import time
 from collections.abc import Sequence
 from typing import NamedTuple
 
 from curvafit.cli.support import error_console, say
+from curvafit.generation import memory
 from curvafit.units import number
 
 #: Least work, in steps times voxels, that has a forecast: some seconds.
@@ -31,7 +31,7 @@ class Cost(NamedTuple):
     voxel: float
 
 
-FLOW = Cost(0.4e9, 70)
+FLOW = Cost(0.4e9, memory.FLOW + memory.FILE)
 SEGMENTATION = Cost(0.6e9, 130)
 INFERENCE = Cost(0.75e9, 1300)
 
@@ -56,9 +56,8 @@ def say_forecast(
     if steps * voxels < SHORT:
         return
     seconds = steps * voxels * step_time(device) / workers
-    memory = workers * (cost.base + cost.voxel * voxels) / 1e9
-    size = " x ".join(map(str, shape))
-    say(f"{name}: {size} {what}, about {_span(seconds)} and {number(memory, 2)} GB on this machine", to=error_console())
+    size, space = " x ".join(map(str, shape)), number(workers * (cost.base + cost.voxel * voxels) / 1e9, 2)
+    say(f"{name}: {size} {what}, about {_span(seconds)} and {space} GB on this machine", to=error_console())
 
 
 def step_time(device: str = "cpu") -> float:
@@ -74,11 +73,6 @@ def step_time(device: str = "cpu") -> float:
         generate(law.coefficients, law.mass, grid, seed=0, schedule=schedule("fast", steps), device=device)
         times.append(time.perf_counter() - start)
     return max(times[2] - times[1], 1e-6) / (STEPS[1] - STEPS[0]) / EDGE**3
-
-
-def cores(workers: int | None) -> int:
-    """Return the number of processes of a command: the option, at least 1, or by default one per core."""
-    return max(1, (os.cpu_count() or 1) if workers is None else workers)
 
 
 def _span(seconds: float) -> str:

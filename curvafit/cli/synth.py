@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli import forecast
-from curvafit.cli.forecast import cores, say_forecast
 from curvafit.cli.reading import reading_of
 from curvafit.cli.support import error_console, numbers, plainly, say, say_notes, whole_triple
 from curvafit.cli.workers import Crew, DashboardOption, SchedulerOption, WorkersOption
@@ -161,11 +159,10 @@ def _build(out: Path, order: Order, count: int, crew: Crew) -> None:
     whole(count, "a count of at least 1 case", 1, MOST)
     check_folder(out)
     check_set(out, order)
-    if crew.scheduler is None and order.recipe.source.within == math.inf:
+    if order.recipe.source.within == math.inf:
         crew.check(order.recipe.largest)
         steps = (count - len(cases_of(out))) * schedule("fast").steps
-        size, share = order.recipe.largest, cores(crew.workers)
-        say_forecast("synth", size, steps, forecast.FLOW, what="voxels a shape", workers=share)
+        crew.say_forecast("synth", order.recipe.largest, steps)
     with crew.at_work() as (makers, progress):
         build_set(out, order, count, progress, workers=makers)
     preview = write_preview(out)

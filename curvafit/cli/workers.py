@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
+from curvafit.cli.forecast import FLOW, say_forecast
 from curvafit.cli.support import kept, stages
 
 if TYPE_CHECKING:
@@ -44,6 +45,16 @@ class Crew(NamedTuple):
         check_workers(self.workers, self.scheduler)
         if shape is not None and self.scheduler is None:
             check_memory(shape, FLOW, "a shape")
+
+    def say_forecast(self, name: str, shape: Sequence[int], steps: float) -> None:
+        """Print the forecast of flows that workers on this machine share; a scheduler's machines are unknown."""
+        from curvafit.data_synth.atlas.draws import device, one_thread
+        from curvafit.data_synth.atlas.workers import processes
+
+        if self.scheduler is None:
+            share = {"workers": processes(self.workers), "device": device()}
+            with one_thread():
+                say_forecast(name, shape, steps, FLOW, what="voxels a shape", **share)
 
     @contextmanager
     def at_work(self, again: Callable[[], str] = lambda: "the same command") -> Iterator[tuple[Workers, Progress]]:

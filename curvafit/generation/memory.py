@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Sequence
-
-import torch
+from typing import TYPE_CHECKING
 
 from curvafit.machine import memory as installed
+
+if TYPE_CHECKING:
+    import torch
 
 #: The least number of bytes for each voxel of a flow: A, Adam's two moments and the start, three float32 numbers each;
 #: u, the gradient, and the field between two passes of the blur.
@@ -33,6 +35,8 @@ def check_memory(voxels: Sequence[int], each: int, what: str, device: torch.devi
 
 def memory(device: torch.device | str = "cpu") -> int:
     """Return the bytes of memory of a device or of this machine; `sys.maxsize` where the number is unknown."""
+    import torch
+
     if torch.device(device).type == "cuda" and torch.cuda.is_available():
         return torch.cuda.get_device_properties(device).total_memory
     return installed()

@@ -14,6 +14,7 @@ from curvafit.generation.viability import Viability
 from curvafit.pictures import Pictured
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
+from curvafit.units import sampling
 
 #: Steps between two entries of the history (and two calls of the callbacks).
 RECORD_EVERY = 10
@@ -86,10 +87,8 @@ class Flow(Pictured):
 
     def __repr__(self) -> str:
         """Return one line with voxels, energy, viability and status."""
-        cube, energy = len(set(self.grid.spacing)) == 1, self.history.energy[-1]
-        edges = " x ".join(f"{h:g}" for h in self.grid.spacing[: 1 if cube else 3])
-        voxels = f"{' x '.join(map(str, self.grid.shape))} voxels of {edges}"
-        return f"Flow({voxels}, energy {energy:.4g}, {'' if self.viability.viable else 'not '}viable: {self.status})"
+        size, viable = sampling(self.grid.shape, self.grid.spacing), "viable" if self.viability.viable else "not viable"
+        return f"Flow({size}, energy {self.history.energy[-1]:.4g}, {viable}: {self.status})"
 
     @property
     def finite(self) -> bool:

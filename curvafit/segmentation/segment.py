@@ -21,7 +21,8 @@ from curvafit.priors.profile import optimal_profile, phase_field
 from curvafit.progress import Progress, silent
 from curvafit.segmentation.evidence import cropped_map, interpolated_distance, of_intensities, of_probability
 from curvafit.segmentation.working import Law, WorkingGrid, law_of
-from curvafit.volumes.field import Field, ScanError, voxels_of
+from curvafit.units import sampling
+from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.part import Crop
 from curvafit.volumes.source import Source, field_of
 
@@ -71,7 +72,8 @@ class Segmentation(Pictured):
     def __repr__(self) -> str:
         mask = self.mask.values
         count = f"{np.count_nonzero(mask)} inside ({100 * mask.mean():.3g} %)"
-        return f"Segmentation({voxels_of(self.mask)}, {count}: {self.status})"
+        size = sampling(self.mask.shape, self.mask.spacing, self.mask.unit)
+        return f"Segmentation({size}, {count}: {self.status})"
 
 
 def segment(

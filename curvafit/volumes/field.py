@@ -11,10 +11,11 @@ import numpy as np
 from curvafit.messages import one_line
 from curvafit.pictures import Pictured
 from curvafit.priors.bounds import SEEDS, quoted, whole
+from curvafit.units import sampling
 from curvafit.volumes.formats.base import ScanError, normalise_unit
 from curvafit.volumes.formats.part import Crop, box_of, fitted
 
-__all__ = ["Field", "ScanError", "positive_triple", "voxels_of"]
+__all__ = ["Field", "ScanError", "positive_triple"]
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -70,7 +71,8 @@ class Field(Pictured):
     def __repr__(self) -> str:
         extent = f" from {self.values.min():.4g} to {self.values.max():.4g}" if self.values.size else ""
         source = f", from {self.source}" if self.source else ""
-        return one_line(f"Field({voxels_of(self)}, {self.values.dtype}{extent}{source})")
+        size = sampling(self.shape, self.spacing, self.unit)
+        return one_line(f"Field({size}, {self.values.dtype}{extent}{source})")
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -118,13 +120,6 @@ class Field(Pictured):
         affine[:3, 3] += affine[:3, :3] @ np.array(start[::-1], dtype=np.float64)
         ends = (f"{first}:{first + n}" for first, n in zip(start, self.shape, strict=True))
         return replace(self, affine=affine, notes=(*self.notes, f"Voxels {', '.join(ends)} (z, y, x) are used."))
-
-
-def voxels_of(field: Field) -> str:
-    """Return the number and the size of a field's voxels in words."""
-    cube = len(set(field.spacing)) == 1
-    edges = " x ".join(f"{h:.4g}" for h in field.spacing[: 1 if cube else 3])
-    return f"{' x '.join(map(str, field.shape))} voxels of {edges} {field.unit}"
 
 
 def positive_triple(spacing: object) -> tuple[float, float, float]:

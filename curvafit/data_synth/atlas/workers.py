@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -111,6 +112,19 @@ def check_workers(count: int | None, scheduler: str | None) -> None:
             raise ValueError(f"expected either workers or a scheduler, got {count} and {scheduler}")
 
 
+def processes(count: int | None) -> int:
+    """Return how many processes make draws on this machine: the number of workers, or by default one per core.
+
+    Cores are those that a container or the scheduler leaves to this process. 0 workers are this process.
+
+    Raises
+    ------
+    ImportError
+        If dask.distributed is not installed and cores are to be counted.
+    """
+    return max(1, _dask("dask.system").CPU_COUNT if count is None else count)
+
+
 @contextmanager
 def cluster(count: int | None = None, scheduler: str | None = None, dashboard: int | None = None) -> Iterator[Workers]:
     """Start workers: of the scheduler at an address, or so many on this machine (as many as cores); 0 is this process.
@@ -129,19 +143,22 @@ def cluster(count: int | None = None, scheduler: str | None = None, dashboard: i
     if count == 0 and scheduler is None:
         yield Here()
         return
-    try:
-        import dask.config
-        import distributed
-        from dask.system import CPU_COUNT
-    except ImportError as error:
-        raise ImportError('expected dask.distributed: pip install "curvafit[atlas]"', name="distributed") from error
+    distributed, settings = _dask("distributed"), _dask("dask.config")
     if scheduler is not None:
         with _connected(distributed, scheduler) as client:
             yield Cluster(client)
         return
     quiet = {"distributed.nanny.pre-spawn-environ.DASK_LOGGING__DISTRIBUTED": "critical"}
-    with dask.config.set(quiet), _local(distributed, count or CPU_COUNT, dashboard) as client:
+    with settings.set(quiet), _local(distributed, processes(count), dashboard) as client:
         yield Cluster(client)
+
+
+def _dask(name: str) -> Any:
+    """Return a module of dask or of dask.distributed."""
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise ImportError('expected dask.distributed: pip install "curvafit[atlas]"', name="distributed") from error
 
 
 @contextmanager
