@@ -207,12 +207,14 @@ def _weights(positions: np.ndarray, n: int) -> tuple[slice, csr_array]:
 
 def _crossings(rays: _Rays, shape: tuple[int, ...]) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return at which planes rays enter and leave a box along each of its axes; what broadcasts to all rays."""
-    ends = [(np.zeros((1, 1), np.float32), np.full((1, 1), shape[0] - 1, np.float32))]
+    start, stop = np.zeros((1, 1), np.float32), np.full((1, 1), shape[0] - 1, np.float32)
+    ends: list[tuple[np.ndarray, np.ndarray]] = [(start, stop)]
     for axis, (slope, places) in enumerate(zip(rays.slopes, rays.places, strict=True)):
         with np.errstate(divide="ignore", invalid="ignore"):
             both = np.sort([-places / slope, (shape[1 + axis] - 1 - places) / slope], axis=0)
-        both = np.where(slope == 0, np.float32([[-np.inf], [np.inf]]), both)
-        ends.append(tuple(np.expand_dims(each, 1 - axis) for each in both))
+        both = np.where(slope == 0, np.array([[-np.inf], [np.inf]], np.float32), both)
+        enter, leave = (np.expand_dims(each, 1 - axis) for each in both)
+        ends.append((enter, leave))
     return ends
 
 
@@ -262,8 +264,8 @@ def _first(field: np.ndarray, rays: _Rays, enter: np.ndarray, leave: np.ndarray,
     def meet(numbers: np.ndarray, place: np.ndarray | float, now: np.ndarray) -> None:
         """Note where rays cross the level, linearly since the plane before or since the box's side."""
         start = np.maximum(enter[numbers], np.ceil(np.float32(place) * times - 1e-3) / times - 1 / times)
-        before = last[numbers]
-        depth[numbers] = start + (place - start) * before / (before - now)
+        past = last[numbers]
+        depth[numbers] = start + (place - start) * past / (past - now)
         waiting[numbers] = False
 
     def look(numbers: np.ndarray, places: np.ndarray) -> None:
@@ -275,12 +277,12 @@ def _first(field: np.ndarray, rays: _Rays, enter: np.ndarray, leave: np.ndarray,
 
     sides = np.flatnonzero(waiting & (enter > 0))
     look(sides, enter[sides])
-    sheets = [values.reshape(rays.shape) for values in (waiting, last)]
+    free, before = waiting.reshape(rays.shape), last.reshape(rays.shape)
     for place, window, values in _planes(field, rays, times):
-        met = np.flatnonzero((values > 0) & sheets[0][window])
+        met = np.flatnonzero((values > 0) & free[window])
         i, j = np.divmod(met, values.shape[1])
         meet((i + window[0].start) * rays.shape[1] + j + window[1].start, place, values.ravel()[met])
-        sheets[1][window] = values
+        before[window] = values
     ends = np.flatnonzero(waiting)
     look(ends, leave[ends])
     return depth
