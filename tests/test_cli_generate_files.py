@@ -49,10 +49,37 @@ def test_a_failure_while_writing_leaves_nothing(tmp_path: Path, monkeypatch: pyt
     def full(*_: Any, **__: Any) -> None:
         raise OSError(28, "No space left on device", "out")
 
-    monkeypatch.setattr("curvafit.drawing.shape_files.surface_picture", full)
+    monkeypatch.setattr("curvafit.drawing.shape_files.write_field", full)
     result = call("generate", *QUICK, "-o", tmp_path / "out.zarr")
     assert result.exit_code == 2 and result.stderr.endswith("error: no space left on device: out\n")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.filterwarnings("default:no picture was drawn")
+def test_a_picture_that_fails_is_one_line_and_undoes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is drawn last; the former one, of another shape, goes."""
+
+    def full(u: np.ndarray, path: Path) -> None:
+        assert sorted(each.name for each in path.parent.iterdir()) == ["out.json", "out.npy"]
+        raise OSError(28, "No space left on device", "out")
+
+    made(*QUICK, "-o", tmp_path / "out.npy")
+    monkeypatch.setattr("curvafit.drawing.shape_files.surface_picture", full)
+    result = call("generate", *QUICK, "--seed", 1, "-o", tmp_path / "out.npy")
+    assert result.exit_code == 0 and result.stderr == "note: no picture was drawn: No space left on device\n"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out.json", "out.npy"]
+
+
+def test_a_shape_without_a_picture_leaves_that_of_others_and_no_former_one(tmp_path: Path) -> None:
+    bare = [*QUICK, "--no-picture", "-o", tmp_path / "out.npy"]
+    (tmp_path / "out.png").write_bytes(b"mine")
+    assert made(*bare)["files"] == ["out.npy", "out.json"]
+    assert (tmp_path / "out.png").read_bytes() == b"mine"
+    refused(call("generate", *QUICK, "-o", tmp_path / "out.npy"), "expected a name that is free, got")
+    (tmp_path / "out.png").unlink()
+    assert made(*bare[:-3], *bare[-2:])["files"] == ["out.npy", "out.json", "out.png"]
+    made(*bare)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out.json", "out.npy"]
 
 
 def test_a_checkpoint_outlives_a_write_that_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -129,7 +129,7 @@ import curvafit.drawing.shape_files
 def slow(*_):
     print("writing", file=sys.stderr, flush=True)
     time.sleep(60)
-curvafit.drawing.shape_files.surface_picture = slow
+curvafit.drawing.shape_files.write_field = slow
 from curvafit.__main__ import main
 main()
 """

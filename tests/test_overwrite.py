@@ -103,7 +103,7 @@ def test_a_record_speaks_for_its_own_files_alone(tmp_path: Path) -> None:
     assert (tmp_path / "a.nii.gz").read_text() == (tmp_path / "a_step00001.tif").read_text() == "mine"
     for _ in range(2):
         made(*quick, "--snapshots", 1, "-o", tmp_path / "b.tif")
-    refused(call("generate", *quick, "-o", tmp_path / "b.stl"), "b.png, a file that this command did not write")
+    refused(call("generate", *quick, "-o", tmp_path / "b.stl"), "b.json, a file that this command did not write")
     (tmp_path / "a.json").write_text('{"format": "curvafit-shape-1", "files": 5}')
     refused(call("generate", *quick, "-o", tmp_path / "a.tif"), TAKEN)
 

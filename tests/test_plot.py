@@ -6,6 +6,7 @@ import io
 import math
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import matplotlib.image
@@ -60,6 +61,31 @@ def test_a_ball_covers_its_disc_and_is_lit_from_the_upper_left() -> None:
     brightness = picture[..., :3].mean(axis=-1)
     middle, reach = picture.shape[0] // 2, round(7 / pixel)
     assert brightness[middle - reach, 100 - reach] > brightness[middle + reach, 100 + reach] + 40
+
+
+@pytest.mark.parametrize(("azimuth", "elevation"), [(0, 0), (0, 90), (45, -90), (90, 0), (200, -50), (-45, 35.26)])
+def test_a_ball_is_a_disc_from_everywhere(azimuth: float, elevation: float) -> None:
+    """Also along an axis, from below, from behind, and along the diagonal."""
+    picture, camera = render(ball((30, 34, 38), 12), width=160, azimuth=azimuth, elevation=elevation)
+    assert cover(picture) * (2 * camera.half[0] / 160) ** 2 == pytest.approx(math.pi * 12**2, rel=0.01)
+
+
+def shaded(z0: float, y0: float, x0: float) -> float:
+    """The brightness amid a plate seen from straight above, x to the right and y up, with a ball over it."""
+    z, y, x = np.meshgrid(*(np.arange(48.0),) * 3, indexing="ij")
+    plate = np.minimum(4.0 - np.abs(z - 8), 9.0 - np.maximum(np.abs(y - 24), np.abs(x - 24)))
+    over = 7.0 - np.sqrt((z - z0) ** 2 + (y - y0) ** 2 + (x - x0) ** 2)
+    picture, _ = render(np.maximum(plate, over), width=96, azimuth=0, elevation=90)
+    centre = picture[44:52, 44:52]
+    assert (centre[..., 3] == 255).all()
+    return float(centre[..., :3].mean())
+
+
+@pytest.mark.parametrize("coarse", [128, 24])
+def test_a_ball_between_a_plate_and_the_light_shades_it(monkeypatch: pytest.MonkeyPatch, coarse: int) -> None:
+    """The light comes from the upper left; on a grid of its own, too, where the volume is large."""
+    monkeypatch.setattr(import_module("curvafit.drawing.render"), "COARSE", coarse)
+    assert shaded(30, 24 + 20, 24 - 12.6) < shaded(30, 24 - 20, 24 + 12.6) - 15
 
 
 def test_spacing_makes_a_ball_of_a_flat_box() -> None:

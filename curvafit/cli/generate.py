@@ -86,6 +86,9 @@ Cap = Annotated[
     bool | None,
     _out("--cap/--no-cap", help="Close a surface on the box's faces (the default), or leave it open there."),
 ]
+Picture = Annotated[
+    bool, _out("--picture/--no-picture", help="Draw the shape beside it (.png), once it is written, or do not.")
+]
 Snapshots = Annotated[str | None, _out(help="Also write the field after these numbers of steps: 10,100,1000.")]
 
 
@@ -111,10 +114,11 @@ def generate(
     unit: Unit = None,
     tile: Tile = None,
     cap: Cap = None,
+    picture: Picture = True,
     snapshots: Snapshots = None,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Make a shape from parameters, with a picture (.png) and a record (.json) beside it."""
+    """Make a shape from parameters, with a record (.json) and a picture (.png) beside it."""
     with plainly():
         box = None if shape is None else whole_triple(shape, "--shape")
         from curvafit.priors.grid import Grid
@@ -136,14 +140,15 @@ def generate(
         law_file = None if texture.prior is None else prior or preset
         inputs = [str(path) for path in (law_file, maps) if path is not None]
         _check(out, saving["checkpoint"], cap)
-        check_target(out, how, steps=options["snapshots"], inputs=inputs, overwrite=overwrite)
+        writing = {"picture": picture, "overwrite": overwrite}
+        check_target(out, how, steps=options["snapshots"], inputs=inputs, **writing)
         flow = _flow({**options, "device": device_of(device)})
         more = {"orientation": Q if Q is None else Q.tolist(), "maps": maps if maps is None else str(maps)}
         more |= {"origin": texture.origin, "wanted_volume_fraction": volume_fraction, "command": command_line()}
         from curvafit.drawing.shape_files import shape_record
 
         record = shape_record(flow, mass=options["mass"], output=how, snapshots=list(flow.snapshots), **more)
-        _write(flow, out, how, record, overwrite)
+        _write(flow, out, record, output=how, **writing)
         _discard(saving["checkpoint"])
 
 
@@ -286,12 +291,12 @@ def _discard(checkpoint: Path | None) -> None:
         checkpoint.unlink(missing_ok=True)
 
 
-def _write(flow: Flow, out: Path, how: Output, record: dict[str, Any], overwrite: bool) -> None:
+def _write(flow: Flow, out: Path, record: dict[str, Any], **how: Any) -> None:
     """Write the files, and print the flow's status and the paths."""
     from curvafit.drawing.shape_files import step_path, write_shape
 
     notes = [] if flow.viability.viable else [flow.status]
-    files = write_shape(flow, out, output=how, record=record, overwrite=overwrite)
+    files = write_shape(flow, out, record=record, **how)
     notes += [f"no surface after {step} steps" for step in flow.snapshots if step_path(out, step) not in files]
     for note in notes:
         say(f"note: {note}", to=error_console())

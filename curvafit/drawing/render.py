@@ -1,29 +1,30 @@
 """A small software renderer: the level set of a volume, seen along parallel rays, with its cut faces capped.
 
-Rays march through the trilinear field, so that no mesh is needed and the cost does not grow with the surface. Light is
-a key light with its soft shadow, and the sky as far as a blurred occupancy leaves it open.
+The volume is a stack of planes that all rays cross one after another (Lacroute & Levoy 1994): each plane is shifted,
+enlarged and compared with the level as a whole array, so that no mesh is needed and the cost does not grow with the
+surface. Light is a key light with its soft shadow, and the sky as far as a blurred occupancy leaves it open.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
-import numba
 import numpy as np
-from scipy.ndimage import gaussian_filter
-
-from curvafit.priors.kernels import threads
+from PIL import Image
+from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.sparse import csr_array
 
 #: Colour of the level set and of the cut faces, linear in [0, 1].
 SURFACE = (0.945, 0.865, 0.715)
 CAP = (0.86, 0.64, 0.47)
 #: Direction towards the key light in the picture's frame: right, up, towards the eye.
 KEY_LIGHT = (-0.42, 0.68, 0.60)
-#: Edge of the blocks that a ray may jump over when nothing is in them, in voxels.
-BLOCK = 8
-#: What a ray that meets nothing reports.
-MISS = 1e9
+#: Distances, in the shortest voxel edge, over which occupancy is blurred for the light of the sky.
+NEAR, FAR = 2.5, 7.0
+#: Voxels along an edge above which the light is computed on a coarser grid.
+COARSE = 128
 
 
 class View(NamedTuple):
@@ -42,16 +43,41 @@ class View(NamedTuple):
 
 
 class _Scene(NamedTuple):
-    """What the loops draw: the field `(Z, Y, X)` less its level; the same smoothed, for normals; how much lies near and
-    farther off; which blocks are not empty; voxel edges over the shortest; the last voxel's index."""
+    """A field less its level, as a stack of planes from the eye on; its voxel edges over the shortest; and the rows
+    right, up and towards the eye in its axes."""
 
     field: np.ndarray
-    smooth: np.ndarray
-    near: np.ndarray
-    far: np.ndarray
-    occupied: np.ndarray
     edges: np.ndarray
-    top: np.ndarray
+    frame: np.ndarray
+
+    @property
+    def look(self) -> np.ndarray:
+        """The direction of sight, in voxels."""
+        return -self.frame[2] / self.edges
+
+    @property
+    def middle(self) -> np.ndarray:
+        """The middle of the box, in voxels."""
+        return (np.array(self.field.shape) - 1) / 2
+
+
+class _Rays(NamedTuple):
+    """Parallel rays through a stack of planes: the ray at `places[0][i]`, `places[1][j]` of plane 0, in voxels, meets
+    plane k farther along by k times `slopes`. A ray's number counts over j, then over i."""
+
+    slopes: np.ndarray
+    places: tuple[np.ndarray, np.ndarray]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Numbers of rays."""
+        return len(self.places[0]), len(self.places[1])
+
+    def at(self, planes: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+        """Return the points `(3, N)`, in voxels, where rays are at planes, in fractions of a plane."""
+        (slope, other), (rows, columns) = self.slopes, self.places
+        i, j = np.divmod(numbers, len(columns))
+        return np.stack([planes, rows[i] + planes * slope, columns[j] + planes * other])
 
 
 def view(
@@ -91,206 +117,247 @@ def render(
     ValueError
         If the volume is not three-dimensional, has an axis under 4 voxels, or is not finite.
     """
-    field = np.ascontiguousarray(u, dtype=np.float32)
+    field = np.asarray(u, dtype=np.float32)
     if field.ndim != 3 or min(field.shape) < 4:
         raise ValueError(f"expected a volume of 3 axes of at least 4 voxels to draw, got shape {field.shape}")
     if not np.isfinite(field).all():
         raise ValueError("expected a finite volume to draw, got NaN or infinite values")
     camera = view(field.shape, spacing, azimuth=azimuth, elevation=elevation)
     height = max(2, round(width * camera.half[1] / camera.half[0]))
-    size = (height * supersample, width * supersample)
-    field = field - np.float32(level)
     edges = np.array(spacing) / min(spacing)
-    smooth = gaussian_filter(field, 0.9 / edges)
-    inside = (field > 0).astype(np.float32)
-    near, far = (gaussian_filter(inside, distance / edges, mode="constant") for distance in (2.5, 7.0))
-    scene = _Scene(field, smooth, near, far, _blocks(field), edges, np.array(field.shape) - 1.0)
-    light = np.array(KEY_LIGHT) / np.linalg.norm(KEY_LIGHT) @ camera.frame
-    colours = np.array(SURFACE), np.array(CAP)
-    pixels = np.zeros((*size, 4), dtype=np.float32)
-    threads.start()
-    _draw(pixels, scene, camera.frame, np.array(camera.half), light, *colours)
-    return _reduced(pixels, supersample), camera
+    order, field = _stack(field - np.float32(level), -camera.frame[2] / edges)
+    scene = _Scene(field, edges[order.axes], order.turned(camera.frame))
+    size = (width * supersample, height * supersample)
+    seen = np.linalg.norm(scene.frame[:2, 1:], axis=0) * scene.edges[1:]  # length of a voxel's edges in the picture
+    rays = _rays(field.shape, scene.look, 2 * camera.half[0] / size[0] / seen)
+    sheet = Image.fromarray(_painted(scene, rays))
+    placement = _placement(scene, rays, camera.half, size)
+    picture = sheet.transform(size, Image.Transform.AFFINE, placement, Image.Resampling.BILINEAR)
+    return np.asarray(picture.reduce(supersample)), camera
 
 
-def _blocks(field: np.ndarray) -> np.ndarray:
-    """Return whether any voxel of a block of `BLOCK`³, or of the layer around it, is inside."""
-    count = [-(-n // BLOCK) for n in field.shape]
-    occupied = np.zeros(count, dtype=np.bool_)
-    for index in np.ndindex(*count):
-        cut = tuple(slice(max(0, i * BLOCK - 1), (i + 1) * BLOCK + 1) for i in index)
-        occupied[index] = field[cut].max() > 0
-    return occupied
+def _placement(scene: _Scene, rays: _Rays, half: tuple[float, float], size: tuple[int, int]) -> list[float]:
+    """Return the affine map from a picture's pixels (x and y down) to those of a sheet of rays (j and i)."""
+    corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]) / size
+    right, up = (2 * corners[:, :1] - 1) * half[0], (1 - 2 * corners[:, 1:]) * half[1]
+    points = (right * scene.frame[0] + up * scene.frame[1]) / scene.edges + scene.middle
+    places = points[:, 1:] - points[:, :1] * rays.slopes
+    rows, columns = (
+        (place - values[0]) / (values[1] - values[0]) + 0.5 for place, values in zip(places.T, rays.places, strict=True)
+    )
+    return [c for x in (columns, rows) for c in (x[1] - x[0], x[2] - x[0], x[0])]
 
 
-def _reduced(pixels: np.ndarray, factor: int) -> np.ndarray:
-    """Return means over factor² samples (colour weighted by cover), encoded as bytes."""
-    height, width = pixels.shape[0] // factor, pixels.shape[1] // factor
-    cover = pixels[..., 3:]
-    weighted = np.concatenate([pixels[..., :3] * cover, cover], axis=-1)
-    total = weighted.reshape(height, factor, width, factor, 4).sum(axis=(1, 3))
-    colour = total[..., :3] / np.maximum(total[..., 3:], 1e-6)
-    alpha = total[..., 3:] / factor**2
-    return np.rint(255 * np.concatenate([np.clip(colour, 0, 1), alpha], axis=-1)).astype(np.uint8)
+# ---- planes and rays -------------------------------------------------------------------------------------------------
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
-def _draw(pixels, scene, frame, half, light, surface, cap):
-    """Send one ray a pixel: find the surface or the cut face, then light it."""
-    f, smooth, occupied, edges, top = scene.field, scene.smooth, scene.occupied, scene.edges, scene.top
-    height, width = pixels.shape[:2]
-    reach = math.sqrt(((top * edges) ** 2).sum()) / 2
-    for row in numba.prange(height):
-        o, d, n, q, s = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-        up = (1 - 2 * (row + 0.5) / height) * half[1]
-        for column in range(width):
-            right = (2 * (column + 0.5) / width - 1) * half[0]
-            for a in range(3):
-                o[a] = (right * frame[0, a] + up * frame[1, a]) / edges[a] + top[a] / 2
-                d[a] = -frame[2, a] / edges[a]
-            t, stop, axis = _span(o, d, top)
-            if t >= stop:
-                continue
-            capped = _at(f, o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]) > 0
-            if not capped:
-                t = _march(f, occupied, o, d, t, stop)
-                if t == MISS:
-                    continue
-            for a in range(3):
-                o[a] += t * d[a]
-                n[a] = 0.0
-            n[axis] = -1.0 if d[axis] > 0 else 1.0
-            if not capped:
-                _normal(smooth, edges, o, n)
-            sky = 1.0 if capped else _sky(scene, o, n)
-            lit = _lit(scene, o, n, light, q, s)
-            eye = n[0] * frame[2, 0] + n[1] * frame[2, 1] + n[2] * frame[2, 2]
-            glow = 1.12 * ((0.50 + 0.14 * eye) * sky + 0.52 * lit * (0.55 + 0.45 * sky))
-            haze = 0.30 * min(max(0.5 + t / (2 * reach), 0.0), 1.0) ** 1.5
-            for a in range(3):
-                colour = (cap[a] if capped else surface[a]) * min(max(glow, 0.0), 1.1)
-                pixels[row, column, a] = min(colour, 1.0) ** 0.9 * (1 - haze) + 0.93 * haze
-            pixels[row, column, 3] = 1.0
+class _Order(NamedTuple):
+    """The axes of a volume as a stack of planes, the first along the rays, and which way they count, from the rays'
+    start."""
+
+    axes: list[int]
+    signs: np.ndarray
+
+    def turned(self, vectors: np.ndarray) -> np.ndarray:
+        """Return vectors `(…, 3)` in these axes."""
+        return (vectors[..., self.axes] * self.signs).astype(np.float32)
 
 
-@numba.njit(cache=True, nogil=True)
-def _normal(smooth, edges, p, n):
-    """Write the unit normal out of the phase at `p` into `n`."""
-    n[0] = (_at(smooth, p[0] - 1, p[1], p[2]) - _at(smooth, p[0] + 1, p[1], p[2])) / edges[0]
-    n[1] = (_at(smooth, p[0], p[1] - 1, p[2]) - _at(smooth, p[0], p[1] + 1, p[2])) / edges[1]
-    n[2] = (_at(smooth, p[0], p[1], p[2] - 1) - _at(smooth, p[0], p[1], p[2] + 1)) / edges[2]
-    length = max(math.sqrt(n[0] ** 2 + n[1] ** 2 + n[2] ** 2), 1e-12)
-    for a in range(3):
-        n[a] /= length
+def _stack(values: np.ndarray, direction: np.ndarray) -> tuple[_Order, np.ndarray]:
+    """Return a volume as the stack of planes that rays along `direction`, in voxels, cross most steeply."""
+    axis = int(np.abs(direction).argmax())
+    order = _Order([axis, *(other for other in range(3) if other != axis)], np.array([np.sign(direction[axis]), 1, 1]))
+    planes = values.transpose(order.axes)
+    return order, planes if direction[axis] > 0 else planes[::-1]
 
 
-@numba.njit(cache=True, nogil=True)
-def _sky(scene, p, n):
-    """Return the share of the sky that is open above `p`, judged from occupancies blurred by 2.5 and by 7 edges."""
-    near, far, edges = scene.near, scene.far, scene.edges
-    a, b, c = n[0] / edges[0], n[1] / edges[1], n[2] / edges[2]
-    close = _at(near, p[0] + 2.5 * a, p[1] + 2.5 * b, p[2] + 2.5 * c)
-    wide = _at(far, p[0] + 7.0 * a, p[1] + 7.0 * b, p[2] + 7.0 * c)
-    return (1 - min(max((close - 0.12) * 1.5, 0.0), 0.7)) * (1 - min(max((wide - 0.05) * 1.3, 0.0), 0.6))
+def _rays(shape: tuple[int, ...], direction: np.ndarray, steps: np.ndarray) -> _Rays:
+    """Return rays along `direction` (a stack's, in voxels), `steps` apart, that fill a stack of planes."""
+    slopes = (direction[1:] / direction[0]).astype(np.float32)
+    shifts = slopes * (shape[0] - 1)
+    first, last = np.minimum(0, -shifts), np.array(shape[1:]) - 1 + np.maximum(0, -shifts)
+    rows, columns = (
+        np.arange(a, b + step, step, dtype=np.float32) for a, b, step in zip(first, last, steps, strict=True)
+    )
+    return _Rays(slopes, (rows, columns))
 
 
-@numba.njit(cache=True, nogil=True)
-def _lit(scene, p, n, light, q, d):
-    """Return what the key light gives at `p`: its cosine, less in shadow. `q` and `d` are scratch."""
-    edges = scene.edges
-    facing = n[0] * light[0] + n[1] * light[1] + n[2] * light[2]
-    if facing <= 0:
-        return 0.0
-    for a in range(3):
-        q[a] = p[a] + 1.5 * n[a] / edges[a]
-        d[a] = light[a] / edges[a]
-    begin, end, _ = _span(q, d, scene.top)
-    if end < 2 or begin > end:
-        return facing
-    return facing * (1 - 0.6 * _shadow(scene.field, scene.occupied, q, d, 2.0, end))
+def _planes(values: np.ndarray, rays: _Rays, times: int = 1) -> Iterator[tuple[float, tuple[slice, slice], np.ndarray]]:
+    """Yield the place of each plane of a stack, and of those between them where `times` is more than 1, the window of
+    rays that cross the plane, and its values there, linearly between voxels."""
+    for n in range((len(values) - 1) * times + 1):
+        k, part = divmod(n, times)
+        plane = values[k] + np.float32(part / times) * (values[k + 1] - values[k]) if part else values[k]
+        (window, rows), (other, columns) = (
+            _weights(places + slope * (n / times), size)
+            for places, slope, size in zip(rays.places, rays.slopes, plane.shape, strict=True)
+        )
+        yield n / times, (window, other), rows @ (columns @ plane.T).T
 
 
-@numba.njit(cache=True, nogil=True)
-def _march(f, occupied, o, d, start, stop):
-    """Return the least t in [start, stop] where the ray o + t d (in voxels) enters the phase, or `MISS`."""
-    t, last = start, start
-    while t <= stop:
-        z, y, x = o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]
-        jump = _jump(occupied, z, y, x, d)
-        value = -1.0 if jump > 0 else _at(f, z, y, x)
-        if value > 0:
-            for _ in range(8):
-                middle = 0.5 * (last + t)
-                if _at(f, o[0] + middle * d[0], o[1] + middle * d[1], o[2] + middle * d[2]) > 0:
-                    t = middle
-                else:
-                    last = middle
-            return t
-        last = t
-        t += jump if jump > 0 else (0.6 if value < -0.6 else 0.12)
-    return MISS
+def _weights(positions: np.ndarray, n: int) -> tuple[slice, csr_array]:
+    """Return which ascending positions lie on n voxels, and the matrix that takes voxels there linearly."""
+    window = slice(*np.searchsorted(positions, (0, np.nextafter(np.float32(n - 1), np.float32(n)))))
+    inside = positions[window]
+    below = np.minimum(inside.astype(np.int32), n - 2)
+    share = inside - below.astype(np.float32)
+    weights, places = (np.stack(pair, axis=1).ravel() for pair in ((1 - share, share), (below, below + 1)))
+    return window, csr_array((weights, places, np.arange(0, len(weights) + 1, 2)), shape=(len(inside), n))
 
 
-@numba.njit(cache=True, nogil=True)
-def _shadow(f, occupied, o, d, start, stop):
-    """Return the share of the key light that does not reach o: 1 where the ray meets the phase, less near it."""
-    t, highest = start, -1.0
-    while t <= stop and highest < 0:
-        z, y, x = o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]
-        jump = _jump(occupied, z, y, x, d)
-        if jump == 0:
-            highest = max(highest, _at(f, z, y, x))
-        t += jump if jump > 0 else 0.7
-    share = min(max(1 + highest / 0.6, 0.0), 1.0)
+def _crossings(rays: _Rays, shape: tuple[int, ...]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return at which planes rays enter and leave a box along each of its axes; what broadcasts to all rays."""
+    start, stop = np.zeros((1, 1), np.float32), np.full((1, 1), shape[0] - 1, np.float32)
+    ends: list[tuple[np.ndarray, np.ndarray]] = [(start, stop)]
+    for axis, (slope, places) in enumerate(zip(rays.slopes, rays.places, strict=True)):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            both = np.sort([-places / slope, (shape[1 + axis] - 1 - places) / slope], axis=0)
+        both = np.where(slope == 0, np.array([[-np.inf], [np.inf]], np.float32), both)
+        enter, leave = (np.expand_dims(each, 1 - axis) for each in both)
+        ends.append((enter, leave))
+    return ends
+
+
+# ---- surface ---------------------------------------------------------------------------------------------------------
+
+
+def _painted(scene: _Scene, rays: _Rays) -> np.ndarray:
+    """Return the colours that rays see, as RGBA bytes `(I, J, 4)`."""
+    crossings = _crossings(rays, scene.field.shape)
+    enter, leave = (
+        choose(choose(*pair), last).ravel()
+        for choose, (*pair, last) in zip((np.maximum, np.minimum), zip(*crossings, strict=True), strict=True)
+    )
+    depth = _first(scene.field, rays, enter, leave, max(1, round(1 / abs(float(scene.look[0])))))
+    numbers = np.flatnonzero(np.isfinite(depth))
+    planes = depth[numbers]
+    capped = planes == enter[numbers]
+    at = rays.at(planes, numbers)
+    light = (np.array(KEY_LIGHT) / np.linalg.norm(KEY_LIGHT) @ scene.frame).astype(np.float32)
+    glow = np.empty(len(numbers), np.float32)
+    glow[~capped] = _surface_glow(scene, light, at[:, ~capped])
+    sides = np.stack([np.broadcast_to(first, rays.shape).ravel()[numbers[capped]] for first, _ in crossings])
+    faces = -np.sign(scene.look) * np.eye(3)
+    glow[capped] = _glow(faces @ scene.frame[2], np.maximum(faces @ light, 0), 1.0)[sides.argmax(axis=0)]
+    reach = np.linalg.norm(scene.middle * scene.edges)
+    nearness = (scene.frame[2] * scene.edges) @ (at - scene.middle[:, None])
+    haze = 0.30 * np.clip(0.5 - nearness / (2 * reach), 0, 1) ** 1.5
+    bright = np.clip(glow, 0, 1.1) ** 0.9
+    sheet = np.zeros((len(depth), 4), np.uint8)
+    for channel, (surface, cap) in enumerate(zip(SURFACE, CAP, strict=True)):
+        colour = np.where(capped, np.float32(cap**0.9), np.float32(surface**0.9))
+        sheet[numbers, channel] = 255 * (np.minimum(colour * bright, 1) * (1 - haze) + 0.93 * haze) + 0.5
+    sheet[numbers, 3] = 255
+    return sheet.reshape(*rays.shape, 4)
+
+
+def _glow(eye: np.ndarray, lit: np.ndarray, sky: np.ndarray | float) -> np.ndarray:
+    """Return the light from a surface: of the sky, more from where it faces the eye, and of the key light."""
+    return 1.12 * ((0.50 + 0.14 * eye) * sky + 0.52 * lit * (0.55 + 0.45 * sky))
+
+
+def _first(field: np.ndarray, rays: _Rays, enter: np.ndarray, leave: np.ndarray, times: int) -> np.ndarray:
+    """Return the planes, in fractions of a plane, at which rays meet the phase; inf where they miss it."""
+    waiting, last = enter <= leave, np.full(enter.shape, -1, np.float32)
+    depth = np.full(enter.shape, np.inf, np.float32)
+
+    def meet(numbers: np.ndarray, place: np.ndarray | float, now: np.ndarray) -> None:
+        """Note where rays cross the level, linearly since the plane before or since the box's side."""
+        start = np.maximum(enter[numbers], np.ceil(np.float32(place) * times - 1e-3) / times - 1 / times)
+        past = last[numbers]
+        depth[numbers] = start + (place - start) * past / (past - now)
+        waiting[numbers] = False
+
+    def look(numbers: np.ndarray, places: np.ndarray) -> None:
+        """Find rays that are inside at places of their own."""
+        now = map_coordinates(field, rays.at(places, numbers), np.float32, 1, "nearest")
+        inside = now > 0
+        meet(numbers[inside], places[inside], now[inside])
+        last[numbers] = now
+
+    sides = np.flatnonzero(waiting & (enter > 0))
+    look(sides, enter[sides])
+    free, before = waiting.reshape(rays.shape), last.reshape(rays.shape)
+    for place, window, values in _planes(field, rays, times):
+        met = np.flatnonzero((values > 0) & free[window])
+        i, j = np.divmod(met, values.shape[1])
+        meet((i + window[0].start) * rays.shape[1] + j + window[1].start, place, values.ravel()[met])
+        before[window] = values
+    ends = np.flatnonzero(waiting)
+    look(ends, leave[ends])
+    return depth
+
+
+# ---- light -----------------------------------------------------------------------------------------------------------
+
+
+def _surface_glow(scene: _Scene, light: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Return the light from the level set at points `(3, N)`, linearly between the voxels around them."""
+    field, edges = scene.field, scene.edges[:, None]
+    seen = np.zeros(field.shape, np.bool_)
+    seen[tuple(at.astype(np.int32))] = True
+    for axis in range(3):
+        after = np.moveaxis(seen, axis, 0)
+        after[1:] |= after[:-1]
+    voxels = np.stack(np.nonzero(seen))
+    smooth = gaussian_filter(field, 0.9 / scene.edges, truncate=3)
+    normal = np.stack([_behind(smooth, voxels, axis) for axis in range(3)]) / (2 * edges)
+    slope = np.maximum(np.linalg.norm(normal, axis=0), 1e-12)
+    normal /= slope
+    points = voxels + np.clip(field[tuple(voxels)] / slope, -1, 1) * normal / edges
+    times = -(-max(field.shape) // COARSE)
+    grey, inside = (_means(values, times) for values in (field, field > 0))
+
+    def coarse(points: np.ndarray) -> np.ndarray:
+        return (points - (times - 1) / 2) / times
+
+    near, far = (
+        map_coordinates(
+            gaussian_filter(inside, distance / times / scene.edges, mode="constant"),
+            coarse(points + distance * normal / edges),
+            order=1,
+            mode="nearest",
+        )
+        for distance in (NEAR, FAR)
+    )
+    sky = (1 - np.clip((near - 0.12) * 1.5, 0, 0.7)) * (1 - np.clip((far - 0.05) * 1.3, 0, 0.6))
+    before = coarse(points + (1.5 * normal + 2.0 * light[:, None]) / edges)
+    lit = np.maximum(light @ normal, 0) * (1 - 0.6 * _shadow(grey, light / scene.edges, before))
+    glow = np.zeros(field.shape, np.float32)
+    glow[seen] = _glow(scene.frame[2] @ normal, lit, sky)
+    return map_coordinates(glow, at, np.float32, 1, "nearest")
+
+
+def _behind(values: np.ndarray, voxels: np.ndarray, axis: int) -> np.ndarray:
+    """Return the value before each voxel (3, N) along an axis, less the value behind it."""
+    (before, behind), end = voxels[None].repeat(2, axis=0), values.shape[axis] - 1
+    before[axis], behind[axis] = np.maximum(before[axis] - 1, 0), np.minimum(behind[axis] + 1, end)
+    return values[tuple(before)] - values[tuple(behind)]
+
+
+def _means(values: np.ndarray, times: int) -> np.ndarray:
+    """Return the means over blocks of `times`³ voxels; those at the end repeat the last voxel."""
+    if times == 1:
+        return values.astype(np.float32, copy=False)
+    Z, Y, X = (-(-n // times) for n in values.shape)
+    whole = np.pad(values, [(0, -n % times) for n in values.shape], mode="edge")
+    return whole.reshape(Z, times, Y, times, X, times).mean(axis=(1, 3, 5), dtype=np.float32)
+
+
+def _shadow(field: np.ndarray, light: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return the share of the key light that does not reach points `(3, N)`, in voxels: 1 where the phase is on the
+    way, less near it."""
+    order, planes = _stack(field, -light)
+    rays = _rays(planes.shape, order.turned(-light), np.ones(2))
+    highest = np.full((len(planes) + 2, *rays.shape), -1, np.float32)
+    for place, window, values in _planes(planes, rays):
+        highest[int(place) + 2][window] = values
+    np.maximum.accumulate(highest, axis=0, out=highest)
+    k, *others = points[order.axes]
+    k = k if order.signs[0] > 0 else len(planes) - 1 - k
+    shifted = [
+        other - k * slope - values[0] for other, slope, values in zip(others, rays.slopes, rays.places, strict=True)
+    ]
+    met = map_coordinates(highest, np.stack([k + 1, *shifted]), np.float32, 1, "nearest")
+    share = np.clip(1 + met / 0.6, 0, 1)
     return share * share * (3 - 2 * share)
-
-
-@numba.njit(cache=True, nogil=True)
-def _jump(occupied, z, y, x, d):
-    """Return how far a ray may go before it leaves an empty block; 0 in an occupied one."""
-    i = min(max(int(z) // BLOCK, 0), occupied.shape[0] - 1)
-    j = min(max(int(y) // BLOCK, 0), occupied.shape[1] - 1)
-    k = min(max(int(x) // BLOCK, 0), occupied.shape[2] - 1)
-    if occupied[i, j, k]:
-        return 0.0
-    return max(min(_leave(z, d[0], i), _leave(y, d[1], j), _leave(x, d[2], k)), 0.0) + 0.05
-
-
-@numba.njit(cache=True, nogil=True)
-def _leave(position, direction, block):
-    """Return how far a ray goes before it leaves a block along one axis."""
-    if abs(direction) < 1e-9:
-        return MISS
-    return ((block + (direction > 0)) * BLOCK - position) / direction
-
-
-@numba.njit(cache=True, nogil=True)
-def _span(position, direction, top):
-    """Return where a line enters and leaves the box [0, top], and the axis along which it enters."""
-    start, stop, axis = -1e9, 1e9, 0
-    for a in range(3):
-        if abs(direction[a]) < 1e-9:
-            if position[a] < 0 or position[a] > top[a]:
-                return 1.0, -1.0, 0
-            continue
-        first, second = -position[a] / direction[a], (top[a] - position[a]) / direction[a]
-        if first > second:
-            first, second = second, first
-        if first > start:
-            start, axis = first, a
-        stop = min(stop, second)
-    return start, stop, axis
-
-
-@numba.njit(cache=True, nogil=True)
-def _at(f, z, y, x):
-    """Interpolate linearly along each axis, clamped to the box."""
-    nz, ny, nx = f.shape
-    z, y, x = min(max(z, 0.0), nz - 1.0), min(max(y, 0.0), ny - 1.0), min(max(x, 0.0), nx - 1.0)
-    i, j, k = min(int(z), nz - 2), min(int(y), ny - 2), min(int(x), nx - 2)
-    c, b, a = z - i, y - j, x - k
-    low = (1 - b) * ((1 - a) * f[i, j, k] + a * f[i, j, k + 1])
-    low += b * ((1 - a) * f[i, j + 1, k] + a * f[i, j + 1, k + 1])
-    high = (1 - b) * ((1 - a) * f[i + 1, j, k] + a * f[i + 1, j, k + 1])
-    high += b * ((1 - a) * f[i + 1, j + 1, k] + a * f[i + 1, j + 1, k + 1])
-    return low * (1 - c) + high * c

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import json
+import warnings
 from collections.abc import Iterable
 from contextlib import suppress
 from importlib.metadata import version
@@ -17,7 +18,7 @@ from scipy.ndimage import map_coordinates
 from torch import Tensor
 
 from curvafit.drawing.plot import surface_picture
-from curvafit.files import check_folder, check_free, move_together, own_record, staged
+from curvafit.files import check_folder, check_free, move_together, own_record, remove, staged
 from curvafit.generation.flow import Flow
 from curvafit.generation.memory import FILE, check_memory
 from curvafit.geometry.mesh import NoSurface, Surface, solid_surface, surface
@@ -92,6 +93,7 @@ def check_target(
     output: Output | None = None,
     *,
     steps: Iterable[int] = (),
+    picture: bool = True,
     inputs: Iterable[str | Path] = (),
     overwrite: bool = False,
 ) -> Path:
@@ -101,6 +103,8 @@ def check_target(
     ----------
     steps
         Of the snapshots that go beside it.
+    picture
+        Whether a picture goes beside it.
     inputs
         What is read, and must stay.
     overwrite
@@ -118,7 +122,7 @@ def check_target(
         raise ValueError(f"expected a name ending in one of {', '.join(known)}, got {target.name!r}")
     if not target.name.lower().endswith(SUFFIXES):
         pick_writer(target, (output or Output()).unit)
-    more = [step_path(target, step) for step in steps]
+    more = [*(step_path(target, step) for step in steps), *([beside(target, ".png")] if picture else [])]
     return check_outputs(target, FORMAT, more=more, inputs=inputs, overwrite=overwrite)
 
 
@@ -130,7 +134,7 @@ def check_outputs(
     inputs: Iterable[str | Path] = (),
     overwrite: bool = False,
 ) -> Path:
-    """The path, if it can be written with its picture, its record and `more` beside it, and nothing else is lost.
+    """The path, if it can be written with its record and `more` beside it, and nothing else is lost.
 
     What the record there, of the same kind, lists as written with this very file may be replaced.
 
@@ -142,16 +146,21 @@ def check_outputs(
     check_folder(target.parent)
     if target.is_dir() and not target.name.lower().endswith(".zarr"):
         raise ValueError(f"expected the name of a file, got the folder {target}")
-    listed = own_record(beside(target, ".json"), kind).get("files")
-    written = listed if isinstance(listed, list) and target.name in listed else []
+    written = _written(target, kind)
 
     def ours(path: Path) -> bool:
         if path.is_dir():
             return path.name.lower().endswith(".zarr") and is_ours(path, kind)
         return path.name in written
 
-    check_free([target, beside(target, ".png"), beside(target, ".json"), *more], ours, inputs, overwrite)
+    check_free([target, beside(target, ".json"), *more], ours, inputs, overwrite)
     return target
+
+
+def _written(target: Path, kind: str) -> list[str]:
+    """The names of files that the record of that kind there lists as written with this very file."""
+    listed = own_record(beside(target, ".json"), kind).get("files")
+    return listed if isinstance(listed, list) and target.name in listed else []
 
 
 def beside(path: str | Path, ending: str) -> Path:
@@ -173,9 +182,12 @@ def write_shape(
     *,
     output: Output | None = None,
     record: dict[str, Any] | None = None,
+    picture: bool = True,
     overwrite: bool = False,
 ) -> tuple[Path, ...]:
-    """Write a flow's field as a volume or a surface, by suffix, with a picture of one box and a record.
+    """Write a flow's field as a volume or a surface, by suffix, with a record and a picture of one box.
+
+    The picture is drawn once the other files are in place. A warning says where that fails; a former one goes.
 
     Parameters
     ----------
@@ -183,13 +195,15 @@ def write_shape(
         See `Output`.
     record
         What to write into the JSON beside it; see `shape_record`.
+    picture
+        Whether to draw one.
     overwrite
         Whether files that no such call wrote may be replaced.
 
     Returns
     -------
-    The paths of shape, picture (`.png`), record (`.json`) and the flow's snapshots, but those that have no surface
-    where one is written. All are made in a temporary folder, then moved.
+    The paths of shape, record (`.json`), the flow's snapshots, but those that have no surface where one is written, and
+    picture (`.png`). All but the picture are made in a temporary folder, then moved together.
 
     Raises
     ------
@@ -197,18 +211,33 @@ def write_shape(
         If the suffix is unknown, the field has no surface, a box that is not periodic is to be repeated, or something
         else stands where one of the files goes.
     """
-    target = check_target(path, output, steps=flow.snapshots, overwrite=overwrite)
+    target = check_target(path, output, steps=flow.snapshots, picture=picture, overwrite=overwrite)
+    image = beside(target, ".png")
+    former = picture or image.name in _written(target, FORMAT)
     with staged(target) as work:
         shape = write_field(flow.field, flow.grid, work / target.name, output)
-        picture, note = beside(shape, ".png"), beside(shape, ".json")
-        surface_picture(flow.field.numpy(), picture)
-        parts = [shape, picture, note]
+        note = beside(shape, ".json")
+        parts = [shape, note]
         for step, field in flow.snapshots.items():
             with suppress(NoSurface):
                 parts.append(write_field(field, flow.grid, step_path(shape, step), output))
-        content = {"format": FORMAT, **(record or {}), "files": [part.name for part in parts]}
+        names = [*(part.name for part in parts), *([image.name] if picture else [])]
+        content = {"format": FORMAT, **(record or {}), "files": names}
         note.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-        return move_together(parts, target.parent)
+        files = move_together(parts, target.parent)
+    if former:
+        remove(image)
+    return (*files, *(_picture(flow, image) if picture else ()))
+
+
+def _picture(flow: Flow, path: Path) -> tuple[Path, ...]:
+    """Draw a flow's surface; where that fails, warn and return no path."""
+    try:
+        surface_picture(flow.field.numpy(), path)
+    except (OSError, ValueError, MemoryError) as error:
+        warnings.warn(f"no picture was drawn: {getattr(error, 'strerror', None) or error}", UserWarning, stacklevel=3)
+        return ()
+    return (path,)
 
 
 def write_field(field: Tensor, grid: Grid, path: str | Path, output: Output | None = None) -> Path:

@@ -45,7 +45,7 @@ def check_mask_target(
     """
     target = Path(path)
     pick_writer(target, unit or "mm")
-    return check_outputs(target, FORMAT, inputs=inputs, overwrite=overwrite)
+    return check_outputs(target, FORMAT, more=[beside(target, ".png")], inputs=inputs, overwrite=overwrite)
 
 
 def write_mask(

@@ -107,11 +107,12 @@ def _asked_for(case: Case, name: str) -> bool:
 
 
 def _complete(place: Place, names: Sequence[str]) -> bool:
-    """Whether what a stopped run left is what it was to make, whole: with a picture and a record, where they belong."""
+    """Whether what a stopped run left is what it was to make, whole: with a record where it belongs; a picture comes
+    last."""
     roots = {_root(name) for name in names}
     alone = all(name.endswith(".npz") for name in roots)
     ends = {name.rpartition(".")[2] for name in roots}
-    return (alone or {"json", "png"} < ends) and not any(list(flaws(place.here / name)) for name in roots)
+    return (alone or {"json"} < ends - {"png"}) and not any(list(flaws(place.here / name)) for name in roots)
 
 
 def _root(name: str) -> str:
