@@ -160,6 +160,40 @@ def extract_atlas(
         say(str(out))
 
 
+@atlas_app.command(
+    "describe",
+    epilog="[bold]Examples[/bold]\n\ncurvafit atlas describe store.zarr -o table.npz\n\n"
+    "curvafit atlas describe box.zarr corner.zarr -o table.npz --views mask,crop",
+)
+def describe_atlas(
+    stores: Annotated[list[Path], typer.Argument(help="Stores made by `curvafit atlas build`.")],
+    out: Annotated[Path, typer.Option("-o", "--output", help="The table (.npz) to write; one that exists goes on.")],
+    views: Annotated[str | None, typer.Option(help="Views of each shape, between commas; by default all.")] = None,
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = None,
+    dashboard: DashboardOption = None,
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Measure each shape of stores as field, mask, crop and scan: the table that `atlas train` reads."""
+    with plainly():
+        if out.suffix.lower() != ".npz":
+            raise ValueError(f"expected a name ending in .npz, got {out.name!r}")
+        from curvafit.atlas_map.describe import describe
+        from curvafit.atlas_map.views import VIEWS
+        from curvafit.files import check_folder, check_free
+        from curvafit.inference.table import is_table
+
+        check_folder(out.parent)
+        check_free([out], is_table, stores, overwrite)
+        crew = Crew(workers, scheduler, dashboard)
+        crew.check()
+        names = tuple(VIEWS) if views is None else tuple(views.split(","))
+        with crew.at_work() as (makers, progress):
+            table = describe(stores, out, names, progress, workers=makers, command=[command_line()])
+        say(f"{len(set(table.shapes))} shapes, {len(table)} views", to=error_console())
+        say(str(out))
+
+
 @atlas_app.command("map", epilog="[bold]Example[/bold]\n\ncurvafit atlas map store.zarr -o map")
 def map_atlas(
     store: Annotated[Path, typer.Argument(help="A store made by `curvafit atlas build`.")],

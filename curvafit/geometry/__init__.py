@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from curvafit.faces import offer
 
 if TYPE_CHECKING:
+    from curvafit.geometry.descriptors import Descriptors, descriptors
     from curvafit.geometry.diagram import Diagram, SurfaceCurvatures, diagram, diagrams, surface_curvatures
     from curvafit.geometry.family import family_of, family_shares, half_thickness
     from curvafit.geometry.mesh import (
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from curvafit.geometry.transport import sinkhorn_divergence, sliced_embedding, wasserstein
 
 __all__ = [
+    "Descriptors",
     "Diagram",
     "Morphometry",
     "NoSurface",
@@ -34,6 +36,7 @@ __all__ = [
     "betti_numbers",
     "capped_surface",
     "components",
+    "descriptors",
     "diagram",
     "diagrams",
     "euler_number",
@@ -55,6 +58,7 @@ __all__ = [
 ]
 
 _HOMES = {
+    "Descriptors": "curvafit.geometry.descriptors",
     "Diagram": "curvafit.geometry.diagram",
     "Morphometry": "curvafit.geometry.morphometry",
     "NoSurface": "curvafit.geometry.mesh",
@@ -64,6 +68,7 @@ _HOMES = {
     "betti_numbers": "curvafit.geometry.topology",
     "capped_surface": "curvafit.geometry.mesh",
     "components": "curvafit.geometry.topology",
+    "descriptors": "curvafit.geometry.descriptors",
     "diagram": "curvafit.geometry.diagram",
     "diagrams": "curvafit.geometry.diagram",
     "euler_number": "curvafit.geometry.topology",

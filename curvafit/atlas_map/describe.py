@@ -1,0 +1,172 @@
+"""The shapes of stores, each in several views, as the table of descriptors that a posterior is trained on."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from curvafit.atlas_map.views import VIEWS
+from curvafit.data_synth.atlas.draws import versions
+from curvafit.data_synth.atlas.store import Store, open_store
+from curvafit.data_synth.atlas.workers import Here, Workers
+from curvafit.generation.viability import well_formed
+from curvafit.geometry.descriptors import Descriptors, descriptors
+from curvafit.geometry.mesh import NoSurface
+from curvafit.inference.table import Table, load_table, parameters_of, row_of, save_table
+from curvafit.priors.grid import Grid
+from curvafit.progress import Progress, silent
+from curvafit.volumes.scan import ScanError
+
+#: Seconds between two writings of a table that grows.
+PAUSE = 60.0
+
+
+def describe(
+    stores: Sequence[str | Path],
+    out: str | Path,
+    views: Sequence[str] = tuple(VIEWS),
+    progress: Progress = silent,
+    *,
+    workers: Workers | None = None,
+    command: Sequence[str] = (),
+) -> Table:
+    """Measure the well-formed shapes of stores in each view, and write the table; views that the file has stay.
+
+    A view depends on the shape, its seed and the view's name alone, so a table that was stopped ends as one that was
+    not, but for the order of its rows. Stores may grow meanwhile: what they have at the start is measured.
+
+    Parameters
+    ----------
+    stores
+        Folders of stores.
+    out
+        The table (.npz), written every minute.
+    views
+        Names in `VIEWS`.
+    progress
+        Called after each shape with a sentence and the share of the shapes that are measured.
+    workers
+        Whoever measures (`data_synth.cluster`); this process by default.
+    command
+        Command line for the provenance.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        If a store is none, two have one name, `out` is no table, a view has another name, or there is nothing to
+        measure.
+    """
+    unknown = [name for name in views if name not in VIEWS]
+    if unknown or not views:
+        raise ValueError(f"expected views among {', '.join(VIEWS)}, got {', '.join(unknown) or 'none'}")
+    opened = [open_store(path) for path in stores]
+    names = [_name(store) for store in opened]
+    if len(set(names)) < len(names):
+        raise ValueError(f"expected stores with names of their own, got {', '.join(names)}")
+    path, crew = Path(out), workers or Here()
+    rows = _Rows(load_table(path) if path.exists() else None, opened, command)
+    todo = [job for store in opened for job in _jobs(store, views, rows)]
+    if not todo and not rows.shapes:
+        raise ValueError(f"expected a well-formed shape in {', '.join(names)}, got none")
+    done, pending, written = 0, 0, time.monotonic()
+    jobs = iter(todo)
+    try:
+        while done < len(todo):
+            while pending < crew.places and (job := next(jobs, None)) is not None:
+                store, index, missing = job
+                crew.submit(partial(measure, views=missing), store.path, [index])
+                pending += 1
+            for measured in crew.done():
+                rows.add(measured)
+                done, pending = done + 1, pending - 1
+                progress(f"measured {done} of {len(todo)} shapes", done / len(todo))
+            if time.monotonic() - written > PAUSE:
+                save_table(rows.table(), path)
+                written = time.monotonic()
+    finally:
+        if rows.shapes:
+            save_table(rows.table(), path)
+    return rows.table()
+
+
+def measure(path: Path, indices: Sequence[int], views: Sequence[str]) -> list[dict[str, Any]]:
+    """Measure some shapes of a store in some views: their parameters and descriptors by view, None without a surface.
+
+    Raises
+    ------
+    KeyError, ValueError
+        If a shape is missing or damaged.
+    """
+    store = open_store(path)
+    grid, epsilon = Grid(store.settings.shape, store.settings.spacing), store.settings.epsilon
+    rows = []
+    for index in indices:
+        record, u = store.record(index), store.field(index)
+        seen = {name: _described(u, grid, epsilon, name, record.seed) for name in views}
+        rows.append({"shape": _shape(store, index), "parameters": parameters_of(record.coefficients, record.mass)})
+        rows[-1]["views"] = seen
+    return rows
+
+
+def _described(u: np.ndarray, grid: Grid, epsilon: float, name: str, seed: int) -> Descriptors | None:
+    rng = np.random.default_rng([seed, *name.encode()])
+    try:
+        view = VIEWS[name](u, grid, rng)
+        return descriptors(view.shape, view.grid, epsilon)
+    except (NoSurface, ScanError):
+        return None
+
+
+class _Rows:
+    """The rows of a table that grows."""
+
+    def __init__(self, table: Table | None, stores: Sequence[Store], command: Sequence[str]) -> None:
+        self.shapes: list[str] = [] if table is None else table.shapes.tolist()
+        self.views: list[str] = [] if table is None else table.views.tolist()
+        self.parameters = [] if table is None else list(table.parameters)
+        self.descriptors = [] if table is None else list(table.descriptors)
+        before = {} if table is None else table.provenance
+        settings = {_name(store): dataclasses.asdict(store.settings) for store in stores}
+        self.provenance = {
+            "stores": before.get("stores", {}) | settings,
+            "command": [*before.get("command", []), *command],
+            "measured_with": versions(),
+        }
+        self.there = set(zip(self.shapes, self.views, strict=True))
+
+    def add(self, measured: dict[str, Any]) -> None:
+        for view, seen in measured["views"].items():
+            self.shapes.append(measured["shape"])
+            self.views.append(view)
+            self.parameters.append(measured["parameters"])
+            self.descriptors.append(row_of(seen).astype(np.float32))
+
+    def table(self) -> Table:
+        shapes, views = np.array(self.shapes, dtype=str), np.array(self.views, dtype=str)
+        return Table(shapes, views, np.array(self.parameters), np.array(self.descriptors), self.provenance)
+
+
+def _jobs(store: Store, views: Sequence[str], rows: _Rows) -> list[tuple[Store, int, tuple[str, ...]]]:
+    """Return the shapes of a store with the views of each that are missing."""
+    jobs = []
+    for index in store.indices():
+        shape = _shape(store, index)
+        missing = tuple(name for name in views if (shape, name) not in rows.there)
+        if missing and store.viable(index) and well_formed(store.record(index).viability):
+            jobs.append((store, index, missing))
+    return jobs
+
+
+def _name(store: Store) -> str:
+    return store.path.resolve().name.removesuffix(".zarr")
+
+
+def _shape(store: Store, index: int) -> str:
+    """Return a shape's name in a table: the store's folder and the draw."""
+    return f"{_name(store)}/{index:06d}"
