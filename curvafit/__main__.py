@@ -1,5 +1,6 @@
 """The program `curvafit`, or `python -m curvafit`, which listens to signals before its long imports."""
 
+import gc
 import warnings
 
 from curvafit.interrupts import exit_code, leave, listen
@@ -7,6 +8,7 @@ from curvafit.interrupts import exit_code, leave, listen
 
 def main() -> None:
     """Run the program."""
+    gc.set_threshold(100_000)  # what imports make stays: to look through it for garbage takes a fifth of the start
     # A signal leaves coroutines of Zarr that were about to read: no matter for a user.
     warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)
     try:

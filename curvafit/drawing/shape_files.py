@@ -17,7 +17,6 @@ import torch
 from scipy.ndimage import map_coordinates
 from torch import Tensor
 
-from curvafit.drawing.plot import surface_picture
 from curvafit.files import check_folder, check_free, move_together, own_record, remove, staged
 from curvafit.generation.flow import Flow
 from curvafit.generation.memory import FILE, check_memory
@@ -232,6 +231,8 @@ def write_shape(
 
 def _picture(flow: Flow, path: Path) -> tuple[Path, ...]:
     """Draw a flow's surface; where that fails, warn and return no path."""
+    from curvafit.drawing.plot import surface_picture
+
     try:
         surface_picture(flow.field.numpy(), path)
     except (OSError, ValueError, MemoryError) as error:

@@ -8,7 +8,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import IO, Any
 
-import h5py
 import numpy as np
 
 from curvafit.priors.bounds import quoted
@@ -93,6 +92,8 @@ def _npy_header(stream: IO[bytes], size: int) -> tuple[tuple[int, ...], bool, np
 
 def read_hdf5(path: Path, *, key: str | None = None, part: Part | None = None, **_: object) -> Raw:
     """Read a dataset, with the spacing and unit of its attributes (`element_size_um`, or `spacing` and `unit`)."""
+    import h5py
+
     with h5py.File(path, "r") as file:
         keys: list[str] = []
         file.visititems(lambda name, item: keys.append(name) if isinstance(item, h5py.Dataset) else None)

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import zarr
 
 from curvafit.files import MARK, is_empty
 from curvafit.interrupts import undisturbed
@@ -29,6 +28,8 @@ _UNITS = {"nm": "nanometer", "um": "micrometer", "mm": "millimeter", "m": "meter
 
 def read_zarr(path: Path, *, key: str | None = None, part: Part | None = None, **_: object) -> Raw:
     """Read an array, or one array of a group, with spacing and unit of its attributes or of OME-Zarr's multiscales."""
+    import zarr
+
     check_store(path)
     node: Any = zarr.open(path, mode="r")
     if isinstance(node, zarr.Array):
@@ -54,6 +55,8 @@ def _raw(array: Any, folder: Path, place: _Place, part: Part | None) -> Raw:
 
 def write_zarr(field: Any, path: Path) -> None:
     """Write an OME-NGFF 0.5 group of one image: the volume as `0`, halved copies as `1`, `2` … down to one chunk."""
+    import zarr
+
     levels = list(_halvings(np.asarray(field.values)))
     kind = {"type": "space", **({"unit": _UNITS[field.unit]} if field.unit in _UNITS else {})}
     image = {
@@ -86,6 +89,8 @@ def _write_level(group: Any, name: str, values: np.ndarray) -> None:
 @undisturbed()
 def mark(folder: Path, kind: str) -> None:
     """Mark a group, in its attributes, as written by this program, with its kind."""
+    import zarr
+
     zarr.open_group(folder, mode="r+").attrs[MARK] = {"kind": kind}
 
 

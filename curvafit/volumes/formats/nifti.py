@@ -8,9 +8,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-import nibabel
 import numpy as np
-from nibabel.volumeutils import apply_read_scaling
 
 from curvafit.volumes.formats.base import Raw, ScanError, complaints, normalise_unit
 from curvafit.volumes.formats.part import Part, part_of
@@ -28,6 +26,8 @@ _TO_FILE = {
 
 def read_nifti(path: Path, *, part: Part | None = None, **_: object) -> Raw:
     """Read values, zooms, unit and affine; zooms other than 1 without a unit are in mm, as for NIfTI's readers."""
+    import nibabel
+
     with complaints("nibabel.global") as repairs:
         image: Any = nibabel.load(path)
         raw = _values(image, path, part)
@@ -59,6 +59,8 @@ def _values(image: Any, path: Path, part: Part | None) -> Raw:
 
     From a file that is not compressed only the part is read.
     """
+    from nibabel.volumeutils import apply_read_scaling
+
     proxy, compression = image.dataobj, path.name.lower().endswith(".gz")
     shape = proxy.shape[::-1]
     long = [axis for axis, n in enumerate(shape[:-3]) if n != 1]
@@ -75,6 +77,8 @@ def _values(image: Any, path: Path, part: Part | None) -> Raw:
 
 def write_nifti(field: Any, path: Path) -> None:
     """Write a field with its unit, and with its affine, or its spacing without one, as qform and sform."""
+    import nibabel
+
     values = field.values.view(np.uint8) if field.values.dtype == bool else field.values
     if values.dtype == np.float16:
         values = values.astype(np.float32)
@@ -102,6 +106,8 @@ def write_nifti_like(values: np.ndarray, like: Path, path: Path, unit: str | Non
     ScanError
         If the other file has a different number of voxels.
     """
+    import nibabel
+
     with complaints("nibabel.global"):
         image: Any = nibabel.load(like)
     header = image.header.copy()

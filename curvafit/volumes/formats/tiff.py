@@ -6,14 +6,16 @@ import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
 import numpy as np
-import tifffile
 
 from curvafit.volumes.formats.base import Damaged, Raw, ScanError, complaints, convert_length, normalise_unit
 from curvafit.volumes.formats.streams import check_array, check_regular
+
+if TYPE_CHECKING:
+    import tifffile
 
 #: Suffixes of a folder's slices.
 SLICES = (".tif", ".tiff")
@@ -39,6 +41,8 @@ _SCREEN = (1, 25.4, 72, 96, 100, 150, 200, 300, 600)
 
 def read_tiff(path: Path, **_: object) -> Raw:
     """Read the first series of a file, or raise Damaged where one of its strips or pages is missing."""
+    import tifffile
+
     with complaints("tifffile") as messages, tifffile.TiffFile(path) as file:
         series = file.series[0]
         check_array(series.shape, series.dtype or np.dtype("V1"), path)
@@ -124,6 +128,8 @@ def _check_pages(file: tifffile.TiffFile, series: tifffile.TiffPageSeries) -> No
 
 def write_tiff(field: Any, path: Path) -> None:
     """Write a TIFF with ImageJ's metadata, or with OME's where ImageJ lacks the type or cannot hold the size."""
+    import tifffile
+
     values, (z, y, x) = _stored(field), field.spacing
     fits = values.nbytes < _IMAGEJ_LIMIT and max(1 / x, 1 / y) < _RESOLUTION_LIMIT
     if values.dtype in (np.uint8, np.uint16, np.float32) and fits:
@@ -139,6 +145,8 @@ def write_tiff(field: Any, path: Path) -> None:
 
 def write_ome_tiff(field: Any, path: Path) -> None:
     """Write a TIFF with OME's metadata."""
+    import tifffile
+
     sizes = {f"PhysicalSize{axis}": h for axis, h in zip("ZYX", field.spacing, strict=True)}
     units = {f"PhysicalSize{axis}Unit": {"um": "µm", "voxel": "pixel"}.get(field.unit, field.unit) for axis in "ZYX"}
     metadata = {"axes": "ZYX", **sizes, **units}
