@@ -51,6 +51,19 @@ class Table:
         i = np.asarray(chosen)
         return Table(self.shapes[i], self.views[i], self.parameters[i], self.descriptors[i], self.provenance)
 
+    def of(self, views: Sequence[str]) -> Table:
+        """Return the rows of some kinds of views.
+
+        Raises
+        ------
+        ValueError
+            If there is none of a kind.
+        """
+        there = set(self.views.tolist())
+        if missing := [view for view in views if view not in there]:
+            raise ValueError(f"expected views among {', '.join(sorted(there))}, got {', '.join(missing)}")
+        return self.rows(np.isin(self.views, list(views)))
+
     @property
     def seen(self) -> Table:
         """Return the rows whose view shows a surface."""
