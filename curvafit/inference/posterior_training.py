@@ -19,8 +19,8 @@ VALIDATION = 0.1
 BATCH, RATE, PATIENCE = 256, 1e-3, 20
 #: Most epochs, and weight decay.
 EPOCHS, DECAY = 300, 1e-3
-#: Weight of the curvature block over the others, each of which has a total variance of 1 before compression.
-CURVATURE = 3.0
+#: Deviations that blocks have before compression, 1 where none is named.
+WEIGHTS = {"curvature": 3.0}
 
 
 def train_posterior(
@@ -83,7 +83,7 @@ def train_posterior(
 
 def compression_of(descriptors: np.ndarray, architecture: Architecture) -> Compression:
     """Return the principal components of some descriptors: columns in deviations (the curvature block in one for all
-    its columns, as its distance asks), blocks in equal weights but for `CURVATURE`."""
+    its columns, as its distance asks), blocks in `WEIGHTS`."""
     names = np.array(column_names())
     names = names[np.isin(names, architecture.blocks)]
     columns = straightened(descriptors, architecture.blocks)
@@ -91,7 +91,7 @@ def compression_of(descriptors: np.ndarray, architecture: Architecture) -> Compr
     weight = np.ones(len(names))
     for block in set(names.tolist()):
         mine = names == block
-        weight[mine] = (CURVATURE if block == "curvature" else 1.0) / np.sqrt(mine.sum())
+        weight[mine] = WEIGHTS.get(block, 1.0) / np.sqrt(mine.sum())
         if block == "curvature":
             scale[mine] = np.sqrt((scale[mine] ** 2).mean())
     plain = Compression(architecture.blocks, mean, scale, np.diag(weight))
