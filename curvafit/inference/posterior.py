@@ -57,7 +57,7 @@ class Compression:
     basis: np.ndarray
 
     def __call__(self, descriptors: np.ndarray) -> np.ndarray:
-        """Return the components `(N, k)`, of about unit variance, of descriptors `(N, 353)`."""
+        """Return the components `(N, k)`, of about unit variance, of descriptors `(N, 351)`."""
         columns = straightened(descriptors, self.blocks)
         return np.clip((columns - self.mean) / self.scale, -FURTHEST, FURTHEST) @ self.basis.T
 
@@ -107,7 +107,7 @@ class Posterior:
     provenance: dict[str, Any]
 
     def sample(self, descriptors: Descriptors | np.ndarray, view: str, count: int = 1000, seed: int = 0) -> np.ndarray:
-        """Draw parameters `(N, count, 6)` given descriptors `(N, 353)`; `(count, 6)` given one.
+        """Draw parameters `(N, count, 6)` given descriptors `(N, 351)`; `(count, 6)` given one.
 
         Raises
         ------
@@ -125,7 +125,7 @@ class Posterior:
         return parameters[0] if single else parameters
 
     def log_density(self, parameters: np.ndarray, descriptors: Descriptors | np.ndarray, view: str) -> np.ndarray:
-        """Return the logarithm of the density of parameters `(N, 6)` given descriptors `(N, 353)`, in nats."""
+        """Return the logarithm of the density of parameters `(N, 6)` given descriptors `(N, 351)`, in nats."""
         rows, _ = _rows(descriptors)
         context = self.context(rows, np.full(len(rows), view))
         free = (self.unbounded(np.atleast_2d(parameters)) - self.centre) / self.spread

@@ -27,7 +27,7 @@ PARAMETERS = ("a11", "log a02", "a10", "a01", "a00", "m0")
 @dataclass(frozen=True, eq=False)
 class Table:
     """N views of shapes: `shapes` and `views` name them (str, `(N,)`); `parameters` is `(N, 6)` (`PARAMETERS`),
-    `descriptors` `(N, 353)` the blocks of `Descriptors` in their order, NaN where a view shows no surface.
+    `descriptors` `(N, 351)` the blocks of `Descriptors` in their order, NaN where a view shows no surface.
     `provenance` says which stores and program made them."""
 
     shapes: np.ndarray
