@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from curvafit.atlas_map import describe as describing
 from curvafit.atlas_map.describe import describe
 from curvafit.atlas_map.views import BLUR, SNR, VIEWS, View
 from curvafit.cli.app import app
@@ -92,7 +91,7 @@ def test_a_stopped_table_goes_on_and_grows(tmp_path: Path, monkeypatch: pytest.M
         return View(u, grid)
 
     with monkeypatch.context() as patch:
-        patch.setitem(describing.VIEWS, "field", stops)
+        patch.setitem(VIEWS, "field", stops)
         with pytest.raises(KeyboardInterrupt):
             describe([store.path], tmp_path / "table.npz", FAST)
     assert len(load_table(tmp_path / "table.npz")) == 2
@@ -109,7 +108,7 @@ def test_a_view_without_a_surface_is_a_row_without_numbers(tmp_path: Path, monke
     def empty(u, grid, rng):
         raise NoSurface("expected a surface, got none")
 
-    monkeypatch.setitem(describing.VIEWS, "crop", empty)
+    monkeypatch.setitem(VIEWS, "crop", empty)
     table = describe([exact_store(tmp_path / "store.zarr", 2).path], tmp_path / "table.npz", ("mask", "crop"))
     assert table.seen.views.tolist() == ["mask", "mask"]
     assert np.isnan(table.descriptors[table.views == "crop"]).all()

@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING
 from curvafit.faces import offer
 
 if TYPE_CHECKING:
+    from curvafit.atlas_map.describe import describe
     from curvafit.atlas_map.extract import extract
     from curvafit.atlas_map.layout import AtlasMap, map_atlas
     from curvafit.atlas_map.map_files import write_map
 
 __all__ = [
     "AtlasMap",
+    "describe",
     "extract",
     "map_atlas",
     "write_map",
@@ -20,6 +22,7 @@ __all__ = [
 
 _HOMES = {
     "AtlasMap": "curvafit.atlas_map.layout",
+    "describe": "curvafit.atlas_map.describe",
     "extract": "curvafit.atlas_map.extract",
     "map_atlas": "curvafit.atlas_map.layout",
     "write_map": "curvafit.atlas_map.map_files",

@@ -190,7 +190,38 @@ def describe_atlas(
         names = tuple(VIEWS) if views is None else tuple(views.split(","))
         with crew.at_work() as (makers, progress):
             table = describe(stores, out, names, progress, workers=makers, command=[command_line()])
-        say(f"{len(set(table.shapes))} shapes, {len(table)} views", to=error_console())
+        say(f"{len(set(table.shapes.tolist()))} shapes, {len(table)} views", to=error_console())
+        say(str(out))
+
+
+@atlas_app.command("train", epilog="[bold]Example[/bold]\n\ncurvafit atlas train table.npz -o posterior.npz")
+def train_atlas(
+    table: Annotated[Path, typer.Argument(help="A table made by `curvafit atlas describe`.")],
+    out: Annotated[Path, typer.Option("-o", "--output", help="The posterior (.npz) to write.")],
+    views: Annotated[str | None, typer.Option(help="Views to learn from, between commas; by default all.")] = None,
+    members: Annotated[int, typer.Option(help="Number of flows, whose equal mixture the posterior is.")] = 3,
+    seed: Annotated[int, typer.Option(help="Seed of the training.")] = 0,
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Train the posterior of the parameters, given descriptors, on a table of them."""
+    with plainly():
+        if out.suffix.lower() != ".npz":
+            raise ValueError(f"expected a name ending in .npz, got {out.name!r}")
+        from curvafit.files import check_folder, check_free
+        from curvafit.inference.posterior import is_posterior, save_posterior
+        from curvafit.inference.posterior_training import train_posterior
+        from curvafit.inference.table import load_table
+
+        check_folder(out.parent)
+        check_free([out], is_posterior, [table], overwrite)
+        content = load_table(table)
+        if views is not None:
+            content = content.of(views.split(","))
+        with stages() as progress:
+            posterior = train_posterior(content, members=members, seed=seed, progress=progress)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        save_posterior(posterior, out)
+        say(f"{posterior.provenance['shapes']} shapes", to=error_console())
         say(str(out))
 
 

@@ -13,27 +13,37 @@ if TYPE_CHECKING:
     from curvafit.inference.infer import Inference, infer
     from curvafit.inference.match import Match, nearest
     from curvafit.inference.measure import scan_diagram
+    from curvafit.inference.posterior import Posterior, load_posterior, save_posterior
+    from curvafit.inference.posterior_training import train_posterior
     from curvafit.inference.prepare import Prepared, prepare
     from curvafit.inference.refine import refine
     from curvafit.inference.refinement import Refinement
     from curvafit.inference.stationarity import stationarity
+    from curvafit.inference.table import Table, load_table, save_table
 
 __all__ = [
     "Atlas",
     "Fit",
     "Inference",
     "Match",
+    "Posterior",
     "Prepared",
     "Refinement",
+    "Table",
     "fixed_point",
     "infer",
     "load_atlas",
+    "load_posterior",
+    "load_table",
     "nearest",
     "prepare",
     "refine",
     "save_atlas",
+    "save_posterior",
+    "save_table",
     "scan_diagram",
     "stationarity",
+    "train_posterior",
 ]
 
 _HOMES = {
@@ -41,17 +51,24 @@ _HOMES = {
     "Fit": "curvafit.inference.fit",
     "Inference": "curvafit.inference.infer",
     "Match": "curvafit.inference.match",
+    "Posterior": "curvafit.inference.posterior",
     "Prepared": "curvafit.inference.prepare",
     "Refinement": "curvafit.inference.refinement",
+    "Table": "curvafit.inference.table",
     "fixed_point": "curvafit.inference.fixed_point",
     "infer": "curvafit.inference.infer",
     "load_atlas": "curvafit.inference.atlas",
+    "load_posterior": "curvafit.inference.posterior",
+    "load_table": "curvafit.inference.table",
     "nearest": "curvafit.inference.match",
     "prepare": "curvafit.inference.prepare",
     "refine": "curvafit.inference.refine",
     "save_atlas": "curvafit.inference.atlas",
+    "save_posterior": "curvafit.inference.posterior",
+    "save_table": "curvafit.inference.table",
     "scan_diagram": "curvafit.inference.measure",
     "stationarity": "curvafit.inference.stationarity",
+    "train_posterior": "curvafit.inference.posterior_training",
 }
 
 offer(__name__, _HOMES)

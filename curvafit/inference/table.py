@@ -27,7 +27,7 @@ PARAMETERS = ("a11", "log a02", "a10", "a01", "a00", "m0")
 @dataclass(frozen=True, eq=False)
 class Table:
     """N views of shapes: `shapes` and `views` name them (str, `(N,)`); `parameters` is `(N, 6)` (`PARAMETERS`),
-    `descriptors` `(N, 353)` the blocks of `Descriptors` in their order, NaN where a view shows no surface.
+    `descriptors` `(N, 351)` the blocks of `Descriptors` in their order, NaN where a view shows no surface.
     `provenance` says which stores and program made them."""
 
     shapes: np.ndarray
@@ -50,6 +50,19 @@ class Table:
         """Return some rows, by their numbers or a mask."""
         i = np.asarray(chosen)
         return Table(self.shapes[i], self.views[i], self.parameters[i], self.descriptors[i], self.provenance)
+
+    def of(self, views: Sequence[str]) -> Table:
+        """Return the rows of some kinds of views.
+
+        Raises
+        ------
+        ValueError
+            If there is none of a kind.
+        """
+        there = set(self.views.tolist())
+        if missing := [view for view in views if view not in there]:
+            raise ValueError(f"expected views among {', '.join(sorted(there))}, got {', '.join(missing)}")
+        return self.rows(np.isin(self.views, list(views)))
 
     @property
     def seen(self) -> Table:

@@ -1,0 +1,157 @@
+"""The posterior on tables whose answer is known, its file, and its command."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import curvafit.inference.posterior_training as training
+from curvafit.cli.app import app
+from curvafit.geometry.descriptors import BLOCKS
+from curvafit.inference.posterior import Architecture, Posterior, load_posterior, save_posterior, straightened
+from curvafit.inference.posterior_training import compression_of, train_posterior
+from curvafit.inference.table import Table, column_names, save_table
+
+LOW, HIGH = np.array([-4, -2.7, -200, -200, -3000, -0.75]), np.array([4, 2.7, 200, 200, 3000, -0.15])
+SMALL = Architecture(components=4, hidden=(64,), transforms=1, dropout=0.0)
+NOISE = 0.2
+#: Which column of the curvature block tells which parameter; the others are not told.
+TOLD = {0: 0, 100: 2}
+
+
+def table(shapes: int = 400, seed: int = 0) -> Table:
+    """Two views of each shape. The mask's curvature block holds a11 and a10, in deviations, in the noise of a fifth of
+    them; the crop's in noise of once their size. Of the others nothing is told."""
+    rng = np.random.default_rng(seed)
+    parameters = rng.uniform(LOW, HIGH, (shapes, 6))
+    standard = (parameters - (LOW + HIGH) / 2) / ((HIGH - LOW) / np.sqrt(12))
+    descriptors = np.ones((2 * shapes, sum(BLOCKS.values()))) + 0.01 * rng.standard_normal((2 * shapes, 1))
+    for column, k in TOLD.items():
+        for first, noise in ((0, NOISE), (shapes, 1.0)):
+            told = standard[:, k] + noise * rng.standard_normal(shapes)
+            descriptors[first : first + shapes, column : column + 40] = 5 + told[:, None]
+    names = np.array([f"s/{i:06d}" for i in range(shapes)])
+    views = np.repeat(["mask", "crop"], shapes)
+    return Table(np.tile(names, 2), views, np.tile(parameters, (2, 1)), descriptors, {})
+
+
+@pytest.fixture(scope="module")
+def posterior() -> Posterior:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training, "RATE", 1e-2)
+        patch.setattr(training, "EPOCHS", 60)
+        return train_posterior(table(800), SMALL, members=2)
+
+
+def test_it_tells_what_the_descriptors_hold_and_no_more(posterior: Posterior) -> None:
+    """Of a uniform parameter seen in Gaussian noise of a fifth of its deviation nearly all, of the others nothing."""
+    fresh, spread = table(200, seed=1), (HIGH - LOW) / np.sqrt(12)
+    for view, told in (("mask", (0.15, 0.45)), ("crop", (0.55, 0.85))):
+        seen = fresh.of([view])
+        draws = posterior.sample(seen.descriptors, view, 200)
+        width = draws.std(1).mean(0) / spread
+        for k in range(6):
+            low, high = told if k in TOLD.values() else (0.9, 1.1)
+            assert low < width[k] < high, (view, k)
+        rank = (draws < seen.parameters[:, None]).mean(1)
+        inside = ((rank > 0.05) & (rank < 0.95)).mean()
+        assert 0.86 < inside < 0.94  # 1200 ranks: 0.9 ± 0.01, and what 800 shapes leave unlearnt
+
+
+def test_draws_lie_in_the_box_and_come_back(posterior: Posterior) -> None:
+    row = table(1, seed=2).of(["mask"]).descriptors
+    draws = posterior.sample(row[0], "mask", 500, seed=3)
+    rim = 0.025 * (HIGH - LOW)
+    assert draws.shape == (500, 6)
+    assert ((draws > LOW - rim) & (draws < HIGH + rim)).all()
+    assert np.array_equal(draws, posterior.sample(row, "mask", 500, seed=3)[0])
+    assert not np.array_equal(draws, posterior.sample(row[0], "mask", 500, seed=4))
+    assert posterior.bounded(posterior.unbounded(draws)) == pytest.approx(draws, rel=1e-4)
+
+
+def test_the_density_is_one_over_the_box(posterior: Posterior) -> None:
+    """Its mean over uniform draws is 1 / volume; the crop's is wide, so a mean of draws will do."""
+    row = table(1, seed=2).of(["crop"]).descriptors
+    rim = 0.02 * (HIGH - LOW)
+    low, wide = LOW - rim, HIGH - LOW + 2 * rim
+    places = low + wide * np.random.default_rng(0).random((20000, 6))
+    density = np.exp(posterior.log_density(places, np.repeat(row, len(places), 0), "crop"))
+    assert density.mean() * wide.prod() == pytest.approx(1, abs=0.1)
+
+
+def test_views_that_it_does_not_know_are_refused(posterior: Posterior) -> None:
+    with pytest.raises(ValueError, match="expected views among crop, mask, got field"):
+        posterior.sample(np.ones(sum(BLOCKS.values())), "field")
+
+
+def test_a_file_holds_it(posterior: Posterior, tmp_path: Path) -> None:
+    path = tmp_path / "posterior.npz"
+    save_posterior(posterior, path)
+    again, row = load_posterior(path), table(1, seed=2).descriptors[0]
+    assert np.array_equal(again.sample(row, "mask", 50), posterior.sample(row, "mask", 50))
+    assert again.provenance == posterior.provenance
+    content = path.read_bytes()
+    path.write_bytes(content[:1000])
+    with pytest.raises(ValueError, match="damaged or something else"):
+        load_posterior(path)
+    path.write_bytes(content)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(BLOCKS, "another", 2)
+        with pytest.raises(ValueError, match="train it again"):
+            load_posterior(path)
+    with pytest.raises(FileNotFoundError, match="expected a posterior"):
+        load_posterior(tmp_path / "nowhere.npz")
+
+
+def test_components_are_uncorrelated_and_of_unit_variance() -> None:
+    rows = np.random.default_rng(0).random((300, sum(BLOCKS.values()))) + 0.5
+    components = compression_of(rows, SMALL)(rows)
+    assert np.cov(components.T) == pytest.approx(np.eye(SMALL.components), abs=0.02)
+
+
+def test_blocks_are_chosen_by_name() -> None:
+    rows, names = np.random.default_rng(0).random((3, sum(BLOCKS.values()))) + 0.5, np.array(column_names())
+    assert straightened(rows, ["curvature", "fabric"]) == pytest.approx(
+        rows[:, np.isin(names, ["curvature", "fabric"])]
+    )
+    assert straightened(rows, ["fraction"]) == pytest.approx(np.log(rows[:, names == "fraction"]))
+
+
+def test_too_few_shapes_are_refused() -> None:
+    with pytest.raises(ValueError, match="expected at least 8 shapes"):
+        train_posterior(table(7), SMALL)
+
+
+def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(training, "EPOCHS", 1)
+    source, out = tmp_path / "table.npz", tmp_path / "posterior.npz"
+    save_table(table(80), source)
+    options = ["--views", "mask", "--members", "1"]
+    result = CliRunner().invoke(app, ["atlas", "train", str(source), "-o", str(out), *options])
+    assert result.exit_code == 0, result.stderr
+    assert result.stdout.strip() == str(out)
+    assert load_posterior(out).views == ("mask",)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["nothing.npz", "-o", "posterior.npz"], "expected a table of descriptors"),
+        (["table.npz", "-o", "posterior.pt"], "expected a name ending in .npz"),
+        (["table.npz", "-o", "table.npz"], "expected an output that writes over no input"),
+        (["table.npz", "-o", "posterior.npz", "--views", "ghost"], "expected views among crop, mask, got ghost"),
+        (["table.npz", "-o", "posterior.npz"], "shapes to train on, got 5"),
+    ],
+)
+def test_the_command_refuses_in_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], words: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    save_table(table(5), "table.npz")
+    result = CliRunner().invoke(app, ["atlas", "train", *arguments])
+    assert result.exit_code == 2
+    assert words in " ".join(result.stderr.split())
+    assert not (tmp_path / "posterior.npz").exists()
