@@ -51,7 +51,7 @@ def found_rows(label: str, found: Refinement, seconds: float, unit: str) -> None
 
 
 def field_table(folder: Path, name: str) -> None:
-    u = author_volume(folder, name.replace("-", " "))
+    u = author_volume(folder, name)
     truth = preset(name).coefficients
     print(
         f"{name}: stationarity of the field (a20 = 1; a11 a02 a10 a01 a00, mass; field error that explains the misfit)"
@@ -71,7 +71,7 @@ def field_table(folder: Path, name: str) -> None:
 
 
 def mask_table(folder: Path, name: str) -> None:
-    u, grid = cropped(author_volume(folder, name.replace("-", " ")))
+    u, grid = cropped(author_volume(folder, name))
     phase = phase_field(u > 0, grid, WORKING_EPSILON)
     truth = preset(name).coefficients.scaled(1 / preset(name).coefficients.a20)
     matches = nearest(diagram(phase, grid, WORKING_EPSILON), load_atlas(), seen_as="mask", count=STARTS)

@@ -1,12 +1,14 @@
-"""Time to texture: the `fast` schedule against the published one, in steps, seconds, energy and curvature diagram.
+"""Time to texture: a schedule against the published one, in seconds, energy and curvature diagram.
 
-    python -m benchmarks.texture [--presets tubes,seeds,…] [--seeds 3] [--edge 100] [-o texture] [--start]
+    python -m benchmarks.texture [--presets tubes,seeds,…] [--schedule fast] [--seeds 3] [--first 0] [--edge 100]
+                                 [-o texture] [--start]
 
 For each preset and schedule: the mean energy, and the seconds of one shape. Distances are those of geometric diagrams:
-`noise` between two seeds of `paper`, `cross` from a seed of `fast` to one of `paper`, `bias` between the two pooled
-diagrams (all seeds' surfaces together), which is what a schedule changes on top of a seed's noise; between twice three
-shapes of one schedule it is some 0.6 of the noise. Shapes are kept in the folder with the commit and the schedule that
-made them: a killed run begins with the shape it was at, and a second one only prints.
+`noise` between two seeds of `paper`, `cross` from a seed of the schedule to one of `paper`, `bias` between the two
+pooled diagrams (all seeds' surfaces together), which is what a schedule changes on top of a seed's noise; between twice
+three shapes of one schedule it is some 0.6 of the noise. `--first` is the first seed: choose a schedule on some, report
+it on others. Shapes are kept in the folder with the commit and the schedule that made them: a killed run begins with
+the shape it was at, and a second one only prints.
 
 `--start` times the command line, start-up included, against 8000 steps of plain torch (timed over a few).
 """
@@ -24,6 +26,7 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
+import torch
 from rich.progress import Progress
 
 from benchmarks.step import plain_stepper
@@ -32,7 +35,6 @@ from curvafit.generation.flow import generate
 from curvafit.generation.schedule import SCHEDULES
 from curvafit.geometry.diagram import Diagram, diagram
 from curvafit.geometry.transport import wasserstein
-from curvafit.priors.coefficients import preset
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 
 #: Tubes of three kinds, layers, spheres of two kinds, sponges of two kinds, trabeculae, metatubes, the paper's flow.
@@ -62,24 +64,25 @@ class Row(NamedTuple):
     bias: float
 
 
-def shape_of(name: str, schedule: str, seed: int, edge: int, folder: Path) -> Shape:
-    """Generate and measure, or read what an earlier run kept."""
-    path, plan = folder / f"{name}-{schedule}-{edge}-{seed}.npz", repr(SCHEDULES[schedule])
+def shape_of(name: str, schedule: str, seed: int, edge: int, folder: Path, *, floored: bool = False) -> Shape:
+    """Generate and measure, or read what an earlier run kept; `floored` rounds u down to 1/100 first."""
+    stem = f"{name}-{schedule}-{edge}-{seed}{'-floored' * floored}"
+    path, plan = folder / f"{stem}.npz", repr(SCHEDULES[schedule])
     if not path.exists() or _plan(path) != plan:
-        parameters, grid = preset(name), Grid((edge,) * 3)
+        grid = Grid((edge,) * 3)
         begun = time.perf_counter()
         with Progress(transient=True) as progress:
             task = progress.add_task(path.stem)
             flow = generate(
-                parameters.coefficients,
-                parameters.mass,
-                grid,
+                name,
+                grid=grid,
                 schedule=schedule,
                 seed=seed,
                 callbacks=[lambda made, total, state: progress.update(task, completed=made, total=total)],
             )
         seconds = time.perf_counter() - begun
-        found = diagram(flow.field, grid, WORKING_EPSILON)
+        u = torch.floor(flow.field * 100) / 100 if floored else flow.field
+        found = diagram(u, grid, WORKING_EPSILON)
         figures = np.array([flow.history.energy[-1], seconds, flow.viability.viable])
         kept = {"figures": figures, "points": found.points, "weights": found.weights, "commit": _commit(), "plan": plan}
         write_atomically(path, lambda temporary: np.savez_compressed(temporary, **kept))
@@ -100,14 +103,18 @@ def _commit() -> str:
     return asked.stdout.strip() or "unknown"
 
 
-def compare(paper: list[Shape], fast: list[Shape]) -> Row:
+def compare(paper: list[Shape], other: list[Shape]) -> Row:
     """Distances within and between two schedules' shapes."""
-    noise = np.mean([wasserstein(a.diagram, b.diagram) for a, b in combinations(paper, 2)])
-    cross = np.mean([wasserstein(a.diagram, b.diagram) for a, b in product(fast, paper)])
-    bias = wasserstein(_pooled(fast), _pooled(paper))
-    energies = tuple(float(np.mean([shape.energy for shape in shapes])) for shapes in (paper, fast))
-    seconds = tuple(float(np.median([shape.seconds for shape in shapes])) for shapes in (paper, fast))
-    return Row(energies, seconds, float(noise), float(cross), float(bias))
+    cross = np.mean([wasserstein(a.diagram, b.diagram) for a, b in product(other, paper)])
+    bias = wasserstein(_pooled(other), _pooled(paper))
+    energies = tuple(float(np.mean([shape.energy for shape in shapes])) for shapes in (paper, other))
+    seconds = tuple(float(np.median([shape.seconds for shape in shapes])) for shapes in (paper, other))
+    return Row(energies, seconds, noise_of(paper), float(cross), float(bias))
+
+
+def noise_of(shapes: list[Shape]) -> float:
+    """Mean distance between two seeds."""
+    return float(np.mean([wasserstein(a.diagram, b.diagram) for a, b in combinations(shapes, 2)]))
 
 
 def _pooled(shapes: list[Shape]) -> Diagram:
@@ -134,7 +141,9 @@ def start_up(edge: int) -> tuple[float, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--presets", default=",".join(PRESETS))
+    parser.add_argument("--schedule", choices=[name for name in SCHEDULES if name != "paper"], default="fast")
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--edge", type=int, default=100)
     parser.add_argument("--start", action="store_true", help="only time a start from the shell")
     parser.add_argument("-o", "--output", type=Path, default=Path("texture"))
@@ -146,17 +155,15 @@ def main() -> None:
         )
         return
     options.output.mkdir(parents=True, exist_ok=True)
-    plans = ", ".join(f"{plan.name} {plan.steps}" for plan in SCHEDULES.values())
+    pair, seeds = ("paper", options.schedule), range(options.first, options.first + options.seeds)
+    plans = ", ".join(f"{name} {SCHEDULES[name].steps}" for name in pair)
     threads = numba.get_num_threads()
-    print(f"{options.edge}³, {options.seeds} seeds; steps: {plans}; {threads} threads; {_commit()}")
-    names = ("E paper", "E fast", "noise", "cross", "bias", "/noise", "s paper", "s fast")
+    print(f"{options.edge}³, seeds {[*seeds]}; steps: {plans}; {threads} threads; {_commit()}")
+    names = (*(f"E {name}" for name in pair), "noise", "cross", "bias", "/noise", *(f"s {name}" for name in pair))
     print(f"{'preset':17}" + "".join(f"{name:>9}" for name in names))
     for name in options.presets.split(","):
-        paper, fast = (
-            [shape_of(name, schedule, seed, options.edge, options.output) for seed in range(options.seeds)]
-            for schedule in ("paper", "fast")
-        )
-        row = compare(paper, fast)
+        paper, other = ([shape_of(name, plan, k, options.edge, options.output) for k in seeds] for plan in pair)
+        row = compare(paper, other)
         distances = (row.noise, row.cross, row.bias, row.bias / row.noise)
         print(
             f"{name:17}"

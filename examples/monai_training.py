@@ -51,7 +51,7 @@ class Annotated(nn.Module):
 def scan(law: str, edge: int, seed: int, steps: int | None, every: int) -> dict[str, Tensor]:
     """Return an image and its labels, of all slices and of one in `every`, `(1, Z, Y, X)` each."""
     texture = texture_of(law)
-    grid, plan = Grid((edge, edge, edge)), schedule("fast", steps)
+    grid, plan = Grid((edge, edge, edge)), schedule("cosine", steps)
     field = generate(texture.coefficients, texture.mass, grid, seed=seed, schedule=plan).field
     truth = (field > 0).float()
     noise = torch.randn(truth.shape, generator=torch.Generator().manual_seed(seed))

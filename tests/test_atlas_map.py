@@ -140,7 +140,7 @@ def test_the_shapes_shown_are_spread_out() -> None:
 def test_the_command_grows_the_very_field(tmp_path: Path) -> None:
     law, mass, seed = Coefficients(1.0, 1.9, 6.1, -40.3, -40.0, 400 / 7), -0.61, 4042424242
     flow = generate(law, mass, Grid((20, 16, 24)), schedule="fast", seed=seed)
-    settings = dataclasses.replace(SETTINGS, shape=(20, 16, 24), schedule=dataclasses.asdict(flow.schedule))
+    settings = dataclasses.replace(SETTINGS, shape=(20, 16, 24), schedule=flow.schedule.as_dict())
     record = dataclasses.replace(exact_record(0), coefficients=law, mass=mass, seed=seed)
     command = shlex.split(regrow_command(record, settings, str(tmp_path / "a.npy")))
     assert command[:2] == ["curvafit", "generate"] and "--steps" not in command and "--epsilon" not in command
@@ -150,8 +150,8 @@ def test_the_command_grows_the_very_field(tmp_path: Path) -> None:
 
 def test_a_command_says_what_is_not_the_default() -> None:
     said = regrow_command(exact_record(4), dataclasses.replace(SETTINGS, epsilon=0.03), "a.tif")
-    assert said.endswith("--shape 24 --seed 1000000004 --schedule fast --steps 30 --epsilon 0.03 -o a.tif")
-    with pytest.raises(ValueError, match=r"expected a schedule of paper, fast and a blur of 0\.02, got others"):
+    assert said.endswith("--shape 24 --seed 1000000004 --schedule cosine --steps 30 --epsilon 0.03 -o a.tif")
+    with pytest.raises(ValueError, match=r"expected a schedule of paper, fast, cosine and a blur of 0\.02, got others"):
         regrow_command(exact_record(4), dataclasses.replace(SETTINGS, blur=0.03), "a.tif")
 
 

@@ -14,6 +14,7 @@ from curvafit.data_synth.imaging.parameters import Imaging
 from curvafit.data_synth.sets.case import Recipe
 from curvafit.data_synth.sets.sources import Generated, PhaseField, source_of
 from curvafit.generation import fraction as steering
+from curvafit.generation.schedule import SCHEDULES
 
 
 @pytest.fixture(scope="module")
@@ -56,8 +57,9 @@ def test_shapes_fill_the_share_that_is_asked_for(monkeypatch):
     source = Generated((point,), ("tubes",), fraction=0.15)
     made = source.shape((20, 20, 20), 0, np.random.default_rng(0))
     assert (made.values > 0).mean() == 0.15 and made.origin["parameters"]["mass"] != -0.5
-    assert "after 1000 steps" in made.origin["status"] and "volume fraction" not in made.origin["status"]
+    assert "after 1500 steps" in made.origin["status"] and "volume fraction" not in made.origin["status"]
     assert source_of(source.as_dict()) == source
+    assert source_of(source.as_dict() | {"schedule": "fast"}).schedule == SCHEDULES["cosine"]  # as version 0.1 wrote it
     with pytest.raises(ValueError, match="expected a volume fraction in .0, 1., got 1.5"):
         Generated((point,), ("tubes",), fraction=1.5)
     monkeypatch.setattr(steering, "LAST", -1.0)

@@ -12,7 +12,7 @@ from curvafit.data_synth.atlas.census import census, verify
 from curvafit.data_synth.atlas.store import open_store
 from curvafit.generation.schedule import schedule
 
-QUICK = schedule("fast", steps=40)
+QUICK = schedule("cosine", steps=40)
 
 
 @pytest.fixture(scope="module")

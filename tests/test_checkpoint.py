@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import os
 import random
@@ -16,7 +17,7 @@ import torch
 
 from curvafit.generation.checkpoint import Checkpoint, identity
 from curvafit.generation.flow import descend, generate, relax
-from curvafit.generation.schedule import Schedule
+from curvafit.generation.schedule import SCHEDULES, Schedule
 from curvafit.priors.coefficients import Coefficients, preset
 from curvafit.priors.grid import Grid
 
@@ -111,6 +112,20 @@ def test_flows_from_a_field_go_on(flow, optimiser, tmp_path):
         return descend(start, TUBES, GRID, flow=flow, optimiser=optimiser, steps=40, **more)
 
     assert_same(interrupted(make, tmp_path / "run", 20), make())
+
+
+@pytest.mark.parametrize("backend", ["torch", "fused"])
+def test_a_flow_goes_on_within_any_phase(backend, tmp_path):
+    if backend == "fused":
+        pytest.importorskip("numba")
+    plan = dataclasses.replace(SCHEDULES["fast"], steps=60)
+    assert plan.bounds == (12, 24)
+
+    def make(**more):
+        return generate(TUBES, MASS, GRID, schedule=plan, backend=backend, **more)
+
+    for after in (10, 20, 30):
+        assert_same(interrupted(make, tmp_path / "run", after), make())
 
 
 def test_relaxing_with_frozen_voxels_goes_on(tmp_path):

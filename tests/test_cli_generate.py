@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import importlib
 import json
 from pathlib import Path
@@ -40,7 +39,7 @@ def test_generate_writes_a_field_a_picture_and_a_record(tmp_path: Path) -> None:
     assert sorted(path.name for path in target.parent.iterdir()) == ["tubes.json", "tubes.nii.gz", "tubes.png"]
     record = json.loads((target.parent / "tubes.json").read_text())
     assert list(record["coefficients"].values()) == [1, 2, 6, -40, -40, 400]
-    assert (record["mass"], record["seed"], record["schedule"]) == (-0.6, 7, dataclasses.asdict(schedule("fast", 30)))
+    assert (record["mass"], record["seed"], record["schedule"]) == (-0.6, 7, schedule("fast", 30).as_dict())
     field = load(target)
     assert field.shape == (24, 24, 24) and field.unit == "voxel"
     assert field.values.mean() == pytest.approx(-0.6, abs=1e-5)
@@ -215,7 +214,7 @@ def test_nifti_is_whole_and_tiled(tmp_path: Path) -> None:
 def test_tubes_of_the_published_size_are_watertight_with_the_volume_of_the_phase(tmp_path: Path) -> None:
     """As STL, closed for another program, whatever shape came."""
     edge = 100
-    size = ["--shape", edge, "--steps", 60, "--spacing", "0.02", "--unit", "mm"]
+    size = ["--shape", edge, "--schedule", "cosine", "--steps", 60, "--spacing", "0.02", "--unit", "mm"]
     record = made("--preset", "tubes", *size, "-o", tmp_path / "tubes.stl")
     mesh = trimesh.load_mesh(tmp_path / "tubes.stl")
     assert mesh.is_watertight and mesh.is_winding_consistent

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import math
 
 import numpy as np
@@ -11,7 +13,7 @@ from found import made_fit
 
 from curvafit.generation.flow import RECORD_EVERY, generate, relax
 from curvafit.generation.initial import white_noise
-from curvafit.generation.schedule import SCHEDULES, Schedule, schedule
+from curvafit.generation.schedule import SCHEDULES, Phase, Schedule, present_name, schedule
 from curvafit.generation.viability import viability
 from curvafit.priors.coefficients import Coefficients, preset
 from curvafit.priors.energy import energy
@@ -163,26 +165,95 @@ def test_viability_is_the_published_predicate():
 
 
 def test_schedules():
-    paper, fast = SCHEDULES["paper"], SCHEDULES["fast"]
+    paper, cosine = SCHEDULES["paper"], SCHEDULES["cosine"]
     assert (paper.steps, paper.rate(0), paper.rate(7999), paper.checks) == (8000, 1e-3, 1e-3, (500, 1000, 5000))
-    assert fast.rate(0) == pytest.approx(fast.start)
-    assert fast.rate(fast.steps - 1) == pytest.approx(fast.stop)
-    assert fast.stop < fast.start / 10
+    assert cosine.rate(0) == pytest.approx(cosine.start)
+    assert cosine.rate(cosine.steps - 1) == pytest.approx(cosine.stop)
     assert paper.betas == (0.9, 0.999)
-    assert 8 * fast.steps <= paper.steps
-    rates = [fast.rate(step) for step in range(fast.steps)]
+    rates = [cosine.rate(step) for step in range(cosine.steps)]
     assert rates == sorted(rates, reverse=True)
-    assert fast.checks == (fast.steps // 2,)
+    assert cosine.checks == (cosine.steps // 2,)
     assert schedule("paper", steps=700).checks == (500,)
-    assert schedule(fast) is fast
+    assert schedule(cosine) is cosine
     for name in ("momentum", "memory"):
         with pytest.raises(ValueError, match=f"expected {name} in \\[0, 1\\), got 1"):
             Schedule("x", 10, 1e-3, 1e-3, "cosine", **{name: 1})
-    with pytest.raises(ValueError, match="expected a schedule among paper, fast, got 'slow'"):
+    with pytest.raises(ValueError, match="expected a schedule among paper, fast, cosine, got 'slow'"):
         schedule("slow")
     for wrong in ((0, 1e-3, "constant"), (10, 0.0, "constant"), (10, 1e-3, "linear")):
         with pytest.raises(ValueError, match="expected"):
             Schedule("x", wrong[0], wrong[1], 1e-3, wrong[2])
+
+
+#: 3 steps of 1e-3, 5 from 1e-3 to 2e-2, and 12 from 2e-2 to 1e-3, each with other decay rates.
+PHASES = Schedule(
+    "phases", 20, 2e-2, 1e-3, "cosine", 0.98, 0.99,
+    (Phase(0.15, 1e-3, 1e-3, "constant"), Phase(0.25, 1e-3, 2e-2, "cosine", 0.95, 0.995)),
+)  # fmt: skip
+
+
+def test_phases_follow_each_other():
+    assert PHASES.bounds == (3, 8)
+    assert [PHASES.rate(step) for step in (0, 2, 3, 7, 8, 19)] == pytest.approx([1e-3, 1e-3, 1e-3, 2e-2, 2e-2, 1e-3])
+    assert [PHASES.betas_at(step) for step in (2, 3, 7, 8)] == [
+        (0.9, 0.999),
+        (0.95, 0.995),
+        (0.95, 0.995),
+        (0.98, 0.99),
+    ]
+    assert dataclasses.replace(PHASES, steps=200).bounds == (30, 80)
+    lengths = [dataclasses.replace(PHASES, steps=steps).rate(steps - 1) for steps in (1, 2, 3)]
+    assert all(1e-3 <= length <= 2e-2 for length in lengths)
+    fast = SCHEDULES["fast"]
+    assert fast.steps <= 1.5 * SCHEDULES["cosine"].steps
+    assert fast.betas == SCHEDULES["paper"].betas and fast.rate(fast.bounds[0] - 1) == SCHEDULES["paper"].rate(0)
+    for wrong in ((0.5, 0.5), (0.0,), (1.0,), (-0.5,)):
+        with pytest.raises(ValueError, match="expected"):
+            dataclasses.replace(PHASES, opening=tuple(Phase(share, 1e-3, 1e-3, "constant") for share in wrong))
+    with pytest.raises(ValueError, match="expected an opening of phases as Phase, got 3"):
+        dataclasses.replace(PHASES, opening=(3,))
+
+
+def test_records_hold_schedules():
+    """Records of version 0.1 have no phases, and called `fast` what is `cosine` now."""
+    old = {
+        "name": "fast",
+        "steps": 30,
+        "start": 2e-2,
+        "stop": 1e-4,
+        "shape": "cosine",
+        "momentum": 0.97,
+        "memory": 0.97,
+    }
+    assert Schedule(**old).as_dict() == old
+    assert present_name(old) == "cosine"
+    assert present_name(old | {"memory": 0.9}) == "fast"
+    for plan in (*SCHEDULES.values(), PHASES):
+        assert Schedule(**json.loads(json.dumps(plan.as_dict()))) == plan
+        assert present_name(plan.as_dict()) == plan.name
+
+
+def test_phases_are_those_of_torch(monkeypatch):
+    """The loop steps as `torch.optim.Adam` does whose length and decay rates are set by hand before each step."""
+    grid, told = Grid((8, 9, 10)), []
+
+    class Watched(torch.optim.Adam):
+        def step(self, closure=None):
+            told.append((self.param_groups[0]["lr"], self.param_groups[0]["betas"]))
+            return super().step(closure)
+
+    monkeypatch.setattr(torch.optim, "Adam", Watched)
+    generate(TUBES, MASS, grid, schedule=PHASES, backend="torch")
+    assert told == [(PHASES.rate(step), PHASES.betas_at(step)) for step in range(PHASES.steps)]
+
+
+def test_fused_phases_are_those_of_torch():
+    """Rounding moves the end far less than the decay rates of the last phase do."""
+    pytest.importorskip("numba")
+    grid, other = Grid((8, 9, 10)), dataclasses.replace(PHASES, momentum=0.95, memory=0.995)
+    fused = generate(TUBES, MASS, grid, schedule=PHASES, backend="fused").field
+    plain, far = (generate(TUBES, MASS, grid, schedule=plan, backend="torch").field for plan in (PHASES, other))
+    assert (fused - plain).abs().max() < (far - plain).abs().max() / 20
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

@@ -36,7 +36,7 @@ def test_a_volume_fraction_is_reached(name, wanted, boundary):
 def test_backends_steer_alike():
     """Chance apart, the mass is a property of the shape's parameters."""
     pytest.importorskip("numba")
-    told = {"volume_fraction": 0.3, "schedule": schedule("fast", steps=100)}
+    told = {"volume_fraction": 0.3, "schedule": schedule("cosine", steps=100)}
     a, grid = preset("sponge").coefficients, Grid((20, 20, 20))
     ends = [generate(a, None, grid, **told, backend=backend) for backend in ("torch", "fused")]
     assert all(share(end.field) == pytest.approx(0.3, rel=2e-3) for end in ends)

@@ -25,7 +25,7 @@ TRUTH = preset("sponge")
 @pytest.fixture(scope="module")
 def sponge() -> torch.Tensor:
     """A sponge flowed until it is nearly stationary."""
-    flow = generate(TRUTH.coefficients, TRUTH.mass, GRID, schedule=schedule("fast", steps=1000), seed=0)
+    flow = generate(TRUTH.coefficients, TRUTH.mass, GRID, schedule=schedule("cosine", steps=1000), seed=0)
     assert flow.viability.viable
     return flow.field
 

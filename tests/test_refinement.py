@@ -26,7 +26,7 @@ GRID = Grid((40, 40, 40))
 @pytest.fixture(scope="module")
 def tubes() -> torch.Tensor:
     shape = preset("tubes")
-    return generate(shape.coefficients, shape.mass, GRID, seed=1, schedule=schedule("fast", steps=500)).field
+    return generate(shape.coefficients, shape.mass, GRID, seed=1, schedule=schedule("cosine", steps=500)).field
 
 
 @pytest.fixture(scope="module")

@@ -24,7 +24,7 @@ distributed = pytest.importorskip("distributed", reason="needs dask.distributed"
 psutil = pytest.importorskip("psutil")
 CommClosedError = pytest.importorskip("distributed.comm").CommClosedError
 
-COUNT, EDGE, PLAN = 8, 16, schedule("fast", steps=60)
+COUNT, EDGE, PLAN = 8, 16, schedule("cosine", steps=60)
 #: As a script: builds with two workers, and says where it is.
 SCRIPT = f"""
 import sys
@@ -32,7 +32,7 @@ from curvafit.data_synth import build, cluster
 from curvafit.generation.schedule import schedule
 if __name__ == "__main__":
     with cluster(2) as crew:
-        plan = schedule("fast", steps={PLAN.steps})
+        plan = schedule("cosine", steps={PLAN.steps})
         build(sys.argv[1], {COUNT}, {EDGE}, 1, plan, lambda text, share: print(text, flush=True), workers=crew)
 """
 

@@ -15,6 +15,7 @@ import torch
 from curvafit.data_synth.atlas.design import boxed
 from curvafit.data_synth.atlas.draws import versions
 from curvafit.data_synth.atlas.store import Record, Store, open_store
+from curvafit.generation.schedule import present_name
 from curvafit.generation.viability import FORMED, well_formed
 from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram, diagrams
 from curvafit.inference.atlas import Atlas
@@ -113,7 +114,7 @@ def _provenance(store: Store, records: list[Record], command: Sequence[str]) -> 
 def _build_command(store: Store, viable: int) -> str:
     """Return the command that makes the same store: building stops at its last viable draw."""
     settings = store.settings
-    shape, name = ",".join(map(str, settings.shape)), settings.schedule["name"]
+    shape, name = ",".join(map(str, settings.shape)), present_name(settings.schedule)
     known = {json.dumps(boxed(law).as_dict()): law for law in ("random", "sobol")}
     design = known.get(json.dumps(settings.design), "design.yaml")
     options = f"--count {viable} --shape {shape} --seed {settings.seed} --design {design} --schedule {name}"

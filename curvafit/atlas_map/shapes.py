@@ -14,7 +14,7 @@ from scipy.signal import resample
 from curvafit.data_synth.atlas.record import Record, Settings
 from curvafit.drawing.render import render
 from curvafit.generation.flow import WORKING_BLUR
-from curvafit.generation.schedule import SCHEDULES
+from curvafit.generation.schedule import SCHEDULES, present_name
 from curvafit.priors.grid import WORKING_EPSILON
 
 #: Width of a thumbnail in pixels, and the longest edge of a small volume in voxels.
@@ -65,7 +65,7 @@ def regrow_command(record: Record, settings: Settings, name: str) -> str:
     options = [f"--coefficients {','.join(map(_plain, record.coefficients))}", f"--mass {_plain(record.mass)}"]
     sizes = settings.shape[:1] if len(set(settings.shape)) == 1 else settings.shape
     options += [f"--shape {','.join(map(str, sizes))}", f"--seed {record.seed}"]
-    plan = settings.schedule["name"]
+    plan = present_name(settings.schedule)
     if plan not in SCHEDULES or not math.isclose(settings.blur, WORKING_BLUR):
         raise ValueError(f"expected a schedule of {', '.join(SCHEDULES)} and a blur of {WORKING_BLUR}, got others")
     options.append(f"--schedule {plan}")

@@ -74,7 +74,7 @@ Shape = Annotated[str | None, _what(help=f"Voxels: N or Z,Y,X; {EDGE} or the map
 Boundary = Annotated[str, _what(help="periodic, or replicate (walls that the shape meets at right angles).")]
 Epsilon = Annotated[float | None, _what(help="Interface width in working units; 0.02 (two voxels) by default.")]
 Seed = Annotated[int, _what(help="Seed of the noise that the shape grows from.")]
-Plan = Annotated[str, _how(help="fast (1000 steps) or paper (8000).")]
+Plan = Annotated[str, _how(help="fast (1500 steps), paper (8000) or cosine (1000).")]
 Steps = Annotated[int | None, _how(help="Number of steps, instead of the schedule's.")]
 Device = Annotated[str, _how(help="cpu, cuda, cuda:1 …")]
 Checkpoint = Annotated[Path | None, _how(help="File to save the run in; the run goes on from it if it exists.")]

@@ -159,7 +159,9 @@ def synthetic_scan(path: str | os.PathLike[str], *, edge: int = 96, seed: int = 
     """
     grid = Grid((edge, edge, edge))
     trabecular = preset("trabec")
-    flow = generate(trabecular.coefficients, trabecular.mass, grid, schedule=schedule("fast", steps=_STEPS), seed=seed)
+    flow = generate(
+        trabecular.coefficients, trabecular.mass, grid, schedule=schedule("cosine", steps=_STEPS), seed=seed
+    )
     if not flow.viability.viable:
         raise ValueError(f"expected a seed and size that make a shape, got {seed} and {edge}: {flow.viability.reason}")
     return save(Field(_ct_image(flow.field.numpy(), seed), (0.02, 0.02, 0.02), "mm", source="synthetic"), path)

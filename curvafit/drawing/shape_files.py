@@ -289,7 +289,7 @@ def shape_record(
         "epsilon": _stated(flow.epsilon),
         "boundary": flow.grid.boundary,
         "seed": flow.seed,
-        "schedule": dataclasses.asdict(flow.schedule),
+        "schedule": flow.schedule.as_dict(),
         "status": flow.status,
         "viable": flow.viability.viable,
         "volume_fraction": float(np.mean(flow.field.numpy() > 0)),

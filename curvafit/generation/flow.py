@@ -72,7 +72,7 @@ def generate(
         Share of voxels with u > 0, instead of a mass. Corrections of the mass approach the share while the flow runs,
         and a small constant makes it exact at the end; where that fails, `status` says so. `Flow.mass` is the mass.
     schedule
-        `"fast"`, `"paper"`, or a `Schedule`.
+        `"fast"`, `"paper"`, `"cosine"` (see `SCHEDULES`), or a `Schedule`.
     seed
         Seed of the start. The same seed, grid and number of threads make the same field, bit for bit.
     orientation

@@ -65,10 +65,11 @@ class Orders:
         check_memory(self.cost.grid.shape, FIELD * snapshots, f"a box with {snapshots} snapshots")
 
     def next_mark(self, steps: int) -> int:
-        """Return the number of steps after which the next record, snapshot or check is due."""
+        """Return the number of steps after which the next record, snapshot, check or phase of the plan is due."""
         regular = steps + RECORD_EVERY - steps % RECORD_EVERY
         checks = self.plan.checks if self.reject_early else ()
-        return min(mark for mark in (regular, self.plan.steps, *self.snapshots, *checks) if mark > steps)
+        marks = (regular, self.plan.steps, *self.plan.bounds, *self.snapshots, *checks)
+        return min(mark for mark in marks if mark > steps)
 
 
 def run(
@@ -89,7 +90,11 @@ def run(
 def _advance(stepper: Stepper, lanes: list[_Lane], orders: Sequence[Orders], checkpoint: Checkpoint | None) -> None:
     """Step until the plan ends or every lane has stopped."""
     plan, steps = orders[0].plan, _resume(stepper, lanes, checkpoint)
+    betas = plan.betas
     while True:
+        if steps < plan.steps and plan.betas_at(steps) != betas:
+            betas = plan.betas_at(steps)
+            stepper.set_betas(betas)
         last = steps == plan.steps or stepper.stalled
         stepper.step(None if last else plan.rate(steps))
         shifts = [lane.settle() for lane in lanes] if last else []

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from bisect import bisect_right
 from dataclasses import dataclass
-from typing import Literal
+from itertools import accumulate
+from typing import Any, Literal
 
-from curvafit.priors.bounds import inside, instance, named, real, whole
+from curvafit.priors.bounds import inside, instance, named, real, several, whole
 
 #: The most steps that a flow may have, and the longest one.
 MOST_STEPS, LONGEST_STEP = 10**7, 1e6
@@ -16,8 +18,37 @@ _PAPER_CHECKS = (500, 1000, 5000)
 
 
 @dataclass(frozen=True)
+class Phase:
+    """Lengths and decay rates of the steps at a schedule's beginning.
+
+    Parameters
+    ----------
+    share
+        Share of the schedule's steps, in (0, 1).
+    start, stop, shape, momentum, memory
+        As in `Schedule`.
+
+    Raises
+    ------
+    ValueError
+        If a number is out of range, or the shape has another name.
+    """
+
+    share: float
+    start: float
+    stop: float
+    shape: Literal["constant", "cosine"]
+    momentum: float = 0.9
+    memory: float = 0.999
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "share", inside(self.share, "a phase's share of the steps in (0, 1)", 0, 1))
+        _check_steps(self)
+
+
+@dataclass(frozen=True)
 class Schedule:
-    """The number of a flow's steps, and their lengths.
+    """The number of a flow's steps, their lengths, and Adam's decay rates.
 
     Parameters
     ----------
@@ -32,11 +63,13 @@ class Schedule:
     momentum, memory
         Adam's decay rates of the gradient and of the gradient's square. Long momentum smooths long steps; short memory
         forgets the steep noise of the start.
+    opening
+        Phases before the steps that the fields above describe, in order; these take the rest of the steps.
 
     Raises
     ------
     ValueError
-        If a number is out of range, or the shape has another name.
+        If a number is out of range, the shape has another name, or the phases' shares leave no rest.
     """
 
     name: str
@@ -46,17 +79,19 @@ class Schedule:
     shape: Literal["constant", "cosine"]
     momentum: float = 0.9
     memory: float = 0.999
+    opening: tuple[Phase, ...] = ()
 
     def __post_init__(self) -> None:
         instance(self.name, str, "a schedule's name as text")
         steps = whole(self.steps, "a whole number of steps, at least 1", 1, MOST_STEPS)
         object.__setattr__(self, "steps", steps)
-        for name in ("start", "stop"):
-            length = real(getattr(self, name), "positive step lengths", 1e-30, LONGEST_STEP)
-            object.__setattr__(self, name, length)
-        named(self.shape, ("constant", "cosine"), "a schedule's shape 'constant' or 'cosine'")
-        for name in ("momentum", "memory"):
-            object.__setattr__(self, name, inside(getattr(self, name), f"{name} in [0, 1)", -math.ulp(0), 1))
+        _check_steps(self)
+        parts = several(self.opening, "phases")
+        phases = tuple(Phase(**part) if isinstance(part, dict) else part for part in parts)
+        for phase in phases:
+            instance(phase, Phase, "an opening of phases as Phase")
+        object.__setattr__(self, "opening", phases)
+        inside(sum(phase.share for phase in self.opening), "phases with shares below 1 in all", -math.ulp(0), 1)
 
     def among(self, step: int) -> int:
         """Return a snapshot's number of steps.
@@ -70,15 +105,38 @@ class Schedule:
 
     def rate(self, step: int) -> float:
         """Return the length of a step, numbered from 0 to steps - 1."""
-        if self.shape == "constant" or self.steps == 1:
-            return self.start
-        phase = math.pi * step / (self.steps - 1)
-        return self.stop + (self.start - self.stop) * (1 + math.cos(phase)) / 2
+        phase, first, count = self._phase(step)
+        if phase.shape == "constant" or count == 1:
+            return phase.start
+        angle = math.pi * (step - first) / (count - 1)
+        return phase.stop + (phase.start - phase.stop) * (1 + math.cos(angle)) / 2
+
+    def betas_at(self, step: int) -> tuple[float, float]:
+        """Return Adam's decay rates at a step: momentum and memory."""
+        phase, _, _ = self._phase(step)
+        return phase.momentum, phase.memory
 
     @property
     def betas(self) -> tuple[float, float]:
-        """Adam's decay rates: momentum and memory."""
-        return self.momentum, self.memory
+        """Adam's decay rates at the first step: momentum and memory."""
+        return self.betas_at(0)
+
+    @property
+    def bounds(self) -> tuple[int, ...]:
+        """The numbers of steps after which a phase of the opening ends."""
+        return tuple(round(self.steps * share) for share in accumulate(phase.share for phase in self.opening))
+
+    def _phase(self, step: int) -> tuple[Phase | Schedule, int, int]:
+        """Return what describes a step: the phase, its first step, and its number of steps."""
+        place = bisect_right(self.bounds, step)
+        first, end = (0, *self.bounds)[place], (*self.bounds, self.steps)[place]
+        return (*self.opening, self)[place], first, end - first
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the fields in JSON's types, for records: `Schedule(**fields)` is the schedule again."""
+        fields = dataclasses.asdict(self)
+        opening = fields.pop("opening")
+        return fields | {"opening": list(opening)} if opening else fields
 
     @property
     def checks(self) -> tuple[int, ...]:
@@ -87,12 +145,31 @@ class Schedule:
         return tuple(mark for mark in marks if 0 < mark < self.steps)
 
 
-#: `paper` is the published schedule; `fast` makes similar textures in an eighth of the steps: `benchmarks.texture`
-#: compares the two for each preset.
+def _check_steps(phase: Phase | Schedule) -> None:
+    """Convert the numbers of a phase's steps; raise ValueError where one is out of range."""
+    for name in ("start", "stop"):
+        length = real(getattr(phase, name), "positive step lengths", 1e-30, LONGEST_STEP)
+        object.__setattr__(phase, name, length)
+    named(phase.shape, ("constant", "cosine"), "a schedule's shape 'constant' or 'cosine'")
+    for name in ("momentum", "memory"):
+        object.__setattr__(phase, name, inside(getattr(phase, name), f"{name} in [0, 1)", -math.ulp(0), 1))
+
+
+#: `paper` is the published schedule. `fast` ends where that ends, in under a fifth of its steps: the published steps
+#: while the topology forms, then longer ones with more momentum and less memory, which follow the same descent.
+#: `cosine` (`fast` in version 0.1) takes long steps at once and cools: sooner, and often to other ends of less energy.
+#: `benchmarks.texture` compares them for each preset.
 SCHEDULES: dict[str, Schedule] = {
     "paper": Schedule("paper", 8000, 1e-3, 1e-3, "constant"),
-    "fast": Schedule("fast", 1000, 2e-2, 1e-4, "cosine", momentum=0.97, memory=0.97),
-}
+    "fast": Schedule(
+        "fast", 1500, 1.5e-2, 1e-3, "cosine", momentum=0.97, memory=0.99,
+        opening=(
+            Phase(0.2, 1e-3, 1e-3, "constant"),
+            Phase(0.2, 1e-3, 1.5e-2, "cosine", momentum=0.97, memory=0.99),
+        ),
+    ),
+    "cosine": Schedule("cosine", 1000, 2e-2, 1e-4, "cosine", momentum=0.97, memory=0.97),
+}  # fmt: skip
 
 
 def schedule(name: str | Schedule, steps: int | None = None) -> Schedule:
@@ -107,3 +184,12 @@ def schedule(name: str | Schedule, steps: int | None = None) -> Schedule:
         named(name, SCHEDULES, f"a schedule among {', '.join(SCHEDULES)}")
         name = SCHEDULES[name]
     return name if steps is None else dataclasses.replace(name, steps=steps)
+
+
+def present_name(fields: dict[str, Any]) -> str:
+    """Return the name in `SCHEDULES` of a schedule's fields (`Schedule.as_dict`), whatever its name and number of steps
+    were when they were recorded; its own name where none is alike.
+    """
+    plan = Schedule(**fields)
+    alike = (dataclasses.replace(known, name=plan.name, steps=plan.steps) == plan for known in SCHEDULES.values())
+    return next((name for name, same in zip(SCHEDULES, alike, strict=True) if same), plan.name)

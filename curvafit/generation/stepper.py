@@ -74,6 +74,15 @@ class Stepper(Protocol):
             self.step(rate)
         return len(rates)
 
+    def set_betas(self, betas: tuple[float, float]) -> None:
+        """Set Adam's decay rates (momentum, memory) from the next step on.
+
+        By default those of the kernels' flow, which reads them in each step; graphs that were recorded hold the old.
+        """
+        flow = vars(self)["_flow"]
+        flow._betas = betas
+        getattr(flow, "_graphs", {}).clear()
+
     def state(self) -> dict[str, Any]:
         """Return tensors and numbers, in lists and dictionaries, that determine all later steps."""
         ...
@@ -144,6 +153,9 @@ class TorchStepper(Stepper):
             self._parameters.grad = self._slope
             self._optimiser.param_groups[0]["lr"] = rate
             self._optimiser.step()
+
+    def set_betas(self, betas: tuple[float, float]) -> None:
+        self._optimiser.param_groups[0]["betas"] = betas
 
     def statistics(self) -> Statistics:
         size = self._slope.abs()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -99,7 +98,7 @@ def settings_of(
     check_memory(grid.shape, FILE, "a shape")
     if design is not None:
         instance(design, Design, "a Design")
-    plan, law = dataclasses.asdict(named_schedule(schedule)), design or boxed()
+    plan, law = named_schedule(schedule).as_dict(), design or boxed()
     law.draw(seed, 0)  # refuses a wrong seed, before a store is made
     return Settings(grid.shape, grid.spacing, WORKING_EPSILON, WORKING_BLUR, law.as_dict(), seed_of(seed), plan)
 

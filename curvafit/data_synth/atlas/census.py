@@ -14,6 +14,7 @@ from curvafit.data_synth.atlas.design import Design
 from curvafit.data_synth.atlas.draws import flows, versions
 from curvafit.data_synth.atlas.record import Record
 from curvafit.data_synth.atlas.store import Store, open_store
+from curvafit.generation.schedule import present_name
 from curvafit.progress import Progress, silent
 
 
@@ -31,7 +32,6 @@ def census(store: Store) -> dict[str, str]:
     records = [store.record(index) for index in store.indices()]
     Design.from_dict(store.settings.design)
     settings, viable = store.settings, sum(record.viability.viable for record in records)
-    schedule = settings.schedule
     return {
         "shapes": str(viable),
         "wanted": str(store.wanted),
@@ -40,7 +40,7 @@ def census(store: Store) -> dict[str, str]:
         "epsilon": f"{settings.epsilon:g} (voxel edges {', '.join(f'{edge:g}' for edge in settings.spacing)})",
         "design": _named(settings.design),
         "seed": str(settings.seed),
-        "schedule": f"{schedule['name']}, {schedule['steps']} steps",
+        "schedule": _schedule(settings.schedule),
         "made with": "; ".join(f"{text} ({count})" for text, count in Counter(map(_made_with, records)).items()),
         "seconds a draw": f"{np.mean([record.seconds for record in records]):.2f}" if records else "none",
         "size": f"{_size(store.path) / 1e6:.1f} MB",
@@ -150,6 +150,12 @@ def _size(folder: Path) -> int:
 def _named(design: dict) -> str:
     points = len(design.get("points", ()))
     return f"{design['law']} of {points} points" if points else f"{design['law']} in {design['box']}"
+
+
+def _schedule(fields: dict) -> str:
+    """Return a schedule's name today, that in the record where it is another, and the number of steps."""
+    name, recorded = present_name(fields), fields["name"]
+    return f"{name}{f' (named {recorded} then)' * (name != recorded)}, {fields['steps']} steps"
 
 
 def _made_with(record: Record) -> str:

@@ -19,6 +19,7 @@ from curvafit.data_synth.imaging.modality import Modality
 from curvafit.data_synth.sets.moves import any_crop
 from curvafit.generation.flow import generate
 from curvafit.generation.fraction import first_mass
+from curvafit.generation.schedule import SCHEDULES, Schedule
 from curvafit.generation.schedule import schedule as named_schedule
 from curvafit.generation.viability import well_formed
 from curvafit.priors.bounds import several
@@ -32,6 +33,8 @@ from curvafit.volumes.formats.base import convert_length
 TRIES = 8
 #: Crops that are looked at for one with both structure and background.
 CROPS = 32
+#: Names of schedules in the records of version 0.1, which held no more of them, and the names today.
+_NAMES_0_1 = {"fast": "cosine", "paper": "paper"}
 #: The types of one law or one store.
 LAWS = tuple(get_origin(kind) or kind for kind in get_args(Law))
 
@@ -86,7 +89,7 @@ class Generated:
 
     points: tuple[tuple[float, ...], ...]
     names: tuple[str, ...]
-    schedule: str = "fast"
+    schedule: str | Schedule = "fast"
     fraction: float | None = None
 
     def __post_init__(self) -> None:
@@ -95,7 +98,7 @@ class Generated:
             raise ValueError(f"expected a name for each of {len(self.points)} points, got {len(self.names)}")
         if self.fraction is not None:
             first_mass(self.fraction)
-        named_schedule(self.schedule)
+        object.__setattr__(self, "schedule", named_schedule(self.schedule))
         object.__setattr__(self, "points", Design("list", points=self.points).points)
 
     @property
@@ -123,12 +126,12 @@ class Generated:
                     grid,
                     volume_fraction=self.fraction,
                     seed=seed,
-                    schedule=named_schedule(self.schedule),
+                    schedule=self.schedule,
                     reject_early=True,
                 )
             if well_formed(flow.viability):
                 point = dict(zip(PARAMETERS, (*six, flow.mass), strict=True))
-                grown = {"seed": seed, "schedule": self.schedule, "status": flow.status}
+                grown = {"seed": seed, "schedule": flow.schedule.as_dict(), "status": flow.status}
                 origin = {"name": self.names[turn], "parameters": point, **grown}
                 return PhaseField(flow.field.numpy(), WORKING_EPSILON / WORKING_SPACING, origin)
             status = flow.status
@@ -168,7 +171,7 @@ class Generated:
             "kind": "generated",
             "names": list(self.names),
             "points": [list(point) for point in self.points],
-            "schedule": self.schedule,
+            "schedule": named_schedule(self.schedule).as_dict(),
             "fraction": self.fraction,
         }
 
@@ -287,9 +290,9 @@ def source_of(content: dict[str, Any]) -> ShapeSource:
     """Return the source that `ShapeSource.as_dict` wrote."""
     if content["kind"] == "stored":
         return Stored(tuple(map(Path, content["paths"])), content["draws"], content["rotate"])
-    return Generated(
-        tuple(map(tuple, content["points"])), tuple(content["names"]), content["schedule"], content["fraction"]
-    )
+    plan = content["schedule"]
+    plan = SCHEDULES[_NAMES_0_1[plan]] if isinstance(plan, str) else Schedule(**plan)
+    return Generated(tuple(map(tuple, content["points"])), tuple(content["names"]), plan, content["fraction"])
 
 
 def voxel_of(laws: Iterable[Law], kind: Modality) -> float:
