@@ -1,8 +1,12 @@
 """The H⁻¹ flow on an NVIDIA device: time a step, against the bytes that must move and against the processor.
 
+    python -m benchmarks.gpu --all [-o gpu.json]
+    python -m benchmarks.gpu --table gpu.json
     python -m benchmarks.gpu [--sizes 64,100,200,300] [--tune 100]
 
-Needs a CUDA device and a torch that brings triton; without them it says so and exits with 2. The first use of a blur
+`--all` measures everything, writes a JSON to send, after each part, and prints it as a table; where it was stopped, it
+goes on. Needs a CUDA device and a torch that brings triton; without them it says so and exits with 2. `--table` prints
+such a JSON, and needs no device. The first use of a blur
 and a boundary compiles the kernels, which is timed apart. `--tune N` instead times a step at N³ for other divisions of
 the work.
 """
@@ -11,13 +15,16 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import json
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import torch
 
+from benchmarks.gpu_parts import Part, distances, machine, measure, table, textures, training, transfers
 from curvafit.generation.initial import white_noise
 from curvafit.generation.schedule import SCHEDULES
 from curvafit.generation.stepper import ADAM_EPS
@@ -145,6 +152,44 @@ def report(sizes: list[int]) -> None:
     print(f"greatest difference from the processor's u: {said}")
 
 
+def parts(sizes: list[int]) -> dict[str, Part]:
+    """What `--all` measures, by name."""
+
+    def steps() -> dict[str, float]:
+        return {f"{size}³ ms": 1e3 * step_seconds(flow(size)) for size in sizes}
+
+    def bytes_() -> dict[str, float]:
+        copied = bandwidth()
+        floors = {f"{size}³ floor ms": 1e3 * FLOOR * size**3 / copied for size in sizes}
+        return {"copy TB/s": copied / 1e12, "a step's bytes a voxel": sum(cuda.BYTES.values()), **floors}
+
+    def runs() -> dict[str, float]:
+        return {
+            "8000 of 100³ s (wanted 0.5)": run_seconds(100, 8000),
+            "2000 of 300³ s (wanted 3)": run_seconds(300, 2000),
+        }
+
+    def batch() -> dict[str, float]:
+        single, many = step_seconds(flow(SHAPE_SIZE)), step_seconds(flow(SHAPE_SIZE, SHAPES), 50)
+        return {"alone ms": 1e3 * single, "all ms": 1e3 * many, "times (wanted 20)": SHAPES * single / many}
+
+    def loop() -> dict[str, float]:
+        recorded = flow(100)
+        return transfers(lambda: recorded.run([1e-3] * 200), 200)
+
+    return {
+        "a step": steps,
+        "bytes": bytes_,
+        "whole runs": runs,
+        f"{SHAPES} shapes of {SHAPE_SIZE}³ at once": batch,
+        "the loop, copies and graphs": loop,
+        "greatest difference from the processor's u": lambda: {"of its deviation": disagreement()},
+        "textures of both devices": textures,
+        "the training loss, forward and backward, ms": training,
+        "distances of diagrams, a pair": distances,
+    }
+
+
 def breakdown(size: int, copied: float) -> None:
     """Each launch by itself; small ones find more in the cache than within a step."""
     moved = flow(size)
@@ -185,11 +230,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sizes", default="64,100,200,300")
     parser.add_argument("--tune", type=int, metavar="N")
+    parser.add_argument("--all", action="store_true", help="measure all parts, and write a JSON of them")
+    parser.add_argument("--table", type=Path, metavar="JSON", help="print the table of a JSON")
+    parser.add_argument("-o", "--output", type=Path, default=Path("gpu.json"), help="the JSON of --all")
     options = parser.parse_args()
+    if options.table:
+        print(table(json.loads(options.table.read_text(encoding="utf-8"))))
+        return
     if not cuda.available("cuda"):
         print("no GPU: this benchmark needs an NVIDIA device, and a torch that brings triton", file=sys.stderr)
         sys.exit(2)
-    if options.tune:
+    if options.all:
+        print(table(measure(options.output, machine(), parts([int(size) for size in options.sizes.split(",")]))))
+    elif options.tune:
         tune(options.tune)
     else:
         report([int(size) for size in options.sizes.split(",")])

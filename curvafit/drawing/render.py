@@ -283,7 +283,7 @@ def _first(field: np.ndarray, rays: _Rays, enter: np.ndarray, leave: np.ndarray,
         i, j = np.divmod(met, values.shape[1])
         meet((i + window[0].start) * rays.shape[1] + j + window[1].start, place, values.ravel()[met])
         before[window] = values
-    ends = np.flatnonzero(waiting)
+    ends = np.flatnonzero(waiting & (leave < len(field) - 1))
     look(ends, leave[ends])
     return depth
 
