@@ -43,7 +43,8 @@ from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
 
 DRAWS = 400
-MEMBERS = 3
+#: Flows of a posterior; in curve and ablation, which compare, a single one.
+MEMBERS = 4
 
 
 class Answers(NamedTuple):
@@ -101,6 +102,11 @@ def process(training: Table, queries: Table) -> Answers:
 
 def posterior(training: Table, queries: Table) -> Answers:
     return asked(train_posterior(training, members=MEMBERS), queries)
+
+
+def lone(training: Table, queries: Table) -> Answers:
+    """The posterior as one flow."""
+    return asked(train_posterior(training, members=1), queries)
 
 
 def asked(trained: Posterior, queries: Table) -> Answers:
@@ -220,7 +226,7 @@ def closure(table: Table, views: Sequence[str], folds: int, cache: Path) -> None
 
 
 def curve(table: Table, counts: Sequence[int], folds: int, cache: Path) -> None:
-    """R² by the number of training shapes, of the process and the posterior."""
+    """R² by the number of training shapes, of the process and of one flow."""
     for count in counts:
 
         def fewer(method: Method, count: int = count) -> Method:
@@ -231,8 +237,8 @@ def curve(table: Table, counts: Sequence[int], folds: int, cache: Path) -> None:
 
             return learn
 
-        for name in ("process", "posterior"):
-            answers = cross_answers(table, fewer(METHODS[name]), folds, cache, f"{name}-first{count}")
+        for name, method in (("process", process), ("flow", lone)):
+            answers = cross_answers(table, fewer(method), folds, cache, f"{name}-first{count}")
             for view in sorted(set(table.views.tolist())):
                 mine = table.views == view
                 values = r_squared(table.parameters[mine], answers.mean[mine])
@@ -240,7 +246,7 @@ def curve(table: Table, counts: Sequence[int], folds: int, cache: Path) -> None:
 
 
 def ablation(table: Table, folds: int, cache: Path) -> None:
-    """R² of the posterior from all blocks, without each, and from the curvature block with each alone."""
+    """R² of one flow from all blocks, without each, and from the curvature block with each alone."""
     every = tuple(BLOCKS)
     cases = {"all": every} | {f"no {name}": tuple(b for b in every if b != name) for name in every}
     cases["curvature"] = ("curvature",)
@@ -248,9 +254,9 @@ def ablation(table: Table, folds: int, cache: Path) -> None:
     for label, blocks in cases.items():
 
         def learn(training: Table, queries: Table, blocks: tuple[str, ...] = blocks) -> Answers:
-            return asked(train_posterior(training, Architecture(blocks=blocks), members=MEMBERS), queries)
+            return asked(train_posterior(training, Architecture(blocks=blocks), members=1), queries)
 
-        answers = cross_answers(table, learn, folds, cache, f"posterior-{label.replace(' ', '_')}")
+        answers = cross_answers(table, learn, folds, cache, f"flow-{label.replace(' ', '_')}")
         values = r_squared(table.parameters, answers.mean)
         print(f"  {label:16} " + " ".join(f"{v:6.2f}" for v in values) + f"   mean {values.mean():.3f}", flush=True)
 

@@ -42,7 +42,7 @@ class Architecture:
     hidden: tuple[int, ...] = (64, 64)
     transforms: int = 2
     bins: int = 8
-    dropout: float = 0.1
+    dropout: float = 0.2
     blocks: tuple[str, ...] = tuple(BLOCKS)
     kind: str = "nsf"
 
@@ -57,7 +57,7 @@ class Compression:
     basis: np.ndarray
 
     def __call__(self, descriptors: np.ndarray) -> np.ndarray:
-        """Return the components `(N, k)`, of about unit variance, of descriptors `(N, 351)`."""
+        """Return the components `(N, k)`, their mean square 1, of descriptors `(N, 351)`."""
         columns = straightened(descriptors, self.blocks)
         return np.clip((columns - self.mean) / self.scale, -FURTHEST, FURTHEST) @ self.basis.T
 
