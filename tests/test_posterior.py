@@ -106,10 +106,38 @@ def test_a_file_holds_it(posterior: Posterior, tmp_path: Path) -> None:
         load_posterior(tmp_path / "nowhere.npz")
 
 
-def test_components_are_uncorrelated_and_of_unit_variance() -> None:
+@pytest.mark.parametrize("name", ["mean", "basis", "box", "0.flow.transform.transforms.0.hyper.0.weight"])
+def test_a_file_with_arrays_of_other_shapes_is_refused(posterior: Posterior, tmp_path: Path, name: str) -> None:
+    path = tmp_path / "posterior.npz"
+    save_posterior(posterior, path)
+    arrays = dict(np.load(path))
+    arrays[name] = arrays[name][:-1]
+    np.savez(path, **arrays)
+    with pytest.raises(ValueError, match="expected a whole posterior, got"):
+        load_posterior(path)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "words"),
+    [
+        ({"components": 0}, "whole numbers"),
+        ({"hidden": (10**9,)}, "whole numbers"),
+        ({"dropout": 1.5}, "a dropout"),
+        ({"blocks": ("ghost",)}, "expected blocks among"),
+    ],
+)
+def test_an_architecture_has_bounds(sizes: dict, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        Architecture(**sizes)
+
+
+def test_components_are_uncorrelated_and_the_first_are_the_largest() -> None:
     rows = np.random.default_rng(0).random((300, sum(BLOCKS.values()))) + 0.5
     components = compression_of(rows, SMALL)(rows)
-    assert np.cov(components.T) == pytest.approx(np.eye(SMALL.components), abs=0.02)
+    variance = components.var(0)
+    assert variance.mean() == pytest.approx(1, abs=0.02)
+    assert (np.diff(variance) < 0).all()
+    assert np.corrcoef(components.T) == pytest.approx(np.eye(SMALL.components), abs=0.02)
 
 
 def test_blocks_are_chosen_by_name() -> None:

@@ -199,7 +199,7 @@ def train_atlas(
     table: Annotated[Path, typer.Argument(help="A table made by `curvafit atlas describe`.")],
     out: Annotated[Path, typer.Option("-o", "--output", help="The posterior (.npz) to write.")],
     views: Annotated[str | None, typer.Option(help="Views to learn from, between commas; by default all.")] = None,
-    members: Annotated[int, typer.Option(help="Number of flows, whose equal mixture the posterior is.")] = 3,
+    members: Annotated[int, typer.Option(help="Number of flows, whose equal mixture the posterior is.")] = 4,
     seed: Annotated[int, typer.Option(help="Seed of the training.")] = 0,
     overwrite: OverwriteOption = False,
 ) -> None:

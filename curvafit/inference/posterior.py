@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from curvafit.files import write_content
 from curvafit.geometry.descriptors import BLOCKS, Descriptors
 from curvafit.inference.table import PARAMETERS, column_names
-from curvafit.priors.bounds import quoted
+from curvafit.priors.bounds import quoted, real, whole
 from curvafit.priors.json_text import parse_json
 from curvafit.volumes.formats import read_archive
 
@@ -30,21 +30,36 @@ LEAST = 1e-3
 BENDS, EULERS = 50.0, 100.0
 #: Furthest that a column may lie from its mean, in its deviations.
 FURTHEST = 6.0
+#: Largest size of a flow, and most flows of an ensemble.
+WIDEST, MOST = 2048, 64
 #: Part by which the box of the parameters is wider, on each side, than what was drawn.
 RIM = 0.02
 
 
 @dataclass(frozen=True)
 class Architecture:
-    """A flow's sizes: spline bins, transforms, widths of the hidden layers, and components of the descriptors."""
+    """Sizes of a flow of splines: principal components of the descriptors that it sees, widths of its hidden layers,
+    transforms, bins of a spline, part of the components that training leaves out at random, and blocks of descriptors.
+
+    Raises
+    ------
+    ValueError
+        If a size is not a whole number from 1 to `WIDEST`, or a block has another name.
+    """
 
     components: int = 32
     hidden: tuple[int, ...] = (64, 64)
     transforms: int = 2
     bins: int = 8
-    dropout: float = 0.1
+    dropout: float = 0.2
     blocks: tuple[str, ...] = tuple(BLOCKS)
-    kind: str = "nsf"
+
+    def __post_init__(self) -> None:
+        for size in (self.components, *self.hidden, self.transforms, self.bins):
+            whole(size, "sizes of a flow that are whole numbers", 1, WIDEST)
+        real(self.dropout, "a dropout", 0.0, 0.9)
+        if not self.blocks or not set(self.blocks) <= set(BLOCKS):
+            raise ValueError(f"expected blocks among {', '.join(BLOCKS)}, got {quoted(list(self.blocks))}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +72,7 @@ class Compression:
     basis: np.ndarray
 
     def __call__(self, descriptors: np.ndarray) -> np.ndarray:
-        """Return the components `(N, k)`, of about unit variance, of descriptors `(N, 351)`."""
+        """Return the components `(N, k)`, their mean square 1, of descriptors `(N, 351)`."""
         columns = straightened(descriptors, self.blocks)
         return np.clip((columns - self.mean) / self.scale, -FURTHEST, FURTHEST) @ self.basis.T
 
@@ -68,11 +83,10 @@ class Member(nn.Module):
     def __init__(self, architecture: Architecture, views: int) -> None:
         super().__init__()
         context = architecture.components + views
-        options: dict[str, Any] = {"transforms": architecture.transforms, "hidden_features": architecture.hidden}
-        if architecture.kind == "nsf":
-            self.flow = zuko.flows.NSF(len(PARAMETERS), context, bins=architecture.bins, **options)
-        else:
-            self.flow = zuko.flows.MAF(len(PARAMETERS), context, **options)
+        sizes, splines = architecture.hidden, architecture.transforms
+        self.flow = zuko.flows.NSF(
+            len(PARAMETERS), context, bins=architecture.bins, transforms=splines, hidden_features=sizes
+        )
         self.dropout = nn.Dropout(architecture.dropout)
 
     def forward(self, context: Tensor) -> torch.distributions.Distribution:
@@ -245,9 +259,16 @@ def _assembled(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Posteri
         raise ValueError("numbers that are not finite")
     sizes = header["architecture"]
     architecture = Architecture(**sizes | {name: tuple(sizes[name]) for name in ("hidden", "blocks")})
+    columns = int(np.isin(column_names(), architecture.blocks).sum())
+    expected = {"mean": (columns,), "scale": (columns,), "basis": (architecture.components, columns)}
+    expected |= {"box": (len(PARAMETERS), 2), "centre": (len(PARAMETERS),), "spread": (len(PARAMETERS),)}
+    for name, shape in expected.items():
+        if arrays[name].shape != shape:
+            raise ValueError(f"{name} of shape {arrays[name].shape}, not {shape}")
+    views = tuple(str(view) for view in header["views"])
     members = []
-    for number in range(header["members"]):
-        member = Member(architecture, len(header["views"])).eval()
+    for number in range(whole(header["members"], "a number of flows", 1, MOST)):
+        member = Member(architecture, len(views)).eval()
         prefix = f"{number}."
         state = {k.removeprefix(prefix): torch.from_numpy(v) for k, v in arrays.items() if k.startswith(prefix)}
         member.load_state_dict(state)
@@ -257,7 +278,7 @@ def _assembled(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Posteri
         architecture,
         tuple(members),
         compression,
-        tuple(header["views"]),
+        views,
         arrays["box"],
         arrays["centre"],
         arrays["spread"],
