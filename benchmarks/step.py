@@ -12,12 +12,16 @@ start's making to the end of the first step.
 from __future__ import annotations
 
 import argparse
+import platform
+import re
 import time
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
+import llvmlite.binding as llvm
 import numba
 import numpy as np
 import torch
@@ -28,6 +32,7 @@ from curvafit.generation.schedule import SCHEDULES
 from curvafit.generation.stepper import ADAM_EPS, TorchStepper
 from curvafit.priors.coefficients import preset
 from curvafit.priors.grid import WORKING_EPSILON, Grid
+from curvafit.priors.kernels import loops
 from curvafit.priors.kernels.cpu import FusedFlow
 
 BLUR = 0.02
@@ -132,6 +137,20 @@ def compare(size: int, rounds: int) -> Comparison:
     )
 
 
+def processor() -> str:
+    """The processor and its caches, and what numba compiles for where that is another."""
+    try:
+        name = re.search(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text())
+        named = name.group(1) if name else platform.machine()
+        folders = sorted(Path("/sys/devices/system/cpu/cpu0/cache").glob("index*"))
+        caches = [f"L{(f / 'level').read_text().strip()} {(f / 'size').read_text().strip()}" for f in folders]
+    except OSError:
+        named, caches = platform.processor() or platform.machine(), []
+    given = getattr(numba.config, "CPU_NAME", None)
+    target = f"compiled for {given or llvm.get_host_cpu_name()}, {8 if loops.WIDE == 8 else 16} floats a vector"
+    return ", ".join([named, *caches, target])
+
+
 def _times(action: Callable[[], object], count: int) -> list[float]:
     seconds = []
     for _ in range(count):
@@ -178,7 +197,7 @@ def main() -> None:
     if options.threads:
         numba.set_num_threads(options.threads)
         torch.set_num_threads(options.threads)
-    print(f"{numba.get_num_threads()} threads")
+    print(f"{processor()}; {numba.get_num_threads()} threads")
     for size in options.sizes.split(","):
         _report(int(size), options.rounds)
 

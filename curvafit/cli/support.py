@@ -227,9 +227,13 @@ def stages() -> Iterator[Callable[[str, float], None]]:
 @contextmanager
 def flow_progress(steps: int) -> Iterator[Callable[..., None]]:
     """Show a progress bar that is a flow's callback."""
-    columns = TextColumn("growing"), BarColumn(), TextColumn("{task.completed:.0f} of {task.total:.0f} steps")
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed:.0f} of {task.total:.0f} steps"),
+    )
     console = error_console()
     quiet = not console.is_terminal
     with Progress(*columns, TimeRemainingColumn(), console=console, transient=True, disable=quiet) as bar:
-        task = bar.add_task("growing", total=steps)
-        yield lambda step, total, state: bar.update(task, completed=step)
+        task = bar.add_task("starting (a first run compiles the kernels for this processor)", total=steps)
+        yield lambda step, total, state: bar.update(task, completed=step, description="growing")

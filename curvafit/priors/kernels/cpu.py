@@ -10,11 +10,12 @@ import math
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import as_strided
 
 from curvafit.priors.curvature import ROOT_FLOOR, ROOT_ROUNDING, XI
 from curvafit.priors.grid import Grid
 from curvafit.priors.kernels import loops
-from curvafit.priors.kernels.loops import EDGE, NARROW, SLACK, TAPS, TOGETHER, WIDE
+from curvafit.priors.kernels.loops import ALL, EDGE, ENDS, MOVE, SLACK, TAPS, TOGETHER, WIDE
 from curvafit.priors.kernels.threads import allowed, limited
 from curvafit.priors.stencils import gaussian_taps
 
@@ -110,10 +111,10 @@ class FusedFlow:
             self._keep[SLACK:-SLACK] = 1 - np.asarray(frozen, np.float32).ravel()
             self._free = 3 * int(np.count_nonzero(self._keep))
         self._between, self._field, self._gradient = _volume(grid), _volume(grid), _volume(grid)
-        self._sums, self._highest = np.empty(Z), np.empty(Z)
+        self._sums, self._highest = np.empty(Z), np.empty(Z, np.int32)
         self._index_z = _continuation(Z, EDGE, EDGE, grid.periodic)
-        rows, ring = self._blur.work.shape[1], 3 * _plane(grid) + loops.ROWS * X + 8 * SLACK
-        self._works = _scratch(threads, rows + ring + Y * X + SLACK)
+        sizes = 3 * _plane(grid) + 2 * SLACK, loops.ROWS * X + SLACK, Y * X + SLACK
+        self._rings, self._slopes, self._fluxes = (_scratch(threads, size) for size in sizes)
 
     @property
     def field(self) -> np.ndarray:
@@ -157,7 +158,7 @@ class FusedFlow:
 
     def blur_divergence(self) -> None:
         """Compute div A blurred along y and x, before the first step."""
-        self._adam_step(False, np.zeros(6, np.float32))
+        self._adam_step(ALL, np.zeros(6, np.float32))
 
     def blur_along_z(self) -> None:
         """Blur along z and add the base, the first part of a step."""
@@ -179,28 +180,33 @@ class FusedFlow:
         self.taken, self._ahead = self.taken + 1, True
         β1, β2 = self._betas
         length, spread = rate / (1 - β1**self.taken), 1 / math.sqrt(1 - β2**self.taken)
-        self._adam_step(True, np.array([1 - β1, β2, 1 - β2, length, spread, self._adam_eps], np.float32))
-        return float(self._highest.max()), float(self._sums.sum()) / max(1, self._free)
+        adam = np.array([1 - β1, β2, 1 - β2, length, spread, self._adam_eps], np.float32)
+        self._adam_step(MOVE, adam)
+        self._adam_step(ENDS, adam)
+        return float(self._highest.max().view(np.float32)), float(self._sums.sum()) / max(1, self._free)
 
-    def _adam_step(self, moves: bool, adam: np.ndarray) -> None:
+    def _adam_step(self, phase: int, adam: np.ndarray) -> None:
         with limited(self._threads):
             loops.adam_step(
-                moves,
+                phase,
                 self._between,
                 self._vector,
                 self._first,
                 self._second,
                 self._keep,
                 self._gradient,
-                self._works,
+                self._blur.rows,
+                self._rings,
+                self._slopes,
+                self._fluxes,
                 self._sums,
                 self._highest,
                 self._half,
                 adam,
-                *self.grid.shape,
+                self.grid.shape,
                 self.grid.periodic,
                 self._index_z,
-                *self._blur.planes,
+                self._blur.planes,
             )
 
 
@@ -212,7 +218,7 @@ class _Blur:
         Z, Y, X = grid.shape
         periodic = grid.periodic
         self._grid, self._threads = grid, threads
-        self._index, self._taps = _continuation(Z, rz, len(z) + TOGETHER, periodic), np.pad(z, TOGETHER - 1)
+        self._index, self._taps = _continuation(Z, rz, len(z) + TOGETHER, periodic), z
         #: Index and weights along y, along x, which samples continue a row at its ends, and the radius along x.
         self.planes = (
             _continuation(Y, ry + EDGE, len(y) + EDGE + TOGETHER, periodic),
@@ -222,7 +228,7 @@ class _Blur:
             _continuation(X, EDGE, EDGE, periodic)[[0, 1, X + EDGE, X + EDGE + 1]],
             rx,
         )
-        self.work = _scratch(threads, 2 * TOGETHER * (X + len(x) + WIDE + NARROW) + SLACK)
+        self.rows = _scratch(threads, 2 * TOGETHER * loops.row_length(X, len(x)) + SLACK)
 
     def along_z(self, source: np.ndarray, out: np.ndarray, shift: float, base: np.ndarray) -> None:
         """Blur along z, and add a number and, where it is not empty, a field."""
@@ -233,7 +239,7 @@ class _Blur:
     def in_planes(self, source: np.ndarray, out: np.ndarray) -> None:
         """Blur along y and x."""
         with limited(self._threads):
-            loops.blur_in_planes(source, out, self.work, *self._grid.shape, *self.planes)
+            loops.blur_in_planes(source, out, self.rows, self._grid.shape, self.planes)
 
 
 class _Density:
@@ -290,7 +296,7 @@ _NO_FIELD = np.empty(0, np.float32)
 
 def _threads(grid: Grid) -> int:
     """How many threads a grid is worth, of those allowed."""
-    return max(1, min(allowed(), math.prod(grid.shape) // _WORTH))
+    return max(1, min(allowed(), math.prod(grid.shape) // _WORTH, grid.shape[0] // TOGETHER))
 
 
 def _flat(size: int) -> np.ndarray:
@@ -312,25 +318,31 @@ def _zeros(size: int) -> np.ndarray:
 
 def _plane(grid: Grid) -> int:
     _, Y, X = grid.shape
-    return (Y + 2 * EDGE) * (X + 2 * EDGE)
+    return loops.pitch(Y, X)
 
 
 def _volume(grid: Grid) -> np.ndarray:
-    return _flat(grid.shape[0] * _plane(grid))
+    """Room for the grid's planes, or for as many as a blur along z makes at once."""
+    return _flat(max(grid.shape[0], TOGETHER) * _plane(grid))
+
+
+def _whole(volume: np.ndarray, grid: Grid) -> np.ndarray:
+    """The field and its continuation in planes, a view."""
+    Z, Y, X = grid.shape
+    rows = (X + 2 * EDGE) * 4
+    return as_strided(volume[SLACK:], (Z, Y + 2 * EDGE, X + 2 * EDGE), (_plane(grid) * 4, rows, 4))
 
 
 def _inner(volume: np.ndarray, grid: Grid) -> np.ndarray:
-    Z, Y, X = grid.shape
-    return volume[SLACK:-SLACK].reshape(Z, Y + 2 * EDGE, X + 2 * EDGE)[:, EDGE:-EDGE, EDGE:-EDGE]
+    return _whole(volume, grid)[:, EDGE:-EDGE, EDGE:-EDGE]
 
 
 def _padded(u: np.ndarray, grid: Grid) -> np.ndarray:
     if u.shape != grid.shape:
         raise ValueError(f"expected a field of shape {grid.shape}, got {u.shape}")
     volume = _volume(grid)
-    Z, Y, X = grid.shape
-    whole = volume[SLACK:-SLACK].reshape(Z, Y + 2 * EDGE, X + 2 * EDGE)
-    y, x = (EDGE + _continuation(n, EDGE, EDGE, grid.periodic) for n in (Y, X))
+    whole = _whole(volume, grid)
+    y, x = (EDGE + _continuation(n, EDGE, EDGE, grid.periodic) for n in grid.shape[1:])
     whole[:, EDGE:-EDGE, EDGE:-EDGE] = u
     for k in (0, 1, -2, -1):
         whole[:, :, k] = whole[:, :, x[k]]
