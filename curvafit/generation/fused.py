@@ -46,6 +46,9 @@ class FusedStepper(Stepper):
     def step(self, rate: float | None) -> None:
         self._statistics = Statistics(self._flow.evaluate(), *self._flow.update(rate or 0.0))
 
+    def set_betas(self, betas: tuple[float, float]) -> None:
+        self._flow.betas = betas
+
     def statistics(self) -> Statistics:
         return self._statistics
 
@@ -116,6 +119,9 @@ class CudaStepper(Stepper):
     def run(self, rates: Sequence[float]) -> int:
         self._flow.run(rates)
         return len(rates)
+
+    def set_betas(self, betas: tuple[float, float]) -> None:
+        self._flow.betas = betas
 
     def statistics(self) -> list[Statistics]:
         """Return the statistics of each shape before the last `step` moved it."""

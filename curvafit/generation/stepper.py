@@ -75,13 +75,8 @@ class Stepper(Protocol):
         return len(rates)
 
     def set_betas(self, betas: tuple[float, float]) -> None:
-        """Set Adam's decay rates (momentum, memory) from the next step on.
-
-        By default those of the kernels' flow, which reads them in each step; graphs that were recorded hold the old.
-        """
-        flow = vars(self)["_flow"]
-        flow._betas = betas
-        getattr(flow, "_graphs", {}).clear()
+        """Set Adam's decay rates (momentum, memory) from the next step on."""
+        ...
 
     def state(self) -> dict[str, Any]:
         """Return tensors and numbers, in lists and dictionaries, that determine all later steps."""

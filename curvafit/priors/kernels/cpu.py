@@ -94,7 +94,9 @@ class FusedFlow:
     ) -> None:
         Z, Y, X = grid.shape
         self.grid, self.taken = grid, 0
-        self._betas, self._adam_eps = betas, adam_eps
+        self._adam_eps = adam_eps
+        #: Adam's decay rates, which may change between steps.
+        self.betas = betas
         self._threads = threads = _threads(grid)
         size = 3 * Z * Y * X
         self._vector, self._first, self._second = (_flat(size) for _ in range(3))
@@ -178,7 +180,7 @@ class FusedFlow:
         The next step's div A, blurred along y and x, takes the gradient's place.
         """
         self.taken, self._ahead = self.taken + 1, True
-        β1, β2 = self._betas
+        β1, β2 = self.betas
         length, spread = rate / (1 - β1**self.taken), 1 / math.sqrt(1 - β2**self.taken)
         adam = np.array([1 - β1, β2, 1 - β2, length, spread, self._adam_eps], np.float32)
         self._adam_step(MOVE, adam)

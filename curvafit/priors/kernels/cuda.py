@@ -199,7 +199,9 @@ class CudaFlow:
         batch = len(start) if start.dim() == 5 else 1
         self.grid, self.taken = grid, 0
         self._layout = layout = _Layout(grid, batch, torch.device(device), tuning or Tuning())
-        self._betas, self._adam_eps, self._taps = betas, adam_eps, _Taps(grid, width)
+        self._adam_eps, self._taps = adam_eps, _Taps(grid, width)
+        #: Adam's decay rates, which may change between steps; a graph holds those that it was recorded with.
+        self.betas = betas
         self._vector = layout.empty(3)
         self._vector.copy_(start.detach().reshape(-1, 3, *grid.shape))
         self._first, self._second = torch.zeros_like(self._vector), torch.zeros_like(self._vector)
@@ -219,7 +221,7 @@ class CudaFlow:
         self._row = torch.zeros(1, dtype=torch.int32, device=device)
         columns, _ = layout.columns(layout.width, layout.tuning.last_rows)
         self._highest, self._sums = (layout.figures(columns) for _ in range(2))
-        self._graphs: dict[tuple[int, bool, bool], Callable[[], None]] = {}
+        self._graphs: dict[tuple[int, bool, bool, tuple[float, float]], Callable[[], None]] = {}
 
     @property
     def field(self) -> Tensor:
@@ -236,7 +238,7 @@ class CudaFlow:
         rates = [float(rate) for rate in rates]
         for begin in range(0, len(rates), _TABLE):
             part = rates[begin : begin + _TABLE]
-            self._table[: len(part)].copy_(_lengths(part, self.taken, self._betas))
+            self._table[: len(part)].copy_(_lengths(part, self.taken, self.betas))
             self._row.zero_()
             done = 0
             while done < len(part):
@@ -300,7 +302,7 @@ class CudaFlow:
         )
 
     def _update(self, move: bool, observe: bool) -> Launch:
-        layout, (β1, β2) = self._layout, self._betas
+        layout, (β1, β2) = self._layout, self.betas
         arguments = {
             "g": self._scratch.smooth,
             "A": self._vector,
@@ -334,14 +336,15 @@ class CudaFlow:
 
     def _replay(self, count: int, move: bool, observe: bool) -> None:
         """Make `count` steps, of which the last observes: recorded once, and the first time launched one by one."""
-        key = (count, move, observe)
+        key = (count, move, observe, self.betas)
         with self._layout.selected():
             if key in self._graphs:
                 self._graphs[key]()
                 return
-            self._eagerly(*key)
+            steps = functools.partial(self._eagerly, count, move, observe)
+            steps()
             if self._layout.device.type == "cuda":
-                self._graphs[key] = _recorded(functools.partial(self._eagerly, *key))
+                self._graphs[key] = _recorded(steps)
 
     def _eagerly(self, count: int, move: bool, observe: bool) -> None:
         for step in range(count):
