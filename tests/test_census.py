@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 
@@ -9,7 +10,7 @@ import pytest
 
 from curvafit.data_synth import build, extend
 from curvafit.data_synth.atlas.census import census, verify
-from curvafit.data_synth.atlas.store import open_store
+from curvafit.data_synth.atlas.store import Store, open_store
 from curvafit.generation.schedule import schedule
 
 QUICK = schedule("cosine", steps=40)
@@ -44,6 +45,14 @@ def test_nothing_is_wrong_with_a_sound_store(path):
     assert found.status.endswith("2 made again: nothing is wrong")
     told = census(open_store(path))
     assert (told["shapes"], told["wanted"], told["voxels"]) == ("4", "4", "16 x 16 x 16")
+    assert told["schedule"] == "cosine, 40 steps"
+
+
+def test_a_census_names_schedules_as_they_are_named_today(path):
+    """Version 0.1 called `fast` what is `cosine` now."""
+    settings = open_store(path).settings
+    old = dataclasses.replace(settings, schedule=settings.schedule | {"name": "fast"})
+    assert census(Store(path, old))["schedule"] == "cosine (named fast then), 40 steps"
 
 
 def test_an_extended_store_is_as_if_built_at_once(path, tmp_path):
