@@ -1,6 +1,7 @@
 """The program `curvafit`, or `python -m curvafit`, which listens to signals before its long imports."""
 
 import gc
+import os
 import warnings
 
 from curvafit.interrupts import exit_code, leave, listen
@@ -9,6 +10,8 @@ from curvafit.interrupts import exit_code, leave, listen
 def main() -> None:
     """Run the program."""
     gc.set_threshold(100_000)  # what imports make stays: to look through it for garbage takes a fifth of the start
+    # Threads that wait for the others of a loop sleep: where two runs share the cores, spinning holds the others up.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     # A signal leaves coroutines of Zarr that were about to read: no matter for a user.
     warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)
     try:
