@@ -25,6 +25,7 @@ import llvmlite.binding as llvm
 import numba
 import numpy as np
 import torch
+from numba.core import config
 
 from curvafit.generation.initial import white_noise
 from curvafit.generation.parametrization import DivergenceForm
@@ -146,7 +147,7 @@ def processor() -> str:
         caches = [f"L{(f / 'level').read_text().strip()} {(f / 'size').read_text().strip()}" for f in folders]
     except OSError:
         named, caches = platform.processor() or platform.machine(), []
-    given = getattr(numba.config, "CPU_NAME", None)
+    given = getattr(config, "CPU_NAME", None)
     target = f"compiled for {given or llvm.get_host_cpu_name()}, {8 if loops.WIDE == 8 else 16} floats a vector"
     return ", ".join([named, *caches, target])
 

@@ -38,9 +38,10 @@ from numba.extending import intrinsic, models, register_model
 
 #: All of fast-math but the leave to assume that no value is NaN or infinite: a diverged flow must show.
 _FLAGS = {"contract", "arcp", "nsz", "afn"}
-_SERIAL = {"cache": True, "fastmath": _FLAGS, "error_model": "numpy", "nogil": True}
-_INLINE = {"fastmath": _FLAGS, "error_model": "numpy", "nogil": True, "forceinline": True}
-_PARALLEL = {**_SERIAL, "parallel": True}
+_SERIAL: dict[str, Any] = {"cache": True, "fastmath": _FLAGS, "error_model": "numpy", "nogil": True}
+_INLINE: dict[str, Any] = {"fastmath": _FLAGS, "error_model": "numpy", "nogil": True, "forceinline": True}
+_SUMMING: dict[str, Any] = {**_INLINE, "fastmath": _FLAGS | {"reassoc"}}
+_PARALLEL: dict[str, Any] = {**_SERIAL, "parallel": True}
 
 
 def _features() -> str:
@@ -660,7 +661,7 @@ def _divergence_plane(A, flux, half, z, shape, periodic):
         flux[_at(row + X - 1)] += fx * (odd * A[_at(o + right)] - A[_at(o + X)])
 
 
-@njit(**{**_INLINE, "fastmath": _FLAGS | {"reassoc"}})
+@njit(**_SUMMING)
 def _sizes(slopes, n):
     """Sum and maximum of the moduli of n slopes; the maximum by their bits, which are in order and keep a NaN."""
     bits = slopes.view(np.int32)
