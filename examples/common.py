@@ -70,7 +70,7 @@ def grown(
     told = {"seed": options.seed} | more
     grid, plan = Grid((options.edge,) * 3), plan_of(options)
     stated = {name: value.tolist() if hasattr(value, "tolist") else value for name, value in told.items()}
-    about = {"a": coefficients.as_dict(), "mass": mass, "grid": grid.shape, "plan": vars(plan), **stated}
+    about = {"a": coefficients.as_dict(), "mass": mass, "grid": grid.shape, "plan": plan.as_dict(), **stated}
     return kept(
         path, about, lambda: generate(coefficients, mass, grid, schedule=plan, device=options.device, **told), keep
     )
