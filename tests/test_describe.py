@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 from curvafit.atlas_map.describe import describe
 from curvafit.atlas_map.views import BLUR, SNR, VIEWS, View
 from curvafit.cli.app import app
+from curvafit.data_synth.atlas.workers import cluster
 from curvafit.geometry.descriptors import BLOCKS, descriptors
 from curvafit.geometry.mesh import NoSurface
 from curvafit.inference.table import PARAMETERS, Table, column_names, law_of, load_table, parameters_of, save_table
@@ -102,6 +103,18 @@ def test_a_stopped_table_goes_on_and_grows(tmp_path: Path, monkeypatch: pytest.M
     grown = describe([store.path], tmp_path / "table.npz", ("crop",))
     assert grown.views.tolist() == whole.views.tolist() + ["crop"] * 5
     assert np.array_equal(grown.descriptors[: len(whole)], whole.descriptors)
+
+
+@pytest.mark.slow
+def test_workers_measure_the_same(tmp_path: Path) -> None:
+    store = exact_store(tmp_path / "store.zarr", 6)
+    alone = describe([store.path], tmp_path / "alone.npz", ("mask", "crop"))
+    with cluster(2) as workers:
+        table = describe([store.path], tmp_path / "table.npz", ("mask", "crop"), workers=workers)
+    order, other = (np.lexsort((each.views, each.shapes)) for each in (table, alone))
+    assert np.array_equal(table.shapes[order], alone.shapes[other])
+    expected = alone.descriptors[other]  # a worker has one thread, which sums in another order
+    assert table.descriptors[order] == pytest.approx(expected, rel=1e-3, abs=1e-3, nan_ok=True)
 
 
 def test_a_view_without_a_surface_is_a_row_without_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -51,7 +51,7 @@ class Architecture:
     hidden: tuple[int, ...] = (64, 64)
     transforms: int = 2
     bins: int = 8
-    dropout: float = 0.2
+    dropout: float = 0.1
     blocks: tuple[str, ...] = tuple(BLOCKS)
 
     def __post_init__(self) -> None:
