@@ -53,7 +53,7 @@ def changes(before: dict[str, str], after: dict[str, str]) -> dict[str, list[str
 _ABSENT = "not imported"
 #: Libraries that set warning filters and names in the environment where they are imported: a program has them already.
 #: Not JAX, whose import is known to draw random numbers; the names that it sets are these. Zarr's threads stay its own.
-_LIBRARIES = ("numba", "scipy.sparse", "scipy.special", "zarr", "torch._dynamo")
+_LIBRARIES = ("numba", "scipy.sparse", "scipy.special", "zarr", "nibabel", "torch._dynamo")
 _OF_ZARR = "zarr_io", "asyncio_"
 _OF_JAX = ("TF_CPP_MIN_LOG_LEVEL", "TPU_SKIP_MDS_QUERY")
 

@@ -60,7 +60,7 @@ def test_without_a_command_help_is_shown(group: list[str]) -> None:
         ([*LAW, "--spacing", "1e300"], "expected a positive voxel edge, at most 1e+12, got 1e+300"),
         ([*LAW, "--spacing", "1e-300"], "expected a positive voxel edge, at least 1e-12"),
         ([*LAW, "--orientation", "0,0,1,1e30"], "expected |the orientation| epsilon² of at most 1e+06"),
-        ([*LAW, "--snapshots", "1e300"], "expected snapshots at 0 to 1000 steps"),
+        ([*LAW, "--snapshots", "1e300"], "expected snapshots at 0 to 1500 steps"),
         ([*LAW, "--checkpoint", "c.pt", "--checkpoint-every", "nan"], "expected a finite number of seconds"),
         ([*LAW[:2], "--volume-fraction", "nan"], "expected a volume fraction in (0, 1), got nan"),
         ([*LAW, "--checkpoint-every", "5"], "expected --checkpoint beside --checkpoint-every"),

@@ -163,7 +163,7 @@ def descend(
     flow: Literal["l2", "mass", "h-1"] = "l2",
     optimiser: Literal["lbfgs", "adam"] = "lbfgs",
     steps: int = 200,
-    schedule: str | Schedule = "fast",
+    schedule: str | Schedule = "cosine",
     epsilon: float | Tensor = WORKING_EPSILON,
     blur: float | None = None,
     orientation: Float[Tensor, "3 3"] | None = None,
