@@ -34,8 +34,7 @@ def train_posterior(
     """Fit an ensemble of flows to the parameters of a table's rows.
 
     Of 423 shapes left out in fifths, seen as masks, it reads R² .66 on average: one flow .64, four with twice the
-    dropout .65 (and m₀'s intervals too wide), Gaussian processes .67, flows for masks alone .01 less than for
-    all views.
+    dropout .65 (and m₀'s intervals too wide), Gaussian processes .67; flows for masks alone read .01 less.
 
     Each member starts from other weights, and stops where the likelihood of its own tenth of the shapes, which it does
     not learn from, is highest: all views of a shape are on one side.
