@@ -9,7 +9,8 @@ from curvafit.interrupts import exit_code, leave, listen
 
 def main() -> None:
     """Run the program."""
-    gc.set_threshold(100_000)  # what imports make stays: to look through it for garbage takes a fifth of the start
+    # What the start makes stays: to look through it for garbage takes a fifth of the start's time.
+    gc.set_threshold(20_000)
     # Threads that wait for the others of a loop sleep: where two runs share the cores, spinning holds the others up.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     # A signal leaves coroutines of Zarr that were about to read: no matter for a user.

@@ -143,7 +143,7 @@ def test_the_command_is_copied_and_the_command_line_takes_it(opened: Opened, atl
     given = generate.make_context("generate", copied[2:]).params
     assert copied[:2] == ["curvafit", "generate"] and given["seed"] == atlas.seeds[9]
     assert [float(part) for part in given["coefficients"].split(",")] == atlas.coefficients[9].tolist()
-    assert given["mass"] == atlas.masses[9] and given["shape"] == "24" and given["schedule"] == "fast"
+    assert given["mass"] == atlas.masses[9] and given["shape"] == "24" and given["schedule"] == "cosine"
 
 
 def scan_fit(atlas: Atlas, like: int) -> Fit:

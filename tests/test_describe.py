@@ -18,6 +18,7 @@ from curvafit.inference.table import PARAMETERS, Table, column_names, law_of, lo
 from curvafit.priors.coefficients import preset
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
+from curvafit.volumes.scan import ScanError
 from tests.exact import Gyroid, centres
 from tests.exact_store import exact_record, exact_store
 
@@ -41,6 +42,19 @@ def test_a_view_shows_the_shape(name: str) -> None:
     assert seen.fraction == pytest.approx(whole.fraction, abs=0.03)
     assert seen.densities == pytest.approx(whole.densities, rel=0.3, abs=0.3 * whole.densities[0])  # κ is up to 20
     assert seen.chords[3:7] == pytest.approx(whole.chords[3:7], abs=0.012)  # 0.01 is a voxel
+
+
+@pytest.mark.parametrize("n", [20, 36, 46])
+def test_a_window_may_have_an_odd_number_of_planes(n: int) -> None:
+    u, grid = gyroid(n)
+    assert VIEWS["scan"](u, grid, np.random.default_rng(1)).shape.shape == (round(0.75 * n),) * 3
+
+
+@pytest.mark.parametrize("name", ["crop", "resampled", "scan"])
+def test_a_window_without_a_structure_is_refused(name: str) -> None:
+    u = np.full((24, 24, 24), -1.0, np.float32)
+    with pytest.raises(ScanError, match="expected a window with an inside and an outside"):
+        VIEWS[name](u, Grid(u.shape), np.random.default_rng(1))
 
 
 @pytest.mark.parametrize("name", ["crop", "resampled", "scan"])
@@ -193,3 +207,16 @@ def test_the_command_writes_a_table(tmp_path: Path) -> None:
     assert result.exit_code == 0, result.stderr
     assert result.stdout.strip() == str(out)
     assert len(load_table(out)) == 2
+
+
+def test_another_store_of_the_same_name_is_not_taken_for_the_first(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    stores = [exact_store(tmp_path / each / "s.zarr", 1) for each in ("a", "b")]
+    describe([stores[0].path], tmp_path / "t.npz", ("field",))
+    header = stores[1].path / "zarr.json"
+    header.write_text(header.read_text().replace('"seed": 3', '"seed": 4'))
+    with pytest.raises(ValueError, match="expected the store s that the table was begun with"):
+        describe([stores[1].path], tmp_path / "t.npz", ("field",))
+    describe([stores[1].path], tmp_path / "t.npz", ("field",), overwrite=True)
+    assert load_table(tmp_path / "t.npz").provenance["stores"]["s"]["seed"] == 4

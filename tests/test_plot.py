@@ -200,3 +200,12 @@ def test_drawing_leaves_pyplot_alone() -> None:
     script = "import sys, curvafit.drawing.plot; print('matplotlib.pyplot' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
+
+
+@pytest.mark.parametrize("azimuth", [0.0, 90.0, 45.0])
+def test_rays_along_the_boxs_sides_stay_in_it(azimuth: float) -> None:
+    """Where a step of a ray is longer than a voxel, its last place may lie beyond the box."""
+    z, y = np.ogrid[-12:12, -12:12]
+    rod = np.repeat((9.0 - np.sqrt(z**2 + y**2))[..., None], 64, axis=2)
+    picture, _ = render(rod, width=20, azimuth=azimuth)
+    assert picture.min() < picture.max()

@@ -183,3 +183,16 @@ def test_the_command_refuses_in_one_sentence(
     assert result.exit_code == 2
     assert words in " ".join(result.stderr.split())
     assert not (tmp_path / "posterior.npz").exists()
+
+
+@pytest.mark.parametrize("members", [0, 65])
+def test_a_number_of_flows_has_bounds(members: int) -> None:
+    with pytest.raises(ValueError, match="expected a number of flows"):
+        train_posterior(table(20), SMALL, members=members)
+
+
+def test_a_parameter_that_does_not_vary_is_named() -> None:
+    fixed = table(20)
+    fixed.parameters[:, 2] = 7.0
+    with pytest.raises(ValueError, match="expected shapes whose parameters all vary, got a10 the same in all"):
+        train_posterior(fixed, SMALL)

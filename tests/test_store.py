@@ -21,7 +21,8 @@ from curvafit.generation.viability import Viability
 from curvafit.priors.coefficients import Coefficients
 
 SHAPE = (6, 5, 4)
-SETTINGS = Settings(SHAPE, (0.01,) * 3, 0.02, 0.02, "experiment-4", 7, {"name": "fast", "steps": 10})
+PLAN = {"name": "cosine", "steps": 10, "start": 2e-2, "stop": 1e-4, "shape": "cosine", "momentum": 0.97, "memory": 0.97}
+SETTINGS = Settings(SHAPE, (0.01,) * 3, 0.02, 0.02, "experiment-4", 7, PLAN)
 finite = st.floats(-1e4, 1e4)
 seeds = st.integers(0, 2**63 - 1)
 
@@ -34,6 +35,15 @@ def record(index: int, viable: bool = True, energy: float = 1.5) -> Record:
 
 def field(index: int) -> np.ndarray:
     return np.random.default_rng(index).uniform(-1, 1, SHAPE).astype(np.float32)
+
+
+def test_a_store_that_called_its_schedule_otherwise_goes_on(tmp_path):
+    """Version 0.1 called `fast` what is `cosine`."""
+    then = Settings(SHAPE, (0.01,) * 3, 0.02, 0.02, "experiment-4", 7, PLAN | {"name": "fast"})
+    open_store(tmp_path / "s.zarr", then)
+    assert open_store(tmp_path / "s.zarr", SETTINGS).settings == then
+    with pytest.raises(ValueError, match="got another schedule"):
+        open_store(tmp_path / "s.zarr", Settings(*list(vars(then).values())[:-1], PLAN | {"steps": 11}))
 
 
 def test_a_draw_comes_back_as_it_went_in(tmp_path):
@@ -157,7 +167,7 @@ def test_damaged_bytes_of_a_field_are_noticed(tmp_path):
 def test_another_version_or_other_settings_are_refused_in_one_sentence(tmp_path):
     path = tmp_path / "s.zarr"
     open_store(path, SETTINGS)
-    other = Settings(SHAPE, (0.01,) * 3, 0.02, 0.02, "experiment-4", 8, {"name": "fast", "steps": 10})
+    other = Settings(SHAPE, (0.01,) * 3, 0.02, 0.02, "experiment-4", 8, PLAN)
     with pytest.raises(ValueError, match=r"expected the settings of .*s.zarr, got another seed: 8 for 7"):
         open_store(path, other)
     header = json.loads((path / "zarr.json").read_text())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import time
 from collections.abc import Sequence
 from functools import partial
@@ -35,6 +36,7 @@ def describe(
     *,
     workers: Workers | None = None,
     command: Sequence[str] = (),
+    overwrite: bool = False,
 ) -> Table:
     """Measure the well-formed shapes of stores in each view, and write the table; views that the file has stay.
 
@@ -55,6 +57,8 @@ def describe(
         Whoever measures (`data_synth.cluster`); this process by default.
     command
         Command line for the provenance.
+    overwrite
+        Whether to begin anew where `out` exists.
 
     Raises
     ------
@@ -70,7 +74,7 @@ def describe(
     if len(set(names)) < len(names):
         raise ValueError(f"expected stores with names of their own, got {', '.join(names)}")
     path, crew = Path(out), workers or Here()
-    rows = _Rows(load_table(path) if path.exists() else None, opened, command)
+    rows = _Rows(load_table(path) if path.exists() and not overwrite else None, opened, command)
     todo = [job for store in opened for job in _jobs(store, views, rows)]
     if not todo and not rows.shapes:
         raise ValueError(f"expected a well-formed shape in {', '.join(names)}, got none")
@@ -132,7 +136,10 @@ class _Rows:
         self.parameters = [] if table is None else list(table.parameters)
         self.descriptors = [] if table is None else list(table.descriptors)
         before = {} if table is None else table.provenance
-        settings = {_name(store): dataclasses.asdict(store.settings) for store in stores}
+        settings = {_name(store): json.loads(json.dumps(dataclasses.asdict(store.settings))) for store in stores}
+        for name, now in settings.items():
+            if before.get("stores", {}).get(name, now) != now:
+                raise ValueError(f"expected the store {name} that the table was begun with, got one made otherwise")
         self.provenance = {
             "stores": before.get("stores", {}) | settings,
             "command": [*before.get("command", []), *command],

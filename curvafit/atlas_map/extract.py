@@ -15,7 +15,7 @@ import torch
 from curvafit.data_synth.atlas.design import boxed
 from curvafit.data_synth.atlas.draws import versions
 from curvafit.data_synth.atlas.store import Record, Store, open_store
-from curvafit.generation.schedule import present_name
+from curvafit.generation.schedule import SCHEDULES, present_name
 from curvafit.generation.viability import FORMED, well_formed
 from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram, diagrams
 from curvafit.inference.atlas import Atlas
@@ -118,4 +118,6 @@ def _build_command(store: Store, viable: int) -> str:
     known = {json.dumps(boxed(law).as_dict()): law for law in ("random", "sobol")}
     design = known.get(json.dumps(settings.design), "design.yaml")
     options = f"--count {viable} --shape {shape} --seed {settings.seed} --design {design} --schedule {name}"
+    if name in SCHEDULES and settings.schedule["steps"] != SCHEDULES[name].steps:
+        options += f" --steps {settings.schedule['steps']}"
     return f"curvafit atlas build {store.path.name} {options}"

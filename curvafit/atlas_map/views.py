@@ -52,6 +52,8 @@ def crop(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
     turned = np.roll(u > 0, [int(rng.integers(n)) for n in u.shape], (0, 1, 2))
     nz, ny, nx = (round(WINDOW * n) for n in u.shape)
     part = np.ascontiguousarray(turned[:nz, :ny, :nx])
+    if part.all() or not part.any():
+        raise ScanError("expected a window with an inside and an outside, got one of them only")
     return View(part, Grid((nz, ny, nx), grid.spacing, "replicate"))
 
 
@@ -78,7 +80,8 @@ def scan(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
     """
     part, window = crop(u, grid, rng)
     grey = ndimage.gaussian_filter(part.astype(np.float32), BLUR, mode="nearest")
-    grey = grey.reshape(-1, SLICE, *grey.shape[1:]).mean(1)
+    whole = np.pad(grey, ((0, -len(grey) % SLICE), (0, 0), (0, 0)), mode="edge")
+    grey = whole.reshape(-1, SLICE, *grey.shape[1:]).mean(1)
     grey += rng.standard_normal(grey.shape, dtype=np.float32) / SNR
     level = find_level(Field(grey, (float(SLICE), 1.0, 1.0), "voxel"), kind="image")
     values = resample(level.values, (1 / SLICE, 1.0, 1.0), (0, 0, 0), part.shape)
@@ -88,6 +91,8 @@ def scan(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
 
 def _thickness(part: np.ndarray) -> float:
     """Return the median thickness in voxels, or raise ScanError where `infer` refuses a structure as too thin."""
+    if not part.any():
+        raise ScanError("expected a structure in the window, got none")
     thickness, thick = median_thickness(part, (1.0, 1.0, 1.0), False)
     if thick < THINNEST - 0.5:
         raise ScanError(f"expected a structure {THINNEST:g} voxels thick, got one of {thick:.2g}")

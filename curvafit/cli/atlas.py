@@ -189,7 +189,9 @@ def describe_atlas(
         crew.check()
         names = tuple(VIEWS) if views is None else tuple(views.split(","))
         with crew.at_work() as (makers, progress):
-            table = describe(stores, out, names, progress, workers=makers, command=[command_line()])
+            table = describe(
+                stores, out, names, progress, workers=makers, command=[command_line()], overwrite=overwrite
+            )
         say(f"{len(set(table.shapes.tolist()))} shapes, {len(table)} views", to=error_console())
         say(str(out))
 

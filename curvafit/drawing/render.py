@@ -294,6 +294,7 @@ def _first(field: np.ndarray, rays: _Rays, enter: np.ndarray, leave: np.ndarray,
 def _surface_glow(scene: _Scene, light: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Return the light from the level set at points `(3, N)`, linearly between the voxels around them."""
     field, edges = scene.field, scene.edges[:, None]
+    at = np.clip(at, 0, np.array(field.shape)[:, None] - 1)
     seen = np.zeros(field.shape, np.bool_)
     seen[tuple(at.astype(np.int32))] = True
     for axis in range(3):

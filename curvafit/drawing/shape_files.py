@@ -22,6 +22,7 @@ from curvafit.generation.flow import Flow
 from curvafit.generation.memory import FILE, check_memory
 from curvafit.geometry.mesh import NoSurface, Surface, solid_surface, surface
 from curvafit.geometry.mesh_files import SUFFIXES, write_surface
+from curvafit.interrupts import undisturbed
 from curvafit.priors.bounds import LONGEST, SHORTEST, instance, real, several, whole
 from curvafit.priors.coefficients import NAMES
 from curvafit.priors.curvature import geometric_curvatures, jet
@@ -223,9 +224,10 @@ def write_shape(
         names = [*(part.name for part in parts), *([image.name] if picture else [])]
         content = {"format": FORMAT, **(record or {}), "files": names}
         note.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-        files = move_together(parts, target.parent)
-    if former:
-        remove(image)
+        with undisturbed():
+            files = move_together(parts, target.parent)
+            if former:
+                remove(image)
     return (*files, *(_picture(flow, image) if picture else ()))
 
 

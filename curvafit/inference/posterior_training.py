@@ -9,8 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from curvafit.inference.posterior import Architecture, Compression, Member, Posterior, straightened
+from curvafit.inference.posterior import MOST, Architecture, Compression, Member, Posterior, straightened
 from curvafit.inference.table import PARAMETERS, Table, column_names
+from curvafit.priors.bounds import seed_of, whole
 from curvafit.progress import Progress, silent
 
 #: Part of the shapes, of all of whose views a member learns nothing: they tell when it has learnt enough.
@@ -53,14 +54,17 @@ def train_posterior(
     Raises
     ------
     ValueError
-        If the table has too few shapes.
+        If the table has too few shapes, or a parameter that does not vary, or an argument is out of range.
     """
+    members, seed = whole(members, "a number of flows", 1, MOST), seed_of(seed)
     sizes, table = architecture or Architecture(), table.seen
     shapes, number = np.unique(table.shapes, return_inverse=True)
     if len(shapes) < 2 * sizes.components:
         raise ValueError(f"expected at least {2 * sizes.components} shapes to train on, got {len(shapes)}")
     views = tuple(sorted(set(table.views.tolist())))
     box = np.stack([table.parameters.min(0), table.parameters.max(0)], axis=1)
+    if fixed := [name for name, (low, high) in zip(PARAMETERS, box, strict=True) if low == high]:
+        raise ValueError(f"expected shapes whose parameters all vary, got {', '.join(fixed)} the same in all")
     posterior = Posterior(
         sizes, (), compression_of(table.descriptors, sizes), views, box,
         np.zeros(len(PARAMETERS)), np.ones(len(PARAMETERS)), _provenance(table, len(shapes), members, seed),

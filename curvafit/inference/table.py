@@ -130,12 +130,14 @@ def load_table(path: str | Path) -> Table:
     if (version := header.get("version")) != VERSION or header.get("blocks") != BLOCKS:
         raise ValueError(
             f"expected descriptors of version {VERSION} with the blocks of this program, got version {quoted(version)} "
-            f"or other blocks in {path}: describe the stores again"
+            f"or other blocks in {path}: describe the stores into another file, or with --overwrite"
         )
     try:
         shapes, views = (np.array(each, dtype=str) for each in json.loads(arrays["names"].tobytes()))
         if not np.isfinite(arrays["parameters"]).all():
             raise ValueError("parameters that are not finite")
+        if arrays["descriptors"].dtype.kind != "f" or not isinstance(header["provenance"], dict):
+            raise ValueError("descriptors that are no numbers, or no provenance")
         return Table(shapes, views, arrays["parameters"], arrays["descriptors"], header["provenance"])
     except (KeyError, ValueError, TypeError) as error:
         raise ValueError(f"expected a whole table of descriptors, got {path} ({str(error)[:200]})") from error

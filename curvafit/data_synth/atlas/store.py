@@ -31,6 +31,7 @@ from zarr.codecs import BloscCodec, Crc32cCodec
 
 from curvafit.data_synth.atlas.record import Record, Settings, attributes_of, digest, record_of
 from curvafit.files import staged, write_content
+from curvafit.generation.schedule import Schedule, present_name
 from curvafit.interrupts import undisturbed
 from curvafit.priors.bounds import quoted
 from curvafit.priors.grid import Grid
@@ -206,7 +207,7 @@ def open_store(path: str | Path, settings: Settings | None = None) -> Store:
     if (version := attributes.get("version")) != VERSION:
         raise ValueError(f"expected a store of version {VERSION} at {path}, got version {quoted(version)}")
     stored = _settings(path, attributes)
-    if settings is not None and settings != stored:
+    if settings is not None and _today(settings) != _today(stored):
         raise ValueError(f"expected the settings of {path}, got another {_difference(stored, settings)}")
     return Store(path, stored)
 
@@ -217,7 +218,7 @@ def _settings(path: Path, attributes: dict[str, Any]) -> Settings:
         values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in attributes["settings"].items()}
         settings = Settings(**values)
         Grid(settings.shape, settings.spacing)
-        sound = len(settings.shape) == len(settings.spacing) == 3 and {"name", "steps"} <= set(settings.schedule)
+        sound = len(settings.shape) == len(settings.spacing) == 3 and bool(Schedule(**settings.schedule).steps)
         if not (
             sound
             and settings.epsilon > 0
@@ -230,6 +231,12 @@ def _settings(path: Path, attributes: dict[str, Any]) -> Settings:
         state = f"got one with a damaged header ({quoted(str(error))})"
         raise ValueError(f"expected a whole store of shapes at {path}, {state}") from error
     return settings
+
+
+def _today(settings: Settings) -> Settings:
+    """Return the settings with the schedule's name of today."""
+    plan = settings.schedule
+    return dataclasses.replace(settings, schedule=plan | {"name": present_name(plan)})
 
 
 def _create(path: Path, settings: Settings) -> None:
