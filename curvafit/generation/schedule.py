@@ -64,7 +64,9 @@ class Schedule:
         Adam's decay rates of the gradient and of the gradient's square. Long momentum smooths long steps; short memory
         forgets the steep noise of the start.
     opening
-        Phases before the steps that the fields above describe, in order; these take the rest of the steps.
+        Phases before the steps that the fields above describe, in order; these take the rest of the steps. Adam's bias
+        corrections are those of the rates in force: where memory shortens after fewer than some 300 steps, the next
+        steps are longer than these say.
 
     Raises
     ------
