@@ -78,7 +78,9 @@ def test_backends_agree_step_by_step():
     moved = float((plain.field - gaussian_blur(gyroid(grid), grid, BLUR)).abs().max())
     assert moved > 0.1
     assert float((plain.field - fused.field).abs().max()) < 1e-4 * moved
-    assert np.allclose(plain.history.energy, fused.history.energy, rtol=1e-5)
+    # Energies part by the fields' distance times the slope: by that share of what the energy falls by.
+    fall = float(np.ptp(plain.history.energy))
+    assert np.allclose(plain.history.energy, fused.history.energy, rtol=0, atol=1e-5 * fall)
     assert np.allclose(plain.history.gradient_mean, fused.history.gradient_mean, rtol=1e-3)
 
 
