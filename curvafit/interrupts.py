@@ -6,6 +6,7 @@ The program listens from its first line (`listen`); the library changes no signa
 from __future__ import annotations
 
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,6 +14,8 @@ from types import FrameType
 
 #: Signals that end the program besides Ctrl-C, where the platform has them.
 _ENDS = ("SIGTERM", "SIGHUP")
+#: Seconds after which a signal whose exception was lost comes again: the finaliser has ended by then.
+_PAUSE = 0.02
 
 
 class Terminated(KeyboardInterrupt):
@@ -36,7 +39,11 @@ def exit_code(error: KeyboardInterrupt) -> int:
 
 
 def listen() -> None:
-    """Turn signals into exceptions of the main thread, which wait while files change; ignored signals stay ignored."""
+    """Turn signals into exceptions of the main thread, which wait while files change; ignored signals stay ignored.
+
+    Where such an exception is raised in a finaliser or a callback, from which Python lets nothing rise, it comes again.
+    """
+    sys.unraisablehook = _again
     for name in ("SIGINT", *_ENDS):
         number = getattr(signal, name, None)
         if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
@@ -71,6 +78,17 @@ def _arrive(number: int, frame: FrameType | None) -> None:
         _Pending.waiting = number
     else:
         raise _exception(number)
+
+
+def _again(unraisable: sys.UnraisableHookArgs) -> None:
+    """Send a signal anew whose exception was lost; print other lost exceptions, as Python does."""
+    error = unraisable.exc_value
+    if not isinstance(error, KeyboardInterrupt):
+        sys.__unraisablehook__(unraisable)
+        return
+    later = threading.Timer(_PAUSE, signal.raise_signal, (exit_code(error) - 128,))
+    later.daemon = True
+    later.start()
 
 
 def _exception(number: int) -> KeyboardInterrupt:

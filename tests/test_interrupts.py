@@ -23,8 +23,10 @@ HEARD = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 @pytest.fixture
 def listening() -> Iterator[None]:
     before = {number: signal.signal(number, signal.SIG_DFL) for number in HEARD}
+    hook = sys.unraisablehook
     listen()
     yield
+    sys.unraisablehook = hook
     for number, handler in before.items():
         signal.signal(number, handler)
 
@@ -40,6 +42,20 @@ def test_a_signal_is_an_exception(number: int, listening: None) -> None:
         send(number)
     assert isinstance(caught.value, Terminated) == (number != signal.SIGINT)
     assert exit_code(caught.value) == 128 + number
+
+
+@pytest.mark.parametrize("number", HEARD)
+def test_a_signal_in_a_finaliser_is_not_lost(number: int, listening: None, capfd: pytest.CaptureFixture) -> None:
+    class Ended:
+        def __del__(self) -> None:
+            os.kill(os.getpid(), number)
+            time.sleep(0.01)
+
+    with pytest.raises(KeyboardInterrupt) as caught:
+        Ended()
+        time.sleep(5)
+    assert exit_code(caught.value) == 128 + number
+    assert capfd.readouterr().err == ""
 
 
 @pytest.mark.parametrize("number", HEARD)
