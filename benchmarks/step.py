@@ -79,7 +79,7 @@ class Comparison(NamedTuple):
 
 
 def fused_flow(size: int) -> FusedFlow:
-    """The flow of the benchmark on a cube."""
+    """Make the flow of the benchmark on a cube."""
     grid, shape = Grid((size, size, size)), preset("tubes")
     a, betas = [float(value) for value in shape.coefficients], SCHEDULES["fast"].betas
     start = white_noise(grid, 0).numpy()
@@ -87,7 +87,7 @@ def fused_flow(size: int) -> FusedFlow:
 
 
 def plain_stepper(size: int) -> TorchStepper:
-    """The same in plain torch."""
+    """Make the same in plain torch."""
     grid, shape = Grid((size, size, size)), preset("tubes")
     form = DivergenceForm(grid, BLUR, shape.mass)
     betas = SCHEDULES["fast"].betas
@@ -95,7 +95,7 @@ def plain_stepper(size: int) -> TorchStepper:
 
 
 def peak_bytes(size: int) -> tuple[FusedFlow, int]:
-    """A flow after its first step, and the most bytes that its arrays and the start took at once."""
+    """Return a flow after its first step, and the most bytes that its arrays and the start took at once."""
     tracemalloc.start()
     flow = fused_flow(size)
     step(flow)
@@ -110,7 +110,7 @@ def step(flow: FusedFlow) -> None:
 
 
 def compare(size: int, rounds: int) -> Comparison:
-    """The two programs in turn."""
+    """Time the two programs in turn."""
     step(fused_flow(8))
     fused, peak = peak_bytes(size)
     plain = plain_stepper(size) if size <= PLAIN else None
@@ -139,7 +139,7 @@ def compare(size: int, rounds: int) -> Comparison:
 
 
 def processor() -> str:
-    """The processor and its caches, and what numba compiles for where that is another."""
+    """Name the processor and its caches, and what numba compiles for where that is another."""
     try:
         name = re.search(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text())
         named = name.group(1) if name else platform.machine()

@@ -138,6 +138,24 @@ np.save(sys.argv[1], np.append(slope, value))
     assert np.quantile(np.abs(slope_found - slope.ravel()), 0.9) < 1e-6 * np.abs(slope).max()
 
 
+def test_the_kernel_cache_follows_the_processor(tmp_path):
+    """What was compiled for one processor is found by the next process there, and not for another."""
+    if platform.machine() not in ("x86_64", "AMD64"):
+        pytest.skip("expected an x86 processor")
+    program = """
+from curvafit.priors.kernels import loops
+loops._scaled(1.0, None, 0)
+print(sum(loops._scaled.stats.cache_hits.values()))
+"""
+    hits = []
+    for name in ("x86-64", "x86-64", "nocona"):
+        target = {"NUMBA_CPU_NAME": name, "NUMBA_CPU_FEATURES": "", "NUMBA_CACHE_DIR": str(tmp_path)}
+        command = [sys.executable, "-c", program]
+        run = subprocess.run(command, check=True, env={**os.environ, **target}, capture_output=True, text=True)
+        hits.append(int(run.stdout))
+    assert hits == [0, 1, 0]
+
+
 def test_threads_do_not_change_the_result():
     numba = pytest.importorskip("numba")
     if numba.config.NUMBA_NUM_THREADS < 2:

@@ -188,6 +188,7 @@ class FusedFlow:
         return float(self._highest.max().view(np.float32)), float(self._sums.sum()) / max(1, self._free)
 
     def _adam_step(self, phase: int, adam: np.ndarray) -> None:
+        """Run the last pass, or a part of it."""
         with limited(self._threads):
             loops.adam_step(
                 phase,
@@ -275,6 +276,7 @@ class _Density:
         self._sums = _scratch(threads, 4 * part + 2 * SLACK)
 
     def __call__(self, u: np.ndarray, gradient: np.ndarray) -> float:
+        """Fill the gradient; return the energy."""
         with limited(self._threads):
             loops.energy_gradient(
                 u,
@@ -297,49 +299,53 @@ _NO_FIELD = np.empty(0, np.float32)
 
 
 def _threads(grid: Grid) -> int:
-    """How many threads a grid is worth, of those allowed."""
+    """Return how many threads a grid is worth, of those allowed."""
     return max(1, min(allowed(), math.prod(grid.shape) // _WORTH, grid.shape[0] // TOGETHER))
 
 
 def _flat(size: int) -> np.ndarray:
-    """So many zeros and the slack around them."""
+    """Make room for a flat array and the slack around it."""
     return _zeros(size + 2 * SLACK)
 
 
 def _scratch(threads: int, size: int) -> np.ndarray:
+    """Make room for each thread, on cache lines of its own."""
     size = -(-size // _LINE) * _LINE
     return _zeros(threads * size).reshape(threads, size)
 
 
 def _zeros(size: int) -> np.ndarray:
-    """On whole cache lines."""
+    """Make zeros that begin at a cache line."""
     room = np.zeros(size + _LINE, np.float32)
     first = -room.ctypes.data // 4 % _LINE
     return room[first : first + size]
 
 
 def _plane(grid: Grid) -> int:
+    """Count the floats from a plane to the next."""
     _, Y, X = grid.shape
     return loops.pitch(Y, X)
 
 
 def _volume(grid: Grid) -> np.ndarray:
-    """Room for the grid's planes, or for as many as a blur along z makes at once."""
+    """Make room for the grid's planes, or for as many as a blur along z makes at once."""
     return _flat(max(grid.shape[0], TOGETHER) * _plane(grid))
 
 
 def _whole(volume: np.ndarray, grid: Grid) -> np.ndarray:
-    """The field and its continuation in planes, a view."""
+    """View the field and its continuation in planes."""
     Z, Y, X = grid.shape
     rows = (X + 2 * EDGE) * 4
     return as_strided(volume[SLACK:], (Z, Y + 2 * EDGE, X + 2 * EDGE), (_plane(grid) * 4, rows, 4))
 
 
 def _inner(volume: np.ndarray, grid: Grid) -> np.ndarray:
+    """View the field without its continuation."""
     return _whole(volume, grid)[:, EDGE:-EDGE, EDGE:-EDGE]
 
 
 def _padded(u: np.ndarray, grid: Grid) -> np.ndarray:
+    """Copy a field into planes and continue it."""
     if u.shape != grid.shape:
         raise ValueError(f"expected a field of shape {grid.shape}, got {u.shape}")
     volume = _volume(grid)
@@ -354,13 +360,13 @@ def _padded(u: np.ndarray, grid: Grid) -> np.ndarray:
 
 
 def _padded_taps(deviation: float) -> tuple[np.ndarray, int]:
-    """The weights with zeros after them, and the radius; a deviation of zero is the identity."""
+    """Return the weights with zeros after them, and the radius; a deviation of zero is the identity."""
     taps = gaussian_taps(deviation) if deviation > 0 else (1.0,)
     return np.array(taps + (0.0,) * (-len(taps) % TAPS), np.float32), len(taps) // 2
 
 
 def _continuation(n: int, before: int, after: int, periodic: bool) -> np.ndarray:
-    """Which of n samples stands at -before, … , n + after - 1."""
+    """Return which of n samples stands at -before, … , n + after - 1."""
     index = np.arange(-before, n + after)
     if periodic:
         return index % n
@@ -369,7 +375,7 @@ def _continuation(n: int, before: int, after: int, periodic: bool) -> np.ndarray
 
 
 def _voxelwise(value, grid: Grid):
-    """A number in float64, or an array with a value for every voxel."""
+    """Return a number in float64, or an array with a value for every voxel."""
     value = np.asarray(value)
     if value.ndim and value.shape != grid.shape:
         raise ValueError(f"expected a number or an array of shape {grid.shape}, got one of shape {value.shape}")
@@ -377,8 +383,8 @@ def _voxelwise(value, grid: Grid):
 
 
 def _weights(a, grid: Grid, epsilon) -> list:
-    """(h/ε)² and the weights of X, T², TS, GT, GS and s in the density (numbers, or arrays where they vary), with
-    differences in units of the spacing h along x: with g = 2h∇u, D = h² Hess u, T = (ε/h²) T', where
+    """Return (h/ε)² and the weights of X, T², TS, GT, GS and s in the density (numbers, or arrays where they vary),
+    with differences in units of the spacing h along x: with g = 2h∇u, D = h² Hess u, T = (ε/h²) T', where
     T' = w (h/ε)² r - tr D, and likewise X and P. The voxel's volume is included."""
     a20, a11, a02, a10, a01, a00 = (_voxelwise(value, grid) for value in a)
     ε, h = _voxelwise(epsilon, grid), grid.spacing[2]
@@ -396,8 +402,8 @@ def _weights(a, grid: Grid, epsilon) -> list:
 
 
 def _density_constants(weights: list, grid: Grid) -> np.ndarray:
-    """ξ² and small numbers, then the weights, where they do not vary, as the loops take them (see `loops._cost`), and
-    the share of the squares that rounding leaves undecided."""
+    """Return ξ² and small numbers, then the weights, where they do not vary, as `loops._cost` takes them, and the
+    share of the squares that rounding leaves undecided."""
     h = grid.spacing[2]
     well, *rest = (float(value) if np.ndim(value) == 0 else math.nan for value in weights)
     low = ROOT_FLOOR * h**2
@@ -409,8 +415,8 @@ def _density_constants(weights: list, grid: Grid) -> np.ndarray:
 
 
 def _local(weights: list, block: int, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """The weights one after the other, volumes where they vary and else one vector, then for a block of rows where x is
-    mirrored (a sign); of each its offset, and whether it is a volume."""
+    """Put the weights one after the other, volumes where they vary and else one vector, then signs that say where x is
+    mirrored in a block of rows; return of each its offset too, and whether it is a volume."""
     parts = []
     for value in weights:
         part = np.full(WIDE, value, np.float32) if np.ndim(value) == 0 else _padded(value, grid)
@@ -426,7 +432,7 @@ def _local(weights: list, block: int, grid: Grid) -> tuple[np.ndarray, np.ndarra
 
 
 def _orientations(orientation, grid: Grid) -> np.ndarray:
-    """Q's zz, yy, xx, zy, zx, yx, as it is and in mirrors across y, z and both."""
+    """Return Q's zz, yy, xx, zy, zx, yx, as it is and in mirrors across y, z and both."""
     Q = np.zeros((3, 3)) if orientation is None else np.asarray(orientation, np.float64)
     if Q.shape != (3, 3) or not np.array_equal(Q, Q.T):
         raise ValueError(f"expected a symmetric 3×3 orientation (z, y, x), got {Q.tolist()}")
@@ -436,7 +442,7 @@ def _orientations(orientation, grid: Grid) -> np.ndarray:
 
 
 def _ratios(grid: Grid) -> np.ndarray | None:
-    """Of the spacing along x to that along z, y, x, and their products zz, yy, xx, zy, zx, yx; None if all are one."""
+    """Return the spacing along x over that along z, y, x, and products zz, yy, xx, zy, zx, yx; None if all are one."""
     z, y, x = (grid.spacing[2] / h for h in grid.spacing)
     return None if z == y == 1 else np.array([z, y, x, z * z, y * y, x * x, z * y, z * x, y * x], np.float32)
 

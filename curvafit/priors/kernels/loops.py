@@ -45,7 +45,7 @@ _PARALLEL: dict[str, Any] = {**_SERIAL, "parallel": True}
 
 
 def _features() -> str:
-    """Of the processor that numba compiles for: the host's, whatever the name, unless others are given."""
+    """Return the features that numba compiles for: the host's, whatever its name, unless others are given."""
     features = getattr(config, "CPU_FEATURES", None)
     return llvm.get_host_cpu_features().flatten() if features is None else features
 
@@ -77,13 +77,13 @@ _at = np.uint64
 
 @njit(**_INLINE)
 def pitch(Y, X):
-    """Floats from a plane to the next: the last row may be rounded up."""
+    """Count the floats from a plane to the next: the last row may be rounded up."""
     return ((Y + 2 * EDGE) * (X + 2 * EDGE) + 2 * LANES - 1) & -LANES
 
 
 @njit(**_INLINE)
 def row_length(X, taps):
-    """Floats of a row, its continuation and what it is rounded up to."""
+    """Count the floats of a row, its continuation and what it is rounded up to."""
     return (X + taps + 2 * LANES) & -LANES
 
 
@@ -104,25 +104,29 @@ class _VectorModel(models.PrimitiveModel):
 
 
 def _ir(width: int) -> ir.VectorType:
+    """Return LLVM's type of a vector of floats."""
     return ir.VectorType(ir.FloatType(), width)
 
 
 def _lanes(builder, first, second, indices):
+    """Shuffle the elements of two vectors."""
     return builder.shuffle_vector(first, second, ir.Constant(ir.VectorType(ir.IntType(32), len(indices)), indices))
 
 
 def _splat(builder, number, width: int):
+    """Fill a vector with one number."""
     nothing = ir.Constant(_ir(width), ir.Undefined)
     return _lanes(builder, builder.insert_element(nothing, number, ir.IntType(32)(0)), nothing, [0] * width)
 
 
 def _function(builder, name: str, result, arguments):
+    """Declare an LLVM function once in a module."""
     known = builder.module.globals.get(name)
     return known or ir.Function(builder.module, ir.FunctionType(result, arguments), name)
 
 
 def _define_operators(vector: _Vector) -> None:
-    """v + v, v - v, v · v, v / v, and with a number on either side."""
+    """Define v + v, v - v, v · v and v / v, also with a number on either side."""
     kinds = ((vector, vector), (vector, types.float32), (types.float32, vector))
     cases = [signature(vector, *kind) for kind in kinds]
     names = {operator.add: "fadd", operator.sub: "fsub", operator.mul: "fmul", operator.truediv: "fdiv"}
@@ -145,13 +149,13 @@ _define_operators(_VECTOR)
 
 
 def _address(context, builder, kind, values, width: int):
-    """Of a vector in an array, the first two values being the array and an index from 0."""
+    """Return a vector's address in an array; the first two values are the array and an index from 0."""
     data = context.make_array(kind)(context, builder, values[0]).data
     return builder.bitcast(builder.gep(data, [values[1]]), _ir(width).as_pointer())
 
 
 def _type_wide(typingctx, array, index):
-    """Floats `index` … of a flat float32 array."""
+    """Load floats `index` … of a flat float32 array."""
 
     def generate(context, builder, sig, values):
         return builder.load(_address(context, builder, sig.args[0], values, WIDE), align=4)
@@ -160,7 +164,7 @@ def _type_wide(typingctx, array, index):
 
 
 def _type_full(typingctx, number):
-    """A vector of equal floats."""
+    """Fill a vector with one float."""
 
     def generate(context, builder, sig, values):
         return _splat(builder, values[0], WIDE)
@@ -169,7 +173,7 @@ def _type_full(typingctx, number):
 
 
 def _type_store(typingctx, array, index, value):
-    """`array[index …] = value`."""
+    """Store: `array[index …] = value`."""
 
     def generate(context, builder, sig, values):
         builder.store(values[2], _address(context, builder, sig.args[0], values, sig.args[2].width), align=4)
@@ -179,7 +183,7 @@ def _type_store(typingctx, array, index, value):
 
 
 def _type_store_first(typingctx, array, index, value, count):
-    """The same for the first `count` floats of it."""
+    """Store the first `count` floats of a vector."""
 
     def generate(context, builder, sig, values):
         width = value.width
@@ -197,7 +201,10 @@ def _type_store_first(typingctx, array, index, value, count):
 
 
 def _type_inverse_root(typingctx, value, one):
-    """1/√value of positive floats. `one` is a vector of ones. LLVM takes the processor's estimate and a Newton step."""
+    """Compute 1/√value of positive floats. `one` is a vector of ones.
+
+    LLVM takes the processor's estimate and a Newton step.
+    """
 
     def generate(context, builder, sig, values):
         x, one = values
@@ -208,7 +215,7 @@ def _type_inverse_root(typingctx, value, one):
 
 
 def _type_where_above(typingctx, value, bound, yes, no):
-    """`yes` where value > bound, else `no`."""
+    """Choose `yes` where value > bound, else `no`."""
 
     def generate(context, builder, sig, values):
         x, bound, yes, no = values
@@ -218,7 +225,7 @@ def _type_where_above(typingctx, value, bound, yes, no):
 
 
 def _type_sum(typingctx, value):
-    """The sum of a vector's floats."""
+    """Add a vector's floats."""
 
     def generate(context, builder, sig, values):
         whole = f"llvm.vector.reduce.fadd.v{value.width}f32"
@@ -239,7 +246,7 @@ _sum: Any = intrinsic(_type_sum)
 
 @njit(**_SERIAL)
 def _scaled(value, ratios, which):
-    """Times one of the spacings' ratios, where they differ."""
+    """Multiply by one of the spacings' ratios, where they differ."""
     if ratios is None:
         return value
     return value * ratios[which]
@@ -247,13 +254,14 @@ def _scaled(value, ratios, which):
 
 @njit(**_SERIAL)
 def _weight(local, places, which, cell):
+    """Read one of the density's weights where they vary."""
     return _wide(local, places[which, 0] + places[which, 1] * cell)
 
 
 @njit(**_SERIAL)
 def _cost(k, local, places, cell):
-    """The density's weights: (h/ε)², the floor of X, then those of X, T², TS, GT, GS and s, and twice the weights of X,
-    T² and s; where they vary, from `cell` on; where `places` is None, `local` is a mask of them."""
+    """Read the density's weights: (h/ε)², the floor of X, then those of X, T², TS, GT, GS and s, and twice those
+    of X, T² and s; where they vary, from `cell` on; where `places` is None, `local` is a mask of them."""
     if local is None:
         return (
             _full(k[7]), _full(k[8]), _full(k[9]), _full(k[10]), _full(k[11]), _full(k[12]), _full(k[13]), _full(k[14]),
@@ -273,7 +281,7 @@ def _cost(k, local, places, cell):
 
 @njit(**_SERIAL)
 def _mirrored(orient, across_z, across_y):
-    """Q as it stands in the box's mirror image: what has one axis that is mirrored is negative."""
+    """Return Q as it stands in the box's mirror image: what has one axis that is mirrored is negative."""
     if orient is None:
         return None
     return orient[2 * across_z + across_y]
@@ -281,7 +289,7 @@ def _mirrored(orient, across_z, across_y):
 
 @njit(**_SERIAL)
 def _tilt(gz, gy, gx, orient, local, places, cell, i):
-    """Q∇u, times the weight of ∇uᵀQ∇u; a row of signs says where x is mirrored."""
+    """Compute Q∇u times the weight of ∇uᵀQ∇u; a row of signs says where x is mirrored."""
     weight, sign = _weight(local, places, 7, cell), _wide(local, places[8, 0] + i)
     gz, gy, gx = weight * gz, weight * gy, weight * gx
     across = sign * gx
@@ -292,7 +300,7 @@ def _tilt(gz, gy, gx, orient, local, places, cell, i):
 
 @njit(**_SERIAL)
 def _partials(u, m, c, p, stride, n, ring, size, at, inside, from_, k, ratios, orient, local, places):
-    """Energy of n cells, and their partial derivatives from `at` on into the ten arrays of the ring, `size` apart.
+    """Compute the energy of n cells and their partial derivatives, from `at` on in the ring's ten arrays, `size` apart.
 
     `m`, `c`, `p` are the cells' offsets in the planes z-1, z, z+1 of u; `inside` is one in the box from `from_` on.
     Differences are in units of the spacing, the constants `k` scaled accordingly. They are read where they are used:
@@ -421,7 +429,7 @@ def _gather(ring, size, at, stride, n, sums, below, centre, above, out, target):
 
 @njit(**_SERIAL)
 def _carry(ring, size, stride, count):
-    """Of a block of `count` rows (in places 2 … of the ring), what the next needs of its last two, to places 0, 1."""
+    """Move what the next block needs of the last two of `count` rows (places 2 … of the ring) to places 0 and 1."""
     far = count * stride
     for array in range(_C, _YP):
         first = SLACK + array * size + stride
@@ -438,7 +446,7 @@ def _energy_gradient_chunk(
     u, out, energies, ring, sums, inside, k, ratios, orient, local, places, index,
     first, last, y0, y1, block, Z, Y, stride,
 ):  # fmt: skip
-    """Planes first … last - 1, rows y0 … y1 - 1 of the gradient, with a halo of one cell computed on every side."""
+    """Compute planes first … last - 1, rows y0 … y1 - 1 of the gradient, and a halo of one cell on every side."""
     plane, size = pitch(Y, stride - 2 * EDGE), (ring.size - 2 * SLACK) // PARTIALS
     share = (sums.size - 2 * SLACK) // 4
     for z in range(first - 1, last + 1):
@@ -489,9 +497,11 @@ def energy_gradient(
 
 
 def _blur_across(begins: bool):
+    """Make the loop over the first weights of a blur across rows, or over further ones."""
+
     @njit(**_INLINE)
     def blur(source, origin, size, index, first, out, target, apart, n, taps, j0, shift):
-        """Four neighbouring sums of weighted rows, `TAPS` weights from j0 on; what it begins with is a number."""
+        """Compute four neighbouring sums of weighted rows, `TAPS` weights from j0 on; they begin with a number."""
         for i in range(n):
             if begins:
                 a = b = c = d = shift
@@ -519,8 +529,8 @@ _begin_across, _add_across = _blur_across(True), _blur_across(False)
 
 @njit(**_INLINE)
 def _blur_rows(source, origin, size, index, first, out, target, apart, n, taps, shift):
-    """Four rows of n, `apart` in `out`, of a blur across rows: `index` says which of those that stand `size` apart in
-    the source is where, from the first one's first tap at `first` on."""
+    """Compute four rows of n, `apart` in `out`, of a blur across rows: `index` says which of those that stand `size`
+    apart in the source is where, from the first one's first tap at `first` on."""
     _begin_across(source, origin, size, index, first, out, target, apart, n, taps, 0, shift)
     for j0 in range(TAPS, taps.size, TAPS):
         _add_across(source, origin, size, index, first, out, target, apart, n, taps, j0, shift)
@@ -528,6 +538,7 @@ def _blur_rows(source, origin, size, index, first, out, target, apart, n, taps, 
 
 @njit(**_INLINE)
 def _blur_z(chunk, chunks, source, out, base, Z, plane, index, taps, shift):
+    """Blur a chunk of planes along z."""
     first, last = chunk * Z // chunks, (chunk + 1) * Z // chunks
     for strip in range(0, plane, _STRIP):
         n = min(_STRIP, plane - strip) & -LANES
@@ -546,12 +557,12 @@ def blur_z(source, out, base, chunks, Z, plane, index, taps, shift):
     """Blur along z, plus a number and, where there is one, a field; strip by strip, four planes at a time. Every chunk
     has four planes or is the whole volume, which has room for four."""
     for chunk in prange(chunks):
-        _blur_z(chunk, chunks, source, out, base, Z, plane, index, taps, shift)
+        _blur_z(np.int64(chunk), chunks, source, out, base, Z, plane, index, taps, shift)
 
 
 @njit(**_INLINE)
 def _continue_rows(rows, start, length, X, r, index):
-    """The continuation of four rows, `length` apart, whose samples stand from start + r on."""
+    """Continue four rows, `length` apart, whose samples stand from start + r on."""
     for j in range(r):
         left, right = r + index[_at(j)], r + index[_at(r + X + j)]
         for k in range(TOGETHER):
@@ -561,9 +572,11 @@ def _continue_rows(rows, start, length, X, r, index):
 
 
 def _blur_along(begins: bool):
+    """Make the loop over the first weights of a blur along rows, or over further ones."""
+
     @njit(**_INLINE)
     def blur(rows, first, out, target, n, taps, j0):
-        """The sums of a row's weighted samples from `first` on, `TAPS` weights from j0 on."""
+        """Compute the sums of a row's weighted samples from `first` on, `TAPS` weights from j0 on."""
         for i in range(n):
             total = _ZERO if begins else out[_at(target + i)]
             for j in range(TAPS):
@@ -614,6 +627,7 @@ def _blur_plane(source, origin, size, rows, out, target, edge, Y, X, blur):
 
 @njit(**_INLINE)
 def _blur_in_planes(chunk, chunks, source, out, rows, shape, blur):
+    """Blur a chunk of planes along y and x."""
     Z, Y, X = shape
     stride = X + 2 * EDGE
     for z in range(chunk * Z // chunks, (chunk + 1) * Z // chunks):
@@ -626,12 +640,12 @@ def blur_in_planes(source, out, rows, shape, blur):
     """Blur along y and x."""
     chunks = rows.shape[0]
     for chunk in prange(chunks):
-        _blur_in_planes(chunk, chunks, source, out, rows, shape, blur)
+        _blur_in_planes(np.int64(chunk), chunks, source, out, rows, shape, blur)
 
 
 @njit(**_INLINE)
 def _within(i, n, periodic):
-    """Index i, at most one beyond either end, brought back: to the other end, or to the nearest."""
+    """Bring back an index, at most one beyond either end: to the other end, or to the nearest."""
     if i < 0:
         return n - 1 if periodic else 0
     if i >= n:
@@ -641,7 +655,7 @@ def _within(i, n, periodic):
 
 @njit(**_INLINE)
 def _divergence_plane(A, flux, half, z, shape, periodic):
-    """div A on a plane: central differences of an odd continuation (no flux through mirrors)."""
+    """Compute div A on a plane: central differences of an odd continuation (no flux through mirrors)."""
     Z, Y, X = shape
     size, n = Y * X, (X + LANES - 1) & -LANES
     Az, Ay, Ax = SLACK, SLACK + (Z + z) * size, SLACK + (2 * Z + z) * size
@@ -663,7 +677,7 @@ def _divergence_plane(A, flux, half, z, shape, periodic):
 
 @njit(**_SUMMING)
 def _sizes(slopes, n):
-    """Sum and maximum of the moduli of n slopes; the maximum by their bits, which are in order and keep a NaN."""
+    """Sum the moduli of n slopes, and find the greatest by their bits, which are in order and keep a NaN."""
     bits = slopes.view(np.int32)
     total, most = _ZERO, np.int32(0)
     for i in range(n):
@@ -675,7 +689,7 @@ def _sizes(slopes, n):
 
 @njit(**_INLINE)
 def _adam_rows(A, m, v, o, keep, free, slopes, n, adam):
-    """Adam on n samples of a component, from `o` on."""
+    """Make Adam's step on n samples of a component, from `o` on."""
     if keep.size > 0:
         for i in range(n):
             slopes[_at(i)] *= keep[_at(free + i)]
@@ -692,8 +706,8 @@ def _adam_rows(A, m, v, o, keep, free, slopes, n, adam):
 
 @njit(**_INLINE)
 def _adam_plane(A, m, v, keep, ring, slopes, below, here, above, half, adam, z, shape):
-    """-∇ of a plane and Adam, some rows at a time; returns sum and maximum of the slopes' moduli. `below`, `here`,
-    `above` are the first samples' offsets in the ring."""
+    """Make Adam's step along -∇ of a plane, some rows at a time; return sum and maximum of the slopes' moduli. `below`,
+    `here`, `above` are the first samples' offsets in the ring."""
     Z, Y, X = shape
     stride, whole = X + 2 * EDGE, (X + LANES - 1) & -LANES
     total, most = 0.0, np.int32(0)
@@ -723,6 +737,7 @@ def _adam_chunk(
     chunk, phase, g, A, m, v, keep, next_g, rows, rings, slopes, fluxes, sums, highest, half, adam, shape, periodic,
     index_z, blur,
 ):  # fmt: skip
+    """Make `adam_step`'s step on a chunk of planes."""
     Z, Y, X = shape
     chunks, stride, plane = rows.shape[0], X + 2 * EDGE, pitch(Y, X)
     corner = EDGE * stride + EDGE
@@ -766,6 +781,6 @@ def adam_step(
     whose neighbours another thread moved: `ENDS`. Or div A alone, of `ALL` planes."""
     for chunk in prange(rows.shape[0]):
         _adam_chunk(
-            chunk, phase, g, A, m, v, keep, out, rows, rings, slopes, fluxes, sums, highest, half, adam, shape,
-            periodic, index_z, blur,
+            chunk, phase, g, A, m, v, keep, out, rows, rings, slopes, fluxes, sums, highest, half, adam,
+            shape, periodic, index_z, blur,
         )  # fmt: skip
