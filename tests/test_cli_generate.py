@@ -29,7 +29,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 def undrawn(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
     """Empty pictures, but where a test is named after its own."""
     if "picture" not in request.node.name:
-        monkeypatch.setattr("curvafit.drawing.plot.surface_picture", lambda u, path: path.write_bytes(b""))
+        monkeypatch.setattr("curvafit.drawing.surfaces.surface_picture", lambda u, path: path.write_bytes(b""))
 
 
 def test_generate_writes_a_field_a_picture_and_a_record(tmp_path: Path) -> None:
@@ -116,6 +116,27 @@ def test_generate_refuses_a_prior_of_another_kind(tmp_path: Path) -> None:
     for content, said in (("{}", "expected a fit.json"), ("[1", "expected a fit.json"), ('{"format": "x"}', "format")):
         prior.write_text(content)
         refused(call("generate", "--prior", prior, "-o", tmp_path / "out.npy"), said)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("generate", "--prior", "fit.json", "-o", "out.npy"),
+        ("segment", "scan.npy", "--prior", "fit.json", "-o", "out.npy"),
+        ("reconstruct", "scan.npy", "--prior", "fit.json", "--every", "4", "-o", "out.npy"),
+        ("synth", "--prior", "fit.json", "--modality", "confocal", "-o", "out"),
+        ("nnunet", "--prior", "fit.json"),
+        ("atlas", "build", "out.zarr", "--around", "fit.json", "--count", "1"),
+    ],
+)
+def test_a_fit_without_a_law_is_refused_by_all_that_take_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: tuple[str, ...]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    made_fit(chosen=None).save("fit.json")
+    np.save("scan.npy", np.zeros((8, 8, 8), dtype=np.uint8))
+    refused(call(*command), "expected a fit.json with a law, got none in fit.json: ")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["fit.json", "scan.npy"]
 
 
 # ---- what is handed on -----------------------------------------------------------------------------------------------

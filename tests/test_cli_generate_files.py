@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,7 +21,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 
 @pytest.fixture(autouse=True)
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("curvafit.drawing.plot.surface_picture", lambda u, path: path.write_bytes(b""))
+    monkeypatch.setattr("curvafit.drawing.surfaces.surface_picture", lambda u, path: path.write_bytes(b""))
 
 
 def test_an_interrupted_run_goes_on_from_its_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -64,10 +65,11 @@ def test_a_picture_that_fails_is_one_line_and_undoes_nothing(tmp_path: Path, mon
         raise OSError(28, "No space left on device", "out")
 
     made(*QUICK, "-o", tmp_path / "out.npy")
-    monkeypatch.setattr("curvafit.drawing.plot.surface_picture", full)
+    monkeypatch.setattr("curvafit.drawing.surfaces.surface_picture", full)
     result = call("generate", *QUICK, "--seed", 1, "-o", tmp_path / "out.npy")
     assert result.exit_code == 0 and result.stderr == "note: no picture was drawn: No space left on device\n"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out.json", "out.npy"]
+    assert json.loads((tmp_path / "out.json").read_bytes())["files"] == ["out.npy", "out.json"]
 
 
 def test_a_shape_without_a_picture_leaves_that_of_others_and_no_former_one(tmp_path: Path) -> None:

@@ -56,6 +56,20 @@ def test_nifti_scaling_and_singleton_axes(tmp_path: Path) -> None:
     assert field.values.max() > 119  # scaled by what the header says on reading
 
 
+@pytest.mark.parametrize("member", [100, 2**28])
+def test_a_compressed_nifti_holds_what_a_plain_one_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, member
+) -> None:
+    monkeypatch.setattr("curvafit.volumes.formats.nifti.MEMBER", member)
+    field = Field(ramp(), (0.3, 0.2, 0.1), "um")
+    plain, packed = (save(field, tmp_path / name).read_bytes() for name in ("scan.nii", "scan.nii.gz"))
+    assert gzip.decompress(packed) == plain
+    assert packed.count(b"\x1f\x8b\x08") == -(-len(plain) // member)
+    back = load(tmp_path / "scan.nii.gz")
+    assert np.array_equal(back.values, field.values)
+    assert (back.spacing, back.unit) == ((0.3, 0.2, 0.1), "um")
+
+
 def imagej(**metadata: object) -> dict:
     return {"imagej": True, "metadata": {"axes": "ZYX", **metadata}}
 

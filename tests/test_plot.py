@@ -13,6 +13,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 
+from curvafit.drawing.corner import bands_figure, corner_figure
 from curvafit.drawing.plot import (
     DIAGONAL,
     diagram_figure,
@@ -21,9 +22,9 @@ from curvafit.drawing.plot import (
     round_length,
     shared_limits,
     slice_figure,
-    surface_picture,
 )
 from curvafit.drawing.render import render, view
+from curvafit.drawing.surfaces import surface_picture
 from curvafit.geometry.diagram import Diagram
 
 
@@ -182,7 +183,7 @@ def test_bars_have_round_lengths(length: float, rounded: float) -> None:
 
 
 def test_pictures_are_written_whole_or_not_at_all(tmp_path: Path) -> None:
-    made = surface_picture(ball((12, 12, 12), 4) > 0, tmp_path / "ball.png", width=160, title="a ball")
+    made = surface_picture(ball((12, 12, 12), 4) > 0, tmp_path / "ball.png", width=160)
     assert matplotlib.image.imread(made).shape[:2] == (160, 160)
     gallery_picture({"one": ball((12, 12, 12), 4), "two": ball((12, 12, 12), 3)}, tmp_path / "two.png", width=320)
     assert matplotlib.image.imread(tmp_path / "two.png").shape[1] == 320
@@ -209,3 +210,39 @@ def test_rays_along_the_boxs_sides_stay_in_it(azimuth: float) -> None:
     rod = np.repeat((9.0 - np.sqrt(z**2 + y**2))[..., None], 64, axis=2)
     picture, _ = render(rod, width=20, azimuth=azimuth)
     assert picture.min() < picture.max()
+
+
+def test_a_corner_plot_has_a_histogram_of_each_and_a_picture_of_each_pair() -> None:
+    draws = np.random.default_rng(0).uniform(0.1, 0.9, (50, 3)) * [1, 10, 100]
+    limits = [(0.0, 1.0), (0.0, 10.0), (0.0, 100.0)]
+    figure = corner_figure(draws, ("a", "b", "c"), limits, {"truth": np.array([0.5, 5.0, 50.0])})
+    places = [(0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)]
+    assert len(figure.axes) == len(places)
+    for axes, (row, column) in zip(figure.axes, places, strict=True):
+        assert axes.get_xlim() == limits[column]
+        assert axes.get_xlabel() == ("abc"[column] if row == 2 else "")
+        assert axes.get_ylabel() == ("abc"[row] if column == 0 < row else "")
+        (mark,) = axes.lines
+        if row == column:
+            assert sum(bar.get_height() for bar in axes.patches) == 50
+            assert list(mark.get_xdata()) == [50 / 10 ** (2 - row)] * 2
+        else:
+            assert axes.get_ylim() == limits[row]
+            assert np.array_equal(np.asarray(axes.collections[0].get_offsets()), draws[:, (column, row)])
+            assert (*mark.get_xdata(), *mark.get_ydata()) == (50 / 10 ** (2 - column), 50 / 10 ** (2 - row))
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["truth"]
+    assert len(corner_figure(draws[:, :1], ("a",), limits[:1], {}).axes) == 1
+
+
+def test_bands_hold_what_they_say_and_show_the_scan_s_numbers() -> None:
+    others = np.outer(np.arange(101.0), np.ones(5))
+    own = np.array([3.0, 1, 4, 1, 5])
+    figure = bands_figure({"curve": (own, others), "number": (own[:1], others[:, :1])})
+    curve, dot = figure.axes
+    assert [curve.get_title(), dot.get_title()] == ["curve", "number"]
+    assert curve.lines[0].get_ydata() == pytest.approx(own) and dot.lines[0].get_ydata() == pytest.approx([3])
+    for band, ends in zip(curve.collections, ((5, 95), (25, 75)), strict=True):
+        values = band.get_paths()[0].vertices[:, 1]
+        assert (values.min(), values.max()) == pytest.approx(ends)
+    for bar, ends in zip(dot.collections, ((5, 95), (25, 75)), strict=True):
+        assert bar.get_paths()[0].vertices[:, 1] == pytest.approx(ends)

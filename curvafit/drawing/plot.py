@@ -14,45 +14,31 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle
 from matplotlib.patheffects import withStroke
 from scipy.ndimage import gaussian_filter
 
-from curvafit.drawing.render import View, render
+from curvafit.drawing.surfaces import DPI, QUIET, boxed
 from curvafit.files import write_content
 from curvafit.geometry.diagram import Diagram
 from curvafit.units import unit_name
 
-#: Colours that stay apart for the colour-blind (Okabe & Ito 2008), and a quiet grey for frames and notes.
-CONTOUR, DIAGONAL, QUIET, INK = "#E69F00", "#C8372D", "#8A8F98", "#22262B"
+#: Colours that stay apart for the colour-blind (Okabe & Ito 2008).
+CONTOUR, DIAGONAL, INK = "#E69F00", "#C8372D", "#22262B"
 #: Area density in a diagram: light where little, dark where much.
 DENSITY = LinearSegmentedColormap.from_list(
     "density", ["#E3ECF5", "#A9CBE3", "#5AA2CB", "#2B6FA8", "#1B3F7A", "#16193F"]
 )
 #: Bins along each axis of a drawn diagram, and decades that its colours span.
 BINS, DECADES = 72, 3.0
-#: Pixels per inch of every picture.
-DPI = 160
 
 Spacing = tuple[float, float, float]
 Limits = tuple[float, float]
 
 
 # ---- surfaces --------------------------------------------------------------------------------------------------------
-
-
-def surface_picture(u: np.ndarray, path: str | Path, *, width: int = 900, title: str = "", **options) -> Path:
-    """Write a picture of the surface of `u` `(Z, Y, X)`; `options` are those of `surface_on`.
-
-    Raises
-    ------
-    ValueError
-        If the volume cannot be drawn (see `render.render`).
-    """
-    return write_picture(surface_figure(u, width=width, title=title, **options), path)
 
 
 def surface_figure(u: np.ndarray, *, width: int = 720, title: str = "", **options) -> Figure:
@@ -76,15 +62,9 @@ def surface_on(
     elevation: float = 24.0,
 ) -> None:
     """Draw the level set of a field (or the outline of a bool mask) in its box, cut faces capped."""
-    values = np.asarray(u)
-    if values.dtype == np.bool_:
-        values, level = gaussian_filter(values.astype(np.float32), 0.7), level + 0.5
-    picture, camera = render(values, spacing=spacing, level=level, width=width, azimuth=azimuth, elevation=elevation)
-    height = picture.shape[0]
+    options = {"spacing": spacing, "level": level, "azimuth": azimuth, "elevation": elevation}
     axes.set_axis_off()
-    axes.add_collection(_edges(camera, (width, height), front=False))
-    axes.imshow(picture, extent=(0, width, height, 0), interpolation="antialiased", zorder=2)
-    axes.add_collection(_edges(camera, (width, height), front=True))
+    axes.imshow(boxed(u, width=width, **options), interpolation="antialiased")
 
 
 def gallery_picture(fields: Mapping[str, np.ndarray], path: str | Path, *, width: int = 1600, **options) -> Path:
@@ -110,17 +90,6 @@ def gallery_figure(fields: Mapping[str, np.ndarray], *, columns: int = 4, width:
         surface_on(axes, u, width=round(width / columns), **options)
         figure.text((column + 0.5) / columns, bottom + 0.05 / rows, name, ha="center", va="center", fontsize=12)
     return figure
-
-
-def _edges(camera: View, size: tuple[int, int], *, front: bool) -> LineCollection:
-    """Return the box's edges in picture pixels: the nine in front of the shape, or the three behind it."""
-    corners = np.array(list(np.ndindex(2, 2, 2)), dtype=float)
-    towards = camera.frame[2]
-    hidden = (corners == (towards < 0)).all(axis=1).argmax()
-    pairs = [(a, b) for a in range(8) for b in range(a + 1, 8) if np.abs(corners[a] - corners[b]).sum() == 1]
-    places = camera.project(corners) * np.array(size)
-    lines = [places[[a, b]] for a, b in pairs if (hidden in (a, b)) != front]
-    return LineCollection(lines, colors=QUIET, linewidths=0.6, alpha=0.55 if front else 0.4, zorder=3 if front else 1)
 
 
 # ---- slices ----------------------------------------------------------------------------------------------------------

@@ -58,7 +58,7 @@ class _Scene(NamedTuple):
     @property
     def middle(self) -> np.ndarray:
         """The middle of the box, in voxels."""
-        return (np.array(self.field.shape) - 1) / 2
+        return (np.array(self.field.shape, np.float32) - 1) / 2
 
 
 class _Rays(NamedTuple):
@@ -104,13 +104,15 @@ def render(
     spacing: tuple[float, float, float] = (1.0, 1.0, 1.0),
     level: float = 0.0,
     width: int = 720,
+    height: int | None = None,
     supersample: int = 2,
     azimuth: float = 32.0,
     elevation: float = 24.0,
 ) -> tuple[np.ndarray, View]:
     """Return the level set of `u` `(Z, Y, X)` as a picture, and the projection that it was drawn by.
 
-    The picture is RGBA, `(height, width, 4)` bytes, transparent where there is nothing.
+    The picture is RGBA bytes, `width` pixels wide, or as wide as lets it be `height` high at most, transparent where
+    there is nothing.
 
     Raises
     ------
@@ -123,14 +125,16 @@ def render(
     if not np.isfinite(field).all():
         raise ValueError("expected a finite volume to draw, got NaN or infinite values")
     camera = view(field.shape, spacing, azimuth=azimuth, elevation=elevation)
+    if height is not None:
+        width = max(2, min(width, round(height * camera.half[0] / camera.half[1])))
     height = max(2, round(width * camera.half[1] / camera.half[0]))
     edges = np.array(spacing) / min(spacing)
     order, field = _stack(field - np.float32(level), -camera.frame[2] / edges)
     scene = _Scene(field, edges[order.axes], order.turned(camera.frame))
     size = (width * supersample, height * supersample)
-    seen = np.linalg.norm(scene.frame[:2, 1:], axis=0) * scene.edges[1:]  # length of a voxel's edges in the picture
-    rays = _rays(field.shape, scene.look, 2 * camera.half[0] / size[0] / seen)
-    sheet = Image.fromarray(_painted(scene, rays))
+    lengths = np.linalg.norm(scene.frame[:2, 1:], axis=0) * scene.edges[1:]  # of a voxel's edges in the picture
+    rays = _rays(field.shape, scene.look, 2 * camera.half[0] / size[0] / lengths)
+    sheet = Image.fromarray(_colours(scene, rays))
     placement = _placement(scene, rays, camera.half, size)
     picture = sheet.transform(size, Image.Transform.AFFINE, placement, Image.Resampling.BILINEAR)
     return np.asarray(picture.reduce(supersample)), camera
@@ -221,7 +225,7 @@ def _crossings(rays: _Rays, shape: tuple[int, ...]) -> list[tuple[np.ndarray, np
 # ---- surface ---------------------------------------------------------------------------------------------------------
 
 
-def _painted(scene: _Scene, rays: _Rays) -> np.ndarray:
+def _colours(scene: _Scene, rays: _Rays) -> np.ndarray:
     """Return the colours that rays see, as RGBA bytes `(I, J, 4)`."""
     crossings = _crossings(rays, scene.field.shape)
     enter, leave = (
@@ -239,10 +243,11 @@ def _painted(scene: _Scene, rays: _Rays) -> np.ndarray:
     sides = np.stack([np.broadcast_to(first, rays.shape).ravel()[numbers[capped]] for first, _ in crossings])
     faces = -np.sign(scene.look) * np.eye(3)
     glow[capped] = _glow(faces @ scene.frame[2], np.maximum(faces @ light, 0), 1.0)[sides.argmax(axis=0)]
-    reach = np.linalg.norm(scene.middle * scene.edges)
-    nearness = (scene.frame[2] * scene.edges) @ (at - scene.middle[:, None])
-    haze = 0.30 * np.clip(0.5 - nearness / (2 * reach), 0, 1) ** 1.5
-    bright = np.clip(glow, 0, 1.1) ** 0.9
+    reach = float(np.linalg.norm(scene.middle * scene.edges))
+    nearness = (scene.frame[2] * scene.edges).astype(np.float32) @ (at - scene.middle[:, None])
+    depth_share = np.clip(0.5 - nearness / (2 * reach), 0, 1)
+    haze = 0.30 * depth_share * np.sqrt(depth_share)
+    bright = np.clip(glow, 0, 1.1) ** np.float32(0.9)
     sheet = np.zeros((len(depth), 4), np.uint8)
     for channel, (surface, cap) in enumerate(zip(SURFACE, CAP, strict=True)):
         colour = np.where(capped, np.float32(cap**0.9), np.float32(surface**0.9))
@@ -279,9 +284,9 @@ def _first(field: np.ndarray, rays: _Rays, enter: np.ndarray, leave: np.ndarray,
     look(sides, enter[sides])
     free, before = waiting.reshape(rays.shape), last.reshape(rays.shape)
     for place, window, values in _planes(field, rays, times):
-        met = np.flatnonzero((values > 0) & free[window])
-        i, j = np.divmod(met, values.shape[1])
-        meet((i + window[0].start) * rays.shape[1] + j + window[1].start, place, values.ravel()[met])
+        hits = np.flatnonzero((values > 0) & free[window])
+        i, j = np.divmod(hits, values.shape[1])
+        meet((i + window[0].start) * rays.shape[1] + j + window[1].start, place, values.ravel()[hits])
         before[window] = values
     ends = np.flatnonzero(waiting & (leave < len(field) - 1))
     look(ends, leave[ends])
@@ -295,12 +300,12 @@ def _surface_glow(scene: _Scene, light: np.ndarray, at: np.ndarray) -> np.ndarra
     """Return the light from the level set at points `(3, N)`, linearly between the voxels around them."""
     field, edges = scene.field, scene.edges[:, None]
     at = np.clip(at, 0, np.array(field.shape)[:, None] - 1)
-    seen = np.zeros(field.shape, np.bool_)
-    seen[tuple(at.astype(np.int32))] = True
+    near = np.zeros(field.shape, np.bool_)
+    near[tuple(at.astype(np.int32))] = True
     for axis in range(3):
-        after = np.moveaxis(seen, axis, 0)
+        after = np.moveaxis(near, axis, 0)
         after[1:] |= after[:-1]
-    voxels = np.stack(np.nonzero(seen))
+    voxels = np.stack(np.nonzero(near))
     smooth = gaussian_filter(field, 0.9 / scene.edges, truncate=3)
     normal = np.stack([_behind(smooth, voxels, axis) for axis in range(3)]) / (2 * edges)
     slope = np.maximum(np.linalg.norm(normal, axis=0), 1e-12)
@@ -312,7 +317,7 @@ def _surface_glow(scene: _Scene, light: np.ndarray, at: np.ndarray) -> np.ndarra
     def coarse(points: np.ndarray) -> np.ndarray:
         return (points - (times - 1) / 2) / times
 
-    near, far = (
+    close, wide = (
         map_coordinates(
             gaussian_filter(inside, distance / times / scene.edges, mode="constant"),
             coarse(points + distance * normal / edges),
@@ -321,11 +326,11 @@ def _surface_glow(scene: _Scene, light: np.ndarray, at: np.ndarray) -> np.ndarra
         )
         for distance in (NEAR, FAR)
     )
-    sky = (1 - np.clip((near - 0.12) * 1.5, 0, 0.7)) * (1 - np.clip((far - 0.05) * 1.3, 0, 0.6))
+    sky = (1 - np.clip((close - 0.12) * 1.5, 0, 0.7)) * (1 - np.clip((wide - 0.05) * 1.3, 0, 0.6))
     before = coarse(points + (1.5 * normal + 2.0 * light[:, None]) / edges)
     lit = np.maximum(light @ normal, 0) * (1 - 0.6 * _shadow(grey, light / scene.edges, before))
     glow = np.zeros(field.shape, np.float32)
-    glow[seen] = _glow(scene.frame[2] @ normal, lit, sky)
+    glow[near] = _glow(scene.frame[2] @ normal, lit, sky)
     return map_coordinates(glow, at, np.float32, 1, "nearest")
 
 
@@ -340,8 +345,9 @@ def _means(values: np.ndarray, times: int) -> np.ndarray:
     """Return the means over blocks of `times`³ voxels; those at the end repeat the last voxel."""
     if times == 1:
         return values.astype(np.float32, copy=False)
-    Z, Y, X = (-(-n // times) for n in values.shape)
-    whole = np.pad(values, [(0, -n % times) for n in values.shape], mode="edge")
+    rest = [-n % times for n in values.shape]
+    whole = np.pad(values, [(0, n) for n in rest], mode="edge") if any(rest) else values
+    Z, Y, X = (n // times for n in whole.shape)
     return whole.reshape(Z, times, Y, times, X, times).mean(axis=(1, 3, 5), dtype=np.float32)
 
 
@@ -356,9 +362,9 @@ def _shadow(field: np.ndarray, light: np.ndarray, points: np.ndarray) -> np.ndar
     np.maximum.accumulate(highest, axis=0, out=highest)
     k, *others = points[order.axes]
     k = k if order.signs[0] > 0 else len(planes) - 1 - k
-    shifted = [
+    places = [
         other - k * slope - values[0] for other, slope, values in zip(others, rays.slopes, rays.places, strict=True)
     ]
-    met = map_coordinates(highest, np.stack([k + 1, *shifted]), np.float32, 1, "nearest")
-    share = np.clip(1 + met / 0.6, 0, 1)
+    level = map_coordinates(highest, np.stack([k + 1, *places]), np.float32, 1, "nearest")
+    share = np.clip(1 + level / 0.6, 0, 1)
     return share * share * (3 - 2 * share)

@@ -14,10 +14,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.ndimage import map_coordinates
 from torch import Tensor
 
-from curvafit.files import check_folder, check_free, move_together, own_record, remove, staged
+from curvafit.files import check_folder, check_free, move_together, own_record, remove, staged, write_content
 from curvafit.generation.flow import Flow
 from curvafit.generation.memory import FILE, check_memory
 from curvafit.geometry.mesh import NoSurface, Surface, solid_surface, surface
@@ -74,7 +73,7 @@ class Output:
         object.__setattr__(self, "tile", tile)
 
     def shape(self, grid: Grid) -> tuple[int, ...]:
-        """Voxels (z, y, x) of what is written of a field.
+        """Return the voxels (z, y, x) of what is written of a field.
 
         Raises
         ------
@@ -97,7 +96,7 @@ def check_target(
     inputs: Iterable[str | Path] = (),
     overwrite: bool = False,
 ) -> Path:
-    """The path, if a shape can be written there by its suffix; asked before the work is done.
+    """Return the path, if a shape can be written there by its suffix; for a check before the work.
 
     Parameters
     ----------
@@ -134,7 +133,7 @@ def check_outputs(
     inputs: Iterable[str | Path] = (),
     overwrite: bool = False,
 ) -> Path:
-    """The path, if it can be written with its record and `more` beside it, and nothing else is lost.
+    """Return the path, if it can be written with its record and `more` beside it, and nothing else is lost.
 
     What the record there, of the same kind, lists as written with this very file may be replaced.
 
@@ -146,32 +145,32 @@ def check_outputs(
     check_folder(target.parent)
     if target.is_dir() and not target.name.lower().endswith(".zarr"):
         raise ValueError(f"expected the name of a file, got the folder {target}")
-    written = _written(target, kind)
+    own = _own_files(target, kind)
 
     def ours(path: Path) -> bool:
         if path.is_dir():
             return path.name.lower().endswith(".zarr") and is_ours(path, kind)
-        return path.name in written
+        return path.name in own
 
     check_free([target, beside(target, ".json"), *more], ours, inputs, overwrite)
     return target
 
 
-def _written(target: Path, kind: str) -> list[str]:
-    """The names of files that the record of that kind there lists as written with this very file."""
+def _own_files(target: Path, kind: str) -> list[str]:
+    """Return the names of files that the record of that kind there lists as written with this very file."""
     listed = own_record(beside(target, ".json"), kind).get("files")
     return listed if isinstance(listed, list) and target.name in listed else []
 
 
 def beside(path: str | Path, ending: str) -> Path:
-    """The path with another ending than its suffix; `.nii.gz` and `.ome.zarr` count as one."""
+    """Return the path with another ending than its suffix; `.nii.gz` and `.ome.zarr` count as one."""
     target = Path(path)
     known = [each for each in (*WRITABLE, *SUFFIXES) if target.name.lower().endswith(each)]
     return target.with_name(target.name[: len(target.name) - max(map(len, known), default=0)] + ending)
 
 
 def step_path(path: str | Path, step: int) -> Path:
-    """Where a snapshot goes: `tubes_step00100.nii.gz` beside `tubes.nii.gz`."""
+    """Return where a snapshot goes: `tubes_step00100.nii.gz` beside `tubes.nii.gz`."""
     suffix = Path(path).name.removeprefix(beside(path, "").name)
     return beside(path, f"_step{step:05d}{suffix}")
 
@@ -187,7 +186,8 @@ def write_shape(
 ) -> tuple[Path, ...]:
     """Write a flow's field as a volume or a surface, by suffix, with a record and a picture of one box.
 
-    The picture is drawn once the other files are in place. A warning says where that fails; a former one goes.
+    The picture is drawn once the other files are in place. Where that fails, a warning says so, and the record does
+    not list it; a former one goes.
 
     Parameters
     ----------
@@ -213,7 +213,7 @@ def write_shape(
     """
     target = check_target(path, output, steps=flow.snapshots, picture=picture, overwrite=overwrite)
     image = beside(target, ".png")
-    former = picture or image.name in _written(target, FORMAT)
+    former = picture or image.name in _own_files(target, FORMAT)
     with staged(target) as work:
         shape = write_field(flow.field, flow.grid, work / target.name, output)
         note = beside(shape, ".json")
@@ -221,19 +221,30 @@ def write_shape(
         for step, field in flow.snapshots.items():
             with suppress(NoSurface):
                 parts.append(write_field(field, flow.grid, step_path(shape, step), output))
-        names = [*(part.name for part in parts), *([image.name] if picture else [])]
-        content = {"format": FORMAT, **(record or {}), "files": names}
-        note.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        content = {"format": FORMAT, **(record or {}), "files": [part.name for part in parts]}
+        drawing = content | {"files": [*content["files"], image.name]}
+        note.write_text(_text(drawing if picture else content), encoding="utf-8")
         with undisturbed():
             files = move_together(parts, target.parent)
             if former:
                 remove(image)
-    return (*files, *(_picture(flow, image) if picture else ()))
+    if not picture:
+        return files
+    if images := _picture(flow, image):
+        return (*files, *images)
+    with suppress(OSError):  # a disk too full for this as well: the record there is whole, and lists a picture too many
+        write_content(beside(target, ".json"), _text(content))
+    return files
+
+
+def _text(record: dict[str, Any]) -> str:
+    """Return a record as the text of its file."""
+    return json.dumps(record, indent=2, allow_nan=False) + "\n"
 
 
 def _picture(flow: Flow, path: Path) -> tuple[Path, ...]:
     """Draw a flow's surface; where that fails, warn and return no path."""
-    from curvafit.drawing.plot import surface_picture
+    from curvafit.drawing.surfaces import surface_picture
 
     try:
         surface_picture(flow.field.numpy(), path)
@@ -277,7 +288,7 @@ def shape_record(
     output: Output | None = None,
     **more: Any,
 ) -> dict[str, Any]:
-    """What is needed to make the shape again: parameters, sampling, seed, schedule, versions; and how it ended.
+    """Return what is needed to make the shape again: parameters, sampling, seed, schedule, versions; and how it ended.
 
     The mass is the flow's own where none is given: that of the field, to float32. A parameter that varies in space is
     stated by its least and greatest value.
@@ -304,14 +315,16 @@ def shape_record(
 
 
 def _stated(value: float | Tensor) -> float | dict[str, float]:
-    """A number, or the range of a map."""
+    """Return a number, or the range of a map."""
     if not isinstance(value, Tensor) or value.numel() == 1:
         return float(value)
     return {"least": float(value.min()), "greatest": float(value.max())}
 
 
 def _vertex_curvatures(mesh: Surface, field: Tensor, grid: Grid) -> dict[str, np.ndarray]:
-    """κ1, κ2 `(V,)` of the level sets of a field, linearly between its voxels; a periodic one repeats."""
+    """Return κ1, κ2 `(V,)` of the level sets of a field, linearly between its voxels; a periodic one repeats."""
+    from scipy.ndimage import map_coordinates
+
     ε = WORKING_EPSILON / WORKING_SPACING * grid.spacing[0]
     κ1, κ2, _, _ = geometric_curvatures(jet(profile_distance(field, ε), grid))
     places = (mesh.vertices / np.array(grid.spacing)).T
@@ -322,7 +335,7 @@ def _vertex_curvatures(mesh: Surface, field: Tensor, grid: Grid) -> dict[str, np
 
 
 def _on_faces(mesh: Surface, box: Grid) -> np.ndarray:
-    """Which vertices are on the box's faces, half a voxel beyond the outermost centres, `(V,)`."""
+    """Return which vertices are on the box's faces, half a voxel beyond the outermost centres, `(V,)`."""
     middle = (np.array(box.shape) - 1) / 2
     reach = np.abs(mesh.vertices / np.array(box.spacing) - middle)
     return np.any(reach > middle + 0.5 - 1e-6, axis=1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import io
 import math
 import re
 from pathlib import Path
@@ -14,6 +15,8 @@ from curvafit.volumes.formats.base import Raw, ScanError, complaints, normalise_
 from curvafit.volumes.formats.part import Part, part_of
 from curvafit.volumes.formats.streams import mapped, read_numbers
 
+#: Bytes that are compressed together.
+MEMBER = 2**28
 #: Our unit -> (NIfTI's, factor to it).
 _TO_FILE = {
     "voxel": ("unknown", 1.0),
@@ -92,7 +95,7 @@ def write_nifti(field: Any, path: Path) -> None:
     image.set_sform(affine, code="aligned")
     if field.unit in ("voxel", "nm"):
         image.header["descrip"] = f"curvafit unit={field.unit}".encode()
-    nibabel.save(image, path)
+    _save(image, path)
 
 
 def write_nifti_like(values: np.ndarray, like: Path, path: Path, unit: str | None = None) -> None:
@@ -119,7 +122,23 @@ def write_nifti_like(values: np.ndarray, like: Path, path: Path, unit: str | Non
     header["cal_min"] = header["cal_max"] = 0
     if unit is not None:
         _rename(header, unit)
-    nibabel.save(type(image)(values.T.reshape(image.shape), None, header), path)
+    _save(type(image)(values.T.reshape(image.shape), None, header), path)
+
+
+def _save(image: Any, path: Path) -> None:
+    """Write an image; where the name ends in .gz compressed by libdeflate, three times as fast as zlib.
+
+    A large file has several members, as gzip allows, so that little memory is needed beside the image.
+    """
+    from imagecodecs import gzip_encode
+
+    buffer = io.BytesIO()
+    image.to_stream(buffer)
+    content, compression = buffer.getbuffer(), path.name.lower().endswith(".gz")
+    with path.open("wb") as stream:
+        for first in range(0, len(content), MEMBER):
+            part = content[first : first + MEMBER]
+            stream.write(gzip_encode(bytes(part), level=1) if compression else part)
 
 
 def _own_unit(header: Any) -> tuple[str, float] | None:
