@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -9,13 +10,13 @@ import pytest
 from typer.testing import CliRunner
 
 from curvafit.atlas_map.describe import describe
-from curvafit.atlas_map.views import BLUR, SNR, VIEWS, View
 from curvafit.cli.app import app
 from curvafit.data_synth.atlas.workers import cluster
 from curvafit.geometry.descriptors import BLOCKS, descriptors
 from curvafit.geometry.mesh import NoSurface
 from curvafit.inference.table import PARAMETERS, Table, column_names, law_of, load_table, parameters_of, save_table
-from curvafit.priors.coefficients import preset
+from curvafit.inference.views import BLUR, SNR, VIEWS, View
+from curvafit.priors.coefficients import Coefficients, preset
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
 from curvafit.volumes.scan import ScanError
@@ -119,6 +120,18 @@ def test_a_stopped_table_goes_on_and_grows(tmp_path: Path, monkeypatch: pytest.M
     assert np.array_equal(grown.descriptors[: len(whole)], whole.descriptors)
 
 
+def test_a_shape_that_is_removed_meanwhile_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = exact_store(tmp_path / "store.zarr", 4)
+
+    def thief(u, grid, rng):
+        shutil.rmtree(store.path / "draws" / "000001", ignore_errors=True)
+        return View(u, grid)
+
+    monkeypatch.setitem(VIEWS, "field", thief)
+    table = describe([store.path], tmp_path / "table.npz", ("field",))
+    assert table.shapes.tolist() == ["store/000000", "store/000003"]
+
+
 @pytest.mark.slow
 def test_workers_measure_the_same(tmp_path: Path) -> None:
     store = exact_store(tmp_path / "store.zarr", 6)
@@ -137,7 +150,7 @@ def test_a_view_without_a_surface_is_a_row_without_numbers(tmp_path: Path, monke
 
     monkeypatch.setitem(VIEWS, "crop", empty)
     table = describe([exact_store(tmp_path / "store.zarr", 2).path], tmp_path / "table.npz", ("mask", "crop"))
-    assert table.seen.views.tolist() == ["mask", "mask"]
+    assert table.visible.views.tolist() == ["mask", "mask"]
     assert np.isnan(table.descriptors[table.views == "crop"]).all()
 
 
@@ -150,6 +163,11 @@ def test_parameters_are_those_of_the_law_in_its_gauge() -> None:
     back, m = law_of(parameters)
     assert list(back) == pytest.approx(list(law.scaled(1 / law.a20)))
     assert m == mass
+    for a20, a02 in ((0.0, 1.0), (1.0, 0.0), (1.0, -2.0)):
+        with pytest.warns(UserWarning, match="keep the energy bounded below"):
+            unbounded = Coefficients(a20, 0.0, a02)
+        with pytest.raises(ValueError, match="expected a law with a20 and a02 above 0, got a20 = "):
+            parameters_of(unbounded, mass)
 
 
 def small_table(rows: int = 3) -> Table:

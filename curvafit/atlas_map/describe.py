@@ -6,13 +6,13 @@ import dataclasses
 import json
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from curvafit.atlas_map.views import VIEWS
 from curvafit.data_synth.atlas.draws import versions
 from curvafit.data_synth.atlas.store import Store, open_store
 from curvafit.data_synth.atlas.workers import Here, Workers
@@ -20,6 +20,7 @@ from curvafit.generation.viability import well_formed
 from curvafit.geometry.descriptors import Descriptors, descriptors
 from curvafit.geometry.mesh import NoSurface
 from curvafit.inference.table import Table, load_table, parameters_of, row_of, save_table
+from curvafit.inference.views import VIEWS
 from curvafit.priors.grid import Grid
 from curvafit.progress import Progress, silent
 from curvafit.volumes.scan import ScanError
@@ -41,7 +42,8 @@ def describe(
     """Measure the well-formed shapes of stores in each view, and write the table; views that the file has stay.
 
     A view depends on the shape, its seed and the view's name alone, so a table that was stopped ends as one that was
-    not, but for the order of its rows. Stores may grow meanwhile: what they have at the start is measured.
+    not, but for the order of its rows. Stores may change meanwhile: what they have at the start is measured,
+    but for what is removed before its turn.
 
     Parameters
     ----------
@@ -69,30 +71,29 @@ def describe(
     unknown = [name for name in views if name not in VIEWS]
     if unknown or not views:
         raise ValueError(f"expected views among {', '.join(VIEWS)}, got {', '.join(unknown) or 'none'}")
-    opened = [open_store(path) for path in stores]
-    names = [_name(store) for store in opened]
+    sources = [open_store(path) for path in stores]
+    names = [_name(store) for store in sources]
     if len(set(names)) < len(names):
         raise ValueError(f"expected stores with names of their own, got {', '.join(names)}")
     path, crew = Path(out), workers or Here()
-    rows = _Rows(load_table(path) if path.exists() and not overwrite else None, opened, command)
-    todo = [job for store in opened for job in _jobs(store, views, rows)]
-    if not todo and not rows.shapes:
+    rows = _Rows(load_table(path) if path.exists() and not overwrite else None, sources, command)
+    jobs = [job for store in sources for job in _jobs(store, views, rows)]
+    if not jobs and not rows.shapes:
         raise ValueError(f"expected a well-formed shape in {', '.join(names)}, got none")
-    done, pending, written = 0, 0, time.monotonic()
-    jobs = iter(todo)
+    queue, count, pending, last_save = iter(jobs), 0, 0, time.monotonic()
     try:
-        while done < len(todo):
-            while pending < crew.places and (job := next(jobs, None)) is not None:
+        while count < len(jobs):
+            while pending < crew.places and (job := next(queue, None)) is not None:
                 store, index, missing = job
                 crew.submit(partial(measure, views=missing), store.path, [index])
                 pending += 1
-            for measured in crew.done():
-                rows.add(measured)
-                done, pending = done + 1, pending - 1
-                progress(f"measured {done} of {len(todo)} shapes", done / len(todo))
-            if time.monotonic() - written > PAUSE:
+            for shape in crew.done():
+                rows.add(shape)
+                count, pending = count + 1, pending - 1
+                progress(f"measured {count} of {len(jobs)} shapes", count / len(jobs))
+            if time.monotonic() - last_save > PAUSE:
                 save_table(rows.table(), path)
-                written = time.monotonic()
+                last_save = time.monotonic()
     finally:
         if rows.shapes:
             save_table(rows.table(), path)
@@ -102,23 +103,29 @@ def describe(
 def measure(path: Path, indices: Sequence[int], views: Sequence[str]) -> list[dict[str, Any]]:
     """Measure some shapes of a store in some views: their parameters and descriptors by view, None without a surface.
 
+    A shape that is no longer in the store has no views.
+
     Raises
     ------
-    KeyError, ValueError
-        If a shape is missing or damaged.
+    ValueError
+        If a shape is damaged, or its law has a20 or a02 that is not above 0.
     """
     store = open_store(path)
     grid, epsilon = Grid(store.settings.shape, store.settings.spacing), store.settings.epsilon
     rows = []
     for index in indices:
-        record, u = store.record(index), store.field(index)
-        seen = {name: _described(u, grid, epsilon, name, record.seed) for name in views}
-        rows.append({"shape": _shape(store, index), "parameters": parameters_of(record.coefficients, record.mass)})
-        rows[-1]["views"] = seen
+        rows.append({"shape": _shape(store, index), "views": {}})
+        try:
+            record, u = store.record(index), store.field(index)
+        except KeyError:
+            continue
+        rows[-1]["parameters"] = parameters_of(record.coefficients, record.mass)
+        rows[-1]["views"] = {name: _view_descriptors(u, grid, epsilon, name, record.seed) for name in views}
     return rows
 
 
-def _described(u: np.ndarray, grid: Grid, epsilon: float, name: str, seed: int) -> Descriptors | None:
+def _view_descriptors(u: np.ndarray, grid: Grid, epsilon: float, name: str, seed: int) -> Descriptors | None:
+    """Return the descriptors of a field in one view, None where that shows no surface."""
     rng = np.random.default_rng([seed, *name.encode()])
     try:
         view = VIEWS[name](u, grid, rng)
@@ -145,16 +152,18 @@ class _Rows:
             "command": [*before.get("command", []), *command],
             "measured_with": versions(),
         }
-        self.there = set(zip(self.shapes, self.views, strict=True))
+        self.keys = set(zip(self.shapes, self.views, strict=True))
 
-    def add(self, measured: dict[str, Any]) -> None:
-        for view, seen in measured["views"].items():
-            self.shapes.append(measured["shape"])
+    def add(self, shape: dict[str, Any]) -> None:
+        """Add a row for each view of a shape, as `measure` returns it."""
+        for view, blocks in shape["views"].items():
+            self.shapes.append(shape["shape"])
             self.views.append(view)
-            self.parameters.append(measured["parameters"])
-            self.descriptors.append(row_of(seen).astype(np.float32))
+            self.parameters.append(shape["parameters"])
+            self.descriptors.append(row_of(blocks).astype(np.float32))
 
     def table(self) -> Table:
+        """Return the rows as a table."""
         shapes, views = np.array(self.shapes, dtype=str), np.array(self.views, dtype=str)
         return Table(shapes, views, np.array(self.parameters), np.array(self.descriptors), self.provenance)
 
@@ -164,13 +173,15 @@ def _jobs(store: Store, views: Sequence[str], rows: _Rows) -> list[tuple[Store, 
     jobs = []
     for index in store.indices():
         shape = _shape(store, index)
-        missing = tuple(name for name in views if (shape, name) not in rows.there)
-        if missing and store.viable(index) and well_formed(store.record(index).viability):
-            jobs.append((store, index, missing))
+        missing = tuple(name for name in views if (shape, name) not in rows.keys)
+        with suppress(KeyError):  # a draw that was removed since it was listed
+            if missing and store.viable(index) and well_formed(store.record(index).viability):
+                jobs.append((store, index, missing))
     return jobs
 
 
 def _name(store: Store) -> str:
+    """Return a store's name in a table: its folder, without the suffix."""
     return store.path.resolve().name.removesuffix(".zarr")
 
 

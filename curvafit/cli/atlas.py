@@ -22,6 +22,7 @@ from curvafit.cli.workers import Crew, DashboardOption, SchedulerOption, Workers
 
 if TYPE_CHECKING:
     from curvafit.data_synth.atlas.design import Design
+    from curvafit.inference.archive import Archive
 
 atlas_app = typer.Typer(help="Collections of generated shapes to match scans against.", no_args_is_help=True)
 
@@ -144,14 +145,10 @@ def extract_atlas(
 ) -> None:
     """Measure a store's shapes, and write the atlas that `infer --atlas` reads."""
     with plainly():
-        if out.suffix.lower() != ".npz":
-            raise ValueError(f"expected a name ending in .npz, got {out.name!r}")
         from curvafit.atlas_map.extract import extract
-        from curvafit.files import check_folder, check_free
-        from curvafit.inference.atlas import is_atlas, save_atlas
+        from curvafit.inference.atlas import ARCHIVE, save_atlas
 
-        check_folder(out.parent)
-        check_free([out], is_atlas, [store], overwrite)
+        _check_archive(out, ARCHIVE, [store], overwrite)
         with stages() as progress:
             atlas = extract(store, [command_line()], progress=progress)
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -176,15 +173,11 @@ def describe_atlas(
 ) -> None:
     """Measure each shape of stores as field, mask, crop and scan: the table that `atlas train` reads."""
     with plainly():
-        if out.suffix.lower() != ".npz":
-            raise ValueError(f"expected a name ending in .npz, got {out.name!r}")
         from curvafit.atlas_map.describe import describe
-        from curvafit.atlas_map.views import VIEWS
-        from curvafit.files import check_folder, check_free
-        from curvafit.inference.table import is_table
+        from curvafit.inference.table import ARCHIVE
+        from curvafit.inference.views import VIEWS
 
-        check_folder(out.parent)
-        check_free([out], is_table, stores, overwrite)
+        _check_archive(out, ARCHIVE, stores, overwrite)
         crew = Crew(workers, scheduler, dashboard)
         crew.check()
         names = tuple(VIEWS) if views is None else tuple(views.split(","))
@@ -207,15 +200,11 @@ def train_atlas(
 ) -> None:
     """Train the posterior of the parameters, given descriptors, on a table of them."""
     with plainly():
-        if out.suffix.lower() != ".npz":
-            raise ValueError(f"expected a name ending in .npz, got {out.name!r}")
-        from curvafit.files import check_folder, check_free
-        from curvafit.inference.posterior import is_posterior, save_posterior
+        from curvafit.inference.posterior import ARCHIVE, save_posterior
         from curvafit.inference.posterior_training import train_posterior
         from curvafit.inference.table import load_table
 
-        check_folder(out.parent)
-        check_free([out], is_posterior, [table], overwrite)
+        _check_archive(out, ARCHIVE, [table], overwrite)
         content = load_table(table)
         if views is not None:
             content = content.of(views.split(","))
@@ -244,6 +233,16 @@ def map_atlas(
             files = write_map(store, out, **options, progress=progress)
         for path in files:
             say(str(path))
+
+
+def _check_archive(out: Path, archive: Archive, inputs: list[Path], overwrite: bool) -> None:
+    """Refuse a target that is no `.npz`, cannot be written, is an input, or is a file of another kind."""
+    from curvafit.files import check_folder, check_free
+
+    if out.suffix.lower() != ".npz":
+        raise ValueError(f"expected a name ending in .npz, got {out.name!r}")
+    check_folder(out.parent)
+    check_free([out], archive.bears, inputs, overwrite)
 
 
 def _design(name: str, around: str | None, spread: float | None) -> Design:

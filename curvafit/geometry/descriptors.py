@@ -28,6 +28,8 @@ LEVELS = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.95, 0.98)
 #: Radii of the two-point function, and how far distances to the surface are measured, in voxels.
 RADII = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 16.0, 20.0)
 DEPTH = 20.0
+#: Length of chords, in voxels, beyond which they are not told apart.
+LONGEST = 40.0
 #: Edge of the bins of curvature, in 1 / (100 voxels): binning moves an embedding by 0.06, seeds move it by 0.6 or more.
 _CURVATURE_BIN = 0.5
 #: Bins to a voxel in which distances to the surface are counted.
@@ -47,7 +49,7 @@ class Descriptors:
     densities
         `(3,)`: area, integral of the mean curvature (κ1 + κ2) / 2, and Euler number of the inside, per volume.
     chords, gaps
-        `(11,)` each: quantiles (`LEVELS`) of the chords inside and outside, along all three axes together.
+        `(11,)` each: quantiles (`LEVELS`), up to 40 voxels, of the chords inside and outside, along all three axes.
     depths, clearances
         `(11,)` each: quantiles of the distance to the surface of the points inside and outside.
     correlation
@@ -137,6 +139,7 @@ def _meshed_volume(grid: Grid) -> float:
 
 
 def _fabric(normals: np.ndarray, area: np.ndarray) -> np.ndarray:
+    """Return the eigenvalues of the mean n⊗n over a surface, of its triangles' normals times their area."""
     counted = area > 0
     tensor = (normals[counted] / area[counted, None]).T @ normals[counted] / area.sum()
     return np.linalg.eigvalsh(tensor)[::-1]
@@ -159,16 +162,18 @@ def _chord_quantiles(phase: np.ndarray, periodic: bool) -> np.ndarray:
     """Return quantiles, in voxels, of the lengths of the runs of a phase along the three axes.
 
     Of a window, each run counts from its ends that are seen: up to the other end, or as longer than what is seen.
+    Quantiles beyond `LONGEST` are that: a small window cannot tell them, and all windows are to be told alike.
     """
     longest = max(phase.shape)
-    ended, seen = np.zeros((2, longest + 1))
+    events, runs = np.zeros((2, longest + 1))
     for axis in range(3):
         lines = np.moveaxis(phase, axis, -1).reshape(-1, phase.shape[axis])
         for ordered in (lines,) if periodic else (lines, lines[:, ::-1]):
             length, complete = _runs(ordered, periodic)
-            ended += np.bincount(length[complete], minlength=longest + 1)
-            seen += np.bincount(length, minlength=longest + 1)
-    return np.interp(LEVELS, _shorter(ended, seen), np.arange(longest + 1) + 0.5)
+            events += np.bincount(length[complete], minlength=longest + 1)
+            runs += np.bincount(length, minlength=longest + 1)
+    quantiles = np.interp(LEVELS, _shorter(events, runs), np.arange(longest + 1) + 0.5)
+    return np.minimum(quantiles, LONGEST)
 
 
 def _runs(lines: np.ndarray, periodic: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -200,8 +205,8 @@ def _depth_quantiles(inside: Tensor, grid: Grid) -> tuple[np.ndarray, np.ndarray
     for phase in (distance > 0, distance < 0):
         depth, known = np.abs(distance[phase]), reach[phase]
         index = (_FINE * np.minimum(depth, known)).astype(int)
-        ended, seen = (np.bincount(each, minlength=_FINE * len(whole)) for each in (index[depth <= known], index))
-        quantiles.append(np.interp(LEVELS, _shorter(ended, seen)[_FINE - 1 :: _FINE], whole))
+        events, points = (np.bincount(each, minlength=_FINE * len(whole)) for each in (index[depth <= known], index))
+        quantiles.append(np.interp(LEVELS, _shorter(events, points)[_FINE - 1 :: _FINE], whole))
     return quantiles[0], quantiles[1]
 
 
@@ -212,11 +217,11 @@ def _distance_to_faces(shape: tuple[int, int, int]) -> np.ndarray:
     return np.minimum(near, DEPTH)
 
 
-def _shorter(ended: np.ndarray, seen: np.ndarray) -> np.ndarray:
+def _shorter(events: np.ndarray, counts: np.ndarray) -> np.ndarray:
     """Return the part of lengths that end in each bin or before it, where some are only known to be longer than what is
     seen of them, by Kaplan & Meier's estimate: how many end in each bin, and how many do or are lost from sight."""
-    risk = np.cumsum(seen[::-1])[::-1]
-    return 1 - np.cumprod(1 - ended / np.maximum(risk, 1))
+    risk = np.cumsum(counts[::-1])[::-1]
+    return 1 - np.cumprod(1 - events / np.maximum(risk, 1))
 
 
 def _correlation(mask: np.ndarray, periodic: bool) -> np.ndarray:
@@ -233,6 +238,7 @@ def _correlation(mask: np.ndarray, periodic: bool) -> np.ndarray:
 
 
 def _autocorrelation(values: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
+    """Return the sums of products of values and the same values at each offset, in a periodic box of some size."""
     return np.fft.irfftn(np.abs(np.fft.rfftn(values, size, (0, 1, 2))) ** 2, size, (0, 1, 2))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -80,6 +80,11 @@ class Diagram(Pictured):
     def area(self) -> float:
         """Return the total weight."""
         return float(self.weights.sum())
+
+    @property
+    def mirrored(self) -> Diagram:
+        """Return the diagram of the same surface with inside and outside exchanged: (κ1, κ2) becomes (-κ2, -κ1)."""
+        return replace(self, points=-self.points[:, ::-1])
 
     @property
     def normalised(self) -> Diagram:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.resources
 import io
-import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,16 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.files import write_content
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.transport import sliced_embedding
-from curvafit.priors.bounds import quoted
+from curvafit.inference.archive import Archive
 from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.json_text import parse_json
-from curvafit.volumes.formats import read_archive
 
-FORMAT = "curvafit atlas"
 VERSION = 1
+ARCHIVE = Archive("an atlas", "an atlas file", "curvafit atlas", VERSION, "extract it again from its store")
 #: How a shape can be seen: as its phase field, or as the mask {u > 0} re-profiled.
 VIEWS = ("field", "mask")
 
@@ -94,19 +90,10 @@ def save_atlas(atlas: Atlas, path: str | Path) -> None:
     Points are stored in float16: κ is rounded by at most 2⁻¹¹ of itself (0.03 at 100), far below the bins' width of 2.
     Weights, as parts of a diagram's area, are stored in float32.
     """
-    header = {"format": FORMAT, "version": VERSION, "ids": list(atlas.ids), "provenance": atlas.provenance}
-    arrays = {
-        "header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8),
-        "coefficients": atlas.coefficients,
-        "masses": atlas.masses,
-        "seeds": atlas.seeds,
-        "volume_fractions": atlas.volume_fractions,
-    }
+    arrays = {name: getattr(atlas, name) for name in ("coefficients", "masses", "seeds", "volume_fractions")}
     for view in VIEWS:
         arrays |= {f"{view}_{name}": value for name, value in _packed(atlas.diagrams(view)).items()}
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)
-    write_content(Path(path), buffer.getvalue())
+    ARCHIVE.save(path, arrays, ids=list(atlas.ids), provenance=atlas.provenance)
 
 
 def load_atlas(path: str | Path | None = None) -> Atlas:
@@ -121,59 +108,29 @@ def load_atlas(path: str | Path | None = None) -> Atlas:
     """
     if path is None:
         packaged = importlib.resources.files("curvafit.inference") / "data" / "atlas.npz"
-        return _parse(packaged.read_bytes(), "the packaged atlas")
+        return ARCHIVE.parse(io.BytesIO(packaged.read_bytes()), "the packaged atlas", _atlas)
     if Path(path).is_dir():
         raise FileNotFoundError(
             f"expected an atlas file, got the folder {path}: `curvafit atlas extract` makes one of it"
         )
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"expected an atlas file, got {path}, where there is none")
-    return _parse(Path(path).read_bytes(), str(path))
+    return ARCHIVE.load(path, _atlas)
 
 
-def is_atlas(path: Path) -> bool:
-    """Return whether a file bears an atlas's format; all else of it may be wrong."""
-    try:
-        header = read_archive(path)["header"].tobytes() if path.is_file() else b""
-        return parse_json(header, "an atlas's header", path)["format"] == FORMAT
-    except (OSError, ValueError, KeyError, TypeError):
-        return False
-
-
-def _packed(measured: tuple[Diagram, ...]) -> dict[str, np.ndarray]:
+def _packed(diagrams: tuple[Diagram, ...]) -> dict[str, np.ndarray]:
     """Return the diagrams as flat arrays: the points of number i are rows offsets[i] to offsets[i + 1]."""
-    areas = np.array([d.weights.sum() for d in measured])
+    areas = np.array([d.weights.sum() for d in diagrams])
     return {
-        "points": np.concatenate([d.points for d in measured]).astype(np.float16),
-        "weights": np.concatenate([d.weights / a for d, a in zip(measured, areas, strict=True)]).astype(np.float32),
-        "offsets": np.cumsum([0] + [len(d.weights) for d in measured]),
+        "points": np.concatenate([d.points for d in diagrams]).astype(np.float16),
+        "weights": np.concatenate([d.weights / a for d, a in zip(diagrams, areas, strict=True)]).astype(np.float32),
+        "offsets": np.cumsum([0] + [len(d.weights) for d in diagrams]),
         "areas": areas,
-        "spreads": np.array([d.spread for d in measured]),
-        "excluded": np.array([d.excluded for d in measured]),
+        "spreads": np.array([d.spread for d in diagrams]),
+        "excluded": np.array([d.excluded for d in diagrams]),
     }
 
 
-def _parse(data: bytes, name: str) -> Atlas:
-    """Return the atlas in a file's bytes."""
-    try:
-        arrays = read_archive(io.BytesIO(data))
-        header = parse_json(arrays["header"].tobytes(), "an atlas's header", name)
-        known = header["format"] == FORMAT
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"expected an atlas file, got {name}, which is truncated or something else") from error
-    if not known:
-        raise ValueError(f"expected an atlas file, got {name}, which is something else")
-    if (version := header.get("version")) != VERSION:
-        raise ValueError(f"expected an atlas of version {VERSION}, got version {quoted(version)} in {name}")
-    try:
-        return _assembled(arrays, header)
-    except KeyError as error:
-        raise ValueError(f"expected a whole atlas of version {VERSION}, got {name} without {error}") from error
-    except (ValueError, IndexError, TypeError, AttributeError) as error:
-        raise ValueError(f"expected a whole atlas of version {VERSION}, got {name} ({str(error)[:200]})") from error
-
-
-def _assembled(arrays: dict[str, np.ndarray], header: dict[str, Any]) -> Atlas:
+def _atlas(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Atlas:
+    """Return the atlas of a file's header and arrays."""
     sound = all(x.dtype.kind in "iuf" and np.isfinite(x).all() for x in arrays.values())
     if not (sound and (np.abs(arrays["masses"]) < 1).all() and all(isinstance(one, str) for one in header["ids"])):
         raise ValueError("expected finite numbers, masses in (-1, 1) and ids that are texts, got others")

@@ -85,8 +85,8 @@ def scan(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
     grey += rng.standard_normal(grey.shape, dtype=np.float32) / SNR
     level = find_level(Field(grey, (float(SLICE), 1.0, 1.0), "voxel"), kind="image")
     values = resample(level.values, (1 / SLICE, 1.0, 1.0), (0, 0, 0), part.shape)
-    found = values > 0
-    return View(without_specks(found, _ball(_thickness(found) / 2), False)[0], window)
+    inside = values > 0
+    return View(without_specks(inside, _ball(_thickness(inside) / 2), False)[0], window)
 
 
 def _thickness(part: np.ndarray) -> float:
@@ -100,6 +100,7 @@ def _thickness(part: np.ndarray) -> float:
 
 
 def _ball(diameter: float) -> float:
+    """Return the volume of a ball."""
     return math.pi / 6 * diameter**3
 
 
