@@ -4,12 +4,14 @@
     python -m benchmarks.closure TABLE.npz --curve 100,200,400          # R² by number of training shapes
     python -m benchmarks.closure TABLE.npz --ablation                   # R² without each block, and with it alone
     CURVAFIT_DATA=… python -m benchmarks.closure TABLE.npz --gallery    # the author's volumes, as masks
+    python -m benchmarks.closure TABLE.npz --misfit                     # how often the check alarms at p < .05
 
 TABLE is made by `curvafit atlas describe`. Each shape is answered for by what was trained on the other folds alone, all
 its views being in one fold. Answers are kept in the cache's folder, so that a stopped run goes on.
 
 Methods: `match`, the nearest training shape by the curvature block; `ridge`, linear regression on all columns;
-`process`, a Gaussian process for each parameter on principal components; `posterior`, the ensemble of flows.
+`process`, a Gaussian process for each parameter on principal components; `posterior`, the ensemble of flows; `refined`,
+the emulator's best parameters from the posterior's draws, with the covariance there.
 
 - error: median |error| in deviations of the prior; R²: 1 - mean square error / variance.
 - in 50, in 90: part of the true values in the central 50 and 90 % intervals; wide 90: their mean width in deviations of
@@ -29,6 +31,7 @@ import time
 import warnings
 import zlib
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -37,13 +40,18 @@ import numpy as np
 from scipy import stats
 
 from curvafit.geometry.descriptors import BLOCKS, descriptors
+from curvafit.inference.check import amortised_p
+from curvafit.inference.compression import compression_of
+from curvafit.inference.emulator import optimum
 from curvafit.inference.posterior import Architecture, Posterior, load_posterior, save_posterior
-from curvafit.inference.posterior_training import compression_of, train_posterior
+from curvafit.inference.posterior_training import train_posterior
 from curvafit.inference.table import PARAMETERS, Table, column_names, load_table, parameters_of
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
 
 DRAWS = 400
+#: Draws from which the best parameters are looked for.
+STARTS = 16
 #: Flows of a posterior; in curve and ablation, which compare, a single one.
 MEMBERS = 4
 
@@ -90,7 +98,7 @@ def process(training: Table, queries: Table) -> Answers:
     mean, spread = np.empty((2, len(queries), len(PARAMETERS)))
     for view in set(queries.views.tolist()):
         mine, rows = queries.views == view, training.of([view])
-        compression = compression_of(rows.descriptors, Architecture())
+        compression = compression_of(rows.descriptors, Architecture().components)
         x, asked = compression(rows.descriptors), compression(queries.descriptors[mine])
         for k, y in enumerate(rows.parameters.T):
             kernel = ConstantKernel(1.0) * RBF(5.0, (0.3, 1e3)) + WhiteKernel(0.1)
@@ -101,8 +109,28 @@ def process(training: Table, queries: Table) -> Answers:
     return Answers(mean, mean[:, None] + spread[:, None] * noise)
 
 
-def posterior(training: Table, queries: Table) -> Answers:
-    return asked(train_posterior(training, members=MEMBERS), queries)
+def posterior(training: Table, queries: Table, cache: Path) -> Answers:
+    return asked(learnt(training, cache), queries)
+
+
+def refined(training: Table, queries: Table, cache: Path) -> Answers:
+    """The best parameters by the emulator, with normal draws about them, cut at the box."""
+    trained, rng = learnt(training, cache), np.random.default_rng(0)
+    mean, draws = np.empty((len(queries), len(PARAMETERS))), np.empty((len(queries), DRAWS, len(PARAMETERS)))
+    for k, (row, view) in enumerate(zip(queries.descriptors, queries.views.tolist(), strict=True)):
+        best = optimum(trained.emulator, row, view, trained.sample(row, view, STARTS))
+        mean[k] = best.parameters
+        draws[k] = np.clip(rng.multivariate_normal(best.parameters, best.covariance, DRAWS), *trained.box.T)
+    return Answers(mean, draws)
+
+
+def learnt(training: Table, cache: Path) -> Posterior:
+    """The posterior of a table, trained once for all that ask it."""
+    path = cache / f"{key_of(training)}-posterior{MEMBERS}.npz"
+    if not path.exists():
+        cache.mkdir(parents=True, exist_ok=True)
+        save_posterior(train_posterior(training, members=MEMBERS), path)
+    return load_posterior(path)
 
 
 def lone(training: Table, queries: Table) -> Answers:
@@ -118,7 +146,9 @@ def asked(trained: Posterior, queries: Table) -> Answers:
     return Answers(draws.mean(1), draws)
 
 
-METHODS: dict[str, Method] = {"match": match, "ridge": ridge, "process": process, "posterior": posterior}
+def methods(cache: Path) -> dict[str, Method]:
+    trained = {"posterior": partial(posterior, cache=cache), "refined": partial(refined, cache=cache)}
+    return {"match": match, "ridge": ridge, "process": process} | trained
 
 
 # ---- folds -----------------------------------------------------------------------------------------------------------
@@ -216,7 +246,7 @@ def show_answers(name: str, truth: np.ndarray, answers: Answers, prior: np.ndarr
 
 
 def closure(table: Table, views: Sequence[str], folds: int, cache: Path) -> None:
-    for name, method in METHODS.items():
+    for name, method in methods(cache).items():
         begun = time.perf_counter()
         answers = cross_answers(table, method, folds, cache, f"{name}-{'-'.join(views)}")
         print(f"{name}: {time.perf_counter() - begun:.0f} s")
@@ -262,19 +292,36 @@ def ablation(table: Table, folds: int, cache: Path) -> None:
         print(f"  {label:16} " + " ".join(f"{v:6.2f}" for v in values) + f"   mean {values.mean():.3f}", flush=True)
 
 
+def misfit(table: Table, folds: int, cache: Path) -> None:
+    """How often shapes of the model raise an alarm, by view: the p-values of each fold by what the others taught."""
+    fold, p = fold_of(table, folds), np.empty(len(table))
+    for k in range(folds):
+        path, mine = cache / f"{key_of(table)}-misfit-{k}of{folds}.npy", np.flatnonzero(fold == k)
+        if not path.exists():
+            trained = learnt(table.rows(fold != k), cache)
+            cache.mkdir(parents=True, exist_ok=True)
+            np.save(path, [p_of(trained, table, row) for row in mine])
+        p[mine] = np.load(path)
+    for view in sorted(set(table.views.tolist())):
+        mine = p[table.views == view]
+        print(
+            f"  {view:10} alarms at .05: {(mine < 0.05).mean():.3f}, at .01: {(mine < 0.01).mean():.3f}, of {len(mine)}"
+        )
+
+
+def p_of(trained: Posterior, table: Table, row: int | np.integer) -> float:
+    descriptors, view = table.descriptors[row], str(table.views[row])
+    return amortised_p(trained, descriptors, view, trained.sample(descriptors, view, STARTS))
+
+
 def gallery(table: Table, folder: Path, cache: Path) -> None:
     """The author's volumes as masks, by what was trained on the whole table."""
     queries = author_table(folder, cache)
-    path = cache / f"{key_of(table)}-whole.npz"
-    if path.exists():
-        trained = load_posterior(path)
-    else:
-        trained = train_posterior(table, members=MEMBERS)
-        cache.mkdir(parents=True, exist_ok=True)
-        save_posterior(trained, path)
+    trained = learnt(table, cache)
     prior = table.parameters.std(0)
-    answers = {name: METHODS[name](table, queries) for name in ("match", "process")}
-    answers["posterior"] = asked(trained, queries)
+    answers = {name: method(table, queries) for name, method in methods(cache).items() if name != "ridge"}
+    alarms = [p_of(trained, queries, k) for k in range(len(queries))]
+    print("misfit: " + ", ".join(f"{n} {p:.3f}" for n, p in zip(queries.shapes, alarms, strict=True)))
     for name, each in answers.items():
         error = (each.mean - queries.parameters) / prior
         print(f"{name}: error in deviations of the prior")
@@ -313,9 +360,10 @@ def main() -> None:
     parser.add_argument("--curve", default=None)
     parser.add_argument("--ablation", action="store_true")
     parser.add_argument("--gallery", action="store_true")
+    parser.add_argument("--misfit", action="store_true")
     options = parser.parse_args()
     warnings.filterwarnings("ignore", module="sklearn")
-    table = load_table(options.table).seen
+    table = load_table(options.table).visible
     views = sorted(set(table.views.tolist())) if options.views is None else options.views.split(",")
     table = table.of(views)
     print(f"{len(np.unique(table.shapes))} shapes; columns: {', '.join(PARAMETERS)}", flush=True)
@@ -323,6 +371,8 @@ def main() -> None:
         curve(table, [int(n) for n in options.curve.split(",")], options.folds, options.cache)
     elif options.ablation:
         ablation(table, options.folds, options.cache)
+    elif options.misfit:
+        misfit(table, options.folds, options.cache)
     elif options.gallery:
         gallery(table, Path(os.environ["CURVAFIT_DATA"]) / "gallery", options.cache)
     else:

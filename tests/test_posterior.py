@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import curvafit.inference.emulator_training as emulator_training
 import curvafit.inference.posterior_training as training
 from curvafit.cli.app import app
 from curvafit.geometry.descriptors import BLOCKS
-from curvafit.inference.posterior import Architecture, Posterior, load_posterior, save_posterior, straightened
-from curvafit.inference.posterior_training import compression_of, train_posterior
-from curvafit.inference.table import Table, column_names, save_table
+from curvafit.inference.compression import columns_of, compression_of
+from curvafit.inference.posterior import Architecture, Posterior, load_posterior, save_posterior
+from curvafit.inference.posterior_training import train_posterior
+from curvafit.inference.table import Table, column_names, law_of, mirrored, parameters_of, save_table
 
 LOW, HIGH = np.array([-4, -2.7, -200, -200, -3000, -0.75]), np.array([4, 2.7, 200, 200, 3000, -0.15])
 SMALL = Architecture(components=4, hidden=(64,), transforms=1, dropout=0.0)
@@ -43,6 +45,7 @@ def posterior() -> Posterior:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(training, "RATE", 1e-2)
         patch.setattr(training, "EPOCHS", 60)
+        patch.setattr(emulator_training, "EPOCHS", 20)
         return train_posterior(table(800), SMALL, members=2)
 
 
@@ -80,11 +83,22 @@ def test_the_density_is_one_over_the_box(posterior: Posterior) -> None:
     places = low + wide * np.random.default_rng(0).random((20000, 6))
     density = np.exp(posterior.log_density(places, np.repeat(row, len(places), 0), "crop"))
     assert density.mean() * wide.prod() == pytest.approx(1, abs=0.1)
+    for corner, side in ((low, -1), (low + wide, 1)):
+        outside = places[:6] * (1 - np.eye(6)) + (corner + side * 1e-3 * wide) * np.eye(6)
+        assert np.array_equal(posterior.log_density(outside, np.repeat(row, 6, 0), "crop"), np.full(6, -np.inf))
 
 
 def test_views_that_it_does_not_know_are_refused(posterior: Posterior) -> None:
     with pytest.raises(ValueError, match="expected views among crop, mask, got field"):
         posterior.sample(np.ones(sum(BLOCKS.values())), "field")
+
+
+def test_descriptors_that_are_not_finite_are_refused(posterior: Posterior) -> None:
+    rows = table(2, seed=2).of(["mask"]).descriptors
+    rows[1, 5] = np.nan
+    for ask in (posterior.sample, lambda *given: posterior.log_density(np.tile(LOW, (2, 1)), *given)):
+        with pytest.raises(ValueError, match="expected descriptors that are finite, got 1 of 2 rows with others"):
+            ask(rows, "mask")
 
 
 def test_a_file_holds_it(posterior: Posterior, tmp_path: Path) -> None:
@@ -133,7 +147,7 @@ def test_an_architecture_has_bounds(sizes: dict, words: str) -> None:
 
 def test_components_are_uncorrelated_and_the_first_are_the_largest() -> None:
     rows = np.random.default_rng(0).random((300, sum(BLOCKS.values()))) + 0.5
-    components = compression_of(rows, SMALL)(rows)
+    components = compression_of(rows, SMALL.components)(rows)
     variance = components.var(0)
     assert variance.mean() == pytest.approx(1, abs=0.02)
     assert (np.diff(variance) < 0).all()
@@ -142,10 +156,8 @@ def test_components_are_uncorrelated_and_the_first_are_the_largest() -> None:
 
 def test_blocks_are_chosen_by_name() -> None:
     rows, names = np.random.default_rng(0).random((3, sum(BLOCKS.values()))) + 0.5, np.array(column_names())
-    assert straightened(rows, ["curvature", "fabric"]) == pytest.approx(
-        rows[:, np.isin(names, ["curvature", "fabric"])]
-    )
-    assert straightened(rows, ["fraction"]) == pytest.approx(np.log(rows[:, names == "fraction"]))
+    assert columns_of(rows, ["curvature", "fabric"]) == pytest.approx(rows[:, np.isin(names, ["curvature", "fabric"])])
+    assert columns_of(rows, ["fraction"]) == pytest.approx(np.log(rows[:, names == "fraction"]))
 
 
 def test_too_few_shapes_are_refused() -> None:
@@ -155,6 +167,7 @@ def test_too_few_shapes_are_refused() -> None:
 
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(training, "EPOCHS", 1)
+    monkeypatch.setattr(emulator_training, "EPOCHS", 1)
     source, out = tmp_path / "table.npz", tmp_path / "posterior.npz"
     save_table(table(80), source)
     options = ["--views", "mask", "--members", "1"]
@@ -196,3 +209,12 @@ def test_a_parameter_that_does_not_vary_is_named() -> None:
     fixed.parameters[:, 2] = 7.0
     with pytest.raises(ValueError, match="expected shapes whose parameters all vary, got a10 the same in all"):
         train_posterior(fixed, SMALL)
+
+
+def test_mirrored_parameters_are_those_of_the_mirrored_law() -> None:
+    rows = np.random.default_rng(0).uniform(LOW, HIGH, (20, 6))
+    assert mirrored(mirrored(rows)) == pytest.approx(rows)
+    for row in rows:
+        six, mass = law_of(row)
+        other = six.mirrored()
+        assert mirrored(row) == pytest.approx(parameters_of(other.scaled(1 / float(other.a20)), -mass))

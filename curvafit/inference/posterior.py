@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import json
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,22 +11,15 @@ import torch
 import zuko
 from torch import Tensor, nn
 
-from curvafit.files import write_content
 from curvafit.geometry.descriptors import BLOCKS, Descriptors
+from curvafit.inference.archive import Archive
+from curvafit.inference.compression import Compression
+from curvafit.inference.emulator import Emulator, Layer
 from curvafit.inference.table import PARAMETERS, column_names
 from curvafit.priors.bounds import quoted, real, whole
-from curvafit.priors.json_text import parse_json
-from curvafit.volumes.formats import read_archive
 
-FORMAT = "curvafit posterior"
-VERSION = 1
-#: Blocks of lengths and parts, whose logarithm is taken; and least value of which it is.
-LOGARITHMIC = ("fraction", "chords", "gaps", "depths", "clearances")
-LEAST = 1e-3
-#: Densities of ∫H and χ are sinh of what is compressed, in these units; that of area is its exponential.
-BENDS, EULERS = 50.0, 100.0
-#: Furthest that a column may lie from its mean, in its deviations.
-FURTHEST = 6.0
+PACKAGED = Path(__file__).parent / "data" / "posterior.npz"
+ARCHIVE = Archive("a posterior", "a posterior", "curvafit posterior", 2, "train it again", {"blocks": BLOCKS})
 #: Largest size of a flow, and most flows of an ensemble.
 WIDEST, MOST = 2048, 64
 #: Part by which the box of the parameters is wider, on each side, than what was drawn.
@@ -60,21 +50,6 @@ class Architecture:
         real(self.dropout, "a dropout", 0.0, 0.9)
         if not self.blocks or not set(self.blocks) <= set(BLOCKS):
             raise ValueError(f"expected blocks among {', '.join(BLOCKS)}, got {quoted(list(self.blocks))}")
-
-
-@dataclass(frozen=True, eq=False)
-class Compression:
-    """From descriptors to their principal components: means and scales by column `(c,)`, basis `(k, c)`."""
-
-    blocks: tuple[str, ...]
-    mean: np.ndarray
-    scale: np.ndarray
-    basis: np.ndarray
-
-    def __call__(self, descriptors: np.ndarray) -> np.ndarray:
-        """Return the components `(N, k)`, their mean square 1, of descriptors `(N, 351)`."""
-        columns = straightened(descriptors, self.blocks)
-        return np.clip((columns - self.mean) / self.scale, -FURTHEST, FURTHEST) @ self.basis.T
 
 
 class Member(nn.Module):
@@ -109,6 +84,10 @@ class Posterior:
         `(6, 2)`: the parameters' least and greatest values.
     centre, spread
         `(6,)`: mean and deviation of the parameters without bounds.
+    emulator
+        What parameters make of the descriptors.
+    misfits
+        By view, what the emulator's best parameters leave unexplained of shapes that it did not learn from, increasing.
     """
 
     architecture: Architecture
@@ -118,6 +97,8 @@ class Posterior:
     box: np.ndarray
     centre: np.ndarray
     spread: np.ndarray
+    emulator: Emulator
+    misfits: dict[str, np.ndarray]
     provenance: dict[str, Any]
 
     def sample(self, descriptors: Descriptors | np.ndarray, view: str, count: int = 1000, seed: int = 0) -> np.ndarray:
@@ -126,7 +107,7 @@ class Posterior:
         Raises
         ------
         ValueError
-            If it was not trained on the view.
+            If it was not trained on the view, or descriptors are not finite.
         """
         rows, single = _rows(descriptors)
         context = self.context(rows, np.full(len(rows), view))
@@ -135,24 +116,42 @@ class Posterior:
             torch.manual_seed(seed)
             draws = [member(context).sample(torch.Size((n,))) for member, n in zip(self.members, parts, strict=True)]
         free = torch.cat(draws).movedim(0, 1).double().numpy()
-        parameters = self.bounded(free * self.spread + self.centre)
+        parameters = self.of_standard(free)
         return parameters[0] if single else parameters
 
     def log_density(self, parameters: np.ndarray, descriptors: Descriptors | np.ndarray, view: str) -> np.ndarray:
-        """Return the logarithm of the density of parameters `(N, 6)` given descriptors `(N, 351)`, in nats."""
+        """Return the logarithm of the density of parameters `(N, 6)` given descriptors `(N, 351)`, in nats.
+
+        It is -inf outside the box, which is wider by 1/50 on each side than what was drawn.
+
+        Raises
+        ------
+        ValueError
+            As `sample`.
+        """
         rows, _ = _rows(descriptors)
         context = self.context(rows, np.full(len(rows), view))
-        free = (self.unbounded(np.atleast_2d(parameters)) - self.centre) / self.spread
+        free = self.standard(np.atleast_2d(parameters))
         with torch.no_grad():
             parts = torch.stack([member(context).log_prob(torch.from_numpy(free).float()) for member in self.members])
         density = torch.logsumexp(parts, 0).double().numpy() - np.log(len(self.members))
-        return density - np.log(self.spread).sum() + self._log_slope(np.atleast_2d(parameters))
+        share = self._share(np.atleast_2d(parameters))
+        within = ((share > 0) & (share < 1)).all(1)
+        return np.where(within, density - np.log(self.spread).sum() + self._log_slope(share), -np.inf)
 
     def context(self, descriptors: np.ndarray, views: np.ndarray) -> Tensor:
-        """Return what the flows see: components of the descriptors and the kind of each view."""
+        """Return what the flows see: components of the descriptors and the kind of each view.
+
+        Raises
+        ------
+        ValueError
+            If a view is of another kind, or descriptors are not finite.
+        """
         unknown = sorted(set(views.tolist()) - set(self.views))
         if unknown:
             raise ValueError(f"expected views among {', '.join(self.views)}, got {', '.join(unknown)}")
+        if bad := int((~np.isfinite(descriptors)).any(1).sum()):
+            raise ValueError(f"expected descriptors that are finite, got {bad} of {len(descriptors)} rows with others")
         kinds = views[:, None] == np.array(self.views)
         return torch.from_numpy(np.concatenate([self.compression(descriptors), kinds], axis=1)).float()
 
@@ -166,55 +165,55 @@ class Posterior:
         low, wide = self._edges
         return low + wide / (1 + np.exp(-free))
 
+    def standard(self, parameters: np.ndarray) -> np.ndarray:
+        """Return the parameters without bounds, in deviations of the shapes that it was trained on."""
+        return (self.unbounded(parameters) - self.centre) / self.spread
+
+    def of_standard(self, standard: np.ndarray) -> np.ndarray:
+        """Return the parameters whose `standard` it is."""
+        return self.bounded(standard * self.spread + self.centre)
+
     def _share(self, parameters: np.ndarray) -> np.ndarray:
+        """Return the parameters' places in the box, widened by its rim: 0 to 1 within."""
         low, wide = self._edges
         return (parameters - low) / wide
 
     @property
     def _edges(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the least parameters of the box, widened by its rim, and its lengths."""
         low, high = self.box.T
         return low - RIM * (high - low), (1 + 2 * RIM) * (high - low)
 
-    def _log_slope(self, parameters: np.ndarray) -> np.ndarray:
-        share = np.clip(self._share(parameters), 1e-6, 1 - 1e-6)
+    def _log_slope(self, share: np.ndarray) -> np.ndarray:
+        """Return the logarithm of the volume of logits to one of parameters, at shares of the box `(N, 6)`."""
+        share = np.clip(share, 1e-6, 1 - 1e-6)
         return -np.log(share * (1 - share) * self._edges[1]).sum(1)
-
-
-def straightened(descriptors: np.ndarray, blocks: Sequence[str]) -> np.ndarray:
-    """Return the columns of some blocks, lengths and densities as logarithms."""
-    names = np.array(column_names())
-    columns = np.array(descriptors, dtype=np.float64)
-    chosen = np.isin(names, LOGARITHMIC)
-    columns[:, chosen] = np.log(np.maximum(columns[:, chosen], LEAST))
-    area, bend, euler = np.flatnonzero(names == "densities")
-    columns[:, area] = np.log(np.maximum(columns[:, area], LEAST))
-    columns[:, bend] = np.arcsinh(columns[:, bend] / BENDS)
-    columns[:, euler] = np.arcsinh(columns[:, euler] / EULERS)
-    return columns[:, np.isin(names, list(blocks))]
 
 
 def save_posterior(posterior: Posterior, path: str | Path) -> None:
     """Write a posterior as one compressed `.npz`: arrays and a JSON header, nothing that runs when it is read."""
-    header = {
-        "format": FORMAT,
-        "version": VERSION,
-        "architecture": asdict(posterior.architecture),
-        "members": len(posterior.members),
-        "views": posterior.views,
-        "blocks": BLOCKS,
-        "provenance": posterior.provenance,
-    }
     arrays = {name: getattr(posterior, name) for name in ("box", "centre", "spread")}
     arrays |= {name: getattr(posterior.compression, name) for name in ("mean", "scale", "basis")}
     for number, member in enumerate(posterior.members):
         arrays |= {f"{number}.{name}": value.numpy() for name, value in member.state_dict().items()}
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, header=np.frombuffer(json.dumps(header).encode(), dtype=np.uint8), **arrays)
-    write_content(Path(path), buffer.getvalue())
+    for name, layers in (("mean", posterior.emulator.mean), ("spread", posterior.emulator.spread)):
+        for level, layer in enumerate(layers):
+            arrays |= {f"emulator.{name}.{level}.{part}": value for part, value in layer._asdict().items()}
+    arrays["emulator.basis"] = posterior.emulator.basis.astype(np.float32)
+    arrays |= {f"misfits.{view}": values.astype(np.float32) for view, values in posterior.misfits.items()}
+    ARCHIVE.save(
+        path,
+        arrays,
+        architecture=asdict(posterior.architecture),
+        members=len(posterior.members),
+        inflation=posterior.emulator.inflation,
+        views=posterior.views,
+        provenance=posterior.provenance,
+    )
 
 
-def load_posterior(path: str | Path) -> Posterior:
-    """Read a posterior.
+def load_posterior(path: str | Path | None = None) -> Posterior:
+    """Read a posterior; by default the packaged one.
 
     Raises
     ------
@@ -223,38 +222,11 @@ def load_posterior(path: str | Path) -> Posterior:
     ValueError
         If it is not a posterior, is damaged, or has another format version or other blocks.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"expected a posterior, got {path}, where there is none")
-    try:
-        arrays = read_archive(path)
-        header = parse_json(arrays.pop("header").tobytes(), "a posterior's header", path)
-        known = header["format"] == FORMAT
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"expected a posterior, got {path}, which is damaged or something else") from error
-    if not known:
-        raise ValueError(f"expected a posterior, got {path}, which is something else")
-    if (version := header.get("version")) != VERSION or header.get("blocks") != BLOCKS:
-        raise ValueError(
-            f"expected a posterior of version {VERSION} with the blocks of this program, got version {quoted(version)} "
-            f"or other blocks in {path}: train it again"
-        )
-    try:
-        return _assembled(header, arrays)
-    except (KeyError, ValueError, TypeError, RuntimeError) as error:
-        raise ValueError(f"expected a whole posterior, got {path} ({str(error)[:200]})") from error
+    return ARCHIVE.load(PACKAGED if path is None else path, _posterior)
 
 
-def is_posterior(path: Path) -> bool:
-    """Return whether a file bears a posterior's format; all else of it may be wrong."""
-    try:
-        header = read_archive(path)["header"].tobytes() if path.is_file() else b""
-        return parse_json(header, "a posterior's header", path)["format"] == FORMAT
-    except (OSError, ValueError, KeyError, TypeError):
-        return False
-
-
-def _assembled(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Posterior:
+def _posterior(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Posterior:
+    """Return the posterior of a file's header and arrays."""
     if not all(np.isfinite(each).all() for each in arrays.values() if each.dtype.kind == "f"):
         raise ValueError("numbers that are not finite")
     sizes = header["architecture"]
@@ -268,7 +240,8 @@ def _assembled(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Posteri
     views = tuple(str(view) for view in header["views"])
     members = []
     for number in range(whole(header["members"], "a number of flows", 1, MOST)):
-        member = Member(architecture, len(views)).eval()
+        with torch.random.fork_rng():  # its first weights are drawn, and then replaced
+            member = Member(architecture, len(views)).eval()
         prefix = f"{number}."
         state = {k.removeprefix(prefix): torch.from_numpy(v) for k, v in arrays.items() if k.startswith(prefix)}
         member.load_state_dict(state)
@@ -282,10 +255,44 @@ def _assembled(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Posteri
         arrays["box"],
         arrays["centre"],
         arrays["spread"],
+        _emulator(compression, views, arrays, header["inflation"]),
+        {view: _column(arrays[f"misfits.{view}"]) for view in views},
         header["provenance"],
     )
 
 
+def _emulator(
+    compression: Compression, views: tuple[str, ...], arrays: dict[str, np.ndarray], inflation: float
+) -> Emulator:
+    components = len(compression.basis)
+    layers = {name: _layers(arrays, f"emulator.{name}", len(PARAMETERS) + len(views)) for name in ("mean", "spread")}
+    for name, each in layers.items():
+        if each[-1].weight.shape[1] != components:
+            raise ValueError(f"networks of the emulator's {name} with {each[-1].weight.shape[1]} outputs")
+    if (basis := arrays["emulator.basis"]).shape != (components, components):
+        raise ValueError(f"emulator.basis of shape {basis.shape}, not {(components, components)}")
+    inflation = real(inflation, "an emulator's inflation", 1e-3, 1e3)
+    return Emulator(compression, views, arrays["box"], layers["mean"], layers["spread"], basis, inflation)
+
+
+def _layers(arrays: dict[str, np.ndarray], name: str, inputs: int) -> tuple[Layer, ...]:
+    """Return the layers of some networks, each of which reads what the one before it gives."""
+    count = sum(key.startswith(f"{name}.") for key in arrays) // 2
+    layers = [Layer(arrays[f"{name}.{k}.weight"], arrays[f"{name}.{k}.bias"]) for k in range(count)]
+    for weight, bias in layers:
+        if weight.ndim != 3 or weight.shape[2] != inputs or bias.shape != weight.shape[:2]:
+            raise ValueError(f"{name} with layers of shapes {weight.shape} and {bias.shape} for {inputs} inputs")
+        inputs = weight.shape[1]
+    return tuple(layers)
+
+
+def _column(values: np.ndarray) -> np.ndarray:
+    if values.ndim != 1 or not len(values):
+        raise ValueError(f"misfits of shape {values.shape}")
+    return np.sort(values)
+
+
 def _rows(descriptors: Descriptors | np.ndarray) -> tuple[np.ndarray, bool]:
+    """Return descriptors as rows, and whether there was one without a leading axis."""
     row = descriptors.vector() if isinstance(descriptors, Descriptors) else np.asarray(descriptors)
     return np.atleast_2d(row), row.ndim == 1

@@ -1,0 +1,312 @@
+"""What parameters make of the descriptors: their mean and covariance between seeds, and the parameters that fit best.
+
+The mean is an ensemble of small networks; the covariance is that of what they miss, in each direction as large as
+parameters and view have it. So the likelihood of descriptors has exact derivatives, which the posterior's flows do not
+offer for sets of parameters, and says along which directions a texture does not tell its parameters.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from curvafit.inference.compression import Compression
+from curvafit.inference.refinement import double_precision_on_cpu
+from curvafit.inference.table import PARAMETERS
+from curvafit.units import number
+
+#: Most steps from a start.
+STEPS = 60
+#: Least deviation between seeds, of a direction whose mean one is 1.
+FAINTEST = 0.05
+#: A direction is weak where what descriptors say leaves more than this part of the prior's deviation.
+WEAK = 0.7
+#: A direction's least share of a parameter that is named, and normal deviations of a 90 % interval.
+NAMED, NINETY = 0.35, 1.645
+
+
+class Layer(NamedTuple):
+    """Weights `(members, outputs, inputs)` and biases `(members, outputs)`."""
+
+    weight: Any
+    bias: Any
+
+
+class Emulated(NamedTuple):
+    """Compressed descriptors of parameters: mean `(N, k)`, and deviations `(N, k)` along the rows of a basis `(k, k)`
+    of directions in which what parameters leave open is uncorrelated."""
+
+    mean: np.ndarray
+    deviation: np.ndarray
+    basis: np.ndarray
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Return the covariances `(N, k, k)` between seeds."""
+        inverse = np.linalg.inv(self.basis)
+        return np.einsum("ij,nj,kj->nik", inverse, self.deviation**2, inverse)
+
+
+@dataclass(frozen=True, eq=False)
+class Emulator:
+    """The compressed descriptors of a view, given parameters.
+
+    Attributes
+    ----------
+    compression
+        From descriptors to what is emulated.
+    views
+        Kinds of views that it was trained on.
+    box
+        `(6, 2)`: the parameters' least and greatest values.
+    mean, spread
+        Layers of the networks of the mean, and of the logarithms of the deviations.
+    basis
+        `(k, k)`: rows are directions in which what the mean misses is uncorrelated.
+    inflation
+        What the mean misses along directions in which parameters move it, squared, over what the deviations say: the
+        means of rows miss alike where shapes are few.
+    """
+
+    compression: Compression
+    views: tuple[str, ...]
+    box: np.ndarray
+    mean: tuple[Layer, ...]
+    spread: tuple[Layer, ...]
+    basis: np.ndarray
+    inflation: float
+
+    def __call__(self, parameters: np.ndarray, view: str) -> Emulated:
+        """Return the mean and deviations of the compressed descriptors of parameters `(N, 6)`."""
+        inputs = self.inputs(parameters, view)
+        mean, spread = forward(self.mean, inputs).mean(0), forward(self.spread, inputs).mean(0)
+        return Emulated(mean, np.maximum(np.exp(spread), FAINTEST), self.basis)
+
+    def inputs(self, parameters: np.ndarray, view: str) -> np.ndarray:
+        """Return what the networks read: the parameters in deviations of the prior, and the kind of view."""
+        scaled = (np.atleast_2d(parameters) - self.centre) / self.deviation
+        return np.concatenate([scaled, np.repeat(self.kind(view)[None], len(scaled), 0)], 1)
+
+    def kind(self, view: str) -> np.ndarray:
+        """Return 1 in the place of a kind of view, else 0."""
+        if view not in self.views:
+            raise ValueError(f"expected views among {', '.join(self.views)}, got {view}")
+        return (np.array(self.views) == view).astype(float)
+
+    @property
+    def centre(self) -> np.ndarray:
+        """Return the means `(6,)` of parameters uniform in the box."""
+        return self.box.mean(1)
+
+    @property
+    def deviation(self) -> np.ndarray:
+        """Return the deviations `(6,)` of parameters uniform in the box."""
+        return (self.box[:, 1] - self.box[:, 0]) / np.sqrt(12)
+
+    def log_likelihood(self, parameters: np.ndarray, descriptors: np.ndarray, view: str) -> np.ndarray:
+        """Return the logarithm `(N,)` of the density of one row of descriptors, compressed, given parameters `(N, 6)`,
+        up to a constant."""
+        emulated = self(parameters, view)
+        missed = (self.compression(np.atleast_2d(descriptors)) - emulated.mean) @ self.basis.T / emulated.deviation
+        return -0.5 * np.square(missed).sum(1) / self.inflation - np.log(emulated.deviation).sum(1)
+
+    def slopes(self, parameters: np.ndarray, view: str) -> np.ndarray:
+        """Return the derivatives `(N, k, 6)` of the whitened mean by parameters `(N, 6)` in deviations of the prior."""
+        with double_precision_on_cpu():
+            import jax.numpy as jnp
+
+            places = jnp.asarray(self.inputs(parameters, view))
+            slopes = np.asarray(_slopes()(_in_jax(self.mean), places))[..., : len(PARAMETERS)]
+        return (self.basis @ slopes) / self(parameters, view).deviation[..., None]
+
+
+class WeakDirection(NamedTuple):
+    """A direction of the parameters, in deviations of the prior, and the ends `(6,)` of its 90 % interval."""
+
+    direction: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+    def __str__(self) -> str:
+        """Return the direction as a sentence."""
+        chosen = [k for k in np.argsort(-np.abs(self.direction)) if abs(self.direction[k]) >= NAMED] or [
+            int(np.abs(self.direction).argmax())
+        ]
+        ends = [
+            ", ".join(f"{PARAMETERS[k]} {number(float(end[k]), 2)}" for k in chosen) for end in (self.low, self.high)
+        ]
+        names = [PARAMETERS[k] for k in chosen]
+        together = ", ".join(names[:-1]) + " and " + names[-1] if len(names) > 1 else names[0]
+        steps = ", ".join(f"{self.direction[k]:+.1f}" for k in chosen)
+        by = f" together by ({steps})" if len(names) > 1 else ""
+        return f"{together}{by}: anything from {ends[0]} to {ends[1]} grows this texture."
+
+
+@dataclass(frozen=True, eq=False)
+class Optimum:
+    """The parameters whose emulated descriptors fit best, in a box that is the prior.
+
+    Attributes
+    ----------
+    parameters, covariance
+        `(6,)` and `(6, 6)`: in working units (`PARAMETERS`); the covariance is that of the quadratic form at the best.
+    singular_values
+        `(6,)`, decreasing: of the derivatives of the whitened descriptors by parameters in deviations of the prior. A
+        direction of value s is known up to 1 / √(1 + s²) of the prior's deviation.
+    weak
+        The directions that are known up to more than `WEAK` of the prior's deviation, weakest first.
+    misfit
+        Sum of the squares of the whitened descriptors that are not explained, over the emulator's inflation.
+    starts
+        `(n,)`: twice the negative log posterior where each start ended, above the best's.
+    """
+
+    parameters: np.ndarray
+    covariance: np.ndarray
+    singular_values: np.ndarray
+    weak: tuple[WeakDirection, ...]
+    misfit: float
+    starts: np.ndarray
+
+
+def optimum(emulator: Emulator, descriptors: np.ndarray, view: str, starts: np.ndarray) -> Optimum:
+    """Find the parameters of greatest posterior density given a row of descriptors, by Levenberg and Marquardt's
+    method from many starts, with exact derivatives in float64.
+
+    Parameters
+    ----------
+    descriptors
+        `(351,)`.
+    starts
+        `(n, 6)`: parameters to start from, such as draws of a posterior; the covariance between seeds is the mean of
+        theirs.
+    """
+    ends = _solved(emulator, np.atleast_2d(descriptors), view, np.asarray(starts, dtype=np.float64)[None])
+    best = int(ends.value[0].argmin())
+    parameters, jacobian = ends.parameters[0, best], ends.jacobian[0, best]
+    return _summary(emulator, parameters, jacobian, float(ends.misfit[0, best]), ends.value[0] - ends.value[0, best])
+
+
+def misfits(emulator: Emulator, descriptors: np.ndarray, view: str, starts: np.ndarray) -> np.ndarray:
+    """Return what the best parameters leave unexplained `(N,)` of rows of descriptors `(N, 351)`, by starts `(N, n,
+    6)` of each: sums of the squares of whitened descriptors."""
+    ends = _solved(emulator, descriptors, view, starts)
+    return ends.misfit[np.arange(len(descriptors)), ends.value.argmin(1)]
+
+
+def forward(layers: tuple[Layer, ...], inputs: Any) -> Any:
+    """Return the outputs `(members, N, outputs)` of each network of inputs `(N, inputs)`, NumPy's or JAX's."""
+    values = inputs[None]
+    for number_of, layer in enumerate(layers):
+        values = values @ layer.weight.swapaxes(1, 2) + layer.bias[:, None]
+        if number_of < len(layers) - 1:
+            values = values * 0.5 * (1 + _tanh(0.5 * values))
+    return values
+
+
+def _tanh(values: Any) -> Any:
+    if isinstance(values, np.ndarray):
+        return np.tanh(values)
+    import jax.numpy as jnp
+
+    return jnp.tanh(values)
+
+
+class _Ends(NamedTuple):
+    """Of N rows and n starts: parameters, derivatives of the whitened descriptors by parameters in deviations of the
+    prior, unexplained squares, and twice the negative log posterior."""
+
+    parameters: np.ndarray
+    jacobian: np.ndarray
+    misfit: np.ndarray
+    value: np.ndarray
+
+
+def _solved(emulator: Emulator, descriptors: np.ndarray, view: str, starts: np.ndarray) -> _Ends:
+    target = emulator.compression(descriptors)
+    emulated = emulator(starts.reshape(-1, starts.shape[-1]), view)
+    deviation = np.sqrt(np.square(emulated.deviation).reshape(*starts.shape[:2], -1).mean(1))
+    low, high = emulator.box.T
+    share = np.clip((starts - low) / (high - low), 0.01, 0.99)
+    with double_precision_on_cpu():
+        import jax.numpy as jnp
+
+        deviation *= np.sqrt(emulator.inflation)
+        rest = (emulator.basis, target, deviation, emulator.kind(view), np.log(share / (1 - share)))
+        ends = _minimiser()(_in_jax(emulator.mean), *(jnp.asarray(part, float) for part in rest))
+        free, jacobian, misfit, value = (np.asarray(part) for part in ends)
+    return _Ends(low + (high - low) / (1 + np.exp(-free)), jacobian, misfit, value)
+
+
+def _in_jax(layers: tuple[Layer, ...]) -> tuple[Layer, ...]:
+    import jax.numpy as jnp
+
+    return tuple(Layer(jnp.asarray(layer.weight, float), jnp.asarray(layer.bias, float)) for layer in layers)
+
+
+@functools.cache
+def _slopes() -> Callable[..., Any]:
+    import jax
+
+    def mean(layers, place):
+        return forward(layers, place[None])[:, 0].mean(0)
+
+    return jax.jit(jax.vmap(jax.jacfwd(mean, 1), (None, 0)))
+
+
+@functools.cache
+def _minimiser() -> Callable[..., Any]:
+    """Return the solver of many rows from many starts, compiled once for each number of them."""
+    import jax
+    import jax.numpy as jnp
+    import optimistix
+
+    def scaled(free):
+        return np.sqrt(12) * (jax.nn.sigmoid(free) - 0.5)
+
+    def unexplained(place, args):
+        layers, basis, target, deviation, kind = args
+        mean = forward(layers, jnp.concatenate([place, kind])[None])[:, 0].mean(0)
+        return basis @ (target - mean) / deviation
+
+    def uniform(free):
+        """Return what squares to twice the negative logarithm of a uniform prior's density in logits."""
+        near = jnp.abs(free) < 1e-2
+        far = jnp.where(near, 1.0, free)
+        cosh = jnp.logaddexp(far / 2, -far / 2) - np.log(2)
+        return jnp.where(near, free / np.sqrt(2), jnp.sign(far) * 2 * jnp.sqrt(cosh))
+
+    def residual(free, args):
+        return jnp.concatenate([unexplained(scaled(free), args), uniform(free)])
+
+    def minimise(layers, basis, target, deviation, kind, start):
+        args = (layers, basis, target, deviation, kind)
+        solver = optimistix.LevenbergMarquardt(rtol=1e-6, atol=1e-6)
+        free = optimistix.least_squares(residual, solver, start, args=args, max_steps=STEPS, throw=False).value
+        left = unexplained(scaled(free), args)
+        slope = jax.jacfwd(unexplained)(scaled(free), args)
+        return free, slope, jnp.sum(left**2), jnp.sum(residual(free, args) ** 2)
+
+    starts = jax.vmap(minimise, (None, None, None, None, None, 0))
+    return jax.jit(jax.vmap(starts, (None, None, 0, 0, None, 0)))
+
+
+def _summary(emulator: Emulator, parameters: np.ndarray, jacobian: np.ndarray, misfit: float, starts: np.ndarray):
+    firmness = jacobian.T @ jacobian
+    covariance = np.linalg.inv(firmness + np.eye(len(PARAMETERS)))
+    squares, columns = np.linalg.eigh(firmness)
+    singular, directions = np.sqrt(np.maximum(squares[::-1], 0)), columns.T[::-1]
+    spread = 1 / np.sqrt(1 + singular**2)
+    weak = []
+    for value, direction in sorted(zip(spread, directions, strict=True), key=lambda pair: -pair[0]):
+        if value > WEAK:
+            direction = direction * np.sign(direction[np.abs(direction).argmax()])
+            step = NINETY * value * direction * emulator.deviation
+            low, high = (np.clip(parameters + sign * step, *emulator.box.T) for sign in (-1, 1))
+            weak.append(WeakDirection(direction, low, high))
+    scale = np.outer(emulator.deviation, emulator.deviation)
+    return Optimum(parameters, scale * covariance, singular, tuple(weak), misfit, starts)

@@ -1,0 +1,66 @@
+"""Shapes grown from a posterior's draws, measured as the query is: what the query is compared with.
+
+They do not correct the posterior. Of 25 masks at 64³, with 12 simulations from the draws of each, the root mean square
+error was .549 deviations of the prior before, and .541 after a ridge regression of the parameters on the posterior
+means of the simulations (Beaumont et al. 2002): within chance. Of the first 20, .506 before, .602 by the emulator moved
+by what it misses of the simulations, and .572 by its importance weights. Seeds are why: of what the emulator misses,
+they make six parts in seven.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from curvafit.geometry.descriptors import Descriptors
+from curvafit.inference.table import row_of
+from curvafit.priors.bounds import whole
+from curvafit.progress import Progress, silent
+
+
+class Simulations(NamedTuple):
+    """Parameters `(n, 6)`, seeds `(n,)` and descriptors `(n, 351)` of the simulations that grew a shape, and how many
+    there were."""
+
+    parameters: np.ndarray
+    seeds: np.ndarray
+    descriptors: np.ndarray
+    count: int
+
+
+def simulations(
+    draws: np.ndarray,
+    simulate: Callable[[np.ndarray, int], Descriptors | None],
+    count: int,
+    *,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> Simulations:
+    """Grow a shape from each of some of a posterior's draws `(n, 6)`, each with a seed of its own.
+
+    Parameters
+    ----------
+    simulate
+        From parameters `(6,)` and a seed to the descriptors of what they grow, measured as the query is; None where
+        nothing grows.
+    count
+        Number of draws that are simulated.
+    seed
+        The k-th simulation has the seed `seed` + k.
+
+    Raises
+    ------
+    ValueError
+        If the count is not from 1 to the number of draws.
+    """
+    count = whole(count, "a number of simulations", 1, len(draws))
+    chosen = draws[np.random.default_rng(seed).choice(len(draws), count, replace=False)]
+    rows = []
+    for k, parameters in enumerate(chosen):
+        rows.append(row_of(simulate(parameters, seed + k)))
+        progress(f"simulated {k + 1} of {count}", (k + 1) / count)
+    descriptors = np.array(rows)
+    grown = np.isfinite(descriptors).all(1)
+    return Simulations(chosen[grown], seed + np.flatnonzero(grown), descriptors[grown], count)
