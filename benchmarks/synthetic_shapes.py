@@ -28,8 +28,9 @@ from curvafit.geometry.diagram import diagram
 from curvafit.geometry.morphometry import local_thickness
 from curvafit.geometry.transport import wasserstein
 from curvafit.inference.atlas import load_atlas
+from curvafit.inference.candidates import Candidate
 from curvafit.inference.fit import Fit
-from curvafit.priors import Coefficients, Prior, read_fit
+from curvafit.priors import Prior, read_fit
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.profile import optimal_profile, phase_field
 
@@ -64,18 +65,22 @@ def fields(kind: str, fit: Path, folder: Path, count: int) -> np.ndarray:
 
 
 def nearest_at_its_density(fit: Fit) -> Fit:
-    """The fit with the coefficients, of the nearest matches' and the refined, whose shapes lie nearest to the scan when
+    """The fit that chooses, of its candidates and matches, the law whose shapes lie nearest to the scan when
     they fill as much of the volume as it does: a match is sought by curvature alone, whatever its density."""
     grid, found = Grid((TRIED, TRIED, TRIED)), []
-    for six in (*(match.coefficients for match in fit.matches), Coefficients(**fit.refined["coefficients"])):
+    matches = (Candidate(match.id, match.coefficients, match.mass, {}) for match in fit.matches)
+    for each in (*fit.candidates, *matches):
         share = fit.morphometry.volume_fraction
-        flow = generate(six, None, grid, volume_fraction=share, schedule=schedule("fast"), reject_early=True)
+        flow = generate(
+            each.coefficients, None, grid, volume_fraction=share, schedule=schedule("fast"), reject_early=True
+        )
         if well_formed(flow.viability):
             seen = diagram(phase_field(flow.field > 0, grid, WORKING_EPSILON), grid, WORKING_EPSILON)
-            found.append((wasserstein(fit.diagram, seen), six))  # type: ignore[arg-type]
-    best, six = min(found, key=itemgetter(0))
+            found.append((wasserstein(fit.diagram, seen), each))  # type: ignore[arg-type]
+    best, chosen = min(found, key=itemgetter(0))
     print(f"distances at the scan's density: {[round(each, 1) for each, _ in found]}, the least {best:.1f}", flush=True)
-    return replace(fit, coefficients=six)
+    candidates = {each.name: each for each in (*fit.candidates, chosen)}
+    return replace(fit, candidates=tuple(candidates.values()), chosen=chosen.name)
 
 
 def law(fit: Path) -> Prior:

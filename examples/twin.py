@@ -45,10 +45,8 @@ def scan(edge: int) -> Field:
     return Field(values, imaging.spacing, imaging.unit)
 
 
-def draw(inference: Inference, path: Path) -> None:
+def draw(inference: Inference, twin: np.ndarray, path: Path) -> None:
     """Write a slice of the scan, the scan's surface and the twin's, side by side."""
-    if inference.best is None:
-        raise SystemExit(f"expected a shape from the inferred parameters: {inference.fit.status}")
     values = inference.scan.values
     smooth = gaussian_filter(values, 1.0)
     level = (smooth[inference.prepared.mask].mean() + smooth[~inference.prepared.mask].mean()) / 2
@@ -59,7 +57,7 @@ def draw(inference: Inference, path: Path) -> None:
     )
     left.set_axis_off()
     surface_on(middle, smooth, level=float(level), width=640)
-    surface_on(right, inference.best, width=640)
+    surface_on(right, twin, width=640)
     titles = ("the scan: a slice", "the scan: its surface", "the twin: grown from what was inferred")
     for axes, title in zip((left, middle, right), titles, strict=True):
         axes.set_title(title, fontsize=13)
@@ -73,9 +71,11 @@ def main() -> None:
     options = parser.parse_args()
     inference = infer(scan(options.edge), kind="image", seed=1)
     print(inference.fit.status)
-    for name, value in inference.fit.coefficients.as_dict().items():
+    if inference.best is None:
+        raise SystemExit(f"expected a shape from the inferred parameters: {inference.fit.status}")
+    for name, value in inference.to_prior().coefficients.as_dict().items():
         print(f"{name} {value:.3g}, truth {preset(PRESET).coefficients.as_dict()[name]:.3g}")
-    draw(inference, options.output)
+    draw(inference, inference.best, options.output)
     print(options.output)
 
 

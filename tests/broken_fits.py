@@ -8,10 +8,9 @@ from found import made_fit
 
 #: Where, what stands there as JSON, what every reader says that it expected.
 BROKEN = [
-    ("mass", "1", "mass as a number between -1 and 1, got 1"),
-    ("mass", "-1.5", "mass as a number between -1 and 1, got -1.5"),
-    ("mass", "true", "mass as a number between -1 and 1, got"),
-    ("mass", "null", "mass as a number between -1 and 1, got"),
+    ("mass", "1", "mass as a number between -1 and 1, or null, got 1"),
+    ("mass", "-1.5", "mass as a number between -1 and 1, or null, got -1.5"),
+    ("mass", "true", "mass as a number between -1 and 1, or null, got"),
     ("mass", None, "mass, got none"),
     ("epsilon_physical", "0", "epsilon_physical as a positive number, got 0"),
     ("epsilon_physical", '"0.02"', "epsilon_physical as a positive number, got"),
@@ -19,7 +18,7 @@ BROKEN = [
     ("working_voxel", "[0.01]", "working_voxel as a positive number, got"),
     ("length_unit", '"furlong"', "length_unit as one of voxel, nm, um, mm, m, got"),
     ("length_unit", "[]", "length_unit as one of voxel, nm, um, mm, m, got"),
-    ("coefficients", "[1, 2, 3, 4, 5, 6]", "coefficients as an object of six coefficients, got"),
+    ("coefficients", "[1, 2, 3, 4, 5, 6]", "coefficients as an object of six coefficients, or null, got"),
     ("coefficients.a02", None, "coefficients.a02, got none"),
     ("coefficients_physical.a10", '"x"', "coefficients_physical.a10 as a finite number, got"),
     ("morphometry.volume_fraction", "2", "morphometry.volume_fraction as a number from 0 to 1, or null, got 2"),

@@ -11,10 +11,14 @@ from matplotlib.figure import Figure
 
 from curvafit.geometry.diagram import Diagram, diagram
 from curvafit.geometry.morphometry import Morphometry
+from curvafit.inference.candidates import Candidate
+from curvafit.inference.draws import Draws
 from curvafit.inference.fit import Fit
 from curvafit.inference.infer import Inference
 from curvafit.inference.match import Match
+from curvafit.inference.misfit import Misfit
 from curvafit.inference.prepare import Prepared
+from curvafit.inference.twins import Twin
 from curvafit.priors import Coefficients, Grid, preset
 from curvafit.volumes.scan import Field
 
@@ -38,10 +42,10 @@ def measured(phase: np.ndarray) -> Diagram:
 
 @lru_cache
 def made_inference(
-    n: int = 48, *, chosen: str = "fit", lost: bool = False, source: str = "tubes <b>&.tif"
+    n: int = 48, *, chosen: str | None = "posterior", lost: bool = False, source: str = "tubes <b>&.tif"
 ) -> Inference:
-    """The inference; with `lost`, nothing grew from the refined parameters."""
-    phase, matched, regenerated = lattice(n, 24, RADIUS), lattice(n, 16, 4.5), lattice(n, 24, 5.5)
+    """The inference; with `lost`, nothing grew from the middle of the posterior."""
+    phase, matched, regrown = lattice(n, 24, RADIUS), lattice(n, 16, 4.5), lattice(n, 24, 5.5)
     noise = np.random.default_rng(0).normal(0, 12, phase.shape)
     grey = np.clip(110 + 60 * phase + noise, 0, 255).astype(np.uint8)
     grid = Grid(phase.shape, 0.01, "replicate")
@@ -49,38 +53,52 @@ def made_inference(
     prepared = Prepared(
         "image", phase, phase > 0, grid, (1.0,) * 3, SCALE, "mm", 110.0, 2 * RADIUS, (whole,), ("Split at 110.",)
     )
-    diagrams = [measured(u) for u in (phase, matched, regenerated)]
+    barren = Twin(None, -0.58, None, None, "the field is of one phase")
+    twins = {"posterior": (barren,) if lost else (twin_of(regrown),) * 2, "match": (twin_of(matched),)}
     return Inference(
         scan=Field(grey, (SCALE,) * 3, "mm", source=source),
         prepared=prepared,
-        diagram=diagrams[0],
-        match_diagram=diagrams[1],
-        fit_diagram=None if lost else diagrams[2],
-        matched=matched,
-        regenerated=None if lost else regenerated,
+        diagram=measured(phase),
+        twins=twins,
         fit=made_fit("match" if lost else chosen, lost),
     )
 
 
-def made_fit(chosen: str = "fit", lost: bool = False) -> Fit:
+def twin_of(phase: np.ndarray) -> Twin:
+    return Twin(phase, -0.58, measured(phase), NUMBERS)
+
+
+NUMBERS = Morphometry(0.187, 0.195, 0.03, 0.45, 4.9, -12, 21.4, "mm")
+
+
+def made_fit(chosen: str | None = "posterior", lost: bool = False) -> Fit:
     near = preset("tubes")
     other = Coefficients(1, 1.8, 5.2, -38.5, -41, 433)
+    rng = np.random.default_rng(1)
+    rows = np.array([1.8, np.log(5.2), -38.5, -41, 433, -0.58]) + rng.normal(size=(60, 6)) * [0.4, 0.2, 6, 9, 51, 0.02]
+    draws = Draws.of(rows, "scan", "corrected by 12 simulations")
     matches = tuple(Match(f"0-{k:05d}", 2.1 + 0.4 * k, near.coefficients, -0.6 + 0.02 * k, 40 + k) for k in range(5))
+    own = {"a20": 0.0, "a11": 0.4, "a02": 0.9, "a10": 6.0, "a01": 9.0, "a00": 51.0, "mass": 0.02}
+    grown = (None, None, ()) if lost else (1.6, 1.1, (NUMBERS, NUMBERS))
+    candidates = (
+        Candidate("posterior", other, -0.58, own, *grown, status="No shape grew: one phase." if lost else ""),
+        Candidate("match", near.coefficients, near.mass, {}, 2.2, None, (NUMBERS,)),
+    )
     return Fit(
         kind="image",
         family="tubes",
-        coefficients=other if chosen == "fit" else near.coefficients,
-        mass=-0.58 if chosen == "fit" else near.mass,
+        candidates=candidates if chosen else (),
         chosen=chosen,
-        uncertainty={"a20": 0.0, "a11": 0.4, "a02": 0.9, "a10": 6.0, "a01": 9.0, "a00": 51.0},
+        draws=draws if chosen else None,
+        weak_directions=("a11 and a00 together: anything from 1 to 2 grows this texture.",),
+        misfit=Misfit(0.4, {"curvature": 0.3, "fabric": 0.004}, "12 simulations"),
+        drift=0.25,
         scale=(1.0, 1.0, 1.0),
         working_voxel=SCALE,
         length_unit="mm",
         matches=matches,
-        refined={"method": "fixed point of a short flow", "coefficients": other.as_dict(), "mass": -0.58},
-        distances={"match": 2.2, "fit": None if lost else 1.6, "seed_noise": 1.1},
-        status="The refined parameters are supported (within seed noise): 1.6 < 2.2 & so on.",
-        morphometry=Morphometry(0.187, 0.195, 0.03, 0.45, 4.9, -12, 21.4, "mm"),
+        status="Supported: 1.6 < 2.2 & so on.",
+        morphometry=NUMBERS,
         notes=("Smoothed by one voxel, split at Otsu's threshold 110.", "Specks < 5 voxels were dropped."),
         provenance={"curvafit": "0.1.0", "scan": "tubes <b>&.tif", "seed": 0, "date": "2025-01-01T00:00:00+00:00"},
     )

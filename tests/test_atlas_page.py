@@ -192,7 +192,7 @@ def test_a_scan_without_a_diagram_is_placed_by_its_matches_or_refused(opened: Op
     for text, said in (
         (made_fit().to_json(), "run curvafit infer again"),
         ("{}", "expected a fit.json with format, got none in odd.json"),
-        (made_fit().to_json().replace("curvafit-fit-1", "fit-0"), "format as curvafit-fit-1"),
+        (made_fit().to_json().replace("curvafit-fit-2", "fit-0"), "format as curvafit-fit-2 or curvafit-fit-1"),
         *((broken(*change), f"expected a fit.json with {said}") for *change, said in BROKEN),
         ("κ", "which is not JSON"),
         (
@@ -205,6 +205,22 @@ def test_a_scan_without_a_diagram_is_placed_by_its_matches_or_refused(opened: Op
     page.set_input_files("#file", {"name": "a b.json", "mimeType": "", "buffer": scan_fit(atlas, 1).to_json().encode()})
     page.locator("#scan-command:has-text(\"--prior 'a b.json'\")").wait_for()
     assert page.locator("#message").is_hidden()
+
+
+def test_a_scan_without_a_law_has_a_place_but_no_command(opened: Opened, atlas_page) -> None:
+    page, atlas = opened.page, atlas_page[1]
+    why = "No law: nothing grew from any candidate."
+    none = dataclasses.replace(scan_fit(atlas, 5), candidates=(), chosen=None, draws=None, status=why)
+    drop(page, none.to_json())
+    page.locator("#scan").wait_for()
+    assert why in page.locator("#scan-says").inner_text() and page.locator("#scan-near button").count() == 5
+    values = page.locator("#scan-parameters td").all_inner_texts()
+    assert values.count("–") == 6 and len(values) == 7  # all but the volume fraction
+    assert page.locator("#scan-law").is_hidden()
+    drop(page, scan_fit(atlas, 5).to_json())
+    page.locator("#scan-law").wait_for()
+    drop(page, dataclasses.replace(none, diagram=None, matches=()).to_json())
+    page.locator(f"#message:has-text('got neither in fit.json: {why}')").wait_for()
 
 
 def test_the_keyboard_is_enough(opened: Opened) -> None:

@@ -12,6 +12,7 @@ import pytest
 from found import lattice, made_fit, measured
 
 from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE
+from curvafit.inference.draws import COLUMNS, Draws
 from curvafit.inference.fit import Fit
 from curvafit.priors import read_fit
 
@@ -23,8 +24,9 @@ def fit() -> Fit:
 
 
 def fields(fit: Fit) -> dict:
-    """All but the diagram."""
-    return {name: value for name, value in vars(fit).items() if name != "diagram"}
+    """All but the diagram; the draws as a file has them."""
+    draws = None if fit.draws is None else fit.draws.as_dict()
+    return {name: value for name, value in vars(fit).items() if name != "diagram"} | {"draws": draws}
 
 
 def test_every_field_comes_back(fit: Fit) -> None:
@@ -45,7 +47,7 @@ def test_a_fit_without_a_diagram_and_with_a_phase_that_is_missing(fit: Fit) -> N
     full = dataclasses.replace(fit.morphometry, volume_fraction=1.0, spacing_mean=math.nan)
     back = Fit.from_json(dataclasses.replace(fit, diagram=None, morphometry=full).to_json())
     assert back.diagram is None and math.isnan(back.morphometry.spacing_mean)
-    assert back.morphometry.volume_fraction == 1.0 and back.distances == fit.distances
+    assert back.morphometry.volume_fraction == 1.0 and back.candidates == fit.candidates
 
 
 def test_texts_come_back_as_they_are(fit: Fit) -> None:
@@ -59,13 +61,77 @@ def test_a_fit_can_be_a_key(fit: Fit) -> None:
 
 def test_a_distance_that_is_unknown_comes_back() -> None:
     lost = made_fit("match", lost=True)
-    assert lost.distances["fit"] is None and Fit.from_json(lost.to_json()).distances == lost.distances
+    assert lost.candidates[0].distance is None and Fit.from_json(lost.to_json()).candidates == lost.candidates
+
+
+def test_numbers_and_uncertainty_are_those_of_one_candidate(fit: Fit) -> None:
+    for chosen in fit.candidates:
+        other = dataclasses.replace(fit, chosen=chosen.name)
+        assert (other.coefficients, other.mass, other.uncertainty) == (
+            chosen.coefficients, chosen.mass, chosen.uncertainty,
+        )  # fmt: skip
+
+
+def test_a_fit_without_a_law_is_none(fit: Fit) -> None:
+    none = made_fit(chosen=None)
+    assert (none.coefficients, none.mass, none.coefficients_physical, none.uncertainty) == (None, None, None, {})
+    assert fields(Fit.from_json(none.to_json())) == fields(none)
+    with pytest.raises(ValueError, match="expected a fit with a law, got one without: Supported"):
+        none.to_prior()
+
+
+def test_a_law_chosen_from_nowhere_is_refused(fit: Fit) -> None:
+    content = json.loads(fit.to_json()) | {"chosen": "optimum"}
+    with pytest.raises(ValueError, match="expected a chosen law among the fit's candidates, got 'optimum'"):
+        Fit.from_json(json.dumps(content))
+
+
+def test_intervals_in_the_scan_s_unit_are_the_draws_in_that_unit(fit: Fit) -> None:
+    assert fit.draws is not None
+    content = json.loads(fit.to_json())
+    for name, power in (("a11", 0), ("a02", 0), ("a10", 1), ("a01", 1), ("a00", 2), ("mass", 0)):
+        working, physical = content["intervals"][name], content["intervals_physical"][name]
+        column = fit.draws.values[:, ("a11", "a02", "a10", "a01", "a00", "mass").index(name)]
+        assert working["median"] == pytest.approx(np.median(column))
+        assert working["90"] == pytest.approx(np.percentile(column, (5, 95)).tolist())
+        assert physical["90"] == pytest.approx([x / fit.length**power for x in working["90"]])
+
+
+def test_intervals_are_central_and_in_powers_of_a_length() -> None:
+    draws = Draws(np.outer(np.arange(101.0), np.ones(6)), "mask", "")
+    working, other = draws.intervals(), draws.intervals(2.0)
+    assert list(working) == list(COLUMNS)
+    for name, scale in zip(COLUMNS, (1, 1, 2, 2, 4, 1), strict=True):
+        assert working[name]["median"] == 50
+        assert (working[name]["50"], working[name]["90"]) == (pytest.approx([25, 75]), pytest.approx([5, 95]))
+        assert other[name]["90"] == pytest.approx([5 / scale, 95 / scale])
+
+
+def test_the_middle_is_the_draw_nearest_to_the_medians() -> None:
+    rows = np.zeros((5, 6))
+    rows[:, 0] = (-3, -1, 0.5, 1, 9)  # median .5
+    rows[:, 2] = (0, 0, 40, 3, 0)  # median 0
+    draws = Draws.of(rows, "mask", "")
+    assert draws.middle(np.ones(6)) == pytest.approx(rows[1])
+    assert draws.middle(np.array([1, 1, 100, 1, 1, 1.0])) == pytest.approx(rows[2])
+
+
+def test_draws_of_several_lengths_are_refused(fit: Fit) -> None:
+    content = json.loads(fit.to_json())
+    content["posterior"]["draws"]["a10"].append(0.1)
+    with pytest.raises(ValueError, match="expected draws of one length in a fit's posterior, got 60, 60, 61"):
+        Fit.from_json(json.dumps(content))
 
 
 def test_a_file_is_read_as_a_fit_and_as_a_prior(tmp_path: Path, fit: Fit) -> None:
     path = fit.save(tmp_path / "fit.json")
     assert fields(Fit.load(path)) == fields(fit)
     assert read_fit(path) == fit.to_prior() == Fit.load(path).to_prior()
+    content = json.loads(path.read_text()) | {"format": "curvafit-fit-1"}
+    path.write_text(json.dumps(content))
+    assert read_fit(path) == fit.to_prior()  # of the format before, the law
+    with pytest.raises(ValueError, match="run `curvafit infer` again"):
+        Fit.load(path)
     with pytest.raises(FileNotFoundError, match=r"expected a fit\.json, found no file"):
         Fit.load(tmp_path / "none.json")
 
@@ -75,7 +141,9 @@ def test_a_file_is_read_as_a_fit_and_as_a_prior(tmp_path: Path, fit: Fit) -> Non
     [
         ("matches", None, "matches, got none"),
         ("status", None, "status, got none"),
-        ("chosen", "both", "chosen as match or fit, got 'both'"),
+        ("chosen", 3, "chosen as a candidate's name, or null, got 3"),
+        ("candidates", [{}], "candidates\\[0\\].name, got none"),
+        ("misfit", {"probability": 2, "blocks": {}, "method": ""}, "misfit.probability as a number from 0 to 1, got 2"),
         ("scale", [1, 1], "scale as a list of 3 numbers"),
         ("morphometry", [], "morphometry as an object, got"),
     ],

@@ -60,13 +60,14 @@ def test_content_that_is_no_object_and_another_format(tmp_path: Path) -> None:
     for text in ("[]", "7", '"x"', "null", "{}"):
         assert "expected a fit.json written by `curvafit infer` with" in refused(tmp_path / "fit.json", text)
     said = refused(tmp_path / "fit.json", json.dumps({"format": ["x" * 10**6] * 100}))
-    assert "expected a fit.json of format curvafit-fit-1, got [" in said
+    assert "expected a fit.json of format curvafit-fit-2, got [" in said
 
 
 def test_what_is_written_is_what_can_be_read() -> None:
     assert violation(made_fit().as_dict()) is None
-    with pytest.raises(ValueError, match="expected mass as a number between -1 and 1, got 1.5 in a fit"):
-        dataclasses.replace(made_fit(), mass=1.5).to_json()
+    heavy = dataclasses.replace(made_fit().candidates[0], mass=1.5)
+    with pytest.raises(ValueError, match="expected mass as a number between -1 and 1, or null, got 1.5 in a fit"):
+        dataclasses.replace(made_fit(), candidates=(heavy,)).to_json()
     with pytest.raises(ValueError, match="expected length_unit as one of voxel, nm, um, mm, m, got 'ell' in a fit"):
         dataclasses.replace(made_fit(), length_unit="ell").to_json()
 

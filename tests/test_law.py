@@ -80,6 +80,14 @@ def test_a_fit_that_is_not_there_is_missed(tmp_path) -> None:
         texture_of(str(tmp_path / "fit.json"))
 
 
+def test_a_fit_without_a_law_is_refused_with_its_verdict(tmp_path) -> None:
+    none = dataclasses.replace(made_fit(chosen=None), status="No law: the scan is noise.")
+    path = none.save(tmp_path / "fit.json")
+    for law in (path, none, dataclasses.replace(made_inference(), fit=none)):
+        with pytest.raises(ValueError, match=r"^expected a fit.*with a law, got .*: No law: the scan is noise\.$"):
+            texture_of(law)
+
+
 def test_units_that_cannot_be_compared_are_refused() -> None:
     fit = dataclasses.replace(made_fit(), length_unit="voxel")
     with pytest.raises(ValueError, match="expected two units among nm, um, mm, m, got mm and the fit's voxel"):

@@ -8,9 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
 
-from curvafit.inference.phases import find_level
+from curvafit.inference.phases import find_level, is_noise
 from curvafit.inference.prepare import LARGEST_WINDOW, WORKING_THICKNESS, Prepared, prepare
-from curvafit.inference.regrid import resample, rich_boxes, without_specks
+from curvafit.inference.regrid import median_thickness, resample, rich_boxes, without_specks
+from curvafit.inference.texture import is_ball
 from curvafit.priors import Grid, phase_field
 from curvafit.volumes.scan import Field, ScanError, load, save
 
@@ -87,6 +88,81 @@ def test_labels() -> None:
 
 
 # ---- size and place --------------------------------------------------------------------------------------------------
+
+
+# ---- the other phase -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("radius", [4, 12])
+def test_a_structure_and_its_background_get_one_working_grid(radius: float) -> None:
+    """The thinner of the two sets it; and the note says how to turn them round."""
+    mask = tube_mask((40, 40, 40), (1, 1, 1), radius)
+    own, other = prepare(Field(mask)), prepare(Field(~mask))
+    assert (own.scale, own.grid, own.thickness) == (other.scale, other.grid, other.thickness)
+    assert np.array_equal(own.mask, ~other.mask)
+    assert own.volume_fraction == pytest.approx(1 - other.volume_fraction) and own.volume_fraction < 0.5
+    assert [note for note in other.notes if "--dark" in note] == [
+        f"The structure fills {other.volume_fraction:.0%} of the volume: "
+        "if the other phase was meant, turn the two round (--dark)."
+    ]
+    assert not any("--dark" in note for note in own.notes)
+    turned = prepare(Field(~mask), kind="mask", dark=True)
+    assert np.array_equal(turned.mask, own.mask) and not any("--dark" in note for note in turned.notes)
+
+
+def test_a_scan_turned_round_twice_is_itself() -> None:
+    own = prepare(Field(tube_mask((24, 24, 24), (1, 1, 1), 5)))
+    assert np.array_equal(own.turned.mask, ~own.mask) and np.array_equal(own.turned.phase, -own.phase)
+    assert np.array_equal(own.turned.turned.mask, own.mask) and own.turned.grid == own.grid
+
+
+def test_only_the_region_of_interest_is_filled_or_turned() -> None:
+    """Half a tube of radius 10 in a region as thick as it: the background there is thinner."""
+    mask, region = tube_mask((40, 40, 40), (1, 1, 1), 10), np.zeros((40, 40, 40), dtype=bool)
+    region[8:32, 8:32, :30] = True
+    own = prepare(Field(mask), roi=region)
+    assert own.roi is not None
+    assert own.volume_fraction == own.mask[own.roi].mean() > 0.5
+    assert not own.turned.mask[~own.roi].any()
+    assert own.turned.volume_fraction == pytest.approx(1 - own.volume_fraction)
+    assert any("of the background" in note for note in own.notes)
+
+
+# ---- what is no texture ----------------------------------------------------------------------------------------------
+
+
+def ball(n: int, centre: float, radius: float) -> np.ndarray:
+    return np.square(np.indices((n, n, n)) - centre).sum(0) < radius**2
+
+
+def test_a_ball_is_one_body_without_handles_or_cavities() -> None:
+    z, y, x = np.indices((40, 40, 40)) - 19.5
+    torus = np.square(np.hypot(y, x) - 11) + np.square(z) < 16
+    own = ball(40, 19.5, 8)
+    assert is_ball(own)
+    assert not is_ball(~own)  # reaches the faces
+    assert not is_ball(torus)
+    assert not is_ball(ball(40, 19.5, 15) & ~own)
+    assert not is_ball(ball(40, 10, 6) | ball(40, 28, 6))
+    assert not is_ball(ball(40, 5, 8))
+    assert not is_ball(np.zeros_like(own))
+
+
+def test_noise_as_an_image_is_smoothed_is_noise() -> None:
+    for seed in range(3):
+        grey = ndimage.gaussian_filter(np.random.default_rng(seed).standard_normal((48, 48, 48)), 1)
+        assert is_noise(grey > 0) and is_noise(grey > 0.1)
+
+
+@pytest.mark.parametrize("period", [12, 14])
+def test_a_fine_gyroid_is_no_noise(period: int) -> None:
+    z, y, x = 2 * np.pi / period * np.indices((4 * period,) * 3)
+    mask = np.sin(x) * np.cos(y) + np.sin(y) * np.cos(z) + np.sin(z) * np.cos(x) > 0.3
+    assert 4 < median_thickness(mask, (1.0, 1.0, 1.0), True)[0] < 6
+    assert not is_noise(mask)
+
+
+# ---- the working grid ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from importlib import import_module
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ import torch
 
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import schedule
-from curvafit.inference.refine import refine
 from curvafit.inference.refinement import admissible, in_gauge, units
 from curvafit.inference.stationarity import _tested, energy_gradients, is_rounded, stationarity
 from curvafit.priors import WORKING_EPSILON, Coefficients, Grid, energy_terms, jet, preset
@@ -128,17 +126,10 @@ def test_refusals(sponge: torch.Tensor) -> None:
         stationarity(sponge[:24, :24, :24], Grid((24,) * 3, 0.01, "replicate"), WORKING_EPSILON, width=4)
 
 
-@pytest.mark.slow
-def test_a_rounded_field_is_told_and_treated_like_a_mask(sponge: torch.Tensor, monkeypatch) -> None:
+def test_a_rounded_field_is_told(sponge: torch.Tensor) -> None:
     rounded = torch.floor(sponge * 100) / 100
     assert is_rounded(rounded) and not is_rounded(sponge)
     assert "not supported" in stationarity(rounded, GRID, WORKING_EPSILON).status
-    method = import_module("curvafit.inference.fixed_point")
-    monkeypatch.setattr(method, "FIRST_STEPS", 1)
-    monkeypatch.setattr(method, "LAST_STEPS", 1)
-    other = refine(rounded, GRID, WORKING_EPSILON, kind="field", starts=[TRUTH.coefficients])
-    assert other.method == "fixed point"
-    assert other.status.startswith("Stationarity is not supported by a field rounded to few values.")
 
 
 def test_gauge_and_domain() -> None:

@@ -13,7 +13,7 @@ import torch
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import schedule
 from curvafit.inference.fixed_point import ShortFlow, _minimiser, _parameters, fixed_point, sharpened
-from curvafit.inference.refine import refine
+from curvafit.inference.stationarity import stationarity
 from curvafit.interrupts import Terminated
 from curvafit.priors.coefficients import Coefficients, preset
 from curvafit.priors.grid import WORKING_EPSILON, Grid
@@ -38,7 +38,7 @@ def mask_phase(tubes: torch.Tensor) -> torch.Tensor:
 def test_the_authors_sponge_gives_its_coefficients_back(data) -> None:
     (path,) = (data / "gallery").glob("sponge coeffs*.nii.gz")
     field = torch.from_numpy(np.asarray(nibabel.load(path).dataobj, dtype=np.float32))
-    found = refine(field, Grid((100, 100, 100)), WORKING_EPSILON, kind="field", starts=[Coefficients(1, 0, 1)])
+    found = stationarity(field, Grid((100, 100, 100)), WORKING_EPSILON, starts=[Coefficients(1, 0, 1)])
     truth = preset("sponge")
     for name in ("a11", "a02", "a10", "a01"):
         assert getattr(found.coefficients, name) == pytest.approx(getattr(truth.coefficients, name), rel=0.05)
@@ -94,11 +94,9 @@ def test_the_halo_of_a_crop_is_held(mask_phase: torch.Tensor) -> None:
     assert bool(flow._frozen[0].all()) and not bool(flow._frozen[16, 16, 16])
 
 
-def test_an_unknown_kind_and_no_start_are_refused(mask_phase: torch.Tensor) -> None:
-    with pytest.raises(ValueError, match="expected kind"):
-        refine(mask_phase, GRID, WORKING_EPSILON, kind="mesh", starts=[Coefficients(1, 2, 1)])
+def test_no_start_is_refused(mask_phase: torch.Tensor) -> None:
     with pytest.raises(ValueError, match="expected at least one start"):
-        refine(mask_phase, GRID, WORKING_EPSILON, kind="mask", starts=[])
+        fixed_point(mask_phase, GRID, WORKING_EPSILON, starts=[])
 
 
 class Bowl:

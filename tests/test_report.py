@@ -12,13 +12,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from found import EPSILON, RADIUS, SCALE, made_inference, without_drawing
+from found import EPSILON, RADIUS, SCALE, made_fit, made_inference, without_drawing
+from matplotlib.figure import Figure
 
 from curvafit.geometry.diagram import diagram
+from curvafit.inference.infer import Inference
 from curvafit.priors import Grid
-from curvafit.priors.fit_file import FORMAT
+from curvafit.priors.fit_file import FORMAT, read_fit
 from curvafit.report.page import parameter_table, report_html, with_command, write_inference
-from curvafit.report.pictures import scan_box
+from curvafit.report.pictures import bands, scan_box
 from curvafit.report.wording import describe, family_radius
 from curvafit.units import GLOSSARY, density, length, number
 from curvafit.volumes.scan import load
@@ -64,11 +66,11 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_page_stands_alone_and_is_well_formed(html: str) -> None:
     page = Page(html)
     links = [value or "" for name, value in page.attributes if name in ("src", "action", "srcset")]
-    assert len(links) == 9 and all(link.startswith("data:image/png;base64,") for link in links)
+    assert len(links) == 10 and all(link.startswith("data:image/png;base64,") for link in links)
     assert "url(" not in html and "<script" not in html
     assert all(base64.b64decode(link.partition(",")[2])[:4] == b"\x89PNG" for link in links)
     alts = [value for name, value in page.attributes if name == "alt"]
-    assert len(alts) == 9 and all(alts)
+    assert len(alts) == 10 and all(alts)
     assert len(html) < 4_000_000
 
 
@@ -89,53 +91,89 @@ def test_the_page_says_what_was_found(html: str) -> None:
     opening = re.search(r"Tubes, radius (\d+) µm, 19 % of the volume\.", text)
     assert opening is not None
     assert float(opening[1]) == pytest.approx(1000 * RADIUS * SCALE, rel=0.05)
-    for said in ("nearest match 2.2", "refined 1.6", "two seeds 1.1", "Two seeds of the same parameters lie 1.1 apart"):
+    for said in ("Nearest match 2.2", "Middle of the posterior 1.6", "Two seeds 1.1", "lie 1.1 apart"):
         assert said in text, said
     for name in ("BV/TV", "Tb.Th", "Tb.Sp", "Conn.D 4.90 /mm³", "BS/BV 21.4 /mm", "0-00004", "Specks < 5 voxels"):
         assert name in text, name
     assert "curvafit generate --prior fit.json" in text
-    assert text.count("better supported") >= 3
+    assert text.count("best supported") == 1
+    assert "moves its surface by 0.25 voxels" in text and "a11 and a00 together" in text
+    assert "12 simulations" in text and "p = 0.40" in text
+
+
+def test_each_block_stands_on_the_band_of_its_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[list[str]] = []
+    monkeypatch.setattr("curvafit.report.pictures.bands_figure", lambda blocks: drawn.append(list(blocks)) or Figure())
+    rng = np.random.default_rng(0)
+    blocks = {"curvature": (rng.random(8), rng.random((12, 8))), "fabric": (rng.random(3), rng.random((12, 3)))}
+    assert bands(made_inference()) == "" and drawn == []
+    assert "<figure" in bands(dataclasses.replace(made_inference(), simulated=blocks))
+    assert drawn == [["curvature, p = 0.30", "fabric, p = 0.0040"]]
 
 
 def test_physical_coefficients_carry_their_power_of_length(html: str) -> None:
     rows = dict(re.findall(r'<tr><th scope="row">(a.{2})</th>(.*?)</tr>', html))
-    assert set(rows) == {"a₂₀", "a₁₁", "a₀₂", "a₁₀", "a₀₁", "a₀₀"}
+    assert {"a₂₀", "a₁₁", "a₀₂", "a₁₀", "a₀₁", "a₀₀"} <= set(rows)
     λ = SCALE / 0.01
-    assert number(-38.5 / λ) in rows["a₁₀"] and number(6 / λ, 2) in rows["a₁₀"] and "1/mm<" in rows["a₁₀"]
-    assert number(433 / λ**2) in rows["a₀₀"] and number(51 / λ**2, 2) in rows["a₀₀"] and "1/mm²" in rows["a₀₀"]
+    assert number(-38.5 / λ) in rows["a₁₀"] and ">6.0<" in rows["a₁₀"] and "1/mm<" in rows["a₁₀"]
+    assert number(433 / λ**2) in rows["a₀₀"] and ">51<" in rows["a₀₀"] and "1/mm²" in rows["a₀₀"]
     assert "fixed" in rows["a₂₀"] and "1/mm" not in rows["a₁₁"]
 
 
 def test_what_could_not_be_made_is_said(undrawn: None) -> None:
     text = " ".join(Page(report_html(made_inference(lost=True))).text.split())
-    assert text.count("no shape grew from these parameters") == 2
-    assert "refined could not be made" in text
-    assert "Bold: the nearest match" in text
+    assert text.count("no shape grew from these parameters") == 1
+    assert "Middle of the posterior nothing grew" in text
+    assert "the chosen law (nearest match)" in text and "It has no uncertainty of its own." in text
 
 
-def test_without_a_match_the_scan_alone_is_drawn(undrawn: None) -> None:
-    alone = dataclasses.replace(made_inference(), matched=None, match_diagram=None)
-    assert report_html(alone).count("no shape grew") == 2
+def test_a_deviation_stands_beside_its_own_number_alone() -> None:
+    """Of a match, which has none, no row shows one, whatever the other candidates have."""
+    rows = parameter_table(made_inference(lost=True))
+    assert [row[2] for row in rows] == [""] * 7
+    assert [row[2] for row in parameter_table(made_inference())][:3] == ["fixed", "0.40", "0.90"]
+
+
+def test_a_scan_without_a_law_has_a_page_all_the_same(tmp_path: Path, undrawn: None) -> None:
+    none = dataclasses.replace(made_inference(), twins={}, fit=made_fit(chosen=None))
+    page = Page(report_html(none))
+    assert "The law, and how well" not in page.text and "Make more of it" not in page.text
+    assert "Familiar numbers" in page.text and none.fit.status in page.text
+    assert parameter_table(none) == []
+    report = write_inference(none, tmp_path / "out")
+    assert sorted(path.name for path in report.parent.iterdir()) == ["fit.json", "report.html"]
+    content = json.loads((report.parent / "fit.json").read_text())
+    assert content["coefficients"] is None and content["mass"] is None and content["chosen"] is None
+    with pytest.raises(ValueError, match="expected a fit.json with a law, got none"):
+        read_fit(report.parent / "fit.json")
 
 
 def test_an_inference_shows_the_scan_beside_its_twin() -> None:
     """In one line, in a notebook and as a figure; alone where nothing grew."""
     inference = made_inference()
     assert repr(inference).startswith(
-        "Inference(tubes from an image of 48 x 48 x 48 voxels, distances: match 2.2, fit 1.6"
+        "Inference(tubes from an image of 48 x 48 x 48 voxels, distances: posterior 1.6, match 2.2"
     )
     assert "\n" not in repr(inference) and inference.fit.status in repr(inference)
-    assert [text.get_text() for text in inference.plot().texts] == ["the scan", "regrown: refined parameters"]
+    assert [text.get_text() for text in inference.plot().texts] == ["the scan", "regrown: middle of the posterior"]
     assert "1.6 &lt; 2.2" in inference._repr_html_() and "data:image/png;base64," in inference._repr_html_()
-    alone = dataclasses.replace(made_inference(lost=True), matched=None)
+    alone = dataclasses.replace(made_inference(lost=True), twins={})
     assert [text.get_text() for text in alone.plot(width=300).texts] == ["the scan"]
-    assert "fit –" in repr(alone)
+    assert "posterior –" in repr(alone)
 
 
-def test_the_scan_is_cut_to_the_regenerated_box() -> None:
-    found = made_inference()
-    smaller = dataclasses.replace(found, regenerated=found.regenerated[:32, :40, :])
-    assert np.array_equal(scan_box(smaller), found.prepared.phase[8:40, 4:44, :])
+def test_the_scan_is_cut_to_the_regrown_box() -> None:
+    inference = made_inference()
+    smaller = regrown(inference, inference.best[:32, :40, :])
+    assert np.array_equal(scan_box(smaller), inference.prepared.phase[8:40, 4:44, :])
+
+
+def regrown(inference: Inference, phase: np.ndarray) -> Inference:
+    """The inference with another shape grown from its chosen law."""
+    twins = {
+        name: tuple(dataclasses.replace(each, phase=phase) for each in grown) for name, grown in inference.twins.items()
+    }
+    return dataclasses.replace(inference, twins=twins)
 
 
 def test_an_inference_is_written_whole(tmp_path: Path, undrawn: None) -> None:
@@ -148,7 +186,7 @@ def test_an_inference_is_written_whole(tmp_path: Path, undrawn: None) -> None:
     assert json.loads((report.parent / "fit.json").read_text())["provenance"]["command"].endswith("-o out")
     volume = load(report.parent / "regenerated.nii.gz")
     assert volume.unit == "mm" and volume.spacing == pytest.approx((SCALE,) * 3)
-    assert np.array_equal(volume.values, found.regenerated)
+    assert np.array_equal(volume.values, found.best)
     assert "curvafit infer &#x27;a b.tif&#x27; -o out" in report.read_text(encoding="utf-8")
 
 
@@ -158,7 +196,7 @@ def test_a_failure_leaves_what_was_there(tmp_path: Path, undrawn: None) -> None:
     mine = f'{{"format": "{FORMAT}"}}'
     (target / "fit.json").write_text(mine)
     (target / "report.html").write_text('<meta name="generator" content="curvafit 0">')
-    broken = dataclasses.replace(made_inference(), regenerated=np.full((48, 48, 48), np.nan))
+    broken = regrown(made_inference(), np.full((48, 48, 48), np.nan))
     with pytest.raises(ValueError, match="expected a finite volume"):
         write_inference(broken, target)
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["fit.json", "out", "report.html"]
@@ -171,15 +209,17 @@ def test_a_shape_that_cannot_be_made_leaves_no_older_volume(tmp_path: Path, undr
     (tmp_path / "fit.json").write_text(f'{{"format": "{FORMAT}"}}')
     (tmp_path / "report.html").write_text('<meta name="generator" content="curvafit 0">')
     (tmp_path / "regenerated.nii.gz").write_text("older")
-    nothing = dataclasses.replace(made_inference(lost=True), matched=None, match_diagram=None)
+    nothing = dataclasses.replace(made_inference(lost=True), twins={})
     write_inference(nothing, tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["fit.json", "report.html"]
 
 
-def test_the_table_follows_the_better_supported() -> None:
-    refined, match = parameter_table(made_inference()), parameter_table(made_inference(chosen="match"))
-    assert [row[0] for row in refined] == ["a20", "a11", "a02", "a10", "a01", "a00", "mass"]
-    assert refined[1][1:3] == ("1.80", "0.40") and match[1][1:3] == ("2.00", "")
+def test_the_table_follows_the_chosen_law() -> None:
+    drawn, match = parameter_table(made_inference()), parameter_table(made_inference(lost=True))
+    assert [row[0] for row in drawn] == ["a20", "a11", "a02", "a10", "a01", "a00", "mass"]
+    assert drawn[1][1:3] == ("1.80", "0.40") and match[1][1:3] == ("2.00", "")
+    low, high = (float(end.replace("−", "-")) for end in drawn[3][3].split(" to "))
+    assert low < -38.5 < high and high - low == pytest.approx(2 * 1.645 * 6, rel=0.4)
 
 
 @pytest.mark.parametrize(("family", "curvatures"), [("spheres", (0.1, 0.1)), ("tubes", (0.1, 0.0))])

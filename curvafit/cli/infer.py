@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from curvafit.inference.infer import Inference
     from curvafit.inference.prepare import Prepared
 
-#: Time of the refinement in flows: 6 to 16, measured on tubes of 64³ and 40³ voxels.
-REFINEMENT = 10
+#: Twins that are grown: of four or five laws one, of the best another.
+TWINS = 6
 
 EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
     (
@@ -47,6 +47,10 @@ def infer(
     atlas: Annotated[Path | None, typer.Option(help="Atlas (.npz) instead of the packaged one.")] = None,
     threshold: Annotated[str, typer.Option(help="Grey level between the phases, or otsu.")] = "otsu",
     dark: Annotated[bool, typer.Option("--dark", help="The structure is the dark phase.")] = False,
+    posterior: Annotated[Path | None, typer.Option(help="Posterior (.npz) instead of the packaged one.")] = None,
+    fast: Annotated[
+        bool, typer.Option("--fast", help="Seconds instead of minutes: nothing is grown, or checked.")
+    ] = False,
     roi: Annotated[Path | None, typer.Option(help="Mask of the region to measure, of the scan's shape.")] = None,
     *,
     reading: Reading,
@@ -57,7 +61,12 @@ def infer(
     with plainly():
         level = threshold_of(threshold)
         what = {"kind": kind, "periodic": periodic, "threshold": level, "dark": dark, "roi": roi}
-        inference, report = _inferred(scan, out, {**what, "atlas": atlas, "seed": seed, **reading}, overwrite)
+        inference, report = _inferred(
+            scan,
+            out,
+            {**what, "atlas": atlas, "posterior": posterior, "fast": fast, "seed": seed, **reading},
+            overwrite,
+        )
         _show(inference)
         say(str(report))
 
@@ -68,28 +77,32 @@ def _inferred(scan: str, out: Path, options: dict[str, Any], overwrite: bool) ->
         from curvafit.inference.infer import infer as infer_scan
         from curvafit.report.page import check_report, with_command, write_inference
 
-        inputs = [each for each in (scan, options["roi"], options["atlas"]) if each is not None]
+        inputs = [each for each in (scan, options["roi"], options["atlas"], options["posterior"]) if each is not None]
         check_report(out, inputs, overwrite)
 
-        inference = infer_scan(scan, progress=progress, watch=_say_forecast, **options)
+        watch = None if options["fast"] else _say_forecast
+        inference = infer_scan(scan, progress=progress, watch=watch, **options)
         progress("drawing the report", 1.0)
         say_notes(inference.scan.notes)
         return inference, write_inference(with_command(inference, command_line()), out, overwrite=overwrite)
 
 
 def _say_forecast(prepared: Prepared) -> None:
-    """Print the forecast of an inference: five flows of shapes for comparison, and the refinement."""
+    """Print the forecast of an inference: the flows of its twins and of the draws that are grown."""
     from curvafit.generation.schedule import schedule
-    from curvafit.inference.infer import REGENERATED_EDGE
+    from curvafit.inference.estimate import EDGES, SIMULATIONS
+    from curvafit.inference.twins import LONGEST_EDGE
 
     window = [edge.stop - edge.start for edge in prepared.windows[0]]
-    twins = math.prod(min(n, REGENERATED_EDGE) for n in window) / math.prod(window)
-    steps = schedule("fast", None).steps * (5 * twins + REFINEMENT)
+    grown = TWINS * math.prod(min(n, LONGEST_EDGE) for n in window)
+    grown += SIMULATIONS * math.prod(min(max(n, EDGES[0]), EDGES[1]) for n in window)
+    steps = math.ceil(schedule("fast", None).steps * grown / math.prod(window))
     say_forecast("infer", window, steps, INFERENCE, what="working voxels")
 
 
 def _show(inference: Inference) -> None:
     """Print the description, the verdict and a small table."""
+    from curvafit.inference.candidates import TITLES
     from curvafit.report.page import parameter_table
     from curvafit.report.wording import describe
     from curvafit.units import length, number
@@ -97,8 +110,11 @@ def _show(inference: Inference) -> None:
     fit = inference.fit
     say(f"{describe(inference)}.", style="bold")
     say(fit.status)
-    heads = ("", "working units", "±", f"with lengths in {fit.length_unit}")
-    output(heads, parameter_table(inference), right=range(1, 4))
-    names = {"match": "nearest match", "fit": "refined", "seed_noise": "two seeds"}
-    apart = ", ".join(f"{names[name]} {number(value, 2)}" for name, value in fit.distances.items())
-    say(f"Distances in 1/working unit ({length(fit.length, fit.length_unit, 3)}): {apart}.")
+    if rows := parameter_table(inference):
+        heads = ("", "working units", "±", "90 % of the posterior", f"with lengths in {fit.length_unit}")
+        output(heads, rows, right=range(1, 5))
+    for each in fit.weak_directions:
+        say(each)
+    if inference.twins:
+        apart = ", ".join(f"{TITLES.get(each.name, each.name)} {number(each.distance, 2)}" for each in fit.candidates)
+        say(f"Distances in 1/working unit ({length(fit.length, fit.length_unit, 3)}): {apart}.")

@@ -1,4 +1,4 @@
-"""From a scan to its parameters: prepare, measure, match, refine, judge."""
+"""From a scan to its parameters: prepare, measure, read the posterior, grow, compare, judge."""
 
 from __future__ import annotations
 
@@ -8,24 +8,29 @@ from curvafit.faces import offer
 
 if TYPE_CHECKING:
     from curvafit.inference.atlas import Atlas, load_atlas, save_atlas
+    from curvafit.inference.candidates import Candidate
+    from curvafit.inference.draws import Draws
     from curvafit.inference.fit import Fit
     from curvafit.inference.fixed_point import fixed_point
     from curvafit.inference.infer import Inference, infer
     from curvafit.inference.match import Match, nearest
     from curvafit.inference.measure import scan_diagram
+    from curvafit.inference.misfit import Misfit
     from curvafit.inference.posterior import Posterior, load_posterior, save_posterior
     from curvafit.inference.posterior_training import train_posterior
     from curvafit.inference.prepare import Prepared, prepare
-    from curvafit.inference.refine import refine
     from curvafit.inference.refinement import Refinement
     from curvafit.inference.stationarity import stationarity
     from curvafit.inference.table import Table, load_table, save_table
 
 __all__ = [
     "Atlas",
+    "Candidate",
+    "Draws",
     "Fit",
     "Inference",
     "Match",
+    "Misfit",
     "Posterior",
     "Prepared",
     "Refinement",
@@ -37,7 +42,6 @@ __all__ = [
     "load_table",
     "nearest",
     "prepare",
-    "refine",
     "save_atlas",
     "save_posterior",
     "save_table",
@@ -48,9 +52,12 @@ __all__ = [
 
 _HOMES = {
     "Atlas": "curvafit.inference.atlas",
+    "Candidate": "curvafit.inference.candidates",
+    "Draws": "curvafit.inference.draws",
     "Fit": "curvafit.inference.fit",
     "Inference": "curvafit.inference.infer",
     "Match": "curvafit.inference.match",
+    "Misfit": "curvafit.inference.misfit",
     "Posterior": "curvafit.inference.posterior",
     "Prepared": "curvafit.inference.prepare",
     "Refinement": "curvafit.inference.refinement",
@@ -62,7 +69,6 @@ _HOMES = {
     "load_table": "curvafit.inference.table",
     "nearest": "curvafit.inference.match",
     "prepare": "curvafit.inference.prepare",
-    "refine": "curvafit.inference.refine",
     "save_atlas": "curvafit.inference.atlas",
     "save_posterior": "curvafit.inference.posterior",
     "save_table": "curvafit.inference.table",

@@ -1,9 +1,8 @@
-"""What an inference found, and the `fit.json` that carries it to the generator and the prior."""
+"""What an inference says of a scan, and the `fit.json` that carries its law to the generator and the prior."""
 
 from __future__ import annotations
 
 import json
-import math
 import re
 from dataclasses import dataclass
 from os import PathLike
@@ -15,7 +14,10 @@ import numpy as np
 from curvafit.files import write_content
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.morphometry import Morphometry
+from curvafit.inference.candidates import Candidate, morphometry_of
+from curvafit.inference.draws import Draws
 from curvafit.inference.match import Match
+from curvafit.inference.misfit import Misfit
 from curvafit.pictures import Pictured
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.fit_file import Prior, fit_bytes, parse_fit, six_of
@@ -27,25 +29,30 @@ _SEEN = {"field": "a phase field", "mask": "a mask", "image": "an image"}
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Fit(Pictured):
-    """The parameters of a scan, in working and in physical units.
+    """The law of a scan, in working and in physical units: what is known of it, and what supports it.
 
     Attributes
     ----------
-    coefficients, mass
-        The better supported of match and refinement (`chosen`), in working units: voxel 0.01, ε 0.02, a20 = 1.
-    uncertainty
-        Standard deviation of each refined coefficient; 0 for the one that fixes the scale.
+    candidates
+        Laws that may have made the scan, with what grew from each.
+    chosen
+        Name of the candidate that is best supported; None where none is a law of the scan: `status` says why.
+    draws
+        Draws from the posterior; None where the scan's descriptors could not be measured.
+    weak_directions
+        Sentences, one for each direction in which the scan leaves the parameters open.
+    misfit
+        How the scan's descriptors lie among those that the model makes; None where that is not known.
+    drift
+        How far, in working voxels (root mean square), a short flow of the chosen law moves the scan's own surface.
     scale
         Working voxel in scan voxels, (z, y, x).
     working_voxel, length_unit
         Edge of a working voxel, and the unit that it and every physical number here is in.
-    matches, refined
-        The nearest shapes of the atlas, and what refinement made of them with its own account (`Refinement`).
-    distances
-        Curvature-diagram distances from the scan to the regenerated `match` and `fit` (None where the shape could not
-        be made) and between two seeds of the chosen one (`seed_noise`).
+    matches
+        The nearest shapes of the atlas.
     status
-        Which of the two is better supported, and what failed.
+        The verdict, in a sentence or two.
     diagram
         The scan's curvature diagram, binned as an atlas's are, in 1 / working unit: with it the scan finds its place on
         an atlas's map.
@@ -53,16 +60,16 @@ class Fit(Pictured):
 
     kind: str
     family: str
-    coefficients: Coefficients
-    mass: float
-    chosen: str
-    uncertainty: dict[str, float]
+    candidates: tuple[Candidate, ...]
+    chosen: str | None
+    draws: Draws | None
+    weak_directions: tuple[str, ...]
+    misfit: Misfit | None
+    drift: float | None
     scale: tuple[float, float, float]
     working_voxel: float
     length_unit: str
     matches: tuple[Match, ...]
-    refined: dict[str, Any]
-    distances: dict[str, float | None]
     status: str
     morphometry: Morphometry
     notes: tuple[str, ...]
@@ -70,9 +77,30 @@ class Fit(Pictured):
     diagram: Diagram | None = None
 
     def __repr__(self) -> str:
-        six = ", ".join(f"{value:.4g}" for value in self.coefficients.as_dict().values())
+        six = "none" if self.best is None else f"({', '.join(f'{x:.4g}' for x in self.best.coefficients)})"
+        mass = "" if self.best is None else f", mass {self.best.mass:.3g}"
         voxel = f"working voxel {self.working_voxel:.4g} {self.length_unit}"
-        return f"Fit({self.family} from {_SEEN[self.kind]}, a = ({six}), mass {self.mass:.3g}, {voxel}: {self.status})"
+        return f"Fit({self.family} from {_SEEN[self.kind]}, a = {six}{mass}, {voxel}: {self.status})"
+
+    @property
+    def best(self) -> Candidate | None:
+        """Return the candidate that was chosen."""
+        return next((each for each in self.candidates if each.name == self.chosen), None)
+
+    @property
+    def coefficients(self) -> Coefficients | None:
+        """Return the chosen coefficients in working units: voxel 0.01, ε 0.02, a20 = 1."""
+        return None if self.best is None else self.best.coefficients
+
+    @property
+    def mass(self) -> float | None:
+        """Return the chosen mass m₀."""
+        return None if self.best is None else self.best.mass
+
+    @property
+    def uncertainty(self) -> dict[str, float]:
+        """Return the standard deviations of the chosen candidate: its own, or none."""
+        return {} if self.best is None else self.best.uncertainty
 
     @property
     def length(self) -> float:
@@ -80,42 +108,56 @@ class Fit(Pictured):
         return self.working_voxel / WORKING_SPACING
 
     @property
-    def coefficients_physical(self) -> Coefficients:
+    def coefficients_physical(self) -> Coefficients | None:
         """The same energy in `length_unit`: quadratic part unchanged, linear / λ, constant / λ²."""
-        return self.coefficients.in_unit(1 / self.length)
+        return None if self.coefficients is None else self.coefficients.in_unit(1 / self.length)
 
     @property
     def epsilon_physical(self) -> float:
         return WORKING_EPSILON * self.length
 
     def to_prior(self) -> Prior:
-        """Return what `read_fit` reads from the fit's file: the fit as a law."""
-        six, ε = self.coefficients_physical, self.epsilon_physical
+        """Return what `read_fit` reads from the fit's file: the fit as a law.
+
+        Raises
+        ------
+        ValueError
+            If the fit has none.
+        """
+        six, mass, physical = self.coefficients, self.mass, self.coefficients_physical
+        if six is None or mass is None or physical is None:
+            raise ValueError(f"expected a fit with a law, got one without: {self.status}")
         filled = self.morphometry.volume_fraction
-        return Prior(self.coefficients, self.mass, six, ε, self.working_voxel, self.length_unit, filled)
+        return Prior(six, mass, physical, self.epsilon_physical, self.working_voxel, self.length_unit, filled)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers, strings, lists and dicts, as `fit.json` holds them."""
+        six, physical, draws = self.coefficients, self.coefficients_physical, self.draws
         return {
             "format": FORMAT,
+            "status": self.status,
             "kind": self.kind,
             "family": self.family,
-            "coefficients": self.coefficients.as_dict(),
+            "coefficients": None if six is None else six.as_dict(),
             "mass": self.mass,
-            "chosen": self.chosen,
             "uncertainty": self.uncertainty,
+            "chosen": self.chosen,
             "scale": list(self.scale),
             "working_voxel": self.working_voxel,
             "length_unit": self.length_unit,
-            "coefficients_physical": self.coefficients_physical.as_dict(),
+            "coefficients_physical": None if physical is None else physical.as_dict(),
             "epsilon_physical": self.epsilon_physical,
+            "intervals": None if draws is None else draws.intervals(),
+            "intervals_physical": None if draws is None else draws.intervals(self.length),
+            "weak_directions": list(self.weak_directions),
+            "misfit": None if self.misfit is None else self.misfit.as_dict(),
+            "drift": self.drift,
+            "candidates": [each.as_dict() for each in self.candidates],
             "matches": [_match_dict(match) for match in self.matches],
-            "refined": self.refined,
-            "distances": self.distances,
-            "status": self.status,
             "morphometry": {name: None if x != x else x for name, x in vars(self.morphometry).items()},
             "notes": list(self.notes),
             "provenance": self.provenance,
+            "posterior": None if draws is None else draws.as_dict(),
             "diagram": None if self.diagram is None else _diagram_dict(self.diagram, self.kind),
         }
 
@@ -162,20 +204,23 @@ class Fit(Pictured):
 
 def _fit_of(content: dict[str, Any]) -> Fit:
     """Return the fit of a checked content."""
-    same = ("kind", "family", "chosen", "length_unit", "refined", "distances", "status", "provenance")
-    measured: dict[str, Any] = {name: math.nan if x is None else x for name, x in content["morphometry"].items()}
-    return Fit(
+    same = ("kind", "family", "chosen", "drift", "length_unit", "status", "provenance")
+    fit = Fit(
         **{name: content[name] for name in same},
-        coefficients=six_of(content["coefficients"]),
-        mass=float(content["mass"]),
-        uncertainty={name: float(value) for name, value in content["uncertainty"].items()},
+        candidates=tuple(map(Candidate.from_dict, content["candidates"])),
+        draws=None if content["posterior"] is None else Draws.from_dict(content["posterior"]),
+        weak_directions=tuple(content["weak_directions"]),
+        misfit=None if content["misfit"] is None else Misfit.from_dict(content["misfit"]),
         scale=tuple(map(float, content["scale"])),  # type: ignore[arg-type]
         working_voxel=float(content["working_voxel"]),
         matches=tuple(map(_match_of, content["matches"])),
-        morphometry=Morphometry(**measured),
+        morphometry=morphometry_of(content["morphometry"]),
         notes=tuple(content["notes"]),
         diagram=None if content["diagram"] is None else _diagram_of(content["diagram"]),
     )
+    if (fit.chosen is None) != (fit.best is None):
+        raise ValueError(f"expected a chosen law among the fit's candidates, got {fit.chosen!r}")
+    return fit
 
 
 def _diagram_dict(diagram: Diagram, kind: str) -> dict[str, Any]:

@@ -117,6 +117,17 @@ def fixed_point(
     )
 
 
+def drift(phase: Float[Tensor, "z y x"], grid: Grid, epsilon: float, coefficients: Coefficients) -> float | None:
+    """Return how far, in voxels, a short flow of a law moves the surface of `phase`: root mean square, low-passed.
+
+    None where the box is too small to have an inside apart from its borders.
+    """
+    if not grid.periodic and min(grid.shape) <= 2 * HALO + STRIDE:
+        return None
+    residual = ShortFlow(phase, grid, epsilon, coefficients).residual(_parameters(coefficients))
+    return float(np.linalg.norm(residual))
+
+
 class ShortFlow:
     """The residual as a function of the five free parameters, with its Jacobian; the last values are remembered."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import datetime
 import platform
 from collections.abc import Callable
@@ -14,75 +13,85 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from curvafit.generation.flow import Flow, generate
-from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram, diagram
+from curvafit.generation.schedule import schedule
+from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram
 from curvafit.geometry.family import family_of
 from curvafit.geometry.morphometry import morphometry
-from curvafit.geometry.pairwise import one_to_many
 from curvafit.inference.atlas import Atlas, load_atlas
+from curvafit.inference.candidates import TITLES, Candidate, best_of
+from curvafit.inference.estimate import Estimate, estimate
 from curvafit.inference.fit import Fit
-from curvafit.inference.match import Match, nearest
+from curvafit.inference.fixed_point import drift
+from curvafit.inference.match import Match, mirrored, nearest
 from curvafit.inference.measure import scan_diagram
 from curvafit.inference.phases import check_options
-from curvafit.inference.prepare import Prepared, prepare
-from curvafit.inference.refine import refine
-from curvafit.inference.refinement import Refinement
+from curvafit.inference.posterior import Posterior, load_posterior
+from curvafit.inference.prepare import HALF, Prepared, prepare
+from curvafit.inference.stationarity import is_rounded, stationarity
+from curvafit.inference.texture import NOISE, untextured
+from curvafit.inference.twins import Twin, twin
+from curvafit.inference.verdict import verdict
 from curvafit.pictures import Pictured
 from curvafit.priors.bounds import SEEDS, instance, whole
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.fit_file import Prior
 from curvafit.priors.grid import WORKING_EPSILON, Grid
-from curvafit.priors.profile import phase_field
 from curvafit.progress import Progress, silent
 from curvafit.units import number
 from curvafit.volumes.field import Field
 from curvafit.volumes.formats.part import Crop
 from curvafit.volumes.source import Source, field_of
 
-#: Longest edge, in working voxels, of the boxes in which shapes are regenerated for comparison.
-REGENERATED_EDGE = 100
-#: Number of nearest shapes, and of those from which refinement starts.
+#: Number of nearest shapes, and of those from which stationarity starts.
 MATCHES, STARTS = 5, 3
-#: The distances of a fit that an inference shows, by the names that people read.
-_DISTANCES = (("match", "match"), ("fit", "fit"), ("two seeds", "seed_noise"))
+#: The parts of a fit where they are not known.
+_BARE: dict[str, Any] = {
+    "candidates": (), "chosen": None, "draws": None, "weak_directions": (), "misfit": None, "drift": None,
+    "matches": (),
+}  # fmt: skip
 _ARTICLES = {"field": "a phase field", "mask": "a mask", "image": "an image"}
 
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Inference(Pictured):
-    """An inference: a fit, and the fields and diagrams of its report.
+    """An inference: a fit, and the scan, diagram and grown shapes of its report.
 
     Attributes
     ----------
     scan, prepared
         The scan as read, and as prepared for measurement.
-    diagram, match_diagram, fit_diagram
-        Curvature diagrams of the scan, the regenerated match and the regenerated fit.
-    matched, regenerated
-        Phase fields `(Z, Y, X)` of the regenerated match and fit, None where no shape grew.
+    diagram
+        Curvature diagram of the scan; None of noise.
+    twins
+        Shapes grown from each candidate's law, by the candidate's name.
     fit
-        The parameters with their uncertainties, distances and status.
+        The law with its uncertainty, the candidates and the verdict.
+    simulated
+        By block of descriptors, the scan's numbers `(k,)` and those of shapes grown from draws of the posterior
+        `(n, k)`; None where none were.
     """
 
     scan: Field
     prepared: Prepared
-    diagram: Diagram
-    match_diagram: Diagram | None
-    fit_diagram: Diagram | None
-    matched: np.ndarray | None
-    regenerated: np.ndarray | None
+    diagram: Diagram | None
+    twins: dict[str, tuple[Twin, ...]]
     fit: Fit
+    simulated: dict[str, tuple[np.ndarray, np.ndarray]] | None = None
 
     def __repr__(self) -> str:
         fit = self.fit
         voxels = " x ".join(map(str, self.scan.values.shape))
-        near = ", ".join(f"{name} {number(fit.distances.get(key), 2)}" for name, key in _DISTANCES)
+        near = ", ".join(f"{each.name} {number(each.distance, 2)}" for each in fit.candidates)
         return f"Inference({fit.family} from {_ARTICLES[fit.kind]} of {voxels} voxels, distances: {near}. {fit.status})"
 
     @property
     def best(self) -> np.ndarray | None:
-        """Return the regenerated shape of the better supported parameters."""
-        return self.regenerated if self.fit.chosen == "fit" else self.matched
+        """Return the first shape grown from the chosen law."""
+        return self.shape_of(self.fit.chosen)
+
+    def shape_of(self, name: str | None) -> np.ndarray | None:
+        """Return the first shape grown from a candidate's law; None where none grew."""
+        return next((each.phase for each in self.twins.get(name or "", ()) if each.phase is not None), None)
 
     def to_prior(self) -> Prior:
         """Return the fit as a law, so that an inference is taken wherever a law is."""
@@ -95,6 +104,8 @@ def infer(
     kind: Literal["auto", "field", "mask", "image"] = "auto",
     periodic: bool = False,
     atlas: str | Path | Atlas | None = None,
+    posterior: str | Path | Posterior | None = None,
+    fast: bool = False,
     threshold: float | Literal["otsu"] = "otsu",
     dark: bool = False,
     roi: Source | None = None,
@@ -107,6 +118,9 @@ def infer(
 ) -> Inference:
     """Infer the generation parameters (a, m₀) of a scanned volume.
 
+    A posterior of the parameters is read from the scan's descriptors; laws drawn from it, the nearest shape of the
+    atlas and, of a phase field, its stationarity are grown, and what grows is compared with the scan.
+
     Parameters
     ----------
     scan
@@ -117,6 +131,10 @@ def infer(
         Whether the box repeats, as generated fields do and scans hardly ever.
     atlas
         The shapes to match against; by default the packaged ones.
+    posterior
+        What reads the descriptors; by default the packaged one (`curvafit atlas train` makes others).
+    fast
+        Grow nothing: seconds instead of minutes, but nothing is checked by a twin.
     threshold, dark, roi
         How the structure is told from the background: see `curvafit.inference.prepare.prepare`.
     label, crop
@@ -136,9 +154,12 @@ def infer(
     check_options(kind, threshold, label)
     if atlas is not None:
         instance(atlas, (str, Path, Atlas), "an atlas, as the path of a file or as Atlas")
+    if posterior is not None:
+        instance(posterior, (str, Path, Posterior), "a posterior, as the path of a file or as Posterior")
     seed = whole(seed, "a seed that is a whole number from 0", 0, SEEDS - 2)  # and the next one
     progress("reading the scan", 0.0)
     atlas = atlas if isinstance(atlas, Atlas) else load_atlas(atlas)
+    posterior = posterior if isinstance(posterior, Posterior) else load_posterior(posterior)
     volume = field_of(scan, label=label, crop=crop, **reading)
     region = None if roi is None else field_of(roi)
     region = region if region is None or crop is None else region.crop(crop)
@@ -146,177 +167,120 @@ def infer(
     if watch is not None:
         watch(prepared)
     progress("measuring curvature", 0.05)
-    measured = scan_diagram(prepared)
-    seen_as = "field" if prepared.kind == "field" else "mask"
-    progress("searching the atlas", 0.1)
-    matches = nearest(measured, atlas, seen_as=seen_as, count=MATCHES)
-    progress("refining the parameters", 0.2)
-    refined = _refined(prepared, matches, seed, progress)
-    progress("regenerating", 0.6)
-    refined = _with_mass(refined, prepared, seed)
-    twins = _regenerate(prepared, matches[0], refined, seed, progress)
-    fit = _fit(prepared, measured, matches, refined, twins, _provenance(volume, atlas, seed))
+    measured = None if prepared.noise else scan_diagram(prepared)
+    provenance = _provenance(volume, atlas, posterior, seed)
+    if measured is None or (reason := untextured(prepared, measured)):
+        status = NOISE if measured is None else reason
+        return Inference(volume, prepared, measured, {}, _fit(prepared, measured, provenance, status))
+    estimated = estimate(prepared, posterior, seed=seed, fast=fast, progress=_part(progress, 0.1, 0.5))
+    progress("searching the atlas", 0.5)
+    matches = _matches(prepared, measured, atlas)
+    laws = _laws(prepared, estimated, matches, seed, _part(progress, 0.5, 0.6))
+    laws, twins = (laws, {}) if fast else _grown(laws, measured, prepared, seed, _part(progress, 0.6, 1.0))
+    chosen, status = verdict(laws, None if estimated is None else estimated.misfit, fast=fast)
+    law = next((each.coefficients for each in laws if each.name == chosen), None)
+    moved = None if law is None else drift(*_window(prepared), WORKING_EPSILON, law)
+    known = {} if estimated is None else estimated.parts
+    fit = _fit(
+        prepared, measured, provenance, status,
+        candidates=laws, chosen=chosen, matches=matches, drift=moved, **known,
+    )  # fmt: skip
     progress("done", 1.0)
-    match, refit = twins["match"][0], twins["fit"][0]
-    return Inference(volume, prepared, measured, match.diagram, refit.diagram, match.phase, refit.phase, fit)
+    simulated = None if estimated is None else estimated.simulated
+    return Inference(volume, prepared, measured, twins, fit, simulated)
 
 
-@dataclass(frozen=True)
-class _Twin:
-    """A regenerated shape, measured as the scan is, or the flow that grew none."""
-
-    flow: Flow
-    phase: np.ndarray | None
-    diagram: Diagram | None
+def _part(progress: Progress, start: float, stop: float) -> Progress:
+    """Return the progress of a part of the work."""
+    return lambda text, share: progress(text, start + (stop - start) * share)
 
 
-def _refined(prepared: Prepared, matches: tuple[Match, ...], seed: int, progress: Progress) -> Refinement:
+def _matches(prepared: Prepared, measured: Diagram, atlas: Atlas) -> tuple[Match, ...]:
+    """Return the nearest shapes of the atlas; of a structure that fills most of the volume, those of its background,
+    with inside and outside exchanged: an atlas holds shapes that fill less than half."""
+    seen_as = "field" if prepared.kind == "field" else "mask"
+    if prepared.volume_fraction <= HALF:
+        return nearest(measured, atlas, seen_as=seen_as, count=MATCHES)
+    return tuple(map(mirrored, nearest(measured.mirrored, atlas, seen_as=seen_as, count=MATCHES)))
+
+
+def _laws(
+    prepared: Prepared, estimated: Estimate | None, matches: tuple[Match, ...], seed: int, progress: Progress
+) -> tuple[Candidate, ...]:
+    """Return the laws to grow, the most trusted first."""
+    drawn = () if estimated is None else estimated.candidates
+    match = Candidate("match", matches[0].coefficients, matches[0].mass, {})
+    if prepared.kind != "field" or is_rounded(prepared.phase):
+        return (*drawn, match)
+    starts = [each.coefficients for each in (*drawn[:1], *matches[:STARTS])]
+    refined = _stationarity(prepared, starts, seed, progress)
+    return (refined, *drawn, match)
+
+
+def _stationarity(prepared: Prepared, starts: list[Coefficients], seed: int, progress: Progress) -> Candidate:
+    refined = stationarity(*_window(prepared), WORKING_EPSILON, starts=starts, seed=seed, progress=progress)
+    deviations = {name: float(value) for name, value in refined.uncertainty.items()}
+    return Candidate("stationarity", refined.coefficients, float(refined.mass), deviations, status=refined.status)
+
+
+def _window(prepared: Prepared) -> tuple[torch.Tensor, Grid]:
+    """Return the phase field of the main window and its grid."""
     phase = torch.from_numpy(np.ascontiguousarray(prepared.phase[prepared.windows[0]]))
-    whole = phase.shape == prepared.grid.shape
     z, y, x = phase.shape
-    grid = Grid((z, y, x), prepared.grid.spacing, prepared.grid.boundary if whole else "replicate")
-    starts = [match.coefficients for match in matches[:STARTS]]
-    return refine(
-        phase,
-        grid,
-        WORKING_EPSILON,
-        kind=prepared.kind,
-        starts=starts,
-        seed=seed,
-        progress=lambda text, share: progress(text, 0.2 + 0.4 * share),
-    )
+    whole = phase.shape == prepared.grid.shape
+    return phase, Grid((z, y, x), prepared.grid.spacing, prepared.grid.boundary if whole else "replicate")
 
 
-def _with_mass(refined: Refinement, prepared: Prepared, seed: int) -> Refinement:
-    """Return a refinement whose mass gives a regenerated shape the scan's volume fraction, to first order.
+def _grown(
+    laws: tuple[Candidate, ...], measured: Diagram, prepared: Prepared, seed: int, progress: Progress
+) -> tuple[tuple[Candidate, ...], dict[str, tuple[Twin, ...]]]:
+    """Grow a twin of each law, and another one of the best: of the nearest, and of the first that is as near."""
+    twins: dict[str, tuple[Twin, ...]] = {}
 
-    The mass of a phase field is its mean and stays. A mask does not state a mass: the phases of a minimiser stop short
-    of ±1 by an amount that depends on curvature.
-    """
-    if prepared.kind == "field":
-        return refined
-    flow = generate(refined.coefficients, refined.mass, _twin_grid(prepared), seed=seed, reject_early=True)
-    if not flow.viability.viable:
-        return refined
-    region = np.ones_like(prepared.mask) if prepared.roi is None else prepared.roi
-    missing = float(prepared.mask[region].mean()) - float((flow.field > 0).double().mean())
-    return dataclasses.replace(refined, mass=float(np.clip(refined.mass + 2 * missing, -0.95, 0.95)))
+    def grow(law: Candidate, share: float) -> Candidate:
+        """Grow another twin of a law."""
+        start = seed + len(twins.get(law.name, ()))
+        progress(f"growing: {TITLES[law.name]}, seed {start}", share)
+        twins[law.name] = (*twins.get(law.name, ()), twin(law.coefficients, law.mass, prepared, start))
+        return law.grown(measured, twins[law.name])
 
-
-def _twin_grid(prepared: Prepared) -> Grid:
-    """Return a periodic box of the main window's size, for the regenerated shapes."""
-    z, y, x = (min(edge.stop - edge.start, REGENERATED_EDGE) for edge in prepared.windows[0])
-    return Grid((z, y, x), prepared.grid.spacing, "periodic")
-
-
-def _regenerate(
-    prepared: Prepared, match: Match, refined: Refinement, seed: int, progress: Progress
-) -> dict[str, tuple[_Twin, _Twin]]:
-    """Regenerate the nearest match and the refined parameters, with two seeds each."""
-    grid = _twin_grid(prepared)
-    twins = {}
-    for step, (name, source) in enumerate((("match", match), ("fit", refined))):
-        pair = []
-        for k in range(2):
-            progress(f"regenerating the {name}, seed {seed + k}", 0.6 + 0.2 * step + 0.1 * k)
-            pair.append(_twin(source.coefficients, source.mass, grid, seed + k, prepared.kind))
-        twins[name] = (pair[0], pair[1])
-    return twins
+    laws = tuple(grow(law, 0.8 * k / len(laws)) for k, law in enumerate(laws))
+    for share in (0.8, 0.9):
+        best = best_of(laws)
+        if best is not None and best.seed_noise is None:
+            laws = tuple(grow(law, share) if law is best else law for law in laws)
+    return laws, twins
 
 
-def _twin(coefficients: Coefficients, mass: float, grid: Grid, seed: int, kind: str) -> _Twin:
-    flow = generate(coefficients, mass, grid, seed=seed, reject_early=True)
-    if not flow.viability.viable:
-        return _Twin(flow, None, None)
-    field = flow.field if kind == "field" else phase_field(flow.field > 0, grid, WORKING_EPSILON)
-    return _Twin(flow, flow.field.numpy(), diagram(field, grid, WORKING_EPSILON))
-
-
-def _fit(
-    prepared: Prepared,
-    measured: Diagram,
-    matches: tuple[Match, ...],
-    refined: Refinement,
-    twins: dict[str, tuple[_Twin, _Twin]],
-    provenance: dict[str, Any],
-) -> Fit:
-    distances = {name: _distance(measured, pair) for name, pair in twins.items()}
-    noises = {name: _noise(pair) for name, pair in twins.items()}
-    chosen, status = _verdict(distances, noises, refined, twins)
-    distances["seed_noise"] = noises[chosen]
-    better = refined if chosen == "fit" else matches[0]
+def _fit(prepared: Prepared, measured: Diagram | None, provenance: dict[str, Any], status: str, **parts: Any) -> Fit:
+    """Return a fit of its parts: no candidates, no law and no posterior where they are not given."""
     grid = prepared.grid
     return Fit(
         kind=prepared.kind,
-        family=family_of(measured, prepared.thickness / 2 * grid.spacing[0]),
-        coefficients=better.coefficients,
-        mass=float(better.mass),
-        chosen=chosen,
-        uncertainty={name: float(value) for name, value in refined.uncertainty.items()},
+        family="noise" if measured is None else family_of(measured, prepared.thickness / 2 * grid.spacing[0]),
         scale=prepared.scale,
         working_voxel=prepared.working_voxel,
         length_unit=prepared.unit,
-        matches=matches,
-        refined=_refinement_dict(refined),
-        distances=distances,
         status=status,
         morphometry=morphometry(prepared.mask, prepared.working_voxel, prepared.unit, periodic=grid.periodic),
         notes=prepared.notes,
         provenance=provenance,
-        diagram=measured.thinned(BIN_WIDTH, TAIL_SHARE),
+        diagram=None if measured is None else measured.thinned(BIN_WIDTH, TAIL_SHARE),
+        **_BARE | parts,
     )
 
 
-def _distance(measured: Diagram, pair: tuple[_Twin, _Twin]) -> float | None:
-    diagrams = [twin.diagram for twin in pair if twin.diagram is not None]
-    return float(one_to_many(measured, diagrams).mean()) if diagrams else None
-
-
-def _noise(pair: tuple[_Twin, _Twin]) -> float | None:
-    first, second = pair[0].diagram, pair[1].diagram
-    return float(one_to_many(first, [second])[0]) if first is not None and second is not None else None
-
-
-def _verdict(
-    distances: dict[str, float | None], noises: dict[str, float | None], refined: Refinement, twins: dict
-) -> tuple[str, str]:
-    """Return which of match and fit is better supported, as a word and as a sentence."""
-    match, fit = distances["match"], distances["fit"]
-    if fit is None:
-        reason = twins["fit"][0].flow.viability.reason
-        return "match", f"The nearest match is better supported: the refined parameters make no shape ({reason})."
-    if match is None:
-        return "fit", "The refined parameters are better supported: the nearest match could not be regenerated."
-    noise = noises["fit"] or noises["match"] or 0.0
-    both = f"regenerated, the fit lies {fit:.1f} from the scan, the match {match:.1f}, two seeds {noise:.1f} apart"
-    if fit <= match + noise:
-        margin = "clearly" if fit < match - noise else "within seed noise"
-        return "fit", f"The refined parameters are supported ({margin}): {both}. {refined.status}"
-    return "match", f"The nearest match is better supported: {both}. {refined.status}"
-
-
-def _refinement_dict(refined: Refinement) -> dict[str, Any]:
-    return {
-        "method": refined.method,
-        "coefficients": refined.coefficients.as_dict(),
-        "mass": float(refined.mass),
-        "singular_values": [float(value) for value in refined.singular_values],
-        "residual": float(refined.residual),
-        "evaluations": int(refined.evaluations),
-        "status": refined.status,
-    }
-
-
-def _provenance(volume: Field, atlas: Atlas, seed: int) -> dict[str, Any]:
+def _provenance(volume: Field, atlas: Atlas, posterior: Posterior, seed: int) -> dict[str, Any]:
     return {
         "curvafit": version("curvafit"),
         "scan": str(volume.source),
         "scan_shape": list(volume.values.shape),
         "scan_spacing": list(volume.spacing),
         "seed": seed,
-        "schedule": "fast",
+        "schedule": schedule("fast", None).as_dict(),
         "epsilon": WORKING_EPSILON,
         "atlas": {"format": atlas.format_version, "shapes": len(atlas.ids)},
+        "posterior": posterior.provenance,
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "python": platform.python_version(),
         "torch": version("torch"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,6 +23,12 @@ class Match:
     coefficients: Coefficients
     mass: float
     seed: int
+
+
+def mirrored(match: Match) -> Match:
+    """Return a match's shape with inside and outside exchanged, in the gauge a20 = 1."""
+    six = match.coefficients.mirrored()
+    return replace(match, coefficients=six.scaled(1 / float(six.a20)), mass=-match.mass)
 
 
 def nearest(

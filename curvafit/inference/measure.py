@@ -1,4 +1,4 @@
-"""The curvature diagram of a prepared scan, of a large one piece by piece."""
+"""The curvature diagram of a prepared scan, of a large one piece by piece, and its descriptors."""
 
 from __future__ import annotations
 
@@ -9,10 +9,15 @@ import math
 import numpy as np
 from scipy import ndimage
 
+from curvafit.geometry.descriptors import Descriptors, descriptors
 from curvafit.geometry.diagram import MARGIN, Diagram, diagram
 from curvafit.geometry.mesh import NoSurface
 from curvafit.inference.prepare import LARGEST_WINDOW, Prepared
+from curvafit.inference.stationarity import is_rounded
 from curvafit.priors.grid import WORKING_EPSILON, Grid
+
+#: Least edge, in working voxels, of a cube whose descriptors are measured.
+SMALLEST_CUBE = 24
 
 
 def scan_diagram(prepared: Prepared) -> Diagram:
@@ -43,3 +48,41 @@ def _tile_diagram(prepared: Prepared, tile: tuple[slice, ...]) -> Diagram:
     grid = Grid((z, y, x), prepared.grid.spacing, prepared.grid.boundary)
     where = None if prepared.roi is None else ndimage.binary_erosion(prepared.roi, iterations=MARGIN)[tile]
     return diagram(phase, grid, WORKING_EPSILON, where=where)
+
+
+def scan_descriptors(prepared: Prepared) -> tuple[Descriptors, str] | None:
+    """Measure a scan's descriptors, and name the kind of view that it is (`inference.views`).
+
+    They are those of the main window, or of the largest cube within the region of interest. None where that cube is
+    smaller than `SMALLEST_CUBE` voxels, or shows no surface.
+    """
+    where = prepared.windows[0] if prepared.roi is None else _largest_cube(prepared.roi)
+    if where is None:
+        return None
+    mask = np.ascontiguousarray(prepared.mask[where])
+    whole = mask.shape == prepared.grid.shape
+    grid = Grid(mask.shape, prepared.grid.spacing, prepared.grid.boundary if whole else "replicate")
+    view = _view(prepared, grid)
+    try:
+        return descriptors(prepared.phase if view == "field" else mask, grid), view
+    except NoSurface:
+        return None
+
+
+def _view(prepared: Prepared, grid: Grid) -> str:
+    """Return what a posterior takes a window for: a field of a part is read as its mask is."""
+    if prepared.kind == "image":
+        return "scan"
+    if grid.periodic:
+        return "field" if prepared.kind == "field" and not is_rounded(prepared.phase) else "mask"
+    return "crop" if prepared.scale == (1.0, 1.0, 1.0) else "resampled"
+
+
+def _largest_cube(region: np.ndarray) -> tuple[slice, slice, slice] | None:
+    """Return the largest cube within a region, of at most a window's edge; None where it is too small."""
+    inside = np.asarray(ndimage.distance_transform_cdt(np.pad(region, 1), metric="chessboard"))[1:-1, 1:-1, 1:-1]
+    reach = min(int(inside.max()), LARGEST_WINDOW // 2) - 1
+    if 2 * reach + 1 < SMALLEST_CUBE:
+        return None
+    z, y, x = (int(i) for i in np.unravel_index(int(inside.argmax()), inside.shape))
+    return slice(z - reach, z + reach + 1), slice(y - reach, y + reach + 1), slice(x - reach, x + reach + 1)

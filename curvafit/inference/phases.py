@@ -13,12 +13,14 @@ from skimage.filters import threshold_otsu
 from curvafit.priors.bounds import SEEDS, named, real, whole
 from curvafit.volumes.scan import Field, ScanError, load
 
-__all__ = ["Kind", "Level", "check_options", "find_level", "region_of_interest"]
+__all__ = ["Kind", "Level", "check_options", "find_level", "is_noise", "region_of_interest"]
 
 Kind = Literal["field", "mask", "image"]
 
 #: Median third difference of neighbours from which values are noisy; fields rounded to 1/100 reach 0.02.
 _NOISE = 0.045
+#: Offsets in scan voxels, beyond the reach of smoothing, and the correlation that noise stays below there.
+_LAGS, _UNCORRELATED = (4, 5, 6, 7, 8), 0.06
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +106,22 @@ def region_of_interest(roi: Field | np.ndarray | str | os.PathLike[str] | None, 
     if not region.any():
         raise ScanError("expected a region of interest with voxels in it, got an empty one")
     return region
+
+
+def is_noise(mask: np.ndarray) -> bool:
+    """Return whether voxels a few apart have nothing to do with each other, along each axis."""
+    share = float(mask.mean())
+    variance = share * (1 - share)
+    for axis in range(3):
+        for lag in _LAGS:
+            if mask.shape[axis] <= 2 * lag:
+                continue
+            lines = np.moveaxis(mask, axis, 0)
+            both = float(np.count_nonzero(lines[lag:] & lines[:-lag])) / lines[lag:].size
+            ends = float(lines[lag:].mean()) * float(lines[:-lag].mean())
+            if abs(both - ends) > _UNCORRELATED * variance:
+                return False
+    return True
 
 
 def _guess_kind(values: np.ndarray, threshold: Literal["otsu"] | float, two: bool) -> Kind:

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 import torch
 
-from curvafit.inference.phases import Kind, Level, find_level, region_of_interest
+from curvafit.inference.phases import Kind, Level, find_level, is_noise, region_of_interest
 from curvafit.inference.regrid import (
     Window,
     bounding_box,
@@ -36,6 +36,9 @@ THINNEST = 3.0
 LARGEST_WINDOW = 128
 LARGEST_BOX = 200
 LARGEST_SCAN = 512
+#: Part of the volume from which on a structure may be the other phase than the one that was meant, and the note.
+HALF = 0.5
+MOSTLY = "The structure fills {:.0%} of the volume: if the other phase was meant, turn the two round (--dark)."
 #: Coarsening stops where a side would have fewer working voxels than this.
 FEWEST = 32
 
@@ -61,7 +64,8 @@ class Prepared:
     threshold
         Grey level that separates the phases, None for fields and masks.
     thickness
-        Median thickness of the structure beneath its surface, in working voxels.
+        Median thickness beneath its surface, in working voxels, of the structure, or of the background where that fills
+        less of the volume.
     windows
         Boxes of at most 128 voxels a side that together cover the grid's surface; the first is the main one. They
         overlap, so sums belong on the whole grid; one smaller than the grid is no periodic box.
@@ -72,6 +76,8 @@ class Prepared:
         a voxel of them is none of the scan's.
     notes
         Sentences on what was decided.
+    noise
+        Whether the structure's voxels have nothing to do with those a few voxels away.
     """
 
     kind: Kind
@@ -87,6 +93,18 @@ class Prepared:
     notes: tuple[str, ...]
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     roi: np.ndarray | None = None
+    noise: bool = False
+
+    @property
+    def volume_fraction(self) -> float:
+        """Return the part of the scan, or of its region of interest, that is structure."""
+        return float((self.mask if self.roi is None else self.mask[self.roi]).mean())
+
+    @property
+    def turned(self) -> Prepared:
+        """Return the same scan with structure and background exchanged."""
+        mask = ~self.mask if self.roi is None else ~self.mask & self.roi
+        return replace(self, mask=mask, phase=-self.phase)
 
 
 def prepare(
@@ -135,7 +153,8 @@ def prepare(
     options = {"kind": kind, "threshold": threshold, "dark": dark}
     extremes = (field.values.min(), field.values.max())
     level = find_level(part, region=region, periodic=periodic, extremes=extremes, **options)  # type: ignore[arg-type]
-    scan = _Scan(level, part.shape, part.spacing, periodic, region, field.notes + notes + (level.note,))
+    noise = level.kind != "field" and is_noise(level.mask)
+    scan = _Scan(level, part.shape, part.spacing, periodic, region, noise, field.notes + notes + (level.note,))
     prepared = _on_working_grid(scan)
     corner = tuple(s.start + o for s, o in zip(where, prepared.origin, strict=True))
     return replace(prepared, unit=field.unit, origin=corner)  # type: ignore[arg-type]
@@ -150,7 +169,22 @@ class _Scan:
     spacing: tuple[float, float, float]
     periodic: bool
     region: np.ndarray | None
+    noise: bool
     notes: tuple[str, ...]
+
+    @property
+    def keeps_grid(self) -> bool:
+        """Return whether thickness has no say in the grid: a phase field has its ε, and noise no thickness."""
+        return self.level.kind == "field" or self.noise
+
+    @property
+    def thinner(self) -> tuple[np.ndarray, str]:
+        """Return the phase that fills less of what counts, whose thickness sets the grid, and its name."""
+        structure = self.counted
+        counted = structure.size if self.region is None else np.count_nonzero(self.region)
+        if np.count_nonzero(structure) <= HALF * counted:
+            return structure, "structure"
+        return (~structure if self.region is None else ~structure & self.region), "background"
 
     @property
     def counted(self) -> np.ndarray:
@@ -173,6 +207,8 @@ def _on_working_grid(scan: _Scan) -> Prepared:
     )
     mask, dropped = _structure(scan.level.kind, values, region, thickness / edge, grid.periodic)
     windows = rich_boxes(surface_voxels(mask), LARGEST_WINDOW)
+    filled = float((mask if region is None else mask[region]).mean())
+    inverted = (MOSTLY.format(filled),) if filled > HALF else ()
     if not windows:
         raise ScanError("expected a surface between structure and background, got none on the working grid")
     if scan.level.kind != "field":
@@ -190,23 +226,26 @@ def _on_working_grid(scan: _Scan) -> Prepared:
         threshold=scan.level.threshold,
         thickness=thickness / edge,
         windows=tuple(windows),
-        notes=scan.notes + notes + why + cut + dropped,
+        notes=scan.notes + notes + why + cut + dropped + inverted,
         origin=tuple(a * s for a, s in zip(start, scale, strict=True)),  # type: ignore[arg-type]
         roi=region,
+        noise=scan.noise,
     )
 
 
 def _thickness(scan: _Scan) -> tuple[float, tuple[str, ...]]:
     """Return the median thickness in the scan's unit; refused where next to nothing is thick enough to have a shape."""
-    median, thick = median_thickness(scan.counted, scan.spacing, scan.periodic)
+    phase, name = scan.thinner
+    median, thick = median_thickness(phase, scan.spacing, scan.periodic)
     voxel = math.prod(scan.spacing) ** (1 / 3)
-    if scan.level.kind != "field" and thick < (THINNEST - 0.5) * voxel:  # balls on the grid understate thin tubes
+    thin = thick < (THINNEST - 0.5) * voxel  # balls on the grid understate thin tubes
+    if thin and not scan.keeps_grid:
         raise ScanError(
-            f"expected a structure at least {THINNEST:g} voxels thick, got one that is thinner nearly everywhere"
+            f"expected a {name} at least {THINNEST:g} voxels thick, got one that is thinner nearly everywhere"
         )
-    note = f"Median thickness {median / voxel:.3g} scan voxels."
+    note = f"Median thickness of the {name} {median / voxel:.3g} scan voxels."
     if median < THINNEST * voxel:
-        note = f"Half of the structure is thinner than {median / voxel:.2g} scan voxels: its curvature is uncertain."
+        note = f"Half of the {name} is thinner than {median / voxel:.2g} scan voxels: its curvature is uncertain."
     return median, (note,)
 
 
@@ -214,9 +253,9 @@ def _scale(scan: _Scan, thickness: float) -> tuple[tuple[float, float, float], t
     """Return the working voxel in scan voxels, per axis; all ones where the scan's grid is kept."""
     spacing, finest = scan.spacing, min(scan.spacing)
     isotropic = max(spacing) <= 1.01 * finest
-    if isotropic and (scan.level.kind == "field" or KEPT_THICKNESS[0] <= thickness / finest <= KEPT_THICKNESS[1]):
+    if isotropic and (scan.keeps_grid or KEPT_THICKNESS[0] <= thickness / finest <= KEPT_THICKNESS[1]):
         return (1.0, 1.0, 1.0), ("The scan's grid is kept.",)
-    edge = finest if scan.level.kind == "field" else thickness / WORKING_THICKNESS
+    edge = finest if scan.keeps_grid else thickness / WORKING_THICKNESS
     extent = min(n * h for n, h in zip(scan.shape, spacing, strict=True))
     note = f"Resampled to {thickness / edge:.3g} voxels a thickness"
     if extent < FEWEST * edge and edge > finest:

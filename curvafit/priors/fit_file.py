@@ -59,9 +59,12 @@ def read_fit(path: str | PathLike[str]) -> Prior:
     Raises
     ------
     FileNotFoundError, ValueError
-        If there is no such file, or it is not a `fit.json` of this format (`fit_schema`).
+        If there is no such file, it is not a `fit.json` of this format or the one before (`fit_schema`), or it has no
+        law.
     """
     content = parse_fit(fit_bytes(path), path, FIT_SCHEMA)
+    if any(content[name] is None for name in ("coefficients", "mass", "coefficients_physical")):
+        raise ValueError(f"expected a fit.json with a law, got none in {path}: {content.get('status', 'no reason')}")
     working, physical = (six_of(content[key]) for key in ("coefficients", "coefficients_physical"))
     mass, epsilon, voxel = (float(content[key]) for key in ("mass", "epsilon_physical", "working_voxel"))
     filled = (content.get("morphometry") or {}).get("volume_fraction")
@@ -97,7 +100,7 @@ def parse_fit(text: str | bytes, place: object, schema: Mapping[str, Any]) -> di
     expected = "a fit.json written by `curvafit infer`"
     content = parse_json(text, expected, place)
     version = content.get("format", FORMAT) if isinstance(content, dict) else FORMAT
-    if version != FORMAT:
+    if version not in schema["properties"]["format"]["enum"]:
         got = f"got {quoted(version)} in {place}: run `curvafit infer` again"
         raise ValueError(f"expected a fit.json of format {FORMAT}, {got}")
     if fault := violation(content, schema):

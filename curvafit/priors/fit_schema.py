@@ -15,7 +15,9 @@ from curvafit.priors.bounds import quoted
 from curvafit.priors.coefficients import NAMES
 from curvafit.units import METRES
 
-FORMAT = "curvafit-fit-1"
+FORMAT = "curvafit-fit-2"
+#: Formats whose law can be read.
+FORMATS = (FORMAT, "curvafit-fit-1")
 
 _NUMBER = {"type": "number", "description": "a finite number"}
 _POSITIVE = {"type": "number", "exclusiveMinimum": 0, "description": "a positive number"}
@@ -52,6 +54,71 @@ _MATCH = {
 _OR_NONE = {"type": ["number", "null"], "description": "a number, or null"}
 _LENGTH = {"type": ["number", "null"], "minimum": 0, "description": "a number from 0, or null"}
 _FILLED = {"type": ["number", "null"], "minimum": 0, "maximum": 1, "description": "a number from 0 to 1, or null"}
+_MORPHOMETRY = {
+    "type": "object",
+    "properties": {
+        "volume_fraction": _FILLED,
+        "thickness_mean": _LENGTH,
+        "thickness_std": _LENGTH,
+        "spacing_mean": _LENGTH,
+        "connectivity_density": _OR_NONE,
+        "euler": _NUMBER,
+        "surface_to_volume": _LENGTH,
+        "unit": _TEXT,
+    },
+    "description": "an object",
+}
+_SIX_OR_NONE = {**_SIX, "type": ["object", "null"], "description": "an object of six coefficients, or null"}
+_MASS_OR_NONE = {**_MASS, "type": ["number", "null"], "description": "a number between -1 and 1, or null"}
+_DEVIATIONS = {
+    "type": "object",
+    "properties": dict.fromkeys((*NAMES, "mass"), _SHARE),
+    "description": "an object of deviations",
+}
+_CANDIDATE = {
+    "type": "object",
+    "required": ["name", "coefficients", "mass", "uncertainty", "distance", "seed_noise", "twins", "status"],
+    "properties": {
+        "name": _TEXT,
+        "coefficients": _SIX,
+        "mass": _MASS,
+        "uncertainty": _DEVIATIONS,
+        "distance": _LENGTH,
+        "seed_noise": _LENGTH,
+        "twins": {
+            "type": "array",
+            "items": {**_MORPHOMETRY, "required": list(_MORPHOMETRY["properties"])},
+            "description": "a list",
+        },
+        "status": _TEXT,
+    },
+    "description": "an object",
+}
+_COLUMN = {"type": "array", "items": _NUMBER, "minItems": 1, "description": "a list of numbers"}
+_DRAWN = (*NAMES[1:], "mass")
+_POSTERIOR = {
+    "type": ["object", "null"],
+    "required": ["view", "method", "draws"],
+    "properties": {
+        "view": _TEXT,
+        "method": _TEXT,
+        "draws": {
+            "type": "object",
+            "required": list(_DRAWN),
+            "properties": dict.fromkeys(_DRAWN, _COLUMN),
+            "description": "an object of columns",
+        },
+    },
+    "description": "an object, or null",
+}
+_INTERVALS = {"type": ["object", "null"], "description": "an object, or null"}
+_PART = {"type": "number", "minimum": 0, "maximum": 1, "description": "a number from 0 to 1"}
+_MISFIT = {
+    "type": ["object", "null"],
+    "required": ["probability", "blocks", "method"],
+    "properties": {"probability": _PART, "blocks": {"type": "object", "description": "an object"}, "method": _TEXT},
+    "description": "an object, or null",
+}
 
 FIT_SCHEMA: dict[str, Any] = {
     "type": "object",
@@ -65,41 +132,29 @@ FIT_SCHEMA: dict[str, Any] = {
         "length_unit",
     ],
     "properties": {
-        "format": {"enum": [FORMAT], "description": FORMAT},
+        "format": {"enum": list(FORMATS), "description": " or ".join(FORMATS)},
         "kind": {"enum": ["field", "mask", "image"], "description": "field, mask or image"},
         "family": _TEXT,
-        "coefficients": _SIX,
-        "mass": _MASS,
-        "chosen": {"enum": ["match", "fit"], "description": "match or fit"},
-        "uncertainty": _SIX,
+        "coefficients": _SIX_OR_NONE,
+        "mass": _MASS_OR_NONE,
+        "chosen": {"type": ["string", "null"], "description": "a candidate's name, or null"},
+        "uncertainty": _DEVIATIONS,
         "scale": {"type": "array", "items": _POSITIVE, "minItems": 3, "description": "a list of 3 numbers"},
-        "coefficients_physical": _SIX,
+        "coefficients_physical": _SIX_OR_NONE,
         "epsilon_physical": _POSITIVE,
         "working_voxel": _POSITIVE,
         "length_unit": {"enum": ["voxel", *METRES], "description": f"one of voxel, {', '.join(METRES)}"},
         "matches": {"type": "array", "items": _MATCH, "description": "a list"},
-        "refined": {"type": "object", "description": "an object"},
-        "distances": {
-            "type": "object",
-            "properties": dict.fromkeys(("match", "fit", "seed_noise"), _LENGTH),
-            "description": "an object of distances",
-        },
+        "intervals": _INTERVALS,
+        "intervals_physical": _INTERVALS,
+        "weak_directions": {"type": "array", "items": _TEXT, "description": "a list of texts"},
+        "misfit": _MISFIT,
+        "drift": _LENGTH,
+        "candidates": {"type": "array", "items": _CANDIDATE, "description": "a list"},
+        "posterior": _POSTERIOR,
         "status": _TEXT,
         "notes": {"type": "array", "items": _TEXT, "description": "a list of texts"},
-        "morphometry": {
-            "type": ["object", "null"],
-            "properties": {
-                "volume_fraction": _FILLED,
-                "thickness_mean": _LENGTH,
-                "thickness_std": _LENGTH,
-                "spacing_mean": _LENGTH,
-                "connectivity_density": _OR_NONE,
-                "euler": _NUMBER,
-                "surface_to_volume": _LENGTH,
-                "unit": _TEXT,
-            },
-            "description": "an object, or null",
-        },
+        "morphometry": {**_MORPHOMETRY, "type": ["object", "null"], "description": "an object, or null"},
         "diagram": _DIAGRAM,
         "provenance": {
             "type": "object",
@@ -119,8 +174,9 @@ def _whole(schema: Mapping[str, Any], **others: Any) -> dict[str, Any]:
 #: The whole fit of an inference, as `Fit` writes and reads it; a law needs less (`FIT_SCHEMA`).
 WHOLE_FIT = _whole(
     FIT_SCHEMA,
+    format={"enum": [FORMAT], "description": FORMAT},
     matches={**FIT_SCHEMA["properties"]["matches"], "items": _whole(_MATCH)},
-    morphometry=_whole({**FIT_SCHEMA["properties"]["morphometry"], "type": "object", "description": "an object"}),
+    morphometry=_whole(_MORPHOMETRY),
 )
 
 _BOUNDS = {

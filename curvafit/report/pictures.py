@@ -9,27 +9,29 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from curvafit.drawing.corner import bands_figure, corner_figure
 from curvafit.drawing.plot import diagram_figure, gallery_figure, png, shared_limits, slice_figure, surface_figure
-from curvafit.units import length
+from curvafit.inference.candidates import TITLES, Candidate
+from curvafit.inference.table import parameters_of
+from curvafit.units import length, number
 
 if TYPE_CHECKING:
+    from curvafit.geometry.diagram import Diagram
     from curvafit.inference.infer import Inference
 
 _AXES = "zyx"
-#: The three shapes of a report: which parameters made it, its title.
-_SHAPES = ((None, "The scan"), ("match", "Nearest match, regrown"), ("fit", "Refined, regrown"))
-#: What the better supported shape was grown from.
-TWINS = {"match": "nearest match", "fit": "refined parameters"}
+#: The parameters as a corner plot names them.
+SYMBOLS = ("a₁₁", "log a₀₂", "a₁₀", "a₀₁", "a₀₀", "m₀")
 
 
 def inference_figure(inference: Inference, **options: Any) -> Figure:
-    """Return a figure of the scan's surface beside its regrown twin, the better supported of the two.
+    """Return a figure of the scan's surface beside its regrown twin.
 
     Where no twin grew, the scan is alone. `options` are those of `gallery_figure`.
     """
     shapes = {"the scan": scan_box(inference)}
     if inference.best is not None:
-        shapes[f"regrown: {TWINS[inference.fit.chosen]}"] = inference.best
+        shapes[f"regrown: {TITLES[str(inference.fit.chosen)]}"] = inference.best
     return gallery_figure(shapes, **{"columns": 2, "width": 900, **options})
 
 
@@ -44,25 +46,87 @@ def slice_figures(inference: Inference) -> str:
 
 
 def surface_figures(inference: Inference) -> str:
-    """Return pictures of the scan's surface, the matched and the regenerated shape, in boxes of one size."""
-    shapes = (scan_box(inference), inference.matched, inference.regenerated)
-    return "".join(_shape(inference, name, title, u) for (name, title), u in zip(_SHAPES, shapes, strict=True))
+    """Return pictures of the scan's surface and of what grew from each candidate, in boxes of one size."""
+    shapes = [(None, scan_box(inference)), *((each, inference.shape_of(each.name)) for each in shown(inference))]
+    return "".join(_shape(inference, candidate, u) for candidate, u in shapes)
 
 
 def diagram_figures(inference: Inference) -> str:
-    """Return the three curvature diagrams with shared axes, in the scan's unit."""
-    diagrams = (inference.diagram, inference.match_diagram, inference.fit_diagram)
+    """Return curvature diagrams with shared axes, in the scan's unit: the scan's, the chosen law's, the match's."""
+    diagrams = [("The scan", inference.diagram), *_grown_diagrams(inference)]
     λ, unit = inference.fit.length, inference.fit.length_unit
-    limits = shared_limits([diagram for diagram in diagrams if diagram is not None], length=λ)
+    limits = shared_limits([diagram for _, diagram in diagrams if diagram is not None], length=λ)
     parts = []
-    for (name, title), diagram in zip(_SHAPES, diagrams, strict=True):
-        caption = f"<b>{title}</b>{_badge(inference, name)}"
+    for title, diagram in diagrams:
+        caption = f"<b>{escape(title)}</b>"
         if diagram is None:
             parts.append(_missing(caption))
         else:
             figure = diagram_figure(diagram, limits=limits, unit=unit, length=λ)
             parts.append(_figure(figure, f"Curvature diagram: {title}", caption))
     return "".join(parts)
+
+
+def corner(inference: Inference) -> str:
+    """Return the corner plot of the posterior's draws in working units, the chosen law and the match marked."""
+    draws = inference.fit.draws
+    if draws is None:
+        return ""
+    marks = {}
+    for each in inference.fit.candidates:
+        if each.name in (inference.fit.chosen, "match"):
+            marks[title_of(each)] = _place(each)
+    figure = corner_figure(draws.parameters, SYMBOLS, _limits(draws.parameters, marks), marks)
+    return _figure(figure, "Draws of the parameters, two by two", "")
+
+
+def bands(inference: Inference) -> str:
+    """Return the scan's descriptors on the bands of simulated ones, block by block; nothing where none were made."""
+    misfit = inference.fit.misfit
+    if inference.simulated is None or misfit is None:
+        return ""
+    titles = {name: f"{name}, p = {number(misfit.blocks.get(name), 2)}" for name in inference.simulated}
+    figure = bands_figure({titles[name]: block for name, block in inference.simulated.items()})
+    return _figure(
+        figure,
+        "The scan's descriptors on the bands of simulated shapes",
+        "Orange: the scan. Bands: 50 and 90 % of shapes grown from draws of the posterior, seen as the scan is. "
+        "Lengths in working units; quantiles from the least to the greatest.",
+    )
+
+
+def shown(inference: Inference) -> list[Candidate]:
+    """Return the candidates in the order in which a page shows them: the chosen one first."""
+    fit = inference.fit
+    return sorted(fit.candidates, key=lambda each: each.name != fit.chosen)
+
+
+def title_of(candidate: Candidate) -> str:
+    """Return a candidate's title, with a capital."""
+    title = TITLES.get(candidate.name, candidate.name)
+    return title[0].upper() + title[1:]
+
+
+def _grown_diagrams(inference: Inference) -> list[tuple[str, Diagram | None]]:
+    """Return the titles and diagrams of the chosen law's first shape and of the nearest match's."""
+    chosen = [each for each in shown(inference) if each.name in (inference.fit.chosen, "match")]
+    twins = [(title_of(each), inference.twins.get(each.name, ())) for each in chosen]
+    return [
+        (f"{title}, regrown", next((twin.diagram for twin in grown if twin.diagram), None)) for title, grown in twins
+    ]
+
+
+def _place(candidate: Candidate) -> np.ndarray:
+    """Return a law's place among the draws."""
+    return parameters_of(candidate.coefficients, candidate.mass)
+
+
+def _limits(draws: np.ndarray, marks: dict[str, np.ndarray]) -> list[tuple[float, float]]:
+    """Return the axes of the parameters: all draws but the outermost, and all marks."""
+    rows = np.concatenate([np.percentile(draws, (0.5, 99.5), axis=0), *(mark[None] for mark in marks.values())])
+    low, high = rows.min(0), rows.max(0)
+    rim = 0.06 * np.maximum(high - low, 1e-6)
+    return list(zip((low - rim).tolist(), (high + rim).tolist(), strict=True))
 
 
 def scan_box(inference: Inference) -> np.ndarray:
@@ -108,25 +172,24 @@ def _slice(inference: Inference, axis: int, index: int, limits: tuple[float, flo
     return _figure(figure, f"Slice across {_AXES[axis]} with the surface's outline", caption)
 
 
-def _shape(inference: Inference, name: str | None, title: str, u: np.ndarray | None) -> str:
-    caption = f"<b>{title}</b>{_badge(inference, name)}"
+def _shape(inference: Inference, candidate: Candidate | None, u: np.ndarray | None) -> str:
+    fit = inference.fit
+    title = "The scan" if candidate is None else f"{title_of(candidate)}, regrown"
+    badge = ' <span class="badge">best supported</span>' if candidate and candidate.name == fit.chosen else ""
+    caption = f"<b>{escape(title)}</b>{badge}"
     if u is None:
         return _missing(caption)
-    fit = inference.fit
     edges = [length(n * fit.working_voxel, fit.length_unit, 3) for n in u.shape]
     box = f"edge {edges[0]}" if len(set(edges)) == 1 else " × ".join(edges)
-    distance = "" if name is None else f"; distance {fit.distances[name]:.1f}"
+    distance = "" if candidate is None or candidate.distance is None else f"; distance {candidate.distance:.1f}"
     return _figure(surface_figure(u), f"Surface: {title}", f"{caption}<br>{escape(box + distance)}")
-
-
-def _badge(inference: Inference, name: str | None) -> str:
-    return ' <span class="badge">better supported</span>' if name == inference.fit.chosen else ""
 
 
 def _figure(figure: Figure, alt: str, caption: str) -> str:
     data = base64.b64encode(png(figure)).decode("ascii")
     image = f'<img alt="{escape(alt)}" src="data:image/png;base64,{data}">'
-    return f"<figure>{image}<figcaption>{caption}</figcaption></figure>\n"
+    below = f"<figcaption>{caption}</figcaption>" if caption else ""
+    return f"<figure>{image}{below}</figure>\n"
 
 
 def _missing(caption: str) -> str:

@@ -38,7 +38,7 @@ _SIZES = {
 def describe(inference: Inference) -> str:
     """Return the sentence that a report opens with: family, size, share of the volume."""
     fit, numbers = inference.fit, inference.fit.morphometry
-    radius = family_radius(inference.diagram, fit.family)
+    radius = None if inference.diagram is None else family_radius(inference.diagram, fit.family)
     physical = numbers.thickness_mean / 2 if radius is None else radius * fit.length
     pattern = _SIZES.get(fit.family, "{family}, {thickness} thick, {share} of the volume")
     return pattern.format(

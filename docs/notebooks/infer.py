@@ -11,8 +11,8 @@
 # %% [markdown]
 # # From a volume to its parameters
 #
-# A shape of known parameters stands in for a scan: so the answer can be checked. It is small (40³ voxels), to run in
-# seconds; take 100³ for figures to rely on.
+# A shape of known parameters stands in for a scan: so the answer can be checked. It is small (40³ voxels), to run in a
+# minute or two; take 100³ for figures to rely on.
 
 # %%
 # %matplotlib inline
@@ -33,13 +33,13 @@ fit = inference.fit
 print(fit.status)
 
 # %% [markdown]
-# `status` is to be read first: it says whether the refined parameters or the nearest shape of the atlas is better
-# supported. Here it is the refined ones, since a phase field gives its coefficients back:
+# `status` is to be read first: it names the law that is best supported, if any is. Several candidates were grown, and
+# the chosen one is the first that is as near as the nearest. A phase field gives its coefficients back by stationarity:
 
 # %%
 print("      truth  inferred     ±")
 for name, value in truth.coefficients.as_dict().items():
-    print(f"{name} {value:8.2f} {fit.coefficients.as_dict()[name]:8.2f} {fit.uncertainty[name]:8.2f}")
+    print(f"{name} {value:8.2f} {fit.coefficients.as_dict()[name]:8.2f} {fit.uncertainty.get(name, float('nan')):8.2f}")
 print(f"mass {truth.mass:7.3f} {fit.mass:8.3f}")
 
 # %% [markdown]

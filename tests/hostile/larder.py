@@ -58,14 +58,16 @@ COEFFICIENTS = (1.0, 2.0, 6.0, -40.0, -40.0, 400.0)
 def fit() -> dict[str, Any]:
     """A `fit.json` as an inference writes it."""
     length = 1.95
+    six = dict(zip(NAMES, COEFFICIENTS, strict=True))
+    own = {"name": "posterior", "coefficients": six, "mass": -0.6, "uncertainty": dict.fromkeys(NAMES, 0.5)}
     physical = [value / length**power for value, power in zip(COEFFICIENTS, (0, 0, 0, 1, 1, 2), strict=True)]
     return {
-        "format": "curvafit-fit-1",
+        "format": "curvafit-fit-2",
         "kind": "image",
         "family": "tubes",
-        "coefficients": dict(zip(NAMES, COEFFICIENTS, strict=True)),
+        "coefficients": six,
         "mass": -0.6,
-        "chosen": "fit",
+        "chosen": "posterior",
         "uncertainty": dict.fromkeys(NAMES, 0.5),
         "scale": [1.0, 1.0, 1.0],
         "working_voxel": 0.0195,
@@ -73,11 +75,17 @@ def fit() -> dict[str, Any]:
         "coefficients_physical": dict(zip(NAMES, physical, strict=True)),
         "epsilon_physical": 0.039,
         "matches": [],
-        "distances": {"match": 2.2, "fit": 1.6, "seed_noise": 1.1},
-        "status": "The refined parameters are supported.",
+        "intervals": None,
+        "intervals_physical": None,
+        "weak_directions": [],
+        "misfit": None,
+        "drift": None,
+        "candidates": [own | {"distance": 1.6, "seed_noise": 1.1, "twins": [], "status": ""}],
+        "status": "Supported.",
         "morphometry": {"volume_fraction": 0.187},
         "notes": [],
         "provenance": {"seed": 0},
+        "posterior": None,
         "diagram": None,
     }
 

@@ -52,7 +52,8 @@ function placed(fit, file) {
   const seenAs = (fit.diagram?.seen_as ?? fit.kind) === "field" ? "field" : "mask";
   const near = diagram ? nearestShapes(diagram, seenAs) : ownMatches(fit);
   if (!near.length) {
-    throw new Error(`expected the scan's diagram or matches in this atlas, got neither in ${file}: run curvafit infer again`);
+    const mend = lawful(fit) ? "run curvafit infer again" : fit.status ?? "it has no law";
+    throw new Error(`expected the scan's diagram or matches in this atlas, got neither in ${file}: ${mend}`);
   }
   const weights = near.map(([, apart]) => 1 / (apart * apart + 1e-6));
   const total = weights.reduce((sum, weight) => sum + weight);
@@ -60,6 +61,9 @@ function placed(fit, file) {
   const spread = Math.max(...near.map(([k]) => Math.hypot(atlas.places[k][0] - place[0], atlas.places[k][1] - place[1])));
   return { fit, file, diagram, seenAs, near, place, spread };
 }
+
+/** Whether a fit has a law, as `read_fit` asks. */
+const lawful = (fit) => [fit.coefficients, fit.mass, fit.coefficients_physical].every((part) => part !== null);
 
 /** Whether a diagram's three columns are of one length, with some area. */
 function whole({ kappa1, kappa2, share }) {
@@ -77,7 +81,7 @@ function ownMatches(fit) {
 }
 
 /** How it was placed, and how far to trust that. */
-function account({ diagram, seenAs, near, spread }) {
+function account({ fit, diagram, seenAs, near, spread }) {
   const say = [`The scan lies at the barycentre of its ${near.length} nearest shapes, each weighted by 1/distance².`];
   if (!diagram) {
     say.push("This fit.json holds no diagram: the nearest shapes are the matches of curvafit infer, with its distances.");
@@ -90,6 +94,7 @@ function account({ diagram, seenAs, near, spread }) {
       : `The nearest shape is ${number(least)} away, farther than 95 % of the atlas’s shapes are from their neighbours: the scan may lie off the map.`);
   }
   if (spread > 0.15) say.push("The nearest shapes lie far apart on the map, so the scan’s place is uncertain.");
+  if (!lawful(fit) && fit.status) say.push(fit.status);
   return say.join(" ");
 }
 
@@ -124,6 +129,7 @@ function showScan(at) {
     : "Wasserstein distances of curvafit infer, in 1/working unit.";
   const known = { ...fit.coefficients, m0: fit.mass, volume: fit.morphometry?.volume_fraction };
   table("scan-parameters", atlas.columns.map(({ key, symbol, says }) => [symbol, says, known[key] ?? NaN]));
+  $("scan-law").hidden = !lawful(fit);
   command("scan-command", `curvafit generate --prior ${quoted(scan.file)} --seed 1 -o more.nii.gz`);
   $("scan-figure").hidden = !scan.diagram;
   drawDiagram($("scan-diagram"), scan.diagram);

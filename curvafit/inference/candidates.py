@@ -1,0 +1,107 @@
+"""Laws that may have made a scan, what grew from each, and which of them is supported."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from curvafit.geometry.diagram import Diagram
+from curvafit.geometry.morphometry import Morphometry
+from curvafit.geometry.pairwise import one_to_many
+from curvafit.inference.twins import Twin
+from curvafit.priors.coefficients import Coefficients
+from curvafit.priors.fit_file import six_of
+
+#: Where a law comes from, as people read it.
+TITLES = {
+    "posterior": "middle of the posterior",
+    "optimum": "best fit of the descriptors",
+    "draw": "best of the simulated draws",
+    "stationarity": "refined by stationarity",
+    "match": "nearest match",
+}
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A law that may have made a scan, in working units, and what grew from it.
+
+    Attributes
+    ----------
+    name
+        Where the law comes from: a key of `TITLES`.
+    uncertainty
+        Standard deviations by coefficient, and of the mass where it has one; empty where they are not known.
+    distance
+        Mean distance of its twins' curvature diagrams from the scan's, 1 / working unit; None where none grew.
+    seed_noise
+        Distance between two twins; None where fewer grew.
+    twins
+        The twins' familiar numbers.
+    status
+        What the method says of itself, or why nothing grew.
+    """
+
+    name: str
+    coefficients: Coefficients
+    mass: float
+    uncertainty: dict[str, float]
+    distance: float | None = None
+    seed_noise: float | None = None
+    twins: tuple[Morphometry, ...] = ()
+    status: str = ""
+
+    def grown(self, scan: Diagram, twins: Sequence[Twin]) -> Candidate:
+        """Return the candidate with what its twins measure against the scan's curvature diagram."""
+        diagrams = [each.diagram for each in twins if each.diagram is not None]
+        if not diagrams:
+            return replace(self, status=f"{self.status} No shape grew: {twins[0].reason}.".strip())
+        distance = float(one_to_many(scan, diagrams).mean())
+        noise = float(one_to_many(diagrams[0], diagrams[1:]).mean()) if len(diagrams) > 1 else None
+        numbers = tuple(each.morphometry for each in twins if each.morphometry is not None)
+        masses = [each.mass for each in twins if each.phase is not None]
+        return replace(self, mass=float(np.mean(masses)), distance=distance, seed_noise=noise, twins=numbers)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the candidate in JSON's types."""
+        numbers = [{name: None if x != x else x for name, x in vars(each).items()} for each in self.twins]
+        return {**vars(self), "coefficients": self.coefficients.as_dict(), "twins": numbers}
+
+    @staticmethod
+    def from_dict(content: Mapping[str, Any]) -> Candidate:
+        """Return what `as_dict` wrote."""
+        twins = tuple(map(morphometry_of, content["twins"]))
+        deviations = {name: float(value) for name, value in content["uncertainty"].items()}
+        same = {name: content[name] for name in ("name", "distance", "seed_noise", "status")}
+        six, mass = six_of(content["coefficients"]), float(content["mass"])
+        return Candidate(**same, coefficients=six, mass=mass, uncertainty=deviations, twins=twins)
+
+
+def morphometry_of(content: Mapping[str, Any]) -> Morphometry:
+    """Return the familiar numbers of a fit's content, NaN where it has null."""
+    numbers: dict[str, Any] = {name: math.nan if value is None else value for name, value in content.items()}
+    return Morphometry(**numbers)
+
+
+def best_of(candidates: Sequence[Candidate]) -> Candidate | None:
+    """Return the first candidate within seed noise of the one nearest to the scan; None where nothing grew.
+
+    The noise is that of the nearest one's twins; where they are fewer than two, the nearest is the best.
+    """
+    grown = {each.name: each.distance for each in candidates if each.distance is not None}
+    if not grown:
+        return None
+    nearest = min((each for each in candidates if each.name in grown), key=lambda each: grown[each.name])
+    reach = grown[nearest.name] + (nearest.seed_noise or 0.0)
+    return next(each for each in candidates if each.name in grown and grown[each.name] <= reach)
+
+
+def noise_of(candidates: Sequence[Candidate]) -> float | None:
+    """Return the distance between two twins of the best candidate; of another one where it has fewer than two."""
+    best = best_of(candidates)
+    known = [each.seed_noise for each in candidates if each.seed_noise is not None]
+    return best.seed_noise if best is not None and best.seed_noise is not None else next(iter(known), None)

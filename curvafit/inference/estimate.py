@@ -1,0 +1,171 @@
+"""What the descriptors of a scan say of its law: draws from a posterior, laws to grow, whether any is believable."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from curvafit.generation.flow import generate
+from curvafit.geometry.descriptors import BLOCKS, Descriptors, descriptors
+from curvafit.geometry.mesh import NoSurface
+from curvafit.inference.candidates import Candidate
+from curvafit.inference.check import FEWEST, amortised_p, check
+from curvafit.inference.draws import Draws
+from curvafit.inference.emulator import Optimum, optimum
+from curvafit.inference.measure import scan_descriptors
+from curvafit.inference.misfit import Misfit
+from curvafit.inference.posterior import Posterior
+from curvafit.inference.prepare import HALF, Prepared
+from curvafit.inference.simulation import Simulations, simulations
+from curvafit.inference.table import column_names, law_of, mirrored
+from curvafit.inference.views import VIEWS
+from curvafit.priors.grid import Grid
+from curvafit.progress import Progress, silent
+from curvafit.volumes.scan import ScanError
+
+#: Draws from the posterior, those from which the best fit is searched, and those that are grown.
+DRAWS, STARTS, SIMULATIONS = 400, 16, 16
+#: Edges, in working voxels, of the boxes in which draws are grown.
+EDGES = (32, 64)
+#: How draws come about, in words.
+METHOD = "amortised: conditional flows given the descriptors"
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """What is known of a scan's law before anything of its size is grown.
+
+    Attributes
+    ----------
+    draws
+        From the posterior.
+    weak_directions
+        Sentences on the directions in which the scan leaves the parameters open.
+    misfit
+        How far out the scan lies among what the model makes.
+    candidates
+        Laws to grow, the most trusted first.
+    simulated
+        By block of descriptors, the scan's numbers `(k,)` and those of the simulations `(n, k)`; None without any.
+    """
+
+    draws: Draws
+    weak_directions: tuple[str, ...]
+    misfit: Misfit
+    candidates: tuple[Candidate, ...]
+    simulated: dict[str, tuple[np.ndarray, np.ndarray]] | None = None
+
+    @property
+    def parts(self) -> dict[str, Any]:
+        """Return the parts of a fit that it knows."""
+        return {"draws": self.draws, "weak_directions": self.weak_directions, "misfit": self.misfit}
+
+
+def estimate(
+    prepared: Prepared, posterior: Posterior, *, seed: int = 0, fast: bool = False, progress: Progress = silent
+) -> Estimate | None:
+    """Read a scan's law from its descriptors: draws from the posterior, some of them grown for the scan to be compared
+    with.
+
+    Parameters
+    ----------
+    fast
+        Grow nothing: the scan is compared with what training left unexplained.
+    progress
+        Called with a sentence and the share done.
+
+    Returns
+    -------
+    Estimate | None
+        None where the descriptors cannot be measured.
+    """
+    progress("measuring descriptors", 0.0)
+    turned = prepared.volume_fraction > HALF
+    seen = prepared.turned if turned else prepared
+    if (measured := scan_descriptors(seen)) is None:
+        return None
+    row, view = measured[0].vector(), measured[1]
+    progress("reading the posterior", 0.1)
+    parameters = posterior.sample(row, view, DRAWS, seed)
+    best = optimum(posterior.emulator, row, view, parameters[:STARTS])
+    reading = _Reading(posterior, row, view, parameters, best, mirrored if turned else np.asarray)
+    if not fast:
+        grown = _simulations(seen, view, parameters, seed, lambda text, share: progress(text, 0.15 + 0.85 * share))
+        if len(grown.parameters) >= FEWEST:
+            return _checked(reading, grown)
+    draws = reading.draws(parameters, METHOD)
+    misfit = Misfit(amortised_p(posterior, row, view, parameters), {}, "by the best fit, nothing grown")
+    return Estimate(draws, reading.weak, misfit, reading.laws(draws))
+
+
+@dataclass(frozen=True, eq=False)
+class _Reading:
+    """What the posterior and the emulator read from a row of descriptors: draws and the best fit.
+
+    Of a structure that fills most of the volume its background is read; `turn` gives the parameters of the structure.
+    """
+
+    posterior: Posterior
+    row: np.ndarray
+    view: str
+    parameters: np.ndarray
+    best: Optimum
+    turn: Callable[[np.ndarray], np.ndarray]
+
+    @property
+    def weak(self) -> tuple[str, ...]:
+        """Return the weak directions as sentences."""
+        of = "" if self.turn is np.asarray else "Of the other phase: "
+        return tuple(f"{of}{each}" for each in self.best.weak)
+
+    def draws(self, parameters: np.ndarray, method: str) -> Draws:
+        """Return draws of the structure's parameters."""
+        return Draws.of(self.turn(parameters), self.view, method)
+
+    def laws(self, draws: Draws) -> tuple[Candidate, ...]:
+        """Return the best fit of the descriptors with its own deviations, and the middle of the draws with theirs."""
+        rng = np.random.default_rng(0)
+        near = rng.multivariate_normal(self.best.parameters, self.best.covariance, DRAWS, check_valid="ignore")
+        low, high = self.posterior.box.T
+        own = self.draws(np.clip(near, low, high), "").deviations
+        middle = draws.middle(np.ptp(draws.parameters, axis=0))
+        return (
+            Candidate("optimum", *law_of(self.turn(self.best.parameters)), own),
+            Candidate("posterior", *law_of(middle), draws.deviations),
+        )
+
+
+def _checked(reading: _Reading, grown: Simulations) -> Estimate:
+    """Return what is known once draws were grown."""
+    posterior, row, count = reading.posterior, reading.row, len(grown.parameters)
+    draws = reading.draws(reading.parameters, METHOD)
+    checked = check(posterior, row, reading.view, grown.descriptors)
+    misfit = Misfit(
+        checked.p, {name: each.p for name, each in checked.blocks.items()}, f"{count} shapes grown from draws"
+    )
+    components = posterior.compression(np.concatenate([row[None], grown.descriptors])) @ posterior.emulator.basis.T
+    near = int(np.square(components[1:] - components[0]).sum(1).argmin())
+    nearest = Candidate("draw", *law_of(reading.turn(grown.parameters[near])), {})
+    names = np.array(column_names())
+    blocks = {name: (row[names == name], grown.descriptors[:, names == name]) for name in BLOCKS}
+    return Estimate(draws, reading.weak, misfit, (*reading.laws(draws), nearest), blocks)
+
+
+def _simulations(prepared: Prepared, view: str, parameters: np.ndarray, seed: int, progress: Progress) -> Simulations:
+    """Grow draws in boxes of at most `EDGES` voxels and measure them as the scan's view."""
+    z, y, x = (int(np.clip(edge.stop - edge.start, *EDGES)) for edge in prepared.windows[0])
+    grid = Grid((z, y, x), prepared.grid.spacing, "periodic")
+
+    def simulate(draw: np.ndarray, start: int) -> Descriptors | None:
+        flow = generate(*law_of(draw), grid, seed=start, reject_early=True)
+        if not flow.viability.viable:
+            return None
+        try:
+            return descriptors(*VIEWS[view](flow.field.numpy(), grid, np.random.default_rng(start)))
+        except (ScanError, NoSurface):
+            return None
+
+    return simulations(parameters, simulate, SIMULATIONS, seed=seed, progress=progress)

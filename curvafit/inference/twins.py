@@ -1,0 +1,64 @@
+"""Shapes grown from a law to stand beside a scan, measured as the scan is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from curvafit.generation.flow import Flow, generate
+from curvafit.geometry.diagram import Diagram, diagram
+from curvafit.geometry.mesh import NoSurface
+from curvafit.geometry.morphometry import Morphometry, morphometry
+from curvafit.inference.prepare import Prepared
+from curvafit.priors.coefficients import Coefficients
+from curvafit.priors.grid import WORKING_EPSILON, Grid
+from curvafit.priors.profile import phase_field
+
+#: Longest edge, in working voxels, of the boxes in which twins grow.
+LONGEST_EDGE = 100
+
+
+@dataclass(frozen=True, eq=False)
+class Twin:
+    """A shape grown from a law: its field, mass, curvature diagram and familiar numbers, or why none grew."""
+
+    phase: np.ndarray | None
+    mass: float
+    diagram: Diagram | None
+    morphometry: Morphometry | None
+    reason: str = ""
+
+
+def twin(coefficients: Coefficients, mass: float, prepared: Prepared, seed: int) -> Twin:
+    """Grow a shape of a law in a box of the scan's main window, at most `LONGEST_EDGE` voxels a side.
+
+    Of a mask or an image it fills the same part of its box as the scan's structure, since a mask does not state a mass;
+    where nothing grows so, it has the law's own mass.
+    """
+    grid = twin_grid(prepared)
+    if prepared.kind != "field":
+        share = prepared.volume_fraction
+        flow = generate(coefficients, grid=grid, volume_fraction=share, seed=seed, reject_early=True)
+        if (grown := _measured(flow, prepared)).phase is not None:
+            return grown
+    return _measured(generate(coefficients, mass, grid, seed=seed, reject_early=True), prepared)
+
+
+def twin_grid(prepared: Prepared) -> Grid:
+    """Return the periodic box in which a scan's twins grow."""
+    z, y, x = (min(edge.stop - edge.start, LONGEST_EDGE) for edge in prepared.windows[0])
+    return Grid((z, y, x), prepared.grid.spacing, "periodic")
+
+
+def _measured(flow: Flow, prepared: Prepared) -> Twin:
+    if not flow.viability.viable:
+        return Twin(None, flow.mass, None, None, flow.viability.reason)
+    mask = flow.field > 0
+    field = flow.field if prepared.kind == "field" else phase_field(mask, flow.grid, WORKING_EPSILON)
+    try:
+        curvature = diagram(field, flow.grid, WORKING_EPSILON)
+    except NoSurface as error:
+        return Twin(None, flow.mass, None, None, str(error))
+    numbers = morphometry(mask.numpy(), prepared.working_voxel, prepared.unit, periodic=True)
+    return Twin(flow.field.numpy(), flow.mass, curvature, numbers)

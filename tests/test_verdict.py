@@ -1,0 +1,117 @@
+"""Which candidate is the best, and what is said of it: each sentence by the numbers that lead to it."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+from found import NUMBERS
+
+from curvafit.geometry.diagram import Diagram
+from curvafit.inference.candidates import Candidate, best_of, noise_of
+from curvafit.inference.misfit import UNBELIEVABLE, Misfit
+from curvafit.inference.twins import Twin
+from curvafit.inference.verdict import FURTHEST, verdict
+from curvafit.priors.coefficients import Coefficients
+
+LAW = Coefficients(1, 2, 6, -40, -40, 400)
+USUAL = Misfit(0.4, {"gaps": 0.3, "chords": 0.2}, "12 simulations")
+ODD = Misfit(0.001, {"gaps": 0.004, "chords": 0.3, "depths": 0.0005}, "12 simulations")
+
+
+def law(name: str, distance: float | None = None, noise: float | None = None, status: str = "") -> Candidate:
+    return Candidate(name, LAW, -0.6, {"a11": 0.4}, distance, noise, status=status)
+
+
+def twin(diagram: Diagram | None, mass: float) -> Twin:
+    if diagram is None:
+        return Twin(None, mass, None, None, "the field is of one phase")
+    return Twin(np.zeros((2, 2, 2)), mass, diagram, NUMBERS)
+
+
+# ---- candidates ------------------------------------------------------------------------------------------------------
+
+
+def test_the_first_within_seed_noise_of_the_nearest_is_the_best() -> None:
+    barren, first, last = law("optimum"), law("posterior", 2.5), law("match", 2.25)
+    nearest, quiet, single = (law("draw", 2.0, noise) for noise in (0.5, 0.25, None))
+    for order, best in (
+        ((barren, first, nearest, last), first),
+        ((last, nearest, first), last),
+        ((barren, first, quiet, last), quiet),
+        ((first, single), single),
+        ((barren,), None),
+        ((), None),
+    ):
+        assert best_of(order) is best
+
+
+def test_seed_noise_is_the_best_one_s_or_another_s() -> None:
+    best, other = law("draw", 2.0, 0.5), law("match", 5.0, 1.5)
+    assert noise_of((other, best)) == 0.5
+    assert noise_of((law("posterior", 1.0), other)) == 1.5
+    assert noise_of((law("posterior", 1.0), law("optimum"))) is None
+    assert noise_of(()) is None
+
+
+def test_what_grew_is_measured_against_the_scan() -> None:
+    """One twin is the scan itself: the mean distance is half the twins' own."""
+    scan, other = (Diagram(np.array([point]), np.ones(1)) for point in ((3.0, 1.0), (9.0, -2.0)))
+    both = law("draw").grown(scan, (twin(scan, -0.5), twin(None, 0.0), twin(other, -0.25)))
+    assert both.seed_noise is not None and both.distance == pytest.approx(both.seed_noise / 2) and both.distance > 1
+    assert (both.mass, both.twins, both.status) == (-0.375, (NUMBERS, NUMBERS), "")
+    one = law("draw").grown(scan, (twin(scan, -0.5),))
+    assert (one.distance, one.seed_noise, one.twins) == (0.0, None, (NUMBERS,))
+    none = law("draw", status="Hm.").grown(scan, (twin(None, 0.0),))
+    assert none == law("draw", status="Hm. No shape grew: the field is of one phase.")
+
+
+def test_a_candidate_comes_back_from_its_json() -> None:
+    whole = dataclasses.replace(law("draw", 2.0, 0.5, "Hm."), twins=(NUMBERS, NUMBERS))
+    for each in (whole, law("match")):
+        assert Candidate.from_dict(json.loads(json.dumps(each.as_dict()))) == each
+    full = dataclasses.replace(whole, twins=(dataclasses.replace(NUMBERS, spacing_mean=math.nan),))
+    content = json.loads(json.dumps(full.as_dict(), allow_nan=False))
+    assert math.isnan(Candidate.from_dict(content).twins[0].spacing_mean)
+
+
+# ---- verdicts --------------------------------------------------------------------------------------------------------
+
+
+def test_without_growing_the_first_is_named_and_not_checked() -> None:
+    said = "Nothing was grown to check the law (--fast)."
+    assert verdict((law("optimum"), law("match")), None, fast=True) == ("optimum", said)
+    unusual = "The model does not make such descriptors (p = 0.0010); the strangest: depths, gaps."
+    assert verdict((law("optimum"),), ODD, fast=True) == ("optimum", f"{unusual} {said}")
+
+
+def test_where_nothing_grew_there_is_no_law() -> None:
+    why = "No shape grew: the field is of one phase."
+    name, status = verdict((law("posterior", status=why), law("match")), USUAL)
+    assert name is None and status == f"No law: nothing grew from any candidate. {why}"
+
+
+def test_the_nearest_is_supported_where_its_twins_are_near() -> None:
+    usual = "The scan's descriptors are of a kind that the model makes (p = 0.40)."
+    near = "Supported (nearest match): its twins lie 2.0 from the scan's curvature diagram"
+    assert verdict((law("match", 2.0, 0.5),), USUAL) == ("match", f"{near}, 0.5 from each other. {usual}")
+    assert verdict((law("match", 2.0, status="Hm."),), None) == ("match", f"{near}. Hm.")
+    limit = law("match", FURTHEST * 0.5, 0.5)
+    assert verdict((limit,), None)[1].startswith("Supported")
+    assert verdict((limit,), dataclasses.replace(USUAL, probability=UNBELIEVABLE))[1].startswith("Supported")
+
+
+def test_a_far_or_strange_one_is_named_but_not_believed() -> None:
+    far = "No believable twin: of the nearest law (best of the simulated draws), its twins lie 2.1 from the scan's"
+    said = f"{far} curvature diagram, 0.5 from each other. Twins should lie some 0.5 from it."
+    assert verdict((law("draw", 2.1, 0.5), law("match", 9.0)), USUAL) == ("draw", said)
+    name, status = verdict((law("draw", 0.1, 0.5),), ODD)
+    assert name == "draw" and status.startswith("No believable twin: ")
+    assert status.endswith(
+        "0.5 from each other. The model does not make such descriptors (p = 0.0010); the strangest: depths, gaps."
+    )
+    single = dataclasses.replace(ODD, blocks={"gaps": 0.3})
+    assert verdict((law("draw", 0.1),), single)[1].endswith("(p = 0.0010); the strangest: none by itself.")
