@@ -14,7 +14,7 @@ from curvafit.geometry.diagram import Diagram
 from curvafit.inference.candidates import Candidate, best_of, noise_of
 from curvafit.inference.misfit import UNBELIEVABLE, Misfit
 from curvafit.inference.twins import Twin
-from curvafit.inference.verdict import FURTHEST, verdict
+from curvafit.inference.verdict import FURTHEST, unlike, verdict
 from curvafit.priors.coefficients import Coefficients
 
 LAW = Coefficients(1, 2, 6, -40, -40, 400)
@@ -96,9 +96,9 @@ def test_where_nothing_grew_there_is_no_law() -> None:
 
 def test_the_nearest_is_supported_where_its_twins_are_near() -> None:
     usual = "The scan's descriptors are of a kind that the model makes (p = 0.40)."
-    near = "Supported (nearest match): its twins lie 2.0 from the scan's curvature diagram"
-    assert verdict((law("match", 2.0, 0.5),), USUAL) == ("match", f"{near}, 0.5 from each other. {usual}")
-    assert verdict((law("match", 2.0, status="Hm."),), None) == ("match", f"{near}. Hm.")
+    near = "Supported (nearest match): its twins lie 0.9 from the scan's curvature diagram"
+    assert verdict((law("match", 0.9, 0.5),), USUAL) == ("match", f"{near}, 0.5 from each other. {usual}")
+    assert verdict((law("match", 0.9, status="Hm."),), None) == ("match", f"{near}. Hm.")
     limit = law("match", FURTHEST * 0.5, 0.5)
     assert verdict((limit,), None)[1].startswith("Supported")
     assert verdict((limit,), dataclasses.replace(USUAL, probability=UNBELIEVABLE))[1].startswith("Supported")
@@ -115,3 +115,13 @@ def test_a_far_or_strange_one_is_named_but_not_believed() -> None:
     )
     single = dataclasses.replace(ODD, blocks={"gaps": 0.3})
     assert verdict((law("draw", 0.1),), single)[1].endswith("(p = 0.0010); the strangest: none by itself.")
+
+
+def test_familiar_numbers_that_differ_are_named() -> None:
+    """By more than 15 %; a number that the scan does not have is none that differs."""
+    near = dataclasses.replace(NUMBERS, thickness_mean=1.14 * NUMBERS.thickness_mean)
+    assert unlike(NUMBERS, (NUMBERS, near)) == unlike(NUMBERS, (near,)) == unlike(NUMBERS, ()) == ""
+    far = dataclasses.replace(NUMBERS, thickness_mean=3 * NUMBERS.thickness_mean, connectivity_density=0.0)
+    assert unlike(NUMBERS, (NUMBERS, far)) == "Twins over scan: thickness 2.0, connectivity 0.50."
+    assert unlike(dataclasses.replace(NUMBERS, thickness_mean=math.nan), (NUMBERS,)) == ""
+    assert unlike(dataclasses.replace(NUMBERS, connectivity_density=0.0), (NUMBERS,)) == ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
 import platform
 from collections.abc import Callable
@@ -30,7 +31,7 @@ from curvafit.inference.prepare import HALF, Prepared, prepare
 from curvafit.inference.stationarity import is_rounded, stationarity
 from curvafit.inference.texture import NOISE, untextured
 from curvafit.inference.twins import Twin, twin
-from curvafit.inference.verdict import verdict
+from curvafit.inference.verdict import unlike, verdict
 from curvafit.pictures import Pictured
 from curvafit.priors.bounds import SEEDS, instance, whole
 from curvafit.priors.coefficients import Coefficients
@@ -255,7 +256,7 @@ def _grown(
 def _fit(prepared: Prepared, measured: Diagram | None, provenance: dict[str, Any], status: str, **parts: Any) -> Fit:
     """Return a fit of its parts: no candidates, no law and no posterior where they are not given."""
     grid = prepared.grid
-    return Fit(
+    fit = Fit(
         kind=prepared.kind,
         family="noise" if measured is None else family_of(measured, prepared.thickness / 2 * grid.spacing[0]),
         scale=prepared.scale,
@@ -268,6 +269,8 @@ def _fit(prepared: Prepared, measured: Diagram | None, provenance: dict[str, Any
         diagram=None if measured is None else measured.thinned(BIN_WIDTH, TAIL_SHARE),
         **_BARE | parts,
     )
+    ratios = "" if fit.best is None else unlike(fit.morphometry, fit.best.twins)
+    return dataclasses.replace(fit, status=f"{status} {ratios}".strip())
 
 
 def _provenance(volume: Field, atlas: Atlas, posterior: Posterior, seed: int) -> dict[str, Any]:

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
+from curvafit.geometry.morphometry import Morphometry
 from curvafit.inference.candidates import TITLES, Candidate, best_of, noise_of
 from curvafit.inference.misfit import UNBELIEVABLE, Misfit
 from curvafit.units import number
 
-#: Twins that lie further from the scan than this many seeds' distances are no twins.
-FURTHEST = 4.0
+#: Twins that lie further from the scan than this many seeds' distances are no twins. True laws' twins lie one away;
+#: of a badly degraded scan, some 1.8.
+FURTHEST = 2.0
+#: Familiar numbers in which twins may differ from the scan, and the part by which they may without being named.
+FAMILIAR = {"thickness": "thickness_mean", "spacing": "spacing_mean", "connectivity": "connectivity_density"}
+NEAR = 0.15
 
 
 def verdict(candidates: Sequence[Candidate], misfit: Misfit | None, *, fast: bool = False) -> tuple[str | None, str]:
@@ -38,6 +44,17 @@ def verdict(candidates: Sequence[Candidate], misfit: Misfit | None, *, fast: boo
 def _joined(*sentences: str) -> str:
     """Return the sentences that are not empty, one after the other."""
     return " ".join(filter(None, sentences))
+
+
+def unlike(scan: Morphometry, twins: Sequence[Morphometry]) -> str:
+    """Return which familiar numbers of the twins differ from the scan's, as a sentence; empty where all are near."""
+    apart = []
+    for word, name in FAMILIAR.items():
+        own, others = getattr(scan, name), [getattr(each, name) for each in twins]
+        ratio = sum(others) / len(others) / own if others and own else math.nan
+        if abs(ratio - 1) > NEAR:
+            apart.append(f"{word} {number(ratio, 2)}")
+    return f"Twins over scan: {', '.join(apart)}." if apart else ""
 
 
 def _unusual(misfit: Misfit | None) -> str:
