@@ -177,8 +177,8 @@ def _folders() -> Iterator[Case]:
         "map": (("atlas", "map", "{larder}/store.zarr", "-o", "home"), ("atlas.html", "atlas.png",
             "cache/distances.npz", "notes.txt")),
         "infer": (
-            ("infer", "{larder}/long.npy", "--kind", "field", "--periodic", "--atlas", "{larder}/atlas.npz", "-o",
-            "home"),
+            ("infer", "{larder}/long.npy", "--fast", "--kind", "field", "--periodic", "--atlas", "{larder}/atlas.npz",
+            "-o", "home"),
             ("fit.json", "report.html", "regenerated.nii.gz", "notes.txt"),
         ),
     }  # fmt: skip
@@ -231,7 +231,9 @@ def _single() -> Iterator[Case]:
             _torn_store),
         "map-into-store": (("atlas", "map", "store.zarr", "-o", "store.zarr"), taking("store.zarr")),
         "extract-into-store": (("atlas", "extract", "store.zarr", "-o", "store.zarr/atlas.npz"), taking("store.zarr")),
-        "infer-into-scan": (("infer", "series", "--atlas", "{larder}/atlas.npz", "-o", "series"), taking("series")),
+        "infer-into-scan": (
+            ("infer", "series", "--fast", "--atlas", "{larder}/atlas.npz", "-o", "series"), taking("series"),
+        ),
     }  # fmt: skip
     for name, (command, setup) in told.items():
         yield Case(f"belongings/single/{name}", setup, command, quick=not name.startswith(("infer", "map")))

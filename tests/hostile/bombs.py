@@ -233,7 +233,18 @@ def cases(seed: int) -> Iterator[Case]:
         write = BOMBS[name][1]
         command = ("generate", "--maps", "a.npz", "--shape", "10", "--steps", "4", "-o", "out.npy")
         yield Case(f"bombs/maps/{name}", _writing(write, "a.npz"), command)
-        command = ("infer", "{larder}/long.npy", "--kind", "field", "--periodic", "--atlas", "a.npz", "-o", "found")
+        command = (
+            "infer",
+            "{larder}/long.npy",
+            "--fast",
+            "--kind",
+            "field",
+            "--periodic",
+            "--atlas",
+            "a.npz",
+            "-o",
+            "found",
+        )
         yield Case(f"bombs/atlas/{name}", _writing(write, "a.npz"), command, quick=False)
     for size in (10**6, 10**12):
         command = ("generate", "--prior", "fit.json", "--shape", "10", "--steps", "4", "-o", "out.npy")

@@ -155,7 +155,18 @@ def cases(seed: int) -> Iterator[Case]:
             yield _case(f"documents/{name}/whole-{what}", each, _rewriting(WHOLE[what], each.path))
     for k in range(16):
         value = dice(seed, f"atlas {k}").choice([*sorted(VALUES), "missing"])
-        command = ("infer", "{larder}/long.npy", "--kind", "field", "--periodic", "--atlas", "atlas.npz", "-o", "found")
+        command = (
+            "infer",
+            "{larder}/long.npy",
+            "--fast",
+            "--kind",
+            "field",
+            "--periodic",
+            "--atlas",
+            "atlas.npz",
+            "-o",
+            "found",
+        )
         setup = every(taking("atlas.npz"), _altering_header(value))
         yield Case(f"documents/atlas/{k:02d}-{value}", setup, command, quick=False)
 

@@ -88,8 +88,8 @@ def _elsewhere(name: str, make: Callable[[Path], None]) -> Iterator[Case]:
     commands = {
         "fit.json": (*_GENERATE[:1], "--prior", "fit.json", "--shape", "10", "--steps", "4", "-o", "out.npy"),
         "box.yaml": ("atlas", "build", "out.zarr", "--design", "box.yaml", "--workers", "0"),
-        "atlas.npz": ("infer", "{larder}/long.npy", "--kind", "field", "--periodic", "--atlas", "atlas.npz", "-o",
-            "found"),
+        "atlas.npz": ("infer", "{larder}/long.npy", "--fast", "--kind", "field", "--periodic", "--atlas", "atlas.npz",
+            "-o", "found"),
         "maps.npz": ("generate", "--maps", "maps.npz", "--shape", "10", "--steps", "4", "-o", "out.npy"),
         "store.zarr": ("atlas", "info", "store.zarr"),
         "set": ("synth", "-o", "set", "--atlas", "{larder}/store.zarr", "--modality", "mra", "--shape", "6",

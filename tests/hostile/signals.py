@@ -55,7 +55,7 @@ SCENES: dict[str, Scene] = {
         count=6,
     ),
     "infer": Scene(
-        ("infer", "{larder}/long.npy", "--kind", "field", "--periodic", "--atlas", "{larder}/atlas.npz", "-o",
+        ("infer", "{larder}/long.npy", "--fast", "--kind", "field", "--periodic", "--atlas", "{larder}/atlas.npz", "-o",
         "found"), ("found",),
         count=5, quick=False,
     ),
