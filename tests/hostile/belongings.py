@@ -9,7 +9,7 @@ import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from .case import Case, Place, Setup, every, nothing, taking
+from .case import INFER, Case, Place, Setup, every, nothing, taking
 from .larder import LAW, QUICK
 
 _SEGMENT = ("segment", "scan.nii.gz", "--prior", "tubes", "--steps", "1")
@@ -177,8 +177,7 @@ def _folders() -> Iterator[Case]:
         "map": (("atlas", "map", "{larder}/store.zarr", "-o", "home"), ("atlas.html", "atlas.png",
             "cache/distances.npz", "notes.txt")),
         "infer": (
-            ("infer", "{larder}/long.npy", "--fast", "--kind", "field", "--periodic", "--atlas", "{larder}/atlas.npz",
-            "-o", "home"),
+            (*INFER, "{larder}/atlas.npz", "-o", "home"),
             ("fit.json", "report.html", "regenerated.nii.gz", "notes.txt"),
         ),
     }  # fmt: skip

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from .case import Case, Place, Setup
+from .case import INFER, Case, Place, Setup
 
 #: Zeros that a bomb swells to; more than the room that a case has.
 SWOLLEN = 6 << 30
@@ -233,18 +233,7 @@ def cases(seed: int) -> Iterator[Case]:
         write = BOMBS[name][1]
         command = ("generate", "--maps", "a.npz", "--shape", "10", "--steps", "4", "-o", "out.npy")
         yield Case(f"bombs/maps/{name}", _writing(write, "a.npz"), command)
-        command = (
-            "infer",
-            "{larder}/long.npy",
-            "--fast",
-            "--kind",
-            "field",
-            "--periodic",
-            "--atlas",
-            "a.npz",
-            "-o",
-            "found",
-        )
+        command = (*INFER, "a.npz", "-o", "found")
         yield Case(f"bombs/atlas/{name}", _writing(write, "a.npz"), command, quick=False)
     for size in (10**6, 10**12):
         command = ("generate", "--prior", "fit.json", "--shape", "10", "--steps", "4", "-o", "out.npy")

@@ -52,6 +52,8 @@ class Place:
 
 
 Setup = Callable[[Place], Any]
+#: An inference that grows nothing, for a whole one takes longer than any case may; an atlas and an output follow.
+INFER = ("infer", "{larder}/long.npy", "--fast", "--kind", "field", "--periodic", "--atlas")
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .case import Case, Place, Setup, dice, every, nothing, taking
+from .case import INFER, Case, Place, Setup, dice, every, nothing, taking
 from .larder import SYNTH
 
 #: What takes the place of a value somewhere in a document, as JSON's text.
@@ -155,18 +155,7 @@ def cases(seed: int) -> Iterator[Case]:
             yield _case(f"documents/{name}/whole-{what}", each, _rewriting(WHOLE[what], each.path))
     for k in range(16):
         value = dice(seed, f"atlas {k}").choice([*sorted(VALUES), "missing"])
-        command = (
-            "infer",
-            "{larder}/long.npy",
-            "--fast",
-            "--kind",
-            "field",
-            "--periodic",
-            "--atlas",
-            "atlas.npz",
-            "-o",
-            "found",
-        )
+        command = (*INFER, "atlas.npz", "-o", "found")
         setup = every(taking("atlas.npz"), _altering_header(value))
         yield Case(f"documents/atlas/{k:02d}-{value}", setup, command, quick=False)
 

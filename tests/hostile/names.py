@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from .case import Case, Place, Setup, every, nothing, taking
+from .case import INFER, Case, Place, Setup, every, nothing, taking
 from .larder import LAW
 
 _GENERATE = ("generate", *LAW, "--shape", "10", "--steps", "4")
@@ -88,8 +88,7 @@ def _elsewhere(name: str, make: Callable[[Path], None]) -> Iterator[Case]:
     commands = {
         "fit.json": (*_GENERATE[:1], "--prior", "fit.json", "--shape", "10", "--steps", "4", "-o", "out.npy"),
         "box.yaml": ("atlas", "build", "out.zarr", "--design", "box.yaml", "--workers", "0"),
-        "atlas.npz": ("infer", "{larder}/long.npy", "--fast", "--kind", "field", "--periodic", "--atlas", "atlas.npz",
-            "-o", "found"),
+        "atlas.npz": (*INFER, "atlas.npz", "-o", "found"),
         "maps.npz": ("generate", "--maps", "maps.npz", "--shape", "10", "--steps", "4", "-o", "out.npy"),
         "store.zarr": ("atlas", "info", "store.zarr"),
         "set": ("synth", "-o", "set", "--atlas", "{larder}/store.zarr", "--modality", "mra", "--shape", "6",

@@ -54,7 +54,7 @@ class Command(NamedTuple):
 
 
 _SMALL = ("--shape", "10", "--steps", "4")
-#: Nothing is grown: that takes longer than any wrong word should.
+#: Nothing is grown, as in `case.INFER`.
 _INFER = ("--fast", "--atlas", "{larder}/atlas.npz")
 _PRIOR = ("--prior", "tubes", "--steps", "2", "-o", "out.nii.gz")
 _STORE = ("store.zarr", "store.zarr/*")

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .case import Case, Fault, Place, Setup, dice, nothing, taking
+from .case import INFER, Case, Fault, Place, Setup, dice, nothing, taking
 from .judge import left, matching, spoken, standing
 from .larder import BUILD, LONG, QUICK, SYNTH
 from .moments import counting, killing
@@ -55,8 +55,7 @@ SCENES: dict[str, Scene] = {
         count=6,
     ),
     "infer": Scene(
-        ("infer", "{larder}/long.npy", "--fast", "--kind", "field", "--periodic", "--atlas", "{larder}/atlas.npz", "-o",
-        "found"), ("found",),
+        (*INFER, "{larder}/atlas.npz", "-o", "found"), ("found",),
         count=5, quick=False,
     ),
 }  # fmt: skip
