@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
@@ -13,6 +12,7 @@ from torch import Tensor, nn
 
 from curvafit.inference.compression import Compression
 from curvafit.inference.emulator import FAINTEST, Emulator, Layer, misfits
+from curvafit.inference.learning import Plan, learn
 from curvafit.inference.table import PARAMETERS, Table
 from curvafit.progress import Progress, silent
 
@@ -20,8 +20,6 @@ from curvafit.progress import Progress, silent
 FOLDS = 5
 #: Widths of the hidden layers.
 HIDDEN = (96, 96)
-#: Least and most rows of a step, and steps that an epoch has between the two.
-BATCH, PACE = (64, 512), 100
 #: First step length, weight decay, most epochs, and epochs without a better validation.
 RATE, DECAY, EPOCHS, PATIENCE = 3e-3, 1e-2, 200, 15
 #: Most rows of a view whose misfits are kept.
@@ -103,17 +101,14 @@ def _inflation(emulator: Emulator, table: Table, left: np.ndarray) -> float:
     return float(squared / expected)
 
 
-def batch_of(rows: int) -> int:
-    """Return how many rows of a table a step sees."""
-    return min(max(rows // PACE, BATCH[0]), BATCH[1])
+def _squares(network: nn.Module, x: Tensor, target: Tensor) -> Tensor:
+    """Return the mean square of what a network's outputs miss."""
+    return (network(x) - target).square().mean()
 
 
-def _squares(output: Tensor, target: Tensor) -> Tensor:
-    return (output - target).square().mean()
-
-
-def _nats(output: Tensor, target: Tensor) -> Tensor:
-    output = output.clamp(min=float(np.log(FAINTEST)))
+def _nats(network: nn.Module, x: Tensor, target: Tensor) -> Tensor:
+    """Return the mean negative logarithm of normal densities whose deviations' logarithms are a network's outputs."""
+    output = network(x).clamp(min=float(np.log(FAINTEST)))
     return (0.5 * (target * torch.exp(-output)).square() + output).mean()
 
 
@@ -121,55 +116,30 @@ def _ensemble(
     x: Tensor,
     y: Tensor,
     part: np.ndarray,
-    cost: Callable[[Tensor, Tensor], Tensor],
+    cost: Callable[[nn.Module, Tensor, Tensor], Tensor],
     seed: int,
     progress: Callable[[int], Progress],
 ) -> list[nn.Sequential]:
     """Return networks; each learns until its own part of the rows, which it does not learn from, is fit best."""
-    networks = []
+    networks, plan = [], Plan(RATE, DECAY, EPOCHS, PATIENCE)
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         for k in range(FOLDS):
-            networks.append(
-                _trained(_network(x.shape[1], y.shape[1]), (x, y), torch.from_numpy(part == k), cost, progress(k))
-            )
+            network, own = _network(x.shape[1], y.shape[1]), torch.from_numpy(part == k)
+            networks.append(learn(network, (x, y), own, cost, plan, _epochs(progress(k))))
     return networks
 
 
+def _epochs(progress: Progress) -> Callable[[int, float], None]:
+    """Return what reports epochs as progress."""
+    return lambda epoch, _: progress(f"epoch {epoch}", epoch / EPOCHS)
+
+
 def _network(inputs: int, outputs: int) -> nn.Sequential:
+    """Return a network as it is before it learns."""
     sizes = (inputs, *HIDDEN)
     layers = [layer for n, m in zip(sizes, HIDDEN, strict=False) for layer in (nn.Linear(n, m), nn.SiLU())]
     return nn.Sequential(*layers, nn.Linear(HIDDEN[-1], outputs))
-
-
-def _trained(
-    network: nn.Sequential,
-    rows: tuple[Tensor, Tensor],
-    held: Tensor,
-    cost: Callable[[Tensor, Tensor], Tensor],
-    progress: Progress,
-) -> nn.Sequential:
-    optimiser = torch.optim.AdamW(network.parameters(), lr=RATE, weight_decay=DECAY)
-    slower = torch.optim.lr_scheduler.ReduceLROnPlateau(optimiser, factor=0.5, patience=PATIENCE // 3)
-    (x, y), (x_held, y_held) = [each[~held] for each in rows], [each[held] for each in rows]
-    best, state, waited = np.inf, copy.deepcopy(network.state_dict()), 0
-    for epoch in range(EPOCHS):
-        for chosen in torch.randperm(len(x)).split(batch_of(len(x))):
-            optimiser.zero_grad()
-            cost(network(x[chosen]), y[chosen]).backward()
-            nn.utils.clip_grad_norm_(network.parameters(), 5.0)
-            optimiser.step()
-        with torch.no_grad():
-            value = float(cost(network(x_held), y_held))
-        slower.step(value)
-        waited = 0 if value < best else waited + 1
-        if value < best:
-            best, state = value, copy.deepcopy(network.state_dict())
-        progress(f"epoch {epoch + 1}", (epoch + 1) / EPOCHS)
-        if waited > PATIENCE:
-            break
-    network.load_state_dict(state)
-    return network
 
 
 def _apart(networks: list[nn.Sequential], x: Tensor, part: np.ndarray) -> Tensor:
@@ -180,6 +150,7 @@ def _apart(networks: list[nn.Sequential], x: Tensor, part: np.ndarray) -> Tensor
 
 
 def _layers(networks: list[nn.Sequential]) -> tuple[Layer, ...]:
+    """Return the weights of networks, stacked."""
     linear = [[layer for layer in network if isinstance(layer, nn.Linear)] for network in networks]
     return tuple(
         Layer(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 from typing import Any
 
@@ -11,7 +10,8 @@ import torch
 from torch import Tensor
 
 from curvafit.inference.compression import compression_of
-from curvafit.inference.emulator_training import batch_of, train_emulator
+from curvafit.inference.emulator_training import train_emulator
+from curvafit.inference.learning import Plan, batch_of, learn
 from curvafit.inference.posterior import MOST, Architecture, Member, Posterior
 from curvafit.inference.table import PARAMETERS, Table
 from curvafit.priors.bounds import seed_of, whole
@@ -101,32 +101,19 @@ def train_posterior(
 
 def _fit(member: Member, context: Tensor, target: Tensor, validation: Tensor, progress: Progress) -> Member:
     """Fit a flow to all rows but those of a mask, and return it as it was where the likelihood of those was highest."""
-    optimiser = torch.optim.AdamW(member.parameters(), lr=RATE, weight_decay=DECAY)
-    slower = torch.optim.lr_scheduler.ReduceLROnPlateau(optimiser, factor=0.5, patience=PATIENCE // 3)
-    x, y = context[~validation], target[~validation]
-    best, state, waited = np.inf, copy.deepcopy(member.state_dict()), 0
-    batch = batch_of(len(x))
-    epochs = min(EPOCHS, STEPS * batch // len(x) + 1)
-    for epoch in range(epochs):
-        member.train()
-        for rows in torch.randperm(len(x)).split(batch):
-            optimiser.zero_grad()
-            loss = -member(x[rows]).log_prob(y[rows]).mean()
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(member.parameters(), 5.0)
-            optimiser.step()
-        member.eval()
-        with torch.no_grad():
-            loss = -float(member(context[validation]).log_prob(target[validation]).mean())
-        slower.step(loss)
-        waited = 0 if loss < best else waited + 1
-        if loss < best:
-            best, state = loss, copy.deepcopy(member.state_dict())
-        progress(f"epoch {epoch + 1}, {best:.3f} nats", (epoch + 1) / epochs)
-        if waited > PATIENCE:
-            break
-    member.load_state_dict(state)
-    return member.eval()
+    rows = int((~validation).sum())
+    epochs = min(EPOCHS, STEPS * batch_of(rows) // rows + 1)
+
+    def report(epoch: int, best: float) -> None:
+        """Say which epoch has ended."""
+        progress(f"epoch {epoch}, {best:.3f} nats", epoch / epochs)
+
+    return learn(member, (context, target), validation, _nats, Plan(RATE, DECAY, epochs, PATIENCE), report)
+
+
+def _nats(member: Member, context: Tensor, target: Tensor) -> Tensor:
+    """Return the mean negative logarithm of the density of parameters."""
+    return -member(context).log_prob(target).mean()
 
 
 def _provenance(table: Table, shapes: int, members: int, seed: int) -> dict[str, Any]:
