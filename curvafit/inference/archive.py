@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.resources
 import io
 import json
 from collections.abc import Callable, Mapping
@@ -99,6 +100,12 @@ class Archive:
             _, _, noun = self.file.partition(" ")
             reason = f"without {error}" if isinstance(error, KeyError) else f"({str(error)[:200]})"
             raise ValueError(f"expected a whole {noun}, got {place} {reason}") from error
+
+    def packaged(self, name: str, assemble: Callable[[dict[str, Any], dict[str, np.ndarray]], Content]) -> Content:
+        """Return what `assemble` makes of a file of this package, in `inference/data`."""
+        source = importlib.resources.files("curvafit.inference") / "data" / name
+        kind = self.name.partition(" ")[2]
+        return self.parse(io.BytesIO(source.read_bytes()), f"the packaged {kind}", assemble)
 
     def bears(self, path: Path) -> bool:
         """Return whether a file bears this format; all else of it may be wrong."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.resources
-import io
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -107,8 +105,7 @@ def load_atlas(path: str | Path | None = None) -> Atlas:
         If it is not an atlas, is truncated, or has another format version.
     """
     if path is None:
-        packaged = importlib.resources.files("curvafit.inference") / "data" / "atlas.npz"
-        return ARCHIVE.parse(io.BytesIO(packaged.read_bytes()), "the packaged atlas", _atlas)
+        return ARCHIVE.packaged("atlas.npz", _atlas)
     if Path(path).is_dir():
         raise FileNotFoundError(
             f"expected an atlas file, got the folder {path}: `curvafit atlas extract` makes one of it"

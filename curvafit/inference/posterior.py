@@ -18,7 +18,6 @@ from curvafit.inference.emulator import Emulator, Layer
 from curvafit.inference.table import PARAMETERS, column_names
 from curvafit.priors.bounds import quoted, real, whole
 
-PACKAGED = Path(__file__).parent / "data" / "posterior.npz"
 ARCHIVE = Archive("a posterior", "a posterior", "curvafit posterior", 2, "train it again", {"blocks": BLOCKS})
 #: Largest size of a flow, and most flows of an ensemble.
 WIDEST, MOST = 2048, 64
@@ -222,7 +221,7 @@ def load_posterior(path: str | Path | None = None) -> Posterior:
     ValueError
         If it is not a posterior, is damaged, or has another format version or other blocks.
     """
-    return ARCHIVE.load(PACKAGED if path is None else path, _posterior)
+    return ARCHIVE.packaged("posterior.npz", _posterior) if path is None else ARCHIVE.load(path, _posterior)
 
 
 def _posterior(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Posterior:
