@@ -90,12 +90,11 @@ def _inferred(scan: str, out: Path, options: dict[str, Any], overwrite: bool) ->
 def _say_forecast(prepared: Prepared) -> None:
     """Print the forecast of an inference: the flows of its twins and of the draws that are grown."""
     from curvafit.generation.schedule import schedule
-    from curvafit.inference.estimate import EDGES, SIMULATIONS
-    from curvafit.inference.twins import LONGEST_EDGE
+    from curvafit.inference.estimate import SIMULATIONS, simulation_grid
+    from curvafit.inference.twins import twin_grid
 
     window = [edge.stop - edge.start for edge in prepared.windows[0]]
-    grown = TWINS * math.prod(min(n, LONGEST_EDGE) for n in window)
-    grown += SIMULATIONS * math.prod(min(max(n, EDGES[0]), EDGES[1]) for n in window)
+    grown = TWINS * math.prod(twin_grid(prepared).shape) + SIMULATIONS * math.prod(simulation_grid(prepared).shape)
     steps = math.ceil(schedule("fast", None).steps * grown / math.prod(window))
     say_forecast("infer", window, steps, INFERENCE, what="working voxels")
 

@@ -68,7 +68,7 @@ class Candidate:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the candidate in JSON's types."""
-        numbers = [{name: None if x != x else x for name, x in vars(each).items()} for each in self.twins]
+        numbers = list(map(content_of, self.twins))
         return {**vars(self), "coefficients": self.coefficients.as_dict(), "twins": numbers}
 
     @staticmethod
@@ -79,6 +79,11 @@ class Candidate:
         same = {name: content[name] for name in ("name", "distance", "seed_noise", "status")}
         six, mass = six_of(content["coefficients"]), float(content["mass"])
         return Candidate(**same, coefficients=six, mass=mass, uncertainty=deviations, twins=twins)
+
+
+def content_of(numbers: Morphometry) -> dict[str, Any]:
+    """Return familiar numbers in JSON's types, null for NaN."""
+    return {name: None if value != value else value for name, value in vars(numbers).items()}
 
 
 def morphometry_of(content: Mapping[str, Any]) -> Morphometry:

@@ -154,10 +154,15 @@ def _checked(reading: _Reading, grown: Simulations) -> Estimate:
     return Estimate(draws, reading.weak, misfit, (*reading.laws(draws), nearest), blocks)
 
 
-def _simulations(prepared: Prepared, view: str, parameters: np.ndarray, seed: int, progress: Progress) -> Simulations:
-    """Grow draws in boxes of at most `EDGES` voxels and measure them as the scan's view."""
+def simulation_grid(prepared: Prepared) -> Grid:
+    """Return the periodic box in which draws are grown: the scan's main window, within `EDGES`."""
     z, y, x = (int(np.clip(edge.stop - edge.start, *EDGES)) for edge in prepared.windows[0])
-    grid = Grid((z, y, x), prepared.grid.spacing, "periodic")
+    return Grid((z, y, x), prepared.grid.spacing, "periodic")
+
+
+def _simulations(prepared: Prepared, view: str, parameters: np.ndarray, seed: int, progress: Progress) -> Simulations:
+    """Grow draws and measure them as the scan's view."""
+    grid = simulation_grid(prepared)
 
     def simulate(draw: np.ndarray, start: int) -> Descriptors | None:
         flow = generate(*law_of(draw), grid, seed=start, reject_early=True)

@@ -14,7 +14,7 @@ import numpy as np
 from curvafit.files import write_content
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.morphometry import Morphometry
-from curvafit.inference.candidates import Candidate, morphometry_of
+from curvafit.inference.candidates import Candidate, content_of, morphometry_of
 from curvafit.inference.draws import Draws
 from curvafit.inference.match import Match
 from curvafit.inference.misfit import Misfit
@@ -154,7 +154,7 @@ class Fit(Pictured):
             "drift": self.drift,
             "candidates": [each.as_dict() for each in self.candidates],
             "matches": [_match_dict(match) for match in self.matches],
-            "morphometry": {name: None if x != x else x for name, x in vars(self.morphometry).items()},
+            "morphometry": content_of(self.morphometry),
             "notes": list(self.notes),
             "provenance": self.provenance,
             "posterior": None if draws is None else draws.as_dict(),

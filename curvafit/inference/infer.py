@@ -170,9 +170,9 @@ def infer(
     progress("measuring curvature", 0.05)
     measured = None if prepared.noise else scan_diagram(prepared)
     provenance = _provenance(volume, atlas, posterior, seed)
-    if measured is None or (reason := untextured(prepared, measured)):
-        status = NOISE if measured is None else reason
-        return Inference(volume, prepared, measured, {}, _fit(prepared, measured, provenance, status))
+    reason = NOISE if measured is None else untextured(prepared, measured)
+    if measured is None or reason:
+        return Inference(volume, prepared, measured, {}, _fit(prepared, measured, provenance, reason))
     estimated = estimate(prepared, posterior, seed=seed, fast=fast, progress=_part(progress, 0.1, 0.5))
     progress("searching the atlas", 0.5)
     matches = _matches(prepared, measured, atlas)
@@ -219,6 +219,7 @@ def _laws(
 
 
 def _stationarity(prepared: Prepared, starts: list[Coefficients], seed: int, progress: Progress) -> Candidate:
+    """Return the law of a phase field's stationarity, with its own deviations."""
     refined = stationarity(*_window(prepared), WORKING_EPSILON, starts=starts, seed=seed, progress=progress)
     deviations = {name: float(value) for name, value in refined.uncertainty.items()}
     return Candidate("stationarity", refined.coefficients, float(refined.mass), deviations, status=refined.status)
@@ -226,10 +227,8 @@ def _stationarity(prepared: Prepared, starts: list[Coefficients], seed: int, pro
 
 def _window(prepared: Prepared) -> tuple[torch.Tensor, Grid]:
     """Return the phase field of the main window and its grid."""
-    phase = torch.from_numpy(np.ascontiguousarray(prepared.phase[prepared.windows[0]]))
-    z, y, x = phase.shape
-    whole = phase.shape == prepared.grid.shape
-    return phase, Grid((z, y, x), prepared.grid.spacing, prepared.grid.boundary if whole else "replicate")
+    where = prepared.windows[0]
+    return torch.from_numpy(np.ascontiguousarray(prepared.phase[where])), prepared.part(where)
 
 
 def _grown(

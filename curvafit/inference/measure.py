@@ -59,9 +59,7 @@ def scan_descriptors(prepared: Prepared) -> tuple[Descriptors, str] | None:
     where = prepared.windows[0] if prepared.roi is None else _largest_cube(prepared.roi)
     if where is None:
         return None
-    mask = np.ascontiguousarray(prepared.mask[where])
-    whole = mask.shape == prepared.grid.shape
-    grid = Grid(mask.shape, prepared.grid.spacing, prepared.grid.boundary if whole else "replicate")
+    mask, grid = np.ascontiguousarray(prepared.mask[where]), prepared.part(where)
     view = _view(prepared, grid)
     try:
         return descriptors(prepared.phase if view == "field" else mask, grid), view

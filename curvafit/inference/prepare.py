@@ -100,6 +100,12 @@ class Prepared:
         """Return the part of the scan, or of its region of interest, that is structure."""
         return float((self.mask if self.roi is None else self.mask[self.roi]).mean())
 
+    def part(self, where: Window) -> Grid:
+        """Return the grid of a part: it repeats only where it is all of a grid that does."""
+        z, y, x = self.mask[where].shape
+        whole = (z, y, x) == self.grid.shape
+        return Grid((z, y, x), self.grid.spacing, self.grid.boundary if whole else "replicate")
+
     @property
     def turned(self) -> Prepared:
         """Return the same scan with structure and background exchanged."""
