@@ -107,13 +107,6 @@ class Emulator:
         """Return the deviations `(6,)` of parameters uniform in the box."""
         return (self.box[:, 1] - self.box[:, 0]) / np.sqrt(12)
 
-    def log_likelihood(self, parameters: np.ndarray, descriptors: np.ndarray, view: str) -> np.ndarray:
-        """Return the logarithm `(N,)` of the density of one row of descriptors, compressed, given parameters `(N, 6)`,
-        up to a constant."""
-        emulated = self(parameters, view)
-        missed = (self.compression(np.atleast_2d(descriptors)) - emulated.mean) @ self.basis.T / emulated.deviation
-        return -0.5 * np.square(missed).sum(1) / self.inflation - np.log(emulated.deviation).sum(1)
-
     def slopes(self, parameters: np.ndarray, view: str) -> np.ndarray:
         """Return the derivatives `(N, k, 6)` of the whitened mean by parameters `(N, 6)` in deviations of the prior."""
         with double_precision_on_cpu():
