@@ -311,7 +311,8 @@ def misfit(table: Table, folds: int, cache: Path) -> None:
 
 def p_of(trained: Posterior, table: Table, row: int | np.integer) -> float:
     descriptors, view = table.descriptors[row], str(table.views[row])
-    return amortised_p(trained, descriptors, view, trained.sample(descriptors, view, STARTS))
+    starts = trained.sample(descriptors, view, STARTS)
+    return amortised_p(trained, view, optimum(trained.emulator, descriptors, view, starts).misfit)
 
 
 def gallery(table: Table, folder: Path, cache: Path) -> None:

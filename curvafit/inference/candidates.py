@@ -30,6 +30,9 @@ TITLES = {
 class Candidate:
     """A law that may have made a scan, in working units, and what grew from it.
 
+    Its mass is that of its twins once they are grown; where that is the one that fills the scan's volume fraction and
+    not the law's own, the deviation of the law's is none of its.
+
     Attributes
     ----------
     name
@@ -63,8 +66,9 @@ class Candidate:
         distance = float(one_to_many(scan, diagrams).mean())
         noise = float(one_to_many(diagrams[0], diagrams[1:]).mean()) if len(diagrams) > 1 else None
         numbers = tuple(each.morphometry for each in twins if each.morphometry is not None)
-        masses = [each.mass for each in twins if each.phase is not None]
-        return replace(self, mass=float(np.mean(masses)), distance=distance, seed_noise=noise, twins=numbers)
+        mass = float(np.mean([each.mass for each in twins if each.phase is not None]))
+        known = {name: value for name, value in self.uncertainty.items() if name != "mass" or mass == self.mass}
+        return replace(self, mass=mass, uncertainty=known, distance=distance, seed_noise=noise, twins=numbers)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the candidate in JSON's types."""

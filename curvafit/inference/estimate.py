@@ -12,7 +12,7 @@ from curvafit.generation.flow import generate
 from curvafit.geometry.descriptors import BLOCKS, Descriptors, descriptors
 from curvafit.geometry.mesh import NoSurface
 from curvafit.inference.candidates import Candidate
-from curvafit.inference.check import FEWEST, amortised_p, check
+from curvafit.inference.check import FEWEST, STARTS, amortised_p, check
 from curvafit.inference.draws import Draws
 from curvafit.inference.emulator import Optimum, optimum
 from curvafit.inference.measure import scan_descriptors
@@ -26,8 +26,8 @@ from curvafit.priors.grid import Grid
 from curvafit.progress import Progress, silent
 from curvafit.volumes.scan import ScanError
 
-#: Draws from the posterior, those from which the best fit is searched, and those that are grown.
-DRAWS, STARTS, SIMULATIONS = 400, 16, 16
+#: Draws from the posterior, and those that are grown.
+DRAWS, SIMULATIONS = 400, 16
 #: Edges, in working voxels, of the boxes in which draws are grown.
 EDGES = (32, 64)
 #: How draws come about, in words.
@@ -97,7 +97,7 @@ def estimate(
         if len(grown.parameters) >= FEWEST:
             return _checked(reading, grown)
     draws = reading.draws(parameters, METHOD)
-    misfit = Misfit(amortised_p(posterior, row, view, parameters), {}, "by the best fit, nothing grown")
+    misfit = Misfit(amortised_p(posterior, view, best.misfit), {}, "by the best fit, nothing grown")
     return Estimate(draws, reading.weak, misfit, reading.laws(draws))
 
 
@@ -161,15 +161,19 @@ def simulation_grid(prepared: Prepared) -> Grid:
 
 
 def _simulations(prepared: Prepared, view: str, parameters: np.ndarray, seed: int, progress: Progress) -> Simulations:
-    """Grow draws and measure them as the scan's view."""
+    """Grow draws and measure them as the scan is: seen as it would show them, in a window where it is one."""
     grid = simulation_grid(prepared)
+    window = VIEWS["mask" if prepared.part(prepared.windows[0]).periodic else "crop"]
 
     def simulate(draw: np.ndarray, start: int) -> Descriptors | None:
         flow = generate(*law_of(draw), grid, seed=start, reject_early=True)
         if not flow.viability.viable:
             return None
         try:
-            return descriptors(*VIEWS[view](flow.field.numpy(), grid, np.random.default_rng(start)))
+            field = flow.field.numpy()
+            if view == "field":
+                return descriptors(field, grid)
+            return descriptors(*window(prepared.seen(field > 0, start), grid, np.random.default_rng(start)))
         except (ScanError, NoSurface):
             return None
 

@@ -68,8 +68,8 @@ def scan_descriptors(prepared: Prepared) -> tuple[Descriptors, str] | None:
 
 
 def _view(prepared: Prepared, grid: Grid) -> str:
-    """Return what a posterior takes a window for: a field of a part is read as its mask is."""
-    if prepared.kind == "image":
+    """Return what a posterior takes a window for: a field of a part is read as its mask is, a clean image as a mask."""
+    if prepared.imaging is not None and prepared.imaging.degraded:
         return "scan"
     if grid.periodic:
         return "field" if prepared.kind == "field" and not is_rounded(prepared.phase) else "mask"

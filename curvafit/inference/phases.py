@@ -153,6 +153,14 @@ def _signed(mask: np.ndarray, dark: bool, note: str) -> Level:
     return Level("mask", np.where(mask != dark, np.float32(1), np.float32(-1)), None, note)
 
 
+def _between_phases(values: np.ndarray) -> float:
+    """Return the middle of the means of the two phases that Otsu's threshold splits: his threshold, but for phases of
+    sharp levels, which any threshold between them splits alike, and of which his is the lowest.
+    """
+    high = values > threshold_otsu(values)
+    return float(values[high].mean(dtype=np.float64) + values[~high].mean(dtype=np.float64)) / 2
+
+
 def _image_level(
     field: Field, threshold: Literal["otsu"] | float, dark: bool, region: np.ndarray | None, periodic: bool
 ) -> Level:
@@ -167,7 +175,7 @@ def _image_level(
     smooth = ndimage.gaussian_filter(field.values.astype(np.float32), width, mode=mode, truncate=3.0)
     counted, raw = (smooth, field.values) if region is None else (smooth[region], field.values[region])
     try:
-        level = float(threshold_otsu(raw)) if threshold == "otsu" else float(threshold)
+        level = _between_phases(raw) if threshold == "otsu" else float(threshold)
     except ValueError:
         raise ScanError(f"expected a threshold that is a number or 'otsu', got {threshold!r}") from None
     lowest, highest = float(counted.min()), float(counted.max())

@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 import torch
 
+from curvafit.inference.imaging import Imaging, imaging_of, voxelised
 from curvafit.inference.phases import Kind, Level, find_level, is_noise, region_of_interest
 from curvafit.inference.regrid import (
     Window,
@@ -78,6 +79,8 @@ class Prepared:
         Sentences on what was decided.
     noise
         Whether the structure's voxels have nothing to do with those a few voxels away.
+    imaging
+        Blur and noise of an image; None of fields and masks.
     """
 
     kind: Kind
@@ -94,11 +97,24 @@ class Prepared:
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     roi: np.ndarray | None = None
     noise: bool = False
+    imaging: Imaging | None = None
 
     @property
     def volume_fraction(self) -> float:
         """Return the part of the scan, or of its region of interest, that is structure."""
         return float((self.mask if self.roi is None else self.mask[self.roi]).mean())
+
+    @property
+    def smallest(self) -> float:
+        """Return the volume, in working voxels, of the smallest piece that counts as structure."""
+        return smallest_piece(self.thickness)
+
+    def seen(self, mask: np.ndarray, seed: int) -> np.ndarray:
+        """Return a periodic mask `(Z, Y, X)` on working voxels as it would come from this scan: from grey levels as
+        blurred and noisy as its own, with noise of a seed, or from a mask on its voxels."""
+        if self.imaging is not None:
+            return self.imaging.seen(mask, self.scale, self.smallest, seed)
+        return mask if self.scale == (1.0, 1.0, 1.0) else voxelised(mask, self.scale, self.smallest)
 
     def part(self, where: Window) -> Grid:
         """Return the grid of a part: it repeats only where it is all of a grid that does."""
@@ -162,6 +178,9 @@ def prepare(
     noise = level.kind != "field" and is_noise(level.mask)
     scan = _Scan(level, part.shape, part.spacing, periodic, region, noise, field.notes + notes + (level.note,))
     prepared = _on_working_grid(scan)
+    if level.kind == "image":
+        grey = -part.values if dark else part.values
+        prepared = replace(prepared, imaging=imaging_of(grey, level.mask, part.spacing))
     corner = tuple(s.start + o for s, o in zip(where, prepared.origin, strict=True))
     return replace(prepared, unit=field.unit, origin=corner)  # type: ignore[arg-type]
 
@@ -316,13 +335,17 @@ def _structure(
     mask = values > 0 if region is None else (values > 0) & region
     if kind == "field":
         return mask, ()
-    smallest = math.pi / 6 * (thickness / 2) ** 3
-    cleaned, specks, pinholes = without_specks(mask, smallest, periodic)
+    cleaned, specks, pinholes = without_specks(mask, smallest_piece(thickness), periodic)
     if not specks and not pinholes:
         return mask, ()
     counts = f"specks: {specks}, pinholes: {pinholes}, {(cleaned != mask).mean():.2g} of the volume"
     cleaned = cleaned if region is None else cleaned & region
     return cleaned, (f"Dropped what is smaller than a ball of half the median thickness ({counts}).",)
+
+
+def smallest_piece(thickness: float) -> float:
+    """Return the volume of a ball of half a thickness: what is smaller is no structure."""
+    return math.pi / 6 * (thickness / 2) ** 3
 
 
 def _profiled(mask: np.ndarray, grid: Grid) -> np.ndarray:

@@ -1,10 +1,11 @@
-"""Shapes grown from a law to stand beside a scan, measured as the scan is."""
+"""Shapes grown from a law to stand beside a scan, seen and measured as the scan is."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
 from curvafit.generation.flow import Flow, generate
 from curvafit.geometry.diagram import Diagram, diagram
@@ -14,6 +15,7 @@ from curvafit.inference.prepare import Prepared
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.profile import phase_field
+from curvafit.volumes.scan import ScanError
 
 #: Longest edge, in working voxels, of the boxes in which twins grow.
 LONGEST_EDGE = 100
@@ -21,7 +23,8 @@ LONGEST_EDGE = 100
 
 @dataclass(frozen=True, eq=False)
 class Twin:
-    """A shape grown from a law: its field, mass, curvature diagram and familiar numbers, or why none grew."""
+    """A shape grown from a law, or why none grew: its field and mass; its curvature diagram and familiar numbers as the
+    scan would show them."""
 
     phase: np.ndarray | None
     mass: float
@@ -40,9 +43,9 @@ def twin(coefficients: Coefficients, mass: float, prepared: Prepared, seed: int)
     if prepared.kind != "field":
         share = prepared.volume_fraction
         flow = generate(coefficients, grid=grid, volume_fraction=share, seed=seed, reject_early=True)
-        if (grown := _measured(flow, prepared)).phase is not None:
+        if (grown := _measured(flow, prepared, seed)).phase is not None:
             return grown
-    return _measured(generate(coefficients, mass, grid, seed=seed, reject_early=True), prepared)
+    return _measured(generate(coefficients, mass, grid, seed=seed, reject_early=True), prepared, seed)
 
 
 def twin_grid(prepared: Prepared) -> Grid:
@@ -51,14 +54,17 @@ def twin_grid(prepared: Prepared) -> Grid:
     return Grid((z, y, x), prepared.grid.spacing, "periodic")
 
 
-def _measured(flow: Flow, prepared: Prepared) -> Twin:
+def _measured(flow: Flow, prepared: Prepared, seed: int) -> Twin:
+    """Return a flow's shape with its diagram and numbers, as the scan would show it."""
     if not flow.viability.viable:
         return Twin(None, flow.mass, None, None, flow.viability.reason)
-    mask = flow.field > 0
-    field = flow.field if prepared.kind == "field" else phase_field(mask, flow.grid, WORKING_EPSILON)
     try:
+        mask, field = flow.field.numpy() > 0, flow.field
+        if prepared.kind != "field":
+            mask = prepared.seen(mask, seed)
+            field = phase_field(torch.from_numpy(mask), flow.grid, WORKING_EPSILON)
         curvature = diagram(field, flow.grid, WORKING_EPSILON)
-    except NoSurface as error:
+    except (NoSurface, ScanError) as error:
         return Twin(None, flow.mass, None, None, str(error))
-    numbers = morphometry(mask.numpy(), prepared.working_voxel, prepared.unit, periodic=True)
+    numbers = morphometry(mask, prepared.working_voxel, prepared.unit, periodic=True)
     return Twin(flow.field.numpy(), flow.mass, curvature, numbers)

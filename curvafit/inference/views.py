@@ -17,7 +17,7 @@ import numpy as np
 from scipy import ndimage
 
 from curvafit.inference.phases import find_level
-from curvafit.inference.prepare import KEPT_THICKNESS, THINNEST
+from curvafit.inference.prepare import KEPT_THICKNESS, THINNEST, smallest_piece
 from curvafit.inference.regrid import centre_distance, median_thickness, resample, without_specks
 from curvafit.priors.grid import Grid
 from curvafit.volumes.scan import Field, ScanError
@@ -70,7 +70,7 @@ def resampled(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
     other = resample(centre_distance(part, (1.0,) * 3, 8.0), zoom, (0, 0, 0), coarse) > 0
     distance = centre_distance(other, zoom, 8.0)
     back = resample(distance, [1 / z for z in zoom], (0, 0, 0), part.shape) > 0
-    return View(without_specks(back, _ball(thickness / 2), False)[0], window)
+    return View(without_specks(back, smallest_piece(thickness), False)[0], window)
 
 
 def scan(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
@@ -86,7 +86,7 @@ def scan(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
     level = find_level(Field(grey, (float(SLICE), 1.0, 1.0), "voxel"), kind="image")
     values = resample(level.values, (1 / SLICE, 1.0, 1.0), (0, 0, 0), part.shape)
     inside = values > 0
-    return View(without_specks(inside, _ball(_thickness(inside) / 2), False)[0], window)
+    return View(without_specks(inside, smallest_piece(_thickness(inside)), False)[0], window)
 
 
 def _thickness(part: np.ndarray) -> float:
@@ -97,11 +97,6 @@ def _thickness(part: np.ndarray) -> float:
     if thick < THINNEST - 0.5:
         raise ScanError(f"expected a structure {THINNEST:g} voxels thick, got one of {thick:.2g}")
     return thickness
-
-
-def _ball(diameter: float) -> float:
-    """Return the volume of a ball."""
-    return math.pi / 6 * diameter**3
 
 
 #: Views by name.

@@ -1,0 +1,104 @@
+"""A scan's blur and noise, and shapes as such a scan shows them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from curvafit import Field
+from curvafit.inference.imaging import Imaging, imaging_of, voxelised
+from curvafit.inference.prepare import prepare
+from curvafit.inference.regrid import centre_distance
+
+CUBIC = (1.0, 1.0, 1.0)
+
+
+def ball(n: int, centre: float, radius: float) -> np.ndarray:
+    z, y, x = np.indices((n, n, n)) + 0.5
+    return (z - centre) ** 2 + (y - centre) ** 2 + (x - centre) ** 2 < radius**2
+
+
+def bodies(n: int = 48) -> np.ndarray:
+    """Balls and a tube in a periodic box."""
+    z, y, _ = np.indices((n, n, n)) + 0.5
+    tube = (z - 38) ** 2 + (y - 12) ** 2 < 25
+    return ball(n, n / 3, 9) | ball(n, 2 * n / 3, 7) | tube
+
+
+def image(mask: np.ndarray, blur: float, noise: float) -> np.ndarray:
+    """Grey levels 100 and 150, blurred, with white noise of a part of their contrast."""
+    filled = ndimage.gaussian_filter(mask.astype(np.float32), blur, mode="wrap")
+    return 100 + 50 * (filled + noise * np.random.default_rng(0).standard_normal(mask.shape, dtype=np.float32))
+
+
+@pytest.mark.parametrize("noise", [0.02, 0.1, 0.3])
+@pytest.mark.parametrize("blur", [0.5, 1.0, 1.5])
+def test_blur_and_noise_are_read_from_grey_levels(blur: float, noise: float) -> None:
+    mask = bodies()
+    imaging = imaging_of(image(mask, blur, noise), mask, CUBIC)
+    assert imaging.blur == pytest.approx(blur, abs=0.5)  # a step of those tried, and a mask's own stairs
+    assert imaging.noise == pytest.approx(noise, rel=0.15, abs=0.01)
+    assert imaging.degraded == (noise > 0.2)
+
+
+def test_thick_slices_are_worse_than_a_mask() -> None:
+    assert Imaging(0.5, 0.02, (2.0, 1.0, 1.0)).degraded
+    assert not Imaging(0.5, 0.02, CUBIC).degraded
+
+
+def test_a_sharp_clean_scan_shows_the_shape() -> None:
+    mask = bodies()
+    seen = Imaging(0.5, 0.01, CUBIC).seen(mask, CUBIC, 4.0, 0)
+    beside = np.abs(centre_distance(mask, CUBIC, 3.0, periodic=True)) <= 1.5
+    assert np.array_equal(seen[~beside], mask[~beside])
+    assert seen.mean() == pytest.approx(mask.mean(), rel=0.05)
+
+
+def test_noise_moves_the_surface_and_seeds_move_it_differently() -> None:
+    mask, noisy = bodies(), Imaging(1.0, 0.4, CUBIC)
+    first, second = (noisy.seen(mask, CUBIC, 20.0, seed) for seed in (0, 1))
+    clean = Imaging(1.0, 0.0, CUBIC).seen(mask, CUBIC, 20.0, 0)
+    assert np.count_nonzero(first != clean) > 100
+    assert np.count_nonzero(first != second) > 100
+
+
+@pytest.mark.parametrize("scale", [CUBIC, (0.5, 1.0, 1.0)])
+def test_what_a_scan_without_noise_shows_moves_with_the_shape(scale: tuple[float, float, float]) -> None:
+    mask, sharp = bodies(), Imaging(1.0, 0.0, (1 / scale[0], 1.0, 1.0))
+    steps = (6, 5, 11)
+    moved = np.roll(mask, steps, (0, 1, 2))
+    for show in (lambda shape: sharp.seen(shape, scale, 4.0, 0), lambda shape: voxelised(shape, scale, 4.0)):
+        difference = show(moved) != np.roll(show(mask), steps, (0, 1, 2))
+        assert difference.mean() < 1e-4  # ties at the threshold
+
+
+def test_voxelised_on_the_same_voxels_is_the_mask() -> None:
+    assert np.array_equal(voxelised(bodies(), CUBIC, 4.0), bodies())
+
+
+def test_thick_slices_lose_a_thin_plate() -> None:
+    mask = bodies()
+    mask[3] = True
+    kept = voxelised(mask, (0.25, 1.0, 1.0), 4.0)
+    assert not kept[3].all()
+
+
+def test_two_sharp_levels_are_split_in_their_middle() -> None:
+    """Otsu's threshold lies anywhere between two sharp levels; at the lower one the structure would be a voxel fat."""
+    mask = bodies()
+    prepared = prepare(Field(image(mask, 0.0, 0.005), CUBIC, "voxel"), kind="image", periodic=True)
+    assert prepared.threshold == pytest.approx(125, abs=2)
+    assert prepared.mask.mean() == pytest.approx(mask.mean(), rel=0.03)
+
+
+def test_an_image_knows_its_imaging_and_a_mask_has_none() -> None:
+    mask = bodies()
+    grey = image(mask, 1.0, 0.1)
+    scan = prepare(Field(grey, CUBIC, "voxel"), kind="image", periodic=True)
+    dark = prepare(Field(-grey, CUBIC, "voxel"), kind="image", periodic=True, dark=True)
+    assert scan.imaging is not None
+    assert dark.imaging is not None
+    assert dark.imaging.blur == scan.imaging.blur
+    assert dark.imaging.noise == pytest.approx(scan.imaging.noise, rel=0.01)
+    assert prepare(Field(mask, CUBIC, "voxel"), periodic=True).imaging is None
