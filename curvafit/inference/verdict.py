@@ -65,4 +65,5 @@ def _unusual(misfit: Misfit | None) -> str:
     if misfit.probability >= UNBELIEVABLE:
         return f"The scan's descriptors are of a kind that the model makes (p = {p})."
     names = ", ".join(misfit.strangest) or "none by itself"
-    return f"The model does not make such descriptors (p = {p}); the strangest: {names}."
+    direction = "The scan has a direction (fabric), and the model has none." if "fabric" in misfit.strangest else ""
+    return _joined(f"The model does not make such descriptors (p = {p}); the strangest: {names}.", direction)
