@@ -10,7 +10,7 @@ each epoch, so that a stopped run goes on; give it the cache of `benchmarks.clos
 Rows, all by one kind of perceptron with one plan, so that only what they read differs:
 
 - masks: the network alone. It sees each mask under one of the cube's 48 symmetries, shifted at random in its periodic
-  box, anew in each epoch. All convolutions are circular, so that no texture ends; of each level's channels the mean and
+  box, anew in each epoch. All convolutions are circular, so that no texture ends; of the levels' channels the mean and
   the deviation over the box are kept.
 - descriptors: the table's columns alone, standardised.
 - both: what the network keeps, beside the columns. The network learns from this row and the first.
@@ -52,8 +52,9 @@ from curvafit.inference.table import PARAMETERS, Table, load_table
 FOLDS = 5
 #: What the three perceptrons read.
 ROWS = ("masks", "descriptors", "both")
-#: Edge in voxels of the blocks that the first convolution reads as channels; channels and stride of each convolution.
-BLOCK, LEVELS = 2, ((16, 1), (32, 2), (32, 1), (64, 2), (128, 1))
+#: Edge in voxels of the blocks that the first convolution reads as channels; channels and stride of each convolution;
+#: and the first of those whose means and deviations are kept: before it, a map has more voxels than it tells.
+BLOCK, LEVELS, FIRST = 2, ((16, 1), (32, 2), (32, 1), (64, 2), (128, 1)), 1
 #: The shift in voxels under which what the network keeps of a periodic box stays the same.
 PERIOD = BLOCK * math.prod(stride for _, stride in LEVELS)
 #: Width of a perceptron's hidden layer, and part of it that training leaves out at random.
@@ -86,7 +87,7 @@ class Reader(nn.Module):
         self.half_precision = half
         inputs = [BLOCK**3, *(channels for channels, _ in LEVELS)]
         self.levels = nn.ModuleList(Level(n, *level) for n, level in zip(inputs, LEVELS, strict=False))
-        features = 2 * sum(inputs[1:])
+        features = 2 * sum(inputs[1 + FIRST :])
         widths = {"masks": features, "descriptors": columns, "both": features + columns}
         self.rows = nn.ModuleDict({row: _perceptron(widths[row]) for row in ROWS})
 
@@ -100,8 +101,10 @@ class Reader(nn.Module):
         kept = []
         with torch.autocast("cpu", torch.bfloat16, enabled=self.half_precision):
             x = 2 * _blocks(masks).to(torch.bfloat16 if self.half_precision else dtype) - 1
-            for level in self.levels:
+            for number, level in enumerate(self.levels):
                 x = level(x)
+                if number < FIRST:
+                    continue
                 values = x.flatten(2).to(dtype)
                 mean = values.mean(2)
                 kept += [mean, ((values - mean[..., None]).square().mean(2) + 1e-5).sqrt()]
@@ -173,7 +176,7 @@ def packed_masks(stores: Sequence[Path], table: Table, cache: Path) -> np.ndarra
     ValueError
         If a row's store is not among them, or their shapes are no cubes of one size that the network divides.
     """
-    path = cache / f"{key_of(table)}-masks.npy"
+    path = cache / f"{key_of(table)}-masks.npz"
     if not path.exists():
         sources = {each.resolve().name.removesuffix(".zarr"): open_store(each) for each in stores}
         names = sorted({shape.partition("/")[0] for shape in table.shapes.tolist()})
@@ -185,13 +188,16 @@ def packed_masks(stores: Sequence[Path], table: Table, cache: Path) -> np.ndarra
         places = (shape.partition("/") for shape in table.shapes.tolist())
         masks = np.stack([np.packbits(sources[name].field(int(draw)) > 0) for name, _, draw in places])
         cache.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, lambda temporary: _save(temporary, masks))
-    return np.load(path)
+        _save(path, masks=masks)
+    return np.load(path)["masks"]
 
 
-def _save(path: Path, values: np.ndarray) -> None:
-    with path.open("wb") as file:
-        np.save(file, values)
+def _save(path: Path, **arrays: np.ndarray) -> None:
+    def write(temporary: Path) -> None:
+        with temporary.open("wb") as file:
+            np.savez(file, **arrays)
+
+    write_atomically(path, write)
 
 
 # ---- training --------------------------------------------------------------------------------------------------------
@@ -280,11 +286,13 @@ def answers(reader: Reader, shapes: Shapes, copies: int = 1) -> dict[str, np.nda
 
 def fold_answers(packed: np.ndarray, table: Table, fold: int, epochs: int, cache: Path) -> dict[str, np.ndarray]:
     """What each row answers of the shapes of a fold, after training on the others."""
+    path = cache / f"{key_of(table)}-network-{epochs}epochs-{fold}of{FOLDS}.pt"
+    if (ended := path.with_suffix(".npz")).exists():
+        return dict(np.load(ended))
     held, standard = fold_of(table, FOLDS) == fold, standard_of(table.rows(fold_of(table, FOLDS) != fold))
     shapes = standard.shapes(packed, table)
     validation = np.random.default_rng(fold).random((~held).sum()) < VALIDATION
     training = Training(shapes.rows(~held), validation, epochs, seed=fold)
-    path = cache / f"{key_of(table)}-network-{epochs}epochs-{fold}of{FOLDS}.pt"
     if path.exists():
         training.load(path)
     began = time.perf_counter()
@@ -296,7 +304,9 @@ def fold_answers(packed: np.ndarray, table: Table, fold: int, epochs: int, cache
         left = f"{1e3 * step:.0f} ms a step, {seconds * (epochs - training.epoch) / 60:.0f} min left"
         print(f"  fold {fold}, epoch {training.epoch} of {epochs}: validation {told}; {left}", flush=True)
     centre, spread = standard.parameters
-    return {row: told * spread + centre for row, told in training.results(shapes.rows(held)).items()}
+    results = {row: told * spread + centre for row, told in training.results(shapes.rows(held)).items()}
+    _save(ended, **results)
+    return results
 
 
 def show(results: dict[str, np.ndarray], truth: np.ndarray) -> None:
