@@ -19,7 +19,8 @@ Rows, all by one kind of perceptron with one plan, so that only what they read d
 Columns: R² of each parameter on the held-out shapes, their mean, and how much more that is than the mean of the last
 row, with its standard deviation over draws of the held-out shapes (bootstrap, both rows on the same draw).
 
-The network computes in bfloat16, twice as fast where the processor has it (AVX-512 BF16, AMX). With glibc, memory that
+Folds are best learnt side by side, each by a process of its own (OMP_NUM_THREADS=1); a last command that names them all
+reads their answers from the cache. The network computes in bfloat16, twice as fast where the processor has it (AVX-512 BF16, AMX). With glibc, memory that
 is not given back to the system saves a fourth of the time: MALLOC_MMAP_THRESHOLD_=4000000000
 MALLOC_TRIM_THRESHOLD_=8000000000 in the environment.
 """
@@ -98,7 +99,7 @@ class Reader(nn.Module):
 
     def features(self, masks: Tensor, dtype: torch.dtype) -> Tensor:
         """Mean and deviation of each channel of each level over the box, `(N, 2 x channels)`."""
-        kept = []
+        statistics = []
         with torch.autocast("cpu", torch.bfloat16, enabled=self.half_precision):
             x = 2 * _blocks(masks).to(torch.bfloat16 if self.half_precision else dtype) - 1
             for number, level in enumerate(self.levels):
@@ -107,8 +108,8 @@ class Reader(nn.Module):
                     continue
                 values = x.flatten(2).to(dtype)
                 mean = values.mean(2)
-                kept += [mean, ((values - mean[..., None]).square().mean(2) + 1e-5).sqrt()]
-        return torch.cat(kept, 1)
+                statistics += [mean, ((values - mean[..., None]).square().mean(2) + 1e-5).sqrt()]
+        return torch.cat(statistics, 1)
 
 
 def _perceptron(inputs: int) -> nn.Sequential:
@@ -141,9 +142,9 @@ class Shapes(NamedTuple):
         """Some masks, each moved anew, with their descriptors and parameters."""
         cube = (self.edge,) * 3
         masks = [np.unpackbits(self.packed[k]).reshape(cube) for k in chosen]
-        moved = np.stack([any_crop(mask, cube, rng)[0] for mask in masks])
+        copies = np.stack([any_crop(mask, cube, rng)[0] for mask in masks])
         descriptors, parameters = (torch.from_numpy(each[chosen]) for each in (self.descriptors, self.parameters))
-        return torch.from_numpy(moved), descriptors.float(), parameters.float()
+        return torch.from_numpy(copies), descriptors.float(), parameters.float()
 
 
 class Standard(NamedTuple):
@@ -195,7 +196,7 @@ def packed_masks(stores: Sequence[Path], table: Table, cache: Path) -> np.ndarra
 def _save(path: Path, **arrays: np.ndarray) -> None:
     def write(temporary: Path) -> None:
         with temporary.open("wb") as file:
-            np.savez(file, **arrays)
+            np.savez(file, allow_pickle=False, **arrays)
 
     write_atomically(path, write)
 
@@ -211,7 +212,7 @@ class Training:
 
     def __init__(self, shapes: Shapes, validation: np.ndarray, epochs: int, seed: int = 0, half: bool = True) -> None:
         torch.manual_seed(seed)
-        self.learnt, self.apart = shapes.rows(~validation), shapes.rows(validation)
+        self.shapes, self.validation = shapes.rows(~validation), shapes.rows(validation)
         self.epochs, self.seed, self.epoch = epochs, seed, 0
         self.reader = Reader(shapes.descriptors.shape[1], half)
         self.optimiser = torch.optim.AdamW(self.reader.parameters(), RATE, weight_decay=DECAY)
@@ -222,8 +223,8 @@ class Training:
         while self.epoch < self.epochs:
             self._learn()
             self.epoch += 1
-            told = answers(self.reader, self.apart)
-            costs = {row: float(np.square(told[row] - self.apart.parameters).mean()) for row in ROWS}
+            values = answers(self.reader, self.validation)
+            costs = {row: float(np.square(values[row] - self.validation.parameters).mean()) for row in ROWS}
             for row, cost in costs.items():
                 if cost < self.best[row][0]:
                     self.best[row] = cost, copy.deepcopy(self.reader.state_dict())
@@ -232,15 +233,15 @@ class Training:
     def _learn(self) -> None:
         rng = np.random.default_rng([self.seed, self.epoch])
         torch.manual_seed(int(rng.integers(2**31)))
-        order = rng.permutation(len(self.learnt.packed))
-        steps = len(order) // BATCH or 1  # batches of one size: the last few shapes wait for the next epoch
+        order = rng.permutation(len(self.shapes.packed))
+        steps = len(order) // BATCH or 1
         self.reader.train()
         for step, chosen in enumerate(np.array_split(order, steps)):
             self.optimiser.param_groups[0]["lr"] = _rate((self.epoch + step / steps) / self.epochs)
-            masks, descriptors, parameters = self.learnt.batch(chosen, rng)
+            masks, descriptors, parameters = self.shapes.batch(chosen, rng)
             self.optimiser.zero_grad()
-            told = self.reader(masks, descriptors)
-            torch.stack([functional.mse_loss(told[row], parameters) for row in ROWS]).sum().backward()
+            values = self.reader(masks, descriptors)
+            torch.stack([functional.mse_loss(values[row], parameters) for row in ROWS]).sum().backward()
             nn.utils.clip_grad_norm_(self.reader.parameters(), STEEPEST)
             self.optimiser.step()
 
@@ -276,8 +277,8 @@ def answers(reader: Reader, shapes: Shapes, copies: int = 1) -> dict[str, np.nda
     rng, parts = np.random.default_rng(0), []
     with torch.no_grad():
         for chosen in np.array_split(np.arange(len(shapes.packed)), len(shapes.packed) // BATCH or 1):
-            told = [reader(*shapes.batch(chosen, rng)[:2]) for _ in range(copies)]
-            parts.append({row: torch.stack([each[row] for each in told]).mean(0).double().numpy() for row in ROWS})
+            values = [reader(*shapes.batch(chosen, rng)[:2]) for _ in range(copies)]
+            parts.append({row: torch.stack([each[row] for each in values]).mean(0).double().numpy() for row in ROWS})
     return {row: np.concatenate([part[row] for part in parts]) for row in ROWS}
 
 
@@ -287,8 +288,8 @@ def answers(reader: Reader, shapes: Shapes, copies: int = 1) -> dict[str, np.nda
 def fold_answers(packed: np.ndarray, table: Table, fold: int, epochs: int, cache: Path) -> dict[str, np.ndarray]:
     """What each row answers of the shapes of a fold, after training on the others."""
     path = cache / f"{key_of(table)}-network-{epochs}epochs-{fold}of{FOLDS}.pt"
-    if (ended := path.with_suffix(".npz")).exists():
-        return dict(np.load(ended))
+    if (record := path.with_suffix(".npz")).exists():
+        return dict(np.load(record))
     held, standard = fold_of(table, FOLDS) == fold, standard_of(table.rows(fold_of(table, FOLDS) != fold))
     shapes = standard.shapes(packed, table)
     validation = np.random.default_rng(fold).random((~held).sum()) < VALIDATION
@@ -299,13 +300,13 @@ def fold_answers(packed: np.ndarray, table: Table, fold: int, epochs: int, cache
     for costs in training.run():
         training.save(path)
         seconds, began = time.perf_counter() - began, time.perf_counter()
-        step = seconds / max(1, len(training.learnt.packed) // BATCH)
-        told = ", ".join(f"{row} {cost:.3f}" for row, cost in costs.items())
+        step = seconds / max(1, len(training.shapes.packed) // BATCH)
+        values = ", ".join(f"{row} {cost:.3f}" for row, cost in costs.items())
         left = f"{1e3 * step:.0f} ms a step, {seconds * (epochs - training.epoch) / 60:.0f} min left"
-        print(f"  fold {fold}, epoch {training.epoch} of {epochs}: validation {told}; {left}", flush=True)
+        print(f"  fold {fold}, epoch {training.epoch} of {epochs}: validation {values}; {left}", flush=True)
     centre, spread = standard.parameters
-    results = {row: told * spread + centre for row, told in training.results(shapes.rows(held)).items()}
-    _save(ended, **results)
+    results = {row: values * spread + centre for row, values in training.results(shapes.rows(held)).items()}
+    _save(record, **results)
     return results
 
 
