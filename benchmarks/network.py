@@ -12,7 +12,7 @@ Rows, all by one kind of perceptron with one plan, so that only what they read d
 - masks: the network alone. It sees each mask under one of the cube's 48 symmetries, shifted at random in its periodic
   box, anew in each epoch. All convolutions are circular, so that no texture ends; of the levels' channels the mean and
   the deviation over the box are kept.
-- descriptors: the table's columns alone, standardised.
+- descriptors: the table's columns alone, standardised (lengths and densities as logarithms).
 - both: what the network keeps, beside the columns. The network learns from this row and the first.
 - ridge, posterior (`--beside`, also process, match, refined): the methods of `benchmarks.closure`, on the same shapes.
 
@@ -20,9 +20,9 @@ Columns: R² of each parameter on the held-out shapes, their mean, and how much 
 row, with its standard deviation over draws of the held-out shapes (bootstrap, both rows on the same draw).
 
 Folds are best learnt side by side, each by a process of its own (OMP_NUM_THREADS=1); a last command that names them all
-reads their answers from the cache. The network computes in bfloat16, twice as fast where the processor has it (AVX-512 BF16, AMX). With glibc, memory that
-is not given back to the system saves a fourth of the time: MALLOC_MMAP_THRESHOLD_=4000000000
-MALLOC_TRIM_THRESHOLD_=8000000000 in the environment.
+reads their answers from the cache. The network computes in bfloat16, twice as fast where the processor has it (AVX-512
+BF16, AMX). With glibc, memory that is not given back to the system saves a fourth of the time:
+MALLOC_MMAP_THRESHOLD_=4000000000 MALLOC_TRIM_THRESHOLD_=8000000000 in the environment.
 """
 
 from __future__ import annotations
