@@ -116,7 +116,8 @@ def test_a_far_or_strange_one_is_named_but_not_believed() -> None:
     single = dataclasses.replace(ODD, blocks={"gaps": 0.3})
     assert verdict((law("draw", 0.1),), single)[1].endswith("(p = 0.0010); the strangest: none by itself.")
     aligned = dataclasses.replace(ODD, blocks={"fabric": 0.001})
-    assert verdict((law("draw", 0.1),), aligned)[1].endswith("The scan has a direction (fabric), and the model has none.")
+    direction = "The scan has a direction (fabric), and the model has none."
+    assert verdict((law("draw", 0.1),), aligned)[1].endswith(direction)
 
 
 def test_familiar_numbers_that_differ_are_named() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -16,10 +17,15 @@ from curvafit.volumes.scan import Field, ScanError
 _BLURS = (0.0, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0)
 #: Edge of the box in which a scan's noise and blur are measured.
 _MEASURED = 96
+#: Voxels this far from the surface lie deep within their phase; the least number of them; and the width beyond which
+#: grey levels vary by their lighting, in voxels of the finest axis.
+_DEEP, _FEWEST, _UNEVEN = 3.5, 500, 4.0
 #: Median of the absolute value of a normal number.
 _NORMAL_MEDIAN = 0.6745
-#: Noise over contrast, and slices' thickness over the finest edge, from which on a scan is worse than a mask.
-NOISY, SLICED = 0.15, 1.5
+#: Smoothed noise over contrast, and slices' thickness over the finest edge, from which on a scan is worse than a mask.
+NOISY, SLICED = 0.02, 1.5
+#: What smoothing by a voxel leaves of white noise's deviation: (2 √π)^(-3/2).
+_WHITE = (2 * math.sqrt(math.pi)) ** -1.5
 
 
 @dataclass(frozen=True)
@@ -30,20 +36,31 @@ class Imaging:
     ----------
     blur
         Deviation of the Gaussian that blurs the structure, in voxels of the finest axis.
-    noise
-        Deviation of white noise, a voxel of the scan, over the contrast of the two phases.
+    noise, smoothed
+        Deviation of the noise over the contrast of the two phases: as it is, and smoothed by a voxel of the finest axis
+        as an image is before it is split. Of white noise that leaves 0.15.
     spacing
         Voxel edges (z, y, x) of the scan.
     """
 
     blur: float
     noise: float
+    smoothed: float
     spacing: tuple[float, float, float]
+
+    @property
+    def grain(self) -> float:
+        """Return the width of the Gaussian that makes such noise of white noise, in voxels of the finest axis.
+
+        Smoothing by a voxel leaves (w² / (w² + 1))^(3/4) of the deviation of noise of width w.
+        """
+        left = min(self.smoothed / self.noise, 0.9) ** (4 / 3) if self.noise > 0 else 0.0
+        return math.sqrt(left / (1 - left)) if left > 1.5 * _WHITE ** (4 / 3) else 0.0
 
     @property
     def degraded(self) -> bool:
         """Return whether a texture is harder to read from the scan than from a mask."""
-        return self.noise > NOISY or max(self.spacing) > SLICED * min(self.spacing)
+        return self.smoothed > NOISY or max(self.spacing) > SLICED * min(self.spacing)
 
     def seen(self, mask: np.ndarray, scale: Sequence[float], smallest: float, seed: int) -> np.ndarray:
         """Return a periodic mask as it would come from such a scan.
@@ -71,8 +88,9 @@ class Imaging:
         filled = np.clip(centre_distance(mask, (1.0, 1.0, 1.0), 2.0, periodic=True) + 0.5, 0, 1)
         grey = resample(filled, voxel, (0, 0, 0), shape, periodic=True)
         grey = ndimage.gaussian_filter(grey, [self.blur * min(voxel) / h for h in voxel], mode="wrap")
-        rng = np.random.default_rng(seed)
-        grey += np.float32(self.noise) * rng.standard_normal(grey.shape, dtype=np.float32)
+        noise = np.random.default_rng(seed).standard_normal(grey.shape, dtype=np.float32)
+        noise = ndimage.gaussian_filter(noise, [self.grain * min(voxel) / h for h in voxel], mode="wrap")
+        grey += np.float32(self.noise) * noise / noise.std()
         edges = (voxel[0], voxel[1], voxel[2])
         values = find_level(Field(grey, edges, "voxel"), kind="image", periodic=True).values
         inside = resample(values, [1 / h for h in voxel], (0, 0, 0), mask.shape, periodic=True) > 0
@@ -100,8 +118,9 @@ def imaging_of(image: np.ndarray, mask: np.ndarray, spacing: tuple[float, float,
     """Measure the noise and blur of a scan from its structure.
 
     The blur, with the contrast, is the one of `_BLURS` with which the blurred structure explains the grey levels best
-    (least squares). The noise is read from third-order differences that neither the structure nor uneven lighting
-    passes (Immerkær 1996, along three axes): noise that neighbours share is understated.
+    (least squares). The noise is what grey levels vary by deep within the phases, where uneven lighting is taken off.
+    Where nothing lies deep it is taken for white and read from third-order differences, which neither the structure nor
+    the lighting passes (Immerkær 1996, along three axes).
 
     Parameters
     ----------
@@ -117,20 +136,49 @@ def imaging_of(image: np.ndarray, mask: np.ndarray, spacing: tuple[float, float,
     """
     box = next(iter(rich_boxes(surface_voxels(mask), _MEASURED)), (slice(None),) * 3)
     image, mask = image[box].astype(np.float32), mask[box]
-    finest = min(spacing)
-    filled = np.clip(centre_distance(mask, spacing, 2 * finest) / finest + 0.5, 0, 1)
     levels = image - image.mean()
+    edges = [h / min(spacing) for h in spacing]
+    blur, contrast = _blur_of(levels, mask, edges)
+    if not contrast > 0:
+        raise ScanError("expected grey levels that tell structure from background, got none that do")
+    noise, smoothed = _deep_noise(levels, mask, edges) or _white_noise(levels)
+    return Imaging(blur, noise / contrast, smoothed / contrast, spacing)
+
+
+def _blur_of(levels: np.ndarray, mask: np.ndarray, edges: Sequence[float]) -> tuple[float, float]:
+    """Return the blur and the contrast of levels of mean 0, on voxels with edges in units of the finest."""
+    filled = np.clip(centre_distance(mask, edges, 2.0) + 0.5, 0, 1)
     explained = []
     for blur in _BLURS:
-        model = ndimage.gaussian_filter(filled, [blur * finest / h for h in spacing])
+        model = ndimage.gaussian_filter(filled, [blur / h for h in edges])
         model -= model.mean()
         product, square = float((model * levels).mean()), float(np.square(model).mean())
         explained.append((product * abs(product) / square, blur, product / square))
     _, blur, contrast = max(explained)
-    if not contrast > 0:
-        raise ScanError("expected grey levels that tell structure from background, got none that do")
-    rough = levels
+    return blur, contrast
+
+
+def _deep_noise(levels: np.ndarray, mask: np.ndarray, edges: Sequence[float]) -> tuple[float, float] | None:
+    """Return the deviation of levels, as they are and smoothed, deep within the phases; None where too little is."""
+    smoothing, uneven = ([width / h for h in edges] for width in (1.0, _UNEVEN))
+    both = (levels, ndimage.gaussian_filter(levels, smoothing))
+    squares, count = np.zeros(2), 0
+    for phase in (mask, ~mask):
+        deep = np.asarray(ndimage.distance_transform_edt(phase, sampling=edges)) >= _DEEP
+        around = np.maximum(ndimage.gaussian_filter(deep.astype(np.float32), uneven), 1e-6)
+        for k, each in enumerate(both):
+            mean = ndimage.gaussian_filter(np.where(deep, each, 0), uneven) / around
+            squares[k] += float(np.square((each - mean)[deep], dtype=np.float64).sum())
+        count += int(np.count_nonzero(deep))
+    if count < _FEWEST:
+        return None
+    noise, smoothed = np.sqrt(squares / count)
+    return float(noise), float(smoothed)
+
+
+def _white_noise(levels: np.ndarray) -> tuple[float, float]:
+    """Return the deviation of white noise in levels, and what smoothing leaves of it."""
     for axis in range(3):
-        rough = np.diff(rough, 2, axis)
-    noise = float(np.median(np.abs(rough))) / _NORMAL_MEDIAN / 6**1.5
-    return Imaging(blur, noise / contrast, spacing)
+        levels = np.diff(levels, 2, axis)
+    noise = float(np.median(np.abs(levels))) / _NORMAL_MEDIAN / 6**1.5
+    return noise, _WHITE * noise
