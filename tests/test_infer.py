@@ -56,7 +56,7 @@ def inference(tubes: np.ndarray) -> Inference:
 def test_a_mask_is_taken_to_parameters_and_back(inference: Inference) -> None:
     fit = inference.fit
     assert fit.kind == "mask" and fit.family == "tubes"
-    assert [each.name for each in fit.candidates] == ["optimum", "posterior", "draw", "match"]
+    assert [each.name for each in fit.candidates] == ["refined", "posterior", "simulation", "match"]
     assert fit.chosen in TITLES and fit.status.endswith(".")
     assert fit.best is not None and fit.best.coefficients.a20 == pytest.approx(1.0)
     assert float(fit.best.coefficients.a02) > 0 and -1 < fit.best.mass < 1

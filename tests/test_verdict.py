@@ -37,7 +37,7 @@ def twin(diagram: Diagram | None, mass: float) -> Twin:
 
 def test_the_first_within_seed_noise_of_the_nearest_is_the_best() -> None:
     barren, first, last = law("optimum"), law("posterior", 2.5), law("match", 2.25)
-    nearest, quiet, single = (law("draw", 2.0, noise) for noise in (0.5, 0.25, None))
+    nearest, quiet, single = (law("simulation", 2.0, noise) for noise in (0.5, 0.25, None))
     for order, best in (
         ((barren, first, nearest, last), first),
         ((last, nearest, first), last),
@@ -50,7 +50,7 @@ def test_the_first_within_seed_noise_of_the_nearest_is_the_best() -> None:
 
 
 def test_seed_noise_is_the_best_one_s_or_another_s() -> None:
-    best, other = law("draw", 2.0, 0.5), law("match", 5.0, 1.5)
+    best, other = law("simulation", 2.0, 0.5), law("match", 5.0, 1.5)
     assert noise_of((other, best)) == 0.5
     assert noise_of((law("posterior", 1.0), other)) == 1.5
     assert noise_of((law("posterior", 1.0), law("optimum"))) is None
@@ -60,17 +60,17 @@ def test_seed_noise_is_the_best_one_s_or_another_s() -> None:
 def test_what_grew_is_measured_against_the_scan() -> None:
     """One twin is the scan itself: the mean distance is half the twins' own."""
     scan, other = (Diagram(np.array([point]), np.ones(1)) for point in ((3.0, 1.0), (9.0, -2.0)))
-    both = law("draw").grown(scan, (twin(scan, -0.5), twin(None, 0.0), twin(other, -0.25)))
+    both = law("simulation").grown(scan, (twin(scan, -0.5), twin(None, 0.0), twin(other, -0.25)))
     assert both.seed_noise is not None and both.distance == pytest.approx(both.seed_noise / 2) and both.distance > 1
     assert (both.mass, both.twins, both.status) == (-0.375, (NUMBERS, NUMBERS), "")
-    one = law("draw").grown(scan, (twin(scan, -0.5),))
+    one = law("simulation").grown(scan, (twin(scan, -0.5),))
     assert (one.distance, one.seed_noise, one.twins) == (0.0, None, (NUMBERS,))
-    none = law("draw", status="Hm.").grown(scan, (twin(None, 0.0),))
-    assert none == law("draw", status="Hm. No shape grew: the field is of one phase.")
+    none = law("simulation", status="Hm.").grown(scan, (twin(None, 0.0),))
+    assert none == law("simulation", status="Hm. No shape grew: the field is of one phase.")
 
 
 def test_a_candidate_comes_back_from_its_json() -> None:
-    whole = dataclasses.replace(law("draw", 2.0, 0.5, "Hm."), twins=(NUMBERS, NUMBERS))
+    whole = dataclasses.replace(law("simulation", 2.0, 0.5, "Hm."), twins=(NUMBERS, NUMBERS))
     for each in (whole, law("match")):
         assert Candidate.from_dict(json.loads(json.dumps(each.as_dict()))) == each
     full = dataclasses.replace(whole, twins=(dataclasses.replace(NUMBERS, spacing_mean=math.nan),))
@@ -105,19 +105,19 @@ def test_the_nearest_is_supported_where_its_twins_are_near() -> None:
 
 
 def test_a_far_or_strange_one_is_named_but_not_believed() -> None:
-    far = "No believable twin: of the nearest law (best of the simulated draws), its twins lie 2.1 from the scan's"
+    far = "No believable twin: of the nearest law (nearest of the simulations), its twins lie 2.1 from the scan's"
     said = f"{far} curvature diagram, 0.5 from each other. Twins should lie some 0.5 from it."
-    assert verdict((law("draw", 2.1, 0.5), law("match", 9.0)), USUAL) == ("draw", said)
-    name, status = verdict((law("draw", 0.1, 0.5),), ODD)
-    assert name == "draw" and status.startswith("No believable twin: ")
+    assert verdict((law("simulation", 2.1, 0.5), law("match", 9.0)), USUAL) == ("simulation", said)
+    name, status = verdict((law("simulation", 0.1, 0.5),), ODD)
+    assert name == "simulation" and status.startswith("No believable twin: ")
     assert status.endswith(
         "0.5 from each other. The model does not make such descriptors (p = 0.0010); the strangest: depths, gaps."
     )
     single = dataclasses.replace(ODD, blocks={"gaps": 0.3})
-    assert verdict((law("draw", 0.1),), single)[1].endswith("(p = 0.0010); the strangest: none by itself.")
+    assert verdict((law("simulation", 0.1),), single)[1].endswith("(p = 0.0010); the strangest: none by itself.")
     aligned = dataclasses.replace(ODD, blocks={"fabric": 0.001})
     direction = "The scan has a direction (fabric), and the model has none."
-    assert verdict((law("draw", 0.1),), aligned)[1].endswith(direction)
+    assert verdict((law("simulation", 0.1),), aligned)[1].endswith(direction)
 
 
 def test_familiar_numbers_that_differ_are_named() -> None:

@@ -91,10 +91,13 @@ def _say_forecast(prepared: Prepared) -> None:
     """Print the forecast of an inference: the flows of its twins and of the draws that are grown."""
     from curvafit.generation.schedule import schedule
     from curvafit.inference.estimate import SIMULATIONS, simulation_grid
+    from curvafit.inference.sequential import BATCH, ROUNDS
     from curvafit.inference.twins import twin_grid
 
     window = [edge.stop - edge.start for edge in prepared.windows[0]]
-    grown = TWINS * math.prod(twin_grid(prepared).shape) + SIMULATIONS * math.prod(simulation_grid(prepared).shape)
+    grown = TWINS * math.prod(twin_grid(prepared).shape) + (SIMULATIONS + ROUNDS * BATCH) * math.prod(
+        simulation_grid(prepared).shape
+    )
     steps = math.ceil(schedule("fast", None).steps * grown / math.prod(window))
     say_forecast("infer", window, steps, INFERENCE, what="working voxels")
 

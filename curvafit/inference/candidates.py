@@ -18,9 +18,10 @@ from curvafit.priors.fit_file import six_of
 
 #: Where a law comes from, as people read it.
 TITLES = {
+    "refined": "refined by simulation",
     "posterior": "middle of the posterior",
     "optimum": "best fit of the descriptors",
-    "draw": "best of the simulated draws",
+    "simulation": "nearest of the simulations",
     "stationarity": "refined by stationarity",
     "match": "nearest match",
 }

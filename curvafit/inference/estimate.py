@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,15 +19,16 @@ from curvafit.inference.measure import scan_descriptors
 from curvafit.inference.misfit import Misfit
 from curvafit.inference.posterior import Posterior
 from curvafit.inference.prepare import HALF, Prepared
-from curvafit.inference.simulation import Simulations, simulations
+from curvafit.inference.sequential import Search
+from curvafit.inference.simulation import Simulate, Simulations, simulations
 from curvafit.inference.table import column_names, law_of, mirrored
 from curvafit.inference.views import VIEWS
 from curvafit.priors.grid import Grid
 from curvafit.progress import Progress, silent
 from curvafit.volumes.scan import ScanError
 
-#: Draws from the posterior, and those that are grown.
-DRAWS, SIMULATIONS = 400, 16
+#: Draws from the posterior, those that are grown, and those among which more are chosen to be grown.
+DRAWS, SIMULATIONS, POOL = 400, 16, 2000
 #: Edges, in working voxels, of the boxes in which draws are grown.
 EDGES = (32, 64)
 #: How draws come about, in words.
@@ -93,9 +94,14 @@ def estimate(
     best = optimum(posterior.emulator, row, view, parameters[:STARTS])
     reading = _Reading(posterior, row, view, parameters, best, mirrored if turned else np.asarray)
     if not fast:
-        grown = _simulations(seen, view, parameters, seed, lambda text, share: progress(text, 0.15 + 0.85 * share))
+        simulate = _simulator(seen, view)
+        grown = simulations(parameters, simulate, SIMULATIONS, seed=seed, progress=_part(progress, 0.15, 0.45))
         if len(grown.parameters) >= FEWEST:
-            return _checked(reading, grown)
+            pool = posterior.sample(row, view, POOL, seed)
+            search = Search(posterior.emulator, view, row)
+            likeliest, every = search.parameters(pool, grown, simulate, seed=seed, progress=_part(progress, 0.45, 1.0))
+            near = every.parameters[search.nearest(every)[0]]
+            return _checked(reading, grown, {"refined": likeliest, "simulation": near})
     draws = reading.draws(parameters, METHOD)
     misfit = Misfit(amortised_p(posterior, view, best.misfit), {}, "by the best fit, nothing grown")
     return Estimate(draws, reading.weak, misfit, reading.laws(draws))
@@ -126,32 +132,36 @@ class _Reading:
         return Draws.of(self.turn(parameters), self.view, method)
 
     def laws(self, draws: Draws) -> tuple[Candidate, ...]:
-        """Return the best fit of the descriptors with its own deviations, and the middle of the draws with theirs."""
+        """Return the middle of the draws with their deviations, and the best fit of the descriptors with its own."""
         rng = np.random.default_rng(0)
         near = rng.multivariate_normal(self.best.parameters, self.best.covariance, DRAWS, check_valid="ignore")
         low, high = self.posterior.box.T
         own = self.draws(np.clip(near, low, high), "").deviations
         middle = draws.middle(np.ptp(draws.parameters, axis=0))
         return (
-            Candidate("optimum", *law_of(self.turn(self.best.parameters)), own),
             Candidate("posterior", *law_of(middle), draws.deviations),
+            Candidate("optimum", *law_of(self.turn(self.best.parameters)), own),
         )
 
 
-def _checked(reading: _Reading, grown: Simulations) -> Estimate:
-    """Return what is known once draws were grown."""
+def _part(progress: Progress, start: float, stop: float) -> Progress:
+    """Return the progress of a part of the work."""
+    return lambda text, share: progress(text, start + (stop - start) * share)
+
+
+def _checked(reading: _Reading, grown: Simulations, others: Mapping[str, np.ndarray]) -> Estimate:
+    """Return what is known once draws were grown, and other parameters were chosen by what grew."""
     posterior, row, count = reading.posterior, reading.row, len(grown.parameters)
     draws = reading.draws(reading.parameters, METHOD)
     checked = check(posterior, row, reading.view, grown.descriptors)
     misfit = Misfit(
         checked.p, {name: each.p for name, each in checked.blocks.items()}, f"{count} shapes grown from draws"
     )
-    components = posterior.compression(np.concatenate([row[None], grown.descriptors])) @ posterior.emulator.basis.T
-    near = int(np.square(components[1:] - components[0]).sum(1).argmin())
-    nearest = Candidate("draw", *law_of(reading.turn(grown.parameters[near])), {})
+    refined, simulation = (Candidate(name, *law_of(reading.turn(each)), {}) for name, each in others.items())
+    middle, _ = reading.laws(draws)
     names = np.array(column_names())
     blocks = {name: (row[names == name], grown.descriptors[:, names == name]) for name in BLOCKS}
-    return Estimate(draws, reading.weak, misfit, (*reading.laws(draws), nearest), blocks)
+    return Estimate(draws, reading.weak, misfit, (refined, middle, simulation), blocks)
 
 
 def simulation_grid(prepared: Prepared) -> Grid:
@@ -160,21 +170,22 @@ def simulation_grid(prepared: Prepared) -> Grid:
     return Grid((z, y, x), prepared.grid.spacing, "periodic")
 
 
-def _simulations(prepared: Prepared, view: str, parameters: np.ndarray, seed: int, progress: Progress) -> Simulations:
-    """Grow draws and measure them as the scan is: seen as it would show them, in a window where it is one."""
+def _simulator(prepared: Prepared, view: str) -> Simulate:
+    """Return what grows parameters and measures them as the scan is: seen as it would show them, in a window where it
+    is one."""
     grid = simulation_grid(prepared)
     window = VIEWS["mask" if prepared.part(prepared.windows[0]).periodic else "crop"]
 
-    def simulate(draw: np.ndarray, start: int) -> Descriptors | None:
-        flow = generate(*law_of(draw), grid, seed=start, reject_early=True)
+    def simulate(parameters: np.ndarray, seed: int) -> Descriptors | None:
+        flow = generate(*law_of(parameters), grid, seed=seed, reject_early=True)
         if not flow.viability.viable:
             return None
+        field = flow.field.numpy()
         try:
-            field = flow.field.numpy()
             if view == "field":
                 return descriptors(field, grid)
-            return descriptors(*window(prepared.seen(field > 0, start), grid, np.random.default_rng(start)))
+            return descriptors(*window(prepared.seen(field > 0, seed), grid, np.random.default_rng(seed)))
         except (ScanError, NoSurface):
             return None
 
-    return simulations(parameters, simulate, SIMULATIONS, seed=seed, progress=progress)
+    return simulate

@@ -29,10 +29,24 @@ class Simulations(NamedTuple):
     descriptors: np.ndarray
     count: int
 
+    def joined(self, parameters: np.ndarray, seeds: np.ndarray, descriptors: np.ndarray, count: int) -> Simulations:
+        """Return these simulations and others, of which there were `count`."""
+        return Simulations(
+            np.concatenate([self.parameters, parameters]),
+            np.concatenate([self.seeds, seeds]),
+            np.concatenate([self.descriptors, descriptors]),
+            self.count + count,
+        )
+
+
+#: From parameters `(6,)` and a seed to the descriptors of what they grow, measured as the query is; None where nothing
+#: grows.
+Simulate = Callable[[np.ndarray, int], Descriptors | None]
+
 
 def simulations(
     draws: np.ndarray,
-    simulate: Callable[[np.ndarray, int], Descriptors | None],
+    simulate: Simulate,
     count: int,
     *,
     seed: int = 0,
@@ -42,9 +56,6 @@ def simulations(
 
     Parameters
     ----------
-    simulate
-        From parameters `(6,)` and a seed to the descriptors of what they grow, measured as the query is; None where
-        nothing grows.
     count
         Number of draws that are simulated.
     seed
