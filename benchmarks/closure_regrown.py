@@ -36,9 +36,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.closure_trials import METHODS, NUMBERS, Bench, Trial, jobs, proceed
+from benchmarks.closure_trials import METHODS, NUMBERS, Bench, Trial, jobs, proceed, queries_of
 from curvafit.data_synth import open_store
-from curvafit.generation.viability import well_formed
 from curvafit.inference.posterior import load_posterior
 from curvafit.inference.table import PARAMETERS
 
@@ -157,8 +156,7 @@ def main() -> None:
     views = tuple(options.views.split(","))
     bench = Bench(store, load_posterior(options.posterior), options.cache, views)
     options.cache.mkdir(parents=True, exist_ok=True)
-    usable = (i for i in store.indices() if store.viable(i) and well_formed(store.record(i).viability))
-    queries = [index for _, index in zip(range(options.queries), usable, strict=False)]
+    queries = queries_of(store, options.queries)
     left = proceed(jobs(bench, queries, options.few), options.minutes)
     for view in views:
         show(view, *load_trials(bench, queries, view), bench.posterior.emulator.deviation)

@@ -6,6 +6,7 @@ import hashlib
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache, lru_cache, partial
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,6 +18,7 @@ from curvafit.data_synth.atlas.store import Store
 from curvafit.files import write_atomically
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import Schedule
+from curvafit.generation.viability import well_formed
 from curvafit.geometry.descriptors import descriptors
 from curvafit.geometry.morphometry import local_thickness
 from curvafit.geometry.pairwise import one_to_many
@@ -114,6 +116,12 @@ def key_of_atlas() -> str:
 
 
 # ---- queries and shapes ----------------------------------------------------------------------------------------------
+
+
+def queries_of(store: Store, count: int) -> list[int]:
+    """A store's first well-formed shapes."""
+    usable = (i for i in store.indices() if store.viable(i) and well_formed(store.record(i).viability))
+    return list(islice(usable, count))
 
 
 @lru_cache(maxsize=8)
