@@ -92,7 +92,8 @@ class Bench(NamedTuple):
         return self.path(index, view, name, *(keys[each] for each in METHODS[name].knows))
 
     def clouds(self, index: int) -> list[Path]:
-        return [self.path(index, f"law{k}", key_of_atlas()) for k in range(laws.LAWS)]
+        """Files of shapes of the laws of the atlas's shapes nearest to a query."""
+        return [self.path(index, f"law{k}", *self.views, key_of_atlas()) for k in range(laws.LAWS)]
 
     @property
     def grid(self) -> Grid:
