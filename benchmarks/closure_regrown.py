@@ -21,6 +21,10 @@ A distance is a mean over the shapes that grew, infinite where none did; it is m
 Floor: the truth's, regrown from the query's own law and mass. Null: of level cuts of Gaussian random fields with the
 whole shape's volume fraction and two-point function (`benchmarks.level_cut`), seen through the view; it needs no law.
 
+`posterior as full` is the posterior's law grown to fill as much of its box as the view shows, as `infer` grows twins of
+masks and images. `chosen` is the law of posterior, optimum or match whose first shape is nearest in the diagram, judged
+by its second alone.
+
 - n, grew: queries that were asked, and the part of which a shape grew.
 - /floor: median over queries of distance over floor, with quartiles. /null: the part of queries that are nearer to the
   query than the null is.
@@ -43,6 +47,8 @@ from curvafit.inference.table import PARAMETERS
 
 #: Greatest median of /floor, by view.
 BARS = {"field": 1.25, "mask": 1.35, "scan": 1.8}
+#: Methods among which the nearest is chosen.
+CHOICE = ("posterior", "optimum", "match")
 
 
 def deviations(families: Sequence[np.ndarray]) -> np.ndarray:
@@ -83,7 +89,17 @@ def load_trials(bench: Bench, queries: Sequence[int], view: str) -> tuple[Trials
     by_method = {
         name: {k: each for k in own if (each := load(bench.trial_path(k, view, name))) is not None} for name in METHODS
     }
-    return own, by_method
+    return own, by_method | {"chosen": chosen(by_method)}
+
+
+def chosen(by_method: dict[str, Trials]) -> Trials:
+    """Of each query the trial of the method, among `CHOICE`, whose first shape is nearest in the diagram, without that
+    shape."""
+    trials = {}
+    for k in set.intersection(*(set(by_method[name]) for name in CHOICE)):
+        best = min((by_method[name][k] for name in CHOICE), key=lambda each: each.distances[0])
+        trials[k] = Trial(best.parameters, best.distances[1:], best.numbers[1:])
+    return trials
 
 
 def load(path: Path) -> Trial | None:
@@ -128,7 +144,7 @@ def show(view: str, own: Trials, by_method: dict[str, Trials], prior: np.ndarray
     ]
     print(f"{view}: floor {texts[0]} in the diagram, {texts[1]} in numbers; bar {BARS.get(view, np.nan):g}")
     wide = " ".join(f"{each + ' /floor':>18} {'/null':>5}" for each in floor._fields)
-    print(f"  {'method':15} {'n':>3} {'grew':>4} {wide} " + " ".join(f"{name:>7}" for name in PARAMETERS))
+    print(f"  {'method':17} {'n':>3} {'grew':>4} {wide} " + " ".join(f"{name:>7}" for name in PARAMETERS))
     for name, trials in by_method.items():
         if not trials:
             continue
@@ -139,7 +155,7 @@ def show(view: str, own: Trials, by_method: dict[str, Trials], prior: np.ndarray
         errors = np.array([each.parameters - own[k].parameters for k, each in trials.items()]) / prior
         grew = np.mean([np.isfinite(each.distances).any() for each in trials.values()])
         error = " ".join(f"{value:7.2f}" for value in np.median(np.abs(errors), axis=0))
-        print(f"  {name:15} {len(trials):3} {grew:4.2f} {ratios} {error if METHODS[name].law else ''}", flush=True)
+        print(f"  {name:17} {len(trials):3} {grew:4.2f} {ratios} {'' if name == 'null' else error}", flush=True)
 
 
 def main() -> None:

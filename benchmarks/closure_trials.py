@@ -43,12 +43,14 @@ NONE = np.full(len(PARAMETERS), np.nan)
 
 class Method(NamedTuple):
     """How a method reads a law (None: it is the null), whether it is asked on the first few queries alone, what it
-    knows of ("posterior", "atlas", both or nothing), and the only views that it reads, if not all."""
+    knows of ("posterior", "atlas", both or nothing), the only views that it reads, if not all, and whether its shapes
+    fill as much of their box as the view shows, whatever the law's mass."""
 
     law: Callable[[laws.Query], np.ndarray] | None
     slow: bool
     knows: tuple[str, ...]
     views: tuple[str, ...] = ()
+    filled: bool = False
 
 
 #: The methods, in the order of the table.
@@ -56,6 +58,7 @@ METHODS = {
     "null": Method(None, False, ()),
     "truth": Method(laws.truth, False, ()),
     "posterior": Method(laws.posterior, False, ("posterior",)),
+    "posterior as full": Method(laws.posterior, False, ("posterior",), ("mask", "scan"), filled=True),
     "optimum": Method(laws.best, False, ("posterior",)),
     "match": Method(laws.match, False, ("atlas",)),
     "literal": Method(laws.literal, False, ("posterior",)),
@@ -135,9 +138,18 @@ def query_of(bench: Bench, index: int, view: str) -> laws.Query | None:
 
 
 @lru_cache(maxsize=16)
-def grown(bench: Bench, parameters: tuple[float, ...], seed: int) -> np.ndarray | None:
-    """The field that a law grows, None where it grows none."""
-    flow = generate(*law_of(parameters), bench.grid, seed=seed, schedule=bench.schedule, reject_early=True)
+def grown(bench: Bench, parameters: tuple[float, ...], seed: int, fraction: float | None = None) -> np.ndarray | None:
+    """The field that a law grows, by its mass or so that it fills a part of the box; None where it grows none."""
+    law, mass = law_of(parameters)
+    flow = generate(
+        law,
+        mass if fraction is None else None,
+        bench.grid,
+        volume_fraction=fraction,
+        seed=seed,
+        schedule=bench.schedule,
+        reject_early=True,
+    )
     return flow.field.numpy() if flow.viability.viable else None
 
 
@@ -165,10 +177,11 @@ def trial(bench: Bench, index: int, view: str, method: Method) -> Trial:
     if query is None:
         return Trial(NONE, np.zeros(0), np.zeros((0, COUNT)))
     parameters = NONE if method.law is None else method.law(query)
+    fraction = float((query.sight.seen.shape > 0).mean()) if method.filled else None
     distances, numbers = np.full(SEEDS, np.inf), np.full((SEEDS, COUNT), np.nan)
     for k in range(SEEDS):
         seed = FIRST_SEED + k
-        shape = null(bench, index, seed) if method.law is None else grown(bench, tuple(parameters), seed)
+        shape = null(bench, index, seed) if method.law is None else grown(bench, tuple(parameters), seed, fraction)
         other = None if shape is None else laws.sight(shape, bench.grid, view, seed)
         if other is not None:
             distances[k] = one_to_many(query.sight.diagram, [other.diagram])[0]

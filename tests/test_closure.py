@@ -10,8 +10,8 @@ import pytest
 from scipy import ndimage
 
 from benchmarks import closure_laws as laws
-from benchmarks.closure_regrown import against, apart, deviations, mean_of_grown, quartiles
-from benchmarks.closure_trials import COUNT, NUMBERS, Job, proceed
+from benchmarks.closure_regrown import against, apart, chosen, deviations, mean_of_grown, quartiles
+from benchmarks.closure_trials import COUNT, NUMBERS, Job, Trial, proceed
 from benchmarks.closure_verdicts import figures
 from benchmarks.level_cut import cut_covariance, gaussian_spectrum, level_cut
 from curvafit.inference.posterior import load_posterior
@@ -116,6 +116,14 @@ def test_ratios_count_what_did_not_grow_as_infinite() -> None:
     assert against(mine, floor, null) == pytest.approx([2.0, 1.5, np.inf, 2 / 5])
     assert quartiles(np.array([1.0, np.inf, np.inf]))[0] == np.inf
     assert mean_of_grown(np.array([1.0, np.inf, 3.0])) == 2 and mean_of_grown(np.array([np.inf])) == np.inf
+
+
+def test_a_law_is_chosen_by_one_shape_and_judged_by_the_other() -> None:
+    numbers = np.zeros((2, COUNT))
+    near, far = (Trial(np.full(6, d), np.array([d, 10 - d]), numbers) for d in (1.0, 2.0))
+    trials = chosen({"posterior": {0: far, 1: far}, "optimum": {0: near, 1: far}, "match": {0: far}})
+    assert set(trials) == {0}
+    assert trials[0].parameters[0] == 1 and trials[0].distances == pytest.approx([9.0])
 
 
 def test_numbers_are_compared_in_deviations_between_seeds() -> None:
