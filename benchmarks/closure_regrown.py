@@ -75,8 +75,11 @@ def mean_of_grown(distances: np.ndarray) -> float:
 
 
 def quartiles(ratios: np.ndarray) -> np.ndarray:
-    """Median and quartiles of numbers that may be infinite."""
-    return np.quantile(ratios, (0.5, 0.25, 0.75), method="nearest") if len(ratios) else np.full(3, np.nan)
+    """Median and quartiles of numbers that may be infinite: between two of them, their mean."""
+    if not len(ratios):
+        return np.full(3, np.nan)
+    low, high = (np.quantile(ratios, (0.5, 0.25, 0.75), method=method) for method in ("lower", "higher"))
+    return (low + high) / 2
 
 
 #: Trials by query.
