@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.closure_trials import queries_of
 from curvafit.data_synth import open_store
 from curvafit.generation.flow import generate
 from curvafit.generation.viability import well_formed
@@ -56,8 +57,7 @@ def main() -> None:
     end = time.monotonic() + 60 * options.minutes
     store, posterior = open_store(options.store), load_posterior(options.posterior)
     options.cache.mkdir(parents=True, exist_ok=True)
-    usable = (i for i in store.indices() if store.viable(i) and well_formed(store.record(i).viability))
-    queries = [index for _, index in zip(range(options.queries), usable, strict=False)]
+    queries = queries_of(store, options.queries)
     for level in (12, options.count):
         for index in queries:
             path = options.cache / f"{store.path.stem}-{index:06d}.npz"

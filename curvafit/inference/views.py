@@ -79,14 +79,19 @@ def scan(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
     Prepared as `infer` prepares an image: smoothed by a voxel, split, interpolated to cubic voxels, cleared of specks.
     """
     part, window = crop(u, grid, rng)
+    level = find_level(degraded(part, rng), kind="image")
+    values = resample(level.values, (1 / SLICE, 1.0, 1.0), (0, 0, 0), part.shape)
+    inside = values > 0
+    return View(without_specks(inside, smallest_piece(_thickness(inside)), False)[0], window)
+
+
+def degraded(part: np.ndarray, rng: np.random.Generator) -> Field:
+    """Return a mask as a bad scan shows it: blurred, slices two voxels thick, noise at SNR 5."""
     grey = ndimage.gaussian_filter(part.astype(np.float32), BLUR, mode="nearest")
     whole = np.pad(grey, ((0, -len(grey) % SLICE), (0, 0), (0, 0)), mode="edge")
     grey = whole.reshape(-1, SLICE, *grey.shape[1:]).mean(1)
     grey += rng.standard_normal(grey.shape, dtype=np.float32) / SNR
-    level = find_level(Field(grey, (float(SLICE), 1.0, 1.0), "voxel"), kind="image")
-    values = resample(level.values, (1 / SLICE, 1.0, 1.0), (0, 0, 0), part.shape)
-    inside = values > 0
-    return View(without_specks(inside, smallest_piece(_thickness(inside)), False)[0], window)
+    return Field(grey, (float(SLICE), 1.0, 1.0), "voxel")
 
 
 def _thickness(part: np.ndarray) -> float:

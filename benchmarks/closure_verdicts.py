@@ -1,0 +1,130 @@
+"""False alarms: how often `infer` finds no believable twin of shapes that the model made itself.
+
+    python -m benchmarks.closure_verdicts STORE [--posterior FILE] [--cache FOLDER] [--queries 60] [--kinds mask,image]
+                                          [--minutes 3]
+
+The queries are STORE's first well-formed shapes, which the posterior must not have learnt from: as the mask of the
+whole box, taken for one that does not repeat, and as the grey levels of `inference.views`'s degraded scan of a window.
+One whole `infer`, with its twins, for each: some 60 s of a core. A run ends after some minutes with the table so far,
+and the next one goes on; a file for each query and kind holds the answer, named after the posterior. What else the
+program does is not in the name: another state of it wants another folder.
+
+- n: queries; refused: those that `infer` refuses to measure, which do not count below.
+- no twin, no law: the parts with these verdicts. far, strange: the parts whose twins lie beyond `verdict.FURTHEST`
+  seeds' distances, and whose misfit is below `misfit.UNBELIEVABLE`: the two reasons for "no twin".
+- distance: of the nearest law's twins from the query, over that of two twins: median, 90 and 95 %.
+- p < .05: part of the queries whose misfit is so low. seconds: median.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.closure_trials import key_of_posterior, queries_of
+from curvafit.data_synth import open_store
+from curvafit.files import write_content
+from curvafit.inference.candidates import best_of, noise_of
+from curvafit.inference.infer import infer
+from curvafit.inference.misfit import UNBELIEVABLE
+from curvafit.inference.posterior import Posterior, load_posterior
+from curvafit.inference.verdict import FURTHEST
+from curvafit.inference.views import crop, degraded
+from curvafit.priors.grid import Grid
+from curvafit.volumes.scan import Field, ScanError
+
+
+def as_mask(field: np.ndarray, rng: np.random.Generator) -> Field:
+    return Field((field > 0).astype(np.uint8), (1.0, 1.0, 1.0), "voxel")
+
+
+def as_image(field: np.ndarray, rng: np.random.Generator) -> Field:
+    z, y, x = field.shape
+    return degraded(crop(field, Grid((z, y, x)), rng).shape, rng)
+
+
+#: What is made of a phase field, by the kind that `infer` takes it for.
+KINDS: dict[str, Callable[[np.ndarray, np.random.Generator], Field]] = {"mask": as_mask, "image": as_image}
+
+
+def answer(field: np.ndarray, kind: Any, posterior: Posterior, seed: int) -> dict[str, Any]:
+    """What `infer` says of a shape, in JSON's types; only the reason where it refuses."""
+    begun = time.perf_counter()
+    try:
+        scan = KINDS[kind](field, np.random.default_rng(seed))
+        fit = infer(scan, kind=kind, posterior=posterior).fit
+    except ScanError as error:
+        return {"refused": str(error)}
+    nearest = best_of(fit.candidates)
+    return {
+        "status": fit.status,
+        "distance": None if nearest is None else nearest.distance,
+        "noise": noise_of(fit.candidates),
+        "misfit": None if fit.misfit is None else fit.misfit.probability,
+        "seconds": time.perf_counter() - begun,
+    }
+
+
+def figures(answers: list[dict[str, Any]]) -> str:
+    """The columns of the table."""
+    told = [each for each in answers if "refused" not in each]
+    ratio = np.array([_number(each["distance"]) / _number(each["noise"]) for each in told])
+    misfit = np.array([_number(each["misfit"]) for each in told])
+    parts = [_part(each["status"].startswith(f"No {word}") for each in told) for word in ("believable twin", "law")]
+    parts += [_part(ratio > FURTHEST), _part(misfit < UNBELIEVABLE)]
+    known = ratio[np.isfinite(ratio)]
+    quantiles = np.quantile(known, (0.5, 0.9, 0.95)) if len(known) else np.full(3, np.nan)
+    seconds = np.median([each["seconds"] for each in told]) if told else np.nan
+    numbers = [*parts, *quantiles, _part(misfit < 0.05)]
+    counts = f"{len(answers):4} {len(answers) - len(told):7} "
+    return counts + " ".join(f"{each:7.2f}" for each in numbers) + f" {seconds:7.0f}"
+
+
+def _number(value: float | None) -> float:
+    return np.nan if value is None else value
+
+
+def _part(cases: Any) -> float:
+    values = list(cases)
+    return float(np.mean(values)) if values else np.nan
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("store", type=Path)
+    parser.add_argument("--posterior", type=Path, default=None)
+    parser.add_argument("--cache", type=Path, default=Path("closure_verdicts"))
+    parser.add_argument("--queries", type=int, default=60)
+    parser.add_argument("--kinds", default=",".join(KINDS))
+    parser.add_argument("--minutes", type=float, default=3.0)
+    options = parser.parse_args()
+    end = time.monotonic() + 60 * options.minutes
+    store, posterior = open_store(options.store), load_posterior(options.posterior)
+    queries, kinds = queries_of(store, options.queries), options.kinds.split(",")
+    key = key_of_posterior(posterior)
+    paths = {
+        (index, kind): options.cache / f"{store.path.stem}-{index:06d}-{kind}-{key}.json"
+        for index in queries
+        for kind in kinds
+    }
+    for (index, kind), path in paths.items():
+        if not path.exists() and time.monotonic() < end:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_content(path, json.dumps(answer(store.field(index), kind, posterior, index), indent=1))
+    columns = ("no twin", "no law", "far", "strange", "distance", "90 %", "95 %", "p < .05", "seconds")
+    print(f"{'kind':6} {'n':>4} {'refused':>7} " + " ".join(f"{each:>7}" for each in columns))
+    for kind in kinds:
+        answers = [json.loads(path.read_text()) for (_, of), path in paths.items() if of == kind and path.exists()]
+        print(f"{kind:6} {figures(answers)}")
+    left = sum(not path.exists() for path in paths.values())
+    print(f"{left} files left: run again" if left else "all done")
+
+
+if __name__ == "__main__":
+    main()
