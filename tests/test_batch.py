@@ -59,7 +59,7 @@ def test_the_mass_is_the_law_s_own():
     flows = generate_batch(["tubes", SPONGE], grid=GRID, seeds=(3, 4), schedule=PLAN)
     for flow, known, seed in zip(flows, (TUBES, SPONGE), (3, 4), strict=True):
         assert_same(flow, generate(known.coefficients, known.mass, GRID, seed=seed, schedule=PLAN))
-    with pytest.raises(ValueError, match="expected either a mass or a volume fraction, got neither"):
+    with pytest.raises(ValueError, match="expected a mass or a volume fraction, got neither"):
         next(generate_batch(TUBES.coefficients, grid=GRID, schedule=PLAN))
 
 

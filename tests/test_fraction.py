@@ -8,7 +8,9 @@ import torch
 
 from curvafit.generation import fraction
 from curvafit.generation.flow import generate
+from curvafit.generation.fraction import first_mass
 from curvafit.generation.schedule import Schedule, schedule
+from curvafit.generation.setup import base_of
 from curvafit.priors.coefficients import Coefficients, preset
 from curvafit.priors.grid import Grid
 
@@ -54,14 +56,25 @@ def test_what_cannot_be_reached_is_told():
     assert f"volume fraction {share(flow.field):.4f} instead of 0.1000" in flow.status
 
 
-def test_either_a_mass_or_a_volume_fraction():
+def test_a_mass_or_a_volume_fraction():
     a, grid = preset("tubes").coefficients, Grid((12, 12, 12))
-    for mass, wanted in ((None, None), (-0.5, 0.2)):
-        with pytest.raises(ValueError, match="expected either a mass or a volume fraction"):
-            generate(a, mass, grid, volume_fraction=wanted)
+    with pytest.raises(ValueError, match="expected a mass or a volume fraction, got neither"):
+        generate(a, None, grid)
+    for mass in (1.0, float("nan"), torch.full(grid.shape, -0.5)):
+        with pytest.raises(ValueError, match=r"expected a mass in \(-1, 1\)"):
+            generate(a, mass, grid, volume_fraction=0.2)
     for wanted in (0.0, 1.0, -0.1, float("nan")):
         with pytest.raises(ValueError, match=r"expected a volume fraction in \(0, 1\)"):
             generate(a, None, grid, volume_fraction=wanted)
+
+
+@pytest.mark.parametrize(("mass", "first"), [(None, -0.6), (-0.5, -0.5), (-0.9, -0.8), (0.3, -0.4)])
+def test_a_flow_begins_with_the_mass_that_is_given(mass, first):
+    """As far as a shape of this share may have it."""
+    assert first_mass(0.2, mass) == pytest.approx(first)
+    a, grid = preset("tubes").coefficients, Grid((16, 16, 16))
+    assert base_of(mass, 0.2, grid) == pytest.approx(first)
+    assert generate(a, mass, grid, volume_fraction=0.2, schedule=schedule("cosine", steps=5)).finite
 
 
 @pytest.mark.parametrize("wanted", [1e-6, 0.001, 0.2, 0.5, 0.999, 1 - 1e-6])

@@ -70,7 +70,8 @@ def generate(
         unit.
     volume_fraction
         Share of voxels with u > 0, instead of a mass. Corrections of the mass approach the share while the flow runs,
-        and a small constant makes it exact at the end; where that fails, `status` says so. `Flow.mass` is the mass.
+        and a small constant makes it exact at the end; where that fails, `status` says so. `Flow.mass` is the mass. A
+        mass beside it is the one to begin with; a law may make few large bodies from one and many small from another.
     schedule
         `"fast"`, `"paper"`, `"cosine"` (see `SCHEDULES`), or a `Schedule`.
     seed

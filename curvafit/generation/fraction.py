@@ -21,8 +21,9 @@ BOUND = 0.95
 LAST = 0.1
 
 
-def first_mass(share: float) -> float:
-    """Return the mass of a sharp shape, with values ±1, that has this share inside.
+def first_mass(share: float, mass: float | None = None) -> float:
+    """Return the mass that a flow towards this share begins with: a given one, as far as a shape of this share may have
+    it; else that of a sharp shape, with values ±1.
 
     Raises
     ------
@@ -30,7 +31,9 @@ def first_mass(share: float) -> float:
         If the share is not in (0, 1).
     """
     share = inside(share, "a volume fraction in (0, 1)", 0, 1)
-    return min(max(2 * share - 1, -BOUND), BOUND)
+    sharp = min(max(2 * share - 1, -BOUND), BOUND)
+    begin = sharp if mass is None else min(max(mass, sharp - REACH), sharp + REACH)
+    return min(max(begin, -BOUND), BOUND)
 
 
 def correction(u: Tensor, share: float, mass: float, steps: int) -> float:

@@ -106,17 +106,18 @@ def check_device(device: torch.device | str) -> None:
 
 
 def base_of(mass: float | Tensor | None, share: float | None, grid: Grid) -> float | Tensor:
-    """Return the base of div A: the mass, a field of masses `(Z, Y, X)`, or a first estimate for a share of volume.
+    """Return the base of div A: the mass, a field of masses `(Z, Y, X)`, or the first one for a share of volume.
 
     Raises
     ------
     ValueError
-        If mass and share are both None or both set, or the one that is set is out of range or has another shape.
+        If mass and share are both None, or one is out of range or has another shape, or the mass beside a share is not
+        one number.
     """
-    if (mass is None) == (share is None):
-        raise ValueError(f"expected either a mass or a volume fraction, got {'neither' if mass is None else 'both'}")
     if share is not None:
-        return fraction.first_mass(share)
+        return fraction.first_mass(share, None if mass is None else inside(mass, "a mass in (-1, 1)", -1, 1))
+    if mass is None:
+        raise ValueError("expected a mass or a volume fraction, got neither")
     if not isinstance(mass, Tensor) or mass.dim() == 0:
         return inside(mass, "a mass in (-1, 1)", -1, 1)
     check_shape("mass", mass, grid)

@@ -137,9 +137,9 @@ class _Reading:
         near = rng.multivariate_normal(self.best.parameters, self.best.covariance, DRAWS, check_valid="ignore")
         low, high = self.posterior.box.T
         own = self.draws(np.clip(near, low, high), "").deviations
-        middle = draws.middle(np.ptp(draws.parameters, axis=0))
+        middle = Draws.of(self.parameters, self.view, "").middle(np.ptp(self.parameters, axis=0))
         return (
-            Candidate("posterior", *law_of(middle), draws.deviations),
+            Candidate("posterior", *law_of(self.turn(middle)), draws.deviations),
             Candidate("optimum", *law_of(self.turn(self.best.parameters)), own),
         )
 

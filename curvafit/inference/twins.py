@@ -42,7 +42,7 @@ def twin(coefficients: Coefficients, mass: float, prepared: Prepared, seed: int)
     grid = twin_grid(prepared)
     if prepared.kind != "field":
         share = prepared.volume_fraction
-        flow = generate(coefficients, grid=grid, volume_fraction=share, seed=seed, reject_early=True)
+        flow = generate(coefficients, mass, grid, volume_fraction=share, seed=seed, reject_early=True)
         if (grown := _measured(flow, prepared, seed)).phase is not None:
             return grown
     return _measured(generate(coefficients, mass, grid, seed=seed, reject_early=True), prepared, seed)
