@@ -1,6 +1,8 @@
 """The law that each method reads from a view of a shape, for `benchmarks.closure_regrown`.
 
 - posterior: of 400 draws the one nearest to their medians, as `infer` grows it. optimum: the emulator's best fit.
+- refined: by simulations chosen one after another, after `SIMULATIONS` of the draws, as `infer` does; they are seen
+  through the query's view.
 - stationarity (fields alone): from the posterior's middle and the three nearest shapes, as `infer` starts it.
 - match: the packaged atlas's shape whose curvature diagram is nearest.
 - point match, point posterior: the fixed point of a short flow (`inference.fixed_point`), started at these two. Its
@@ -28,17 +30,21 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from curvafit.geometry.descriptors import descriptors
+from curvafit.generation.flow import generate
+from curvafit.geometry.descriptors import Descriptors, descriptors
 from curvafit.geometry.diagram import Diagram, diagram
 from curvafit.geometry.mesh import NoSurface
 from curvafit.inference.atlas import load_atlas
+from curvafit.inference.check import STARTS
 from curvafit.inference.draws import Draws
 from curvafit.inference.emulator import optimum
-from curvafit.inference.estimate import DRAWS, STARTS
+from curvafit.inference.estimate import DRAWS, POOL, SIMULATIONS
 from curvafit.inference.fixed_point import fixed_point
 from curvafit.inference.infer import STARTS as MATCHES
 from curvafit.inference.match import Match, nearest
 from curvafit.inference.posterior import Posterior
+from curvafit.inference.sequential import Search
+from curvafit.inference.simulation import simulations
 from curvafit.inference.stationarity import stationarity
 from curvafit.inference.table import column_names, law_of, parameters_of
 from curvafit.inference.views import VIEWS, View
@@ -91,12 +97,15 @@ class Query:
         For the methods that read descriptors.
     clouds
         Files of shapes of other laws, for `synthetic`: `parameters`, and by view their rows of descriptors `(n, 351)`.
+    box
+        In which shapes are grown.
     """
 
     sight: Sight
     parameters: np.ndarray
     posterior: Posterior
     clouds: Sequence[Path]
+    box: Grid
 
     @cached_property
     def row(self) -> np.ndarray:
@@ -105,6 +114,22 @@ class Query:
     @cached_property
     def draws(self) -> np.ndarray:
         return self.posterior.sample(self.row, self.sight.name, DRAWS)
+
+    @cached_property
+    def refined(self) -> np.ndarray:
+        """The law that simulations refine."""
+
+        def simulate(parameters: np.ndarray, seed: int) -> Descriptors | None:
+            flow = generate(*law_of(parameters), self.box, seed=seed, reject_early=True)
+            seen = sight(flow.field.numpy(), self.box, self.sight.name, seed) if flow.viability.viable else None
+            try:
+                return None if seen is None else descriptors(*seen.seen)
+            except NoSurface:
+                return None
+
+        search = Search(self.posterior.emulator, self.sight.name, self.row)
+        pool = self.posterior.sample(self.row, self.sight.name, POOL)
+        return search.parameters(pool, simulations(self.draws, simulate, SIMULATIONS), simulate)[0]
 
 
 def truth(query: Query) -> np.ndarray:
@@ -117,6 +142,10 @@ def posterior(query: Query) -> np.ndarray:
 
 def best(query: Query) -> np.ndarray:
     return optimum(query.posterior.emulator, query.row, query.sight.name, query.draws[:STARTS]).parameters
+
+
+def refined(query: Query) -> np.ndarray:
+    return query.refined
 
 
 def by_stationarity(query: Query) -> np.ndarray:

@@ -61,6 +61,8 @@ METHODS = {
     "posterior as full": Method(laws.posterior, False, ("posterior",), ("mask", "scan"), filled=True),
     "optimum": Method(laws.best, False, ("posterior",)),
     "match": Method(laws.match, False, ("atlas",)),
+    "refined": Method(laws.refined, True, ("posterior",)),
+    "refined as full": Method(laws.refined, True, ("posterior",), ("mask", "scan"), filled=True),
     "literal": Method(laws.literal, False, ("posterior",)),
     "stationarity": Method(laws.by_stationarity, True, ("posterior", "atlas"), ("field",)),
     "point match": Method(partial(laws.point, laws.match), True, ("atlas",)),
@@ -134,16 +136,16 @@ def query_of(bench: Bench, index: int, view: str) -> laws.Query | None:
     record = bench.store.record(index)
     parameters = parameters_of(record.coefficients, record.mass)
     seen = laws.sight(bench.store.field(index), bench.grid, view, index)
-    return None if seen is None else laws.Query(seen, parameters, bench.posterior, bench.clouds(index))
+    return None if seen is None else laws.Query(seen, parameters, bench.posterior, bench.clouds(index), bench.grid)
 
 
 @lru_cache(maxsize=16)
 def grown(bench: Bench, parameters: tuple[float, ...], seed: int, fraction: float | None = None) -> np.ndarray | None:
-    """The field that a law grows, by its mass or so that it fills a part of the box; None where it grows none."""
+    """The field that a law grows, by its mass, or by one that fills a part of the box; None where it grows none."""
     law, mass = law_of(parameters)
     flow = generate(
         law,
-        mass if fraction is None else None,
+        mass,
         bench.grid,
         volume_fraction=fraction,
         seed=seed,

@@ -99,7 +99,7 @@ def test_the_literal_loss_is_least_in_a_corner() -> None:
     grid, posterior = Grid(ball.shape), load_posterior()
     seen = laws.sight(ball, grid, "field", 0)
     assert seen is not None
-    corner = laws.literal(laws.Query(seen, np.zeros(6), posterior, ()))
+    corner = laws.literal(laws.Query(seen, np.zeros(6), posterior, (), seen.seen.grid))
     low, high = posterior.box.T
     assert np.isin(corner[:-1], [low[:-1], high[:-1]]).all()
     others = np.random.default_rng(0).uniform(low, high, (20, 6))
