@@ -174,7 +174,7 @@ def test_an_example_is_degraded_as_the_volume_is() -> None:
     ("options", "said"),
     [
         ({"example": ball(), "known": [15, 16]}, "three or more known slices"),
-        ({"example": Field(ball(), 1.0, "mm"), "every": 8}, "an example with the spacing of the slices"),
+        ({"example": Field(ball(), (1.0,) * 3, "mm"), "every": 8}, "an example with the spacing of the slices"),
         ({"example": np.zeros((32, 32, 32), dtype=np.uint8), "every": 8}, "got empty ones"),
         ({"example": ball() * np.float32(0.5), "every": 8}, "values that are not whole numbers"),
     ],
@@ -197,7 +197,7 @@ def test_a_fit_has_the_laws_that_it_trusts(tmp_path: Path) -> None:
     fit = replace(fit, candidates=(*fit.candidates, *known))
     path = tmp_path / "fit.json"
     path.write_text(fit.to_json())
-    scan = Field(ball(), 0.0195, "mm")
+    scan = Field(ball(), (0.0195,) * 3, "mm")
     laws, _ = laws_of(fit, scan)
     assert laws[0] == law_of(fit, scan)[0]
     for each in known[1:]:

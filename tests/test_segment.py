@@ -230,7 +230,7 @@ def test_an_axis_and_numbers_of_slices() -> None:
         ({"every": 8, "epsilon": -1.0}, "positive epsilon"),
         ({"known": [4, 28]}, "three or more known slices"),
         ({"every": 8, "stiffness": 0.0}, "a positive stiffness"),
-        ({"every": 8, "example": Field(tubes(), 0.5)}, "the spacing of the slices"),
+        ({"every": 8, "example": Field(tubes(), (0.5,) * 3)}, "the spacing of the slices"),
     ],
 )
 def test_bad_slices_are_refused(options, said) -> None:

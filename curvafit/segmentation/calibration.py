@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -97,7 +97,7 @@ def choice(task: Task, settings: Sequence[Setting], filled: Callable[[Slices, Se
     Parameters
     ----------
     settings
-        Settings with a law; each starts from the best plain interpolation.
+        Settings with a law. Slices left out double the gap, so that the best interpolation there is no better start.
     filled
         Fills the volume between slices by a setting: a mask (Z, Y, X).
     """
@@ -108,7 +108,7 @@ def choice(task: Task, settings: Sequence[Setting], filled: Callable[[Slices, Se
     start, before = Setting(WAYS[0]), counts(Setting(WAYS[0]))
     for each in map(Setting, WAYS[1:]):
         start, before = _better((each, counts(each)), (start, before))
-    tried = [(each, counts(each)) for each in (replace(setting, way=start.way) for setting in settings)]
+    tried = [(each, counts(each)) for each in settings]
     best, after = max(tried, key=lambda each: float(_dice(each[1].sum(0))))
     with_prior, without = (float(_dice(each.sum(0))) for each in (after, before))
     return Choice(_better((best, after), (start, before))[0], with_prior, without, _difference(after, before)[1])
