@@ -53,7 +53,7 @@ def reconstruct(
     progress: Progress = silent,
     **reading: Any,
 ) -> Segmentation:
-    """Fill a volume between known slices: the best plain interpolation, or F_ε lowered from there if that is better.
+    """Fill a volume between known slices: lower F_ε from a spline if that is better than plain interpolation.
 
     What is better is tried out on an example that is degraded as the volume is, or else on every second known slice,
     which the others predict. The known slices stay as they are. Where the volume ends, the surface goes on freely.
