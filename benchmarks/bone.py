@@ -35,8 +35,9 @@ from curvafit.files import write_atomically, write_content
 from curvafit.geometry.topology import betti_numbers
 from curvafit.inference.infer import infer
 from curvafit.priors.coefficients import Coefficients
-from curvafit.segmentation.evidence import interpolated_distance
-from curvafit.segmentation.segment import reconstruct, segment
+from curvafit.segmentation.completion import reconstruct
+from curvafit.segmentation.segment import segment
+from curvafit.segmentation.slices import Slices
 from curvafit.volumes.scan import Field
 
 EDGE, SPACING = 96, 0.0195
@@ -66,15 +67,12 @@ def sparse(truth: np.ndarray, every: int, priors: dict[str, Coefficients | Path]
     """Each way's mask from every so many slices, up to the last of them."""
     places = list(range(0, EDGE, every))
     length = places[-1] + 1
-    distance = interpolated_distance(truth[places], places, length, (1.0, 1.0, 1.0))
-    z = np.arange(length) / every
-    low = np.minimum(z.astype(int), len(places) - 2)
-    share = (z - low)[:, None, None]
+    slices = Slices(truth[places], tuple(places), length, (1.0, 1.0, 1.0))
     masks = {
         "truth": truth[:length],
-        "nearest slice": truth[np.array(places)[np.rint(z).astype(int)]],
-        "linear": (1 - share) * distance[places][low] + share * distance[places][low + 1] > 0,
-        "cubic (start)": distance > 0,
+        "nearest slice": slices.level("nearest") > 0,
+        "linear": slices.level("linear") > 0,
+        "cubic spline": slices.level("spline") > 0,
     }
     scan = Field(truth.astype(np.uint8), (SPACING,) * 3, "mm")
     for name, prior in priors.items():

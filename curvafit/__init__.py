@@ -29,7 +29,9 @@ if TYPE_CHECKING:
     from curvafit.inference.infer import Inference, infer
     from curvafit.priors.coefficients import Coefficients, preset
     from curvafit.priors.grid import Grid
-    from curvafit.segmentation.segment import Segmentation, reconstruct, segment
+    from curvafit.segmentation.completion import reconstruct
+    from curvafit.segmentation.result import Segmentation
+    from curvafit.segmentation.segment import segment
     from curvafit.volumes.scan import Field, load, save
 
 __version__ = "0.1.0"
@@ -65,7 +67,7 @@ _HOMES = {
     "Flow": "curvafit.generation.result",
     "Grid": "curvafit.priors.grid",
     "Inference": "curvafit.inference.infer",
-    "Segmentation": "curvafit.segmentation.segment",
+    "Segmentation": "curvafit.segmentation.result",
     "descend": "curvafit.generation.flow",
     "diagram": "curvafit.geometry.diagram",
     "generate": "curvafit.generation.flow",
@@ -73,7 +75,7 @@ _HOMES = {
     "infer": "curvafit.inference.infer",
     "load": "curvafit.volumes.scan",
     "preset": "curvafit.priors.coefficients",
-    "reconstruct": "curvafit.segmentation.segment",
+    "reconstruct": "curvafit.segmentation.completion",
     "save": "curvafit.volumes.scan",
     "segment": "curvafit.segmentation.segment",
     "wasserstein": "curvafit.geometry.transport",

@@ -154,7 +154,7 @@ def test_infer_checks_before_it_reads(
 def test_reconstruct_refuses_what_it_would_ignore(tmp_path: Path) -> None:
     save(Field(np.indices((9, 9, 9)).sum(0) // 12), tmp_path / "scan.npy")
     told = ["reconstruct", tmp_path / "scan.npy", "--prior", "tubes", "-o", tmp_path / "out.npy", "--slices", "0,8"]
-    refused(call(*told, "--first", "2"), "expected --first beside --every, got 2 beside --slices")
+    refused(call(*told, "--first", "2"), "expected --first beside --every, got 2 beside --known")
 
 
 @pytest.mark.filterwarnings("default::UserWarning")

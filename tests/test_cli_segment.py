@@ -181,9 +181,16 @@ def test_a_picture_shows_the_slices(oblique: Path, tmp_path: Path) -> None:
         (("segment", "SCAN", "--prior", "tubes", "--spacing", "0", "-o", "m.nii.gz"), "--spacing"),
         (("segment", "SCAN", "--prior", "tubes", "--probability", "SMALL", "-o", "m.nii.gz"), "of the scan's shape"),
         (("segment", "none.tif", "--prior", "tubes", "-o", "m.nii.gz"), "no such file"),
-        (("reconstruct", "SCAN", "--prior", "tubes", "-o", "m.nii.gz"), "--every or --slices"),
+        (("reconstruct", "SCAN", "--prior", "tubes", "-o", "m.nii.gz"), "--every or --known"),
         (("reconstruct", "SCAN", "--prior", "tubes", "--every", "4", "--axis", "w", "-o", "m.nii.gz"), "--axis"),
-        (("reconstruct", "SCAN", "--prior", "tubes", "--slices", "1,a", "-o", "m.nii.gz"), "--slices"),
+        (("reconstruct", "SCAN", "--prior", "tubes", "--slices", "1,a", "-o", "m.nii.gz"), "--known"),
+        (("reconstruct", "SCAN", "--every", "4", "-o", "m.nii.gz"), "--prior or --example, got neither"),
+        (("reconstruct", "BALL", "--prior", "tubes", "--known", "6,14", "-o", "m.nii.gz"), "expected three or more"),
+        (("reconstruct", "BALL", "--every", "4", "--example", "SMALL", "-o", "m.nii.gz"), "with the spacing of the"),
+        (
+            ("reconstruct", "BALL", "--prior", "tubes", "--every", "4", "--stiffness", "0", "-o", "m.nii.gz"),
+            "stiffness",
+        ),
         (("reconstruct", "SCAN", "--prior", "tubes", "--slices", "3,77", "-o", "m.nii.gz"), "within 0 to 19"),
     ],
 )
@@ -191,7 +198,8 @@ def test_wrong_input_is_a_sentence(arguments, said, oblique, tmp_path, monkeypat
     monkeypatch.chdir(tmp_path)
     (tmp_path / "fit.json").write_text(made_fit().to_json())
     np.save(tmp_path / "small.npy", np.linspace(0, 1, 125, dtype=np.float32).reshape(5, 5, 5))
-    places = {"SCAN": oblique, "FIT": "fit.json", "SMALL": "small.npy"}
+    save(Field(ball(), 0.02, "mm"), tmp_path / "ball.nii")
+    places = {"SCAN": oblique, "FIT": "fit.json", "SMALL": "small.npy", "BALL": "ball.nii"}
     result = call(*(places.get(part, part) for part in arguments))
     assert result.exit_code == 2, (result.output, result.exception)
     lines = result.stderr.strip().splitlines()
@@ -279,5 +287,6 @@ def test_no_input_is_written_over(arguments, target, tmp_path, monkeypatch) -> N
 
 
 def test_steps_are_those_of_the_library() -> None:
-    library = importlib.import_module("curvafit.segmentation.segment")
-    assert importlib.import_module("curvafit.cli.segment").STEPS == library.STEPS
+    command = importlib.import_module("curvafit.cli.segment")
+    for room, steps in (("segment", command.STEPS), ("completion", command.COMPLETION_STEPS)):
+        assert steps == importlib.import_module(f"curvafit.segmentation.{room}").STEPS

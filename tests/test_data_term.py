@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 
@@ -16,8 +17,9 @@ from curvafit.generation.flow import descend
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
+from curvafit.segmentation.completion import reconstruct
 from curvafit.segmentation.evidence import of_probability
-from curvafit.segmentation.segment import reconstruct, segment
+from curvafit.segmentation.segment import segment
 from curvafit.volumes.scan import Field
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
@@ -30,7 +32,7 @@ def drawn(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-@pytest.mark.parametrize("kind", [Evidence, Hinge])
+@pytest.mark.parametrize("kind", [Evidence, Hinge, partial(Hinge, margin=0.2)])
 def test_a_data_term_s_gradient(kind) -> None:
     term, u, way = kind(drawn(8, 9, 10)), 1.2 * drawn(8, 9, 10, seed=1), drawn(8, 9, 10, seed=2)
     step = 1e-5
@@ -47,8 +49,13 @@ def test_evidence_of_a_mask_is_its_log_likelihood() -> None:
 
 
 def test_a_hinge_lets_go_where_it_is_right() -> None:
-    value, slope = Hinge(torch.full((8, 9, 10), -3.0)).slope(torch.full((8, 9, 10), -1.1), GRID)
-    assert value == 0 and not slope.any()
+    ratio, near, short = (torch.full((8, 9, 10), each) for each in (-3.0, -1.1, -0.3))
+    for margin, u in ((1.0, near), (0.2, short)):
+        value, slope = Hinge(ratio, margin).slope(u, GRID)
+        assert value == 0 and not slope.any()
+    assert Hinge(ratio).slope(short, GRID)[0] > 0 and Hinge(ratio, 0.2).to("cpu").margin == 0.2
+    with pytest.raises(ValueError, match="a margin from 0 to 1"):
+        Hinge(ratio, 2.0)
 
 
 @pytest.mark.parametrize("bad", [torch.full((4, 4, 4), math.nan), torch.zeros(4, 4)])

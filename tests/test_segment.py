@@ -14,8 +14,10 @@ from scipy import ndimage
 from skimage.filters import threshold_otsu
 
 from curvafit.priors.coefficients import Coefficients, preset
-from curvafit.segmentation.evidence import interpolated_distance, of_intensities, of_probability
-from curvafit.segmentation.segment import reconstruct, segment
+from curvafit.segmentation.completion import STIFFNESS, reconstruct
+from curvafit.segmentation.evidence import of_intensities, of_probability
+from curvafit.segmentation.segment import segment
+from curvafit.segmentation.slices import Slices
 from curvafit.segmentation.working import WorkingGrid, law_of
 from curvafit.volumes.scan import Field, save
 
@@ -92,7 +94,7 @@ def test_a_probability_map_is_at_the_scan_s_place() -> None:
 
 def test_distances_between_slices() -> None:
     disc = np.hypot(*(np.mgrid[:32, :32] - 15.5)) < 10
-    distance = interpolated_distance(np.stack([disc, np.zeros_like(disc)]), [2, 6], 9, (2.0, 1.0, 1.0))
+    distance = Slices(np.stack([disc, np.zeros_like(disc)]), (2, 6), 9, (2.0, 1.0, 1.0)).level("spline")
     assert np.array_equal(distance[2] > 0, disc) and np.array_equal(distance[0], distance[2])
     assert distance[6:].max() == -8  # as far outside as the slices are apart
     np.testing.assert_allclose(distance[4], (distance[2] + distance[6]) / 2, atol=1e-6)
@@ -196,12 +198,8 @@ def test_known_slices_are_kept_and_the_rest_beats_interpolation() -> None:
     n, every = 41, 8
     truth = np.linalg.norm(np.mgrid[:n, :n, :n] - 20.0, axis=0) < 15.2
     places = np.arange(0, n, every)
-    found = reconstruct(Field(truth.astype(np.uint8)), WILLMORE, every=every)
-    lines = interpolated_distance(truth[places], list(places), n, (1.0, 1.0, 1.0))
-    share = np.arange(n) / every
-    low = np.minimum(share.astype(int), len(places) - 2)
-    w = (share - low)[:, None, None]
-    lines = (1 - w) * lines[places][low] + w * lines[places][low + 1] > 0
+    found = reconstruct(Field(truth.astype(np.uint8)), WILLMORE, every=every, stiffness=STIFFNESS)
+    lines = Slices(truth[places], tuple(places), n, (1.0, 1.0, 1.0)).level("linear") > 0
     assert np.array_equal(found.mask.values[places], truth[places])
     assert dice(found.mask.values, truth) > dice(lines, truth) + 0.01
     assert found.weight is None
@@ -230,7 +228,9 @@ def test_an_axis_and_numbers_of_slices() -> None:
         ({"every": 8, "axis": 3}, "axis 0, 1 or 2"),
         ({"every": 31}, "voxels inside and outside"),
         ({"every": 8, "epsilon": -1.0}, "positive epsilon"),
-        ({"every": 8, "prior": Coefficients(1e-30, 0, 1e-30).scaled(1e-30)}, "with a force"),
+        ({"known": [4, 28]}, "three or more known slices"),
+        ({"every": 8, "stiffness": 0.0}, "a positive stiffness"),
+        ({"every": 8, "example": Field(tubes(), (0.5,) * 3)}, "the spacing of the slices"),
     ],
 )
 def test_bad_slices_are_refused(options, said) -> None:
@@ -255,12 +255,12 @@ def test_labels_count_as_inside_and_what_is_extrapolated_is_said() -> None:
     truth = tubes()
     labels = np.where(truth, np.random.default_rng(0).integers(1, 200, truth.shape), 0).astype(np.float32)
     labels[1::2] += 0.5  # these are not read
-    found = reconstruct(Field(labels), WILLMORE, every=8.0, first=2, steps=1)  # type: ignore[arg-type]
-    plain = reconstruct(Field(truth), WILLMORE, known=[2, 10, 18, 26], steps=1)
+    found = reconstruct(Field(labels), WILLMORE, every=8.0, first=2, steps=1, stiffness=1e7)  # type: ignore[arg-type]
+    plain = reconstruct(Field(truth), WILLMORE, known=[2, 10, 18, 26], steps=1, stiffness=1e7)
     assert np.array_equal(found.mask.values, plain.mask.values) and found.notes == plain.notes
     assert "The 2 before the first and the 5 beyond the last are extrapolated." in found.notes
     assert "after 1 step:" in found.status
-    whole = reconstruct(Field(truth), WILLMORE, known=[0, 15, 31], steps=1)
+    whole = reconstruct(Field(truth), WILLMORE, known=[0, 15, 31], steps=1, stiffness=1e7)
     assert not any("extrapolated" in note for note in whole.notes)
 
 

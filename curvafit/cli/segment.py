@@ -23,8 +23,9 @@ from curvafit.cli.support import (
 )
 
 if TYPE_CHECKING:
+    from curvafit.inference.infer import Inference
     from curvafit.progress import Progress
-    from curvafit.segmentation.segment import Segmentation
+    from curvafit.segmentation.result import Segmentation
     from curvafit.volumes.scan import Field
 
 SEGMENT_EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
@@ -37,7 +38,8 @@ SEGMENT_EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
 RECONSTRUCT_EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
     (
         "curvafit reconstruct labels.nii.gz --every 8 --prior bone/fit.json -o volume.nii.gz",
-        "curvafit reconstruct labels.tif --slices 0,7,15 --axis x --prior tubes -o volume.tif",
+        "curvafit reconstruct labels.nii.gz --every 8 --example whole.nii.gz -o volume.nii.gz",
+        "curvafit reconstruct labels.tif --known 0,7,15 --axis x --prior tubes -o volume.tif",
     )
 )
 
@@ -49,14 +51,20 @@ Probability = Annotated[Path | None, _what(help="Probability of the inside, a vo
 Weight = Annotated[float | None, _what(help="Cost of a unit of the energy, in nats; by default 2 / (a20 + a02).")]
 Threshold = Annotated[str, _what(help="Grey level between the phases, or otsu.")]
 Dark = Annotated[bool, _what("--dark", help="The structure is the dark phase.")]
+OwnPrior = Annotated[str | None, _what("--prior", help="As in segment; by default inferred from the example.")]
+Example = Annotated[Path | None, _what(help="Mask of another such volume, known whole: the prior is tried out on it.")]
+Stiffness = Annotated[float | None, _what(help="Stiffness of springs on the known slices: try nothing out.")]
+Periodic = Annotated[bool, _what("--periodic", help="The volume repeats, as generated ones do.")]
 Epsilon = Annotated[float | None, _what(help="ε in the scan's unit; by default twice the smallest voxel edge.")]
 Steps = Annotated[int, _what(help="Steps of the flow.", min=1)]
 Every = Annotated[int | None, _what(help="Distance of known slices: with 8, every eighth slice is known.")]
 First = Annotated[int | None, _what(help="Number of the first known slice, with --every; by default 0.")]
 Axis = Annotated[str, _what(help="Axis across the slices: z, y or x (first, second, last axis of an array).")]
 
-#: Steps of the flow, as in `curvafit.segmentation.segment`, which help must not import.
-STEPS = 150
+#: Steps of the flows, as in `curvafit.segmentation`, which help must not import.
+STEPS, COMPLETION_STEPS = 150, 400
+#: Flows of a reconstruction: of two laws that are tried out, and of the better one.
+FLOWS = 3
 
 
 @reads_volume
@@ -94,52 +102,73 @@ def segment(
             return segment_scan(volume, prior, probability=chances, steps=steps, progress=progress, **options)
 
         more = {"probability": None if probability is None else str(probability), **options}
-        _run(scan, out, prior, reading, compute, {"job": "segment", "steps": steps, **more}, overwrite)
+        _run(scan, out, prior, reading, compute, {"job": "segment", "steps": steps, **more}, overwrite=overwrite)
 
 
 @reads_volume
 def reconstruct(
     slices: Volume,
     out: Target,
-    prior: Prior,
+    prior: OwnPrior = None,
     every: Every = None,
     first: First = None,
-    known: Annotated[str | None, _what("--slices", help="Or: the numbers of the known slices, 0,7,15.")] = None,
+    known: Annotated[str | None, _what("--known", "--slices", help="Or: numbers of the known slices, 0,7,15.")] = None,
     axis: Axis = "z",
-    epsilon: Epsilon = None,
-    steps: Steps = STEPS,
     *,
+    example: Example = None,
+    stiffness: Stiffness = None,
+    periodic: Periodic = False,
+    epsilon: Epsilon = None,
+    steps: Steps = COMPLETION_STEPS,
     reading: Reading,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Fill a mask between known slices under a curvature prior; write the mask, a picture and a record."""
+    """Fill a mask between known slices, with a curvature prior where it helps; write mask, picture and record."""
     with plainly():
         if axis.lower() not in ("z", "y", "x"):
             raise ValueError(f"expected --axis z, y or x, got {axis!r}")
         if (every is None) == (known is None):
-            raise ValueError(f"expected either --every or --slices, got {'neither' if every is None else 'both'}")
-        numbers = None if known is None else list(whole_numbers(known, "--slices"))
+            raise ValueError(f"expected either --every or --known, got {'neither' if every is None else 'both'}")
+        if prior is None and example is None:
+            raise ValueError("expected --prior or --example, got neither")
+        numbers = None if known is None else list(whole_numbers(known, "--known"))
         if known is not None and first is not None:
-            raise ValueError(f"expected --first beside --every, got {first} beside --slices")
-        options = {"every": every, "first": first or 0, "known": numbers, "axis": "zyx".index(axis.lower())}
+            raise ValueError(f"expected --first beside --every, got {first} beside --known")
+        place = {"every": every, "first": first or 0, "known": numbers, "axis": "zyx".index(axis.lower())}
+        options: dict[str, Any] = {**place, "stiffness": stiffness, "periodic": periodic, "epsilon": epsilon}
 
         def compute(volume: Field, progress: Progress) -> Segmentation:
-            from curvafit.segmentation.segment import reconstruct as fill
+            from curvafit.segmentation.completion import reconstruct as fill
+            from curvafit.volumes.scan import load
 
-            return fill(volume, prior, epsilon=epsilon, steps=steps, progress=progress, **options)  # type: ignore[arg-type]
+            alike = {name: reading[name] for name in ("spacing", "unit", "label", "strict")}
+            whole = None if example is None else load(example, **alike)
+            say_notes(() if whole is None else whole.notes)
+            law = prior if prior is not None else _inferred(whole, progress)
+            return fill(volume, law, example=whole, steps=steps, progress=progress, **options)
 
-        record = {"job": "reconstruct", "steps": steps, "epsilon": epsilon, **options}
-        _run(slices, out, prior, reading, compute, record, overwrite)
+        more = {"example": None if example is None else str(example), **options}
+        record = {"job": "reconstruct", "steps": steps, **more}
+        _run(slices, out, prior, reading, compute, record, overwrite=overwrite, flows=FLOWS if stiffness is None else 1)
+
+
+def _inferred(example: Field | None, progress: Progress) -> Inference:
+    """Return what an example's mask says of its law, without a twin."""
+    from curvafit.inference.infer import infer
+
+    return infer(example, kind="mask", fast=True, progress=progress)  # type: ignore[arg-type]
 
 
 def _run(
     source: str,
     out: Path,
-    prior: str,
+    prior: str | None,
     reading: dict[str, Any],
     compute: Callable[[Field, Progress], Segmentation],
     record: dict[str, Any],
+    *,
     overwrite: bool,
+    flows: int = 1,
 ) -> None:
     """Check, read, compute, write and print."""
     from curvafit.priors.coefficients import preset_name
@@ -149,15 +178,16 @@ def _run(
     from curvafit.volumes.scan import load
 
     law_file = None if preset_name(prior) else prior
-    inputs = [each for each in (source, law_file, record.get("probability")) if each is not None]
+    inputs = [each for each in (source, law_file, record.get("probability"), record.get("example")) if each is not None]
     check_mask_target(out, inputs=inputs, overwrite=overwrite)
-    texture_of(prior)
+    if prior is not None:
+        texture_of(prior)
     with stages() as progress:
         progress("reading", 0.0)
         volume = load(source, **reading)
         check_mask_target(out, volume.unit, overwrite=overwrite)
         working = WorkingGrid.of(volume, record["epsilon"])
-        say_forecast(record["job"], working.grid.shape, record["steps"], SEGMENTATION, what="working voxels")
+        say_forecast(record["job"], working.grid.shape, flows * record["steps"], SEGMENTATION, what="working voxels")
         result = compute(volume, progress)
         progress("writing", 1.0)
         content = {"command": command_line(), "prior": prior, **record}

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, Self
 
 import torch
 from torch import Tensor
 
-from curvafit.priors.bounds import quoted
+from curvafit.priors.bounds import quoted, real
 from curvafit.priors.grid import Grid
 from curvafit.priors.shapes import Float
 
@@ -40,7 +40,7 @@ class _OfVoxels:
 
     def to(self, device: torch.device | str, /) -> Self:
         """Return the same term on a device."""
-        return type(self)(self.ratio.to(device))
+        return replace(self, ratio=self.ratio.to(device))
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,25 +72,35 @@ class Evidence(_OfVoxels):
 
 @dataclass(frozen=True, eq=False)
 class Hinge(_OfVoxels):
-    """D(u) = V Σ |r| (1 - sign(r) u)₊² / 4, which holds u at ±1 or beyond on the side of r's sign.
+    """D(u) = V Σ |r| (m - sign(r) u)₊² / 4, which holds u at ±m or beyond on the side of r's sign.
 
-    The term is for voxels whose side is known: no force where u is on that side, a spring where it is not. An error of
-    2 costs |r| times the voxel's volume.
+    The term is for voxels whose side is known: no force where u is on that side, a spring where it is not. At a margin
+    of 1 an error of 2 costs |r| times the voxel's volume, but a profile that crosses the known voxels is squeezed: with
+    the margin of a voxel next to the surface (`priors.profile.optimal_profile`) it is free.
 
     Parameters
     ----------
     ratio
         r, `(Z, Y, X)`, finite; 0 where nothing is known.
+    margin
+        m, from 0 to 1.
 
     Raises
     ------
     ValueError
-        If the ratio is not a finite 3D tensor.
+        If the ratio is not a finite 3D tensor, or the margin is out of range.
     """
+
+    margin: float = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "margin", real(self.margin, "a margin from 0 to 1", 0, 1))
 
     def slope(self, u: Float[Tensor, "z y x"], grid: Grid, /) -> tuple[float, Float[Tensor, "z y x"]]:
         """Return D(u) and the gradient of D."""
         r = self.ratio.to(u.dtype)
-        short, size = (1 - r.sign() * u).clamp_min(0), r.abs()
-        value = float((size * short * short).sum(dtype=torch.float64)) * grid.voxel_volume / 4
-        return value, r * short * (-0.5 * grid.voxel_volume)
+        short = (self.margin - r.sign() * u).clamp_min(0)
+        pull = r * short
+        value = float((pull.abs() * short).sum(dtype=torch.float64)) * grid.voxel_volume / 4
+        return value, pull * (-0.5 * grid.voxel_volume)

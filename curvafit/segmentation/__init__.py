@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING
 from curvafit.faces import offer
 
 if TYPE_CHECKING:
-    from curvafit.segmentation.segment import Segmentation, reconstruct, segment
+    from curvafit.segmentation.completion import reconstruct
+    from curvafit.segmentation.result import Segmentation
+    from curvafit.segmentation.segment import segment
 
 __all__ = [
     "Segmentation",
@@ -16,8 +18,8 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Segmentation": "curvafit.segmentation.segment",
-    "reconstruct": "curvafit.segmentation.segment",
+    "Segmentation": "curvafit.segmentation.result",
+    "reconstruct": "curvafit.segmentation.completion",
     "segment": "curvafit.segmentation.segment",
 }
 

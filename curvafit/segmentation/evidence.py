@@ -1,22 +1,20 @@
-"""Evidence of the inside in a scan, a probability map or a few slices, and a first guess of the surface."""
+"""Evidence of the inside in a scan or a probability map, and a first guess of the surface."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
 from scipy import ndimage
-from scipy.interpolate import CubicSpline
 from skimage.filters import threshold_otsu
 
 from curvafit.units import METRES
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.part import Crop
 
-__all__ = ["VoxelEvidence", "cropped_map", "interpolated_distance", "of_intensities", "of_probability"]
+__all__ = ["VoxelEvidence", "cropped_map", "of_intensities", "of_probability"]
 
 #: Percentiles to which grey levels are clipped for Otsu's threshold.
 TAILS = (0.1, 99.9)
@@ -127,29 +125,6 @@ def _check_place(other: Field, scan: Field) -> None:
     far = float(np.linalg.norm(factor * two - one, axis=1).max()) / min(scan.spacing)
     if not far < ASTRAY:
         raise ScanError(f"expected a probability map with the scan's affine, got one {far:.3g} voxels away")
-
-
-def interpolated_distance(
-    slices: np.ndarray, places: Sequence[int], length: int, spacing: Sequence[float]
-) -> np.ndarray:
-    """Return the signed distance (length, Y, X) between known masks (N, Y, X) at `places` along the first axis.
-
-    At a mask it is the distance within the plane, positive inside; between masks the natural cubic spline (a line for
-    two masks); before the first and beyond the last the value of the nearest. An empty mask has minus the largest gap
-    between slices, a full one plus this gap.
-    """
-    gap = float(np.diff(places).max()) * spacing[0]
-    distances = np.stack([_plane_distance(mask, spacing[1:], gap) for mask in slices])
-    where = np.arange(length).clip(places[0], places[-1])
-    return CubicSpline(places, distances, bc_type="natural")(where).astype(np.float32)
-
-
-def _plane_distance(mask: np.ndarray, spacing: Sequence[float], gap: float) -> np.ndarray:
-    if not mask.any() or mask.all():
-        return np.full(mask.shape, gap if mask.any() else -gap)
-    inner, outer = (np.asarray(ndimage.distance_transform_edt(side, sampling=spacing)) for side in (mask, ~mask))
-    half = min(spacing) / 2
-    return np.where(mask, inner - half, half - outer)
 
 
 def _smoothed(values: np.ndarray, scan: Field, width: float) -> np.ndarray:

@@ -16,7 +16,7 @@ from curvafit.drawing.plot import DPI
 from curvafit.drawing.sections import section_figure
 from curvafit.drawing.shape_files import beside, check_outputs
 from curvafit.files import move_together, staged
-from curvafit.segmentation.segment import Segmentation
+from curvafit.segmentation.result import Segmentation
 from curvafit.volumes.formats import pick_writer
 from curvafit.volumes.formats.nifti import write_nifti_like
 from curvafit.volumes.scan import Field, save
@@ -114,7 +114,7 @@ def _record(segmentation: Segmentation, scan: Field, more: dict[str, Any]) -> di
         "shape": list(scan.shape),
         "spacing": list(scan.spacing),
         "unit": scan.unit,
-        "coefficients": segmentation.coefficients.as_dict(),
+        "coefficients": None if segmentation.coefficients is None else segmentation.coefficients.as_dict(),
         "epsilon": segmentation.epsilon,
         "weight": segmentation.weight,
         "volume_fraction": float(segmentation.mask.values.mean()),

@@ -3,21 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from os import PathLike
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from curvafit.priors.bounds import LONGEST, SHORTEST, instance, real
 from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.grid import WORKING_EPSILON, Grid
+from curvafit.priors.fit_file import fit_bytes, parse_fit, six_of
+from curvafit.priors.fit_schema import FIT_SCHEMA
+from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.priors.law import Law, texture_of
 from curvafit.priors.loss import RESOLVED, upsampling
 from curvafit.priors.refined import refined
 from curvafit.units import METRES
 from curvafit.volumes.scan import Field, ScanError
 
-__all__ = ["Law", "WorkingGrid", "law_of"]
+__all__ = ["Law", "WorkingGrid", "law_of", "laws_of"]
+
+
+#: Candidates of a fit that are laws of their own: the nearest match's destroys.
+TRUSTED = ("optimum", "posterior")
 
 
 def law_of(prior: Law, scan: Field) -> tuple[Coefficients, tuple[str, ...]]:
@@ -44,28 +52,57 @@ def law_of(prior: Law, scan: Field) -> tuple[Coefficients, tuple[str, ...]]:
     return law, () if texture.unit == scan.unit else (note,)
 
 
+def laws_of(prior: Law, scan: Field) -> tuple[tuple[Coefficients, ...], tuple[str, ...]]:
+    """Return the laws that a prior trusts, with lengths in the scan's unit, and sentences on their origin.
+
+    The first is that of `law_of`. A fit has others, which were read from the same descriptors (`TRUSTED`).
+    """
+    law, notes = law_of(prior, scan)
+    fitted = texture_of(prior).prior
+    if fitted is None:
+        return (law,), notes
+    scale = WORKING_SPACING / fitted.working_voxel
+    others = (each for each in _candidates(prior) if each != fitted.coefficients)
+    priors = (fitted._replace(coefficients=each, physical=each.in_unit(scale)) for each in others)
+    return (law, *(law_of(each, scan)[0] for each in priors)), notes
+
+
+def _candidates(prior: Law) -> list[Coefficients]:
+    """Return the trusted candidates of a fit or its file, in working units; none of a law without candidates."""
+    if isinstance(prior, (str, PathLike)):
+        rows = parse_fit(fit_bytes(prior), prior, FIT_SCHEMA).get("candidates", ())
+        return [six_of(row["coefficients"]) for row in rows if row["name"] in TRUSTED]
+    candidates = getattr(getattr(prior, "fit", prior), "candidates", ())
+    return [each.coefficients for each in candidates if each.name in TRUSTED]
+
+
 @dataclass(frozen=True)
 class WorkingGrid:
-    """The grid of a flow: working units, and axes refined until ε spans two voxels.
+    """The grid of a flow: working units, axes refined until ε spans two voxels, and a halo without data.
 
     Attributes
     ----------
     grid
-        The grid in working units; the boundary replicates.
+        The grid in working units, halo included; the boundary replicates, unless the scan repeats.
     times
         The number of parts of a scan voxel along each axis.
     unit, epsilon
         A working length of 1, and ε, in the scan's unit.
+    halo
+        Voxels of the grid around the scan on each side.
     """
 
     grid: Grid
     times: tuple[int, int, int]
     unit: float
     epsilon: float
+    halo: int = 0
 
     @classmethod
-    def of(cls, scan: Field, epsilon: float | None) -> WorkingGrid:
+    def of(cls, scan: Field, epsilon: float | None, *, halo: int = 0, periodic: bool = False) -> WorkingGrid:
         """Return the working grid of a scan; ε is twice the smallest voxel edge by default.
+
+        A scan that repeats has no halo.
 
         Raises
         ------
@@ -77,9 +114,11 @@ class WorkingGrid:
         if min(scan.shape) < 4:
             raise ScanError(f"expected at least 4 voxels along each axis, got {scan.shape}")
         times, unit = upsampling(scan.spacing, ε), ε / WORKING_EPSILON
-        shape = tuple(n * t for n, t in zip(scan.shape, times, strict=True))
+        halo = 0 if periodic else halo
+        shape = tuple(n * t + 2 * halo for n, t in zip(scan.shape, times, strict=True))
         spacing = tuple(h / t / unit for h, t in zip(scan.spacing, times, strict=True))
-        return cls(Grid(shape, spacing, "replicate"), times, unit, ε)  # type: ignore[arg-type]
+        grid = Grid(shape, spacing, "periodic" if periodic else "replicate")  # type: ignore[arg-type]
+        return cls(grid, times, unit, ε, halo)  # type: ignore[arg-type]
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -90,14 +129,16 @@ class WorkingGrid:
         return (f"ε spans fewer than 2 voxels on some axes: the flow ran on a grid refined {axes}.",)
 
     def finer(self, values: np.ndarray) -> Tensor:
-        """Return a smooth volume interpolated to the flow's grid."""
+        """Return a smooth volume interpolated to the flow's grid, and continued into the halo by its last values."""
         u = torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
         for axis, n in enumerate(self.times):
             u = refined(u, axis, n)
-        return u
+        return pad(u[None, None], (self.halo,) * 6, mode="replicate")[0, 0]
 
     def spread(self, values: np.ndarray, centre: int | None = None) -> Tensor:
-        """Return the evidence of voxels shared among their parts; along axis `centre` only the middle parts get it."""
+        """Return the evidence of voxels shared among their parts, none in the halo; along axis `centre` only the middle
+        parts get it.
+        """
         u = torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
         for axis, n in enumerate(self.times):
             share = torch.full((n,), 1 / n)
@@ -105,10 +146,12 @@ class WorkingGrid:
                 share = (torch.arange(n) - (n - 1) / 2).abs().lt(1).float()
             u = u.unsqueeze(axis + 1) * share.reshape(-1, *(1,) * (2 - axis))
             u = u.flatten(axis, axis + 1)
-        return u
+        return pad(u, (self.halo,) * 6)
 
     def back(self, u: Tensor) -> np.ndarray:
-        """Return the mean of each scan voxel's parts."""
+        """Return the mean of each scan voxel's parts, without the halo."""
+        for axis in range(3):
+            u = u.narrow(axis, self.halo, u.shape[axis] - 2 * self.halo)
         for axis, n in enumerate(self.times):
             u = u.unflatten(axis, (-1, n)).mean(axis + 1)
         return u.numpy()

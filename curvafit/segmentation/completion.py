@@ -1,0 +1,218 @@
+"""A volume between known slices: plain interpolation, or F_ε lowered from there with the slices held."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from curvafit.generation import data
+from curvafit.priors.bounds import real, whole
+from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
+from curvafit.progress import Progress, silent
+from curvafit.segmentation.calibration import Choice, Setting, Task, choice, left_out
+from curvafit.segmentation.engine import HALO, completed
+from curvafit.segmentation.result import Segmentation, ending, result_of
+from curvafit.segmentation.slices import Slices
+from curvafit.segmentation.working import Law, WorkingGrid, laws_of
+from curvafit.units import sampling
+from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.source import Source, field_of
+
+__all__ = ["STEPS", "reconstruct"]
+
+#: Default steps of Adam.
+STEPS = 400
+#: Stiffness of the springs on known voxels, in working units: a tenth of it gives way, ten times as much stalls.
+STIFFNESS = 1e7
+#: Margin of the springs: u of the optimal profile half a voxel from the surface, as known voxels next to it are.
+MARGIN = math.tanh(WORKING_SPACING / 2 / (math.sqrt(2) * WORKING_EPSILON))
+#: Least and greatest stiffness.
+STIFFEST = (1e-9, 1e12)
+#: Most values of known slices; more are grey levels.
+LABELS = 256
+#: Share by which the voxels of two files may differ in size.
+SAME = 1e-3
+
+
+def reconstruct(
+    slices: Source,
+    prior: Law,
+    *,
+    every: int | None = None,
+    first: int = 0,
+    known: Sequence[int] | None = None,
+    axis: int = 0,
+    example: Source | None = None,
+    stiffness: float | None = None,
+    periodic: bool = False,
+    epsilon: float | None = None,
+    steps: int = STEPS,
+    progress: Progress = silent,
+    **reading: Any,
+) -> Segmentation:
+    """Fill a volume between known slices: lower F_ε from a spline if that is better than plain interpolation.
+
+    What is better is tried out on an example that is degraded as the volume is, or else on every second known slice,
+    which the others predict. The known slices stay as they are. Where the volume ends, the surface goes on freely.
+
+    Parameters
+    ----------
+    slices
+        A mask, or labels, of the whole volume's shape, positive inside, as a path, a `Field`, an array or a tensor;
+        only the known slices count.
+    prior
+        As in `segment`. Each law that a fit trusts is tried.
+    every, first
+        Slices `first`, `first + every`, … along `axis` are known. The volume is extrapolated before the first known
+        slice and beyond the last.
+    known
+        The numbers of the known slices, two or more, in place of `every` and `first`.
+    axis
+        The axis of the array, 0, 1 or 2, that is z, y or x.
+    example
+        A mask of another volume of the same kind, known whole. A file or an array has the slices' `spacing` and `unit`.
+    stiffness
+        Stiffness of the springs on known voxels, in working units: nothing is tried out, and the first law is lowered
+        from the spline.
+    periodic
+        Whether the volume repeats, as generated ones do.
+    epsilon, steps, progress, reading
+        As in `segment`.
+
+    Raises
+    ------
+    ValueError
+        As `segment`; or if fewer than two slices are known, or too few to try the prior out on and there is neither an
+        example nor a stiffness; or if known slices are all empty, all full or grey levels, or the example's spacing is
+        another one.
+    FileNotFoundError
+        If there is no such `fit.json`.
+    """
+    volume = field_of(slices, **reading)
+    axis = whole(axis, "an axis 0, 1 or 2 (z, y, x)", 0, 2)
+    places = _places(volume.shape[axis], every, first, known)
+    target = _slices(volume, places, axis, periodic)
+    place = WorkingGrid.of(target.frame, epsilon, halo=HALO, periodic=periodic)
+    if stiffness is not None:
+        stiffness = real(stiffness, "a positive stiffness", *STIFFEST)
+    other = None if example is None else _like(example, volume, reading)
+    laws, notes = laws_of(prior, volume)
+    settings = [Setting("spline", law, STIFFNESS if stiffness is None else stiffness, steps) for law in laws]
+
+    def fill(slices: Slices, setting: Setting) -> np.ndarray:
+        return _filled(slices, setting, epsilon, lambda _, share: progress("trying the prior out", share))[0]
+
+    chosen, tried = settings[0], ""
+    if stiffness is None:
+        tasks = left_out(target) if other is None else _example(other, places, axis)
+        if tasks is None:
+            raise ScanError(
+                "expected three or more known slices with voxels inside and outside, an example or a stiffness, got "
+                f"{len(places)} slices"
+            )
+        best = choice(tasks, settings, fill)
+        chosen, tried = best.setting, _gain(best, "left out" if other is None else "of the example")
+    mask, u, end = _filled(target, chosen, epsilon, progress)
+    notes = (*notes, *_known(places, volume.shape[axis]), *place.notes)
+    mask, u = (np.ascontiguousarray(np.moveaxis(each, 0, axis)) for each in (mask, u))
+    status = f"{tried}{end}"
+    return result_of(volume, mask, u, weight=None, law=chosen.law, epsilon=place.epsilon, status=status, notes=notes)
+
+
+def _filled(
+    slices: Slices, setting: Setting, epsilon: float | None, progress: Progress
+) -> tuple[np.ndarray, np.ndarray, str]:
+    """Return the mask and the phase field of a volume that a setting fills, and how its flow ended."""
+    place = WorkingGrid.of(slices.frame, epsilon, halo=HALO, periodic=slices.periodic)
+    level, held = slices.level(setting.way), list(slices.places)
+    if setting.law is None:
+        u = np.tanh(level / (math.sqrt(2) * place.epsilon))
+        return level > 0, u, f"{100 * float((u > 0).mean()):.2f} % of the volume is inside"
+    pull = np.zeros(level.shape, dtype=np.float32)
+    pull[held] = np.where(slices.inside, setting.stiffness, -setting.stiffness)
+    flow = completed(
+        level, setting.law, data.Hinge(place.spread(pull, centre=0), MARGIN), place, setting.steps, progress
+    )
+    u = place.back(flow.field)
+    mask = u > 0
+    mask[held] = slices.inside
+    return mask, u, ending(flow, mask)
+
+
+def _gain(best: Choice, where: str) -> str:
+    """Return what a calibration found, as the beginning of a sentence."""
+    way = best.setting.way
+    if best.setting.law is None:
+        return f"no prior helps here: Dice {best.plain:.3f} on slices {where} by {way}, {best.dice:.3f} with a prior; "
+    return f"a prior helps, from {way}: Dice {best.dice:.3f} on slices {where}, {best.plain:.3f} without; "
+
+
+def _slices(volume: Field, places: Sequence[int], axis: int, periodic: bool = False) -> Slices:
+    """Return the known slices of a volume across an axis, which comes first.
+
+    Raises
+    ------
+    ScanError
+        If they are grey levels, or all empty, or all full.
+    """
+    inside = _labels(np.moveaxis(volume.values, axis, 0)[list(places)]) > 0
+    if inside.all() or not inside.any():
+        raise ScanError(
+            f"expected known slices with voxels inside and outside, got {'full' if inside.all() else 'empty'} ones"
+        )
+    edges = [volume.spacing[k] for k in (axis, *(k for k in range(3) if k != axis))]
+    return Slices(inside, tuple(places), volume.shape[axis], (edges[0], edges[1], edges[2]), volume.unit, periodic)
+
+
+def _like(example: Source, volume: Field, reading: dict[str, Any]) -> Field:
+    """Return the example; raise ScanError where its voxels differ in size from the volume's."""
+    placed = {} if isinstance(example, Field) else {name: reading.get(name) for name in ("spacing", "unit")}
+    other = field_of(example, **placed)
+    if other.unit != volume.unit or not np.allclose(other.spacing, volume.spacing, rtol=SAME):
+        one, two = (sampling(each.shape, each.spacing, each.unit) for each in (volume, other))
+        raise ScanError(f"expected an example with the spacing of the slices ({one}), got {two}")
+    return other
+
+
+def _example(example: Field, places: Sequence[int], axis: int) -> Task | None:
+    """Return the task to fill an example between slices that are as far apart as the known ones at most."""
+    gap, length = int(np.diff(places).max()), example.shape[axis]
+    given = range(0, length, gap)
+    if gap < 2 or len(given) < 2:
+        return None
+    between = [n for n in range(given[-1]) if n % gap]
+    truth = _labels(np.moveaxis(example.values, axis, 0)[between]) > 0
+    return Task(_slices(example, given, axis), truth, between)
+
+
+def _places(length: int, every: int | None, first: int, known: Sequence[int] | None) -> list[int]:
+    if (every is None) == (known is None):
+        raise ScanError("expected either every how many slices are known, or their numbers")
+    numbers = [real(n, "whole numbers of slices") for n in ((every, first) if known is None else known)]
+    if not all(math.isfinite(number) and number == int(number) for number in numbers):  # type: ignore[arg-type, operator]
+        raise ScanError(f"expected whole numbers of slices, got {', '.join(map(str, numbers))}")
+    if every is not None and (every < 1 or first < 0):
+        raise ScanError(f"expected every from 1 and first from 0, got {every} and {first}")
+    places = sorted({int(n) for n in (known if known is not None else range(int(first), length, int(every or 1)))})
+    if len(places) < 2 or places[0] < 0 or places[-1] >= length:
+        raise ScanError(f"expected two or more known slices within 0 to {length - 1}, got {places}")
+    return places
+
+
+def _known(places: list[int], length: int) -> tuple[str, ...]:
+    """Return sentences on the number of known slices, and of slices that are extrapolated."""
+    before, beyond = places[0], length - 1 - places[-1]
+    outer = f"The {before} before the first and the {beyond} beyond the last are extrapolated."
+    return f"{len(places)} of {length} slices are known.", *((outer,) if before or beyond else ())
+
+
+def _labels(values: np.ndarray) -> np.ndarray:
+    """Return the values, or raise ScanError where they are grey levels."""
+    if values.dtype.kind == "f" and not np.array_equal(values, np.round(values)):
+        raise ScanError("expected known slices with a mask or labels, got values that are not whole numbers")
+    if values.dtype.itemsize > 1 and (count := len(np.unique(values))) > LABELS:
+        raise ScanError(f"expected known slices with a mask or at most {LABELS} labels, got {count} values")
+    return values

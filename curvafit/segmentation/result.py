@@ -1,0 +1,78 @@
+"""The result of a segmentation, and how its flow ended in words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from curvafit.generation.flow import Flow
+from curvafit.pictures import Pictured
+from curvafit.priors.coefficients import Coefficients
+from curvafit.units import sampling
+from curvafit.volumes.field import Field
+
+__all__ = ["Segmentation", "ending", "result_of"]
+
+#: A flow has settled where its last ten steps lower the energy by less than this share.
+SETTLED = 0.001
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class Segmentation(Pictured):
+    """A mask, with its phase field, its energy and its status.
+
+    Attributes
+    ----------
+    mask, phase
+        The mask, bool, and the phase field u, float32, with the scan's grid, spacing, unit and affine.
+    weight
+        λ, in nats per unit of F_ε; None for a reconstruction from known slices.
+    coefficients, epsilon
+        The coefficients of F_ε and ε, with lengths in the scan's unit; no coefficients where no prior helps.
+    status
+        A sentence: what a prior gained, whether the flow settled, and which share of the volume is inside.
+    notes
+        Sentences on the evidence and on assumptions.
+    """
+
+    mask: Field
+    phase: Field
+    weight: float | None
+    coefficients: Coefficients | None
+    epsilon: float
+    status: str
+    notes: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        mask = self.mask.values
+        count = f"{np.count_nonzero(mask)} inside ({100 * mask.mean():.3g} %)"
+        size = sampling(self.mask.shape, self.mask.spacing, self.mask.unit)
+        return f"Segmentation({size}, {count}: {self.status})"
+
+
+def ending(flow: Flow, mask: np.ndarray) -> str:
+    """Return whether a flow settled, and which share of the volume is inside, as a sentence."""
+    share, energy = float(mask.mean()), flow.history.energy
+    fall = (energy[-2] - energy[-1]) / max(abs(energy[-1]), 1e-30) if len(energy) > 1 else 1.0
+    count, word = int(flow.history.step[-1]), "settled" if abs(fall) < SETTLED else "still moving"
+    length = f"{count} step" if count == 1 else f"{count} steps"
+    if share in (0.0, 1.0):
+        return f"no surface is left after {length}: the prior is too strong for the data, lower its weight"
+    return f"{word} after {length}: {100 * share:.2f} % of the volume is inside"
+
+
+def result_of(
+    scan: Field,
+    mask: np.ndarray,
+    u: np.ndarray,
+    *,
+    weight: float | None,
+    law: Coefficients | None,
+    epsilon: float,
+    status: str,
+    notes: tuple[str, ...],
+) -> Segmentation:
+    """Return the segmentation of a scan from its arrays (Z, Y, X)."""
+    fields = [replace(scan, values=values, source=scan.source, notes=()) for values in (mask, u)]
+    return Segmentation(fields[0], fields[1], weight, law, epsilon, status, (*scan.notes, *notes))
