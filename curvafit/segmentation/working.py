@@ -25,7 +25,7 @@ __all__ = ["Law", "WorkingGrid", "law_of", "laws_of"]
 
 
 #: Candidates of a fit that are laws of their own: the nearest match's destroys.
-TRUSTED = ("optimum", "posterior")
+TRUSTED = ("refined", "posterior", "simulation", "optimum")
 
 
 def law_of(prior: Law, scan: Field) -> tuple[Coefficients, tuple[str, ...]]:
