@@ -126,5 +126,7 @@ def test_familiar_numbers_that_differ_are_named() -> None:
     assert unlike(NUMBERS, (NUMBERS, near)) == unlike(NUMBERS, (near,)) == unlike(NUMBERS, ()) == ""
     far = dataclasses.replace(NUMBERS, thickness_mean=3 * NUMBERS.thickness_mean, connectivity_density=0.0)
     assert unlike(NUMBERS, (NUMBERS, far)) == "Twins over scan: thickness 2.0, connectivity 0.50."
+    pieces = dataclasses.replace(NUMBERS, connectivity_density=-NUMBERS.connectivity_density)
+    assert unlike(NUMBERS, (pieces,)) == "Twins over scan: connectivity of the other sign."
     assert unlike(dataclasses.replace(NUMBERS, thickness_mean=math.nan), (NUMBERS,)) == ""
     assert unlike(dataclasses.replace(NUMBERS, connectivity_density=0.0), (NUMBERS,)) == ""

@@ -52,7 +52,9 @@ def unlike(scan: Morphometry, twins: Sequence[Morphometry]) -> str:
     for word, name in FAMILIAR.items():
         own, others = getattr(scan, name), [getattr(each, name) for each in twins]
         ratio = sum(others) / len(others) / own if others and own else math.nan
-        if abs(ratio - 1) > NEAR:
+        if ratio < 0:
+            apart.append(f"{word} of the other sign")
+        elif abs(ratio - 1) > NEAR:
             apart.append(f"{word} {number(ratio, 2)}")
     return f"Twins over scan: {', '.join(apart)}." if apart else ""
 
