@@ -10,8 +10,8 @@ and the next one goes on; a file for each query and kind holds the answer, named
 program does is not in the name: another state of it wants another folder.
 
 - n: queries; refused: those that `infer` refuses to measure, which do not count below.
-- no twin, no law: the parts with these verdicts. far, strange: the parts whose twins lie beyond `verdict.FURTHEST`
-  seeds' distances, and whose misfit is below `misfit.UNBELIEVABLE`: the two reasons for "no twin".
+- no twin, near, no law: the parts with these verdicts. far, strange: the parts whose twins lie beyond `verdict.CLOSE`
+  seeds' distances, and whose misfit is below `misfit.UNBELIEVABLE`: the two reasons against a law.
 - distance: of the nearest law's twins from the query, over that of two twins: median, 90 and 95 %.
 - p < .05: part of the queries whose misfit is so low. seconds: median.
 """
@@ -34,7 +34,7 @@ from curvafit.inference.candidates import best_of, noise_of
 from curvafit.inference.infer import infer
 from curvafit.inference.misfit import UNBELIEVABLE
 from curvafit.inference.posterior import Posterior, load_posterior
-from curvafit.inference.verdict import FURTHEST
+from curvafit.inference.verdict import CLOSE
 from curvafit.inference.views import crop, degraded
 from curvafit.priors.grid import Grid
 from curvafit.volumes.scan import Field, ScanError
@@ -76,8 +76,9 @@ def figures(answers: list[dict[str, Any]]) -> str:
     told = [each for each in answers if "refused" not in each]
     ratio = np.array([_number(each["distance"]) / _number(each["noise"]) for each in told])
     misfit = np.array([_number(each["misfit"]) for each in told])
-    parts = [_part(each["status"].startswith(f"No {word}") for each in told) for word in ("believable twin", "law")]
-    parts += [_part(ratio > FURTHEST), _part(misfit < UNBELIEVABLE)]
+    begins = ("No believable twin", "Near", "No law")
+    parts = [_part(each["status"].startswith(begin) for each in told) for begin in begins]
+    parts += [_part(ratio > CLOSE), _part(misfit < UNBELIEVABLE)]
     known = ratio[np.isfinite(ratio)]
     quantiles = np.quantile(known, (0.5, 0.9, 0.95)) if len(known) else np.full(3, np.nan)
     seconds = np.median([each["seconds"] for each in told]) if told else np.nan
@@ -117,7 +118,7 @@ def main() -> None:
         if not path.exists() and time.monotonic() < end:
             path.parent.mkdir(parents=True, exist_ok=True)
             write_content(path, json.dumps(answer(store.field(index), kind, posterior, index), indent=1))
-    columns = ("no twin", "no law", "far", "strange", "distance", "90 %", "95 %", "p < .05", "seconds")
+    columns = ("no twin", "near", "no law", "far", "strange", "distance", "90 %", "95 %", "p < .05", "seconds")
     print(f"{'kind':6} {'n':>4} {'refused':>7} " + " ".join(f"{each:>7}" for each in columns))
     for kind in kinds:
         answers = [json.loads(path.read_text()) for (_, of), path in paths.items() if of == kind and path.exists()]

@@ -167,5 +167,5 @@ def test_false_alarms_are_counted_among_what_was_measured() -> None:
     alarm = {"status": "No believable twin: far.", "distance": 3.0, "noise": 1.0, "misfit": 0.2, "seconds": 10.0}
     good = {"status": "Supported (match).", "distance": 1.0, "noise": 1.0, "misfit": 0.03, "seconds": 20.0}
     row = figures([alarm, good, {"refused": "too thin"}]).split()
-    assert row[:6] == ["3", "1", "0.50", "0.00", "0.50", "0.00"]
-    assert row[6] == "2.00" and row[9:] == ["0.50", "15"]
+    assert row[:7] == ["3", "1", "0.50", "0.00", "0.00", "0.50", "0.00"]
+    assert row[7] == "2.00" and row[10:] == ["0.50", "15"]

@@ -14,7 +14,7 @@ from curvafit.geometry.diagram import Diagram
 from curvafit.inference.candidates import Candidate, best_of, noise_of
 from curvafit.inference.misfit import UNBELIEVABLE, Misfit
 from curvafit.inference.twins import Twin
-from curvafit.inference.verdict import FURTHEST, unlike, verdict
+from curvafit.inference.verdict import CLOSE, FURTHEST, unlike, verdict
 from curvafit.priors.coefficients import Coefficients
 
 LAW = Coefficients(1, 2, 6, -40, -40, 400)
@@ -83,41 +83,59 @@ def test_a_candidate_comes_back_from_its_json() -> None:
 
 def test_without_growing_the_first_is_named_and_not_checked() -> None:
     said = "Nothing was grown to check the law (--fast)."
-    assert verdict((law("optimum"), law("match")), None, fast=True) == ("optimum", said)
+    assert verdict((law("optimum"), law("match")), None, NUMBERS, fast=True) == ("optimum", said)
     unusual = "The model does not make such descriptors (p = 0.0010); the strangest: depths, gaps."
-    assert verdict((law("optimum"),), ODD, fast=True) == ("optimum", f"{unusual} {said}")
+    assert verdict((law("optimum"),), ODD, NUMBERS, fast=True) == ("optimum", f"{unusual} {said}")
 
 
 def test_where_nothing_grew_there_is_no_law() -> None:
     why = "No shape grew: the field is of one phase."
-    name, status = verdict((law("posterior", status=why), law("match")), USUAL)
+    name, status = verdict((law("posterior", status=why), law("match")), USUAL, NUMBERS)
     assert name is None and status == f"No law: nothing grew from any candidate. {why}"
 
 
 def test_the_nearest_is_supported_where_its_twins_are_near() -> None:
     usual = "The scan's descriptors are of a kind that the model makes (p = 0.40)."
     near = "Supported (nearest match): its twins lie 0.9 from the scan's curvature diagram"
-    assert verdict((law("match", 0.9, 0.5),), USUAL) == ("match", f"{near}, 0.5 from each other. {usual}")
-    assert verdict((law("match", 0.9, status="Hm."),), None) == ("match", f"{near}. Hm.")
-    limit = law("match", FURTHEST * 0.5, 0.5)
-    assert verdict((limit,), None)[1].startswith("Supported")
-    assert verdict((limit,), dataclasses.replace(USUAL, probability=UNBELIEVABLE))[1].startswith("Supported")
+    assert verdict((law("match", 0.9, 0.5),), USUAL, NUMBERS) == ("match", f"{near}, 0.5 from each other. {usual}")
+    assert verdict((law("match", 0.9, status="Hm."),), None, NUMBERS) == ("match", f"{near}. Hm.")
+    limit = law("match", CLOSE * 0.5, 0.5)
+    assert verdict((limit,), None, NUMBERS)[1].startswith("Supported")
+    assert verdict((limit,), dataclasses.replace(USUAL, probability=UNBELIEVABLE), NUMBERS)[1].startswith("Supported")
+
+
+def test_twins_with_the_scans_familiar_numbers_are_near() -> None:
+    near = dataclasses.replace(law("match", 1.1, 0.5), twins=(NUMBERS, NUMBERS))
+    name, status = verdict((near,), USUAL, NUMBERS)
+    assert name == "match"
+    assert status.startswith("Near (nearest match): its twins lie 1.1 from the scan's curvature diagram, 0.5 from each")
+    thick = dataclasses.replace(NUMBERS, thickness_mean=1.5 * NUMBERS.thickness_mean)
+    _, status = verdict((dataclasses.replace(near, twins=(thick,)),), USUAL, NUMBERS)
+    assert status.startswith("No believable twin: ") and status.endswith("Twins over scan: thickness 1.5.")
+    close = dataclasses.replace(near, distance=0.9, twins=(thick,))
+    _, status = verdict((close,), USUAL, NUMBERS)
+    assert status.startswith("Supported") and "Twins over scan: thickness 1.5." in status
 
 
 def test_a_far_or_strange_one_is_named_but_not_believed() -> None:
-    far = "No believable twin: of the nearest law (nearest of the simulations), its twins lie 2.1 from the scan's"
+    far = "No believable twin: of the nearest law (nearest of the simulations), its twins lie 2.6 from the scan's"
     said = f"{far} curvature diagram, 0.5 from each other. Twins should lie some 0.5 from it."
-    assert verdict((law("simulation", 2.1, 0.5), law("match", 9.0)), USUAL) == ("simulation", said)
-    name, status = verdict((law("simulation", 0.1, 0.5),), ODD)
+    assert verdict((law("simulation", 1.04 * FURTHEST * 0.5, 0.5), law("match", 9.0)), USUAL, NUMBERS) == (
+        "simulation",
+        said,
+    )
+    name, status = verdict((law("simulation", 0.1, 0.5),), ODD, NUMBERS)
     assert name == "simulation" and status.startswith("No believable twin: ")
     assert status.endswith(
         "0.5 from each other. The model does not make such descriptors (p = 0.0010); the strangest: depths, gaps."
     )
     single = dataclasses.replace(ODD, blocks={"gaps": 0.3})
-    assert verdict((law("simulation", 0.1),), single)[1].endswith("(p = 0.0010); the strangest: none by itself.")
+    assert verdict((law("simulation", 0.1),), single, NUMBERS)[1].endswith(
+        "(p = 0.0010); the strangest: none by itself."
+    )
     aligned = dataclasses.replace(ODD, blocks={"fabric": 0.001})
     direction = "The scan has a direction (fabric), and the model has none."
-    assert verdict((law("simulation", 0.1),), aligned)[1].endswith(direction)
+    assert verdict((law("simulation", 0.1),), aligned, NUMBERS)[1].endswith(direction)
 
 
 def test_familiar_numbers_that_differ_are_named() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import datetime
 import platform
 from collections.abc import Callable
@@ -17,7 +16,7 @@ import torch
 from curvafit.generation.schedule import schedule
 from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram
 from curvafit.geometry.family import family_of
-from curvafit.geometry.morphometry import morphometry
+from curvafit.geometry.morphometry import Morphometry, morphometry
 from curvafit.inference.atlas import Atlas, load_atlas
 from curvafit.inference.candidates import TITLES, Candidate, best_of
 from curvafit.inference.estimate import Estimate, estimate
@@ -31,7 +30,7 @@ from curvafit.inference.prepare import HALF, Prepared, prepare
 from curvafit.inference.stationarity import is_rounded, stationarity
 from curvafit.inference.texture import NOISE, untextured
 from curvafit.inference.twins import Twin, twin
-from curvafit.inference.verdict import unlike, verdict
+from curvafit.inference.verdict import verdict
 from curvafit.pictures import Pictured
 from curvafit.priors.bounds import SEEDS, instance, whole
 from curvafit.priors.coefficients import Coefficients
@@ -169,21 +168,22 @@ def infer(
         watch(prepared)
     progress("measuring curvature", 0.05)
     measured = None if prepared.noise else scan_diagram(prepared)
+    numbers = morphometry(prepared.mask, prepared.working_voxel, prepared.unit, periodic=prepared.grid.periodic)
     provenance = _provenance(volume, atlas, posterior, seed)
     reason = NOISE if measured is None else untextured(prepared, measured)
     if measured is None or reason:
-        return Inference(volume, prepared, measured, {}, _fit(prepared, measured, provenance, reason))
+        return Inference(volume, prepared, measured, {}, _fit(prepared, measured, numbers, provenance, reason))
     estimated = estimate(prepared, posterior, seed=seed, fast=fast, progress=_part(progress, 0.1, 0.5))
     progress("searching the atlas", 0.5)
     matches = _matches(prepared, measured, atlas)
     laws = _laws(prepared, estimated, matches, seed, _part(progress, 0.5, 0.6))
     laws, twins = (laws, {}) if fast else _grown(laws, measured, prepared, seed, _part(progress, 0.6, 1.0))
-    chosen, status = verdict(laws, None if estimated is None else estimated.misfit, fast=fast)
+    chosen, status = verdict(laws, None if estimated is None else estimated.misfit, numbers, fast=fast)
     law = next((each.coefficients for each in laws if each.name == chosen), None)
     moved = None if law is None else drift(*_window(prepared), WORKING_EPSILON, law)
     known = {} if estimated is None else estimated.parts
     fit = _fit(
-        prepared, measured, provenance, status,
+        prepared, measured, numbers, provenance, status,
         candidates=laws, chosen=chosen, matches=matches, drift=moved, **known,
     )  # fmt: skip
     progress("done", 1.0)
@@ -252,24 +252,29 @@ def _grown(
     return laws, twins
 
 
-def _fit(prepared: Prepared, measured: Diagram | None, provenance: dict[str, Any], status: str, **parts: Any) -> Fit:
+def _fit(
+    prepared: Prepared,
+    measured: Diagram | None,
+    numbers: Morphometry,
+    provenance: dict[str, Any],
+    status: str,
+    **parts: Any,
+) -> Fit:
     """Return a fit of its parts: no candidates, no law and no posterior where they are not given."""
     grid = prepared.grid
-    fit = Fit(
+    return Fit(
         kind=prepared.kind,
         family="noise" if measured is None else family_of(measured, prepared.thickness / 2 * grid.spacing[0]),
         scale=prepared.scale,
         working_voxel=prepared.working_voxel,
         length_unit=prepared.unit,
         status=status,
-        morphometry=morphometry(prepared.mask, prepared.working_voxel, prepared.unit, periodic=grid.periodic),
+        morphometry=numbers,
         notes=prepared.notes,
         provenance=provenance,
         diagram=None if measured is None else measured.thinned(BIN_WIDTH, TAIL_SHARE),
         **_BARE | parts,
     )
-    ratios = "" if fit.best is None else unlike(fit.morphometry, fit.best.twins)
-    return dataclasses.replace(fit, status=f"{status} {ratios}".strip())
 
 
 def _provenance(volume: Field, atlas: Atlas, posterior: Posterior, seed: int) -> dict[str, Any]:

@@ -10,16 +10,19 @@ from curvafit.inference.candidates import TITLES, Candidate, best_of, noise_of
 from curvafit.inference.misfit import UNBELIEVABLE, Misfit
 from curvafit.units import number
 
-#: Twins that lie further from the scan than this many seeds' distances are no twins. True laws' twins lie one away;
-#: of a badly degraded scan, some 1.8.
-FURTHEST = 2.0
+#: Twins within this many seeds' distances of the scan support their law: true laws' twins lie one away, of a badly
+#: degraded scan some 1.8. Twins within `FURTHEST` whose familiar numbers are the scan's are near; others are no twins.
+CLOSE, FURTHEST = 2.0, 5.0
 #: Familiar numbers in which twins may differ from the scan, and the part by which they may without being named.
 FAMILIAR = {"thickness": "thickness_mean", "spacing": "spacing_mean", "connectivity": "connectivity_density"}
 NEAR = 0.15
 
 
-def verdict(candidates: Sequence[Candidate], misfit: Misfit | None, *, fast: bool = False) -> tuple[str | None, str]:
-    """Return the name of the best supported law and the verdict; no name where nothing grew.
+def verdict(
+    candidates: Sequence[Candidate], misfit: Misfit | None, scan: Morphometry, *, fast: bool = False
+) -> tuple[str | None, str]:
+    """Return the name of the best supported law and the verdict on a scan of these familiar numbers; no name where
+    nothing grew.
 
     A law that is not believable is still named: it is the nearest that there is, and the verdict says that it is not
     the scan's.
@@ -33,12 +36,15 @@ def verdict(candidates: Sequence[Candidate], misfit: Misfit | None, *, fast: boo
     title = TITLES[best.name]
     apart = f"its twins lie {best.distance:.1f} from the scan's curvature diagram"
     apart += f", {noise:.1f} from each other." if noise else "."
-    far = noise is not None and best.distance > FURTHEST * noise
+    ratio, familiar = 0.0 if not noise else best.distance / noise, unlike(scan, best.twins)
     strange = misfit is not None and misfit.probability < UNBELIEVABLE
-    if far or strange:
+    if strange or ratio > FURTHEST or (ratio > CLOSE and familiar):
         reason = _unusual(misfit) if strange else f"Twins should lie some {noise:.1f} from it."
-        return best.name, _joined(f"No believable twin: of the nearest law ({title}), {apart}", reason)
-    return best.name, _joined(f"Supported ({title}): {apart}", _unusual(misfit), best.status)
+        return best.name, _joined(f"No believable twin: of the nearest law ({title}), {apart}", reason, familiar)
+    if ratio > CLOSE:
+        alike = "They have its thickness, spacing and connectivity, and another law may come nearer."
+        return best.name, _joined(f"Near ({title}): {apart}", alike, _unusual(misfit), best.status)
+    return best.name, _joined(f"Supported ({title}): {apart}", _unusual(misfit), familiar, best.status)
 
 
 def _joined(*sentences: str) -> str:
