@@ -40,7 +40,23 @@ def test_blur_and_noise_are_read_from_grey_levels(blur: float, noise: float) -> 
     assert imaging.blur == pytest.approx(blur, abs=0.5)  # a step of those tried, and a mask's own stairs
     assert imaging.noise == pytest.approx(noise, rel=0.15, abs=0.01)
     assert imaging.degraded == (noise > 0.2)
-    assert imaging.grain < 0.5  # white noise has none
+    assert imaging.grain <= 0.6  # white noise has none; a blur of 1.5 reaches into what lies deep
+    assert abs(imaging.fat) <= 0.5  # stairs
+
+
+def test_what_smoothing_leaves_of_white_noise() -> None:
+    assert Imaging(0.5, 1.0, 0.0, 0.0, CUBIC).smoothed == pytest.approx((2 * np.sqrt(np.pi)) ** -1.5, rel=1e-3)
+    levels = np.random.default_rng(0).standard_normal((48, 96, 96))
+    smooth = ndimage.gaussian_filter(levels, (0.5, 1.0, 1.0))
+    assert Imaging(0.5, 1.0, 0.0, 0.0, (2.0, 1.0, 1.0)).smoothed == pytest.approx(smooth.std(), rel=0.05)
+
+
+@pytest.mark.parametrize("spacing", [CUBIC, (2.0, 1.0, 1.0)])
+def test_noise_is_read_on_slices_that_are_thicker(spacing: tuple[float, float, float]) -> None:
+    mask = bodies()[:: int(spacing[0])]
+    imaging = imaging_of(image(mask, 0.7, 0.2), mask, spacing)
+    assert imaging.noise == pytest.approx(0.2, rel=0.15)
+    assert imaging.grain <= 0.5
 
 
 @pytest.mark.parametrize("grain", [0.7, 1.2])
@@ -53,6 +69,17 @@ def test_noise_that_neighbours_share_is_read_with_its_grain(grain: float) -> Non
     assert imaging.grain == pytest.approx(grain, rel=0.25)
 
 
+@pytest.mark.parametrize("fat", [1, 2])
+def test_a_mask_that_is_too_fat_is_known_as_such(fat: int) -> None:
+    """And does not lower the contrast, by which the noise would seem too great."""
+    mask = bodies()
+    imaging = imaging_of(image(mask, 1.0, 0.2), ndimage.binary_dilation(mask, iterations=fat), CUBIC)
+    assert imaging.fat == pytest.approx(
+        min(0.8 * fat, 1.5), abs=0.5
+    )  # of faces' neighbours: less than a voxel in the mean
+    assert imaging.noise == pytest.approx(0.2, rel=0.15)
+
+
 def test_thin_structures_have_their_noise_read_from_differences() -> None:
     mask = np.zeros((32, 32, 32), dtype=bool)
     mask[::6] = mask[1::6] = True
@@ -60,29 +87,29 @@ def test_thin_structures_have_their_noise_read_from_differences() -> None:
 
 
 def test_thick_slices_are_worse_than_a_mask() -> None:
-    assert Imaging(0.5, 0.02, 0.003, (2.0, 1.0, 1.0)).degraded
-    assert not Imaging(0.5, 0.02, 0.003, CUBIC).degraded
+    assert Imaging(0.5, 0.02, 0.0, 0.0, (2.0, 1.0, 1.0)).degraded
+    assert not Imaging(0.5, 0.02, 0.0, 0.0, CUBIC).degraded
 
 
 def test_a_sharp_clean_scan_shows_the_shape() -> None:
     mask = bodies()
-    seen = Imaging(0.5, 0.01, 0.0015, CUBIC).seen(mask, CUBIC, 4.0, 0)
+    seen = Imaging(0.5, 0.01, 0.0, 0.0, CUBIC).seen(mask, CUBIC, 4.0, 0)
     beside = np.abs(centre_distance(mask, CUBIC, 3.0, periodic=True)) <= 1.5
     assert np.array_equal(seen[~beside], mask[~beside])
     assert seen.mean() == pytest.approx(mask.mean(), rel=0.05)
 
 
 def test_noise_moves_the_surface_and_seeds_move_it_differently() -> None:
-    mask, noisy = bodies(), Imaging(1.0, 0.4, 0.06, CUBIC)
+    mask, noisy = bodies(), Imaging(1.0, 0.4, 0.0, 0.0, CUBIC)
     first, second = (noisy.seen(mask, CUBIC, 20.0, seed) for seed in (0, 1))
-    clean = Imaging(1.0, 0.0, 0.0, CUBIC).seen(mask, CUBIC, 20.0, 0)
+    clean = Imaging(1.0, 0.0, 0.0, 0.0, CUBIC).seen(mask, CUBIC, 20.0, 0)
     assert np.count_nonzero(first != clean) > 100
     assert np.count_nonzero(first != second) > 100
 
 
 @pytest.mark.parametrize("scale", [CUBIC, (0.5, 1.0, 1.0)])
 def test_what_a_scan_without_noise_shows_moves_with_the_shape(scale: tuple[float, float, float]) -> None:
-    mask, sharp = bodies(), Imaging(1.0, 0.0, 0.0, (1 / scale[0], 1.0, 1.0))
+    mask, sharp = bodies(), Imaging(1.0, 0.0, 0.0, 0.0, (1 / scale[0], 1.0, 1.0))
     steps = (6, 5, 11)
     moved = np.roll(mask, steps, (0, 1, 2))
     for show in (lambda shape: sharp.seen(shape, scale, 4.0, 0), lambda shape: voxelised(shape, scale, 4.0)):

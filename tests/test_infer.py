@@ -277,12 +277,12 @@ def test_a_scan_is_seen_as_a_kind_of_view() -> None:
         "mask": {"kind": "mask"},
         "crop": {"grid": Grid(grid.shape, grid.spacing, "replicate")},
         "resampled": {"grid": Grid(grid.shape, grid.spacing, "replicate"), "scale": (1.0, 1.0, 2.0)},
-        "scan": {"kind": "image", "imaging": Imaging(1.0, 0.3, 0.05, (1.0, 1.0, 1.0))},
+        "scan": {"kind": "image", "imaging": Imaging(1.0, 0.3, 0.0, 0.0, (1.0, 1.0, 1.0))},
     }
     for view, changes in parts.items():
         seen = scan_descriptors(dataclasses.replace(whole, **changes))
         assert seen is not None and seen[1] == view, view
-    clean = dataclasses.replace(whole, kind="image", imaging=Imaging(1.0, 0.05, 0.008, (1.0, 1.0, 1.0)))
+    clean = dataclasses.replace(whole, kind="image", imaging=Imaging(1.0, 0.05, 0.0, 0.0, (1.0, 1.0, 1.0)))
     assert (seen := scan_descriptors(clean)) is not None and seen[1] == "mask"
     rounded = scan_descriptors(dataclasses.replace(whole, phase=np.round(whole.phase, 2)))
     assert rounded is not None and rounded[1] == "mask"

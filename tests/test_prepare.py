@@ -332,7 +332,7 @@ def test_bone_is_kept_on_its_grid(data) -> None:
     scan = load(data / "scans" / "lhdl_trabecular_200.tif")
     truth = load(data / "scans" / "lhdl_trabecular_200_otsu_mask.tif").values > 0
     inner = (slice(60, 140),) * 3
-    assert find_level(scan).threshold == 84  # as the mask's README states
+    assert find_level(scan).threshold == pytest.approx(84, abs=0.5)  # as the mask's README states, between whole levels
     prepared = prepare(Field(scan.values[inner], scan.spacing, scan.unit), threshold=84)
     check(prepared)
     assert (prepared.kind, prepared.scale, prepared.working_voxel, prepared.unit) == ("image", (1, 1, 1), 19.5, "um")

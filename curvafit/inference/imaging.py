@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -15,8 +14,12 @@ from curvafit.volumes.scan import Field, ScanError
 
 #: Blurs that are tried, in voxels of the finest axis.
 _BLURS = (0.0, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0)
+#: Fat that is tried, in voxels of the finest axis.
+_FAT = (-0.5, -0.25, 0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5)
+#: Grains that are tried, in voxels of the finest axis.
+_GRAINS = (0.0, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.2, 1.4, 1.7, 2.0, 2.5, 3.0)
 #: Edge of the box in which a scan's noise and blur are measured.
-_MEASURED = 96
+_MEASURED = 64
 #: Voxels this far from the surface lie deep within their phase; the least number of them; and the width beyond which
 #: grey levels vary by their lighting, in voxels of the finest axis.
 _DEEP, _FEWEST, _UNEVEN = 3.5, 500, 4.0
@@ -24,8 +27,6 @@ _DEEP, _FEWEST, _UNEVEN = 3.5, 500, 4.0
 _NORMAL_MEDIAN = 0.6745
 #: Smoothed noise over contrast, and slices' thickness over the finest edge, from which on a scan is worse than a mask.
 NOISY, SLICED = 0.02, 1.5
-#: What smoothing by a voxel leaves of white noise's deviation: (2 √π)^(-3/2).
-_WHITE = (2 * math.sqrt(math.pi)) ** -1.5
 
 
 @dataclass(frozen=True)
@@ -36,26 +37,27 @@ class Imaging:
     ----------
     blur
         Deviation of the Gaussian that blurs the structure, in voxels of the finest axis.
-    noise, smoothed
-        Deviation of the noise over the contrast of the two phases: as it is, and smoothed by a voxel of the finest axis
-        as an image is before it is split. Of white noise that leaves 0.15.
+    noise
+        Deviation of the noise over the contrast of the two phases.
+    grain
+        Deviation of the Gaussian that makes such noise of white noise, in voxels of the finest axis.
+    fat
+        How far the structure that was split off reaches beyond what was blurred, in voxels of the finest axis.
     spacing
         Voxel edges (z, y, x) of the scan.
     """
 
     blur: float
     noise: float
-    smoothed: float
+    grain: float
+    fat: float
     spacing: tuple[float, float, float]
 
     @property
-    def grain(self) -> float:
-        """Return the width of the Gaussian that makes such noise of white noise, in voxels of the finest axis.
-
-        Smoothing by a voxel leaves (w² / (w² + 1))^(3/4) of the deviation of noise of width w.
-        """
-        left = min(self.smoothed / self.noise, 0.9) ** (4 / 3) if self.noise > 0 else 0.0
-        return math.sqrt(left / (1 - left)) if left > 1.5 * _WHITE ** (4 / 3) else 0.0
+    def smoothed(self) -> float:
+        """Return the noise that is left by the smoothing by a voxel of the finest axis with which an image is split; of
+        white noise on cubic voxels it leaves 0.15."""
+        return self.noise * _left(self.grain, self.spacing)
 
     @property
     def degraded(self) -> bool:
@@ -117,8 +119,10 @@ def _sampling(shape: Sequence[int], scale: Sequence[float]) -> tuple[list[int], 
 def imaging_of(image: np.ndarray, mask: np.ndarray, spacing: tuple[float, float, float]) -> Imaging:
     """Measure the noise and blur of a scan from its structure.
 
-    The blur, with the contrast, is the one of `_BLURS` with which the blurred structure explains the grey levels best
-    (least squares). The noise is what grey levels vary by deep within the phases, where uneven lighting is taken off.
+    The blur, with the contrast, is the one of `_BLURS` with which the structure, blurred, explains the grey levels best
+    (least squares); with it is found by how much the structure that was split off is too fat, as thin ones are where
+    noise shifts the threshold. The noise is what grey levels vary by deep within the phases, where uneven lighting is
+    taken off.
     Where nothing lies deep it is taken for white and read from third-order differences, which neither the structure nor
     the lighting passes (Immerkær 1996, along three axes).
 
@@ -138,28 +142,33 @@ def imaging_of(image: np.ndarray, mask: np.ndarray, spacing: tuple[float, float,
     image, mask = image[box].astype(np.float32), mask[box]
     levels = image - image.mean()
     edges = [h / min(spacing) for h in spacing]
-    blur, contrast = _blur_of(levels, mask, edges)
+    blur, contrast, fat = _blur_of(levels, mask, edges)
     if not contrast > 0:
         raise ScanError("expected grey levels that tell structure from background, got none that do")
-    noise, smoothed = _deep_noise(levels, mask, edges) or _white_noise(levels)
-    return Imaging(blur, noise / contrast, smoothed / contrast, spacing)
+    noise, left = _deep_noise(levels, mask, edges) or (_white_noise(levels), 0.0)
+    grain = min(_GRAINS, key=lambda width: abs(_left(width, spacing) - left))
+    return Imaging(blur, noise / contrast, grain, fat, spacing)
 
 
-def _blur_of(levels: np.ndarray, mask: np.ndarray, edges: Sequence[float]) -> tuple[float, float]:
-    """Return the blur and the contrast of levels of mean 0, on voxels with edges in units of the finest."""
-    filled = np.clip(centre_distance(mask, edges, 2.0) + 0.5, 0, 1)
+def _blur_of(levels: np.ndarray, mask: np.ndarray, edges: Sequence[float]) -> tuple[float, float, float]:
+    """Return the blur, the contrast, and by how much the structure is fatter than what was blurred, of levels of mean 0
+    on voxels with edges in units of the finest."""
+    distance = centre_distance(mask, edges, 4.0)
     explained = []
-    for blur in _BLURS:
-        model = ndimage.gaussian_filter(filled, [blur / h for h in edges])
-        model -= model.mean()
-        product, square = float((model * levels).mean()), float(np.square(model).mean())
-        explained.append((product * abs(product) / square, blur, product / square))
-    _, blur, contrast = max(explained)
-    return blur, contrast
+    for fat in _FAT:
+        filled = np.clip(distance - fat + 0.5, 0, 1)
+        for blur in _BLURS:
+            model = ndimage.gaussian_filter(filled, [blur / h for h in edges])
+            model -= model.mean()
+            product, square = float((model * levels).mean()), float(np.square(model).mean())
+            if square > 0:
+                explained.append((product * abs(product) / square, blur, product / square, fat))
+    return max(explained)[1:]
 
 
 def _deep_noise(levels: np.ndarray, mask: np.ndarray, edges: Sequence[float]) -> tuple[float, float] | None:
-    """Return the deviation of levels, as they are and smoothed, deep within the phases; None where too little is."""
+    """Return the deviation of levels deep within the phases, and the part of it that smoothing leaves; None where too
+    little lies deep."""
     smoothing, uneven = ([width / h for h in edges] for width in (1.0, _UNEVEN))
     both = (levels, ndimage.gaussian_filter(levels, smoothing))
     squares, count = np.zeros(2), 0
@@ -173,12 +182,21 @@ def _deep_noise(levels: np.ndarray, mask: np.ndarray, edges: Sequence[float]) ->
     if count < _FEWEST:
         return None
     noise, smoothed = np.sqrt(squares / count)
-    return float(noise), float(smoothed)
+    return float(noise), float(smoothed / max(noise, 1e-30))
 
 
-def _white_noise(levels: np.ndarray) -> tuple[float, float]:
-    """Return the deviation of white noise in levels, and what smoothing leaves of it."""
+def _white_noise(levels: np.ndarray) -> float:
+    """Return the deviation of white noise in levels."""
     for axis in range(3):
         levels = np.diff(levels, 2, axis)
-    noise = float(np.median(np.abs(levels))) / _NORMAL_MEDIAN / 6**1.5
-    return noise, _WHITE * noise
+    return float(np.median(np.abs(levels))) / _NORMAL_MEDIAN / 6**1.5
+
+
+def _left(grain: float, spacing: Sequence[float]) -> float:
+    """Return the part of the deviation of noise of a grain that smoothing by a voxel of the finest axis leaves."""
+    spike, left = np.eye(1, 65, 32)[0], 1.0
+    for edge in spacing:
+        width = min(spacing) / edge
+        noise = ndimage.gaussian_filter(spike, grain * width)
+        left *= float(np.linalg.norm(ndimage.gaussian_filter(noise, width)) / np.linalg.norm(noise))
+    return left
