@@ -91,13 +91,21 @@ def left_out(slices: Slices) -> Task | None:
     return Task(given, slices.inside[list(out)], [slices.places[k] for k in out])
 
 
-def choice(task: Task, settings: Sequence[Setting], filled: Callable[[Slices, Setting], np.ndarray]) -> Choice:
+def choice(
+    task: Task,
+    settings: Sequence[Setting],
+    filled: Callable[[Slices, Setting], np.ndarray],
+    ways: Sequence[str] = WAYS,
+) -> Choice:
     """Return the setting with the best Dice on a task: a prior where it is better than plain beyond the noise.
 
     Parameters
     ----------
     settings
-        Settings with a law. Slices left out double the gap, so that the best interpolation there is no better start.
+        Settings with a law, lowered from the first of the ways.
+    ways
+        Plain interpolations to compare with. Slices left out double the gap, at which the nearest slice may win by much
+        that loses by more at the gap itself: there only what is lowered and its start are to be compared.
     filled
         Fills the volume between slices by a setting: a mask (Z, Y, X).
     """
@@ -105,8 +113,8 @@ def choice(task: Task, settings: Sequence[Setting], filled: Callable[[Slices, Se
     def counts(setting: Setting) -> np.ndarray:
         return _tallies(filled(task.slices, setting)[list(task.places)], task.truth)
 
-    start, before = Setting(WAYS[0]), counts(Setting(WAYS[0]))
-    for each in map(Setting, WAYS[1:]):
+    start, before = Setting(ways[0]), counts(Setting(ways[0]))
+    for each in map(Setting, ways[1:]):
         start, before = _better((each, counts(each)), (start, before))
     tried = [(each, counts(each)) for each in settings]
     best, after = max(tried, key=lambda each: float(_dice(each[1].sum(0))))

@@ -15,7 +15,7 @@ from curvafit.progress import Progress, silent
 from curvafit.segmentation.calibration import Choice, Setting, Task, choice, left_out
 from curvafit.segmentation.engine import HALO, completed
 from curvafit.segmentation.result import Segmentation, ending, result_of
-from curvafit.segmentation.slices import Slices
+from curvafit.segmentation.slices import WAYS, Slices
 from curvafit.segmentation.working import Law, WorkingGrid, laws_of
 from curvafit.units import sampling
 from curvafit.volumes.field import Field, ScanError
@@ -113,7 +113,7 @@ def reconstruct(
                 "expected three or more known slices with voxels inside and outside, an example or a stiffness, got "
                 f"{len(places)} slices"
             )
-        best = choice(tasks, settings, fill)
+        best = choice(tasks, settings, fill, WAYS[:1] if other is None else WAYS)
         chosen, tried = best.setting, _gain(best, "left out" if other is None else "of the example")
     mask, u, end = _filled(target, chosen, epsilon, progress)
     notes = (*notes, *_known(places, volume.shape[axis]), *place.notes)
