@@ -10,3 +10,8 @@ Progress = Callable[[str, float], None]
 
 def silent(text: str, share: float) -> None:
     """Say nothing: the default progress."""
+
+
+def part(progress: Progress, start: float, stop: float) -> Progress:
+    """Return the progress of a part of the work, from one share of the whole to another."""
+    return lambda text, share: progress(text, start + (stop - start) * share)

@@ -26,7 +26,7 @@ from curvafit.files import bears, check_folder, check_free, is_empty, write_cont
 from curvafit.generation.viability import well_formed
 from curvafit.geometry.diagram import Diagram
 from curvafit.inference.atlas import Atlas
-from curvafit.progress import Progress, silent
+from curvafit.progress import Progress, part, silent
 from curvafit.volumes.formats import read_archive
 
 #: Folder beside the two files for what took long: measured shapes, distances, places.
@@ -113,7 +113,7 @@ def _measures(store: Store, cache: Path, progress: Progress) -> tuple[Atlas, lis
         shapes.append(Shown(cached["thumbnail"].tobytes(), cached["volume"].tobytes()))
         return float(cached["fraction"]), _diagram(cached, "field"), _diagram(cached, "mask")
 
-    atlas = extract(store, measure=look, progress=lambda text, share: progress(text, 0.6 * share))
+    atlas = extract(store, measure=look, progress=part(progress, 0.0, 0.6))
     return atlas, records, shapes, commands
 
 
@@ -121,7 +121,7 @@ def _measure(store: Store, record: Record) -> _Arrays:
     fraction, *diagrams = measured(store, record)
     views = shown(store.field(record.index))
     arrays = {"fraction": np.array(fraction)} | {
-        name: np.frombuffer(part, dtype=np.uint8) for name, part in views._asdict().items()
+        name: np.frombuffer(view, dtype=np.uint8) for name, view in views._asdict().items()
     }
     for view, diagram in zip(("field", "mask"), diagrams, strict=True):
         figures = np.array([diagram.spread, diagram.excluded])
@@ -136,8 +136,8 @@ def _diagram(cached: _Arrays, view: str) -> Diagram:
 
 def _mapped(atlas: Atlas, cache: Path, device: str, progress: Progress) -> AtlasMap:
     """Return the map of an atlas, its distances and places from the cache where they are there."""
-    saved, part = cache / "distances.npz", _part(progress, 0.6, 0.85)
-    compare = partial(diagram_distances, atlas.field_diagrams, device=device, progress=part, saved=saved)
+    saved, comparing = cache / "distances.npz", part(progress, 0.6, 0.85)
+    compare = partial(diagram_distances, atlas.field_diagrams, device=device, progress=comparing, saved=saved)
     try:
         distances = compare()
     except ValueError:  # a file that is damaged, or of other settings
@@ -147,11 +147,6 @@ def _mapped(atlas: Atlas, cache: Path, device: str, progress: Progress) -> Atlas
     key = hashlib.sha256(distances.tobytes()).hexdigest()[:12]
     places = _cached(cache / f"places-{key}-{version('umap-learn')}.npz", lambda: {"positions": embed(distances)})
     return map_atlas(atlas, distances, places["positions"])
-
-
-def _part(progress: Progress, first: float, last: float) -> Progress:
-    """Return the progress of a part of the work, from the share `first` to the share `last` of the whole."""
-    return lambda text, share: progress(text, first + (last - first) * share)
 
 
 def _cached(path: Path, make: Callable[[], _Arrays]) -> _Arrays:

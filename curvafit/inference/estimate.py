@@ -24,7 +24,7 @@ from curvafit.inference.simulation import Simulate, Simulations, simulations
 from curvafit.inference.table import column_names, law_of, mirrored
 from curvafit.inference.views import VIEWS
 from curvafit.priors.grid import Grid
-from curvafit.progress import Progress, silent
+from curvafit.progress import Progress, part, silent
 from curvafit.volumes.scan import ScanError
 
 #: Draws from the posterior, those that are grown, and those among which more are chosen to be grown.
@@ -95,11 +95,11 @@ def estimate(
     reading = _Reading(posterior, row, view, parameters, best, mirrored if turned else np.asarray)
     if not fast:
         simulate = _simulator(seen, view)
-        grown = simulations(parameters, simulate, SIMULATIONS, seed=seed, progress=_part(progress, 0.15, 0.45))
+        grown = simulations(parameters, simulate, SIMULATIONS, seed=seed, progress=part(progress, 0.15, 0.45))
         if len(grown.parameters) >= FEWEST:
             pool = posterior.sample(row, view, POOL, seed)
             search = Search(posterior.emulator, view, row)
-            likeliest, every = search.parameters(pool, grown, simulate, seed=seed, progress=_part(progress, 0.45, 1.0))
+            likeliest, every = search.parameters(pool, grown, simulate, seed=seed, progress=part(progress, 0.45, 1.0))
             near = every.parameters[search.nearest(every)[0]]
             return _checked(reading, grown, {"refined": likeliest, "simulation": near})
     draws = reading.draws(parameters, METHOD)
@@ -142,11 +142,6 @@ class _Reading:
             Candidate("posterior", *law_of(self.turn(middle)), draws.deviations),
             Candidate("optimum", *law_of(self.turn(self.best.parameters)), own),
         )
-
-
-def _part(progress: Progress, start: float, stop: float) -> Progress:
-    """Return the progress of a part of the work."""
-    return lambda text, share: progress(text, start + (stop - start) * share)
 
 
 def _checked(reading: _Reading, grown: Simulations, others: Mapping[str, np.ndarray]) -> Estimate:

@@ -36,7 +36,7 @@ from curvafit.priors.bounds import SEEDS, instance, whole
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.fit_file import Prior
 from curvafit.priors.grid import WORKING_EPSILON, Grid
-from curvafit.progress import Progress, silent
+from curvafit.progress import Progress, part, silent
 from curvafit.units import number
 from curvafit.volumes.field import Field
 from curvafit.volumes.formats.part import Crop
@@ -173,11 +173,11 @@ def infer(
     reason = NOISE if measured is None else untextured(prepared, measured)
     if measured is None or reason:
         return Inference(volume, prepared, measured, {}, _fit(prepared, measured, numbers, provenance, reason))
-    estimated = estimate(prepared, posterior, seed=seed, fast=fast, progress=_part(progress, 0.1, 0.5))
+    estimated = estimate(prepared, posterior, seed=seed, fast=fast, progress=part(progress, 0.1, 0.5))
     progress("searching the atlas", 0.5)
     matches = _matches(prepared, measured, atlas)
-    laws = _laws(prepared, estimated, matches, seed, _part(progress, 0.5, 0.6))
-    laws, twins = (laws, {}) if fast else _grown(laws, measured, prepared, seed, _part(progress, 0.6, 1.0))
+    laws = _laws(prepared, estimated, matches, seed, part(progress, 0.5, 0.6))
+    laws, twins = (laws, {}) if fast else _grown(laws, measured, prepared, seed, part(progress, 0.6, 1.0))
     chosen, status = verdict(laws, None if estimated is None else estimated.misfit, numbers, fast=fast)
     law = next((each.coefficients for each in laws if each.name == chosen), None)
     moved = None if law is None else drift(*_window(prepared), WORKING_EPSILON, law)
@@ -189,11 +189,6 @@ def infer(
     progress("done", 1.0)
     simulated = None if estimated is None else estimated.simulated
     return Inference(volume, prepared, measured, twins, fit, simulated)
-
-
-def _part(progress: Progress, start: float, stop: float) -> Progress:
-    """Return the progress of a part of the work."""
-    return lambda text, share: progress(text, start + (stop - start) * share)
 
 
 def _matches(prepared: Prepared, measured: Diagram, atlas: Atlas) -> tuple[Match, ...]:
