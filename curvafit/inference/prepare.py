@@ -6,6 +6,7 @@ import math
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -115,6 +116,17 @@ class Prepared:
         if self.imaging is not None:
             return self.imaging.seen(mask, self.scale, self.smallest, seed)
         return mask if self.scale == (1.0, 1.0, 1.0) else voxelised(mask, self.scale, self.smallest)
+
+    @cached_property
+    def true_share(self) -> float:
+        """Return the part of the volume that the structure fills, an image's without what its noise and blur fatten it
+        by; that of the mask where nothing would be left."""
+        if self.imaging is None:
+            return self.volume_fraction
+        distance = centre_distance(self.mask, (1.0, 1.0, 1.0), 4.0)
+        inside = distance > self.imaging.fat / max(self.scale)
+        share = float((inside if self.roi is None else inside[self.roi]).mean())
+        return share if 0 < share < 1 else self.volume_fraction
 
     def part(self, where: Window) -> Grid:
         """Return the grid of a part: it repeats only where it is all of a grid that does."""

@@ -12,7 +12,6 @@ from curvafit.geometry.diagram import Diagram, diagram
 from curvafit.geometry.mesh import NoSurface
 from curvafit.geometry.morphometry import Morphometry, morphometry
 from curvafit.inference.prepare import Prepared
-from curvafit.inference.regrid import centre_distance
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.profile import phase_field
@@ -37,28 +36,16 @@ class Twin:
 def twin(coefficients: Coefficients, mass: float, prepared: Prepared, seed: int) -> Twin:
     """Grow a shape of a law in a box of the scan's main window, at most `LONGEST_EDGE` voxels a side.
 
-    Of a mask or an image it fills the same part of its box as the structure (`true_share`), since a mask does not state
-    a mass; where nothing grows so, it has the law's own mass.
+    Of a mask or an image it fills the same part of its box as the structure (`Prepared.true_share`), since a mask does
+    not state a mass; where nothing grows so, it has the law's own mass.
     """
     grid = twin_grid(prepared)
     if prepared.kind != "field":
-        share = true_share(prepared)
+        share = prepared.true_share
         flow = generate(coefficients, mass, grid, volume_fraction=share, seed=seed, reject_early=True)
         if (grown := _measured(flow, prepared, seed)).phase is not None:
             return grown
     return _measured(generate(coefficients, mass, grid, seed=seed, reject_early=True), prepared, seed)
-
-
-def true_share(prepared: Prepared) -> float:
-    """Return the part of the volume that the structure fills, an image's without what its noise and blur fatten it by;
-    that of the mask where nothing would be left."""
-    imaging, roi = prepared.imaging, prepared.roi
-    if imaging is None:
-        return prepared.volume_fraction
-    distance = centre_distance(prepared.mask, (1.0, 1.0, 1.0), 4.0)
-    inside = distance > imaging.fat / max(prepared.scale)
-    share = float((inside if roi is None else inside[roi]).mean())
-    return share if 0 < share < 1 else prepared.volume_fraction
 
 
 def twin_grid(prepared: Prepared) -> Grid:
