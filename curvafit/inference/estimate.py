@@ -104,7 +104,7 @@ def estimate(
             return _checked(reading, grown, {"refined": likeliest, "simulation": near})
     draws = reading.draws(parameters, METHOD)
     misfit = Misfit(amortised_p(posterior, view, best.misfit), {}, "by the best fit, nothing grown")
-    return Estimate(draws, reading.weak, misfit, reading.laws(draws))
+    return Estimate(draws, reading.weak, misfit, (reading.middle(draws), reading.optimum))
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,17 +131,19 @@ class _Reading:
         """Return draws of the structure's parameters."""
         return Draws.of(self.turn(parameters), self.view, method)
 
-    def laws(self, draws: Draws) -> tuple[Candidate, ...]:
-        """Return the middle of the draws with their deviations, and the best fit of the descriptors with its own."""
+    def middle(self, draws: Draws) -> Candidate:
+        """Return the middle of the draws with their deviations."""
+        middle = Draws.of(self.parameters, self.view, "").middle(np.ptp(self.parameters, axis=0))
+        return Candidate("posterior", *law_of(self.turn(middle)), draws.deviations)
+
+    @property
+    def optimum(self) -> Candidate:
+        """Return the best fit of the descriptors with its own deviations."""
         rng = np.random.default_rng(0)
         near = rng.multivariate_normal(self.best.parameters, self.best.covariance, DRAWS, check_valid="ignore")
         low, high = self.posterior.box.T
         own = self.draws(np.clip(near, low, high), "").deviations
-        middle = Draws.of(self.parameters, self.view, "").middle(np.ptp(self.parameters, axis=0))
-        return (
-            Candidate("posterior", *law_of(self.turn(middle)), draws.deviations),
-            Candidate("optimum", *law_of(self.turn(self.best.parameters)), own),
-        )
+        return Candidate("optimum", *law_of(self.turn(self.best.parameters)), own)
 
 
 def _checked(reading: _Reading, grown: Simulations, others: Mapping[str, np.ndarray]) -> Estimate:
@@ -153,10 +155,9 @@ def _checked(reading: _Reading, grown: Simulations, others: Mapping[str, np.ndar
         checked.p, {name: each.p for name, each in checked.blocks.items()}, f"{count} shapes grown from draws"
     )
     refined, simulation = (Candidate(name, *law_of(reading.turn(each)), {}) for name, each in others.items())
-    middle, _ = reading.laws(draws)
     names = np.array(column_names())
     blocks = {name: (row[names == name], grown.descriptors[:, names == name]) for name in BLOCKS}
-    return Estimate(draws, reading.weak, misfit, (refined, middle, simulation), blocks)
+    return Estimate(draws, reading.weak, misfit, (refined, reading.middle(draws), simulation), blocks)
 
 
 def simulation_grid(prepared: Prepared) -> Grid:
