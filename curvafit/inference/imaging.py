@@ -94,9 +94,13 @@ class Imaging:
         noise = ndimage.gaussian_filter(noise, [self.grain * min(voxel) / h for h in voxel], mode="wrap")
         grey += np.float32(self.noise) * noise / noise.std()
         edges = (voxel[0], voxel[1], voxel[2])
-        values = find_level(Field(grey, edges, "voxel"), kind="image", periodic=True).values
-        inside = resample(values, [1 / h for h in voxel], (0, 0, 0), mask.shape, periodic=True) > 0
-        return without_specks(inside, smallest, True)[0]
+        return without_specks(split(Field(grey, edges, "voxel"), mask.shape, periodic=True), smallest, True)[0]
+
+
+def split(scan: Field, shape: Sequence[int], *, periodic: bool = False) -> np.ndarray:
+    """Return the structure of grey levels, split as an image is, on cubic voxels of edge 1 `(Z, Y, X)`."""
+    values = find_level(scan, kind="image", periodic=periodic).values
+    return resample(values, [1 / h for h in scan.spacing], (0, 0, 0), shape, periodic=periodic) > 0
 
 
 def voxelised(mask: np.ndarray, scale: Sequence[float], smallest: float) -> np.ndarray:

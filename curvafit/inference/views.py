@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import ndimage
 
-from curvafit.inference.phases import find_level
+from curvafit.inference.imaging import split
 from curvafit.inference.prepare import KEPT_THICKNESS, THINNEST, smallest_piece
 from curvafit.inference.regrid import centre_distance, median_thickness, resample, without_specks
 from curvafit.priors.grid import Grid
@@ -79,9 +79,7 @@ def scan(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
     Prepared as `infer` prepares an image: smoothed by a voxel, split, interpolated to cubic voxels, cleared of specks.
     """
     part, window = crop(u, grid, rng)
-    level = find_level(degraded(part, rng), kind="image")
-    values = resample(level.values, (1 / SLICE, 1.0, 1.0), (0, 0, 0), part.shape)
-    inside = values > 0
+    inside = split(degraded(part, rng), part.shape)
     return View(without_specks(inside, smallest_piece(_thickness(inside)), False)[0], window)
 
 
