@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -62,6 +63,23 @@ def test_it_tells_what_the_descriptors_hold_and_no_more(posterior: Posterior) ->
         rank = (draws < seen.parameters[:, None]).mean(1)
         inside = ((rank > 0.05) & (rank < 0.95)).mean()
         assert 0.86 < inside < 0.94  # 1200 ranks: 0.9 ± 0.01, and what 800 shapes leave unlearnt
+
+
+def test_what_tells_the_mass_is_not_hidden_by_dropout(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A line of the descriptors, rising in one view and falling in the other, tells the mass but for a tenth."""
+    monkeypatch.setattr(training, "EPOCHS", 20)
+    monkeypatch.setattr(emulator_training, "EPOCHS", 1)
+    rows, spread = table(500), (HIGH - LOW)[5] / np.sqrt(12)
+    mass = (rows.parameters[:, 5] - (LOW + HIGH)[5] / 2) / spread
+    told = np.where(rows.views == "mask", mass, -mass) + 0.1 * np.random.default_rng(3).standard_normal(len(rows))
+    rows.descriptors[:, 40:80] = 5 + told[:, None]
+    known = np.isin(rows.shapes, np.unique(rows.shapes)[:400])
+    learnt = train_posterior(rows.rows(known), dataclasses.replace(SMALL, dropout=0.5), members=1)
+    for view in ("mask", "crop"):
+        fresh = rows.rows(~known).of([view])
+        draws = learnt.sample(fresh.descriptors, view, 200)[..., 5]
+        assert np.std(draws.mean(1) - fresh.parameters[:, 5]) < 0.2 * spread
+        assert draws.std(1).mean() < 0.25 * spread
 
 
 def test_draws_lie_in_the_box_and_come_back(posterior: Posterior) -> None:

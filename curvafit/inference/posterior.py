@@ -18,9 +18,11 @@ from curvafit.inference.emulator import Emulator, Layer
 from curvafit.inference.table import PARAMETERS, column_names
 from curvafit.priors.bounds import quoted, real, whole
 
-ARCHIVE = Archive("a posterior", "a posterior", "curvafit posterior", 2, "train it again", {"blocks": BLOCKS})
+ARCHIVE = Archive("a posterior", "a posterior", "curvafit posterior", 3, "train it again", {"blocks": BLOCKS})
 #: Largest size of a flow, and most flows of an ensemble.
 WIDEST, MOST = 2048, 64
+#: Which of the parameters is the mass.
+MASS = PARAMETERS.index("m0")
 #: Part by which the box of the parameters is wider, on each side, than what was drawn.
 RIM = 0.02
 
@@ -52,7 +54,14 @@ class Architecture:
 
 
 class Member(nn.Module):
-    """One flow of an ensemble: a conditional distribution of the six parameters, in coordinates without bounds."""
+    """One flow of an ensemble: a conditional distribution of the six parameters, in coordinates without bounds.
+
+    Of the mass it is that of what a straight line of the context leaves, by view, in the deviations `width` `(views,)`:
+    the volume fraction tells the mass, and dropout would hide it.
+    """
+
+    slope: Tensor
+    width: Tensor
 
     def __init__(self, architecture: Architecture, views: int) -> None:
         super().__init__()
@@ -62,9 +71,16 @@ class Member(nn.Module):
             len(PARAMETERS), context, bins=architecture.bins, transforms=splines, hidden_features=sizes
         )
         self.dropout = nn.Dropout(architecture.dropout)
+        self.register_buffer("slope", torch.zeros(views, context))
+        self.register_buffer("width", torch.ones(views))
 
     def forward(self, context: Tensor) -> torch.distributions.Distribution:
-        return self.flow(self.dropout(context))
+        view = context[:, -len(self.width) :]
+        mean = torch.zeros(len(context), len(PARAMETERS))
+        width = torch.ones_like(mean)
+        mean[:, MASS], width[:, MASS] = (view @ self.slope * context).sum(1), view @ self.width
+        line = torch.distributions.AffineTransform(mean, width, event_dim=1)
+        return torch.distributions.TransformedDistribution(self.flow(self.dropout(context)), [line])
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ from torch import Tensor
 from curvafit.inference.compression import compression_of
 from curvafit.inference.emulator_training import train_emulator
 from curvafit.inference.learning import Plan, batch_of, learn
-from curvafit.inference.posterior import MOST, Architecture, Member, Posterior
+from curvafit.inference.posterior import MASS, MOST, Architecture, Member, Posterior
 from curvafit.inference.table import PARAMETERS, Table
 from curvafit.priors.bounds import seed_of, whole
 from curvafit.progress import Progress, silent
@@ -21,6 +21,8 @@ from curvafit.progress import Progress, silent
 VALIDATION = 0.1
 #: First step length, weight decay, and how many epochs a member goes on without a better validation.
 RATE, DECAY, PATIENCE = 1e-3, 1e-3, 20
+#: How much steep lines of the mass are shunned, in rows.
+RIDGE = 3.0
 #: Most epochs, and most steps, which bound the time that a large table takes.
 EPOCHS, STEPS = 300, 12_000
 #: Part of the time that the emulator takes.
@@ -101,6 +103,7 @@ def train_posterior(
 
 def _fit(member: Member, context: Tensor, target: Tensor, validation: Tensor, progress: Progress) -> Member:
     """Fit a flow to all rows but those of a mask, and return it as it was where the likelihood of those was highest."""
+    _draw_lines(member, context[~validation], target[~validation, MASS])
     rows = int((~validation).sum())
     epochs = min(EPOCHS, STEPS * batch_of(rows) // rows + 1)
 
@@ -109,6 +112,15 @@ def _fit(member: Member, context: Tensor, target: Tensor, validation: Tensor, pr
         progress(f"epoch {epoch}, {best:.3f} nats", epoch / epochs)
 
     return learn(member, (context, target), validation, _nats, Plan(RATE, DECAY, epochs, PATIENCE), report)
+
+
+def _draw_lines(member: Member, context: Tensor, mass: Tensor) -> None:
+    """Give a flow the straight lines, one for each view, that the mass is nearest to, and its deviations from them."""
+    for view in range(len(member.width)):
+        mine = context[:, view - len(member.width)] == 1
+        x, y = context[mine].double(), mass[mine].double()
+        slope = torch.linalg.solve(x.T @ x + RIDGE * torch.eye(x.shape[1]), x.T @ y)
+        member.slope[view], member.width[view] = slope, (y - x @ slope).std()
 
 
 def _nats(member: Member, context: Tensor, target: Tensor) -> Tensor:
