@@ -57,7 +57,7 @@ def oblique(tmp_path: Path) -> Path:
 
 def test_segment_keeps_the_header_to_the_bit(oblique: Path, tmp_path: Path) -> None:
     target = tmp_path / "new" / "mask.nii.gz"
-    result = call("segment", oblique, "--prior", "tubes", "--steps", 20, "-o", target)
+    result = call("segment", oblique, "--prior", "tubes", "--weight", 0.5, "--steps", 300, "-o", target)
     assert result.exit_code == 0, (result.output, result.exception)
     assert sorted(path.name for path in target.parent.iterdir()) == ["mask.json", "mask.nii.gz", "mask.png"]
     one, other = nibabel.load(oblique), nibabel.load(target)
@@ -70,8 +70,8 @@ def test_segment_keeps_the_header_to_the_bit(oblique: Path, tmp_path: Path) -> N
     assert 2 * overlap.sum() / ((values > 0).sum() + ball().sum()) > 0.9
     record = json.loads(target.with_name("mask.json").read_text())
     assert record["format"] == "curvafit-mask-1" and record["job"] == "segment" and record["prior"] == "tubes"
-    assert record["steps"] == 20 and record["weight"] > 0
-    assert record["command"] == f"curvafit segment {oblique} --prior tubes --steps 20 -o {target}"
+    assert record["steps"] == 300 and record["weight"] == 0.5
+    assert record["command"] == f"curvafit segment {oblique} --prior tubes --weight 0.5 --steps 300 -o {target}"
     assert record["unit"] == "mm" and record["epsilon"] == pytest.approx(2 * min(record["spacing"]))
     assert str(target) in result.stdout and "of the volume is inside" in result.stdout
     again = call("segment", oblique, "--prior", "tubes", "--steps", 1, "-o", target)
@@ -113,7 +113,9 @@ def test_other_formats_and_a_fit_in_another_unit(tmp_path: Path) -> None:
     path, prior, target = tmp_path / "scan.tif", tmp_path / "fit.json", tmp_path / "mask.ome.tif"
     save(Field(grey(), (19.5,) * 3, "um"), path)
     prior.write_text(made_fit().to_json())
-    result = call("segment", path, "--prior", prior, "--dark", "--threshold", 150, "--steps", 2, "-o", target)
+    result = call(
+        "segment", path, "--prior", prior, "--dark", "--threshold", 150, "--weight", 1, "--steps", 2, "-o", target
+    )
     assert result.exit_code == 0, (result.output, result.exception)
     assert "in mm, are converted to um" in result.stdout
     made = load(target)
@@ -128,12 +130,12 @@ def test_a_probability_map(tmp_path: Path) -> None:
     path, likely, target = tmp_path / "scan.npy", tmp_path / "p.npy", tmp_path / "mask.npy"
     np.save(path, grey())
     np.save(likely, np.where(ball(), 0.9, 0.2).astype(np.float32))
-    options = ("--prior", "sponge", "--weight", 0.5, "--steps", 10)
+    options = ("--prior", "sponge", "--weight", 0.05, "--steps", 300)
     result = call("segment", path, "--probability", likely, *options, "-o", target)
     assert result.exit_code == 0, (result.output, result.exception)
     assert (np.load(target).astype(bool) != ball()).mean() < 0.02
     record = json.loads((tmp_path / "mask.json").read_text())
-    assert record["weight"] == 0.5 and record["probability"] == str(likely)
+    assert record["weight"] == 0.05 and record["probability"] == str(likely)
     assert "threshold" not in record and "dark" not in record
     placed = call("segment", path, "--probability", likely, *options, "--spacing", 3, "--unit", "um", "-o", target)
     assert placed.exit_code == 0 and json.loads((tmp_path / "mask.json").read_text())["unit"] == "um"
@@ -288,5 +290,4 @@ def test_no_input_is_written_over(arguments, target, tmp_path, monkeypatch) -> N
 
 def test_steps_are_those_of_the_library() -> None:
     command = importlib.import_module("curvafit.cli.segment")
-    for room, steps in (("segment", command.STEPS), ("completion", command.COMPLETION_STEPS)):
-        assert steps == importlib.import_module(f"curvafit.segmentation.{room}").STEPS
+    assert command.STEPS == importlib.import_module("curvafit.segmentation.engine").STEPS

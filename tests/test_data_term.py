@@ -137,7 +137,7 @@ def test_evidence_counts_its_nats_once_whatever_the_volume_of_a_part(epsilon: fl
         gained.append(ends[1] - ends[0])
         return descend(start, law, grid, data=data, **options)
 
-    monkeypatch.setattr(import_module("curvafit.segmentation.segment"), "descend", watched)
+    monkeypatch.setattr(import_module("curvafit.segmentation.engine"), "descend", watched)
     noise = np.random.default_rng(0).standard_normal(SHAPE)
     likely = Field((1 / (1 + np.exp(-DISTANCE - noise))).astype(np.float32), EDGES)
     law = Coefficients(1.5, 0.5, 2.5)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -48,7 +49,7 @@ _what = partial(typer.Option, rich_help_panel="What to do")
 Target = Annotated[Path, typer.Option("-o", "--output", help="Mask to write: .nii.gz .nii .tif .npy .mrc .zarr.")]
 Prior = Annotated[str, _what(help="fit.json of `curvafit infer`, or a preset's name (see `curvafit presets`).")]
 Probability = Annotated[Path | None, _what(help="Probability of the inside, a volume, instead of grey levels.")]
-Weight = Annotated[float | None, _what(help="Cost of a unit of the energy, in nats; by default 2 / (a20 + a02).")]
+Weight = Annotated[float | None, _what(help="Cost of a unit of the energy, in nats; by default chosen, with the law.")]
 Threshold = Annotated[str, _what(help="Grey level between the phases, or otsu.")]
 Dark = Annotated[bool, _what("--dark", help="The structure is the dark phase.")]
 OwnPrior = Annotated[str | None, _what("--prior", help="As in segment; by default inferred from the example.")]
@@ -61,10 +62,10 @@ Every = Annotated[int | None, _what(help="Distance of known slices: with 8, ever
 First = Annotated[int | None, _what(help="Number of the first known slice, with --every; by default 0.")]
 Axis = Annotated[str, _what(help="Axis across the slices: z, y or x (first, second, last axis of an array).")]
 
+#: Laws that are tried of an example's fit, which is not known yet.
+INFERRED = 2
 #: Steps of the flows, as in `curvafit.segmentation`, which help must not import.
-STEPS, COMPLETION_STEPS = 150, 400
-#: Flows of a reconstruction: of two laws that are tried out, and of the better one.
-FLOWS = 3
+STEPS = 400
 
 
 @reads_volume
@@ -101,8 +102,14 @@ def segment(
             say_notes(() if chances is None else chances.notes)
             return segment_scan(volume, prior, probability=chances, steps=steps, progress=progress, **options)
 
-        more = {"probability": None if probability is None else str(probability), **options}
-        _run(scan, out, prior, reading, compute, {"job": "segment", "steps": steps, **more}, overwrite=overwrite)
+        def tried(laws: int, voxels: int) -> float:
+            from curvafit.segmentation.weighing import trial_steps
+
+            return trial_steps(laws + 1, steps, voxels) if weight is None and probability is None else 0.0
+
+        record = {"job": "segment", "steps": steps, **options}
+        record |= {"probability": None if probability is None else str(probability)}
+        _run(scan, out, prior, reading, compute, record, overwrite=overwrite, tried=tried)
 
 
 @reads_volume
@@ -119,7 +126,7 @@ def reconstruct(
     stiffness: Stiffness = None,
     periodic: Periodic = False,
     epsilon: Epsilon = None,
-    steps: Steps = COMPLETION_STEPS,
+    steps: Steps = STEPS,
     reading: Reading,
     overwrite: OverwriteOption = False,
 ) -> None:
@@ -149,7 +156,11 @@ def reconstruct(
 
         more = {"example": None if example is None else str(example), **options}
         record = {"job": "reconstruct", "steps": steps, **more}
-        _run(slices, out, prior, reading, compute, record, overwrite=overwrite, flows=FLOWS if stiffness is None else 1)
+
+        def tried(laws: int, voxels: int) -> float:
+            return laws * steps if stiffness is None else 0.0
+
+        _run(slices, out, prior, reading, compute, record, overwrite=overwrite, tried=tried)
 
 
 def _inferred(example: Field | None, progress: Progress) -> Inference:
@@ -168,13 +179,14 @@ def _run(
     record: dict[str, Any],
     *,
     overwrite: bool,
-    flows: int = 1,
+    tried: Callable[[int, int], float],
 ) -> None:
-    """Check, read, compute, write and print."""
+    """Check, read, compute, write and print; `tried` says how many steps it takes to try laws out, given their number
+    and that of the working voxels."""
     from curvafit.priors.coefficients import preset_name
     from curvafit.priors.law import texture_of
     from curvafit.segmentation.mask_files import check_mask_target, write_mask
-    from curvafit.segmentation.working import WorkingGrid
+    from curvafit.segmentation.working import WorkingGrid, laws_of
     from curvafit.volumes.scan import load
 
     law_file = None if preset_name(prior) else prior
@@ -186,8 +198,10 @@ def _run(
         progress("reading", 0.0)
         volume = load(source, **reading)
         check_mask_target(out, volume.unit, overwrite=overwrite)
-        working = WorkingGrid.of(volume, record["epsilon"])
-        say_forecast(record["job"], working.grid.shape, flows * record["steps"], SEGMENTATION, what="working voxels")
+        shape = WorkingGrid.of(volume, record["epsilon"]).grid.shape
+        laws = INFERRED if prior is None else len(laws_of(prior, volume)[0])
+        steps = record["steps"] + tried(laws, math.prod(shape))
+        say_forecast(record["job"], shape, steps, SEGMENTATION, what="working voxels")
         result = compute(volume, progress)
         progress("writing", 1.0)
         content = {"command": command_line(), "prior": prior, **record}

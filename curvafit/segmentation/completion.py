@@ -13,7 +13,7 @@ from curvafit.priors.bounds import real, whole
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
 from curvafit.progress import Progress, silent
 from curvafit.segmentation.calibration import Choice, Setting, Task, choice, left_out
-from curvafit.segmentation.engine import HALO, completed
+from curvafit.segmentation.engine import HALO, STEPS, completed
 from curvafit.segmentation.result import Segmentation, ending, result_of
 from curvafit.segmentation.slices import WAYS, Slices
 from curvafit.segmentation.working import Law, WorkingGrid, laws_of
@@ -21,10 +21,8 @@ from curvafit.units import sampling
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.source import Source, field_of
 
-__all__ = ["STEPS", "reconstruct"]
+__all__ = ["reconstruct"]
 
-#: Default steps of Adam.
-STEPS = 400
 #: Stiffness of the springs on known voxels, in working units: a tenth of it gives way, ten times as much stalls.
 STIFFNESS = 1e7
 #: Margin of the springs: u of the optimal profile half a voxel from the surface, as known voxels next to it are.

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import numpy as np
+from torch import Tensor
 
-from curvafit.generation.data import Data
+from curvafit.generation.data import Data, Evidence
 from curvafit.generation.flow import WORKING_BLUR, Flow, descend
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON
 from curvafit.priors.profile import phase_field
 from curvafit.progress import Progress, silent
+from curvafit.segmentation.evidence import VoxelEvidence
 from curvafit.segmentation.working import WorkingGrid
 from curvafit.volumes.field import ScanError
 
-__all__ = ["HALO", "completed", "stiff"]
+__all__ = ["BENDING", "HALO", "STEPS", "bending", "completed", "started", "stiff", "weighed"]
 
+#: Default steps of Adam.
+STEPS = 400
 #: Voxels of the grid around a volume that does not repeat: far enough for the border's right angles not to reach it.
 HALO = 6
 #: a20 + a02 of the law in a flow, on which the steps of Adam depend; the Willmore energy has it.
@@ -40,17 +44,12 @@ def completed(
     ScanError
         If the start has one phase only, a20 + a02 is not positive, or the energy does not stay finite.
     """
-    inside = place.finer(level) > 0
-    if not inside.any() or inside.all():
-        raise ScanError(
-            f"expected a structure and background in the scan, got {'none' if inside.all() else 'one phase'}"
-        )
 
     def watch(step: int, total: int, state: object) -> None:
         progress("lowering the energy", step / total)
 
     flow = descend(
-        phase_field(inside, place.grid, WORKING_EPSILON),
+        started(level, place),
         stiff(law).in_unit(place.unit),
         place.grid,
         data=data,
@@ -65,15 +64,49 @@ def completed(
     return flow
 
 
-def stiff(law: Coefficients) -> Coefficients:
-    """Return a law scaled to a20 + a02 = `BENDING`.
+def weighed(
+    evidence: VoxelEvidence,
+    law: Coefficients,
+    nats: float,
+    place: WorkingGrid,
+    steps: int,
+    progress: Progress = silent,
+) -> Flow:
+    """Lower -log p(scan | mask) + F_ε, of which a unit of the Willmore energy costs so many nats, as `completed`."""
+    term = Evidence(place.spread(evidence.ratio) / (nats * place.grid.voxel_volume))
+    return completed(evidence.level, law, term, place, steps, progress)
+
+
+def started(level: np.ndarray, place: WorkingGrid) -> Tensor:
+    """Return the phase field, on the place's grid, of the set where a smooth volume (Z, Y, X) is positive.
 
     Raises
     ------
     ScanError
-        If a20 + a02 is not positive.
+        If it is positive everywhere or nowhere.
     """
-    bending = float(law.a20 + law.a02)
-    if bending <= 0:
-        raise ScanError(f"expected coefficients with a20 + a02 > 0, got {bending:g}: surfaces would crumple")
-    return law.scaled(BENDING / bending)
+    inside = place.finer(level) > 0
+    if not inside.any() or inside.all():
+        raise ScanError(
+            f"expected a structure and background in the scan, got {'none' if inside.all() else 'one phase'}"
+        )
+    return phase_field(inside, place.grid, WORKING_EPSILON)
+
+
+def bending(law: Coefficients) -> float:
+    """Return a20 + a02: bumps on a plane cost half of it times their Willmore energy.
+
+    Raises
+    ------
+    ScanError
+        If it is not positive.
+    """
+    sum_of_squares = float(law.a20 + law.a02)
+    if sum_of_squares <= 0:
+        raise ScanError(f"expected coefficients with a20 + a02 > 0, got {sum_of_squares:g}: surfaces would crumple")
+    return sum_of_squares
+
+
+def stiff(law: Coefficients) -> Coefficients:
+    """Return a law scaled to a20 + a02 = `BENDING`; raise ScanError as `bending`."""
+    return law.scaled(BENDING / bending(law))

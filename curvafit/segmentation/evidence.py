@@ -14,7 +14,15 @@ from curvafit.units import METRES
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.part import Crop
 
-__all__ = ["VoxelEvidence", "cropped_map", "of_intensities", "of_probability"]
+__all__ = [
+    "Classes",
+    "VoxelEvidence",
+    "classes_of",
+    "cropped_map",
+    "grey_levels",
+    "of_classes",
+    "of_probability",
+]
 
 #: Percentiles to which grey levels are clipped for Otsu's threshold.
 TAILS = (0.1, 99.9)
@@ -47,44 +55,91 @@ class VoxelEvidence:
     note: str
 
 
-def of_intensities(scan: Field, threshold: float | str = "otsu", dark: bool = False) -> VoxelEvidence:
-    """Return the evidence of two classes of grey levels with one Gaussian noise: r = (g - t) (c₁ - c₀) / σ².
+@dataclass(frozen=True)
+class Classes:
+    """Two phases of a scan: mean grey levels outside and inside, one Gaussian noise, and the level that splits them."""
 
-    Otsu's threshold splits the smoothed scan; c₀, c₁ and σ are means and pooled deviation of the raw levels on either
-    side, and t is half way between the means. The scan is then smoothed again, by a width that depends on the noise. A
-    structure of less than 0.1 % of the volume needs a threshold: Otsu's takes such a structure for a tail of the noise.
+    outside: float
+    inside: float
+    noise: float
+    middle: float
 
-    Parameters
-    ----------
-    threshold
-        t, or `"otsu"`.
-    dark
-        Whether the inside is the dark phase.
+    @property
+    def contrast(self) -> float:
+        """Return the difference of the means, negative where the structure is dark."""
+        return self.inside - self.outside
+
+    @property
+    def faint(self) -> bool:
+        """Return whether the means differ by so little that they may be noise."""
+        return abs(self.contrast) < FAINT * self.noise
+
+    def __str__(self) -> str:
+        low, high = sorted((self.outside, self.inside))
+        return f"classes at {low:.4g} and {high:.4g}, noise {self.noise:.3g}, split at {self.middle:.4g}"
+
+
+def grey_levels(scan: Field, threshold: float | str = "otsu") -> np.ndarray:
+    """Return a scan's grey levels, float32, without its tails where Otsu's threshold is to split them.
 
     Raises
     ------
     ScanError
-        If a value is not finite, or a threshold leaves nothing on one side.
+        If a value is not finite, or the threshold is another word.
     """
     values = scan.values.astype(np.float32)
     if not np.isfinite(values).all():
         raise ScanError(f"expected finite values, got {np.count_nonzero(~np.isfinite(values))} that are not")
     if isinstance(threshold, str) and threshold != "otsu":
         raise ScanError(f"expected a threshold that is a number or 'otsu', got {threshold!r}")
-    automatic = threshold == "otsu"
-    if automatic and not np.all((values == values.min()) | (values == values.max())):  # a mask's rarer value is no tail
-        values = np.clip(values, *np.percentile(values, TAILS))
-    smooth = _smoothed(values, scan, WIDTHS[0] + 0.3)
-    means, noise = _classes(values, smooth, threshold)
-    smooth = _smoothed(values, scan, _width(noise / (means[1] - means[0])))
-    means, noise = _classes(values, smooth, threshold)
-    contrast = means[1] - means[0]
-    middle, sign = sum(means) / 2 if automatic else float(threshold), -1 if dark else 1
-    noise = max(noise, LEAST_NOISE * contrast)
-    note = f"classes at {means[0]:.4g} and {means[1]:.4g}, noise {noise:.3g}, split at {middle:.4g}"
-    if automatic and contrast < FAINT * noise:
-        note += "; they differ by less than the noise, as where the structure is rare: better give a threshold"
-    return VoxelEvidence(sign * (values - middle) * np.float32(contrast / noise**2), sign * (smooth - middle), note)
+    if threshold == "otsu" and not np.all((values == values.min()) | (values == values.max())):
+        return np.clip(values, *np.percentile(values, TAILS))  # a mask's rarer value is no tail
+    return values
+
+
+def classes_of(values: np.ndarray, scan: Field, threshold: float | str = "otsu", dark: bool = False) -> Classes:
+    """Return the classes of grey levels on either side of Otsu's threshold of the smoothed scan: means and pooled
+    deviation of the raw levels, and the split half way between the means.
+
+    The scan is then smoothed again, by a width that depends on the noise. A structure of less than 0.1 % of the volume
+    needs a threshold: Otsu's takes such a structure for a tail of the noise.
+
+    Parameters
+    ----------
+    threshold
+        The split, or `"otsu"`.
+    dark
+        Whether the inside is the dark phase.
+
+    Raises
+    ------
+    ScanError
+        If a threshold leaves nothing on one side.
+    """
+    means, noise = _classes(values, _smoothed(values, scan, WIDTHS[0] + 0.3), threshold)
+    means, noise = _classes(values, _smoothed(values, scan, _width(noise / (means[1] - means[0]))), threshold)
+    middle = sum(means) / 2 if threshold == "otsu" else float(threshold)
+    outside, inside = means[::-1] if dark else means
+    return Classes(outside, inside, max(noise, LEAST_NOISE * (means[1] - means[0])), middle)
+
+
+def of_classes(values: np.ndarray, scan: Field, classes: Classes, known: np.ndarray | None = None) -> VoxelEvidence:
+    """Return the evidence of grey levels (Z, Y, X) with known classes: r = (g - t) (c₁ - c₀) / σ².
+
+    Parameters
+    ----------
+    known
+        Voxels whose grey levels count, bool (Z, Y, X), all by default: others have no evidence.
+    """
+    steep, sign = np.float32(classes.contrast / classes.noise**2), -1 if classes.contrast < 0 else 1
+    ratio, width = (values - np.float32(classes.middle)) * steep, _width(classes.noise / abs(classes.contrast))
+    if known is None:
+        level = _smoothed(values, scan, width) - np.float32(classes.middle)
+    else:
+        ratio = np.where(known, ratio, np.float32(0))
+        weight = np.maximum(_smoothed(known.astype(np.float32), scan, width), np.float32(1e-6))
+        level = _smoothed(np.where(known, values - np.float32(classes.middle), np.float32(0)), scan, width) / weight
+    return VoxelEvidence(ratio, sign * level, str(classes))
 
 
 def of_probability(probability: Field, scan: Field) -> VoxelEvidence:

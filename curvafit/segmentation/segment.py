@@ -2,31 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-from torch import Tensor
-
-from curvafit.generation import data
-from curvafit.generation.flow import Flow, descend
 from curvafit.priors.bounds import real
 from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.grid import WORKING_EPSILON
-from curvafit.priors.profile import phase_field
-from curvafit.progress import Progress, silent
-from curvafit.segmentation.evidence import cropped_map, of_intensities, of_probability
+from curvafit.progress import Progress, part, silent
+from curvafit.segmentation.engine import BENDING, HALO, STEPS, bending, started, weighed
+from curvafit.segmentation.evidence import classes_of, cropped_map, grey_levels, of_classes, of_probability
 from curvafit.segmentation.result import Segmentation, ending, result_of
-from curvafit.segmentation.working import Law, WorkingGrid, law_of
+from curvafit.segmentation.weighing import Weighing, weighing
+from curvafit.segmentation.working import Law, WorkingGrid, laws_of
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.part import Crop
 from curvafit.volumes.source import Source, field_of
 
-__all__ = ["STEPS", "segment"]
+__all__ = ["segment"]
 
-#: Default steps of Adam.
-STEPS = 150
-#: Cost in nats of a unit of the Willmore energy: best, or nearly, on bone and tubes from little noise to much.
+#: Cost in nats of a unit of the Willmore energy for probability maps.
 NATS = 1.0
+#: A law that is tried beside the prior's.
+WILLMORE = Coefficients.willmore()
+#: What is said of classes that may be noise.
+FAINT = "The classes differ by less than the noise, as where the structure is rare: better give a threshold."
+#: Share of the time that trying laws out takes.
+TRIALS = 0.7
 #: Least and greatest weight.
 WEIGHTS = (1e-9, 1e9)
 
@@ -47,6 +47,10 @@ def segment(
 ) -> Segmentation:
     """Find the structure of a scan: lower -log p(scan | mask) + λ F_ε from a smoothed, thresholded start.
 
+    Which law is lowered, and with which weight, is decided by grey levels that are left out: those that a fit trusts
+    and the Willmore energy are tried, and where none tells them better than the start does, the start is the answer.
+    Of a probability map nothing can be left out, since its voxels tell each other.
+
     Parameters
     ----------
     scan
@@ -58,9 +62,9 @@ def segment(
         The probability of the inside, in [0, 1], in place of grey levels, `threshold` and `dark`: a volume of the
         scan's shape, at the scan's place where both files state one. A file's map has the scan's `spacing` and `unit`.
     weight
-        λ, in nats per unit of F_ε; by default 2 / (a20 + a02). Small bumps on a plane cost (a20 + a02) / 2 times their
-        Willmore energy (linear terms aside, since ∫κ1κ2 = 0): with the default, every prior counts as strongly as the
-        Willmore energy, and the data count by their noise.
+        λ, in nats per unit of F_ε, for the first law; by default it is chosen, with the law, by voxels left out. Small
+        bumps on a plane cost (a20 + a02) / 2 times their Willmore energy (linear terms aside, since ∫κ1κ2 = 0). For a
+        probability map it is 2 / (a20 + a02) by default: the prior then counts as strongly as the Willmore energy.
     threshold, dark
         The grey level between the phases, or `"otsu"`; whether the structure is the dark one.
     epsilon
@@ -82,56 +86,49 @@ def segment(
         If there is no such `fit.json`.
     """
     scan = field_of(scan, crop=crop, **reading)
-    law, notes = law_of(prior, scan)
-    place = WorkingGrid.of(scan, epsilon)
-    weight = None if weight is None else real(weight, "a positive weight", *WEIGHTS)
+    laws, notes = laws_of(prior, scan)
+    place = WorkingGrid.of(scan, epsilon, halo=HALO)
+    stiffness = bending(laws[0]) / BENDING
+    nats = NATS if weight is None else real(weight, "a positive weight", *WEIGHTS) * stiffness
     if not (isinstance(threshold, str) and threshold == "otsu"):
         real(threshold, "a threshold that is a number or 'otsu'")
-    if probability is None:
-        evidence = of_intensities(scan, threshold, dark)
-    elif dark or threshold != "otsu":
-        raise ScanError("expected neither a threshold nor dark with a probability map, which says what is inside")
-    else:
+    chosen: Weighing | None = None
+    if probability is not None:
+        if dark or threshold != "otsu":
+            raise ScanError("expected neither a threshold nor dark with a probability map, which says what is inside")
         placed = {} if isinstance(probability, Field) else {name: reading.get(name) for name in ("spacing", "unit")}
         evidence = of_probability(cropped_map(field_of(probability, **placed), crop), scan)
-    start = _started(evidence.level, place)
-    stiffness = float(law.a20 + law.a02) / 2
-    if stiffness <= 0:
-        raise ScanError(f"expected coefficients with a20 + a02 > 0, got {2 * stiffness:g}: surfaces would crumple")
-    λ = NATS / stiffness if weight is None else float(weight)
-    ratio = place.spread(evidence.ratio) / (λ * stiffness * place.grid.voxel_volume)
-    flow = _lowered(start, law.scaled(1 / stiffness), data.Evidence(ratio), place, steps, progress)
+    else:
+        values = grey_levels(scan, threshold)
+        classes = classes_of(values, scan, threshold, dark)
+        if weight is None:
+            chosen = weighing(
+                values, scan, classes, (*laws, *({WILLMORE} - set(laws))),
+                epsilon=epsilon, steps=steps, measured=threshold == "otsu", progress=part(progress, 0.0, TRIALS),
+            )  # fmt: skip
+            nats, classes, progress = chosen.nats, chosen.classes, part(progress, TRIALS, 1.0)
+        evidence = of_classes(values, scan, classes)
+        if classes.faint and threshold == "otsu" and (chosen is None or chosen.law is None):
+            notes = (*notes, FAINT)
     notes = (*notes, f"{evidence.note[0].upper()}{evidence.note[1:]}.", *place.notes)
-    u = place.back(flow.field)
-    return result_of(scan, u > 0, u, weight=λ, law=law, epsilon=place.epsilon, status=ending(flow, u > 0), notes=notes)
+    law = laws[0] if chosen is None else chosen.law
+    if law is None:
+        u = place.back(started(evidence.level, place))
+        status = f"{100 * float((u > 0).mean()):.2f} % of the volume is inside"
+    else:
+        flow = weighed(evidence, law, nats, place, steps, progress)
+        u = place.back(flow.field)
+        status = ending(flow, u > 0)
+    λ = weight if weight is not None or law is None else nats * BENDING / bending(law)
+    if chosen is not None:
+        status = f"{_gain(chosen, laws)}; {status}"
+    return result_of(scan, u > 0, u, weight=λ, law=law, epsilon=place.epsilon, status=status, notes=notes)
 
 
-def _started(level: np.ndarray, place: WorkingGrid) -> Tensor:
-    """Return the phase field of the set where a smooth volume is positive."""
-    inside = place.finer(level) > 0
-    if not inside.any() or inside.all():
-        raise ScanError(
-            f"expected a structure and background in the scan, got {'none' if inside.all() else 'one phase'}"
-        )
-    return phase_field(inside, place.grid, WORKING_EPSILON)
-
-
-def _lowered(
-    start: Tensor, law: Coefficients, term: data.Data, place: WorkingGrid, steps: int, progress: Progress
-) -> Flow:
-    def watch(step: int, total: int, state: object) -> None:
-        progress("lowering the energy", step / total)
-
-    flow = descend(
-        start,
-        law.in_unit(place.unit),
-        place.grid,
-        data=term,
-        optimiser="adam",
-        steps=steps,
-        blur=0.0,
-        callbacks=[watch],
-    )
-    if not flow.finite:
-        raise ScanError(f"expected an energy that stays finite, got a flow that {flow.status}: lower the weight")
-    return flow
+def _gain(chosen: Weighing, laws: Sequence[Coefficients]) -> str:
+    """Return what was chosen and what it gains, as the beginning of a sentence."""
+    share = f"{100 * chosen.gain:+.2g} ± {100 * chosen.noise:.2g} % of the voxels left out are on their side"
+    if chosen.law is None:
+        return f"no prior helps here: with the best {share}"
+    law = "the prior helps" if chosen.law in laws else "the Willmore energy helps, more than the prior"
+    return f"{law}, at {chosen.nats:g} nats: {share}"
