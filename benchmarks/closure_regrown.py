@@ -1,7 +1,7 @@
 """Shapes regrown from inferred laws against the shape that was read, beside the truth regrown and a null.
 
     python -m benchmarks.closure_regrown STORE [--posterior FILE] [--cache FOLDER] [--queries 60] [--few 10]
-                                         [--views field,mask,scan] [--minutes 3]
+                                         [--views field,mask,scan] [--methods refined,…] [--minutes 3]
 
 The queries are STORE's first well-formed shapes, which neither the posterior nor the packaged atlas must have learnt
 from. Each is seen through each view (`inference.views`), and each method reads a law from the view, as
@@ -170,6 +170,7 @@ def main() -> None:
     parser.add_argument("--queries", type=int, default=60)
     parser.add_argument("--few", type=int, default=10)
     parser.add_argument("--views", default=",".join(BARS))
+    parser.add_argument("--methods", default=",".join(METHODS), help="those that are run; all that is kept is shown")
     parser.add_argument("--minutes", type=float, default=3.0)
     options = parser.parse_args()
     store = open_store(options.store)
@@ -177,7 +178,7 @@ def main() -> None:
     bench = Bench(store, load_posterior(options.posterior), options.cache, views)
     options.cache.mkdir(parents=True, exist_ok=True)
     queries = queries_of(store, options.queries)
-    left = proceed(jobs(bench, queries, options.few), options.minutes)
+    left = proceed(jobs(bench, queries, options.few, options.methods.split(",")), options.minutes)
     for view in views:
         show(view, *load_trials(bench, queries, view), bench.posterior.emulator.deviation)
     print(f"{left} files left: run again" if left else "all done")

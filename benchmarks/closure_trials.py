@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from functools import cache, lru_cache, partial
 from itertools import islice
 from pathlib import Path
@@ -222,23 +222,23 @@ class Job(NamedTuple):
     make: Callable[[], Trial | dict[str, np.ndarray]]
 
 
-def jobs(bench: Bench, queries: Sequence[int], few: int) -> Iterator[Job]:
-    """The files to make, in their order."""
+def jobs(bench: Bench, queries: Sequence[int], few: int, names: Collection[str] = tuple(METHODS)) -> Iterator[Job]:
+    """The files to make for some methods, in their order."""
     for index in queries:
         for view in bench.views:
             yield Job(bench.path(index, view, "itself"), partial(itself, bench, index, view))
-        yield from trials(bench, index, slow=False)
+        yield from trials(bench, index, names, slow=False)
     for index in queries[:few]:
-        for k, path in enumerate(bench.clouds(index)):
+        for k, path in enumerate(bench.clouds(index) if "synthetic" in names else ()):
             yield Job(path, partial(cloud, bench, index, k))
-        yield from trials(bench, index, slow=True)
+        yield from trials(bench, index, names, slow=True)
 
 
-def trials(bench: Bench, index: int, *, slow: bool) -> Iterator[Job]:
-    """The trials of a query by the slow methods, or by the others."""
+def trials(bench: Bench, index: int, names: Collection[str], *, slow: bool) -> Iterator[Job]:
+    """The trials of a query by the slow ones of some methods, or by the others."""
     for name, method in METHODS.items():
         for view in bench.views:
-            if method.slow == slow and view in (method.views or bench.views):
+            if name in names and method.slow == slow and view in (method.views or bench.views):
                 yield Job(bench.trial_path(index, view, name), partial(trial, bench, index, view, method))
 
 
