@@ -49,7 +49,7 @@ SCANS = {
     "mitochondria-2": Scan("urocell_mito_fib1-3-2-1.nii.gz", "mitochondria", kind="mask"),
     "felt": Scan("fiberform_100.tif", "felt"),
     "polymer": Scan("quanfima_polymer3d_8bit_128x128x128.raw", "polymer", {"raw_shape": (128, 128, 128)}),
-    "membranes": Scan("plantseg_sample_ovule.h5", "membranes", {"dataset": "raw"}),
+    "membranes": Scan("plantseg_sample_ovule.h5", "membranes", {"key": "raw"}),
     "capillaries": Scan("vesselexpress_000_mask.tif", "capillaries", kind="mask"),
     "minivess": Scan("minivess_mv68_mask.nii.gz", "capillaries", kind="mask"),
     "sandstone": Scan("openpnm_berea_100_to_300.npz", "sandstone"),
