@@ -43,10 +43,12 @@ class Scan(NamedTuple):
     kind: str = "auto"
 
 
+#: The voxels of UroCell, whose headers state others.
+NANOMETRES = {"spacing": 16.0, "unit": "nm"}
 SCANS = {
     "bone": Scan("lhdl_trabecular_200.tif", "bone"),
-    "mitochondria-1": Scan("urocell_mito_fib1-0-0-0.nii.gz", "mitochondria", kind="mask"),
-    "mitochondria-2": Scan("urocell_mito_fib1-3-2-1.nii.gz", "mitochondria", kind="mask"),
+    "mitochondria-1": Scan("urocell_mito_fib1-0-0-0.nii.gz", "mitochondria", NANOMETRES, kind="mask"),
+    "mitochondria-2": Scan("urocell_mito_fib1-3-2-1.nii.gz", "mitochondria", NANOMETRES, kind="mask"),
     "felt": Scan("fiberform_100.tif", "felt"),
     "polymer": Scan("quanfima_polymer3d_8bit_128x128x128.raw", "polymer", {"raw_shape": (128, 128, 128)}),
     "membranes": Scan("plantseg_sample_ovule.h5", "membranes", {"key": "raw"}),
