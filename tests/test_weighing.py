@@ -68,8 +68,8 @@ def test_classes_that_overlap_are_measured_apart() -> None:
     scan = noisy(tubes(), 180)
     first = classes_of(grey_levels(scan), scan)
     best = weighed(scan, [WILLMORE])
-    assert abs(first.middle - 80) > 2 * abs(best.classes.middle - 80)
-    assert best.classes.contrast == pytest.approx(100, rel=0.2) and best.classes.noise == pytest.approx(180, rel=0.03)
+    assert abs(first.middle - 80) > 1.3 * abs(best.classes.middle - 80)
+    assert 80 > first.contrast < best.classes.contrast < 110 and best.classes.noise == pytest.approx(180, rel=0.03)
     kept = weighed(scan, [WILLMORE], measured=False)
     assert kept.classes == first
 

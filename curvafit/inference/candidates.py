@@ -67,7 +67,7 @@ class Candidate:
         distance = float(one_to_many(scan, diagrams).mean())
         noise = float(one_to_many(diagrams[0], diagrams[1:]).mean()) if len(diagrams) > 1 else None
         numbers = tuple(each.morphometry for each in twins if each.morphometry is not None)
-        mass = float(np.mean([each.mass for each in twins if each.phase is not None]))
+        mass = float(np.clip(np.mean([each.mass for each in twins if each.phase is not None]), -1, 1))
         known = {name: value for name, value in self.uncertainty.items() if name != "mass" or mass == self.mass}
         return replace(self, mass=mass, uncertainty=known, distance=distance, seed_noise=noise, twins=numbers)
 

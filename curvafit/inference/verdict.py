@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 from curvafit.geometry.morphometry import Morphometry
@@ -13,7 +12,7 @@ from curvafit.units import number
 #: Twins within this many seeds' distances of the scan support their law: true laws' twins lie one away, of a badly
 #: degraded scan some 1.8. Twins within `FURTHEST` whose familiar numbers are the scan's are near; others are no twins.
 CLOSE, FURTHEST = 2.0, 5.0
-#: Familiar numbers in which twins may differ from the scan, and the part by which they may without being named.
+#: Familiar numbers in which twins may differ from the scan, and the part by which all of them must to be named.
 FAMILIAR = {"thickness": "thickness_mean", "spacing": "spacing_mean", "connectivity": "connectivity_density"}
 NEAR = 0.15
 
@@ -44,7 +43,11 @@ def verdict(
     if ratio > CLOSE:
         alike = "They have its thickness, spacing and connectivity, and another law may come nearer."
         return best.name, _joined(f"Near ({title}): {apart}", alike, _unusual(misfit), best.status)
-    return best.name, _joined(f"Supported ({title}): {apart}", _unusual(misfit), familiar, best.status)
+    if familiar:
+        return best.name, _joined(
+            f"Near ({title}): {apart}", "That is near enough.", familiar, _unusual(misfit), best.status
+        )
+    return best.name, _joined(f"Supported ({title}): {apart}", _unusual(misfit), best.status)
 
 
 def _joined(*sentences: str) -> str:
@@ -53,15 +56,15 @@ def _joined(*sentences: str) -> str:
 
 
 def unlike(scan: Morphometry, twins: Sequence[Morphometry]) -> str:
-    """Return which familiar numbers of the twins differ from the scan's, as a sentence; empty where all are near."""
+    """Return the familiar numbers in which all twins differ from the scan the same way, as a sentence; or nothing."""
     apart = []
     for word, name in FAMILIAR.items():
-        own, others = getattr(scan, name), [getattr(each, name) for each in twins]
-        ratio = sum(others) / len(others) / own if others and own else math.nan
-        if ratio < 0:
-            apart.append(f"{word} of the other sign")
-        elif abs(ratio - 1) > NEAR:
-            apart.append(f"{word} {number(ratio, 2)}")
+        own = getattr(scan, name)
+        ratios = [getattr(each, name) / own for each in twins] if own else []
+        if not ratios or not (min(ratios) > 1 + NEAR or max(ratios) < 1 - NEAR):
+            continue
+        ratio = sum(ratios) / len(ratios)
+        apart.append(f"{word} of the other sign" if ratio < 0 else f"{word} {number(ratio, 2)}")
     return f"Twins over scan: {', '.join(apart)}." if apart else ""
 
 

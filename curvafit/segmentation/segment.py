@@ -102,9 +102,10 @@ def segment(
         values = grey_levels(scan, threshold)
         classes = classes_of(values, scan, threshold, dark)
         if weight is None:
+            overlap = threshold == "otsu" and classes.faint
             chosen = weighing(
                 values, scan, classes, (*laws, *({WILLMORE} - set(laws))),
-                epsilon=epsilon, steps=steps, measured=threshold == "otsu", progress=part(progress, 0.0, TRIALS),
+                epsilon=epsilon, steps=steps, measured=overlap, progress=part(progress, 0.0, TRIALS),
             )  # fmt: skip
             nats, classes, progress = chosen.nats, chosen.classes, part(progress, TRIALS, 1.0)
         evidence = of_classes(values, scan, classes)

@@ -25,9 +25,8 @@ LEFT_OUT, TIMES, LONGEST_BLOCK, CORRELATED = 0.25, 2, 6, 0.15
 #: Weights that are tried, in nats of a unit of the Willmore energy, and the first of them.
 WEIGHTS = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
 FIRST = WEIGHTS.index(1.0)
-#: Times that the classes are measured again, on voxels left out this many voxels within a phase: others hold both. All
-#: laws are tried in the first round and the last.
-ROUNDS, DEPTH = 3, 1.5
+#: Times that the classes are measured again. All laws are tried in the first round and the last.
+ROUNDS = 3
 #: Fewest voxels of a class that are measured.
 FEWEST = 100
 #: Edge of the cubes whose gains are taken to be independent, in voxels.
@@ -89,7 +88,7 @@ def weighing(
     steps
         Steps of each flow.
     measured
-        Whether the classes are measured again, where the voxels left out lie well within a phase; else they stay.
+        Whether the classes are measured again, of the voxels left out on either side; else they stay.
 
     Raises
     ------
@@ -142,7 +141,7 @@ def _trials(laws: int, rounds: int) -> int:
 @dataclass(frozen=True)
 class _Trial:
     """What a law and a weight make of voxels left out: the sum of the log-likelihood ratios of those inside, in nats;
-    gain and standard error, as in `Weighing`; and the classes of those well within a phase."""
+    gain and standard error, as in `Weighing`; and the classes on either side."""
 
     worth: float
     gain: float
@@ -166,8 +165,7 @@ def _tried(
             return _Trial(-np.inf, -1.0, 0.0, classes)
         worth += float(ratio[out & mask].sum())
         change += np.where(out, (mask.astype(np.int8) - (known.level > 0)) * ratio, 0)
-        for phase, each in zip(phases, (~mask, mask), strict=True):
-            phase |= out & (np.asarray(ndimage.distance_transform_edt(each)) > DEPTH)
+        phases |= np.stack([out & ~mask, out & mask])
     for axis, n in enumerate(levels.shape):
         change = np.add.reduceat(change, np.arange(0, n, TILE), axis=axis)
     right = 2 * (classes.noise / classes.contrast) ** 2 / sum(int(out.sum()) for out in outs)

@@ -25,7 +25,7 @@ MOST = 1024
 #: Seconds that a scheduler has to answer.
 PATIENCE = 10
 #: A worker's environment. Dask has the C library give memory back at once: arrays of a megabyte are then mapped anew
-#: each time, and measuring shapes takes four times as long.
+#: each time, and measuring shapes takes nearly four times as long.
 _ENVIRONMENT = {
     "DASK_LOGGING__DISTRIBUTED": "critical",
     "MALLOC_TRIM_THRESHOLD_": 1 << 28,
