@@ -64,7 +64,7 @@ def test_what_grew_is_measured_against_the_scan() -> None:
     assert both.seed_noise is not None and both.distance == pytest.approx(both.seed_noise / 2) and both.distance > 1
     assert (both.mass, both.twins, both.status) == (-0.375, (NUMBERS, NUMBERS), "")
     over = law("simulation").grown(scan, (twin(scan, -1.002), twin(scan, -1.001)))
-    assert over.mass == -1  # a rare structure's field lies a little below -1 in the mean, and a fit holds no such mass
+    assert -1 < over.mass < -0.999  # a rare structure's field lies below -1 in the mean, and a fit holds no such mass
     one = law("simulation").grown(scan, (twin(scan, -0.5),))
     assert (one.distance, one.seed_noise, one.twins) == (0.0, None, (NUMBERS,))
     none = law("simulation", status="Hm.").grown(scan, (twin(None, 0.0),))
@@ -146,14 +146,14 @@ def test_a_far_or_strange_one_is_named_but_not_believed() -> None:
 def test_familiar_numbers_that_differ_are_named() -> None:
     """Where all twins differ by more than 15 %, the same way; none that the scan does not have."""
     near = dataclasses.replace(NUMBERS, thickness_mean=1.14 * NUMBERS.thickness_mean)
-    assert unlike(NUMBERS, (NUMBERS, near)) == unlike(NUMBERS, (near,)) == unlike(NUMBERS, ()) == ""
+    assert unlike(NUMBERS, (NUMBERS, near)) == unlike(NUMBERS, (near,)) == unlike(NUMBERS, ()) == []
     far = dataclasses.replace(NUMBERS, thickness_mean=3 * NUMBERS.thickness_mean, connectivity_density=0.0)
     further = dataclasses.replace(far, thickness_mean=5 * NUMBERS.thickness_mean)
-    assert unlike(NUMBERS, (far, further)) == "Twins over scan: thickness 4.0, connectivity 0."
-    assert unlike(NUMBERS, (NUMBERS, far)) == ""
+    assert unlike(NUMBERS, (far, further)) == ["thickness 4.0", "connectivity 0"]
+    assert unlike(NUMBERS, (NUMBERS, far)) == []
     thin = dataclasses.replace(NUMBERS, thickness_mean=0.5 * NUMBERS.thickness_mean)
-    assert unlike(NUMBERS, (thin, dataclasses.replace(far, connectivity_density=NUMBERS.connectivity_density))) == ""
+    assert unlike(NUMBERS, (thin, dataclasses.replace(far, connectivity_density=NUMBERS.connectivity_density))) == []
     pieces = dataclasses.replace(NUMBERS, connectivity_density=-NUMBERS.connectivity_density)
-    assert unlike(NUMBERS, (pieces,)) == "Twins over scan: connectivity of the other sign."
-    assert unlike(dataclasses.replace(NUMBERS, thickness_mean=math.nan), (NUMBERS,)) == ""
-    assert unlike(dataclasses.replace(NUMBERS, connectivity_density=0.0), (NUMBERS,)) == ""
+    assert unlike(NUMBERS, (pieces,)) == ["connectivity of the other sign"]
+    assert unlike(dataclasses.replace(NUMBERS, thickness_mean=math.nan), (NUMBERS,)) == []
+    assert unlike(dataclasses.replace(NUMBERS, connectivity_density=0.0), (NUMBERS,)) == []

@@ -16,6 +16,8 @@ from curvafit.inference.twins import Twin
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.fit_file import six_of
 
+#: Greatest mass of either sign: a rare structure's field lies a little beyond ±1 in the mean.
+RARE = 1 - 1e-6
 #: Where a law comes from, as people read it.
 TITLES = {
     "refined": "refined by simulation",
@@ -67,7 +69,7 @@ class Candidate:
         distance = float(one_to_many(scan, diagrams).mean())
         noise = float(one_to_many(diagrams[0], diagrams[1:]).mean()) if len(diagrams) > 1 else None
         numbers = tuple(each.morphometry for each in twins if each.morphometry is not None)
-        mass = float(np.clip(np.mean([each.mass for each in twins if each.phase is not None]), -1, 1))
+        mass = float(np.clip(np.mean([each.mass for each in twins if each.phase is not None]), -RARE, RARE))
         known = {name: value for name, value in self.uncertainty.items() if name != "mass" or mass == self.mass}
         return replace(self, mass=mass, uncertainty=known, distance=distance, seed_noise=noise, twins=numbers)
 

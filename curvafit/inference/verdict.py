@@ -35,10 +35,12 @@ def verdict(
     title = TITLES[best.name]
     apart = f"its twins lie {best.distance:.1f} from the scan's curvature diagram"
     apart += f", {noise:.1f} from each other." if noise else "."
-    ratio, familiar = 0.0 if not noise else best.distance / noise, unlike(scan, best.twins)
+    ratio, other = 0.0 if not noise else best.distance / noise, unlike(scan, best.twins)
+    familiar = f"Twins over scan: {', '.join(other)}." if other else ""
     strange = misfit is not None and misfit.probability < UNBELIEVABLE
-    if strange or ratio > FURTHEST or (ratio > CLOSE and familiar):
-        reason = _unusual(misfit) if strange else f"Twins should lie some {noise:.1f} from it."
+    if strange or ratio > FURTHEST or len(other) > (ratio <= CLOSE):
+        far = f"Twins should lie some {noise:.1f} from it." if ratio > CLOSE else ""
+        reason = _unusual(misfit) if strange else far
         return best.name, _joined(f"No believable twin: of the nearest law ({title}), {apart}", reason, familiar)
     if ratio > CLOSE:
         alike = "They have its thickness, spacing and connectivity, and another law may come nearer."
@@ -55,8 +57,8 @@ def _joined(*sentences: str) -> str:
     return " ".join(filter(None, sentences))
 
 
-def unlike(scan: Morphometry, twins: Sequence[Morphometry]) -> str:
-    """Return the familiar numbers in which all twins differ from the scan the same way, as a sentence; or nothing."""
+def unlike(scan: Morphometry, twins: Sequence[Morphometry]) -> list[str]:
+    """Return the familiar numbers in which all twins differ from the scan the same way, with their ratios, as words."""
     apart = []
     for word, name in FAMILIAR.items():
         own = getattr(scan, name)
@@ -65,7 +67,7 @@ def unlike(scan: Morphometry, twins: Sequence[Morphometry]) -> str:
             continue
         ratio = sum(ratios) / len(ratios)
         apart.append(f"{word} of the other sign" if ratio < 0 else f"{word} {number(ratio, 2)}")
-    return f"Twins over scan: {', '.join(apart)}." if apart else ""
+    return apart
 
 
 def _unusual(misfit: Misfit | None) -> str:
