@@ -45,6 +45,9 @@ def verdict(
     if ratio > CLOSE:
         alike = "They have its thickness, spacing and connectivity, and another law may come nearer."
         return best.name, _joined(f"Near ({title}): {apart}", alike, _unusual(misfit), best.status)
+    if noise is None:
+        once = "No law grew twice, so it is not known how far apart two seeds lie."
+        return best.name, _joined(f"Near ({title}): {apart}", once, familiar, _unusual(misfit), best.status)
     if familiar:
         return best.name, _joined(
             f"Near ({title}): {apart}", "That is near enough.", familiar, _unusual(misfit), best.status
