@@ -103,9 +103,20 @@ def test_where_a_prior_tells_nothing_the_start_is_the_answer() -> None:
     scan = noisy(tubes(), 5)
     wrong = Coefficients(1.0, 0.0, 1.0, 30.0, 30.0, 900.0)
     best = weighed(scan, [wrong])
-    assert best.law is None
+    assert best.law is None and best.classes == classes_of(grey_levels(scan), scan)
     found = segment(scan, wrong, steps=100)
     assert (found.mask.values != tubes()).mean() < 0.01
+
+
+def test_sides_that_explain_less_than_the_start_s_measure_no_classes() -> None:
+    """A mask that grows fat brings the classes together, which makes it fatter."""
+    truth, noise = tubes(), 150.0
+    scan, classes = noisy(truth, noise), Classes(30.0, 130.0, noise, 80.0)
+    outs = room._blocks(scan.shape, 2)
+    fat = ndimage.binary_dilation(truth, iterations=8)
+    assert room._tried(scan, outs, classes, lambda known: fat).classes == classes
+    apart = room._tried(scan, outs, classes, lambda known: truth).classes
+    assert apart != classes and apart.contrast == pytest.approx(100, rel=0.1)
 
 
 def test_a_flow_that_fails_is_no_choice(monkeypatch: pytest.MonkeyPatch) -> None:

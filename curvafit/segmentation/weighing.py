@@ -49,7 +49,7 @@ class Weighing:
         By which part more of the voxels left out the best law finds on their side of the surface than the start does,
         and its standard error.
     classes
-        The grey levels of the two phases, as measured again.
+        The grey levels of the two phases, as measured again; as they were given where no law helps.
     """
 
     law: Coefficients | None
@@ -88,14 +88,15 @@ def weighing(
     steps
         Steps of each flow.
     measured
-        Whether the classes are measured again, of the voxels left out on either side; else they stay.
+        Whether the classes are measured again, of the voxels left out on either side, where these sides explain more of
+        their levels than those of the start; else they stay.
 
     Raises
     ------
     ScanError
         If the start has one phase only.
     """
-    inside = of_classes(values, scan, classes).level > 0
+    given, inside = classes, of_classes(values, scan, classes).level > 0
     where = _busiest(inside)
     part = replace(scan.crop(where), values=values[where])
     outs = _blocks(part.shape, _outlasting(part.values, inside[where]))
@@ -125,7 +126,9 @@ def weighing(
             number += step
     number = max(tried, key=lambda each: tried[each].worth)
     gain, noise = tried[number].gain, tried[number].noise
-    return Weighing(best if gain > BEYOND * noise else None, WEIGHTS[number], gain, noise, classes)
+    if gain > BEYOND * noise:
+        return Weighing(best, WEIGHTS[number], gain, noise, classes)
+    return Weighing(None, WEIGHTS[number], gain, noise, given)
 
 
 def trial_steps(laws: int, steps: int, voxels: int) -> float:
@@ -156,7 +159,8 @@ def _tried(
     then others."""
     levels = part.values
     ratio = of_classes(levels, part, classes).ratio.astype(np.float64)
-    worth, change, phases = 0.0, np.zeros(levels.shape), np.zeros((2, *levels.shape), dtype=bool)
+    worth, change = 0.0, np.zeros(levels.shape)
+    phases, starts = np.zeros((2, 2, *levels.shape), dtype=bool)
     for out in outs:
         known = of_classes(levels, part, classes, ~out)
         try:
@@ -166,11 +170,23 @@ def _tried(
         worth += float(ratio[out & mask].sum())
         change += np.where(out, (mask.astype(np.int8) - (known.level > 0)) * ratio, 0)
         phases |= np.stack([out & ~mask, out & mask])
+        starts |= np.stack([out & (known.level <= 0), out & (known.level > 0)])
     for axis, n in enumerate(levels.shape):
         change = np.add.reduceat(change, np.arange(0, n, TILE), axis=axis)
     right = 2 * (classes.noise / classes.contrast) ** 2 / sum(int(out.sum()) for out in outs)
     error = float(np.sqrt(np.square(change).sum()))
-    return _Trial(worth, right * float(change.sum()), right * error, _measured(levels, phases, classes))
+    explains = _explained(levels, phases) > _explained(levels, starts)
+    measured = _measured(levels, phases, classes) if explains else classes
+    return _Trial(worth, right * float(change.sum()), right * error, measured)
+
+
+def _explained(levels: np.ndarray, phases: np.ndarray) -> float:
+    """Return the sum of squares of the levels in two phases `(2, Z, Y, X)` that the phases' means explain."""
+    outside, inside = (levels[phase].astype(np.float64) for phase in phases)
+    if not len(outside) or not len(inside):
+        return 0.0
+    weight = len(outside) * len(inside) / (len(outside) + len(inside))
+    return float(weight * (inside.mean() - outside.mean()) ** 2)
 
 
 def _measured(levels: np.ndarray, phases: np.ndarray, classes: Classes) -> Classes:
