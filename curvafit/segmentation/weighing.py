@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from scipy import ndimage
 
 from curvafit.priors.coefficients import Coefficients
 from curvafit.progress import Progress, silent
+from curvafit.segmentation.calibration import BEYOND
 from curvafit.segmentation.engine import HALO, weighed
 from curvafit.segmentation.evidence import LEAST_NOISE, Classes, VoxelEvidence, of_classes
 from curvafit.segmentation.working import WorkingGrid
@@ -31,8 +33,6 @@ ROUNDS = 3
 FEWEST = 100
 #: Edge of the cubes whose gains are taken to be independent, in voxels.
 TILE = 8
-#: Standard errors by which a law must be better than none.
-BEYOND = 1.0
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,8 @@ def weighing(
     place = WorkingGrid.of(part, epsilon, halo=HALO)
     rounds, count = ROUNDS if measured else 1, 0
 
-    def trial(law: Coefficients, nats: float) -> _Trial:
+    @cache
+    def trial(law: Coefficients, nats: float, classes: Classes) -> _Trial:
         nonlocal count
         count += 1
         progress("trying the prior out", min(count / _trials(len(laws), rounds), 1.0))
@@ -112,15 +113,15 @@ def weighing(
     best = laws[0]
     for number in range(rounds):
         asked = laws if number in (0, rounds - 1) else [best]
-        trials = [trial(law, WEIGHTS[FIRST]) for law in asked]
+        trials = [trial(law, WEIGHTS[FIRST], classes) for law in asked]
         best, first = max(zip(asked, trials, strict=True), key=lambda each: each[1].worth)
         if measured:
             classes = first.classes
-    tried = {FIRST: trial(best, WEIGHTS[FIRST])}
+    tried = {FIRST: trial(best, WEIGHTS[FIRST], classes)}
     for step in (1, -1):
         number = FIRST + step
         while 0 <= number < len(WEIGHTS):
-            tried[number] = trial(best, WEIGHTS[number])
+            tried[number] = trial(best, WEIGHTS[number], classes)
             if tried[number].worth <= tried[number - step].worth:
                 break
             number += step
