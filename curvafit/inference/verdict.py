@@ -10,7 +10,8 @@ from curvafit.inference.misfit import UNBELIEVABLE, Misfit
 from curvafit.units import number
 
 #: Twins within this many seeds' distances of the scan support their law: true laws' twins lie one away, of a badly
-#: degraded scan some 1.8. Twins within `FURTHEST` whose familiar numbers are the scan's are near; others are no twins.
+#: degraded scan some 1.8. Twins within `FURTHEST` whose familiar numbers are the scan's are near, and so are those that
+#: are close but for one familiar number; others are no twins.
 CLOSE, FURTHEST = 2.0, 5.0
 #: Familiar numbers in which twins may differ from the scan, and the part by which all of them must to be named.
 FAMILIAR = {"thickness": "thickness_mean", "spacing": "spacing_mean", "connectivity": "connectivity_density"}
@@ -38,7 +39,8 @@ def verdict(
     ratio, other = 0.0 if not noise else best.distance / noise, unlike(scan, best.twins)
     familiar = f"Twins over scan: {', '.join(other)}." if other else ""
     strange = misfit is not None and misfit.probability < UNBELIEVABLE
-    if strange or ratio > FURTHEST or len(other) > (ratio <= CLOSE):
+    allowed = 1 if ratio <= CLOSE else 0
+    if strange or ratio > FURTHEST or len(other) > allowed:
         far = f"Twins should lie some {noise:.1f} from it." if ratio > CLOSE else ""
         reason = _unusual(misfit) if strange else far
         return best.name, _joined(f"No believable twin: of the nearest law ({title}), {apart}", reason, familiar)
