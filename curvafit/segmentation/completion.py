@@ -14,7 +14,7 @@ from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
 from curvafit.progress import Progress, silent
 from curvafit.segmentation.calibration import Choice, Setting, Task, choice, left_out
 from curvafit.segmentation.engine import HALO, STEPS, completed
-from curvafit.segmentation.result import Segmentation, ending, result_of
+from curvafit.segmentation.result import Segmentation, ending, filled, result_of
 from curvafit.segmentation.slices import WAYS, Slices
 from curvafit.segmentation.working import Law, WorkingGrid, laws_of
 from curvafit.units import sampling
@@ -128,7 +128,7 @@ def _filled(
     level, held = slices.level(setting.way), list(slices.places)
     if setting.law is None:
         u = np.tanh(level / (math.sqrt(2) * place.epsilon))
-        return level > 0, u, f"{100 * float((u > 0).mean()):.2f} % of the volume is inside"
+        return level > 0, u, filled(u > 0)
     pull = np.zeros(level.shape, dtype=np.float32)
     pull[held] = np.where(slices.inside, setting.stiffness, -setting.stiffness)
     flow = completed(

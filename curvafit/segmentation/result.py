@@ -12,7 +12,7 @@ from curvafit.priors.coefficients import Coefficients
 from curvafit.units import sampling
 from curvafit.volumes.field import Field
 
-__all__ = ["Segmentation", "ending", "result_of"]
+__all__ = ["Segmentation", "ending", "filled", "result_of"]
 
 #: A flow has settled where its last ten steps lower the energy by less than this share.
 SETTLED = 0.001
@@ -59,7 +59,12 @@ def ending(flow: Flow, mask: np.ndarray) -> str:
     length = f"{count} step" if count == 1 else f"{count} steps"
     if share in (0.0, 1.0):
         return f"no surface is left after {length}: the prior is too strong for the data, lower its weight"
-    return f"{word} after {length}: {100 * share:.2f} % of the volume is inside"
+    return f"{word} after {length}: {filled(mask)}"
+
+
+def filled(mask: np.ndarray) -> str:
+    """Return which share of the volume is inside, as a sentence."""
+    return f"{100 * float(mask.mean()):.2f} % of the volume is inside"
 
 
 def result_of(

@@ -10,7 +10,7 @@ from curvafit.priors.coefficients import Coefficients
 from curvafit.progress import Progress, part, silent
 from curvafit.segmentation.engine import BENDING, HALO, STEPS, bending, started, weighed
 from curvafit.segmentation.evidence import classes_of, cropped_map, grey_levels, of_classes, of_probability
-from curvafit.segmentation.result import Segmentation, ending, result_of
+from curvafit.segmentation.result import Segmentation, ending, filled, result_of
 from curvafit.segmentation.weighing import Weighing, weighing
 from curvafit.segmentation.working import Law, WorkingGrid, laws_of
 from curvafit.volumes.field import Field, ScanError
@@ -115,7 +115,7 @@ def segment(
     law = laws[0] if chosen is None else chosen.law
     if law is None:
         u = place.back(started(evidence.level, place))
-        status = f"{100 * float((u > 0).mean()):.2f} % of the volume is inside"
+        status = filled(u > 0)
     else:
         flow = weighed(evidence, law, nats, place, steps, progress)
         u = place.back(flow.field)
