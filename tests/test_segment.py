@@ -201,6 +201,8 @@ def test_a_probability_map_is_regularised() -> None:
     map_ = (1 / (1 + np.exp(-ratio))).astype(np.float32)
     found = segment(noisy(truth, 90), WILLMORE, probability=map_)
     assert dice(found.mask.values, truth) > dice(map_ > 0.5, truth) + 0.05
+    thrice = segment(noisy(truth, 90), WILLMORE.scaled(3), probability=map_, steps=1)
+    assert (found.weight, thrice.weight) == pytest.approx((1, 1 / 3))  # 2 / (a20 + a02)
 
 
 @pytest.mark.slow
