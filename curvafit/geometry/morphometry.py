@@ -16,7 +16,7 @@ from numba import njit
 from scipy import ndimage
 from skimage import measure
 
-from curvafit.geometry.topology import euler_number
+from curvafit.geometry.topology import euler_number, euler_of_window
 
 __all__ = ["Morphometry", "local_thickness", "morphometry"]
 
@@ -54,14 +54,15 @@ def morphometry(
     spacing
         Voxel edges (z, y, x) in `unit`, or one for all.
     periodic
-        The box repeats. Else nothing is known beyond it: balls may reach out of it, its faces count as no surface,
-        and the Euler number is that of the part inside.
+        The box repeats. Else it is a window and nothing is known beyond it: balls may reach out of it, its faces count
+        as no surface, and of the Euler number it has its share (`topology.euler_of_window`).
 
     Returns
     -------
     Morphometry
-        `euler` is 26-connected; `surface_to_volume` is the area by marching cubes over the structure's volume, in
-        1/unit; `connectivity_density` is (1 - χ) over the box's volume, in 1/unit³.
+        `euler` is 26-connected, and a window's share rounded; `surface_to_volume` is the area by marching cubes over
+        the structure's volume, in 1/unit; `connectivity_density` is (1 - χ) over the box's volume, or over that between
+        the centres of a window's outer voxels, in 1/unit³.
 
     Raises
     ------
@@ -78,14 +79,15 @@ def morphometry(
     voxel = math.prod(edges)
     thickness = local_thickness(mask, edges, periodic=periodic)[mask]
     gap = local_thickness(~mask, edges, periodic=periodic)[~mask]
-    euler = euler_number(mask, periodic=periodic)
+    euler = float(euler_number(mask, periodic=True)) if periodic else euler_of_window(mask)
+    sampled = math.prod(mask.shape if periodic else (max(n - 1, 1) for n in mask.shape))
     return Morphometry(
         volume_fraction=filled / mask.size,
         thickness_mean=float(thickness.mean(dtype=np.float64)),
         thickness_std=float(thickness.std(dtype=np.float64)),
         spacing_mean=float(gap.mean(dtype=np.float64)),
-        connectivity_density=(1 - euler) / (mask.size * voxel),
-        euler=euler,
+        connectivity_density=(1 - euler) / (sampled * voxel),
+        euler=round(euler),
         surface_to_volume=_surface(mask, edges, periodic) / (filled * voxel),
         unit=unit,
     )

@@ -40,6 +40,27 @@ def euler_number(mask: np.ndarray, *, periodic: bool = False) -> int:
     return total
 
 
+def euler_of_window(mask: np.ndarray) -> float:
+    """Return what a window of a larger structure adds to χ, on average over windows.
+
+    χ of the part inside counts what the faces cut off. So half of χ of each outer layer is taken off, and a quarter of
+    that of each outer row is added, and an eighth of each corner taken off (Odgaard & Gundersen 1993; BoneJ's Δχ):
+    windows of n voxels a side then add (n - 1)³ voxels' share of the whole in the mean, and a structure that no face
+    touches has its own χ.
+    """
+    total = 0.0
+    for where in product((slice(None), 0, -1), repeat=3):
+        part = mask[where]
+        if part.ndim == 0:
+            euler = float(part)
+        elif part.ndim == 1:
+            euler = float(np.count_nonzero(np.diff(part.astype(np.int8), prepend=0) == 1))
+        else:
+            euler = float(measure.euler_number(np.ascontiguousarray(part), connectivity=part.ndim))
+        total += (-0.5) ** (3 - part.ndim) * euler
+    return total
+
+
 def betti_numbers(mask: np.ndarray, *, periodic: bool = False) -> tuple[int, int, int]:
     """Return b0 pieces (26-connected), b1 tunnels, b2 cavities (6-connected).
 
