@@ -24,7 +24,7 @@ LONGEST_EDGE = 100
 @dataclass(frozen=True, eq=False)
 class Twin:
     """A shape grown from a law, or why none grew: its field and mass; its curvature diagram and familiar numbers as the
-    scan would show them."""
+    scan would show them, the numbers as of a window where the scan is one."""
 
     phase: np.ndarray | None
     mass: float
@@ -66,5 +66,6 @@ def _measured(flow: Flow, prepared: Prepared, seed: int) -> Twin:
         curvature = diagram(field, flow.grid, WORKING_EPSILON)
     except (NoSurface, ScanError) as error:
         return Twin(None, flow.mass, None, None, str(error))
-    numbers = morphometry(mask, prepared.working_voxel, prepared.unit, periodic=True)
+    periodic = prepared.grid.periodic
+    numbers = morphometry(mask, prepared.working_voxel, prepared.unit, periodic=periodic)
     return Twin(flow.field.numpy(), flow.mass, curvature, numbers)
