@@ -1,18 +1,20 @@
 """False alarms: how often `infer` finds no believable twin of shapes that the model made itself.
 
-    python -m benchmarks.closure_verdicts STORE [--posterior FILE] [--cache FOLDER] [--queries 60] [--kinds mask,image]
-                                          [--minutes 3]
+    python -m benchmarks.closure_verdicts STORE [--posterior FILE] [--cache FOLDER] [--queries 60] [--from 0]
+                                          [--kinds mask,image] [--minutes 3]
 
 The queries are STORE's first well-formed shapes, which the posterior must not have learnt from: as the mask of the
 whole box, taken for one that does not repeat, and as the grey levels of `inference.views`'s degraded scan of a window.
-One whole `infer`, with its twins, for each: some 60 s of a core. A run ends after some minutes with the table so far,
-and the next one goes on; a file for each query and kind holds the answer, named after the posterior. What else the
-program does is not in the name: another state of it wants another folder.
+One whole `infer`, with its twins, for each: some 60 s of a core; and twins of the true law, seen as the scan, to tell
+what the law misses from what a true one would. A run ends after some minutes with the table so far, and the next one
+goes on; a file for each query and kind holds the fit, named after the posterior, and each table judges the fits anew.
+What else the program does is not in the name: another state of it wants another folder.
 
+- law: what `infer` answers, or truth, where the true law is the only candidate.
 - n: queries; refused: those that `infer` refuses to measure, which do not count below.
 - no twin, near, no law: the parts with these verdicts. far, strange: the parts whose twins lie beyond `verdict.CLOSE`
   seeds' distances, and whose misfit is below `misfit.UNBELIEVABLE`: the two reasons against a law.
-- distance: of the nearest law's twins from the query, over that of two twins: median, 90 and 95 %.
+- distance: of the best law's twins from the query, over that of two twins: median, 90 and 95 %.
 - p < .05: part of the queries whose misfit is so low. seconds: median.
 """
 
@@ -22,6 +24,7 @@ import argparse
 import json
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,12 +32,15 @@ import numpy as np
 
 from benchmarks.closure_trials import key_of_posterior, queries_of
 from curvafit.data_synth import open_store
+from curvafit.data_synth.atlas.store import Store
 from curvafit.files import write_content
-from curvafit.inference.candidates import best_of, noise_of
-from curvafit.inference.infer import infer
+from curvafit.inference.candidates import Candidate, best_of, noise_of
+from curvafit.inference.fit import Fit
+from curvafit.inference.infer import TWINS, infer
 from curvafit.inference.misfit import UNBELIEVABLE
 from curvafit.inference.posterior import Posterior, load_posterior
-from curvafit.inference.verdict import CLOSE
+from curvafit.inference.twins import twin
+from curvafit.inference.verdict import CLOSE, verdict
 from curvafit.inference.views import crop, degraded
 from curvafit.priors.grid import Grid
 from curvafit.volumes.scan import Field, ScanError
@@ -53,35 +59,57 @@ def as_image(field: np.ndarray, rng: np.random.Generator) -> Field:
 KINDS: dict[str, Callable[[np.ndarray, np.random.Generator], Field]] = {"mask": as_mask, "image": as_image}
 
 
-def answer(field: np.ndarray, kind: Any, posterior: Posterior, seed: int) -> dict[str, Any]:
-    """What `infer` says of a shape, in JSON's types; only the reason where it refuses."""
+def answer(store: Store, index: int, kind: str, posterior: Posterior) -> dict[str, Any]:
+    """What `infer` says of a shape, and what twins of its own law are, in JSON's types; only the reason where it
+    refuses."""
     begun = time.perf_counter()
     try:
-        scan = KINDS[kind](field, np.random.default_rng(seed))
-        fit = infer(scan, kind=kind, posterior=posterior).fit
+        scan = KINDS[kind](store.field(index), np.random.default_rng(index))
+        answered = infer(scan, kind=kind, posterior=posterior)  # type: ignore[arg-type]
     except ScanError as error:
         return {"refused": str(error)}
-    nearest = best_of(fit.candidates)
-    return {
-        "status": fit.status,
-        "distance": None if nearest is None else nearest.distance,
-        "noise": noise_of(fit.candidates),
-        "misfit": None if fit.misfit is None else fit.misfit.probability,
-        "seconds": time.perf_counter() - begun,
-    }
+    seconds, record, prepared = time.perf_counter() - begun, store.record(index), answered.prepared
+    law = record.coefficients.in_unit(prepared.working_voxel)
+    truth = Candidate("match", law, record.mass, {})
+    if answered.diagram is not None:
+        grown = [twin(law, record.mass, prepared, seed) for seed in range(TWINS)]
+        truth = truth.grown(answered.diagram, grown)
+    return {"fit": answered.fit.to_json(), "truth": truth.as_dict(), "seconds": seconds}
 
 
-def figures(answers: list[dict[str, Any]]) -> str:
+@dataclass(frozen=True)
+class Judged:
+    """One answer's verdict and the numbers behind it."""
+
+    status: str
+    distance: float
+    noise: float
+    misfit: float
+    seconds: float
+
+
+def judged(content: dict[str, Any], true: bool) -> Judged:
+    """The verdict on what `infer` answered, by today's rules; on the true law."""
+    fit = Fit.from_json(content["fit"])
+    laws = (Candidate.from_dict(content["truth"]),) if true else fit.candidates
+    best = best_of(laws)
+    status = verdict(laws, fit.misfit, fit.morphometry)[1] if laws else fit.status
+    distance = None if best is None else best.distance
+    misfit = None if fit.misfit is None else fit.misfit.probability
+    return Judged(status, _number(distance), _number(noise_of(laws)), _number(misfit), content["seconds"])
+
+
+def figures(answers: list[dict[str, Any]], true: bool) -> str:
     """The columns of the table."""
-    told = [each for each in answers if "refused" not in each]
-    ratio = np.array([_number(each["distance"]) / _number(each["noise"]) for each in told])
-    misfit = np.array([_number(each["misfit"]) for each in told])
+    told = [judged(each, true) for each in answers if "refused" not in each]
+    ratio = np.array([each.distance / each.noise for each in told])
+    misfit = np.array([each.misfit for each in told])
     begins = ("No believable twin", "Near", "No law")
-    parts = [_part(each["status"].startswith(begin) for each in told) for begin in begins]
+    parts = [_part(each.status.startswith(begin) for each in told) for begin in begins]
     parts += [_part(ratio > CLOSE), _part(misfit < UNBELIEVABLE)]
     known = ratio[np.isfinite(ratio)]
     quantiles = np.quantile(known, (0.5, 0.9, 0.95)) if len(known) else np.full(3, np.nan)
-    seconds = np.median([each["seconds"] for each in told]) if told else np.nan
+    seconds = np.median([each.seconds for each in told]) if told else np.nan
     numbers = [*parts, *quantiles, _part(misfit < 0.05)]
     counts = f"{len(answers):4} {len(answers) - len(told):7} "
     return counts + " ".join(f"{each:7.2f}" for each in numbers) + f" {seconds:7.0f}"
@@ -102,12 +130,13 @@ def main() -> None:
     parser.add_argument("--posterior", type=Path, default=None)
     parser.add_argument("--cache", type=Path, default=Path("closure_verdicts"))
     parser.add_argument("--queries", type=int, default=60)
+    parser.add_argument("--from", type=int, default=0, dest="first", help="how many of them to leave out")
     parser.add_argument("--kinds", default=",".join(KINDS))
     parser.add_argument("--minutes", type=float, default=3.0)
     options = parser.parse_args()
     end = time.monotonic() + 60 * options.minutes
     store, posterior = open_store(options.store), load_posterior(options.posterior)
-    queries, kinds = queries_of(store, options.queries), options.kinds.split(",")
+    queries, kinds = queries_of(store, options.queries)[options.first :], options.kinds.split(",")
     key = key_of_posterior(posterior)
     paths = {
         (index, kind): options.cache / f"{store.path.stem}-{index:06d}-{kind}-{key}.json"
@@ -117,12 +146,13 @@ def main() -> None:
     for (index, kind), path in paths.items():
         if not path.exists() and time.monotonic() < end:
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_content(path, json.dumps(answer(store.field(index), kind, posterior, index), indent=1))
+            write_content(path, json.dumps(answer(store, index, kind, posterior)))
     columns = ("no twin", "near", "no law", "far", "strange", "distance", "90 %", "95 %", "p < .05", "seconds")
-    print(f"{'kind':6} {'n':>4} {'refused':>7} " + " ".join(f"{each:>7}" for each in columns))
+    print(f"{'kind':6} {'law':6} {'n':>4} {'refused':>7} " + " ".join(f"{each:>7}" for each in columns))
     for kind in kinds:
         answers = [json.loads(path.read_text()) for (_, of), path in paths.items() if of == kind and path.exists()]
-        print(f"{kind:6} {figures(answers)}")
+        for law, true in (("infer", False), ("truth", True)):
+            print(f"{kind:6} {law:6} {figures(answers, true)}")
     left = sum(not path.exists() for path in paths.values())
     print(f"{left} files left: run again" if left else "all done")
 

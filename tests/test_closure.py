@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from pathlib import Path
 
 import numpy as np
 import pytest
+from found import made_fit
 from scipy import ndimage
 
 from benchmarks import closure_laws as laws
@@ -14,6 +16,7 @@ from benchmarks.closure_regrown import against, apart, chosen, deviations, mean_
 from benchmarks.closure_trials import COUNT, NUMBERS, Job, Trial, proceed
 from benchmarks.closure_verdicts import figures
 from benchmarks.level_cut import cut_covariance, gaussian_spectrum, level_cut
+from curvafit.inference.misfit import Misfit
 from curvafit.inference.posterior import load_posterior
 from curvafit.inference.table import law_of
 from curvafit.priors.energy import energy
@@ -164,8 +167,16 @@ def test_a_run_goes_on_where_it_was(tmp_path: Path) -> None:
 
 
 def test_false_alarms_are_counted_among_what_was_measured() -> None:
-    alarm = {"status": "No believable twin: far.", "distance": 3.0, "noise": 1.0, "misfit": 0.2, "seconds": 10.0}
-    good = {"status": "Supported (match).", "distance": 1.0, "noise": 1.0, "misfit": 0.03, "seconds": 20.0}
-    row = figures([alarm, good, {"refused": "too thin"}]).split()
-    assert row[:7] == ["3", "1", "0.50", "0.00", "0.00", "0.50", "0.00"]
-    assert row[7] == "2.00" and row[10:] == ["0.50", "15"]
+    """The fits by hand are judged anew: `made_fit`'s twins are near, those of its true law far or the scan's own."""
+    fit, true = made_fit(), made_fit().candidates[1]
+    odd = dataclasses.replace(fit, misfit=Misfit(0.001, {}, ""))
+    far = dataclasses.replace(true, distance=9.0, seed_noise=1.0)
+    answers = [
+        {"fit": each.to_json(), "truth": law.as_dict(), "seconds": seconds}
+        for each, law, seconds in ((odd, far, 10.0), (fit, dataclasses.replace(far, distance=1.0), 20.0))
+    ]
+    row = figures([*answers, {"refused": "too thin"}], False).split()
+    assert row[:7] == ["3", "1", "0.50", "0.00", "0.00", "0.00", "0.50"]
+    assert row[7] == "1.45" and row[10:] == ["0.50", "15"]  # 1.6 / 1.1
+    row = figures([{**each, "fit": fit.to_json()} for each in answers], True).split()
+    assert row[:7] == ["2", "0", "0.50", "0.00", "0.00", "0.50", "0.00"] and row[7] == "5.00"

@@ -14,7 +14,7 @@ from curvafit.geometry.diagram import Diagram
 from curvafit.inference.candidates import Candidate, best_of, noise_of
 from curvafit.inference.misfit import UNBELIEVABLE, Misfit
 from curvafit.inference.twins import Twin
-from curvafit.inference.verdict import CLOSE, FURTHEST, unlike, verdict
+from curvafit.inference.verdict import CLOSE, FURTHEST, TELLING, unlike, verdict
 from curvafit.priors.coefficients import Coefficients
 
 LAW = Coefficients(1, 2, 6, -40, -40, 400)
@@ -63,6 +63,8 @@ def test_what_grew_is_measured_against_the_scan() -> None:
     both = law("simulation").grown(scan, (twin(scan, -0.5), twin(None, 0.0), twin(other, -0.25)))
     assert both.seed_noise is not None and both.distance == pytest.approx(both.seed_noise / 2) and both.distance > 1
     assert (both.mass, both.twins, both.status) == (-0.375, (NUMBERS, NUMBERS), "")
+    three = law("simulation").grown(scan, (twin(scan, -0.5), twin(other, -0.25), twin(other, -0.25)))
+    assert three.seed_noise == pytest.approx(2 / 3 * both.seed_noise)  # of three pairs, two differ
     over = law("simulation").grown(scan, (twin(scan, -1.002), twin(scan, -1.001)))
     assert -1 < over.mass < -0.999  # a rare structure's field lies below -1 in the mean, and a fit holds no such mass
     one = law("simulation").grown(scan, (twin(scan, -0.5),))
@@ -144,6 +146,26 @@ def test_a_far_or_strange_one_is_named_but_not_believed() -> None:
     aligned = dataclasses.replace(ODD, blocks={"fabric": 0.001})
     direction = "The scan has a direction (fabric), and the model has none."
     assert verdict((law("simulation", 0.1),), aligned, NUMBERS)[1].endswith(direction)
+
+
+def test_seeds_far_apart_support_nothing() -> None:
+    near = law("match", 1.5 * TELLING, 1.01 * TELLING)
+    assert "the volume holds too little of it" in verdict((near,), USUAL, NUMBERS)[1]
+    assert verdict((near,), USUAL, NUMBERS)[1].startswith("Near (nearest match): ")
+    assert verdict((law("match", TELLING, TELLING),), USUAL, NUMBERS)[1].startswith("Supported")
+
+
+def test_few_tunnels_may_differ_by_the_root_of_their_count() -> None:
+    """Of 100 tunnels 17 are beyond 15 %, of 16 they may be a quarter."""
+    for tunnels, ratio, words in (
+        (100, 1.14, []),
+        (100, 1.17, ["connectivity 1.2"]),
+        (16, 1.24, []),
+        (16, 0.7, ["connectivity 0.70"]),
+    ):
+        scan = dataclasses.replace(NUMBERS, euler=1 - tunnels)
+        other = dataclasses.replace(scan, connectivity_density=ratio * scan.connectivity_density)
+        assert unlike(scan, (other,)) == words
 
 
 def test_familiar_numbers_that_differ_are_named() -> None:

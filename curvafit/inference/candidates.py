@@ -45,7 +45,7 @@ class Candidate:
     distance
         Mean distance of its twins' curvature diagrams from the scan's, 1 / working unit; None where none grew.
     seed_noise
-        Distance between two twins; None where fewer grew.
+        Mean distance between two of its twins; None where fewer grew.
     twins
         The twins' familiar numbers.
     status
@@ -67,7 +67,8 @@ class Candidate:
         if not diagrams:
             return replace(self, status=f"{self.status} No shape grew: {twins[0].reason}.".strip())
         distance = float(one_to_many(scan, diagrams).mean())
-        noise = float(one_to_many(diagrams[0], diagrams[1:]).mean()) if len(diagrams) > 1 else None
+        pairs = [one_to_many(each, diagrams[k + 1 :]) for k, each in enumerate(diagrams[:-1])]
+        noise = float(np.concatenate(pairs).mean()) if pairs else None
         numbers = tuple(each.morphometry for each in twins if each.morphometry is not None)
         mass = float(np.clip(np.mean([each.mass for each in twins if each.phase is not None]), -RARE, RARE))
         known = {name: value for name, value in self.uncertainty.items() if name != "mass" or mass == self.mass}

@@ -44,6 +44,8 @@ from curvafit.volumes.source import Source, field_of
 
 #: Number of nearest shapes, and of those from which stationarity starts.
 MATCHES, STARTS = 5, 3
+#: Twins of the best law, and shapes that may be grown to find which it is.
+TWINS, REGROWN = 3, 4
 #: The parts of a fit where they are not known.
 _BARE: dict[str, Any] = {
     "candidates": (), "chosen": None, "draws": None, "weak_directions": (), "misfit": None, "drift": None,
@@ -229,7 +231,7 @@ def _window(prepared: Prepared) -> tuple[torch.Tensor, Grid]:
 def _grown(
     laws: tuple[Candidate, ...], measured: Diagram, prepared: Prepared, seed: int, progress: Progress
 ) -> tuple[tuple[Candidate, ...], dict[str, tuple[Twin, ...]]]:
-    """Grow a twin of each law, and another one of the best: of the nearest, and of the first that is as near."""
+    """Grow a twin of each law, and `TWINS` of the best: of the nearest, and of the first that is as near."""
     twins: dict[str, tuple[Twin, ...]] = {}
 
     def grow(law: Candidate, share: float) -> Candidate:
@@ -239,11 +241,11 @@ def _grown(
         twins[law.name] = (*twins.get(law.name, ()), twin(law.coefficients, law.mass, prepared, start))
         return law.grown(measured, twins[law.name])
 
-    laws = tuple(grow(law, 0.8 * k / len(laws)) for k, law in enumerate(laws))
-    for share in (0.8, 0.9):
+    laws = tuple(grow(law, 0.7 * k / len(laws)) for k, law in enumerate(laws))
+    for k in range(REGROWN):
         best = best_of(laws)
-        if best is not None and best.seed_noise is None:
-            laws = tuple(grow(law, share) if law is best else law for law in laws)
+        if best is not None and len(twins[best.name]) < TWINS:
+            laws = tuple(grow(law, 0.7 + 0.3 * k / REGROWN) if law is best else law for law in laws)
     return laws, twins
 
 

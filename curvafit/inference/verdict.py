@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from curvafit.geometry.morphometry import Morphometry
@@ -13,6 +14,8 @@ from curvafit.units import number
 #: degraded scan some 1.8. Twins within `FURTHEST` whose familiar numbers are the scan's are near, and so are those that
 #: are close but for one familiar number; others are no twins.
 CLOSE, FURTHEST = 2.0, 5.0
+#: Seeds further apart than this (1 / working unit) tell no texture: those of the presets lie .3 to 1.3 apart at 100³.
+TELLING = 2.0
 #: Familiar numbers in which twins may differ from the scan, and the part by which all of them must to be named.
 FAMILIAR = {"thickness": "thickness_mean", "spacing": "spacing_mean", "connectivity": "connectivity_density"}
 NEAR = 0.15
@@ -44,17 +47,17 @@ def verdict(
         far = f"Twins should lie some {noise:.1f} from it." if ratio > CLOSE else ""
         reason = _unusual(misfit) if strange else far
         return best.name, _joined(f"No believable twin: of the nearest law ({title}), {apart}", reason, familiar)
+    doubt = ""
     if ratio > CLOSE:
-        alike = "They have its thickness, spacing and connectivity, and another law may come nearer."
-        return best.name, _joined(f"Near ({title}): {apart}", alike, _unusual(misfit), best.status)
-    if noise is None:
-        once = "No law grew twice, so it is not known how far apart two seeds lie."
-        return best.name, _joined(f"Near ({title}): {apart}", once, familiar, _unusual(misfit), best.status)
-    if familiar:
-        return best.name, _joined(
-            f"Near ({title}): {apart}", "That is near enough.", familiar, _unusual(misfit), best.status
-        )
-    return best.name, _joined(f"Supported ({title}): {apart}", _unusual(misfit), best.status)
+        doubt = "They have its thickness, spacing and connectivity, and another law may come nearer."
+    elif noise is None:
+        doubt = "No law grew twice, so it is not known how far apart two seeds lie."
+    elif noise > TELLING:
+        doubt = "So far apart, two seeds tell no texture: the volume holds too little of it, take a larger one."
+    elif familiar:
+        doubt = "That is near enough."
+    word = "Near" if doubt else "Supported"
+    return best.name, _joined(f"{word} ({title}): {apart}", doubt, familiar, _unusual(misfit), best.status)
 
 
 def _joined(*sentences: str) -> str:
@@ -63,12 +66,17 @@ def _joined(*sentences: str) -> str:
 
 
 def unlike(scan: Morphometry, twins: Sequence[Morphometry]) -> list[str]:
-    """Return the familiar numbers in which all twins differ from the scan the same way, with their ratios, as words."""
+    """Return the familiar numbers in which all twins differ from the scan the same way, with their ratios, as words.
+
+    They differ by more than `NEAR`, and where few bodies and tunnels were counted by more than such a count's own
+    square root, which two seeds of one law would differ by.
+    """
     apart = []
     for word, name in FAMILIAR.items():
         own = getattr(scan, name)
         ratios = [getattr(each, name) / own for each in twins] if own else []
-        if not ratios or not (min(ratios) > 1 + NEAR or max(ratios) < 1 - NEAR):
+        reach = max(NEAR, 1 / math.sqrt(abs(1 - scan.euler))) if name == "connectivity_density" and own else NEAR
+        if not ratios or not (min(ratios) > 1 + reach or max(ratios) < 1 - reach):
             continue
         ratio = sum(ratios) / len(ratios)
         apart.append(f"{word} of the other sign" if ratio < 0 else f"{word} {number(ratio, 2)}")
