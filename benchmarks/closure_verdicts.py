@@ -5,13 +5,14 @@
 
 The queries are STORE's first well-formed shapes, which the posterior must not have learnt from: as the mask of the
 whole box, taken for one that does not repeat, and as the grey levels of `inference.views`'s degraded scan of a window.
-One whole `infer`, with its twins, for each: some 60 s of a core; and twins of the true law, seen as the scan, to tell
-what the law misses from what a true one would. A run ends after some minutes with the table so far, and the next one
-goes on; a file for each query and kind holds the fit, named after the posterior, and each table judges the fits anew.
-What else the program does is not in the name: another state of it wants another folder.
+One whole `infer`, with its twins, for each: some 100 s of a core; and, where the scan's voxels are kept, twins of the
+true law, seen as the scan, to tell what the law misses from what a true one would. A run ends after some minutes with
+the table so far, and the next one goes on; a file for each query and kind holds the fit, named after the posterior, and
+each table judges the fits anew. What else the program does is not in the name: another state of it wants another
+folder.
 
 - law: what `infer` answers, or truth, where the true law is the only candidate.
-- n: queries; refused: those that `infer` refuses to measure, which do not count below.
+- n: queries; other: those that `infer` refuses to measure, or whose true law was not grown; they do not count below.
 - no twin, near, no law: the parts with these verdicts. far, strange: the parts whose twins lie beyond `verdict.CLOSE`
   seeds' distances, and whose misfit is below `misfit.UNBELIEVABLE`: the two reasons against a law.
 - distance: of the best law's twins from the query, over that of two twins: median, 90 and 95 %.
@@ -69,12 +70,12 @@ def answer(store: Store, index: int, kind: str, posterior: Posterior) -> dict[st
     except ScanError as error:
         return {"refused": str(error)}
     seconds, record, prepared = time.perf_counter() - begun, store.record(index), answered.prepared
-    law = record.coefficients.in_unit(prepared.working_voxel)
-    truth = Candidate("match", law, record.mass, {})
-    if answered.diagram is not None:
-        grown = [twin(law, record.mass, prepared, seed) for seed in range(TWINS)]
-        truth = truth.grown(answered.diagram, grown)
-    return {"fit": answered.fit.to_json(), "truth": truth.as_dict(), "seconds": seconds}
+    answer = {"fit": answered.fit.to_json(), "seconds": seconds}
+    if answered.diagram is None or prepared.scale != (1.0, 1.0, 1.0):
+        return answer
+    grown = [twin(record.coefficients, record.mass, prepared, seed) for seed in range(TWINS)]
+    truth = Candidate("match", record.coefficients, record.mass, {}).grown(answered.diagram, grown)
+    return answer | {"truth": truth.as_dict()}
 
 
 @dataclass(frozen=True)
@@ -101,14 +102,15 @@ def judged(content: dict[str, Any], true: bool) -> Judged:
 
 def figures(answers: list[dict[str, Any]], true: bool) -> str:
     """The columns of the table."""
-    told = [judged(each, true) for each in answers if "refused" not in each]
+    known = "truth" if true else "fit"
+    told = [judged(each, true) for each in answers if known in each]
     ratio = np.array([each.distance / each.noise for each in told])
     misfit = np.array([each.misfit for each in told])
     begins = ("No believable twin", "Near", "No law")
     parts = [_part(each.status.startswith(begin) for each in told) for begin in begins]
     parts += [_part(ratio > CLOSE), _part(misfit < UNBELIEVABLE)]
-    known = ratio[np.isfinite(ratio)]
-    quantiles = np.quantile(known, (0.5, 0.9, 0.95)) if len(known) else np.full(3, np.nan)
+    finite = ratio[np.isfinite(ratio)]
+    quantiles = np.quantile(finite, (0.5, 0.9, 0.95)) if len(finite) else np.full(3, np.nan)
     seconds = np.median([each.seconds for each in told]) if told else np.nan
     numbers = [*parts, *quantiles, _part(misfit < 0.05)]
     counts = f"{len(answers):4} {len(answers) - len(told):7} "
@@ -148,7 +150,7 @@ def main() -> None:
             path.parent.mkdir(parents=True, exist_ok=True)
             write_content(path, json.dumps(answer(store, index, kind, posterior)))
     columns = ("no twin", "near", "no law", "far", "strange", "distance", "90 %", "95 %", "p < .05", "seconds")
-    print(f"{'kind':6} {'law':6} {'n':>4} {'refused':>7} " + " ".join(f"{each:>7}" for each in columns))
+    print(f"{'kind':6} {'law':6} {'n':>4} {'other':>7} " + " ".join(f"{each:>7}" for each in columns))
     for kind in kinds:
         answers = [json.loads(path.read_text()) for (_, of), path in paths.items() if of == kind and path.exists()]
         for law, true in (("infer", False), ("truth", True)):
