@@ -24,7 +24,7 @@ LONGEST_EDGE = 100
 @dataclass(frozen=True, eq=False)
 class Twin:
     """A shape grown from a law, or why none grew: its field and mass; its curvature diagram and familiar numbers as the
-    scan would show them, the numbers as of a window where the scan is one."""
+    scan would show them, of a window where the scan is one: what its faces hide is hidden of the twin as well."""
 
     phase: np.ndarray | None
     mass: float
@@ -60,12 +60,12 @@ def _measured(flow: Flow, prepared: Prepared, seed: int) -> Twin:
         return Twin(None, flow.mass, None, None, flow.viability.reason)
     try:
         mask, field = flow.field.numpy() > 0, flow.field
+        window = Grid(flow.grid.shape, flow.grid.spacing, prepared.grid.boundary)
         if prepared.kind != "field":
             mask = prepared.seen(mask, seed)
-            field = phase_field(torch.from_numpy(mask), flow.grid, WORKING_EPSILON)
-        curvature = diagram(field, flow.grid, WORKING_EPSILON)
+            field = phase_field(torch.from_numpy(mask), window, WORKING_EPSILON)
+        curvature = diagram(field, window, WORKING_EPSILON)
     except (NoSurface, ScanError) as error:
         return Twin(None, flow.mass, None, None, str(error))
-    periodic = prepared.grid.periodic
-    numbers = morphometry(mask, prepared.working_voxel, prepared.unit, periodic=periodic)
+    numbers = morphometry(mask, prepared.working_voxel, prepared.unit, periodic=window.periodic)
     return Twin(flow.field.numpy(), flow.mass, curvature, numbers)
