@@ -8,8 +8,8 @@ the other half's first queries, what it says of the draws is compared with what 
 labels (L-C2ST, Linhart et al. 2023, by the package sbi). Descriptors are compressed as for the flows. sbi's perceptrons
 stop too early on so few queries to see what is plainly wrong.
 
-- p < .05, p < .01: part of the queries at which the draws can be told from the truth: .05 and .01 where none can.
-- least: the smallest p times the number of queries.
+- p < .05, p < .10: part of the queries at which the draws can be told from the truth: some .05 and .10 where none can
+  (the forests are the same for all, so these parts vary together). median: of p.
 """
 
 from __future__ import annotations
@@ -68,14 +68,14 @@ def main() -> None:
     learn = partial(posterior, cache=options.cache)
     answers = cross_answers(table, learn, options.folds, options.cache, f"posterior-{options.views.replace(',', '-')}")
     assert answers.draws is not None
-    print(f"{'view':8} {'queries':>7} {'p < .05':>8} {'p < .01':>8} {'least':>8}")
+    print(f"{'view':8} {'queries':>7} {'p < .05':>8} {'p < .10':>8} {'median':>8}")
     for view in views:
         mine = table.views == view
         rows = table.descriptors[mine]
         context = compression_of(rows, Architecture().components)(rows)
         p = local_p(table.parameters[mine], context, answers.draws[mine], options.asked)
-        least = min(1.0, len(p) * p.min())
-        print(f"{view:8} {len(p):7} {(p < 0.05).mean():8.3f} {(p < 0.01).mean():8.3f} {least:8.2g}", flush=True)
+        parts = [(p < 0.05).mean(), (p < 0.10).mean(), np.median(p)]
+        print(f"{view:8} {len(p):7} " + " ".join(f"{each:8.3f}" for each in parts), flush=True)
 
 
 if __name__ == "__main__":
