@@ -156,12 +156,17 @@ def test_seeds_far_apart_support_nothing() -> None:
 
 
 def test_few_tunnels_may_differ_by_the_root_of_their_count() -> None:
-    """Of 100 tunnels 17 are beyond 15 %, of 16 they may be a quarter."""
+    """Two counts of n differ by the root of 2 n: of 100 by 14, where 15 % is more; of one by more than two."""
     for tunnels, ratio, words in (
+        (1000, 1.14, []),
+        (1000, 1.17, ["connectivity 1.2"]),
         (100, 1.14, []),
         (100, 1.17, ["connectivity 1.2"]),
-        (16, 1.24, []),
-        (16, 0.7, ["connectivity 0.70"]),
+        (100, 0.8, ["connectivity 0.80"]),
+        (16, 1.3, []),
+        (16, 0.6, ["connectivity 0.60"]),
+        (1, 3.0, []),
+        (1, 4.0, ["connectivity 4.0"]),
     ):
         scan = dataclasses.replace(NUMBERS, euler=1 - tunnels)
         other = dataclasses.replace(scan, connectivity_density=ratio * scan.connectivity_density)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import numpy as np
+
 from curvafit.geometry.morphometry import Morphometry
 from curvafit.inference.candidates import TITLES, Candidate, best_of, noise_of
 from curvafit.inference.misfit import UNBELIEVABLE, Misfit
@@ -68,18 +70,18 @@ def _joined(*sentences: str) -> str:
 def unlike(scan: Morphometry, twins: Sequence[Morphometry]) -> list[str]:
     """Return the familiar numbers in which all twins differ from the scan the same way, with their ratios, as words.
 
-    They differ by more than `NEAR`, and where few bodies and tunnels were counted by more than such a count's own
-    square root, which two seeds of one law would differ by.
+    They differ by more than `NEAR`; connectivities also by more than chance alone lets two counts of so many bodies and
+    tunnels differ, the root of their sum.
     """
     apart = []
     for word, name in FAMILIAR.items():
         own = getattr(scan, name)
-        ratios = [getattr(each, name) / own for each in twins] if own else []
-        reach = max(NEAR, 1 / math.sqrt(abs(1 - scan.euler))) if name == "connectivity_density" and own else NEAR
-        if not ratios or not (min(ratios) > 1 + reach or max(ratios) < 1 - reach):
-            continue
-        ratio = sum(ratios) / len(ratios)
-        apart.append(f"{word} of the other sign" if ratio < 0 else f"{word} {number(ratio, 2)}")
+        ratios = np.array([getattr(each, name) / own for each in twins] if own else [])
+        count = abs(1 - scan.euler) if name == "connectivity_density" else math.inf
+        reach = np.maximum(NEAR, np.sqrt((1 + np.abs(ratios)) / max(count, 1)))
+        if len(ratios) and ((ratios > 1 + reach).all() or (ratios < 1 - reach).all()):
+            ratio = float(ratios.mean())
+            apart.append(f"{word} of the other sign" if ratio < 0 else f"{word} {number(ratio, 2)}")
     return apart
 
 
