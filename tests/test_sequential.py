@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from curvafit.geometry.descriptors import BLOCKS, Descriptors
-from curvafit.inference.sequential import BATCH, ROUNDS, Process, Search
+from curvafit.inference.sequential import BATCH, LAST, ROUNDS, Process, Search
 from curvafit.inference.simulation import Simulate, Simulations, simulations
 from tests.emulated import BOX, HIGH, LOW, NOISE, linear, row, told
 
@@ -49,7 +49,7 @@ def test_what_the_emulator_misses_is_learnt() -> None:
     assert apart(parameters) < 0.5 * apart(draws.mean(0))
     assert apart(parameters) < 1.5
     assert (parameters >= LOW).all() and (parameters <= HIGH).all()
-    assert every.count == len(every.parameters) == 12 + ROUNDS * BATCH
+    assert every.count == len(every.parameters) == 12 + ROUNDS * BATCH + 1
     assert len(set(every.seeds.tolist())) == every.count
     nearest = every.parameters[Search(linear(), "mask", QUERY).nearest(every)[0]]
     assert apart(nearest) <= min(map(apart, every.parameters)) + 1.0  # noise is .3
@@ -63,7 +63,16 @@ def test_where_nothing_grows_is_avoided() -> None:
     bound = float(TRUTH[0])
     parameters, every, _ = searched(simulator(bound))
     assert len(every.parameters) < every.count
-    assert parameters[0] > bound - 0.5 * (HIGH - LOW)[0] / np.sqrt(12)
+    assert parameters[0] >= bound
+
+
+def test_the_answer_grows_or_is_the_nearest_that_did() -> None:
+    """Nothing grows after the first simulations: the nearest of those is the answer."""
+    first = simulations(np.random.default_rng(0).uniform(LOW, HIGH, (400, 6)), simulator(), 12)
+    search = Search(linear(), "mask", QUERY)
+    parameters, every = search.parameters(first.parameters, first, lambda *_: None)
+    assert every.count == 12 + ROUNDS * BATCH + LAST and len(every.parameters) == 12
+    assert np.array_equal(parameters, first.parameters[search.nearest(first)[0]])
 
 
 def test_a_process_passes_through_what_it_is_told() -> None:

@@ -19,8 +19,8 @@ from curvafit.inference.simulation import Simulate, Simulations
 from curvafit.inference.table import row_of
 from curvafit.progress import Progress, silent
 
-#: Rounds, and simulations in each.
-ROUNDS, BATCH = 7, 3
+#: Rounds, and simulations in each; and how often at most the likeliest is looked for that grows.
+ROUNDS, BATCH, LAST = 7, 3, 4
 #: Parameters are also chosen around so many of the nearest simulations, so many at each of these deviations, in those
 #: of the prior.
 NEAREST, AROUND, WIDTHS = 4, 300, (0.15, 0.4)
@@ -105,7 +105,8 @@ class Search:
     ) -> tuple[np.ndarray, Simulations]:
         """Find the parameters `(6,)` that are likeliest to grow the query's descriptors.
 
-        Each round simulates the likeliest parameters so far, and others by their likelihood.
+        Each round simulates the likeliest parameters so far, and others by their likelihood; at the end the likeliest
+        alone, until they grow a shape. Where they do not, those of the nearest simulation are the answer.
 
         Parameters
         ----------
@@ -120,19 +121,20 @@ class Search:
             The parameters, and all simulations.
         """
         rng, barren = np.random.default_rng(seed), draws[:0]
-        for k in range(rounds):
+        for k in range(rounds + LAST):
             candidates, deviance = self._judged(draws, simulated, barren, rng)
             likelihood = np.exp(-0.5 * (deviance - deviance.min()) / np.sqrt(len(self.emulator.basis)))
-            others = rng.choice(len(candidates), BATCH - 1, p=likelihood / likelihood.sum())
+            others = rng.choice(len(candidates), BATCH - 1 if k < rounds else 0, p=likelihood / likelihood.sum())
             chosen = candidates[[int(deviance.argmin()), *others]]
-            seeds = seed + simulated.count + np.arange(BATCH)
+            seeds = seed + simulated.count + np.arange(len(chosen))
             rows = np.array([row_of(simulate(each, int(start))) for each, start in zip(chosen, seeds, strict=True)])
             grown = np.isfinite(rows).all(1)
             barren = np.concatenate([barren, chosen[~grown]])
-            simulated = simulated.joined(chosen[grown], seeds[grown], rows[grown], BATCH)
-            progress(f"refined by {simulated.count} simulations", (k + 1) / rounds)
-        candidates, deviance = self._judged(draws, simulated, barren, rng)
-        return candidates[deviance.argmin()], simulated
+            simulated = simulated.joined(chosen[grown], seeds[grown], rows[grown], len(chosen))
+            progress(f"refined by {simulated.count} simulations", min((k + 1) / (rounds + 1), 1.0))
+            if k >= rounds and grown.all():
+                return chosen[0], simulated
+        return simulated.parameters[self.nearest(simulated)[0]], simulated
 
     def _judged(
         self, draws: np.ndarray, simulated: Simulations, barren: np.ndarray, rng: np.random.Generator
