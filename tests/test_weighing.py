@@ -81,21 +81,20 @@ def test_the_law_that_tells_more_of_what_is_left_out_is_chosen() -> None:
     assert best.law == WILLMORE and best.gain > best.noise > 0 and best.nats in room.WEIGHTS
 
 
-def test_the_gain_is_that_of_the_truth() -> None:
+@pytest.mark.parametrize("measured", [False, True])
+def test_the_gain_is_that_of_the_truth(measured: bool) -> None:
     """Of masks that are known, the gain stated is, within its error, the one counted."""
     truth, noise = tubes(), 150.0
     scan, classes = noisy(truth, noise), Classes(30.0, 130.0, noise, 80.0)
     outs = room._blocks(scan.shape, 2)
-    starts: list[np.ndarray] = []
-
-    def right(known) -> np.ndarray:
-        starts.append(known.level > 0)
-        return truth
-
-    trial = room._tried(scan, outs, classes, right)
-    wrong = sum(int(((start != truth) & out).sum()) for start, out in zip(starts, outs, strict=True))
-    share = wrong / sum(int(out.sum()) for out in outs)
-    assert abs(trial.gain - share) < 3 * trial.noise and 0 < trial.noise < share
+    judge = room._Judge(scan.values, outs, classes, measured)
+    start = room._sides(scan, outs, classes, lambda known: known.level > 0)
+    right = room._sides(scan, outs, classes, lambda known: truth)
+    gain, error = judge.gain(right, start)
+    left = np.logical_or.reduce(outs)
+    share = float((start[1] != (truth & left)).sum() / left.sum())
+    assert abs(gain - share) < 3 * error and 0 < error < share
+    assert judge.gain(start, start)[0] == 0 and judge.gain(start, right)[0] < 0
 
 
 def test_where_a_prior_tells_nothing_the_start_is_the_answer() -> None:
@@ -108,15 +107,21 @@ def test_where_a_prior_tells_nothing_the_start_is_the_answer() -> None:
     assert (found.mask.values != tubes()).mean() < 0.01
 
 
-def test_sides_that_explain_less_than_the_start_s_measure_no_classes() -> None:
-    """A mask that grows fat brings the classes together, which makes it fatter."""
+def test_sides_are_judged_without_the_classes_that_made_them() -> None:
+    """A mask that grows fat brings the classes together, which makes it fatter: it explains less than the truth, by
+    whatever classes it came about."""
     truth, noise = tubes(), 150.0
-    scan, classes = noisy(truth, noise), Classes(30.0, 130.0, noise, 80.0)
+    scan = noisy(truth, noise)
     outs = room._blocks(scan.shape, 2)
-    fat = ndimage.binary_dilation(truth, iterations=8)
-    assert room._tried(scan, outs, classes, lambda known: fat).classes == classes
-    apart = room._tried(scan, outs, classes, lambda known: truth).classes
-    assert apart != classes and apart.contrast == pytest.approx(100, rel=0.1)
+    for classes in (Classes(30.0, 130.0, noise, 80.0), Classes(50.0, 80.0, noise, 65.0)):
+        judge = room._Judge(scan.values, outs, classes, True)
+        worth = [
+            judge.worth(room._sides(scan, outs, classes, lambda known, mask=mask: mask))
+            for mask in (truth, ndimage.binary_dilation(truth, iterations=3), ndimage.binary_erosion(truth))
+        ]
+        assert worth[0] > max(worth[1:])
+    apart = room._measured(scan.values, room._sides(scan, outs, classes, lambda known: truth), classes)
+    assert apart.contrast == pytest.approx(100, rel=0.1)
 
 
 def test_a_flow_that_fails_is_no_choice(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 from scipy import ndimage
@@ -27,8 +26,8 @@ LEFT_OUT, TIMES, LONGEST_BLOCK, CORRELATED = 0.25, 2, 6, 0.15
 #: Weights that are tried, in nats of a unit of the Willmore energy, and the first of them.
 WEIGHTS = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
 FIRST = WEIGHTS.index(1.0)
-#: Times that the classes are measured again. All laws are tried in the first round and the last.
-ROUNDS = 3
+#: Times that the classes are measured again, as long as that makes so many nats more likely what was left out.
+ROUNDS, ENOUGH = 4, 3.0
 #: Fewest voxels of a class that are measured.
 FEWEST = 100
 #: Edge of the cubes whose gains are taken to be independent, in voxels.
@@ -75,7 +74,9 @@ def weighing(
     A quarter of the voxels of a part of the scan is left out, in blocks, and then another; from the evidence of the
     others the surface is found by each law. The log-likelihood ratios of the voxels left out, summed over what is
     inside, are in the mean (c₁ - c₀)² / 2σ² times the voxels that are rightly inside less those that are not, whatever
-    the law. The best law at the first weight is tried at others.
+    the law. Where the classes themselves are to be measured, the sides are worth what their own means explain of the
+    levels left out, whatever the classes they came from. The best law at the first weight is tried at others; then with
+    the classes of the voxels on its sides, as long as that explains more; and at last the other laws with these.
 
     Parameters
     ----------
@@ -88,97 +89,152 @@ def weighing(
     steps
         Steps of each flow.
     measured
-        Whether the classes are measured again, of the voxels left out on either side, where these sides explain more of
-        their levels than those of the start; else they stay.
+        Whether the classes are measured again, of the voxels left out on either side; else they stay.
 
     Raises
     ------
     ScanError
         If the start has one phase only.
     """
-    given, inside = classes, of_classes(values, scan, classes).level > 0
+    inside = of_classes(values, scan, classes).level > 0
     where = _busiest(inside)
     part = replace(scan.crop(where), values=values[where])
     outs = _blocks(part.shape, _outlasting(part.values, inside[where]))
     place = WorkingGrid.of(part, epsilon, halo=HALO)
-    rounds, count = ROUNDS if measured else 1, 0
+    judge = _Judge(part.values, outs, classes, measured)
 
-    @cache
-    def trial(law: Coefficients, nats: float, classes: Classes) -> _Trial:
-        nonlocal count
-        count += 1
-        progress("trying the prior out", min(count / _trials(len(laws), rounds), 1.0))
-        return _tried(part, outs, classes, lambda known: place.back(weighed(known, law, nats, place, steps).field) > 0)
+    def found(known: VoxelEvidence, law: Coefficients, nats: float) -> np.ndarray:
+        return place.back(weighed(known, law, nats, place, steps).field) > 0
 
-    best = laws[0]
-    for number in range(rounds):
-        asked = laws if number in (0, rounds - 1) else [best]
-        trials = [trial(law, WEIGHTS[FIRST], classes) for law in asked]
-        best, first = max(zip(asked, trials, strict=True), key=lambda each: each[1].worth)
-        if measured:
-            classes = first.classes
-    tried = {FIRST: trial(best, WEIGHTS[FIRST], classes)}
-    for step in (1, -1):
-        number = FIRST + step
-        while 0 <= number < len(WEIGHTS):
-            tried[number] = trial(best, WEIGHTS[number], classes)
-            if tried[number].worth <= tried[number - step].worth:
-                break
-            number += step
-    number = max(tried, key=lambda each: tried[each].worth)
-    gain, noise = tried[number].gain, tried[number].noise
-    if gain > BEYOND * noise:
-        return Weighing(best, WEIGHTS[number], gain, noise, classes)
-    return Weighing(None, WEIGHTS[number], gain, noise, given)
+    trials = _Trials(part, judge, found, _expected(len(laws), measured), progress)
+    chosen = trials.best(laws, FIRST, classes)
+    for _ in range(ROUNDS if measured else 0):
+        apart = _measured(part.values, chosen.phases, chosen.classes)
+        other = trials.best([chosen.law], chosen.number, apart)
+        if other.worth < chosen.worth + ENOUGH:
+            break
+        chosen = other
+    if chosen.classes != classes:
+        chosen = trials.best(laws, chosen.number, chosen.classes)
+    gain, noise = judge.gain(chosen.phases, _sides(part, outs, classes, lambda known: known.level > 0))
+    if np.isfinite(chosen.worth) and gain > BEYOND * noise:
+        return Weighing(chosen.law, WEIGHTS[chosen.number], gain, noise, chosen.classes)
+    return Weighing(None, WEIGHTS[chosen.number], gain, noise, classes)
 
 
 def trial_steps(laws: int, steps: int, voxels: int) -> float:
     """Return about how many steps of a flow on so many voxels it takes to try laws out."""
-    return TIMES * _trials(laws, ROUNDS) * steps * min(1.0, (EDGE + 2 * HALO) ** 3 / voxels)
+    return TIMES * _expected(laws, True) * steps * min(1.0, (EDGE + 2 * HALO) ** 3 / voxels)
 
 
-def _trials(laws: int, rounds: int) -> int:
+def _expected(laws: int, measured: bool) -> int:
     """Return about how many laws and weights are tried."""
-    return laws + (rounds > 1) * (laws + rounds - 2) + 3
+    return (laws + 2) * (1 + measured)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Trial:
-    """What a law and a weight make of voxels left out: the sum of the log-likelihood ratios of those inside, in nats;
-    gain and standard error, as in `Weighing`; and the classes on either side."""
+    """A law, the number of its weight, the classes by which it was tried; the voxels left out on either side of its
+    surface, bool (2, Z, Y, X), and what that is worth, in nats."""
 
-    worth: float
-    gain: float
-    noise: float
+    law: Coefficients
+    number: int
     classes: Classes
+    phases: np.ndarray
+    worth: float
 
 
-def _tried(
-    part: Field, outs: Sequence[np.ndarray], classes: Classes, found: Callable[[VoxelEvidence], np.ndarray]
-) -> _Trial:
-    """Return the trial of what finds a mask (Z, Y, X) from evidence, on a part of which some voxels are left out, and
-    then others."""
-    levels = part.values
-    ratio = of_classes(levels, part, classes).ratio.astype(np.float64)
-    worth, change = 0.0, np.zeros(levels.shape)
-    phases, starts = np.zeros((2, 2, *levels.shape), dtype=bool)
-    for out in outs:
-        known = of_classes(levels, part, classes, ~out)
+@dataclass(frozen=True, eq=False)
+class _Judge:
+    """What the levels (Z, Y, X) of voxels left out say of two sides, bool (2, Z, Y, X).
+
+    With classes that are known their log-likelihood ratios are summed over the inside; with classes that are to be
+    measured the sides are worth what their own means explain, whatever the classes by which they came about.
+    """
+
+    levels: np.ndarray
+    outs: Sequence[np.ndarray]
+    classes: Classes
+    measured: bool
+
+    def worth(self, phases: np.ndarray) -> float:
+        """Return the log-likelihood of the sides, in nats, but for a constant."""
+        if self.measured:
+            return _explained(self.levels, phases) / (2 * self.classes.noise**2)
+        classes = self.classes
+        inside = self.levels[phases[1]].astype(np.float64)
+        return float((inside - classes.middle).sum() * classes.contrast / classes.noise**2)
+
+    def gain(self, phases: np.ndarray, start: np.ndarray) -> tuple[float, float]:
+        """Return by which part more of the voxels are on their side than in other sides, and its standard error."""
+        classes = _measured(self.levels, phases, self.classes) if self.measured else self.classes
+        change = (phases[1].astype(np.int8) - start[1]) * (self.levels - classes.middle).astype(np.float64)
+        for axis, n in enumerate(change.shape):
+            change = np.add.reduceat(change, np.arange(0, n, TILE), axis=axis)
+        right = 2 / classes.contrast / sum(int(out.sum()) for out in self.outs)
+        more = self.worth(phases) - self.worth(start)
+        return (
+            more * right * self.classes.noise**2 / classes.contrast,
+            abs(right) * float(np.sqrt(np.square(change).sum())),
+        )
+
+
+class _Trials:
+    """Trials on a part of a scan by what finds a mask (Z, Y, X) from evidence, by a law and its weight: each is made
+    once."""
+
+    def __init__(
+        self,
+        part: Field,
+        judge: _Judge,
+        found: Callable[[VoxelEvidence, Coefficients, float], np.ndarray],
+        expected: int,
+        progress: Progress,
+    ) -> None:
+        self._part, self._judge, self._found = part, judge, found
+        self._expected, self._progress = expected, progress
+        self._made: dict[tuple[Coefficients, int, Classes], _Trial] = {}
+
+    def best(self, laws: Sequence[Coefficients], number: int, classes: Classes) -> _Trial:
+        """Return the best law at the weight of a number, or at the weights on either side of it while they are better
+        still."""
+        first = best = max((self._trial(law, number, classes) for law in laws), key=lambda each: each.worth)
+        for step in (1, -1):
+            last = first
+            while 0 <= last.number + step < len(WEIGHTS):
+                further = self._trial(last.law, last.number + step, classes)
+                if further.worth <= last.worth:
+                    break
+                last = further
+            best = max(best, last, key=lambda each: each.worth)
+        return best
+
+    def _trial(self, law: Coefficients, number: int, classes: Classes) -> _Trial:
+        if (law, number, classes) not in self._made:
+            self._progress("trying the prior out", min((len(self._made) + 1) / self._expected, 1.0))
+            self._made[law, number, classes] = self._tried(law, number, classes)
+        return self._made[law, number, classes]
+
+    def _tried(self, law: Coefficients, number: int, classes: Classes) -> _Trial:
+        """Return a trial, one that is worth nothing where the flow fails."""
         try:
-            mask = found(known)
+            phases = _sides(
+                self._part, self._judge.outs, classes, lambda known: self._found(known, law, WEIGHTS[number])
+            )
         except ScanError:
-            return _Trial(-np.inf, -1.0, 0.0, classes)
-        worth += float(ratio[out & mask].sum())
-        change += np.where(out, (mask.astype(np.int8) - (known.level > 0)) * ratio, 0)
+            return _Trial(law, number, classes, np.zeros((2, *self._part.shape), dtype=bool), -np.inf)
+        return _Trial(law, number, classes, phases, self._judge.worth(phases))
+
+
+def _sides(
+    part: Field, outs: Sequence[np.ndarray], classes: Classes, found: Callable[[VoxelEvidence], np.ndarray]
+) -> np.ndarray:
+    """Return the voxels left out, bool (2, Z, Y, X), that are outside and inside of what is found of the others."""
+    phases = np.zeros((2, *part.shape), dtype=bool)
+    for out in outs:
+        mask = found(of_classes(part.values, part, classes, ~out))
         phases |= np.stack([out & ~mask, out & mask])
-        starts |= np.stack([out & (known.level <= 0), out & (known.level > 0)])
-    for axis, n in enumerate(levels.shape):
-        change = np.add.reduceat(change, np.arange(0, n, TILE), axis=axis)
-    right = 2 * (classes.noise / classes.contrast) ** 2 / sum(int(out.sum()) for out in outs)
-    error = float(np.sqrt(np.square(change).sum()))
-    explains = _explained(levels, phases) > _explained(levels, starts)
-    measured = _measured(levels, phases, classes) if explains else classes
-    return _Trial(worth, right * float(change.sum()), right * error, measured)
+    return phases
 
 
 def _explained(levels: np.ndarray, phases: np.ndarray) -> float:
