@@ -13,8 +13,8 @@ folder.
 
 - law: what `infer` answers, or truth, where the true law is the only candidate.
 - n: queries; other: those that `infer` refuses to measure, or whose true law was not grown; they do not count below.
-- no twin, near, no law: the parts with these verdicts. far, strange: the parts whose twins lie beyond `verdict.CLOSE`
-  seeds' distances, and whose misfit is below `misfit.UNBELIEVABLE`: the two reasons against a law.
+- no twin, near, no law: the parts with these verdicts. far, strange: the parts whose twins lie beyond
+  `candidates.CLOSE` seeds' distances, and whose misfit is below `misfit.UNBELIEVABLE`: the two reasons against a law.
 - distance: of the best law's twins from the query, over that of two twins: median, 90 and 95 %.
 - p < .05: part of the queries whose misfit is so low. seconds: median.
 """
@@ -35,13 +35,13 @@ from benchmarks.closure_trials import key_of_posterior, queries_of
 from curvafit.data_synth import open_store
 from curvafit.data_synth.atlas.store import Store
 from curvafit.files import write_content
-from curvafit.inference.candidates import Candidate, best_of, noise_of
+from curvafit.inference.candidates import CLOSE, Candidate, best_of, noise_of
 from curvafit.inference.fit import Fit
 from curvafit.inference.infer import TWINS, infer
 from curvafit.inference.misfit import UNBELIEVABLE
 from curvafit.inference.posterior import Posterior, load_posterior
 from curvafit.inference.twins import twin
-from curvafit.inference.verdict import CLOSE, verdict
+from curvafit.inference.verdict import verdict
 from curvafit.inference.views import crop, degraded
 from curvafit.priors.grid import Grid
 from curvafit.volumes.scan import Field, ScanError

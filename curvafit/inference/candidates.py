@@ -18,6 +18,9 @@ from curvafit.priors.fit_file import six_of
 
 #: Greatest mass of either sign: a rare structure's field lies a little beyond ±1 in the mean.
 RARE = 1 - 1e-6
+#: Twins within this many seeds' distances of the scan support their law: true laws' twins lie one away, of a badly
+#: degraded scan some 1.8.
+CLOSE = 2.0
 #: Where a law comes from, as people read it.
 TITLES = {
     "refined": "refined by simulation",
@@ -103,14 +106,18 @@ def morphometry_of(content: Mapping[str, Any]) -> Morphometry:
 def best_of(candidates: Sequence[Candidate]) -> Candidate | None:
     """Return the first candidate within seed noise of the one nearest to the scan; None where nothing grew.
 
-    The noise is that of the nearest one's twins; where they are fewer than two, the nearest is the best.
+    The noise is that of the nearest one's twins; where they are fewer than two, the nearest is the best. Of those
+    within it the first is taken whose own twins lie at most `CLOSE` times as far from the scan as from each other, if
+    there is one: seeds that are more alike than the scan is to any of them are another texture's.
     """
     grown = {each.name: each.distance for each in candidates if each.distance is not None}
     if not grown:
         return None
     nearest = min((each for each in candidates if each.name in grown), key=lambda each: grown[each.name])
     reach = grown[nearest.name] + (nearest.seed_noise or 0.0)
-    return next(each for each in candidates if each.name in grown and grown[each.name] <= reach)
+    within = [each for each in candidates if each.name in grown and grown[each.name] <= reach]
+    close = (each for each in within if each.seed_noise is None or grown[each.name] <= CLOSE * each.seed_noise)
+    return next(close, within[0])
 
 
 def noise_of(candidates: Sequence[Candidate]) -> float | None:

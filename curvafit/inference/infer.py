@@ -45,7 +45,7 @@ from curvafit.volumes.source import Source, field_of
 #: Number of nearest shapes, and of those from which stationarity starts.
 MATCHES, STARTS = 5, 3
 #: Twins of the best law, and shapes that may be grown to find which it is.
-TWINS, REGROWN = 3, 4
+TWINS, REGROWN = 3, 6
 #: The parts of a fit where they are not known.
 _BARE: dict[str, Any] = {
     "candidates": (), "chosen": None, "draws": None, "weak_directions": (), "misfit": None, "drift": None,

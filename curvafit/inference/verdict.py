@@ -8,14 +8,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from curvafit.geometry.morphometry import Morphometry
-from curvafit.inference.candidates import TITLES, Candidate, best_of, noise_of
+from curvafit.inference.candidates import CLOSE, TITLES, Candidate, best_of, noise_of
 from curvafit.inference.misfit import UNBELIEVABLE, Misfit
 from curvafit.units import number
 
-#: Twins within this many seeds' distances of the scan support their law: true laws' twins lie one away, of a badly
-#: degraded scan some 1.8. Twins within `FURTHEST` whose familiar numbers are the scan's are near, and so are those that
-#: are close but for one familiar number; others are no twins.
-CLOSE, FURTHEST = 2.0, 5.0
+#: Beyond `CLOSE`, twins within so many seeds' distances whose familiar numbers are the scan's are near, and so are
+#: those that are close but for one familiar number; others are no twins.
+FURTHEST = 5.0
 #: Seeds further apart than this (1 / working unit) tell no texture: those of the presets lie .3 to 1.3 apart at 100³.
 TELLING = 2.0
 #: Familiar numbers in which twins may differ from the scan, and the part by which all of them must to be named.
@@ -70,15 +69,15 @@ def _joined(*sentences: str) -> str:
 def unlike(scan: Morphometry, twins: Sequence[Morphometry]) -> list[str]:
     """Return the familiar numbers in which all twins differ from the scan the same way, with their ratios, as words.
 
-    They differ by more than `NEAR`; connectivities also by more than chance alone lets two counts of so many bodies and
-    tunnels differ, the root of their sum.
+    They differ by more than `NEAR`; connectivities also by more than chance lets two counts of so many bodies and
+    tunnels differ, twice the root of their sum.
     """
     apart = []
     for word, name in FAMILIAR.items():
         own = getattr(scan, name)
         ratios = np.array([getattr(each, name) / own for each in twins] if own else [])
         count = abs(1 - scan.euler) if name == "connectivity_density" else math.inf
-        reach = np.maximum(NEAR, np.sqrt((1 + np.abs(ratios)) / max(count, 1)))
+        reach = np.maximum(NEAR, 2 * np.sqrt((1 + np.abs(ratios)) / max(count, 1)))
         if len(ratios) and ((ratios > 1 + reach).all() or (ratios < 1 - reach).all()):
             ratio = float(ratios.mean())
             apart.append(f"{word} of the other sign" if ratio < 0 else f"{word} {number(ratio, 2)}")
