@@ -119,7 +119,8 @@ def test_sides_are_judged_without_the_classes_that_made_them() -> None:
             judge.worth(room._sides(scan, outs, classes, lambda known, mask=mask: mask))
             for mask in (truth, ndimage.binary_dilation(truth, iterations=3), ndimage.binary_erosion(truth))
         ]
-        assert worth[0] > max(worth[1:])
+        assert worth[0] > max(worth[1:]) > 0
+        assert judge.worth(room._sides(scan, outs, classes, lambda known: ~truth)) == pytest.approx(-worth[0])
     apart = room._measured(scan.values, room._sides(scan, outs, classes, lambda known: truth), classes)
     assert apart.contrast == pytest.approx(100, rel=0.1)
 

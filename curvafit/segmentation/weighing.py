@@ -159,9 +159,9 @@ class _Judge:
 
     def worth(self, phases: np.ndarray) -> float:
         """Return the log-likelihood of the sides, in nats, but for a constant."""
-        if self.measured:
-            return _explained(self.levels, phases) / (2 * self.classes.noise**2)
         classes = self.classes
+        if self.measured:
+            return float(np.sign(classes.contrast)) * _explained(self.levels, phases) / (2 * classes.noise**2)
         inside = self.levels[phases[1]].astype(np.float64)
         return float((inside - classes.middle).sum() * classes.contrast / classes.noise**2)
 
@@ -172,11 +172,9 @@ class _Judge:
         for axis, n in enumerate(change.shape):
             change = np.add.reduceat(change, np.arange(0, n, TILE), axis=axis)
         right = 2 / classes.contrast / sum(int(out.sum()) for out in self.outs)
-        more = self.worth(phases) - self.worth(start)
-        return (
-            more * right * self.classes.noise**2 / classes.contrast,
-            abs(right) * float(np.sqrt(np.square(change).sum())),
-        )
+        nats = self.worth(phases) - self.worth(start)
+        error = abs(right) * float(np.sqrt(np.square(change).sum()))
+        return nats * self.classes.noise**2 / classes.contrast * right, error
 
 
 class _Trials:
@@ -238,12 +236,14 @@ def _sides(
 
 
 def _explained(levels: np.ndarray, phases: np.ndarray) -> float:
-    """Return the sum of squares of the levels in two phases `(2, Z, Y, X)` that the phases' means explain."""
+    """Return the sum of squares of the levels in two phases `(2, Z, Y, X)` that the phases' means explain, negative
+    where the second is the darker one."""
     outside, inside = (levels[phase].astype(np.float64) for phase in phases)
     if not len(outside) or not len(inside):
         return 0.0
     weight = len(outside) * len(inside) / (len(outside) + len(inside))
-    return float(weight * (inside.mean() - outside.mean()) ** 2)
+    contrast = float(inside.mean() - outside.mean())
+    return weight * contrast * abs(contrast)
 
 
 def _measured(levels: np.ndarray, phases: np.ndarray, classes: Classes) -> Classes:
