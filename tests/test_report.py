@@ -101,6 +101,13 @@ def test_the_page_says_what_was_found(html: str) -> None:
     assert "12 simulations" in text and "p = 0.40" in text
 
 
+def test_a_law_that_is_not_believed_is_not_called_supported() -> None:
+    inference = made_inference()
+    fit = dataclasses.replace(inference.fit, status="No believable twin: of the nearest law …")
+    html = report_html(dataclasses.replace(inference, fit=fit))
+    assert "best supported" not in html and html.count('<span class="badge">the nearest</span>') == 1
+
+
 def test_each_block_stands_on_the_band_of_its_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[list[str]] = []
     monkeypatch.setattr("curvafit.report.pictures.bands_figure", lambda blocks: drawn.append(list(blocks)) or Figure())

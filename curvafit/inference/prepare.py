@@ -119,13 +119,17 @@ class Prepared:
 
     @cached_property
     def true_share(self) -> float:
-        """Return the part of the volume that the structure fills, an image's without what its noise and blur fatten it
-        by; that of the mask where nothing would be left."""
+        """Return the part of the volume that the structure fills, of an image without what noise and blur change it by:
+        by as much as they change the structure of the main window, without what they fattened it by."""
         if self.imaging is None:
             return self.volume_fraction
-        distance = centre_distance(self.mask, (1.0, 1.0, 1.0), 4.0)
-        inside = distance > self.imaging.fat / max(self.scale)
-        share = float((inside if self.roi is None else inside[self.roi]).mean())
+        mask = self.mask[self.windows[0]]
+        inside = centre_distance(mask, (1.0, 1.0, 1.0), 4.0) > self.imaging.fat / max(self.scale)
+        try:
+            seen = np.count_nonzero(self.seen(inside, 0))
+        except ScanError:
+            return self.volume_fraction
+        share = self.volume_fraction * np.count_nonzero(inside) / max(seen, 1)
         return share if 0 < share < 1 else self.volume_fraction
 
     def part(self, where: Window) -> Grid:

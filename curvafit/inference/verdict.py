@@ -15,6 +15,8 @@ from curvafit.units import number
 #: Beyond `CLOSE`, twins within so many seeds' distances whose familiar numbers are the scan's are near, and so are
 #: those that are close but for one familiar number; others are no twins.
 FURTHEST = 5.0
+#: What a verdict begins with where no law is the scan's.
+UNBELIEVED = "No believable twin"
 #: Seeds further apart than this (1 / working unit) tell no texture: those of the presets lie .3 to 1.3 apart at 100³.
 TELLING = 2.0
 #: Familiar numbers in which twins may differ from the scan, and the part by which all of them must to be named.
@@ -47,7 +49,7 @@ def verdict(
     if strange or ratio > FURTHEST or len(other) > allowed:
         far = f"Twins should lie some {noise:.1f} from it." if ratio > CLOSE else ""
         reason = _unusual(misfit) if strange else far
-        return best.name, _joined(f"No believable twin: of the nearest law ({title}), {apart}", reason, familiar)
+        return best.name, _joined(f"{UNBELIEVED}: of the nearest law ({title}), {apart}", reason, familiar)
     doubt = ""
     if ratio > CLOSE:
         doubt = "They have its thickness, spacing and connectivity, and another law may come nearer."

@@ -13,6 +13,7 @@ from curvafit.drawing.corner import bands_figure, corner_figure
 from curvafit.drawing.plot import diagram_figure, gallery_figure, png, shared_limits, slice_figure, surface_figure
 from curvafit.inference.candidates import TITLES, Candidate
 from curvafit.inference.table import parameters_of
+from curvafit.inference.verdict import UNBELIEVED
 from curvafit.units import length, number
 
 if TYPE_CHECKING:
@@ -175,8 +176,9 @@ def _slice(inference: Inference, axis: int, index: int, limits: tuple[float, flo
 def _shape(inference: Inference, candidate: Candidate | None, u: np.ndarray | None) -> str:
     fit = inference.fit
     title = "The scan" if candidate is None else f"{title_of(candidate)}, regrown"
-    badge = ' <span class="badge">best supported</span>' if candidate and candidate.name == fit.chosen else ""
-    caption = f"<b>{escape(title)}</b>{badge}"
+    chosen = candidate is not None and candidate.name == fit.chosen
+    word = "the nearest" if fit.status.startswith(UNBELIEVED) else "best supported"
+    caption = f"<b>{escape(title)}</b>" + f' <span class="badge">{word}</span>' * chosen
     if u is None:
         return _missing(caption)
     edges = [length(n * fit.working_voxel, fit.length_unit, 3) for n in u.shape]
