@@ -113,8 +113,9 @@ def agreement(fits: Mapping[tuple[str, int], Fit], scale: np.ndarray) -> None:
             for other in draws
             if SCANS[other[0]].tissue != SCANS[name].tissue
         }
-        nearest = min(others, key=others.__getitem__)
-        print(f"{name:15}{np.sqrt(np.square(away).mean()):7.2f}{p:8.3f}   {others[nearest]:.2f} ({nearest[0]})")
+        nearest = min(others, key=others.__getitem__, default=None)
+        other = "-" if nearest is None else f"{others[nearest]:.2f} ({nearest[0]})"
+        print(f"{name:15}{np.sqrt(np.square(away).mean()):7.2f}{p:8.3f}   {other}")
 
 
 def main() -> None:
