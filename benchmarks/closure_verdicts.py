@@ -13,7 +13,7 @@ folder.
 
 - law: what `infer` answers, or truth, where the true law is the only candidate.
 - n: queries; other: those that `infer` refuses to measure, or whose true law was not grown; they do not count below.
-- no twin, near, no law: the parts with these verdicts. far, strange: the parts whose twins lie beyond
+- no twin, near, undecided, no law: the parts with these verdicts. far, strange: the parts whose twins lie beyond
   `candidates.CLOSE` seeds' distances, and whose misfit is below `misfit.UNBELIEVABLE`: the two reasons against a law.
 - distance: of the best law's twins from the query, over that of two twins: median, 90 and 95 %.
 - p < .05: part of the queries whose misfit is so low. seconds: median.
@@ -106,7 +106,7 @@ def figures(answers: list[dict[str, Any]], true: bool) -> str:
     told = [judged(each, true) for each in answers if known in each]
     ratio = np.array([each.distance / each.noise for each in told])
     misfit = np.array([each.misfit for each in told])
-    begins = ("No believable twin", "Near", "No law")
+    begins = ("No believable twin", "Near", "Undecided", "No law")
     parts = [_part(each.status.startswith(begin) for each in told) for begin in begins]
     parts += [_part(ratio > CLOSE), _part(misfit < UNBELIEVABLE)]
     finite = ratio[np.isfinite(ratio)]
@@ -149,7 +149,19 @@ def main() -> None:
         if not path.exists() and time.monotonic() < end:
             path.parent.mkdir(parents=True, exist_ok=True)
             write_content(path, json.dumps(answer(store, index, kind, posterior)))
-    columns = ("no twin", "near", "no law", "far", "strange", "distance", "90 %", "95 %", "p < .05", "seconds")
+    columns = (
+        "no twin",
+        "near",
+        "undec.",
+        "no law",
+        "far",
+        "strange",
+        "distance",
+        "90 %",
+        "95 %",
+        "p < .05",
+        "seconds",
+    )
     print(f"{'kind':6} {'law':6} {'n':>4} {'other':>7} " + " ".join(f"{each:>7}" for each in columns))
     for kind in kinds:
         answers = [json.loads(path.read_text()) for (_, of), path in paths.items() if of == kind and path.exists()]

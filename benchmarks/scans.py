@@ -6,7 +6,8 @@ Each scan of CURVAFIT_DATA/scans has a folder with its report; what is there is 
 minutes on 2 cores, its halves seconds.
 
 First table: the structure's share, thickness and spacing in working voxels; p of `misfit`; the means of the chosen
-law's twins over the scan, for the share, thickness, spacing, connectivity density and surface; the verdict.
+law's twins over the scan, for the share, thickness, spacing, connectivity density and surface; the verdict by today's
+rules.
 Second table: the halves along the scan's longest axis, by posterior alone (`fast`), in working units, in deviations of
 the prior: the distance between their means (root mean square over the six parameters), its p-value if they were draws
 of two posteriors of one law (χ² with 6 degrees), and the distance to the nearest half of another tissue.
@@ -26,7 +27,7 @@ from scipy import stats
 from curvafit.inference.fit import Fit
 from curvafit.inference.infer import Inference, infer
 from curvafit.inference.posterior import load_posterior
-from curvafit.inference.verdict import FAMILIAR
+from curvafit.inference.verdict import FAMILIAR, verdict
 from curvafit.report.page import write_inference
 from curvafit.volumes.scan import Field, ScanError, load
 
@@ -94,7 +95,8 @@ def row(name: str, fit: Fit | str) -> str:
     p = "     -" if fit.misfit is None else f"{fit.misfit.probability:6.3f}"
     twins = () if best is None else best.twins
     ratios = [np.mean([getattr(each, key) for each in twins]) / getattr(own, key) if twins else np.nan for key in SHOWN]
-    return f"{name:15}{sizes} {p} " + " ".join(f"{ratio:6.2f}" for ratio in ratios) + f"  {fit.status.split(':')[0]}"
+    status = verdict(fit.candidates, fit.misfit, own)[1] if fit.candidates else fit.status
+    return f"{name:15}{sizes} {p} " + " ".join(f"{ratio:6.2f}" for ratio in ratios) + f"  {status.split(':')[0]}"
 
 
 def agreement(fits: Mapping[tuple[str, int], Fit], scale: np.ndarray) -> None:

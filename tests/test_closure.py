@@ -176,7 +176,7 @@ def test_false_alarms_are_counted_among_what_was_measured() -> None:
         for each, law, seconds in ((odd, far, 10.0), (fit, dataclasses.replace(far, distance=1.0), 20.0))
     ]
     row = figures([*answers, {"refused": "too thin"}], False).split()
-    assert row[:7] == ["3", "1", "0.50", "0.00", "0.00", "0.00", "0.50"]
-    assert row[7] == "1.45" and row[10:] == ["0.50", "15"]  # 1.6 / 1.1
+    assert row[:8] == ["3", "1", "0.50", "0.00", "0.00", "0.00", "0.00", "0.50"]
+    assert row[8] == "1.45" and row[11:] == ["0.50", "15"]  # 1.6 / 1.1
     row = figures([{**each, "fit": fit.to_json()} for each in answers], True).split()
-    assert row[:7] == ["2", "0", "0.50", "0.00", "0.00", "0.50", "0.00"] and row[7] == "5.00"
+    assert row[:8] == ["2", "0", "0.50", "0.00", "0.00", "0.00", "0.50", "0.00"] and row[8] == "5.00"

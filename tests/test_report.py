@@ -101,9 +101,10 @@ def test_the_page_says_what_was_found(html: str) -> None:
     assert "12 simulations" in text and "p = 0.40" in text
 
 
-def test_a_law_that_is_not_believed_is_not_called_supported() -> None:
+@pytest.mark.parametrize("status", ["No believable twin: of the nearest law …", "Undecided (nearest match): …"])
+def test_a_law_that_is_not_believed_is_not_called_supported(status: str) -> None:
     inference = made_inference()
-    fit = dataclasses.replace(inference.fit, status="No believable twin: of the nearest law …")
+    fit = dataclasses.replace(inference.fit, status=status)
     html = report_html(dataclasses.replace(inference, fit=fit))
     assert "best supported" not in html and html.count('<span class="badge">the nearest</span>') == 1
 

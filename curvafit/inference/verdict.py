@@ -15,8 +15,8 @@ from curvafit.units import number
 #: Beyond `CLOSE`, twins within so many seeds' distances whose familiar numbers are the scan's are near, and so are
 #: those that are close but for one familiar number; others are no twins.
 FURTHEST = 5.0
-#: What a verdict begins with where no law is the scan's.
-UNBELIEVED = "No believable twin"
+#: What a verdict begins with where no law is the scan's, and where it is not known.
+UNBELIEVED, UNDECIDED = "No believable twin", "Undecided"
 #: Seeds further apart than this (1 / working unit) tell no texture: those of the presets lie .3 to 1.3 apart at 100³.
 TELLING = 2.0
 #: Familiar numbers in which twins may differ from the scan, and the part by which all of them must to be named.
@@ -50,16 +50,18 @@ def verdict(
         far = f"Twins should lie some {noise:.1f} from it." if ratio > CLOSE else ""
         reason = _unusual(misfit) if strange else far
         return best.name, _joined(f"{UNBELIEVED}: of the nearest law ({title}), {apart}", reason, familiar)
-    doubt = ""
+    word, doubt = "Supported", ""
     if ratio > CLOSE:
-        doubt = "They have its thickness, spacing and connectivity, and another law may come nearer."
+        word, doubt = "Near", "They have its thickness, spacing and connectivity, and another law may come nearer."
     elif noise is None:
-        doubt = "No law grew twice, so it is not known how far apart two seeds lie."
+        word, doubt = UNDECIDED, "No law grew twice, so it is not known how far apart two seeds lie."
     elif noise > TELLING:
-        doubt = "So far apart, two seeds tell no texture: the volume holds too little of it, take a larger one."
+        word, doubt = (
+            "Undecided",
+            "Seeds so far apart tell no texture: this law makes none, or the volume holds too little.",
+        )
     elif familiar:
-        doubt = "That is near enough."
-    word = "Near" if doubt else "Supported"
+        word, doubt = "Near", "That is near enough."
     return best.name, _joined(f"{word} ({title}): {apart}", doubt, familiar, _unusual(misfit), best.status)
 
 

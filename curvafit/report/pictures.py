@@ -13,7 +13,7 @@ from curvafit.drawing.corner import bands_figure, corner_figure
 from curvafit.drawing.plot import diagram_figure, gallery_figure, png, shared_limits, slice_figure, surface_figure
 from curvafit.inference.candidates import TITLES, Candidate
 from curvafit.inference.table import parameters_of
-from curvafit.inference.verdict import UNBELIEVED
+from curvafit.inference.verdict import UNBELIEVED, UNDECIDED
 from curvafit.units import length, number
 
 if TYPE_CHECKING:
@@ -177,7 +177,7 @@ def _shape(inference: Inference, candidate: Candidate | None, u: np.ndarray | No
     fit = inference.fit
     title = "The scan" if candidate is None else f"{title_of(candidate)}, regrown"
     chosen = candidate is not None and candidate.name == fit.chosen
-    word = "the nearest" if fit.status.startswith(UNBELIEVED) else "best supported"
+    word = "the nearest" if fit.status.startswith((UNBELIEVED, UNDECIDED)) else "best supported"
     caption = f"<b>{escape(title)}</b>" + f' <span class="badge">{word}</span>' * chosen
     if u is None:
         return _missing(caption)
