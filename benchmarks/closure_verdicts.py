@@ -41,7 +41,7 @@ from curvafit.inference.infer import TWINS, infer
 from curvafit.inference.misfit import UNBELIEVABLE
 from curvafit.inference.posterior import Posterior, load_posterior
 from curvafit.inference.twins import twin
-from curvafit.inference.verdict import verdict
+from curvafit.inference.verdict import UNBELIEVED, UNDECIDED, verdict
 from curvafit.inference.views import crop, degraded
 from curvafit.priors.grid import Grid
 from curvafit.volumes.scan import Field, ScanError
@@ -106,7 +106,7 @@ def figures(answers: list[dict[str, Any]], true: bool) -> str:
     told = [judged(each, true) for each in answers if known in each]
     ratio = np.array([each.distance / each.noise for each in told])
     misfit = np.array([each.misfit for each in told])
-    begins = ("No believable twin", "Near", "Undecided", "No law")
+    begins = (UNBELIEVED, "Near", UNDECIDED, "No law")
     parts = [_part(each.status.startswith(begin) for each in told) for begin in begins]
     parts += [_part(ratio > CLOSE), _part(misfit < UNBELIEVABLE)]
     finite = ratio[np.isfinite(ratio)]
