@@ -4,21 +4,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from os import PathLike
 from typing import Any
 
 import numpy as np
 
 from curvafit.generation import data
 from curvafit.priors.bounds import real, whole
+from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
 from curvafit.progress import Progress, silent
 from curvafit.segmentation.calibration import Choice, Setting, Task, choice, left_out
-from curvafit.segmentation.engine import HALO, STEPS, completed
+from curvafit.segmentation.engine import STEPS
+from curvafit.segmentation.lowering import Workers, lowered
 from curvafit.segmentation.result import Segmentation, ending, filled, result_of
 from curvafit.segmentation.slices import WAYS, Slices
+from curvafit.segmentation.tiles import Tiling
+from curvafit.segmentation.weighing import densest
 from curvafit.segmentation.working import Law, WorkingGrid, laws_of
 from curvafit.units import sampling
+from curvafit.volumes.boxes import digest_of
 from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.formats.part import Box
 from curvafit.volumes.source import Source, field_of
 
 __all__ = ["reconstruct"]
@@ -29,6 +37,8 @@ STIFFNESS = 1e7
 MARGIN = math.tanh(WORKING_SPACING / 2 / (math.sqrt(2) * WORKING_EPSILON))
 #: Least and greatest stiffness.
 STIFFEST = (1e-9, 1e12)
+#: Longest edge of the box on which the prior is tried out in a volume of several tiles, and the fewest slices there.
+PART, FEWEST = 96, 5
 #: Most values of known slices; more are grey levels.
 LABELS = 256
 #: Share by which the voxels of two files may differ in size.
@@ -48,6 +58,9 @@ def reconstruct(
     periodic: bool = False,
     epsilon: float | None = None,
     steps: int = STEPS,
+    tile: int | None = None,
+    store: str | PathLike[str] | None = None,
+    workers: Workers | None = None,
     progress: Progress = silent,
     **reading: Any,
 ) -> Segmentation:
@@ -77,7 +90,7 @@ def reconstruct(
         from the spline.
     periodic
         Whether the volume repeats, as generated ones do.
-    epsilon, steps, progress, reading
+    epsilon, steps, tile, store, workers, progress, reading
         As in `segment`.
 
     Raises
@@ -93,7 +106,7 @@ def reconstruct(
     axis = whole(axis, "an axis 0, 1 or 2 (z, y, x)", 0, 2)
     places = _places(volume.shape[axis], every, first, known)
     target = _slices(volume, places, axis, periodic)
-    place = WorkingGrid.of(target.frame, epsilon, halo=HALO, periodic=periodic)
+    tiling = Tiling.of(target.frame, epsilon, tile, periodic=periodic)
     if stiffness is not None:
         stiffness = real(stiffness, "a positive stiffness", *STIFFEST)
     other = None if example is None else _like(example, volume, reading)
@@ -101,11 +114,14 @@ def reconstruct(
     settings = [Setting("spline", law, STIFFNESS if stiffness is None else stiffness, steps) for law in laws]
 
     def fill(slices: Slices, setting: Setting) -> np.ndarray:
-        return _filled(slices, setting, epsilon, lambda _, share: progress("trying the prior out", share))[0]
+        tiles = Tiling.of(slices.frame, epsilon, periodic=slices.periodic)
+        return _filled(slices, setting, tiles, lambda _, share: progress("trying the prior out", share))[0]
 
     chosen, tried = settings[0], ""
     if stiffness is None:
-        tasks = left_out(target) if other is None else _example(other, places, axis)
+        tasks = (
+            left_out(target if tiling.count == 1 else _part(target)) if other is None else _example(other, places, axis)
+        )
         if tasks is None:
             raise ScanError(
                 "expected three or more known slices with voxels inside and outside, an example or a stiffness, got "
@@ -113,31 +129,69 @@ def reconstruct(
             )
         best = choice(tasks, settings, fill, WAYS[:1] if other is None else WAYS)
         chosen, tried = best.setting, _gain(best, "left out" if other is None else "of the example")
-    mask, u, end = _filled(target, chosen, epsilon, progress)
-    notes = (*notes, *_known(places, volume.shape[axis]), *place.notes)
+    mask, u, end = _filled(target, chosen, tiling, progress, store=store, workers=workers)
+    notes = (*notes, *_known(places, volume.shape[axis]), *tiling.place.notes)
     mask, u = (np.ascontiguousarray(np.moveaxis(each, 0, axis)) for each in (mask, u))
     status = f"{tried}{end}"
-    return result_of(volume, mask, u, weight=None, law=chosen.law, epsilon=place.epsilon, status=status, notes=notes)
+    return result_of(
+        volume, mask, u, weight=None, law=chosen.law, epsilon=tiling.place.epsilon, status=status, notes=notes
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Between:
+    """The volume between slices, which a setting fills."""
+
+    slices: Slices
+    setting: Setting
+
+    @property
+    def law(self) -> Coefficients | None:
+        return self.setting.law
+
+    @property
+    def steps(self) -> int:
+        return self.setting.steps
+
+    @property
+    def parts(self) -> dict[str, object]:
+        slices, setting = self.slices, self.setting
+        numbers = {"places": slices.places, "spacing": slices.spacing, "periodic": slices.periodic}
+        return {"slices": digest_of(slices.inside), **numbers, "way": setting.way, "stiffness": setting.stiffness}
+
+    def given(self, box: Box, place: WorkingGrid) -> tuple[np.ndarray, data.Data]:
+        """Return the interpolation, and springs on the known voxels."""
+        level, (rows, inside) = self.slices.level(self.setting.way, box), self.slices.known(box)
+        pull, stiffness = np.zeros(level.shape, dtype=np.float32), self.setting.stiffness
+        pull[rows] = np.where(inside, stiffness, -stiffness)
+        return level, data.Hinge(place.spread(pull, centre=0), MARGIN)
+
+    def plain(self, level: np.ndarray, place: WorkingGrid) -> np.ndarray:
+        """Return the profile of the interpolation."""
+        return np.tanh(level / (math.sqrt(2) * place.epsilon))
+
+    def mask(self, phase: np.ndarray, box: Box) -> np.ndarray:
+        """Return the voxels where the phase field is positive, and the known ones as they are."""
+        mask, (rows, inside) = phase > 0, self.slices.known(box)
+        mask[rows] = inside
+        return mask
 
 
 def _filled(
-    slices: Slices, setting: Setting, epsilon: float | None, progress: Progress
+    slices: Slices, setting: Setting, tiling: Tiling, progress: Progress, **tools: Any
 ) -> tuple[np.ndarray, np.ndarray, str]:
     """Return the mask and the phase field of a volume that a setting fills, and how its flow ended."""
-    place = WorkingGrid.of(slices.frame, epsilon, halo=HALO, periodic=slices.periodic)
-    level, held = slices.level(setting.way), list(slices.places)
-    if setting.law is None:
-        u = np.tanh(level / (math.sqrt(2) * place.epsilon))
-        return level > 0, u, filled(u > 0)
-    pull = np.zeros(level.shape, dtype=np.float32)
-    pull[held] = np.where(slices.inside, setting.stiffness, -setting.stiffness)
-    flow = completed(
-        level, setting.law, data.Hinge(place.spread(pull, centre=0), MARGIN), place, setting.steps, progress
-    )
-    u = place.back(flow.field)
-    mask = u > 0
-    mask[held] = slices.inside
-    return mask, u, ending(flow, mask)
+    found = lowered(_Between(slices, setting), tiling, progress=progress, **tools)
+    return found.mask, found.phase, filled(found.mask) if setting.law is None else ending(found)
+
+
+def _part(slices: Slices) -> Slices:
+    """Return the known slices in a box, of edges up to `PART`, that holds most of their surface."""
+    count = max(FEWEST, PART // slices.gap + 1)
+    rows, ys, xs = densest(slices.inside, (count, PART, PART))
+    places = [place - slices.places[rows.start] for place in slices.places[rows]]
+    inside = slices.inside[rows, ys, xs]
+    return replace(slices, inside=inside, places=tuple(places), length=places[-1] + 1, periodic=False)
 
 
 def _gain(best: Choice, where: str) -> str:

@@ -15,7 +15,7 @@ from curvafit.segmentation.evidence import VoxelEvidence
 from curvafit.segmentation.working import WorkingGrid
 from curvafit.volumes.field import ScanError
 
-__all__ = ["BENDING", "HALO", "STEPS", "bending", "completed", "started", "stiff", "weighed"]
+__all__ = ["BENDING", "HALO", "STEPS", "bending", "completed", "likelihood", "started", "stiff", "weighed"]
 
 #: Default steps of Adam.
 STEPS = 400
@@ -42,7 +42,7 @@ def completed(
     Raises
     ------
     ScanError
-        If the start has one phase only, a20 + a02 is not positive, or the energy does not stay finite.
+        If a20 + a02 is not positive, or the energy does not stay finite.
     """
 
     def watch(step: int, total: int, state: object) -> None:
@@ -73,23 +73,22 @@ def weighed(
     progress: Progress = silent,
 ) -> Flow:
     """Lower -log p(scan | mask) + F_ε, of which a unit of the Willmore energy costs so many nats, as `completed`."""
-    term = Evidence(place.spread(evidence.ratio) / (nats * place.grid.voxel_volume))
-    return completed(evidence.level, law, term, place, steps, progress)
+    return completed(evidence.level, law, likelihood(evidence, nats, place), place, steps, progress)
+
+
+def likelihood(evidence: VoxelEvidence, nats: float, place: WorkingGrid) -> Evidence:
+    """Return -log p(scan | mask), in units of F_ε, of which a unit of the Willmore energy costs so many nats."""
+    return Evidence(place.spread(evidence.ratio) / (nats * place.grid.voxel_volume))
 
 
 def started(level: np.ndarray, place: WorkingGrid) -> Tensor:
     """Return the phase field, on the place's grid, of the set where a smooth volume (Z, Y, X) is positive.
 
-    Raises
-    ------
-    ScanError
-        If it is positive everywhere or nowhere.
+    Where it is positive everywhere or nowhere, as in a tile far from the surface, the field is 1 or -1.
     """
     inside = place.finer(level) > 0
-    if not inside.any() or inside.all():
-        raise ScanError(
-            f"expected a structure and background in the scan, got {'none' if inside.all() else 'one phase'}"
-        )
+    if inside.all() or not inside.any():
+        return 2 * inside.float() - 1
     return phase_field(inside, place.grid, WORKING_EPSILON)
 
 

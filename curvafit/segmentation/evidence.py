@@ -17,9 +17,13 @@ from curvafit.volumes.formats.part import Crop
 __all__ = [
     "Classes",
     "VoxelEvidence",
+    "bounds_of",
+    "check_chances",
+    "check_map",
     "classes_of",
     "cropped_map",
     "grey_levels",
+    "of_chances",
     "of_classes",
     "of_probability",
 ]
@@ -90,11 +94,23 @@ def grey_levels(scan: Field, threshold: float | str = "otsu") -> np.ndarray:
     values = scan.values.astype(np.float32)
     if not np.isfinite(values).all():
         raise ScanError(f"expected finite values, got {np.count_nonzero(~np.isfinite(values))} that are not")
+    return values.clip(*bounds_of(values, threshold))
+
+
+def bounds_of(values: np.ndarray, threshold: float | str = "otsu") -> tuple[float, float]:
+    """Return the levels between which Otsu's threshold takes grey levels as they are; infinite ones for a number.
+
+    Raises
+    ------
+    ScanError
+        If the threshold is another word.
+    """
     if isinstance(threshold, str) and threshold != "otsu":
         raise ScanError(f"expected a threshold that is a number or 'otsu', got {threshold!r}")
     if threshold == "otsu" and not np.all((values == values.min()) | (values == values.max())):
-        return np.clip(values, *np.percentile(values, TAILS))  # a mask's rarer value is no tail
-    return values
+        low, high = np.percentile(values, TAILS)  # a mask's rarer value is no tail
+        return float(low), float(high)
+    return -math.inf, math.inf
 
 
 def classes_of(values: np.ndarray, scan: Field, threshold: float | str = "otsu", dark: bool = False) -> Classes:
@@ -150,16 +166,29 @@ def of_probability(probability: Field, scan: Field) -> VoxelEvidence:
     ScanError
         If the map's shape or place is not the scan's, or a value lies outside [0, 1].
     """
+    check_map(probability, scan)
+    values = probability.values.astype(np.float32)
+    return of_chances(values, scan, check_chances(float(values.min()), float(values.max())))
+
+
+def of_chances(values: np.ndarray, scan: Field, note: str) -> VoxelEvidence:
+    """Return the evidence of probabilities (Z, Y, X): r = log p / (1 - p)."""
+    p = values.clip(CERTAIN, 1 - CERTAIN)
+    return VoxelEvidence(np.log(p / (1 - p)), _smoothed(values, scan, WIDTHS[0]) - 0.5, note)
+
+
+def check_chances(lowest: float, highest: float) -> str:
+    """Return a sentence on the range of probabilities, or raise ScanError where it leaves [0, 1]."""
+    if not 0 <= lowest <= highest <= 1:
+        raise ScanError(f"expected probabilities in [0, 1], got {lowest:g} to {highest:g}")
+    return f"probabilities from {lowest:.3g} to {highest:.3g}"
+
+
+def check_map(probability: Field, scan: Field) -> None:
+    """Raise ScanError where a map's shape or place is not the scan's."""
     if probability.shape != scan.shape:
         raise ScanError(f"expected a probability map of the scan's shape {scan.shape}, got {probability.shape}")
     _check_place(probability, scan)
-    values = probability.values.astype(np.float32)
-    lowest, highest = float(values.min()), float(values.max())
-    if not 0 <= lowest <= highest <= 1:
-        raise ScanError(f"expected probabilities in [0, 1], got {lowest:g} to {highest:g}")
-    p = values.clip(CERTAIN, 1 - CERTAIN)
-    note = f"probabilities from {lowest:.3g} to {highest:.3g}"
-    return VoxelEvidence(np.log(p / (1 - p)), _smoothed(values, scan, WIDTHS[0]) - 0.5, note)
 
 
 def cropped_map(probability: Field, crop: Crop | None) -> Field:

@@ -78,7 +78,7 @@ def write_mask(
     The paths of mask, picture (`.png`) and record (`.json`), which appear together once all three are whole.
     """
     target = check_mask_target(path, scan.unit, () if like is None else (like,), overwrite)
-    mask = segmentation.mask.values.astype(np.uint8)
+    mask = segmentation.mask.values.view(np.uint8)
     with staged(target) as work:
         temporary = work / target.name
         if like is not None and all(str(each).lower().endswith(_NIFTI) for each in (like, target)):

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from curvafit.generation.flow import Flow
 from curvafit.pictures import Pictured
 from curvafit.priors.coefficients import Coefficients
+from curvafit.segmentation.lowering import Lowered
 from curvafit.units import sampling
 from curvafit.volumes.field import Field
 
@@ -51,15 +51,15 @@ class Segmentation(Pictured):
         return f"Segmentation({size}, {count}: {self.status})"
 
 
-def ending(flow: Flow, mask: np.ndarray) -> str:
+def ending(found: Lowered) -> str:
     """Return whether a flow settled, and which share of the volume is inside, as a sentence."""
-    share, energy = float(mask.mean()), flow.history.energy
-    fall = (energy[-2] - energy[-1]) / max(abs(energy[-1]), 1e-30) if len(energy) > 1 else 1.0
-    count, word = int(flow.history.step[-1]), "settled" if abs(fall) < SETTLED else "still moving"
+    share, energy = float(found.mask.mean()), found.energies
+    fall = (energy[0] - energy[-1]) / max(abs(energy[-1]), 1e-30) if len(energy) > 1 else 1.0
+    count, word = found.steps, "settled" if abs(fall) < SETTLED else "still moving"
     length = f"{count} step" if count == 1 else f"{count} steps"
     if share in (0.0, 1.0):
         return f"no surface is left after {length}: the prior is too strong for the data, lower its weight"
-    return f"{word} after {length}: {filled(mask)}"
+    return f"{word} after {length}: {filled(found.mask)}"
 
 
 def filled(mask: np.ndarray) -> str:

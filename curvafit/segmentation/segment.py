@@ -3,19 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass
+from os import PathLike
+from typing import Any, Protocol
 
+import numpy as np
+from torch import Tensor
+
+from curvafit.generation.data import Evidence
 from curvafit.priors.bounds import real
 from curvafit.priors.coefficients import Coefficients
 from curvafit.progress import Progress, part, silent
-from curvafit.segmentation.engine import BENDING, HALO, STEPS, bending, started, weighed
-from curvafit.segmentation.evidence import classes_of, cropped_map, grey_levels, of_classes, of_probability
+from curvafit.segmentation.engine import BENDING, STEPS, bending, likelihood, started
+from curvafit.segmentation.evidence import (
+    Classes,
+    VoxelEvidence,
+    bounds_of,
+    check_chances,
+    check_map,
+    classes_of,
+    cropped_map,
+    grey_levels,
+    of_chances,
+    of_classes,
+)
+from curvafit.segmentation.lowering import Workers, lowered
 from curvafit.segmentation.result import Segmentation, ending, filled, result_of
-from curvafit.segmentation.weighing import Weighing, weighing
+from curvafit.segmentation.tiles import Tiling
+from curvafit.segmentation.weighing import Weighing, busiest, weighing
 from curvafit.segmentation.working import Law, WorkingGrid, laws_of
+from curvafit.volumes.boxes import Boxes, boxes_of, extent, thinned
 from curvafit.volumes.field import Field, ScanError
-from curvafit.volumes.formats.part import Crop
-from curvafit.volumes.source import Source, field_of
+from curvafit.volumes.formats.part import Box, Crop
+from curvafit.volumes.source import Source
 
 __all__ = ["segment"]
 
@@ -27,20 +47,25 @@ WILLMORE = Coefficients.willmore()
 FAINT = "The classes differ by less than the noise, as where the structure is rare: better give a threshold."
 #: Share of the time that trying laws out takes.
 TRIALS = 0.7
+#: Probability maps that have the scan's spacing and unit.
+_UNPLACED = (str, PathLike, np.ndarray, Tensor)
 #: Least and greatest weight.
 WEIGHTS = (1e-9, 1e9)
 
 
 def segment(
-    scan: Source,
+    scan: Source | Boxes,
     prior: Law,
     *,
-    probability: Source | None = None,
+    probability: Source | Boxes | None = None,
     weight: float | None = None,
     threshold: float | str = "otsu",
     dark: bool = False,
     epsilon: float | None = None,
     steps: int = STEPS,
+    tile: int | None = None,
+    store: str | PathLike[str] | None = None,
+    workers: Workers | None = None,
     crop: Crop | None = None,
     progress: Progress = silent,
     **reading: Any,
@@ -71,6 +96,13 @@ def segment(
         ε in the scan's unit; by default twice the smallest voxel edge. Thinner structures do not survive.
     steps
         Steps of Adam.
+    tile
+        The energy is lowered on tiles of at most so many working voxels a side, with overlap: memory is bounded, and
+        the result does not depend on the tiles beyond a few voxels of the surface. By default the scan is one tile up
+        to 256³ working voxels; larger ones have tiles of 192³.
+    store, workers
+        A folder in which finished tiles stay: the same call goes on with them after a kill, and the result's arrays are
+        mapped files there. Whoever lowers the tiles, such as `curvafit.data_synth.atlas.workers.cluster`.
     crop
         A box of voxels, of the scan and of the probability map: see `curvafit.load`.
     progress
@@ -85,9 +117,10 @@ def segment(
     FileNotFoundError
         If there is no such `fit.json`.
     """
-    scan = field_of(scan, crop=crop, **reading)
-    laws, notes = laws_of(prior, scan)
-    place = WorkingGrid.of(scan, epsilon, halo=HALO)
+    boxes = boxes_of(scan, crop=crop, **reading)
+    frame = boxes.frame
+    laws, notes = laws_of(prior, frame)
+    tiling = Tiling.of(frame, epsilon, tile)
     stiffness = bending(laws[0]) / BENDING
     nats = NATS if weight is None else real(weight, "a positive weight", *WEIGHTS) * stiffness
     if not (isinstance(threshold, str) and threshold == "otsu"):
@@ -96,34 +129,121 @@ def segment(
     if probability is not None:
         if dark or threshold != "otsu":
             raise ScanError("expected neither a threshold nor dark with a probability map, which says what is inside")
-        placed = {} if isinstance(probability, Field) else {name: reading.get(name) for name in ("spacing", "unit")}
-        evidence = of_probability(cropped_map(field_of(probability, **placed), crop), scan)
+        evidence = _likely(probability, frame, crop, reading)
+        _check_phases(evidence, tiling)
     else:
-        values = grey_levels(scan, threshold)
-        classes = classes_of(values, scan, threshold, dark)
+        extent(boxes)
+        sample, blocks = thinned(boxes)
+        values, bounds = grey_levels(sample, threshold), bounds_of(sample.values.astype(np.float32), threshold)
+        classes = classes_of(values, sample, threshold, dark)
+        _check_phases(_Grey(boxes, bounds, classes, ""), tiling)
         if weight is None:
-            overlap = threshold == "otsu" and classes.faint
+            overlap, block = threshold == "otsu" and classes.faint, busiest(values, sample, classes, blocks)
             chosen = weighing(
-                values, scan, classes, (*laws, *({WILLMORE} - set(laws))),
+                values[block], sample.crop(block), classes, (*laws, *({WILLMORE} - set(laws))),
                 epsilon=epsilon, steps=steps, measured=overlap, progress=part(progress, 0.0, TRIALS),
             )  # fmt: skip
             nats, classes, progress = chosen.nats, chosen.classes, part(progress, TRIALS, 1.0)
-        evidence = of_classes(values, scan, classes)
+        evidence = _Grey(boxes, bounds, classes, str(classes))
         if classes.faint and threshold == "otsu" and (chosen is None or chosen.law is None):
             notes = (*notes, FAINT)
-    notes = (*notes, f"{evidence.note[0].upper()}{evidence.note[1:]}.", *place.notes)
+    notes = (*notes, f"{evidence.note[0].upper()}{evidence.note[1:]}.", *tiling.place.notes)
     law = laws[0] if chosen is None else chosen.law
-    if law is None:
-        u = place.back(started(evidence.level, place))
-        status = filled(u > 0)
-    else:
-        flow = weighed(evidence, law, nats, place, steps, progress)
-        u = place.back(flow.field)
-        status = ending(flow, u > 0)
+    found = lowered(_Scan(evidence, law, nats, steps), tiling, store=store, workers=workers, progress=progress)
     λ = weight if weight is not None or law is None else nats * BENDING / bending(law)
+    status = filled(found.mask) if law is None else ending(found)
     if chosen is not None:
         status = f"{_gain(chosen, laws)}; {status}"
-    return result_of(scan, u > 0, u, weight=λ, law=law, epsilon=place.epsilon, status=status, notes=notes)
+    return result_of(
+        frame, found.mask, found.phase, weight=λ, law=law, epsilon=tiling.place.epsilon, status=status, notes=notes
+    )
+
+
+class _Evidence(Protocol):
+    """The evidence of a box of voxels, and a sentence on it."""
+
+    @property
+    def boxes(self) -> Boxes: ...
+
+    @property
+    def note(self) -> str: ...
+
+    def __call__(self, box: Box, /) -> VoxelEvidence: ...
+
+
+@dataclass(frozen=True, eq=False)
+class _Grey:
+    """The evidence of grey levels, cut at bounds, with known classes."""
+
+    boxes: Boxes
+    bounds: tuple[float, float]
+    classes: Classes
+    note: str
+
+    def __call__(self, box: Box, /) -> VoxelEvidence:
+        values = self.boxes.part(box).astype(np.float32).clip(*self.bounds)
+        return of_classes(values, self.boxes.frame, self.classes)
+
+
+@dataclass(frozen=True, eq=False)
+class _Chances:
+    """The evidence of probabilities, for a scan with a frame."""
+
+    boxes: Boxes
+    frame: Field
+    note: str
+
+    def __call__(self, box: Box, /) -> VoxelEvidence:
+        return of_chances(self.boxes.part(box).astype(np.float32), self.frame, self.note)
+
+
+def _likely(probability: Source | Boxes, frame: Field, crop: Crop | None, reading: dict[str, Any]) -> _Chances:
+    """Return the evidence of a probability map, once it is sure to be one of the scan."""
+    placed = {name: reading.get(name) for name in ("spacing", "unit")} if isinstance(probability, _UNPLACED) else {}
+    check_map(cropped_map(boxes_of(probability, **placed).frame, crop), frame)
+    boxes = boxes_of(probability, crop=crop, **placed)
+    return _Chances(boxes, frame, check_chances(*extent(boxes)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Scan:
+    """A scan's evidence, and a law with its weight."""
+
+    evidence: _Evidence
+    law: Coefficients | None
+    nats: float
+    steps: int
+
+    @property
+    def parts(self) -> dict[str, object]:
+        evidence = self.evidence
+        return {"scan": evidence.boxes.digest, "evidence": evidence.note, "nats": self.nats}
+
+    def given(self, box: Box, place: WorkingGrid) -> tuple[np.ndarray, Evidence]:
+        """Return the first guess and the evidence on a box."""
+        evidence = self.evidence(box)
+        return evidence.level, likelihood(evidence, self.nats, place)
+
+    def plain(self, level: np.ndarray, place: WorkingGrid) -> np.ndarray:
+        """Return the phase field of the first guess."""
+        return place.back(started(level, place))
+
+    def mask(self, phase: np.ndarray, box: Box) -> np.ndarray:
+        """Return the voxels where the phase field is positive."""
+        return phase > 0
+
+
+def _check_phases(evidence: _Evidence, tiling: Tiling) -> None:
+    """Raise ScanError where the first guess has one phase only; tiles are looked at until there are both."""
+    seen: set[bool] = set()
+    for tile in tiling.tiles:
+        inside = evidence(tile.core).level > 0
+        seen |= {bool(inside.any()), bool(inside.all())}
+        if len(seen) == 2:
+            return
+    raise ScanError(
+        f"expected a structure and background in the scan, got {'no background' if True in seen else 'none'}"
+    )
 
 
 def _gain(chosen: Weighing, laws: Sequence[Coefficients]) -> str:

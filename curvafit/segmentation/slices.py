@@ -10,6 +10,7 @@ from scipy import ndimage
 from scipy.interpolate import CubicSpline, make_interp_spline
 
 from curvafit.volumes.field import Field
+from curvafit.volumes.formats.part import Box
 
 __all__ = ["WAYS", "Slices"]
 
@@ -53,8 +54,20 @@ class Slices:
         """Return the slices of these numbers in `places`' order, 0 to N - 1."""
         return replace(self, inside=self.inside[list(numbers)], places=tuple(self.places[k] for k in numbers))
 
-    def level(self, way: str) -> np.ndarray:
-        """Return an interpolation, float32 (length, Y, X), positive inside.
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """The shape of the volume."""
+        return (self.length, *self.inside.shape[1:])  # type: ignore[return-value]
+
+    def known(self, box: Box) -> tuple[list[int], np.ndarray]:
+        """Return the numbers, within a box, of the known slices there, and the masks in the box, bool (N, Y, X)."""
+        numbers, ys, xs = self._numbers(box)
+        row = {place: k for k, place in enumerate(self.places)}
+        rows = [k for k, place in enumerate(numbers) if place in row]
+        return rows, self.inside[[row[int(numbers[k])] for k in rows]][:, ys][:, :, xs]
+
+    def level(self, way: str, box: Box | None = None) -> np.ndarray:
+        """Return an interpolation, float32 (length, Y, X), positive inside, or a box of it.
 
         At a known slice it is the signed distance within the plane. Before the first slice and beyond the last it has
         the value of the nearest; in a volume that repeats it goes around. An empty mask has minus the largest gap
@@ -64,12 +77,15 @@ class Slices:
         ----------
         way
             One of `WAYS`; the spline is natural, or periodic, and a line between two slices.
+        box
+            Voxels; of a volume that repeats they may lie around it.
         """
-        places, distances = np.array(self.places), self._distances()
-        where = np.arange(self.length).clip(places[0], places[-1])
+        numbers, ys, xs = self._numbers((slice(0, self.length), slice(0, None), slice(0, None)) if box is None else box)
+        places, distances = np.array(self.places), self._distances(ys, xs)
+        where = numbers.clip(places[0], places[-1])
         if self.periodic:
             places, distances = np.append(places, places[0] + self.length), np.concatenate([distances, distances[:1]])
-            where = (np.arange(self.length) - places[0]) % self.length + places[0]
+            where = (numbers - places[0]) % self.length + places[0]
         if way == "spline":
             curve = CubicSpline(places, distances, bc_type="periodic" if self.periodic else "natural")
         elif way == "linear":
@@ -85,8 +101,15 @@ class Slices:
         steps = np.diff(self.places)
         return int(max(*steps, self.places[0] + self.length - self.places[-1]) if self.periodic else steps.max())
 
-    def _distances(self) -> np.ndarray:
-        return np.stack([_plane_distance(mask, self.spacing[1:], self.gap * self.spacing[0]) for mask in self.inside])
+    def _numbers(self, box: Box) -> list[np.ndarray]:
+        """Return the numbers of a box's voxels along each axis."""
+        edges = zip(box, self.shape, strict=True)
+        return [np.arange(edge.start, n if edge.stop is None else edge.stop) % n for edge, n in edges]
+
+    def _distances(self, ys: np.ndarray, xs: np.ndarray) -> np.ndarray:
+        """Return the signed distances within the known planes, at these rows and columns."""
+        edges, gap = self.spacing[1:], self.gap * self.spacing[0]
+        return np.stack([_plane_distance(mask, edges, gap)[np.ix_(ys, xs)] for mask in self.inside])
 
 
 def _plane_distance(mask: np.ndarray, spacing: Sequence[float], gap: float) -> np.ndarray:

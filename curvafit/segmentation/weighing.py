@@ -15,8 +15,9 @@ from curvafit.segmentation.engine import HALO, weighed
 from curvafit.segmentation.evidence import LEAST_NOISE, Classes, VoxelEvidence, of_classes
 from curvafit.segmentation.working import WorkingGrid
 from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.formats.part import Box
 
-__all__ = ["Weighing", "trial_steps", "weighing"]
+__all__ = ["Weighing", "busiest", "densest", "trial_steps", "weighing"]
 
 #: Longest edge in voxels of the part on which laws and weights are tried.
 EDGE = 64
@@ -97,7 +98,7 @@ def weighing(
         If the start has one phase only.
     """
     inside = of_classes(values, scan, classes).level > 0
-    where = _busiest(inside)
+    where = densest(inside, (EDGE, EDGE, EDGE))
     part = replace(scan.crop(where), values=values[where])
     outs = _blocks(part.shape, _outlasting(part.values, inside[where]))
     place = WorkingGrid.of(part, epsilon, halo=HALO)
@@ -120,6 +121,12 @@ def weighing(
     if np.isfinite(chosen.worth) and gain > BEYOND * noise:
         return Weighing(chosen.law, WEIGHTS[chosen.number], gain, noise, chosen.classes)
     return Weighing(None, WEIGHTS[chosen.number], gain, noise, classes)
+
+
+def busiest(values: np.ndarray, scan: Field, classes: Classes, blocks: Sequence[Box]) -> Box:
+    """Return the block, of several of a sample's, that holds most of the surface of its first guess."""
+    inside = of_classes(values, scan, classes).level > 0
+    return max(blocks, key=lambda block: int(_surface(inside[block]).sum()))
 
 
 def trial_steps(laws: int, steps: int, voxels: int) -> float:
@@ -258,16 +265,22 @@ def _measured(levels: np.ndarray, phases: np.ndarray, classes: Classes) -> Class
     return Classes(low, high, noise, (low + high) / 2)
 
 
-def _busiest(inside: np.ndarray) -> tuple[slice, slice, slice]:
-    """Return the box, of edges up to `EDGE`, that holds most of a mask's surface."""
-    surface = sum(np.abs(np.diff(inside.astype(np.int8), axis=axis, append=0)) for axis in range(3))
-    box = [min(n, EDGE) for n in inside.shape]
-    held = np.asarray(surface, dtype=np.float32)
+def densest(inside: np.ndarray, edges: tuple[int, int, int]) -> Box:
+    """Return the box, of at most these edges, that holds most of a mask's surface."""
+    box = [min(n, edge) for n, edge in zip(inside.shape, edges, strict=True)]
+    held = _surface(inside).astype(np.float32)
     for axis, edge in enumerate(box):
         held = ndimage.uniform_filter1d(held, edge, axis, mode="constant")
     inner = tuple(slice(b // 2, n - (b - 1) // 2) for n, b in zip(inside.shape, box, strict=True))
     z, y, x = (int(k) for k in np.unravel_index(int(held[inner].argmax()), held[inner].shape))
     return slice(z, z + box[0]), slice(y, y + box[1]), slice(x, x + box[2])
+
+
+def _surface(inside: np.ndarray) -> np.ndarray:
+    """Return how many of a voxel's next neighbours along the axes are on the other side."""
+    sides = inside.astype(np.int8)
+    z, y, x = (np.abs(np.diff(sides, axis=axis, append=0)) for axis in range(3))
+    return z + y + x
 
 
 def _outlasting(values: np.ndarray, inside: np.ndarray) -> int:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from os import PathLike
 
 import numpy as np
@@ -23,6 +24,8 @@ from curvafit.volumes.scan import Field, ScanError
 
 __all__ = ["Law", "WorkingGrid", "law_of", "laws_of"]
 
+#: Whether there is a halo before and beyond the voxels, along each axis.
+Ends = tuple[tuple[bool, bool], tuple[bool, bool], tuple[bool, bool]]
 
 #: Candidates of a fit that are laws of their own: the nearest match's destroys.
 TRUSTED = ("refined", "posterior", "simulation", "optimum")
@@ -88,8 +91,8 @@ class WorkingGrid:
         The number of parts of a scan voxel along each axis.
     unit, epsilon
         A working length of 1, and ε, in the scan's unit.
-    halo
-        Voxels of the grid around the scan on each side.
+    halo, ends
+        Voxels of the grid around the scan, on the sides that have a halo.
     """
 
     grid: Grid
@@ -97,6 +100,7 @@ class WorkingGrid:
     unit: float
     epsilon: float
     halo: int = 0
+    ends: Ends = ((True, True), (True, True), (True, True))
 
     @classmethod
     def of(cls, scan: Field, epsilon: float | None, *, halo: int = 0, periodic: bool = False) -> WorkingGrid:
@@ -120,6 +124,12 @@ class WorkingGrid:
         grid = Grid(shape, spacing, "periodic" if periodic else "replicate")  # type: ignore[arg-type]
         return cls(grid, times, unit, ε, halo)  # type: ignore[arg-type]
 
+    def part(self, shape: Sequence[int], ends: Ends) -> WorkingGrid:
+        """Return the grid of a box of scan voxels, with the halo on these sides; a box does not repeat."""
+        pairs = zip(shape, self.times, ends, strict=True)
+        edges = tuple(n * times + self.halo * sum(sides) for n, times, sides in pairs)
+        return replace(self, grid=Grid(edges, self.grid.spacing, "replicate"), ends=ends)  # type: ignore[arg-type]
+
     @property
     def notes(self) -> tuple[str, ...]:
         """Return a sentence on the axes that are refined, or none."""
@@ -133,7 +143,7 @@ class WorkingGrid:
         u = torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
         for axis, n in enumerate(self.times):
             u = refined(u, axis, n)
-        return pad(u[None, None], (self.halo,) * 6, mode="replicate")[0, 0]
+        return pad(u[None, None], self._sides, mode="replicate")[0, 0]
 
     def spread(self, values: np.ndarray, centre: int | None = None) -> Tensor:
         """Return the evidence of voxels shared among their parts, none in the halo; along axis `centre` only the middle
@@ -146,12 +156,17 @@ class WorkingGrid:
                 share = (torch.arange(n) - (n - 1) / 2).abs().lt(1).float()
             u = u.unsqueeze(axis + 1) * share.reshape(-1, *(1,) * (2 - axis))
             u = u.flatten(axis, axis + 1)
-        return pad(u, (self.halo,) * 6)
+        return pad(u, self._sides)
 
     def back(self, u: Tensor) -> np.ndarray:
         """Return the mean of each scan voxel's parts, without the halo."""
-        for axis in range(3):
-            u = u.narrow(axis, self.halo, u.shape[axis] - 2 * self.halo)
+        for axis, (before, beyond) in enumerate(self.ends):
+            u = u.narrow(axis, self.halo * before, u.shape[axis] - self.halo * (before + beyond))
         for axis, n in enumerate(self.times):
             u = u.unflatten(axis, (-1, n)).mean(axis + 1)
         return u.numpy()
+
+    @property
+    def _sides(self) -> tuple[int, ...]:
+        """The voxels of the halo on each side, the last axis first, as torch pads."""
+        return tuple(self.halo * side for sides in reversed(self.ends) for side in sides)

@@ -18,7 +18,7 @@ from curvafit.volumes.formats import Raw, ScanError, normalise_unit
 from curvafit.volumes.formats.guard import read_file
 from curvafit.volumes.formats.part import Crop, Part, box_of, selected
 
-__all__ = ["Source", "field_of", "load", "read_values"]
+__all__ = ["Source", "field_of", "load", "located", "placed", "read_values"]
 
 #: A volume as a caller gives it.
 Source = str | os.PathLike[str] | Field | np.ndarray | torch.Tensor
@@ -118,14 +118,14 @@ def load(
         not 3D, not finite, constant or larger than memory, the spacing is not positive, or the file has no such
         channel, label or crop.
     """
-    location, key = _split_key(os.fspath(path), key)
+    location, key = located(path, key)
     part = Part(channel, box_of(crop))
     read = read_file(location, key, raw_shape, dtype, None if part.whole else part)
     raw, start = selected(read, part, location)
     if strict and raw.gaps:
         raise ScanError(f"expected a whole volume, got {location}: {raw.gaps[0]}")
     _check_values(raw.values, location)
-    field = _placed(raw, f"{location}::{key}" if key else str(location), spacing, unit)
+    field = placed(raw, f"{location}::{key}" if key else str(location), spacing, unit)
     return _part(field if part.crop is None else field.moved(start), label)
 
 
@@ -175,7 +175,9 @@ def _array(source: np.ndarray | torch.Tensor) -> np.ndarray:
     return source
 
 
-def _split_key(path: str, key: str | None) -> tuple[Path, str | None]:
+def located(path: str | os.PathLike[str], key: str | None) -> tuple[Path, str | None]:
+    """Return the file of a path, and the name of the array in the file, which the path may state after `::`."""
+    path = os.fspath(path)
     if "::" in path and Path(path).exists():
         return Path(path), key
     name, separator, inner = path.rpartition("::")
@@ -200,7 +202,7 @@ def _check_finite(values: np.ndarray, place: object) -> tuple[float, float]:
     return lowest, highest
 
 
-def _placed(raw: Raw, source: str, spacing: Sequence[float] | float | None, unit: str | None) -> Field:
+def placed(raw: Raw, source: str, spacing: Sequence[float] | float | None, unit: str | None) -> Field:
     """Return the values in native byte order, with the spacing and unit of the caller or, by default, of the file."""
     notes = [*raw.gaps, *raw.notes, *(() if spacing is not None or unit is not None else raw.guesses)]
     file_unit, factor = ("voxel", 1.0) if spacing is not None and unit is not None else normalise_unit(raw.unit)

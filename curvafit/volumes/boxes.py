@@ -1,0 +1,225 @@
+"""A volume of which boxes of voxels are read, so that it need not fit into memory."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise, product
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.formats import pick_reader
+from curvafit.volumes.formats.arrays import read_hdf5, read_npy, read_raw
+from curvafit.volumes.formats.guard import read_file
+from curvafit.volumes.formats.ngff import read_zarr
+from curvafit.volumes.formats.nifti import read_nifti
+from curvafit.volumes.formats.part import Box, Crop, Part, box_of, fitted, selected
+from curvafit.volumes.source import Source, field_of, located, placed
+
+__all__ = ["Boxes", "boxes_of", "digest_of", "extent", "frame_of", "thinned", "whole_of"]
+
+#: Readers that read a box alone.
+_BY_BOX = (read_zarr, read_hdf5, read_npy, read_raw, read_nifti)
+#: Voxels of a slab that is looked at.
+_SLAB = 2**24
+#: A sample has at most so many runs of neighbouring voxels along each axis, each so long.
+RUNS, LONG = 4, 64
+
+
+class Boxes(Protocol):
+    """A volume of which boxes are read."""
+
+    @property
+    def frame(self) -> Field:
+        """The volume's shape and place, with zeros for values."""
+        ...
+
+    @property
+    def digest(self) -> str:
+        """A text that changes with the content."""
+        ...
+
+    def part(self, box: Box) -> np.ndarray:
+        """Return the values (Z, Y, X) of a box of voxels."""
+        ...
+
+
+def boxes_of(
+    source: Source | Boxes,
+    *,
+    spacing: Sequence[float] | float | None = None,
+    unit: str | None = None,
+    label: int | None = None,
+    crop: Crop | None = None,
+    **reading: Any,
+) -> Boxes:
+    """Return the boxes of any source of a volume.
+
+    From Zarr, HDF5, NPY, RAW and uncompressed NIfTI, boxes are read where they are asked for. Of other sources the
+    whole lies in memory, in the file's type. The arguments are those of `field_of`; boxes are returned as they are.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ScanError
+        As `field_of`.
+    """
+    if isinstance(source, _Whole | _Stored):
+        return source
+    options: dict[str, Any] = {"spacing": spacing, "unit": unit, "crop": crop, **reading}
+    if label is None and isinstance(source, str | os.PathLike):
+        path, key = located(source, reading.get("key"))
+        if _by_box(path, reading.get("raw_shape")):
+            return _stored(path, key, options)
+    return _Whole(field_of(source, label=label, **options))  # type: ignore[arg-type]
+
+
+def frame_of(field: Field) -> Field:
+    """Return a volume's shape and place, with zeros for values."""
+    return replace(field, values=np.broadcast_to(np.zeros((), field.values.dtype), field.shape))
+
+
+def whole_of(boxes: Boxes) -> Field:
+    """Return the volume in memory, in its own type."""
+    z, y, x = (slice(0, n) for n in boxes.frame.shape)
+    return replace(boxes.frame, values=boxes.part((z, y, x)))
+
+
+def extent(boxes: Boxes) -> tuple[float, float]:
+    """Return the least and the greatest value.
+
+    Raises
+    ------
+    ScanError
+        If a value is not finite.
+    """
+    lowest, highest, faults = np.inf, -np.inf, 0
+    for values in _slabs(boxes):
+        faults += np.count_nonzero(~np.isfinite(values)) if values.dtype.kind == "f" else 0
+        lowest, highest = min(lowest, float(values.min())), max(highest, float(values.max()))
+    if faults:
+        raise ScanError(f"expected finite values, got {faults} that are not")
+    return lowest, highest
+
+
+def thinned(boxes: Boxes) -> tuple[Field, list[Box]]:
+    """Return a sample of a volume, without an affine, and the boxes of it within which voxels are neighbours.
+
+    The sample is the volume itself where it is short; along an axis of more than `RUNS` x `LONG` voxels it has so many
+    runs of so many voxels, from the middles of equal parts.
+    """
+    runs = [_runs(n) for n in boxes.frame.shape]
+    sample = np.empty([sum(run.stop - run.start for run in axis) for axis in runs], boxes.frame.values.dtype)
+    blocks = [_end_to_end(axis) for axis in runs]
+    places = [(z, y, x) for z, y, x in product(*blocks)]
+    for place, (z, y, x) in zip(places, product(*runs), strict=True):
+        sample[place] = boxes.part((z, y, x))
+    return replace(boxes.frame, values=sample, affine=None), places
+
+
+def _runs(n: int) -> list[slice]:
+    """Return the runs of a sample along an axis of n voxels."""
+    if n <= RUNS * LONG:
+        return [slice(0, n)]
+    starts = [(2 * k + 1) * n // (2 * RUNS) - LONG // 2 for k in range(RUNS)]
+    return [slice(start, start + LONG) for start in starts]
+
+
+def _end_to_end(runs: Sequence[slice]) -> list[slice]:
+    """Return where runs lie in a sample."""
+    ends = np.cumsum([0, *(run.stop - run.start for run in runs)]).tolist()
+    return [slice(start, stop) for start, stop in pairwise(ends)]
+
+
+def _slabs(boxes: Boxes) -> Iterator[np.ndarray]:
+    """Yield a volume's slices, some at once."""
+    depth, *plane = boxes.frame.shape
+    thick = max(1, _SLAB // max(1, plane[0] * plane[1]))
+    for z in range(0, depth, thick):
+        yield boxes.part((slice(z, min(z + thick, depth)), slice(0, plane[0]), slice(0, plane[1])))
+
+
+def digest_of(values: np.ndarray) -> str:
+    """Return a text that tells arrays apart."""
+    content = np.ascontiguousarray(values)
+    return f"{content.dtype} {content.shape} {hashlib.sha256(content.view(np.uint8).data).hexdigest()[:16]}"
+
+
+@dataclass(frozen=True)
+class _Whole:
+    """A volume in memory."""
+
+    field: Field
+
+    @cached_property
+    def frame(self) -> Field:
+        return frame_of(self.field)
+
+    @cached_property
+    def digest(self) -> str:
+        return digest_of(self.field.values)
+
+    def part(self, box: Box) -> np.ndarray:
+        return self.field.values[box]
+
+
+@dataclass(frozen=True, eq=False)
+class _Stored:
+    """A volume in a file: its options of reading, its channel, and its first voxel in the file's array."""
+
+    frame: Field
+    path: Path
+    options: dict[str, Any]
+    channel: int | None
+    first: tuple[int, ...]
+
+    @property
+    def digest(self) -> str:
+        """The file's name, size and time of change; those of a folder are its files' together."""
+        files = [path for path in self.path.rglob("*") if path.is_file()] if self.path.is_dir() else [self.path]
+        states = [path.stat() for path in files]
+        size, time = sum(state.st_size for state in states), max(state.st_mtime_ns for state in states)
+        return f"{self.path.resolve()} {self.channel} {self.first} {self.options}: {size} bytes at {time}"
+
+    def part(self, box: Box) -> np.ndarray:
+        z, y, x = (slice(edge.start + n, edge.stop + n) for edge, n in zip(box, self.first, strict=True))
+        values = _read(self.path, self.options, Part(self.channel, (z, y, x)))[0].values
+        return np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("="))
+
+
+def _by_box(path: Path, raw_shape: Sequence[int] | None) -> bool:
+    """Return whether a file can be read box by box."""
+    if not path.exists() or path.name.lower().endswith(".gz"):
+        return False
+    return pick_reader(path, raw_shape is not None) in _BY_BOX
+
+
+def _stored(path: Path, key: str | None, options: dict[str, Any]) -> _Stored:
+    """Return the boxes of a file, whose first voxel is read to know its place."""
+    reading = {"key": key, "raw_shape": options.get("raw_shape"), "dtype": options.get("dtype")}
+    channel = options.get("channel")
+    corner, shape = _read(path, reading, Part(channel, (slice(0, 1), slice(0, 1), slice(0, 1))))
+    if options.get("strict") and corner.gaps:
+        raise ScanError(f"expected a whole volume, got {path}: {corner.gaps[0]}")
+    box = fitted(box_of(options["crop"]), shape, path)
+    first, size = [edge.start for edge in box], [edge.stop - edge.start for edge in box]
+    field = placed(corner, f"{path}::{key}" if key else str(path), options["spacing"], options["unit"])
+    frame = replace(field, values=np.broadcast_to(field.values, size))
+    frame = frame_of(frame if options["crop"] is None else frame.moved(first))
+    return _Stored(frame, path, reading, channel, tuple(first))
+
+
+def _read(path: Path, reading: dict[str, Any], part: Part) -> tuple[Any, tuple[int, ...]]:
+    """Return a part of a file's content, with three axes, and the shape of the whole (z, y, x)."""
+    read = read_file(path, part=part, **reading)
+    assert read.whole is not None
+    shape = read.whole
+    space = part.index(shape, read.channels, path)[1]
+    return selected(read, part, path)[0], tuple(shape[axis] for axis in space)
