@@ -256,7 +256,7 @@ def test_a_label_of_a_volume_is_filled_in(tmp_path: Path) -> None:
 def test_places_that_cannot_be_written_are_refused_first(name, said, oblique, tmp_path, monkeypatch) -> None:
     (tmp_path / "taken").write_text("")
     (tmp_path / "other.json").write_text("{}")
-    monkeypatch.setattr("curvafit.volumes.scan.load", lambda *_, **__: pytest.fail("read all the same"))
+    monkeypatch.setattr("curvafit.volumes.boxes.boxes_of", lambda *_, **__: pytest.fail("read all the same"))
     refused(call("segment", oblique, "--prior", "tubes", "-o", tmp_path / name), said)
 
 
@@ -282,7 +282,7 @@ def test_no_input_is_written_over(arguments, target, tmp_path, monkeypatch) -> N
     (tmp_path / "mine.json").write_text('{"format": "curvafit-mask-1"}')
     (tmp_path / "link.npy").symlink_to("g.npy")
     (tmp_path / "hard.npy").hardlink_to("h.h5")
-    monkeypatch.setattr("curvafit.volumes.scan.load", lambda *_, **__: pytest.fail("read all the same"))
+    monkeypatch.setattr("curvafit.volumes.boxes.boxes_of", lambda *_, **__: pytest.fail("read all the same"))
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     refused(call(*arguments, "-o", target), "writes over no input")
     assert before == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}

@@ -37,7 +37,15 @@ INFERENCE = Cost(0.75e9, 1300)
 
 
 def say_forecast(
-    name: str, shape: Sequence[int], steps: float, cost: Cost, *, what: str = "voxels", workers: int = 1, device="cpu"
+    name: str,
+    shape: Sequence[int],
+    steps: float,
+    cost: Cost,
+    *,
+    what: str = "voxels",
+    workers: int = 1,
+    device="cpu",
+    held: int | None = None,
 ) -> None:
     """Print the time and memory of a long command on the error stream; a short one has no forecast.
 
@@ -51,12 +59,14 @@ def say_forecast(
         Steps of all flows together.
     workers
         Processes that share the flows, each with its own memory.
+    held
+        Voxels that a process holds at once, by default all.
     """
     voxels = math.prod(shape)
     if steps * voxels < SHORT:
         return
     seconds = steps * voxels * step_time(device) / workers
-    size, space = " x ".join(map(str, shape)), number(workers * (cost.base + cost.voxel * voxels) / 1e9, 2)
+    size, space = " x ".join(map(str, shape)), number(workers * (cost.base + cost.voxel * (held or voxels)) / 1e9, 2)
     say(f"{name}: {size} {what}, about {_span(seconds)} and {space} GB on this machine", to=error_console())
 
 

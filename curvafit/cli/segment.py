@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,6 +16,7 @@ from curvafit.cli.reading import Reading, Volume, reads_volume
 from curvafit.cli.support import (
     OverwriteOption,
     command_line,
+    kept,
     plainly,
     say,
     say_notes,
@@ -26,7 +28,10 @@ from curvafit.cli.support import (
 if TYPE_CHECKING:
     from curvafit.inference.infer import Inference
     from curvafit.progress import Progress
+    from curvafit.segmentation.lowering import Workers
     from curvafit.segmentation.result import Segmentation
+    from curvafit.segmentation.tiles import Tiling
+    from curvafit.volumes.boxes import Boxes
     from curvafit.volumes.scan import Field
 
 SEGMENT_EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
@@ -58,12 +63,22 @@ Stiffness = Annotated[float | None, _what(help="Stiffness of springs on the know
 Periodic = Annotated[bool, _what("--periodic", help="The volume repeats, as generated ones do.")]
 Epsilon = Annotated[float | None, _what(help="ε in the scan's unit; by default twice the smallest voxel edge.")]
 Steps = Annotated[int, _what(help="Steps of the flow.", min=1)]
+TileOption = Annotated[
+    int | None,
+    _what("--tile", help="Longest side of a tile, in working voxels; by default one tile up to 256³, else 192.", min=8),
+]
+WorkersOption = Annotated[
+    int | None,
+    _what("--workers", help="Processes that lower tiles at once; by default this one, a tile at a time.", min=0),
+]
 Every = Annotated[int | None, _what(help="Distance of known slices: with 8, every eighth slice is known.")]
 First = Annotated[int | None, _what(help="Number of the first known slice, with --every; by default 0.")]
 Axis = Annotated[str, _what(help="Axis across the slices: z, y or x (first, second, last axis of an array).")]
 
 #: Laws that are tried of an example's fit, which is not known yet.
 INFERRED = 2
+#: Bytes for each voxel of the whole volume, beside its tiles: the scan, and the mask in the file's layout.
+ASSEMBLED = 6
 #: Steps of the flows, as in `curvafit.segmentation`, which help must not import.
 STEPS = 400
 
@@ -79,6 +94,8 @@ def segment(
     dark: Dark = False,
     epsilon: Epsilon = None,
     steps: Steps = STEPS,
+    tile: TileOption = None,
+    workers: WorkersOption = None,
     *,
     reading: Reading,
     overwrite: OverwriteOption = False,
@@ -92,7 +109,7 @@ def segment(
             extra = "--dark" if dark else f"--threshold {threshold}"
             raise ValueError(f"expected neither --threshold nor --dark with --probability, got {extra}")
 
-        def compute(volume: Field, progress: Progress) -> Segmentation:
+        def compute(volume: Boxes, progress: Progress, **tools: Any) -> Segmentation:
             from curvafit.segmentation.evidence import cropped_map
             from curvafit.segmentation.segment import segment as segment_scan
             from curvafit.volumes.scan import load
@@ -100,16 +117,16 @@ def segment(
             alike = {name: reading[name] for name in ("spacing", "unit", "strict")}
             chances = None if probability is None else cropped_map(load(probability, **alike), reading["crop"])
             say_notes(() if chances is None else chances.notes)
-            return segment_scan(volume, prior, probability=chances, steps=steps, progress=progress, **options)
+            return segment_scan(volume, prior, probability=chances, steps=steps, progress=progress, **tools, **options)
 
         def tried(laws: int, voxels: int) -> float:
             from curvafit.segmentation.weighing import trial_steps
 
             return trial_steps(laws + 1, steps, voxels) if weight is None and probability is None else 0.0
 
-        record = {"job": "segment", "steps": steps, **options}
+        record = {"job": "segment", "steps": steps, "tile": tile, **options}
         record |= {"probability": None if probability is None else str(probability)}
-        _run(scan, out, prior, reading, compute, record, overwrite=overwrite, tried=tried)
+        _run(scan, out, prior, reading, compute, record, overwrite=overwrite, tried=tried, workers=workers)
 
 
 @reads_volume
@@ -127,6 +144,8 @@ def reconstruct(
     periodic: Periodic = False,
     epsilon: Epsilon = None,
     steps: Steps = STEPS,
+    tile: TileOption = None,
+    workers: WorkersOption = None,
     reading: Reading,
     overwrite: OverwriteOption = False,
 ) -> None:
@@ -144,23 +163,25 @@ def reconstruct(
         place = {"every": every, "first": first or 0, "known": numbers, "axis": "zyx".index(axis.lower())}
         options: dict[str, Any] = {**place, "stiffness": stiffness, "periodic": periodic, "epsilon": epsilon}
 
-        def compute(volume: Field, progress: Progress) -> Segmentation:
+        def compute(volume: Boxes, progress: Progress, **tools: Any) -> Segmentation:
             from curvafit.segmentation.completion import reconstruct as fill
+            from curvafit.volumes.boxes import whole_of
             from curvafit.volumes.scan import load
 
             alike = {name: reading[name] for name in ("spacing", "unit", "label", "strict")}
             whole = None if example is None else load(example, **alike)
             say_notes(() if whole is None else whole.notes)
             law = prior if prior is not None else _inferred(whole, progress)
-            return fill(volume, law, example=whole, steps=steps, progress=progress, **options)
+            slices = whole_of(volume)
+            return fill(slices, law, example=whole, steps=steps, progress=progress, **tools, **options)
 
         more = {"example": None if example is None else str(example), **options}
-        record = {"job": "reconstruct", "steps": steps, **more}
+        record = {"job": "reconstruct", "steps": steps, "tile": tile, **more}
 
         def tried(laws: int, voxels: int) -> float:
             return laws * steps if stiffness is None else 0.0
 
-        _run(slices, out, prior, reading, compute, record, overwrite=overwrite, tried=tried)
+        _run(slices, out, prior, reading, compute, record, overwrite=overwrite, tried=tried, workers=workers)
 
 
 def _inferred(example: Field | None, progress: Progress) -> Inference:
@@ -175,19 +196,22 @@ def _run(
     out: Path,
     prior: str | None,
     reading: dict[str, Any],
-    compute: Callable[[Field, Progress], Segmentation],
+    compute: Callable[..., Segmentation],
     record: dict[str, Any],
     *,
     overwrite: bool,
     tried: Callable[[int, int], float],
+    workers: int | None,
 ) -> None:
     """Check, read, compute, write and print; `tried` says how many steps it takes to try laws out, given their number
-    and that of the working voxels."""
+    and that of the working voxels. Tiles stay beside the output until it is written."""
+    from curvafit.files import remove
     from curvafit.priors.coefficients import preset_name
     from curvafit.priors.law import texture_of
     from curvafit.segmentation.mask_files import check_mask_target, write_mask
-    from curvafit.segmentation.working import WorkingGrid, laws_of
-    from curvafit.volumes.scan import load
+    from curvafit.segmentation.tiles import Tiling
+    from curvafit.segmentation.working import laws_of
+    from curvafit.volumes.boxes import boxes_of, whole_of
 
     law_file = None if preset_name(prior) else prior
     inputs = [each for each in (source, law_file, record.get("probability"), record.get("example")) if each is not None]
@@ -196,21 +220,77 @@ def _run(
         texture_of(prior)
     with stages() as progress:
         progress("reading", 0.0)
-        volume = load(source, **reading)
-        check_mask_target(out, volume.unit, overwrite=overwrite)
-        shape = WorkingGrid.of(volume, record["epsilon"]).grid.shape
-        laws = INFERRED if prior is None else len(laws_of(prior, volume)[0])
-        steps = record["steps"] + tried(laws, math.prod(shape))
-        say_forecast(record["job"], shape, steps, SEGMENTATION, what="working voxels")
-        result = compute(volume, progress)
+        boxes = boxes_of(source, **reading)
+        check_mask_target(out, boxes.frame.unit, overwrite=overwrite)
+        tiling = Tiling.of(boxes.frame, record["epsilon"], record["tile"], periodic=record.get("periodic", False))
+        laws = INFERRED if prior is None else len(laws_of(prior, boxes.frame)[0])
+        _say_forecast(record, tiling, laws, tried, workers)
+        store = out.with_name(f".{out.name}.curvafit-tiles") if tiling.count > 1 else None
+        with kept() if store is not None else nullcontext(), _crew(workers, tiling) as crew:
+            result = compute(boxes, progress, tile=record["tile"], store=store, workers=crew)
         progress("writing", 1.0)
         content = {"command": command_line(), "prior": prior, **record}
         place = ("spacing", "crop", "channel")
         like = source if all(reading[name] is None for name in place) else None
         more = {"record": content, "overwrite": overwrite}
-        files = write_mask(result, volume, out, like=like, unit=reading["unit"], **more)
+        files = write_mask(result, whole_of(boxes), out, like=like, unit=reading["unit"], **more)
+        if store is not None:
+            remove(store)
     for note in result.notes:
         say(note)
     say(f"{result.status[0].upper()}{result.status[1:]}.", style="bold")
     for path in files:
         say(str(path))
+
+
+def _say_forecast(
+    record: dict[str, Any], tiling: Tiling, laws: int, tried: Callable[[int, int], float], workers: int | None
+) -> None:
+    """Print the forecast: of tiles, the time counts the overlap, and the memory is that of those lowered at once."""
+    shape = tuple(n * times for n, times in zip(tiling.shape, tiling.place.times, strict=True))
+    voxels, job, steps, several = math.prod(shape), record["job"], record["steps"], tiling.count > 1
+    trials = tried(laws, voxels)
+    if not several:
+        say_forecast(job, shape, steps + trials, SEGMENTATION, what="working voxels")
+        return
+    share, at_once = sum(tiling.voxels) / voxels, max(1, min(workers or 1, tiling.count))
+    what = f"working voxels in {tiling.count} tiles"
+    cost = SEGMENTATION._replace(base=SEGMENTATION.base + ASSEMBLED * math.prod(tiling.shape) / at_once)
+    held = max(tiling.voxels)
+    say_forecast(job, shape, steps * share + trials, cost, what=what, workers=at_once, held=held)
+
+
+@contextmanager
+def _crew(workers: int | None, tiling: Tiling) -> Iterator[Workers | None]:
+    """Start workers for tiles, where they are asked for and there are several tiles."""
+    if not workers or tiling.count == 1:
+        yield None
+        return
+    from curvafit.data_synth.atlas.workers import cluster
+
+    with cluster(workers) as crew:
+        yield _OneThread(crew)
+
+
+class _OneThread:
+    """Workers of one thread each."""
+
+    def __init__(self, workers: Workers) -> None:
+        self._workers = workers
+
+    @property
+    def places(self) -> int:
+        return self._workers.places
+
+    def submit(self, make: Callable[..., list[Any]], path: Path, indices: Sequence[int]) -> None:
+        self._workers.submit(partial(_on_one_thread, make), path, indices)
+
+    def done(self) -> list[Any]:
+        return self._workers.done()
+
+
+def _on_one_thread(make: Callable[..., list[Any]], path: Path, indices: Sequence[int]) -> list[Any]:
+    from curvafit.data_synth.atlas.draws import one_thread
+
+    with one_thread():
+        return make(path, indices)

@@ -1,0 +1,109 @@
+"""`segment` and `reconstruct` in tiles: what a kill leaves, what the same command makes of it, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import re
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calling import call, refused
+
+from curvafit.segmentation.tile_store import FolderStore
+from curvafit.volumes import load, save
+from curvafit.volumes.field import Field
+
+pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
+
+
+@pytest.fixture
+def scan(tmp_path: Path) -> Path:
+    """A tube along z in noise, as a Zarr store."""
+    z, y, x = (np.arange(n) for n in (66, 12, 14))
+    mask = np.hypot(y[:, None] - 5.3 + np.sin(z / 5)[:, None, None], x - 6.6) < 4
+    values = 100 * mask + 30 * np.random.default_rng(0).standard_normal(mask.shape)
+    return save(Field(values.astype(np.float32), (0.1, 0.1, 0.1), "mm"), tmp_path / "scan.zarr")
+
+
+def command(scan: Path, target: Path, *more: object) -> tuple:
+    return ("segment", scan, "--prior", "tubes", "--weight", 1, "--steps", 5, "--tile", 14, "-o", target, *more)
+
+
+def killed(monkeypatch: pytest.MonkeyPatch, tile: int) -> None:
+    """A run that is interrupted at a tile."""
+    write = FolderStore.write
+
+    def stop(store: FolderStore, core, piece) -> None:
+        if piece.number == tile:
+            raise KeyboardInterrupt
+        write(store, core, piece)
+
+    monkeypatch.setattr(FolderStore, "write", stop)
+
+
+@pytest.mark.parametrize("name", ["mask.npy", "mask.zarr", "mask.nii.gz"])
+def test_the_same_command_goes_on_after_a_kill(scan: Path, tmp_path: Path, monkeypatch, name: str) -> None:
+    whole, target = tmp_path / "whole" / name, tmp_path / "killed" / name
+    assert call(*command(scan, whole)).exit_code == 0
+    with monkeypatch.context() as patch:
+        killed(patch, 2)
+        result = call(*command(scan, target))
+    assert result.exit_code == 130 and "what is made is kept, and the same command goes on with it" in result.stderr
+    assert [path.name for path in target.parent.iterdir()] == [f".{name}.curvafit-tiles"]
+    refused(call(*command(scan, target, "--epsilon", 0.25)), "expected tiles of this run, got some with place")
+    result = call(*command(scan, target))
+    assert result.exit_code == 0, (result.output, result.exception)
+    stem = name.split(".")[0]
+    assert sorted(path.name for path in target.parent.iterdir()) == sorted([name, f"{stem}.json", f"{stem}.png"])
+    one, other = load(whole), load(target)
+    assert one.values.tobytes() == other.values.tobytes() and one.spacing == other.spacing
+    assert json.loads((target.parent / f"{stem}.json").read_text())["tile"] == 14
+
+
+def test_slices_are_filled_in_tiles(scan: Path, tmp_path: Path) -> None:
+    labels = tmp_path / "labels.npy"
+    np.save(labels, load(scan).values > 50)
+    options = ("--every", 6, "--prior", "tubes", "--stiffness", 1e7, "--steps", 5, "--tile", 14)
+    result = call("reconstruct", labels, *options, "-o", tmp_path / "volume.npy")
+    assert result.exit_code == 0, (result.output, result.exception)
+    assert np.array_equal(np.load(tmp_path / "volume.npy")[::6] > 0, np.load(labels)[::6])
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_the_forecast_tells_of_tiles(scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    forecast = import_module("curvafit.cli.forecast")
+    monkeypatch.setattr(forecast, "SHORT", 0)
+    monkeypatch.setattr(forecast, "step_time", lambda device: 1e-8)
+    said = call(*command(scan, tmp_path / "mask.npy")).stderr
+    assert re.search(
+        r"^segment: 66 x 12 x 14 working voxels in 5 tiles, about .* and 0\.6\d? GB on", said, re.MULTILINE
+    )
+
+
+def test_worker_processes_make_the_same_mask(scan: Path, tmp_path: Path) -> None:
+    masks = []
+    for name, more in (("one", ()), ("two", ("--workers", 2))):
+        result = call(*command(scan, tmp_path / name / "mask.npy", *more))
+        assert result.exit_code == 0, (result.output, result.exception)
+        masks.append(np.load(tmp_path / name / "mask.npy"))
+    assert (masks[0] != masks[1]).mean() < 1e-3  # other processes may add up otherwise
+
+
+def test_workers_without_dask_are_told_what_to_install(scan: Path, tmp_path: Path, monkeypatch) -> None:
+    workers = import_module("curvafit.data_synth.atlas.workers")
+
+    def missing(name: str) -> None:
+        raise ImportError(name)
+
+    monkeypatch.setattr(workers, "import_module", missing)
+    result = call(*command(scan, tmp_path / "mask.npy", "--workers", 2))
+    assert result.exit_code == 2 and 'pip install "curvafit[atlas]"' in result.stderr
+    assert not list(tmp_path.glob("*mask*"))
+    assert call(*command(scan, tmp_path / "mask.npy", "--workers", 0)).exit_code == 0
+
+
+def test_a_tile_that_is_too_small_is_refused(scan: Path, tmp_path: Path) -> None:
+    result = call(*command(scan, tmp_path / "mask.npy", "--tile", 7))
+    assert result.exit_code == 2 and "'--tile'" in result.stderr and not list(tmp_path.glob("*mask*"))
