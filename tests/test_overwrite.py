@@ -151,8 +151,8 @@ def test_atlases_leave_other_peoples_files(tmp_path: Path, monkeypatch: pytest.M
     quick_map(monkeypatch)
     monkeypatch.setattr("curvafit.atlas_map.map_files.map_picture", lambda mapped, field, path: path.write_bytes(b""))
     for _ in range(2):
-        write_map(store, tmp_path / "map")
-    check_map(tmp_path / "map", store)
+        write_map([store], tmp_path / "map")
+    check_map(tmp_path / "map", [store])
 
 
 def test_a_store_may_begin_in_an_empty_folder(tmp_path: Path) -> None:
