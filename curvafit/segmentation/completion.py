@@ -130,7 +130,7 @@ def _filled(
         u = np.tanh(level / (math.sqrt(2) * place.epsilon))
         return level > 0, u, filled(u > 0)
     pull = np.zeros(level.shape, dtype=np.float32)
-    pull[held] = np.where(slices.inside, setting.stiffness, -setting.stiffness)
+    pull[held] = np.where(slices.inside, setting.strength, -setting.strength)
     flow = completed(
         level, setting.law, data.Hinge(place.spread(pull, centre=0), MARGIN), place, setting.steps, progress
     )
@@ -175,7 +175,7 @@ def _like(example: Source, volume: Field, reading: dict[str, Any]) -> Field:
     return other
 
 
-def _example(example: Field, places: Sequence[int], axis: int) -> Task | None:
+def _example(example: Field, places: Sequence[int], axis: int) -> Task[Slices] | None:
     """Return the task to fill an example between slices that are as far apart as the known ones at most."""
     gap, length = int(np.diff(places).max()), example.shape[axis]
     given = range(0, length, gap)
