@@ -15,7 +15,8 @@ from curvafit.segmentation.slices import WAYS, Slices
 __all__ = ["BEYOND", "Choice", "Setting", "Task", "choice", "climbed", "left_out"]
 
 #: What is given of a volume, and what is tried of it.
-Given, Trial = TypeVar("Given"), TypeVar("Trial")
+Given = TypeVar("Given")
+Trial = TypeVar("Trial")
 #: Edge of the cubes whose counts are taken to be independent, in voxels.
 TILE = 16
 #: Standard errors by which a setting must be better than a simpler one.
@@ -138,9 +139,7 @@ def choice(
     return Choice(start if gain.within else best, worth(best), worth(start), gain.noise)
 
 
-def climbed(
-    first: Trial, neighbour: Callable[[Trial, int], Trial | None], worth: Callable[[Trial], float]
-) -> Trial:
+def climbed(first: Trial, neighbour: Callable[[Trial, int], Trial | None], worth: Callable[[Trial], float]) -> Trial:
     """Return the best of a trial and its neighbours on either side, each as long as the last is better than before.
 
     `neighbour` returns the next trial towards 1 or -1, None beyond the end.

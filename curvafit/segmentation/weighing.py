@@ -16,7 +16,7 @@ from curvafit.segmentation.evidence import LEAST_NOISE, Classes, VoxelEvidence, 
 from curvafit.segmentation.working import WorkingGrid
 from curvafit.volumes.field import Field, ScanError
 
-__all__ = ["Weighing", "trial_steps", "weighing"]
+__all__ = ["Weighing", "busiest", "trial_steps", "weighing"]
 
 #: Longest edge in voxels of the part on which laws and weights are tried.
 EDGE = 64
@@ -97,7 +97,7 @@ def weighing(
         If the start has one phase only.
     """
     inside = of_classes(values, scan, classes).level > 0
-    where = _busiest(inside)
+    where = busiest(inside, EDGE)
     part = replace(scan.crop(where), values=values[where])
     outs = _blocks(part.shape, _outlasting(part.values, inside[where]))
     place = WorkingGrid.of(part, epsilon, halo=HALO)
@@ -259,13 +259,13 @@ def _measured(levels: np.ndarray, phases: np.ndarray, classes: Classes) -> Class
     return Classes(low, high, noise, (low + high) / 2)
 
 
-def _busiest(inside: np.ndarray) -> tuple[slice, slice, slice]:
-    """Return the box, of edges up to `EDGE`, that holds most of a mask's surface."""
+def busiest(inside: np.ndarray, edge: int) -> tuple[slice, slice, slice]:
+    """Return the box, of edges up to so many voxels, that holds most of a mask's surface."""
     surface = sum(np.abs(np.diff(inside.astype(np.int8), axis=axis, append=0)) for axis in range(3))
-    box = [min(n, EDGE) for n in inside.shape]
+    box = [min(n, edge) for n in inside.shape]
     held = np.asarray(surface, dtype=np.float32)
-    for axis, edge in enumerate(box):
-        held = ndimage.uniform_filter1d(held, edge, axis, mode="constant")
+    for axis, length in enumerate(box):
+        held = ndimage.uniform_filter1d(held, length, axis, mode="constant")
     inner = tuple(slice(b // 2, n - (b - 1) // 2) for n, b in zip(inside.shape, box, strict=True))
     z, y, x = (int(k) for k in np.unravel_index(int(held[inner].argmax()), held[inner].shape))
     return slice(z, z + box[0]), slice(y, y + box[1]), slice(x, x + box[2])
