@@ -105,7 +105,7 @@ def test_every_second_slice_is_left_out(count: int, periodic: bool, out: list[in
     places = tuple(range(8, 8 + 4 * count, 4))
     task = left_out(Slices(mask[list(places)], places, len(mask), EDGES, periodic=periodic))
     assert task is not None and list(task.places) == [places[k] for k in out]
-    assert task.slices.places == tuple(place for k, place in enumerate(places) if k not in out)
+    assert task.given.places == tuple(place for k, place in enumerate(places) if k not in out)
     assert np.array_equal(task.truth, mask[task.places])
 
 

@@ -58,7 +58,7 @@ def test_blocks_outlast_the_noise(width: float, edge: int) -> None:
 def test_the_part_that_is_tried_is_where_the_surface_is() -> None:
     inside = np.zeros((30, 150, 90), dtype=bool)
     inside[:, 100:140, 5:25] = np.random.default_rng(0).random((30, 40, 20)) < 0.5
-    z, y, x = room._busiest(inside)
+    z, y, x = room.busiest(inside, room.EDGE)
     assert (z.start, z.stop) == (0, 30) and y.stop - y.start == x.stop - x.start == room.EDGE
     assert y.start <= 100 and y.stop >= 140 and x.start <= 5 and x.stop <= 90
 

@@ -33,7 +33,6 @@ SEGMENT_EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
     (
         "curvafit segment bone.nii.gz --prior bone/fit.json -o mask.nii.gz",
         "curvafit segment cells.h5 --key raw --dark --prior sponge --spacing 0.2 --unit um -o mask.tif",
-        "curvafit segment vessels.nii.gz --probability network.nii.gz --prior vessels/fit.json -o mask.nii.gz",
     )
 )
 RECONSTRUCT_EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
@@ -48,7 +47,6 @@ _what = partial(typer.Option, rich_help_panel="What to do")
 
 Target = Annotated[Path, typer.Option("-o", "--output", help="Mask to write: .nii.gz .nii .tif .npy .mrc .zarr.")]
 Prior = Annotated[str, _what(help="fit.json of `curvafit infer`, or a preset's name (see `curvafit presets`).")]
-Probability = Annotated[Path | None, _what(help="Probability of the inside, a volume, instead of grey levels.")]
 Weight = Annotated[float | None, _what(help="Cost of a unit of the energy, in nats; by default chosen, with the law.")]
 Threshold = Annotated[str, _what(help="Grey level between the phases, or otsu.")]
 Dark = Annotated[bool, _what("--dark", help="The structure is the dark phase.")]
@@ -64,6 +62,8 @@ Axis = Annotated[str, _what(help="Axis across the slices: z, y or x (first, seco
 
 #: Laws that are tried of an example's fit, which is not known yet.
 INFERRED = 2
+#: Entries of a record that name files of an example.
+EXAMPLES = ("example", "example_probabilities")
 #: Steps of the flows, as in `curvafit.segmentation`, which help must not import.
 STEPS = 400
 
@@ -73,7 +73,6 @@ def segment(
     scan: Volume,
     out: Target,
     prior: Prior,
-    probability: Probability = None,
     weight: Weight = None,
     threshold: Threshold = "otsu",
     dark: Dark = False,
@@ -86,30 +85,20 @@ def segment(
     """Find the structure of a noisy scan under a curvature prior; write its mask, a picture and a record."""
     with plainly():
         options: dict[str, Any] = {"weight": weight, "epsilon": epsilon}
-        if probability is None:
-            options |= {"threshold": threshold_of(threshold), "dark": dark}
-        elif dark or threshold.lower() != "otsu":
-            extra = "--dark" if dark else f"--threshold {threshold}"
-            raise ValueError(f"expected neither --threshold nor --dark with --probability, got {extra}")
+        options |= {"threshold": threshold_of(threshold), "dark": dark}
 
         def compute(volume: Field, progress: Progress) -> Segmentation:
-            from curvafit.segmentation.evidence import cropped_map
             from curvafit.segmentation.segment import segment as segment_scan
-            from curvafit.volumes.scan import load
 
-            alike = {name: reading[name] for name in ("spacing", "unit", "strict")}
-            chances = None if probability is None else cropped_map(load(probability, **alike), reading["crop"])
-            say_notes(() if chances is None else chances.notes)
-            return segment_scan(volume, prior, probability=chances, steps=steps, progress=progress, **options)
+            return segment_scan(volume, prior, steps=steps, progress=progress, **options)
 
         def tried(laws: int, voxels: int) -> float:
             from curvafit.segmentation.weighing import trial_steps
 
-            return trial_steps(laws + 1, steps, voxels) if weight is None and probability is None else 0.0
+            return trial_steps(laws + 1, steps, voxels) if weight is None else 0.0
 
         record = {"job": "segment", "steps": steps, **options}
-        record |= {"probability": None if probability is None else str(probability)}
-        _run(scan, out, prior, reading, compute, record, overwrite=overwrite, tried=tried)
+        run_job(scan, out, prior, reading, compute, record, overwrite=overwrite, tried=tried)
 
 
 @reads_volume
@@ -151,7 +140,7 @@ def reconstruct(
             alike = {name: reading[name] for name in ("spacing", "unit", "label", "strict")}
             whole = None if example is None else load(example, **alike)
             say_notes(() if whole is None else whole.notes)
-            law = prior if prior is not None else _inferred(whole, progress)
+            law = prior if prior is not None else inferred(whole, progress)
             return fill(volume, law, example=whole, steps=steps, progress=progress, **options)
 
         more = {"example": None if example is None else str(example), **options}
@@ -160,17 +149,17 @@ def reconstruct(
         def tried(laws: int, voxels: int) -> float:
             return laws * steps if stiffness is None else 0.0
 
-        _run(slices, out, prior, reading, compute, record, overwrite=overwrite, tried=tried)
+        run_job(slices, out, prior, reading, compute, record, overwrite=overwrite, tried=tried)
 
 
-def _inferred(example: Field | None, progress: Progress) -> Inference:
+def inferred(example: Field | None, progress: Progress) -> Inference:
     """Return what an example's mask says of its law, without a twin."""
     from curvafit.inference.infer import infer
 
     return infer(example, kind="mask", fast=True, progress=progress)  # type: ignore[arg-type]
 
 
-def _run(
+def run_job(
     source: str,
     out: Path,
     prior: str | None,
@@ -180,9 +169,20 @@ def _run(
     *,
     overwrite: bool,
     tried: Callable[[int, int], float],
+    read: Callable[..., Field] | None = None,
+    image: Path | None = None,
 ) -> None:
-    """Check, read, compute, write and print; `tried` says how many steps it takes to try laws out, given their number
-    and that of the working voxels."""
+    """Check, read, compute, write and print.
+
+    Parameters
+    ----------
+    tried
+        Says how many steps it takes to try laws out, given their number and that of the working voxels.
+    read
+        Reads the source, with the options in `reading`; by default `curvafit.load`.
+    image
+        The file whose header the mask gets; by default the source.
+    """
     from curvafit.priors.coefficients import preset_name
     from curvafit.priors.law import texture_of
     from curvafit.segmentation.mask_files import check_mask_target, write_mask
@@ -190,13 +190,13 @@ def _run(
     from curvafit.volumes.scan import load
 
     law_file = None if preset_name(prior) else prior
-    inputs = [each for each in (source, law_file, record.get("probability"), record.get("example")) if each is not None]
+    inputs = [each for each in (source, law_file, image, *map(record.get, EXAMPLES)) if each is not None]
     check_mask_target(out, inputs=inputs, overwrite=overwrite)
     if prior is not None:
         texture_of(prior)
     with stages() as progress:
         progress("reading", 0.0)
-        volume = load(source, **reading)
+        volume = (read or load)(source, **reading)
         check_mask_target(out, volume.unit, overwrite=overwrite)
         shape = WorkingGrid.of(volume, record["epsilon"]).grid.shape
         laws = INFERRED if prior is None else len(laws_of(prior, volume)[0])
@@ -205,8 +205,8 @@ def _run(
         result = compute(volume, progress)
         progress("writing", 1.0)
         content = {"command": command_line(), "prior": prior, **record}
-        place = ("spacing", "crop", "channel")
-        like = source if all(reading[name] is None for name in place) else None
+        place = ("spacing", "crop") if image else ("spacing", "crop", "channel")
+        like = (image or source) if all(reading[name] is None for name in place) else None
         more = {"record": content, "overwrite": overwrite}
         files = write_mask(result, volume, out, like=like, unit=reading["unit"], **more)
     for note in result.notes:

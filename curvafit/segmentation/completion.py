@@ -14,10 +14,10 @@ from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
 from curvafit.progress import Progress, silent
 from curvafit.segmentation.calibration import Choice, Setting, Task, choice, left_out
 from curvafit.segmentation.engine import HALO, STEPS, completed
+from curvafit.segmentation.known import check_spacing, labels
 from curvafit.segmentation.result import Segmentation, ending, filled, result_of
 from curvafit.segmentation.slices import WAYS, Slices
 from curvafit.segmentation.working import Law, WorkingGrid, laws_of
-from curvafit.units import sampling
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.source import Source, field_of
 
@@ -29,10 +29,6 @@ STIFFNESS = 1e7
 MARGIN = math.tanh(WORKING_SPACING / 2 / (math.sqrt(2) * WORKING_EPSILON))
 #: Least and greatest stiffness.
 STIFFEST = (1e-9, 1e12)
-#: Most values of known slices; more are grey levels.
-LABELS = 256
-#: Share by which the voxels of two files may differ in size.
-SAME = 1e-3
 
 
 def reconstruct(
@@ -130,7 +126,7 @@ def _filled(
         u = np.tanh(level / (math.sqrt(2) * place.epsilon))
         return level > 0, u, filled(u > 0)
     pull = np.zeros(level.shape, dtype=np.float32)
-    pull[held] = np.where(slices.inside, setting.stiffness, -setting.stiffness)
+    pull[held] = np.where(slices.inside, setting.strength, -setting.strength)
     flow = completed(
         level, setting.law, data.Hinge(place.spread(pull, centre=0), MARGIN), place, setting.steps, progress
     )
@@ -156,7 +152,7 @@ def _slices(volume: Field, places: Sequence[int], axis: int, periodic: bool = Fa
     ScanError
         If they are grey levels, or all empty, or all full.
     """
-    inside = _labels(np.moveaxis(volume.values, axis, 0)[list(places)]) > 0
+    inside = labels(np.moveaxis(volume.values, axis, 0)[list(places)], "known slices") > 0
     if inside.all() or not inside.any():
         raise ScanError(
             f"expected known slices with voxels inside and outside, got {'full' if inside.all() else 'empty'} ones"
@@ -169,20 +165,18 @@ def _like(example: Source, volume: Field, reading: dict[str, Any]) -> Field:
     """Return the example; raise ScanError where its voxels differ in size from the volume's."""
     placed = {} if isinstance(example, Field) else {name: reading.get(name) for name in ("spacing", "unit")}
     other = field_of(example, **placed)
-    if other.unit != volume.unit or not np.allclose(other.spacing, volume.spacing, rtol=SAME):
-        one, two = (sampling(each.shape, each.spacing, each.unit) for each in (volume, other))
-        raise ScanError(f"expected an example with the spacing of the slices ({one}), got {two}")
+    check_spacing(other, volume, "the slices")
     return other
 
 
-def _example(example: Field, places: Sequence[int], axis: int) -> Task | None:
+def _example(example: Field, places: Sequence[int], axis: int) -> Task[Slices] | None:
     """Return the task to fill an example between slices that are as far apart as the known ones at most."""
     gap, length = int(np.diff(places).max()), example.shape[axis]
     given = range(0, length, gap)
     if gap < 2 or len(given) < 2:
         return None
     between = [n for n in range(given[-1]) if n % gap]
-    truth = _labels(np.moveaxis(example.values, axis, 0)[between]) > 0
+    truth = labels(np.moveaxis(example.values, axis, 0)[between], "an example") > 0
     return Task(_slices(example, given, axis), truth, between)
 
 
@@ -205,12 +199,3 @@ def _known(places: list[int], length: int) -> tuple[str, ...]:
     before, beyond = places[0], length - 1 - places[-1]
     outer = f"The {before} before the first and the {beyond} beyond the last are extrapolated."
     return f"{len(places)} of {length} slices are known.", *((outer,) if before or beyond else ())
-
-
-def _labels(values: np.ndarray) -> np.ndarray:
-    """Return the values, or raise ScanError where they are grey levels."""
-    if values.dtype.kind == "f" and not np.array_equal(values, np.round(values)):
-        raise ScanError("expected known slices with a mask or labels, got values that are not whole numbers")
-    if values.dtype.itemsize > 1 and (count := len(np.unique(values))) > LABELS:
-        raise ScanError(f"expected known slices with a mask or at most {LABELS} labels, got {count} values")
-    return values

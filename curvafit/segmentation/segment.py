@@ -9,18 +9,15 @@ from curvafit.priors.bounds import real
 from curvafit.priors.coefficients import Coefficients
 from curvafit.progress import Progress, part, silent
 from curvafit.segmentation.engine import BENDING, HALO, STEPS, bending, started, weighed
-from curvafit.segmentation.evidence import classes_of, cropped_map, grey_levels, of_classes, of_probability
+from curvafit.segmentation.evidence import classes_of, grey_levels, of_classes
 from curvafit.segmentation.result import Segmentation, ending, filled, result_of
 from curvafit.segmentation.weighing import Weighing, weighing
 from curvafit.segmentation.working import Law, WorkingGrid, laws_of
-from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.part import Crop
 from curvafit.volumes.source import Source, field_of
 
 __all__ = ["segment"]
 
-#: Cost in nats of a unit of the Willmore energy for probability maps.
-NATS = 1.0
 #: A law that is tried beside the prior's.
 WILLMORE = Coefficients.willmore()
 #: What is said of classes that may be noise.
@@ -35,7 +32,6 @@ def segment(
     scan: Source,
     prior: Law,
     *,
-    probability: Source | None = None,
     weight: float | None = None,
     threshold: float | str = "otsu",
     dark: bool = False,
@@ -49,7 +45,7 @@ def segment(
 
     Which law is lowered, and with which weight, is decided by grey levels that are left out: those that a fit trusts
     and the Willmore energy are tried, and where none tells them better than the start does, the start is the answer.
-    Of a probability map nothing can be left out, since its voxels tell each other.
+    A network's probabilities are for `refine`: none of them can be left out, since they tell each other.
 
     Parameters
     ----------
@@ -58,13 +54,9 @@ def segment(
     prior
         `Coefficients` with lengths in the scan's unit; or a preset's name, in working units of which the smallest voxel
         edge is 0.01; or the path of a `fit.json`, whose unit is converted.
-    probability
-        The probability of the inside, in [0, 1], in place of grey levels, `threshold` and `dark`: a volume of the
-        scan's shape, at the scan's place where both files state one. A file's map has the scan's `spacing` and `unit`.
     weight
         λ, in nats per unit of F_ε, for the first law; by default it is chosen, with the law, by voxels left out. Small
-        bumps on a plane cost (a20 + a02) / 2 times their Willmore energy (linear terms aside, since ∫κ1κ2 = 0). For a
-        probability map it is 2 / (a20 + a02) by default: the prior then counts as strongly as the Willmore energy.
+        bumps on a plane cost (a20 + a02) / 2 times their Willmore energy (linear terms aside, since ∫κ1κ2 = 0).
     threshold, dark
         The grey level between the phases, or `"otsu"`; whether the structure is the dark one.
     epsilon
@@ -72,7 +64,7 @@ def segment(
     steps
         Steps of Adam.
     crop
-        A box of voxels, of the scan and of the probability map: see `curvafit.load`.
+        A box of voxels: see `curvafit.load`.
     progress
         Called with a sentence and the share done.
     reading
@@ -88,31 +80,25 @@ def segment(
     scan = field_of(scan, crop=crop, **reading)
     laws, notes = laws_of(prior, scan)
     place = WorkingGrid.of(scan, epsilon, halo=HALO)
-    stiffness = bending(laws[0]) / BENDING
-    nats = NATS if weight is None else real(weight, "a positive weight", *WEIGHTS) * stiffness
+    if weight is not None:
+        weight = real(weight, "a positive weight", *WEIGHTS)
     if not (isinstance(threshold, str) and threshold == "otsu"):
         real(threshold, "a threshold that is a number or 'otsu'")
+    values = grey_levels(scan, threshold)
+    classes = classes_of(values, scan, threshold, dark)
+    law, nats = laws[0], bending(laws[0]) / BENDING * (weight or 0.0)
     chosen: Weighing | None = None
-    if probability is not None:
-        if dark or threshold != "otsu":
-            raise ScanError("expected neither a threshold nor dark with a probability map, which says what is inside")
-        placed = {} if isinstance(probability, Field) else {name: reading.get(name) for name in ("spacing", "unit")}
-        evidence = of_probability(cropped_map(field_of(probability, **placed), crop), scan)
-    else:
-        values = grey_levels(scan, threshold)
-        classes = classes_of(values, scan, threshold, dark)
-        if weight is None:
-            overlap = threshold == "otsu" and classes.faint
-            chosen = weighing(
-                values, scan, classes, (*laws, *({WILLMORE} - set(laws))),
-                epsilon=epsilon, steps=steps, measured=overlap, progress=part(progress, 0.0, TRIALS),
-            )  # fmt: skip
-            nats, classes, progress = chosen.nats, chosen.classes, part(progress, TRIALS, 1.0)
-        evidence = of_classes(values, scan, classes)
-        if classes.faint and threshold == "otsu" and (chosen is None or chosen.law is None):
-            notes = (*notes, FAINT)
+    if weight is None:
+        overlap = threshold == "otsu" and classes.faint
+        chosen = weighing(
+            values, scan, classes, (*laws, *({WILLMORE} - set(laws))),
+            epsilon=epsilon, steps=steps, measured=overlap, progress=part(progress, 0.0, TRIALS),
+        )  # fmt: skip
+        law, nats, classes, progress = chosen.law, chosen.nats, chosen.classes, part(progress, TRIALS, 1.0)
+    evidence = of_classes(values, scan, classes)
+    if classes.faint and threshold == "otsu" and (chosen is None or chosen.law is None):
+        notes = (*notes, FAINT)
     notes = (*notes, f"{evidence.note[0].upper()}{evidence.note[1:]}.", *place.notes)
-    law = laws[0] if chosen is None else chosen.law
     if law is None:
         u = place.back(started(evidence.level, place))
         status = filled(u > 0)

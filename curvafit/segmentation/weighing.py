@@ -10,13 +10,13 @@ from scipy import ndimage
 
 from curvafit.priors.coefficients import Coefficients
 from curvafit.progress import Progress, silent
-from curvafit.segmentation.calibration import BEYOND
+from curvafit.segmentation.calibration import BEYOND, climbed
 from curvafit.segmentation.engine import HALO, weighed
 from curvafit.segmentation.evidence import LEAST_NOISE, Classes, VoxelEvidence, of_classes
 from curvafit.segmentation.working import WorkingGrid
 from curvafit.volumes.field import Field, ScanError
 
-__all__ = ["Weighing", "trial_steps", "weighing"]
+__all__ = ["Weighing", "busiest", "trial_steps", "weighing"]
 
 #: Longest edge in voxels of the part on which laws and weights are tried.
 EDGE = 64
@@ -97,7 +97,7 @@ def weighing(
         If the start has one phase only.
     """
     inside = of_classes(values, scan, classes).level > 0
-    where = _busiest(inside)
+    where = busiest(inside, EDGE)
     part = replace(scan.crop(where), values=values[where])
     outs = _blocks(part.shape, _outlasting(part.values, inside[where]))
     place = WorkingGrid.of(part, epsilon, halo=HALO)
@@ -196,16 +196,13 @@ class _Trials:
     def best(self, laws: Sequence[Coefficients], number: int, classes: Classes) -> _Trial:
         """Return the best law at the weight of a number, or at the weights on either side of it while they are better
         still."""
-        first = best = max((self._trial(law, number, classes) for law in laws), key=lambda each: each.worth)
-        for step in (1, -1):
-            last = first
-            while 0 <= last.number + step < len(WEIGHTS):
-                further = self._trial(last.law, last.number + step, classes)
-                if further.worth <= last.worth:
-                    break
-                last = further
-            best = max(best, last, key=lambda each: each.worth)
-        return best
+
+        def neighbour(trial: _Trial, step: int) -> _Trial | None:
+            further = trial.number + step
+            return self._trial(trial.law, further, classes) if 0 <= further < len(WEIGHTS) else None
+
+        first = max((self._trial(law, number, classes) for law in laws), key=_worth)
+        return climbed(first, neighbour, _worth)
 
     def _trial(self, law: Coefficients, number: int, classes: Classes) -> _Trial:
         if (law, number, classes) not in self._made:
@@ -222,6 +219,10 @@ class _Trials:
         except ScanError:
             return _Trial(law, number, classes, np.zeros((2, *self._part.shape), dtype=bool), -np.inf)
         return _Trial(law, number, classes, phases, self._judge.worth(phases))
+
+
+def _worth(trial: _Trial) -> float:
+    return trial.worth
 
 
 def _sides(
@@ -258,13 +259,13 @@ def _measured(levels: np.ndarray, phases: np.ndarray, classes: Classes) -> Class
     return Classes(low, high, noise, (low + high) / 2)
 
 
-def _busiest(inside: np.ndarray) -> tuple[slice, slice, slice]:
-    """Return the box, of edges up to `EDGE`, that holds most of a mask's surface."""
+def busiest(inside: np.ndarray, edge: int) -> tuple[slice, slice, slice]:
+    """Return the box, of edges up to so many voxels, that holds most of a mask's surface."""
     surface = sum(np.abs(np.diff(inside.astype(np.int8), axis=axis, append=0)) for axis in range(3))
-    box = [min(n, EDGE) for n in inside.shape]
+    box = [min(n, edge) for n in inside.shape]
     held = np.asarray(surface, dtype=np.float32)
-    for axis, edge in enumerate(box):
-        held = ndimage.uniform_filter1d(held, edge, axis, mode="constant")
+    for axis, length in enumerate(box):
+        held = ndimage.uniform_filter1d(held, length, axis, mode="constant")
     inner = tuple(slice(b // 2, n - (b - 1) // 2) for n, b in zip(inside.shape, box, strict=True))
     z, y, x = (int(k) for k in np.unravel_index(int(held[inner].argmax()), held[inner].shape))
     return slice(z, z + box[0]), slice(y, y + box[1]), slice(x, x + box[2])
