@@ -18,7 +18,7 @@ from curvafit.segmentation.grown import grown
 from curvafit.segmentation.probability import BINS, calibration_error, entropy, evidence, fitted, probability
 from curvafit.segmentation.slices import Slices, reach
 from curvafit.segmentation.suggestion import remaining, suggestions
-from curvafit.segmentation.working import drawn_laws, law_of
+from curvafit.segmentation.working import drawn_laws
 from curvafit.volumes.field import Field
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
@@ -205,7 +205,6 @@ def test_draws_are_laws_in_the_scan_s_unit(tmp_path: Path) -> None:
     none = replace(fit, draws=None)
     for prior in ("tubes", WILLMORE, none):
         assert drawn_laws(prior, scan, 3) == ()
-    assert law_of(none, scan)
 
 
 # ---- suggestions -----------------------------------------------------------------------------------------------------
