@@ -154,6 +154,14 @@ def test_a_grown_task_has_the_volume_s_slices() -> None:
     assert same.truth.shape == (28, 32, 32) and same.slices.inside.any() and not same.slices.inside.all()
 
 
+def test_a_law_of_which_no_shape_grows_is_refused() -> None:
+    """Of two voxels in a thousand no flow makes a shape."""
+    mask = np.zeros((16, 32, 32), dtype=bool)
+    mask[:, :1, :2] = True
+    with pytest.raises(ValueError, match="a shape with volume fraction 0.002 grows, got none: give an example"):
+        grown(known(mask, [0, 8, 15]), WILLMORE, None)
+
+
 # ---- reconstruct -----------------------------------------------------------------------------------------------------
 
 

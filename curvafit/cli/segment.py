@@ -199,7 +199,7 @@ def _run(
 
     law_file = None if preset_name(prior) else prior
     inputs = [each for each in (source, law_file, record.get("probability"), record.get("example")) if each is not None]
-    more = {"overwrite": overwrite, "probability": bool(record.get("runs") or record.get("suggest"))}
+    more: dict[str, Any] = {"overwrite": overwrite, "probability": bool(record.get("runs") or record.get("suggest"))}
     check_mask_target(out, inputs=inputs, **more)
     if prior is not None:
         texture_of(prior)

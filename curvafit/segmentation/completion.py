@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -122,10 +121,15 @@ def reconstruct(
     def fill(slices: Slices, setting: Setting) -> np.ndarray:
         return _filled(slices, setting, epsilon, lambda _, share: progress("trying the prior out", share))[0]
 
+    def again(slices: Slices, setting: Setting, level: np.ndarray, step: Progress) -> tuple[np.ndarray, float]:
+        _, u, _ = _filled(slices, setting, epsilon, lambda _, share: step("running again", share), level)
+        return u, place.epsilon
+
     chosen, tried, uncertain = settings[0], "", None
-    known_whole = None if other is None else _example(other, places, axis)
+    whole_example = None if other is None else _example(other, places, axis)
+    fair = (whole_example or grown(target, laws[0], epsilon, progress)) if runs else None
     if stiffness is None:
-        task = left_out(target) if other is None else known_whole
+        task = left_out(target) if other is None else whole_example
         if task is None:
             raise ScanError(
                 "expected three or more known slices with voxels inside and outside, an example or a stiffness, got "
@@ -134,12 +138,11 @@ def reconstruct(
         best = choice(task, settings, fill, WAYS[:1] if other is None else WAYS)
         chosen, tried = best.setting, _gain(best, "left out" if other is None else "of the example")
     mask, u, end = _filled(target, chosen, epsilon, progress)
-    if runs:
+    if fair is not None:
         drawn = () if chosen.law is None else drawn_laws(prior, volume, runs)
-        task = known_whole or grown(target, laws[0], epsilon, progress)
-        odds = chances(task, target, chosen, drawn or (chosen.law,), runs, partial(_phase, epsilon), progress)
+        odds = chances(fair, target, chosen, drawn or (chosen.law,), runs, again, progress)
         uncertain = _uncertainty(odds, target, volume, axis, range(runs), suggest)
-        end = f"{end}; {_learned(uncertain, 'a shape of the law' if known_whole is None else 'the example')}"
+        end = f"{end}; {_learned(uncertain, 'the example' if fair is whole_example else 'a shape of the law')}"
     notes = (*notes, *_known(places, volume.shape[axis]), *place.notes)
     mask, u = (np.ascontiguousarray(np.moveaxis(each, 0, axis)) for each in (mask, u))
     more = {"weight": None, "law": chosen.law, "epsilon": place.epsilon, "uncertainty": uncertain}
@@ -167,14 +170,6 @@ def _filled(
     mask = u > 0
     mask[held] = slices.inside
     return mask, u, ending(flow, mask)
-
-
-def _phase(
-    epsilon: float | None, slices: Slices, setting: Setting, level: np.ndarray, progress: Progress
-) -> tuple[np.ndarray, float]:
-    """Return the phase field that a setting makes of a level, and its ε."""
-    ε = WorkingGrid.of(slices.frame, epsilon, periodic=slices.periodic).epsilon
-    return _filled(slices, setting, epsilon, progress, level)[1], ε
 
 
 def _uncertainty(

@@ -35,10 +35,11 @@ def grown(slices: Slices, law: Coefficients, epsilon: float | None, progress: Pr
     planes = [min(n, max(4, EDGE // part)) for n, part in zip(slices.inside.shape[1:], times[1:], strict=True)]
     frame = Field(np.broadcast_to(np.float32(0), (slices.length, *planes)), slices.spacing, slices.unit)
     place = WorkingGrid.of(frame, epsilon, periodic=True)
+    share = float(slices.inside.mean())
     flow = generate(
         stiff(law).in_unit(place.unit),
         grid=place.grid,
-        volume_fraction=float(slices.inside.mean()),
+        volume_fraction=share,
         seed=SEED,
         callbacks=[lambda step, total, state: progress("growing a shape of the law", step / total)],
     )
@@ -46,6 +47,9 @@ def grown(slices: Slices, law: Coefficients, epsilon: float | None, progress: Pr
     known, rest = list(slices.places), np.setdiff1d(np.arange(slices.length), slices.places)
     inside = mask[known]
     if not flow.finite or inside.all() or not inside.any():
-        raise ScanError(f"expected a law from which a shape grows, got a flow that {flow.status}: give an example")
+        raise ScanError(
+            f"expected a law of which a shape with volume fraction {share:.2g} grows, got none: give an example, or "
+            "ask for no runs"
+        )
     given = Slices(inside, slices.places, slices.length, slices.spacing, slices.unit, slices.periodic)
     return Task(given, mask[rest], [int(n) for n in rest])
