@@ -143,6 +143,30 @@ def test_reconstruct_fills_what_it_is_not_told(tmp_path: Path) -> None:
     assert np.array_equal(load(named).values, load(target).values)
 
 
+def test_reconstruct_writes_what_is_uncertain(tmp_path: Path) -> None:
+    """A probability beside the mask, with the header of the slices, as long as its mask; and what to annotate next."""
+    path, target = tmp_path / "slices.nii.gz", tmp_path / "out" / "volume.nii.gz"
+    save(Field(ball().astype(np.uint8), (0.1, 0.1, 0.1), "mm"), path)
+    told = ("reconstruct", path, "--every", 4, "--example", path, "--prior", "tubes", "--steps", 2, "-o", target)
+    result = call(*told, "--suggest", 2)
+    assert result.exit_code == 0, (result.output, result.exception)
+    names = ["volume.json", "volume.nii.gz", "volume.png", "volume_probability.nii.gz"]
+    assert sorted(each.name for each in target.parent.iterdir()) == names
+    chances, mask = load(target.parent / names[-1]), load(target)
+    assert chances.values.dtype == np.float32 and np.array_equal(chances.affine, mask.affine)  # type: ignore[arg-type]
+    assert np.array_equal(chances.values[::4], ball()[::4])
+    record = json.loads((target.parent / "volume.json").read_text())
+    assert record["runs"] == 8 and record["seeds"] == [*range(8)] and 0 <= record["calibration_error"] < 1
+    assert sorted(record["files"]) == names and len(record["suggestions"]) == 2
+    said = " ".join(result.stdout.split())
+    assert f"annotate next: {', '.join(map(str, record['suggestions']))}." in said and "8 are made" in said
+    assert call(*told).exit_code == 0
+    assert sorted(each.name for each in target.parent.iterdir()) == names[:-1]
+    (target.parent / names[-1]).write_text("mine")
+    refused(call(*told, "--runs", 1), "expected a name that is free")
+    refused(call(*told[:-1], tmp_path / "other.npy", "--suggest", 16), "a number of slices from 0")
+
+
 def test_a_picture_shows_the_slices(oblique: Path, tmp_path: Path) -> None:
     from matplotlib.image import imread
 

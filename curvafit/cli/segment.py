@@ -40,6 +40,7 @@ RECONSTRUCT_EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
         "curvafit reconstruct labels.nii.gz --every 8 --prior bone/fit.json -o volume.nii.gz",
         "curvafit reconstruct labels.nii.gz --every 8 --example whole.nii.gz -o volume.nii.gz",
         "curvafit reconstruct labels.tif --known 0,7,15 --axis x --prior tubes -o volume.tif",
+        "curvafit reconstruct labels.nii.gz --every 8 --prior bone/fit.json --suggest 3 -o volume.nii.gz",
     )
 )
 
@@ -54,6 +55,8 @@ OwnPrior = Annotated[str | None, _what("--prior", help="As in segment; by defaul
 Example = Annotated[Path | None, _what(help="Mask of another such volume, known whole: the prior is tried out on it.")]
 Stiffness = Annotated[float | None, _what(help="Stiffness of springs on the known slices: try nothing out.")]
 Periodic = Annotated[bool, _what("--periodic", help="The volume repeats, as generated ones do.")]
+Runs = Annotated[int, _what(help="Further runs that tell the probability of the inside; 8 are a good number.", min=0)]
+Suggest = Annotated[int, _what(help="Number of slices to suggest for annotation; needs --runs, by default 8.", min=0)]
 Epsilon = Annotated[float | None, _what(help="ε in the scan's unit; by default twice the smallest voxel edge.")]
 Steps = Annotated[int, _what(help="Steps of the flow.", min=1)]
 Every = Annotated[int | None, _what(help="Distance of known slices: with 8, every eighth slice is known.")]
@@ -66,6 +69,8 @@ INFERRED = 2
 EXAMPLES = ("example", "example_probabilities")
 #: Steps of the flows, as in `curvafit.segmentation`, which help must not import.
 STEPS = 400
+#: Number of runs for suggestions, as in `curvafit.segmentation`.
+RUNS = 8
 
 
 @reads_volume
@@ -114,6 +119,8 @@ def reconstruct(
     example: Example = None,
     stiffness: Stiffness = None,
     periodic: Periodic = False,
+    runs: Runs = 0,
+    suggest: Suggest = 0,
     epsilon: Epsilon = None,
     steps: Steps = STEPS,
     reading: Reading,
@@ -132,6 +139,7 @@ def reconstruct(
             raise ValueError(f"expected --first beside --every, got {first} beside --known")
         place = {"every": every, "first": first or 0, "known": numbers, "axis": "zyx".index(axis.lower())}
         options: dict[str, Any] = {**place, "stiffness": stiffness, "periodic": periodic, "epsilon": epsilon}
+        options |= {"runs": runs, "suggest": suggest}
 
         def compute(volume: Field, progress: Progress) -> Segmentation:
             from curvafit.segmentation.completion import reconstruct as fill
@@ -147,7 +155,7 @@ def reconstruct(
         record = {"job": "reconstruct", "steps": steps, **more}
 
         def tried(laws: int, voxels: int) -> float:
-            return laws * steps if stiffness is None else 0.0
+            return ((laws if stiffness is None else 0) + 2 * (runs or RUNS * bool(suggest))) * steps
 
         run_job(slices, out, prior, reading, compute, record, overwrite=overwrite, tried=tried)
 
@@ -191,13 +199,14 @@ def run_job(
 
     law_file = None if preset_name(prior) else prior
     inputs = [each for each in (source, law_file, image, *map(record.get, EXAMPLES)) if each is not None]
-    check_mask_target(out, inputs=inputs, overwrite=overwrite)
+    more: dict[str, Any] = {"overwrite": overwrite, "probability": bool(record.get("runs") or record.get("suggest"))}
+    check_mask_target(out, inputs=inputs, **more)
     if prior is not None:
         texture_of(prior)
     with stages() as progress:
         progress("reading", 0.0)
         volume = (read or load)(source, **reading)
-        check_mask_target(out, volume.unit, overwrite=overwrite)
+        check_mask_target(out, volume.unit, **more)
         shape = WorkingGrid.of(volume, record["epsilon"]).grid.shape
         laws = INFERRED if prior is None else len(laws_of(prior, volume)[0])
         steps = record["steps"] + tried(laws, math.prod(shape))
@@ -207,8 +216,7 @@ def run_job(
         content = {"command": command_line(), "prior": prior, **record}
         place = ("spacing", "crop") if image else ("spacing", "crop", "channel")
         like = (image or source) if all(reading[name] is None for name in place) else None
-        more = {"record": content, "overwrite": overwrite}
-        files = write_mask(result, volume, out, like=like, unit=reading["unit"], **more)
+        files = write_mask(result, volume, out, like=like, unit=reading["unit"], record=content, overwrite=overwrite)
     for note in result.notes:
         say(note)
     say(f"{result.status[0].upper()}{result.status[1:]}.", style="bold")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,10 +15,14 @@ from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
 from curvafit.progress import Progress, silent
 from curvafit.segmentation.calibration import Choice, Setting, Task, choice, left_out
 from curvafit.segmentation.engine import HALO, STEPS, completed
+from curvafit.segmentation.ensemble import RUNS, Chances, chances
+from curvafit.segmentation.grown import grown
 from curvafit.segmentation.known import check_spacing, labels
-from curvafit.segmentation.result import Segmentation, ending, filled, result_of
+from curvafit.segmentation.probability import entropy
+from curvafit.segmentation.result import Segmentation, Uncertainty, ending, filled, result_of
 from curvafit.segmentation.slices import WAYS, Slices
-from curvafit.segmentation.working import Law, WorkingGrid, laws_of
+from curvafit.segmentation.suggestion import suggestions
+from curvafit.segmentation.working import Law, WorkingGrid, drawn_laws, laws_of
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.source import Source, field_of
 
@@ -29,6 +34,8 @@ STIFFNESS = 1e7
 MARGIN = math.tanh(WORKING_SPACING / 2 / (math.sqrt(2) * WORKING_EPSILON))
 #: Least and greatest stiffness.
 STIFFEST = (1e-9, 1e12)
+#: Most runs.
+MOST = 1000
 
 
 def reconstruct(
@@ -42,6 +49,8 @@ def reconstruct(
     example: Source | None = None,
     stiffness: float | None = None,
     periodic: bool = False,
+    runs: int = 0,
+    suggest: int = 0,
     epsilon: float | None = None,
     steps: int = STEPS,
     progress: Progress = silent,
@@ -73,6 +82,11 @@ def reconstruct(
         from the spline.
     periodic
         Whether the volume repeats, as generated ones do.
+    runs
+        Number of further runs, from other starts and under laws drawn from a fit's posterior. How probable the inside
+        is where they agree is learned from the example, or else from a shape grown from the law: two flows a run.
+    suggest
+        Number of slices to suggest: those to annotate next; needs `runs`, by default 8.
     epsilon, steps, progress, reading
         As in `segment`.
 
@@ -80,8 +94,8 @@ def reconstruct(
     ------
     ValueError
         As `segment`; or if fewer than two slices are known, or too few to try the prior out on and there is neither an
-        example nor a stiffness; or if known slices are all empty, all full or grey levels, or the example's spacing is
-        another one.
+        example nor a stiffness; or if known slices are all empty, all full or grey levels, the example's
+        spacing is another one, or more slices are to be suggested than are unknown.
     FileNotFoundError
         If there is no such `fit.json`.
     """
@@ -92,36 +106,54 @@ def reconstruct(
     place = WorkingGrid.of(target.frame, epsilon, halo=HALO, periodic=periodic)
     if stiffness is not None:
         stiffness = real(stiffness, "a positive stiffness", *STIFFEST)
+    suggest = whole(suggest, "a number of slices from 0", 0, volume.shape[axis] - len(places))
+    runs = whole(runs, "a number of runs from 0", 0, MOST)
     other = None if example is None else _like(example, volume, reading)
     laws, notes = laws_of(prior, volume)
+    if suggest and not runs:
+        runs, notes = RUNS, (*notes, f"Suggestions need runs: {RUNS} are made.")
     settings = [Setting("spline", law, STIFFNESS if stiffness is None else stiffness, steps) for law in laws]
 
     def fill(slices: Slices, setting: Setting) -> np.ndarray:
         return _filled(slices, setting, epsilon, lambda _, share: progress("trying the prior out", share))[0]
 
-    chosen, tried = settings[0], ""
+    def again(slices: Slices, setting: Setting, level: np.ndarray, step: Progress) -> tuple[np.ndarray, float]:
+        _, u, _ = _filled(slices, setting, epsilon, lambda _, share: step("running again", share), level)
+        return u, place.epsilon
+
+    chosen, tried, uncertain = settings[0], "", None
+    whole_example = None if other is None else _example(other, places, axis)
+    fair = (whole_example or grown(target, laws[0], epsilon, progress)) if runs else None
     if stiffness is None:
-        tasks = left_out(target) if other is None else _example(other, places, axis)
-        if tasks is None:
+        task = left_out(target) if other is None else whole_example
+        if task is None:
             raise ScanError(
                 "expected three or more known slices with voxels inside and outside, an example or a stiffness, got "
                 f"{len(places)} slices"
             )
-        best = choice(tasks, settings, fill, WAYS[:1] if other is None else WAYS)
+        best = choice(task, settings, fill, WAYS[:1] if other is None else WAYS)
         chosen, tried = best.setting, _gain(best, "left out" if other is None else "of the example")
     mask, u, end = _filled(target, chosen, epsilon, progress)
+    if fair is not None:
+        drawn = () if chosen.law is None else drawn_laws(prior, volume, runs)
+        odds = chances(fair, target, chosen, drawn or (chosen.law,), runs, again, progress)
+        uncertain = _uncertainty(odds, target, volume, axis, range(runs), suggest)
+        end = f"{end}; {_learned(uncertain, 'the example' if fair is whole_example else 'a shape of the law')}"
     notes = (*notes, *_known(places, volume.shape[axis]), *place.notes)
     mask, u = (np.ascontiguousarray(np.moveaxis(each, 0, axis)) for each in (mask, u))
-    status = f"{tried}{end}"
-    return result_of(volume, mask, u, weight=None, law=chosen.law, epsilon=place.epsilon, status=status, notes=notes)
+    more = {"weight": None, "law": chosen.law, "epsilon": place.epsilon, "uncertainty": uncertain}
+    return result_of(volume, mask, u, status=f"{tried}{end}", notes=notes, **more)
 
 
 def _filled(
-    slices: Slices, setting: Setting, epsilon: float | None, progress: Progress
+    slices: Slices, setting: Setting, epsilon: float | None, progress: Progress, level: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, str]:
-    """Return the mask and the phase field of a volume that a setting fills, and how its flow ended."""
+    """Return the mask and the phase field of a volume that a setting fills, and how its flow ended.
+
+    It starts from the setting's interpolation, or from another level.
+    """
     place = WorkingGrid.of(slices.frame, epsilon, halo=HALO, periodic=slices.periodic)
-    level, held = slices.level(setting.way), list(slices.places)
+    level, held = slices.level(setting.way) if level is None else level, list(slices.places)
     if setting.law is None:
         u = np.tanh(level / (math.sqrt(2) * place.epsilon))
         return level > 0, u, filled(u > 0)
@@ -134,6 +166,24 @@ def _filled(
     mask = u > 0
     mask[held] = slices.inside
     return mask, u, ending(flow, mask)
+
+
+def _uncertainty(
+    odds: Chances, slices: Slices, volume: Field, axis: int, seeds: Sequence[int], count: int
+) -> Uncertainty:
+    """Return what probabilities say of a volume, and so many suggestions."""
+    entropies = entropy(odds.values).sum((1, 2))
+    values = np.ascontiguousarray(np.moveaxis(odds.values, 0, axis))
+    probability = replace(volume, values=values, notes=())
+    following = suggestions(entropies, slices.places, count, slices.periodic)
+    return Uncertainty(probability, tuple(seeds), odds.error, following)
+
+
+def _learned(uncertain: Uncertainty, where: str) -> str:
+    """Return how good probabilities are, and what to annotate next, as the end of a sentence."""
+    following = ", ".join(map(str, uncertain.suggestions))
+    text = f"probabilities of {len(uncertain.seeds)} runs err by {uncertain.calibration_error:.3f} on {where}"
+    return f"{text}; annotate next: {following}" if following else text
 
 
 def _gain(best: Choice, where: str) -> str:

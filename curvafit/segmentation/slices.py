@@ -11,7 +11,7 @@ from scipy.interpolate import CubicSpline, make_interp_spline
 
 from curvafit.volumes.field import Field
 
-__all__ = ["WAYS", "Slices"]
+__all__ = ["WAYS", "Slices", "plane_distances", "reach"]
 
 #: Plain interpolations, the usual one first: signed distances on a cubic spline and on lines; the nearest slice.
 WAYS = ("spline", "linear", "nearest")
@@ -80,13 +80,46 @@ class Slices:
         return curve(where).astype(np.float32)
 
     @property
+    def reach(self) -> np.ndarray:
+        """How far each slice is from the known ones, (length,), in the unit of the spacing; see `reach`."""
+        return self.spacing[0] * reach(self.places, self.length, self.periodic)
+
+    @property
     def gap(self) -> int:
         """The largest distance of two slices that follow each other, in slices."""
         steps = np.diff(self.places)
         return int(max(*steps, self.places[0] + self.length - self.places[-1]) if self.periodic else steps.max())
 
     def _distances(self) -> np.ndarray:
-        return np.stack([_plane_distance(mask, self.spacing[1:], self.gap * self.spacing[0]) for mask in self.inside])
+        return plane_distances(self.inside, self.spacing, self.gap)
+
+
+def reach(places: Sequence[int], length: int, periodic: bool = False) -> np.ndarray:
+    """Return how far slices are from the known ones, float64 (length,), in slices: the error of an interpolation grows
+    in proportion.
+
+    With the distances d and e to the known slices before and after it is d e / (d + e): 0 at a known slice, a quarter
+    of the gap in its middle. Where there is none on one side, it is the distance to the other.
+
+    Parameters
+    ----------
+    places
+        Numbers of the known slices, ascending.
+    """
+    known, every = np.array(places), np.arange(length)
+    if periodic:
+        known = np.concatenate([known - length, known, known + length])
+    ends = np.concatenate([[-np.inf], known, [np.inf]])
+    before, after = every - ends[ends.searchsorted(every, "right") - 1], ends[ends.searchsorted(every)] - every
+    near, far = np.minimum(before, after), np.maximum(before, after)
+    return near / (1 + near / np.maximum(far, 1))
+
+
+def plane_distances(masks: np.ndarray, spacing: Sequence[float], gap: int) -> np.ndarray:
+    """Return signed distances within planes (N, Y, X), positive inside; empty and full planes have minus and plus a gap
+    of so many slices.
+    """
+    return np.stack([_plane_distance(mask, spacing[1:], gap * spacing[0]) for mask in masks])
 
 
 def _plane_distance(mask: np.ndarray, spacing: Sequence[float], gap: float) -> np.ndarray:
