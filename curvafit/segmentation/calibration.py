@@ -10,8 +10,10 @@ import numpy as np
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.slices import WAYS, Slices
 
-__all__ = ["Choice", "Setting", "Task", "choice", "left_out"]
+__all__ = ["ODDS", "Choice", "Setting", "Task", "choice", "left_out"]
 
+#: The way of `odds.Odds`, beside those of `slices.WAYS`.
+ODDS = "odds"
 #: Edge of the tiles of a slice whose counts are taken to be independent, in voxels.
 TILE = 16
 #: Standard errors by which a setting must be better than a simpler one.
@@ -25,17 +27,20 @@ class Setting:
     Attributes
     ----------
     way
-        One of `slices.WAYS`.
+        One of `slices.WAYS`, or `ODDS`.
     law
         Coefficients with lengths in the scan's unit.
     stiffness, steps
         Stiffness of the springs on known voxels, and steps of the flow.
+    pull
+        Stiffness of the springs on the others for each nat of an example's odds.
     """
 
     way: str
     law: Coefficients | None = None
     stiffness: float = 0.0
     steps: int = 0
+    pull: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +98,7 @@ def left_out(slices: Slices) -> Task | None:
 
 def choice(
     task: Task,
-    settings: Sequence[Setting],
+    lowered: Callable[[str], Sequence[Setting]],
     filled: Callable[[Slices, Setting], np.ndarray],
     ways: Sequence[str] = WAYS,
 ) -> Choice:
@@ -101,8 +106,8 @@ def choice(
 
     Parameters
     ----------
-    settings
-        Settings with a law, lowered from the first of the ways.
+    lowered
+        Returns the settings with a law that are lowered from a way: the best of the plain ones.
     ways
         Plain interpolations to compare with. Slices left out double the gap, at which the nearest slice may win by much
         that loses by more at the gap itself: there only what is lowered and its start are to be compared.
@@ -116,7 +121,7 @@ def choice(
     start, before = Setting(ways[0]), counts(Setting(ways[0]))
     for each in map(Setting, ways[1:]):
         start, before = _better((each, counts(each)), (start, before))
-    tried = [(each, counts(each)) for each in settings]
+    tried = [(each, counts(each)) for each in lowered(start.way)]
     best, after = max(tried, key=lambda each: float(_dice(each[1].sum(0))))
     with_prior, without = (float(_dice(each.sum(0))) for each in (after, before))
     return Choice(_better((best, after), (start, before))[0], with_prior, without, _difference(after, before)[1])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,9 @@ from curvafit.generation import data
 from curvafit.priors.bounds import real, whole
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
 from curvafit.progress import Progress, silent
-from curvafit.segmentation.calibration import Choice, Setting, Task, choice, left_out
+from curvafit.segmentation.calibration import ODDS, Choice, Setting, Task, choice, left_out
 from curvafit.segmentation.engine import HALO, STEPS, completed
+from curvafit.segmentation.odds import Odds
 from curvafit.segmentation.result import Segmentation, ending, filled, result_of
 from curvafit.segmentation.slices import WAYS, Slices
 from curvafit.segmentation.working import Law, WorkingGrid, laws_of
@@ -29,6 +31,9 @@ STIFFNESS = 1e7
 MARGIN = math.tanh(WORKING_SPACING / 2 / (math.sqrt(2) * WORKING_EPSILON))
 #: Least and greatest stiffness.
 STIFFEST = (1e-9, 1e12)
+#: Stiffness of the springs on other voxels, in working units, for each nat of an example's odds: one is tried after the
+#: other.
+PULLS = (1e4, 3e4)
 #: Most values of known slices; more are grey levels.
 LABELS = 256
 #: Share by which the voxels of two files may differ in size.
@@ -51,10 +56,12 @@ def reconstruct(
     progress: Progress = silent,
     **reading: Any,
 ) -> Segmentation:
-    """Fill a volume between known slices: lower F_ε from a spline if that is better than plain interpolation.
+    """Fill a volume between known slices: lower F_ε from an interpolation if that is better than the interpolation.
 
     What is better is tried out on an example that is degraded as the volume is, or else on every second known slice,
-    which the others predict. The known slices stay as they are. Where the volume ends, the surface goes on freely.
+    which the others predict. The example also tells how likely voxels between two slices are inside, by their distances
+    from both outlines: where that is the best interpolation, these odds hold the surface while F_ε is lowered. Known
+    slices stay as they are. Where the volume ends, the surface goes on freely.
 
     Parameters
     ----------
@@ -98,38 +105,49 @@ def reconstruct(
         stiffness = real(stiffness, "a positive stiffness", *STIFFEST)
     other = None if example is None else _like(example, volume, reading)
     laws, notes = laws_of(prior, volume)
-    settings = [Setting("spline", law, STIFFNESS if stiffness is None else stiffness, steps) for law in laws]
+    firm, odds = STIFFNESS if stiffness is None else stiffness, None
+
+    def lowered(way: str) -> list[Setting]:
+        pulls = PULLS if way == ODDS else (0.0,)
+        return [Setting(way, law, firm, steps, pull) for law, pull in product(laws, pulls)]
 
     def fill(slices: Slices, setting: Setting) -> np.ndarray:
-        return _filled(slices, setting, epsilon, lambda _, share: progress("trying the prior out", share))[0]
+        level = _level(slices, setting.way, odds, crossed=True)
+        return _filled(slices, level, setting, epsilon, lambda _, share: progress("trying the prior out", share))[0]
 
-    chosen, tried = settings[0], ""
+    chosen, tried = lowered("spline")[0], ""
     if stiffness is None:
-        tasks = left_out(target) if other is None else _example(other, places, axis)
-        if tasks is None:
+        task = left_out(target) if other is None else _example(other, places, axis)
+        if task is None:
             raise ScanError(
                 "expected three or more known slices with voxels inside and outside, an example or a stiffness, got "
                 f"{len(places)} slices"
             )
-        best = choice(tasks, settings, fill, WAYS[:1] if other is None else WAYS)
+        odds = None if other is None else Odds.of(task.slices, task.truth, task.places)
+        best = choice(task, lowered, fill, WAYS[:1] if other is None else (*WAYS, ODDS))
         chosen, tried = best.setting, _gain(best, "left out" if other is None else "of the example")
-    mask, u, end = _filled(target, chosen, epsilon, progress)
+    mask, u, end = _filled(target, _level(target, chosen.way, odds), chosen, epsilon, progress)
     notes = (*notes, *_known(places, volume.shape[axis]), *place.notes)
     mask, u = (np.ascontiguousarray(np.moveaxis(each, 0, axis)) for each in (mask, u))
     status = f"{tried}{end}"
     return result_of(volume, mask, u, weight=None, law=chosen.law, epsilon=place.epsilon, status=status, notes=notes)
 
 
+def _level(slices: Slices, way: str, odds: Odds | None, *, crossed: bool = False) -> np.ndarray:
+    """Return a plain interpolation, or an example's odds; crossed, if the slices are the example's own."""
+    return slices.level(way) if odds is None or way != ODDS else odds.level(slices, crossed=crossed)
+
+
 def _filled(
-    slices: Slices, setting: Setting, epsilon: float | None, progress: Progress
+    slices: Slices, level: np.ndarray, setting: Setting, epsilon: float | None, progress: Progress
 ) -> tuple[np.ndarray, np.ndarray, str]:
-    """Return the mask and the phase field of a volume that a setting fills, and how its flow ended."""
+    """Return the mask and the phase field of a volume that a setting fills from a level, and how its flow ended."""
     place = WorkingGrid.of(slices.frame, epsilon, halo=HALO, periodic=slices.periodic)
-    level, held = slices.level(setting.way), list(slices.places)
     if setting.law is None:
         u = np.tanh(level / (math.sqrt(2) * place.epsilon))
         return level > 0, u, filled(u > 0)
-    pull = np.zeros(level.shape, dtype=np.float32)
+    held, between = list(slices.places), slices.between[:, None, None]
+    pull = np.where(between, setting.pull / min(slices.spacing[1:]) * level, 0).astype(np.float32)
     pull[held] = np.where(slices.inside, setting.stiffness, -setting.stiffness)
     flow = completed(
         level, setting.law, data.Hinge(place.spread(pull, centre=0), MARGIN), place, setting.steps, progress
