@@ -205,18 +205,23 @@ def masks_of(case: Case, way: str, folder: Path) -> Path:
 
 def table(found: Mapping[Case, Mapping[str, dict]]) -> None:
     """A row a case, and the medians of each structure at each distance of the slices."""
+    if not found:
+        return
+    tried = [way for way in TRIED if way in next(iter(found.values()))]
     plain = [way for way in next(iter(found.values())) if way not in TRIED]
-    columns = ("spline", "best", *TRIED)
-    print(f"\n{'':24}{'Dice':>7}{'':{7 * len(plain) + 5}}{'Betti':^28}{'thickness':^28}{'connectivity':^28}")
-    print(f"{'':24}" + "".join(f"{way:>7}" for way in plain) + f"{'example':>9}{'left out':>9}", end=" ")
-    print("".join(f"{way:>9}" for way in columns) * 3)
+    columns, width = ("spline", "best", *tried), 9 * (2 + len(tried))
+    print(
+        f"\n{'':32}{'Dice':{8 * len(plain)}}{'gain':{9 * len(tried)}}", *(f"{figure:{width}}" for figure in FIGURES[1:])
+    )
+    print(f"{'':32}" + "".join(f"{way:>8}" for way in plain) + "".join(f"{way:>9}" for way in tried), end=" ")
+    print(" ".join(["".join(f"{way:>9}" for way in columns)] * 3))
     for name, every in dict.fromkeys((case.name, case.every) for case in found):
-        rows = [_row(each) for case, each in found.items() if (case.name, case.every) == (name, every)]
-        for case, each in zip([c for c in found if (c.name, c.every) == (name, every)], rows, strict=True):
-            stars = ["*" if found[case][way]["status"].startswith("no prior") else " " for way in TRIED]
-            _print(str(case), plain, each, stars)
-        middle = {key: float(np.median([each[key] for each in rows])) for key in rows[0]}
-        _print(f"{name}, every {every}: median", plain, middle, ["", ""])
+        rows = {case: _row(each) for case, each in found.items() if (case.name, case.every) == (name, every)}
+        for case, row in rows.items():
+            stars = ["*" if found[case][way]["status"].startswith("no prior") else " " for way in tried]
+            _print(str(case), plain, dict(zip(tried, stars, strict=True)), row)
+        middle = {key: float(np.median([row[key] for row in rows.values()])) for key in next(iter(rows.values()))}
+        _print(f"{name}, every {every}: median", plain, dict.fromkeys(tried, " "), middle)
 
 
 def _row(ways: Mapping[str, dict]) -> dict[tuple[str, str], float]:
@@ -224,14 +229,14 @@ def _row(ways: Mapping[str, dict]) -> dict[tuple[str, str], float]:
     best = max((way for way in ways if way not in TRIED), key=lambda way: ways[way]["dice"])
     row = {(way, figure): each[figure] for way, each in ways.items() for figure in FIGURES}
     row |= {("best", figure): ways[best][figure] for figure in FIGURES}
-    return row | {(way, "gain"): 100 * (ways[way]["dice"] - ways[best]["dice"]) for way in TRIED}
+    return row | {(way, "gain"): 100 * (ways[way]["dice"] - ways[best]["dice"]) for way in TRIED if way in ways}
 
 
-def _print(title: str, plain: list[str], row: Mapping[tuple[str, str], float], stars: list[str]) -> None:
-    cells = "".join(f"{row[way, 'dice']:7.3f}" for way in plain)
-    gains = "".join(f"{row[way, 'gain']:+8.1f}{star:1}" for way, star in zip(TRIED, stars, strict=True))
-    others = "".join(f"{row[way, figure]:9.2f}" for figure in FIGURES[1:] for way in ("spline", "best", *TRIED))
-    print(f"{title:24}{cells}{gains} {others}", flush=True)
+def _print(title: str, plain: list[str], stars: Mapping[str, str], row: Mapping[tuple[str, str], float]) -> None:
+    cells = "".join(f"{row[way, 'dice']:8.3f}" for way in plain)
+    gains = "".join(f"{row[way, 'gain']:+8.1f}{star}" for way, star in stars.items())
+    others = ["".join(f"{row[way, key]:9.2f}" for way in ("spline", "best", *stars)) for key in FIGURES[1:]]
+    print(f"{title:32}{cells}{gains}", *others, flush=True)
 
 
 def draw(case: Case, folder: Path) -> None:
@@ -257,6 +262,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", default=",".join(STRUCTURES))
     parser.add_argument("--every", default="8")
+    parser.add_argument("--ways", default=",".join(TRIED), help="besides the interpolations")
     parser.add_argument("--seconds", type=float, default=1e9)
     parser.add_argument("--picture", metavar="CASE", help="as bone-0-1-8: structure, side, block, every")
     parser.add_argument("-o", "--output", type=Path, default=Path("completion_scans"))
@@ -267,9 +273,9 @@ def main() -> None:
         draw(Case(name, *map(int, numbers)), options.output)
         return
     found, begun = {}, time.monotonic()
-    ways = (*baselines(), *TRIED)
+    ways = (*baselines(), *filter(None, options.ways.split(",")))
     for every, name in product(map(int, options.every.split(",")), options.only.split(",")):
-        for case in (Case(name, side, block, every) for block in range(BLOCKS[name]) for side in (0, 1)):
+        for case in (Case(name, side, block, every) for side in (0, 1) for block in range(BLOCKS[name])):
             if time.monotonic() - begun > options.seconds:
                 break
             found[case] = {way: scored(case, way, options.output) for way in ways}
