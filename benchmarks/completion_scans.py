@@ -244,7 +244,7 @@ def draw(case: Case, folder: Path) -> None:
     truth = np.moveaxis(case.target.values > 0, case.axis, 0)
     middles = [n + case.every // 2 for n in range(0, len(truth) - case.every, case.every)]
     chosen = sorted(sorted(middles, key=lambda n: -int(truth[n].sum()))[:3])
-    ways = ("spline", *TRIED)
+    ways = [way for way in ("spline", *TRIED) if masks_of(case, way, folder).exists()]
     figure = Figure(figsize=(3 * len(chosen), 3 * len(ways)), layout="constrained")
     FigureCanvasAgg(figure)
     for row, way in enumerate(ways):
