@@ -149,7 +149,7 @@ class Bench:
         if way in plain:
             return plain[way](), ""
         task = Task(self.seed + 1, self.truth(self.seed + 1), range(len(truth)))
-        chosen = choice(task, [self.setting(law, FIRST) for law in self.laws], self.filled, (PLAIN,), NATS)
+        chosen = choice(task, lambda _: [self.setting(law, FIRST) for law in self.laws], self.filled, (PLAIN,), NATS)
         number = "none" if chosen.setting.law is None else f"law {self.laws.index(chosen.setting.law)}"
         said = f"{number} at {chosen.setting.strength:g} nats: {chosen.plain:.3f} to {chosen.dice:.3f}"
         return self.filled(self.seed, chosen.setting), f"{said} ± {chosen.noise:.3f}"

@@ -135,7 +135,7 @@ def test_strengths_are_tried_as_long_as_they_are_better() -> None:
 
     other = WILLMORE.scaled(2)
     settings = [Setting(PLAIN, law, FIRST, 1) for law in (WILLMORE, other)]
-    best = choice(Task(None, truth, range(len(truth))), settings, fill, (PLAIN,), NATS)
+    best = choice(Task(None, truth, range(len(truth))), lambda _: settings, fill, (PLAIN,), NATS)
     assert best.setting == Setting(PLAIN, WILLMORE, NATS[-1], 1) and len(tried) == len(set(tried))
     assert {setting.strength for setting in tried if setting.law is WILLMORE} == {3.0, *NATS[NATS.index(FIRST) :]}
     assert [setting.strength for setting in tried if setting.law is other] == [FIRST, NATS[-1]]
@@ -149,7 +149,7 @@ def test_errors_side_by_side_are_one() -> None:
     def fill(given: None, setting: Setting) -> np.ndarray:
         return truth if setting.law is None else truth & half
 
-    best = choice(Task(None, truth, range(16)), [Setting(PLAIN, WILLMORE, 1.0, 1)], fill, (PLAIN,))
+    best = choice(Task(None, truth, range(16)), lambda way: [Setting(way, WILLMORE, 1.0, 1)], fill, (PLAIN,))
     assert best.noise == pytest.approx(math.sqrt(1 / 4))  # without the one cube 0, without the other -1
 
 

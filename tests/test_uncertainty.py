@@ -131,15 +131,17 @@ def task(mask: np.ndarray, places: list[int], *, periodic: bool = False) -> Task
 def test_a_mirrored_volume_has_mirrored_probabilities() -> None:
     mask, places = ball() | np.roll(ball(radius=5), 9, 0), [0, 6, 12, 15, 24, 31]
     mirrored = sorted(31 - n for n in places)
-    one = chances(task(mask, places), known(mask, places), Setting("spline"), [None], 2, still)
-    other = chances(task(mask[::-1], mirrored), known(mask[::-1], mirrored), Setting("spline"), [None], 2, still)
+    one = chances(task(mask, places), known(mask, places), Setting("spline"), [None], 2, level=Slices.level, flow=still)
+    turned = task(mask[::-1], mirrored), known(mask[::-1], mirrored)
+    other = chances(*turned, Setting("spline"), [None], 2, level=Slices.level, flow=still)
     np.testing.assert_allclose(other.values[::-1], one.values, atol=1e-3)
     assert other.error == pytest.approx(one.error, abs=1e-3)
 
 
 def test_runs_disagree_between_known_slices_alone() -> None:
     mask, places = ball(), [0, 8, 16, 24, 31]
-    odds = chances(task(mask, places), known(mask, places), Setting("spline"), [None], RUNS, moved)
+    same = task(mask, places), known(mask, places)
+    odds = chances(*same, Setting("spline"), [None], RUNS, level=Slices.level, flow=moved)
     assert np.array_equal(odds.values[places], mask[places])
     assert odds.values.min() >= 0 and odds.values.max() <= 1
     unsure = entropy(odds.values).sum((1, 2))
@@ -149,9 +151,9 @@ def test_runs_disagree_between_known_slices_alone() -> None:
 def test_a_grown_task_has_the_volume_s_slices() -> None:
     slices = known(ball(), [0, 5, 10, 31])
     same = grown(slices, WILLMORE, None)
-    assert same.slices.places == slices.places and same.slices.length == 32
+    assert same.given.places == slices.places and same.given.length == 32
     assert [*same.places] == [n for n in range(32) if n not in slices.places]
-    assert same.truth.shape == (28, 32, 32) and same.slices.inside.any() and not same.slices.inside.all()
+    assert same.truth.shape == (28, 32, 32) and same.given.inside.any() and not same.given.inside.all()
 
 
 def test_a_law_of_which_no_shape_grows_is_refused() -> None:

@@ -12,11 +12,13 @@ import numpy as np
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.slices import WAYS, Slices
 
-__all__ = ["BEYOND", "Choice", "Setting", "Task", "choice", "climbed", "left_out"]
+__all__ = ["BEYOND", "ODDS", "Choice", "Setting", "Task", "choice", "climbed", "left_out"]
 
 #: What is given of a volume, and what is tried of it.
 Given = TypeVar("Given")
 Trial = TypeVar("Trial")
+#: The way of `odds.Odds`, beside those of `slices.WAYS`.
+ODDS = "odds"
 #: Edge of the cubes whose counts are taken to be independent, in voxels.
 TILE = 16
 #: Standard errors by which a setting must be better than a simpler one.
@@ -30,17 +32,20 @@ class Setting:
     Attributes
     ----------
     way
-        One of `slices.WAYS`, or another plain way.
+        One of `slices.WAYS`, `ODDS` or another plain way.
     law
         Coefficients with lengths in the scan's unit.
     strength, steps
         Stiffness of the springs on known voxels, or nats of a unit of the Willmore energy; and steps of the flow.
+    pull
+        Stiffness of the springs on the others for each nat of an example's odds.
     """
 
     way: str
     law: Coefficients | None = None
     strength: float = 0.0
     steps: int = 0
+    pull: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +103,7 @@ def left_out(slices: Slices) -> Task[Slices] | None:
 
 def choice(
     task: Task[Given],
-    settings: Sequence[Setting],
+    lowered: Callable[[str], Sequence[Setting]],
     filled: Callable[[Given, Setting], np.ndarray],
     ways: Sequence[str] = WAYS,
     strengths: Sequence[float] = (),
@@ -107,9 +112,9 @@ def choice(
 
     Parameters
     ----------
-    settings
-        Settings with a law, lowered from the first of the ways. The best is tried at the strengths on either side as
-        long as they are better, and the others at the strength that is best then.
+    lowered
+        Returns the settings with a law that are lowered from a way: the best of the plain ones. The best is tried at
+        the strengths on either side as long as they are better, and the others at the strength that is best then.
     filled
         Fills the volume of what is given by a setting: a mask (Z, Y, X).
     ways
@@ -133,6 +138,7 @@ def choice(
     start = Setting(ways[0])
     for each in map(Setting, ways[1:]):
         start = start if _difference(counts(each), counts(start)).within else each
+    settings = lowered(start.way)
     best = climbed(max(settings, key=worth), stronger, worth)
     best = max((best, *(replace(each, strength=best.strength) for each in settings)), key=worth)
     gain = _difference(counts(best), counts(start))

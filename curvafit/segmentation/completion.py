@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -13,11 +14,12 @@ from curvafit.generation import data
 from curvafit.priors.bounds import real, whole
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
 from curvafit.progress import Progress, silent
-from curvafit.segmentation.calibration import Choice, Setting, Task, choice, left_out
+from curvafit.segmentation.calibration import ODDS, Choice, Setting, Task, choice, left_out
 from curvafit.segmentation.engine import HALO, STEPS, completed
 from curvafit.segmentation.ensemble import RUNS, Chances, chances
 from curvafit.segmentation.grown import grown
 from curvafit.segmentation.known import check_spacing, labels
+from curvafit.segmentation.odds import Odds
 from curvafit.segmentation.probability import entropy
 from curvafit.segmentation.result import Segmentation, Uncertainty, ending, filled, result_of
 from curvafit.segmentation.slices import WAYS, Slices
@@ -36,6 +38,9 @@ MARGIN = math.tanh(WORKING_SPACING / 2 / (math.sqrt(2) * WORKING_EPSILON))
 STIFFEST = (1e-9, 1e12)
 #: Most runs.
 MOST = 1000
+#: Stiffness of the springs on other voxels, in working units, for each nat of an example's odds: one is tried after the
+#: other.
+PULLS = (1e4, 3e4)
 
 
 def reconstruct(
@@ -56,10 +61,12 @@ def reconstruct(
     progress: Progress = silent,
     **reading: Any,
 ) -> Segmentation:
-    """Fill a volume between known slices: lower F_ε from a spline if that is better than plain interpolation.
+    """Fill a volume between known slices: lower F_ε from an interpolation if that is better than the interpolation.
 
     What is better is tried out on an example that is degraded as the volume is, or else on every second known slice,
-    which the others predict. The known slices stay as they are. Where the volume ends, the surface goes on freely.
+    which the others predict. The example also tells how likely voxels between two slices are inside, by their distances
+    from both outlines: where that is the best interpolation, these odds hold the surface while F_ε is lowered. Known
+    slices stay as they are. Where the volume ends, the surface goes on freely.
 
     Parameters
     ----------
@@ -112,16 +119,24 @@ def reconstruct(
     laws, notes = laws_of(prior, volume)
     if suggest and not runs:
         runs, notes = RUNS, (*notes, f"Suggestions need runs: {RUNS} are made.")
-    settings = [Setting("spline", law, STIFFNESS if stiffness is None else stiffness, steps) for law in laws]
+    firm, odds = STIFFNESS if stiffness is None else stiffness, None
+
+    def lowered(way: str) -> list[Setting]:
+        pulls = PULLS if way == ODDS else (0.0,)
+        return [Setting(way, law, firm, steps, pull) for law, pull in product(laws, pulls)]
+
+    def level(slices: Slices, way: str) -> np.ndarray:
+        return slices.level(way) if odds is None or way != ODDS else odds.level(slices, crossed=slices is not target)
 
     def fill(slices: Slices, setting: Setting) -> np.ndarray:
-        return _filled(slices, setting, epsilon, lambda _, share: progress("trying the prior out", share))[0]
+        step: Progress = lambda _, share: progress("trying the prior out", share)  # noqa: E731
+        return _filled(slices, level(slices, setting.way), setting, epsilon, step)[0]
 
-    def again(slices: Slices, setting: Setting, level: np.ndarray, step: Progress) -> tuple[np.ndarray, float]:
-        _, u, _ = _filled(slices, setting, epsilon, lambda _, share: step("running again", share), level)
+    def again(slices: Slices, setting: Setting, start: np.ndarray, step: Progress) -> tuple[np.ndarray, float]:
+        _, u, _ = _filled(slices, start, setting, epsilon, lambda _, share: step("running again", share))
         return u, place.epsilon
 
-    chosen, tried, uncertain = settings[0], "", None
+    chosen, tried, uncertain = lowered("spline")[0], "", None
     whole_example = None if other is None else _example(other, places, axis)
     fair = (whole_example or grown(target, laws[0], epsilon, progress)) if runs else None
     if stiffness is None:
@@ -131,13 +146,14 @@ def reconstruct(
                 "expected three or more known slices with voxels inside and outside, an example or a stiffness, got "
                 f"{len(places)} slices"
             )
-        best = choice(task, settings, fill, WAYS[:1] if other is None else WAYS)
+        odds = None if other is None else Odds.of(task.given, task.truth, task.places)
+        best = choice(task, lowered, fill, WAYS[:1] if other is None else (*WAYS, ODDS))
         chosen, tried = best.setting, _gain(best, "left out" if other is None else "of the example")
-    mask, u, end = _filled(target, chosen, epsilon, progress)
+    mask, u, end = _filled(target, level(target, chosen.way), chosen, epsilon, progress)
     if fair is not None:
         drawn = () if chosen.law is None else drawn_laws(prior, volume, runs)
-        odds = chances(fair, target, chosen, drawn or (chosen.law,), runs, again, progress)
-        uncertain = _uncertainty(odds, target, volume, axis, range(runs), suggest)
+        likely = chances(fair, target, chosen, drawn or (chosen.law,), runs, level=level, flow=again, progress=progress)
+        uncertain = _uncertainty(likely, target, volume, axis, range(runs), suggest)
         end = f"{end}; {_learned(uncertain, 'the example' if fair is whole_example else 'a shape of the law')}"
     notes = (*notes, *_known(places, volume.shape[axis]), *place.notes)
     mask, u = (np.ascontiguousarray(np.moveaxis(each, 0, axis)) for each in (mask, u))
@@ -146,18 +162,15 @@ def reconstruct(
 
 
 def _filled(
-    slices: Slices, setting: Setting, epsilon: float | None, progress: Progress, level: np.ndarray | None = None
+    slices: Slices, level: np.ndarray, setting: Setting, epsilon: float | None, progress: Progress
 ) -> tuple[np.ndarray, np.ndarray, str]:
-    """Return the mask and the phase field of a volume that a setting fills, and how its flow ended.
-
-    It starts from the setting's interpolation, or from another level.
-    """
+    """Return the mask and the phase field of a volume that a setting fills from a level, and how its flow ended."""
     place = WorkingGrid.of(slices.frame, epsilon, halo=HALO, periodic=slices.periodic)
-    level, held = slices.level(setting.way) if level is None else level, list(slices.places)
     if setting.law is None:
         u = np.tanh(level / (math.sqrt(2) * place.epsilon))
         return level > 0, u, filled(u > 0)
-    pull = np.zeros(level.shape, dtype=np.float32)
+    held, between = list(slices.places), slices.between[:, None, None]
+    pull = np.where(between, setting.pull / min(slices.spacing[1:]) * level, 0).astype(np.float32)
     pull[held] = np.where(slices.inside, setting.strength, -setting.strength)
     flow = completed(
         level, setting.law, data.Hinge(place.spread(pull, centre=0), MARGIN), place, setting.steps, progress

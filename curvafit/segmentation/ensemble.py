@@ -23,6 +23,8 @@ RUNS = 8
 #: Distance from a surface, in voxels, within which probabilities are judged.
 NEAR = 3
 
+#: Interpolates between slices in a way: a level (Z, Y, X), positive inside.
+Level = Callable[[Slices, str], np.ndarray]
 #: Fills a volume between slices by a setting, from a level of its own: a phase field (Z, Y, X), and ε.
 Flow = Callable[[Slices, Setting, np.ndarray, Progress], tuple[np.ndarray, float]]
 
@@ -52,6 +54,8 @@ def chances(
     setting: Setting,
     laws: Sequence[Coefficients | None],
     runs: int,
+    *,
+    level: Level,
     flow: Flow,
     progress: Progress = silent,
 ) -> Chances:
@@ -69,9 +73,9 @@ def chances(
     laws
         Of which the runs take one after another; None lowers no energy.
     """
-    spread = _spread(task, setting.way)
+    spread = _spread(task, level(task.given, setting.way))
     tried, target = (
-        _Runs.of(each, setting, laws, spread, runs, flow, half)
+        _Runs.of(each, level(each, setting.way), setting, laws, spread, count=runs, flow=flow, progress=half)
         for each, half in ((task.given, part(progress, 0, 0.5)), (slices, part(progress, 0.5, 1)))
     )
     rows = list(task.places)
@@ -103,14 +107,15 @@ class _Runs:
     def of(
         cls,
         slices: Slices,
+        level: np.ndarray,
         setting: Setting,
         laws: Sequence[Coefficients | None],
         spread: float,
+        *,
         count: int,
         flow: Flow,
         progress: Progress,
     ) -> _Runs:
-        level = slices.level(setting.way)
         votes, distance = np.zeros(level.shape, dtype=np.uint16), np.zeros(level.shape, dtype=np.float32)
         for seed in range(count):
             step = part(progress, seed / count, (seed + 1) / count)
@@ -134,11 +139,11 @@ class _Runs:
         return values
 
 
-def _spread(task: Task[Slices], way: str) -> float:
+def _spread(task: Task[Slices], level: np.ndarray) -> float:
     """Return how far an interpolation's distances are from a task's true ones, over the slices' reach: the median."""
     slices, rows = task.given, list(task.places)
-    truth = plane_distances(task.truth, slices.spacing, slices.gap)
-    ratio = np.abs(slices.level(way)[rows] - truth) / slices.reach[rows, None, None]
+    truth = plane_distances(task.truth, slices.spacing[1:], slices.gap * slices.spacing[0])
+    ratio = np.abs(level[rows] - truth) / slices.reach[rows, None, None]
     return float(np.median(ratio[np.abs(truth) < NEAR * min(slices.spacing[1:])]))
 
 

@@ -195,7 +195,7 @@ def calibrate(
             return np.zeros(box.shape, dtype=bool)
 
     task = Task(of_probability(box), inside[where], range(box.shape[0]))
-    best = choice(task, [Setting(PLAIN, law, FIRST, steps) for law in every], fill, (PLAIN,), NATS)
+    best = choice(task, lambda way: [Setting(way, law, FIRST, steps) for law in every], fill, (PLAIN,), NATS)
     return Calibration(best, best.setting.law in laws, field)
 
 

@@ -65,7 +65,7 @@ class Slices:
         way
             One of `WAYS`; the spline is natural, or periodic, and a line between two slices.
         """
-        places, distances = np.array(self.places), self._distances()
+        places, distances = np.array(self.places), self.distances(self.gap * self.spacing[0])
         where = np.arange(self.length).clip(places[0], places[-1])
         if self.periodic:
             places, distances = np.append(places, places[0] + self.length), np.concatenate([distances, distances[:1]])
@@ -90,8 +90,32 @@ class Slices:
         steps = np.diff(self.places)
         return int(max(*steps, self.places[0] + self.length - self.places[-1]) if self.periodic else steps.max())
 
-    def _distances(self) -> np.ndarray:
-        return plane_distances(self.inside, self.spacing, self.gap)
+    @property
+    def neighbours(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """For each slice of the volume: its distance in slices from the nearer of the known slices around it, and the
+        numbers of this one and of the other, 0 to N - 1; both are the same before the first and beyond the last.
+        """
+        places, where, count = np.array(self.places), np.arange(self.length), len(self.places)
+        before, after = np.searchsorted(places, where, "right") - 1, np.searchsorted(places, where, "left")
+        if not self.periodic:
+            before, after = before.clip(0), after.clip(max=count - 1)
+        down, up = where - places[before % count], places[after % count] - where
+        if self.periodic:
+            down, up = down % self.length, up % self.length
+        before, after, down, up = before % count, after % count, np.abs(down), np.abs(up)
+        return np.minimum(down, up), np.where(down <= up, before, after), np.where(down <= up, after, before)
+
+    @property
+    def between(self) -> np.ndarray:
+        """Which slices of the volume lie between two known ones, bool (length,)."""
+        away, near, far = self.neighbours
+        return (away > 0) & (near != far)
+
+    def distances(self, gap: float) -> np.ndarray:
+        """Return the known slices' signed distances within the plane, positive inside: minus `gap` in an empty mask,
+        plus `gap` in a full one.
+        """
+        return plane_distances(self.inside, self.spacing[1:], gap)
 
 
 def reach(places: Sequence[int], length: int, periodic: bool = False) -> np.ndarray:
@@ -115,11 +139,11 @@ def reach(places: Sequence[int], length: int, periodic: bool = False) -> np.ndar
     return near / (1 + near / np.maximum(far, 1))
 
 
-def plane_distances(masks: np.ndarray, spacing: Sequence[float], gap: int) -> np.ndarray:
-    """Return signed distances within planes (N, Y, X), positive inside; empty and full planes have minus and plus a gap
-    of so many slices.
+def plane_distances(masks: np.ndarray, spacing: Sequence[float], gap: float) -> np.ndarray:
+    """Return signed distances within planes (N, Y, X) with voxel edges (y, x), positive inside; empty and full planes
+    have minus and plus the gap.
     """
-    return np.stack([_plane_distance(mask, spacing[1:], gap * spacing[0]) for mask in masks])
+    return np.stack([_plane_distance(mask, spacing, gap) for mask in masks])
 
 
 def _plane_distance(mask: np.ndarray, spacing: Sequence[float], gap: float) -> np.ndarray:
