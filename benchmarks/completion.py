@@ -6,7 +6,8 @@ A shape of 64³ is known at every so many slices, as a box that repeats and as a
 The law is inferred from the mask of another seed, without growing anything. Dice and the sum of the Betti numbers'
 errors count between the first and the last known slice only.
 
-- `spline`, `linear`, `nearest`: plain interpolations; the best of them *in hindsight* is what the others are held to.
+- `spline`, `linear`, `nearest`, `ITK` (its morphological contour interpolation, where its package is installed): plain
+  interpolations; the best of them *in hindsight* is what the others are held to.
 - `calibrated`: `reconstruct` with the inferred fit, tried out on slices left out; `example`: on the other seed's mask.
 - `optimum`, `posterior`, `match`, `true`, `Willmore`: a law, not calibrated; `short`: the setting before (150 steps, no
   blur, and springs that squeeze the profile).
@@ -17,7 +18,6 @@ Finished cases stay in the folder: a second run goes on. `--seconds` ends a run 
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from dataclasses import replace
 from itertools import product
@@ -25,10 +25,10 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.completion_ways import ITK, baselines, interpolated, scores, stored
 from curvafit.files import write_atomically, write_content
 from curvafit.generation import data
 from curvafit.generation.flow import descend, generate
-from curvafit.geometry.topology import betti_numbers
 from curvafit.inference.fit import Fit
 from curvafit.inference.infer import infer
 from curvafit.priors.coefficients import Coefficients, preset
@@ -65,8 +65,8 @@ def completed(way: str, law: str, seed: int, every: int, periodic: bool, folder:
     """A way's mask, and what it says of itself."""
     truth, places = shape(law, seed, folder), range(0, EDGE, every)
     slices = Slices(truth[places], tuple(places), EDGE, (1.0, 1.0, 1.0), periodic=periodic)
-    if way in WAYS:
-        return slices.level(way) > 0, ""
+    if way in (*WAYS, ITK):
+        return interpolated(slices, way), ""
     fit = fitted(law, seed + 1, folder)
     known = {"every": every, "periodic": periodic}
     if way in ("calibrated", "example"):
@@ -94,23 +94,17 @@ def _short(slices: Slices, fit: Fit) -> np.ndarray:
     return mask
 
 
-def score(mask: np.ndarray, truth: np.ndarray) -> dict[str, float]:
-    """Dice, and the sum of the Betti numbers' errors."""
-    pairs = zip(betti_numbers(mask), betti_numbers(truth), strict=True)
-    dice = 2 * float((mask & truth).sum()) / float(mask.sum() + truth.sum())
-    return {"dice": dice, "betti": float(sum(abs(a - b) for a, b in pairs))}
-
-
 def case(way: str, law: str, seed: int, every: int, periodic: bool, folder: Path) -> dict:
     """A way's scores between the first and the last known slice, made once."""
-    path = folder / f"case-{way}-{law}-{seed}-{every}-{'box' if periodic else 'crop'}.json"
-    if not path.exists():
+
+    def make() -> dict:
         begun = time.process_time()
         mask, status = completed(way, law, seed, every, periodic, folder)
         between = slice(0, (EDGE - 1) // every * every + 1)
-        scores = score(mask[between], shape(law, seed, folder)[between])
-        write_content(path, json.dumps({**scores, "status": status, "seconds": time.process_time() - begun}))
-    return json.loads(path.read_text())
+        found = scores(mask[between], shape(law, seed, folder)[between])
+        return {**found, "status": status, "seconds": time.process_time() - begun}
+
+    return stored(folder / f"case-{way}-{law}-{seed}-{every}-{'box' if periodic else 'crop'}.json", make)
 
 
 def table(cases: dict[tuple, dict], laws: list[str], levels: list[int], ways: list[str]) -> None:
@@ -120,7 +114,7 @@ def table(cases: dict[tuple, dict], laws: list[str], levels: list[int], ways: li
         whole = [k for k in range(len(laws)) if all(row[k] for row in rows.values())]
         if not whole:
             continue
-        best = [max(rows[way][k]["dice"] for way in WAYS) for k in whole]
+        best = [max(row[k]["dice"] for way, row in rows.items() if way not in PRIORS) for k in whole]
         print(f"\n{'boxes' if periodic else 'crops'}, every {every}: {', '.join(laws[k] for k in whole)}")
         for way, row in rows.items():
             dice = np.array([row[k]["dice"] for k in whole])
@@ -141,7 +135,10 @@ def main() -> None:
     options = parser.parse_args()
     options.output.mkdir(parents=True, exist_ok=True)
     laws, levels = options.laws.split(","), [int(n) for n in options.every.split(",")]
-    ways, boxes = [*WAYS, *filter(None, options.ways.split(","))], [box == "box" for box in options.boxes.split(",")]
+    ways, boxes = (
+        [*baselines(), *filter(None, options.ways.split(","))],
+        [box == "box" for box in options.boxes.split(",")],
+    )
     cases, begun = {}, time.monotonic()
     for every, law, periodic, way in product(levels, laws, boxes, ways):
         if time.monotonic() - begun > options.seconds:

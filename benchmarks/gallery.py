@@ -62,10 +62,15 @@ def author_volume(folder: Path, name: str) -> torch.Tensor:
     return torch.from_numpy(np.asarray(nibabel.load(path).dataobj, dtype=np.float32))
 
 
+def is_floored(u: torch.Tensor) -> bool:
+    """Whether a volume is rounded to 1/100."""
+    return bool((100 * u - (100 * u).round()).abs().max() < 1e-3)
+
+
 def compare(folder: Path, name: str, schedule: str, seeds: range, shapes: Path) -> Row:
     """Compare an author's volume with our shapes of some seeds."""
     u = author_volume(folder, name)
-    grid, floored = Grid(tuple(u.shape)), bool((100 * u - (100 * u).round()).abs().max() < 1e-3)
+    grid, floored = Grid(tuple(u.shape)), is_floored(u)
     author = diagram(u, grid, WORKING_EPSILON)
     ours = [shape_of(name, schedule, seed, grid.shape[0], shapes, floored=floored) for seed in seeds]
     distance = np.mean([wasserstein(author, shape.diagram) for shape in ours])

@@ -5,7 +5,8 @@ curvatures at constant volume.
 
 - Infer: `infer(scan)` gives the parameters of a scanned volume, with `.fit`, `.plot()` and a report.
 - Synthesise: `generate(law)` grows a shape of a texture; `generate_batch` grows several at once.
-- Prior: `segment(scan, law)` and `reconstruct(labels, law)` give a mask; `curvafit.priors` has the loss for networks.
+- Prior: `segment(scan, law)`, `refine(probabilities, law)` and `reconstruct(labels, law)` give a mask;
+  `curvafit.priors` has the loss for networks.
 - Files: `load(path)` and `save(volume, path)` read and write volumes with their spacing and unit.
 - Measures: `diagram(u, grid, epsilon)` and `wasserstein(a, b)`; more in `curvafit.geometry`.
 
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from curvafit.priors.coefficients import Coefficients, preset
     from curvafit.priors.grid import Grid
     from curvafit.segmentation.completion import reconstruct
+    from curvafit.segmentation.refine import refine
     from curvafit.segmentation.result import Segmentation
     from curvafit.segmentation.segment import segment
     from curvafit.volumes.scan import Field, load, save
@@ -54,6 +56,7 @@ __all__ = [
     "load",
     "preset",
     "reconstruct",
+    "refine",
     "save",
     "segment",
     "wasserstein",
@@ -76,6 +79,7 @@ _HOMES = {
     "load": "curvafit.volumes.scan",
     "preset": "curvafit.priors.coefficients",
     "reconstruct": "curvafit.segmentation.completion",
+    "refine": "curvafit.segmentation.refine",
     "save": "curvafit.volumes.scan",
     "segment": "curvafit.segmentation.segment",
     "wasserstein": "curvafit.geometry.transport",

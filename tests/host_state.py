@@ -208,6 +208,7 @@ class Calls:
             "load": lambda: [curvafit.load(path) for path in sorted(self.folder.glob("a.*"))],
             "segment": lambda: curvafit.segment(scan, "tubes", threshold=100.0, steps=2),
             "reconstruct": lambda: curvafit.reconstruct(slices, "tubes", every=4, steps=2),
+            "refine": lambda: curvafit.refine(0.1 + 0.8 * self.ball, "tubes", weight=1.0, steps=2),
             "infer": self._infer,
             "read_fit": lambda: priors.read_fit(self.folder / "fit.json"),
             "texture_of": lambda: [priors.texture_of(law) for law in ("tubes", self.a, self.folder / "fit.json")],

@@ -14,9 +14,9 @@ import torch
 from curvafit.atlas_map.extract import extract
 from curvafit.data_synth.atlas import build as building
 from curvafit.data_synth.atlas import draws
-from curvafit.data_synth.atlas.design import INTERVALS, boxed
+from curvafit.data_synth.atlas.design import INTERVALS, Design, boxed
 from curvafit.data_synth.atlas.store import open_store
-from curvafit.generation.schedule import SCHEDULES, present_name, schedule
+from curvafit.generation.schedule import present_name, schedule
 from curvafit.generation.viability import Viability
 from curvafit.inference.atlas import VERSION, Atlas, load_atlas, save_atlas
 from curvafit.priors.grid import Grid
@@ -64,7 +64,7 @@ def balls(monkeypatch):
 
 @pytest.fixture
 def atlas(tmp_path, balls) -> Atlas:
-    return extract(building.build(tmp_path / "s.zarr", 6, SHAPE, seed=2), command=["then this"])
+    return extract([building.build(tmp_path / "s.zarr", 6, SHAPE, seed=2)], command=["then this"])
 
 
 def test_building_draws_in_order_until_enough_are_viable(tmp_path, balls):
@@ -126,7 +126,7 @@ def test_wrong_counts_and_other_settings_are_refused(tmp_path, balls):
 def test_an_atlas_holds_what_the_store_does(tmp_path, atlas):
     store = open_store(tmp_path / "s.zarr")
     viable = [r for r in map(store.record, store.indices()) if r.viability.viable]
-    assert atlas.ids == tuple(f"2-{r.index:05d}" for r in viable)
+    assert atlas.ids == tuple(f"s-{r.index:05d}" for r in viable)
     assert [atlas.shape_coefficients(i) for i in range(6)] == [r.coefficients for r in viable]
     np.testing.assert_array_equal(atlas.masses, [r.mass for r in viable])
     np.testing.assert_array_equal(atlas.seeds, [r.seed for r in viable])
@@ -138,17 +138,37 @@ def test_an_atlas_holds_what_the_store_does(tmp_path, atlas):
         f"curvafit atlas build s.zarr --count {len(viable)} --shape 20,20,20 --seed 2 --design random --schedule fast"
     )
     assert atlas.provenance["command"] == [build, "then this"]
-    assert atlas.provenance["settings"]["seed"] == 2
-    assert atlas.provenance["draws"] == len(store.indices())
+    assert atlas.provenance["settings"]["shape"] == (SHAPE,) * 3
+    account = atlas.provenance["stores"]["s"]
+    assert (account["settings"]["seed"], account["draws"]) == (2, len(store.indices()))
+
+
+def test_an_atlas_of_two_stores_holds_both(tmp_path, balls):
+    one, other = (building.build(tmp_path / f"{name}.zarr", 2, SHAPE, seed=4) for name in ("one", "other"))
+    both = extract([one, tmp_path / "other.zarr"])
+    alone = [extract([store]) for store in (one, other)]
+    assert both.ids == alone[0].ids + alone[1].ids and len(set(both.ids)) == 4
+    np.testing.assert_array_equal(both.masses, np.concatenate([each.masses for each in alone]))
+    assert list(both.provenance["stores"]) == ["one", "other"]
+    assert [line.split()[3] for line in both.provenance["command"]] == ["one.zarr", "other.zarr"]
+
+
+def test_stores_of_one_name_or_of_two_grids_make_no_atlas(tmp_path, balls):
+    one = building.build(tmp_path / "one.zarr", 1, SHAPE)
+    with pytest.raises(ValueError, match="expected stores with names of their own, got one, one"):
+        extract([one, one])
+    larger = open_store(tmp_path / "larger.zarr", _settings(Grid((24, 20, 20)), schedule("fast")))
+    with pytest.raises(ValueError, match="expected stores of one grid and ε, got 2: 20 x 20 x 20, 24 x 20 x 20 voxels"):
+        extract([one, larger])
 
 
 def test_faint_and_over_sharp_shapes_stay_in_the_store_and_out_of_the_atlas(tmp_path, balls):
     for count, highest in enumerate((1.0, 0.4, 4.0, 1.5), 1):
         balls.highest = highest
         store = building.build(tmp_path / "s.zarr", count, SHAPE)
-    whole = extract(store)
+    whole = extract([store])
     assert len(whole) == 2
-    assert whole.provenance["viable"] == 4
+    assert whole.provenance["stores"]["s"]["viable"] == 4
 
 
 def test_an_atlas_file_comes_back_within_its_stated_rounding(tmp_path, atlas):
@@ -239,20 +259,22 @@ def test_arrays_that_do_not_fit_together_are_refused(atlas):
 def test_a_store_without_well_formed_shapes_gives_no_atlas(tmp_path):
     store = open_store(tmp_path / "s.zarr", _settings(Grid((16,) * 3), schedule("fast")))
     with pytest.raises(ValueError, match="expected at least one well-formed shape in .*, got none in 0 draws"):
-        extract(store)
+        extract([store])
 
 
-def test_the_packaged_atlas_is_of_the_random_law_and_small():
+def test_the_packaged_atlas_is_of_its_designs_and_small():
     atlas = load_atlas()
     file = building.Path(__file__).parent.parent / "curvafit" / "inference" / "data" / "atlas.npz"
-    assert file.stat().st_size < 5e6
-    assert len(atlas) >= 1000 and len(set(atlas.ids)) == len(set(atlas.seeds.tolist())) == len(atlas)
-    settings = atlas.provenance["settings"]
-    assert present_name(settings["schedule"]) in SCHEDULES and min(settings["shape"]) >= 64
+    assert file.stat().st_size < 7e6
+    assert len(atlas) >= 1000 and len(set(atlas.ids)) == len(atlas)
+    stores = atlas.provenance["stores"]
+    assert all(present_name(store["settings"]["schedule"]) == "fast" for store in stores.values())
+    assert min(atlas.provenance["settings"]["shape"]) >= 64
     for position, name in enumerate(atlas.ids):
-        seed, index = map(int, name.split("-"))
-        made = (atlas.shape_coefficients(position), atlas.masses[position], atlas.seeds[position])
-        assert boxed().draw(seed, index) == made
+        store, index = name.split("-")
+        settings = stores[store]["settings"]
+        point = (atlas.shape_coefficients(position), atlas.masses[position], atlas.seeds[position])
+        assert Design.from_dict(settings["design"]).draw(settings["seed"], int(index)) == point
     low, high = INTERVALS["mass"]
     assert low < atlas.masses.min() and atlas.masses.max() < high
     assert all(np.isfinite(d.points).all() and d.weights.min() > 0 for d in atlas.diagrams("mask"))

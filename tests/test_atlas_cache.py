@@ -28,13 +28,13 @@ def test_nothing_is_measured_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(atlas_files, "_measure", look)
     monkeypatch.setattr(atlas_files, "map_picture", lambda mapped, field, path: path)
     exact_store(tmp_path / "s.zarr", 7)
-    _, page = write_map(tmp_path / "s.zarr", tmp_path / "map")
+    _, page = write_map([tmp_path / "s.zarr"], tmp_path / "map")
     assert looked == [0, 1, 3, 4, 5, 6]
     before = page.read_text()
     exact_store(tmp_path / "s.zarr", 9, first=7)
-    kept = sorted((tmp_path / "map" / "cache").glob("shape-3-00004-*"))
+    kept = sorted((tmp_path / "map" / "cache").glob("shape-s-00004-*"))
     kept[0].write_bytes(kept[0].read_bytes()[:100])
-    write_map(tmp_path / "s.zarr", tmp_path / "map")
+    write_map([tmp_path / "s.zarr"], tmp_path / "map")
     assert looked == [0, 1, 3, 4, 5, 6, 4, 7, 8] and page.read_text() != before
     assert not list((tmp_path / "map").rglob(".*"))
 
@@ -53,7 +53,7 @@ def test_a_damaged_file_of_distances_is_made_anew(tmp_path: Path, monkeypatch: p
     exact_store(tmp_path / "s.zarr", 7)
     (tmp_path / "map" / "cache").mkdir(parents=True)
     (tmp_path / "map" / "cache" / "distances.npz").write_bytes(b"torn")
-    _, page = write_map(tmp_path / "s.zarr", tmp_path / "map", overwrite=True)
+    _, page = write_map([tmp_path / "s.zarr"], tmp_path / "map", overwrite=True)
     assert page.exists() and not (tmp_path / "map" / "cache" / "distances.npz").exists()
 
 
@@ -72,7 +72,7 @@ def test_shapes_that_a_build_adds_meanwhile_mix_up_nothing(tmp_path: Path, monke
 
     monkeypatch.setattr(atlas_files, "extract", extract_later)
     monkeypatch.setattr(atlas_files, "map_picture", picture)
-    _, page = write_map(store, tmp_path / "map")
+    _, page = write_map([store], tmp_path / "map")
     assert len(shown_of) == 8
     for name, u in shown_of.items():
         np.testing.assert_array_equal(u, exact_field(int(name.split("-")[1])))
@@ -80,3 +80,21 @@ def test_shapes_that_a_build_adds_meanwhile_mix_up_nothing(tmp_path: Path, monke
     assert [f"shape_{name}.nii.gz" in line for name, line in zip(data["ids"], data["commands"], strict=True)] == [
         True
     ] * 8
+
+
+def test_a_map_of_two_stores_shows_the_shapes_of_both(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    quick_map(monkeypatch)
+    shown_of = {}
+
+    def picture(mapped, field, path):
+        shown_of.update({name: field(k) for k, name in enumerate(mapped.atlas.ids)})
+        return path
+
+    monkeypatch.setattr(atlas_files, "map_picture", picture)
+    stores = [exact_store(tmp_path / "one.zarr", 7), exact_store(tmp_path / "other.zarr", 9, first=7)]
+    _, page = write_map(stores, tmp_path / "map")
+    assert {name.split("-")[0] for name in shown_of} == {"one", "other"}
+    for name, u in shown_of.items():
+        np.testing.assert_array_equal(u, exact_field(int(name.split("-")[1])))
+    said = page.read_text()
+    assert all(f"<dt>{name}: draws</dt>" in said for name in ("one", "other"))

@@ -32,7 +32,7 @@ COUNT = 16
 
 @pytest.fixture(scope="module")
 def mapped(tmp_path_factory: pytest.TempPathFactory) -> AtlasMap:
-    atlas = extract(exact_store(tmp_path_factory.mktemp("map") / "s.zarr", COUNT))
+    atlas = extract([exact_store(tmp_path_factory.mktemp("map") / "s.zarr", COUNT)])
     apart = cdist(atlas.embeddings("field"), atlas.embeddings("field"))
     return map_atlas(atlas, apart, np.random.default_rng(0).normal(size=(len(atlas), 2)))
 
@@ -44,7 +44,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     exact_store(folder / "s.zarr", COUNT)
     with pytest.MonkeyPatch.context() as patch:
         quick_map(patch)
-        write_map(folder / "s.zarr", folder / "map", command="curvafit atlas map <s>")
+        write_map([folder / "s.zarr"], folder / "map", command="curvafit atlas map <s>")
     return folder
 
 
@@ -182,13 +182,13 @@ def test_both_files_say_how_they_were_made(made: Path) -> None:
         "n_neighbors": 13, "min_dist": 0.05, "spread": 1.0, "random_state": 1, "metric": "precomputed"
     }  # fmt: skip
     assert told["map"]["hdbscan"] == {"min_cluster_size": 10, "min_samples": 10}
-    assert told["atlas"]["settings"]["seed"] == 3 and "umap-learn" in told["map"]["versions"]
+    assert told["atlas"]["stores"]["s"]["settings"]["seed"] == 3 and "umap-learn" in told["map"]["versions"]
     page = (made / "map" / "atlas.html").read_text()
     for said in (
         "curvafit atlas map &lt;s&gt;",
         "blur 1.0, reach 20.0",
         "random_state 1",
-        "14 of the store&#x27;s shapes",
+        "14 of the shapes",
     ):
         assert said in page, said
 
@@ -204,7 +204,7 @@ def test_the_page_holds_what_was_measured(made: Path) -> None:
     page = (made / "map" / "atlas.html").read_text()
     texts = dict(re.findall(r'<script type="[a-z/]+" id="(\w+)">(.*?)</script>', page, re.DOTALL))
     data = json.loads(texts["data"])
-    atlas = extract(made / "s.zarr")
+    atlas = extract([made / "s.zarr"])
 
     def piece(name: str, k: int) -> bytes:
         first, last = data["offsets"][name][k : k + 2]

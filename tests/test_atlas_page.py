@@ -66,8 +66,8 @@ def atlas_page(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Atlas]:
     with pytest.MonkeyPatch.context() as patch:
         quick_map(patch)
         patch.setattr("curvafit.atlas_map.map_files.map_picture", lambda mapped, field, path: path)
-        _, page = write_map(folder / "s.zarr", folder / "map")
-    return page.as_uri(), extract(folder / "s.zarr")
+        _, page = write_map([folder / "s.zarr"], folder / "map")
+    return page.as_uri(), extract([folder / "s.zarr"])
 
 
 @pytest.fixture(scope="module")

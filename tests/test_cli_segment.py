@@ -126,24 +126,6 @@ def test_other_formats_and_a_fit_in_another_unit(tmp_path: Path) -> None:
     assert record["coefficients"] == pytest.approx(made_fit().coefficients_physical.in_unit(1e-3).as_dict())
 
 
-def test_a_probability_map(tmp_path: Path) -> None:
-    path, likely, target = tmp_path / "scan.npy", tmp_path / "p.npy", tmp_path / "mask.npy"
-    np.save(path, grey())
-    np.save(likely, np.where(ball(), 0.9, 0.2).astype(np.float32))
-    options = ("--prior", "sponge", "--weight", 0.05, "--steps", 300)
-    result = call("segment", path, "--probability", likely, *options, "-o", target)
-    assert result.exit_code == 0, (result.output, result.exception)
-    assert (np.load(target).astype(bool) != ball()).mean() < 0.02
-    record = json.loads((tmp_path / "mask.json").read_text())
-    assert record["weight"] == 0.05 and record["probability"] == str(likely)
-    assert "threshold" not in record and "dark" not in record
-    placed = call("segment", path, "--probability", likely, *options, "--spacing", 3, "--unit", "um", "-o", target)
-    assert placed.exit_code == 0 and json.loads((tmp_path / "mask.json").read_text())["unit"] == "um"
-    for more in (("--dark",), ("--threshold", 128)):
-        other = call("segment", path, "--probability", likely, *options, *more, "-o", tmp_path / "other.npy")
-        refused(other, f"with --probability, got {' '.join(map(str, more))}")
-
-
 def test_reconstruct_fills_what_it_is_not_told(tmp_path: Path) -> None:
     truth, path, target = ball((20, 18, 17)), tmp_path / "slices.nii.gz", tmp_path / "volume.nii.gz"
     given = np.zeros_like(truth)
@@ -159,6 +141,30 @@ def test_reconstruct_fills_what_it_is_not_told(tmp_path: Path) -> None:
     options = ("--slices", "0,4,8,12,16", "--axis", "x", "--prior", "sponge", "--steps", 20)
     assert call("reconstruct", path, *options, "-o", named).exit_code == 0
     assert np.array_equal(load(named).values, load(target).values)
+
+
+def test_reconstruct_writes_what_is_uncertain(tmp_path: Path) -> None:
+    """A probability beside the mask, with the header of the slices, as long as its mask; and what to annotate next."""
+    path, target = tmp_path / "slices.nii.gz", tmp_path / "out" / "volume.nii.gz"
+    save(Field(ball().astype(np.uint8), (0.1, 0.1, 0.1), "mm"), path)
+    told = ("reconstruct", path, "--every", 4, "--example", path, "--prior", "tubes", "--steps", 2, "-o", target)
+    result = call(*told, "--suggest", 2)
+    assert result.exit_code == 0, (result.output, result.exception)
+    names = ["volume.json", "volume.nii.gz", "volume.png", "volume_probability.nii.gz"]
+    assert sorted(each.name for each in target.parent.iterdir()) == names
+    chances, mask = load(target.parent / names[-1]), load(target)
+    assert chances.values.dtype == np.float32 and np.array_equal(chances.affine, mask.affine)  # type: ignore[arg-type]
+    assert np.array_equal(chances.values[::4], ball()[::4])
+    record = json.loads((target.parent / "volume.json").read_text())
+    assert record["runs"] == 8 and record["seeds"] == [*range(8)] and 0 <= record["calibration_error"] < 1
+    assert sorted(record["files"]) == names and len(record["suggestions"]) == 2
+    said = " ".join(result.stdout.split())
+    assert f"annotate next: {', '.join(map(str, record['suggestions']))}." in said and "8 are made" in said
+    assert call(*told).exit_code == 0
+    assert sorted(each.name for each in target.parent.iterdir()) == names[:-1]
+    (target.parent / names[-1]).write_text("mine")
+    refused(call(*told, "--runs", 1), "expected a name that is free")
+    refused(call(*told[:-1], tmp_path / "other.npy", "--suggest", 16), "a number of slices from 0")
 
 
 def test_a_picture_shows_the_slices(oblique: Path, tmp_path: Path) -> None:
@@ -181,7 +187,6 @@ def test_a_picture_shows_the_slices(oblique: Path, tmp_path: Path) -> None:
         (("segment", "SCAN", "--prior", "tubes", "--weight", "-1", "-o", "m.nii.gz"), "positive weight"),
         (("segment", "SCAN", "--prior", "tubes", "--threshold", "low", "-o", "m.nii.gz"), "--threshold as a number,"),
         (("segment", "SCAN", "--prior", "tubes", "--spacing", "0", "-o", "m.nii.gz"), "--spacing"),
-        (("segment", "SCAN", "--prior", "tubes", "--probability", "SMALL", "-o", "m.nii.gz"), "of the scan's shape"),
         (("segment", "none.tif", "--prior", "tubes", "-o", "m.nii.gz"), "no such file"),
         (("reconstruct", "SCAN", "--prior", "tubes", "-o", "m.nii.gz"), "--every or --known"),
         (("reconstruct", "SCAN", "--prior", "tubes", "--every", "4", "--axis", "w", "-o", "m.nii.gz"), "--axis"),
@@ -213,14 +218,10 @@ def test_a_part_of_a_file_is_segmented_where_it_was(oblique: Path, tmp_path: Pat
     whole = nibabel.load(oblique)
     times = np.stack([np.asanyarray(whole.dataobj)[::-1], np.asanyarray(whole.dataobj)], axis=-1)
     nibabel.save(nibabel.Nifti1Image(times, OBLIQUE), tmp_path / "times.nii")
-    save(Field(ball().astype(np.float32) * 0.8 + 0.1), tmp_path / "likely.npy")
     options = ["--channel", "1", "--crop", "2:,1:17,:-1", "--spacing", "0.09,0.06,0.06", "--unit", "mm"]
-    likely = ["--probability", tmp_path / "likely.npy"]
-    for k, (source, part, more) in enumerate(
-        ((tmp_path / "times.nii", options, []), (oblique, options[2:4], []), (oblique, options[2:4], likely))
-    ):
+    for k, (source, part) in enumerate(((tmp_path / "times.nii", options), (oblique, options[2:4]))):
         target = tmp_path / f"mask{k}.nii.gz"
-        result = call("segment", source, *part, *more, "--prior", "tubes", "--steps", 5, "-o", target)
+        result = call("segment", source, *part, "--prior", "tubes", "--steps", 5, "-o", target)
         assert result.exit_code == 0, (result.output, result.exception)
         mask = nibabel.load(target)
         assert mask.shape == (15, 16, 18)
@@ -265,7 +266,9 @@ def test_places_that_cannot_be_written_are_refused_first(name, said, oblique, tm
     [
         (("segment", "g.npy", "--prior", "tubes"), "g.npy"),
         (("segment", "g.npy", "--prior", "tubes"), "link.npy"),
-        (("segment", "g.npy", "--prior", "tubes", "--probability", "p.npy"), "p.npy"),
+        (("refine", "g.npy", "--example", "p.npy", "--example-probabilities", "law.npy"), "p.npy"),
+        (("refine", "g.npy", "--example", "p.npy", "--example-probabilities", "law.npy"), "law.npy"),
+        (("refine", "g.npy", "--prior", "tubes", "--weight", "1", "--like", "p.npy"), "p.npy"),
         (("segment", "g.npy", "--prior", "mine.json"), "mine.npy"),
         (("segment", "g.npy", "--prior", "law.npy"), "law.npy"),
         (("segment", "slices", "--prior", "tubes"), "slices/1.tif"),

@@ -19,7 +19,7 @@ from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
 from curvafit.segmentation.completion import reconstruct
 from curvafit.segmentation.evidence import of_probability
-from curvafit.segmentation.segment import segment
+from curvafit.segmentation.refine import refine
 from curvafit.volumes.scan import Field
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
@@ -141,7 +141,7 @@ def test_evidence_counts_its_nats_once_whatever_the_volume_of_a_part(epsilon: fl
     noise = np.random.default_rng(0).standard_normal(SHAPE)
     likely = Field((1 / (1 + np.exp(-DISTANCE - noise))).astype(np.float32), EDGES)
     law = Coefficients(1.5, 0.5, 2.5)
-    found = segment(likely, law, probability=likely, weight=0.3, epsilon=epsilon, steps=1)
+    found = refine(likely, law, weight=0.3, epsilon=epsilon, steps=1)
     assert found.epsilon == epsilon
-    nats = float(of_probability(likely, likely).ratio.sum(dtype=np.float64))
+    nats = float(of_probability(likely).ratio.sum(dtype=np.float64))
     assert 0.3 * 2 * gained[0] == pytest.approx(nats, rel=1e-4)  # λ times the stiffness, 0.3 (1.5 + 2.5) / 2

@@ -144,8 +144,8 @@ def test_the_kernel_cache_follows_the_processor(tmp_path):
         pytest.skip("expected an x86 processor")
     program = """
 from curvafit.priors.kernels import loops
-loops._scaled(1.0, None, 0)
-print(sum(loops._scaled.stats.cache_hits.values()))
+loops.pitch(4, 4)
+print(sum(loops.pitch.stats.cache_hits.values()))
 """
     hits = []
     for name in ("x86-64", "x86-64", "nocona"):

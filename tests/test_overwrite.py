@@ -45,11 +45,12 @@ def commands(scan: Path) -> dict[str, list[object]]:
     return {
         "generate": ["generate", *QUICK, "--shape", 12, "--steps", 2],
         "segment": ["segment", *segmenting],
+        "refine": ["refine", *segmenting, "--weight", 1],
         "reconstruct": ["reconstruct", *segmenting, "--every", 4],
     }
 
 
-@pytest.mark.parametrize("command", ["generate", "segment", "reconstruct"])
+@pytest.mark.parametrize("command", ["generate", "segment", "refine", "reconstruct"])
 def test_folders_with_something_else_in_them_stay(command: str, scan: Path, tmp_path: Path) -> None:
     """A thesis, an atlas, and the volume of a command for another purpose."""
     thesis(tmp_path / "home.zarr")
@@ -61,7 +62,7 @@ def test_folders_with_something_else_in_them_stay(command: str, scan: Path, tmp_
     assert tree(tmp_path) == before
 
 
-@pytest.mark.parametrize("command", ["generate", "segment", "reconstruct"])
+@pytest.mark.parametrize("command", ["generate", "segment", "refine", "reconstruct"])
 @pytest.mark.parametrize("name", ["out.zarr", "out.npy"])
 def test_its_own_output_is_replaced(command: str, name: str, scan: Path, tmp_path: Path) -> None:
     """But not once it holds something else, and not by a command for another purpose."""
@@ -82,7 +83,7 @@ def test_its_own_output_is_replaced(command: str, name: str, scan: Path, tmp_pat
     assert not (tmp_path / name / "notes.txt").exists()
 
 
-@pytest.mark.parametrize("command", ["generate", "segment", "reconstruct"])
+@pytest.mark.parametrize("command", ["generate", "segment", "refine", "reconstruct"])
 @pytest.mark.parametrize("taken", ["out.npy", "out.png", "out.json"])
 def test_files_of_the_same_names_stay(command: str, taken: str, scan: Path, tmp_path: Path) -> None:
     (tmp_path / taken).write_text("mine")
@@ -151,8 +152,8 @@ def test_atlases_leave_other_peoples_files(tmp_path: Path, monkeypatch: pytest.M
     quick_map(monkeypatch)
     monkeypatch.setattr("curvafit.atlas_map.map_files.map_picture", lambda mapped, field, path: path.write_bytes(b""))
     for _ in range(2):
-        write_map(store, tmp_path / "map")
-    check_map(tmp_path / "map", store)
+        write_map([store], tmp_path / "map")
+    check_map(tmp_path / "map", [store])
 
 
 def test_a_store_may_begin_in_an_empty_folder(tmp_path: Path) -> None:

@@ -15,11 +15,11 @@ from skimage.filters import threshold_otsu
 
 from curvafit.priors.coefficients import Coefficients, preset
 from curvafit.segmentation.completion import STIFFNESS, reconstruct
-from curvafit.segmentation.evidence import VoxelEvidence, classes_of, grey_levels, of_classes, of_probability
+from curvafit.segmentation.evidence import VoxelEvidence, classes_of, grey_levels, of_classes
 from curvafit.segmentation.segment import segment
 from curvafit.segmentation.slices import Slices
 from curvafit.segmentation.working import WorkingGrid, law_of
-from curvafit.volumes.scan import Field, save
+from curvafit.volumes.scan import Field
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 
@@ -86,31 +86,6 @@ def test_a_rare_structure_needs_a_threshold_and_is_told_so() -> None:
     found = of_intensities(scan, 80.0)
     assert dice(found.level > 0, ball) > 0.9
     assert np.median(found.ratio[ball]) > 40 > -40 > np.median(found.ratio[~ball])
-
-
-def test_a_probability_is_its_own_evidence() -> None:
-    p = np.random.default_rng(0).random((6, 7, 8)).astype(np.float32)
-    found = of_probability(Field(p), Field(p))
-    np.testing.assert_allclose(1 / (1 + np.exp(-found.ratio.astype(float))), p.clip(1e-4, 1 - 1e-4), atol=1e-6)
-    for bad, said in ((p[1:], "shape"), (2 * p, r"\[0, 1\]")):
-        with pytest.raises(ValueError, match=said):
-            of_probability(Field(bad), Field(p))
-
-
-def test_a_probability_map_is_at_the_scan_s_place() -> None:
-    p = np.random.default_rng(0).random((6, 7, 8)).astype(np.float32)
-    affine = np.array([[-0.02, 0.001, 0, 5], [0.001, 0.02, 0, -17], [0, 0, 0.03, 3], [0, 0, 0, 1]])
-    scan = Field(p, (0.03, 0.02, 0.02), "mm", affine)
-    for unit, factor in (("mm", 1), ("um", 1e3), ("voxel", 1)):
-        spacing = (0.03 * factor, 0.02 * factor, 0.02 * factor)
-        other = np.diag([factor] * 3 + [1]) @ affine
-        same = of_probability(Field(p, spacing, unit, other.astype(np.float32)), scan)
-        np.testing.assert_array_equal(same.ratio, of_probability(scan, scan).ratio)
-        for column in (0, 3):  # mirrored, or a voxel away
-            moved = other.copy()
-            moved[0, column] += (0.04, None, None, 0.02)[column] * factor  # type: ignore[operator]
-            with pytest.raises(ValueError, match="with the scan's affine, got one .* voxels away"):
-                segment(scan, WILLMORE, probability=Field(p, spacing, unit, moved))
 
 
 def test_distances_between_slices() -> None:
@@ -182,27 +157,6 @@ def test_noisy_tubes_come_out_better_than_from_a_threshold_at_any_smoothing() ->
     assert np.array_equal(found.mask.affine, scan.affine)  # type: ignore[arg-type]
     assert found.mask.values.dtype == bool and np.array_equal(found.mask.values, found.phase.values > 0)
     assert "the prior helps" in found.status and found.coefficients == WILLMORE
-
-
-def test_a_probability_s_file_is_read_as_the_scan_s(tmp_path: Path) -> None:
-    inside = np.linalg.norm(np.indices((12, 12, 12)) - 5.5, axis=0) < 4
-    affine = np.diag([0.5, 0.5, 0.5, 1.0])
-    scan, likely = (
-        save(Field(values, 0.5, "mm", affine), tmp_path / name)
-        for values, name in ((noisy(inside, 10).values, "scan.nii"), (inside.astype(np.float32), "map.nii"))
-    )
-    found = segment(scan, WILLMORE, probability=likely, steps=2, spacing=0.25, unit="um")
-    assert found.mask.spacing == (0.25, 0.25, 0.25) and found.mask.unit == "um"
-
-
-def test_a_probability_map_is_regularised() -> None:
-    truth = tubes()
-    ratio = 4 * (2 * truth - 1) + 4 * np.random.default_rng(2).standard_normal(truth.shape)
-    map_ = (1 / (1 + np.exp(-ratio))).astype(np.float32)
-    found = segment(noisy(truth, 90), WILLMORE, probability=map_)
-    assert dice(found.mask.values, truth) > dice(map_ > 0.5, truth) + 0.05
-    thrice = segment(noisy(truth, 90), WILLMORE.scaled(3), probability=map_, steps=1)
-    assert (found.weight, thrice.weight) == pytest.approx((1, 1 / 3))  # 2 / (a20 + a02)
 
 
 @pytest.mark.slow
@@ -293,8 +247,6 @@ def test_labels_count_as_inside_and_what_is_extrapolated_is_said() -> None:
         ({"weight": 0.0}, "positive weight"),
         ({"threshold": 500.0}, "within the smoothed scan's"),
         ({"threshold": "li"}, "a number or 'otsu'"),
-        ({"threshold": 80.0, "probability": tubes()}, "neither a threshold nor dark"),
-        ({"dark": True, "probability": tubes()}, "neither a threshold nor dark"),
         ({"epsilon": math.inf}, "positive epsilon"),
         ({"prior": Coefficients(torch.ones(32, 32, 32), 0, 1)}, "coefficients that are numbers"),
     ],

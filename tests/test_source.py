@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from curvafit import infer, reconstruct, segment
+from curvafit import infer, reconstruct, refine, segment
 from curvafit.volumes import Field, ScanError, field_of, load, save
 
 
@@ -97,11 +97,20 @@ def test_segment_takes_each_source(tmp_path: Path) -> None:
     ):
         assert np.array_equal(found.mask.values, wanted.mask.values)
         assert (found.mask.spacing, found.mask.unit) == (scan.spacing, "um")
-    likely = save(Field(0.1 + 0.8 * BALL, **AT), tmp_path / "likely.nii.gz")
     assert repr(wanted).startswith(f"Segmentation(10 x 11 x 12 voxels of 3 x 2 x 2 um, {wanted.mask.values.sum()} in")
     assert repr(wanted).endswith(f"%): {wanted.status})") and "\n" not in repr(wanted) and wanted == wanted
-    by_path, by_array = (segment(scan, "tubes", probability=p, steps=2) for p in (likely, 0.1 + 0.8 * BALL))
-    assert np.array_equal(by_path.phase.values, by_array.phase.values)
+
+
+def test_refine_takes_each_source(tmp_path: Path) -> None:
+    likely = Field((0.1 + 0.8 * BALL).astype(np.float32), **AT)
+    wanted = refine(likely, "tubes", weight=1.0, steps=2)
+    for source, options in (
+        (save(likely, tmp_path / "likely.nii.gz"), {}),
+        (likely.values, AT),
+        (torch.from_numpy(likely.values), AT),
+    ):
+        found = refine(source, "tubes", weight=1.0, steps=2, **options)
+        assert np.array_equal(found.phase.values, wanted.phase.values) and found.mask.spacing == likely.spacing
 
 
 def test_reconstruct_takes_each_source(tmp_path: Path) -> None:
@@ -111,7 +120,9 @@ def test_reconstruct_takes_each_source(tmp_path: Path) -> None:
         assert np.array_equal(reconstruct(source, "tubes", every=4, steps=2, **options).mask.values, wanted.mask.values)
 
 
-@pytest.mark.parametrize("job", [infer, lambda *a, **o: segment(*a, "tubes", **o)])
+@pytest.mark.parametrize(
+    "job", [infer, lambda *a, **o: segment(*a, "tubes", **o), lambda *a, **o: refine(*a, "tubes", weight=1, **o)]
+)
 def test_no_job_drops_an_option_in_silence(job) -> None:
     for options, got in (({"spacing": 2}, "spacing"), ({"unit": "mm"}, "unit"), ({"strict": True}, "strict")):
         with pytest.raises(ScanError, match=f"expected {got} only with .*, got it with a Field"):

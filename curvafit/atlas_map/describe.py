@@ -72,7 +72,7 @@ def describe(
     if unknown or not views:
         raise ValueError(f"expected views among {', '.join(VIEWS)}, got {', '.join(unknown) or 'none'}")
     sources = [open_store(path) for path in stores]
-    names = [_name(store) for store in sources]
+    names = [store.name for store in sources]
     if len(set(names)) < len(names):
         raise ValueError(f"expected stores with names of their own, got {', '.join(names)}")
     path, crew = Path(out), workers or Here()
@@ -143,7 +143,7 @@ class _Rows:
         self.parameters = [] if table is None else list(table.parameters)
         self.descriptors = [] if table is None else list(table.descriptors)
         before = {} if table is None else table.provenance
-        settings = {_name(store): json.loads(json.dumps(dataclasses.asdict(store.settings))) for store in stores}
+        settings = {store.name: json.loads(json.dumps(dataclasses.asdict(store.settings))) for store in stores}
         for name, now in settings.items():
             if before.get("stores", {}).get(name, now) != now:
                 raise ValueError(f"expected the store {name} that the table was begun with, got one made otherwise")
@@ -180,11 +180,6 @@ def _jobs(store: Store, views: Sequence[str], rows: _Rows) -> list[tuple[Store, 
     return jobs
 
 
-def _name(store: Store) -> str:
-    """Return a store's name in a table: its folder, without the suffix."""
-    return store.path.resolve().name.removesuffix(".zarr")
-
-
 def _shape(store: Store, index: int) -> str:
     """Return a shape's name in a table: the store's folder and the draw."""
-    return f"{_name(store)}/{index:06d}"
+    return f"{store.name}/{index:06d}"

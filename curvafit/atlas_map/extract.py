@@ -1,4 +1,4 @@
-"""A store's well-formed shapes measured, as the atlas that inference searches."""
+"""The well-formed shapes of stores measured, as the atlas that inference searches."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ Measured = tuple[float, Diagram, Diagram]
 
 
 def extract(
-    store: str | Path | Store,
+    stores: Sequence[str | Path | Store],
     command: Sequence[str] = (),
     measure: Callable[[Store, Record], Measured] | None = None,
     progress: Progress = silent,
 ) -> Atlas:
-    """Measure every well-formed shape of a store (`generation.viability.well_formed`), as field and as mask.
+    """Measure every well-formed shape of stores (`generation.viability.well_formed`), as field and as mask.
 
     Parameters
     ----------
-    store
-        An open store, or its folder.
+    stores
+        Open stores, or their folders.
     command
-        Command lines for the provenance, after the one that makes the store.
+        Command lines for the provenance, after those that make the stores.
     measure
         What to call in place of `measured`: one that remembers.
     progress
@@ -48,39 +48,56 @@ def extract(
     Raises
     ------
     FileNotFoundError, ValueError
-        If there is no such store, it is of another version, or holds no well-formed shape.
+        If there is no such store, one is of another version or grid, two have one name, or none holds a well-formed
+        shape.
     """
-    store = store if isinstance(store, Store) else open_store(store)
-    records = [store.record(index) for index in store.indices()]
-    formed = [record for record in records if well_formed(record.viability)]
-    if not formed:
-        raise ValueError(f"expected at least one well-formed shape in {store.path}, got none in {len(records)} draws")
-    fractions, field_diagrams, mask_diagrams = zip(
-        *_measures(store, formed, measure or measured, progress), strict=True
-    )
+    sources = [store if isinstance(store, Store) else open_store(store) for store in stores]
+    _check_alike(sources)
+    draws = [[store.record(index) for index in store.indices()] for store in sources]
+    shapes = [
+        (store, record)
+        for store, records in zip(sources, draws, strict=True)
+        for record in records
+        if well_formed(record.viability)
+    ]
+    if not shapes:
+        places, count = " or ".join(str(store.path) for store in sources), sum(map(len, draws))
+        raise ValueError(f"expected at least one well-formed shape in {places}, got none in {count} draws")
+    fractions, field_diagrams, mask_diagrams = zip(*_measures(shapes, measure or measured, progress), strict=True)
     return Atlas(
-        ids=tuple(shape_id(store, record) for record in formed),
-        coefficients=np.array([list(record.coefficients) for record in formed], dtype=np.float64),
-        masses=np.array([record.mass for record in formed]),
-        seeds=np.array([record.seed for record in formed], dtype=np.int64),
+        ids=tuple(shape_id(store, record) for store, record in shapes),
+        coefficients=np.array([list(record.coefficients) for _, record in shapes], dtype=np.float64),
+        masses=np.array([record.mass for _, record in shapes]),
+        seeds=np.array([record.seed for _, record in shapes], dtype=np.int64),
         volume_fractions=np.array(fractions),
         field_diagrams=field_diagrams,
         mask_diagrams=mask_diagrams,
-        provenance=_provenance(store, records, command),
+        provenance=_provenance(sources, draws, command),
     )
 
 
+def _check_alike(stores: Sequence[Store]) -> None:
+    """Raise ValueError where two stores have one name, or grids or ε that differ."""
+    names = [store.name for store in stores]
+    if len(set(names)) < len(names):
+        raise ValueError(f"expected stores with names of their own, got {', '.join(names)}")
+    grids = {(store.settings.shape, store.settings.spacing, store.settings.epsilon) for store in stores}
+    if len(grids) > 1:
+        sizes = ", ".join(" x ".join(map(str, shape)) for shape, _, _ in sorted(grids))
+        raise ValueError(f"expected stores of one grid and ε, got {len(grids)}: {sizes} voxels")
+
+
 def _measures(
-    store: Store, records: list[Record], measure: Callable[[Store, Record], Measured], progress: Progress
+    shapes: Sequence[tuple[Store, Record]], measure: Callable[[Store, Record], Measured], progress: Progress
 ) -> Iterator[Measured]:
-    for done, record in enumerate(records):
-        progress(f"measuring {len(records)} shapes", done / len(records))
+    for done, (store, record) in enumerate(shapes):
+        progress(f"measuring {len(shapes)} shapes", done / len(shapes))
         yield measure(store, record)
 
 
 def shape_id(store: Store, record: Record) -> str:
-    """Return the name of a draw in an atlas: the seed of the design and the index of the draw."""
-    return f"{store.settings.seed}-{record.index:05d}"
+    """Return the name of a draw in an atlas: the store's name and the index of the draw."""
+    return f"{store.name}-{record.index:05d}"
 
 
 def measured(store: Store, record: Record) -> Measured:
@@ -90,24 +107,33 @@ def measured(store: Store, record: Record) -> Measured:
     return float((field > 0).double().mean()), *diagrams(field, grid, store.settings.epsilon)
 
 
-def _provenance(store: Store, records: list[Record], command: Sequence[str]) -> dict[str, Any]:
-    viable = sum(record.viability.viable for record in records)
-    generators = sorted({json.dumps(record.versions, sort_keys=True) for record in records})
+def _provenance(stores: Sequence[Store], draws: Sequence[list[Record]], command: Sequence[str]) -> dict[str, Any]:
+    accounts = {store.name: _account(store, records) for store, records in zip(stores, draws, strict=True)}
+    builds = (_build_command(store, accounts[store.name]["viable"]) for store in stores)
     return {
-        "command": [_build_command(store, viable), *command],
+        "command": [*builds, *command],
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
-        "draws": len(records),
-        "viable": viable,
         "selection": {"extent_of_both_phases": FORMED},
-        "settings": dataclasses.asdict(store.settings),
+        "settings": {name: getattr(stores[0].settings, name) for name in ("shape", "spacing", "epsilon")},
+        "stores": accounts,
         "diagrams": {
             "curvature": "geometric",
             "bin_width": BIN_WIDTH,
             "tail_share": TAIL_SHARE,
             "unit": "1/working unit",
         },
-        "generated_with": [json.loads(text) for text in generators],
         "measured_with": versions(),
+    }
+
+
+def _account(store: Store, records: Sequence[Record]) -> dict[str, Any]:
+    """Return how a store was made."""
+    generators = sorted({json.dumps(record.versions, sort_keys=True) for record in records})
+    return {
+        "draws": len(records),
+        "viable": sum(record.viability.viable for record in records),
+        "settings": dataclasses.asdict(store.settings),
+        "generated_with": [json.loads(text) for text in generators],
     }
 
 
@@ -116,7 +142,7 @@ def _build_command(store: Store, viable: int) -> str:
     settings = store.settings
     shape, name = ",".join(map(str, settings.shape)), present_name(settings.schedule)
     known = {json.dumps(boxed(law).as_dict()): law for law in ("random", "sobol")}
-    design = known.get(json.dumps(settings.design), "design.yaml")
+    design = known.get(json.dumps(settings.design), f"{store.name}.yaml")
     options = f"--count {viable} --shape {shape} --seed {settings.seed} --design {design} --schedule {name}"
     if name in SCHEDULES and settings.schedule["steps"] != SCHEDULES[name].steps:
         options += f" --steps {settings.schedule['steps']}"

@@ -1,4 +1,4 @@
-"""`atlas.png` and `atlas.html` of a store, made in steps that are not made twice."""
+"""`atlas.png` and `atlas.html` of stores, made in steps that are not made twice."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import dataclasses
 import hashlib
 import io
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -41,13 +41,13 @@ _CACHE_VERSION = 1
 _Arrays = dict[str, np.ndarray]
 
 
-def check_map(directory: str | Path, store: str | Path, overwrite: bool = False) -> Path:
-    """Return the folder, if the map of a store can be written there; for a check before long work.
+def check_map(directory: str | Path, stores: Sequence[str | Path], overwrite: bool = False) -> Path:
+    """Return the folder, if the map of stores can be written there; for a check before long work.
 
     Raises
     ------
     ValueError
-        If it is no folder that can be written to, lies in the store, or something else stands where a file goes.
+        If it is no folder that can be written to, lies in a store, or something else stands where a file goes.
     """
     folder = check_folder(directory)
     page, cache = folder / "atlas.html", folder / CACHE
@@ -57,12 +57,12 @@ def check_map(directory: str | Path, store: str | Path, overwrite: bool = False)
             return is_empty(cache) or bears(cache / TAG, _TAGGED)
         return path.is_file() and bears(page, _MARK)
 
-    check_free([page, folder / "atlas.png", cache], ours, [store], overwrite)
+    check_free([page, folder / "atlas.png", cache], ours, stores, overwrite)
     return folder
 
 
 def write_map(
-    store: str | Path | Store,
+    stores: Sequence[str | Path | Store],
     directory: str | Path,
     *,
     device: str = "cpu",
@@ -70,51 +70,53 @@ def write_map(
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> tuple[Path, Path]:
-    """Write `atlas.png` and `atlas.html` of a store's well-formed shapes into a folder; returns their paths.
+    """Write `atlas.png` and `atlas.html` of the stores' well-formed shapes into a folder; returns their paths.
 
     What takes long is kept in the folder's `cache`, shape by shape: a run that was stopped goes on where it was, one
-    on a larger store measures the new shapes only. The cache may be deleted at any time.
+    on larger stores measures the new shapes only. The cache may be deleted at any time.
 
     Raises
     ------
     ImportError
         If the extra `[atlas]` is not installed.
     FileNotFoundError, ValueError
-        If there is no such store, it has too few well-formed shapes, or as `check_map`; `overwrite` tells whether files
-        that no such call wrote may be replaced.
+        If there is no such store, there are too few well-formed shapes, or as `extract` and `check_map`; `overwrite`
+        tells whether files that no such call wrote may be replaced.
     """
     check_extra()
-    store = store if isinstance(store, Store) else open_store(store)
-    check_map(directory, store.path, overwrite)
-    check_size(sum(well_formed(store.record(index).viability) for index in store.indices()))
+    sources = [store if isinstance(store, Store) else open_store(store) for store in stores]
+    check_map(directory, [store.path for store in sources], overwrite)
+    check_size(sum(well_formed(store.record(index).viability) for store in sources for index in store.indices()))
     folder = Path(directory)
     (folder / CACHE).mkdir(parents=True, exist_ok=True)
     write_content(folder / CACHE / TAG, f"{_TAGGED}\n")
-    atlas, records, shapes, commands = _measures(store, folder / CACHE, progress)
+    atlas, draws, shapes, commands = _measures(sources, folder / CACHE, progress)
     mapped = _mapped(atlas, folder / CACHE, device, progress)
     progress("drawing", 0.95)
-    picture = map_picture(mapped, lambda k: store.field(records[k].index), folder / "atlas.png")
-    text = page_html(mapped, shapes, commands, _account(mapped, store, command))
+    picture = map_picture(mapped, lambda k: draws[k][0].field(draws[k][1]), folder / "atlas.png")
+    text = page_html(mapped, shapes, commands, _account(mapped, sources, command))
     page = write_content(folder / "atlas.html", text)
     progress("done", 1.0)
     return picture, page
 
 
-def _measures(store: Store, cache: Path, progress: Progress) -> tuple[Atlas, list[Record], list[Shown], list[str]]:
-    """Return every shape's measures, and with each its record, its pictures and the command that grows it again."""
-    records: list[Record] = []
+def _measures(
+    stores: Sequence[Store], cache: Path, progress: Progress
+) -> tuple[Atlas, list[tuple[Store, int]], list[Shown], list[str]]:
+    """Return every shape's measures, and with each its draw, its pictures and the command that grows it again."""
+    draws: list[tuple[Store, int]] = []
     shapes: list[Shown] = []
     commands: list[str] = []
 
     def look(store: Store, record: Record) -> Measured:
-        records.append(record)
+        draws.append((store, record.index))
         commands.append(regrow_command(record, store.settings, f"shape_{shape_id(store, record)}.nii.gz"))
         cached = _cached(cache / f"shape-{_key(store, record)}.npz", lambda: _measure(store, record))
         shapes.append(Shown(cached["thumbnail"].tobytes(), cached["volume"].tobytes()))
         return float(cached["fraction"]), _diagram(cached, "field"), _diagram(cached, "mask")
 
-    atlas = extract(store, measure=look, progress=part(progress, 0.0, 0.6))
-    return atlas, records, shapes, commands
+    atlas = extract(stores, measure=look, progress=part(progress, 0.0, 0.6))
+    return atlas, draws, shapes, commands
 
 
 def _measure(store: Store, record: Record) -> _Arrays:
@@ -168,13 +170,17 @@ def _key(store: Store, record: Record) -> str:
     return f"{shape_id(store, record)}-{hashlib.sha256(content.encode()).hexdigest()[:12]}"
 
 
-def _account(mapped: AtlasMap, store: Store, command: str) -> list[tuple[str, str]]:
+def _account(mapped: AtlasMap, stores: Sequence[Store], command: str) -> list[tuple[str, str]]:
     """Return the rows of the page that say how the map was made."""
-    settings = mapped.settings
+    settings, several = mapped.settings, len(stores) > 1
     rows = {
         "command": command,
-        "well-formed": f"{len(mapped)} of the store's shapes",
-        **census(store),
+        "well-formed": f"{len(mapped)} of the shapes",
+        **{
+            f"{store.name}: {name}" if several else name: words
+            for store in stores
+            for name, words in census(store).items()
+        },
         "distances": _listed(settings["distances"]),
         "UMAP": _listed(settings["umap"]),
         "HDBSCAN": _listed(settings["hdbscan"]) + f": {max(mapped.clusters) + 1} clusters",

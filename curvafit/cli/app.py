@@ -17,6 +17,8 @@ from curvafit.cli.hosts import EXAMPLE as NNUNET_EXAMPLE
 from curvafit.cli.hosts import nnunet
 from curvafit.cli.infer import EXAMPLES as INFER_EXAMPLES
 from curvafit.cli.infer import infer
+from curvafit.cli.refine import EXAMPLES as REFINE_EXAMPLES
+from curvafit.cli.refine import refine
 from curvafit.cli.refusal import Commands
 from curvafit.cli.samples import samples_app
 from curvafit.cli.segment import RECONSTRUCT_EXAMPLES, SEGMENT_EXAMPLES, reconstruct, segment
@@ -40,6 +42,7 @@ app.command(epilog=GENERATE_EXAMPLES)(generate)
 app.command()(presets)
 app.command(epilog=NNUNET_EXAMPLE)(nnunet)
 app.command(epilog=SEGMENT_EXAMPLES)(segment)
+app.command(epilog=REFINE_EXAMPLES)(refine)
 app.command(epilog=RECONSTRUCT_EXAMPLES)(reconstruct)
 app.command(epilog=SYNTH_EXAMPLES)(synth)
 app.add_typer(samples_app, name="samples")

@@ -137,20 +137,24 @@ def verify_atlas(
         raise typer.Exit(1)
 
 
-@atlas_app.command("extract", epilog="[bold]Example[/bold]\n\ncurvafit atlas extract store.zarr -o atlas.npz")
+@atlas_app.command(
+    "extract",
+    epilog="[bold]Examples[/bold]\n\ncurvafit atlas extract store.zarr -o atlas.npz\n\n"
+    "curvafit atlas extract box.zarr corner.zarr -o atlas.npz",
+)
 def extract_atlas(
-    store: Annotated[Path, typer.Argument(help="A store made by `curvafit atlas build`.")],
+    stores: Annotated[list[Path], typer.Argument(help="Stores made by `curvafit atlas build`, of one grid.")],
     out: Annotated[Path, typer.Option("-o", "--output", help="The atlas (.npz) to write.")],
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Measure a store's shapes, and write the atlas that `infer --atlas` reads."""
+    """Measure the shapes of stores, and write the atlas that `infer --atlas` reads."""
     with plainly():
         from curvafit.atlas_map.extract import extract
         from curvafit.inference.atlas import ARCHIVE, save_atlas
 
-        _check_archive(out, ARCHIVE, [store], overwrite)
+        _check_archive(out, ARCHIVE, stores, overwrite)
         with stages() as progress:
-            atlas = extract(store, [command_line()], progress=progress)
+            atlas = extract(stores, [command_line()], progress=progress)
         out.parent.mkdir(parents=True, exist_ok=True)
         save_atlas(atlas, out)
         say(f"{len(atlas.ids)} shapes", to=error_console())
@@ -216,21 +220,25 @@ def train_atlas(
         say(str(out))
 
 
-@atlas_app.command("map", epilog="[bold]Example[/bold]\n\ncurvafit atlas map store.zarr -o map")
+@atlas_app.command(
+    "map",
+    epilog="[bold]Examples[/bold]\n\ncurvafit atlas map store.zarr -o map\n\n"
+    "curvafit atlas map box.zarr corner.zarr -o map",
+)
 def map_atlas(
-    store: Annotated[Path, typer.Argument(help="A store made by `curvafit atlas build`.")],
+    stores: Annotated[list[Path], typer.Argument(help="Stores made by `curvafit atlas build`, of one grid.")],
     out: Annotated[Path, typer.Option("-o", "--output", help="Folder for atlas.html, atlas.png and a cache.")],
     device: Annotated[str, typer.Option(help="Device for the distances: cpu, cuda, cuda:1 …")] = "cpu",
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Draw a map of a store's shapes: a picture, and a page to explore the shapes and to place scans."""
+    """Draw a map of the shapes of stores: a picture, and a page to explore the shapes and to place scans."""
     with plainly():
         with kept(), stages() as progress:
             from curvafit.atlas_map.map_files import check_map, write_map
 
-            check_map(out, store, overwrite)
+            check_map(out, stores, overwrite)
             options = {"device": device_of(device), "command": command_line(), "overwrite": overwrite}
-            files = write_map(store, out, **options, progress=progress)
+            files = write_map(stores, out, **options, progress=progress)
         for path in files:
             say(str(path))
 

@@ -38,7 +38,6 @@ SEGMENT_EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
     (
         "curvafit segment bone.nii.gz --prior bone/fit.json -o mask.nii.gz",
         "curvafit segment cells.h5 --key raw --dark --prior sponge --spacing 0.2 --unit um -o mask.tif",
-        "curvafit segment vessels.nii.gz --probability network.nii.gz --prior vessels/fit.json -o mask.nii.gz",
     )
 )
 RECONSTRUCT_EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
@@ -46,6 +45,7 @@ RECONSTRUCT_EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
         "curvafit reconstruct labels.nii.gz --every 8 --prior bone/fit.json -o volume.nii.gz",
         "curvafit reconstruct labels.nii.gz --every 8 --example whole.nii.gz -o volume.nii.gz",
         "curvafit reconstruct labels.tif --known 0,7,15 --axis x --prior tubes -o volume.tif",
+        "curvafit reconstruct labels.nii.gz --every 8 --prior bone/fit.json --suggest 3 -o volume.nii.gz",
     )
 )
 
@@ -53,7 +53,6 @@ _what = partial(typer.Option, rich_help_panel="What to do")
 
 Target = Annotated[Path, typer.Option("-o", "--output", help="Mask to write: .nii.gz .nii .tif .npy .mrc .zarr.")]
 Prior = Annotated[str, _what(help="fit.json of `curvafit infer`, or a preset's name (see `curvafit presets`).")]
-Probability = Annotated[Path | None, _what(help="Probability of the inside, a volume, instead of grey levels.")]
 Weight = Annotated[float | None, _what(help="Cost of a unit of the energy, in nats; by default chosen, with the law.")]
 Threshold = Annotated[str, _what(help="Grey level between the phases, or otsu.")]
 Dark = Annotated[bool, _what("--dark", help="The structure is the dark phase.")]
@@ -61,6 +60,8 @@ OwnPrior = Annotated[str | None, _what("--prior", help="As in segment; by defaul
 Example = Annotated[Path | None, _what(help="Mask of another such volume, known whole: the prior is tried out on it.")]
 Stiffness = Annotated[float | None, _what(help="Stiffness of springs on the known slices: try nothing out.")]
 Periodic = Annotated[bool, _what("--periodic", help="The volume repeats, as generated ones do.")]
+Runs = Annotated[int, _what(help="Further runs that tell the probability of the inside; 8 are a good number.", min=0)]
+Suggest = Annotated[int, _what(help="Number of slices to suggest for annotation; needs --runs, by default 8.", min=0)]
 Epsilon = Annotated[float | None, _what(help="ε in the scan's unit; by default twice the smallest voxel edge.")]
 Steps = Annotated[int, _what(help="Steps of the flow.", min=1)]
 TileOption = Annotated[
@@ -79,8 +80,12 @@ Axis = Annotated[str, _what(help="Axis across the slices: z, y or x (first, seco
 INFERRED = 2
 #: Bytes for each voxel of the whole volume, beside its tiles: the scan, and the mask in the file's layout.
 ASSEMBLED = 6
+#: Entries of a record that name files of an example.
+EXAMPLES = ("example", "example_probabilities")
 #: Steps of the flows, as in `curvafit.segmentation`, which help must not import.
 STEPS = 400
+#: Number of runs for suggestions, as in `curvafit.segmentation`.
+RUNS = 8
 
 
 @reads_volume
@@ -88,7 +93,6 @@ def segment(
     scan: Volume,
     out: Target,
     prior: Prior,
-    probability: Probability = None,
     weight: Weight = None,
     threshold: Threshold = "otsu",
     dark: Dark = False,
@@ -103,30 +107,20 @@ def segment(
     """Find the structure of a noisy scan under a curvature prior; write its mask, a picture and a record."""
     with plainly():
         options: dict[str, Any] = {"weight": weight, "epsilon": epsilon}
-        if probability is None:
-            options |= {"threshold": threshold_of(threshold), "dark": dark}
-        elif dark or threshold.lower() != "otsu":
-            extra = "--dark" if dark else f"--threshold {threshold}"
-            raise ValueError(f"expected neither --threshold nor --dark with --probability, got {extra}")
+        options |= {"threshold": threshold_of(threshold), "dark": dark}
 
         def compute(volume: Boxes, progress: Progress, **tools: Any) -> Segmentation:
-            from curvafit.segmentation.evidence import cropped_map
             from curvafit.segmentation.segment import segment as segment_scan
-            from curvafit.volumes.scan import load
 
-            alike = {name: reading[name] for name in ("spacing", "unit", "strict")}
-            chances = None if probability is None else cropped_map(load(probability, **alike), reading["crop"])
-            say_notes(() if chances is None else chances.notes)
-            return segment_scan(volume, prior, probability=chances, steps=steps, progress=progress, **tools, **options)
+            return segment_scan(volume, prior, steps=steps, progress=progress, **tools, **options)
 
         def tried(laws: int, voxels: int) -> float:
             from curvafit.segmentation.weighing import trial_steps
 
-            return trial_steps(laws + 1, steps, voxels) if weight is None and probability is None else 0.0
+            return trial_steps(laws + 1, steps, voxels) if weight is None else 0.0
 
         record = {"job": "segment", "steps": steps, "tile": tile, **options}
-        record |= {"probability": None if probability is None else str(probability)}
-        _run(scan, out, prior, reading, compute, record, overwrite=overwrite, tried=tried, workers=workers)
+        run_job(scan, out, prior, reading, compute, record, overwrite=overwrite, tried=tried, workers=workers)
 
 
 @reads_volume
@@ -142,6 +136,8 @@ def reconstruct(
     example: Example = None,
     stiffness: Stiffness = None,
     periodic: Periodic = False,
+    runs: Runs = 0,
+    suggest: Suggest = 0,
     epsilon: Epsilon = None,
     steps: Steps = STEPS,
     tile: TileOption = None,
@@ -162,6 +158,7 @@ def reconstruct(
             raise ValueError(f"expected --first beside --every, got {first} beside --known")
         place = {"every": every, "first": first or 0, "known": numbers, "axis": "zyx".index(axis.lower())}
         options: dict[str, Any] = {**place, "stiffness": stiffness, "periodic": periodic, "epsilon": epsilon}
+        options |= {"runs": runs, "suggest": suggest}
 
         def compute(volume: Boxes, progress: Progress, **tools: Any) -> Segmentation:
             from curvafit.segmentation.completion import reconstruct as fill
@@ -171,7 +168,7 @@ def reconstruct(
             alike = {name: reading[name] for name in ("spacing", "unit", "label", "strict")}
             whole = None if example is None else load(example, **alike)
             say_notes(() if whole is None else whole.notes)
-            law = prior if prior is not None else _inferred(whole, progress)
+            law = prior if prior is not None else inferred(whole, progress)
             slices = whole_of(volume)
             return fill(slices, law, example=whole, steps=steps, progress=progress, **tools, **options)
 
@@ -179,19 +176,19 @@ def reconstruct(
         record = {"job": "reconstruct", "steps": steps, "tile": tile, **more}
 
         def tried(laws: int, voxels: int) -> float:
-            return laws * steps if stiffness is None else 0.0
+            return ((laws if stiffness is None else 0) + 2 * (runs or RUNS * bool(suggest))) * steps
 
-        _run(slices, out, prior, reading, compute, record, overwrite=overwrite, tried=tried, workers=workers)
+        run_job(slices, out, prior, reading, compute, record, overwrite=overwrite, tried=tried, workers=workers)
 
 
-def _inferred(example: Field | None, progress: Progress) -> Inference:
+def inferred(example: Field | None, progress: Progress) -> Inference:
     """Return what an example's mask says of its law, without a twin."""
     from curvafit.inference.infer import infer
 
     return infer(example, kind="mask", fast=True, progress=progress)  # type: ignore[arg-type]
 
 
-def _run(
+def run_job(
     source: str,
     out: Path,
     prior: str | None,
@@ -201,10 +198,23 @@ def _run(
     *,
     overwrite: bool,
     tried: Callable[[int, int], float],
-    workers: int | None,
+    workers: int | None = None,
+    read: Callable[..., Field] | None = None,
+    image: Path | None = None,
 ) -> None:
-    """Check, read, compute, write and print; `tried` says how many steps it takes to try laws out, given their number
-    and that of the working voxels. Tiles stay beside the output until it is written."""
+    """Check, read, compute, write and print. Tiles stay beside the output until it is written.
+
+    Parameters
+    ----------
+    tried
+        Says how many steps it takes to try laws out, given their number and that of the working voxels.
+    workers
+        Number of processes that lower tiles at once; this one by default.
+    read
+        Reads the source, with the options in `reading`; by default its boxes are read where they are asked for.
+    image
+        The file whose header the mask gets; by default the source.
+    """
     from curvafit.files import remove
     from curvafit.priors.coefficients import preset_name
     from curvafit.priors.law import texture_of
@@ -214,14 +224,15 @@ def _run(
     from curvafit.volumes.boxes import boxes_of, whole_of
 
     law_file = None if preset_name(prior) else prior
-    inputs = [each for each in (source, law_file, record.get("probability"), record.get("example")) if each is not None]
-    check_mask_target(out, inputs=inputs, overwrite=overwrite)
+    inputs = [each for each in (source, law_file, image, *map(record.get, EXAMPLES)) if each is not None]
+    more: dict[str, Any] = {"overwrite": overwrite, "probability": bool(record.get("runs") or record.get("suggest"))}
+    check_mask_target(out, inputs=inputs, **more)
     if prior is not None:
         texture_of(prior)
     with stages() as progress:
         progress("reading", 0.0)
-        boxes = boxes_of(source, **reading)
-        check_mask_target(out, boxes.frame.unit, overwrite=overwrite)
+        boxes = boxes_of(source, **reading) if read is None else boxes_of(read(source, **reading))
+        check_mask_target(out, boxes.frame.unit, **more)
         tiling = Tiling.of(boxes.frame, record["epsilon"], record["tile"], periodic=record.get("periodic", False))
         laws = INFERRED if prior is None else len(laws_of(prior, boxes.frame)[0])
         _say_forecast(record, tiling, laws, tried, workers)
@@ -230,10 +241,10 @@ def _run(
             result = compute(boxes, progress, tile=record["tile"], store=store, workers=crew)
         progress("writing", 1.0)
         content = {"command": command_line(), "prior": prior, **record}
-        place = ("spacing", "crop", "channel")
-        like = source if all(reading[name] is None for name in place) else None
-        more = {"record": content, "overwrite": overwrite}
-        files = write_mask(result, whole_of(boxes), out, like=like, unit=reading["unit"], **more)
+        place = ("spacing", "crop") if image else ("spacing", "crop", "channel")
+        like = (image or source) if all(reading[name] is None for name in place) else None
+        whole = whole_of(boxes)
+        files = write_mask(result, whole, out, like=like, unit=reading["unit"], record=content, overwrite=overwrite)
         if store is not None:
             remove(store)
     for note in result.notes:

@@ -145,7 +145,7 @@ def check_outputs(
     check_folder(target.parent)
     if target.is_dir() and not target.name.lower().endswith(".zarr"):
         raise ValueError(f"expected the name of a file, got the folder {target}")
-    own = _own_files(target, kind)
+    own = own_files(target, kind)
 
     def ours(path: Path) -> bool:
         if path.is_dir():
@@ -156,7 +156,7 @@ def check_outputs(
     return target
 
 
-def _own_files(target: Path, kind: str) -> list[str]:
+def own_files(target: Path, kind: str) -> list[str]:
     """Return the names of files that the record of that kind there lists as written with this very file."""
     listed = own_record(beside(target, ".json"), kind).get("files")
     return listed if isinstance(listed, list) and target.name in listed else []
@@ -213,7 +213,7 @@ def write_shape(
     """
     target = check_target(path, output, steps=flow.snapshots, picture=picture, overwrite=overwrite)
     image = beside(target, ".png")
-    former = picture or image.name in _own_files(target, FORMAT)
+    former = picture or image.name in own_files(target, FORMAT)
     with staged(target) as work:
         shape = write_field(flow.field, flow.grid, work / target.name, output)
         note = beside(shape, ".json")

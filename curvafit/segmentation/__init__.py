@@ -8,18 +8,28 @@ from curvafit.faces import offer
 
 if TYPE_CHECKING:
     from curvafit.segmentation.completion import reconstruct
+    from curvafit.segmentation.postprocessing import Refine
+    from curvafit.segmentation.refine import Calibration, calibrate, refine
     from curvafit.segmentation.result import Segmentation
     from curvafit.segmentation.segment import segment
 
 __all__ = [
+    "Calibration",
+    "Refine",
     "Segmentation",
+    "calibrate",
     "reconstruct",
+    "refine",
     "segment",
 ]
 
 _HOMES = {
+    "Calibration": "curvafit.segmentation.refine",
+    "Refine": "curvafit.segmentation.postprocessing",
     "Segmentation": "curvafit.segmentation.result",
+    "calibrate": "curvafit.segmentation.refine",
     "reconstruct": "curvafit.segmentation.completion",
+    "refine": "curvafit.segmentation.refine",
     "segment": "curvafit.segmentation.segment",
 }
 

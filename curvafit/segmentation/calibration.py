@@ -1,18 +1,25 @@
-"""The choice between plain interpolations and priors by slices whose content is known: left out, or an example's."""
+"""The choice between plain ways and priors by masks that are known: slices left out, or an example."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Generic, TypeVar
 
 import numpy as np
 
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.slices import WAYS, Slices
 
-__all__ = ["Choice", "Setting", "Task", "choice", "left_out"]
+__all__ = ["BEYOND", "ODDS", "Choice", "Setting", "Task", "choice", "climbed", "left_out"]
 
-#: Edge of the tiles of a slice whose counts are taken to be independent, in voxels.
+#: What is given of a volume, and what is tried of it.
+Given = TypeVar("Given")
+Trial = TypeVar("Trial")
+#: The way of `odds.Odds`, beside those of `slices.WAYS`.
+ODDS = "odds"
+#: Edge of the cubes whose counts are taken to be independent, in voxels.
 TILE = 16
 #: Standard errors by which a setting must be better than a simpler one.
 BEYOND = 1.0
@@ -20,39 +27,42 @@ BEYOND = 1.0
 
 @dataclass(frozen=True)
 class Setting:
-    """A way to fill a volume: an interpolation, and a law that is lowered from there, or none.
+    """A way to fill a volume: a plain one, and a law that is lowered from there, or none.
 
     Attributes
     ----------
     way
-        One of `slices.WAYS`.
+        One of `slices.WAYS`, `ODDS` or another plain way.
     law
         Coefficients with lengths in the scan's unit.
-    stiffness, steps
-        Stiffness of the springs on known voxels, and steps of the flow.
+    strength, steps
+        Stiffness of the springs on known voxels, or nats of a unit of the Willmore energy; and steps of the flow.
+    pull
+        Stiffness of the springs on the others for each nat of an example's odds.
     """
 
     way: str
     law: Coefficients | None = None
-    stiffness: float = 0.0
+    strength: float = 0.0
     steps: int = 0
+    pull: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
-class Task:
-    """Slices to fill a volume from, and others to compare it with.
+class Task(Generic[Given]):
+    """What is given of a volume, and masks to compare the volume with.
 
     Attributes
     ----------
-    slices
-        What is given.
+    given
+        Slices, or evidence.
     truth
-        Other masks, bool (N, Y, X).
+        Known masks, bool (N, Y, X), which are not given.
     places
-        Their numbers in the volume.
+        Their numbers in the volume, ascending.
     """
 
-    slices: Slices
+    given: Given
     truth: np.ndarray
     places: Sequence[int]
 
@@ -66,7 +76,7 @@ class Choice:
     setting
         The setting.
     dice, plain
-        Dice of the best prior and of the best plain interpolation on the task's slices.
+        Dice of the best prior and of the best plain way on the task's masks.
     noise
         Standard error of the difference.
     """
@@ -77,7 +87,7 @@ class Choice:
     noise: float
 
 
-def left_out(slices: Slices) -> Task | None:
+def left_out(slices: Slices) -> Task[Slices] | None:
     """Return the task to predict every second known slice from the others; None where there are too few.
 
     The first and the last slice are not left out, unless the volume repeats.
@@ -92,47 +102,83 @@ def left_out(slices: Slices) -> Task | None:
 
 
 def choice(
-    task: Task,
-    settings: Sequence[Setting],
-    filled: Callable[[Slices, Setting], np.ndarray],
+    task: Task[Given],
+    lowered: Callable[[str], Sequence[Setting]],
+    filled: Callable[[Given, Setting], np.ndarray],
     ways: Sequence[str] = WAYS,
+    strengths: Sequence[float] = (),
 ) -> Choice:
     """Return the setting with the best Dice on a task: a prior where it is better than plain beyond the noise.
 
     Parameters
     ----------
-    settings
-        Settings with a law, lowered from the first of the ways.
-    ways
-        Plain interpolations to compare with. Slices left out double the gap, at which the nearest slice may win by much
-        that loses by more at the gap itself: there only what is lowered and its start are to be compared.
+    lowered
+        Returns the settings with a law that are lowered from a way: the best of the plain ones. The best is tried at
+        the strengths on either side as long as they are better, and the others at the strength that is best then.
     filled
-        Fills the volume between slices by a setting: a mask (Z, Y, X).
+        Fills the volume of what is given by a setting: a mask (Z, Y, X).
+    ways
+        Plain ways to compare with. Slices left out double the gap, at which the nearest slice may win by much that
+        loses by more at the gap itself: there only what is lowered and its start are to be compared.
+    strengths
+        Strengths to try, ascending, the settings' own among them; by default none but their own.
     """
 
+    @cache
     def counts(setting: Setting) -> np.ndarray:
-        return _tallies(filled(task.slices, setting)[list(task.places)], task.truth)
+        return _tallies(filled(task.given, setting)[list(task.places)], task.truth, task.places)
 
-    start, before = Setting(ways[0]), counts(Setting(ways[0]))
+    def worth(setting: Setting) -> float:
+        return float(_dice(counts(setting).sum(0)))
+
+    def stronger(setting: Setting, step: int) -> Setting | None:
+        number = [*strengths, setting.strength].index(setting.strength) + step
+        return replace(setting, strength=strengths[number]) if 0 <= number < len(strengths) else None
+
+    start = Setting(ways[0])
     for each in map(Setting, ways[1:]):
-        start, before = _better((each, counts(each)), (start, before))
-    tried = [(each, counts(each)) for each in settings]
-    best, after = max(tried, key=lambda each: float(_dice(each[1].sum(0))))
-    with_prior, without = (float(_dice(each.sum(0))) for each in (after, before))
-    return Choice(_better((best, after), (start, before))[0], with_prior, without, _difference(after, before)[1])
+        start = start if _difference(counts(each), counts(start)).within else each
+    settings = lowered(start.way)
+    best = climbed(max(settings, key=worth), stronger, worth)
+    best = max((best, *(replace(each, strength=best.strength) for each in settings)), key=worth)
+    gain = _difference(counts(best), counts(start))
+    return Choice(start if gain.within else best, worth(best), worth(start), gain.noise)
 
 
-def _better(new: tuple[Setting, np.ndarray], old: tuple[Setting, np.ndarray]) -> tuple[Setting, np.ndarray]:
-    """Return the new setting and its counts where they are better beyond the noise, else the old ones."""
-    gain, noise = _difference(new[1], old[1])
-    return new if gain > BEYOND * noise else old
+def climbed(first: Trial, neighbour: Callable[[Trial, int], Trial | None], worth: Callable[[Trial], float]) -> Trial:
+    """Return the best of a trial and its neighbours on either side, each as long as the last is better than before.
+
+    `neighbour` returns the next trial towards 1 or -1, None beyond the end.
+    """
+    best = first
+    for step in (1, -1):
+        last = first
+        while (further := neighbour(last, step)) is not None and worth(further) > worth(last):
+            last = further
+        best = max(best, last, key=worth)
+    return best
 
 
-def _tallies(masks: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Return the voxels in both of two stacks of slices, and the sum of the voxels in each, for each tile: (T, 2)."""
-    edges = [np.arange(0, n, TILE) for n in truth.shape[1:]]
+@dataclass(frozen=True)
+class _Difference:
+    """The difference of two Dice coefficients and its standard error."""
+
+    gain: float
+    noise: float
+
+    @property
+    def within(self) -> bool:
+        """Return whether the gain is within the noise."""
+        return not self.gain > BEYOND * self.noise
+
+
+def _tallies(masks: np.ndarray, truth: np.ndarray, places: Sequence[int]) -> np.ndarray:
+    """Return the voxels in both of two stacks of slices, and the sum of the voxels in each, for each cube: (T, 2)."""
     pair = np.stack([masks & truth, masks.astype(np.uint8) + truth.astype(np.uint8)], axis=-1).astype(np.int64)
-    return np.add.reduceat(np.add.reduceat(pair, edges[0], axis=1), edges[1], axis=2).reshape(-1, 2)
+    for axis, where in enumerate((places, *map(range, truth.shape[1:]))):
+        starts = np.unique(np.asarray(where) // TILE, return_index=True)[1]
+        pair = np.add.reduceat(pair, starts, axis=axis)
+    return pair.reshape(-1, 2)
 
 
 def _dice(counts: np.ndarray) -> np.ndarray:
@@ -141,8 +187,8 @@ def _dice(counts: np.ndarray) -> np.ndarray:
     return np.where(sizes == 0, 1.0, 2 * both / np.maximum(sizes, 1))
 
 
-def _difference(after: np.ndarray, before: np.ndarray) -> tuple[float, float]:
-    """Return the difference of two Dice coefficients and its standard error, the jackknife's over tiles."""
+def _difference(after: np.ndarray, before: np.ndarray) -> _Difference:
+    """Return the difference of two Dice coefficients of counts (T, 2), with the jackknife's error over the cubes."""
     whole = _dice(after.sum(0)) - _dice(before.sum(0))
     each = _dice(after.sum(0) - after) - _dice(before.sum(0) - before)
-    return float(whole), float(np.sqrt((len(each) - 1) * each.var()))
+    return _Difference(float(whole), float(np.sqrt((len(each) - 1) * each.var())))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from os import PathLike
 from typing import Any
 
@@ -15,15 +16,20 @@ from curvafit.priors.bounds import real, whole
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
 from curvafit.progress import Progress, silent
-from curvafit.segmentation.calibration import Choice, Setting, Task, choice, left_out
+from curvafit.segmentation.calibration import ODDS, Choice, Setting, Task, choice, left_out
 from curvafit.segmentation.engine import STEPS
+from curvafit.segmentation.ensemble import RUNS, Chances, chances
+from curvafit.segmentation.grown import grown
+from curvafit.segmentation.known import check_spacing, labels
 from curvafit.segmentation.lowering import Workers, lowered
-from curvafit.segmentation.result import Segmentation, ending, filled, result_of
+from curvafit.segmentation.odds import Odds
+from curvafit.segmentation.probability import entropy
+from curvafit.segmentation.result import Segmentation, Uncertainty, ending, filled, result_of
 from curvafit.segmentation.slices import WAYS, Slices
+from curvafit.segmentation.suggestion import suggestions
 from curvafit.segmentation.tiles import Tiling
 from curvafit.segmentation.weighing import densest
-from curvafit.segmentation.working import Law, WorkingGrid, laws_of
-from curvafit.units import sampling
+from curvafit.segmentation.working import Law, WorkingGrid, drawn_laws, laws_of
 from curvafit.volumes.boxes import digest_of
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.part import Box
@@ -39,10 +45,11 @@ MARGIN = math.tanh(WORKING_SPACING / 2 / (math.sqrt(2) * WORKING_EPSILON))
 STIFFEST = (1e-9, 1e12)
 #: Longest edge of the box on which the prior is tried out in a volume of several tiles, and the fewest slices there.
 PART, FEWEST = 96, 5
-#: Most values of known slices; more are grey levels.
-LABELS = 256
-#: Share by which the voxels of two files may differ in size.
-SAME = 1e-3
+#: Most runs.
+MOST = 1000
+#: Stiffness of the springs on other voxels, in working units, for each nat of an example's odds: one is tried after the
+#: other.
+PULLS = (1e4, 3e4)
 
 
 def reconstruct(
@@ -56,6 +63,8 @@ def reconstruct(
     example: Source | None = None,
     stiffness: float | None = None,
     periodic: bool = False,
+    runs: int = 0,
+    suggest: int = 0,
     epsilon: float | None = None,
     steps: int = STEPS,
     tile: int | None = None,
@@ -64,10 +73,12 @@ def reconstruct(
     progress: Progress = silent,
     **reading: Any,
 ) -> Segmentation:
-    """Fill a volume between known slices: lower F_ε from a spline if that is better than plain interpolation.
+    """Fill a volume between known slices: lower F_ε from an interpolation if that is better than the interpolation.
 
     What is better is tried out on an example that is degraded as the volume is, or else on every second known slice,
-    which the others predict. The known slices stay as they are. Where the volume ends, the surface goes on freely.
+    which the others predict. The example also tells how likely voxels between two slices are inside, by their distances
+    from both outlines: where that is the best interpolation, these odds hold the surface while F_ε is lowered. Known
+    slices stay as they are. Where the volume ends, the surface goes on freely.
 
     Parameters
     ----------
@@ -90,6 +101,11 @@ def reconstruct(
         from the spline.
     periodic
         Whether the volume repeats, as generated ones do.
+    runs
+        Number of further runs, from other starts and under laws drawn from a fit's posterior. How probable the inside
+        is where they agree is learned from the example, or else from a shape grown from the law: two flows a run.
+    suggest
+        Number of slices to suggest: those to annotate next; needs `runs`, by default 8.
     epsilon, steps, tile, store, workers, progress, reading
         As in `segment`.
 
@@ -97,8 +113,8 @@ def reconstruct(
     ------
     ValueError
         As `segment`; or if fewer than two slices are known, or too few to try the prior out on and there is neither an
-        example nor a stiffness; or if known slices are all empty, all full or grey levels, or the example's spacing is
-        another one.
+        example nor a stiffness; or if known slices are all empty, all full or grey levels, the example's
+        spacing is another one, or more slices are to be suggested than are unknown.
     FileNotFoundError
         If there is no such `fit.json`.
     """
@@ -109,41 +125,62 @@ def reconstruct(
     tiling = Tiling.of(target.frame, epsilon, tile, periodic=periodic)
     if stiffness is not None:
         stiffness = real(stiffness, "a positive stiffness", *STIFFEST)
+    suggest = whole(suggest, "a number of slices from 0", 0, volume.shape[axis] - len(places))
+    runs = whole(runs, "a number of runs from 0", 0, MOST)
     other = None if example is None else _like(example, volume, reading)
     laws, notes = laws_of(prior, volume)
-    settings = [Setting("spline", law, STIFFNESS if stiffness is None else stiffness, steps) for law in laws]
+    if suggest and not runs:
+        runs, notes = RUNS, (*notes, f"Suggestions need runs: {RUNS} are made.")
+    firm, odds = STIFFNESS if stiffness is None else stiffness, None
+
+    def settings(way: str) -> list[Setting]:
+        pulls = PULLS if way == ODDS else (0.0,)
+        return [Setting(way, law, firm, steps, pull) for law, pull in product(laws, pulls)]
+
+    def level(slices: Slices, way: str) -> np.ndarray:
+        return slices.level(way) if odds is None or way != ODDS else odds.level(slices, crossed=slices is not target)
+
+    def start(slices: Slices, setting: Setting) -> np.ndarray | None:
+        return level(slices, ODDS) if setting.way == ODDS else None
 
     def fill(slices: Slices, setting: Setting) -> np.ndarray:
-        tiles = Tiling.of(slices.frame, epsilon, periodic=slices.periodic)
-        return _filled(slices, setting, tiles, lambda _, share: progress("trying the prior out", share))[0]
+        step: Progress = lambda _, share: progress("trying the prior out", share)  # noqa: E731
+        return _filled(_Between(slices, setting, start(slices, setting)), epsilon, None, step)[0]
 
-    chosen, tried = settings[0], ""
+    def again(slices: Slices, setting: Setting, moved: np.ndarray, step: Progress) -> tuple[np.ndarray, float]:
+        steps: Progress = lambda _, share: step("running again", share)  # noqa: E731
+        return _filled(_Between(slices, setting, moved), epsilon, tile, steps)[1], tiling.place.epsilon
+
+    chosen, tried, uncertain = settings("spline")[0], "", None
+    whole_example = None if other is None else _example(other, places, axis)
+    fair = (whole_example or grown(target, laws[0], epsilon, progress)) if runs else None
     if stiffness is None:
-        tasks = (
-            left_out(target if tiling.count == 1 else _part(target)) if other is None else _example(other, places, axis)
-        )
-        if tasks is None:
-            raise ScanError(
-                "expected three or more known slices with voxels inside and outside, an example or a stiffness, got "
-                f"{len(places)} slices"
-            )
-        best = choice(tasks, settings, fill, WAYS[:1] if other is None else WAYS)
+        part = target if tiling.count == 1 else _part(target)
+        task = _sure(left_out(part) if other is None else whole_example, len(places))
+        odds = None if other is None else Odds.of(task.given, task.truth, task.places)
+        best = choice(task, settings, fill, WAYS[:1] if other is None else (*WAYS, ODDS))
         chosen, tried = best.setting, _gain(best, "left out" if other is None else "of the example")
-    mask, u, end = _filled(target, chosen, tiling, progress, store=store, workers=workers)
+    between = _Between(target, chosen, start(target, chosen))
+    mask, u, end = _filled(between, epsilon, tile, progress, store=store, workers=workers)
+    if fair is not None:
+        drawn = () if chosen.law is None else drawn_laws(prior, volume, runs)
+        likely = chances(fair, target, chosen, drawn or (chosen.law,), runs, level=level, flow=again, progress=progress)
+        uncertain = _uncertainty(likely, target, volume, axis, range(runs), suggest)
+        end = f"{end}; {_learned(uncertain, 'the example' if fair is whole_example else 'a shape of the law')}"
     notes = (*notes, *_known(places, volume.shape[axis]), *tiling.place.notes)
     mask, u = (np.ascontiguousarray(np.moveaxis(each, 0, axis)) for each in (mask, u))
-    status = f"{tried}{end}"
-    return result_of(
-        volume, mask, u, weight=None, law=chosen.law, epsilon=tiling.place.epsilon, status=status, notes=notes
-    )
+    more = {"weight": None, "law": chosen.law, "epsilon": tiling.place.epsilon, "uncertainty": uncertain}
+    return result_of(volume, mask, u, status=f"{tried}{end}", notes=notes, **more)
 
 
 @dataclass(frozen=True, eq=False)
 class _Between:
-    """The volume between slices, which a setting fills."""
+    """The volume between slices, which a setting fills from an interpolation (length, Y, X), by default that of its
+    way."""
 
     slices: Slices
     setting: Setting
+    level: np.ndarray | None = None
 
     @property
     def law(self) -> Coefficients | None:
@@ -157,13 +194,18 @@ class _Between:
     def parts(self) -> dict[str, object]:
         slices, setting = self.slices, self.setting
         numbers = {"places": slices.places, "spacing": slices.spacing, "periodic": slices.periodic}
-        return {"slices": digest_of(slices.inside), **numbers, "way": setting.way, "stiffness": setting.stiffness}
+        start = setting.way if self.level is None else digest_of(self.level)
+        springs = {"strength": setting.strength, "pull": setting.pull}
+        return {"slices": digest_of(slices.inside), **numbers, "start": start, **springs}
 
     def given(self, box: Box, place: WorkingGrid) -> tuple[np.ndarray, data.Data]:
-        """Return the interpolation, and springs on the known voxels."""
-        level, (rows, inside) = self.slices.level(self.setting.way, box), self.slices.known(box)
-        pull, stiffness = np.zeros(level.shape, dtype=np.float32), self.setting.stiffness
-        pull[rows] = np.where(inside, stiffness, -stiffness)
+        """Return the interpolation, and springs on the known voxels and on those that odds hold."""
+        slices, setting, (rows, inside) = self.slices, self.setting, self.slices.known(box)
+        numbers = slices.numbers(box)
+        level = slices.level(setting.way, box) if self.level is None else self.level[np.ix_(*numbers)]
+        held = slices.between[numbers[0], None, None]
+        pull = np.where(held, setting.pull / min(slices.spacing[1:]) * level, 0).astype(np.float32)
+        pull[rows] = np.where(inside, setting.strength, -setting.strength)
         return level, data.Hinge(place.spread(pull, centre=0), MARGIN)
 
     def plain(self, level: np.ndarray, place: WorkingGrid) -> np.ndarray:
@@ -178,11 +220,22 @@ class _Between:
 
 
 def _filled(
-    slices: Slices, setting: Setting, tiling: Tiling, progress: Progress, **tools: Any
+    between: _Between, epsilon: float | None, tile: int | None, progress: Progress, **tools: Any
 ) -> tuple[np.ndarray, np.ndarray, str]:
     """Return the mask and the phase field of a volume that a setting fills, and how its flow ended."""
-    found = lowered(_Between(slices, setting), tiling, progress=progress, **tools)
-    return found.mask, found.phase, filled(found.mask) if setting.law is None else ending(found)
+    tiling = Tiling.of(between.slices.frame, epsilon, tile, periodic=between.slices.periodic)
+    found = lowered(between, tiling, progress=progress, **tools)
+    return found.mask, found.phase, filled(found.mask) if between.law is None else ending(found)
+
+
+def _sure(task: Task[Slices] | None, count: int) -> Task[Slices]:
+    """Return a task; raise ScanError where the slices, so many, give none."""
+    if task is None:
+        raise ScanError(
+            "expected three or more known slices with voxels inside and outside, an example or a stiffness, got "
+            f"{count} slices"
+        )
+    return task
 
 
 def _part(slices: Slices) -> Slices:
@@ -192,6 +245,24 @@ def _part(slices: Slices) -> Slices:
     places = [place - slices.places[rows.start] for place in slices.places[rows]]
     inside = slices.inside[rows, ys, xs]
     return replace(slices, inside=inside, places=tuple(places), length=places[-1] + 1, periodic=False)
+
+
+def _uncertainty(
+    odds: Chances, slices: Slices, volume: Field, axis: int, seeds: Sequence[int], count: int
+) -> Uncertainty:
+    """Return what probabilities say of a volume, and so many suggestions."""
+    entropies = entropy(odds.values).sum((1, 2))
+    values = np.ascontiguousarray(np.moveaxis(odds.values, 0, axis))
+    probability = replace(volume, values=values, notes=())
+    following = suggestions(entropies, slices.places, count, slices.periodic)
+    return Uncertainty(probability, tuple(seeds), odds.error, following)
+
+
+def _learned(uncertain: Uncertainty, where: str) -> str:
+    """Return how good probabilities are, and what to annotate next, as the end of a sentence."""
+    following = ", ".join(map(str, uncertain.suggestions))
+    text = f"probabilities of {len(uncertain.seeds)} runs err by {uncertain.calibration_error:.3f} on {where}"
+    return f"{text}; annotate next: {following}" if following else text
 
 
 def _gain(best: Choice, where: str) -> str:
@@ -210,7 +281,7 @@ def _slices(volume: Field, places: Sequence[int], axis: int, periodic: bool = Fa
     ScanError
         If they are grey levels, or all empty, or all full.
     """
-    inside = _labels(np.moveaxis(volume.values, axis, 0)[list(places)]) > 0
+    inside = labels(np.moveaxis(volume.values, axis, 0)[list(places)], "known slices") > 0
     if inside.all() or not inside.any():
         raise ScanError(
             f"expected known slices with voxels inside and outside, got {'full' if inside.all() else 'empty'} ones"
@@ -223,20 +294,18 @@ def _like(example: Source, volume: Field, reading: dict[str, Any]) -> Field:
     """Return the example; raise ScanError where its voxels differ in size from the volume's."""
     placed = {} if isinstance(example, Field) else {name: reading.get(name) for name in ("spacing", "unit")}
     other = field_of(example, **placed)
-    if other.unit != volume.unit or not np.allclose(other.spacing, volume.spacing, rtol=SAME):
-        one, two = (sampling(each.shape, each.spacing, each.unit) for each in (volume, other))
-        raise ScanError(f"expected an example with the spacing of the slices ({one}), got {two}")
+    check_spacing(other, volume, "the slices")
     return other
 
 
-def _example(example: Field, places: Sequence[int], axis: int) -> Task | None:
+def _example(example: Field, places: Sequence[int], axis: int) -> Task[Slices] | None:
     """Return the task to fill an example between slices that are as far apart as the known ones at most."""
     gap, length = int(np.diff(places).max()), example.shape[axis]
     given = range(0, length, gap)
     if gap < 2 or len(given) < 2:
         return None
     between = [n for n in range(given[-1]) if n % gap]
-    truth = _labels(np.moveaxis(example.values, axis, 0)[between]) > 0
+    truth = labels(np.moveaxis(example.values, axis, 0)[between], "an example") > 0
     return Task(_slices(example, given, axis), truth, between)
 
 
@@ -259,12 +328,3 @@ def _known(places: list[int], length: int) -> tuple[str, ...]:
     before, beyond = places[0], length - 1 - places[-1]
     outer = f"The {before} before the first and the {beyond} beyond the last are extrapolated."
     return f"{len(places)} of {length} slices are known.", *((outer,) if before or beyond else ())
-
-
-def _labels(values: np.ndarray) -> np.ndarray:
-    """Return the values, or raise ScanError where they are grey levels."""
-    if values.dtype.kind == "f" and not np.array_equal(values, np.round(values)):
-        raise ScanError("expected known slices with a mask or labels, got values that are not whole numbers")
-    if values.dtype.itemsize > 1 and (count := len(np.unique(values))) > LABELS:
-        raise ScanError(f"expected known slices with a mask or at most {LABELS} labels, got {count} values")
-    return values

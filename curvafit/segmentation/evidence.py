@@ -3,27 +3,20 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from itertools import product
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
 from skimage.filters import threshold_otsu
 
-from curvafit.units import METRES
 from curvafit.volumes.field import Field, ScanError
-from curvafit.volumes.formats.part import Crop
 
 __all__ = [
     "Classes",
     "VoxelEvidence",
     "bounds_of",
-    "check_chances",
-    "check_map",
     "classes_of",
-    "cropped_map",
     "grey_levels",
-    "of_chances",
     "of_classes",
     "of_probability",
 ]
@@ -34,8 +27,6 @@ TAILS = (0.1, 99.9)
 QUIET, WIDTHS = 1 / 16, (0.7, 3.0)
 #: Least noise, as a share of the contrast; least distance of a probability from 0 and 1.
 LEAST_NOISE, CERTAIN = 0.05, 1e-4
-#: Voxels by which the same place may differ in two files.
-ASTRAY = 0.1
 #: Contrast, in units of the noise, below which the classes of Otsu's threshold may be noise.
 FAINT = 1.0
 
@@ -158,57 +149,22 @@ def of_classes(values: np.ndarray, scan: Field, classes: Classes, known: np.ndar
     return VoxelEvidence(ratio, sign * level, str(classes))
 
 
-def of_probability(probability: Field, scan: Field) -> VoxelEvidence:
-    """Return the evidence of a probability map (Z, Y, X) in [0, 1]: r = log p / (1 - p).
+def of_probability(probability: Field) -> VoxelEvidence:
+    """Return the evidence of a probability map (Z, Y, X) in [0, 1]: r = log p / (1 - p), and p - 1/2 as first guess.
 
     Raises
     ------
     ScanError
-        If the map's shape or place is not the scan's, or a value lies outside [0, 1].
+        If a value lies outside [0, 1].
     """
-    check_map(probability, scan)
     values = probability.values.astype(np.float32)
-    return of_chances(values, scan, check_chances(float(values.min()), float(values.max())))
-
-
-def of_chances(values: np.ndarray, scan: Field, note: str) -> VoxelEvidence:
-    """Return the evidence of probabilities (Z, Y, X): r = log p / (1 - p)."""
-    p = values.clip(CERTAIN, 1 - CERTAIN)
-    return VoxelEvidence(np.log(p / (1 - p)), _smoothed(values, scan, WIDTHS[0]) - 0.5, note)
-
-
-def check_chances(lowest: float, highest: float) -> str:
-    """Return a sentence on the range of probabilities, or raise ScanError where it leaves [0, 1]."""
+    lowest, highest = float(values.min()), float(values.max())
     if not 0 <= lowest <= highest <= 1:
-        raise ScanError(f"expected probabilities in [0, 1], got {lowest:g} to {highest:g}")
-    return f"probabilities from {lowest:.3g} to {highest:.3g}"
-
-
-def check_map(probability: Field, scan: Field) -> None:
-    """Raise ScanError where a map's shape or place is not the scan's."""
-    if probability.shape != scan.shape:
-        raise ScanError(f"expected a probability map of the scan's shape {scan.shape}, got {probability.shape}")
-    _check_place(probability, scan)
-
-
-def cropped_map(probability: Field, crop: Crop | None) -> Field:
-    """Return the part of a map for a crop of its scan; a map without an affine stays without one."""
-    if crop is None:
-        return probability
-    part = probability.crop(crop)
-    return part if probability.affine is not None else replace(part, affine=None)
-
-
-def _check_place(other: Field, scan: Field) -> None:
-    """Raise ScanError where the two affines, if both exist, differ by more than `ASTRAY` at a corner."""
-    if scan.affine is None or other.affine is None:
-        return
-    factor = METRES[other.unit] / METRES[scan.unit] if {other.unit, scan.unit} <= METRES.keys() else 1.0
-    corners = np.array(list(product(*((0, n - 1) for n in scan.shape[::-1]))))
-    one, two = (corners @ affine[:3, :3].T + affine[:3, 3] for affine in (scan.affine, other.affine))
-    far = float(np.linalg.norm(factor * two - one, axis=1).max()) / min(scan.spacing)
-    if not far < ASTRAY:
-        raise ScanError(f"expected a probability map with the scan's affine, got one {far:.3g} voxels away")
+        source = f" in {probability.source}" if probability.source else ""
+        raise ScanError(f"expected probabilities in [0, 1], got {lowest:g} to {highest:g}{source}")
+    p = values.clip(CERTAIN, 1 - CERTAIN)
+    note = f"probabilities from {lowest:.3g} to {highest:.3g}"
+    return VoxelEvidence(np.log(p / (1 - p)), values - np.float32(0.5), note)
 
 
 def _smoothed(values: np.ndarray, scan: Field, width: float) -> np.ndarray:

@@ -14,9 +14,11 @@ from matplotlib.figure import Figure
 
 from curvafit.drawing.plot import DPI
 from curvafit.drawing.sections import section_figure
-from curvafit.drawing.shape_files import beside, check_outputs
-from curvafit.files import move_together, staged
-from curvafit.segmentation.result import Segmentation
+from curvafit.drawing.shape_files import beside, check_outputs, own_files
+from curvafit.files import move_together, remove, staged
+from curvafit.interrupts import undisturbed
+from curvafit.segmentation.probability import entropy
+from curvafit.segmentation.result import Segmentation, Uncertainty
 from curvafit.volumes.formats import pick_writer
 from curvafit.volumes.formats.nifti import write_nifti_like
 from curvafit.volumes.scan import Field, save
@@ -30,22 +32,28 @@ _NIFTI = (".nii", ".nii.gz")
 
 
 def check_mask_target(
-    path: str | Path, unit: str | None = None, inputs: Iterable[str | Path] = (), overwrite: bool = False
+    path: str | Path,
+    unit: str | None = None,
+    inputs: Iterable[str | Path] = (),
+    overwrite: bool = False,
+    *,
+    probability: bool = False,
 ) -> Path:
     """Return the path, or raise ValueError where a mask in `unit` cannot be written there; called before the work.
 
     `inputs` are the files, or folders, that are read: none may be overwritten. `overwrite` says whether files of other
-    origin may be replaced.
+    origin may be replaced, `probability` whether a map goes beside the mask.
 
     Raises
     ------
     ValueError
-        If the suffix is not a volume's, its format needs a unit, the folder cannot be written to, or the mask, the
-        record or the picture would replace an input or another file.
+        If the suffix is not a volume's, its format needs a unit, the folder cannot be written to, or one of the files
+        would replace an input or another file.
     """
     target = Path(path)
     pick_writer(target, unit or "mm")
-    return check_outputs(target, FORMAT, more=[beside(target, ".png")], inputs=inputs, overwrite=overwrite)
+    more = [beside(target, ".png"), *([_map_path(target)] if probability else [])]
+    return check_outputs(target, FORMAT, more=more, inputs=inputs, overwrite=overwrite)
 
 
 def write_mask(
@@ -57,8 +65,10 @@ def write_mask(
     unit: str | None = None,
     record: dict[str, Any] | None = None,
     overwrite: bool = False,
-) -> tuple[Path, Path, Path]:
-    """Write the mask (0 and 1, uint8), a picture of the middle slices, and a record.
+) -> tuple[Path, ...]:
+    """Write the mask (0 and 1, uint8), a picture, a record, and the probability of the inside where there is one.
+
+    The picture shows the middle slices, or the most uncertain ones with their uncertainty.
 
     Parameters
     ----------
@@ -75,34 +85,70 @@ def write_mask(
 
     Returns
     -------
-    The paths of mask, picture (`.png`) and record (`.json`), which appear together once all three are whole.
+    The paths of mask, picture (`.png`), record (`.json`) and probability (`mask_probability.nii.gz` beside
+    `mask.nii.gz`), which appear together once all are whole. A former probability goes.
     """
-    target = check_mask_target(path, scan.unit, () if like is None else (like,), overwrite)
-    mask = segmentation.mask.values.view(np.uint8)
+    chances = segmentation.probability
+    inputs = () if like is None else (like,)
+    target = check_mask_target(path, scan.unit, inputs, overwrite, probability=chances is not None)
+    former = _map_path(target).name in own_files(target, FORMAT)
+
+    def write(values: np.ndarray, place: Path) -> Path:
+        if like is not None and all(str(each).lower().endswith(_NIFTI) for each in (like, target)):
+            write_nifti_like(values, Path(like), place, unit)
+        else:
+            save(Field(values, scan.spacing, scan.unit, scan.affine), place, kind=FORMAT)
+        return place
+
     with staged(target) as work:
         temporary = work / target.name
-        if like is not None and all(str(each).lower().endswith(_NIFTI) for each in (like, target)):
-            write_nifti_like(mask, Path(like), temporary, unit)
-        else:
-            save(Field(mask, scan.spacing, scan.unit, scan.affine), temporary, kind=FORMAT)
+        write(segmentation.mask.values.view(np.uint8), temporary)
         picture, note = beside(temporary, ".png"), beside(temporary, ".json")
         rows = [(scan.values, None), (scan.values, segmentation.mask.values)]
-        section_figure(rows, scan.spacing).savefig(picture, dpi=DPI)
-        parts = (temporary, picture, note)
+        _figure(rows, segmentation).savefig(picture, dpi=DPI)
+        parts = [temporary, picture, note]
+        if chances is not None:
+            parts.append(write(chances.values, _map_path(temporary)))
         content = {**_record(segmentation, scan, record or {}), "files": [part.name for part in parts]}
         note.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-        return move_together(parts, target.parent)  # type: ignore[return-value]
+        with undisturbed():
+            files = move_together(parts, target.parent)
+            if former and chances is None:
+                remove(_map_path(target))
+        return files
 
 
 def segmentation_figure(segmentation: Segmentation) -> Figure:
-    """Return a figure of the phase field's middle slices with the mask's outline.
+    """Return a figure of the phase field's middle slices with the mask's outline, or of the most uncertain slices.
 
     Raises
     ------
     ValueError
         If the phase field is not finite.
     """
-    return section_figure([(segmentation.phase.values, segmentation.mask.values)], segmentation.phase.spacing)
+    return _figure([(segmentation.phase.values, segmentation.mask.values)], segmentation)
+
+
+def _figure(rows: list[tuple[np.ndarray, np.ndarray | None]], segmentation: Segmentation) -> Figure:
+    """Return a figure of the middle slices; of a probability its entropy too, and the most uncertain slices."""
+    chances, mask = segmentation.probability, segmentation.mask
+    if chances is None:
+        return section_figure(rows, mask.spacing)
+    unsure = entropy(chances.values)
+    places = [int(unsure.sum(tuple({0, 1, 2} - {axis})).argmax()) for axis in range(3)]
+    return section_figure([*rows, (unsure, mask.values)], mask.spacing, places)
+
+
+def _map_path(target: Path) -> Path:
+    """Return where the probability goes: `mask_probability.nii.gz` beside `mask.nii.gz`."""
+    return beside(target, f"_probability{target.name.removeprefix(beside(target, '').name)}")
+
+
+def _doubts(uncertain: Uncertainty | None) -> dict[str, Any]:
+    if uncertain is None:
+        return {}
+    names = ("seeds", "calibration_error", "suggestions")
+    return {name: getattr(uncertain, name) for name in names} | {"runs": len(uncertain.seeds)}
 
 
 def _record(segmentation: Segmentation, scan: Field, more: dict[str, Any]) -> dict[str, Any]:
@@ -118,6 +164,7 @@ def _record(segmentation: Segmentation, scan: Field, more: dict[str, Any]) -> di
         "epsilon": segmentation.epsilon,
         "weight": segmentation.weight,
         "volume_fraction": float(segmentation.mask.values.mean()),
+        **_doubts(segmentation.uncertainty),
         "notes": list(segmentation.notes),
         "curvafit": version("curvafit"),
         "torch": version("torch"),

@@ -12,10 +12,33 @@ from curvafit.segmentation.lowering import Lowered
 from curvafit.units import sampling
 from curvafit.volumes.field import Field
 
-__all__ = ["Segmentation", "ending", "filled", "result_of"]
+__all__ = ["Segmentation", "Uncertainty", "ending", "filled", "result_of"]
 
 #: A flow has settled where its last ten steps lower the energy by less than this share.
 SETTLED = 0.001
+
+
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """What several runs say of a volume between known slices.
+
+    Attributes
+    ----------
+    probability
+        The probability of the inside, float32, with the scan's grid, spacing, unit and affine; 0 or 1 on known slices.
+    seeds
+        The seed of each run.
+    calibration_error
+        By how much shares inside differ from probabilities, on average, within 3 voxels of the surface, on the slices
+        that the probabilities were calibrated on.
+    suggestions
+        Numbers of the slices to annotate next, the most telling first.
+    """
+
+    probability: Field
+    seeds: tuple[int, ...]
+    calibration_error: float
+    suggestions: tuple[int, ...]
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -34,6 +57,8 @@ class Segmentation(Pictured):
         A sentence: what a prior gained, whether the flow settled, and which share of the volume is inside.
     notes
         Sentences on the evidence and on assumptions.
+    uncertainty
+        The probability of the inside, and what to annotate next, of a reconstruction with several runs.
     """
 
     mask: Field
@@ -43,6 +68,12 @@ class Segmentation(Pictured):
     epsilon: float
     status: str
     notes: tuple[str, ...]
+    uncertainty: Uncertainty | None = None
+
+    @property
+    def probability(self) -> Field | None:
+        """The probability of the inside, of a reconstruction with several runs."""
+        return None if self.uncertainty is None else self.uncertainty.probability
 
     def __repr__(self) -> str:
         mask = self.mask.values
@@ -77,7 +108,8 @@ def result_of(
     epsilon: float,
     status: str,
     notes: tuple[str, ...],
+    uncertainty: Uncertainty | None = None,
 ) -> Segmentation:
     """Return the segmentation of a scan from its arrays (Z, Y, X)."""
     fields = [replace(scan, values=values, source=scan.source, notes=()) for values in (mask, u)]
-    return Segmentation(fields[0], fields[1], weight, law, epsilon, status, (*scan.notes, *notes))
+    return Segmentation(fields[0], fields[1], weight, law, epsilon, status, (*scan.notes, *notes), uncertainty)

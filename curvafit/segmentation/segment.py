@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from os import PathLike
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -15,32 +15,19 @@ from curvafit.priors.bounds import real
 from curvafit.priors.coefficients import Coefficients
 from curvafit.progress import Progress, part, silent
 from curvafit.segmentation.engine import BENDING, STEPS, bending, likelihood, started
-from curvafit.segmentation.evidence import (
-    Classes,
-    VoxelEvidence,
-    bounds_of,
-    check_chances,
-    check_map,
-    classes_of,
-    cropped_map,
-    grey_levels,
-    of_chances,
-    of_classes,
-)
+from curvafit.segmentation.evidence import Classes, VoxelEvidence, bounds_of, classes_of, grey_levels, of_classes
 from curvafit.segmentation.lowering import Workers, lowered
 from curvafit.segmentation.result import Segmentation, ending, filled, result_of
 from curvafit.segmentation.tiles import Tiling
 from curvafit.segmentation.weighing import Weighing, busiest, weighing
 from curvafit.segmentation.working import Law, WorkingGrid, laws_of
 from curvafit.volumes.boxes import Boxes, boxes_of, extent, thinned
-from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.field import ScanError
 from curvafit.volumes.formats.part import Box, Crop
 from curvafit.volumes.source import Source
 
 __all__ = ["segment"]
 
-#: Cost in nats of a unit of the Willmore energy for probability maps.
-NATS = 1.0
 #: A law that is tried beside the prior's.
 WILLMORE = Coefficients.willmore()
 #: What is said of classes that may be noise.
@@ -57,7 +44,6 @@ def segment(
     scan: Source | Boxes,
     prior: Law,
     *,
-    probability: Source | Boxes | None = None,
     weight: float | None = None,
     threshold: float | str = "otsu",
     dark: bool = False,
@@ -74,7 +60,7 @@ def segment(
 
     Which law is lowered, and with which weight, is decided by grey levels that are left out: those that a fit trusts
     and the Willmore energy are tried, and where none tells them better than the start does, the start is the answer.
-    Of a probability map nothing can be left out, since its voxels tell each other.
+    A network's probabilities are for `refine`: none of them can be left out, since they tell each other.
 
     Parameters
     ----------
@@ -83,13 +69,9 @@ def segment(
     prior
         `Coefficients` with lengths in the scan's unit; or a preset's name, in working units of which the smallest voxel
         edge is 0.01; or the path of a `fit.json`, whose unit is converted.
-    probability
-        The probability of the inside, in [0, 1], in place of grey levels, `threshold` and `dark`: a volume of the
-        scan's shape, at the scan's place where both files state one. A file's map has the scan's `spacing` and `unit`.
     weight
         λ, in nats per unit of F_ε, for the first law; by default it is chosen, with the law, by voxels left out. Small
-        bumps on a plane cost (a20 + a02) / 2 times their Willmore energy (linear terms aside, since ∫κ1κ2 = 0). For a
-        probability map it is 2 / (a20 + a02) by default: the prior then counts as strongly as the Willmore energy.
+        bumps on a plane cost (a20 + a02) / 2 times their Willmore energy (linear terms aside, since ∫κ1κ2 = 0).
     threshold, dark
         The grey level between the phases, or `"otsu"`; whether the structure is the dark one.
     epsilon
@@ -104,7 +86,7 @@ def segment(
         A folder in which finished tiles stay: the same call goes on with them after a kill, and the result's arrays are
         mapped files there. Whoever lowers the tiles, such as `curvafit.data_synth.atlas.workers.cluster`.
     crop
-        A box of voxels, of the scan and of the probability map: see `curvafit.load`.
+        A box of voxels: see `curvafit.load`.
     progress
         Called with a sentence and the share done.
     reading
@@ -121,34 +103,28 @@ def segment(
     frame = boxes.frame
     laws, notes = laws_of(prior, frame)
     tiling = Tiling.of(frame, epsilon, tile)
-    stiffness = bending(laws[0]) / BENDING
-    nats = NATS if weight is None else real(weight, "a positive weight", *WEIGHTS) * stiffness
+    if weight is not None:
+        weight = real(weight, "a positive weight", *WEIGHTS)
     if not (isinstance(threshold, str) and threshold == "otsu"):
         real(threshold, "a threshold that is a number or 'otsu'")
+    extent(boxes)
+    sample, blocks = thinned(boxes)
+    values, bounds = grey_levels(sample, threshold), bounds_of(sample.values.astype(np.float32), threshold)
+    classes = classes_of(values, sample, threshold, dark)
+    _check_phases(_Grey(boxes, bounds, classes), tiling)
+    law, nats = laws[0], bending(laws[0]) / BENDING * (weight or 0.0)
     chosen: Weighing | None = None
-    if probability is not None:
-        if dark or threshold != "otsu":
-            raise ScanError("expected neither a threshold nor dark with a probability map, which says what is inside")
-        evidence = _likely(probability, frame, crop, reading)
-        _check_phases(evidence, tiling)
-    else:
-        extent(boxes)
-        sample, blocks = thinned(boxes)
-        values, bounds = grey_levels(sample, threshold), bounds_of(sample.values.astype(np.float32), threshold)
-        classes = classes_of(values, sample, threshold, dark)
-        _check_phases(_Grey(boxes, bounds, classes, ""), tiling)
-        if weight is None:
-            overlap, block = threshold == "otsu" and classes.faint, busiest(values, sample, classes, blocks)
-            chosen = weighing(
-                values[block], sample.crop(block), classes, (*laws, *({WILLMORE} - set(laws))),
-                epsilon=epsilon, steps=steps, measured=overlap, progress=part(progress, 0.0, TRIALS),
-            )  # fmt: skip
-            nats, classes, progress = chosen.nats, chosen.classes, part(progress, TRIALS, 1.0)
-        evidence = _Grey(boxes, bounds, classes, str(classes))
-        if classes.faint and threshold == "otsu" and (chosen is None or chosen.law is None):
-            notes = (*notes, FAINT)
-    notes = (*notes, f"{evidence.note[0].upper()}{evidence.note[1:]}.", *tiling.place.notes)
-    law = laws[0] if chosen is None else chosen.law
+    if weight is None:
+        overlap, block = threshold == "otsu" and classes.faint, busiest(values, sample, classes, blocks)
+        chosen = weighing(
+            values[block], sample.crop(block), classes, (*laws, *({WILLMORE} - set(laws))),
+            epsilon=epsilon, steps=steps, measured=overlap, progress=part(progress, 0.0, TRIALS),
+        )  # fmt: skip
+        law, nats, classes, progress = chosen.law, chosen.nats, chosen.classes, part(progress, TRIALS, 1.0)
+    evidence, note = _Grey(boxes, bounds, classes), str(classes)
+    if classes.faint and threshold == "otsu" and (chosen is None or chosen.law is None):
+        notes = (*notes, FAINT)
+    notes = (*notes, f"{note[0].upper()}{note[1:]}.", *tiling.place.notes)
     found = lowered(_Scan(evidence, law, nats, steps), tiling, store=store, workers=workers, progress=progress)
     λ = weight if weight is not None or law is None else nats * BENDING / bending(law)
     status = filled(found.mask) if law is None else ending(found)
@@ -159,18 +135,6 @@ def segment(
     )
 
 
-class _Evidence(Protocol):
-    """The evidence of a box of voxels, and a sentence on it."""
-
-    @property
-    def boxes(self) -> Boxes: ...
-
-    @property
-    def note(self) -> str: ...
-
-    def __call__(self, box: Box, /) -> VoxelEvidence: ...
-
-
 @dataclass(frozen=True, eq=False)
 class _Grey:
     """The evidence of grey levels, cut at bounds, with known classes."""
@@ -178,38 +142,17 @@ class _Grey:
     boxes: Boxes
     bounds: tuple[float, float]
     classes: Classes
-    note: str
 
-    def __call__(self, box: Box, /) -> VoxelEvidence:
+    def __call__(self, box: Box) -> VoxelEvidence:
         values = self.boxes.part(box).astype(np.float32).clip(*self.bounds)
         return of_classes(values, self.boxes.frame, self.classes)
-
-
-@dataclass(frozen=True, eq=False)
-class _Chances:
-    """The evidence of probabilities, for a scan with a frame."""
-
-    boxes: Boxes
-    frame: Field
-    note: str
-
-    def __call__(self, box: Box, /) -> VoxelEvidence:
-        return of_chances(self.boxes.part(box).astype(np.float32), self.frame, self.note)
-
-
-def _likely(probability: Source | Boxes, frame: Field, crop: Crop | None, reading: dict[str, Any]) -> _Chances:
-    """Return the evidence of a probability map, once it is sure to be one of the scan."""
-    placed = {name: reading.get(name) for name in ("spacing", "unit")} if isinstance(probability, _UNPLACED) else {}
-    check_map(cropped_map(boxes_of(probability, **placed).frame, crop), frame)
-    boxes = boxes_of(probability, crop=crop, **placed)
-    return _Chances(boxes, frame, check_chances(*extent(boxes)))
 
 
 @dataclass(frozen=True, eq=False)
 class _Scan:
     """A scan's evidence, and a law with its weight."""
 
-    evidence: _Evidence
+    evidence: _Grey
     law: Coefficients | None
     nats: float
     steps: int
@@ -217,7 +160,7 @@ class _Scan:
     @property
     def parts(self) -> dict[str, object]:
         evidence = self.evidence
-        return {"scan": evidence.boxes.digest, "evidence": evidence.note, "nats": self.nats}
+        return {"scan": evidence.boxes.digest, "evidence": str(evidence.classes), "nats": self.nats}
 
     def given(self, box: Box, place: WorkingGrid) -> tuple[np.ndarray, Evidence]:
         """Return the first guess and the evidence on a box."""
@@ -233,7 +176,7 @@ class _Scan:
         return phase > 0
 
 
-def _check_phases(evidence: _Evidence, tiling: Tiling) -> None:
+def _check_phases(evidence: _Grey, tiling: Tiling) -> None:
     """Raise ScanError where the first guess has one phase only; tiles are looked at until there are both."""
     seen: set[bool] = set()
     for tile in tiling.tiles:

@@ -12,7 +12,7 @@ from scipy.interpolate import CubicSpline, make_interp_spline
 from curvafit.volumes.field import Field
 from curvafit.volumes.formats.part import Box
 
-__all__ = ["WAYS", "Slices"]
+__all__ = ["WAYS", "Slices", "plane_distances", "reach"]
 
 #: Plain interpolations, the usual one first: signed distances on a cubic spline and on lines; the nearest slice.
 WAYS = ("spline", "linear", "nearest")
@@ -61,7 +61,7 @@ class Slices:
 
     def known(self, box: Box) -> tuple[list[int], np.ndarray]:
         """Return the numbers, within a box, of the known slices there, and the masks in the box, bool (N, Y, X)."""
-        numbers, ys, xs = self._numbers(box)
+        numbers, ys, xs = self.numbers(box)
         row = {place: k for k, place in enumerate(self.places)}
         rows = [k for k, place in enumerate(numbers) if place in row]
         return rows, self.inside[[row[int(numbers[k])] for k in rows]][:, ys][:, :, xs]
@@ -80,8 +80,8 @@ class Slices:
         box
             Voxels; of a volume that repeats they may lie around it.
         """
-        numbers, ys, xs = self._numbers((slice(0, self.length), slice(0, None), slice(0, None)) if box is None else box)
-        places, distances = np.array(self.places), self._distances(ys, xs)
+        numbers, ys, xs = self.numbers((slice(0, self.length), slice(0, None), slice(0, None)) if box is None else box)
+        places, distances = np.array(self.places), self.distances(self.gap * self.spacing[0])[:, ys][:, :, xs]
         where = numbers.clip(places[0], places[-1])
         if self.periodic:
             places, distances = np.append(places, places[0] + self.length), np.concatenate([distances, distances[:1]])
@@ -96,20 +96,75 @@ class Slices:
         return curve(where).astype(np.float32)
 
     @property
+    def reach(self) -> np.ndarray:
+        """How far each slice is from the known ones, (length,), in the unit of the spacing; see `reach`."""
+        return self.spacing[0] * reach(self.places, self.length, self.periodic)
+
+    @property
     def gap(self) -> int:
         """The largest distance of two slices that follow each other, in slices."""
         steps = np.diff(self.places)
         return int(max(*steps, self.places[0] + self.length - self.places[-1]) if self.periodic else steps.max())
 
-    def _numbers(self, box: Box) -> list[np.ndarray]:
+    def numbers(self, box: Box) -> list[np.ndarray]:
         """Return the numbers of a box's voxels along each axis."""
         edges = zip(box, self.shape, strict=True)
         return [np.arange(edge.start, n if edge.stop is None else edge.stop) % n for edge, n in edges]
 
-    def _distances(self, ys: np.ndarray, xs: np.ndarray) -> np.ndarray:
-        """Return the signed distances within the known planes, at these rows and columns."""
-        edges, gap = self.spacing[1:], self.gap * self.spacing[0]
-        return np.stack([_plane_distance(mask, edges, gap)[np.ix_(ys, xs)] for mask in self.inside])
+    @property
+    def neighbours(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """For each slice of the volume: its distance in slices from the nearer of the known slices around it, and the
+        numbers of this one and of the other, 0 to N - 1; both are the same before the first and beyond the last.
+        """
+        places, where, count = np.array(self.places), np.arange(self.length), len(self.places)
+        before, after = np.searchsorted(places, where, "right") - 1, np.searchsorted(places, where, "left")
+        if not self.periodic:
+            before, after = before.clip(0), after.clip(max=count - 1)
+        down, up = where - places[before % count], places[after % count] - where
+        if self.periodic:
+            down, up = down % self.length, up % self.length
+        before, after, down, up = before % count, after % count, np.abs(down), np.abs(up)
+        return np.minimum(down, up), np.where(down <= up, before, after), np.where(down <= up, after, before)
+
+    @property
+    def between(self) -> np.ndarray:
+        """Which slices of the volume lie between two known ones, bool (length,)."""
+        away, near, far = self.neighbours
+        return (away > 0) & (near != far)
+
+    def distances(self, gap: float) -> np.ndarray:
+        """Return the known slices' signed distances within the plane, positive inside: minus `gap` in an empty mask,
+        plus `gap` in a full one.
+        """
+        return plane_distances(self.inside, self.spacing[1:], gap)
+
+
+def reach(places: Sequence[int], length: int, periodic: bool = False) -> np.ndarray:
+    """Return how far slices are from the known ones, float64 (length,), in slices: the error of an interpolation grows
+    in proportion.
+
+    With the distances d and e to the known slices before and after it is d e / (d + e): 0 at a known slice, a quarter
+    of the gap in its middle. Where there is none on one side, it is the distance to the other.
+
+    Parameters
+    ----------
+    places
+        Numbers of the known slices, ascending.
+    """
+    known, every = np.array(places), np.arange(length)
+    if periodic:
+        known = np.concatenate([known - length, known, known + length])
+    ends = np.concatenate([[-np.inf], known, [np.inf]])
+    before, after = every - ends[ends.searchsorted(every, "right") - 1], ends[ends.searchsorted(every)] - every
+    near, far = np.minimum(before, after), np.maximum(before, after)
+    return near / (1 + near / np.maximum(far, 1))
+
+
+def plane_distances(masks: np.ndarray, spacing: Sequence[float], gap: float) -> np.ndarray:
+    """Return signed distances within planes (N, Y, X) with voxel edges (y, x), positive inside; empty and full planes
+    have minus and plus the gap.
+    """
+    return np.stack([_plane_distance(mask, spacing, gap) for mask in masks])
 
 
 def _plane_distance(mask: np.ndarray, spacing: Sequence[float], gap: float) -> np.ndarray:

@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from curvafit.priors.coefficients import Coefficients
 from curvafit.progress import Progress, silent
-from curvafit.segmentation.calibration import BEYOND
+from curvafit.segmentation.calibration import BEYOND, climbed
 from curvafit.segmentation.engine import HALO, weighed
 from curvafit.segmentation.evidence import LEAST_NOISE, Classes, VoxelEvidence, of_classes
 from curvafit.segmentation.working import WorkingGrid
@@ -203,16 +203,13 @@ class _Trials:
     def best(self, laws: Sequence[Coefficients], number: int, classes: Classes) -> _Trial:
         """Return the best law at the weight of a number, or at the weights on either side of it while they are better
         still."""
-        first = best = max((self._trial(law, number, classes) for law in laws), key=lambda each: each.worth)
-        for step in (1, -1):
-            last = first
-            while 0 <= last.number + step < len(WEIGHTS):
-                further = self._trial(last.law, last.number + step, classes)
-                if further.worth <= last.worth:
-                    break
-                last = further
-            best = max(best, last, key=lambda each: each.worth)
-        return best
+
+        def neighbour(trial: _Trial, step: int) -> _Trial | None:
+            further = trial.number + step
+            return self._trial(trial.law, further, classes) if 0 <= further < len(WEIGHTS) else None
+
+        first = max((self._trial(law, number, classes) for law in laws), key=_worth)
+        return climbed(first, neighbour, _worth)
 
     def _trial(self, law: Coefficients, number: int, classes: Classes) -> _Trial:
         if (law, number, classes) not in self._made:
@@ -229,6 +226,10 @@ class _Trials:
         except ScanError:
             return _Trial(law, number, classes, np.zeros((2, *self._part.shape), dtype=bool), -np.inf)
         return _Trial(law, number, classes, phases, self._judge.worth(phases))
+
+
+def _worth(trial: _Trial) -> float:
+    return trial.worth
 
 
 def _sides(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 
@@ -12,8 +12,8 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from curvafit.priors.bounds import LONGEST, SHORTEST, instance, real
-from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.fit_file import fit_bytes, parse_fit, six_of
+from curvafit.priors.coefficients import NAMES, Coefficients
+from curvafit.priors.fit_file import Prior, fit_bytes, parse_fit, six_of
 from curvafit.priors.fit_schema import FIT_SCHEMA
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.priors.law import Law, texture_of
@@ -22,7 +22,7 @@ from curvafit.priors.refined import refined
 from curvafit.units import METRES
 from curvafit.volumes.scan import Field, ScanError
 
-__all__ = ["Law", "WorkingGrid", "law_of", "laws_of"]
+__all__ = ["Law", "WorkingGrid", "drawn_laws", "law_of", "laws_of"]
 
 #: Whether there is a halo before and beyond the voxels, along each axis.
 Ends = tuple[tuple[bool, bool], tuple[bool, bool], tuple[bool, bool]]
@@ -64,10 +64,37 @@ def laws_of(prior: Law, scan: Field) -> tuple[tuple[Coefficients, ...], tuple[st
     fitted = texture_of(prior).prior
     if fitted is None:
         return (law,), notes
-    scale = WORKING_SPACING / fitted.working_voxel
     others = (each for each in _candidates(prior) if each != fitted.coefficients)
-    priors = (fitted._replace(coefficients=each, physical=each.in_unit(scale)) for each in others)
-    return (law, *(law_of(each, scan)[0] for each in priors)), notes
+    return (law, *_in_scan(others, fitted, scan)), notes
+
+
+def drawn_laws(prior: Law, scan: Field, count: int) -> tuple[Coefficients, ...]:
+    """Return so many laws drawn from the posterior of a fit, with lengths in the scan's unit; none of other priors."""
+    fitted = texture_of(prior).prior
+    rows = np.empty((0, 5)) if fitted is None else _draws(prior)
+    if fitted is None or not len(rows):
+        return ()
+    some = rows[np.linspace(0, len(rows) - 1, count).astype(int)]
+    return _in_scan((Coefficients(1.0, *map(float, row)) for row in some), fitted, scan)
+
+
+def _in_scan(laws: Iterable[Coefficients], fitted: Prior, scan: Field) -> tuple[Coefficients, ...]:
+    """Return laws in a fit's working units with lengths in the scan's unit."""
+    scale = WORKING_SPACING / fitted.working_voxel
+    priors = (fitted._replace(coefficients=each, physical=each.in_unit(scale)) for each in laws)
+    return tuple(law_of(each, scan)[0] for each in priors)
+
+
+def _draws(prior: Law) -> np.ndarray:
+    """Return a fit's draws of the coefficients but a20 = 1, (N, 5), from the fit or its file; N = 0 without draws."""
+    if isinstance(prior, (str, PathLike)):
+        posterior = parse_fit(fit_bytes(prior), prior, FIT_SCHEMA).get("posterior") or {"draws": {}}
+        columns = [posterior["draws"].get(name, ()) for name in NAMES[1:]]
+        if len({len(column) for column in columns}) > 1:
+            raise ScanError(f"expected draws of one length in the posterior of {prior}, got {[*map(len, columns)]}")
+        return np.array(columns, dtype=np.float64).T
+    draws = getattr(getattr(prior, "fit", prior), "draws", None)
+    return np.empty((0, 5)) if draws is None else draws.values[:, :5]
 
 
 def _candidates(prior: Law) -> list[Coefficients]:

@@ -18,7 +18,7 @@ from curvafit.volumes.formats import Raw, ScanError, normalise_unit
 from curvafit.volumes.formats.guard import read_file
 from curvafit.volumes.formats.part import Crop, Part, box_of, selected
 
-__all__ = ["Source", "field_of", "load", "located", "placed", "read_values"]
+__all__ = ["Source", "field_of", "load", "located", "place_of", "placed", "read_values"]
 
 #: A volume as a caller gives it.
 Source = str | os.PathLike[str] | Field | np.ndarray | torch.Tensor
@@ -127,6 +127,21 @@ def load(
     _check_values(raw.values, location)
     field = placed(raw, f"{location}::{key}" if key else str(location), spacing, unit)
     return _part(field if part.crop is None else field.moved(start), label)
+
+
+def place_of(path: str | os.PathLike[str]) -> Field:
+    """Return the content of a volume file for its place: spacing, unit and affine; its values are not checked.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ScanError
+        If the suffix is unknown, the file is damaged, or the volume is not 3D.
+    """
+    location, key = located(path, None)
+    raw, _ = selected(read_file(location, key), Part(), location)
+    return placed(raw, str(location), None, None)
 
 
 def read_values(path: str | os.PathLike[str]) -> np.ndarray:

@@ -91,7 +91,7 @@ def fit() -> dict[str, Any]:
 
 
 def _write_scans(folder: Path) -> None:
-    """Tubes through a box: a noisy scan, a mask, a field."""
+    """Tubes through a box: a noisy scan, a mask, a field, a network's probabilities beside its mask."""
     import nibabel
 
     z, y, x = np.meshgrid(*(np.arange(n) for n in (16, 17, 18)), indexing="ij")
@@ -103,6 +103,9 @@ def _write_scans(folder: Path) -> None:
         image = nibabel.Nifti1Image(values.T, np.diag([0.0195] * 3 + [1.0]))
         image.header.set_xyzt_units("mm")
         nibabel.save(image, folder / f"{name}.nii.gz")
+    inside = (0.5 + 0.45 * phase).astype(np.float16)
+    np.savez_compressed(folder / "chances.npz", probabilities=np.stack((1 - inside, inside)))
+    shutil.copyfile(folder / "mask.nii.gz", folder / "chances.nii.gz")
 
 
 def _write_channels(folder: Path) -> None:

@@ -77,7 +77,7 @@ COMMANDS: dict[str, Command] = {
     "generate-preset": Command(("generate", *_SMALL, "-o", "out.npy"), "preset prior maps", each=5),
     "segment": Command(
         ("segment", "scan.nii.gz", *_PRIOR),
-        "weight threshold epsilon steps spacing unit key prior raw-shape dtype probability channel label crop",
+        "weight threshold epsilon steps spacing unit key prior raw-shape dtype channel label crop",
         "steps",
         taking("scan.nii.gz"),
         each=6,
@@ -85,10 +85,24 @@ COMMANDS: dict[str, Command] = {
     "segment-channels": Command(
         ("segment", "channels.nii.gz", "--channel", "0", *_PRIOR), "channel crop", setup=taking("channels.nii.gz")
     ),
+    "refine": Command(
+        ("refine", "chances.npz", "--channel", "1", "--weight", "1", *_PRIOR),
+        "weight epsilon steps spacing unit key prior channel label crop like",
+        "steps",
+        taking("chances.npz", "chances.nii.gz"),
+        each=6,
+    ),
+    "refine-example": Command(
+        ("refine", "chances.npz", "--channel", "1", "--example", "{larder}/chances.nii.gz", "--example-probabilities",
+         "{larder}/chances.npz", *_PRIOR),
+        "weight example example-probabilities channel label",
+        setup=taking("chances.npz", "chances.nii.gz"),
+        each=3,
+    ),
     "reconstruct": Command(
         ("reconstruct", "mask.nii.gz", "--every", "4", *_PRIOR),
-        "every first slices axis example stiffness periodic epsilon steps spacing unit channel label crop",
-        "steps",
+        "every first slices axis example stiffness periodic runs suggest epsilon steps spacing unit channel label crop",
+        "steps runs",
         taking("mask.nii.gz"),
         each=5,
     ),
@@ -224,6 +238,8 @@ _SENSELESS: dict[str, tuple[str, ...]] = {
     "infer-small": ("infer", "mask.nii.gz", "--fast", "--kind", "mask", "--atlas", "{larder}/atlas.npz", "-o", "out"),
     "infer-empty": ("infer", "", "-o", "out"),
     "segment-itself": ("segment", "mask.nii.gz", "--prior", "tubes", "-o", "mask.nii.gz"),
+    "refine-neither": ("refine", "chances.npz", "--channel", "1", "--prior", "tubes", "-o", "a.npy"),
+    "refine-grey": ("refine", "scan.nii.gz", "--prior", "tubes", "--weight", "1", "-o", "a.npy"),
     "reconstruct-both": (
         "reconstruct",
         "mask.nii.gz",

@@ -52,6 +52,11 @@ class Store:
         self.path, self.settings = path, settings
 
     @property
+    def name(self) -> str:
+        """Return the store's name in atlases and tables: its folder's, without the suffix."""
+        return self.path.resolve().name.removesuffix(".zarr")
+
+    @property
     def wanted(self) -> int:
         """Return how many viable shapes the store is to have."""
         attributes = _group_attributes(self.path)

@@ -38,10 +38,15 @@ from numba.extending import intrinsic, models, register_model
 
 #: Of fast-math not the leave to assume that no value is NaN or infinite: a diverged flow must show.
 _FLAGS = {"contract", "arcp", "nsz", "afn"}
-_SERIAL: dict[str, Any] = {"cache": True, "fastmath": _FLAGS | {"reassoc"}, "error_model": "numpy", "nogil": True}
-_INLINE: dict[str, Any] = {"fastmath": _FLAGS, "error_model": "numpy", "nogil": True, "forceinline": True}
-_SUMMING: dict[str, Any] = {**_INLINE, "fastmath": _FLAGS | {"reassoc"}}
-_PARALLEL: dict[str, Any] = {**_SERIAL, "parallel": True}
+_PLAIN: dict[str, Any] = {"fastmath": _FLAGS, "error_model": "numpy", "nogil": True}
+#: Parts are compiled into their callers; Python calls none of them, so that no wrappers are compiled.
+_PART: dict[str, Any] = {**_PLAIN, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+_INLINE: dict[str, Any] = {**_PART, "forceinline": True}
+_SUMS = {"fastmath": _FLAGS | {"reassoc"}}
+_SERIAL: dict[str, Any] = {**_PART, **_SUMS}
+_SUMMING: dict[str, Any] = {**_INLINE, **_SUMS}
+_COUNTING: dict[str, Any] = {**_PLAIN, "forceinline": True, "cache": True}
+_PARALLEL: dict[str, Any] = {**_PLAIN, **_SUMS, "parallel": True, "cache": True}
 
 
 def _features() -> str:
@@ -75,13 +80,13 @@ MOVE, ENDS, ALL = range(3)
 _at = np.uint64
 
 
-@njit(**_INLINE)
+@njit(**_COUNTING)
 def pitch(Y, X):
     """Count the floats from a plane to the next: the last row may be rounded up."""
     return ((Y + 2 * EDGE) * (X + 2 * EDGE) + 2 * LANES - 1) & -LANES
 
 
-@njit(**_INLINE)
+@njit(**_COUNTING)
 def row_length(X, taps):
     """Count the floats of a row, its continuation and what it is rounded up to."""
     return (X + taps + 2 * LANES) & -LANES
@@ -780,7 +785,8 @@ def adam_step(
     planes have moved, div A for the next step, blurred along y and x, while A is in the cache: `MOVE`. Then the planes
     whose neighbours another thread moved: `ENDS`. Or div A alone, of `ALL` planes."""
     for chunk in prange(rows.shape[0]):
+        # numba infers a signed counter and compiles an unsigned one: the part would be compiled for both.
         _adam_chunk(
-            chunk, phase, g, A, m, v, keep, out, rows, rings, slopes, fluxes, sums, highest, half, adam,
+            np.int64(chunk), phase, g, A, m, v, keep, out, rows, rings, slopes, fluxes, sums, highest, half, adam,
             shape, periodic, index_z, blur,
         )  # fmt: skip

@@ -1,0 +1,58 @@
+"""Plain interpolations of the volume between known slices, ITK's among them, and the scores of a volume."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+
+from curvafit.files import write_content
+from curvafit.geometry.topology import betti_numbers
+from curvafit.segmentation.slices import WAYS, Slices
+
+#: ITK's morphological contour interpolation (Albu, Beugeling, Laurendeau 2008; Zukić et al. 2016).
+ITK = "ITK"
+
+
+def baselines() -> tuple[str, ...]:
+    """The plain interpolations; ITK's where its package is installed, or a sentence on what to install."""
+    if find_spec("itk") is not None:
+        return (*WAYS, ITK)
+    print("no ITK: install itk-morphologicalcontourinterpolation, or the extra 'bench'")
+    return WAYS
+
+
+def interpolated(slices: Slices, way: str) -> np.ndarray:
+    """The mask of a plain interpolation."""
+    return _by_itk(slices) if way == ITK else slices.level(way) > 0
+
+
+def _by_itk(slices: Slices) -> np.ndarray:
+    """ITK's mask between the first and the last known slice, none beyond; it does not go around."""
+    import itk
+
+    labels = np.zeros((slices.length, *slices.inside.shape[1:]), dtype=np.uint8)
+    labels[list(slices.places)] = slices.inside
+    interpolator = itk.MorphologicalContourInterpolator.New(itk.image_from_array(labels))
+    interpolator.SetAxis(2)  # ITK counts axes from the last
+    interpolator.Update()
+    mask = itk.array_from_image(interpolator.GetOutput()) > 0
+    mask[list(slices.places)] = slices.inside
+    return mask
+
+
+def scores(mask: np.ndarray, truth: np.ndarray) -> dict[str, float]:
+    """Dice, and the sum of the Betti numbers' errors."""
+    pairs = zip(betti_numbers(mask), betti_numbers(truth), strict=True)
+    dice = 2 * float((mask & truth).sum()) / float(mask.sum() + truth.sum())
+    return {"dice": dice, "betti": float(sum(abs(a - b) for a, b in pairs))}
+
+
+def stored(path: Path, make: Callable[[], dict]) -> dict:
+    """What a file holds, made once."""
+    if not path.exists():
+        write_content(path, json.dumps(make()))
+    return json.loads(path.read_text())

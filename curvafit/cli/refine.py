@@ -1,0 +1,136 @@
+"""The command that makes a mask of a network's probabilities: refine."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from curvafit.cli.reading import Reading, reads_volume
+from curvafit.cli.segment import STEPS, Epsilon, OwnPrior, Steps, TileOption, Weight, WorkersOption, inferred, run_job
+from curvafit.cli.support import OverwriteOption, plainly, say_notes
+
+if TYPE_CHECKING:
+    from curvafit.progress import Progress
+    from curvafit.segmentation.result import Segmentation
+    from curvafit.volumes.boxes import Boxes
+
+EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
+    (
+        "curvafit refine p.nii.gz --example mask2.nii.gz --example-probabilities p2.nii.gz -o mask.nii.gz",
+        "curvafit refine case.npz --channel 1 --prior vessels/fit.json --weight 10 -o mask.nii.gz",
+        "curvafit refine predicted --channel 1 --example mask2.nii.gz --example-probabilities p2.npz -o refined",
+    )
+)
+
+_what = partial(typer.Option, rich_help_panel="What to do")
+
+Probabilities = Annotated[
+    str, typer.Argument(help="Probability of the inside: NIfTI, TIFF, NPY, NPZ, Zarr …; or a folder of NPZ files.")
+]
+Target = Annotated[Path, typer.Option("-o", "--output", help="Mask to write: .nii.gz .tif …; for a folder, a folder.")]
+Example = Annotated[Path | None, _what(help="True mask of another volume: law and weight are tried out on it.")]
+Others = Annotated[Path | None, _what(help="The same network's probabilities for the example.")]
+Like = Annotated[Path | None, _what(help="Image of the same voxels; by default one beside an NPZ, of its name.")]
+
+
+@reads_volume
+def refine(
+    probabilities: Probabilities,
+    out: Target,
+    prior: OwnPrior = None,
+    example: Example = None,
+    example_probabilities: Others = None,
+    weight: Weight = None,
+    epsilon: Epsilon = None,
+    *,
+    steps: Steps = STEPS,
+    tile: TileOption = None,
+    workers: WorkersOption = None,
+    like: Like = None,
+    reading: Reading,
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Make a mask of a network's probabilities, with a curvature prior where it helps; write mask, picture and record.
+
+    Law and weight are those that do best on an example; where p > 1/2 does best, that is the mask. Of nnU-Net's
+    NPZ files --channel takes the class; a folder of them becomes a folder of masks. --label is the example's.
+    """
+    with plainly():
+        from curvafit.segmentation.known import check_spacing
+        from curvafit.segmentation.refine import calibrate, chances_of, check_judge, image_beside, trial_steps
+        from curvafit.segmentation.refine import refine as refine_map
+
+        if (example is None) != (example_probabilities is None):
+            raise ValueError("expected --example and --example-probabilities together, got one of them")
+        check_judge(example, weight)
+        if prior is None and example is None:
+            raise ValueError("expected --prior or --example, got neither")
+        files = _files(probabilities, out)
+        if like is not None and len(files) > 1:
+            raise ValueError("expected no --like for a folder, where images lie beside the NPZ files, got one")
+        maps = {name: value for name, value in reading.items() if name != "label"}
+        others = {name: value for name, value in maps.items() if name != "crop"}
+        place = {name: reading[name] for name in ("spacing", "unit", "label", "strict")}
+        options = {"epsilon": epsilon, "steps": steps}
+        learned: dict[str, Any] = {}
+
+        def learn(volume: Boxes, progress: Progress) -> None:
+            """Try the prior out on the example, once."""
+            from curvafit.progress import part
+            from curvafit.volumes.scan import load
+
+            chances, mask = chances_of(example_probabilities, **others), load(example, **place)  # type: ignore[arg-type]
+            check_spacing(chances, volume.frame, "the probabilities")
+            say_notes((*chances.notes, *mask.notes))
+            learned["prior"] = prior if prior is not None else inferred(mask, progress)
+            tried = calibrate(chances, mask, learned["prior"], progress=part(progress, 0.0, 0.7), **options)
+            learned["example"], record["calibration"] = tried, tried.as_dict()
+
+        def compute(volume: Boxes, progress: Progress, **tools: Any) -> Segmentation:
+            from curvafit.volumes.boxes import whole_of
+
+            if example is not None and not learned:
+                learn(volume, progress)
+            told = learned or {"prior": prior, "weight": weight}
+            return refine_map(whole_of(volume), progress=progress, **told, **tools, **options)
+
+        def tried(laws: int, voxels: int) -> float:
+            return 0.0 if learned or example is None else trial_steps(laws + 1, steps, voxels)
+
+        named = {"example": example, "example_probabilities": example_probabilities, "like": like}
+        record: dict[str, Any] = {"job": "refine", "weight": weight, "tile": tile, **options}
+        record |= {name: None if path is None else str(path) for name, path in named.items()}
+        images = {source: like or (image_beside(source) if _unplaced(reading) else None) for source, _ in files}
+        if len(files) > 1:
+            _check(files, [*images.values(), *named.values()], maps, overwrite)
+        for source, target in files:
+            run_job(
+                source, target, prior, {**maps, "like": like}, compute, record,
+                overwrite=overwrite, tried=tried, workers=workers, read=chances_of, image=images[source],
+            )  # fmt: skip
+
+
+def _unplaced(reading: dict[str, Any]) -> bool:
+    """Return whether the options leave the place of the voxels to a file."""
+    return reading["spacing"] is None and reading["unit"] is None
+
+
+def _files(source: str, out: Path) -> list[tuple[str, Path]]:
+    """Return the maps to read and the masks to write: those of a folder of NPZ files, or one."""
+    maps = sorted(Path(source).glob("*.npz")) if Path(source).is_dir() else []
+    return [(str(path), out / f"{path.stem}.nii.gz") for path in maps] or [(source, out)]
+
+
+def _check(files: list[tuple[str, Path]], more: list[Path | None], reading: dict[str, Any], overwrite: bool) -> None:
+    """Read all maps and check all targets before the first is worked on."""
+    from curvafit.segmentation.evidence import of_probability
+    from curvafit.segmentation.mask_files import check_mask_target
+    from curvafit.segmentation.refine import chances_of
+
+    inputs = [*(source for source, _ in files), *(path for path in more if path is not None)]
+    for source, target in files:
+        check_mask_target(target, inputs=inputs, overwrite=overwrite)
+        of_probability(chances_of(source, **reading))

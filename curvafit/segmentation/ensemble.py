@@ -1,0 +1,156 @@
+"""Runs from other starts and under other laws, and what their agreement is worth where the truth is known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy import ndimage
+
+from curvafit.priors.coefficients import Coefficients
+from curvafit.priors.profile import profile_distance
+from curvafit.progress import Progress, part, silent
+from curvafit.segmentation.calibration import Setting, Task
+from curvafit.segmentation.probability import calibration_error, evidence, fitted, probability
+from curvafit.segmentation.slices import Slices, plane_distances
+
+__all__ = ["NEAR", "RUNS", "Chances", "Flow", "chances", "near"]
+
+#: Default number of runs.
+RUNS = 8
+#: Distance from a surface, in voxels, within which probabilities are judged.
+NEAR = 3
+
+#: Interpolates between slices in a way: a level (Z, Y, X), positive inside.
+Level = Callable[[Slices, str], np.ndarray]
+#: Fills a volume between slices by a setting, from a level of its own: a phase field (Z, Y, X), and ε.
+Flow = Callable[[Slices, Setting, np.ndarray, Progress], tuple[np.ndarray, float]]
+
+
+@dataclass(frozen=True, eq=False)
+class Chances:
+    """Probabilities of the inside.
+
+    Attributes
+    ----------
+    values
+        (Z, Y, X), float32: 0 or 1 on known slices.
+    error
+        The calibration error on the slices that the probabilities were fitted to, near the surface.
+    weights
+        Those of `probability.fitted`.
+    """
+
+    values: np.ndarray
+    error: float
+    weights: tuple[float, ...]
+
+
+def chances(
+    task: Task[Slices],
+    slices: Slices,
+    setting: Setting,
+    laws: Sequence[Coefficients | None],
+    runs: int,
+    *,
+    level: Level,
+    flow: Flow,
+    progress: Progress = silent,
+) -> Chances:
+    """Return the probability of the inside in each voxel between slices.
+
+    A few runs are too sure of what they agree on. So the same runs are made on a task, where it is known what is inside
+    how often, and three weights are fitted: of their votes, of the depth below their mean surface in units of a slice's
+    `reach`, and a constant.
+
+    Parameters
+    ----------
+    setting
+        The chosen one. Run number k starts from its interpolation with a smooth random displacement, of seed k, as
+        large as the interpolation errs on the task.
+    laws
+        Of which the runs take one after another; None lowers no energy.
+    """
+    spread = _spread(task, level(task.given, setting.way))
+    tried, target = (
+        _Runs.of(each, level(each, setting.way), setting, laws, spread, count=runs, flow=flow, progress=half)
+        for each, half in ((task.given, part(progress, 0, 0.5)), (slices, part(progress, 0.5, 1)))
+    )
+    rows = list(task.places)
+    weights = fitted(tried.evidence(rows), task.truth.ravel())
+    told = tried.probabilities(weights)
+    close = near(told > 0.5)[rows]
+    error = calibration_error(told[rows][close], task.truth[close])
+    return Chances(target.probabilities(weights), error, tuple(map(float, weights)))
+
+
+def near(mask: np.ndarray) -> np.ndarray:
+    """Return the voxels whose centres are within `NEAR` voxels of a mask's surface; none where there is no surface."""
+    if mask.all() or not mask.any():
+        return np.zeros(mask.shape, dtype=bool)
+    inner, outer = (np.asarray(ndimage.distance_transform_edt(side)) for side in (mask, ~mask))
+    return np.where(mask, inner, outer) < NEAR + 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class _Runs:
+    """What runs say: how many have a voxel inside, and the mean signed distance to their surfaces."""
+
+    slices: Slices
+    votes: np.ndarray
+    distance: np.ndarray
+    count: int
+
+    @classmethod
+    def of(
+        cls,
+        slices: Slices,
+        level: np.ndarray,
+        setting: Setting,
+        laws: Sequence[Coefficients | None],
+        spread: float,
+        *,
+        count: int,
+        flow: Flow,
+        progress: Progress,
+    ) -> _Runs:
+        votes, distance = np.zeros(level.shape, dtype=np.uint16), np.zeros(level.shape, dtype=np.float32)
+        for seed in range(count):
+            step = part(progress, seed / count, (seed + 1) / count)
+            start = level + (spread * slices.reach)[:, None, None].astype(np.float32) * _wave(slices, seed)
+            u, ε = flow(slices, replace(setting, law=laws[seed % len(laws)]), start, step)
+            votes += u > 0
+            distance += profile_distance(torch.from_numpy(u), ε).numpy() / count
+        return cls(slices, votes, distance, count)
+
+    def evidence(self, rows: Sequence[int]) -> np.ndarray:
+        """Return the evidence (N, 2) in the voxels of slices that are not known."""
+        depth = self.distance[rows] / self.slices.reach[rows, None, None]
+        return evidence(self.votes[rows].ravel(), self.count, depth.ravel())
+
+    def probabilities(self, weights: np.ndarray) -> np.ndarray:
+        values = np.empty(self.votes.shape, dtype=np.float32)
+        for row, far in enumerate(self.slices.reach):
+            if far > 0:
+                values[row] = probability(self.evidence([row]), weights).reshape(values.shape[1:])
+        values[list(self.slices.places)] = self.slices.inside
+        return values
+
+
+def _spread(task: Task[Slices], level: np.ndarray) -> float:
+    """Return how far an interpolation's distances are from a task's true ones, over the slices' reach: the median."""
+    slices, rows = task.given, list(task.places)
+    truth = plane_distances(task.truth, slices.spacing[1:], slices.gap * slices.spacing[0])
+    ratio = np.abs(level[rows] - truth) / slices.reach[rows, None, None]
+    return float(np.median(ratio[np.abs(truth) < NEAR * min(slices.spacing[1:])]))
+
+
+def _wave(slices: Slices, seed: int) -> np.ndarray:
+    """Return a smooth random field (Z, Y, X) of deviation 1, as long in all directions as a quarter of the gap."""
+    edges = np.array(slices.spacing)
+    noise = np.random.default_rng(seed).standard_normal(slices.frame.shape, dtype=np.float32)
+    mode = "wrap" if slices.periodic else "reflect"
+    wave = ndimage.gaussian_filter(noise, slices.gap * edges[0] / edges / 4, mode=mode)
+    return wave / wave.std()

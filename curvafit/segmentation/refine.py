@@ -1,0 +1,316 @@
+"""A network's probabilities and the energy F_ε of the surface: a better mask, and nothing is trained."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from curvafit.generation.data import Evidence
+from curvafit.priors.bounds import real
+from curvafit.priors.coefficients import Coefficients
+from curvafit.progress import Progress, part, silent
+from curvafit.segmentation.calibration import Choice, Setting, Task, choice
+from curvafit.segmentation.engine import BENDING, HALO, STEPS, bending, likelihood
+from curvafit.segmentation.evidence import VoxelEvidence, of_probability
+from curvafit.segmentation.known import check_place, check_spacing, labels
+from curvafit.segmentation.lowering import Workers, lowered
+from curvafit.segmentation.result import Segmentation, ending, filled, result_of
+from curvafit.segmentation.segment import TRIALS, WEIGHTS, WILLMORE
+from curvafit.segmentation.tiles import Tiling
+from curvafit.segmentation.weighing import densest
+from curvafit.segmentation.working import Law, WorkingGrid, laws_of
+from curvafit.volumes.boxes import digest_of
+from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.formats.part import Box, Crop
+from curvafit.volumes.source import Source, field_of, place_of
+
+__all__ = ["Calibration", "calibrate", "chances_of", "check_judge", "image_beside", "refine", "trial_steps"]
+
+#: The plain way from probabilities to a mask.
+PLAIN = "p > 1/2"
+#: Weights that are tried, in nats of a unit of the Willmore energy, and the first of them.
+NATS = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
+FIRST = 10.0
+#: Longest edge in voxels of the part of an example on which laws and weights are tried.
+EDGE = 96
+#: Images that may lie beside an NPZ file of the same name and say where its voxels are.
+IMAGES = (".nii.gz", ".nii", ".nrrd", ".mha", ".mhd", ".tif", ".tiff")
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What an example says of a prior for a network's probabilities.
+
+    Attributes
+    ----------
+    choice
+        The law and its strength in nats of a unit of the Willmore energy, or p > 1/2; and the Dice of both.
+    fitted
+        Whether the law is one of the prior's, rather than the Willmore energy.
+    example
+        The example's probabilities, whose voxels are as large as those of the maps that are refined.
+    """
+
+    choice: Choice
+    fitted: bool
+    example: Field
+
+    def __str__(self) -> str:
+        best = self.choice
+        if best.setting.law is None:
+            return f"no prior helps here: Dice {best.plain:.3f} on the example, {best.dice:.3f} with the best prior"
+        name = "the prior helps" if self.fitted else "the Willmore energy helps, more than the prior"
+        gain = f"{best.dice:.3f} on the example, {best.plain:.3f} without, ± {best.noise:.3f}"
+        return f"{name}, at {best.setting.strength:g} nats: Dice {gain}"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what was chosen and what it gained, for a record."""
+        best, law = self.choice, "prior" if self.fitted else "Willmore"
+        return {
+            "law": None if best.setting.law is None else law,
+            "nats": None if best.setting.law is None else best.setting.strength,
+            "dice": best.dice,
+            "dice_without": best.plain,
+            "noise": best.noise,
+        }
+
+
+def refine(
+    probabilities: Source,
+    prior: Law,
+    *,
+    example: tuple[Source, Source] | Calibration | None = None,
+    weight: float | None = None,
+    label: int | None = None,
+    epsilon: float | None = None,
+    steps: int = STEPS,
+    tile: int | None = None,
+    store: str | os.PathLike[str] | None = None,
+    workers: Workers | None = None,
+    progress: Progress = silent,
+    **reading: Any,
+) -> Segmentation:
+    """Find the structure in a network's probabilities p: lower Σ r over the outside + λ F_ε from p > 1/2, r = logit p.
+
+    A network is surer than it is right, and its errors lie side by side: the evidence of a voxel is worth τ logit p,
+    with a τ that is not known. Only λ / τ matters, and an example tells it: the laws that a fit trusts and the Willmore
+    energy are tried there at weights over decades, and where none is better than p > 1/2 beyond the noise, the mask is
+    p > 1/2. Where p > 1/2 has no surface, it stays as it is.
+
+    Parameters
+    ----------
+    probabilities
+        The probability of the inside, in [0, 1]: the path of a file, a `Field`, or an array or tensor (Z, Y, X).
+    prior
+        As in `segment`.
+    example
+        The same network's probabilities for another volume, on which it was not trained, and the true mask, which is
+        positive inside; or the `Calibration` by them. A file or an array is read as `probabilities` is.
+    weight
+        λ, in nats per unit of F_ε, in place of an example: the first law is lowered, whether that helps or not.
+    label
+        The voxels of the example's mask that are the structure have this value.
+    epsilon, steps, tile, store, workers, progress
+        As in `segment`.
+    reading
+        Options of reading a file, or the place of an array: `like`, the path of an image of the same voxels that says
+        where they are (by default one that lies beside an NPZ file and has its name, as nnU-Net's segmentations do);
+        spacing, unit, channel and the others of `curvafit.load`.
+
+    Raises
+    ------
+    ValueError
+        If there is neither an example nor a weight, or both; if the probabilities are not within [0, 1], or the
+        example's mask lies elsewhere or has no inside or outside; or as `segment`.
+    FileNotFoundError
+        If there is no such file.
+    """
+    check_judge(example, weight)
+    field = chances_of(probabilities, **reading)
+    evidence, tiling = of_probability(field), Tiling.of(field, epsilon, tile)
+    laws, notes = laws_of(prior, field)
+    said = ""
+    if example is None:
+        strength = real(weight, "a positive weight", *WEIGHTS) * bending(laws[0]) / BENDING
+        setting = Setting(PLAIN, laws[0], strength, steps)
+    else:
+        if not isinstance(example, Calibration):
+            alike = {name: value for name, value in reading.items() if name not in ("like", "crop")}
+            chances, truth = chances_of(example[0], **alike), _truth(example[1], label, alike)
+            check_spacing(chances, field, "the probabilities")
+            trials, progress = part(progress, 0.0, TRIALS), part(progress, TRIALS, 1.0)
+            example = calibrate(chances, truth, prior, epsilon=epsilon, steps=steps, progress=trials)
+        check_spacing(example.example, field, "the probabilities")
+        setting, said = example.choice.setting, f"{example}; "
+    mask, u, end = _filled(evidence, setting, tiling, progress, store=store, workers=workers)
+    λ = None if setting.law is None else setting.strength * BENDING / bending(setting.law)
+    notes = (*notes, f"{evidence.note[0].upper()}{evidence.note[1:]}.", *tiling.place.notes)
+    return result_of(
+        field, mask, u, weight=λ, law=setting.law, epsilon=tiling.place.epsilon, status=f"{said}{end}", notes=notes
+    )
+
+
+def calibrate(
+    probabilities: Source,
+    mask: Source,
+    prior: Law,
+    *,
+    label: int | None = None,
+    epsilon: float | None = None,
+    steps: int = STEPS,
+    progress: Progress = silent,
+    **reading: Any,
+) -> Calibration:
+    """Return the law and weight that bring a network's probabilities nearest to a true mask, for `refine`.
+
+    A part of 96³ voxels that holds most of the surface is judged by Dice. See `refine` for the parameters.
+
+    Raises
+    ------
+    ValueError
+        As `refine`.
+    FileNotFoundError
+        If there is no such file.
+    """
+    field, truth = chances_of(probabilities, **reading), _truth(mask, label, reading)
+    check_place(truth, field)
+    inside = labels(truth.values, "an example") > 0
+    if inside.all() or not inside.any():
+        got = "a full" if inside.all() else "an empty"
+        raise ScanError(f"expected an example with voxels inside and outside, got {got} mask")
+    laws, _ = laws_of(prior, field)
+    every = (*laws, *({WILLMORE} - set(laws)))
+    for law in laws:
+        bending(law)
+    of_probability(field)
+    where = densest(inside, (EDGE, EDGE, EDGE))
+    box = replace(field, values=field.values[where])
+    tiling = Tiling.of(box, epsilon)
+    count = 0
+
+    def fill(evidence: VoxelEvidence, setting: Setting) -> np.ndarray:
+        nonlocal count
+        count += 1
+        progress("trying the prior out", min(count / _expected(len(every)), 1.0))
+        try:
+            return _filled(evidence, setting, tiling, silent)[0]
+        except ScanError:  # the energy does not stay finite
+            return np.zeros(box.shape, dtype=bool)
+
+    task = Task(of_probability(box), inside[where], range(box.shape[0]))
+    best = choice(task, lambda way: [Setting(way, law, FIRST, steps) for law in every], fill, (PLAIN,), NATS)
+    return Calibration(best, best.setting.law in laws, field)
+
+
+def _truth(mask: Source, label: int | None, reading: dict[str, Any]) -> Field:
+    """Return an example's mask, read with the spacing and unit of its probabilities."""
+    placed = {} if isinstance(mask, Field) else {name: reading.get(name) for name in ("spacing", "unit")}
+    return field_of(mask, label=label, **placed)
+
+
+def check_judge(example: object, weight: float | None) -> None:
+    """Raise ScanError unless there is either an example or a weight."""
+    if (example is None) == (weight is None):
+        got = "neither" if weight is None else "both"
+        raise ScanError(f"expected either an example, on which law and weight are judged, or a weight, got {got}")
+
+
+def chances_of(
+    source: Source,
+    *,
+    like: str | os.PathLike[str] | None = None,
+    spacing: Sequence[float] | float | None = None,
+    unit: str | None = None,
+    crop: Crop | None = None,
+    **reading: Any,
+) -> Field:
+    """Return a network's probabilities at their place: that of an image of the same voxels, where there is one.
+
+    See `refine` for the parameters.
+
+    Raises
+    ------
+    ScanError
+        If the image has another shape, or both an image and a spacing or unit are given.
+    FileNotFoundError
+        If there is no such file.
+    """
+    stated = spacing is not None or unit is not None
+    if like is not None and stated:
+        raise ScanError("expected either an image that says where the voxels are, or a spacing and unit, got both")
+    image = image_beside(source) if like is None and not stated else like
+    if image is None:
+        return field_of(source, spacing=spacing, unit=unit, crop=crop, **reading)
+    place = place_of(image)
+    field = field_of(source, spacing=place.spacing, unit=place.unit, **reading)
+    if field.shape != place.shape:
+        raise ScanError(f"expected probabilities with the shape {place.shape} of {image}, got {field.shape}")
+    field = replace(field, affine=place.affine, notes=(*field.notes, f"The voxels are those of {image}."))
+    return field if crop is None else field.crop(crop)
+
+
+def image_beside(source: Source) -> Path | None:
+    """Return the image beside an NPZ file that has its name, None where there is none or the source is another."""
+    if not isinstance(source, str | os.PathLike) or not os.fspath(source).lower().endswith(".npz"):
+        return None
+    stem = os.fspath(source)[: -len(".npz")]
+    return next((Path(stem + suffix) for suffix in IMAGES if Path(stem + suffix).is_file()), None)
+
+
+def trial_steps(laws: int, steps: int, voxels: int) -> float:
+    """Return about how many steps of a flow on so many voxels it takes to try laws out on an example."""
+    return _expected(laws) * steps * min(1.0, (EDGE + 2 * HALO) ** 3 / voxels)
+
+
+def _expected(laws: int) -> int:
+    """Return about how many laws and weights are tried."""
+    return 2 * laws + 3
+
+
+@dataclass(frozen=True, eq=False)
+class _Chances:
+    """The evidence of probabilities, and a setting; where they have no surface, they stay as they are."""
+
+    evidence: VoxelEvidence
+    setting: Setting
+
+    @property
+    def law(self) -> Coefficients | None:
+        inside = self.evidence.level > 0
+        return None if inside.all() or not inside.any() else self.setting.law
+
+    @property
+    def steps(self) -> int:
+        return self.setting.steps
+
+    @property
+    def parts(self) -> dict[str, object]:
+        return {"probabilities": digest_of(self.evidence.ratio), "nats": self.setting.strength}
+
+    def given(self, box: Box, place: WorkingGrid) -> tuple[np.ndarray, Evidence]:
+        """Return the first guess and the evidence on a box."""
+        part = replace(self.evidence, ratio=self.evidence.ratio[box], level=self.evidence.level[box])
+        nats = self.setting.strength
+        return part.level, likelihood(part, nats, place)
+
+    def plain(self, level: np.ndarray, place: WorkingGrid) -> np.ndarray:
+        """Return 2 p - 1."""
+        return 2 * level
+
+    def mask(self, phase: np.ndarray, box: Box) -> np.ndarray:
+        """Return the voxels where the phase field is positive."""
+        return phase > 0
+
+
+def _filled(
+    evidence: VoxelEvidence, setting: Setting, tiling: Tiling, progress: Progress, **tools: Any
+) -> tuple[np.ndarray, np.ndarray, str]:
+    """Return the mask and the phase field of a setting, and how its flow ended."""
+    problem = _Chances(evidence, setting)
+    found = lowered(problem, tiling, progress=progress, **tools)
+    return found.mask, found.phase, filled(found.mask) if problem.law is None else ending(found)
