@@ -14,7 +14,7 @@ from curvafit.inference.candidates import Candidate
 from curvafit.priors.coefficients import Coefficients
 from curvafit.progress import silent
 from curvafit.segmentation.calibration import ODDS, Choice, Setting, Task, choice, left_out
-from curvafit.segmentation.completion import MARGIN, _filled, reconstruct
+from curvafit.segmentation.completion import MARGIN, _Between, _filled, reconstruct
 from curvafit.segmentation.engine import stiff
 from curvafit.segmentation.odds import Odds
 from curvafit.segmentation.slices import WAYS, Slices
@@ -131,7 +131,8 @@ def test_odds_hold_the_surface_while_the_energy_is_lowered() -> None:
     slices = known(truth, 8)
     level = odds_of(pancakes(2)).level(slices)
     held, free = (
-        _filled(slices, level, Setting(ODDS, WILLMORE, 1e7, 60, pull), None, silent)[0] for pull in (1e7, 0.0)
+        _filled(_Between(slices, Setting(ODDS, WILLMORE, 1e7, 60, pull), level), None, None, silent)[0]
+        for pull in (1e7, 0.0)
     )
     assert (held != truth).sum() < (free != truth).sum()
 

@@ -295,7 +295,7 @@ class _Chances:
     def given(self, box: Box, place: WorkingGrid) -> tuple[np.ndarray, Evidence]:
         """Return the first guess and the evidence on a box."""
         part = replace(self.evidence, ratio=self.evidence.ratio[box], level=self.evidence.level[box])
-        nats = self.setting.strength
+        nats = FIRST if self.law is None else self.setting.strength  # a start alone has no weight
         return part.level, likelihood(part, nats, place)
 
     def plain(self, level: np.ndarray, place: WorkingGrid) -> np.ndarray:
