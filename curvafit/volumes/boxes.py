@@ -1,4 +1,4 @@
-"""A volume of which boxes of voxels are read, so that it need not fit into memory."""
+"""A volume of which boxes of voxels are read, so that no more of it is in memory than is worked on."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from curvafit.volumes.formats.guard import read_file
 from curvafit.volumes.formats.ngff import read_zarr
 from curvafit.volumes.formats.nifti import read_nifti
 from curvafit.volumes.formats.part import Box, Crop, Part, box_of, fitted, selected
+from curvafit.volumes.formats.streams import check_array
 from curvafit.volumes.source import Source, field_of, located, placed
 
 __all__ = ["Boxes", "boxes_of", "digest_of", "extent", "frame_of", "thinned", "whole_of"]
@@ -210,6 +211,7 @@ def _stored(path: Path, key: str | None, options: dict[str, Any]) -> _Stored:
         raise ScanError(f"expected a whole volume, got {path}: {corner.gaps[0]}")
     box = fitted(box_of(options["crop"]), shape, path)
     first, size = [edge.start for edge in box], [edge.stop - edge.start for edge in box]
+    check_array(size, corner.values.dtype, path)  # a mask is written from memory
     field = placed(corner, f"{path}::{key}" if key else str(path), options["spacing"], options["unit"])
     frame = replace(field, values=np.broadcast_to(field.values, size))
     frame = frame_of(frame if options["crop"] is None else frame.moved(first))
