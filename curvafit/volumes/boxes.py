@@ -27,6 +27,8 @@ __all__ = ["Boxes", "boxes_of", "digest_of", "extent", "frame_of", "thinned", "w
 
 #: Readers that read a box alone.
 _BY_BOX = (read_zarr, read_hdf5, read_npy, read_raw, read_nifti)
+#: The first voxel.
+_CORNER = (slice(0, 1), slice(0, 1), slice(0, 1))
 #: Voxels of a slab that is looked at.
 _SLAB = 2**24
 #: A sample has at most so many runs of neighbouring voxels along each axis, each so long.
@@ -206,7 +208,7 @@ def _stored(path: Path, key: str | None, options: dict[str, Any]) -> _Stored:
     """Return the boxes of a file, whose first voxel is read to know its place."""
     reading = {"key": key, "raw_shape": options.get("raw_shape"), "dtype": options.get("dtype")}
     channel = options.get("channel")
-    corner, shape = _read(path, reading, Part(channel, (slice(0, 1), slice(0, 1), slice(0, 1))))
+    corner, shape = _read(path, reading, Part(channel, _CORNER, some=options["crop"] is None))
     if options.get("strict") and corner.gaps:
         raise ScanError(f"expected a whole volume, got {path}: {corner.gaps[0]}")
     box = fitted(box_of(options["crop"]), shape, path)

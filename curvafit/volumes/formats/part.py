@@ -26,10 +26,12 @@ _FORM = 'a crop as "z0:z1,y0:y1,x0:x1" or three slices'
 
 @dataclass(frozen=True)
 class Part:
-    """A channel, counted from 0, and a box; None stands for all."""
+    """A channel, counted from 0, and a box; None stands for all. Of some parts the others are asked for later: then all
+    of the array must fit into memory."""
 
     channel: int | None = None
     crop: Box | None = None
+    some: bool = False
 
     @property
     def whole(self) -> bool:
@@ -115,6 +117,8 @@ def fitting(array: Any, part: Part | None, place: object, channels: int | None =
     if part is None:
         check_array(array.shape, array.dtype, place)
         return ...
+    if part.some:
+        check_array(array.shape, array.dtype, place)
     index, _ = part.index(array.shape, channels, place)
     check_array([edge.stop - edge.start for edge in index], array.dtype, place)
     return index
