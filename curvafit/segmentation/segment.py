@@ -8,7 +8,6 @@ from os import PathLike
 from typing import Any
 
 import numpy as np
-from torch import Tensor
 
 from curvafit.generation.data import Evidence
 from curvafit.priors.bounds import real
@@ -34,8 +33,6 @@ WILLMORE = Coefficients.willmore()
 FAINT = "The classes differ by less than the noise, as where the structure is rare: better give a threshold."
 #: Share of the time that trying laws out takes.
 TRIALS = 0.7
-#: Probability maps that have the scan's spacing and unit.
-_UNPLACED = (str, PathLike, np.ndarray, Tensor)
 #: Least and greatest weight.
 WEIGHTS = (1e-9, 1e9)
 
