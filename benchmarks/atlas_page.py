@@ -60,7 +60,7 @@ def page(count: int) -> str:
     fields = [gaussian_filter(rng.normal(size=(EDGE,) * 3), 3.5, mode="wrap") for _ in range(TEXTURES)]
     textures = [shown(np.tanh(1.2 * field / field.std() - 0.5)) for field in fields]
     command = "curvafit generate --coefficients " + ",".join(["-123.4567890123456"] * 6) + " --mass -0.65432109876"
-    commands = [f"{command} --shape 64 --seed {10**9 + k} --schedule fast -o a.nii.gz" for k in range(count)]
+    commands = [f"{command} --shape 64 --seed {10**9 + k} --schedule deep -o a.nii.gz" for k in range(count)]
     return page_html(stand_in(count), [textures[k % TEXTURES] for k in range(count)], commands, [])
 
 

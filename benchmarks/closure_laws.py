@@ -31,6 +31,7 @@ import numpy as np
 import torch
 
 from curvafit.generation.flow import generate
+from curvafit.generation.schedule import LEARNED
 from curvafit.geometry.descriptors import Descriptors, descriptors
 from curvafit.geometry.diagram import Diagram, diagram
 from curvafit.geometry.mesh import NoSurface
@@ -120,7 +121,7 @@ class Query:
         """The law that simulations refine."""
 
         def simulate(parameters: np.ndarray, seed: int) -> Descriptors | None:
-            flow = generate(*law_of(parameters), self.box, seed=seed, reject_early=True)
+            flow = generate(*law_of(parameters), self.box, seed=seed, schedule=LEARNED, reject_early=True)
             seen = sight(flow.field.numpy(), self.box, self.sight.name, seed) if flow.viability.viable else None
             try:
                 return None if seen is None else descriptors(*seen.seen)

@@ -19,6 +19,7 @@ import numpy as np
 from benchmarks.closure_trials import queries_of
 from curvafit.data_synth import open_store
 from curvafit.generation.flow import generate
+from curvafit.generation.schedule import LEARNED
 from curvafit.generation.viability import well_formed
 from curvafit.geometry.descriptors import descriptors
 from curvafit.inference.posterior import Posterior, load_posterior
@@ -33,7 +34,7 @@ BOX = (64, 64, 64)
 def simulate(parameters: np.ndarray, seed: int) -> np.ndarray | None:
     """The mask that a law grows, None where it grows none."""
     law, mass = law_of(parameters)
-    flow = generate(law, mass, Grid(BOX), seed=10_000 + seed, reject_early=True)
+    flow = generate(law, mass, Grid(BOX), seed=10_000 + seed, schedule=LEARNED, reject_early=True)
     return (flow.field > 0).numpy() if well_formed(flow.viability) else None
 
 

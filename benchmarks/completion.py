@@ -47,7 +47,7 @@ def shape(law: str, seed: int, folder: Path) -> np.ndarray:
     """A mask of a law, made once."""
     path = folder / f"{law}-{seed}.npy"
     if not path.exists():
-        mask = generate(law, grid=EDGE, seed=seed).field.numpy() > 0
+        mask = generate(law, grid=EDGE, schedule="deep", seed=seed).field.numpy() > 0
         write_atomically(path, lambda temporary: np.save(temporary, np.packbits(mask)))
     return np.unpackbits(np.load(path)).reshape(EDGE, EDGE, EDGE) > 0
 

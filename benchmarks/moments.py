@@ -50,7 +50,7 @@ def shape_of(name: str, kind: str, seed: int, edge: int, folder: Path) -> Shape:
     if not path.exists():
         grid = Grid((edge,) * 3)
         with mock.patch.object(setup, "TorchStepper", rounding(TYPES[kind])):
-            flow = generate(name, grid=grid, seed=seed, backend="torch")
+            flow = generate(name, grid=grid, schedule="deep", seed=seed, backend="torch")
         shape = diagram(flow.field, grid, WORKING_EPSILON)
         content = [flow.history.energy[-1], flow.viability.viable, shape.points, shape.weights]
         write_atomically(path, lambda temporary: torch.save(content, temporary))

@@ -1,13 +1,13 @@
-"""Ways to the published flow's end that `fast` does not take, and whether they come nearer to it.
+"""Ways to the published flow's end, of which `fast` is one, and whether they come near to it.
 
-    python -m benchmarks.sooner [--presets sponge,bilayers] [--ways fast,coarse,…] [--seeds 3] [--first 0] [--edge 64]
-                                [--author] [-o sooner]
+    python -m benchmarks.sooner [--presets sponge,bilayers] [--ways fast,deep,coarse,…] [--seeds 3] [--first 0]
+                                [--edge 64] [--author] [-o sooner]
 
 `coarse`: all published steps on half the grid (ε is one voxel there), from the mean of eight voxels of `generate`'s
-start, then 500 on the full grid. `noise`: `fast` with A shaken every ten steps, by less and less until step 1000.
-`restart`: `fast` with its momentum forgotten whenever the energy rises. `settled`: `fast` until ten steps lower the
-energy by less than 1 %. `half`: `fast` with longest steps half as long. `fourier`: `fast`'s published steps, then 400
-with momentum, the gradient divided in Fourier space by F_ε's second derivative at rest.
+start, then 500 on the full grid. `noise`: `deep` with A shaken every ten steps, by less and less until step 1000.
+`restart`: `deep` with its momentum forgotten whenever the energy rises. `settled`: `deep` until ten steps lower the
+energy by less than 1 %. `fourier`: `deep`'s published steps, then 400 with momentum, the gradient divided in Fourier
+space by F_ε's second derivative at rest.
 
 `cost` is in steps of the full grid (a Fourier step counts as three). E, `noise` and `/noise` are those of
 `benchmarks.texture`, beside `paper`, whose folder may be shared: shapes are kept. With `--author` (and --edge 100)
@@ -19,7 +19,6 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -39,9 +38,7 @@ from curvafit.priors.coefficients import preset
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.priors.kernels.cpu import FusedFlow, energy_gradient
 
-PAPER, FAST = SCHEDULES["paper"], SCHEDULES["fast"]
-_PEAK = FAST.start / 2
-HALF = replace(FAST, start=_PEAK, opening=(FAST.opening[0], replace(FAST.opening[1], stop=_PEAK)))
+PAPER, FAST, DEEP = (SCHEDULES[name] for name in ("paper", "fast", "deep"))
 #: What is asked after a step, of the flow, the energies before the steps so far and a generator: whether to stop.
 Question = Callable[[FusedFlow, list[float], np.random.Generator], bool]
 
@@ -50,7 +47,7 @@ def fused(name: str, grid: Grid, start: np.ndarray) -> FusedFlow:
     """Begin a flow. Its slopes are as large as a voxel, and so is the number that Adam adds to their root."""
     law, small = preset(name), ADAM_EPS * grid.voxel_volume / WORKING_SPACING**3
     cost = law.coefficients, grid, WORKING_EPSILON, WORKING_BLUR
-    return FusedFlow(start, law.mass, *cost, betas=FAST.betas, adam_eps=small)
+    return FusedFlow(start, law.mass, *cost, betas=DEEP.betas, adam_eps=small)
 
 
 def steps(flow: FusedFlow, plan: Schedule, count: int, ask: Question = lambda *_: False, seed: int = 0) -> int:
@@ -65,8 +62,8 @@ def steps(flow: FusedFlow, plan: Schedule, count: int, ask: Question = lambda *_
     return len(energies)
 
 
-def along(name: str, edge: int, seed: int, ask: Question = lambda *_: False, plan: Schedule = FAST) -> tuple:
-    """Follow `fast`, or another plan; return energy, u and cost, as the other ways do."""
+def along(name: str, edge: int, seed: int, ask: Question = lambda *_: False, plan: Schedule = DEEP) -> tuple:
+    """Follow `deep`, or another plan; return energy, u and cost, as the other ways do."""
     flow = fused(name, Grid(edge), white_noise(Grid(edge), seed).numpy())
     count = steps(flow, plan, plan.steps, ask, seed)
     return flow.evaluate(), flow.field, count
@@ -106,9 +103,9 @@ def settled(_, energies: list[float], __) -> bool:
 
 
 def fourier(name: str, edge: int, seed: int, count: int = 400, length: float = 0.2, momentum: float = 0.9) -> tuple:
-    grid, law, opening = Grid(edge), preset(name), FAST.bounds[0]
+    grid, law, opening = Grid(edge), preset(name), DEEP.bounds[0]
     flow = fused(name, grid, white_noise(grid, seed).numpy())
-    steps(flow, FAST, opening)
+    steps(flow, DEEP, opening)
     flow.evaluate()
     axis = 2 * np.pi * fft.fftfreq(edge, WORKING_SPACING)
     k2 = (axis[:, None, None] ** 2 + axis[:, None] ** 2 + axis[: edge // 2 + 1] ** 2).astype(np.float32)
@@ -125,12 +122,12 @@ def fourier(name: str, edge: int, seed: int, count: int = 400, length: float = 0
 
 
 WAYS: dict[str, Callable[[str, int, int], tuple]] = {
-    "fast": along,
+    "fast": lambda *case: along(*case, plan=FAST),
+    "deep": along,
     "coarse": coarse,
     "noise": lambda *case: along(*case, shaken),
     "restart": lambda *case: along(*case, restarted),
     "settled": lambda *case: along(*case, settled),
-    "half": lambda *case: along(*case, plan=HALF),
     "fourier": fourier,
 }
 

@@ -22,7 +22,7 @@ from curvafit.data_synth.imaging.randomness import correlated
 from curvafit.data_synth.sets.sources import Generated
 from curvafit.files import write_atomically
 from curvafit.generation.flow import generate
-from curvafit.generation.schedule import schedule
+from curvafit.generation.schedule import LEARNED
 from curvafit.generation.viability import well_formed
 from curvafit.geometry.diagram import diagram
 from curvafit.geometry.morphometry import local_thickness
@@ -71,9 +71,7 @@ def nearest_at_its_density(fit: Fit) -> Fit:
     matches = (Candidate(match.id, match.coefficients, match.mass, {}) for match in fit.matches)
     for each in (*fit.candidates, *matches):
         share = fit.morphometry.volume_fraction
-        flow = generate(
-            each.coefficients, None, grid, volume_fraction=share, schedule=schedule("fast"), reject_early=True
-        )
+        flow = generate(each.coefficients, None, grid, volume_fraction=share, schedule=LEARNED, reject_early=True)
         if well_formed(flow.viability):
             seen = diagram(phase_field(flow.field > 0, grid, WORKING_EPSILON), grid, WORKING_EPSILON)
             found.append((wasserstein(fit.diagram, seen), each))  # type: ignore[arg-type]

@@ -16,7 +16,7 @@ from curvafit.data_synth.atlas import build as building
 from curvafit.data_synth.atlas import draws
 from curvafit.data_synth.atlas.design import INTERVALS, Design, boxed
 from curvafit.data_synth.atlas.store import open_store
-from curvafit.generation.schedule import present_name, schedule
+from curvafit.generation.schedule import LEARNED, present_name, schedule
 from curvafit.generation.viability import Viability
 from curvafit.inference.atlas import VERSION, Atlas, load_atlas, save_atlas
 from curvafit.priors.grid import Grid
@@ -268,7 +268,7 @@ def test_the_packaged_atlas_is_of_its_designs_and_small():
     assert file.stat().st_size < 7e6
     assert len(atlas) >= 1000 and len(set(atlas.ids)) == len(atlas)
     stores = atlas.provenance["stores"]
-    assert all(present_name(store["settings"]["schedule"]) == "fast" for store in stores.values())
+    assert all(present_name(store["settings"]["schedule"]) == LEARNED for store in stores.values())
     assert min(atlas.provenance["settings"]["shape"]) >= 64
     for position, name in enumerate(atlas.ids):
         store, index = name.split("-")

@@ -117,7 +117,7 @@ def test_wrong_seeds_are_refused(seed: Any) -> None:
         ({"checkpoint_every": math.inf}, "expected a finite number of seconds between checkpoints"),
         ({"volume_fraction": math.nan, "mass": None}, "expected a volume fraction in"),
         ({"mass": "half"}, "expected a mass in"),
-        ({"schedule": None}, "expected a schedule among paper, fast, cosine, got None"),
+        ({"schedule": None}, "expected a schedule among paper, fast, deep, cosine, got None"),
     ],
 )
 def test_flows_refuse_what_is_out_of_range(wrong: dict[str, Any], said: str) -> None:

@@ -180,7 +180,7 @@ def test_schedules():
     for name in ("momentum", "memory"):
         with pytest.raises(ValueError, match=f"expected {name} in \\[0, 1\\), got 1"):
             Schedule("x", 10, 1e-3, 1e-3, "cosine", **{name: 1})
-    with pytest.raises(ValueError, match="expected a schedule among paper, fast, cosine, got 'slow'"):
+    with pytest.raises(ValueError, match="expected a schedule among paper, fast, deep, cosine, got 'slow'"):
         schedule("slow")
     for wrong in ((0, 1e-3, "constant"), (10, 0.0, "constant"), (10, 1e-3, "linear")):
         with pytest.raises(ValueError, match="expected"):
@@ -230,6 +230,7 @@ def test_records_hold_schedules():
     assert Schedule(**old).as_dict() == old
     assert present_name(old) == "cosine"
     assert present_name(old | {"memory": 0.9}) == "fast"
+    assert present_name(SCHEDULES["deep"].as_dict() | {"name": "fast"}) == "deep"  # so named before version 0.2
     for plan in (*SCHEDULES.values(), PHASES):
         assert Schedule(**json.loads(json.dumps(plan.as_dict()))) == plan
         assert present_name(plan.as_dict()) == plan.name

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from curvafit.generation.flow import generate
-from curvafit.generation.schedule import schedule
+from curvafit.generation.schedule import LEARNED, SCHEDULES
 from curvafit.geometry.descriptors import BLOCKS, descriptors
 from curvafit.geometry.diagram import diagram
 from curvafit.geometry.transport import wasserstein
@@ -104,7 +104,7 @@ def test_fit_json_holds_what_the_generator_needs(inference: Inference, tmp_path)
     content = json.loads(path.read_text())
     assert content["format"] == FORMAT
     assert content["provenance"]["seed"] == 3 and content["length_unit"] == "um"
-    assert content["provenance"]["schedule"]["steps"] == schedule("fast").steps
+    assert content["provenance"]["schedule"] == SCHEDULES[LEARNED].as_dict()
     kept = content["diagram"]
     assert kept["seen_as"] == "mask" and sum(kept["share"]) == pytest.approx(1, abs=1e-4)
     assert len(kept["kappa1"]) == len(kept["share"]) and path.read_text().count("\n") < 1000

@@ -49,7 +49,7 @@ def build_atlas(
         str | None, typer.Option(help="Preset or fit.json to draw parameters around, instead of --design.")
     ] = None,
     spread: Annotated[float | None, typer.Option(help="With --around: share of the random law's intervals.")] = None,
-    schedule: Annotated[str, typer.Option(help="Schedule of the flow: fast, paper or cosine.")] = "fast",
+    schedule: Annotated[str, typer.Option(help="Schedule of the flow: fast, paper, deep or cosine.")] = "fast",
     steps: Annotated[int | None, typer.Option(help="Number of steps, instead of the schedule's.")] = None,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,

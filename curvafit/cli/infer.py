@@ -89,7 +89,7 @@ def _inferred(scan: str, out: Path, options: dict[str, Any], overwrite: bool) ->
 
 def _say_forecast(prepared: Prepared) -> None:
     """Print the forecast of an inference: the flows of its twins and of the draws that are grown."""
-    from curvafit.generation.schedule import schedule
+    from curvafit.generation.schedule import LEARNED, SCHEDULES
     from curvafit.inference.estimate import SIMULATIONS, simulation_grid
     from curvafit.inference.sequential import BATCH, ROUNDS
     from curvafit.inference.twins import twin_grid
@@ -98,7 +98,7 @@ def _say_forecast(prepared: Prepared) -> None:
     grown = TWINS * math.prod(twin_grid(prepared).shape) + (SIMULATIONS + ROUNDS * BATCH) * math.prod(
         simulation_grid(prepared).shape
     )
-    steps = math.ceil(schedule("fast", None).steps * grown / math.prod(window))
+    steps = math.ceil(SCHEDULES[LEARNED].steps * grown / math.prod(window))
     say_forecast("infer", window, steps, INFERENCE, what="working voxels")
 
 

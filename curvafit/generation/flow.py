@@ -73,7 +73,7 @@ def generate(
         and a small constant makes it exact at the end; where that fails, `status` says so. `Flow.mass` is the mass. A
         mass beside it is the one to begin with; a law may make few large bodies from one and many small from another.
     schedule
-        `"fast"`, `"paper"`, `"cosine"` (see `SCHEDULES`), or a `Schedule`.
+        `"fast"`, `"paper"`, `"deep"`, `"cosine"` (see `SCHEDULES`), or a `Schedule`.
     seed
         Seed of the start. The same seed, grid and number of threads make the same field, bit for bit.
     orientation

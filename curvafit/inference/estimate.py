@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from curvafit.generation.flow import generate
+from curvafit.generation.schedule import LEARNED
 from curvafit.geometry.descriptors import BLOCKS, Descriptors, descriptors
 from curvafit.geometry.mesh import NoSurface
 from curvafit.inference.candidates import Candidate
@@ -173,7 +174,7 @@ def _simulator(prepared: Prepared, view: str) -> Simulate:
     window = VIEWS["mask" if prepared.part(prepared.windows[0]).periodic else "crop"]
 
     def simulate(parameters: np.ndarray, seed: int) -> Descriptors | None:
-        flow = generate(*law_of(parameters), grid, seed=seed, reject_early=True)
+        flow = generate(*law_of(parameters), grid, schedule=LEARNED, seed=seed, reject_early=True)
         if not flow.viability.viable:
             return None
         field = flow.field.numpy()

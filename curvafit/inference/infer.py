@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from curvafit.generation.schedule import schedule
+from curvafit.generation.schedule import LEARNED, SCHEDULES
 from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram
 from curvafit.geometry.family import family_of
 from curvafit.geometry.morphometry import Morphometry, morphometry
@@ -281,7 +281,7 @@ def _provenance(volume: Field, atlas: Atlas, posterior: Posterior, seed: int) ->
         "scan_shape": list(volume.values.shape),
         "scan_spacing": list(volume.spacing),
         "seed": seed,
-        "schedule": schedule("fast", None).as_dict(),
+        "schedule": SCHEDULES[LEARNED].as_dict(),
         "epsilon": WORKING_EPSILON,
         "atlas": {"format": atlas.format_version, "shapes": len(atlas.ids)},
         "posterior": posterior.provenance,

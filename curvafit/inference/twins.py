@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from curvafit.generation.flow import Flow, generate
+from curvafit.generation.schedule import LEARNED
 from curvafit.geometry.diagram import Diagram, diagram
 from curvafit.geometry.mesh import NoSurface
 from curvafit.geometry.morphometry import Morphometry, morphometry
@@ -39,13 +40,13 @@ def twin(coefficients: Coefficients, mass: float, prepared: Prepared, seed: int)
     Of a mask or an image it fills the same part of its box as the structure (`Prepared.true_share`), since a mask does
     not state a mass; where nothing grows so, it has the law's own mass.
     """
-    grid = twin_grid(prepared)
+    grid, told = twin_grid(prepared), {"schedule": LEARNED, "seed": seed, "reject_early": True}
     if prepared.kind != "field":
         share = prepared.true_share
-        flow = generate(coefficients, mass, grid, volume_fraction=share, seed=seed, reject_early=True)
+        flow = generate(coefficients, mass, grid, volume_fraction=share, **told)
         if (grown := _measured(flow, prepared, seed)).phase is not None:
             return grown
-    return _measured(generate(coefficients, mass, grid, seed=seed, reject_early=True), prepared, seed)
+    return _measured(generate(coefficients, mass, grid, **told), prepared, seed)
 
 
 def twin_grid(prepared: Prepared) -> Grid:

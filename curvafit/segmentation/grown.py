@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from curvafit.generation.flow import generate
+from curvafit.generation.schedule import LEARNED
 from curvafit.priors.coefficients import Coefficients
 from curvafit.progress import Progress, silent
 from curvafit.segmentation.calibration import Task
@@ -39,6 +40,7 @@ def grown(slices: Slices, law: Coefficients, epsilon: float | None, progress: Pr
     flow = generate(
         stiff(law).in_unit(place.unit),
         grid=place.grid,
+        schedule=LEARNED,
         volume_fraction=share,
         seed=SEED,
         callbacks=[lambda step, total, state: progress("growing a shape of the law", step / total)],
