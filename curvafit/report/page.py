@@ -279,7 +279,7 @@ _PYTHON = escape(
 from curvafit.priors import read_fit
 
 fit = read_fit("fit.json")
-flow = curvafit.generate(fit.coefficients, fit.mass, 100, seed=1)"""
+flow = curvafit.generate(fit.coefficients, fit.mass, 100, schedule="deep", seed=1)"""
 )
 
 
