@@ -6,7 +6,7 @@
 `coarse`: all published steps on half the grid (ε is one voxel there), from the mean of eight voxels of `generate`'s
 start, then 500 on the full grid. `noise`: `deep` with A shaken every ten steps, by less and less until step 1000.
 `restart`: `deep` with its momentum forgotten whenever the energy rises. `settled`: `deep` until ten steps lower the
-energy by less than 1 %. `half`: `deep` with longest steps half as long. `fourier`: `deep`'s published steps, then 400
+energy by less than 1 %. `level`: steps as long in all as those of `paper`. `fourier`: `deep`'s published steps, then 400
 with momentum, the gradient divided in Fourier space by F_ε's second derivative at rest.
 
 `cost` is in steps of the full grid (a Fourier step counts as three). E, `noise` and `/noise` are those of
@@ -40,8 +40,8 @@ from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.priors.kernels.cpu import FusedFlow, energy_gradient
 
 PAPER, FAST, DEEP = (SCHEDULES[name] for name in ("paper", "fast", "deep"))
-_PEAK = DEEP.start / 2
-HALF = replace(DEEP, start=_PEAK, opening=(DEEP.opening[0], replace(DEEP.opening[1], stop=_PEAK)))
+_PEAK = 1.18e-2
+LEVEL = replace(DEEP, start=_PEAK, opening=(DEEP.opening[0], replace(DEEP.opening[1], stop=_PEAK)))
 #: What is asked after a step, of the flow, the energies before the steps so far and a generator: whether to stop.
 Question = Callable[[FusedFlow, list[float], np.random.Generator], bool]
 
@@ -127,7 +127,7 @@ def fourier(name: str, edge: int, seed: int, count: int = 400, length: float = 0
 WAYS: dict[str, Callable[[str, int, int], tuple]] = {
     "fast": lambda *case: along(*case, plan=FAST),
     "deep": along,
-    "half": lambda *case: along(*case, plan=HALF),
+    "level": lambda *case: along(*case, plan=LEVEL),
     "coarse": coarse,
     "noise": lambda *case: along(*case, shaken),
     "restart": lambda *case: along(*case, restarted),

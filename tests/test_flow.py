@@ -206,8 +206,7 @@ def test_phases_follow_each_other():
     assert dataclasses.replace(PHASES, steps=200).bounds == (30, 80)
     lengths = [dataclasses.replace(PHASES, steps=steps).rate(steps - 1) for steps in (1, 2, 3)]
     assert all(1e-3 <= length <= 2e-2 for length in lengths)
-    fast, paper = SCHEDULES["fast"], SCHEDULES["paper"]
-    assert sum(map(fast.rate, range(fast.steps))) == pytest.approx(paper.steps * paper.start, rel=0.01)
+    fast = SCHEDULES["fast"]
     assert fast.steps <= 1.5 * SCHEDULES["cosine"].steps
     assert fast.betas == SCHEDULES["paper"].betas and fast.rate(fast.bounds[0] - 1) == SCHEDULES["paper"].rate(0)
     for wrong in ((0.5, 0.5), (0.0,), (1.0,), (-0.5,)):
