@@ -6,8 +6,8 @@
 `coarse`: all published steps on half the grid (ε is one voxel there), from the mean of eight voxels of `generate`'s
 start, then 500 on the full grid. `noise`: `deep` with A shaken every ten steps, by less and less until step 1000.
 `restart`: `deep` with its momentum forgotten whenever the energy rises. `settled`: `deep` until ten steps lower the
-energy by less than 1 %. `level`: steps as long in all as those of `paper`. `fourier`: `deep`'s published steps, then 400
-with momentum, the gradient divided in Fourier space by F_ε's second derivative at rest.
+energy by less than 1 %. `level`: steps as long in all as those of `paper`. `fourier`: `deep`'s published steps, then
+400 with momentum, the gradient divided in Fourier space by F_ε's second derivative at rest.
 
 `cost` is in steps of the full grid (a Fourier step counts as three). E, `noise` and `/noise` are those of
 `benchmarks.texture`, beside `paper`, whose folder may be shared: shapes are kept. With `--author` (and --edge 100)

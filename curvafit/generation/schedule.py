@@ -165,9 +165,9 @@ def _opened(name: str, longest: float) -> Schedule:
     return Schedule(name, 1500, longest, 1e-3, **late, opening=opening)
 
 
-#: `paper` is the published schedule. `fast` ends near where that ends, in under a fifth of its steps. `deep`, with steps
-#: twice as long, descends further where the energy still falls: `weird` ends elsewhere. `cosine` takes long steps at
-#: once and cools: sooner, and often to other ends of less energy. `benchmarks.texture` compares them for each preset.
+#: `paper` is the published schedule. `fast` ends near its end, in under a fifth of its steps. `deep`, with steps twice
+#: as long, descends further where the energy still falls: `weird` ends elsewhere. `cosine` takes long steps at once and
+#: cools: sooner, and often to other ends of less energy. `benchmarks.texture` compares them for each preset.
 SCHEDULES: dict[str, Schedule] = {
     "paper": Schedule("paper", 8000, 1e-3, 1e-3, "constant"),
     "fast": _opened("fast", 7.5e-3),
