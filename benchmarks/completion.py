@@ -13,6 +13,7 @@ errors count between the first and the last known slice only.
   blur, and springs that squeeze the profile).
 
 Finished cases stay in the folder: a second run goes on. `--seconds` ends a run early. The table has medians over laws.
+`--picture LAW` draws three slices of a crop's truth, spline and completed volume in place of the table.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.completion_ways import ITK, baselines, interpolated, scores, stored
+from benchmarks.completion_ways import ITK, baselines, draw, interpolated, scores, stored
 from curvafit.files import write_atomically, write_content
 from curvafit.generation import data
 from curvafit.generation.flow import descend, generate
@@ -131,10 +132,19 @@ def main() -> None:
     parser.add_argument("--ways", default=",".join(PRIORS), help="besides the interpolations")
     parser.add_argument("--boxes", default="box,crop")
     parser.add_argument("--seconds", type=float, default=1e9)
+    parser.add_argument("--picture", metavar="LAW", help="at the first distance of --every")
     parser.add_argument("-o", "--output", type=Path, default=Path("completion"))
     options = parser.parse_args()
     options.output.mkdir(parents=True, exist_ok=True)
     laws, levels = options.laws.split(","), [int(n) for n in options.every.split(",")]
+    if options.picture:
+        case = options.picture, options.target, levels[0], False, options.output
+        masks = {
+            title: completed(way, *case)[0] for title, way in (("spline", "spline"), ("reconstruct", "calibrated"))
+        }
+        path = options.output / f"{options.picture}.png"
+        draw(shape(options.picture, options.target, options.output), masks, levels[0], path)
+        return
     ways, boxes = (
         [*baselines(), *filter(None, options.ways.split(","))],
         [box == "box" for box in options.boxes.split(",")],

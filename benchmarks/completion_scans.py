@@ -32,13 +32,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from scipy import ndimage
 from skimage.filters import threshold_otsu
 from skimage.segmentation import find_boundaries
 
-from benchmarks.completion_ways import ITK, baselines, interpolated, scores, stored
+from benchmarks.completion_ways import ITK, baselines, draw, interpolated, scores, stored
 from curvafit.files import write_atomically, write_content
 from curvafit.geometry.morphometry import local_thickness
 from curvafit.geometry.topology import euler_of_window
@@ -239,23 +237,15 @@ def _print(title: str, plain: list[str], stars: Mapping[str, str], row: Mapping[
     print(f"{title:32}{cells}{gains}", *others, flush=True)
 
 
-def draw(case: Case, folder: Path) -> None:
-    """Draw three slices half way between known ones: the truth, and the start and the completed volume over it."""
-    truth = np.moveaxis(case.target.values > 0, case.axis, 0)
-    middles = [n + case.every // 2 for n in range(0, len(truth) - case.every, case.every)]
-    chosen = sorted(sorted(middles, key=lambda n: -int(truth[n].sum()))[:3])
-    ways = [way for way in ("spline", *TRIED) if masks_of(case, way, folder).exists()]
-    figure = Figure(figsize=(3 * len(chosen), 3 * len(ways)), layout="constrained")
-    FigureCanvasAgg(figure)
-    for row, way in enumerate(ways):
-        packed = np.unpackbits(np.load(masks_of(case, way, folder)), count=truth.size)
-        mask = np.moveaxis(packed.reshape(case.target.shape) > 0, case.axis, 0)
-        for column, n in enumerate(chosen):
-            axes = figure.add_subplot(len(ways), len(chosen), row * len(chosen) + column + 1)
-            axes.imshow(truth[n], cmap="gray", interpolation="nearest", vmax=2)
-            axes.contour(mask[n], [0.5], colors="tab:orange", linewidths=1.2)
-            axes.set(title=f"{way}, slice {n}", xticks=[], yticks=[])
-    write_atomically(folder / f"{case}.png", lambda temporary: figure.savefig(temporary, dpi=110))
+def picture(case: Case, folder: Path) -> None:
+    """Draw a case's spline and, where they were made, its completed volumes."""
+
+    def mask(way: str) -> np.ndarray:
+        packed = np.unpackbits(np.load(masks_of(case, way, folder)), count=case.target.values.size)
+        return np.moveaxis(packed.reshape(case.target.shape) > 0, case.axis, 0)
+
+    masks = {way: mask(way) for way in ("spline", *TRIED) if masks_of(case, way, folder).exists()}
+    draw(np.moveaxis(case.target.values > 0, case.axis, 0), masks, case.every, folder / f"{case}.png")
 
 
 def main() -> None:
@@ -270,7 +260,7 @@ def main() -> None:
     options.output.mkdir(parents=True, exist_ok=True)
     if options.picture:
         name, *numbers = options.picture.rsplit("-", 3)
-        draw(Case(name, *map(int, numbers)), options.output)
+        picture(Case(name, *map(int, numbers)), options.output)
         return
     found, begun = {}, time.monotonic()
     ways = (*baselines(), *filter(None, options.ways.split(",")))

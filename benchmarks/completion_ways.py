@@ -1,15 +1,17 @@
-"""Plain interpolations of the volume between known slices, ITK's among them, and the scores of a volume."""
+"""Plain interpolations of the volume between known slices, ITK's among them, scores of a volume, and its picture."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
-from curvafit.files import write_content
+from curvafit.files import write_atomically, write_content
 from curvafit.geometry.topology import betti_numbers
 from curvafit.segmentation.slices import WAYS, Slices
 
@@ -56,3 +58,21 @@ def stored(path: Path, make: Callable[[], dict]) -> dict:
     if not path.exists():
         write_content(path, json.dumps(make()))
     return json.loads(path.read_text())
+
+
+def draw(truth: np.ndarray, masks: Mapping[str, np.ndarray], every: int, path: Path) -> None:
+    """Draw three of the fullest slices half way between known ones: the truth, and each way's outline over it.
+
+    Arrays are (slices, Y, X).
+    """
+    middles = [n + every // 2 for n in range(0, len(truth) - every, every)]
+    chosen = sorted(sorted(middles, key=lambda n: -int(truth[n].sum()))[:3])
+    figure = Figure(figsize=(3 * len(chosen), 3 * len(masks)), layout="constrained")
+    FigureCanvasAgg(figure)
+    for row, (way, mask) in enumerate(masks.items()):
+        for column, n in enumerate(chosen):
+            axes = figure.add_subplot(len(masks), len(chosen), row * len(chosen) + column + 1)
+            axes.imshow(truth[n], cmap="gray_r", interpolation="nearest", vmax=3)
+            axes.contour(mask[n], [0.5], colors="tab:orange", linewidths=1.6)
+            axes.set(title=f"{way}, slice {n}", xticks=[], yticks=[])
+    write_atomically(path, lambda temporary: figure.savefig(temporary, dpi=110))
