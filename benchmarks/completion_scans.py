@@ -9,8 +9,8 @@ follow the first axis, or the second where the first has fewer than 48.
 
 - `spline`, `linear`, `nearest`, `ITK` (its morphological contour interpolation, where its package is installed): the
   best of them *in hindsight*, by Dice, is what the others are held to (`best`).
-- `example`: `reconstruct`, tried out on the example; `left out`: on slices left out; a star where it said that no prior
-  helps.
+- `example`: `reconstruct`, tried out on the example; `whole`: on all of the other side; `left out`: on slices left out;
+  a star where it said that no prior helps.
 
 Between the first and the last known slice: Dice, the sum of the Betti numbers' errors, the error of the mean thickness
 in voxels, and that of the connectivity density in loops a million voxels. The last rows are medians of a structure.
@@ -47,7 +47,7 @@ from curvafit.segmentation.slices import WAYS, Slices
 from curvafit.volumes.scan import Field, load
 
 #: Ways that are tried out.
-TRIED = ("example", "left out")
+TRIED = ("example", "whole", "left out")
 FIGURES = ("dice", "betti", "thickness", "connectivity")
 #: Slices of a block along its first axis below which those along the second are known.
 FEW = 48
@@ -168,8 +168,9 @@ def completed(case: Case, way: str, folder: Path) -> tuple[np.ndarray, str]:
         places = range(0, len(first), case.every)
         slices = Slices(first[places], tuple(places), len(first), edges, target.unit)
         return np.moveaxis(interpolated(slices, way), 0, axis), ""
-    other = {"example": blocks(case.name, 1 - case.side)[0]} if way == "example" else {}
-    found = reconstruct(target, fitted(case.name, 1 - case.side, folder), every=case.every, axis=axis, **other)
+    examples = {"example": blocks(case.name, 1 - case.side)[0], "whole": sides(case.name)[1 - case.side]}
+    known = {"every": case.every, "axis": axis, "example": examples.get(way)}
+    found = reconstruct(target, fitted(case.name, 1 - case.side, folder), **known)
     return found.mask.values > 0, found.status
 
 

@@ -16,6 +16,7 @@ from curvafit.progress import silent
 from curvafit.segmentation.calibration import ODDS, Choice, Setting, Task, choice, left_out
 from curvafit.segmentation.completion import MARGIN, _Between, _filled, reconstruct
 from curvafit.segmentation.engine import stiff
+from curvafit.segmentation.example import Example
 from curvafit.segmentation.odds import Odds
 from curvafit.segmentation.slices import WAYS, Slices
 from curvafit.segmentation.working import TRUSTED, WorkingGrid, law_of, laws_of
@@ -116,6 +117,18 @@ def test_each_half_of_an_example_is_judged_by_the_other() -> None:
     halves = np.concatenate([pancakes(1, seed=2), pancakes(3, seed=3)], axis=2)
     level = odds_of(halves).level(known(halves, 8), crossed=True)
     assert np.array_equal(level > 0, np.concatenate([pancakes(3, seed=2), pancakes(1, seed=3)], axis=2))
+
+
+def test_laws_are_lowered_on_a_box_of_an_example(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Odds are counted on all of it, and a box of it is judged by the half that it does not lie in."""
+    monkeypatch.setattr("curvafit.segmentation.example.PART", 20)
+    mask = np.concatenate([pancakes(1, seed=2), pancakes(3, seed=3)], axis=2)
+    example = Example.of(Field(mask.astype(np.uint8)), range(0, 33, 8), axis=0)
+    given, box = example.part.given, example.box
+    assert given.shape == (33, 20, 20) and example.whole.given.shape == mask.shape
+    assert np.array_equal(given.inside, mask[box][::8])
+    assert np.array_equal(example.part.truth, mask[box][[n for n in range(32) if n % 8]])
+    np.testing.assert_array_equal(example.level(given, ODDS), example.level(example.whole.given, ODDS)[box])
 
 
 def test_odds_replace_an_interpolation_where_they_are_better() -> None:
@@ -240,7 +253,11 @@ def test_an_example_is_degraded_as_the_volume_is() -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"example": ball(), "known": [15, 16]}, "three or more known slices"),
+        ({"example": ball(), "known": [15, 16]}, "slices with others between them, .* got slices 1 apart"),
+        (
+            {"example": ball()[:8], "every": 8},
+            "an example longer than their distance, got slices 8 apart and an example of 8",
+        ),
         ({"example": Field(ball(), (1.0,) * 3, "mm"), "every": 8}, "an example with the spacing of the slices"),
         ({"example": np.zeros((32, 32, 32), dtype=np.uint8), "every": 8}, "got empty ones"),
         ({"example": ball() * np.float32(0.5), "every": 8}, "values that are not whole numbers"),

@@ -12,7 +12,7 @@ import numpy as np
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.slices import WAYS, Slices
 
-__all__ = ["BEYOND", "ODDS", "Choice", "Setting", "Task", "choice", "climbed", "left_out"]
+__all__ = ["BEYOND", "ODDS", "Choice", "Setting", "Task", "choice", "climbed", "left_out", "plainest"]
 
 #: What is given of a volume, and what is tried of it.
 Given = TypeVar("Given")
@@ -135,14 +135,24 @@ def choice(
         number = [*strengths, setting.strength].index(setting.strength) + step
         return replace(setting, strength=strengths[number]) if 0 <= number < len(strengths) else None
 
-    start = Setting(ways[0])
-    for each in map(Setting, ways[1:]):
-        start = start if _difference(counts(each), counts(start)).within else each
+    start = Setting(plainest(task, filled, ways))
     settings = lowered(start.way)
     best = climbed(max(settings, key=worth), stronger, worth)
     best = max((best, *(replace(each, strength=best.strength) for each in settings)), key=worth)
     gain = _difference(counts(best), counts(start))
     return Choice(start if gain.within else best, worth(best), worth(start), gain.noise)
+
+
+def plainest(task: Task[Given], filled: Callable[[Given, Setting], np.ndarray], ways: Sequence[str] = WAYS) -> str:
+    """Return the plain way with the best Dice on a task: a later one where it is better beyond the noise."""
+    if len(ways) == 1:
+        return ways[0]
+    places = list(task.places)
+    counts = {way: _tallies(filled(task.given, Setting(way))[places], task.truth, places) for way in ways}
+    best = ways[0]
+    for way in ways[1:]:
+        best = best if _difference(counts[way], counts[best]).within else way
+    return best
 
 
 def climbed(first: Trial, neighbour: Callable[[Trial, int], Trial | None], worth: Callable[[Trial], float]) -> Trial:

@@ -16,19 +16,18 @@ from curvafit.priors.bounds import real, whole
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
 from curvafit.progress import Progress, silent
-from curvafit.segmentation.calibration import ODDS, Choice, Setting, Task, choice, left_out
+from curvafit.segmentation.calibration import ODDS, Choice, Setting, Task, choice, left_out, plainest
 from curvafit.segmentation.engine import STEPS
 from curvafit.segmentation.ensemble import RUNS, Chances, chances
+from curvafit.segmentation.example import Example, slices_of, within
 from curvafit.segmentation.grown import grown
-from curvafit.segmentation.known import check_spacing, labels
+from curvafit.segmentation.known import check_spacing
 from curvafit.segmentation.lowering import Workers, lowered
-from curvafit.segmentation.odds import Odds
 from curvafit.segmentation.probability import entropy
 from curvafit.segmentation.result import Segmentation, Uncertainty, ending, filled, result_of
 from curvafit.segmentation.slices import WAYS, Slices
 from curvafit.segmentation.suggestion import suggestions
 from curvafit.segmentation.tiles import Tiling
-from curvafit.segmentation.weighing import densest
 from curvafit.segmentation.working import Law, WorkingGrid, drawn_laws, laws_of
 from curvafit.volumes.boxes import digest_of
 from curvafit.volumes.field import Field, ScanError
@@ -43,8 +42,6 @@ STIFFNESS = 1e7
 MARGIN = math.tanh(WORKING_SPACING / 2 / (math.sqrt(2) * WORKING_EPSILON))
 #: Least and greatest stiffness.
 STIFFEST = (1e-9, 1e12)
-#: Longest edge of the box on which the prior is tried out in a volume of several tiles, and the fewest slices there.
-PART, FEWEST = 96, 5
 #: Most runs.
 MOST = 1000
 #: Stiffness of the springs on other voxels, in working units, for each nat of an example's odds: one is tried after the
@@ -121,29 +118,29 @@ def reconstruct(
     volume = field_of(slices, **reading)
     axis = whole(axis, "an axis 0, 1 or 2 (z, y, x)", 0, 2)
     places = _places(volume.shape[axis], every, first, known)
-    target = _slices(volume, places, axis, periodic)
+    target = slices_of(volume, places, axis, periodic)
     tiling = Tiling.of(target.frame, epsilon, tile, periodic=periodic)
     if stiffness is not None:
         stiffness = real(stiffness, "a positive stiffness", *STIFFEST)
     suggest = whole(suggest, "a number of slices from 0", 0, volume.shape[axis] - len(places))
     runs = whole(runs, "a number of runs from 0", 0, MOST)
-    other = None if example is None else _like(example, volume, reading)
+    other = None if example is None else Example.of(_like(example, volume, reading), places, axis)
     laws, notes = laws_of(prior, volume)
     if suggest and not runs:
         runs, notes = RUNS, (*notes, f"Suggestions need runs: {RUNS} are made.")
-    firm, odds = STIFFNESS if stiffness is None else stiffness, None
+    firm = STIFFNESS if stiffness is None else stiffness
+    level = Slices.level if other is None else other.level
 
     def settings(way: str) -> list[Setting]:
         pulls = PULLS if way == ODDS else (0.0,)
         return [Setting(way, law, firm, steps, pull) for law, pull in product(laws, pulls)]
 
-    def level(slices: Slices, way: str) -> np.ndarray:
-        return slices.level(way) if odds is None or way != ODDS else odds.level(slices, crossed=slices is not target)
-
     def start(slices: Slices, setting: Setting) -> np.ndarray | None:
         return level(slices, ODDS) if setting.way == ODDS else None
 
     def fill(slices: Slices, setting: Setting) -> np.ndarray:
+        if setting.law is None:
+            return level(slices, setting.way) > 0
         step: Progress = lambda _, share: progress("trying the prior out", share)  # noqa: E731
         return _filled(_Between(slices, setting, start(slices, setting)), epsilon, None, step)[0]
 
@@ -152,13 +149,11 @@ def reconstruct(
         return _filled(_Between(slices, setting, moved), epsilon, tile, steps)[1], tiling.place.epsilon
 
     chosen, tried, uncertain = settings("spline")[0], "", None
-    whole_example = None if other is None else _example(other, places, axis)
-    fair = (whole_example or grown(target, laws[0], epsilon, progress)) if runs else None
+    fair = (grown(target, laws[0], epsilon, progress) if other is None else other.part) if runs else None
     if stiffness is None:
-        part = target if tiling.count == 1 else _part(target)
-        task = _sure(left_out(part) if other is None else whole_example, len(places))
-        odds = None if other is None else Odds.of(task.given, task.truth, task.places)
-        best = choice(task, settings, fill, WAYS[:1] if other is None else (*WAYS, ODDS))
+        task = left_out(target if tiling.count == 1 else within(target)[0]) if other is None else other.part
+        way = "spline" if other is None else plainest(other.whole, fill, (*WAYS, ODDS))
+        best = choice(_sure(task, len(places)), settings, fill, (way,))
         chosen, tried = best.setting, _gain(best, "left out" if other is None else "of the example")
     between = _Between(target, chosen, start(target, chosen))
     mask, u, end = _filled(between, epsilon, tile, progress, store=store, workers=workers)
@@ -166,7 +161,7 @@ def reconstruct(
         drawn = () if chosen.law is None else drawn_laws(prior, volume, runs)
         likely = chances(fair, target, chosen, drawn or (chosen.law,), runs, level=level, flow=again, progress=progress)
         uncertain = _uncertainty(likely, target, volume, axis, range(runs), suggest)
-        end = f"{end}; {_learned(uncertain, 'the example' if fair is whole_example else 'a shape of the law')}"
+        end = f"{end}; {_learned(uncertain, 'a shape of the law' if other is None else 'the example')}"
     notes = (*notes, *_known(places, volume.shape[axis]), *tiling.place.notes)
     mask, u = (np.ascontiguousarray(np.moveaxis(each, 0, axis)) for each in (mask, u))
     more = {"weight": None, "law": chosen.law, "epsilon": tiling.place.epsilon, "uncertainty": uncertain}
@@ -238,15 +233,6 @@ def _sure(task: Task[Slices] | None, count: int) -> Task[Slices]:
     return task
 
 
-def _part(slices: Slices) -> Slices:
-    """Return the known slices in a box, of edges up to `PART`, that holds most of their surface."""
-    count = max(FEWEST, PART // slices.gap + 1)
-    rows, ys, xs = densest(slices.inside, (count, PART, PART))
-    places = [place - slices.places[rows.start] for place in slices.places[rows]]
-    inside = slices.inside[rows, ys, xs]
-    return replace(slices, inside=inside, places=tuple(places), length=places[-1] + 1, periodic=False)
-
-
 def _uncertainty(
     odds: Chances, slices: Slices, volume: Field, axis: int, seeds: Sequence[int], count: int
 ) -> Uncertainty:
@@ -273,40 +259,12 @@ def _gain(best: Choice, where: str) -> str:
     return f"a prior helps, from {way}: Dice {best.dice:.3f} on slices {where}, {best.plain:.3f} without; "
 
 
-def _slices(volume: Field, places: Sequence[int], axis: int, periodic: bool = False) -> Slices:
-    """Return the known slices of a volume across an axis, which comes first.
-
-    Raises
-    ------
-    ScanError
-        If they are grey levels, or all empty, or all full.
-    """
-    inside = labels(np.moveaxis(volume.values, axis, 0)[list(places)], "known slices") > 0
-    if inside.all() or not inside.any():
-        raise ScanError(
-            f"expected known slices with voxels inside and outside, got {'full' if inside.all() else 'empty'} ones"
-        )
-    edges = [volume.spacing[k] for k in (axis, *(k for k in range(3) if k != axis))]
-    return Slices(inside, tuple(places), volume.shape[axis], (edges[0], edges[1], edges[2]), volume.unit, periodic)
-
-
 def _like(example: Source, volume: Field, reading: dict[str, Any]) -> Field:
     """Return the example; raise ScanError where its voxels differ in size from the volume's."""
     placed = {} if isinstance(example, Field) else {name: reading.get(name) for name in ("spacing", "unit")}
     other = field_of(example, **placed)
     check_spacing(other, volume, "the slices")
     return other
-
-
-def _example(example: Field, places: Sequence[int], axis: int) -> Task[Slices] | None:
-    """Return the task to fill an example between slices that are as far apart as the known ones at most."""
-    gap, length = int(np.diff(places).max()), example.shape[axis]
-    given = range(0, length, gap)
-    if gap < 2 or len(given) < 2:
-        return None
-    between = [n for n in range(given[-1]) if n % gap]
-    truth = labels(np.moveaxis(example.values, axis, 0)[between], "an example") > 0
-    return Task(_slices(example, given, axis), truth, between)
 
 
 def _places(length: int, every: int | None, first: int, known: Sequence[int] | None) -> list[int]:
