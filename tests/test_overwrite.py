@@ -43,7 +43,7 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def commands(scan: Path) -> dict[str, list[object]]:
     segmenting = [scan, "--prior", "tubes", "--steps", 1]
     return {
-        "generate": ["generate", *QUICK, "--shape", 12, "--steps", 2],
+        "generate": ["generate", *QUICK, "--shape", 12, "--steps", 4],
         "segment": ["segment", *segmenting],
         "refine": ["refine", *segmenting, "--weight", 1],
         "reconstruct": ["reconstruct", *segmenting, "--every", 4],
@@ -95,7 +95,7 @@ def test_files_of_the_same_names_stay(command: str, taken: str, scan: Path, tmp_
 
 def test_a_record_speaks_for_its_own_files_alone(tmp_path: Path) -> None:
     """A shape beside a scan of the same stem does not make the scan replaceable; nor its snapshots."""
-    quick = [*QUICK, "--shape", 12, "--steps", 2]
+    quick = [*QUICK, "--shape", 12, "--steps", 4]
     made(*quick, "-o", tmp_path / "a.tif")
     (tmp_path / "a.nii.gz").write_text("mine")
     (tmp_path / "a_step00001.tif").write_text("mine")
