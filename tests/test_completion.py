@@ -125,7 +125,10 @@ def test_laws_are_lowered_on_a_box_of_an_example(monkeypatch: pytest.MonkeyPatch
     mask = np.concatenate([pancakes(1, seed=2), pancakes(3, seed=3)], axis=2)
     example = Example.of(Field(mask.astype(np.uint8)), range(0, 33, 8), axis=0)
     given, box = example.part.given, example.box
-    assert given.shape == (33, 20, 20) and example.whole.given.shape == mask.shape
+    assert given.shape == (33, 20, 20) and example.whole.given.shape == mask.shape and not example.notes
+    monkeypatch.setattr("curvafit.segmentation.example.LARGEST", 32)
+    smaller = Example.of(Field(mask.astype(np.uint8)), range(0, 33, 8), axis=0)
+    assert smaller.notes == ("Of the example 33 x 32 x 32 voxels are read, where most of its surface is.",)
     assert np.array_equal(given.inside, mask[box][::8])
     assert np.array_equal(example.part.truth, mask[box][[n for n in range(32) if n % 8]])
     np.testing.assert_array_equal(example.level(given, ODDS), example.level(example.whole.given, ODDS)[box])

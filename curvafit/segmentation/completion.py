@@ -162,7 +162,7 @@ def reconstruct(
         likely = chances(fair, target, chosen, drawn or (chosen.law,), runs, level=level, flow=again, progress=progress)
         uncertain = _uncertainty(likely, target, volume, axis, range(runs), suggest)
         end = f"{end}; {_learned(uncertain, 'a shape of the law' if other is None else 'the example')}"
-    notes = (*notes, *_known(places, volume.shape[axis]), *tiling.place.notes)
+    notes = (*notes, *(() if other is None else other.notes), *_known(places, volume.shape[axis]), *tiling.place.notes)
     mask, u = (np.ascontiguousarray(np.moveaxis(each, 0, axis)) for each in (mask, u))
     more = {"weight": None, "law": chosen.law, "epsilon": tiling.place.epsilon, "uncertainty": uncertain}
     return result_of(volume, mask, u, status=f"{tried}{end}", notes=notes, **more)

@@ -36,12 +36,15 @@ class Example:
         The part's place in the whole.
     odds
         Of all of it.
+    notes
+        A sentence where only a box of the example is read.
     """
 
     whole: Task[Slices]
     part: Task[Slices]
     box: Box
     odds: Odds
+    notes: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, volume: Field, places: Sequence[int], axis: int) -> Example:
@@ -64,7 +67,10 @@ class Example:
         every = Task(slices_of(volume, given, axis), labels(inside[between], "an example") > 0, between)
         whole, _ = _cut(every, LARGEST)
         part, box = _cut(whole, PART)
-        return cls(whole, part, box, Odds.of(whole.given, whole.truth, whole.places))
+        read = " x ".join(map(str, whole.given.shape))
+        notes = (f"Of the example {read} voxels are read, where most of its surface is.",)
+        cut = whole.given.inside.size < every.given.inside.size
+        return cls(whole, part, box, Odds.of(whole.given, whole.truth, whole.places), notes if cut else ())
 
     def level(self, slices: Slices, way: str) -> np.ndarray:
         """Return an interpolation of a volume, or of the example's own slices; `ODDS` is the example's."""
