@@ -63,17 +63,17 @@ def test_only_the_direction_of_a_counts(mask_phase: torch.Tensor) -> None:
 
 @pytest.mark.slow
 def test_the_fixed_point_fit_improves_on_its_start(mask_phase: torch.Tensor, monkeypatch) -> None:
-    """Already in few steps: none is taken that raises the residual."""
+    """Already in few steps, from a law that moves the surface far: of three seeds to .3 to .7 of its residual."""
     monkeypatch.setattr(import_module("curvafit.inference.fixed_point"), "FIRST_STEPS", 1)
     monkeypatch.setattr(import_module("curvafit.inference.fixed_point"), "LAST_STEPS", 2)
-    start = Coefficients(1, 1, 3, -60, 20, 800)
+    start = preset("sponge").coefficients
     flow = ShortFlow(mask_phase, GRID, WORKING_EPSILON, start)
     before = np.linalg.norm(flow.residual(_parameters(start)))
     told: list[float] = []
     found = fixed_point(
         mask_phase, GRID, WORKING_EPSILON, starts=[start], progress=lambda text, share: told.append(share)
     )
-    assert found.residual < before
+    assert found.residual < 0.9 * before
     assert found.coefficients.a20 == 1 and found.coefficients.a02 > 0
     assert len(told) == found.evaluations and told == sorted(told)
     assert found.mass == pytest.approx(float(mask_phase.mean()), abs=1e-6)
