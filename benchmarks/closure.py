@@ -334,15 +334,20 @@ def gallery(table: Table, folder: Path, cache: Path) -> None:
             show("wide 90", width(each.draws, 0.9) / prior)
 
 
+def truth_of(path: Path) -> np.ndarray:
+    """The parameters in an author's file's name."""
+    law, mass = re.search(r"\[(.*?)\]", path.name), re.search(r" m (-?[\d.]+)\.nii", path.name)
+    assert law is not None
+    assert mass is not None
+    return parameters_of(Coefficients(*map(float, law[1].split())), float(mass[1]))
+
+
 def author_table(folder: Path, cache: Path) -> Table:
     """The author's volumes, measured as masks; the parameters are in the names of the files."""
     names, parameters, rows = [], [], []
     for path in sorted(folder.glob("*coeffs*.nii.gz")):
-        inside, mass = re.search(r"\[(.*?)\]", path.name), re.search(r" m (-?[\d.]+)\.nii", path.name)
-        assert inside is not None
-        assert mass is not None
         names.append(path.name.partition(" coeffs")[0].replace(" ", ""))
-        parameters.append(parameters_of(Coefficients(*map(float, inside[1].split())), float(mass[1])))
+        parameters.append(truth_of(path))
         kept = cache / f"author-{names[-1]}.npy"
         if not kept.exists():
             mask = np.ascontiguousarray(np.asarray(nibabel.load(path).dataobj) > 0)  # type: ignore[attr-defined]

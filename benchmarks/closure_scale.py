@@ -16,33 +16,24 @@ from __future__ import annotations
 
 import argparse
 import os
-import re
 from pathlib import Path
 
 import nibabel
 import numpy as np
 from scipy import ndimage
 
+from benchmarks.closure import truth_of
 from curvafit.files import write_atomically
 from curvafit.geometry.descriptors import descriptors
 from curvafit.inference.check import amortised_p
 from curvafit.inference.emulator import optimum
 from curvafit.inference.estimate import DRAWS, STARTS
 from curvafit.inference.posterior import load_posterior
-from curvafit.inference.table import PARAMETERS, parameters_of
-from curvafit.priors.coefficients import Coefficients
+from curvafit.inference.table import PARAMETERS
 from curvafit.priors.grid import Grid
 
 #: What a law's parameters are divided by, as a power of the scale.
 POWERS = np.array([0, 0, 1, 1, 2, 0])
-
-
-def truth_of(path: Path) -> np.ndarray:
-    """The parameters in an author's file's name."""
-    law, mass = re.search(r"\[(.*?)\]", path.name), re.search(r" m (-?[\d.]+)\.nii", path.name)
-    assert law is not None
-    assert mass is not None
-    return parameters_of(Coefficients(*map(float, law[1].split())), float(mass[1]))
 
 
 def row_of(path: Path, scale: float, cache: Path) -> np.ndarray:
