@@ -138,10 +138,8 @@ def main() -> None:
     options.output.mkdir(parents=True, exist_ok=True)
     laws, levels = options.laws.split(","), [int(n) for n in options.every.split(",")]
     if options.picture:
-        case = options.picture, options.target, levels[0], False, options.output
-        masks = {
-            title: completed(way, *case)[0] for title, way in (("spline", "spline"), ("reconstruct", "calibrated"))
-        }
+        crop = options.picture, options.target, levels[0], False, options.output
+        masks = {title: completed(way, *crop)[0] for title, way in (("spline",) * 2, ("reconstruct", "calibrated"))}
         path = options.output / f"{options.picture}.png"
         draw(shape(options.picture, options.target, options.output), masks, levels[0], path)
         return

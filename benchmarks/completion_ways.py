@@ -38,7 +38,7 @@ def _by_itk(slices: Slices) -> np.ndarray:
 
     labels = np.zeros((slices.length, *slices.inside.shape[1:]), dtype=np.uint8)
     labels[list(slices.places)] = slices.inside
-    interpolator = itk.MorphologicalContourInterpolator.New(itk.image_from_array(labels))
+    interpolator = itk.MorphologicalContourInterpolator.New(itk.image_from_array(labels))  # type: ignore[attr-defined]
     interpolator.SetAxis(2)  # ITK counts axes from the last
     interpolator.Update()
     mask = itk.array_from_image(interpolator.GetOutput()) > 0

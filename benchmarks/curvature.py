@@ -66,7 +66,7 @@ def gallery_gaps(folder: Path) -> list[tuple[str, float, float]]:
 
     rows = []
     for path in sorted(folder.glob("*.nii.gz")):
-        u = torch.from_numpy(nibabel.load(path).get_fdata(dtype=np.float32))
+        u = torch.from_numpy(nibabel.Nifti1Image.from_filename(path).get_fdata(dtype=np.float32))
         grid = Grid(tuple(u.shape), (0.01,) * 3)  # type: ignore[arg-type]
         profiled = phase_field(u > 0, grid, 0.02)
         pairs = ([diagram(field, grid, 0.02, curvature=kind) for field in (u, profiled)] for kind in KINDS)

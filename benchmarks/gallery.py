@@ -59,7 +59,7 @@ def presets_of(folder: Path) -> list[str]:
 
 def author_volume(folder: Path, name: str) -> torch.Tensor:
     (path,) = (path for path in folder.glob("*.nii.gz") if preset_name(path.name.partition(_COEFFICIENTS)[0]) == name)
-    return torch.from_numpy(np.asarray(nibabel.load(path).dataobj, dtype=np.float32))
+    return torch.from_numpy(np.asarray(nibabel.Nifti1Image.from_filename(path).dataobj, dtype=np.float32))
 
 
 def is_floored(u: torch.Tensor) -> bool:

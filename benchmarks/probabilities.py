@@ -30,7 +30,8 @@ from scipy import ndimage
 from skimage.restoration import denoise_tv_chambolle
 from skimage.segmentation import random_walker
 
-from benchmarks.completion import fitted, score, shape
+from benchmarks.completion import fitted, shape
+from benchmarks.completion_ways import scores
 from curvafit.files import write_atomically, write_content
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.calibration import Setting, Task, choice
@@ -164,7 +165,7 @@ def case(bench: Bench, way: str) -> dict:
     path = bench.folder / f"probability-{''.join(filter(str.isalnum, way))}-{bench.law}-{bench.seed}.json"
     if not path.exists():
         mask, chosen = bench.mask(way)
-        write_content(path, json.dumps({**score(mask, bench.truth(bench.seed)), "chosen": chosen}))
+        write_content(path, json.dumps({**scores(mask, bench.truth(bench.seed)), "chosen": chosen}))
     return json.loads(path.read_text())
 
 

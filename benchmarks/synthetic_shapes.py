@@ -140,7 +140,7 @@ def radius(shapes: np.ndarray) -> float:
 
 
 def shape(source: Generated, found: Prior, k: int) -> np.ndarray:
-    return source.shape(box(found), 0, np.random.default_rng(k)).field
+    return source.shape(box(found), 0, np.random.default_rng(k)).values
 
 
 def _tubes(edges: tuple[int, ...], fraction: float, size: float, seed: int) -> np.ndarray:
