@@ -8,7 +8,7 @@ curvatures at constant volume.
 - Prior: `segment(scan, law)`, `refine(probabilities, law)` and `reconstruct(labels, law)` give a mask;
   `curvafit.priors` has the loss for networks.
 - Files: `load(path)` and `save(volume, path)` read and write volumes with their spacing and unit.
-- Measures: `diagram(u, grid, epsilon)` and `wasserstein(a, b)`; more in `curvafit.geometry`.
+- Measure: `measure(scan)`, `diagram(u, grid, epsilon)` and `wasserstein(a, b)`; more in `curvafit.geometry`.
 
 A law is `Coefficients`, the name of a preset (`preset`), or the path of a `fit.json`. The public names are loaded when
 they are first used: importing the package imports nothing.
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from curvafit.segmentation.refine import refine
     from curvafit.segmentation.result import Segmentation
     from curvafit.segmentation.segment import segment
+    from curvafit.studies.measure import Measures, measure
     from curvafit.volumes.scan import Field, load, save
 
 __version__ = "0.1.0"
@@ -46,6 +47,7 @@ __all__ = [
     "Flow",
     "Grid",
     "Inference",
+    "Measures",
     "Segmentation",
     "__version__",
     "descend",
@@ -54,6 +56,7 @@ __all__ = [
     "generate_batch",
     "infer",
     "load",
+    "measure",
     "preset",
     "reconstruct",
     "refine",
@@ -70,6 +73,7 @@ _HOMES = {
     "Flow": "curvafit.generation.result",
     "Grid": "curvafit.priors.grid",
     "Inference": "curvafit.inference.infer",
+    "Measures": "curvafit.studies.measure",
     "Segmentation": "curvafit.segmentation.result",
     "descend": "curvafit.generation.flow",
     "diagram": "curvafit.geometry.diagram",
@@ -77,6 +81,7 @@ _HOMES = {
     "generate_batch": "curvafit.generation.batch",
     "infer": "curvafit.inference.infer",
     "load": "curvafit.volumes.scan",
+    "measure": "curvafit.studies.measure",
     "preset": "curvafit.priors.coefficients",
     "reconstruct": "curvafit.segmentation.completion",
     "refine": "curvafit.segmentation.refine",

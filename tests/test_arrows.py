@@ -17,7 +17,7 @@ FLOORS = (
     ("generation", "volumes"),
     ("geometry",),
     ("inference", "drawing"),
-    ("segmentation", "data_synth", "report"),
+    ("segmentation", "data_synth", "report", "studies"),
     ("atlas_map",),
     ("cli", "nnunet"),
     ("__main__",),

@@ -17,6 +17,8 @@ from curvafit.cli.hosts import EXAMPLE as NNUNET_EXAMPLE
 from curvafit.cli.hosts import nnunet
 from curvafit.cli.infer import EXAMPLES as INFER_EXAMPLES
 from curvafit.cli.infer import infer
+from curvafit.cli.measure import EXAMPLES as MEASURE_EXAMPLES
+from curvafit.cli.measure import measure
 from curvafit.cli.refine import EXAMPLES as REFINE_EXAMPLES
 from curvafit.cli.refine import refine
 from curvafit.cli.refusal import Commands
@@ -38,6 +40,7 @@ app = typer.Typer(
     cls=Commands,
 )
 app.command(epilog=INFER_EXAMPLES)(infer)
+app.command(epilog=MEASURE_EXAMPLES)(measure)
 app.command(epilog=GENERATE_EXAMPLES)(generate)
 app.command()(presets)
 app.command(epilog=NNUNET_EXAMPLE)(nnunet)

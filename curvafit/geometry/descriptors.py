@@ -18,6 +18,7 @@ from torch import Tensor
 
 from curvafit.geometry.diagram import Diagram, surface_curvatures
 from curvafit.geometry.mesh import NoSurface, area_vectors, surface
+from curvafit.geometry.topology import euler_shares
 from curvafit.geometry.transport import sliced_embedding
 from curvafit.priors.bounds import instance
 from curvafit.priors.grid import WORKING_EPSILON, Grid
@@ -146,16 +147,8 @@ def _fabric(normals: np.ndarray, area: np.ndarray) -> np.ndarray:
 
 
 def _euler_density(mask: np.ndarray, grid: Grid) -> float:
-    """Return χ per volume of the union of the closed voxels: each voxel with the corner, edges and faces at its low
-    end; of a window, those that have their neighbours there within it."""
-    total = 0
-    for axes in ((), (0,), (1,), (2,), (0, 1), (0, 2), (1, 2), (0, 1, 2)):
-        cells = mask
-        for axis in axes:
-            cells = cells | np.roll(cells, 1, axis)
-        counted = cells if grid.periodic else cells[1:, 1:, 1:]
-        total += (-1) ** (3 - len(axes)) * int(np.count_nonzero(counted))
-    return total / _meshed_volume(grid)
+    """Return χ per volume of the union of the closed voxels, of a window by the voxels whose neighbours are seen."""
+    return int(euler_shares(mask, periodic=grid.periodic).sum(dtype=np.int64)) / _meshed_volume(grid)
 
 
 def _chord_quantiles(phase: np.ndarray, periodic: bool) -> np.ndarray:

@@ -24,14 +24,22 @@ def family_shares(diagram: Diagram, radius: float) -> dict[str, float]:
 
     Directions after Koenderink's shape index; `radius` is the structure's half-thickness in the diagram's unit.
     """
-    kappa1, kappa2 = diagram.points.T
-    weights = diagram.weights / diagram.weights.sum()
+    area = (
+        np.bincount(families(diagram.points, radius), diagram.weights, minlength=len(FAMILIES)) / diagram.weights.sum()
+    )
+    shares = dict(zip(FAMILIES, map(float, area), strict=True))
+    return {"layers": shares.pop("layers")} | shares
+
+
+def families(points: np.ndarray, radius: float) -> np.ndarray:
+    """Return the family, as its number in `FAMILIES`, of each point (κ1, κ2), (N, 2); see `family_shares`."""
+    kappa1, kappa2 = points.T
     flat = np.hypot(kappa1, kappa2) * radius * _FLAT_RADII < 1
     angle = np.degrees(np.arctan2(kappa2, kappa1))
     angle = np.where(angle > 45 + 1e-9, angle - 360, angle)
     nearest = np.abs(angle[:, None] - np.array(list(_ANGLES.values()))).argmin(1)
-    shares = {name: float(weights[(nearest == k) & ~flat].sum()) for k, name in enumerate(_ANGLES)}
-    return {"layers": float(weights[flat].sum())} | shares
+    numbers = np.array([FAMILIES.index(name) for name in _ANGLES])
+    return np.where(flat, FAMILIES.index("layers"), numbers[nearest])
 
 
 def family_of(diagram: Diagram, radius: float) -> str:

@@ -16,9 +16,10 @@ from numba import njit
 from scipy import ndimage
 from skimage import measure
 
+from curvafit.geometry.mesh import Surface, areas
 from curvafit.geometry.topology import euler_number, euler_of_window
 
-__all__ = ["Morphometry", "local_thickness", "morphometry"]
+__all__ = ["Morphometry", "local_thickness", "morphometry", "smooth_surface"]
 
 #: How far a periodic box is continued before distances are taken, in voxels.
 _WRAPPED = 32
@@ -88,7 +89,7 @@ def morphometry(
         spacing_mean=float(gap.mean(dtype=np.float64)),
         connectivity_density=(1 - euler) / (sampled * voxel),
         euler=round(euler),
-        surface_to_volume=_surface(mask, edges, periodic) / (filled * voxel),
+        surface_to_volume=float(areas(smooth_surface(mask, edges, periodic=periodic)).sum()) / (filled * voxel),
         unit=unit,
     )
 
@@ -184,11 +185,11 @@ def _paint(order, radius, painted, owner, shape, spacing, edge):  # pragma: no c
                         owner[row + i] = centre
 
 
-def _surface(mask: np.ndarray, spacing: tuple[float, float, float], periodic: bool) -> float:
-    """Return the marching-cubes area of the mask after a Gaussian of 0.7 voxels, so that its stairs do not count.
+def smooth_surface(mask: np.ndarray, spacing: tuple[float, float, float], *, periodic: bool = False) -> Surface:
+    """Return the mask's surface by marching cubes after a Gaussian of 0.7 voxels, so that its stairs do not count.
 
     On balls and tubes the area is within 4 % at a radius of 5 voxels and 2 % at 9; less blur counts stairs, more
-    shrinks what is small.
+    shrinks what is small. Vertices are (z, y, x) from the first voxel's centre, in spacing's unit.
     """
     soft = ndimage.gaussian_filter(mask.astype(np.float32), 0.7, mode="wrap" if periodic else "nearest")
     if not soft.min() < 0.5 < soft.max():
@@ -196,4 +197,4 @@ def _surface(mask: np.ndarray, spacing: tuple[float, float, float], periodic: bo
     if periodic:
         soft = np.pad(soft, [(0, 1)] * 3, mode="wrap")
     vertices, faces, _, _ = measure.marching_cubes(soft, 0.5, spacing=spacing)
-    return float(measure.mesh_surface_area(vertices, faces))
+    return Surface(vertices.astype(np.float64), faces.astype(np.int64))

@@ -31,12 +31,25 @@ def euler_number(mask: np.ndarray, *, periodic: bool = False) -> int:
     """Return χ of the union of the closed voxels (26-connected); a periodic box's is that on the torus."""
     if not periodic:
         return int(measure.euler_number(mask, connectivity=3))
-    total = 0
+    return int(euler_shares(mask, periodic=True).sum(dtype=np.int64))
+
+
+def euler_shares(mask: np.ndarray, *, periodic: bool = False) -> np.ndarray:
+    """Return what each voxel adds to χ of the union of the closed voxels (26-connected), int8 (Z, Y, X).
+
+    A voxel has itself and the corner, edges and faces at its low end: -1 for the voxel, 1 for each face, -1 for each
+    edge, 1 for the corner that belongs to the union. In a window the first layers, whose neighbours are not seen, have
+    none. Sums over parts of a window are their shares of χ.
+    """
+    total = np.zeros(mask.shape, dtype=np.int8)
     for axes in ((), (0,), (1,), (2,), (0, 1), (0, 2), (1, 2), (0, 1, 2)):
         cells = mask
         for axis in axes:
             cells = cells | np.roll(cells, 1, axis)
-        total += (-1) ** (3 - len(axes)) * int(np.count_nonzero(cells))
+        total += ((-1) ** (3 - len(axes)) * cells.astype(np.int8)).astype(np.int8)
+    if not periodic:
+        for axis in range(3):
+            total[(slice(None),) * axis + (0,)] = 0
     return total
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import ndimage
 
 from curvafit.geometry.descriptors import Descriptors, descriptors
-from curvafit.geometry.diagram import MARGIN, Diagram, diagram
+from curvafit.geometry.diagram import MARGIN, Diagram, SurfaceCurvatures, surface_curvatures
 from curvafit.geometry.mesh import NoSurface
 from curvafit.inference.prepare import LARGEST_WINDOW, Prepared
 from curvafit.inference.stationarity import is_rounded
@@ -21,18 +21,27 @@ SMALLEST_CUBE = 24
 
 
 def scan_diagram(prepared: Prepared) -> Diagram:
-    """Return the geometric curvature diagram of a prepared scan; of a large one tile by tile, each cell in one tile."""
+    """Return the geometric curvature diagram of a prepared scan."""
+    curvatures = scan_curvatures(prepared)
+    return Diagram(curvatures.points, curvatures.areas, excluded=curvatures.excluded)
+
+
+def scan_curvatures(prepared: Prepared) -> SurfaceCurvatures:
+    """Return the geometric curvatures of a prepared scan's surface; of a large one tile by tile, each cell in one tile.
+
+    Centres are in working units from the centre of the grid's first voxel.
+    """
     grid = prepared.grid
     cuts = [[slice(None)] if grid.periodic else _tiles(n) for n in grid.shape]
-    parts: list[Diagram] = []
+    parts: list[SurfaceCurvatures] = []
     for tile in itertools.product(*cuts):
         with contextlib.suppress(NoSurface):
-            parts.append(_tile_diagram(prepared, tile))
+            parts.append(_tile_curvatures(prepared, tile))
     if not parts:
         raise ValueError("expected a surface inside the scan, got none away from its borders")
-    points, weights = (np.concatenate([getattr(part, name) for part in parts]) for name in ("points", "weights"))
-    lost = sum(part.excluded * part.area for part in parts) / weights.sum()
-    return Diagram(points, weights, excluded=float(lost))
+    centres, points, areas = (np.concatenate(each) for each in zip(*(part[:3] for part in parts), strict=True))
+    lost = sum(part.excluded * float(part.areas.sum()) for part in parts) / areas.sum()
+    return SurfaceCurvatures(centres, points, areas, float(lost))
 
 
 def _tiles(n: int) -> list[slice]:
@@ -42,12 +51,14 @@ def _tiles(n: int) -> list[slice]:
     return [slice(a - MARGIN, b + MARGIN + 1) for a, b in itertools.pairwise(ends)]
 
 
-def _tile_diagram(prepared: Prepared, tile: tuple[slice, ...]) -> Diagram:
+def _tile_curvatures(prepared: Prepared, tile: tuple[slice, ...]) -> SurfaceCurvatures:
     phase = np.ascontiguousarray(prepared.phase[tile])
     z, y, x = phase.shape
     grid = Grid((z, y, x), prepared.grid.spacing, prepared.grid.boundary)
     where = None if prepared.roi is None else ndimage.binary_erosion(prepared.roi, iterations=MARGIN)[tile]
-    return diagram(phase, grid, WORKING_EPSILON, where=where)
+    found = surface_curvatures(phase, grid, WORKING_EPSILON, where=where)
+    corner = np.array([edge.start or 0 for edge in tile]) * np.array(grid.spacing)
+    return found._replace(centres=found.centres + corner)
 
 
 def scan_descriptors(prepared: Prepared) -> tuple[Descriptors, str] | None:

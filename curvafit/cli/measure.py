@@ -1,0 +1,80 @@
+"""The command that measures scans."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from curvafit.cli.reading import Reading, reads_volume
+from curvafit.cli.support import OverwriteOption, output, plainly, say, say_notes, stages, threshold_of
+
+if TYPE_CHECKING:
+    from curvafit.studies.measure import Measures, Quantity
+
+EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
+    (
+        "curvafit measure bone.tif --spacing 0.0195 --unit mm",
+        "curvafit measure mouse1.nii.gz mouse2.nii.gz mouse3.nii.gz -o measures.csv",
+        "curvafit measure cells.ome.zarr --channel 1 --dark --threshold 90 -o measures.parquet",
+    )
+)
+Scans = Annotated[
+    list[str], typer.Argument(help="NIfTI, TIFF (or folder of slices), NPY, NPZ, HDF5 (file.h5::key), RAW, Zarr …")
+]
+
+
+@reads_volume
+def measure(
+    scans: Scans,
+    out: Annotated[Path | None, typer.Option("-o", "--output", help="Table to write: .csv .json .parquet.")] = None,
+    kind: Annotated[str, typer.Option(help="Kind of volume: auto, field, mask or image.")] = "auto",
+    periodic: Annotated[bool, typer.Option("--periodic", help="The box repeats (generated fields).")] = False,
+    threshold: Annotated[str, typer.Option(help="Grey level between the phases, or otsu.")] = "otsu",
+    dark: Annotated[bool, typer.Option("--dark", help="The structure is the dark phase.")] = False,
+    *,
+    reading: Reading,
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Measure scans in seconds: morphometry, fabric and curvature in physical units, with 95 % intervals."""
+    with plainly():
+        options: dict[str, Any] = {"kind": kind, "periodic": periodic, "threshold": threshold_of(threshold)}
+        options |= {"dark": dark, **reading}
+        with stages() as progress:
+            from curvafit.studies.measure import measure as measure_scan
+            from curvafit.studies.tables import check_table, write_table
+
+            if out is not None:
+                check_table(out, scans, overwrite)
+            found = []
+            for number, scan in enumerate(scans):
+
+                def watch(text: str, share: float, number: int = number, scan: str = scan) -> None:
+                    progress(f"{scan}: {text}", (number + share) / len(scans))
+
+                found.append(measure_scan(scan, progress=watch, **options))
+        for each in found:
+            _show(each, len(scans) > 1)
+        if out is not None:
+            say(str(write_table(found, out, overwrite=overwrite)))
+
+
+def _show(measures: Measures, several: bool) -> None:
+    """Print the numbers of a scan."""
+    if several:
+        say(measures.source, style="bold")
+    say_notes(measures.notes)
+    rows = [(each.name, each.symbol, *_cells(each, measures.unit)) for each in measures.quantities]
+    output(("", "", "value", "95 %", "unit"), rows, right=(2, 3))
+    z, y, x = measures.direction
+    say(f"The surface is most nearly parallel to the direction {z:.2f}, {y:.2f}, {x:.2f} (z, y, x).")
+
+
+def _cells(quantity: Quantity, unit: str) -> tuple[str, str, str]:
+    """Return a number, its interval and its unit as text."""
+    from curvafit.units import number, per_unit, unit_name
+
+    power = quantity.power
+    name = "" if power == 0 else unit_name(unit) if power > 0 else per_unit(unit, -power)
+    return number(quantity.value, 4), f"± {number(quantity.half, 2)}", name

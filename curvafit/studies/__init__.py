@@ -1,0 +1,22 @@
+"""One scan's numbers with their errors, and what many scans say together."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from curvafit.faces import offer
+
+if TYPE_CHECKING:
+    from curvafit.studies.measure import Measures, Quantity, measure
+    from curvafit.studies.tables import write_table
+
+__all__ = ["Measures", "Quantity", "measure", "write_table"]
+
+_HOMES = {
+    "Measures": "curvafit.studies.measure",
+    "Quantity": "curvafit.studies.measure",
+    "measure": "curvafit.studies.measure",
+    "write_table": "curvafit.studies.tables",
+}
+
+offer(__name__, _HOMES)

@@ -1,0 +1,285 @@
+"""The numbers of a scan in seconds: morphometry, fabric and curvature in physical units, each with its interval."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from curvafit.geometry.diagram import Diagram
+from curvafit.geometry.family import FAMILIES, families
+from curvafit.geometry.mesh import area_vectors
+from curvafit.geometry.morphometry import local_thickness, smooth_surface
+from curvafit.geometry.topology import euler_number, euler_of_window, euler_shares
+from curvafit.inference.measure import scan_curvatures
+from curvafit.inference.phases import check_options, find_level
+from curvafit.inference.prepare import Prepared, prepare, smallest_piece
+from curvafit.inference.regrid import median_thickness, without_specks
+from curvafit.priors.grid import WORKING_SPACING
+from curvafit.progress import Progress, silent
+from curvafit.studies.blocks import LEAST, Blocks, errors
+from curvafit.volumes.scan import Field, ScanError
+from curvafit.volumes.source import Source, field_of
+
+__all__ = ["Measures", "Quantity", "measure"]
+
+#: What is summed over blocks, in powers of the scan's unit; normals are the six parts of n⊗n, zz zy zx yy yx xx.
+SUMS = ("volume", "inside", "thickness", "thickness²", "gap", "χ", "area", *(f"n{k}" for k in range(6)))
+SUMS += ("curved", "H", "H²", "K", "κ1", "κ2", "C", *FAMILIES)
+_UPPER = np.triu_indices(3)
+Sums = Mapping[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A number of a scan.
+
+    Attributes
+    ----------
+    name, symbol
+        In words, and as the field abbreviates it: `"thickness"`, `"Tb.Th"`.
+    value, half
+        The number, and half the width of its 95 % interval, in the scan's unit to `power`; NaN where the scan is too
+        small to tell.
+    power
+        Power of length: 0 of a share, 1 of a thickness, -3 of a density.
+    """
+
+    name: str
+    symbol: str
+    value: float
+    half: float
+    power: int
+
+
+#: Name, symbol and power of each quantity, and how it comes from sums.
+QUANTITIES: tuple[tuple[str, str, int, Callable[[Sums], np.ndarray]], ...] = (
+    ("volume fraction", "BV/TV", 0, lambda s: s["inside"] / s["volume"]),
+    ("thickness", "Tb.Th", 1, lambda s: s["thickness"] / s["inside"]),
+    (
+        "thickness deviation",
+        "Tb.Th.SD",
+        1,
+        lambda s: _deviation(s["thickness"] / s["inside"], s["thickness²"] / s["inside"]),
+    ),
+    ("spacing", "Tb.Sp", 1, lambda s: s["gap"] / (s["volume"] - s["inside"])),
+    ("connectivity density", "Conn.D", -3, lambda s: -s["χ"] / s["volume"]),
+    ("Euler number", "χ", 0, lambda s: s["χ"]),
+    ("surface to volume", "BS/BV", -1, lambda s: s["area"] / s["inside"]),
+    ("surface density", "BS/TV", -1, lambda s: s["area"] / s["volume"]),
+    ("anisotropy", "DA", 0, lambda s: 1 - _spectrum(s)[..., 0] / _spectrum(s)[..., 2]),
+    ("mean curvature", "H", -1, lambda s: s["H"] / s["curved"]),
+    ("mean curvature deviation", "H.SD", -1, lambda s: _deviation(s["H"] / s["curved"], s["H²"] / s["curved"])),
+    ("Gaussian curvature", "K", -2, lambda s: s["K"] / s["curved"]),
+    ("greater curvature", "κ1", -1, lambda s: s["κ1"] / s["curved"]),
+    ("smaller curvature", "κ2", -1, lambda s: s["κ2"] / s["curved"]),
+    ("curvedness", "C", -1, lambda s: s["C"] / s["curved"]),
+    *((f"share of {name}", name, 0, lambda s, name=name: s[name] / s["curved"]) for name in FAMILIES),
+)
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class Measures:
+    """What a scan measures.
+
+    Attributes
+    ----------
+    kind
+        `"field"`, `"mask"` or `"image"`: what the scan was taken for.
+    quantities
+        The numbers (`QUANTITIES`).
+    direction
+        Unit vector (z, y, x) to which the surface is most nearly parallel: the axis of a bundle of tubes.
+    diagram
+        Areas over (κ1, κ2), in the scan's unit.
+    blocks
+        Blocks along (z, y, x) over which the intervals are estimated.
+    """
+
+    source: str
+    unit: str
+    shape: tuple[int, int, int]
+    spacing: tuple[float, float, float]
+    kind: str
+    quantities: tuple[Quantity, ...]
+    direction: tuple[float, float, float]
+    diagram: Diagram
+    blocks: tuple[int, int, int]
+    notes: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        some = ", ".join(f"{each.symbol} {each.value:.4g}" for each in self.quantities[:4])
+        return f"Measures({some}, in {self.unit}, of {self.source or 'an array'})"
+
+    def __getitem__(self, name: str) -> Quantity:
+        """Return the quantity of a name or a symbol; raise KeyError where there is none."""
+        for each in self.quantities:
+            if name in (each.name, each.symbol):
+                return each
+        raise KeyError(f"expected one of {', '.join(each.name for each in self.quantities)}, got {name!r}")
+
+
+def measure(
+    scan: Source,
+    *,
+    kind: Literal["auto", "field", "mask", "image"] = "auto",
+    periodic: bool = False,
+    threshold: Literal["otsu"] | float = "otsu",
+    dark: bool = False,
+    progress: Progress = silent,
+    **reading: Any,
+) -> Measures:
+    """Measure a scan: nothing is inferred, nothing grown.
+
+    Volume fraction, thickness, spacing, connectivity, surface and fabric are those of the structure on the scan's own
+    voxels, all of them. Curvature is that of the scan on the working grid, as `infer` reads it. Intervals are 95 %, by
+    a jackknife over blocks of a period (thickness and spacing) of the structure (`studies.blocks.errors`); a scan with
+    fewer than eight has none.
+
+    Parameters
+    ----------
+    scan
+        The path of a file, a `Field`, or an array or tensor (Z, Y, X).
+    kind, periodic, threshold, dark
+        As in `infer`.
+    reading
+        Options of reading a file, or the place of an array: see `curvafit.load`.
+
+    Raises
+    ------
+    ValueError
+        If the scan has no structure, or none that the voxels resolve; or as `curvafit.load`.
+    FileNotFoundError
+        If there is no such file.
+    """
+    check_options(kind, threshold, reading.get("label"))
+    field = field_of(scan, **reading)
+    options = {"threshold": threshold, "dark": dark, "periodic": periodic}
+    progress("finding the structure", 0.0)
+    mask, seen, notes = _structure(field, kind, options)
+    progress("measuring thickness", 0.1)
+    maps = [local_thickness(each, field.spacing, periodic=periodic) for each in (mask, ~mask)]
+    blocks = Blocks.of(field.shape, field.spacing, sum(float(each[each > 0].mean(dtype=np.float64)) for each in maps))
+    progress("measuring curvature", 0.6)
+    prepared = prepare(field, kind=seen, **options)  # type: ignore[arg-type]
+    curved, diagram = _curved(blocks, prepared)
+    sums = {**_filled(blocks, mask, maps, field.spacing), **_surfaced(blocks, mask, field.spacing, periodic), **curved}
+    table = np.stack([sums[name] for name in SUMS], axis=1)
+    values, euler = _figures(table.sum(0)), _euler(mask, periodic)
+    values[[name for name, *_ in QUANTITIES].index("Euler number")] = euler
+    values[[name for name, *_ in QUANTITIES].index("connectivity density")] = (1 - euler) / _seen(mask, field, periodic)
+    halves = errors(table, blocks, _figures) if blocks.count >= LEAST else np.full(len(values), np.nan)
+    if blocks.count < LEAST:
+        notes = (*notes, f"No intervals: they need {LEAST} blocks of a period, and the scan has {blocks.count}.")
+    rows = zip(QUANTITIES, values, halves, strict=True)
+    _, axes = np.linalg.eigh(_tensor(dict(zip(SUMS, table.sum(0), strict=True))))
+    return Measures(
+        source=field.source,
+        unit=field.unit,
+        shape=field.shape,
+        spacing=field.spacing,
+        kind=prepared.kind,
+        quantities=tuple(Quantity(name, symbol, float(v), float(h), power) for (name, symbol, power, _), v, h in rows),
+        direction=tuple(map(float, axes[:, 0] * np.sign(axes[np.abs(axes[:, 0]).argmax(), 0]))),  # type: ignore[arg-type]
+        diagram=diagram,
+        blocks=blocks.counts,
+        notes=(*notes, *(f"Of curvature: {note}" for note in prepared.notes if note not in notes)),
+    )
+
+
+def _structure(field: Field, kind: str, options: dict[str, Any]) -> tuple[np.ndarray, str, tuple[str, ...]]:
+    """Return the structure on the scan's voxels, what it was taken for, and notes; of an image, without specks."""
+    level = find_level(field, kind=kind, **options)  # type: ignore[arg-type]
+    mask, notes = level.mask, (*field.notes, level.note)
+    if level.kind == "image":
+        thickness, _ = median_thickness(mask, field.spacing, options["periodic"])
+        smallest = smallest_piece(thickness) / math.prod(field.spacing)
+        mask, specks, holes = without_specks(mask, smallest, options["periodic"])
+        if specks or holes:
+            notes = (
+                *notes,
+                f"Dropped what is smaller than a ball of half the median thickness: {specks} specks, {holes} pinholes.",
+            )
+    if mask.all() or not mask.any():
+        raise ScanError("expected a structure and background in the scan, got one of them only")
+    return mask, level.kind, notes
+
+
+def _filled(
+    blocks: Blocks, mask: np.ndarray, maps: list[np.ndarray], spacing: tuple[float, float, float]
+) -> dict[str, np.ndarray]:
+    """Return the sums of what voxels have."""
+    voxel, (thickness, gap) = math.prod(spacing), maps
+    return {
+        "volume": voxel * blocks.sums(np.ones(mask.shape, dtype=bool)),
+        "inside": voxel * blocks.sums(mask),
+        "thickness": voxel * blocks.sums(thickness),
+        "thickness²": voxel * blocks.sums(np.square(thickness)),
+        "gap": voxel * blocks.sums(gap),
+    }
+
+
+def _surfaced(
+    blocks: Blocks, mask: np.ndarray, spacing: tuple[float, float, float], periodic: bool
+) -> dict[str, np.ndarray]:
+    """Return the sums of χ, of area, and of n⊗n dA in the upper triangle's order (z, y, x)."""
+    mesh = smooth_surface(mask, spacing, periodic=periodic)
+    normals = area_vectors(mesh)[:, ::-1]
+    area = np.linalg.norm(normals, axis=1)
+    parts = normals[:, _UPPER[0]] * normals[:, _UPPER[1]] / np.where(area > 0, area, 1)[:, None]
+    sums = blocks.gathered(mesh.barycentres / np.array(spacing), np.column_stack([area, parts]))
+    names = ("area", *(f"n{k}" for k in range(6)))
+    return {"χ": blocks.sums(euler_shares(mask, periodic=periodic)), **dict(zip(names, sums.T, strict=True))}
+
+
+def _curved(blocks: Blocks, prepared: Prepared) -> tuple[dict[str, np.ndarray], Diagram]:
+    """Return the sums of curvatures times area, and the diagram, in the scan's unit."""
+    centres, points, areas, excluded = scan_curvatures(prepared)
+    length = prepared.working_voxel / WORKING_SPACING
+    diagram = Diagram(points / length, areas * length**2, f"1/{prepared.unit}", excluded=excluded)
+    voxels = (centres / WORKING_SPACING + 0.5) * np.array(prepared.scale) - 0.5 + np.array(prepared.origin)
+    κ1, κ2 = diagram.points.T
+    H = (κ1 + κ2) / 2
+    kinds = np.eye(len(FAMILIES))[families(points, prepared.thickness / 2 * WORKING_SPACING)]
+    columns = np.column_stack([np.ones_like(H), H, H**2, κ1 * κ2, κ1, κ2, np.hypot(κ1, κ2) / math.sqrt(2), kinds])
+    sums = blocks.gathered(voxels, columns * diagram.weights[:, None])
+    return dict(zip(("curved", "H", "H²", "K", "κ1", "κ2", "C", *FAMILIES), sums.T, strict=True)), diagram
+
+
+def _figures(sums: np.ndarray) -> np.ndarray:
+    """Return the quantities (…, K) of sums (…, C)."""
+    named = dict(zip(SUMS, np.moveaxis(sums, -1, 0), strict=True))
+    with np.errstate(divide="ignore", invalid="ignore"):  # draws of blocks without surface
+        return np.stack([figure(named) for *_, figure in QUANTITIES], axis=-1)
+
+
+def _deviation(mean: np.ndarray, square: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.maximum(square - mean**2, 0))
+
+
+def _tensor(sums: Sums) -> np.ndarray:
+    """Return ∫ n⊗n dA / area, (…, 3, 3)."""
+    tensor = np.empty((*np.shape(sums["area"]), 3, 3))
+    for k, (i, j) in enumerate(zip(*_UPPER, strict=True)):
+        tensor[..., i, j] = tensor[..., j, i] = sums[f"n{k}"] / sums["area"]
+    return tensor
+
+
+def _spectrum(sums: Sums) -> np.ndarray:
+    """Return the eigenvalues of the fabric, ascending (…, 3); NaN without surface."""
+    tensor = _tensor(sums)
+    known = np.asarray(np.isfinite(tensor).all(axis=(-1, -2)))[..., None]
+    return np.where(known, np.linalg.eigvalsh(np.where(known[..., None], tensor, 0)), np.nan)
+
+
+def _euler(mask: np.ndarray, periodic: bool) -> float:
+    """Return χ: of a window, its share of that of what it is cut from."""
+    return float(euler_number(mask, periodic=True)) if periodic else euler_of_window(mask)
+
+
+def _seen(mask: np.ndarray, field: Field, periodic: bool) -> float:
+    """Return the volume that χ is counted in: of a window, that between the centres of its outer voxels."""
+    return math.prod(field.spacing) * math.prod(mask.shape if periodic else (max(n - 1, 1) for n in mask.shape))

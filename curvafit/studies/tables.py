@@ -1,0 +1,120 @@
+"""Tidy tables of what scans measure: a row for each scan and quantity, as CSV, JSON or Parquet."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from curvafit.files import bears, check_free, own_record, write_atomically, write_content
+from curvafit.studies.measure import Measures
+
+__all__ = ["SUFFIXES", "check_table", "rows_of", "write_table"]
+
+#: Suffixes of the files that are written.
+SUFFIXES = (".csv", ".json", ".parquet")
+#: Columns of a table; a CSV file begins with them.
+COLUMNS = ("scan", "quantity", "symbol", "value", "low", "high", "unit", "direction", "version")
+#: `format` of a JSON table.
+FORMAT = "curvafit measures 1"
+
+
+def rows_of(measures: Measures) -> list[dict[str, Any]]:
+    """Return a row for each quantity of a scan, by column; None where there is no number."""
+    from importlib.metadata import version
+
+    release, z, y, x = version("curvafit"), *measures.direction
+    rows = []
+    for each in measures.quantities:
+        ends = (each.value, each.value - each.half, each.value + each.half)
+        value, low, high = (end if math.isfinite(end) else None for end in ends)
+        axis = f"{z:.4f} {y:.4f} {x:.4f}" if each.symbol == "DA" else ""
+        cells = (
+            measures.source,
+            each.name,
+            each.symbol,
+            value,
+            low,
+            high,
+            _unit(measures.unit, each.power),
+            axis,
+            release,
+        )
+        rows.append(dict(zip(COLUMNS, cells, strict=True)))
+    return rows
+
+
+def check_table(path: str | PathLike[str], inputs: Sequence[str | Path] = (), overwrite: bool = False) -> Path:
+    """Return the path of a table that may be written.
+
+    Raises
+    ------
+    ValueError
+        If the suffix is another, or the file is an input or of another origin, without `overwrite`.
+    ImportError
+        If a Parquet table is to be written without pandas and pyarrow.
+    """
+    target = Path(path)
+    if target.suffix.lower() not in SUFFIXES:
+        raise ValueError(f"expected a table to write as {', '.join(SUFFIXES)}, got {target}")
+    if target.suffix.lower() == ".parquet":
+        _pandas()
+    check_free([target], _ours, inputs, overwrite)
+    return target
+
+
+def write_table(measures: Sequence[Measures], path: str | PathLike[str], *, overwrite: bool = False) -> Path:
+    """Write a table of scans as `.csv`, `.json` or `.parquet`, and return its path.
+
+    Raises
+    ------
+    ValueError, ImportError
+        As `check_table`.
+    """
+    target = check_table(path, overwrite=overwrite)
+    rows = [row for each in measures for row in rows_of(each)]
+    if target.suffix.lower() == ".parquet":
+        frame = _pandas().DataFrame(rows, columns=list(COLUMNS))
+        return write_atomically(target, lambda temporary: frame.to_parquet(temporary, index=False))
+    if target.suffix.lower() == ".json":
+        scans = [
+            {"scan": each.source, "kind": each.kind, "blocks": each.blocks, "notes": each.notes} for each in measures
+        ]
+        return write_content(target, json.dumps({"format": FORMAT, "scans": scans, "rows": rows}, indent=1))
+    text = io.StringIO(newline="")
+    writer = csv.writer(text)
+    writer.writerow(COLUMNS)
+    writer.writerows(row.values() for row in rows)
+    return write_content(target, text.getvalue())
+
+
+def _ours(target: Path) -> bool:
+    """Return whether a file is a table of this program."""
+    if target.suffix.lower() == ".csv":
+        return bears(target, ",".join(COLUMNS))
+    return target.suffix.lower() == ".json" and bool(own_record(target, FORMAT))
+
+
+def _unit(unit: str, power: int) -> str:
+    """Return a unit to a power in plain signs: mm, 1/mm, 1/mm^3."""
+    if power == 0:
+        return ""
+    raised = unit if abs(power) == 1 else f"{unit}^{abs(power)}"
+    return raised if power > 0 else f"1/{raised}"
+
+
+def _pandas() -> Any:
+    try:
+        import pandas
+        import pyarrow  # noqa: F401
+    except ImportError as error:
+        raise ImportError(
+            'expected pandas and pyarrow for a Parquet table, got neither: pip install "curvafit[tables]"',
+            name="pandas",
+        ) from error
+    return pandas

@@ -1,0 +1,238 @@
+"""`measure`: exact shapes, laws of units and symmetries, sums over blocks and their errors, tables and the command."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calling import call, refused
+
+from curvafit.geometry.morphometry import morphometry
+from curvafit.geometry.topology import euler_number, euler_shares
+from curvafit.studies import tables
+from curvafit.studies.blocks import LEAST, Blocks, errors
+from curvafit.studies.measure import QUANTITIES, Measures, measure
+from curvafit.studies.tables import COLUMNS, rows_of, write_table
+from curvafit.volumes.scan import Field
+
+N = 48
+
+
+def tubes(n: int = N, pitch: int = 24, radius: float = 6.0) -> np.ndarray:
+    """Parallel tubes along z, on a square lattice, uint8."""
+    y, x = np.indices((n, n)) % pitch - pitch / 2
+    return np.broadcast_to(np.hypot(y, x) < radius, (n, n, n)).astype(np.uint8)
+
+
+def balls(n: int = N, pitch: int = 24, radius: float = 8.0) -> np.ndarray:
+    z, y, x = np.indices((n,) * 3) % pitch - pitch / 2 + 0.5
+    return (z**2 + y**2 + x**2 < radius**2).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def cut() -> np.ndarray:
+    """A window of a level set of a Gaussian field, uint8."""
+    from scipy import ndimage
+
+    field = ndimage.gaussian_filter(np.random.default_rng(3).standard_normal((64,) * 3), 2.5, mode="wrap")
+    return (field > np.quantile(field, 0.7))[:56, :52, :].astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def measures(cut: np.ndarray) -> Measures:
+    return measure(Field(cut, (0.5, 0.5, 0.5), "um"))
+
+
+# ---- exact shapes ----------------------------------------------------------------------------------------------------
+
+
+def test_parallel_tubes() -> None:
+    found = measure(tubes(), periodic=True)
+    assert found["volume fraction"].value == pytest.approx(tubes().mean(), abs=1e-12)
+    assert found["Tb.Th"].value == pytest.approx(12, abs=1e-6)
+    assert found["share of tubes"].value > 0.95
+    assert found["κ1"].value == pytest.approx(1 / 6, rel=0.05)
+    assert abs(found["κ2"].value) < 0.01
+    assert found["Euler number"].value == 0  # on the torus
+    assert np.abs(found.direction) == pytest.approx([1, 0, 0], abs=1e-3)
+    assert found["DA"].value == pytest.approx(1, abs=1e-6)  # the surface has no normal along z
+    assert found.unit == "voxel"
+
+
+def test_balls_in_a_periodic_box() -> None:
+    found = measure(balls(), periodic=True, kind="mask")
+    assert found["Euler number"].value == 8
+    assert found["connectivity density"].value == pytest.approx(-7 / N**3)
+    assert found["share of spheres"].value > 0.95
+    assert found["H"].value == pytest.approx(1 / 8, rel=0.05)
+    assert found["K"].value == pytest.approx(1 / 64, rel=0.1)
+    assert found["BS/BV"].value == pytest.approx(3 / 8, rel=0.05)
+    assert found["DA"].value < 0.02
+
+
+def test_the_familiar_numbers_are_those_of_morphometry(cut: np.ndarray, measures: Measures) -> None:
+    numbers = morphometry(cut > 0, 0.5, "um")
+    for symbol, name in (
+        ("BV/TV", "volume_fraction"),
+        ("Tb.Th", "thickness_mean"),
+        ("Tb.Th.SD", "thickness_std"),
+        ("Tb.Sp", "spacing_mean"),
+        ("Conn.D", "connectivity_density"),
+        ("BS/BV", "surface_to_volume"),
+    ):
+        assert measures[symbol].value == pytest.approx(getattr(numbers, name), rel=1e-5), symbol
+    assert round(measures["χ"].value) == numbers.euler
+
+
+def test_curvature_obeys_gauss_and_bonnet() -> None:
+    """∫K dA = 4πχ of the solid, here 8 balls."""
+    found = measure(balls(), periodic=True, kind="mask")
+    assert found["K"].value * found["BS/TV"].value * N**3 == pytest.approx(4 * math.pi * 8, rel=0.05)
+
+
+# ---- laws ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_change_of_unit_scales_each_number_by_its_power(cut: np.ndarray, measures: Measures) -> None:
+    longer = measure(Field(cut, (1.5, 1.5, 1.5), "um"))
+    for one, other in zip(measures.quantities, longer.quantities, strict=True):
+        assert other.value == pytest.approx(one.value * 3.0**one.power, rel=1e-4, abs=1e-9), one.name
+        assert other.half == pytest.approx(one.half * 3.0**one.power, rel=1e-3, abs=1e-9), one.name
+
+
+def test_a_turn_changes_nothing_but_the_direction(cut: np.ndarray, measures: Measures) -> None:
+    turned = measure(Field(np.ascontiguousarray(cut.transpose(1, 2, 0)), (0.5, 0.5, 0.5), "um"))
+    for one, other in zip(measures.quantities, turned.quantities, strict=True):
+        # Lewiner's cubes and balls painted in another order: not to the bit
+        assert other.value == pytest.approx(one.value, rel=0.01, abs=0.002), one.name
+    z, y, x = np.abs(measures.direction)
+    assert np.abs(turned.direction) == pytest.approx([y, x, z], abs=0.05)
+
+
+def test_layers_say_that_the_direction_is_within_them() -> None:
+    layers = np.broadcast_to((np.indices((N,))[0] % 16 < 7)[:, None, None], (N, N, N)).astype(np.uint8)
+    found = measure(layers, kind="mask", periodic=True)
+    assert found["share of layers"].value > 0.95
+    assert abs(found.direction[0]) < 1e-6
+    assert found["Tb.Th"].value == pytest.approx(7, abs=1)
+
+
+# ---- blocks ----------------------------------------------------------------------------------------------------------
+
+
+def test_blocks_add_up_to_the_whole() -> None:
+    blocks, rng = Blocks.of((50, 37, 29), (1.0, 1.0, 1.0), 9.0), np.random.default_rng(0)
+    values, places, weights = rng.random((50, 37, 29)), rng.uniform(-0.5, 60, (500, 3)), rng.random((500, 2))
+    assert blocks.counts == (5, 4, 3)
+    assert blocks.sums(values).sum() == pytest.approx(values.sum())
+    assert blocks.gathered(places, weights).sum(0) == pytest.approx(weights.sum(0))
+    assert blocks.gathered(np.array([[10.4, 0, 0]]), np.ones((1, 1))).argmax() == 12  # slice 10 begins the second block
+
+
+def test_shares_of_the_euler_number_add_up(cut: np.ndarray) -> None:
+    mask = cut > 0
+    assert int(euler_shares(mask, periodic=True).sum(dtype=np.int64)) == euler_number(mask, periodic=True)
+    padded = np.pad(mask, ((1, 0),) * 3)  # what lies before the first voxels is seen to be empty
+    rim = np.pad(mask, ((1, 1),) * 3)
+    assert int(euler_shares(rim).sum(dtype=np.int64)) == euler_number(mask)
+    assert euler_shares(padded)[1:, 1:, 1:].shape == mask.shape
+
+
+def mean(sums: np.ndarray) -> np.ndarray:
+    return sums[..., :1] / sums[..., 1:]
+
+
+@pytest.mark.parametrize("counts", [(2, 2, 2), (4, 3, 1), (4, 4, 4)])
+def test_intervals_of_independent_blocks_hold_as_often_as_they_say(counts: tuple[int, int, int]) -> None:
+    blocks, rng = Blocks((12, 12, 12), tuple(tuple(range(n)) for n in counts)), np.random.default_rng(1)  # type: ignore[arg-type]
+    held = 0
+    for _ in range(2000):
+        values = rng.standard_normal(blocks.count)
+        half = errors(np.stack([values, np.ones(blocks.count)], axis=1), blocks, mean)
+        held += abs(values.mean()) <= half[0]
+    # Satterthwaite's degrees of freedom are approximate: within 2 % of 95 %, and 2000 draws tell 1.5 %
+    assert held / 2000 == pytest.approx(0.95, abs=0.03)
+
+
+def test_intervals_widen_where_neighbours_are_alike() -> None:
+    """By 2.3 in truth; the kernel counts half of what neighbours share, a jackknife of single blocks nothing."""
+    blocks = Blocks((12, 12, 12), ((0, 3, 6, 9),) * 3)  # type: ignore[arg-type]
+    rng, rows = np.random.default_rng(2), []
+    for _ in range(200):
+        rough = rng.standard_normal((5, 5, 5))
+        alike = sum(rough[i : i + 4, j : j + 4, k : k + 4] for i in (0, 1) for j in (0, 1) for k in (0, 1)) / 8**0.5
+        both = [rng.standard_normal(64), np.ravel(alike)]
+        rows.append([errors(np.stack([each, np.ones(64)], axis=1), blocks, mean)[0] for each in both])
+    apart, together = np.median(rows, axis=0)
+    assert together > 1.3 * apart
+
+
+def test_a_small_scan_has_no_intervals(cut: np.ndarray) -> None:
+    found = measure(cut[:24, :24, :24], kind="mask")
+    assert math.prod(found.blocks) < LEAST
+    assert all(math.isnan(each.half) for each in found.quantities)
+    assert any(note.startswith("No intervals") for note in found.notes)
+
+
+# ---- tables and the command ------------------------------------------------------------------------------------------
+
+
+def test_tables_are_tidy(measures: Measures, tmp_path: Path) -> None:
+    path = write_table([measures, measures], tmp_path / "table.csv")
+    rows = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
+    assert tuple(rows[0]) == COLUMNS
+    assert len(rows) == 2 * len(QUANTITIES)
+    assert float(rows[1]["value"]) == measures["Tb.Th"].value
+    assert float(rows[1]["high"]) - float(rows[1]["low"]) == pytest.approx(2 * measures["Tb.Th"].half)
+    assert [rows[k]["unit"] for k in (0, 1, 4, 6)] == ["", "um", "1/um^3", "1/um"]
+    content = json.loads(write_table([measures], tmp_path / "table.json").read_text(encoding="utf-8"))
+    assert content["rows"] == rows_of(measures)
+    assert write_table([measures], path) == path  # its own file
+
+
+def test_parquet_has_the_same_rows(measures: Measures, tmp_path: Path) -> None:
+    pandas = pytest.importorskip("pandas", reason="the extra 'tables' is not installed")
+    pytest.importorskip("pyarrow", reason="the extra 'tables' is not installed")
+    frame = pandas.read_parquet(write_table([measures], tmp_path / "table.parquet"))
+    assert list(frame.columns) == list(COLUMNS)
+    assert frame["value"].tolist() == [row["value"] for row in rows_of(measures)]
+
+
+def test_parquet_without_pandas_names_the_extra(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "pandas", None)
+    with pytest.raises(ImportError, match=r"pip install \"curvafit\[tables\]\""):
+        tables.check_table(tmp_path / "table.parquet")
+
+
+def test_the_command_prints_and_writes(cut: np.ndarray, tmp_path: Path) -> None:
+    scan, table = tmp_path / "scan.npy", tmp_path / "table.csv"
+    np.save(scan, cut)
+    result = call("measure", scan, scan, "--spacing", 0.5, "--unit", "um", "-o", table)
+    assert result.exit_code == 0, result.output
+    assert "Tb.Th" in result.output
+    assert "1/µm³" in result.output
+    assert len(table.read_text(encoding="utf-8").splitlines()) == 1 + 2 * len(QUANTITIES)
+    again = call("measure", scan, "--spacing", 0.5, "--unit", "um", "-o", table)
+    assert again.exit_code == 0, again.output
+
+
+def test_bad_input_is_refused(cut: np.ndarray, tmp_path: Path) -> None:
+    scan, foreign = tmp_path / "scan.npy", tmp_path / "mine.csv"
+    np.save(scan, cut)
+    foreign.write_text("a,b\n1,2\n", encoding="utf-8")
+    before = foreign.read_bytes()
+    for arguments, words in (
+        ((scan, "-o", foreign), "a name that is free"),
+        ((scan, "-o", tmp_path / "table.xlsx"), ".csv, .json, .parquet"),
+        ((scan, "-o", scan), ".csv, .json, .parquet"),
+        ((tmp_path / "none.npy", "-o", tmp_path / "t.csv"), "none.npy"),
+        ((scan, "--kind", "tube", "-o", tmp_path / "t.csv"), "kind auto, field, mask or image"),
+        ((scan, "--label", 7, "-o", tmp_path / "t.csv"), "label"),
+    ):
+        refused(call("measure", *arguments), words)
+    assert foreign.read_bytes() == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.csv", "scan.npy"]
