@@ -45,6 +45,7 @@ RECONSTRUCT_EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
         "curvafit reconstruct labels.nii.gz --every 8 --prior bone/fit.json -o volume.nii.gz",
         "curvafit reconstruct labels.nii.gz --every 8 --example whole.nii.gz -o volume.nii.gz",
         "curvafit reconstruct labels.tif --known 0,7,15 --axis x --prior tubes -o volume.tif",
+        "curvafit reconstruct organelles.nii.gz --every 8 --labels all --example whole.nii.gz -o volume.nii.gz",
         "curvafit reconstruct labels.nii.gz --every 8 --prior bone/fit.json --suggest 3 -o volume.nii.gz",
     )
 )
@@ -74,6 +75,9 @@ WorkersOption = Annotated[
 ]
 Every = Annotated[int | None, _what(help="Distance of known slices: with 8, every eighth slice is known.")]
 First = Annotated[int | None, _what(help="Number of the first known slice, with --every; by default 0.")]
+Labels = Annotated[
+    str | None, _what(help="Several structures that exclude each other: all, or their labels, 1,2,5; writes labels.")
+]
 Axis = Annotated[str, _what(help="Axis across the slices: z, y or x (first, second, last axis of an array).")]
 
 #: Laws that are tried of an example's fit, which is not known yet.
@@ -133,6 +137,7 @@ def reconstruct(
     known: Annotated[str | None, _what("--known", "--slices", help="Or: numbers of the known slices, 0,7,15.")] = None,
     axis: Axis = "z",
     *,
+    labels: Labels = None,
     example: Example = None,
     stiffness: Stiffness = None,
     periodic: Periodic = False,
@@ -153,6 +158,11 @@ def reconstruct(
             raise ValueError(f"expected either --every or --known, got {'neither' if every is None else 'both'}")
         if prior is None and example is None:
             raise ValueError("expected --prior or --example, got neither")
+        if labels is not None and (reading["label"] is not None or runs or suggest):
+            raise ValueError(
+                "expected --labels without --label, --runs and --suggest, which are of one structure, got both"
+            )
+        several = None if labels in (None, "all") else list(whole_numbers(labels, "--labels"))
         numbers = None if known is None else list(whole_numbers(known, "--known"))
         if known is not None and first is not None:
             raise ValueError(f"expected --first beside --every, got {first} beside --known")
@@ -168,12 +178,19 @@ def reconstruct(
             alike = {name: reading[name] for name in ("spacing", "unit", "label", "strict")}
             whole = None if example is None else load(example, **alike)
             say_notes(() if whole is None else whole.notes)
-            law = prior if prior is not None else inferred(whole, progress)
             slices = whole_of(volume)
+            if labels is not None:
+                from curvafit.segmentation.several import reconstruct_labels
+
+                laws = prior if prior is not None else inferred_of_each(whole, several, progress)
+                one = {name: value for name, value in options.items() if name not in ("runs", "suggest")}
+                common = {"example": whole, "steps": steps, "progress": progress}
+                return reconstruct_labels(slices, laws, chosen=several, **common, **tools, **one)
+            law = prior if prior is not None else inferred(whole, progress)
             return fill(slices, law, example=whole, steps=steps, progress=progress, **tools, **options)
 
         more = {"example": None if example is None else str(example), **options}
-        record = {"job": "reconstruct", "steps": steps, "tile": tile, **more}
+        record = {"job": "reconstruct", "steps": steps, "tile": tile, **({"labels": labels} if labels else {}), **more}
 
         def tried(laws: int, voxels: int) -> float:
             return ((laws if stiffness is None else 0) + 2 * (runs or RUNS * bool(suggest))) * steps
@@ -186,6 +203,24 @@ def inferred(example: Field | None, progress: Progress) -> Inference:
     from curvafit.inference.infer import infer
 
     return infer(example, kind="mask", fast=True, progress=progress)  # type: ignore[arg-type]
+
+
+def inferred_of_each(example: Field | None, chosen: list[int] | None, progress: Progress) -> dict[int, Any]:
+    """Return what an example says of the law of each label; the Willmore energy where it says nothing."""
+    from dataclasses import replace
+
+    from curvafit.priors.coefficients import Coefficients
+    from curvafit.segmentation.several import labels_of
+    from curvafit.volumes.scan import ScanError
+
+    laws: dict[int, Any] = {}
+    for number in labels_of(example.values, chosen):  # type: ignore[union-attr]
+        try:
+            laws[number] = inferred(replace(example, values=example.values == number), progress)  # type: ignore[arg-type, union-attr]
+        except ScanError as reason:
+            say_notes([f"Label {number} of the example has no law ({reason}): the Willmore energy is tried."])
+            laws[number] = Coefficients.willmore()
+    return laws
 
 
 def run_job(

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from curvafit.segmentation.refine import Calibration, calibrate, refine
     from curvafit.segmentation.result import Segmentation
     from curvafit.segmentation.segment import segment
+    from curvafit.segmentation.several import reconstruct_labels
 
 __all__ = [
     "Calibration",
@@ -19,6 +20,7 @@ __all__ = [
     "Segmentation",
     "calibrate",
     "reconstruct",
+    "reconstruct_labels",
     "refine",
     "segment",
 ]
@@ -29,6 +31,7 @@ _HOMES = {
     "Segmentation": "curvafit.segmentation.result",
     "calibrate": "curvafit.segmentation.refine",
     "reconstruct": "curvafit.segmentation.completion",
+    "reconstruct_labels": "curvafit.segmentation.several",
     "refine": "curvafit.segmentation.refine",
     "segment": "curvafit.segmentation.segment",
 }

@@ -34,7 +34,7 @@ from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.part import Box
 from curvafit.volumes.source import Source, field_of
 
-__all__ = ["reconstruct"]
+__all__ = ["known_places", "reconstruct"]
 
 #: Stiffness of the springs on known voxels, in working units: a tenth of it gives way, ten times as much stalls.
 STIFFNESS = 1e7
@@ -117,7 +117,7 @@ def reconstruct(
     """
     volume = field_of(slices, **reading)
     axis = whole(axis, "an axis 0, 1 or 2 (z, y, x)", 0, 2)
-    places = _places(volume.shape[axis], every, first, known)
+    places = known_places(volume.shape[axis], every, first, known)
     target = slices_of(volume, places, axis, periodic)
     tiling = Tiling.of(target.frame, epsilon, tile, periodic=periodic)
     if stiffness is not None:
@@ -267,7 +267,8 @@ def _like(example: Source, volume: Field, reading: dict[str, Any]) -> Field:
     return other
 
 
-def _places(length: int, every: int | None, first: int, known: Sequence[int] | None) -> list[int]:
+def known_places(length: int, every: int | None, first: int, known: Sequence[int] | None) -> list[int]:
+    """Return the numbers of the known slices, ascending; raise ScanError where they are no such numbers."""
     if (every is None) == (known is None):
         raise ScanError("expected either every how many slices are known, or their numbers")
     numbers = [real(n, "whole numbers of slices") for n in ((every, first) if known is None else known)]

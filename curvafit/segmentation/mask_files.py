@@ -66,7 +66,7 @@ def write_mask(
     record: dict[str, Any] | None = None,
     overwrite: bool = False,
 ) -> tuple[Path, ...]:
-    """Write the mask (0 and 1, uint8), a picture, a record, and the probability of the inside where there is one.
+    """Write the mask (0 and 1, uint8) or labels, a picture, a record, and the probability where there is one.
 
     The picture shows the middle slices, or the most uncertain ones with their uncertainty.
 
@@ -102,9 +102,11 @@ def write_mask(
 
     with staged(target) as work:
         temporary = work / target.name
-        write(segmentation.mask.values.view(np.uint8), temporary)
+        values = segmentation.mask.values.view(np.uint8) if segmentation.labels is None else segmentation.labels.values
+        write(values, temporary)
         picture, note = beside(temporary, ".png"), beside(temporary, ".json")
-        rows = [(scan.values, None), (scan.values, segmentation.mask.values)]
+        shown = segmentation.mask.values if segmentation.labels is None else None
+        rows = [(scan.values, None), (scan.values if segmentation.labels is None else values, shown)]
         _figure(rows, segmentation).savefig(picture, dpi=DPI)
         parts = [temporary, picture, note]
         if chances is not None:

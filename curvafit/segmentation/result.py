@@ -59,6 +59,8 @@ class Segmentation(Pictured):
         Sentences on the evidence and on assumptions.
     uncertainty
         The probability of the inside, and what to annotate next, of a reconstruction with several runs.
+    labels
+        Of several structures, which one is at each voxel, 0 where there is none: whole numbers.
     """
 
     mask: Field
@@ -69,6 +71,7 @@ class Segmentation(Pictured):
     status: str
     notes: tuple[str, ...]
     uncertainty: Uncertainty | None = None
+    labels: Field | None = None
 
     @property
     def probability(self) -> Field | None:
