@@ -18,7 +18,7 @@ import curvafit
 from curvafit import priors
 
 #: Types and tables whose makers, or users, are among the calls.
-PASSIVE = {"Fit", "Flow", "Inference", "Segmentation"}
+PASSIVE = {"Fit", "Flow", "Inference", "Measures", "Segmentation"}
 PASSIVE |= {"Law", "Preset", "Prior", "Texture", "PRESETS", "SIGMA", "WORKING_EPSILON", "WORKING_SPACING"}
 NAMES = list(host_state.calls(Path(tempfile.gettempdir())))
 
