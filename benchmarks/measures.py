@@ -2,8 +2,8 @@
 
     python -m benchmarks.measures [--count 100] [--edge 72] [--widths 2,3] [--periods 0.5,1,1.5]
 
-Volumes are windows of level sets of Gaussian random fields (white noise, smoothed by so many voxels, cut at its 30 %
-quantile over the whole field), which have no end and no defects. The truth is the mean over all volumes. Columns:
+Volumes are windows of level sets of Gaussian random fields (white noise, smoothed by so many voxels, cut so that 30 %
+of the whole field are inside), which have no end and no defects. The truth is the mean over all volumes. Columns:
 width, periods a block, blocks a volume, and of each quantity the share of volumes whose 95 % interval holds it.
 """
 

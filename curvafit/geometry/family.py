@@ -24,10 +24,8 @@ def family_shares(diagram: Diagram, radius: float) -> dict[str, float]:
 
     Directions after Koenderink's shape index; `radius` is the structure's half-thickness in the diagram's unit.
     """
-    area = (
-        np.bincount(families(diagram.points, radius), diagram.weights, minlength=len(FAMILIES)) / diagram.weights.sum()
-    )
-    shares = dict(zip(FAMILIES, map(float, area), strict=True))
+    areas = np.bincount(families(diagram.points, radius), diagram.weights, minlength=len(FAMILIES))
+    shares = dict(zip(FAMILIES, map(float, areas / areas.sum()), strict=True))
     return {"layers": shares.pop("layers")} | shares
 
 

@@ -19,7 +19,7 @@ from skimage import measure
 from curvafit.geometry.mesh import Surface, areas
 from curvafit.geometry.topology import euler_number, euler_of_window
 
-__all__ = ["Morphometry", "local_thickness", "morphometry", "smooth_surface"]
+__all__ = ["Morphometry", "connectivity_of", "local_thickness", "morphometry", "smooth_surface"]
 
 #: How far a periodic box is continued before distances are taken, in voxels.
 _WRAPPED = 32
@@ -80,18 +80,26 @@ def morphometry(
     voxel = math.prod(edges)
     thickness = local_thickness(mask, edges, periodic=periodic)[mask]
     gap = local_thickness(~mask, edges, periodic=periodic)[~mask]
-    euler = float(euler_number(mask, periodic=True)) if periodic else euler_of_window(mask)
-    sampled = math.prod(mask.shape if periodic else (max(n - 1, 1) for n in mask.shape))
+    euler, connectivity = connectivity_of(mask, edges, periodic=periodic)
     return Morphometry(
         volume_fraction=filled / mask.size,
         thickness_mean=float(thickness.mean(dtype=np.float64)),
         thickness_std=float(thickness.std(dtype=np.float64)),
         spacing_mean=float(gap.mean(dtype=np.float64)),
-        connectivity_density=(1 - euler) / (sampled * voxel),
+        connectivity_density=connectivity,
         euler=round(euler),
         surface_to_volume=float(areas(smooth_surface(mask, edges, periodic=periodic)).sum()) / (filled * voxel),
         unit=unit,
     )
+
+
+def connectivity_of(
+    mask: np.ndarray, spacing: tuple[float, float, float], *, periodic: bool = False
+) -> tuple[float, float]:
+    """Return χ, and the connectivity density 1 - χ over the volume that χ is counted in (`morphometry`)."""
+    euler = float(euler_number(mask, periodic=True)) if periodic else euler_of_window(mask)
+    sampled = math.prod(mask.shape if periodic else (max(n - 1, 1) for n in mask.shape))
+    return euler, (1 - euler) / (sampled * math.prod(spacing))
 
 
 def local_thickness(

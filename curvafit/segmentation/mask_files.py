@@ -102,11 +102,10 @@ def write_mask(
 
     with staged(target) as work:
         temporary = work / target.name
-        values = segmentation.mask.values.view(np.uint8) if segmentation.labels is None else segmentation.labels.values
-        write(values, temporary)
+        mask, labels = segmentation.mask.values, segmentation.labels
+        write(mask.view(np.uint8) if labels is None else labels.values, temporary)
         picture, note = beside(temporary, ".png"), beside(temporary, ".json")
-        shown = segmentation.mask.values if segmentation.labels is None else None
-        rows = [(scan.values, None), (scan.values if segmentation.labels is None else values, shown)]
+        rows = [(scan.values, None), (scan.values, mask) if labels is None else (labels.values, None)]
         _figure(rows, segmentation).savefig(picture, dpi=DPI)
         parts = [temporary, picture, note]
         if chances is not None:

@@ -16,9 +16,9 @@ from curvafit.priors.loss import RESOLVED
 from curvafit.priors.profile import optimal_profile
 from curvafit.progress import Progress, part, silent
 from curvafit.segmentation.completion import known_places, reconstruct
+from curvafit.segmentation.example import slices_of
 from curvafit.segmentation.known import labels
 from curvafit.segmentation.result import Segmentation
-from curvafit.segmentation.slices import Slices
 from curvafit.segmentation.working import Law
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.source import Source, field_of
@@ -91,10 +91,10 @@ def reconstruct_labels(
             "store": None if store is None else Path(store) / str(number),
             "progress": part(progress, count / len(numbers), (count + 1) / len(numbers)),
         }
-        one = _completed(volume, number, laws[number], places, axis, other, {**options, **each})
-        owner = np.where(one.phase > deepest, number, owner)
-        deepest = np.maximum(deepest, one.phase)
-        parts.append(replace(one, phase=deepest[:0]))  # not kept
+        phase, one = _completed(volume, number, laws[number], places, axis, other, {**options, **each})
+        owner = np.where(phase > deepest, number, owner)
+        deepest = np.maximum(deepest, phase)
+        parts.append(one)
     if all(one.refusal for one in parts):
         raise parts[0].refusal  # type: ignore[misc]
     inside = np.isin(planes, numbers)
@@ -135,9 +135,8 @@ def labels_of(values: np.ndarray, chosen: Sequence[int] | None) -> list[int]:
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """A label's phase field and ε, what is said of it, and why it was not completed."""
+    """A label's ε, what is said of it, and why it was not completed."""
 
-    phase: np.ndarray
     epsilon: float
     status: str
     notes: tuple[str, ...]
@@ -146,8 +145,8 @@ class _Part:
 
 def _completed(
     volume: Field, number: int, law: Law, places: list[int], axis: int, example: Field | None, options: dict[str, Any]
-) -> _Part:
-    """Return a label's volume, as `reconstruct` fills it, or interpolated where that refuses."""
+) -> tuple[np.ndarray, _Part]:
+    """Return a label's phase field, as `reconstruct` fills it, or interpolated where that refuses."""
     name, notes, shown = f"label {number}", (), None
     mask = replace(volume, values=volume.values == number, notes=())
     if example is not None and (example.values == number).any():
@@ -157,10 +156,8 @@ def _completed(
     try:
         found = reconstruct(mask, law, known=places, axis=axis, example=shown, **options)
     except ScanError as reason:
-        edges = [volume.spacing[k] for k in (axis, *(k for k in range(3) if k != axis))]
-        inside = np.moveaxis(mask.values, axis, 0)[places]
-        between = Slices(inside, tuple(places), volume.shape[axis], (edges[0], edges[1], edges[2]), volume.unit)
+        between = slices_of(mask, places, axis)
         level = np.ascontiguousarray(np.moveaxis(between.level("spline"), 0, axis))
         phase = optimal_profile(torch.from_numpy(level), RESOLVED * min(volume.spacing)).numpy()
-        return _Part(phase, 0.0, "interpolated by a spline", (*notes, f"Of {name}: {reason}."), reason)
-    return _Part(found.phase.values, found.epsilon, found.status, (*notes, *found.notes))
+        return phase, _Part(0.0, "interpolated by a spline", (*notes, f"Of {name}: {reason}."), reason)
+    return found.phase.values, _Part(found.epsilon, found.status, (*notes, *found.notes))

@@ -66,8 +66,7 @@ def errors(sums: np.ndarray, blocks: Blocks, figures: Callable[[np.ndarray], np.
     With ψ the change of a figure when a block is left out, the variance is ψᵀ W ψ: W has 1 on its diagonal, and ½ for
     each axis along which two blocks are neighbours (Bartlett's kernel, as Newey & West 1987 for series). Were blocks
     independent, ψᵀ W ψ would be σ² tr(P W P) / n², P taking the mean off: that sets its scale, and with tr² / tr(·²)
-    the degrees of freedom of Student's t. A bootstrap over single blocks takes neighbours for independent: its 95 %
-    intervals held .60 to .90 (`python -m benchmarks.measures`).
+    the degrees of freedom of Student's t. A bootstrap over single blocks would take neighbours for independent.
 
     Parameters
     ----------

@@ -12,8 +12,8 @@ import numpy as np
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.family import FAMILIES, families
 from curvafit.geometry.mesh import area_vectors
-from curvafit.geometry.morphometry import local_thickness, smooth_surface
-from curvafit.geometry.topology import euler_number, euler_of_window, euler_shares
+from curvafit.geometry.morphometry import connectivity_of, local_thickness, smooth_surface
+from curvafit.geometry.topology import euler_shares
 from curvafit.inference.measure import scan_curvatures
 from curvafit.inference.phases import check_options, find_level
 from curvafit.inference.prepare import Prepared, prepare, smallest_piece
@@ -70,7 +70,7 @@ QUANTITIES: tuple[tuple[str, str, int, Callable[[Sums], np.ndarray]], ...] = (
     ("Euler number", "χ", 0, lambda s: s["χ"]),
     ("surface to volume", "BS/BV", -1, lambda s: s["area"] / s["inside"]),
     ("surface density", "BS/TV", -1, lambda s: s["area"] / s["volume"]),
-    ("anisotropy", "DA", 0, lambda s: 1 - _spectrum(s)[..., 0] / _spectrum(s)[..., 2]),
+    ("anisotropy", "DA", 0, lambda s: _anisotropy(s)),
     ("mean curvature", "H", -1, lambda s: s["H"] / s["curved"]),
     ("mean curvature deviation", "H.SD", -1, lambda s: _deviation(s["H"] / s["curved"], s["H²"] / s["curved"])),
     ("Gaussian curvature", "K", -2, lambda s: s["K"] / s["curved"]),
@@ -168,9 +168,9 @@ def measure(
     curved, diagram = _curved(blocks, prepared)
     sums = {**_filled(blocks, mask, maps, field.spacing), **_surfaced(blocks, mask, field.spacing, periodic), **curved}
     table = np.stack([sums[name] for name in SUMS], axis=1)
-    values, euler = _figures(table.sum(0)), _euler(mask, periodic)
-    values[[name for name, *_ in QUANTITIES].index("Euler number")] = euler
-    values[[name for name, *_ in QUANTITIES].index("connectivity density")] = (1 - euler) / _seen(mask, field, periodic)
+    values, names = _figures(table.sum(0)), [name for name, *_ in QUANTITIES]
+    whole = [names.index("Euler number"), names.index("connectivity density")]
+    values[whole] = connectivity_of(mask, field.spacing, periodic=periodic)
     halves = errors(table, blocks, _figures) if blocks.count >= LEAST else np.full(len(values), np.nan)
     if blocks.count < LEAST:
         notes = (*notes, f"No intervals: they need {LEAST} blocks of a period, and the scan has {blocks.count}.")
@@ -268,18 +268,9 @@ def _tensor(sums: Sums) -> np.ndarray:
     return tensor
 
 
-def _spectrum(sums: Sums) -> np.ndarray:
-    """Return the eigenvalues of the fabric, ascending (…, 3); NaN without surface."""
+def _anisotropy(sums: Sums) -> np.ndarray:
+    """Return 1 - smallest / largest eigenvalue of the fabric; NaN without surface."""
     tensor = _tensor(sums)
     known = np.asarray(np.isfinite(tensor).all(axis=(-1, -2)))[..., None]
-    return np.where(known, np.linalg.eigvalsh(np.where(known[..., None], tensor, 0)), np.nan)
-
-
-def _euler(mask: np.ndarray, periodic: bool) -> float:
-    """Return χ: of a window, its share of that of what it is cut from."""
-    return float(euler_number(mask, periodic=True)) if periodic else euler_of_window(mask)
-
-
-def _seen(mask: np.ndarray, field: Field, periodic: bool) -> float:
-    """Return the volume that χ is counted in: of a window, that between the centres of its outer voxels."""
-    return math.prod(field.spacing) * math.prod(mask.shape if periodic else (max(n - 1, 1) for n in mask.shape))
+    spectrum = np.where(known, np.linalg.eigvalsh(np.where(known[..., None], tensor, 0)), np.nan)
+    return 1 - spectrum[..., 0] / spectrum[..., 2]
