@@ -13,7 +13,7 @@ pytest.importorskip("resource", reason="cases are forked from a warm process")
 
 from .catalogue import SHARES
 
-ROOT = Path(__file__).resolve().parent.parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 
 pytestmark = [
     pytest.mark.slow,

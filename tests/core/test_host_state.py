@@ -1,0 +1,83 @@
+"""Nothing of the program that calls is changed: threads, random numbers, precision, warnings, environment, the rest."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import host_state
+import pytest
+import torch
+
+import curvafit
+from curvafit import priors
+
+#: Types and tables whose makers, or users, are among the calls.
+PASSIVE = {"Fit", "Flow", "Inference", "Measures", "Segmentation"}
+PASSIVE |= {"Law", "Preset", "Prior", "Texture", "PRESETS", "SIGMA", "WORKING_EPSILON", "WORKING_SPACING"}
+NAMES = list(host_state.calls(Path(tempfile.gettempdir())))
+
+
+@pytest.fixture(scope="module")
+def found() -> dict[str, dict]:
+    """What each call changed, all made in one process of their own."""
+    root = Path(__file__).resolve().parents[2]
+    threads = str(host_state.NUMBA_THREADS)
+    script = [sys.executable, str(root / "tests" / "host_state.py")]
+    path = os.pathsep.join([str(root), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        script, env={**os.environ, "PYTHONPATH": path, "NUMBA_NUM_THREADS": threads},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def test_every_public_name_is_called() -> None:
+    assert {*curvafit.__all__, *priors.__all__} - PASSIVE <= set(NAMES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_call_changes_nothing_of_the_host(name: str, found) -> None:
+    if name in ("infer", "read_fit", "texture_of") and importlib.util.find_spec("optimistix") is None:
+        pytest.skip("needs optimistix")
+    assert found[name] == {}
+
+
+def test_a_change_is_seen() -> None:
+    """The snapshot's own test: of what may be changed and put back here."""
+    before = host_state.snapshot()
+    assert host_state.changes(before, host_state.snapshot()) == {}
+    generator, folder, names = torch.get_rng_state(), Path.cwd(), dict(os.environ)
+    try:
+        torch.rand(1)
+        os.environ["CURVAFIT_TEST"] = "1"
+        torch.set_grad_enabled(False)
+        os.chdir(tempfile.gettempdir())
+        changed = host_state.changes(before, host_state.snapshot())
+    finally:
+        torch.set_rng_state(generator)
+        torch.set_grad_enabled(True)
+        os.environ.pop("CURVAFIT_TEST")
+        os.chdir(folder)
+    assert {"torch random", "torch gradients", "process environment", "process folder"} <= set(changed)
+    assert dict(os.environ) == names
+
+
+SETTLED = """
+import multiprocessing, torch
+from curvafit.priors import CurvaturePrior
+CurvaturePrior("tubes")(torch.rand(1, 1, 8, 8, 8))
+multiprocessing.set_start_method("spawn")
+print(multiprocessing.get_start_method())
+"""
+
+
+def test_a_program_may_choose_how_processes_start_afterwards() -> None:
+    done = subprocess.run([sys.executable, "-c", SETTLED], capture_output=True, text=True, check=False)
+    assert done.stdout.strip() == "spawn", done.stderr

@@ -1,0 +1,151 @@
+"""Signals: exceptions that clean up, that wait while files change, and an exit code that tells of them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from curvafit.files import move_together, staged
+from curvafit.interrupts import Terminated, exit_code, listen, undisturbed
+
+ROOT = Path(__file__).resolve().parents[2]
+HEARD = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
+
+
+@pytest.fixture
+def listening() -> Iterator[None]:
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in HEARD}
+    hook = sys.unraisablehook
+    listen()
+    yield
+    sys.unraisablehook = hook
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def send(number: int) -> None:
+    os.kill(os.getpid(), number)
+    time.sleep(0.01)
+
+
+@pytest.mark.parametrize("number", HEARD)
+def test_a_signal_is_an_exception(number: int, listening: None) -> None:
+    with pytest.raises(KeyboardInterrupt) as caught:
+        send(number)
+    assert isinstance(caught.value, Terminated) == (number != signal.SIGINT)
+    assert exit_code(caught.value) == 128 + number
+
+
+@pytest.mark.parametrize("number", HEARD)
+def test_a_signal_in_a_finaliser_is_not_lost(number: int, listening: None, capfd: pytest.CaptureFixture) -> None:
+    class Ended:
+        def __del__(self) -> None:
+            os.kill(os.getpid(), number)
+            time.sleep(0.01)
+
+    with pytest.raises(KeyboardInterrupt) as caught:
+        Ended()
+        time.sleep(5)
+    assert exit_code(caught.value) == 128 + number
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("number", HEARD)
+def test_it_waits_until_files_are_moved(
+    number: int, listening: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = os.replace
+
+    def disturbed(source: Path, target: Path) -> None:
+        real(source, target)
+        send(number)
+
+    monkeypatch.setattr(os, "replace", disturbed)
+    with pytest.raises(KeyboardInterrupt), staged(tmp_path / "out") as work:
+        for name in "abc":
+            (work / name).write_text(name)
+        move_together([work / name for name in "abc"], tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b", "c"]
+
+
+def test_nested_blocks_end_with_the_outermost(listening: None) -> None:
+    reached = []
+    with pytest.raises(Terminated), undisturbed():
+        with undisturbed():
+            send(signal.SIGTERM)
+            reached.append("inner")
+        reached.append("outer")
+    assert reached == ["inner", "outer"]
+    with undisturbed():
+        pass
+
+
+def test_what_is_ignored_stays_ignored() -> None:
+    """As under nohup."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    others = {number: signal.getsignal(number) for number in HEARD[:2]}
+    try:
+        listen()
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+        for number, handler in others.items():
+            signal.signal(number, handler)
+
+
+def test_other_threads_are_let_alone() -> None:
+    """They get no signals; their changes hold none back."""
+    inside, done = threading.Event(), threading.Event()
+
+    def work() -> None:
+        with undisturbed():
+            inside.set()
+            done.wait(5)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    inside.wait(5)
+    try:
+        with pytest.raises(KeyboardInterrupt), undisturbed():
+            raise KeyboardInterrupt
+    finally:
+        done.set()
+        thread.join()
+
+
+@pytest.mark.parametrize(("number", "word"), [(signal.SIGTERM, "terminated"), (signal.SIGINT, "interrupted")])
+def test_a_program_that_is_ended_leaves_nothing(number: int, word: str, tmp_path: Path) -> None:
+    """At a moment when it is writing: the shape's temporary folder is there."""
+    program = [sys.executable, "-c", SLOW, "generate", "--preset", "tubes", "--shape", "16", "--steps", "3"]
+    with subprocess.Popen(
+        [*program, "-o", str(tmp_path / "out.nii.gz")], cwd=ROOT, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stderr is not None and process.stderr.readline() == "writing\n"
+        assert [path.name[:5] for path in tmp_path.iterdir()] == [".out."]
+        process.send_signal(number)
+        said = process.stderr.read()
+    assert process.returncode == 128 + number
+    assert said == f"{word}: nothing is left half-written\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+SLOW = """
+import signal, sys, time
+for number in (signal.SIGINT, signal.SIGTERM):  # a program in the background ignores Ctrl-C
+    signal.signal(number, signal.SIG_DFL)
+import curvafit.drawing.shape_files
+def slow(*_):
+    print("writing", file=sys.stderr, flush=True)
+    time.sleep(60)
+curvafit.drawing.shape_files.write_field = slow
+from curvafit.__main__ import main
+main()
+"""

@@ -1,0 +1,191 @@
+"""What no such command wrote stays, until --overwrite says otherwise; what is read stays always: for every command."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calling import QUICK, call, made, refused
+from disk import tree
+from exact_store import exact_store, quick_map
+from found import made_inference
+
+from curvafit.atlas_map.map_files import check_map, write_map
+from curvafit.data_synth.atlas.store import open_store
+from curvafit.report.page import FILES, write_inference
+from curvafit.volumes.scan import Field, load, save
+
+pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
+
+TAKEN = "expected a name that is free, got"
+MASK = Field((np.indices((12, 12, 12)).sum(0) % 12 < 6).astype(np.uint8))
+
+
+@pytest.fixture(autouse=True)
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("curvafit.drawing.surfaces.surface_picture", lambda u, path: path.write_bytes(b""))
+
+
+def thesis(folder: Path) -> Path:
+    folder.mkdir(parents=True)
+    (folder / "thesis.txt").write_text("mine")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("scan") / "slices.npy"
+    return save(MASK, path)
+
+
+def commands(scan: Path) -> dict[str, list[object]]:
+    segmenting = [scan, "--prior", "tubes", "--steps", 1]
+    return {
+        "generate": ["generate", *QUICK, "--shape", 12, "--steps", 4],
+        "segment": ["segment", *segmenting],
+        "refine": ["refine", *segmenting, "--weight", 1],
+        "reconstruct": ["reconstruct", *segmenting, "--every", 4],
+    }
+
+
+@pytest.mark.parametrize("command", ["generate", "segment", "refine", "reconstruct"])
+def test_folders_with_something_else_in_them_stay(command: str, scan: Path, tmp_path: Path) -> None:
+    """A thesis, an atlas, and the volume of a command for another purpose."""
+    thesis(tmp_path / "home.zarr")
+    exact_store(tmp_path / "atlas.zarr", 2)
+    save(MASK, tmp_path / "volume.zarr")
+    before = tree(tmp_path)
+    for name in ("home.zarr", "atlas.zarr", "volume.zarr"):
+        refused(call(*commands(scan)[command], "-o", tmp_path / name), TAKEN)
+    assert tree(tmp_path) == before
+
+
+@pytest.mark.parametrize("command", ["generate", "segment", "refine", "reconstruct"])
+@pytest.mark.parametrize("name", ["out.zarr", "out.npy"])
+def test_its_own_output_is_replaced(command: str, name: str, scan: Path, tmp_path: Path) -> None:
+    """But not once it holds something else, and not by a command for another purpose."""
+    told = [*commands(scan)[command], "-o", tmp_path / name]
+    other = "segment" if command == "generate" else "generate"
+    (tmp_path / "out.zarr").mkdir()
+    for _ in range(2):
+        result = call(*told)
+        assert result.exit_code == 0, result.output
+    refused(call(*commands(scan)[other], "-o", tmp_path / name), TAKEN)
+    if name == "out.zarr":
+        (tmp_path / name / "notes.txt").write_text("mine")
+        before = tree(tmp_path)
+        refused(call(*told), TAKEN)
+        assert tree(tmp_path) == before
+    assert call(*told, "--overwrite").exit_code == 0
+    assert load(tmp_path / name).shape == (12, 12, 12)
+    assert not (tmp_path / name / "notes.txt").exists()
+
+
+@pytest.mark.parametrize("command", ["generate", "segment", "refine", "reconstruct"])
+@pytest.mark.parametrize("taken", ["out.npy", "out.png", "out.json"])
+def test_files_of_the_same_names_stay(command: str, taken: str, scan: Path, tmp_path: Path) -> None:
+    (tmp_path / taken).write_text("mine")
+    refused(call(*commands(scan)[command], "-o", tmp_path / "out.npy"), TAKEN)
+    assert tree(tmp_path) == {taken: b"mine"}
+    assert call(*commands(scan)[command], "-o", tmp_path / "out.npy", "--overwrite").exit_code == 0
+    assert sorted(tree(tmp_path)) == ["out.json", "out.npy", "out.png"]
+
+
+def test_a_record_speaks_for_its_own_files_alone(tmp_path: Path) -> None:
+    """A shape beside a scan of the same stem does not make the scan replaceable; nor its snapshots."""
+    quick = [*QUICK, "--shape", 12, "--steps", 4]
+    made(*quick, "-o", tmp_path / "a.tif")
+    (tmp_path / "a.nii.gz").write_text("mine")
+    (tmp_path / "a_step00001.tif").write_text("mine")
+    refused(call("generate", *quick, "-o", tmp_path / "a.nii.gz"), TAKEN)
+    refused(call("generate", *quick, "--snapshots", 1, "-o", tmp_path / "a.tif"), TAKEN)
+    assert (tmp_path / "a.nii.gz").read_text() == (tmp_path / "a_step00001.tif").read_text() == "mine"
+    for _ in range(2):
+        made(*quick, "--snapshots", 1, "-o", tmp_path / "b.tif")
+    refused(call("generate", *quick, "-o", tmp_path / "b.stl"), "b.json, a file that this command did not write")
+    (tmp_path / "a.json").write_text('{"format": "curvafit-shape-1", "files": 5}')
+    refused(call("generate", *quick, "-o", tmp_path / "a.tif"), TAKEN)
+
+
+def test_infer_leaves_other_peoples_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = '<meta name="generator" content="curvafit 0">'
+    monkeypatch.setattr("curvafit.report.page.write_report", lambda found, path: path.write_text(page))
+    monkeypatch.setattr(importlib.import_module("curvafit.inference.infer"), "infer", lambda *_, **__: made_inference())
+    told = ["infer", save(MASK, tmp_path / "scan.npy")]
+    for name in FILES:
+        folder = thesis(tmp_path / name.replace(".", ""))
+        (folder / name).write_text("mine")
+        before = tree(folder)
+        refused(call(*told, "-o", folder), TAKEN)
+        with pytest.raises(ValueError, match=TAKEN):
+            write_inference(made_inference(), folder)
+        assert tree(folder) == before
+        assert call(*told, "-o", folder, "--overwrite").exit_code == 0
+        assert call(*told, "-o", folder).exit_code == 0
+        assert sorted(tree(folder)) == sorted([*FILES, "thesis.txt"])
+        (folder / "report.html").write_text("mine")  # beside a fit.json that was copied there
+        refused(call(*told, "-o", folder), TAKEN)
+        again = ["infer", folder / "regenerated.nii.gz", "-o", folder, "--overwrite"]
+        refused(call(*again), "expected an output that writes over no input")
+
+
+def test_atlases_leave_other_peoples_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store, folder = tmp_path / "store.zarr", thesis(tmp_path / "home.zarr")
+    exact_store(store, 7)
+    (tmp_path / "atlas.npz").write_text("mine")
+    before = tree(tmp_path)
+    refused(call("atlas", "build", folder, "--count", 1, "--workers", 0), "got something else")
+    refused(call("atlas", "extract", store, "-o", tmp_path / "atlas.npz"), TAKEN)
+    refused(call("atlas", "map", store, "-o", store), "over no input")
+    for name in ("atlas.html", "atlas.png"):
+        there = thesis(tmp_path / name.replace(".", ""))
+        (there / name).write_text("mine")
+        refused(call("atlas", "map", store, "-o", there), TAKEN)
+        assert tree(there) == {"thesis.txt": b"mine", name: b"mine"}
+    thesis(tmp_path / "mine" / "cache")
+    refused(call("atlas", "map", store, "-o", tmp_path / "mine"), TAKEN)
+    assert before.items() <= tree(tmp_path).items()
+    for _ in range(2):
+        assert call("atlas", "extract", store, "-o", tmp_path / "new.npz").exit_code == 0
+    quick_map(monkeypatch)
+    monkeypatch.setattr("curvafit.atlas_map.map_files.map_picture", lambda mapped, field, path: path.write_bytes(b""))
+    for _ in range(2):
+        write_map([store], tmp_path / "map")
+    check_map(tmp_path / "map", [store])
+
+
+def test_a_store_may_begin_in_an_empty_folder(tmp_path: Path) -> None:
+    (tmp_path / "s.zarr").mkdir()
+    told = ["atlas", "build", tmp_path / "s.zarr", "--count", 1, "--shape", 12, "--around", "sponge", "--workers", 0]
+    monkey = pytest.MonkeyPatch()
+    with monkey.context() as patch:
+        patch.setattr("curvafit.data_synth.atlas.build.build", lambda *_, **__: None)
+        assert call(*told).exit_code == 0
+    assert open_store(tmp_path / "s.zarr").indices() == []
+
+
+def test_a_store_records_the_number_of_steps_that_was_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plans = []
+    monkeypatch.setattr("curvafit.data_synth.atlas.build.build", lambda *settings, **_: plans.append(settings[4]))
+    told = ["atlas", "build", tmp_path / "s.zarr", "--count", 1, "--shape", 12, "--workers", 0, "--schedule", "paper"]
+    assert call(*told, "--steps", 700).exit_code == 0
+    assert [(plan.name, plan.steps) for plan in plans] == [("paper", 700)]
+
+
+def test_a_sample_is_copied_over_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sample = tmp_path / "cache" / "synthetic.nii.gz"
+    sample.parent.mkdir()
+    sample.write_text("a sample")
+    monkeypatch.setenv("CURVAFIT_CACHE", str(sample.parent))
+    (tmp_path / "mine.nii.gz").write_text("mine")
+    told = ["samples", "get", "synthetic", "-o"]
+    result = call(*told, tmp_path / "mine.nii.gz")
+    assert result.exit_code == 2 and TAKEN in result.stderr and (tmp_path / "mine.nii.gz").read_text() == "mine"
+    for _ in range(2):
+        assert call(*told, tmp_path / "new.nii.gz").exit_code == 0
+    assert call(*told, tmp_path / "mine.nii.gz", "--overwrite").exit_code == 0
+    assert (tmp_path / "mine.nii.gz").read_text() == "a sample"

@@ -1,0 +1,67 @@
+"""Shapes on disk: units, repeats, curvatures at the vertices of a surface."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import torch
+from disk import vtk_array
+from exact import Sphere, centres
+from torch import Tensor
+
+from curvafit.drawing.shape_files import Output, beside, step_path, write_field
+from curvafit.priors.grid import Grid
+from curvafit.volumes.scan import load
+
+
+def ball(boundary) -> tuple[Tensor, Grid]:
+    """A ball of radius 9 voxels that leaves the box through one face."""
+    grid = Grid((26, 26, 26), 0.01, boundary)
+    distance = Sphere(0.09, (0.13, 0.13, 0.2)).distance(centres(Grid(grid.shape, grid.spacing, "replicate")))
+    return torch.tanh(distance / (2**0.5 * 0.02)).float(), grid
+
+
+@pytest.mark.parametrize("tile", [(1, 1, 1), (2, 1, 1)])
+def test_vtp_bears_the_curvatures_in_its_unit(tmp_path: Path, tile: tuple[int, int, int]) -> None:
+    """1/R of the ball in 1/mm where its surface is, 0 on the caps."""
+    u, grid = ball("periodic" if tile != (1, 1, 1) else "replicate")
+    path = write_field(u, grid, tmp_path / "ball.vtp", Output(0.5, "mm", tile))
+    arrays = {node.attrib["Name"]: vtk_array(node) for node in ElementTree.parse(path).iter("DataArray")}
+    x, _, z = arrays["Points"].T
+    on_ball = np.abs(x - 9.75) < 1.5
+    for name in ("kappa1", "kappa2"):
+        κ = arrays[name].ravel()
+        assert np.median(κ[on_ball]) == pytest.approx(1 / 4.5, rel=0.02)
+        assert np.ptp(κ[on_ball]) < 0.05
+        assert (κ[np.abs(x - 12.75) < 1e-5] == 0).all()
+    assert z.max() > 13 if tile[0] == 2 else z.max() < 13
+
+
+def test_repeats_need_a_periodic_box(tmp_path: Path) -> None:
+    u, grid = ball("replicate")
+    with pytest.raises(ValueError, match="expected a periodic box to repeat, got boundary 'replicate'"):
+        write_field(u, grid, tmp_path / "ball.npy", Output(tile=(2, 1, 1)))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_unit_is_named_and_converted_once(tmp_path: Path) -> None:
+    how = Output(0.002, "cm")
+    assert (how.voxel, how.unit) == (0.02, "mm")
+    field = load(write_field(*ball("periodic"), tmp_path / "ball.nii", how))
+    assert field.spacing == pytest.approx((0.02, 0.02, 0.02)) and field.unit == "mm"
+    for wrong, said in (
+        ({"voxel": 0.0}, "positive voxel edge"),
+        ({"tile": (1, 0, 1)}, "repeats"),
+        ({"unit": "x"}, "unit"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            Output(**wrong)
+
+
+def test_names_beside_a_shape() -> None:
+    assert beside("a/b.c.nii.gz", ".json") == Path("a/b.c.json")
+    assert step_path("a/b.c.nii.gz", 10) == Path("a/b.c_step00010.nii.gz")
+    assert step_path("b.STL", 120000) == Path("b_step120000.STL")

@@ -1,0 +1,286 @@
+"""Building resumes to the same draws; atlas files come back within their stated rounding, damaged ones are refused."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import types
+
+import numpy as np
+import pytest
+import torch
+
+from curvafit.atlas_map.extract import extract
+from curvafit.data_synth.atlas import build as building
+from curvafit.data_synth.atlas import draws
+from curvafit.data_synth.atlas.design import INTERVALS, Design, boxed
+from curvafit.data_synth.atlas.store import open_store
+from curvafit.generation.schedule import LEARNED, present_name, schedule
+from curvafit.generation.viability import Viability
+from curvafit.inference.atlas import VERSION, Atlas, load_atlas, save_atlas
+from curvafit.priors.grid import Grid
+from curvafit.priors.profile import optimal_profile
+
+SHAPE = 20
+
+
+def ball(radius: float) -> torch.Tensor:
+    """The phase field of a ball (radius in working units) in the middle of a box of `SHAPE` voxels."""
+    axes = (torch.arange(SHAPE) - SHAPE / 2 + 0.25) * 0.01
+    z, y, x = torch.meshgrid(axes, axes, axes, indexing="ij")
+    return optimal_profile(radius - (z**2 + y**2 + x**2).sqrt(), 0.02).float()
+
+
+class Balls:
+    """Stands for `generate_batch`: a ball sized by the mass, viable where a11 > 0; remembers, may be stopped."""
+
+    def __init__(self, stop_after: int | None = None) -> None:
+        self.seeds: list[int] = []
+        self.stop_after = stop_after
+        self.highest = 1.0
+
+    def __call__(self, coefficients, masses, grid, *, seeds, reject_early, **options):
+        assert reject_early
+        return (self._made(*job) for job in zip(coefficients, masses, seeds, strict=True))
+
+    def _made(self, coefficients, mass, seed):
+        if len(self.seeds) == self.stop_after:
+            raise KeyboardInterrupt
+        self.seeds.append(seed)
+        viable = coefficients.a11 > 0
+        history = types.SimpleNamespace(step=np.array([1, 9]), energy=np.array([2.0, 1.0]))
+        viability = Viability(0.1, self.highest, -1.0, viable, "" if viable else "a11 is negative")
+        field = ball(0.05 + 0.03 * mass)
+        return types.SimpleNamespace(field=field, history=history, viability=viability, status="converged")
+
+
+@pytest.fixture
+def balls(monkeypatch):
+    stand_in = Balls()
+    monkeypatch.setattr(draws, "generate_batch", stand_in)
+    return stand_in
+
+
+@pytest.fixture
+def atlas(tmp_path, balls) -> Atlas:
+    return extract([building.build(tmp_path / "s.zarr", 6, SHAPE, seed=2)], command=["then this"])
+
+
+def test_building_draws_in_order_until_enough_are_viable(tmp_path, balls):
+    said = []
+    store = building.build(tmp_path / "s.zarr", 5, SHAPE, seed=1, progress=lambda *news: said.append(news))
+    records = [store.record(index) for index in store.indices()]
+    assert store.indices() == list(range(len(records)))
+    assert sum(record.viability.viable for record in records) == 5 and records[-1].viability.viable
+    assert any(not record.viability.viable for record in records)
+    assert [(r.coefficients, r.mass, r.seed) for r in records] == [boxed().draw(1, i) for i in store.indices()]
+    assert balls.seeds == [record.seed for record in records]
+    viable = np.cumsum([record.viability.viable for record in records])
+    assert said == [(f"{n} viable of {i} draws", n / 5) for i, n in enumerate(viable, 1)]
+    assert (records[0].steps, records[0].energy) == (9, 1.0)
+    assert store.settings.schedule == schedule("fast").as_dict()
+
+
+def test_an_interrupted_build_resumes_to_the_same_store_and_makes_no_draw_twice(tmp_path, monkeypatch):
+    whole, first, second = Balls(), Balls(stop_after=4), Balls()
+    monkeypatch.setattr(draws, "generate_batch", whole)
+    straight = building.build(tmp_path / "straight.zarr", 5, SHAPE)
+    monkeypatch.setattr(draws, "generate_batch", first)
+    with pytest.raises(KeyboardInterrupt):
+        building.build(tmp_path / "s.zarr", 5, SHAPE)
+    monkeypatch.setattr(draws, "generate_batch", second)
+    resumed = building.build(tmp_path / "s.zarr", 5, SHAPE)
+    assert len(first.seeds) == 4 and first.seeds + second.seeds == whole.seeds
+    assert resumed.indices() == straight.indices()
+    for index in straight.indices():
+        one, other = (dataclasses.replace(s.record(index), seconds=0) for s in (straight, resumed))
+        assert one == other
+    building.build(tmp_path / "s.zarr", 5, SHAPE)
+    assert first.seeds + second.seeds == whole.seeds  # a finished store asks for nothing
+
+
+@pytest.mark.slow
+def test_a_real_draw_is_what_its_record_says(tmp_path):
+    quick = dataclasses.replace(schedule("fast"), name="quick", steps=30)
+    grid = Grid((16,) * 3)
+    store = open_store(tmp_path / "s.zarr", _settings(grid, quick))
+    (record,) = draws.make(store.path, [0])
+    assert store.record(0) == record and record.versions == draws.versions()
+    assert 0 < record.steps <= 30 and np.isfinite(record.energy)
+    if record.viability.viable:
+        assert float(store.field(0).mean()) == pytest.approx(record.mass, abs=1e-6)
+
+
+def test_wrong_counts_and_other_settings_are_refused(tmp_path, balls):
+    with pytest.raises(ValueError, match="expected a count of at least 1 shape, got 0"):
+        building.build(tmp_path / "s.zarr", 0, SHAPE)
+    with pytest.raises(ValueError, match="expected a seed that is a whole number from 0, got -1"):
+        building.build(tmp_path / "s.zarr", 1, SHAPE, seed=-1)
+    assert not list(tmp_path.iterdir())
+    building.build(tmp_path / "s.zarr", 1, SHAPE)
+    with pytest.raises(ValueError, match="expected the settings of .*, got another seed: 3 for 0"):
+        building.build(tmp_path / "s.zarr", 1, SHAPE, seed=3)
+
+
+def test_an_atlas_holds_what_the_store_does(tmp_path, atlas):
+    store = open_store(tmp_path / "s.zarr")
+    viable = [r for r in map(store.record, store.indices()) if r.viability.viable]
+    assert atlas.ids == tuple(f"s-{r.index:05d}" for r in viable)
+    assert [atlas.shape_coefficients(i) for i in range(6)] == [r.coefficients for r in viable]
+    np.testing.assert_array_equal(atlas.masses, [r.mass for r in viable])
+    np.testing.assert_array_equal(atlas.seeds, [r.seed for r in viable])
+    np.testing.assert_allclose(atlas.volume_fractions[0], np.mean(store.field(viable[0].index) > 0))
+    for measured in atlas.diagrams("field"):  # balls: κ1 and κ2 are 1/R all over, the area 4πR²
+        κ = np.average(measured.points, axis=0, weights=measured.weights)
+        assert measured.weights.sum() * κ[0] * κ[1] == pytest.approx(4 * np.pi, rel=0.12)
+    build = (
+        f"curvafit atlas build s.zarr --count {len(viable)} --shape 20,20,20 --seed 2 --design random --schedule fast"
+    )
+    assert atlas.provenance["command"] == [build, "then this"]
+    assert atlas.provenance["settings"]["shape"] == (SHAPE,) * 3
+    account = atlas.provenance["stores"]["s"]
+    assert (account["settings"]["seed"], account["draws"]) == (2, len(store.indices()))
+
+
+def test_an_atlas_of_two_stores_holds_both(tmp_path, balls):
+    one, other = (building.build(tmp_path / f"{name}.zarr", 2, SHAPE, seed=4) for name in ("one", "other"))
+    both = extract([one, tmp_path / "other.zarr"])
+    alone = [extract([store]) for store in (one, other)]
+    assert both.ids == alone[0].ids + alone[1].ids and len(set(both.ids)) == 4
+    np.testing.assert_array_equal(both.masses, np.concatenate([each.masses for each in alone]))
+    assert list(both.provenance["stores"]) == ["one", "other"]
+    assert [line.split()[3] for line in both.provenance["command"]] == ["one.zarr", "other.zarr"]
+
+
+def test_stores_of_one_name_or_of_two_grids_make_no_atlas(tmp_path, balls):
+    one = building.build(tmp_path / "one.zarr", 1, SHAPE)
+    with pytest.raises(ValueError, match="expected stores with names of their own, got one, one"):
+        extract([one, one])
+    larger = open_store(tmp_path / "larger.zarr", _settings(Grid((24, 20, 20)), schedule("fast")))
+    with pytest.raises(ValueError, match="expected stores of one grid and ε, got 2: 20 x 20 x 20, 24 x 20 x 20 voxels"):
+        extract([one, larger])
+
+
+def test_faint_and_over_sharp_shapes_stay_in_the_store_and_out_of_the_atlas(tmp_path, balls):
+    for count, highest in enumerate((1.0, 0.4, 4.0, 1.5), 1):
+        balls.highest = highest
+        store = building.build(tmp_path / "s.zarr", count, SHAPE)
+    whole = extract([store])
+    assert len(whole) == 2
+    assert whole.provenance["stores"]["s"]["viable"] == 4
+
+
+def test_an_atlas_file_comes_back_within_its_stated_rounding(tmp_path, atlas):
+    save_atlas(atlas, tmp_path / "a.npz")
+    back = load_atlas(tmp_path / "a.npz")
+    assert (back.ids, back.format_version) == (atlas.ids, VERSION)
+    assert back.provenance == json.loads(json.dumps(atlas.provenance))
+    for name in ("coefficients", "masses", "seeds", "volume_fractions"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(atlas, name))
+    for view in ("field", "mask"):
+        for one, other in zip(atlas.diagrams(view), back.diagrams(view), strict=True):
+            assert np.all(np.abs(one.points - other.points) <= 2**-11 * np.abs(one.points) + 2**-24)
+            np.testing.assert_allclose(other.weights, one.weights, rtol=2**-23)
+            assert other.spread == pytest.approx(one.spread)
+    assert [path.name for path in tmp_path.glob("*.npz*")] == ["a.npz"]
+
+
+def test_an_atlas_of_another_version_is_refused(tmp_path, atlas):
+    save_atlas(atlas, tmp_path / "a.npz")
+    with np.load(tmp_path / "a.npz") as archive:
+        arrays = dict(archive)
+    header = json.loads(arrays["header"].tobytes()) | {"version": VERSION + 1}
+    arrays["header"] = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
+    np.savez(tmp_path / "b.npz", **arrays)
+    sentence = f"expected an atlas of version {VERSION}, got version {VERSION + 1} in .*b.npz"
+    with pytest.raises(ValueError, match=sentence):
+        load_atlas(tmp_path / "b.npz")
+
+
+def test_a_damaged_atlas_is_refused_wherever_it_is_cut(tmp_path, atlas):
+    save_atlas(atlas, tmp_path / "a.npz")
+    whole = (tmp_path / "a.npz").read_bytes()
+    for length in (0, 1, 50, len(whole) // 2, len(whole) - 1):
+        (tmp_path / "cut.npz").write_bytes(whole[:length])
+        with pytest.raises(ValueError, match=r"expected an atlas file, got .*cut.npz, which is truncated"):
+            load_atlas(tmp_path / "cut.npz")
+    for start in range(100, len(whole) - 100, len(whole) // 20):
+        (tmp_path / "cut.npz").write_bytes(whole[:start] + bytes(64) + whole[start + 64 :])
+        with pytest.raises(ValueError, match=r"expected an atlas file|expected a whole atlas"):
+            load_atlas(tmp_path / "cut.npz")
+
+
+def test_other_files_are_no_atlas(tmp_path):
+    with pytest.raises(FileNotFoundError, match="expected an atlas file, got .*none.npz, where there is none"):
+        load_atlas(tmp_path / "none.npz")
+    with pytest.raises(FileNotFoundError, match="expected an atlas file, got the folder .*: `curvafit atlas extract`"):
+        load_atlas(tmp_path)
+    buffer = io.BytesIO()
+    np.savez(buffer, a=np.zeros(3))
+    header = np.frombuffer(b'{"format": "another"}', dtype=np.uint8)
+    np.savez(tmp_path / "other.npz", header=header)
+    (tmp_path / "array.npz").write_bytes(buffer.getvalue())
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    for name in ("other.npz", "array.npz", "array.npy"):
+        with pytest.raises(ValueError, match="expected an atlas file, got .* something else"):
+            load_atlas(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("masses", lambda values: values + 2),
+        ("coefficients", lambda values: values * np.nan),
+        ("mask_offsets", lambda values: values[::-1]),
+        ("field_points", lambda values: values[:-1]),
+        ("mask_areas", lambda values: values.astype("S9")),
+        ("header", lambda values: np.frombuffer(b"[" * 100_000, np.uint8)),
+    ],
+)
+def test_an_atlas_with_damaged_arrays_is_one_sentence(tmp_path, atlas, name, change):
+    save_atlas(atlas, tmp_path / "atlas.npz")
+    with np.load(tmp_path / "atlas.npz") as archive:
+        arrays = dict(archive)
+    np.savez(tmp_path / "atlas.npz", **arrays | {name: change(arrays[name])})
+    with pytest.raises(ValueError, match=r"^expected an? (whole )?atlas [^\n]{1,400}$"):
+        load_atlas(tmp_path / "atlas.npz")
+
+
+def test_arrays_that_do_not_fit_together_are_refused(atlas):
+    with pytest.raises(ValueError, match=r"expected masses of shape \(6,\), got \(5,\)"):
+        dataclasses.replace(atlas, masses=atlas.masses[1:])
+    with pytest.raises(ValueError, match="expected a field and a mask diagram for each of at least one shape"):
+        dataclasses.replace(atlas, mask_diagrams=atlas.mask_diagrams[1:])
+    with pytest.raises(ValueError, match="expected shapes seen as 'field' or 'mask', got 'image'"):
+        atlas.diagrams("image")
+
+
+def test_a_store_without_well_formed_shapes_gives_no_atlas(tmp_path):
+    store = open_store(tmp_path / "s.zarr", _settings(Grid((16,) * 3), schedule("fast")))
+    with pytest.raises(ValueError, match="expected at least one well-formed shape in .*, got none in 0 draws"):
+        extract([store])
+
+
+def test_the_packaged_atlas_is_of_its_designs_and_small():
+    atlas = load_atlas()
+    file = building.Path(__file__).parents[2] / "curvafit" / "inference" / "data" / "atlas.npz"
+    assert file.stat().st_size < 7e6
+    assert len(atlas) >= 1000 and len(set(atlas.ids)) == len(atlas)
+    stores = atlas.provenance["stores"]
+    assert all(present_name(store["settings"]["schedule"]) == LEARNED for store in stores.values())
+    assert min(atlas.provenance["settings"]["shape"]) >= 64
+    for position, name in enumerate(atlas.ids):
+        store, index = name.split("-")
+        settings = stores[store]["settings"]
+        point = (atlas.shape_coefficients(position), atlas.masses[position], atlas.seeds[position])
+        assert Design.from_dict(settings["design"]).draw(settings["seed"], int(index)) == point
+    low, high = INTERVALS["mass"]
+    assert low < atlas.masses.min() and atlas.masses.max() < high
+    assert all(np.isfinite(d.points).all() and d.weights.min() > 0 for d in atlas.diagrams("mask"))
+    assert all(line.startswith("curvafit atlas ") for line in atlas.provenance["command"])
+
+
+def _settings(grid: Grid, plan) -> building.Settings:
+    epsilon, blur = building.WORKING_EPSILON, building.WORKING_BLUR
+    return building.Settings(grid.shape, grid.spacing, epsilon, blur, boxed().as_dict(), 0, plan.as_dict())

@@ -1,0 +1,122 @@
+"""Simulations of draws, and the check of a query among them, on descriptors whose law is known."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import numpy as np
+import pytest
+from emulated import BOX, HIGH, LOW, NOISE, linear, row, told
+
+from curvafit.geometry.descriptors import BLOCKS, Descriptors
+from curvafit.inference import check
+from curvafit.inference.emulator import misfits
+from curvafit.inference.posterior import Posterior
+from curvafit.inference.simulation import simulations
+from curvafit.inference.table import PARAMETERS, column_names
+
+NAMES = np.array(column_names())
+
+
+class Linear:
+    """A posterior whose emulator is `linear`, and whose draws lie about the five sums that a row tells."""
+
+    def __init__(self) -> None:
+        self.emulator = linear()
+        self.compression = self.emulator.compression
+        self.misfits = {"mask": np.sort(np.random.default_rng(0).chisquare(1, 400))}
+
+    def sample(self, rows: np.ndarray, view: str, count: int, seed: int = 0) -> np.ndarray:
+        assert view == "mask"
+        noise = NOISE * np.random.default_rng(seed).standard_normal((len(rows), count, 6))
+        sums = self.compression(rows)[:, None]
+        scaled = np.concatenate(
+            [sums[..., :1] / np.sqrt(2), sums[..., 1:4], sums[..., :1] / np.sqrt(2), sums[..., 4:]], 2
+        )
+        return BOX.mean(1) + (scaled + noise) * (HIGH - LOW) / np.sqrt(12)
+
+    def standard(self, parameters: np.ndarray) -> np.ndarray:
+        return (parameters - BOX.mean(1)) / ((HIGH - LOW) / np.sqrt(12))
+
+
+POSTERIOR = cast(Posterior, Linear())
+
+
+def grown(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Rows of parameters near the middle, in the noise that the emulator knows; the other blocks are noise alone."""
+    rows = row(BOX.mean(1) + 0.1 * rng.standard_normal((count, 6)) * (HIGH - LOW))
+    rows[:, :5] += NOISE * rng.standard_normal((count, 5))
+    rows[:, 288:] += 0.1 * rng.standard_normal((count, rows.shape[1] - 288))
+    return rows
+
+
+def test_a_row_of_the_same_law_passes_and_another_does_not() -> None:
+    rng = np.random.default_rng(1)
+    p = [check.check(POSTERIOR, (rows := grown(rng, 25))[0], "mask", rows[1:]).p for _ in range(12)]
+    assert 0.25 < np.mean(p) < 0.75  # of uniform ones .5 ± .08
+    rows = grown(rng, 25)
+    rows[0, 2] += 5  # beyond the box
+    assert check.check(POSTERIOR, rows[0], "mask", rows[1:]).p < 1e-3
+
+
+def test_a_block_that_differs_is_named() -> None:
+    rows = grown(np.random.default_rng(2), 25)
+    rows[0, NAMES == "gaps"] *= 2
+    blocks = check.check(POSTERIOR, rows[0], "mask", rows[1:]).blocks
+    assert list(blocks) == list(BLOCKS)
+    assert blocks["gaps"].p < 1e-3
+    assert min(blocks[name].p for name in ("chords", "depths", "clearances", "correlation")) > 1e-3
+    for name, block in blocks.items():
+        assert block.band.shape == (3, BLOCKS[name])
+        assert (np.diff(block.band, axis=0) >= 0).all()
+        assert block.band == pytest.approx(np.quantile(rows[1:, name == NAMES], check.LEVELS, axis=0))
+
+
+def test_without_simulations_the_reference_tells() -> None:
+    rows = grown(np.random.default_rng(3), 2)
+    rows[1, 2] += 5
+    left = misfits(POSTERIOR.emulator, rows, "mask", POSTERIOR.sample(rows, "mask", check.STARTS))
+    assert check.amortised_p(POSTERIOR, "mask", left[0]) > 1e-2
+    assert check.amortised_p(POSTERIOR, "mask", left[1]) == pytest.approx(1 / 401)
+
+
+def test_few_simulations_are_refused() -> None:
+    rows = grown(np.random.default_rng(4), 5)
+    with pytest.raises(ValueError, match="expected at least 6 simulations to compare with, got 4"):
+        check.check(POSTERIOR, rows[0], "mask", rows[1:])
+
+
+def described(parameters: np.ndarray, seed: int) -> Descriptors | None:
+    """Descriptors that hold the parameters and the seed; none of every third seed."""
+    blocks = {name: np.zeros(length) for name, length in BLOCKS.items()}
+    blocks["curvature"][:7] = *parameters, seed
+    return None if seed % 3 == 0 else Descriptors(**blocks)
+
+
+def test_simulations_are_of_draws_each_with_its_seed() -> None:
+    draws = np.random.default_rng(5).uniform(LOW, HIGH, (40, 6))
+    grown = simulations(draws, described, 9, seed=3)
+    assert grown.count == 9
+    assert grown.seeds.tolist() == [4, 5, 7, 8, 10, 11]
+    assert np.array_equal(grown.descriptors[:, :6], grown.parameters)
+    assert np.array_equal(grown.descriptors[:, 6], grown.seeds)
+    assert len(np.unique(grown.parameters, axis=0)) == 6
+    assert set(map(tuple, grown.parameters)) <= set(map(tuple, draws))
+    assert grown.parameters.shape == (6, len(PARAMETERS))
+
+
+@pytest.mark.parametrize("count", [0, 41])
+def test_a_number_of_simulations_has_bounds(count: int) -> None:
+    with pytest.raises(ValueError, match="expected a number of simulations"):
+        simulations(np.zeros((40, 6)), described, count)
+
+
+def test_nothing_grown_is_no_row() -> None:
+    grown = simulations(np.zeros((40, 6)), lambda parameters, seed: None, 3)
+    assert grown.descriptors.shape == (0, sum(BLOCKS.values()))
+    assert len(grown.parameters) == len(grown.seeds) == 0
+
+
+def test_told_is_what_the_emulator_says() -> None:
+    parameters = np.random.default_rng(6).uniform(LOW, HIGH, (3, 6))
+    assert POSTERIOR.emulator(parameters, "mask").mean == pytest.approx(told(parameters))

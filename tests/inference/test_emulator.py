@@ -1,0 +1,74 @@
+"""The emulator on a table whose law is known, and the parameters that fit best by it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from emulated import BOX, HIDDEN, HIGH, LOW, NOISE, PLAIN, linear, row, told
+
+import curvafit.inference.emulator_training as training
+from curvafit.inference.emulator import misfits, optimum
+from curvafit.inference.emulator_training import train_emulator
+from curvafit.inference.table import Table
+
+
+def test_the_best_parameters_are_the_true_ones_but_for_what_is_not_told() -> None:
+    truth = np.array([[1.0, 0.5, 60.0, -80.0, 500.0, -0.5]])
+    starts = np.random.default_rng(0).uniform(LOW, HIGH, (8, 6))
+    best = optimum(linear(), row(truth), "mask", starts)
+    assert told(best.parameters[None]) == pytest.approx(told(truth), abs=0.03)  # the prior pulls by a hundredth
+    assert best.starts == pytest.approx(0, abs=1e-2)
+    assert best.singular_values == pytest.approx([10, 10, 10, 10, 10, 0], abs=1e-5)
+    (weak,) = best.weak
+    assert abs(weak.direction @ HIDDEN) == pytest.approx(1)
+    deviation = np.sqrt(np.diag(best.covariance)) / ((HIGH - LOW) / np.sqrt(12))
+    assert deviation == pytest.approx([0.71, 0.1, 0.1, 0.1, 0.71, 0.1], abs=0.01)
+    assert "a11 and a00 together by (+0.7, -0.7)" in str(weak) or "a00 and a11 together by (+0.7, -0.7)" in str(weak)
+
+
+def test_what_no_parameters_make_is_left_over() -> None:
+    """Outside the box by three deviations of the prior, in noise of a tenth of one."""
+    inside = row(np.zeros((1, 6)) + BOX.mean(1))
+    outside = inside.copy()
+    outside[0, 2] += 5
+    starts = np.tile(BOX.mean(1), (2, 4, 1))
+    left = misfits(linear(), np.concatenate([inside, outside]), "mask", starts)
+    assert left[0] < 0.1
+    assert left[1] > (3 / NOISE) ** 2
+
+
+def test_slopes_are_exact() -> None:
+    emulator, at = linear(), np.random.default_rng(1).uniform(LOW, HIGH, (3, 6))
+    step = 1e-4 * emulator.deviation
+    for k in range(6):
+        ends = [emulator(at + sign * step * np.eye(6)[k], "mask").mean for sign in (-1, 1)]
+        slope = emulator.slopes(at, "mask")[..., k]
+        assert slope == pytest.approx((ends[1] - ends[0]) / 2e-4 / NOISE, abs=1e-4)
+
+
+def test_training_finds_mean_deviation_and_correlation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A table in which components are `told`, in noise of which the first two share half."""
+    rng = np.random.default_rng(0)
+    monkeypatch.setattr(training, "EPOCHS", 25)
+    monkeypatch.setattr(training, "HIDDEN", (32,))
+    parameters = rng.uniform(LOW, HIGH, (600, 6))
+    shared = rng.standard_normal((600, 1))
+    noise = 0.3 * rng.standard_normal((600, 5))
+    noise[:, :2] = 0.3 * (shared + rng.standard_normal((600, 2))) / np.sqrt(2)
+    descriptors = row(parameters)
+    descriptors[:, :5] += noise
+    names, views = np.array([f"s/{i}" for i in range(600)]), np.array(["mask"] * 600)
+    emulator, left = train_emulator(Table(names, views, parameters, descriptors, {}), PLAIN, BOX)
+    fresh = rng.uniform(LOW, HIGH, (200, 6))
+    emulated = emulator(fresh, "mask")
+    assert np.square(emulated.mean - told(fresh)).mean() < 0.2 * 0.3**2  # what 600 noisy rows leave of five lines
+    covariance = emulated.covariance.mean(0)
+    assert np.sqrt(np.diag(covariance)) == pytest.approx(0.3, rel=0.15)
+    assert covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1]) == pytest.approx(0.5, abs=0.12)
+    assert 0.8 < emulator.inflation < 1.5
+    assert left["mask"].mean() == pytest.approx(1, abs=0.3)  # five equations for six parameters, in a box
+
+
+def test_views_that_it_does_not_know_are_refused() -> None:
+    with pytest.raises(ValueError, match="expected views among mask, got scan"):
+        linear()(BOX.mean(1), "scan")

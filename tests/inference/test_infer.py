@@ -1,0 +1,296 @@
+"""The main job on a small shape of our own, end to end, and the laws that its result must obey."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from exact import Gyroid, centres
+
+from curvafit.generation.flow import generate
+from curvafit.generation.schedule import LEARNED, SCHEDULES
+from curvafit.geometry.descriptors import BLOCKS, descriptors
+from curvafit.geometry.diagram import diagram
+from curvafit.geometry.transport import wasserstein
+from curvafit.inference.candidates import TITLES
+from curvafit.inference.draws import COLUMNS
+from curvafit.inference.estimate import DRAWS
+from curvafit.inference.fit import Fit
+from curvafit.inference.imaging import Imaging
+from curvafit.inference.infer import Inference, infer
+from curvafit.inference.measure import scan_descriptors, scan_diagram
+from curvafit.inference.posterior import load_posterior
+from curvafit.inference.prepare import prepare
+from curvafit.inference.table import law_of, mirrored, parameters_of
+from curvafit.priors.coefficients import preset
+from curvafit.priors.fit_file import read_fit
+from curvafit.priors.fit_schema import FORMAT
+from curvafit.priors.grid import WORKING_EPSILON, Grid
+from curvafit.report.page import write_inference
+from curvafit.volumes.scan import Field
+
+GRID = Grid((44, 44, 44))
+
+
+@pytest.fixture(scope="module")
+def tubes() -> np.ndarray:
+    shape = preset("tubes")
+    return generate(shape.coefficients, shape.mass, GRID, seed=5).field.numpy()
+
+
+@pytest.fixture(scope="module")
+def inference(tubes: np.ndarray) -> Inference:
+    """With fewer simulations than a user's: every stage is passed, none polished."""
+    scan = Field((tubes > 0).astype(np.uint8), (2.0, 2.0, 2.0), "um", source="tubes")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(import_module("curvafit.inference.estimate"), "SIMULATIONS", 10)
+        return infer(scan, kind="mask", periodic=True, seed=3)
+
+
+@pytest.mark.slow
+def test_a_mask_is_taken_to_parameters_and_back(inference: Inference) -> None:
+    fit = inference.fit
+    assert fit.kind == "mask" and fit.family == "tubes"
+    assert [each.name for each in fit.candidates] == ["refined", "posterior", "simulation", "match"]
+    assert fit.chosen in TITLES and fit.status.endswith(".")
+    assert fit.best is not None and fit.best.coefficients.a20 == pytest.approx(1.0)
+    assert float(fit.best.coefficients.a02) > 0 and -1 < fit.best.mass < 1
+    distances = {each.name: each.distance for each in fit.candidates if each.distance is not None}
+    nearest = next(each for each in fit.candidates if distances.get(each.name) == min(distances.values()))
+    assert distances[fit.best.name] <= min(distances.values()) + (nearest.seed_noise or 0)
+    assert min(distances.values()) < 6
+    assert [match.distance for match in fit.matches] == sorted(match.distance for match in fit.matches)
+    assert inference.best is not None and inference.best.shape == GRID.shape
+    assert fit.misfit is not None and set(fit.misfit.blocks) == set(BLOCKS)
+    assert fit.drift is not None and 0 < fit.drift < 5
+    filled = [twin.volume_fraction for twin in fit.best.twins]
+    assert filled == pytest.approx([fit.morphometry.volume_fraction] * len(filled), abs=0.01)
+
+
+@pytest.mark.slow
+def test_the_truth_lies_among_the_draws(inference: Inference) -> None:
+    """Each parameter within the draws' extremes: what a 90 % interval misses one time in ten."""
+    shape, draws = preset("tubes"), inference.fit.draws
+    assert draws is not None and draws.view == "mask" and len(draws.values) == DRAWS
+    truth = law_of(parameters_of(shape.coefficients, shape.mass))
+    low, high = draws.values.min(0), draws.values.max(0)
+    for name, value in (*truth[0].as_dict().items(), ("mass", truth[1])):
+        if name != "a20":
+            k = COLUMNS.index(name)
+            assert low[k] < value < high[k], name
+
+
+@pytest.mark.slow
+def test_physical_numbers_are_the_working_ones_in_another_unit(inference: Inference) -> None:
+    fit, physical = inference.fit, inference.fit.coefficients_physical
+    assert fit.coefficients is not None and physical is not None
+    assert fit.scale == (1.0, 1.0, 1.0) and fit.working_voxel == pytest.approx(2.0)
+    λ = fit.working_voxel / 0.01
+    assert fit.epsilon_physical == pytest.approx(4.0)
+    assert physical.a11 == pytest.approx(float(fit.coefficients.a11))
+    assert physical.a10 == pytest.approx(float(fit.coefficients.a10) / λ)
+    assert physical.a00 == pytest.approx(float(fit.coefficients.a00) / λ**2)
+
+
+@pytest.mark.slow
+def test_fit_json_holds_what_the_generator_needs(inference: Inference, tmp_path) -> None:
+    path, fit = tmp_path / "fit.json", inference.fit
+    path.write_text(fit.to_json())
+    content = json.loads(path.read_text())
+    assert content["format"] == FORMAT
+    assert content["provenance"]["seed"] == 3 and content["length_unit"] == "um"
+    assert content["provenance"]["schedule"] == SCHEDULES[LEARNED].as_dict()
+    kept = content["diagram"]
+    assert kept["seen_as"] == "mask" and sum(kept["share"]) == pytest.approx(1, abs=1e-4)
+    assert len(kept["kappa1"]) == len(kept["share"]) and path.read_text().count("\n") < 1000
+    prior, law = read_fit(path), fit.to_prior()
+    assert tuple(prior.coefficients) == pytest.approx(tuple(law.coefficients))
+    assert tuple(prior.physical) == pytest.approx(tuple(law.physical))
+    assert (prior.mass, prior.epsilon) == pytest.approx((law.mass, law.epsilon))
+    assert (prior.working_voxel, prior.unit) == (fit.working_voxel, fit.length_unit)
+
+
+# ---- laws ------------------------------------------------------------------------------------------------------------
+
+
+def quick(values: np.ndarray, spacing: float = 1.0, unit: str = "um", **options) -> Fit:
+    """The fit of a mask without any shape grown."""
+    scan = Field(values.astype(np.uint8), (spacing,) * 3, unit)
+    return infer(scan, kind="mask", periodic=True, fast=True, **options).fit
+
+
+def places(fit: Fit) -> np.ndarray:
+    """The medians and quartiles of the draws in deviations of the prior's box, `(18,)`."""
+    assert fit.draws is not None
+    box = load_posterior().box
+    rows = (fit.draws.parameters - box[:, 0]) / (box[:, 1] - box[:, 0]) * np.sqrt(12)
+    return np.percentile(rows, (25, 50, 75), axis=0).ravel()
+
+
+@pytest.fixture(scope="module")
+def straight(tubes: np.ndarray) -> Fit:
+    return quick(tubes > 0)
+
+
+def test_a_law_does_not_know_its_axes(tubes: np.ndarray, straight: Fit) -> None:
+    """Descriptors of turned voxels differ by rounding and by the order of sums: a hundredth of a deviation is ample."""
+    turned = quick(np.ascontiguousarray(tubes.transpose(2, 0, 1)) > 0)
+    np.testing.assert_allclose(places(turned), places(straight), atol=0.05)
+    flipped = quick(np.ascontiguousarray(tubes[::-1]) > 0)
+    np.testing.assert_allclose(places(flipped), places(straight), atol=0.05)
+
+
+def test_a_law_in_another_unit_is_the_same_law(tubes: np.ndarray, straight: Fit) -> None:
+    other = quick(tubes > 0, spacing=0.003, unit="mm")
+    np.testing.assert_allclose(places(other), places(straight), atol=1e-9)
+    mine, theirs = straight.to_prior(), other.to_prior()
+    assert tuple(mine.in_unit("um")) == pytest.approx(tuple(theirs.in_unit("um").in_unit(3.0)), rel=1e-9)
+
+
+def test_inside_for_outside_is_the_mirrored_law(tubes: np.ndarray, straight: Fit) -> None:
+    """And the note says how to turn it round."""
+    other = quick(tubes <= 0)
+    assert straight.draws is not None and other.draws is not None
+    np.testing.assert_allclose(other.draws.parameters, mirrored(straight.draws.parameters), rtol=1e-5, atol=1e-5)
+    own, law = straight.to_prior(), other.to_prior()
+    six = own.coefficients.mirrored()
+    assert tuple(law.coefficients) == pytest.approx(tuple(six.scaled(1 / float(six.a20))), rel=1e-6)
+    assert law.mass == pytest.approx(-own.mass)
+    assert any("--dark" in note for note in other.notes) and not any("--dark" in note for note in straight.notes)
+    mine, theirs = straight.matches[0], other.matches[0]
+    assert mine.id == theirs.id and theirs.mass == -mine.mass
+    assert mine.distance == pytest.approx(theirs.distance, rel=0.02)
+
+
+def _noise(n: int) -> np.ndarray:
+    return np.random.default_rng(0).random((n, n, n)) < 0.4
+
+
+def _ball(n: int) -> np.ndarray:
+    return np.square(np.indices((n, n, n)) - n / 2 + 1.2).sum(0) < (n / 4) ** 2
+
+
+def _plane(n: int) -> np.ndarray:
+    z, y, _ = np.indices((n, n, n))
+    return np.abs(z + 0.3 * y - 0.6 * n) < 4
+
+
+@pytest.mark.parametrize(
+    ("shape", "said"), [(_noise, "the scan is noise"), (_ball, "a single ball-like body"), (_plane, "is flat")]
+)
+def test_what_is_no_texture_has_no_law(shape, said: str, tmp_path: Path) -> None:
+    inference = infer(Field(shape(40).astype(np.uint8), (1.0,) * 3, "um"), kind="mask")
+    assert inference.fit.coefficients is None and inference.fit.status.startswith("No law: ")
+    assert said in inference.fit.status
+    report = write_inference(inference, tmp_path / "out")
+    assert json.loads((report.parent / "fit.json").read_text())["coefficients"] is None
+    assert said in report.read_text(encoding="utf-8")
+    with pytest.raises(ValueError, match="expected a fit with a law"):
+        inference.to_prior()
+
+
+def test_grey_noise_is_noise_and_a_texture_under_it_is_not(tubes: np.ndarray) -> None:
+    rng = np.random.default_rng(1)
+    grey = rng.normal(100, 20, GRID.shape).astype(np.float32)
+    assert prepare(Field(grey, (1.0,) * 3, "um"), kind="image").noise
+    assert not prepare(Field(grey + 60 * (tubes > 0), (1.0,) * 3, "um"), kind="image").noise
+
+
+def test_read_fit_refuses_what_is_no_fit(tmp_path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"expected a fit\.json, found no file"):
+        read_fit(tmp_path / "none.json")
+    path = tmp_path / "fit.json"
+    for text in ("{", "[]", "{}", '{"format": "curvafit-fit-2"}'):
+        path.write_text(text)
+        with pytest.raises(ValueError, match="expected a fit.json written by"):
+            read_fit(path)
+    path.write_text('{"format": "curvafit-fit-0"}')
+    with pytest.raises(ValueError, match="expected a fit.json of format"):
+        read_fit(path)
+
+
+def test_tiles_measure_what_the_whole_box_measures(tubes: np.ndarray) -> None:
+    rng = np.random.default_rng(0)
+    scan = Field(np.tile(tubes, (1, 1, 4))[:, :, :160], (1.0, 1.0, 1.0), "um")
+    prepared = prepare(scan, kind="field")
+    assert prepared.phase.shape == (44, 44, 160)
+    tiled = scan_diagram(prepared)
+    grid = Grid((44, 44, 160), prepared.grid.spacing, "replicate")
+    whole = diagram(torch.from_numpy(prepared.phase), grid, WORKING_EPSILON)
+    assert tiled.area == pytest.approx(whole.area, rel=1e-6)
+    np.testing.assert_allclose(tiled.mean(), whole.mean(), rtol=1e-6, atol=1e-6)
+    direction = rng.normal(size=2)
+    for share in (0.1, 0.5, 0.9):
+        assert _quantile(tiled, direction, share) == pytest.approx(
+            _quantile(whole, direction, share), rel=1e-3, abs=0.05
+        )
+
+
+def test_a_region_of_interest_hides_the_surface_that_it_cuts() -> None:
+    inside = Gyroid(0.22).distance(centres(Grid((44, 44, 44)))).numpy() > 0
+    scan = Field(inside.astype(np.uint8), (1.0, 1.0, 1.0), "um")
+    z, y, x = np.indices(scan.values.shape) - 21.5
+    region = z**2 + y**2 + x**2 < 20**2
+    prepared = prepare(scan, kind="mask", roi=region)
+    measured = scan_diagram(prepared)
+    assert prepared.roi is not None
+    bare = scan_diagram(dataclasses.replace(prepared, roi=None))
+    assert 0.3 * bare.area < measured.area < 0.9 * bare.area
+    whole = prepare(scan, kind="mask")  # the same ball of the uncut shape
+    beyond = (whole.grid.shape[0] - prepared.grid.shape[0]) // 2
+    kept = scan_diagram(dataclasses.replace(whole, roi=np.pad(prepared.roi, beyond)))
+    assert measured.area == pytest.approx(kept.area, rel=0.02)
+    near, far = wasserstein(measured, kept), wasserstein(bare, kept)
+    assert 2 * near < far, (near, far)
+
+
+def test_the_largest_cube_of_a_region_is_described() -> None:
+    """Of a region of a box beside a thin slab, the box; of a smaller one nothing, and of one without a surface."""
+    mask = Gyroid(0.22).distance(centres(GRID)).numpy() > 0
+    own = dataclasses.replace(prepare(Field(mask), kind="mask"), mask=mask, grid=Grid(GRID.shape, 0.01, "replicate"))
+    region = np.zeros(GRID.shape, dtype=bool)
+    region[6:33, 10:37, 12:39] = region[40:43] = True
+    seen = scan_descriptors(dataclasses.replace(own, roi=region))
+    assert seen is not None and seen[1] == "crop"
+    cube = np.ascontiguousarray(mask[6:33, 10:37, 12:39])
+    expected = descriptors(cube, Grid((27, 27, 27), 0.01, "replicate"))
+    assert seen[0].vector() == pytest.approx(expected.vector())
+    assert scan_descriptors(dataclasses.replace(own, roi=region, mask=np.ones_like(mask))) is None
+    region[6:10] = False  # 23 voxels
+    assert scan_descriptors(dataclasses.replace(own, roi=region)) is None
+
+
+def test_a_scan_is_seen_as_a_kind_of_view() -> None:
+    grid = Grid((32, 32, 32))
+    whole = prepare(
+        Field(np.tanh(20 * Gyroid(0.32).distance(centres(grid, (0.001, 0.0023, 0.0007))).numpy()).astype(np.float32)),
+        kind="field",
+        periodic=True,
+    )
+    assert whole.kind == "field" and whole.grid.periodic
+    parts: dict[str, dict] = {
+        "field": {},
+        "mask": {"kind": "mask"},
+        "crop": {"grid": Grid(grid.shape, grid.spacing, "replicate")},
+        "resampled": {"grid": Grid(grid.shape, grid.spacing, "replicate"), "scale": (1.0, 1.0, 2.0)},
+        "scan": {"kind": "image", "imaging": Imaging(1.0, 0.3, 0.0, 0.0, (1.0, 1.0, 1.0))},
+    }
+    for view, changes in parts.items():
+        seen = scan_descriptors(dataclasses.replace(whole, **changes))
+        assert seen is not None and seen[1] == view, view
+    clean = dataclasses.replace(whole, kind="image", imaging=Imaging(1.0, 0.05, 0.0, 0.0, (1.0, 1.0, 1.0)))
+    assert (seen := scan_descriptors(clean)) is not None and seen[1] == "mask"
+    rounded = scan_descriptors(dataclasses.replace(whole, phase=np.round(whole.phase, 2)))
+    assert rounded is not None and rounded[1] == "mask"
+
+
+def _quantile(measured, direction: np.ndarray, share: float) -> float:
+    values = measured.points @ direction
+    order = np.argsort(values)
+    cumulated = np.cumsum(measured.weights[order]) / measured.area
+    return float(values[order][np.searchsorted(cumulated, share)])

@@ -1,0 +1,29 @@
+"""What the tests of the kernels share: grids, a law, a smooth field and its gradient in plain torch."""
+
+from __future__ import annotations
+
+import torch
+
+from curvafit.priors.coefficients import Coefficients
+from curvafit.priors.energy import energy
+from curvafit.priors.grid import Grid
+from curvafit.priors.stencils import gaussian_blur
+
+BOUNDARIES = ("periodic", "replicate")
+SPACINGS = ((0.01, 0.01, 0.01), (0.013, 0.01, 0.008))
+TUBES = Coefficients(1, 2, 6, -40, -40, 400)
+BETAS, ADAM_EPS, BLUR, EPSILON = (0.9, 0.999), 1e-2, 0.02, 0.02
+
+
+def smooth_field(grid: Grid, seed: int = 0, rms: float = 0.8) -> torch.Tensor:
+    """A blurred noise in float64, about as rough as a phase field."""
+    noise = torch.randn(grid.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    field = gaussian_blur(noise, grid, 0.02)
+    return field * rms / field.std() - 0.3
+
+
+def torch_gradient(u: torch.Tensor, a: Coefficients, grid: Grid, ε=EPSILON, Q=None) -> tuple[float, torch.Tensor]:
+    free = u.clone().requires_grad_()
+    value = energy(free, a, grid, ε, Q)
+    (slope,) = torch.autograd.grad(value, free)
+    return float(value.detach()), slope.double()

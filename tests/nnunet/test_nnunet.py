@@ -1,0 +1,143 @@
+"""nnU-Net's trainer: what the command prints, and the trainer inside the real package where that is installed."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+from calling import call, refused
+
+ROOT = Path(__file__).resolve().parents[2]
+FOLDER = ROOT / "curvafit" / "nnunet"
+
+
+# ---- the command -----------------------------------------------------------------------------------------------------
+
+
+def test_the_command_prints_lines_that_a_shell_takes(tmp_path):
+    done = call("nnunet", "--prior", "tubes", "--weight", "0.01", "--epsilon", "0.5")
+    assert done.exit_code == 0, done.stderr
+    names = ["nnUNet_extTrainer", *(f"CURVAFIT_{name}" for name in ("PRIOR", "WEIGHT", "EPSILON", "WARMUP"))]
+    script = done.stdout + '\necho "' + "|".join(f"${name}" for name in names) + '"'
+    for before in (None, "/elsewhere"):
+        env = {"PATH": os.environ["PATH"]} | ({} if before is None else {"nnUNet_extTrainer": before})
+        said = subprocess.run(["bash", "-c", script], env=env, capture_output=True, text=True, check=True)
+        folder, *rest = said.stdout.strip().split("|")
+        assert folder.split(os.pathsep) == [str(FOLDER), *([before] if before else [])]
+        assert rest == ["tubes", "0.01", "0.5", "50"]
+        assert "unset CURVAFIT_SHARE" in script
+    shared = call("nnunet", "--prior", "Bilinear_Tubes").stdout.splitlines()
+    assert "export CURVAFIT_PRIOR=bilinear-tubes" in shared
+    assert "export CURVAFIT_SHARE=0.1" in shared and "unset CURVAFIT_WEIGHT" in shared
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--prior", "tubs", "--weight", "1"), "expected --prior to be a fit.json or a preset"),
+        (("--prior", "none.json", "--weight", "1"), "expected a fit.json, found no file none.json"),
+        (("--prior", "tubes", "--weight", "-1"), "expected --weight to be a positive number, got -1"),
+        (("--prior", "tubes", "--share", "nan"), "expected --share to be a positive number, got nan"),
+        (("--prior", "tubes", "--epsilon", "inf"), "expected --epsilon to be a positive number, got inf"),
+        (("--prior", "tubes", "--warmup", "nan"), "expected --warmup to be a positive number, got nan"),
+        (("--prior", "tubes", "--share", "1", "--weight", "1"), "expected either --share or --weight"),
+    ],
+)
+def test_wrong_options_are_said(options, message):
+    refused(call("nnunet", *options), message)
+
+
+# ---- the trainer -----------------------------------------------------------------------------------------------------
+
+PROGRAM = """
+import copy, json, os, sys
+import torch
+from nnunetv2.utilities.find_objects import recursive_find_trainer_class_by_name
+from nnunetv2.training.loss.deep_supervision import DeepSupervisionWrapper
+
+kind = recursive_find_trainer_class_by_name("nnUNetTrainerCurvafit")
+labels, ignore = {"background": 0, "vessel": 1, "ignore": 2}, 2
+dataset = {"channel_names": {"0": "CT"}, "labels": labels, "numTraining": 1, "file_ending": ".nii.gz"}
+stages = {"n_stages": 3, "features_per_stage": [4, 8, 8], "conv_op": "torch.nn.modules.conv.Conv3d",
+    "kernel_sizes": [[3, 3, 3]] * 3, "strides": [[1, 1, 1], [1, 2, 2], [2, 2, 2]], "n_conv_per_stage": [1, 1, 1],
+    "n_conv_per_stage_decoder": [1, 1], "conv_bias": True, "norm_op": "torch.nn.modules.instancenorm.InstanceNorm3d",
+    "norm_op_kwargs": {"eps": 1e-5, "affine": True}, "dropout_op": None, "dropout_op_kwargs": None,
+    "nonlin": "torch.nn.LeakyReLU", "nonlin_kwargs": {"inplace": True}}
+plan = {"data_identifier": "x", "preprocessor_name": "DefaultPreprocessor", "batch_size": 1, "patch_size": [16, 32, 32],
+    "spacing": [2.0, 1.0, 1.0], "normalization_schemes": ["ZScoreNormalization"], "use_mask_for_norm": [False],
+    "batch_dice": False, "architecture": {
+        "network_class_name": "dynamic_network_architectures.architectures.unet.PlainConvUNet",
+        "arch_kwargs": stages, "_kw_requires_import": ["conv_op", "norm_op", "dropout_op", "nonlin"]}}
+plans = {"dataset_name": "Dataset001_X", "plans_name": "nnUNetPlans", "continue_training": False,
+    "configurations": {"3d_fullres": plan}, "foreground_intensity_properties_per_channel": {},
+    "transpose_forward": [0, 1, 2], "transpose_backward": [0, 1, 2]}
+trainer = kind(copy.deepcopy(plans), "3d_fullres", 0, dataset, device=torch.device("cpu"))
+trainer.initialize()
+assert isinstance(trainer.loss, DeepSupervisionWrapper)
+torch.manual_seed(0)
+image = torch.randn(1, 1, 16, 32, 32)
+target = [torch.randint(0, 3, (1, 1, *n)).float() for n in ((16, 32, 32), (16, 16, 16))]
+trainer.network.train()
+outputs = trainer.network(image)
+assert [tuple(o.shape[2:]) for o in outputs] == [(16, 32, 32), (16, 16, 16)]
+combined, factors = trainer.loss.loss, trainer.loss.weight_factors
+with torch.no_grad():
+    value = trainer.loss(outputs, target)
+    base = sum(f * combined.base(o, t) for f, o, t in zip(factors, outputs, target) if f)
+    own = sum(f * combined.prior(o, t) for f, o, t in zip(factors, outputs, target) if f)
+weight = float(os.environ["CURVAFIT_WEIGHT"])
+warmup = int(float(os.environ["CURVAFIT_WARMUP"]) * 250) * sum(f != 0 for f in factors)
+assert combined.warmup == warmup and int(combined.calls) == 0
+combined.warmup = 0
+with torch.no_grad():
+    torch.testing.assert_close(trainer.loss(outputs, target), base + weight * own)
+combined.warmup = warmup
+before = [p.detach().clone() for p in trainer.network.parameters()]
+step = trainer.train_step({"data": image, "target": target})
+assert step["loss"] == step["loss"] and any(bool((a != b).any()) for a, b in zip(before, trainer.network.parameters()))
+made = int(combined.calls)
+with torch.no_grad():
+    trainer.validation_step({"data": image, "target": [t.clone() for t in target]})
+assert int(combined.calls) == made
+trainer.current_epoch = 3
+trainer.on_train_epoch_start()
+assert int(combined.calls) == 3 * 250 * made
+os.environ["CURVAFIT_SHARE"] = "0.2"
+shared = kind(copy.deepcopy(plans), "3d_fullres", 0, dataset, device=torch.device("cpu"))
+shared.initialize()
+shared.dataloader_train = iter([{"data": image, "target": [t.clone() for t in target]}] * 20)
+for epoch in (1, 2):
+    assert shared.loss.loss.weight == 0
+    shared.current_epoch = epoch
+    shared.on_train_epoch_start()
+combined = shared.loss.loss
+leaf = shared.network(image)[0].detach().float().requires_grad_()
+slopes = [torch.autograd.grad(part(leaf, target[0]), leaf)[0].norm() for part in (combined.base, combined.prior)]
+assert abs(float(combined.weight * slopes[1] / slopes[0]) - 0.2) < 1e-3
+assert shared.train_step({"data": image, "target": target})["loss"] < 1e3
+print("done")
+"""
+
+
+@pytest.mark.skipif(
+    importlib.util.find_spec("nnunetv2") is None, reason="nnunetv2 is not installed: pip install nnunetv2"
+)
+def test_the_trainer_in_the_real_package(tmp_path):
+    env = {"nnUNet_extTrainer": str(FOLDER), "CURVAFIT_PRIOR": "tubes", "CURVAFIT_WEIGHT": "0.01"}
+    env |= {"CURVAFIT_WARMUP": "2", "PYTHONPATH": str(ROOT), "nnUNet_compile": "f"}
+    for name in ("raw", "preprocessed", "results"):
+        (tmp_path / name).mkdir()
+        env[f"nnUNet_{name}"] = str(tmp_path / name)
+    (tmp_path / "preprocessed" / "Dataset001_X" / "x").mkdir(parents=True)
+    (tmp_path / "preprocessed" / "Dataset001_X" / "x" / "case.npz").touch()  # tells how data are stored
+    command = [sys.executable, "-c", textwrap.dedent(PROGRAM)]
+    done = subprocess.run(command, env=os.environ | env, capture_output=True, text=True, check=False)
+    assert done.returncode == 0 and done.stdout.rstrip().endswith("done"), done.stderr
+    del env["CURVAFIT_WEIGHT"]
+    done = subprocess.run(command, env=os.environ | env, capture_output=True, text=True, check=False)
+    assert "expected CURVAFIT_WEIGHT to be a number from 0, got ''" in done.stderr

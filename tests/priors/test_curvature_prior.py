@@ -1,0 +1,213 @@
+"""The curvature prior: what it computes, whatever the window, the sampling, the labels and the precision."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from loss_cases import LAW, TUBES, fit_file, noise, probabilities, slope_of
+from torch import Tensor
+
+from curvafit.priors import Coefficients, CurvaturePrior, Grid, curvature_prior, energy, optimal_profile
+from curvafit.priors.refined import refined
+from curvafit.priors.stencils import gaussian_blur
+
+
+def ball(shape: tuple[int, int, int], spacing: tuple[float, float, float], radius: float, epsilon: float) -> Tensor:
+    """The phase field of a ball in the middle of a box, `(1, 1, Z, Y, X)`."""
+    axes = (h * (torch.arange(n, dtype=torch.float64) - (n - 1) / 2) for n, h in zip(shape, spacing, strict=True))
+    z, y, x = torch.meshgrid(*axes, indexing="ij")
+    return optimal_profile(radius - (z**2 + y**2 + x**2).sqrt(), epsilon)[None, None]
+
+
+# ---- the value -------------------------------------------------------------------------------------------------------
+
+
+def test_the_sum_is_the_energy_of_the_interior():
+    spacing, epsilon = (1.2, 1.0, 0.9), 2.5
+    p = probabilities(2, 12, 11, 10)
+    inside = torch.zeros(12, 11, 10)
+    inside[1:-1, 1:-1, 1:-1] = 1
+    expected = energy(2 * p - 1, LAW, Grid((12, 11, 10), spacing, "replicate"), epsilon, mask=inside)
+    # In other units of length: the offsets ξ in the definition are numbers, and nowhere felt.
+    found = curvature_prior(p, LAW, spacing, epsilon, normalize=None)
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=0)
+    prior = CurvaturePrior(LAW, spacing=spacing, epsilon=epsilon, reduction="sum")
+    torch.testing.assert_close(prior(p[:, None]), found.sum())
+
+
+def test_a_preset_is_in_working_units_of_the_finest_axis():
+    u = ball((14, 14, 14), (0.01, 0.01, 0.01), 0.05, 0.02)
+    mask = torch.zeros(14, 14, 14)
+    mask[1:-1, 1:-1, 1:-1] = 1
+    expected = energy(u[0], TUBES, Grid((14, 14, 14), 0.01, "replicate"), 0.02, mask=mask)
+    prior = CurvaturePrior("tubes", spacing=0.35, reduction="sum")
+    assert prior.epsilon == 0.7
+    torch.testing.assert_close(prior((u + 1) / 2), expected.sum(), rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize("normalize", ["voxel", "area"])
+def test_a_change_of_unit_changes_nothing(normalize):
+    p = probabilities(1, 1, 10, 10, 12)
+    micro = CurvaturePrior(LAW, spacing=(2.0, 1.0, 1.0), epsilon=4.0, normalize=normalize)
+    milli = CurvaturePrior(LAW.in_unit(1e3), spacing=(2e-3, 1e-3, 1e-3), epsilon=4e-3, normalize=normalize)
+    torch.testing.assert_close(micro(p), milli(p), rtol=1e-10, atol=0)
+
+
+def test_a_fit_is_in_its_own_unit_or_converted(tmp_path):
+    path = fit_file(tmp_path / "fit.json", "um")
+    (law,) = CurvaturePrior(path, spacing=2.0).coefficients
+    assert tuple(law) == pytest.approx(tuple(TUBES.in_unit(1 / 200)))
+    (law,) = CurvaturePrior(str(path), spacing=2e-3, unit="mm").coefficients
+    assert tuple(law) == pytest.approx(tuple(TUBES.in_unit(1e3 / 200)))
+    with pytest.raises(ValueError, match="expected two units among nm, um, mm, m, got voxel and the fit's um"):
+        CurvaturePrior(path, unit="voxel")
+
+
+def test_area_is_that_of_the_interface():
+    """On a ball of radius R ≫ ε the energy per area is p(1/R, 1/R) ε², but for an error in (Δx/ε)² and (ε/R)²."""
+    radius, epsilon = 16.0, 2.0
+    u = ball((44, 44, 44), (1.0, 1.0, 1.0), radius, epsilon)
+    willmore = CurvaturePrior(Coefficients.willmore(), epsilon=epsilon, normalize="area")
+    assert float(willmore((u + 1) / 2)) == pytest.approx(4 * (epsilon / radius) ** 2, rel=0.02)
+
+
+# ---- windows ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("spacing", "border"), [((1.0, 1.0, 1.0), 1), ((2.0, 1.0, 1.0), 2)])
+def test_tiles_add_up_to_the_interior_of_the_whole(spacing, border):
+    p = probabilities(1, 1, 12, 20, 20)
+    with pytest.warns(UserWarning, match="z 2-fold") if spacing[0] > 1 else no_warning():
+        prior = CurvaturePrior("tubes", spacing=spacing, border=border, reduction="sum")
+    inner = 8 if border == 2 else 9
+    tiles = [
+        p[..., y : min(20, y + inner + 2 * border), x : min(20, x + inner + 2 * border)]
+        for y in range(0, 20 - 2 * border, inner)
+        for x in range(0, 20 - 2 * border, inner)
+    ]
+    assert len(tiles) == 4 and all(tile.shape != p.shape for tile in tiles)
+    torch.testing.assert_close(sum(prior(tile) for tile in tiles), prior(p), rtol=1e-10, atol=0)
+
+
+class no_warning:
+    def __enter__(self) -> None: ...
+    def __exit__(self, *_) -> None: ...
+
+
+def test_the_mean_compares_across_patch_sizes():
+    """Patches of a repeating pattern: the energies go with the volume, the means do not."""
+    cell = 2 * probabilities(16, 16, 16) - 1
+    whole = (gaussian_blur(cell.repeat(3, 3, 3), Grid((48, 48, 48), 1.0), 1.0)[None, None] + 1) / 2
+    mean, total = CurvaturePrior("tubes"), CurvaturePrior("tubes", reduction="sum")
+    sizes = (18, 34)
+    patches = [whole[..., 8 : 8 + n, 8 : 8 + n, 8 : 8 + n] for n in sizes]
+    means, sums = ([float(prior(patch)) for patch in patches] for prior in (mean, total))
+    assert means[0] == pytest.approx(means[1], rel=1e-9)
+    assert sums[1] == pytest.approx(8 * sums[0], rel=1e-9)
+
+
+def test_the_level_of_a_deep_supervision_has_its_own_spacing():
+    p = probabilities(1, 1, 8, 8, 8)
+    level = CurvaturePrior("tubes", spacing=0.5, epsilon=2.0, shape=(8, 16, 16))
+    with pytest.warns(UserWarning, match="interpolating"):
+        CurvaturePrior("tubes", spacing=(0.5, 1.0, 1.0), epsilon=1.0)
+    coarse = CurvaturePrior(level.coefficients[0], spacing=(0.5, 1.0, 1.0), epsilon=2.0)
+    torch.testing.assert_close(level(p), coarse(p))
+    fine = probabilities(1, 1, 8, 16, 16)
+    torch.testing.assert_close(level(fine), CurvaturePrior("tubes", spacing=0.5, epsilon=2.0)(fine))
+
+
+# ---- anisotropy ------------------------------------------------------------------------------------------------------
+
+
+def ball_energy(times: int, epsilon: float) -> float:
+    """F_ε / σ of a ball on a grid `times` coarser along z."""
+    from curvafit.priors import SIGMA
+
+    spacing = (float(times), 1.0, 1.0)
+    n = 48 // times
+    u = ball((n, 48, 48), spacing, 14.0, epsilon)
+    value = curvature_prior((u[0] + 1) / 2, Coefficients.willmore(), spacing, epsilon, normalize=None)
+    return float(value) / SIGMA
+
+
+def test_a_resampled_volume_has_the_same_energy():
+    """Where the grid resolves ε the error of second differences is (Δz/ε)², so twice as coarse is four times as wrong;
+    where it is interpolated (Δz = ε) the cubic's third order leaves a few per cent, of either sign."""
+    epsilon = 4.0
+    fine, coarse = ball_energy(1, epsilon), ball_energy(2, epsilon)
+    exact = 16 * math.pi
+    finest = ball_energy(1, epsilon) + (ball_energy(1, epsilon) - ball_energy(2, epsilon)) / 3
+    assert abs(coarse / finest - 1) < 0.06
+    assert (coarse - finest) / (fine - finest) == pytest.approx(4, rel=1e-6)
+    assert finest == pytest.approx(exact, rel=0.15)
+    assert ball_energy(4, epsilon) == pytest.approx(fine, rel=0.08)
+
+
+def test_cubic_convolution_keeps_parabolas():
+    z = torch.arange(12, dtype=torch.float64)
+    fine = (torch.arange(36, dtype=torch.float64) + 0.5) / 3 - 0.5
+    inside = slice(6, -6)
+    for law in (lambda t: 0 * t + 2, lambda t: 3 * t - 1, lambda t: t**2 - 4 * t):
+        found = refined(law(z)[None, :, None, None].expand(2, 12, 4, 5), 0, 3)
+        assert found.shape == (2, 36, 4, 5)
+        torch.testing.assert_close(found[1, inside, 2, 3], law(fine)[inside])
+
+
+# ---- gradients and precision -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("normalize", ["voxel", "area"])
+@pytest.mark.parametrize("options", [{}, {"spacing": (2.0, 1.0, 1.0), "epsilon": 2.0}, {"blur": 0.7}])
+@pytest.mark.filterwarnings("ignore:ε = 2")
+def test_gradcheck(normalize, options):
+    prior = CurvaturePrior("tubes", softmax=True, normalize=normalize, **options)
+    logits = noise(1, 2, 6, 5, 7).requires_grad_()
+    assert torch.autograd.gradcheck(prior, (logits,), fast_mode=True)
+
+
+def test_the_fused_kernels_have_the_gradient_of_the_definition():
+    prior = CurvaturePrior("tubes", sigmoid=True, spacing=(1.5, 1.0, 1.0), epsilon=3.0)
+    logits = 3 * gaussian_blur(noise(2, 2, 20, 18, 33), Grid((20, 18, 33), 1.0, "replicate"), 1.0)
+    mask = (noise(2, 1, 20, 18, 33, seed=5) > -0.5).double()
+    exact = slope_of(lambda x: prior(x, mask=mask), logits)
+    found = slope_of(lambda x: prior(x, mask=mask), logits.float())
+    torch.testing.assert_close(prior(logits.float(), mask=mask).double(), prior(logits, mask=mask), rtol=1e-5, atol=0)
+    error = (found.double() - exact).abs() / exact.abs().max()
+    assert error.quantile(0.9) < 1e-6 and error.max() < 1e-2
+
+
+@pytest.mark.parametrize("kind", [torch.bfloat16, torch.float16])
+@pytest.mark.filterwarnings("ignore:ε = 2")
+def test_autocast_changes_nothing(kind):
+    """Half-precision logits are computed with in float32, inside autocast and out of it; large ones stay finite.
+
+    An interpolated axis is a matrix product, which autocast would do in half precision.
+    """
+    prior = CurvaturePrior("tubes", sigmoid=True, spacing=(2.0, 1.0, 1.0))
+    logits = (40 * noise(1, 2, 8, 8, 8, dtype=torch.float32)).to(kind)
+    expected = prior(logits.float())
+    with torch.autocast("cpu", dtype=kind):
+        found = prior(logits)
+        slope = slope_of(prior, logits)
+    assert found.dtype == torch.float32 and torch.equal(found, expected)
+    assert slope.dtype == kind and bool(torch.isfinite(slope).all()) and bool(slope.any())
+
+
+@pytest.mark.parametrize("value", [0.0, 1e4, -1e4])
+@pytest.mark.parametrize("normalize", ["voxel", "area"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_constant_or_saturated_input_is_harmless(value, normalize, dtype):
+    prior = CurvaturePrior("trabec", sigmoid=True, normalize=normalize)
+    logits = torch.full((1, 1, 8, 8, 8), value, dtype=dtype)
+    assert bool(torch.isfinite(prior(logits))) and bool(torch.isfinite(slope_of(prior, logits)).all())
+    checkered = torch.where(noise(1, 1, 8, 8, 8) > 0, 1e4, -1e4).to(dtype)
+    assert bool(torch.isfinite(prior(checkered))) and bool(torch.isfinite(slope_of(prior, checkered)).all())
+
+
+def test_it_is_deterministic():
+    prior, logits = CurvaturePrior("tubes", sigmoid=True), noise(2, 1, 20, 20, 20, dtype=torch.float32)
+    assert torch.equal(prior(logits), prior(logits))
+    assert torch.equal(slope_of(prior, logits), slope_of(prior, logits))

@@ -1,0 +1,156 @@
+"""The curvature prior's derivatives in every mode: those of the definition in float64, or refused in one sentence."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from loss_cases import LAW, noise, probabilities
+from torch import Tensor
+from torch.func import grad, hessian, jacfwd, jacrev, jvp, vjp, vmap
+
+from curvafit.priors import CurvaturePrior, Grid, curvature_prior
+from curvafit.priors.kernels.differentiable import areas, energies
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:ε = .* interpolating"),
+    pytest.mark.filterwarnings("ignore:.*torch.jit.script:DeprecationWarning"),  # torch's own, of `torch.func.jvp`
+    pytest.mark.filterwarnings("ignore:Dynamo detected a call to a `functools.lru_cache`"),
+]
+
+GRID, EPSILON = Grid((8, 9, 10), (0.012, 0.01, 0.01), "replicate"), 0.02
+MASK = torch.rand(1, 8, 9, 10, generator=torch.Generator().manual_seed(1))
+
+#: Functions of probabilities (2, 8, 9, 10), two numbers each.
+FUNCTIONS = {
+    "voxel": lambda p: curvature_prior(p, LAW, (1.0, 1.0, 1.0), 2.0, mask=MASK),
+    "area": lambda p: curvature_prior(p, LAW, (1.0, 1.0, 1.0), 2.0, normalize="area", blur=0.5),
+    "interpolated": lambda p: curvature_prior(p, LAW, (2.0, 1.0, 1.0), 2.0, normalize=None),
+    "module": lambda p: CurvaturePrior(LAW, sigmoid=True, reduction="none")(p[:, None]).flatten(),
+    "energies": lambda p: energies(2 * p - 1, LAW, GRID, EPSILON, MASK),
+    "areas": lambda p: areas(2 * p - 1, GRID, EPSILON, MASK),
+}
+functions = pytest.mark.parametrize("function", FUNCTIONS.values(), ids=FUNCTIONS)
+
+
+def fields(*batch: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Probabilities and a direction, in float64 but of float32's numbers."""
+    p = torch.stack([probabilities(2, 8, 9, 10, seed=seed + k) for k in range(max(1, *batch, 1))])
+    p = (p if batch else p[0]).float().double()
+    return p, noise(*p.shape, seed=7).float().double()
+
+
+def close(found: Tensor, exact: Tensor) -> None:
+    assert found.dtype == torch.float32 and found.shape == exact.shape
+    assert float((found.double() - exact).abs().max()) < 1e-3 * float(exact.abs().max())
+
+
+@functions
+def test_forward_mode_is_float64s_and_the_finite_difference(function) -> None:
+    p, direction = fields()
+    value, slope = jvp(function, (p.float(),), (direction.float(),))
+    close(value, function(p))
+    close(slope, jvp(function, (p,), (direction,))[1])
+    step = 1e-6
+    difference = (function(p + step * direction) - function(p - step * direction)) / (2 * step)
+    close(slope, difference)
+    with torch.autograd.forward_ad.dual_level():
+        dual = function(torch.autograd.forward_ad.make_dual(p.float(), direction.float()))
+        torch.testing.assert_close(torch.autograd.forward_ad.unpack_dual(dual).tangent, slope)
+
+
+@functions
+def test_reverse_mode_is_float64s_and_forward_modes_transpose(function) -> None:
+    p, direction = fields()
+    one = grad(lambda p: function(p).sum())
+    close(one(p.float()), one(p))
+    rows = jacrev(function)(p.float())
+    close(rows, jacrev(function)(p))
+    slope = jvp(function, (p.float(),), (direction.float(),))[1]
+    torch.testing.assert_close(
+        (rows * direction.float()).flatten(1).sum(1), slope, rtol=1e-3, atol=1e-4 * float(slope.abs().max())
+    )
+    weights = torch.tensor([0.3, -2.0])
+    (pulled,) = vjp(function, p.float())[1](weights)
+    torch.testing.assert_close(pulled, torch.einsum("b,b...->...", weights, rows))
+
+
+@functions
+@pytest.mark.parametrize("dim", [0, 2, -1])
+def test_batches_of_batches_are_one_after_the_other(function, dim) -> None:
+    p, direction = fields(3)
+    alone = torch.stack([function(each) for each in p.float()])
+    torch.testing.assert_close(vmap(function, in_dims=dim)(p.float().movedim(0, dim)), alone)
+    one = grad(lambda p: function(p).sum())
+    torch.testing.assert_close(vmap(one)(p.float()), torch.stack([one(each) for each in p.float()]))
+    slopes = vmap(lambda p, d: jvp(function, (p,), (d,))[1])(p.float(), direction.float())
+    close(slopes, torch.stack([jvp(function, (q,), (d,))[1] for q, d in zip(p, direction, strict=True)]))
+
+
+def test_masks_may_be_batched_alone() -> None:
+    """What is given once serves every batch; a mask that is wrong is seen where it is not batched."""
+    p, prior = fields()[0].float()[:, None], CurvaturePrior(LAW)
+    masks = torch.rand(3, 2, 1, 8, 9, 10, generator=torch.Generator().manual_seed(2))
+    alone = torch.stack([prior(p, mask=mask) for mask in masks])
+    torch.testing.assert_close(vmap(lambda mask: prior(p, mask=mask))(masks), alone)
+    slopes = vmap(lambda mask: grad(lambda p: prior(p, mask=mask))(p))(masks)
+    torch.testing.assert_close(slopes, torch.stack([grad(lambda p, m=mask: prior(p, mask=m))(p) for mask in masks]))
+
+
+def test_forward_modes_jacobian_of_a_few_voxels() -> None:
+    def moved(shift: Tensor) -> Tensor:
+        return FUNCTIONS["area"](p.to(shift) + shift[:, None, None] * pattern.to(shift))
+
+    p, pattern = fields()[0], noise(2, 3, 9, 10, seed=4).repeat_interleave(8, 1)[:, :8]
+    shift = torch.zeros(2, 1, dtype=torch.float64)
+    close(jacfwd(moved)(shift.float()), jacfwd(moved)(shift))
+
+
+@functions
+@pytest.mark.parametrize("twice", [
+    lambda f: hessian(f),
+    lambda f: jacfwd(jacfwd(f)),
+    lambda f: jacrev(jacrev(f)),
+    lambda f: jacrev(jacfwd(f)),
+    lambda f: lambda x: vmap(grad(lambda y: grad(f)(y).square().sum()))(x[None]),
+], ids=["forward over reverse", "forward twice", "reverse twice", "reverse over forward", "batched"])  # fmt: skip
+def test_second_derivatives_are_for_float64(function, twice) -> None:
+    p, direction = fields()
+
+    def along(t: Tensor) -> Tensor:
+        return function(p.to(t) + t * direction.to(t)).square().sum()
+
+    assert bool(torch.isfinite(twice(along)(torch.tensor(0.1, dtype=torch.float64))).all())
+    with pytest.raises(
+        RuntimeError, match=r"^expected first derivatives of F_ε in float32, got a second one: take float64"
+    ):
+        twice(along)(torch.tensor(0.1))
+
+
+def test_the_gradient_of_a_gradient_is_for_float64() -> None:
+    p = fields()[0].float().requires_grad_()
+    (slope,) = torch.autograd.grad(FUNCTIONS["energies"](p).sum(), p, create_graph=True)
+    with pytest.raises(RuntimeError, match="expected first derivatives of F_ε in float32"):
+        torch.autograd.grad(slope.square().sum(), p)
+
+
+@pytest.mark.parametrize("name", ["voxel", "interpolated", "energies", "areas"])
+def test_compiled_gradients_are_the_same(name) -> None:
+    """What the compiler takes is an operator of its own. (The tests' shape checks keep it from tracing the blur.)"""
+    torch.compiler.reset()
+    p = fields()[0].float()
+    slopes = []
+    for function in (FUNCTIONS[name], torch.compile(FUNCTIONS[name], backend="aot_eager", fullgraph=True)):
+        leaf = p.clone().requires_grad_()
+        function(leaf).sum().backward()
+        slopes.append(leaf.grad)
+    torch.testing.assert_close(*slopes)
+
+
+def test_the_operator_is_one() -> None:
+    """Schema, meta kernel, autograd and tracing of the registered operator agree."""
+    from curvafit.priors.kernels import differentiable
+
+    u = (2 * fields()[0] - 1).float().requires_grad_()
+    given = u, MASK.expand(u.shape).contiguous(), [float(a) for a in LAW], list(GRID.spacing), EPSILON
+    tests = ("test_schema", "test_faketensor", "test_autograd_registration")
+    torch.library.opcheck(differentiable._energies, given, test_utils=tests)

@@ -1,0 +1,194 @@
+"""The example scripts, each through its main at a tiny size: a table that makes sense, a picture, kept shapes."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import nibabel
+import numpy as np
+import pytest
+import trimesh
+
+from curvafit.geometry.mesh import surface
+from curvafit.priors.coefficients import preset
+
+pytestmark = pytest.mark.slow
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+
+Run = Callable[..., list[str]]
+
+
+@pytest.fixture
+def script(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], ModuleType]:
+    monkeypatch.syspath_prepend(EXAMPLES)
+    monkeypatch.delenv("CURVAFIT_DATA", raising=False)
+    monkeypatch.setattr(importlib.import_module("common"), "PIXELS", 60)
+    return importlib.import_module
+
+
+@pytest.fixture
+def run(script, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
+    """Run a script with options, check its files, and give the table's lines under the head."""
+
+    def ran(name: str, *options: object) -> list[str]:
+        monkeypatch.setattr(sys, "argv", [name, *map(str, options), "-o", str(tmp_path)])
+        script(name).main()
+        assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+        lines = (tmp_path / f"{name}.txt").read_text(encoding="utf-8").splitlines()
+        head = [line for line in lines if line.startswith("#")]
+        assert "seed 0" in head[0] and "steps=" in head[1] and "curvafit" in head[2] and "commit" in head[2]
+        return lines[len(head) :]
+
+    return ran
+
+
+def numbers(line: str) -> list[float]:
+    """What of a line are numbers."""
+    found = []
+    for word in line.replace("%", "").replace(",", " ").split():
+        try:
+            found.append(float(word))
+        except ValueError:
+            continue
+    return found
+
+
+def test_convergence(run: Run) -> None:
+    _, *rows, status = run("convergence", "--edge", 24, "--schedule", "fast", "--steps", 300)
+    steps, energies, *_ = zip(*map(numbers, rows), strict=True)
+    assert steps == (10, 30, 100, 300)
+    assert all(a > b for a, b in pairwise(energies))
+    assert numbers(rows[-1])[-1] == 0 and 0.02 < numbers(rows[-1])[-2] < 0.4
+    assert "after 300 steps" in status
+
+
+def test_gallery(run: Run, script, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(script("gallery"), "NAMES", ("tubes", "exp-0366"))
+    size = ("--edge", 28, "--steps", 150)
+    alone = run("gallery", *size)
+    assert alone[1].split()[0] == "tubes" and len(numbers(alone[1])) == 6
+    folder = tmp_path / "gallery"
+    folder.mkdir()
+    for name in ("tubes", "exp-0366"):
+        with np.load(tmp_path / f"{name}.npz") as data:
+            u = data["field"] if name == "tubes" else np.floor(data["field"] * 100) / 100
+        path = folder / f"{name.replace('-', ' ')} coeffs [1] m -0.nii.gz"
+        nibabel.save(nibabel.Nifti1Image(u, np.eye(4)), path)
+    monkeypatch.setenv("CURVAFIT_DATA", str(tmp_path))
+    for before, line in zip(alone[1:], run("gallery", *size)[1:], strict=False):
+        assert line.startswith(before)
+        to_geometric, geometric, to_diffuse, diffuse = numbers(line)[-4:]
+        assert to_geometric == to_diffuse == 0 and 0.1 < geometric < 30 and 0.1 < diffuse < 30
+
+
+def test_interpolation(run: Run, script) -> None:
+    _, *lines = run("interpolation", "--edge", 28, "--count", 3, "--steps", 150)
+    assert [line.split()[-1] for line in (lines[0], lines[2], lines[6], lines[8])] == [*script("interpolation").CORNERS]
+    for line in (lines[9], lines[11]):
+        near, close, far, wide, ratio = numbers(line.partition(":")[2])
+        assert (near, far) == (12, 6)
+        assert 0.05 < ratio < 1 and ratio == pytest.approx(close / wide, rel=0.01)
+
+
+def test_interpolated_parameters(script) -> None:
+    between = script("interpolation").between
+    layers, spheres, tubes, sponges = (preset(f"bilinear-{n}") for n in ("layers", "spheres", "tubes", "sponges"))
+    for place, corner in {(0, 0): layers, (0, 1): spheres, (1, 1): tubes, (1, 0): sponges}.items():
+        assert between(*place) == (corner.coefficients, pytest.approx(corner.mass))
+    a, mass = between(0, 0.25)
+    assert a.a00 == pytest.approx(0.25 * 937.5) and mass == pytest.approx(0.75 * -0.3 + 0.25 * -0.6)
+
+
+def test_seeds_and_kept_shapes(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    size = ("--edge", 28, "--count", 3, "--steps", 150)
+    lines = run("seeds", *size)
+    assert "random-0000: " in capsys.readouterr().out
+    for line in lines[2:4]:
+        near, _, far, _, ratio = numbers(line)
+        assert 0 < near < far < 30 and ratio == pytest.approx(100 * near / far, rel=0.02)
+    (tmp_path / "seed-1.npz").unlink()
+    assert run("seeds", *size) == lines
+    made = [line for line in capsys.readouterr().out.splitlines() if " steps" in line and ".npz" not in line]
+    assert [line.split(":")[0] for line in made if line.startswith(("seed-", "random-"))] == ["seed-1"]
+
+
+def test_shapes_of_other_parameters_are_made_anew(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    first = run("orientation", "--edge", 24, "--steps", 60)
+    capsys.readouterr()
+    second = run("orientation", "--edge", 24, "--steps", 80)
+    assert "layers: " in capsys.readouterr().out and first != second
+
+
+def test_orientation(run: Run) -> None:
+    _, *rows = run("orientation", "--edge", 32, "--steps", 120)
+    free_tubes, tubes, free_layers, layers = map(numbers, rows)
+    assert [free_tubes[0], tubes[0], free_layers[0], layers[0]] == [0, 1000, 0, 800]
+    assert tubes[1] < free_tubes[1] and layers[1] < free_layers[1] < 1
+
+
+def test_lean_of_plane_surfaces(script) -> None:
+    place = np.broadcast_to(np.cos(2 * np.pi * np.arange(24) / 24)[:, None, None], (24, 24, 24))
+    lean = script("orientation").lean
+    assert lean(place) == pytest.approx(1, abs=1e-6)
+    assert lean(np.swapaxes(place, 0, 2)) == pytest.approx(0, abs=1e-6)
+
+
+def test_spatialised(run: Run) -> None:
+    _, *rows, status = run("spatialised", "--edge", 20, "--schedule", "paper", "--steps", 300)
+    assert [row.split()[0] for row in rows] == ["p1", "p2", "p3", "p4"]
+    assert "after 300 steps" in status
+    inside = [numbers(row)[2] for row in rows]
+    assert inside[0] == max(inside) and 0.05 < inside[0] < 0.5
+
+
+def test_spatialised_maps(script) -> None:
+    a, mass = script("spatialised").maps(21)
+    assert a.a20.shape == mass.shape == (1, 1, 6 * 21)
+    for k, number in enumerate((1, 1, 2, 3, 4, 4)):
+        stated = preset(f"spatial-{number}")
+        assert a.tensor()[:, 0, 0, 21 * k + 10].tolist() == pytest.approx([*stated.coefficients])
+        assert float(mass[0, 0, 21 * k + 10]) == pytest.approx(stated.mass)
+    ends = mass[0, 0, 0] + mass[0, 0, -1], mass[0, 0, 20] + mass[0, 0, 21], mass[0, 0, 41] + mass[0, 0, 42]
+    assert [float(end) / 2 for end in ends] == pytest.approx([-0.55, -0.4, -0.5])
+
+
+def test_modalities(script, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(sys, "argv", ["modalities", "--edge", "24", "-o", str(tmp_path)])
+    script("modalities").main()
+    assert (tmp_path / "modalities.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(("name", "genus"), [("sphere", 0), ("torus", 1), ("smaller-torus", 1), ("genus-2", 2)])
+def test_willmore_starts_have_their_genus(script, name: str, genus: int) -> None:
+    field, grid = script("willmore").start(name, 48, 4)
+    shape = surface(field, grid)
+    assert trimesh.Trimesh(shape.vertices, shape.faces).euler_number == 2 - 2 * genus
+    assert script("willmore").genus(SimpleNamespace(grid=grid, field=field)) == genus
+
+
+def test_willmore_energy_is_extrapolated(script) -> None:
+    """Energies with errors of ε² and (Δx/ε)² give what there is without."""
+    willmore = script("willmore")
+    rows = []
+    for edge, width in ((15, 4), (20, 5), (20, 4)):
+        field, grid = willmore.start("sphere", edge, width)
+        ε = width * grid.spacing[0]
+        flow = SimpleNamespace(grid=grid, field=field)
+        rows.append(willmore.Row(ε, 50 + 3 * ε**2 - 7 / width**2, 0.0, 0.0, flow))
+    assert willmore.extrapolated(rows) == pytest.approx(50, abs=1e-9)
+
+
+def test_willmore(script, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    options = ("--cases", "sphere", "--scale", 0.3, "--steps", 3, "-o", tmp_path)
+    monkeypatch.setattr(sys, "argv", ["willmore", *map(str, options)])
+    script("willmore").main()
+    _, *rows, _, area = (tmp_path / "willmore.txt").read_text(encoding="utf-8").splitlines()
+    assert [numbers(row.split(")")[1])[1] for row in rows] == pytest.approx([16 * np.pi] * 3, rel=0.09)
+    assert numbers(area)[0] == pytest.approx(4 * np.pi * 0.66**2, rel=0.1)
+    assert (tmp_path / "sphere.png").read_bytes().startswith(b"\x89PNG")
