@@ -31,7 +31,7 @@ from skimage.filters import threshold_otsu
 from skimage.restoration import denoise_tv_chambolle
 from skimage.segmentation import random_walker
 
-from curvafit.files import write_atomically, write_content
+from curvafit.core.files import write_atomically, write_content
 from curvafit.geometry.topology import betti_numbers
 from curvafit.inference.infer import infer
 from curvafit.priors.coefficients import Coefficients

@@ -23,7 +23,7 @@ import numpy as np
 from scipy import ndimage
 
 from benchmarks.closure import truth_of
-from curvafit.files import write_atomically
+from curvafit.core.files import write_atomically
 from curvafit.geometry.descriptors import descriptors
 from curvafit.inference.check import amortised_p
 from curvafit.inference.emulator import optimum

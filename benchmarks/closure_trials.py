@@ -14,8 +14,8 @@ import numpy as np
 
 from benchmarks import closure_laws as laws
 from benchmarks.level_cut import level_cut
+from curvafit.core.files import write_atomically
 from curvafit.data_synth.atlas.store import Store
-from curvafit.files import write_atomically
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.viability import well_formed

@@ -32,9 +32,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.closure_trials import key_of_posterior, queries_of
+from curvafit.core.files import write_content
 from curvafit.data_synth import open_store
 from curvafit.data_synth.atlas.store import Store
-from curvafit.files import write_content
 from curvafit.inference.candidates import CLOSE, Candidate, best_of, noise_of
 from curvafit.inference.fit import Fit
 from curvafit.inference.infer import TWINS, infer

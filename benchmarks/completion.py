@@ -27,7 +27,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.completion_ways import ITK, baselines, draw, interpolated, scores, stored
-from curvafit.files import write_atomically, write_content
+from curvafit.core.files import write_atomically, write_content
 from curvafit.generation import data
 from curvafit.generation.flow import descend, generate
 from curvafit.inference.fit import Fit

@@ -37,7 +37,7 @@ from skimage.filters import threshold_otsu
 from skimage.segmentation import find_boundaries
 
 from benchmarks.completion_ways import ITK, baselines, draw, interpolated, scores, stored
-from curvafit.files import write_atomically, write_content
+from curvafit.core.files import write_atomically, write_content
 from curvafit.geometry.morphometry import local_thickness
 from curvafit.geometry.topology import euler_of_window
 from curvafit.inference.fit import Fit

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from curvafit.files import write_atomically, write_content
+from curvafit.core.files import write_atomically, write_content
 from curvafit.geometry.topology import betti_numbers
 from curvafit.segmentation.slices import WAYS, Slices
 

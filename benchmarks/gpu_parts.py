@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from curvafit.files import write_content
+from curvafit.core.files import write_content
 
 #: What the file says that it is.
 FORMAT = "curvafit-gpu-1"

@@ -18,7 +18,7 @@ from unittest import mock
 import torch
 
 from benchmarks.texture import Shape, compare, noise_of
-from curvafit.files import write_atomically
+from curvafit.core.files import write_atomically
 from curvafit.generation import setup
 from curvafit.generation.flow import generate
 from curvafit.generation.stepper import TorchStepper

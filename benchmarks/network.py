@@ -42,9 +42,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from benchmarks.closure import fold_of, key_of, methods, r_squared
+from curvafit.core.files import write_atomically
 from curvafit.data_synth import open_store
 from curvafit.data_synth.sets.moves import any_crop
-from curvafit.files import write_atomically
 from curvafit.geometry.descriptors import BLOCKS
 from curvafit.inference.compression import FURTHEST, columns_of
 from curvafit.inference.learning import STEEPEST

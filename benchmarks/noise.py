@@ -30,7 +30,7 @@ from skimage.restoration import denoise_tv_chambolle
 
 from benchmarks.bone import walked
 from benchmarks.completion import LAWS, fitted, shape
-from curvafit.files import write_content
+from curvafit.core.files import write_content
 from curvafit.geometry.topology import betti_numbers
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.engine import HALO, STEPS, weighed

@@ -32,7 +32,7 @@ from skimage.segmentation import random_walker
 
 from benchmarks.completion import fitted, shape
 from benchmarks.completion_ways import scores
-from curvafit.files import write_atomically, write_content
+from curvafit.core.files import write_atomically, write_content
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.calibration import Setting, Task, choice
 from curvafit.segmentation.engine import BENDING, STEPS, bending

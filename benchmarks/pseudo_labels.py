@@ -40,7 +40,7 @@ from torch import Tensor, nn
 from benchmarks.completion import shape
 from benchmarks.vessel_data import UNKNOWN
 from benchmarks.vessel_training import BATCH, FILTERS, Plan, Training, dice_ce
-from curvafit.files import write_atomically, write_content
+from curvafit.core.files import write_atomically, write_content
 from curvafit.geometry.topology import betti_numbers
 from curvafit.inference.fit import Fit
 from curvafit.inference.infer import infer

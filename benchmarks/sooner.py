@@ -28,7 +28,7 @@ from scipy import fft, ndimage
 
 from benchmarks.gallery import author_volume, is_floored
 from benchmarks.texture import Shape, compare, shape_of
-from curvafit.files import write_atomically
+from curvafit.core.files import write_atomically
 from curvafit.generation.flow import WORKING_BLUR
 from curvafit.generation.initial import white_noise
 from curvafit.generation.schedule import SCHEDULES, Schedule

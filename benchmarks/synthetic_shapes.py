@@ -18,9 +18,9 @@ import torch
 from rich.progress import track
 from torch import Tensor
 
+from curvafit.core.files import write_atomically
 from curvafit.data_synth.imaging.randomness import correlated
 from curvafit.data_synth.sets.sources import Generated
-from curvafit.files import write_atomically
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import LEARNED
 from curvafit.generation.viability import well_formed

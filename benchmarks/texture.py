@@ -30,7 +30,7 @@ import torch
 from rich.progress import Progress
 
 from benchmarks.step import plain_stepper
-from curvafit.files import write_atomically
+from curvafit.core.files import write_atomically
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import SCHEDULES
 from curvafit.geometry.diagram import Diagram, diagram

@@ -31,7 +31,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.completion import EDGE, shape
-from curvafit.files import write_atomically, write_content
+from curvafit.core.files import write_atomically, write_content
 from curvafit.segmentation import reconstruct, tiles
 from curvafit.segmentation.completion import STIFFNESS
 

@@ -33,7 +33,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.completion import EDGE, fitted, shape
-from curvafit.files import write_content
+from curvafit.core.files import write_content
 from curvafit.segmentation.completion import reconstruct
 from curvafit.segmentation.ensemble import RUNS, near
 from curvafit.segmentation.probability import calibration_error

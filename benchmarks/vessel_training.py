@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from benchmarks.vessel_data import PATCH, SPACING, UNKNOWN, Part, patch, sparse
-from curvafit.files import write_atomically
+from curvafit.core.files import write_atomically
 from curvafit.priors.combined import CombinedLoss
 from curvafit.priors.segmentation import CurvaturePrior
 

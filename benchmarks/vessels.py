@@ -28,7 +28,7 @@ from benchmarks.vessel_data import SPACING, STACKS, part
 from benchmarks.vessel_report import picture, table
 from benchmarks.vessel_scores import block_counts, scores
 from benchmarks.vessel_training import LOSSES, Plan, Setting, Training, dice_ce, predict
-from curvafit.files import write_content
+from curvafit.core.files import write_content
 from curvafit.inference.infer import infer
 from curvafit.volumes.scan import Field
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from curvafit.faces import offer
+from curvafit.core.faces import offer
 
 if TYPE_CHECKING:
     from curvafit.generation.batch import generate_batch
@@ -90,7 +90,7 @@ _HOMES = {
     "wasserstein": "curvafit.geometry.transport",
 }
 
-#: The function that draws each type with a picture, as `module:function`; see `curvafit.pictures`.
+#: The function that draws each type with a picture, as `module:function`; see `curvafit.core.pictures`.
 _FIGURES = {
     "Diagram": "curvafit.drawing.plot:diagram_figure",
     "Field": "curvafit.drawing.sections:field_figure",

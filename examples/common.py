@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import FigureBase
 
+from curvafit.core.files import write_atomically
 from curvafit.data_synth.atlas.draws import versions
 from curvafit.drawing.plot import diagram_on, shared_limits, surface_on
 from curvafit.drawing.surfaces import QUIET
-from curvafit.files import write_atomically
 from curvafit.generation.flow import Flow, generate
 from curvafit.generation.schedule import Schedule, schedule
 from curvafit.geometry.diagram import Diagram, diagram

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from curvafit.core.files import write_atomically
 from curvafit.drawing.plot import gallery_picture
-from curvafit.files import write_atomically
 from curvafit.generation.flow import generate
 from curvafit.priors.coefficients import NAMES, PRESETS
 from curvafit.priors.grid import Grid

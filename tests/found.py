@@ -17,9 +17,9 @@ from curvafit.inference.fit import Fit
 from curvafit.inference.infer import Inference
 from curvafit.inference.match import Match
 from curvafit.inference.misfit import Misfit
-from curvafit.inference.prepare import Prepared
 from curvafit.inference.twins import Twin
 from curvafit.priors import Coefficients, Grid, preset
+from curvafit.scan.prepare import Prepared
 from curvafit.volumes.scan import Field
 
 EPSILON = 0.02

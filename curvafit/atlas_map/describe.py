@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from curvafit.core.progress import Progress, silent
 from curvafit.data_synth.atlas.draws import versions
 from curvafit.data_synth.atlas.store import Store, open_store
 from curvafit.data_synth.atlas.workers import Here, Workers
@@ -22,7 +23,6 @@ from curvafit.geometry.mesh import NoSurface
 from curvafit.inference.table import Table, load_table, parameters_of, row_of, save_table
 from curvafit.inference.views import VIEWS
 from curvafit.priors.grid import Grid
-from curvafit.progress import Progress, silent
 from curvafit.volumes.scan import ScanError
 
 #: Seconds between two writings of a table that grows.

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from curvafit.core.progress import Progress, silent
 from curvafit.data_synth.atlas.design import boxed
 from curvafit.data_synth.atlas.draws import versions
 from curvafit.data_synth.atlas.store import Record, Store, open_store
@@ -20,7 +21,6 @@ from curvafit.generation.viability import FORMED, well_formed
 from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram, diagrams
 from curvafit.inference.atlas import Atlas
 from curvafit.priors.grid import Grid
-from curvafit.progress import Progress, silent
 
 #: What is measured of a draw: volume fraction of {u > 0}, diagram of the field, diagram of its mask.
 Measured = tuple[float, Diagram, Diagram]

@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from curvafit.core.progress import Progress, silent
 from curvafit.geometry.diagram import BIN_WIDTH, Diagram
 from curvafit.geometry.family import FAMILIES, family_of, family_shares, half_thickness, leading_family
 from curvafit.geometry.pairwise import pairwise
 from curvafit.inference.atlas import Atlas
-from curvafit.progress import Progress, silent
 
 #: The paper's settings (Experiment 4): of UMAP, of HDBSCAN on the embedded points, of the distances.
 UMAP: dict[str, Any] = {"n_neighbors": 25, "min_dist": 0.05, "spread": 1.0, "random_state": 1}

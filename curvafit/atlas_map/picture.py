@@ -18,9 +18,9 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
 from curvafit.atlas_map.layout import AtlasMap
+from curvafit.core.files import write_atomically
 from curvafit.drawing.plot import DPI, INK, QUIET
 from curvafit.drawing.render import render
-from curvafit.files import write_atomically
 
 #: Colours that stay apart for the colour-blind: of families (Okabe & Ito 2008), and of clusters (Tol's muted ones).
 FAMILY_COLOURS = {

@@ -59,9 +59,9 @@ def build_atlas(
     with plainly():
         box = whole_triple(shape, "--shape")
         law = _design(design, around, spread)
+        from curvafit.core.files import check_folder
         from curvafit.data_synth.atlas.build import build, check_count, settings_of
         from curvafit.data_synth.atlas.store import open_store
-        from curvafit.files import check_folder
         from curvafit.generation.schedule import schedule as named
 
         check_count(count, 1)
@@ -245,7 +245,7 @@ def map_atlas(
 
 def _check_archive(out: Path, archive: Archive, inputs: list[Path], overwrite: bool) -> None:
     """Refuse a target that is no `.npz`, cannot be written, is an input, or is a file of another kind."""
-    from curvafit.files import check_folder, check_free
+    from curvafit.core.files import check_folder, check_free
 
     if out.suffix.lower() != ".npz":
         raise ValueError(f"expected a name ending in .npz, got {out.name!r}")

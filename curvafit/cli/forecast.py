@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from curvafit.cli.support import error_console, say
+from curvafit.core.units import number
 from curvafit.generation import memory
-from curvafit.units import number
 
 #: Least work, in steps times voxels, that has a forecast: some seconds.
 SHORT = 2e8

@@ -24,7 +24,7 @@ from curvafit.cli.support import (
     whole_numbers,
     whole_triple,
 )
-from curvafit.interrupts import exit_code
+from curvafit.core.interrupts import exit_code
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -244,8 +244,8 @@ def _orientation(text: str) -> Tensor:
 
 def _check(out: Path, checkpoint: Path | None, cap: bool | None) -> None:
     """Refuse a checkpoint at the place of an output, and options of a surface where a volume is written."""
+    from curvafit.core.files import check_folder
     from curvafit.drawing.shape_files import beside
-    from curvafit.files import check_folder
     from curvafit.geometry.mesh_files import SUFFIXES
 
     if cap is not None and not out.name.lower().endswith(SUFFIXES):

@@ -23,7 +23,7 @@ from curvafit.cli.support import (
 
 if TYPE_CHECKING:
     from curvafit.inference.infer import Inference
-    from curvafit.inference.prepare import Prepared
+    from curvafit.scan.prepare import Prepared
 
 #: Twins that are grown: of four or five laws one, of the best another.
 TWINS = 6
@@ -104,10 +104,10 @@ def _say_forecast(prepared: Prepared) -> None:
 
 def _show(inference: Inference) -> None:
     """Print the description, the verdict and a small table."""
+    from curvafit.core.units import length, number
     from curvafit.inference.candidates import TITLES
     from curvafit.report.page import parameter_table
     from curvafit.report.wording import describe
-    from curvafit.units import length, number
 
     fit = inference.fit
     say(f"{describe(inference)}.", style="bold")

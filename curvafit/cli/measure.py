@@ -73,7 +73,7 @@ def _show(measures: Measures, several: bool) -> None:
 
 def _cells(quantity: Quantity, unit: str) -> tuple[str, str, str]:
     """Return a number, its interval and its unit as text."""
-    from curvafit.units import number, per_unit, unit_name
+    from curvafit.core.units import number, per_unit, unit_name
 
     power = quantity.power
     name = "" if power == 0 else unit_name(unit) if power > 0 else per_unit(unit, -power)

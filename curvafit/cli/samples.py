@@ -62,7 +62,7 @@ def _synthetic() -> Path:
 
 def _copied(path: Path, target: Path, overwrite: bool) -> Path:
     """Copy a sample to a target, whose suffix must be the sample's."""
-    from curvafit.files import check_free, write_atomically
+    from curvafit.core.files import check_free, write_atomically
 
     target = target / path.name if target.is_dir() else target
     suffix = path.name[path.name.index(".") :]

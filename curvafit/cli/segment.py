@@ -26,8 +26,8 @@ from curvafit.cli.support import (
 )
 
 if TYPE_CHECKING:
+    from curvafit.core.progress import Progress
     from curvafit.inference.infer import Inference
-    from curvafit.progress import Progress
     from curvafit.segmentation.lowering import Workers
     from curvafit.segmentation.result import Segmentation
     from curvafit.segmentation.tiles import Tiling
@@ -250,7 +250,7 @@ def run_job(
     image
         The file whose header the mask gets; by default the source.
     """
-    from curvafit.files import remove
+    from curvafit.core.files import remove
     from curvafit.priors.coefficients import preset_name
     from curvafit.priors.law import texture_of
     from curvafit.segmentation.mask_files import check_mask_target, write_mask

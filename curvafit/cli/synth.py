@@ -150,11 +150,11 @@ def synth(
 
 
 def _build(out: Path, order: Order, count: int, crew: Crew) -> None:
+    from curvafit.core.checks import whole
+    from curvafit.core.files import check_folder
     from curvafit.data_synth.sets.picture import write_preview
     from curvafit.data_synth.sets.sets import MOST, build_set, cases_of, check_set
-    from curvafit.files import check_folder
     from curvafit.generation.schedule import schedule
-    from curvafit.priors.bounds import whole
 
     whole(count, "a count of at least 1 case", 1, MOST)
     check_folder(out)

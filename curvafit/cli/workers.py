@@ -14,8 +14,8 @@ from curvafit.cli.support import kept, stages
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from curvafit.core.progress import Progress
     from curvafit.data_synth.atlas.workers import Workers
-    from curvafit.progress import Progress
 
 WorkersOption = Annotated[
     int | None,

@@ -7,7 +7,7 @@ if __name__ != "curvafit.data_synth":
 
 from typing import TYPE_CHECKING
 
-from curvafit.faces import offer
+from curvafit.core.faces import offer
 
 if TYPE_CHECKING:
     from curvafit.data_synth.atlas.build import build, extend

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
-from curvafit.files import write_content
+from curvafit.core.files import write_content
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import schedule
 from curvafit.priors import Grid, preset

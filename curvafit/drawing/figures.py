@@ -1,4 +1,4 @@
-"""The figure of each result, as `.plot()` gives it (`curvafit.pictures`)."""
+"""The figure of each result, as `.plot()` gives it (`curvafit.core.pictures`)."""
 
 from __future__ import annotations
 

@@ -20,10 +20,10 @@ from matplotlib.patches import Polygon, Rectangle
 from matplotlib.patheffects import withStroke
 from scipy.ndimage import gaussian_filter
 
+from curvafit.core.files import write_content
+from curvafit.core.units import unit_name
 from curvafit.drawing.surfaces import DPI, QUIET, boxed
-from curvafit.files import write_content
 from curvafit.geometry.diagram import Diagram
-from curvafit.units import unit_name
 
 #: Colours that stay apart for the colour-blind (Okabe & Ito 2008).
 CONTOUR, DIAGONAL, INK = "#E69F00", "#C8372D", "#22262B"

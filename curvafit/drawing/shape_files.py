@@ -16,13 +16,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from curvafit.files import check_folder, check_free, move_together, own_record, remove, staged, write_content
+from curvafit.core.checks import LONGEST, SHORTEST, instance, real, several, whole
+from curvafit.core.files import check_folder, check_free, move_together, own_record, remove, staged, write_content
+from curvafit.core.interrupts import undisturbed
 from curvafit.generation.flow import Flow
 from curvafit.generation.memory import FILE, check_memory
 from curvafit.geometry.mesh import NoSurface, Surface, solid_surface, surface
 from curvafit.geometry.mesh_files import SUFFIXES, write_surface
-from curvafit.interrupts import undisturbed
-from curvafit.priors.bounds import LONGEST, SHORTEST, instance, real, several, whole
 from curvafit.priors.coefficients import NAMES
 from curvafit.priors.curvature import geometric_curvatures, jet
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid

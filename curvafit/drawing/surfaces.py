@@ -9,8 +9,8 @@ import numpy as np
 from PIL import Image, ImageDraw
 from scipy.ndimage import gaussian_filter
 
+from curvafit.core.files import write_content
 from curvafit.drawing.render import View, render
-from curvafit.files import write_content
 
 #: Pixels per inch of every picture, and a quiet grey for frames and notes.
 DPI = 160

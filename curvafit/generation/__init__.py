@@ -7,7 +7,7 @@ if __name__ != "curvafit.generation":
 
 from typing import TYPE_CHECKING
 
-from curvafit.faces import offer
+from curvafit.core.faces import offer
 
 if TYPE_CHECKING:
     from curvafit.generation.batch import generate_batch

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from curvafit.core.checks import named, several, whole
 from curvafit.generation.cost import Cost
 from curvafit.generation.flow import WORKING_BLUR, Backend, generate
 from curvafit.generation.fused import CudaStepper
@@ -21,7 +22,6 @@ from curvafit.generation.schedule import Schedule
 from curvafit.generation.schedule import schedule as named_schedule
 from curvafit.generation.setup import base_of, kind_of
 from curvafit.priors import kernels
-from curvafit.priors.bounds import named, several, whole
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.law import Law, textures_of

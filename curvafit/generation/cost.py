@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from curvafit.core.checks import instance, quoted, real
 from curvafit.generation.data import Data
-from curvafit.priors.bounds import instance, quoted, real
 from curvafit.priors.coefficients import NAMES, POWERS, Coefficients, check_strength
 from curvafit.priors.grid import Grid
 

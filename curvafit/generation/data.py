@@ -8,7 +8,7 @@ from typing import Protocol, Self
 import torch
 from torch import Tensor
 
-from curvafit.priors.bounds import quoted, real
+from curvafit.core.checks import quoted, real
 from curvafit.priors.grid import Grid
 from curvafit.priors.shapes import Float
 

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from curvafit.core.checks import named, quoted, seed_of
 from curvafit.generation.cost import Cost
 from curvafit.generation.data import Data
 from curvafit.generation.initial import white_noise
@@ -19,7 +20,6 @@ from curvafit.generation.result import RECORD_EVERY, Callback, Flow, History, St
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.schedule import schedule as named_schedule
 from curvafit.generation.setup import Execution, base_of
-from curvafit.priors.bounds import named, quoted, seed_of
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.law import Law, texture_of
 from curvafit.priors.shapes import Bool, Float

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from torch import Tensor
 
-from curvafit.priors.bounds import inside
+from curvafit.core.checks import inside
 
 #: Share of the steps after which corrections begin: before, the sign of u says little about a shape's volume.
 BEGIN = 0.2

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
+from curvafit.core.checks import instance, real, seed_of
 from curvafit.generation.memory import FIELD, check_memory
-from curvafit.priors.bounds import instance, real, seed_of
 from curvafit.priors.grid import Grid
 from curvafit.priors.shapes import Float
 

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from curvafit.core.checks import quoted, several
 from curvafit.generation import fraction
 from curvafit.generation.checkpoint import Checkpoint
 from curvafit.generation.cost import Cost
@@ -21,7 +22,6 @@ from curvafit.generation.result import RECORD_EVERY, Callback, Flow, History, St
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.stepper import ShapeView, Statistics, Stepper
 from curvafit.generation.viability import Viability, viability
-from curvafit.priors.bounds import quoted, several
 
 #: A flow is called converged where its energy changes by less than this share over the last tenth of the steps.
 SETTLED = 0.01

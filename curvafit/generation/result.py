@@ -9,12 +9,12 @@ from typing import Protocol
 import numpy as np
 from torch import Tensor
 
+from curvafit.core.pictures import Pictured
+from curvafit.core.units import sampling
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.viability import Viability
-from curvafit.pictures import Pictured
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
-from curvafit.units import sampling
 
 #: Steps between two entries of the history (and two calls of the callbacks).
 RECORD_EVERY = 10

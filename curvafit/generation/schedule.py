@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from itertools import accumulate
 from typing import Any, Literal
 
-from curvafit.priors.bounds import inside, instance, named, real, several, whole
+from curvafit.core.checks import inside, instance, named, real, several, whole
 
 #: The most steps that a flow may have, and the longest one.
 MOST_STEPS, LONGEST_STEP = 10**7, 1e6

@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from curvafit.core.checks import inside, instance, named, quoted, real
 from curvafit.generation import fraction
 from curvafit.generation.checkpoint import Checkpoint, identity
 from curvafit.generation.cost import Cost, check_shape
@@ -17,7 +18,6 @@ from curvafit.generation.parametrization import Blur, DivergenceForm, Form
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.stepper import LbfgsStepper, Stepper, TorchStepper
 from curvafit.priors import kernels, stencils
-from curvafit.priors.bounds import inside, instance, named, quoted, real
 from curvafit.priors.grid import Grid
 
 

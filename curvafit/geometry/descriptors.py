@@ -16,11 +16,11 @@ import torch
 from scipy.fft import next_fast_len
 from torch import Tensor
 
+from curvafit.core.checks import instance
 from curvafit.geometry.diagram import Diagram, surface_curvatures
 from curvafit.geometry.mesh import NoSurface, area_vectors, surface
 from curvafit.geometry.topology import euler_shares
 from curvafit.geometry.transport import sliced_embedding
-from curvafit.priors.bounds import instance
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.profile import phase_field, signed_distance
 

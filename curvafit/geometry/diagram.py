@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from curvafit.core.checks import LONGEST, SHORTEST, instance, named, real
+from curvafit.core.pictures import Pictured
 from curvafit.geometry.mesh import NoSurface, Surface, areas, surface
-from curvafit.pictures import Pictured
-from curvafit.priors.bounds import LONGEST, SHORTEST, instance, named, real
 from curvafit.priors.curvature import diffuse_curvatures, geometric_curvatures, jet
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import phase_field, profile_distance

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from curvafit.files import write_content
+from curvafit.core.files import write_content
 from curvafit.geometry.mesh import Surface, area_vectors
 
 #: Suffixes that `write_surface` knows.

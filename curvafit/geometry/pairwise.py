@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from curvafit.files import write_atomically
+from curvafit.core.checks import quoted
+from curvafit.core.files import write_atomically
+from curvafit.core.json_text import parse_json
+from curvafit.core.progress import Progress, silent
 from curvafit.geometry.diagram import BIN_WIDTH, Diagram
 from curvafit.geometry.sinkhorn import Measures, costs, packed, pair_halvings
 from curvafit.geometry.transport import comparable
-from curvafit.priors.bounds import quoted
-from curvafit.priors.json_text import parse_json
-from curvafit.progress import Progress, silent
 from curvafit.volumes.formats import read_archive
 
 #: Pairs that are taken at once: a few seconds on a processor.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from curvafit.faces import offer
+from curvafit.core.faces import offer
 
 if TYPE_CHECKING:
     from curvafit.inference.atlas import Atlas, load_atlas, save_atlas
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from curvafit.inference.misfit import Misfit
     from curvafit.inference.posterior import Posterior, load_posterior, save_posterior
     from curvafit.inference.posterior_training import train_posterior
-    from curvafit.inference.prepare import Prepared, prepare
     from curvafit.inference.refinement import Refinement
     from curvafit.inference.stationarity import stationarity
     from curvafit.inference.table import Table, load_table, save_table
+    from curvafit.scan.prepare import Prepared, prepare
 
 __all__ = [
     "Atlas",
@@ -59,7 +59,7 @@ _HOMES = {
     "Match": "curvafit.inference.match",
     "Misfit": "curvafit.inference.misfit",
     "Posterior": "curvafit.inference.posterior",
-    "Prepared": "curvafit.inference.prepare",
+    "Prepared": "curvafit.scan.prepare",
     "Refinement": "curvafit.inference.refinement",
     "Table": "curvafit.inference.table",
     "fixed_point": "curvafit.inference.fixed_point",
@@ -68,7 +68,7 @@ _HOMES = {
     "load_posterior": "curvafit.inference.posterior",
     "load_table": "curvafit.inference.table",
     "nearest": "curvafit.inference.match",
-    "prepare": "curvafit.inference.prepare",
+    "prepare": "curvafit.scan.prepare",
     "save_atlas": "curvafit.inference.atlas",
     "save_posterior": "curvafit.inference.posterior",
     "save_table": "curvafit.inference.table",

@@ -12,9 +12,9 @@ from typing import IO, Any, TypeVar
 
 import numpy as np
 
-from curvafit.files import write_content
-from curvafit.priors.bounds import quoted
-from curvafit.priors.json_text import parse_json
+from curvafit.core.checks import quoted
+from curvafit.core.files import write_content
+from curvafit.core.json_text import parse_json
 from curvafit.volumes.formats import read_archive
 
 Content = TypeVar("Content")

@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from curvafit.core.units import number
 from curvafit.inference.compression import Compression
 from curvafit.inference.refinement import double_precision_on_cpu
 from curvafit.inference.table import PARAMETERS
-from curvafit.units import number
 
 #: Most steps from a start.
 STEPS = 60

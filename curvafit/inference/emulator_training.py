@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from curvafit.core.progress import Progress, silent
 from curvafit.inference.compression import Compression
 from curvafit.inference.emulator import FAINTEST, Emulator, Layer, misfits
 from curvafit.inference.learning import Plan, learn
 from curvafit.inference.table import PARAMETERS, Table
-from curvafit.progress import Progress, silent
 
 #: Networks of the mean, of which each leaves out another part of the shapes, and of the deviations.
 FOLDS = 5

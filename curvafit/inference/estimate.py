@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from curvafit.core.progress import Progress, part, silent
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import LEARNED
 from curvafit.geometry.descriptors import BLOCKS, Descriptors, descriptors
@@ -19,13 +20,12 @@ from curvafit.inference.emulator import Optimum, optimum
 from curvafit.inference.measure import scan_descriptors
 from curvafit.inference.misfit import Misfit
 from curvafit.inference.posterior import Posterior
-from curvafit.inference.prepare import HALF, Prepared
 from curvafit.inference.sequential import Search
 from curvafit.inference.simulation import Simulate, Simulations, simulations
 from curvafit.inference.table import column_names, law_of, mirrored
 from curvafit.inference.views import VIEWS
 from curvafit.priors.grid import Grid
-from curvafit.progress import Progress, part, silent
+from curvafit.scan.prepare import HALF, Prepared
 from curvafit.volumes.scan import ScanError
 
 #: Draws from the posterior, those that are grown, and those among which more are chosen to be grown.

@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.files import write_content
+from curvafit.core.files import write_content
+from curvafit.core.pictures import Pictured
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.morphometry import Morphometry
 from curvafit.inference.candidates import Candidate, content_of, morphometry_of
 from curvafit.inference.draws import Draws
 from curvafit.inference.match import Match
 from curvafit.inference.misfit import Misfit
-from curvafit.pictures import Pictured
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.fit_file import Prior, fit_bytes, parse_fit, six_of
 from curvafit.priors.fit_schema import FORMAT, WHOLE_FIT, violation

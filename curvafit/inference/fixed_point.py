@@ -15,16 +15,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from curvafit.core.progress import Progress, silent
 from curvafit.generation.flow import relax
 from curvafit.generation.schedule import Schedule
 from curvafit.inference.refinement import Refinement, called, double_precision_on_cpu, import_jax, named
-from curvafit.inference.regrid import rich_boxes, surface_voxels
 from curvafit.inference.stationarity import energy_gradients
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
 from curvafit.priors.shapes import Float
 from curvafit.priors.stencils import gaussian_blur, gradient
-from curvafit.progress import Progress, silent
+from curvafit.scan.regrid import rich_boxes, surface_voxels
 
 #: The short flow: Adam steps of 1e-3 as published.
 SHORT_FLOW = Schedule("short", 150, 1e-3, 1e-3, "constant")

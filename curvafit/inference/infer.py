@@ -13,6 +13,10 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
+from curvafit.core.checks import SEEDS, instance, whole
+from curvafit.core.pictures import Pictured
+from curvafit.core.progress import Progress, part, silent
+from curvafit.core.units import number
 from curvafit.generation.schedule import LEARNED, SCHEDULES
 from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram
 from curvafit.geometry.family import family_of
@@ -24,20 +28,16 @@ from curvafit.inference.fit import Fit
 from curvafit.inference.fixed_point import drift
 from curvafit.inference.match import Match, mirrored, nearest
 from curvafit.inference.measure import scan_diagram
-from curvafit.inference.phases import check_options
 from curvafit.inference.posterior import Posterior, load_posterior
-from curvafit.inference.prepare import HALF, Prepared, prepare
 from curvafit.inference.stationarity import is_rounded, stationarity
-from curvafit.inference.texture import NOISE, untextured
 from curvafit.inference.twins import Twin, twin
 from curvafit.inference.verdict import verdict
-from curvafit.pictures import Pictured
-from curvafit.priors.bounds import SEEDS, instance, whole
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.fit_file import Prior
 from curvafit.priors.grid import WORKING_EPSILON, Grid
-from curvafit.progress import Progress, part, silent
-from curvafit.units import number
+from curvafit.scan.phases import check_options
+from curvafit.scan.prepare import HALF, Prepared, prepare
+from curvafit.scan.texture import NOISE, untextured
 from curvafit.volumes.field import Field
 from curvafit.volumes.formats.part import Crop
 from curvafit.volumes.source import Source, field_of
@@ -138,7 +138,7 @@ def infer(
     fast
         Grow nothing: seconds instead of minutes, but nothing is checked by a twin.
     threshold, dark, roi
-        How the structure is told from the background: see `curvafit.inference.prepare.prepare`.
+        How the structure is told from the background: see `curvafit.scan.prepare.prepare`.
     label, crop
         The voxels of one value as a mask; a box of voxels, of the scan and of `roi`: see `curvafit.load`.
     watch

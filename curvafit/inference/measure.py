@@ -12,9 +12,9 @@ from scipy import ndimage
 from curvafit.geometry.descriptors import Descriptors, descriptors
 from curvafit.geometry.diagram import MARGIN, Diagram, SurfaceCurvatures, surface_curvatures
 from curvafit.geometry.mesh import NoSurface
-from curvafit.inference.prepare import LARGEST_WINDOW, Prepared
 from curvafit.inference.stationarity import is_rounded
 from curvafit.priors.grid import WORKING_EPSILON, Grid
+from curvafit.scan.prepare import LARGEST_WINDOW, Prepared
 
 #: Least edge, in working voxels, of a cube whose descriptors are measured.
 SMALLEST_CUBE = 24

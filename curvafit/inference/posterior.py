@@ -11,12 +11,12 @@ import torch
 import zuko
 from torch import Tensor, nn
 
+from curvafit.core.checks import quoted, real, whole
 from curvafit.geometry.descriptors import BLOCKS, Descriptors
 from curvafit.inference.archive import Archive
 from curvafit.inference.compression import Compression
 from curvafit.inference.emulator import Emulator, Layer
 from curvafit.inference.table import PARAMETERS, column_names
-from curvafit.priors.bounds import quoted, real, whole
 
 ARCHIVE = Archive("a posterior", "a posterior", "curvafit posterior", 3, "train it again", {"blocks": BLOCKS})
 #: Largest size of a flow, and most flows of an ensemble.

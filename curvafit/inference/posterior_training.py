@@ -9,13 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from curvafit.core.checks import seed_of, whole
+from curvafit.core.progress import Progress, silent
 from curvafit.inference.compression import compression_of
 from curvafit.inference.emulator_training import train_emulator
 from curvafit.inference.learning import Plan, batch_of, learn
 from curvafit.inference.posterior import MASS, MOST, Architecture, Member, Posterior
 from curvafit.inference.table import PARAMETERS, Table
-from curvafit.priors.bounds import seed_of, whole
-from curvafit.progress import Progress, silent
 
 #: Part of the shapes, of all of whose views a member learns nothing: they tell when it has learnt enough.
 VALIDATION = 0.1

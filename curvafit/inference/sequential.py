@@ -14,10 +14,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy import linalg
 
+from curvafit.core.progress import Progress, silent
 from curvafit.inference.emulator import Emulator
 from curvafit.inference.simulation import Simulate, Simulations
 from curvafit.inference.table import row_of
-from curvafit.progress import Progress, silent
 
 #: Rounds, and simulations in each; and how often at most the likeliest is looked for that grows.
 ROUNDS, BATCH, LAST = 7, 3, 4

@@ -14,10 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from curvafit.core.checks import whole
+from curvafit.core.progress import Progress, silent
 from curvafit.geometry.descriptors import Descriptors
 from curvafit.inference.table import row_of
-from curvafit.priors.bounds import whole
-from curvafit.progress import Progress, silent
 
 
 class Simulations(NamedTuple):

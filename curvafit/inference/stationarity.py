@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from curvafit.core.progress import Progress, silent
 from curvafit.inference.refinement import (
     Refinement,
     admissible,
@@ -31,7 +32,6 @@ from curvafit.priors.energy import energy_terms
 from curvafit.priors.grid import Grid
 from curvafit.priors.shapes import Float
 from curvafit.priors.stencils import gaussian_blur, pad
-from curvafit.progress import Progress, silent
 
 #: Standard deviation of the test functions, in voxels; in a crop less, for what their support takes from each side.
 TEST_WIDTH, CROP_WIDTH = 4.0, 3.0

@@ -12,10 +12,10 @@ from curvafit.generation.schedule import LEARNED
 from curvafit.geometry.diagram import Diagram, diagram
 from curvafit.geometry.mesh import NoSurface
 from curvafit.geometry.morphometry import Morphometry, morphometry
-from curvafit.inference.prepare import Prepared
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.profile import phase_field
+from curvafit.scan.prepare import Prepared
 from curvafit.volumes.scan import ScanError
 
 #: Longest edge, in working voxels, of the boxes in which twins grow.

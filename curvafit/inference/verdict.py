@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from curvafit.core.units import number
 from curvafit.geometry.morphometry import Morphometry
 from curvafit.inference.candidates import CLOSE, TITLES, Candidate, best_of, noise_of
 from curvafit.inference.misfit import UNBELIEVABLE, Misfit
-from curvafit.units import number
 
 #: Beyond `CLOSE`, twins within so many seeds' distances whose familiar numbers are the scan's are near, and so are
 #: those that are close but for one familiar number; others are no twins.

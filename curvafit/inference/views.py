@@ -16,10 +16,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy import ndimage
 
-from curvafit.inference.imaging import split
-from curvafit.inference.prepare import KEPT_THICKNESS, THINNEST, smallest_piece
-from curvafit.inference.regrid import centre_distance, median_thickness, resample, without_specks
 from curvafit.priors.grid import Grid
+from curvafit.scan.imaging import split
+from curvafit.scan.prepare import KEPT_THICKNESS, THINNEST, smallest_piece
+from curvafit.scan.regrid import centre_distance, median_thickness, resample, without_specks
 from curvafit.volumes.scan import Field, ScanError
 
 #: Part of each side that a crop keeps.

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from curvafit.priors.bounds import LONGEST, SHORTEST, plain_name, quoted, real
+from curvafit.core.checks import LONGEST, SHORTEST, plain_name, quoted, real
 
 #: Names in the paper's order: κ1², κ1κ2, κ2², κ1, κ2, 1.
 NAMES = ("a20", "a11", "a02", "a10", "a01", "a00")

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from curvafit.priors.bounds import real, whole
+from curvafit.core.checks import real, whole
 
 
 class CombinedLoss(nn.Module):

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from curvafit.priors.bounds import quoted, real, several
+from curvafit.core.checks import quoted, real, several
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.curvature import Jet, diffuse_curvatures, jet, second_form
 from curvafit.priors.grid import Grid

@@ -7,11 +7,11 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from curvafit.priors.bounds import quoted
+from curvafit.core.checks import quoted
+from curvafit.core.json_text import parse_json
+from curvafit.core.units import METRES
 from curvafit.priors.coefficients import NAMES, Coefficients
 from curvafit.priors.fit_schema import FIT_SCHEMA, FORMAT, violation
-from curvafit.priors.json_text import parse_json
-from curvafit.units import METRES
 
 
 class Prior(NamedTuple):

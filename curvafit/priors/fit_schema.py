@@ -11,9 +11,9 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from curvafit.priors.bounds import quoted
+from curvafit.core.checks import quoted
+from curvafit.core.units import METRES
 from curvafit.priors.coefficients import NAMES
-from curvafit.units import METRES
 
 FORMAT = "curvafit-fit-2"
 #: Formats whose law can be read.

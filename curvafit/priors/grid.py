@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from curvafit.priors.bounds import LONGEST, SHORTEST, named, real, whole
+from curvafit.core.checks import LONGEST, SHORTEST, named, real, whole
 
 Boundary = Literal["periodic", "replicate"]
 

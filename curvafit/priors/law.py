@@ -10,7 +10,7 @@ from typing import Protocol, runtime_checkable
 
 from torch import Tensor
 
-from curvafit.priors.bounds import quoted
+from curvafit.core.checks import quoted
 from curvafit.priors.coefficients import PRESETS, Coefficients, Preset, preset_name
 from curvafit.priors.fit_file import Prior, read_fit
 from curvafit.priors.grid import WORKING_SPACING

@@ -10,13 +10,13 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from curvafit.priors.bounds import quoted, real, whole
+from curvafit.core.checks import quoted, real, whole
+from curvafit.core.units import METRES
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
 from curvafit.priors.law import Law, Texture, textures_of
 from curvafit.priors.loss import COARSEST, MOST, RESOLVED, check_numbers, curvature_prior, upsampling
 from curvafit.priors.values import number_of, plain
-from curvafit.units import METRES
 
 #: The most that a weight or a mask's value may be: float32 holds its products.
 HEAVIEST = 1e9

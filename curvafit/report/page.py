@@ -10,9 +10,10 @@ from pathlib import Path
 from string import Template
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from curvafit.files import bears, check_folder, check_free, move_together, own_record, staged, write_content
+from curvafit.core.files import bears, check_folder, check_free, move_together, own_record, staged, write_content
+from curvafit.core.interrupts import undisturbed
+from curvafit.core.units import density, length, number, per_unit, percent, unit_name
 from curvafit.inference.candidates import TITLES, Candidate, noise_of
-from curvafit.interrupts import undisturbed
 from curvafit.priors.coefficients import NAMES
 from curvafit.priors.fit_file import FORMAT
 from curvafit.report.pictures import (
@@ -26,7 +27,6 @@ from curvafit.report.pictures import (
     window_framed,
 )
 from curvafit.report.wording import describe, glossary_link
-from curvafit.units import density, length, number, per_unit, percent, unit_name
 from curvafit.volumes.scan import Field, save
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from curvafit.units import GLOSSARY, length, percent
+from curvafit.core.units import GLOSSARY, length, percent
 
 if TYPE_CHECKING:
     from curvafit.geometry.diagram import Diagram

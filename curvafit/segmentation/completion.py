@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from curvafit.core.checks import real, whole
+from curvafit.core.progress import Progress, silent
 from curvafit.generation import data
-from curvafit.priors.bounds import real, whole
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
-from curvafit.progress import Progress, silent
 from curvafit.segmentation.calibration import ODDS, Choice, Setting, Task, choice, left_out, plainest
 from curvafit.segmentation.engine import STEPS
 from curvafit.segmentation.ensemble import RUNS, Chances, chances

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from torch import Tensor
 
+from curvafit.core.progress import Progress, silent
 from curvafit.generation.data import Data, Evidence
 from curvafit.generation.flow import WORKING_BLUR, Flow, descend
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON
 from curvafit.priors.profile import phase_field
-from curvafit.progress import Progress, silent
 from curvafit.segmentation.evidence import VoxelEvidence
 from curvafit.segmentation.working import WorkingGrid
 from curvafit.volumes.field import ScanError

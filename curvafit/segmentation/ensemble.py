@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from scipy import ndimage
 
+from curvafit.core.progress import Progress, part, silent
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.profile import profile_distance
-from curvafit.progress import Progress, part, silent
 from curvafit.segmentation.calibration import Setting, Task
 from curvafit.segmentation.probability import calibration_error, evidence, fitted, probability
 from curvafit.segmentation.slices import Slices, plane_distances

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from curvafit.core.progress import Progress, silent
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import LEARNED
 from curvafit.priors.coefficients import Coefficients
-from curvafit.progress import Progress, silent
 from curvafit.segmentation.calibration import Task
 from curvafit.segmentation.engine import stiff
 from curvafit.segmentation.slices import Slices

@@ -6,7 +6,7 @@ from itertools import product
 
 import numpy as np
 
-from curvafit.units import METRES, sampling
+from curvafit.core.units import METRES, sampling
 from curvafit.volumes.field import Field, ScanError
 
 __all__ = ["check_place", "check_spacing", "labels"]

@@ -12,9 +12,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from curvafit.core.progress import Progress, part, silent
 from curvafit.generation.data import Data
 from curvafit.priors.coefficients import Coefficients
-from curvafit.progress import Progress, part, silent
 from curvafit.segmentation.engine import completed
 from curvafit.segmentation.tile_store import MemoryStore, Piece, folder_store
 from curvafit.segmentation.tiles import Tile, Tiling

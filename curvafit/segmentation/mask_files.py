@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from curvafit.core.files import move_together, remove, staged
+from curvafit.core.interrupts import undisturbed
 from curvafit.drawing.plot import DPI
 from curvafit.drawing.sections import section_figure
 from curvafit.drawing.shape_files import beside, check_outputs, own_files
-from curvafit.files import move_together, remove, staged
-from curvafit.interrupts import undisturbed
 from curvafit.segmentation.probability import entropy
 from curvafit.segmentation.result import Segmentation, Uncertainty
 from curvafit.volumes.formats import pick_writer

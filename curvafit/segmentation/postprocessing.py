@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from curvafit.priors.bounds import SEEDS, quoted, whole
+from curvafit.core.checks import SEEDS, quoted, whole
 from curvafit.segmentation.engine import STEPS
 from curvafit.segmentation.refine import Calibration, calibrate, check_judge, refine
 from curvafit.segmentation.working import Law

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from curvafit.core.checks import real
+from curvafit.core.progress import Progress, part, silent
 from curvafit.generation.data import Evidence
-from curvafit.priors.bounds import real
 from curvafit.priors.coefficients import Coefficients
-from curvafit.progress import Progress, part, silent
 from curvafit.segmentation.calibration import Choice, Setting, Task, choice
 from curvafit.segmentation.engine import BENDING, HALO, STEPS, bending, likelihood
 from curvafit.segmentation.evidence import VoxelEvidence, of_probability

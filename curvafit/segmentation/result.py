@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from curvafit.pictures import Pictured
+from curvafit.core.pictures import Pictured
+from curvafit.core.units import sampling
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.lowering import Lowered
-from curvafit.units import sampling
 from curvafit.volumes.field import Field
 
 __all__ = ["Segmentation", "Uncertainty", "ending", "filled", "result_of"]

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from curvafit.core.checks import real
+from curvafit.core.progress import Progress, part, silent
 from curvafit.generation.data import Evidence
-from curvafit.priors.bounds import real
 from curvafit.priors.coefficients import Coefficients
-from curvafit.progress import Progress, part, silent
 from curvafit.segmentation.engine import BENDING, STEPS, bending, likelihood, started
 from curvafit.segmentation.evidence import Classes, VoxelEvidence, bounds_of, classes_of, grey_levels, of_classes
 from curvafit.segmentation.lowering import Workers, lowered

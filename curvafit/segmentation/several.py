@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from curvafit.priors.bounds import SEEDS, whole
+from curvafit.core.checks import SEEDS, whole
+from curvafit.core.progress import Progress, part, silent
 from curvafit.priors.loss import RESOLVED
 from curvafit.priors.profile import optimal_profile
-from curvafit.progress import Progress, part, silent
 from curvafit.segmentation.completion import known_places, reconstruct
 from curvafit.segmentation.example import slices_of
 from curvafit.segmentation.known import labels

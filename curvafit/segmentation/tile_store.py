@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from filelock import FileLock, Timeout
 
-from curvafit.files import write_content
+from curvafit.core.files import write_content
 from curvafit.generation.checkpoint import identity
 from curvafit.volumes.formats.part import Box
 

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from itertools import pairwise, product
 
-from curvafit.priors.bounds import whole
+from curvafit.core.checks import whole
 from curvafit.priors.grid import MOST
 from curvafit.segmentation.engine import HALO
 from curvafit.segmentation.working import Ends, WorkingGrid

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import ndimage
 
+from curvafit.core.progress import Progress, silent
 from curvafit.priors.coefficients import Coefficients
-from curvafit.progress import Progress, silent
 from curvafit.segmentation.calibration import BEYOND, climbed
 from curvafit.segmentation.engine import HALO, weighed
 from curvafit.segmentation.evidence import LEAST_NOISE, Classes, VoxelEvidence, of_classes

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from curvafit.priors.bounds import LONGEST, SHORTEST, instance, real
+from curvafit.core.checks import LONGEST, SHORTEST, instance, real
+from curvafit.core.units import METRES
 from curvafit.priors.coefficients import NAMES, Coefficients
 from curvafit.priors.fit_file import Prior, fit_bytes, parse_fit, six_of
 from curvafit.priors.fit_schema import FIT_SCHEMA
@@ -19,7 +20,6 @@ from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.priors.law import Law, texture_of
 from curvafit.priors.loss import RESOLVED, upsampling
 from curvafit.priors.refined import refined
-from curvafit.units import METRES
 from curvafit.volumes.scan import Field, ScanError
 
 __all__ = ["Law", "WorkingGrid", "drawn_laws", "law_of", "laws_of"]

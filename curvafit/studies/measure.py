@@ -9,17 +9,17 @@ from typing import Any, Literal
 
 import numpy as np
 
+from curvafit.core.progress import Progress, silent
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.family import FAMILIES, families
 from curvafit.geometry.mesh import area_vectors
 from curvafit.geometry.morphometry import connectivity_of, local_thickness, smooth_surface
 from curvafit.geometry.topology import euler_shares
 from curvafit.inference.measure import scan_curvatures
-from curvafit.inference.phases import check_options, find_level
-from curvafit.inference.prepare import Prepared, prepare, smallest_piece
-from curvafit.inference.regrid import median_thickness, without_specks
 from curvafit.priors.grid import WORKING_SPACING
-from curvafit.progress import Progress, silent
+from curvafit.scan.phases import check_options, find_level
+from curvafit.scan.prepare import Prepared, prepare, smallest_piece
+from curvafit.scan.regrid import median_thickness, without_specks
 from curvafit.studies.blocks import LEAST, Blocks, errors
 from curvafit.volumes.scan import Field, ScanError
 from curvafit.volumes.source import Source, field_of

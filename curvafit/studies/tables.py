@@ -11,7 +11,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from curvafit.files import bears, check_free, own_record, write_atomically, write_content
+from curvafit.core.files import bears, check_free, own_record, write_atomically, write_content
 from curvafit.studies.measure import Measures
 
 __all__ = ["SUFFIXES", "check_table", "rows_of", "write_table"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from curvafit.faces import offer
+from curvafit.core.faces import offer
 
 if TYPE_CHECKING:
     from curvafit.volumes.field import Field

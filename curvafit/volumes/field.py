@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from curvafit.messages import one_line
-from curvafit.pictures import Pictured
-from curvafit.priors.bounds import SEEDS, quoted, whole
-from curvafit.units import sampling
+from curvafit.core.checks import SEEDS, quoted, whole
+from curvafit.core.messages import one_line
+from curvafit.core.pictures import Pictured
+from curvafit.core.units import sampling
 from curvafit.volumes.formats.base import ScanError, normalise_unit
 from curvafit.volumes.formats.part import Crop, box_of, fitted
 

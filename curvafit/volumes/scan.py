@@ -6,7 +6,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from curvafit.files import check_free, write_atomically
+from curvafit.core.files import check_free, write_atomically
 from curvafit.volumes.field import Field
 from curvafit.volumes.formats import READERS, WRITERS, ScanError, pick_writer
 from curvafit.volumes.formats.ngff import is_ours, mark

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from curvafit.priors.bounds import quoted
+from curvafit.core.checks import quoted
 from curvafit.volumes.field import Field, positive_triple
 from curvafit.volumes.formats import Raw, ScanError, normalise_unit
 from curvafit.volumes.formats.guard import read_file

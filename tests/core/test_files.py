@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from disk import tree
 
-from curvafit.files import (
+from curvafit.core.files import (
     bears,
     check_folder,
     check_free,

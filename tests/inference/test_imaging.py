@@ -7,9 +7,9 @@ import pytest
 from scipy import ndimage
 
 from curvafit import Field
-from curvafit.inference.imaging import Imaging, imaging_of, voxelised
-from curvafit.inference.prepare import prepare
-from curvafit.inference.regrid import centre_distance
+from curvafit.scan.imaging import Imaging, imaging_of, voxelised
+from curvafit.scan.prepare import prepare
+from curvafit.scan.regrid import centre_distance
 
 CUBIC = (1.0, 1.0, 1.0)
 

@@ -21,17 +21,17 @@ from curvafit.inference.candidates import TITLES
 from curvafit.inference.draws import COLUMNS
 from curvafit.inference.estimate import DRAWS
 from curvafit.inference.fit import Fit
-from curvafit.inference.imaging import Imaging
 from curvafit.inference.infer import Inference, infer
 from curvafit.inference.measure import scan_descriptors, scan_diagram
 from curvafit.inference.posterior import load_posterior
-from curvafit.inference.prepare import prepare
 from curvafit.inference.table import law_of, mirrored, parameters_of
 from curvafit.priors.coefficients import preset
 from curvafit.priors.fit_file import read_fit
 from curvafit.priors.fit_schema import FORMAT
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.report.page import write_inference
+from curvafit.scan.imaging import Imaging
+from curvafit.scan.prepare import prepare
 from curvafit.volumes.scan import Field
 
 GRID = Grid((44, 44, 44))

@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
 
-from curvafit.inference.phases import find_level, is_noise
-from curvafit.inference.prepare import LARGEST_WINDOW, WORKING_THICKNESS, Prepared, prepare
-from curvafit.inference.regrid import median_thickness, resample, rich_boxes, without_specks
-from curvafit.inference.texture import is_ball
 from curvafit.priors import Grid, phase_field
+from curvafit.scan.phases import find_level, is_noise
+from curvafit.scan.prepare import LARGEST_WINDOW, WORKING_THICKNESS, Prepared, prepare
+from curvafit.scan.regrid import median_thickness, resample, rich_boxes, without_specks
+from curvafit.scan.texture import is_ball
 from curvafit.volumes.scan import Field, ScanError, load, save
 
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 
+from curvafit.core.interrupts import Terminated
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import schedule
 from curvafit.inference.fixed_point import ShortFlow, _minimiser, _parameters, fixed_point, sharpened
 from curvafit.inference.stationarity import stationarity
-from curvafit.interrupts import Terminated
 from curvafit.priors.coefficients import Coefficients, preset
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.profile import phase_field

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from curvafit.core.checks import SHOWN, quoted, real, whole
 from curvafit.data_synth.atlas.design import Design, around, boxed
 from curvafit.data_synth.atlas.workers import check_workers
 from curvafit.data_synth.imaging.modalities import MODALITIES
@@ -17,7 +18,6 @@ from curvafit.data_synth.sets.sources import Generated
 from curvafit.drawing.shape_files import Output
 from curvafit.generation import Schedule, descend, generate, generate_batch, white_noise
 from curvafit.generation.memory import check_memory, memory
-from curvafit.priors.bounds import SHOWN, quoted, real, whole
 from curvafit.priors.coefficients import Coefficients, preset
 from curvafit.priors.energy import orientation
 from curvafit.priors.grid import Grid

@@ -12,8 +12,8 @@ import torch
 from matplotlib.figure import Figure
 
 import curvafit
+from curvafit.core.pictures import Pictured
 from curvafit.generation import Schedule, generate
-from curvafit.pictures import Pictured
 from curvafit.priors import WORKING_EPSILON, Grid, preset
 
 BRIEF = Schedule("brief", 60, 1e-2, 1e-3, "constant")

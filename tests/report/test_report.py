@@ -15,6 +15,7 @@ import torch
 from found import EPSILON, RADIUS, SCALE, made_fit, made_inference, without_drawing
 from matplotlib.figure import Figure
 
+from curvafit.core.units import GLOSSARY, density, length, number
 from curvafit.geometry.diagram import diagram
 from curvafit.inference.infer import Inference
 from curvafit.priors import Grid
@@ -22,7 +23,6 @@ from curvafit.priors.fit_file import FORMAT, read_fit
 from curvafit.report.page import parameter_table, report_html, with_command, write_inference
 from curvafit.report.pictures import bands, scan_box
 from curvafit.report.wording import describe, family_radius
-from curvafit.units import GLOSSARY, density, length, number
 from curvafit.volumes.scan import load
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}

@@ -10,9 +10,9 @@ import pytest
 import torch
 from found import made_fit
 
+from curvafit.core.progress import silent
 from curvafit.inference.candidates import Candidate
 from curvafit.priors.coefficients import Coefficients
-from curvafit.progress import silent
 from curvafit.segmentation.calibration import ODDS, Choice, Setting, Task, choice, left_out
 from curvafit.segmentation.completion import MARGIN, _Between, _filled, reconstruct
 from curvafit.segmentation.engine import stiff

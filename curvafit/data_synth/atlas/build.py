@@ -6,6 +6,8 @@ import itertools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from curvafit.core.checks import instance, seed_of, whole
+from curvafit.core.progress import Progress, silent
 from curvafit.data_synth.atlas.design import Design, boxed
 from curvafit.data_synth.atlas.draws import make
 from curvafit.data_synth.atlas.store import Settings, Store, open_store
@@ -14,9 +16,7 @@ from curvafit.generation.flow import WORKING_BLUR
 from curvafit.generation.memory import FILE, FLOW, check_memory
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.schedule import schedule as named_schedule
-from curvafit.priors.bounds import instance, seed_of, whole
 from curvafit.priors.grid import WORKING_EPSILON, Grid
-from curvafit.progress import Progress, silent
 
 #: A design is given up when none of its first so many draws was viable, or fewer than one in so many.
 BARREN = 200

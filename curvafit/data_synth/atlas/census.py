@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
+from curvafit.core.progress import Progress, silent
 from curvafit.data_synth.atlas.design import Design
 from curvafit.data_synth.atlas.draws import flows, versions
 from curvafit.data_synth.atlas.record import Record
 from curvafit.data_synth.atlas.store import Store, open_store
 from curvafit.generation.schedule import present_name
-from curvafit.progress import Progress, silent
 
 
 @dataclass(frozen=True)

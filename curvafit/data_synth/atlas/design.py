@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 from scipy.stats import qmc
 
-from curvafit.priors.bounds import SEEDS, named, quoted, real, seed_of, several, whole
+from curvafit.core.checks import SEEDS, named, quoted, real, seed_of, several, whole
 from curvafit.priors.coefficients import NAMES, POWERS, Coefficients, check_strength
 from curvafit.priors.grid import WORKING_EPSILON
 

@@ -7,9 +7,9 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
+from curvafit.core.checks import quoted, real
 from curvafit.data_synth.atlas.design import PARAMETERS, Design, around, boxed
 from curvafit.data_synth.atlas.yaml_text import parse_yaml
-from curvafit.priors.bounds import quoted, real
 from curvafit.priors.law import texture_of
 
 #: The kinds of design, and the keys that may stand beside each.

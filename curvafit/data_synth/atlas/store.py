@@ -29,13 +29,13 @@ import numpy as np
 import zarr
 from zarr.codecs import BloscCodec, Crc32cCodec
 
+from curvafit.core.checks import quoted
+from curvafit.core.files import staged, write_content
+from curvafit.core.interrupts import undisturbed
+from curvafit.core.json_text import parse_json
 from curvafit.data_synth.atlas.record import Record, Settings, attributes_of, digest, record_of
-from curvafit.files import staged, write_content
 from curvafit.generation.schedule import Schedule, present_name
-from curvafit.interrupts import undisturbed
-from curvafit.priors.bounds import quoted
 from curvafit.priors.grid import Grid
-from curvafit.priors.json_text import parse_json
 
 FORMAT = "curvafit shapes"
 VERSION = 2

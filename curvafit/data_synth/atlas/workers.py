@@ -10,8 +10,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+from curvafit.core.checks import whole
 from curvafit.data_synth.atlas.draws import device
-from curvafit.priors.bounds import whole
 
 if TYPE_CHECKING:
     from distributed import Client

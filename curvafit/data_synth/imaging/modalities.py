@@ -4,6 +4,7 @@ Widths of optical point-spread functions: 0.2 λ / NA across (Zhang, Zerubia and
 0.37 λ / (n - √(n² - NA²)) along the axis, as deviations; a specimen's aberrations make them up to twice as wide.
 """
 
+from curvafit.core.checks import plain_name, quoted
 from curvafit.data_synth.imaging.modality import Modality
 from curvafit.data_synth.imaging.parameters import (
     Contrast,
@@ -14,7 +15,6 @@ from curvafit.data_synth.imaging.parameters import (
     Optics,
     Specimen,
 )
-from curvafit.priors.bounds import plain_name, quoted
 
 CONFOCAL = Modality(
     "confocal",

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from curvafit.core.checks import LONGEST, SHORTEST, real
 from curvafit.data_synth.imaging.parameters import Imaging
 from curvafit.data_synth.imaging.randomness import seeds_of
-from curvafit.priors.bounds import LONGEST, SHORTEST, real
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ from operator import attrgetter
 from types import NoneType
 from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
 
+from curvafit.core.checks import quoted, real
+from curvafit.core.units import METRES
 from curvafit.data_synth.imaging.separable import Triple
-from curvafit.priors.bounds import quoted, real
-from curvafit.units import METRES
 
 
 class Range(NamedTuple):

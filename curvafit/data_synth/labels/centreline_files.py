@@ -8,8 +8,8 @@ from pathlib import Path
 import networkx as nx
 import numpy as np
 
-from curvafit.files import write_atomically, write_content
-from curvafit.units import METRES
+from curvafit.core.files import write_atomically, write_content
+from curvafit.core.units import METRES
 
 #: SWC's type of what is neither soma, axon nor dendrite.
 UNDEFINED = 0

@@ -10,12 +10,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from curvafit.core.checks import LONGEST, SHORTEST, instance, quoted, real, seed_of, several, whole
 from curvafit.data_synth.atlas.draws import one_thread
 from curvafit.data_synth.imaging.imaging import field_shape, image, regrid, visible
 from curvafit.data_synth.imaging.modality import Modality
 from curvafit.data_synth.imaging.parameters import Imaging
 from curvafit.data_synth.sets.sources import ShapeSource, source_of
-from curvafit.priors.bounds import LONGEST, SHORTEST, instance, quoted, real, seed_of, several, whole
 
 #: Shapes that a case gets until one is seen on the image's voxels, which may be coarse.
 TRIES = 8

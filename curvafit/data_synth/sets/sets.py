@@ -15,6 +15,11 @@ from typing import Any
 
 import numpy as np
 
+from curvafit.core.checks import instance, named, quoted, several, whole
+from curvafit.core.files import remove, write_content
+from curvafit.core.interrupts import undisturbed
+from curvafit.core.json_text import parse_json
+from curvafit.core.progress import Progress, silent
 from curvafit.data_synth.atlas.draws import versions
 from curvafit.data_synth.atlas.workers import Here, Workers
 from curvafit.data_synth.labels.centreline import centreline
@@ -22,12 +27,7 @@ from curvafit.data_synth.labels.centreline_files import write_graphml, write_swc
 from curvafit.data_synth.labels.labels import NAMES, labels_of
 from curvafit.data_synth.sets.case import Case, Recipe
 from curvafit.data_synth.sets.layouts import LAYOUTS, About
-from curvafit.files import remove, write_content
-from curvafit.interrupts import undisturbed
-from curvafit.priors.bounds import instance, named, quoted, several, whole
 from curvafit.priors.grid import Grid
-from curvafit.priors.json_text import parse_json
-from curvafit.progress import Progress, silent
 from curvafit.volumes.scan import Field, save
 
 FORMAT = "curvafit set"

@@ -12,6 +12,8 @@ from typing import Any, NamedTuple, Protocol, TypeVar, get_args, get_origin
 
 import numpy as np
 
+from curvafit.core.checks import several
+from curvafit.core.units import METRES
 from curvafit.data_synth.atlas.design import PARAMETERS, Design
 from curvafit.data_synth.atlas.draws import one_thread
 from curvafit.data_synth.atlas.store import Store, open_store
@@ -22,11 +24,9 @@ from curvafit.generation.fraction import first_mass
 from curvafit.generation.schedule import SCHEDULES, Schedule
 from curvafit.generation.schedule import schedule as named_schedule
 from curvafit.generation.viability import well_formed
-from curvafit.priors.bounds import several
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.priors.law import Law, Texture, textures_of
-from curvafit.units import METRES
 from curvafit.volumes.formats.base import convert_length
 
 #: Seeds that a shape gets to become well-formed.

@@ -13,13 +13,13 @@ import torch
 from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
+from curvafit.core.checks import LONGEST, SHORTEST, named, real, seed_of, several, whole
 from curvafit.data_synth.imaging.imaging import field_shape
 from curvafit.data_synth.imaging.modalities import modality
 from curvafit.data_synth.imaging.modality import Modality
 from curvafit.data_synth.imaging.randomness import correlated
 from curvafit.data_synth.sets.case import check_calibres, check_crop, drawn_voxel, edges_of, imaged
 from curvafit.data_synth.sets.sources import LAWS, Generated, Pool, Stored, voxel_of
-from curvafit.priors.bounds import LONGEST, SHORTEST, named, real, seed_of, several, whole
 from curvafit.priors.law import Law
 
 #: Length over which one texture gives way to another, as a share of the crop's longest edge.

@@ -10,7 +10,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from curvafit.priors.bounds import quoted
+from curvafit.core.checks import quoted
 from curvafit.volumes.formats.base import Damaged, Raw, ScanError, pick_key, stated
 from curvafit.volumes.formats.part import Part, part_of
 from curvafit.volumes.formats.streams import check_regular, mapped, read_numbers

@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from curvafit.messages import one_line
-from curvafit.priors.bounds import quoted
-from curvafit.units import METRES
+from curvafit.core.checks import quoted
+from curvafit.core.messages import one_line
+from curvafit.core.units import METRES
 
 #: Name of a unit in a file -> (our name, factor to it).
 _UNITS: dict[str, tuple[str, float]] = {

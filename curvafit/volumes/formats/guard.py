@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from curvafit.messages import one_line
-from curvafit.priors.bounds import quoted
+from curvafit.core.checks import quoted
+from curvafit.core.messages import one_line
 from curvafit.volumes.formats import KEYED, pick_reader
 from curvafit.volumes.formats.base import Damaged, Raw, ScanError, complaints
 from curvafit.volumes.formats.part import Part

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.files import MARK, is_empty
-from curvafit.interrupts import undisturbed
+from curvafit.core.files import MARK, is_empty
+from curvafit.core.interrupts import undisturbed
 from curvafit.volumes.formats.base import Raw, pick_key, stated
 from curvafit.volumes.formats.chunks import check_store, missing_chunks
 from curvafit.volumes.formats.part import Part, fitting, part_of

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.priors.bounds import SEEDS, quoted, whole
+from curvafit.core.checks import SEEDS, quoted, whole
 from curvafit.volumes.formats.base import Raw, ScanError
 from curvafit.volumes.formats.streams import check_array
 

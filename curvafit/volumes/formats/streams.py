@@ -14,7 +14,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from curvafit.machine import memory
+from curvafit.core.machine import memory
 from curvafit.volumes.formats.base import Damaged, ScanError
 
 #: Bytes of one read.

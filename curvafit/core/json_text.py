@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
-from curvafit.priors.bounds import quoted
+from curvafit.core.checks import quoted
 
 #: The most digits of a whole number.
 DIGITS = 40

@@ -12,9 +12,10 @@ from typing import Literal
 import numpy as np
 import torch
 
-from curvafit.inference.imaging import Imaging, imaging_of, voxelised
-from curvafit.inference.phases import Kind, Level, find_level, is_noise, region_of_interest
-from curvafit.inference.regrid import (
+from curvafit.priors import WORKING_EPSILON, WORKING_SPACING, Grid, phase_field
+from curvafit.scan.imaging import Imaging, imaging_of, voxelised
+from curvafit.scan.phases import Kind, Level, find_level, is_noise, region_of_interest
+from curvafit.scan.regrid import (
     Window,
     bounding_box,
     centre_distance,
@@ -24,7 +25,6 @@ from curvafit.inference.regrid import (
     surface_voxels,
     without_specks,
 )
-from curvafit.priors import WORKING_EPSILON, WORKING_SPACING, Grid, phase_field
 from curvafit.volumes.scan import Field, ScanError
 
 __all__ = ["KEPT_THICKNESS", "LARGEST_BOX", "LARGEST_WINDOW", "WORKING_THICKNESS", "Prepared", "prepare"]

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from curvafit.inference.phases import find_level
-from curvafit.inference.regrid import centre_distance, resample, rich_boxes, surface_voxels, without_specks
+from curvafit.scan.phases import find_level
+from curvafit.scan.regrid import centre_distance, resample, rich_boxes, surface_voxels, without_specks
 from curvafit.volumes.scan import Field, ScanError
 
 #: Blurs that are tried, in voxels of the finest axis.

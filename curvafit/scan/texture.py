@@ -6,7 +6,7 @@ import numpy as np
 
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.topology import betti_numbers
-from curvafit.inference.prepare import Prepared
+from curvafit.scan.prepare import Prepared
 
 #: Least mean of √(κ1² + κ2²) times the window's edge at which a surface is not flat; a ball that fits has 2.8.
 FLATTEST = 2.0

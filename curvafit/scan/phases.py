@@ -10,7 +10,7 @@ import numpy as np
 from scipy import ndimage
 from skimage.filters import threshold_otsu
 
-from curvafit.priors.bounds import SEEDS, named, real, whole
+from curvafit.core.checks import SEEDS, named, real, whole
 from curvafit.volumes.scan import Field, ScanError, load
 
 __all__ = ["Kind", "Level", "check_options", "find_level", "is_noise", "region_of_interest"]
