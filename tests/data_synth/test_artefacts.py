@@ -110,35 +110,31 @@ CHECKED: dict[str, Callable[[Tensor], Tensor]] = {
 def test_what_is_no_volume_is_refused(name: str) -> None:
     broken = FULL.clone()
     broken[0, 0, 1, 2, 3] = math.nan
-    for wrong, said in (
-        (broken, "finite values, got NaN or infinity"),
-        (FULL[0], r"of shape \(B, 1, Z, Y, X\), got \(1, 40, 40, 40\)"),
-        (FULL.long(), "of a floating type, got torch.int64"),
-    ):
-        with pytest.raises(ValueError, match=said):
+    for wrong, word in ((broken, "finite"), (FULL[0], "shape"), (FULL.long(), "floating")):
+        with pytest.raises(ValueError, match=word):
             CHECKED[name](wrong)
 
 
 @pytest.mark.parametrize(
-    ("call", "said"),
+    ("call", "word"),
     [
-        (lambda: degrade.occupancy(FULL, 0.0), "expected a positive ε in voxels, got 0.0"),
-        (lambda: degrade.intensities(FULL, (1, -2)), "expected levels of background and structure from 0"),
-        (lambda: degrade.texture(FULL, 1.0, -0.1, 3.0, [1]), "expected a deviation from 0 and a positive length"),
-        (lambda: degrade.blur(FULL, 1.0, (1, 2)), "expected a blur of 3 numbers"),
-        (lambda: degrade.blur_with_depth(FULL, 1.0, 1.0, -1.0), "expected a growth and an attenuation from 0"),
-        (lambda: degrade.sample(FULL, 1.0, (1, 0, 1)), "expected a spacing of 3 positive numbers"),
-        (lambda: degrade.poisson(FULL - 1, [1]), "expected photons from 0, got -1"),
-        (lambda: degrade.poisson_gaussian(FULL, -1, 1, 0, [1]), "expected a gain and a read noise from 0"),
-        (lambda: degrade.rician(FULL, math.nan, [1]), "expected a noise deviation from 0, got nan"),
-        (lambda: degrade.digitised(FULL, 0), "expected a ceiling above 0, got 0"),
-        (lambda: degrade.bias(FULL, 1.0, 1.5, 3.0, [1]), r"expected a bias in \[0, 1\]"),
-        (lambda: degrade.stripes(FULL, 1.0, 0.1, 1.0, [1], 3), "expected stripes from 0, a width above 0 and an axis"),
-        (lambda: degrade.rings(FULL, 1.0, 0.1, 0.0, [1]), "expected rings from 0 and a width above 0"),
-        (lambda: degrade.dropout(FULL, 1.0, 1.2, 3.0, 0.5, [1]), r"expected a share and a loss in \[0, 1\]"),
-        (lambda: degrade.clutter(FULL, 1.0, -1.0, 1.0, [1]), "expected a density from 0 and a positive radius"),
+        (lambda: degrade.occupancy(FULL, 0.0), "ε"),
+        (lambda: degrade.intensities(FULL, (1, -2)), "levels"),
+        (lambda: degrade.texture(FULL, 1.0, -0.1, 3.0, [1]), "deviation"),
+        (lambda: degrade.blur(FULL, 1.0, (1, 2)), "blur"),
+        (lambda: degrade.blur_with_depth(FULL, 1.0, 1.0, -1.0), "growth"),
+        (lambda: degrade.sample(FULL, 1.0, (1, 0, 1)), "spacing"),
+        (lambda: degrade.poisson(FULL - 1, [1]), "photons"),
+        (lambda: degrade.poisson_gaussian(FULL, -1, 1, 0, [1]), "gain"),
+        (lambda: degrade.rician(FULL, math.nan, [1]), "nan"),
+        (lambda: degrade.digitised(FULL, 0), "ceiling"),
+        (lambda: degrade.bias(FULL, 1.0, 1.5, 3.0, [1]), "bias"),
+        (lambda: degrade.stripes(FULL, 1.0, 0.1, 1.0, [1], 3), "axis"),
+        (lambda: degrade.rings(FULL, 1.0, 0.1, 0.0, [1]), "rings"),
+        (lambda: degrade.dropout(FULL, 1.0, 1.2, 3.0, 0.5, [1]), "share"),
+        (lambda: degrade.clutter(FULL, 1.0, -1.0, 1.0, [1]), "density"),
     ],
 )
-def test_bad_parameters_are_named(call: Callable[[], Tensor], said: str) -> None:
-    with pytest.raises(ValueError, match=said):
+def test_bad_parameters_are_named(call: Callable[[], Tensor], word: str) -> None:
+    with pytest.raises(ValueError, match=word):
         call()

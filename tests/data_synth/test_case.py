@@ -37,7 +37,7 @@ def test_a_case_is_the_image_of_its_field(recipe):
 def test_a_set_does_not_go_on_with_a_store_that_grew(recipe):
     kept = recipe.source.as_dict()
     assert source_of(kept) == recipe.source and kept["draws"] > 0
-    with pytest.raises(ValueError, match="well-formed shapes .*before, got 7"):
+    with pytest.raises(ValueError, match="grew"):
         source_of(kept | {"draws": kept["draws"] + 1}).shape((8, 8, 8), 0, np.random.default_rng(0))
 
 
@@ -60,7 +60,7 @@ def test_shapes_fill_the_share_that_is_asked_for(monkeypatch):
     assert "after 1500 steps" in made.origin["status"] and "volume fraction" not in made.origin["status"]
     assert source_of(source.as_dict()) == source
     assert source_of(source.as_dict() | {"schedule": "fast"}).schedule == SCHEDULES["cosine"]  # as version 0.1 wrote it
-    with pytest.raises(ValueError, match="expected a volume fraction in .0, 1., got 1.5"):
+    with pytest.raises(ValueError, match="fraction"):
         Generated((point,), ("tubes",), fraction=1.5)
     monkeypatch.setattr(steering, "LAST", -1.0)
     missed = source.shape((20, 20, 20), 0, np.random.default_rng(0))
@@ -69,7 +69,7 @@ def test_shapes_fill_the_share_that_is_asked_for(monkeypatch):
 
 def test_what_does_not_grow_is_said():
     barren = Generated(((1.0, 0.0, 1.0, 0.0, 0.0, 3000.0, -0.9),), ("nothing",))
-    with pytest.raises(ValueError, match="expected nothing to grow from one of 8 seeds, got none: "):
+    with pytest.raises(ValueError, match="seeds"):
         barren.shape((12, 12, 12), 0, np.random.default_rng(0))
 
 
@@ -95,7 +95,7 @@ def test_a_shape_that_falls_between_the_slices_is_not_a_case():
     seen = Sheets(third=5)
     case = Recipe(seen, coarse, (1, 8, 8), 1.0).case(0)
     assert seen.asked == 3 and (case.field[0, :4] > 0).all() and (case.field[0, 4:] < 0).all()
-    with pytest.raises(ValueError, match="expected structure and background on 1 x 8 x 8 voxels, got one 8 times"):
+    with pytest.raises(ValueError, match="1 x 8 x 8"):
         Recipe(Sheets(third=0), coarse, (1, 8, 8), 1.0).case(0)
 
 
@@ -107,9 +107,9 @@ def test_structures_of_many_calibres(recipe):
     assert len(set(voxels)) == 4 and min(voxels) >= 0.5 and max(voxels) <= 1.0
     assert [case.epsilon for case in cases] == pytest.approx([2 * voxel for voxel in voxels])
     assert Recipe.from_dict(json.loads(json.dumps(thick.as_dict()))) == thick
-    with pytest.raises(ValueError, match="expected calibres as two positive factors, the lower first"):
+    with pytest.raises(ValueError, match="calibres"):
         replace(recipe, calibres=(2.0, 1.0))
-    with pytest.raises(ValueError, match="expected crops within the 24 voxels"):
+    with pytest.raises(ValueError, match="24 voxels"):
         replace(recipe, calibres=(0.2, 1.0))
 
 

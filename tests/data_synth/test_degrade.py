@@ -61,10 +61,10 @@ def test_a_sample_has_its_seed_alone(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", RANDOM)
-@pytest.mark.parametrize("seeds", [[], [1, 2], [-1], [0.5], [True]])
-def test_seeds_are_whole_numbers_one_a_sample(name: str, seeds: list) -> None:
-    with pytest.raises(ValueError, match="expected 1 seeds, whole numbers from 0, one a sample"):
-        RANDOM[name](FULL, seeds)
+def test_seeds_are_whole_numbers_one_a_sample(name: str) -> None:
+    for seeds in ([], [1, 2], [-1], [0.5], [True]):
+        with pytest.raises(ValueError, match="seeds"):
+            RANDOM[name](FULL, seeds)  # type: ignore[arg-type]
 
 
 # ---- optics ----------------------------------------------------------------------------------------------------------

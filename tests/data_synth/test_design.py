@@ -74,5 +74,5 @@ def test_the_law_stays_what_stores_and_atlases_were_made_with():
 
 def test_wrong_seeds_are_refused():
     for seed, index in ((-1, 0), (0, -1), (0.5, 0), (0, "1"), (True, 0)):
-        with pytest.raises(ValueError, match="expected (a seed|an index) that is a whole number from 0"):
+        with pytest.raises(ValueError, match="seed|index"):
             boxed().draw(seed, index)

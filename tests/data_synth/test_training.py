@@ -102,7 +102,7 @@ def test_samples_of_many_calibres(store):
     dataset = TextureDataset(store, QUIET, SHAPE, calibres=(1.0, 1.5))
     voxels = [dataset.sample(k).record["voxel"] for k in range(4)]
     assert len(set(voxels)) == 4 and 1.5 * QUIET.voxel >= max(voxels) > min(voxels) >= QUIET.voxel
-    with pytest.raises(ValueError, match="expected calibres as two positive factors"):
+    with pytest.raises(ValueError, match="calibres"):
         TextureDataset(store, QUIET, SHAPE, calibres=(0.0, 1.0))
 
 
@@ -154,7 +154,7 @@ def test_images_are_normalised_as_asked(store):
     assert float(share.min()) == 0 and float(share.max()) == 1
     assert 0.985 < float(((share > 0) & (share < 1)).double().mean()) < 0.995
     assert torch.equal(own, -plain)
-    with pytest.raises(ValueError, match="expected a normalisation among zscore, percentile, a function or None"):
+    with pytest.raises(ValueError, match="normalis"):
         TextureDataset(store, QUIET, SHAPE, normalise="minmax")
 
 
@@ -187,11 +187,11 @@ def test_shapes_of_laws(tmp_path):
     filled = TextureDataset(tubes.coefficients, QUIET, 12, shapes=1, volume_fraction=0.2)
     assert dataset.voxels == filled.voxels == [QUIET.voxel]
     assert repr(filled).startswith("TextureDataset(1 shapes of coefficients; quiet; 12 x 12 x 12 voxels")
-    with pytest.raises(ValueError, match="expected a preset or a fit, which have a mass, got coefficients"):
+    with pytest.raises(ValueError, match="mass"):
         TextureDataset(tubes.coefficients, QUIET, 12)
-    with pytest.raises(ValueError, match="expected a preset among"):
+    with pytest.raises(ValueError, match="preset"):
         TextureDataset("tubez", QUIET, 12)
-    with pytest.raises(ValueError, match="expected a sequence of laws or stores, got 3"):
+    with pytest.raises(ValueError, match="3"):
         TextureDataset(3, QUIET, 12)  # type: ignore[arg-type]
 
 
@@ -214,24 +214,24 @@ def test_torchio_s_form(store):
 
 @pytest.mark.parametrize("size", [16.5, "16", (8, 8), (8, 8, 0)])
 def test_a_size_that_is_none_is_refused(store, size):
-    with pytest.raises(ValueError, match="expected (a sequence of )?3 whole numbers of voxels"):
+    with pytest.raises(ValueError, match="voxels"):
         TextureDataset(store, QUIET, size)
 
 
 @pytest.mark.parametrize(("name", "value"), [("voxel", 0), ("voxel", -1), ("seed", -1), ("seed", 0.5)])
 def test_a_voxel_or_a_seed_that_is_none_is_refused(store, name, value):
-    with pytest.raises(ValueError, match="expected a (shape's voxel of positive length|seed that is a whole number)"):
+    with pytest.raises(ValueError, match="voxel|seed"):
         TextureDataset(store, QUIET, SHAPE, **{name: value})
 
 
 def test_bad_input(store, tmp_path):
-    with pytest.raises(ValueError, match="expected crops within the 24 voxels of the stored shapes, but 25 x 8 x 8"):
+    with pytest.raises(ValueError, match="24 voxels"):
         TextureDataset(store, QUIET, (25, 8, 8))
-    with pytest.raises(FileNotFoundError, match="expected a store of shapes at .*missing.zarr"):
+    with pytest.raises(FileNotFoundError, match="missing.zarr"):
         TextureDataset(tmp_path / "missing.zarr", QUIET, SHAPE)
-    with pytest.raises(ValueError, match="expected at least one source and one modality, got 1 and 0"):
+    with pytest.raises(ValueError, match="modality"):
         TextureDataset(store, [], SHAPE)
-    with pytest.raises(ValueError, match="expected a length above 0 and a blend in"):
+    with pytest.raises(ValueError, match="blend"):
         TextureDataset(store, QUIET, SHAPE, blend=1.5)
-    with pytest.raises(ValueError, match="expected a length above 0"):
+    with pytest.raises(ValueError, match="length"):
         TextureDataset(store, QUIET, SHAPE, length=0)
