@@ -14,7 +14,7 @@ import numpy as np
 
 from curvafit.core.checks import quoted
 from curvafit.core.files import write_content
-from curvafit.core.json_text import parse_json
+from curvafit.core.records import parse_json
 from curvafit.volumes.formats import read_archive
 
 Content = TypeVar("Content")

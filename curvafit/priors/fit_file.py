@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from curvafit.core.checks import quoted
-from curvafit.core.json_text import parse_json
+from curvafit.core.records import parse_json
 from curvafit.core.units import METRES
 from curvafit.priors.coefficients import NAMES, Coefficients
 from curvafit.priors.fit_schema import FIT_SCHEMA, FORMAT, violation

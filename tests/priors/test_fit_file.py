@@ -10,7 +10,7 @@ import pytest
 from broken_fits import BROKEN, broken
 from found import made_fit
 
-from curvafit.core.json_text import parse_json, quoted
+from curvafit.core.records import parse_json, quoted
 from curvafit.priors import read_fit
 from curvafit.priors.fit_schema import FIT_SCHEMA, WHOLE_FIT, violation
 

@@ -8,7 +8,7 @@ from typing import Any
 import yaml
 
 from curvafit.core.checks import quoted
-from curvafit.core.json_text import DIGITS, repeated
+from curvafit.core.records import DIGITS, repeated
 
 #: Values of a text at most, each counted wherever an alias repeats it.
 _MOST = 1_000_000

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from curvafit.core.json_text import parse_json
+from curvafit.core.records import parse_json
 from curvafit.data_synth.sets.layouts import LAYOUTS
 from curvafit.data_synth.sets.sets import RECORDS, case_name, cases_of, read_order
 from curvafit.drawing.plot import CONTOUR, write_picture

@@ -18,8 +18,8 @@ import numpy as np
 from curvafit.core.checks import instance, named, quoted, several, whole
 from curvafit.core.files import remove, write_content
 from curvafit.core.interrupts import undisturbed
-from curvafit.core.json_text import parse_json
 from curvafit.core.progress import Progress, silent
+from curvafit.core.records import parse_json
 from curvafit.data_synth.atlas.draws import versions
 from curvafit.data_synth.atlas.workers import Here, Workers
 from curvafit.data_synth.labels.centreline import centreline
