@@ -245,7 +245,7 @@ def _orientation(text: str) -> Tensor:
 def _check(out: Path, checkpoint: Path | None, cap: bool | None) -> None:
     """Refuse a checkpoint at the place of an output, and options of a surface where a volume is written."""
     from curvafit.core.files import check_folder
-    from curvafit.drawing.shape_files import beside
+    from curvafit.core.records import sibling
     from curvafit.geometry.mesh_files import SUFFIXES
 
     if cap is not None and not out.name.lower().endswith(SUFFIXES):
@@ -253,7 +253,7 @@ def _check(out: Path, checkpoint: Path | None, cap: bool | None) -> None:
         raise ValueError(f"expected {option} beside a surface ({', '.join(SUFFIXES)}), got {out.name!r}")
     if checkpoint is not None:
         check_folder(checkpoint.parent)
-        outputs = (out, beside(out, ".json"), beside(out, ".png"))
+        outputs = (out, sibling(out, ".json"), sibling(out, ".png"))
         if checkpoint in [path.resolve() for path in outputs]:
             raise ValueError(f"expected a checkpoint that is not an output, got {checkpoint}")
 

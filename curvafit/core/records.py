@@ -1,17 +1,346 @@
-"""Safe reading of JSON, for every header, record and fit of the package."""
+"""Files of this program: a header with arrays in one format, and the rule on what may be written over.
+
+- `Format` names a kind of file. `Format.write` writes a header, alone as JSON or with arrays as NPZ, whole or not at
+  all; `Format.read` reads it and refuses what is damaged, of another kind or of another version.
+- `can_write` refuses a name that is taken: a program replaces only what it wrote, unless the caller says `overwrite`.
+- `parse_json` and `read_archive` read JSON and NPZ files that anyone may have written.
+"""
 
 from __future__ import annotations
 
+import io
 import json
 import math
+import re
+import zipfile
 from collections import Counter
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any, NamedTuple, TypeVar
+
+import numpy as np
 
 from curvafit.core.checks import quoted
+from curvafit.core.files import MARK, check_folder, check_free, is_empty, write_content
+from curvafit.core.machine import memory
 
-#: The most digits of a whole number.
+Content = TypeVar("Content")
+
+#: Suffixes of two parts; any other suffix is what follows the last dot.
+_DOUBLE = (".nii.gz", ".ome.tif", ".ome.tiff", ".ome.zarr")
+#: Files of a Zarr group of images that `curvafit.volumes` wrote.
+_WRITTEN = re.compile(r"(\d+/)?zarr\.json|\d+/c(/\d+)*")
+#: What the making of a result from a damaged file may raise.
+_FAULTS = (KeyError, ValueError, IndexError, TypeError, AttributeError, RuntimeError)
+#: The most digits of a whole number in JSON.
 DIGITS = 40
+#: Bytes of one read.
+_PIECE = 1 << 22
+#: NPY's versions of plain numbers.
+_NPY_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+
+
+# ---- records ---------------------------------------------------------------------------------------------------------
+
+
+class Record(NamedTuple):
+    """The content of a file: a header of JSON's types, and arrays by name."""
+
+    header: dict[str, Any]
+    arrays: dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Format:
+    """A kind of file that this program writes, by the `format` in the file's header.
+
+    A file is JSON, or NPZ where there are arrays: then the member `header` holds the JSON. Nothing in a file runs when
+    it is read.
+
+    Parameters
+    ----------
+    name
+        The header's `format`, such as `"curvafit atlas"`.
+    version
+        The header's `version`; None for a format without one.
+    title
+        The file in words, for messages: `"an atlas file"`.
+    remedy
+        What to do about a file of another version, for messages: `"extract it again from its store"`.
+    fixed
+        Further entries of the header that must be as they are here, such as settings that all content depends on.
+
+    Examples
+    --------
+    >>> atlas = Format("curvafit atlas", 1, "an atlas file", remedy="extract it again from its store")
+    >>> atlas.write("atlas.npz", {"unit": "mm"}, {"points": points})
+    >>> header, arrays = atlas.read("atlas.npz")
+    """
+
+    name: str
+    version: int | None = None
+    title: str = "a file of curvafit"
+    remedy: str = "make it again"
+    fixed: Mapping[str, Any] = field(default_factory=dict)
+
+    def write(
+        self,
+        path: str | Path,
+        header: Mapping[str, Any],
+        arrays: Mapping[str, np.ndarray] | None = None,
+        *,
+        compress: bool = True,
+    ) -> Path:
+        """Write a header alone as JSON, or with arrays as NPZ; the file is whole or not there.
+
+        The header gets the entries `format`, `version` and those of `fixed`. A file of that name is replaced: call
+        `can_write` before.
+        """
+        version = {} if self.version is None else {"version": self.version}
+        content = {"format": self.name, **version, **self.fixed, **header}
+        if arrays is None:
+            return write_content(Path(path), json.dumps(content, indent=2, allow_nan=False) + "\n")
+        buffer, save = io.BytesIO(), np.savez_compressed if compress else np.savez
+        save(buffer, allow_pickle=False, header=encode(content), **arrays)
+        return write_content(Path(path), buffer.getbuffer())
+
+    def read(
+        self,
+        source: str | Path | IO[bytes],
+        build: Callable[[dict[str, Any], dict[str, np.ndarray]], Content] = Record,
+        *,
+        place: str | None = None,
+    ) -> Content:
+        """Return the header and the arrays of a file, or what `build(header, arrays)` makes of them.
+
+        Parameters
+        ----------
+        source
+            A path, or an open file.
+        build
+            Any exception that damaged content may lead to in it becomes a ValueError.
+        place
+            What messages call the source, by default its path.
+
+        Raises
+        ------
+        FileNotFoundError
+            If there is no such file.
+        ValueError
+            If the file is damaged, of another format or version, or has other `fixed` entries.
+        """
+        source = Path(source) if isinstance(source, str) else source
+        place = place or str(source)
+        if isinstance(source, Path) and not source.exists():
+            raise FileNotFoundError(f"{place} is not there: expected {self.title}")
+        try:
+            header, arrays = _read(source)
+        except (OSError, *_FAULTS) as error:
+            raise ValueError(f"{place} is not {self.title}: it is truncated, damaged or something else") from error
+        self.check(header, place)
+        try:
+            return build(header, arrays)
+        except _FAULTS as error:
+            reason = f"it lacks {error}" if isinstance(error, KeyError) else str(error)[:200]
+            raise ValueError(f"{place} is not {self.title} that can be read: {reason}") from error
+
+    def check(self, header: Any, place: object) -> None:
+        """Raise ValueError where a header is of another format or version, or has other `fixed` entries."""
+        if not isinstance(header, dict) or header.get("format") != self.name:
+            raise ValueError(f"{place} is not {self.title}: it is something else")
+        wanted = {**({} if self.version is None else {"version": self.version}), **self.fixed}
+        others = [f"{name} {quoted(header.get(name))}" for name, value in wanted.items() if header.get(name) != value]
+        if others:
+            mine = ", ".join(f"{name} {quoted(wanted[name])}" for name in wanted if header.get(name) != wanted[name])
+            raise ValueError(f"{place} is {self.title} with {', '.join(others)} instead of {mine}: {self.remedy}")
+
+    def owns(self, path: Path) -> bool:
+        """Return whether a file says that it is of this format, or a Zarr store of images that it is of this kind.
+
+        The version, and all else in the file, may be another.
+        """
+        if path.is_dir():
+            return path.name.lower().endswith(".zarr") and is_own_zarr(path, self.name)
+        try:
+            return _read(path).header.get("format") == self.name
+        except (OSError, *_FAULTS):
+            return False
+
+    def companions(self, target: Path) -> list[str]:
+        """Return the names of the files that the record beside `target` lists as written together with `target`.
+
+        That record is `sibling(target, ".json")`; without one of this format that lists `target` there are none.
+        """
+        try:
+            header = _read(sibling(target, ".json")).header
+        except (OSError, *_FAULTS):
+            return []
+        names = header.get("files") if header.get("format") == self.name else None
+        return names if isinstance(names, list) and target.name in names else []
+
+
+def can_write(
+    path: str | Path,
+    ours: Format | Callable[[Path], bool],
+    *,
+    more: Iterable[Path] = (),
+    inputs: Iterable[str | Path] = (),
+    overwrite: bool = False,
+) -> Path:
+    """Return the path if a file can be written there, and `more` beside it, and nothing of value is lost.
+
+    Call it before long work, and again before writing.
+
+    Parameters
+    ----------
+    path
+        A file, or a Zarr store, that may exist.
+    ours
+        The format of what is written: then `path` may be replaced if it is of this format, and so may files that the
+        record `sibling(path, ".json")` lists as written together with `path`. Or a function that says which paths may.
+    more
+        Further files that will be written.
+    inputs
+        Files or folders that are read, also as `file.h5::key`: they are never written over, nor anything in them.
+    overwrite
+        Whether files and folders of another origin may be replaced.
+
+    Raises
+    ------
+    ValueError
+        If the place cannot be written to, or one of the files would replace an input or something of another origin.
+    """
+    target = Path(path)
+    check_folder(target.parent)
+    if target.is_dir() and not target.name.lower().endswith(".zarr"):
+        raise ValueError(f"{target} is a folder: give the name of a file")
+    check_free([target, *more], _replaceable(ours, target), inputs, overwrite)
+    return target
+
+
+def _replaceable(ours: Format | Callable[[Path], bool], target: Path) -> Callable[[Path], bool]:
+    """Return the function that says whether a path that exists may be replaced."""
+    if not isinstance(ours, Format):
+        return ours
+    listed = ours.companions(target)
+    return lambda path: (path.is_file() and path.name in listed) or (path == target and ours.owns(path))
+
+
+def sibling(path: str | Path, ending: str) -> Path:
+    """Return the path with another ending than its suffix; `.nii.gz`, `.ome.tif` and `.ome.zarr` count as one."""
+    target = Path(path)
+    suffix = next((double for double in _DOUBLE if target.name.lower().endswith(double)), target.suffix)
+    return target.with_name(target.name[: len(target.name) - len(suffix)] + ending)
+
+
+def is_own_zarr(folder: Path, kind: str) -> bool:
+    """Return whether a folder is empty, or a Zarr group of images with the mark of this kind and nothing else in it."""
+    if folder.is_symlink() or is_empty(folder):
+        return not folder.is_symlink()
+    try:
+        attributes = parse_json((folder / "zarr.json").read_bytes(), "a Zarr group", folder)["attributes"]
+        if attributes[MARK]["kind"] != kind:
+            return False
+    except (OSError, *_FAULTS):
+        return False
+    inside = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir())
+    return all(_WRITTEN.fullmatch(name) for name in inside)
+
+
+def encode(value: Any) -> np.ndarray:
+    """Return a value as JSON in an array of bytes."""
+    return np.frombuffer(json.dumps(value).encode(), dtype=np.uint8)
+
+
+def _read(source: Path | IO[bytes]) -> Record:
+    """Return the header and the arrays of a file, or raise one of many exceptions where it is of another kind."""
+    if isinstance(source, Path):
+        if not source.is_file():  # a pipe may never end
+            raise ValueError(f"{source} is not a file")
+        with source.open("rb") as file:
+            return _read(file)
+    start = source.read(2)
+    source.seek(0)
+    if start != b"PK":
+        return Record(dict(parse_json(source.read(), "a header", "it")), {})
+    arrays = read_archive(source)
+    return Record(dict(parse_json(arrays.pop("header").tobytes(), "a header", "it")), arrays)
+
+
+# ---- NPZ and JSON ----------------------------------------------------------------------------------------------------
+
+
+def read_archive(source: Path | IO[bytes]) -> dict[str, np.ndarray]:
+    """Return all arrays of an NPZ file by name; each is read to its end, where its checksum is.
+
+    Raises
+    ------
+    OSError, ValueError
+        If the file cannot be read, is damaged, or is not an NPZ file.
+    """
+    if isinstance(source, Path) and source.exists() and not source.is_file():
+        raise ValueError(f"{source} is not an NPZ file")
+    try:
+        with zipfile.ZipFile(source) as archive:
+            members = [name for name in archive.namelist() if name.endswith(".npy")]
+            return {name.removesuffix(".npy"): _member(archive, name) for name in members}
+    except (OSError, ValueError):
+        raise
+    except Exception as reason:  # zipfile, zlib and numpy have a dozen ways to say so
+        raise ValueError(f"expected a whole NPZ file, got one that cannot be read ({quoted(str(reason))})") from reason
+
+
+def _member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
+    with archive.open(name) as stream:
+        return read_array(stream, archive.getinfo(name).file_size)
+
+
+def read_array(stream: Any, size: int) -> np.ndarray:
+    """Return the numbers of an NPY stream of `size` bytes.
+
+    Raises
+    ------
+    ValueError
+        If the header is of something other than plain numbers, or the stream does not end with them.
+    """
+    shape, fortran, dtype = read_array_header(stream, size)
+    values = read_numbers(stream, shape[::-1] if fortran else shape, dtype)
+    return values.T if fortran else values
+
+
+def read_array_header(stream: Any, size: int) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Return shape, whether the first axis is the fastest, and type, of an NPY stream of `size` bytes."""
+    version = np.lib.format.read_magic(stream)
+    if version not in _NPY_HEADERS:
+        raise ValueError(f"NPY of version {version} holds no plain numbers")
+    shape, fortran, dtype = _NPY_HEADERS[version](stream)
+    if not dtype.hasobject and math.prod(shape) * dtype.itemsize != size - stream.tell():
+        raise ValueError(f"{math.prod(shape) * dtype.itemsize} bytes of values by its header, not so many in the file")
+    return shape, fortran, dtype
+
+
+def read_numbers(stream: Any, shape: Sequence[int], dtype: np.dtype) -> np.ndarray:
+    """Return the array of a stream, last axis fastest; the stream must end with it.
+
+    A gzip, bzip2 or zip stream compares its checksum only at its end.
+
+    Raises
+    ------
+    ValueError, OSError, EOFError, zlib.error, zipfile.BadZipFile
+        If the values are not numbers, do not fit into memory, or the stream is shorter, longer or damaged.
+    """
+    shape = tuple(map(int, shape))
+    nbytes = math.prod(shape) * dtype.itemsize
+    if dtype.kind in "OV" or min(shape, default=1) < 0 or nbytes > memory():
+        raise ValueError(f"an array {shape} of {str(dtype)[:80]} cannot be read into memory")
+    values = np.empty(math.prod(shape), dtype)
+    buffer, size = values.view(np.uint8).data if nbytes else memoryview(b""), 0
+    while size < nbytes and (count := stream.readinto(buffer[size : size + _PIECE])):
+        size += count
+    if size < nbytes or stream.read(1):
+        raise ValueError(f"{nbytes} bytes of values by its header, {size if size < nbytes else 'more'} in the file")
+    return values.reshape(shape)
 
 
 def parse_json(content: str | bytes, expected: str, place: object) -> Any:

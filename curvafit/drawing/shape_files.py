@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
-import json
 import warnings
 from collections.abc import Iterable
 from contextlib import suppress
@@ -17,8 +16,9 @@ import torch
 from torch import Tensor
 
 from curvafit.core.checks import LONGEST, SHORTEST, instance, real, several, whole
-from curvafit.core.files import check_folder, check_free, move_together, own_record, remove, staged, write_content
+from curvafit.core.files import move_together, remove, staged
 from curvafit.core.interrupts import undisturbed
+from curvafit.core.records import Format, can_write, sibling
 from curvafit.generation.flow import Flow
 from curvafit.generation.memory import FILE, check_memory
 from curvafit.geometry.mesh import NoSurface, Surface, solid_surface, surface
@@ -28,11 +28,10 @@ from curvafit.priors.curvature import geometric_curvatures, jet
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.priors.profile import profile_distance
 from curvafit.volumes.formats import normalise_unit, pick_writer
-from curvafit.volumes.formats.ngff import is_ours
 from curvafit.volumes.scan import WRITABLE, Field, save
 
 #: What a record beside a shape says that it is.
-FORMAT = "curvafit-shape-1"
+FORMAT = Format("curvafit-shape-1", title="the record of a shape")
 #: Times that a box may be repeated along an axis.
 MOST = 10**6
 
@@ -121,58 +120,15 @@ def check_target(
         raise ValueError(f"expected a name ending in one of {', '.join(known)}, got {target.name!r}")
     if not target.name.lower().endswith(SUFFIXES):
         pick_writer(target, (output or Output()).unit)
-    more = [*(step_path(target, step) for step in steps), *([beside(target, ".png")] if picture else [])]
-    return check_outputs(target, FORMAT, more=more, inputs=inputs, overwrite=overwrite)
-
-
-def check_outputs(
-    target: Path,
-    kind: str,
-    *,
-    more: Iterable[Path] = (),
-    inputs: Iterable[str | Path] = (),
-    overwrite: bool = False,
-) -> Path:
-    """Return the path, if it can be written with its record and `more` beside it, and nothing else is lost.
-
-    What the record there, of the same kind, lists as written with this very file may be replaced.
-
-    Raises
-    ------
-    ValueError
-        As `check_target`.
-    """
-    check_folder(target.parent)
-    if target.is_dir() and not target.name.lower().endswith(".zarr"):
-        raise ValueError(f"expected the name of a file, got the folder {target}")
-    own = own_files(target, kind)
-
-    def ours(path: Path) -> bool:
-        if path.is_dir():
-            return path.name.lower().endswith(".zarr") and is_ours(path, kind)
-        return path.name in own
-
-    check_free([target, beside(target, ".json"), *more], ours, inputs, overwrite)
-    return target
-
-
-def own_files(target: Path, kind: str) -> list[str]:
-    """Return the names of files that the record of that kind there lists as written with this very file."""
-    listed = own_record(beside(target, ".json"), kind).get("files")
-    return listed if isinstance(listed, list) and target.name in listed else []
-
-
-def beside(path: str | Path, ending: str) -> Path:
-    """Return the path with another ending than its suffix; `.nii.gz` and `.ome.zarr` count as one."""
-    target = Path(path)
-    known = [each for each in (*WRITABLE, *SUFFIXES) if target.name.lower().endswith(each)]
-    return target.with_name(target.name[: len(target.name) - max(map(len, known), default=0)] + ending)
+    more = [sibling(target, ".json"), *(step_path(target, step) for step in steps)]
+    more += [sibling(target, ".png")] if picture else []
+    return can_write(target, FORMAT, more=more, inputs=inputs, overwrite=overwrite)
 
 
 def step_path(path: str | Path, step: int) -> Path:
     """Return where a snapshot goes: `tubes_step00100.nii.gz` beside `tubes.nii.gz`."""
-    suffix = Path(path).name.removeprefix(beside(path, "").name)
-    return beside(path, f"_step{step:05d}{suffix}")
+    suffix = Path(path).name.removeprefix(sibling(path, "").name)
+    return sibling(path, f"_step{step:05d}{suffix}")
 
 
 def write_shape(
@@ -212,18 +168,18 @@ def write_shape(
         else stands where one of the files goes.
     """
     target = check_target(path, output, steps=flow.snapshots, picture=picture, overwrite=overwrite)
-    image = beside(target, ".png")
-    former = picture or image.name in own_files(target, FORMAT)
+    image = sibling(target, ".png")
+    former = picture or image.name in FORMAT.companions(target)
     with staged(target) as work:
         shape = write_field(flow.field, flow.grid, work / target.name, output)
-        note = beside(shape, ".json")
+        note = sibling(shape, ".json")
         parts = [shape, note]
         for step, field in flow.snapshots.items():
             with suppress(NoSurface):
                 parts.append(write_field(field, flow.grid, step_path(shape, step), output))
-        content = {"format": FORMAT, **(record or {}), "files": [part.name for part in parts]}
+        content = {**(record or {}), "files": [part.name for part in parts]}
         drawing = content | {"files": [*content["files"], image.name]}
-        note.write_text(_text(drawing if picture else content), encoding="utf-8")
+        FORMAT.write(note, drawing if picture else content)
         with undisturbed():
             files = move_together(parts, target.parent)
             if former:
@@ -233,13 +189,8 @@ def write_shape(
     if images := _picture(flow, image):
         return (*files, *images)
     with suppress(OSError):  # a disk too full for this as well: the record there is whole, and lists a picture too many
-        write_content(beside(target, ".json"), _text(content))
+        FORMAT.write(sibling(target, ".json"), content)
     return files
-
-
-def _text(record: dict[str, Any]) -> str:
-    """Return a record as the text of its file."""
-    return json.dumps(record, indent=2, allow_nan=False) + "\n"
 
 
 def _picture(flow: Flow, path: Path) -> tuple[Path, ...]:
@@ -270,7 +221,7 @@ def write_field(field: Tensor, grid: Grid, path: str | Path, output: Output | No
     how.shape(grid)
     values, edges = np.tile(field.numpy(), how.tile), (how.voxel, how.voxel, how.voxel)
     if not target.name.lower().endswith(SUFFIXES):
-        return save(Field(values, edges, how.unit), target, kind=FORMAT)
+        return save(Field(values, edges, how.unit), target, kind=FORMAT.name)
     box = Grid(values.shape, edges, grid.boundary)
     mesh = solid_surface(values, box) if how.cap else surface(values, box)
     data = None
@@ -294,7 +245,7 @@ def shape_record(
     stated by its least and greatest value.
     """
     return {
-        "format": FORMAT,
+        "format": FORMAT.name,
         "coefficients": dict(zip(NAMES, map(_stated, flow.coefficients), strict=True)),
         "mass": _stated(flow.mass if mass is None else mass),
         "shape": list(flow.grid.shape),

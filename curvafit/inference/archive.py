@@ -14,8 +14,7 @@ import numpy as np
 
 from curvafit.core.checks import quoted
 from curvafit.core.files import write_content
-from curvafit.core.records import parse_json
-from curvafit.volumes.formats import read_archive
+from curvafit.core.records import parse_json, read_archive
 
 Content = TypeVar("Content")
 

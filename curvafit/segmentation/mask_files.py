@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import json
 from collections.abc import Iterable
 from importlib.metadata import version
 from pathlib import Path
@@ -14,9 +13,9 @@ from matplotlib.figure import Figure
 
 from curvafit.core.files import move_together, remove, staged
 from curvafit.core.interrupts import undisturbed
+from curvafit.core.records import Format, can_write, sibling
 from curvafit.drawing.plot import DPI
 from curvafit.drawing.sections import section_figure
-from curvafit.drawing.shape_files import beside, check_outputs, own_files
 from curvafit.segmentation.probability import entropy
 from curvafit.segmentation.result import Segmentation, Uncertainty
 from curvafit.volumes.formats import pick_writer
@@ -26,7 +25,7 @@ from curvafit.volumes.scan import Field, save
 __all__ = ["FORMAT", "check_mask_target", "segmentation_figure", "write_mask"]
 
 #: `format` of the record beside a mask.
-FORMAT = "curvafit-mask-1"
+FORMAT = Format("curvafit-mask-1", title="the record of a mask")
 
 _NIFTI = (".nii", ".nii.gz")
 
@@ -52,8 +51,8 @@ def check_mask_target(
     """
     target = Path(path)
     pick_writer(target, unit or "mm")
-    more = [beside(target, ".png"), *([_map_path(target)] if probability else [])]
-    return check_outputs(target, FORMAT, more=more, inputs=inputs, overwrite=overwrite)
+    more = [sibling(target, ".json"), sibling(target, ".png"), *([_map_path(target)] if probability else [])]
+    return can_write(target, FORMAT, more=more, inputs=inputs, overwrite=overwrite)
 
 
 def write_mask(
@@ -91,27 +90,27 @@ def write_mask(
     chances = segmentation.probability
     inputs = () if like is None else (like,)
     target = check_mask_target(path, scan.unit, inputs, overwrite, probability=chances is not None)
-    former = _map_path(target).name in own_files(target, FORMAT)
+    former = _map_path(target).name in FORMAT.companions(target)
 
     def write(values: np.ndarray, place: Path) -> Path:
         if like is not None and all(str(each).lower().endswith(_NIFTI) for each in (like, target)):
             write_nifti_like(values, Path(like), place, unit)
         else:
-            save(Field(values, scan.spacing, scan.unit, scan.affine), place, kind=FORMAT)
+            save(Field(values, scan.spacing, scan.unit, scan.affine), place, kind=FORMAT.name)
         return place
 
     with staged(target) as work:
         temporary = work / target.name
         mask, labels = segmentation.mask.values, segmentation.labels
         write(mask.view(np.uint8) if labels is None else labels.values, temporary)
-        picture, note = beside(temporary, ".png"), beside(temporary, ".json")
+        picture, note = sibling(temporary, ".png"), sibling(temporary, ".json")
         rows = [(scan.values, None), (scan.values, mask) if labels is None else (labels.values, None)]
         _figure(rows, segmentation).savefig(picture, dpi=DPI)
         parts = [temporary, picture, note]
         if chances is not None:
             parts.append(write(chances.values, _map_path(temporary)))
         content = {**_record(segmentation, scan, record or {}), "files": [part.name for part in parts]}
-        note.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        FORMAT.write(note, content)
         with undisturbed():
             files = move_together(parts, target.parent)
             if former and chances is None:
@@ -142,7 +141,7 @@ def _figure(rows: list[tuple[np.ndarray, np.ndarray | None]], segmentation: Segm
 
 def _map_path(target: Path) -> Path:
     """Return where the probability goes: `mask_probability.nii.gz` beside `mask.nii.gz`."""
-    return beside(target, f"_probability{target.name.removeprefix(beside(target, '').name)}")
+    return sibling(target, f"_probability{target.name.removeprefix(sibling(target, '').name)}")
 
 
 def _doubts(uncertain: Uncertainty | None) -> dict[str, Any]:
@@ -154,7 +153,6 @@ def _doubts(uncertain: Uncertainty | None) -> dict[str, Any]:
 
 def _record(segmentation: Segmentation, scan: Field, more: dict[str, Any]) -> dict[str, Any]:
     return {
-        "format": FORMAT,
         "status": segmentation.status,
         **more,
         "scan": scan.source,

@@ -9,8 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from curvafit.core.records import read_archive
 from curvafit.priors.coefficients import NAMES
-from curvafit.volumes.formats import READERS, ScanError, read_archive
+from curvafit.volumes.formats import READERS, ScanError
 from curvafit.volumes.scan import read_values
 
 #: What may vary: the six coefficients, the mass and ε, all in working units.

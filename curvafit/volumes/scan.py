@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from curvafit.core.files import check_free, write_atomically
+from curvafit.core.records import is_own_zarr
 from curvafit.volumes.field import Field
 from curvafit.volumes.formats import READERS, WRITERS, ScanError, pick_writer
-from curvafit.volumes.formats.ngff import is_ours, mark
+from curvafit.volumes.formats.ngff import mark
 from curvafit.volumes.source import Source, field_of, load, read_values
 
 __all__ = ["READABLE", "WRITABLE", "Field", "ScanError", "load", "read_values", "save"]
@@ -58,7 +59,7 @@ def save(
     field = field_of(source, spacing=spacing, unit=unit)
     target = Path(path)
     writer = pick_writer(target, field.unit)
-    check_free([target], lambda there: not there.is_dir() or is_ours(there, kind), overwrite=overwrite)
+    check_free([target], lambda there: not there.is_dir() or is_own_zarr(there, kind), overwrite=overwrite)
 
     def write(temporary: Path) -> None:
         writer(field, temporary)

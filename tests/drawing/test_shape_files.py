@@ -12,7 +12,8 @@ from disk import vtk_array
 from exact import Sphere, centres
 from torch import Tensor
 
-from curvafit.drawing.shape_files import Output, beside, step_path, write_field
+from curvafit.core.records import sibling
+from curvafit.drawing.shape_files import Output, step_path, write_field
 from curvafit.priors.grid import Grid
 from curvafit.volumes.scan import load
 
@@ -62,6 +63,6 @@ def test_a_unit_is_named_and_converted_once(tmp_path: Path) -> None:
 
 
 def test_names_beside_a_shape() -> None:
-    assert beside("a/b.c.nii.gz", ".json") == Path("a/b.c.json")
+    assert sibling("a/b.c.nii.gz", ".json") == Path("a/b.c.json")
     assert step_path("a/b.c.nii.gz", 10) == Path("a/b.c_step00010.nii.gz")
     assert step_path("b.STL", 120000) == Path("b_step120000.STL")

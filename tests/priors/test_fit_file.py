@@ -10,7 +10,7 @@ import pytest
 from broken_fits import BROKEN, broken
 from found import made_fit
 
-from curvafit.core.records import parse_json, quoted
+from curvafit.core.records import quoted
 from curvafit.priors import read_fit
 from curvafit.priors.fit_schema import FIT_SCHEMA, WHOLE_FIT, violation
 
@@ -93,9 +93,3 @@ def test_a_quotation_is_short() -> None:
     loop.append(loop)
     for value in (bomb, loop, "y" * 10**6, {str(k): "z" * 999 for k in range(999)}, 7**400, b"\n" * 10**5):
         assert len(quoted(value)) < 200 and "\n" not in quoted(value)
-
-
-def test_json_is_read_in_bytes_or_text() -> None:
-    assert parse_json(b'\xef\xbb\xbf{"a": [1, 2.5, null]}', "JSON", "here") == {"a": [1, 2.5, None]}
-    with pytest.raises(ValueError, match=r"expected a header, got here, which is not JSON \(.* in line 2\)"):
-        parse_json("{\n,", "a header", "here")

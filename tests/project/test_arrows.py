@@ -14,8 +14,7 @@ WINGS = ("priors", "generation", "data_synth")
 FLOORS = (
     ("core",),
     ("priors",),
-    ("generation", "volumes"),
-    ("geometry",),
+    ("generation", "volumes", "geometry"),
     ("scan", "drawing"),
     ("inference",),
     ("data_synth",),

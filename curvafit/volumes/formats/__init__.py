@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from curvafit.volumes.formats.arrays import read_archive, read_hdf5, read_npy, read_npz, read_raw, write_npy
+from curvafit.volumes.formats.arrays import read_hdf5, read_npy, read_npz, read_raw, write_npy
 from curvafit.volumes.formats.base import Raw, ScanError, normalise_unit
 from curvafit.volumes.formats.medical import check_mrc, is_dicom, read_dicom, read_itk, read_mrc, read_nrrd, write_mrc
 from curvafit.volumes.formats.ngff import read_zarr, write_zarr
@@ -22,7 +22,6 @@ __all__ = [
     "normalise_unit",
     "pick_reader",
     "pick_writer",
-    "read_archive",
 ]
 
 #: Suffix -> reader(path, key=, raw_shape=, dtype=).

@@ -6,29 +6,30 @@ import math
 import zipfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
 from curvafit.core.checks import quoted
-from curvafit.volumes.formats.base import Damaged, Raw, ScanError, pick_key, stated
+from curvafit.core.records import read_array, read_array_header
+from curvafit.volumes.formats.base import Raw, ScanError, pick_key, stated
 from curvafit.volumes.formats.part import Part, part_of
 from curvafit.volumes.formats.streams import check_regular, mapped, read_numbers
 
 #: Attributes that may state a spacing or its unit.
 _ATTRIBUTES = ("element_size_um", "spacing", "voxel_size", "unit", "units")
-#: NPY's versions; the third is for names of fields.
-_NPY_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 _RAW_TYPES = "uint8, int8, uint16, int16, uint32, int32, float32, float64 (or with > for big-endian, as in >u2)"
 
 
 def read_npy(path: Path, *, part: Part | None = None, **_: object) -> Raw:
     """Read the numbers of an NPY file, or of a part of it."""
     with path.open("rb") as stream:
+        shape, fortran, dtype = read_array_header(stream, path.stat().st_size)
+        order = shape[::-1] if fortran else shape
         if part is None:
-            return Raw(_array(stream, path, path.stat().st_size))
-        shape, fortran, dtype = _npy_header(stream, path.stat().st_size)
-        values = mapped(path, stream.tell(), shape[::-1] if fortran else shape, dtype)
+            values = read_numbers(stream, order, dtype, path)
+            return Raw(values.T if fortran else values)
+        values = mapped(path, stream.tell(), order, dtype)
     return part_of(values.T if fortran else values, part, path)
 
 
@@ -40,54 +41,11 @@ def write_npy(field: Any, path: Path) -> None:
 
 def read_npz(path: Path, *, key: str | None = None, **_: object) -> Raw:
     """Read the array of an NPZ file that a key names."""
-    with path.open("rb") as stream, zipfile.ZipFile(stream) as archive:
-        members = _members(archive)
-        return Raw(_member(archive, members[pick_key(list(members), key, path)]))
-
-
-def read_archive(source: Path | IO[bytes]) -> dict[str, np.ndarray]:
-    """Return all arrays of an NPZ file by name; each is read to its end, where its checksum is.
-
-    Raises
-    ------
-    OSError, ValueError
-        If the file cannot be read, is damaged, or is not an NPZ file.
-    """
-    try:
-        with zipfile.ZipFile(check_regular(source) if isinstance(source, Path) else source) as archive:
-            return {name: _member(archive, member) for name, member in _members(archive).items()}
-    except (OSError, ValueError):
-        raise
-    except Exception as reason:  # zipfile, zlib and numpy have a dozen ways to say so
-        raise ValueError(f"expected a whole NPZ file, got one that cannot be read ({quoted(str(reason))})") from reason
-
-
-def _members(archive: zipfile.ZipFile) -> dict[str, str]:
-    """Return the member of an NPZ file that holds each array, by the array's name."""
-    return {name.removesuffix(".npy"): name for name in archive.namelist() if name.endswith(".npy")}
-
-
-def _member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
-    with archive.open(name) as stream:
-        return _array(stream, name, archive.getinfo(name).file_size)
-
-
-def _array(stream: IO[bytes], place: object, size: int) -> np.ndarray:
-    """Return the numbers of an NPY stream of `size` bytes; the stream must end with them."""
-    shape, fortran, dtype = _npy_header(stream, size)
-    values = read_numbers(stream, shape[::-1] if fortran else shape, dtype, place)
-    return values.T if fortran else values
-
-
-def _npy_header(stream: IO[bytes], size: int) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Return shape, whether the first axis is the fastest, and type, of an NPY stream of `size` bytes."""
-    version = np.lib.format.read_magic(stream)
-    if version not in _NPY_HEADERS:
-        raise Damaged(f"NPY of version {version} holds no plain numbers")
-    shape, fortran, dtype = _NPY_HEADERS[version](stream)
-    if not dtype.hasobject and math.prod(shape) * dtype.itemsize != size - stream.tell():
-        raise Damaged(f"{math.prod(shape) * dtype.itemsize} bytes of values by its header, not so many in the file")
-    return shape, fortran, dtype
+    with path.open("rb") as file, zipfile.ZipFile(file) as archive:
+        names = [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
+        member = f"{pick_key(names, key, path)}.npy"
+        with archive.open(member) as stream:
+            return Raw(read_array(stream, archive.getinfo(member).file_size))
 
 
 def read_hdf5(path: Path, *, key: str | None = None, part: Part | None = None, **_: object) -> Raw:

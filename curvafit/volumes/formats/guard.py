@@ -55,7 +55,7 @@ def guarded(reader: Callable[..., Raw], path: Path, **options: object) -> Raw:
         raise
     except MemoryError as reason:
         raise ScanError(f"expected a volume that fits into memory, got {path}, which does not") from reason
-    except Damaged as reason:
+    except (Damaged, ValueError) as reason:
         cause, text = reason, str(reason)
     except Exception as reason:  # every library has its own way to say that a file is damaged
         cause, text = reason, f"{type(reason).__name__}: {reason}"

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import json
-import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from curvafit.core.files import MARK, is_empty
+from curvafit.core.files import MARK
 from curvafit.core.interrupts import undisturbed
 from curvafit.volumes.formats.base import Raw, pick_key, stated
 from curvafit.volumes.formats.chunks import check_store, missing_chunks
@@ -18,8 +16,6 @@ from curvafit.volumes.formats.part import Part, fitting, part_of
 
 #: Edge of a chunk, and of the largest volume that is not halved any more, in voxels.
 CHUNK = 64
-#: Files of a group that `write_zarr` wrote.
-_WRITTEN = re.compile(r"(\d+/)?zarr\.json|\d+/c(/\d+)*")
 #: Spacing along all axes, unit and axis of channels of an array, each where it is known.
 _Place = tuple[tuple[Any, ...] | None, Any, int | None]
 #: Our unit -> OME-NGFF's, which has none for the voxel.
@@ -92,20 +88,6 @@ def mark(folder: Path, kind: str) -> None:
     import zarr
 
     zarr.open_group(folder, mode="r+").attrs[MARK] = {"kind": kind}
-
-
-def is_ours(folder: Path, kind: str) -> bool:
-    """Return whether a folder is empty, or a group of `write_zarr` with the mark of this kind and nothing else."""
-    if folder.is_symlink() or is_empty(folder):
-        return not folder.is_symlink()
-    try:
-        attributes = json.loads((folder / "zarr.json").read_bytes())["attributes"]
-        if attributes[MARK]["kind"] != kind:
-            return False
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return False
-    inside = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir())
-    return all(_WRITTEN.fullmatch(name) for name in inside)
 
 
 def _halvings(values: np.ndarray) -> Iterator[tuple[np.ndarray, float]]:

@@ -14,6 +14,7 @@ from typing import IO, Any
 
 import numpy as np
 
+from curvafit.core import records
 from curvafit.core.machine import memory
 from curvafit.volumes.formats.base import Damaged, ScanError
 
@@ -24,26 +25,15 @@ _COMPRESSED = {b"\x1f\x8b": "gzip", b"BZh": "bzip2"}
 
 
 def read_numbers(stream: Any, shape: Sequence[int], dtype: np.dtype, place: object) -> np.ndarray:
-    """Return the array of a stream, last axis fastest; the stream must end with it.
-
-    A gzip, bzip2 or zip stream compares its checksum only at its end.
+    """Return the array of a stream, as `records.read_numbers` does.
 
     Raises
     ------
     ScanError
         If the array does not fit into memory.
-    Damaged, OSError, EOFError, zlib.error, zipfile.BadZipFile
-        If the stream is shorter, longer or damaged.
     """
     check_array(shape, dtype, place)
-    values = np.empty(math.prod(shape), dtype)
-    buffer, size = values.view(np.uint8).data if values.nbytes else memoryview(b""), 0
-    while size < values.nbytes and (count := stream.readinto(buffer[size : size + _PIECE])):
-        size += count
-    if size < values.nbytes or stream.read(1):
-        content = size if size < values.nbytes else "more"
-        raise Damaged(f"{values.nbytes} bytes of values by its header, {content} in the file")
-    return values.reshape(tuple(shape))
+    return records.read_numbers(stream, shape, dtype)
 
 
 def mapped(path: Path, start: int, shape: Sequence[int], dtype: np.dtype) -> np.ndarray:
