@@ -150,13 +150,13 @@ def synth(
 
 
 def _build(out: Path, order: Order, count: int, crew: Crew) -> None:
-    from curvafit.core.checks import whole
+    from curvafit.core.checks import check_int
     from curvafit.core.files import check_folder
     from curvafit.data_synth.sets.picture import write_preview
     from curvafit.data_synth.sets.sets import MOST, build_set, cases_of, check_set
     from curvafit.generation.schedule import schedule
 
-    whole(count, "a count of at least 1 case", 1, MOST)
+    check_int(count, "a count of at least 1 case", 1, MOST)
     check_folder(out)
     check_set(out, order)
     if order.recipe.source.within == math.inf:

@@ -27,7 +27,7 @@ def quoted(value: Any) -> str:
     return text if len(text) <= SHOWN else f"{text[: SHOWN - 2]} …"
 
 
-def whole(value: Any, expected: str, least: int, most: int, *, of: Any = None) -> int:
+def check_int(value: Any, expected: str, least: int, most: int, *, of: Any = None) -> int:
     """Return a whole number from `least` to `most` as an int; Python's and NumPy's types are accepted.
 
     Parameters
@@ -52,10 +52,12 @@ def whole(value: Any, expected: str, least: int, most: int, *, of: Any = None) -
     return number
 
 
-def real(value: Any, expected: str, least: float = -math.inf, most: float = math.inf, *, of: Any = None) -> float:
+def check_float(
+    value: Any, expected: str, least: float = -math.inf, most: float = math.inf, *, of: Any = None
+) -> float:
     """Return a finite number from `least` to `most` as a float; any numeric type is accepted.
 
-    The other parameters are those of `whole`.
+    The other parameters are those of `check_int`.
 
     Raises
     ------
@@ -73,21 +75,21 @@ def real(value: Any, expected: str, least: float = -math.inf, most: float = math
     return number
 
 
-def inside(value: Any, expected: str, low: float, high: float) -> float:
-    """Return a number above `low` and below `high`, as `real` does.
+def check_open_interval(value: Any, expected: str, low: float, high: float) -> float:
+    """Return a number above `low` and below `high`, as `check_float` does.
 
     Raises
     ------
     ValueError
         If the value is not such a number.
     """
-    number = real(value, expected)
+    number = check_float(value, expected)
     if not low < number < high:
         raise ValueError(f"expected {expected}, got {quoted(value)}")
     return number
 
 
-def several(values: Any, name: str) -> tuple[Any, ...]:
+def as_tuple(values: Any, name: str) -> tuple[Any, ...]:
     """Return the values of a sequence of any type but text.
 
     Raises
@@ -104,13 +106,13 @@ def several(values: Any, name: str) -> tuple[Any, ...]:
     return parts
 
 
-def instance(value: Any, kinds: type | tuple[type, ...], expected: str) -> None:
+def check_type(value: Any, kinds: type | tuple[type, ...], expected: str) -> None:
     """Raise ValueError where a value is not an instance of `kinds`; the message says what was `expected`."""
     if not isinstance(value, kinds):
         raise ValueError(f"expected {expected}, got {quoted(value)}")
 
 
-def named(value: Any, names: Iterable[str], expected: str) -> None:
+def check_choice(value: Any, names: Iterable[str], expected: str) -> None:
     """Raise ValueError where a value is not among `names`; the message says what was `expected`."""
     if not isinstance(value, str) or value not in names:
         raise ValueError(f"expected {expected}, got {quoted(value)}")
@@ -129,7 +131,7 @@ def seed_of(value: Any) -> int:
     ValueError
         If the value is not such a number.
     """
-    return whole(value, "a seed that is a whole number from 0", 0, SEEDS - 1)
+    return check_int(value, "a seed that is a whole number from 0", 0, SEEDS - 1)
 
 
 def _beyond(number: float | None, least: float, most: float) -> str:

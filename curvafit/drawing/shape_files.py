@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from curvafit.core.checks import LONGEST, SHORTEST, instance, real, several, whole
+from curvafit.core.checks import LONGEST, SHORTEST, as_tuple, check_float, check_int, check_type
 from curvafit.core.files import move_together, remove, staged
 from curvafit.core.interrupts import undisturbed
 from curvafit.core.records import Format, can_write, sibling
@@ -61,14 +61,14 @@ class Output:
     cap: bool = True
 
     def __post_init__(self) -> None:
-        instance(self.unit, str, "a unit as text")
+        check_type(self.unit, str, "a unit as text")
         unit, factor = normalise_unit(self.unit)
         object.__setattr__(self, "unit", unit)
-        edge = real(self.voxel, "a positive voxel edge", SHORTEST, LONGEST)
+        edge = check_float(self.voxel, "a positive voxel edge", SHORTEST, LONGEST)
         object.__setattr__(self, "voxel", edge * factor)
         said = "3 whole repeats of at least 1 (z, y, x)"
-        tile = several(self.tile, "3 whole repeats (z, y, x)")
-        tile = tuple(whole(n, said, 1, MOST, of=tile) for n in (tile if len(tile) == 3 else (None,)))
+        tile = as_tuple(self.tile, "3 whole repeats (z, y, x)")
+        tile = tuple(check_int(n, said, 1, MOST, of=tile) for n in (tile if len(tile) == 3 else (None,)))
         object.__setattr__(self, "tile", tile)
 
     def shape(self, grid: Grid) -> tuple[int, ...]:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from curvafit.core.checks import named, several, whole
+from curvafit.core.checks import as_tuple, check_choice, check_int
 from curvafit.generation.cost import Cost
 from curvafit.generation.flow import WORKING_BLUR, Backend, generate
 from curvafit.generation.fused import CudaStepper
@@ -65,14 +65,14 @@ def generate_batch(
     ValueError
         At once if the sequences differ in length; otherwise as `generate` does, when the shape is made.
     """
-    together = whole(together, "at least one shape at a time", 1, 10**6)
+    together = check_int(together, "at least one shape at a time", 1, 10**6)
     jobs, plan = _jobs(laws, masses, seeds), named_schedule(schedule)
     grid = grid if isinstance(grid, Grid) else Grid(grid)  # type: ignore[arg-type]
     options = {
         "schedule": plan, "epsilon": epsilon, "blur": blur, "orientation": orientation,
         "snapshots": snapshots, "reject_early": reject_early, "backend": backend, "device": device,
     }  # fmt: skip
-    named(backend, ("auto", "torch", "fused"), "a backend 'auto', 'torch' or 'fused'")
+    check_choice(backend, ("auto", "torch", "fused"), "a backend 'auto', 'torch' or 'fused'")
     if kind_of(device) == "cuda" and backend != "torch" and kernels.fused(device):
         groups = [jobs[first : first + together] for first in range(0, len(jobs), together)]
         return (flow for group in groups for flow in _joint_flows(group, grid, options))
@@ -91,8 +91,8 @@ def _jobs(laws, masses, seeds) -> list[_Job]:
     """Return one job for each shape."""
     columns = [
         textures_of(laws),
-        [masses] if masses is None or isinstance(masses, (Real, Tensor)) else several(masses, "masses"),
-        [seeds] if isinstance(seeds, Real) else several(seeds, "seeds"),
+        [masses] if masses is None or isinstance(masses, (Real, Tensor)) else as_tuple(masses, "masses"),
+        [seeds] if isinstance(seeds, Real) else as_tuple(seeds, "seeds"),
     ]
     lengths = {len(column) for column in columns} - {1}
     if len(lengths) > 1 or 0 in lengths:

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from curvafit.core.checks import instance, quoted, real
+from curvafit.core.checks import check_float, check_type, quoted
 from curvafit.generation.data import Data
 from curvafit.priors.coefficients import NAMES, POWERS, Coefficients, check_strength
 from curvafit.priors.grid import Grid
@@ -42,7 +42,7 @@ class Cost:
 
     def __post_init__(self) -> None:
         for name, kind in (("coefficients", Coefficients), ("grid", Grid)):
-            instance(getattr(self, name), kind, f"{name} as {kind.__name__}")
+            check_type(getattr(self, name), kind, f"{name} as {kind.__name__}")
         self._check_lengths()
         self._check_tensors()
         self._check_strengths()
@@ -54,8 +54,8 @@ class Cost:
             raise ValueError(f"expected voxel edges from {VOXELS[0]:g} to {VOXELS[1]:g} for a flow, got {edges}")
         expected = "epsilon > 0 and blur >= 0 in the spacing's unit"
         if not isinstance(self.epsilon, Tensor):
-            object.__setattr__(self, "epsilon", real(self.epsilon, expected, math.ulp(0)))
-        object.__setattr__(self, "blur", real(self.blur, expected, 0))
+            object.__setattr__(self, "epsilon", check_float(self.epsilon, expected, math.ulp(0)))
+        object.__setattr__(self, "blur", check_float(self.blur, expected, 0))
         lengths = torch.as_tensor(self.epsilon, dtype=torch.float64)
         low, high = float(lengths.min()), float(lengths.max())
         if not (low > 0 and math.isfinite(high)):

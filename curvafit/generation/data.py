@@ -8,7 +8,7 @@ from typing import Protocol, Self
 import torch
 from torch import Tensor
 
-from curvafit.core.checks import quoted, real
+from curvafit.core.checks import check_float, quoted
 from curvafit.priors.grid import Grid
 from curvafit.priors.shapes import Float
 
@@ -95,7 +95,7 @@ class Hinge(_OfVoxels):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "margin", real(self.margin, "a margin from 0 to 1", 0, 1))
+        object.__setattr__(self, "margin", check_float(self.margin, "a margin from 0 to 1", 0, 1))
 
     def slope(self, u: Float[Tensor, "z y x"], grid: Grid, /) -> tuple[float, Float[Tensor, "z y x"]]:
         """Return D(u) and the gradient of D."""

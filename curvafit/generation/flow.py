@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from curvafit.core.checks import named, quoted, seed_of
+from curvafit.core.checks import check_choice, quoted, seed_of
 from curvafit.generation.cost import Cost
 from curvafit.generation.data import Data
 from curvafit.generation.initial import white_noise
@@ -205,7 +205,7 @@ def descend(
     ValueError
         If the flow or the optimiser has another name; otherwise as `relax` does.
     """
-    named(flow, FORMS, f"a flow among {', '.join(FORMS)}")
+    check_choice(flow, FORMS, f"a flow among {', '.join(FORMS)}")
     plan = named_schedule(schedule, steps)
     if isinstance(optimiser, str) and optimiser == "lbfgs":
         plan = Schedule("lbfgs", steps, 1.0, 1.0, "constant")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from torch import Tensor
 
-from curvafit.core.checks import inside
+from curvafit.core.checks import check_open_interval
 
 #: Share of the steps after which corrections begin: before, the sign of u says little about a shape's volume.
 BEGIN = 0.2
@@ -30,7 +30,7 @@ def first_mass(share: float, mass: float | None = None) -> float:
     ValueError
         If the share is not in (0, 1).
     """
-    share = inside(share, "a volume fraction in (0, 1)", 0, 1)
+    share = check_open_interval(share, "a volume fraction in (0, 1)", 0, 1)
     sharp = min(max(2 * share - 1, -BOUND), BOUND)
     begin = sharp if mass is None else min(max(mass, sharp - REACH), sharp + REACH)
     return min(max(begin, -BOUND), BOUND)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from curvafit.core.checks import instance, real, seed_of
+from curvafit.core.checks import check_float, check_type, seed_of
 from curvafit.generation.memory import FIELD, check_memory
 from curvafit.priors.grid import Grid
 from curvafit.priors.shapes import Float
@@ -24,8 +24,8 @@ def white_noise(grid: Grid, seed: int, amplitude: float = AMPLITUDE) -> Float[to
     ValueError
         If the seed is not a whole number from 0, or the box does not fit into memory.
     """
-    instance(grid, Grid, "a Grid")
-    amplitude = real(amplitude, "a finite amplitude")
+    check_type(grid, Grid, "a Grid")
+    amplitude = check_float(amplitude, "a finite amplitude")
     generator = torch.Generator().manual_seed(seed_of(seed))
     check_memory((*grid.shape, 3), FIELD, "a box")
     noise = amplitude * torch.rand((3, *grid.shape), generator=generator, dtype=torch.float32)

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from curvafit.core.checks import quoted, several
+from curvafit.core.checks import as_tuple, quoted
 from curvafit.generation import fraction
 from curvafit.generation.checkpoint import Checkpoint
 from curvafit.generation.cost import Cost
@@ -53,7 +53,7 @@ class Orders:
 
     def __post_init__(self) -> None:
         for name in ("snapshots", "callbacks"):
-            object.__setattr__(self, name, several(getattr(self, name), name))
+            object.__setattr__(self, name, as_tuple(getattr(self, name), name))
         if faults := [callback for callback in self.callbacks if not callable(callback)]:
             raise ValueError(f"expected callbacks that can be called, got {quoted(faults[0])}")
         object.__setattr__(self, "snapshots", tuple(map(self.plan.among, self.snapshots)))

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from itertools import accumulate
 from typing import Any, Literal
 
-from curvafit.core.checks import inside, instance, named, real, several, whole
+from curvafit.core.checks import as_tuple, check_choice, check_float, check_int, check_open_interval, check_type
 
 #: The most steps that a flow may have, and the longest one.
 MOST_STEPS, LONGEST_STEP = 10**7, 1e6
@@ -42,7 +42,9 @@ class Phase:
     memory: float = 0.999
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "share", inside(self.share, "a phase's share of the steps in (0, 1)", 0, 1))
+        object.__setattr__(
+            self, "share", check_open_interval(self.share, "a phase's share of the steps in (0, 1)", 0, 1)
+        )
         _check_steps(self)
 
 
@@ -84,16 +86,18 @@ class Schedule:
     opening: tuple[Phase, ...] = ()
 
     def __post_init__(self) -> None:
-        instance(self.name, str, "a schedule's name as text")
-        steps = whole(self.steps, "a whole number of steps, at least 1", 1, MOST_STEPS)
+        check_type(self.name, str, "a schedule's name as text")
+        steps = check_int(self.steps, "a whole number of steps, at least 1", 1, MOST_STEPS)
         object.__setattr__(self, "steps", steps)
         _check_steps(self)
-        parts = several(self.opening, "phases")
+        parts = as_tuple(self.opening, "phases")
         phases = tuple(Phase(**part) if isinstance(part, dict) else part for part in parts)
         for phase in phases:
-            instance(phase, Phase, "an opening of phases as Phase")
+            check_type(phase, Phase, "an opening of phases as Phase")
         object.__setattr__(self, "opening", phases)
-        inside(sum(phase.share for phase in self.opening), "phases with shares below 1 in all", -math.ulp(0), 1)
+        check_open_interval(
+            sum(phase.share for phase in self.opening), "phases with shares below 1 in all", -math.ulp(0), 1
+        )
 
     def among(self, step: int) -> int:
         """Return a snapshot's number of steps.
@@ -103,7 +107,7 @@ class Schedule:
         ValueError
             If it is not a whole number from 0 to the schedule's number of steps.
         """
-        return whole(step, f"snapshots at 0 to {self.steps} steps", 0, self.steps)
+        return check_int(step, f"snapshots at 0 to {self.steps} steps", 0, self.steps)
 
     def rate(self, step: int) -> float:
         """Return the length of a step, numbered from 0 to steps - 1."""
@@ -150,11 +154,11 @@ class Schedule:
 def _check_steps(phase: Phase | Schedule) -> None:
     """Convert the numbers of a phase's steps; raise ValueError where one is out of range."""
     for name in ("start", "stop"):
-        length = real(getattr(phase, name), "positive step lengths", 1e-30, LONGEST_STEP)
+        length = check_float(getattr(phase, name), "positive step lengths", 1e-30, LONGEST_STEP)
         object.__setattr__(phase, name, length)
-    named(phase.shape, ("constant", "cosine"), "a schedule's shape 'constant' or 'cosine'")
+    check_choice(phase.shape, ("constant", "cosine"), "a schedule's shape 'constant' or 'cosine'")
     for name in ("momentum", "memory"):
-        object.__setattr__(phase, name, inside(getattr(phase, name), f"{name} in [0, 1)", -math.ulp(0), 1))
+        object.__setattr__(phase, name, check_open_interval(getattr(phase, name), f"{name} in [0, 1)", -math.ulp(0), 1))
 
 
 def _opened(name: str, longest: float) -> Schedule:
@@ -188,7 +192,7 @@ def schedule(name: str | Schedule, steps: int | None = None) -> Schedule:
         If there is no schedule of that name.
     """
     if not isinstance(name, Schedule):
-        named(name, SCHEDULES, f"a schedule among {', '.join(SCHEDULES)}")
+        check_choice(name, SCHEDULES, f"a schedule among {', '.join(SCHEDULES)}")
         name = SCHEDULES[name]
     return name if steps is None else dataclasses.replace(name, steps=steps)
 

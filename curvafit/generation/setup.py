@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from curvafit.core.checks import inside, instance, named, quoted, real
+from curvafit.core.checks import check_choice, check_float, check_open_interval, check_type, quoted
 from curvafit.generation import fraction
 from curvafit.generation.checkpoint import Checkpoint, identity
 from curvafit.generation.cost import Cost, check_shape
@@ -38,11 +38,11 @@ class Execution:
     keep: bool = False
 
     def __post_init__(self) -> None:
-        named(self.backend, ("auto", "torch", "fused"), "a backend 'auto', 'torch' or 'fused'")
+        check_choice(self.backend, ("auto", "torch", "fused"), "a backend 'auto', 'torch' or 'fused'")
         check_device(self.device)
         if self.checkpoint is not None:
-            instance(self.checkpoint, (str, Path), "a path for the checkpoint")
-        real(self.every, "a finite number of seconds between checkpoints, at least 0", 0)
+            check_type(self.checkpoint, (str, Path), "a path for the checkpoint")
+        check_float(self.every, "a finite number of seconds between checkpoints, at least 0", 0)
 
     @property
     def blur(self) -> Blur:
@@ -59,7 +59,7 @@ class Execution:
         ValueError
             If the optimiser is unknown, or the backend is `"fused"` and there is no fused kernel.
         """
-        named(optimiser, ("adam", "lbfgs"), "an optimiser 'adam' or 'lbfgs'")
+        check_choice(optimiser, ("adam", "lbfgs"), "an optimiser 'adam' or 'lbfgs'")
         able, betas = kernels.fused(self.device), plan.betas
         if self.backend == "fused" and not able:
             raise ValueError(f"expected a device with fused kernels (and numba or triton), got {self.device}")
@@ -115,11 +115,13 @@ def base_of(mass: float | Tensor | None, share: float | None, grid: Grid) -> flo
         one number.
     """
     if share is not None:
-        return fraction.first_mass(share, None if mass is None else inside(mass, "a mass in (-1, 1)", -1, 1))
+        return fraction.first_mass(
+            share, None if mass is None else check_open_interval(mass, "a mass in (-1, 1)", -1, 1)
+        )
     if mass is None:
         raise ValueError("expected a mass or a volume fraction, got neither")
     if not isinstance(mass, Tensor) or mass.dim() == 0:
-        return inside(mass, "a mass in (-1, 1)", -1, 1)
+        return check_open_interval(mass, "a mass in (-1, 1)", -1, 1)
     check_shape("mass", mass, grid)
     if not bool((mass.abs() < 1).all()):
         raise ValueError(f"expected a mass in (-1, 1), got {float(mass.min())} to {float(mass.max())}")

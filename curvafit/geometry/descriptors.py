@@ -16,7 +16,7 @@ import torch
 from scipy.fft import next_fast_len
 from torch import Tensor
 
-from curvafit.core.checks import instance
+from curvafit.core.checks import check_type
 from curvafit.geometry.diagram import Diagram, surface_curvatures
 from curvafit.geometry.mesh import NoSurface, area_vectors, surface
 from curvafit.geometry.topology import euler_shares
@@ -102,8 +102,8 @@ def descriptors(shape: np.ndarray | Tensor, grid: Grid, epsilon: float = WORKING
     ValueError
         If voxels are not cubic, or there is no surface (`NoSurface`) whose curvature the grid resolves.
     """
-    instance(grid, Grid, "a Grid")
-    instance(shape, (np.ndarray, Tensor), f"a field or a mask of shape {grid.shape}")
+    check_type(grid, Grid, "a Grid")
+    check_type(shape, (np.ndarray, Tensor), f"a field or a mask of shape {grid.shape}")
     voxel = grid.spacing[0]
     if max(grid.spacing) > (1 + 1e-6) * min(grid.spacing):
         raise ValueError(f"expected cubic voxels, got {grid.spacing}")

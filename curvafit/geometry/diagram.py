@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from curvafit.core.checks import LONGEST, SHORTEST, instance, named, real
+from curvafit.core.checks import LONGEST, SHORTEST, check_choice, check_float, check_type
 from curvafit.core.pictures import Pictured
 from curvafit.geometry.mesh import NoSurface, Surface, areas, surface
 from curvafit.priors.curvature import diffuse_curvatures, geometric_curvatures, jet
@@ -205,10 +205,10 @@ def surface_curvatures(
     ValueError
         If there is no surface in the box or in `where`, the field is not finite, or `curvature` has another name.
     """
-    named(curvature, ("geometric", "diffuse"), "curvature 'geometric' or 'diffuse'")
-    instance(grid, Grid, "a Grid")
-    instance(u, (np.ndarray, Tensor), f"a field of shape {grid.shape}")
-    epsilon = real(epsilon, "a positive epsilon", SHORTEST, LONGEST)
+    check_choice(curvature, ("geometric", "diffuse"), "curvature 'geometric' or 'diffuse'")
+    check_type(grid, Grid, "a Grid")
+    check_type(u, (np.ndarray, Tensor), f"a field of shape {grid.shape}")
+    epsilon = check_float(epsilon, "a positive epsilon", SHORTEST, LONGEST)
     if where is not None and np.shape(where) != grid.shape:
         raise ValueError(f"expected a mask of shape {grid.shape}, got {np.shape(where)}")
     values = torch.as_tensor(u)

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from curvafit.core.checks import SEEDS, instance, whole
+from curvafit.core.checks import SEEDS, check_int, check_type
 from curvafit.core.pictures import Pictured
 from curvafit.core.progress import Progress, part, silent
 from curvafit.core.units import number
@@ -155,10 +155,10 @@ def infer(
     """
     check_options(kind, threshold, label)
     if atlas is not None:
-        instance(atlas, (str, Path, Atlas), "an atlas, as the path of a file or as Atlas")
+        check_type(atlas, (str, Path, Atlas), "an atlas, as the path of a file or as Atlas")
     if posterior is not None:
-        instance(posterior, (str, Path, Posterior), "a posterior, as the path of a file or as Posterior")
-    seed = whole(seed, "a seed that is a whole number from 0", 0, SEEDS - 2)  # and the next one
+        check_type(posterior, (str, Path, Posterior), "a posterior, as the path of a file or as Posterior")
+    seed = check_int(seed, "a seed that is a whole number from 0", 0, SEEDS - 2)  # and the next one
     progress("reading the scan", 0.0)
     atlas = atlas if isinstance(atlas, Atlas) else load_atlas(atlas)
     posterior = posterior if isinstance(posterior, Posterior) else load_posterior(posterior)

@@ -11,7 +11,7 @@ import torch
 import zuko
 from torch import Tensor, nn
 
-from curvafit.core.checks import quoted, real, whole
+from curvafit.core.checks import check_float, check_int, quoted
 from curvafit.geometry.descriptors import BLOCKS, Descriptors
 from curvafit.inference.archive import Archive
 from curvafit.inference.compression import Compression
@@ -47,8 +47,8 @@ class Architecture:
 
     def __post_init__(self) -> None:
         for size in (self.components, *self.hidden, self.transforms, self.bins):
-            whole(size, "sizes of a flow that are whole numbers", 1, WIDEST)
-        real(self.dropout, "a dropout", 0.0, 0.9)
+            check_int(size, "sizes of a flow that are whole numbers", 1, WIDEST)
+        check_float(self.dropout, "a dropout", 0.0, 0.9)
         if not self.blocks or not set(self.blocks) <= set(BLOCKS):
             raise ValueError(f"expected blocks among {', '.join(BLOCKS)}, got {quoted(list(self.blocks))}")
 
@@ -254,7 +254,7 @@ def _posterior(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Posteri
             raise ValueError(f"{name} of shape {arrays[name].shape}, not {shape}")
     views = tuple(str(view) for view in header["views"])
     members = []
-    for number in range(whole(header["members"], "a number of flows", 1, MOST)):
+    for number in range(check_int(header["members"], "a number of flows", 1, MOST)):
         with torch.random.fork_rng():  # its first weights are drawn, and then replaced
             member = Member(architecture, len(views)).eval()
         prefix = f"{number}."
@@ -286,7 +286,7 @@ def _emulator(
             raise ValueError(f"networks of the emulator's {name} with {each[-1].weight.shape[1]} outputs")
     if (basis := arrays["emulator.basis"]).shape != (components, components):
         raise ValueError(f"emulator.basis of shape {basis.shape}, not {(components, components)}")
-    inflation = real(inflation, "an emulator's inflation", 1e-3, 1e3)
+    inflation = check_float(inflation, "an emulator's inflation", 1e-3, 1e3)
     return Emulator(compression, views, arrays["box"], layers["mean"], layers["spread"], basis, inflation)
 
 

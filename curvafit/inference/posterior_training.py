@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from curvafit.core.checks import seed_of, whole
+from curvafit.core.checks import check_int, seed_of
 from curvafit.core.progress import Progress, silent
 from curvafit.inference.compression import compression_of
 from curvafit.inference.emulator_training import train_emulator
@@ -61,7 +61,7 @@ def train_posterior(
     ValueError
         If the table has too few shapes, or a parameter that does not vary, or an argument is out of range.
     """
-    members, seed = whole(members, "a number of flows", 1, MOST), seed_of(seed)
+    members, seed = check_int(members, "a number of flows", 1, MOST), seed_of(seed)
     sizes, table = architecture or Architecture(), table.visible
     shapes, number = np.unique(table.shapes, return_inverse=True)
     if len(shapes) < 2 * sizes.components:

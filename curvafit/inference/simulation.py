@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from curvafit.core.checks import whole
+from curvafit.core.checks import check_int
 from curvafit.core.progress import Progress, silent
 from curvafit.geometry.descriptors import Descriptors
 from curvafit.inference.table import row_of
@@ -66,7 +66,7 @@ def simulations(
     ValueError
         If the count is not from 1 to the number of draws.
     """
-    count = whole(count, "a number of simulations", 1, len(draws))
+    count = check_int(count, "a number of simulations", 1, len(draws))
     chosen = draws[np.random.default_rng(seed).choice(len(draws), count, replace=False)]
     rows = []
     for k, parameters in enumerate(chosen):

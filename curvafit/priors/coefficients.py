@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from curvafit.core.checks import LONGEST, SHORTEST, plain_name, quoted, real
+from curvafit.core.checks import LONGEST, SHORTEST, check_float, plain_name, quoted
 
 #: Names in the paper's order: κ1², κ1κ2, κ2², κ1, κ2, 1.
 NAMES = ("a20", "a11", "a02", "a10", "a01", "a00")
@@ -50,7 +50,7 @@ class Coefficients:
         for name in NAMES:
             value = getattr(self, name)
             if not isinstance(value, Tensor):
-                object.__setattr__(self, name, real(value, f"a finite coefficient {name}"))
+                object.__setattr__(self, name, check_float(value, f"a finite coefficient {name}"))
             elif value.is_complex() or not bool(torch.isfinite(value).all()):
                 got = "values that are not finite" if value.dim() > 0 else quoted(value.item())
                 raise ValueError(f"expected a finite coefficient {name}, got {got}")
@@ -89,7 +89,7 @@ class Coefficients:
         ValueError
             If the unit is not a positive number.
         """
-        unit = real(unit, "a positive length unit", SHORTEST, LONGEST)
+        unit = check_float(unit, "a positive length unit", SHORTEST, LONGEST)
         a20, a11, a02, a10, a01, a00 = self
         return Coefficients(a20, a11, a02, a10 * unit, a01 * unit, a00 * unit**2)
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from curvafit.core.checks import real, whole
+from curvafit.core.checks import check_float, check_int
 
 
 class CombinedLoss(nn.Module):
@@ -43,8 +43,8 @@ class CombinedLoss(nn.Module):
         self, base: Callable[[Tensor, Tensor], Tensor], prior: nn.Module, weight: float = 1.0, warmup: int = 0
     ) -> None:
         super().__init__()
-        self.weight = real(weight, "a finite weight from 0", 0)
-        self.warmup = whole(warmup, "a warm-up of a whole number of calls from 0", 0, 2**53)
+        self.weight = check_float(weight, "a finite weight from 0", 0)
+        self.warmup = check_int(warmup, "a warm-up of a whole number of calls from 0", 0, 2**53)
         self.base, self.prior = base, prior
         self.parts: dict[str, Tensor] = {}
         self.register_buffer("calls", torch.zeros((), dtype=torch.int64))

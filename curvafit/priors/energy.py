@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from curvafit.core.checks import quoted, real, several
+from curvafit.core.checks import as_tuple, check_float, quoted
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.curvature import Jet, diffuse_curvatures, jet, second_form
 from curvafit.priors.grid import Grid
@@ -80,11 +80,11 @@ def orientation(direction: Sequence[int | float] | Tensor, strength: int | float
         If the direction is not three finite numbers that are not all 0, or the strength is not finite.
     """
     expected = "a direction of 3 finite numbers (z, y, x), not all 0"
-    parts = [real(part, expected, of=direction) for part in several(direction, "3 numbers")]
+    parts = [check_float(part, expected, of=direction) for part in as_tuple(direction, "3 numbers")]
     θ = torch.tensor(parts, dtype=torch.float64)
     if tuple(θ.shape) != (3,) or not bool(torch.isfinite(θ).all()) or not bool(θ.any()):
         raise ValueError(f"expected {expected}, got {quoted(direction)}")
-    strength = real(strength, "a finite strength")
+    strength = check_float(strength, "a finite strength")
     θ = θ * 2.0 ** -math.frexp(float(θ.abs().max()))[1]  # exact, and its square is finite
     θ = θ / θ.norm()
     return strength * torch.outer(θ, θ)

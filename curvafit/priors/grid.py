@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from curvafit.core.checks import LONGEST, SHORTEST, named, real, whole
+from curvafit.core.checks import LONGEST, SHORTEST, check_choice, check_float, check_int
 
 Boundary = Literal["periodic", "replicate"]
 
@@ -44,9 +44,9 @@ class Grid:
 
     def __post_init__(self) -> None:
         counts, edges = "a shape of 3 whole numbers, each at least 4", "a spacing of 3 positive numbers (z, y, x)"
-        shape = tuple(whole(n, counts, 4, MOST, of=self.shape) for n in _triple(self.shape))
-        spacing = tuple(real(h, edges, SHORTEST, LONGEST, of=self.spacing) for h in _triple(self.spacing))
-        named(self.boundary, ("periodic", "replicate"), "boundary 'periodic' or 'replicate'")
+        shape = tuple(check_int(n, counts, 4, MOST, of=self.shape) for n in _triple(self.shape))
+        spacing = tuple(check_float(h, edges, SHORTEST, LONGEST, of=self.spacing) for h in _triple(self.spacing))
+        check_choice(self.boundary, ("periodic", "replicate"), "boundary 'periodic' or 'replicate'")
         object.__setattr__(self, "shape", shape)
         object.__setattr__(self, "spacing", spacing)
 

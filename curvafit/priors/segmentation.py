@@ -10,7 +10,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from curvafit.core.checks import quoted, real, whole
+from curvafit.core.checks import check_float, check_int, quoted
 from curvafit.core.units import METRES
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
@@ -112,9 +112,9 @@ class CurvaturePrior(nn.Module):
         self.include_background, self.to_onehot_y, self.ignore_index = include_background, to_onehot_y, ignore_index
         self.spacing = _edges(spacing)
         width = RESOLVED * min(self.spacing) if epsilon is None else epsilon
-        self.epsilon = real(width, "epsilon > 0 in spacing's unit", math.ulp(0), COARSEST * min(self.spacing))
-        self.blur = real(blur, "blur >= 0 in spacing's unit", 0, COARSEST * min(self.spacing))
-        self.border = whole(border, "a border of whole voxels from 0", 0, _MOST_BORDER)
+        self.epsilon = check_float(width, "epsilon > 0 in spacing's unit", math.ulp(0), COARSEST * min(self.spacing))
+        self.blur = check_float(blur, "blur >= 0 in spacing's unit", 0, COARSEST * min(self.spacing))
+        self.border = check_int(border, "a border of whole voxels from 0", 0, _MOST_BORDER)
         self._warned: set[str] = set()
         self.shape = None if shape is None else Grid(shape, self.spacing).shape  # type: ignore[arg-type]
         self.weight = _weights(weight)

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import ndimage
 from skimage.filters import threshold_otsu
 
-from curvafit.core.checks import SEEDS, named, real, whole
+from curvafit.core.checks import SEEDS, check_choice, check_float, check_int
 from curvafit.volumes.scan import Field, ScanError, load
 
 __all__ = ["Kind", "Level", "check_options", "find_level", "is_noise", "region_of_interest"]
@@ -78,11 +78,11 @@ def find_level(
 
 def check_options(kind: str, threshold: float | str, label: int | None) -> None:
     """Raise ValueError where what tells the structure is no such thing, or counts for nothing beside another option."""
-    named(kind, ("auto", "field", "mask", "image"), "kind auto, field, mask or image")
+    check_choice(kind, ("auto", "field", "mask", "image"), "kind auto, field, mask or image")
     otsu = isinstance(threshold, str) and threshold == "otsu"
-    level = "otsu" if otsu else real(threshold, "a threshold that is a number or 'otsu'")
+    level = "otsu" if otsu else check_float(threshold, "a threshold that is a number or 'otsu'")
     if label is not None:
-        whole(label, "a label that is a whole number", -SEEDS, SEEDS)
+        check_int(label, "a label that is a whole number", -SEEDS, SEEDS)
         if kind in ("field", "image") or level != "otsu":
             raise ValueError("expected a label, which tells the structure, without a kind or a threshold, got both")
     if kind in ("field", "mask") and level != "otsu":

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.core.checks import real, whole
+from curvafit.core.checks import check_float, check_int
 from curvafit.core.progress import Progress, silent
 from curvafit.generation import data
 from curvafit.priors.coefficients import Coefficients
@@ -116,14 +116,14 @@ def reconstruct(
         If there is no such `fit.json`.
     """
     volume = field_of(slices, **reading)
-    axis = whole(axis, "an axis 0, 1 or 2 (z, y, x)", 0, 2)
+    axis = check_int(axis, "an axis 0, 1 or 2 (z, y, x)", 0, 2)
     places = known_places(volume.shape[axis], every, first, known)
     target = slices_of(volume, places, axis, periodic)
     tiling = Tiling.of(target.frame, epsilon, tile, periodic=periodic)
     if stiffness is not None:
-        stiffness = real(stiffness, "a positive stiffness", *STIFFEST)
-    suggest = whole(suggest, "a number of slices from 0", 0, volume.shape[axis] - len(places))
-    runs = whole(runs, "a number of runs from 0", 0, MOST)
+        stiffness = check_float(stiffness, "a positive stiffness", *STIFFEST)
+    suggest = check_int(suggest, "a number of slices from 0", 0, volume.shape[axis] - len(places))
+    runs = check_int(runs, "a number of runs from 0", 0, MOST)
     other = None if example is None else Example.of(_like(example, volume, reading), places, axis)
     laws, notes = laws_of(prior, volume)
     if suggest and not runs:
@@ -271,7 +271,7 @@ def known_places(length: int, every: int | None, first: int, known: Sequence[int
     """Return the numbers of the known slices, ascending; raise ScanError where they are no such numbers."""
     if (every is None) == (known is None):
         raise ScanError("expected either every how many slices are known, or their numbers")
-    numbers = [real(n, "whole numbers of slices") for n in ((every, first) if known is None else known)]
+    numbers = [check_float(n, "whole numbers of slices") for n in ((every, first) if known is None else known)]
     if not all(math.isfinite(number) and number == int(number) for number in numbers):  # type: ignore[arg-type, operator]
         raise ScanError(f"expected whole numbers of slices, got {', '.join(map(str, numbers))}")
     if every is not None and (every < 1 or first < 0):

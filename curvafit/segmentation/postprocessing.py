@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from curvafit.core.checks import SEEDS, quoted, whole
+from curvafit.core.checks import SEEDS, check_int, quoted
 from curvafit.segmentation.engine import STEPS
 from curvafit.segmentation.refine import Calibration, calibrate, check_judge, refine
 from curvafit.segmentation.working import Law
@@ -54,7 +54,7 @@ class Refine:
         steps: int = STEPS,
     ) -> None:
         check_judge(example, weight)
-        self.channel = whole(channel, "a channel that is a whole number from 0", 0, SEEDS)
+        self.channel = check_int(channel, "a channel that is a whole number from 0", 0, SEEDS)
         self.place = {"spacing": spacing, "unit": unit}
         if isinstance(example, tuple):
             example = calibrate(*example, prior, epsilon=epsilon, steps=steps, **self.place)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.core.checks import real
+from curvafit.core.checks import check_float
 from curvafit.core.progress import Progress, part, silent
 from curvafit.generation.data import Evidence
 from curvafit.priors.coefficients import Coefficients
@@ -136,7 +136,7 @@ def refine(
     laws, notes = laws_of(prior, field)
     said = ""
     if example is None:
-        strength = real(weight, "a positive weight", *WEIGHTS) * bending(laws[0]) / BENDING
+        strength = check_float(weight, "a positive weight", *WEIGHTS) * bending(laws[0]) / BENDING
         setting = Setting(PLAIN, laws[0], strength, steps)
     else:
         if not isinstance(example, Calibration):

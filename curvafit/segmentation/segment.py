@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.core.checks import real
+from curvafit.core.checks import check_float
 from curvafit.core.progress import Progress, part, silent
 from curvafit.generation.data import Evidence
 from curvafit.priors.coefficients import Coefficients
@@ -101,9 +101,9 @@ def segment(
     laws, notes = laws_of(prior, frame)
     tiling = Tiling.of(frame, epsilon, tile)
     if weight is not None:
-        weight = real(weight, "a positive weight", *WEIGHTS)
+        weight = check_float(weight, "a positive weight", *WEIGHTS)
     if not (isinstance(threshold, str) and threshold == "otsu"):
-        real(threshold, "a threshold that is a number or 'otsu'")
+        check_float(threshold, "a threshold that is a number or 'otsu'")
     extent(boxes)
     sample, blocks = thinned(boxes)
     values, bounds = grey_levels(sample, threshold), bounds_of(sample.values.astype(np.float32), threshold)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from curvafit.core.checks import SEEDS, whole
+from curvafit.core.checks import SEEDS, check_int
 from curvafit.core.progress import Progress, part, silent
 from curvafit.priors.loss import RESOLVED
 from curvafit.priors.profile import optimal_profile
@@ -123,7 +123,9 @@ def labels_of(values: np.ndarray, chosen: Sequence[int] | None) -> list[int]:
     """
     there = [int(value) for value in np.unique(labels(values, "known slices"))]
     numbers = (
-        [each for each in there if each] if chosen is None else sorted({whole(n, FORM, -SEEDS, SEEDS) for n in chosen})
+        [each for each in there if each]
+        if chosen is None
+        else sorted({check_int(n, FORM, -SEEDS, SEEDS) for n in chosen})
     )
     listed = ", ".join(map(str, there[:12])) + (", …" if len(there) > 12 else "")
     if not numbers or 0 in numbers:

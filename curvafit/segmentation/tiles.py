@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from itertools import pairwise, product
 
-from curvafit.core.checks import whole
+from curvafit.core.checks import check_int
 from curvafit.priors.grid import MOST
 from curvafit.segmentation.engine import HALO
 from curvafit.segmentation.working import Ends, WorkingGrid
@@ -88,7 +88,7 @@ class Tiling:
         place = WorkingGrid.of(frame, epsilon, halo=HALO, periodic=periodic)
         if edge is None:
             edge = max(place.grid.shape) if math.prod(place.grid.shape) <= WHOLE else EDGE
-        edge = whole(edge, f"a tile of {SHORTEST} or more working voxels a side", SHORTEST, MOST)
+        edge = check_int(edge, f"a tile of {SHORTEST} or more working voxels a side", SHORTEST, MOST)
         pairs = zip(frame.shape, place.times, strict=True)
         return cls(frame.shape, place, tuple(-(-n // max(1, edge // times)) for n, times in pairs))  # type: ignore[arg-type]
 

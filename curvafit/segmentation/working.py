@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from curvafit.core.checks import LONGEST, SHORTEST, instance, real
+from curvafit.core.checks import LONGEST, SHORTEST, check_float, check_type
 from curvafit.core.units import METRES
 from curvafit.priors.coefficients import NAMES, Coefficients
 from curvafit.priors.fit_file import Prior, fit_bytes, parse_fit, six_of
@@ -41,7 +41,7 @@ def law_of(prior: Law, scan: Field) -> tuple[Coefficients, tuple[str, ...]]:
     FileNotFoundError
         If there is no such file.
     """
-    instance(scan, Field, "a scan as Field")
+    check_type(scan, Field, "a scan as Field")
     texture = texture_of(prior)
     if texture.prior is None:
         note = f"The {texture.origin}, at a working voxel of one scan voxel."
@@ -141,7 +141,7 @@ class WorkingGrid:
             If ε is not positive or the scan is too small.
         """
         form = f"a positive epsilon in {scan.unit}"
-        ε = RESOLVED * min(scan.spacing) if epsilon is None else real(epsilon, form, SHORTEST, LONGEST)
+        ε = RESOLVED * min(scan.spacing) if epsilon is None else check_float(epsilon, form, SHORTEST, LONGEST)
         if min(scan.shape) < 4:
             raise ScanError(f"expected at least 4 voxels along each axis, got {scan.shape}")
         times, unit = upsampling(scan.spacing, ε), ε / WORKING_EPSILON

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from curvafit.core.checks import SEEDS, quoted, whole
+from curvafit.core.checks import SEEDS, check_int, quoted
 from curvafit.core.messages import one_line
 from curvafit.core.pictures import Pictured
 from curvafit.core.units import sampling
@@ -105,7 +105,7 @@ class Field(Pictured):
         ValueError
             If the label is not a whole number.
         """
-        label = whole(label, "a label that is a whole number", -SEEDS, SEEDS)
+        label = check_int(label, "a label that is a whole number", -SEEDS, SEEDS)
         mask = self.values == label
         if mask.all() or not mask.any():
             values = np.unique(self.values)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from curvafit.core.checks import SHOWN, quoted, real, whole
+from curvafit.core.checks import SHOWN, check_float, check_int, quoted
 from curvafit.data_synth.atlas.design import Design, around, boxed
 from curvafit.data_synth.atlas.workers import check_workers
 from curvafit.data_synth.imaging.modalities import MODALITIES
@@ -29,32 +29,32 @@ NO_NUMBERS: list[Any] = [None, True, "8", b"8", [8], {}, object(), math.nan, 1j,
 
 @pytest.mark.parametrize("wrong", NO_NUMBERS)
 def test_what_is_no_number_is_refused(wrong: Any) -> None:
-    for check in (lambda: whole(wrong, "a count", 0, 9), lambda: real(wrong, "a length", 0, 9)):
+    for check in (lambda: check_int(wrong, "a count", 0, 9), lambda: check_float(wrong, "a length", 0, 9)):
         with pytest.raises(ValueError, match="^expected a (count|length), got "):
             check()
 
 
 def test_numbers_of_any_type_are_numbers() -> None:
     for three in (3, np.int8(3), np.int64(3), np.uint64(3), torch.tensor(3)):
-        assert whole(three, "a count", 0, 9) == real(three, "a length", 0, 9) == 3
-        assert type(whole(three, "a count", 0, 9)) is int
-    assert real(np.float32(0.5), "a length") == real(torch.tensor(0.5), "a length") == 0.5
+        assert check_int(three, "a count", 0, 9) == check_float(three, "a length", 0, 9) == 3
+        assert type(check_int(three, "a count", 0, 9)) is int
+    assert check_float(np.float32(0.5), "a length") == check_float(torch.tensor(0.5), "a length") == 0.5
     for broken in (3.0, np.float64(3)):
         with pytest.raises(ValueError, match="expected a count, got"):
-            whole(broken, "a count", 0, 9)
+            check_int(broken, "a count", 0, 9)
 
 
 def test_a_bound_is_named_where_it_counts() -> None:
     with pytest.raises(ValueError, match="expected a count from 1, got 0$"):
-        whole(0, "a count from 1", 1, 9)
+        check_int(0, "a count from 1", 1, 9)
     with pytest.raises(ValueError, match="expected a count from 1, at most 9, got 10$"):
-        whole(10, "a count from 1", 1, 9)
+        check_int(10, "a count from 1", 1, 9)
     with pytest.raises(ValueError, match="expected a positive length, at least 0.001, got 1e-09$"):
-        real(1e-9, "a positive length", 1e-3, 9)
+        check_float(1e-9, "a positive length", 1e-3, 9)
     with pytest.raises(ValueError, match="expected a positive length, got -1$"):
-        real(-1, "a positive length", 1e-3, 9)
+        check_float(-1, "a positive length", 1e-3, 9)
     with pytest.raises(ValueError, match=r"expected a length, got 10{9,}\.\.\.0{9,}$"):
-        real(10**400, "a length")
+        check_float(10**400, "a length")
 
 
 def test_quotations_are_one_short_line() -> None:

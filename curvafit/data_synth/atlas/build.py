@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from curvafit.core.checks import instance, seed_of, whole
+from curvafit.core.checks import check_int, check_type, seed_of
 from curvafit.core.progress import Progress, silent
 from curvafit.data_synth.atlas.design import Design, boxed
 from curvafit.data_synth.atlas.draws import make
@@ -87,7 +87,7 @@ def extend(store_path: str | Path, count: int, progress: Progress = silent, *, w
 
 def check_count(count: int, least: int) -> None:
     """Raise ValueError where a number of shapes is none, under the least or over 10 million."""
-    whole(count, "a count of at least 1 shape" if least else "a count of shapes from 0", least, MOST)
+    check_int(count, "a count of at least 1 shape" if least else "a count of shapes from 0", least, MOST)
 
 
 def settings_of(
@@ -97,7 +97,7 @@ def settings_of(
     grid = Grid(shape)  # type: ignore[arg-type]
     check_memory(grid.shape, FILE, "a shape")
     if design is not None:
-        instance(design, Design, "a Design")
+        check_type(design, Design, "a Design")
     plan, law = named_schedule(schedule).as_dict(), design or boxed()
     law.draw(seed, 0)  # refuses a wrong seed, before a store is made
     return Settings(grid.shape, grid.spacing, WORKING_EPSILON, WORKING_BLUR, law.as_dict(), seed_of(seed), plan)

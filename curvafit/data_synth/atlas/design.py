@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 from scipy.stats import qmc
 
-from curvafit.core.checks import SEEDS, named, quoted, real, seed_of, several, whole
+from curvafit.core.checks import SEEDS, as_tuple, check_choice, check_float, check_int, quoted, seed_of
 from curvafit.priors.coefficients import NAMES, POWERS, Coefficients, check_strength
 from curvafit.priors.grid import WORKING_EPSILON
 
@@ -67,9 +67,9 @@ class Design:
     log: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        named(self.law, get_args(Law), f"a law among {', '.join(get_args(Law))}")
+        check_choice(self.law, get_args(Law), f"a law among {', '.join(get_args(Law))}")
         for name in ("box", "points"):
-            rows = (several(row, f"numbers in each row of {name}") for row in several(getattr(self, name), name))
+            rows = (as_tuple(row, f"numbers in each row of {name}") for row in as_tuple(getattr(self, name), name))
             object.__setattr__(self, name, tuple(rows))
         if any(len(interval) != 2 for interval in self.box):
             raise ValueError("expected intervals of two numbers in a box, got one of another length")
@@ -77,7 +77,7 @@ class Design:
         if not rows or any(len(row) != len(PARAMETERS) for row in rows):
             raise ValueError(f"expected {len(PARAMETERS)} parameters ({', '.join(PARAMETERS)}) for a {self.law} design")
         for value in (value for row in rows for value in row):
-            real(value, "finite parameters in a design")
+            check_float(value, "finite parameters in a design")
         for name, interval in zip(PARAMETERS, self.box, strict=False):
             if interval[0] > interval[1]:
                 raise ValueError(f"expected an interval of {name} from low to high, got {list(interval)}")
@@ -172,11 +172,11 @@ def around(point: Sequence[float], spread: float, law: Law = "random") -> Design
     ValueError
         If the spread is not positive or over 100, or the point is not seven numbers with a20 > 0.
     """
-    spread = real(spread, "a positive spread", *SPREADS)
-    point = several(point, "seven numbers as a point")
+    spread = check_float(spread, "a positive spread", *SPREADS)
+    point = as_tuple(point, "seven numbers as a point")
     if len(point) != len(PARAMETERS):
         raise ValueError(f"expected a point of {len(PARAMETERS)} numbers ({', '.join(PARAMETERS)}), got {len(point)}")
-    real(point[0], "a point with a20 > 0", 1e-6, 1e6)
+    check_float(point[0], "a point with a20 > 0", 1e-6, 1e6)
     centre = dict(zip(PARAMETERS, (*(value / point[0] for value in point[:-1]), point[-1]), strict=True))
     box = {name: _near(centre[name], spread * (high - low) / 2) for name, (low, high) in INTERVALS.items()}
     least = INTERVALS["a02"][0]
@@ -187,7 +187,7 @@ def around(point: Sequence[float], spread: float, law: Law = "random") -> Design
 
 def _logarithmic(names: Sequence[str], box: Sequence[tuple[float, float]]) -> tuple[str, ...]:
     """Check the names of the parameters that a box holds in logarithms."""
-    names = several(names, "names of parameters in log")
+    names = as_tuple(names, "names of parameters in log")
     positive = [name for name, (low, _) in zip(PARAMETERS, box, strict=False) if low > 0]
     for name in names:
         if name not in positive:
@@ -211,5 +211,5 @@ def _is_number(value: Any) -> bool:
 
 
 def _stream(seed: int, index: int, purpose: str) -> np.random.SeedSequence:
-    index = whole(index, "an index that is a whole number from 0", 0, SEEDS - 1)
+    index = check_int(index, "an index that is a whole number from 0", 0, SEEDS - 1)
     return np.random.SeedSequence(seed_of(seed), spawn_key=(index, ("parameters", "start").index(purpose)))

@@ -7,7 +7,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from curvafit.core.checks import quoted, real
+from curvafit.core.checks import check_float, quoted
 from curvafit.data_synth.atlas.design import PARAMETERS, Design, around, boxed
 from curvafit.data_synth.atlas.yaml_text import parse_yaml
 from curvafit.priors.law import texture_of
@@ -101,4 +101,4 @@ def _number(value: Any) -> Any:
 
 def _spread(value: Any) -> float:
     value = _number(value)
-    return real(value, "a spread that is a number")
+    return check_float(value, "a spread that is a number")

@@ -10,7 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from curvafit.core.checks import whole
+from curvafit.core.checks import check_int
 from curvafit.data_synth.atlas.draws import device
 
 if TYPE_CHECKING:
@@ -114,7 +114,7 @@ class Cluster:
 def check_workers(count: int | None, scheduler: str | None) -> None:
     """Raise ValueError where the number of workers is none, or there is a scheduler, whose workers are its own."""
     if count is not None:
-        whole(count, "a number of workers from 0", 0, MOST)
+        check_int(count, "a number of workers from 0", 0, MOST)
         if scheduler is not None:
             raise ValueError(f"expected either workers or a scheduler, got {count} and {scheduler}")
 

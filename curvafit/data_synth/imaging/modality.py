@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.core.checks import LONGEST, SHORTEST, real
+from curvafit.core.checks import LONGEST, SHORTEST, check_float
 from curvafit.data_synth.imaging.parameters import Imaging
 from curvafit.data_synth.imaging.randomness import seeds_of
 
@@ -42,7 +42,7 @@ class Modality:
     ranges: Mapping[str, tuple[Any, Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        real(self.voxel, "a shape's voxel of positive length", SHORTEST, LONGEST)
+        check_float(self.voxel, "a shape's voxel of positive length", SHORTEST, LONGEST)
         ranges = {
             name: tuple(self.base.assign({name: end})[name] for end in ends) for name, ends in self.ranges.items()
         }

@@ -10,7 +10,7 @@ from operator import attrgetter
 from types import NoneType
 from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
 
-from curvafit.core.checks import quoted, real
+from curvafit.core.checks import check_float, quoted
 from curvafit.core.units import METRES
 from curvafit.data_synth.imaging.separable import Triple
 
@@ -53,7 +53,7 @@ def _number(name: str, value: Any, kind: Any, allowed: Range) -> Any:
     values = value if kind is Triple else (value,)
     if not isinstance(values, (tuple, list)) or (kind is Triple and len(values) != 3):
         raise ValueError(f"expected {words}, got {quoted(value)}")
-    numbers = tuple(real(each, words, of=value) for each in values)
+    numbers = tuple(check_float(each, words, of=value) for each in values)
     if not all(allowed.least <= number <= allowed.most for number in numbers):
         raise ValueError(f"expected {words}, got {quoted(value)}")
     return numbers if kind is Triple else numbers[0]

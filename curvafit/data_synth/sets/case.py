@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from curvafit.core.checks import LONGEST, SHORTEST, instance, quoted, real, seed_of, several, whole
+from curvafit.core.checks import LONGEST, SHORTEST, as_tuple, check_float, check_int, check_type, quoted, seed_of
 from curvafit.data_synth.atlas.draws import one_thread
 from curvafit.data_synth.imaging.imaging import field_shape, image, regrid, visible
 from curvafit.data_synth.imaging.modality import Modality
@@ -68,11 +68,13 @@ class Recipe:
     calibres: tuple[float, float] = (1.0, 1.0)
 
     def __post_init__(self) -> None:
-        instance(self.modality, Modality, "a Modality")
+        check_type(self.modality, Modality, "a Modality")
         if not callable(getattr(self.source, "shape", None)):
             raise ValueError(f"expected a source of shapes, got {quoted(self.source)}")
         object.__setattr__(self, "shape", edges_of(self.shape))
-        object.__setattr__(self, "voxel", real(self.voxel, "a shape's voxel of positive length", SHORTEST, LONGEST))
+        object.__setattr__(
+            self, "voxel", check_float(self.voxel, "a shape's voxel of positive length", SHORTEST, LONGEST)
+        )
         object.__setattr__(self, "seed", seed_of(self.seed))
         check_calibres(self.calibres)
         for factor in self.calibres:
@@ -150,8 +152,8 @@ def imaged(
 
 def edges_of(shape: Sequence[int]) -> tuple[int, int, int]:
     """Return the voxels (z, y, x) of an image as whole numbers above 0, or raise ValueError."""
-    words, edges = "3 whole numbers of voxels above 0 (z, y, x)", several(shape, "3 whole numbers of voxels")
-    z, y, x = (whole(n, words, 1, MOST, of=edges) for n in (edges if len(edges) == 3 else (None,) * 3))
+    words, edges = "3 whole numbers of voxels above 0 (z, y, x)", as_tuple(shape, "3 whole numbers of voxels")
+    z, y, x = (check_int(n, words, 1, MOST, of=edges) for n in (edges if len(edges) == 3 else (None,) * 3))
     return z, y, x
 
 
@@ -164,8 +166,8 @@ def drawn_voxel(voxel: float, calibres: Sequence[float], rng: np.random.Generato
 
 def check_calibres(calibres: Sequence[float]) -> None:
     """Raise ValueError where these are not two positive factors, the lower first."""
-    words, pair = "calibres as two positive factors, the lower first", several(calibres, "two factors")
-    low, high = (real(n, words, *CALIBRES, of=pair) for n in (pair if len(pair) == 2 else (None, None)))
+    words, pair = "calibres as two positive factors, the lower first", as_tuple(calibres, "two factors")
+    low, high = (check_float(n, words, *CALIBRES, of=pair) for n in (pair if len(pair) == 2 else (None, None)))
     if low > high:
         raise ValueError(f"expected {words}, got {quoted(pair)}")
 

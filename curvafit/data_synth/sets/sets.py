@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.core.checks import instance, named, quoted, several, whole
+from curvafit.core.checks import as_tuple, check_choice, check_int, check_type, quoted
 from curvafit.core.files import remove, write_content
 from curvafit.core.interrupts import undisturbed
 from curvafit.core.progress import Progress, silent
@@ -59,11 +59,11 @@ class Order:
     parts: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        instance(self.recipe, Recipe, "a Recipe")
-        named(self.layout, LAYOUTS, f"a layout among {', '.join(LAYOUTS)}")
-        object.__setattr__(self, "parts", several(self.parts, "labels"))
+        check_type(self.recipe, Recipe, "a Recipe")
+        check_choice(self.layout, LAYOUTS, f"a layout among {', '.join(LAYOUTS)}")
+        object.__setattr__(self, "parts", as_tuple(self.parts, "labels"))
         for part in self.parts:
-            named(part, PARTS, f"labels among {', '.join(PARTS)}")
+            check_choice(part, PARTS, f"labels among {', '.join(PARTS)}")
         if self.parts and min(self.recipe.shape) < 4:
             edges = " x ".join(map(str, self.recipe.shape))
             raise ValueError(f"expected images of at least 4 voxels along each axis beside --labels, got {edges}")
@@ -92,7 +92,7 @@ def build_set(
     OSError
         If the folder can't be written, or the workers are gone. The cases that were made are kept.
     """
-    count = whole(count, "a count of at least 1 case", 1, MOST)
+    count = check_int(count, "a count of at least 1 case", 1, MOST)
     folder, workers = Path(folder), workers or Here()
     with _begun(folder, order):
         return _filled(folder, order, count, progress, workers)

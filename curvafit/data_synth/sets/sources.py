@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Protocol, TypeVar, get_args, get_origin
 
 import numpy as np
 
-from curvafit.core.checks import several
+from curvafit.core.checks import as_tuple
 from curvafit.core.units import METRES
 from curvafit.data_synth.atlas.design import PARAMETERS, Design
 from curvafit.data_synth.atlas.draws import one_thread
@@ -93,8 +93,8 @@ class Generated:
     fraction: float | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "names", several(self.names, "names"))
-        if len(self.names) != len(several(self.points, "points")):
+        object.__setattr__(self, "names", as_tuple(self.names, "names"))
+        if len(self.names) != len(as_tuple(self.points, "points")):
             raise ValueError(f"expected a name for each of {len(self.points)} points, got {len(self.names)}")
         if self.fraction is not None:
             first_mass(self.fraction)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
-from curvafit.core.checks import LONGEST, SHORTEST, named, real, seed_of, several, whole
+from curvafit.core.checks import LONGEST, SHORTEST, as_tuple, check_choice, check_float, check_int, seed_of
 from curvafit.data_synth.imaging.imaging import field_shape
 from curvafit.data_synth.imaging.modalities import modality
 from curvafit.data_synth.imaging.modality import Modality
@@ -110,10 +110,10 @@ class TextureDataset(IterableDataset):
         self.size = edges_of((size,) * 3 if isinstance(size, (int, Real)) else size)
         self.length, self.seed, self.blend = int(length), seed_of(seed), blend
         self.calibres, self.normalise, self.transform = calibres, _normalisation(normalise), transform
-        sources: list[Any] = [source] if isinstance(source, LAWS) else list(several(source, "laws or stores"))
+        sources: list[Any] = [source] if isinstance(source, LAWS) else list(as_tuple(source, "laws or stores"))
         self._check(sources)
         stores = all(map(_is_store, sources))
-        edge = None if voxel is None else real(voxel, "a shape's voxel of positive length", SHORTEST, LONGEST)
+        edge = None if voxel is None else check_float(voxel, "a shape's voxel of positive length", SHORTEST, LONGEST)
         self.voxels = [edge or voxel_of([] if stores else sources, kind) for kind in self.modalities]
         if stores:
             if volume_fraction is not None:
@@ -194,7 +194,7 @@ class TextureDataset(IterableDataset):
 
     def _pool(self, generated: Generated, count: int, rotate: bool) -> Pool:
         """Return a pool of shapes as large as the largest crop."""
-        whole(count, "a pool of at least 1 shape", 1, MOST_POOLED)
+        check_int(count, "a pool of at least 1 shape", 1, MOST_POOLED)
         crops = zip(self.modalities, self.voxels, strict=True)
         largest = max(max(field_shape(self.size, edge * self.calibres[0], kind.base)) for kind, edge in crops)
         return Pool(generated, count, ROUND * -(-largest // ROUND), rotate)
@@ -273,7 +273,7 @@ def _is_store(source: Any) -> bool:
 def _normalisation(normalise: str | Callable[[Tensor], Tensor] | None) -> Callable[[Tensor], Tensor] | None:
     if normalise is None or callable(normalise):
         return normalise
-    named(normalise, NORMALISATIONS, f"a normalisation among {', '.join(NORMALISATIONS)}, a function or None")
+    check_choice(normalise, NORMALISATIONS, f"a normalisation among {', '.join(NORMALISATIONS)}, a function or None")
     return NORMALISATIONS[normalise]
 
 

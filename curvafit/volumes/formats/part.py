@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.core.checks import SEEDS, quoted, whole
+from curvafit.core.checks import SEEDS, check_int, quoted
 from curvafit.volumes.formats.base import Raw, ScanError
 from curvafit.volumes.formats.streams import check_array
 
@@ -87,7 +87,7 @@ class Part:
         if channels is None:
             raise ScanError(f"expected no channel of {place}, which holds a single one, got {quoted(self.channel)}")
         count = shape[channels]
-        if not 0 <= whole(self.channel, "a channel that is a whole number from 0", -SEEDS, SEEDS) < count:
+        if not 0 <= check_int(self.channel, "a channel that is a whole number from 0", -SEEDS, SEEDS) < count:
             raise ScanError(f"expected a channel from 0 to {count - 1} of {place}, got {self.channel}")
         return channels
 
