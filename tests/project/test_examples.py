@@ -118,13 +118,6 @@ def test_seeds_and_kept_shapes(run: Run, tmp_path: Path, capsys: pytest.CaptureF
     assert [line.split(":")[0] for line in made if line.startswith(("seed-", "random-"))] == ["seed-1"]
 
 
-def test_shapes_of_other_parameters_are_made_anew(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
-    first = run("orientation", "--edge", 24, "--steps", 60)
-    capsys.readouterr()
-    second = run("orientation", "--edge", 24, "--steps", 80)
-    assert "layers: " in capsys.readouterr().out and first != second
-
-
 def test_orientation(run: Run) -> None:
     _, *rows = run("orientation", "--edge", 32, "--steps", 120)
     free_tubes, tubes, free_layers, layers = map(numbers, rows)
@@ -156,12 +149,6 @@ def test_spatialised_maps(script) -> None:
         assert float(mass[0, 0, 21 * k + 10]) == pytest.approx(stated.mass)
     ends = mass[0, 0, 0] + mass[0, 0, -1], mass[0, 0, 20] + mass[0, 0, 21], mass[0, 0, 41] + mass[0, 0, 42]
     assert [float(end) / 2 for end in ends] == pytest.approx([-0.55, -0.4, -0.5])
-
-
-def test_modalities(script, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(sys, "argv", ["modalities", "--edge", "24", "-o", str(tmp_path)])
-    script("modalities").main()
-    assert (tmp_path / "modalities.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize(("name", "genus"), [("sphere", 0), ("torus", 1), ("smaller-torus", 1), ("genus-2", 2)])

@@ -26,10 +26,7 @@ def run(name: str) -> dict[str, Any]:
     return runpy.run_path(str(NOTEBOOKS / f"{name}.py"))
 
 
-def test_these_are_all() -> None:
-    assert {path.stem for path in NOTEBOOKS.glob("*.py")} == {"infer", "generate", "prior"}
-
-
+@pytest.mark.long
 def test_infer() -> None:
     """A phase field gives its coefficients back: from another processor's shape as well."""
     ended = run("infer")

@@ -1,18 +1,58 @@
-"""Files that other programs read: workflows, issue forms, the docs' table of contents."""
+"""Files beside the package: one version, pins that hold, links that lead somewhere, no place of one machine."""
 
 from __future__ import annotations
 
-import importlib
+import ast
 import re
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import pytest
 import yaml
 
+import curvafit
+
 ROOT = Path(__file__).resolve().parents[2]
-GITHUB = ROOT / ".github"
+
+
+def project() -> dict:
+    return tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+
+
+# ---- versions --------------------------------------------------------------------------------------------------------
+
+
+def test_one_version_everywhere() -> None:
+    version = project()["version"]
+    released = re.findall(r"^## \[(\d[^\]]*)\]", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
+    cited = re.findall(r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE)
+    assert released[0] == version
+    assert cited == [version]
+    assert curvafit.__version__ == version
+
+
+def test_the_command_is_installed() -> None:
+    from importlib.metadata import entry_points
+
+    (script,) = entry_points(group="console_scripts", name="curvafit")
+    assert callable(script.load())
+
+
+def test_constraints_hold_every_requirement() -> None:
+    from packaging.requirements import Requirement
+    from packaging.utils import canonicalize_name
+
+    lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    pins = dict(line.split("==") for line in lines if line and not line.startswith("#"))
+    pins = {canonicalize_name(name): version for name, version in pins.items()}
+    groups = [project()["dependencies"], *project()["optional-dependencies"].values()]
+    for requirement in (Requirement(text) for group in groups for text in group):
+        if requirement.name not in ("curvafit", "triton"):  # a torch for CUDA brings the triton that it wants
+            assert requirement.specifier.contains(pins[canonicalize_name(requirement.name)]), requirement
+
+
+# ---- docs ------------------------------------------------------------------------------------------------------------
 
 
 class Loader(yaml.SafeLoader):
@@ -22,78 +62,55 @@ class Loader(yaml.SafeLoader):
 Loader.add_constructor("!ENV", lambda loader, node: loader.construct_sequence(node))
 
 
-def read(path: Path) -> Any:
-    return yaml.load(path.read_text(encoding="utf-8"), Loader)
-
-
-def test_the_workflow_tests_every_python_from_the_least() -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    matrix = read(GITHUB / "workflows" / "test.yml")["jobs"]["test"]["strategy"]["matrix"]
-    minors = [int(version.removeprefix("3.")) for version in matrix["python"]]
-    assert project["requires-python"] == f">={matrix['python'][0]}"
-    assert minors == list(range(11, minors[-1] + 1)) and minors[-1] >= 14
-    assert {name.partition("-")[0] for name in matrix["os"]} == {"ubuntu", "macos", "windows"}
-
-
-def test_a_workflow_makes_what_the_makefile_knows() -> None:
-    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
-    texts = [path.read_text(encoding="utf-8") for path in (*GITHUB.rglob("*.yml"), ROOT / ".ci" / "run")]
-    called = set(re.findall(r"\bmake ([a-z-]+)", "\n".join(re.sub(r"#.*", "", text) for text in texts)))
-    assert {"lint", "test", "docs"} <= called <= targets
-
-
-def test_a_release_publishes_only_what_was_checked() -> None:
-    jobs = read(GITHUB / "workflows" / "release.yml")["jobs"]
-    assert jobs["publish"]["needs"] == "build" and jobs["publish"]["permissions"] == {"id-token": "write"}
-    assert any("twine check" in step.get("run", "") for step in jobs["build"]["steps"])
-
-
-@pytest.mark.parametrize("name", ["bug", "feature", "question"])
-def test_issue_forms_are_forms(name: str) -> None:
-    form = read(GITHUB / "ISSUE_TEMPLATE" / f"{name}.yml")
-    assert form["name"] and form["description"]
-    asked = [part["attributes"]["label"] for part in form["body"]]
-    assert asked and any(part.get("validations", {}).get("required") for part in form["body"])
-
-
 def test_every_page_of_the_docs_is_in_the_table_of_contents() -> None:
     docs = ROOT / "docs"
-    listed = set(pages(read(ROOT / "mkdocs.yml")["nav"]))
+    nav = yaml.load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"), Loader)["nav"]
     there = {path.relative_to(docs).as_posix() for path in docs.rglob("*.md")}
     there |= {path.relative_to(docs).as_posix() for path in (docs / "notebooks").glob("*.py")}
-    assert listed == there
+    assert set(pages(nav)) == there
 
 
-def pages(part: Any) -> list[str]:
+def pages(part: Any) -> Iterator[str]:
     """The files that a table of contents names."""
     if isinstance(part, str):
-        return [part]
-    parts = part.values() if isinstance(part, dict) else part
-    return [page for each in parts for page in pages(each)]
-
-
-def test_every_face_has_its_page() -> None:
-    rooms = {p.parent.name for p in (ROOT / "curvafit").glob("*/__init__.py") if "__all__" in p.read_text("utf-8")}
-    documented = {path.stem for path in (ROOT / "docs" / "api").glob("*.md")} - {"index", "curvafit"}
-    assert documented == rooms
+        yield part
+        return
+    for inner in part.values() if isinstance(part, dict) else part:
+        yield from pages(inner)
 
 
 def test_links_of_the_first_pages_lead_somewhere() -> None:
     for page in ("README.md", "CONTRIBUTING.md"):
         links = re.findall(r"\]\(([^)#\s]+)", (ROOT / page).read_text(encoding="utf-8"))
         assert [link for link in links if "://" not in link and not (ROOT / link).exists()] == []
-    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) < 130
 
 
-def test_a_function_named_as_its_module_stands_on_the_page_of_its_room() -> None:
-    """The page of a room lists its names by itself but for these, which it takes for the modules."""
-    for page in (ROOT / "docs" / "api").glob("*.md"):
-        room = f"curvafit.{page.stem}"
-        if page.stem not in ("index", "curvafit"):
-            names = importlib.import_module(room).__all__
-            twins = {
-                f"::: {room}.{name}.{name}"
-                for name in names
-                if (ROOT / "curvafit" / page.stem / f"{name}.py").is_file()
-            }
-            assert twins <= set(page.read_text(encoding="utf-8").splitlines()), page.name
+def test_what_ci_makes_is_in_the_makefile() -> None:
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    texts = [path.read_text(encoding="utf-8") for path in (*(ROOT / ".github").rglob("*.yml"), ROOT / ".ci" / "run")]
+    called = set(re.findall(r"\bmake ([a-z-]+)", "\n".join(re.sub(r"#.*", "", text) for text in texts)))
+    assert called <= targets
+
+
+# ---- sources ---------------------------------------------------------------------------------------------------------
+
+
+def sources() -> list[Path]:
+    return [p for part in ("curvafit", "tests", "benchmarks", "examples") for p in sorted((ROOT / part).rglob("*.py"))]
+
+
+def test_no_file_names_a_place_on_one_machine() -> None:
+    place = re.compile(r"(?<![\w.:/-])/(?:home|root|Users|work|tmp|mnt|media|opt|var)/|\b[A-Z]:\\\\\w")
+    files = [*sources(), *ROOT.glob("*.md"), *ROOT.glob("*.t[ox][mt]l*"), ROOT / "Makefile", ROOT / ".ci" / "run"]
+    files += [*(ROOT / "docs").rglob("*.md")]
+    assert place.search("open('/" + "home/me/scan.tif')")
+    found = {str(p.relative_to(ROOT)): m[0] for p in files if (m := place.search(p.read_text(encoding="utf-8")))}
+    assert found == {}
+
+
+def test_no_test_hides_another() -> None:
+    for path in sorted((ROOT / "tests").rglob("*.py")):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        names = [node.name for node in tree.body if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")]
+        assert len(names) == len(set(names)), path.name
+        assert path.name.startswith("test_") or not names, path.name

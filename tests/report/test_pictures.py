@@ -68,6 +68,6 @@ def test_a_picture_of_a_shape_and_none_of_what_is_not_finite(flow) -> None:
     shown = dataclasses.replace(flow, field=ball)._repr_html_()
     assert re.search(r'<img src="data:image/png;base64,[\w+/=]{100,}" width="320"', shown)
     broken = dataclasses.replace(flow, field=torch.full((16, 16, 16), torch.nan))
-    with pytest.raises(ValueError, match="expected"):
+    with pytest.raises(ValueError, match="finite"):
         broken.plot()
     assert "<img" not in broken._repr_html_() and "16 x 16 x 16" in broken._repr_html_()

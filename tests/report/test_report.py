@@ -101,12 +101,12 @@ def test_the_page_says_what_was_found(html: str) -> None:
     assert "12 simulations" in text and "p = 0.40" in text
 
 
-@pytest.mark.parametrize("status", ["No believable twin: of the nearest law …", "Undecided (nearest match): …"])
-def test_a_law_that_is_not_believed_is_not_called_supported(status: str) -> None:
+def test_a_law_that_is_not_believed_is_not_called_supported(undrawn: None) -> None:
     inference = made_inference()
-    fit = dataclasses.replace(inference.fit, status=status)
-    html = report_html(dataclasses.replace(inference, fit=fit))
-    assert "best supported" not in html and html.count('<span class="badge">the nearest</span>') == 1
+    for status in ("No believable twin: of the nearest law …", "Undecided (nearest match): …"):
+        fit = dataclasses.replace(inference.fit, status=status)
+        html = report_html(dataclasses.replace(inference, fit=fit))
+        assert "best supported" not in html and html.count('<span class="badge">the nearest</span>') == 1
 
 
 def test_each_block_stands_on_the_band_of_its_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -152,7 +152,7 @@ def test_a_scan_without_a_law_has_a_page_all_the_same(tmp_path: Path, undrawn: N
     assert sorted(path.name for path in report.parent.iterdir()) == ["fit.json", "report.html"]
     content = json.loads((report.parent / "fit.json").read_text())
     assert content["coefficients"] is None and content["mass"] is None and content["chosen"] is None
-    with pytest.raises(ValueError, match="expected a fit.json with a law, got none"):
+    with pytest.raises(ValueError, match="law"):
         read_fit(report.parent / "fit.json")
 
 
@@ -205,11 +205,11 @@ def test_a_failure_leaves_what_was_there(tmp_path: Path, undrawn: None) -> None:
     (target / "fit.json").write_text(mine)
     (target / "report.html").write_text('<meta name="generator" content="curvafit 0">')
     broken = regrown(made_inference(), np.full((48, 48, 48), np.nan))
-    with pytest.raises(ValueError, match="expected a finite volume"):
+    with pytest.raises(ValueError, match="finite"):
         write_inference(broken, target)
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["fit.json", "out", "report.html"]
     assert (target / "fit.json").read_text() == mine
-    with pytest.raises(ValueError, match="expected a folder"):
+    with pytest.raises(ValueError, match="folder"):
         write_inference(made_inference(), target / "fit.json")
 
 
