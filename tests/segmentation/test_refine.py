@@ -1,143 +1,387 @@
-"""Stationarity on fields that are stationary, or are not; rounded fields."""
+"""Masks of a network's probabilities: their evidence and place, what an example says, the command, and MONAI."""
 
 from __future__ import annotations
 
+import json
 import math
+from importlib import import_module
+from pathlib import Path
 
+import nibabel
 import numpy as np
 import pytest
 import torch
+from calling import call, refused
+from found import made_fit
+from scipy import ndimage
 
-from curvafit.generation.flow import generate
-from curvafit.generation.schedule import schedule
-from curvafit.inference.refinement import admissible, in_gauge, units
-from curvafit.inference.stationarity import _tested, energy_gradients, is_rounded, stationarity
-from curvafit.priors import WORKING_EPSILON, Coefficients, Grid, energy_terms, jet, preset
+from curvafit.priors.coefficients import Coefficients
+from curvafit.segmentation import Refine, calibrate, refine
+from curvafit.segmentation.calibration import Setting, Task, choice, climbed
+from curvafit.segmentation.evidence import of_probability
+from curvafit.segmentation.refine import FIRST, NATS, PLAIN, chances_of
+from curvafit.volumes.scan import Field, load, save
 
-EDGE = 36
-GRID = Grid((EDGE,) * 3)
-FAR = Coefficients(1, 0.5, 3, 30, -20, 100)
-TRUTH = preset("sponge")
+pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 
-
-@pytest.fixture(scope="module")
-def sponge() -> torch.Tensor:
-    """A sponge flowed until it is nearly stationary."""
-    flow = generate(TRUTH.coefficients, TRUTH.mass, GRID, schedule=schedule("cosine", steps=1000), seed=0)
-    assert flow.viability.viable
-    return flow.field
+WILLMORE = Coefficients.willmore()
 
 
-@pytest.fixture(scope="module")
-def found(sponge: torch.Tensor):
-    return stationarity(sponge, GRID, WORKING_EPSILON, starts=[FAR])
+def tubes(shape: tuple[int, int, int] = (24, 26, 28), at: float = 0.0) -> np.ndarray:
+    """Two crossing tubes, none thinner than seven voxels."""
+    z, y, x = (np.arange(n).reshape([-1 if k == axis else 1 for k in range(3)]) - n / 2 for axis, n in enumerate(shape))
+    return (np.hypot(z + 5 + at, y) < 4) | (np.hypot(z - 4 + 0.2 * y, x - at) < 3.5)
 
 
-def noise(shape: tuple[int, int, int], seed: int = 0) -> torch.Tensor:
-    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+def network(truth: np.ndarray, seed: int) -> np.ndarray:
+    """Probabilities that are far too sure, with errors that lie side by side."""
+    noise = np.random.default_rng(seed).standard_normal(truth.shape)
+    ratio = 5 * (2 * truth - 1) + 9 * ndimage.gaussian_filter(noise, 0.8) * 4
+    return (1 / (1 + np.exp(-ratio))).astype(np.float32)
 
 
-@pytest.mark.parametrize("boundary", ["periodic", "replicate"])
-def test_gradients_of_the_six_terms_are_autograds(boundary: str) -> None:
-    grid = Grid((30, 7, 9), 0.01, boundary)  # type: ignore[arg-type]
-    u = (0.8 * torch.tanh(noise(grid.shape))).requires_grad_()
-    each = energy_gradients(u.detach(), grid, WORKING_EPSILON)
-    inside = (slice(None) if grid.periodic else slice(1, -1),) * 3
-    for k, term in enumerate(energy_terms(jet(u, grid), WORKING_EPSILON)):
-        (whole,) = torch.autograd.grad(term.sum(), u, retain_graph=True)
-        torch.testing.assert_close(each[k][inside], whole[inside], rtol=1e-9, atol=1e-9)
+def dice(a: np.ndarray, b: np.ndarray) -> float:
+    return 2 * float((a & b).sum()) / float(a.sum() + b.sum())
 
 
-@pytest.mark.slow
-def test_stationarity_finds_what_made_a_field(found) -> None:
-    for name in ("a11", "a02", "a10", "a01"):
-        truth = getattr(TRUTH.coefficients, name)
-        assert getattr(found.coefficients, name) == pytest.approx(truth, rel=0.1), name
-    assert found.coefficients.a20 == 1
-    assert found.mass == pytest.approx(TRUTH.mass, abs=1e-5)
-    assert found.method == "stationarity" and found.status.startswith("Stationarity is supported")
+# ---- evidence and place ----------------------------------------------------------------------------------------------
 
 
-def test_all_starts_end_at_the_whitened_singular_vector(found) -> None:
-    """The constrained minimum is inside the domain here, so it is the unconstrained one; its value is 1 by the
-    choice of the error's size."""
-    residuals = [residual for _, residual in found.starts]
-    assert len(residuals) == 2
-    np.testing.assert_allclose(residuals, residuals[0], rtol=1e-4)
-    assert found.residual == pytest.approx(residuals[0])
-    assert len(found.singular_values) == 6
-    assert found.singular_values[-1] == pytest.approx(1, abs=0.2)
-    assert sorted(found.singular_values, reverse=True) == list(found.singular_values)
+def test_a_probability_is_its_own_evidence() -> None:
+    p = np.random.default_rng(0).random((6, 7, 8)).astype(np.float32)
+    p[0, 0, :2] = 0, 1
+    found = of_probability(Field(p))
+    np.testing.assert_allclose(1 / (1 + np.exp(-found.ratio.astype(float))), p.clip(1e-4, 1 - 1e-4), atol=1e-6)
+    assert np.array_equal(found.level > 0, p > 0.5)
+    for bad, said in ((2 * p, "got 0 to 2"), (p - 1e-3, "got -0.001 to")):
+        with pytest.raises(ValueError, match=rf"expected probabilities in \[0, 1\], {said}"):
+            of_probability(Field(bad))
 
 
-def test_deviations_cover_the_error_within_a_few(found) -> None:
-    assert found.uncertainty["a20"] == 0
-    for name in ("a11", "a02", "a10", "a01", "a00"):
-        miss = abs(getattr(found.coefficients, name) - getattr(TRUTH.coefficients, name))
-        assert miss < 6 * found.uncertainty[name], name
+#: Turned about z, with the shift and the mirrored axis of a real scanner.
+TURNED = np.array([[-0.5, 0.02, 0, 17.3], [0.02, 0.4, 0, -3.2], [0, 0, 1.2, 40], [0, 0, 0, 1]])
 
 
-@pytest.mark.slow
-def test_a_field_that_is_not_stationary_is_not_said_to_be(sponge: torch.Tensor, found) -> None:
-    bent = (sponge + 0.05 * torch.sin(torch.linspace(0, 6 * math.pi, EDGE))).clamp(-1, 1)
-    other = stationarity(bent, GRID, WORKING_EPSILON)
-    assert other.residual > 5 * found.residual
+def predicted(folder: Path, name: str, p: np.ndarray) -> Path:
+    """A case as nnU-Net writes it with --save_probabilities: classes z, y, x in an NPZ beside the segmentation."""
+    folder.mkdir(exist_ok=True)
+    image = nibabel.Nifti1Image((p > 0.5).astype(np.uint8).T, TURNED)
+    image.header.set_xyzt_units("mm")
+    nibabel.save(image, folder / f"{name}.nii.gz")
+    path = folder / f"{name}.npz"
+    np.savez_compressed(path, probabilities=np.stack((1 - p, p)).astype(np.float16))
+    return path
 
 
-@pytest.mark.slow
-def test_a_shift_changes_nothing(sponge: torch.Tensor, found) -> None:
-    """An even shift maps octants and the propagated noise elsewhere, the equations onto themselves."""
-    moved = stationarity(sponge.roll((6, 10, 4), (0, 1, 2)), GRID, WORKING_EPSILON)
-    for name in ("a11", "a02", "a10", "a01"):
-        assert getattr(moved.coefficients, name) == pytest.approx(getattr(found.coefficients, name), rel=0.02), name
+def test_nnu_net_s_probabilities_lie_where_its_segmentation_does(tmp_path: Path) -> None:
+    p = np.random.default_rng(0).random((5, 6, 7)).astype(np.float32)
+    path = predicted(tmp_path, "case.7", p)
+    found, image = chances_of(path, channel=1), load(tmp_path / "case.7.nii.gz")
+    np.testing.assert_allclose(found.values, p, atol=1e-3)
+    assert (found.spacing, found.unit) == (image.spacing, "mm") and found.spacing == pytest.approx(
+        (1.2, 0.4, 0.5), 2e-3
+    )
+    assert np.array_equal(found.affine, image.affine)  # type: ignore[arg-type]
+    np.testing.assert_allclose(chances_of(path, channel=0).values, 1 - p, atol=1e-3)
+    part = chances_of(path, channel=1, crop="1:,:4,2:")
+    np.testing.assert_array_equal(part.affine @ [0, 0, 0, 1], image.affine @ [2, 0, 1, 1])  # type: ignore[operator]
+    told = chances_of(path, channel=1, spacing=2.0, unit="um")
+    assert (told.spacing, told.unit, told.affine) == ((2.0, 2.0, 2.0), "um", None)
+    alike = chances_of(p, like=tmp_path / "case.7.nii.gz")
+    assert alike.spacing == image.spacing and np.array_equal(alike.affine, image.affine)  # type: ignore[arg-type]
 
 
-@pytest.mark.slow
-def test_the_mirror_image_has_mirrored_coefficients(sponge: torch.Tensor, found) -> None:
-    """F_ε[-u; a] = F_ε[u; a'], so -u gives a', in the gauge a20 = 1."""
-    mirrored = found.coefficients.mirrored()
-    expected = mirrored.scaled(1 / mirrored.a20)
-    other = stationarity(-sponge, GRID, WORKING_EPSILON)
-    assert list(other.coefficients)[1:5] == pytest.approx(list(expected)[1:5], rel=0.02)
+def test_an_empty_segmentation_says_where_the_voxels_are(tmp_path: Path) -> None:
+    path = predicted(tmp_path, "empty", 0.4 * np.random.default_rng(0).random((5, 6, 7)).astype(np.float32))
+    found = refine(path, WILLMORE, channel=1, weight=1.0)
+    assert not found.mask.values.any() and found.mask.unit == "mm" and found.status == "0.00 % of the volume is inside"
 
 
-@pytest.mark.slow
-def test_a_crop_says_what_its_inside_says(sponge: torch.Tensor) -> None:
-    """The equations of a crop are those of the whole field: its border's continuation is never read."""
-    grid, width = Grid((32, 32, 32), 0.01, "replicate"), 2.5
-    whole = _tested(energy_gradients(sponge.double(), GRID, WORKING_EPSILON), GRID, WORKING_EPSILON, width)
-    crop = sponge[:32, :32, :32].double()
-    part = _tested(energy_gradients(crop, grid, WORKING_EPSILON), grid, WORKING_EPSILON, width)
-    assert part.shape == (6, 4, 4, 4)
-    np.testing.assert_allclose(part, whole[:, 6:10, 6:10, 6:10], rtol=1e-6, atol=1e-9 * np.abs(whole).max())
-    found = stationarity(crop, grid, WORKING_EPSILON)
-    for name in ("a11", "a02", "a10", "a01"):
-        assert getattr(found.coefficients, name) == pytest.approx(getattr(TRUTH.coefficients, name), rel=0.1), name
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"like": "other.npy"}, r"expected probabilities with the shape \(3, 3, 3\) of other.npy, got \(5, 6, 7\)"),
+        ({"like": "case.nii.gz", "spacing": 2}, "either an image that says where the voxels are, or a spacing"),
+        ({}, "a channel, counted from 0, picks one volume of several"),
+        ({"channel": 2}, "expected a channel from 0 to 1"),
+    ],
+)
+def test_a_place_that_does_not_fit_is_refused(options, said, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    predicted(tmp_path, "case", np.random.default_rng(0).random((5, 6, 7)))
+    np.save("other.npy", np.zeros((3, 3, 3)))
+    with pytest.raises(ValueError, match=said):
+        chances_of("case.npz", **({"channel": 1} | options if options else {}))
 
 
-def test_refusals(sponge: torch.Tensor) -> None:
-    with pytest.raises(ValueError, match="expected a crop of at least 24 voxels"):
-        stationarity(sponge[:20, :20, :20], Grid((20, 20, 20), 0.01, "replicate"), WORKING_EPSILON)
-    with pytest.raises(ValueError, match="expected a finite field"):
-        stationarity(sponge.clone().fill_(math.nan), GRID, WORKING_EPSILON)
-    with pytest.raises(ValueError, match="expected a field of shape"):
-        stationarity(sponge[:-1], GRID, WORKING_EPSILON)
-    with pytest.raises(ValueError, match="expected a test width"):
-        stationarity(sponge[:24, :24, :24], Grid((24,) * 3, 0.01, "replicate"), WORKING_EPSILON, width=4)
+# ---- the choice ------------------------------------------------------------------------------------------------------
 
 
-def test_a_rounded_field_is_told(sponge: torch.Tensor) -> None:
-    rounded = torch.floor(sponge * 100) / 100
-    assert is_rounded(rounded) and not is_rounded(sponge)
-    assert "not supported" in stationarity(rounded, GRID, WORKING_EPSILON).status
+def test_a_climb_ends_at_the_best_on_either_side() -> None:
+    def neighbour(number: int, step: int) -> int | None:
+        return number + step if 0 <= number + step < len(heights) else None
+
+    for heights, first, best in (([5, 1, 2, 3, 4], 2, 4), ([5, 4, 3, 1, 9], 2, 0), ([1, 2, 1], 1, 1), ([7], 0, 0)):
+        assert climbed(first, neighbour, heights.__getitem__) == best
 
 
-def test_gauge_and_domain() -> None:
-    coefficients, fixed = in_gauge(np.array([2.0, 4, 8, -20, 6, 100]))
-    assert list(coefficients) == [1, 2, 4, -10, 3, 50] and fixed == 0
-    coefficients, fixed = in_gauge(np.array([1e-5, 4, 2.0, 0, 0, 0]))
-    assert coefficients.a02 == 1 and fixed == 2
-    inside = admissible(np.array([-0.2, 1.0, 4.2, 1, 1, 1]))
-    assert inside[0] > 0 and inside[2] > 0 and inside[0] + inside[2] == pytest.approx(2)
-    a = Coefficients(1, 2, 3, 4, 5, 6)
-    assert np.array(list(a)) / units(0.5) == pytest.approx(list(a.in_unit(0.5)))
+def test_strengths_are_tried_as_long_as_they_are_better() -> None:
+    truth, tried = tubes(), []
+
+    def fill(given: None, setting: Setting) -> np.ndarray:
+        tried.append(setting)
+        wrong = 1 if setting.law is None else 1 - 0.1 * [*NATS].index(setting.strength)
+        return truth & (np.random.default_rng(0).random(truth.shape) > 0.3 * wrong)
+
+    other = WILLMORE.scaled(2)
+    settings = [Setting(PLAIN, law, FIRST, 1) for law in (WILLMORE, other)]
+    best = choice(Task(None, truth, range(len(truth))), lambda _: settings, fill, (PLAIN,), NATS)
+    assert best.setting == Setting(PLAIN, WILLMORE, NATS[-1], 1) and len(tried) == len(set(tried))
+    assert {setting.strength for setting in tried if setting.law is WILLMORE} == {3.0, *NATS[NATS.index(FIRST) :]}
+    assert [setting.strength for setting in tried if setting.law is other] == [FIRST, NATS[-1]]
+
+
+def test_errors_side_by_side_are_one() -> None:
+    """Counts of one cube have no error that is known: 16 voxels in a row are one observation, not sixteen."""
+    truth = np.ones((16, 16, 32), dtype=bool)
+    half = np.arange(32) < 16
+
+    def fill(given: None, setting: Setting) -> np.ndarray:
+        return truth if setting.law is None else truth & half
+
+    best = choice(Task(None, truth, range(16)), lambda way: [Setting(way, WILLMORE, 1.0, 1)], fill, (PLAIN,))
+    assert best.noise == pytest.approx(math.sqrt(1 / 4))  # without the one cube 0, without the other -1
+
+
+# ---- what comes out --------------------------------------------------------------------------------------------------
+
+
+def test_perfect_probabilities_stay() -> None:
+    truth = tubes()
+    p = truth.astype(np.float32)
+    found = refine(p, "tubes", example=(p, truth), steps=5)
+    assert np.array_equal(found.mask.values, truth) and found.coefficients is None and found.weight is None
+    assert found.status.startswith("no prior helps here: Dice 1.000 on the example, ")
+    assert np.array_equal(found.phase.values > 0, truth)
+    assert dice(refine(p, WILLMORE, weight=1e-3).mask.values, truth) > 0.98
+
+
+def test_where_no_prior_helps_the_mask_is_what_is_likely() -> None:
+    learned = calibrate(tubes().astype(np.float32), tubes(), WILLMORE, steps=5)
+    p = np.random.default_rng(0).random((12, 13, 14)).astype(np.float32)
+    p[0] = 0.5
+    found = refine(p, WILLMORE, example=learned)
+    assert np.array_equal(found.mask.values, p > 0.5) and found.status.startswith(f"{learned}; ")
+
+
+def test_an_example_chooses_a_weight_that_helps_elsewhere() -> None:
+    one, other = tubes(), tubes(at=1.5)
+    p = network(other, 1)
+    learned = calibrate(network(one, 0), one, WILLMORE, steps=150)
+    found = refine(p, WILLMORE, example=learned, steps=150)
+    assert dice(found.mask.values, other) > dice(p > 0.5, other) + 0.05
+    assert found.coefficients == WILLMORE and found.weight == learned.choice.setting.strength
+    assert f"the prior helps, at {found.weight:g} nats: Dice {learned.choice.dice:.3f} on the example" in found.status
+    again = refine(p, WILLMORE, example=(network(one, 0), one), steps=150)
+    assert np.array_equal(again.mask.values, found.mask.values) and again.status == found.status
+
+
+def test_law_and_weight_together_or_evidence_and_weight_together_change_nothing() -> None:
+    """But for voxels at the surface: the flows round otherwise."""
+    p = network(tubes(), 0).clip(0.02, 0.98)
+    odds = (p / (1 - p)) ** 2
+    one = refine(p, WILLMORE, weight=6.0, steps=100)
+    for sure, law, weight in ((p, WILLMORE.scaled(3), 2.0), (odds / (1 + odds), WILLMORE, 12.0)):
+        other = refine(sure, law, weight=weight, steps=100)
+        assert other.weight == pytest.approx(weight) and (one.mask.values != other.mask.values).mean() < 1e-3
+
+
+@pytest.mark.parametrize("p", [np.linspace(0, 0.5, 1000, dtype=np.float32), np.linspace(0.6, 1, 1000)])
+def test_a_map_without_a_surface_stays(p: np.ndarray) -> None:
+    found = refine(p.reshape(10, 10, 10), WILLMORE, weight=1.0)
+    assert np.array_equal(found.mask.values, p.reshape(10, 10, 10) > 0.5)
+
+
+MAP = network(tubes(), 0)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({}, "either an example, on which law and weight are judged, or a weight, got neither"),
+        ({"weight": 1.0, "example": (MAP, tubes())}, "or a weight, got both"),
+        ({"weight": 0.0}, "positive weight"),
+        ({"weight": 1.0, "epsilon": -1.0}, "positive epsilon"),
+        ({"weight": 1.0, "channel": 1}, "expected channel only with the path of a file"),
+        ({"example": (MAP, tubes()[1:])}, r"a mask of the probabilities' shape \(24, 26, 28\), got \(23, 26, 28\)"),
+        ({"example": (MAP, np.zeros(MAP.shape))}, "with voxels inside and outside, got an empty mask"),
+        ({"example": (MAP, np.ones(MAP.shape))}, "with voxels inside and outside, got a full mask"),
+        ({"example": (MAP, MAP)}, "expected an example with a mask or labels"),
+        ({"example": (2 * MAP, tubes())}, r"probabilities in \[0, 1\]"),
+        ({"example": (Field(MAP, 0.5), tubes())}, "an example with the spacing of the probabilities"),
+        ({"example": (MAP, tubes()), "label": 3}, "expected a label of the scan"),
+        ({"weight": 1.0, "prior": made_fit()}, "got voxel and the fit's mm: give --spacing and --unit"),
+        ({"example": (MAP, tubes()), "prior": "tube"}, "expected a preset among"),
+    ],
+)
+def test_what_cannot_be_judged_is_refused(options, said) -> None:
+    with pytest.raises(ValueError, match=said):
+        refine(MAP, **{"prior": WILLMORE, **options})
+
+
+def test_values_that_are_not_finite_are_refused() -> None:
+    p = MAP.copy()
+    p[3, 4, 5] = math.nan
+    with pytest.raises(ValueError, match="expected finite values, got 1 that are NaN"):
+        refine(p, WILLMORE, weight=1.0)
+
+
+@pytest.mark.filterwarnings("ignore:a20 > 0:UserWarning")
+def test_a_law_without_stiffness_is_refused() -> None:
+    for judge in ({"weight": 1.0}, {"example": (MAP, tubes())}):
+        with pytest.raises(ValueError, match="a20 . a02 > 0"):
+            refine(MAP, Coefficients(1, 0, -2), **judge)
+
+
+def test_a_mask_is_at_the_probabilities_place() -> None:
+    truth = tubes((14, 15, 16))
+    chances = Field(network(truth, 0), (1.2, 0.4, 0.5), "mm", TURNED)
+    for unit, factor in (("mm", 1), ("um", 1e3), ("voxel", 1)):
+        spacing = (1.2 * factor, 0.4 * factor, 0.5 * factor)
+        there = np.diag([factor] * 3 + [1]) @ TURNED
+        learned = calibrate(chances, Field(truth, spacing, unit, there), WILLMORE, steps=1)
+        assert learned.example is chances
+        moved = there.copy()
+        moved[0, 3] += 0.5 * factor
+        with pytest.raises(ValueError, match="expected a mask with the probabilities' affine, got one .* voxels away"):
+            calibrate(chances, Field(truth, spacing, unit, moved), WILLMORE, steps=1)
+
+
+# ---- a callable ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float16])
+def test_a_callable_gives_the_mask_of_a_class(dtype: torch.dtype) -> None:
+    p = torch.from_numpy(np.stack((1 - MAP, MAP))).to(dtype)
+    step = Refine(WILLMORE, weight=3.0, steps=20, spacing=(2.0, 1.0, 1.0), unit="um")
+    before, mask = p.clone(), step(p)
+    wanted = refine(p[1], WILLMORE, weight=3.0, steps=20, spacing=(2.0, 1.0, 1.0), unit="um")
+    assert mask.shape == (1, *MAP.shape) and mask.dtype == dtype and torch.equal(p, before)
+    assert np.array_equal(mask[0].numpy() > 0, wanted.mask.values)
+    other = Refine(WILLMORE, example=(MAP, tubes()), steps=2, channel=0)
+    assert torch.equal(other(p[1:]) > 0, Refine(WILLMORE, example=other.example, steps=2)(p) > 0)
+
+
+@pytest.mark.parametrize(
+    ("options", "given", "said"),
+    [
+        ({}, None, "got neither"),
+        ({"weight": 1.0, "channel": 0.5}, None, "a channel that is a whole number"),
+        ({"weight": 1.0}, torch.zeros(5, 5, 5), r"expected probabilities \(C, Z, Y, X\) as a tensor, got \(5, 5, 5\)"),
+        ({"weight": 1.0}, np.zeros((2, 5, 5, 5)), r"expected probabilities \(C, Z, Y, X\) as a tensor"),
+        ({"weight": 1.0}, torch.zeros(1, 5, 5, 5), "expected a channel from 0 to 0, got 1"),
+        ({"weight": 1.0}, torch.full((2, 5, 5, 5), 7.0), r"probabilities in \[0, 1\], got 7 to 7"),
+    ],
+)
+def test_a_callable_refuses(options, given, said) -> None:
+    with pytest.raises(ValueError, match=said):
+        Refine(WILLMORE, **options)(given)
+
+
+def test_a_callable_stands_in_monai_s_chain() -> None:
+    monai = pytest.importorskip("monai.transforms", reason="needs monai, of the extra [dev]")
+    data = pytest.importorskip("monai.data", reason="needs monai, of the extra [dev]")
+    logits = torch.from_numpy(np.log(np.stack((1 - MAP, MAP)) + 1e-6))
+    step = Refine(WILLMORE, weight=3.0, steps=5)
+    chain = monai.Compose([monai.Activations(softmax=True), step])
+    affine = torch.diag(torch.tensor([0.4, 0.5, 1.2, 1.0]))
+    mask = chain(data.MetaTensor(logits, affine=affine))
+    assert torch.equal(torch.as_tensor(mask.affine).float(), affine) and mask.shape == (1, *MAP.shape)
+    assert torch.equal(mask.as_tensor(), step(torch.softmax(logits, 0)))
+
+
+# ---- the command -----------------------------------------------------------------------------------------------------
+
+
+def test_refine_keeps_the_header_and_says_what_was_chosen(tmp_path: Path) -> None:
+    path, target = predicted(tmp_path / "in", "a", MAP), tmp_path / "new" / "mask.nii.gz"
+    other = predicted(tmp_path / "in", "b", network(tubes(), 3))
+    labels = Field(np.where(tubes(), 3, 1).astype(np.uint8), (1.2, 0.4, 0.5), "mm", TURNED)
+    save(labels, tmp_path / "truth.nii.gz")
+    told = ("refine", path, "--channel", 1, "--prior", "tubes", "--steps", 30, "--example", tmp_path / "truth.nii.gz")
+    told = (*told, "--example-probabilities", other, "--label", 3, "-o", target)
+    result = call(*told)
+    assert result.exit_code == 0, (result.output, result.exception)
+    one, mask = (nibabel.load(each) for each in (path.with_suffix(".nii.gz"), target))
+    assert mask.affine.tobytes() == one.affine.tobytes() and mask.shape == one.shape  # type: ignore[attr-defined]
+    record = json.loads((target.parent / "mask.json").read_text())
+    assert (record["job"], record["steps"], record["example_probabilities"]) == ("refine", 30, str(other))
+    chosen = record["calibration"]
+    assert record["status"].startswith("no prior helps here" if chosen["law"] is None else "the ")
+    assert (
+        0 < chosen["dice_without"] <= 1 and f"Dice {max(chosen['dice'], chosen['dice_without']):.3f}" in result.stdout
+    )
+    assert sorted(each.name for each in target.parent.iterdir()) == ["mask.json", "mask.nii.gz", "mask.png"]
+
+
+def test_a_folder_of_predictions_is_refined_by_one_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, at in (("a", 0.0), ("b", 1.5), ("c.d", 0.7)):
+        predicted(tmp_path / "in", name, network(tubes(at=at), 5))
+    example = predicted(tmp_path, "example", network(tubes(), 6))
+    truth = tmp_path / "truth.npy"
+    np.save(truth, tubes())
+    calls, room = [], import_module("curvafit.segmentation.refine")
+    monkeypatch.setattr(room, "choice", lambda *a, **o: calls.append(1) or choice(*a, **o))
+    options = ("--channel", 1, "--prior", "tubes", "--steps", 2, "--example", truth, "--example-probabilities", example)
+    result = call("refine", tmp_path / "in", *options, "-o", tmp_path / "out")
+    assert result.exit_code == 0, (result.output, result.exception)
+    assert len(calls) == 1
+    masks = sorted(path.name for path in (tmp_path / "out").glob("*.nii.gz"))
+    assert masks == ["a.nii.gz", "b.nii.gz", "c.d.nii.gz"]
+    for name in masks:
+        one, other = (load(tmp_path / folder / name) for folder in ("in", "out"))
+        assert np.array_equal(one.affine, other.affine)  # type: ignore[arg-type]
+    single = call("refine", tmp_path / "in" / "b.npz", *options, "-o", tmp_path / "b.nii.gz")
+    assert single.exit_code == 0
+    assert np.array_equal(load(tmp_path / "b.nii.gz").values, load(tmp_path / "out" / "b.nii.gz").values)
+    refused(call("refine", tmp_path / "in", *options, "-o", tmp_path / "in"), "writes over no input")
+    refused(
+        call("refine", tmp_path / "in", *options, "--like", truth, "-o", tmp_path / "more"), "no --like for a folder"
+    )
+    predicted(tmp_path / "in", "z", 1.5 * network(tubes(), 5))
+    refused(call("refine", tmp_path / "in", *options, "-o", tmp_path / "more"), "expected probabilities in [0, 1]")
+    assert not (tmp_path / "more").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--prior", "tubes"), "either an example, on which law and weight are judged, or a weight, got neither"),
+        (("--example", "truth.npy"), "--example and --example-probabilities together, got one of them"),
+        (("--weight", "1"), "expected --prior or --example, got neither"),
+        (("--prior", "tube", "--weight", "1"), "expected a preset among"),
+        (("--prior", "tubes", "--weight", "-1"), "positive weight"),
+        (("--prior", "tubes", "--weight", "1", "--like", "small.npy"), "with the shape (5, 5, 5) of small.npy"),
+        (("--prior", "tubes", "--weight", "1", "--like", "none.nii"), "no such file"),
+        (
+            ("--prior", "tubes", "--example", "small.npy", "--example-probabilities", "p.npy"),
+            "the probabilities' shape",
+        ),
+        (
+            ("--prior", "tubes", "--example", "truth.npy", "--example-probabilities", "grey.npy"),
+            "probabilities in [0, 1]",
+        ),
+        (("--prior", "tubes", "--example", "truth.npy", "--example-probabilities", "p.npy", "--label", "4"), "a label"),
+    ],
+)
+def test_wrong_input_is_a_sentence(arguments, said, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    np.save("p.npy", MAP)
+    np.save("grey.npy", 100 * MAP)
+    np.save("truth.npy", tubes())
+    np.save("small.npy", np.arange(125.0).reshape(5, 5, 5) > 60)
+    result = call("refine", "p.npy", *arguments, "-o", "mask.nii.gz")
+    assert result.exit_code == 2, (result.output, result.exception)
+    lines = result.stderr.strip().splitlines()
+    assert lines[-1].startswith("error: ") and said in lines[-1], lines
+    assert not list(tmp_path.glob("*mask*"))

@@ -1,0 +1,143 @@
+"""Stationarity on fields that are stationary, or are not; rounded fields."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from curvafit.generation.flow import generate
+from curvafit.generation.schedule import schedule
+from curvafit.inference.refinement import admissible, in_gauge, units
+from curvafit.inference.stationarity import _tested, energy_gradients, is_rounded, stationarity
+from curvafit.priors import WORKING_EPSILON, Coefficients, Grid, energy_terms, jet, preset
+
+EDGE = 36
+GRID = Grid((EDGE,) * 3)
+FAR = Coefficients(1, 0.5, 3, 30, -20, 100)
+TRUTH = preset("sponge")
+
+
+@pytest.fixture(scope="module")
+def sponge() -> torch.Tensor:
+    """A sponge flowed until it is nearly stationary."""
+    flow = generate(TRUTH.coefficients, TRUTH.mass, GRID, schedule=schedule("cosine", steps=1000), seed=0)
+    assert flow.viability.viable
+    return flow.field
+
+
+@pytest.fixture(scope="module")
+def found(sponge: torch.Tensor):
+    return stationarity(sponge, GRID, WORKING_EPSILON, starts=[FAR])
+
+
+def noise(shape: tuple[int, int, int], seed: int = 0) -> torch.Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("boundary", ["periodic", "replicate"])
+def test_gradients_of_the_six_terms_are_autograds(boundary: str) -> None:
+    grid = Grid((30, 7, 9), 0.01, boundary)  # type: ignore[arg-type]
+    u = (0.8 * torch.tanh(noise(grid.shape))).requires_grad_()
+    each = energy_gradients(u.detach(), grid, WORKING_EPSILON)
+    inside = (slice(None) if grid.periodic else slice(1, -1),) * 3
+    for k, term in enumerate(energy_terms(jet(u, grid), WORKING_EPSILON)):
+        (whole,) = torch.autograd.grad(term.sum(), u, retain_graph=True)
+        torch.testing.assert_close(each[k][inside], whole[inside], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_stationarity_finds_what_made_a_field(found) -> None:
+    for name in ("a11", "a02", "a10", "a01"):
+        truth = getattr(TRUTH.coefficients, name)
+        assert getattr(found.coefficients, name) == pytest.approx(truth, rel=0.1), name
+    assert found.coefficients.a20 == 1
+    assert found.mass == pytest.approx(TRUTH.mass, abs=1e-5)
+    assert found.method == "stationarity" and found.status.startswith("Stationarity is supported")
+
+
+def test_all_starts_end_at_the_whitened_singular_vector(found) -> None:
+    """The constrained minimum is inside the domain here, so it is the unconstrained one; its value is 1 by the
+    choice of the error's size."""
+    residuals = [residual for _, residual in found.starts]
+    assert len(residuals) == 2
+    np.testing.assert_allclose(residuals, residuals[0], rtol=1e-4)
+    assert found.residual == pytest.approx(residuals[0])
+    assert len(found.singular_values) == 6
+    assert found.singular_values[-1] == pytest.approx(1, abs=0.2)
+    assert sorted(found.singular_values, reverse=True) == list(found.singular_values)
+
+
+def test_deviations_cover_the_error_within_a_few(found) -> None:
+    assert found.uncertainty["a20"] == 0
+    for name in ("a11", "a02", "a10", "a01", "a00"):
+        miss = abs(getattr(found.coefficients, name) - getattr(TRUTH.coefficients, name))
+        assert miss < 6 * found.uncertainty[name], name
+
+
+@pytest.mark.slow
+def test_a_field_that_is_not_stationary_is_not_said_to_be(sponge: torch.Tensor, found) -> None:
+    bent = (sponge + 0.05 * torch.sin(torch.linspace(0, 6 * math.pi, EDGE))).clamp(-1, 1)
+    other = stationarity(bent, GRID, WORKING_EPSILON)
+    assert other.residual > 5 * found.residual
+
+
+@pytest.mark.slow
+def test_a_shift_changes_nothing(sponge: torch.Tensor, found) -> None:
+    """An even shift maps octants and the propagated noise elsewhere, the equations onto themselves."""
+    moved = stationarity(sponge.roll((6, 10, 4), (0, 1, 2)), GRID, WORKING_EPSILON)
+    for name in ("a11", "a02", "a10", "a01"):
+        assert getattr(moved.coefficients, name) == pytest.approx(getattr(found.coefficients, name), rel=0.02), name
+
+
+@pytest.mark.slow
+def test_the_mirror_image_has_mirrored_coefficients(sponge: torch.Tensor, found) -> None:
+    """F_ε[-u; a] = F_ε[u; a'], so -u gives a', in the gauge a20 = 1."""
+    mirrored = found.coefficients.mirrored()
+    expected = mirrored.scaled(1 / mirrored.a20)
+    other = stationarity(-sponge, GRID, WORKING_EPSILON)
+    assert list(other.coefficients)[1:5] == pytest.approx(list(expected)[1:5], rel=0.02)
+
+
+@pytest.mark.slow
+def test_a_crop_says_what_its_inside_says(sponge: torch.Tensor) -> None:
+    """The equations of a crop are those of the whole field: its border's continuation is never read."""
+    grid, width = Grid((32, 32, 32), 0.01, "replicate"), 2.5
+    whole = _tested(energy_gradients(sponge.double(), GRID, WORKING_EPSILON), GRID, WORKING_EPSILON, width)
+    crop = sponge[:32, :32, :32].double()
+    part = _tested(energy_gradients(crop, grid, WORKING_EPSILON), grid, WORKING_EPSILON, width)
+    assert part.shape == (6, 4, 4, 4)
+    np.testing.assert_allclose(part, whole[:, 6:10, 6:10, 6:10], rtol=1e-6, atol=1e-9 * np.abs(whole).max())
+    found = stationarity(crop, grid, WORKING_EPSILON)
+    for name in ("a11", "a02", "a10", "a01"):
+        assert getattr(found.coefficients, name) == pytest.approx(getattr(TRUTH.coefficients, name), rel=0.1), name
+
+
+def test_refusals(sponge: torch.Tensor) -> None:
+    with pytest.raises(ValueError, match="expected a crop of at least 24 voxels"):
+        stationarity(sponge[:20, :20, :20], Grid((20, 20, 20), 0.01, "replicate"), WORKING_EPSILON)
+    with pytest.raises(ValueError, match="expected a finite field"):
+        stationarity(sponge.clone().fill_(math.nan), GRID, WORKING_EPSILON)
+    with pytest.raises(ValueError, match="expected a field of shape"):
+        stationarity(sponge[:-1], GRID, WORKING_EPSILON)
+    with pytest.raises(ValueError, match="expected a test width"):
+        stationarity(sponge[:24, :24, :24], Grid((24,) * 3, 0.01, "replicate"), WORKING_EPSILON, width=4)
+
+
+def test_a_rounded_field_is_told(sponge: torch.Tensor) -> None:
+    rounded = torch.floor(sponge * 100) / 100
+    assert is_rounded(rounded) and not is_rounded(sponge)
+    assert "not supported" in stationarity(rounded, GRID, WORKING_EPSILON).status
+
+
+def test_gauge_and_domain() -> None:
+    coefficients, fixed = in_gauge(np.array([2.0, 4, 8, -20, 6, 100]))
+    assert list(coefficients) == [1, 2, 4, -10, 3, 50] and fixed == 0
+    coefficients, fixed = in_gauge(np.array([1e-5, 4, 2.0, 0, 0, 0]))
+    assert coefficients.a02 == 1 and fixed == 2
+    inside = admissible(np.array([-0.2, 1.0, 4.2, 1, 1, 1]))
+    assert inside[0] > 0 and inside[2] > 0 and inside[0] + inside[2] == pytest.approx(2)
+    a = Coefficients(1, 2, 3, 4, 5, 6)
+    assert np.array(list(a)) / units(0.5) == pytest.approx(list(a.in_unit(0.5)))
