@@ -34,7 +34,7 @@ from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.part import Box
 from curvafit.volumes.source import Source, field_of
 
-__all__ = ["known_places", "reconstruct"]
+__all__ = ["SlicesProblem", "known_places", "reconstruct"]
 
 #: Stiffness of the springs on known voxels, in working units: a tenth of it gives way, ten times as much stalls.
 STIFFNESS = 1e7
@@ -142,11 +142,11 @@ def reconstruct(
         if setting.law is None:
             return level(slices, setting.way) > 0
         step: Progress = lambda _, share: progress("trying the prior out", share)  # noqa: E731
-        return _filled(_Between(slices, setting, start(slices, setting)), epsilon, None, step)[0]
+        return _filled(SlicesProblem(slices, setting, start(slices, setting)), epsilon, None, step)[0]
 
     def again(slices: Slices, setting: Setting, moved: np.ndarray, step: Progress) -> tuple[np.ndarray, float]:
         steps: Progress = lambda _, share: step("running again", share)  # noqa: E731
-        return _filled(_Between(slices, setting, moved), epsilon, tile, steps)[1], tiling.place.epsilon
+        return _filled(SlicesProblem(slices, setting, moved), epsilon, tile, steps)[1], tiling.place.epsilon
 
     chosen, tried, uncertain = settings("spline")[0], "", None
     fair = (grown(target, laws[0], epsilon, progress) if other is None else other.part) if runs else None
@@ -155,7 +155,7 @@ def reconstruct(
         way = "spline" if other is None else plainest(other.whole, fill, (*WAYS, ODDS))
         best = choice(_sure(task, len(places)), settings, fill, (way,))
         chosen, tried = best.setting, _gain(best, "left out" if other is None else "of the example")
-    between = _Between(target, chosen, start(target, chosen))
+    between = SlicesProblem(target, chosen, start(target, chosen))
     mask, u, end = _filled(between, epsilon, tile, progress, store=store, workers=workers)
     if fair is not None:
         drawn = () if chosen.law is None else drawn_laws(prior, volume, runs)
@@ -169,7 +169,7 @@ def reconstruct(
 
 
 @dataclass(frozen=True, eq=False)
-class _Between:
+class SlicesProblem:
     """The volume between slices, which a setting fills from an interpolation (length, Y, X), by default that of its
     way."""
 
@@ -215,7 +215,7 @@ class _Between:
 
 
 def _filled(
-    between: _Between, epsilon: float | None, tile: int | None, progress: Progress, **tools: Any
+    between: SlicesProblem, epsilon: float | None, tile: int | None, progress: Progress, **tools: Any
 ) -> tuple[np.ndarray, np.ndarray, str]:
     """Return the mask and the phase field of a volume that a setting fills, and how its flow ended."""
     tiling = Tiling.of(between.slices.frame, epsilon, tile, periodic=between.slices.periodic)

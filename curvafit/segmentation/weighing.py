@@ -100,9 +100,9 @@ def weighing(
     inside = of_classes(values, scan, classes).level > 0
     where = densest(inside, (EDGE, EDGE, EDGE))
     part = replace(scan.crop(where), values=values[where])
-    outs = _blocks(part.shape, _outlasting(part.values, inside[where]))
+    outs = hold_out_masks(part.shape, block_edge(part.values, inside[where]))
     place = WorkingGrid.of(part, epsilon, halo=HALO)
-    judge = _Judge(part.values, outs, classes, measured)
+    judge = Judge(part.values, outs, classes, measured)
 
     def found(known: VoxelEvidence, law: Coefficients, nats: float) -> np.ndarray:
         return place.back(weighed(known, law, nats, place, steps).field) > 0
@@ -110,14 +110,14 @@ def weighing(
     trials = _Trials(part, judge, found, _expected(len(laws), measured), progress)
     chosen = trials.best(laws, FIRST, classes)
     for _ in range(ROUNDS if measured else 0):
-        apart = _measured(part.values, chosen.phases, chosen.classes)
+        apart = measure_classes(part.values, chosen.phases, chosen.classes)
         other = trials.best([chosen.law], chosen.number, apart)
         if other.worth < chosen.worth + ENOUGH:
             break
         chosen = other
     if chosen.classes != classes:
         chosen = trials.best(laws, chosen.number, chosen.classes)
-    gain, noise = judge.gain(chosen.phases, _sides(part, outs, classes, lambda known: known.level > 0))
+    gain, noise = judge.gain(chosen.phases, predict_sides(part, outs, classes, lambda known: known.level > 0))
     if np.isfinite(chosen.worth) and gain > BEYOND * noise:
         return Weighing(chosen.law, WEIGHTS[chosen.number], gain, noise, chosen.classes)
     return Weighing(None, WEIGHTS[chosen.number], gain, noise, classes)
@@ -152,7 +152,7 @@ class _Trial:
 
 
 @dataclass(frozen=True, eq=False)
-class _Judge:
+class Judge:
     """What the levels (Z, Y, X) of voxels left out say of two sides, bool (2, Z, Y, X).
 
     With classes that are known their log-likelihood ratios are summed over the inside; with classes that are to be
@@ -174,7 +174,7 @@ class _Judge:
 
     def gain(self, phases: np.ndarray, start: np.ndarray) -> tuple[float, float]:
         """Return by which part more of the voxels are on their side than in other sides, and its standard error."""
-        classes = _measured(self.levels, phases, self.classes) if self.measured else self.classes
+        classes = measure_classes(self.levels, phases, self.classes) if self.measured else self.classes
         change = (phases[1].astype(np.int8) - start[1]) * (self.levels - classes.middle).astype(np.float64)
         for axis, n in enumerate(change.shape):
             change = np.add.reduceat(change, np.arange(0, n, TILE), axis=axis)
@@ -191,7 +191,7 @@ class _Trials:
     def __init__(
         self,
         part: Field,
-        judge: _Judge,
+        judge: Judge,
         found: Callable[[VoxelEvidence, Coefficients, float], np.ndarray],
         expected: int,
         progress: Progress,
@@ -220,7 +220,7 @@ class _Trials:
     def _tried(self, law: Coefficients, number: int, classes: Classes) -> _Trial:
         """Return a trial, one that is worth nothing where the flow fails."""
         try:
-            phases = _sides(
+            phases = predict_sides(
                 self._part, self._judge.outs, classes, lambda known: self._found(known, law, WEIGHTS[number])
             )
         except ScanError:
@@ -232,7 +232,7 @@ def _worth(trial: _Trial) -> float:
     return trial.worth
 
 
-def _sides(
+def predict_sides(
     part: Field, outs: Sequence[np.ndarray], classes: Classes, found: Callable[[VoxelEvidence], np.ndarray]
 ) -> np.ndarray:
     """Return the voxels left out, bool (2, Z, Y, X), that are outside and inside of what is found of the others."""
@@ -254,7 +254,7 @@ def _explained(levels: np.ndarray, phases: np.ndarray) -> float:
     return weight * contrast * abs(contrast)
 
 
-def _measured(levels: np.ndarray, phases: np.ndarray, classes: Classes) -> Classes:
+def measure_classes(levels: np.ndarray, phases: np.ndarray, classes: Classes) -> Classes:
     """Return the classes of the voxels of two phases `(2, Z, Y, X)`; the old ones where these are few, or the other way
     round."""
     outside, inside = (levels[phase].astype(np.float64) for phase in phases)
@@ -284,7 +284,7 @@ def _surface(inside: np.ndarray) -> np.ndarray:
     return z + y + x
 
 
-def _outlasting(values: np.ndarray, inside: np.ndarray) -> int:
+def block_edge(values: np.ndarray, inside: np.ndarray) -> int:
     """Return the edge of a block within which the noise of grey levels may be alike."""
     residual = values - np.where(inside, values[inside].mean(), values[~inside].mean())
     square = float(np.square(residual).mean())
@@ -300,7 +300,7 @@ def _turned(values: np.ndarray) -> list[np.ndarray]:
     return [np.moveaxis(values, axis, 0) for axis in range(3)]
 
 
-def _blocks(shape: Sequence[int], edge: int) -> list[np.ndarray]:
+def hold_out_masks(shape: Sequence[int], edge: int) -> list[np.ndarray]:
     """Return the voxels that are left out, in blocks chosen at random, and those that are left out then: bool of a
     shape."""
     coarse = np.random.default_rng(0).random([-(-n // edge) for n in shape])

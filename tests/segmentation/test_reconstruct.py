@@ -1,31 +1,39 @@
-"""A volume between known slices: interpolations, halo, and the choice between them and a prior by the data."""
+"""A volume between known slices: interpolations, an example's odds, the choice of a prior by the data, labels."""
 
 from __future__ import annotations
 
+import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
+import nibabel
 import numpy as np
 import pytest
 import torch
+from calling import call, refused
 from found import made_fit
 
-from curvafit.core.progress import silent
 from curvafit.inference.candidates import Candidate
-from curvafit.priors.coefficients import Coefficients
-from curvafit.segmentation.calibration import ODDS, Choice, Setting, Task, choice, left_out
-from curvafit.segmentation.completion import MARGIN, _Between, _filled, reconstruct
+from curvafit.priors.coefficients import Coefficients, preset
+from curvafit.segmentation.calibration import ODDS, Setting, left_out
+from curvafit.segmentation.completion import MARGIN, STIFFNESS, SlicesProblem, reconstruct
 from curvafit.segmentation.engine import stiff
 from curvafit.segmentation.example import Example
+from curvafit.segmentation.lowering import lowered
 from curvafit.segmentation.odds import Odds
+from curvafit.segmentation.several import reconstruct_labels
 from curvafit.segmentation.slices import WAYS, Slices
+from curvafit.segmentation.tiles import Tiling
 from curvafit.segmentation.working import TRUSTED, WorkingGrid, law_of, laws_of
-from curvafit.volumes.field import Field
+from curvafit.volumes.field import Field, ScanError
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 
 WILLMORE = Coefficients.willmore()
 EDGES = (1.0, 1.0, 1.0)
+#: Nothing is tried out, and few steps.
+QUICK = {"stiffness": 1e7, "steps": 30}
 
 
 def straight(length: int = 24) -> np.ndarray:
@@ -35,6 +43,12 @@ def straight(length: int = 24) -> np.ndarray:
 
 def ball(n: int = 32) -> np.ndarray:
     return np.linalg.norm(np.mgrid[:n, :n, :n] - (n - 1) / 2, axis=0) < n / 3
+
+
+def leaning(n: int = 32) -> np.ndarray:
+    """A leaning tube and a ball."""
+    z, y, x = np.mgrid[:n, :n, :n] - n / 2 + 0.5
+    return (np.hypot(y - 0.3 * z, x - 4) < 4) | (z**2 + (y + 9) ** 2 + (x + 9) ** 2 < 25)
 
 
 def known(mask: np.ndarray, every: int, *, periodic: bool = False) -> Slices:
@@ -71,6 +85,14 @@ def test_the_nearest_slice_is_nearest() -> None:
     inside[0, 1:3] = True
     level = Slices(inside, (1, 5), 8, EDGES).level("nearest")
     assert [bool((each > 0).any()) for each in level] == [True] * 4 + [False] * 4
+
+
+def test_distances_between_slices() -> None:
+    disc = np.hypot(*(np.mgrid[:32, :32] - 15.5)) < 10
+    distance = Slices(np.stack([disc, np.zeros_like(disc)]), (2, 6), 9, (2.0, 1.0, 1.0)).level("spline")
+    assert np.array_equal(distance[2] > 0, disc) and np.array_equal(distance[0], distance[2])
+    assert distance[6:].max() == -8  # as far outside as the slices are apart
+    np.testing.assert_allclose(distance[4], (distance[2] + distance[6]) / 2, atol=1e-6)
 
 
 def test_the_known_slices_around_a_slice() -> None:
@@ -145,9 +167,9 @@ def test_odds_hold_the_surface_while_the_energy_is_lowered() -> None:
     """With springs on every voxel the odds last longer than without: thin discs cost much."""
     truth = pancakes(2, seed=1)
     slices = known(truth, 8)
-    level = odds_of(pancakes(2)).level(slices)
+    level, tiling = odds_of(pancakes(2)).level(slices), Tiling.of(slices.frame, None)
     held, free = (
-        _filled(_Between(slices, Setting(ODDS, WILLMORE, 1e7, 60, pull), level), None, None, silent)[0]
+        lowered(SlicesProblem(slices, Setting(ODDS, WILLMORE, 1e7, 60, pull), level), tiling).mask
         for pull in (1e7, 0.0)
     )
     assert (held != truth).sum() < (free != truth).sum()
@@ -199,38 +221,6 @@ def test_there_may_be_too_few_slices_to_leave_any_out() -> None:
     assert left_out(Slices(middle, (0, 4, 8), 9, EDGES)) is None
 
 
-def decided(better: np.ndarray) -> Choice:
-    """The choice between interpolations of a ball and a prior that fills with `better`."""
-    mask, slices = ball(48), known(ball(48), 12)
-    between = [n for n in range(36) if n % 12]
-
-    def filled(given: Slices, setting: Setting) -> np.ndarray:
-        return given.level(setting.way) > 0 if setting.law is None else better
-
-    return choice(Task(slices, mask[between], between), lambda way: [Setting(way, WILLMORE, 1.0, 1)], filled)
-
-
-def test_a_prior_is_taken_where_it_is_better_only() -> None:
-    best = decided(ball(48))
-    assert best.setting.law is WILLMORE and best.dice == 1 > best.plain
-    plain = decided(np.zeros((48, 48, 48), dtype=bool))
-    assert plain.setting.law is None and plain.dice == 0 and plain.plain == best.plain
-    same = decided(known(ball(48), 12).level(plain.setting.way) > 0)
-    assert same.setting == plain.setting and same.noise == 0
-
-
-def test_a_gain_within_the_noise_is_none() -> None:
-    """A single voxel is one tile's gain: as large as its standard error, (T - 1) / T of it being the jackknife's."""
-    way = decided(ball(48)).setting.way
-    start = known(ball(48), 12).level(way) > 0
-    wrong = np.argwhere(start != ball(48))
-    wrong = wrong[(wrong[:, 0] < 36) & (wrong[:, 0] % 12 > 0)]
-    better = start.copy()
-    better[tuple(wrong[0])] ^= True
-    best = decided(better)
-    assert best.setting.law is None and best.dice > best.plain
-
-
 def test_no_prior_helps_where_the_interpolation_is_exact() -> None:
     truth = straight()
     found = reconstruct(truth, WILLMORE, every=6, steps=3)
@@ -245,6 +235,27 @@ def test_the_same_slices_make_the_same_choice() -> None:
     assert np.array_equal(one.mask.values[::6], ball()[::6])
 
 
+def test_known_slices_are_kept_and_the_rest_beats_interpolation() -> None:
+    """A ball: lines between its sections cut it short, their spline less, its curvature least."""
+    n, every = 41, 8
+    truth = np.linalg.norm(np.mgrid[:n, :n, :n] - 20.0, axis=0) < 15.2
+    places = np.arange(0, n, every)
+    found = reconstruct(Field(truth.astype(np.uint8)), WILLMORE, every=every, stiffness=STIFFNESS)
+    lines = Slices(truth[places], tuple(places), n, (1.0, 1.0, 1.0)).level("linear") > 0
+    assert np.array_equal(found.mask.values[places], truth[places])
+    assert dice(found.mask.values, truth) > dice(lines, truth) + 0.01
+    assert found.weight is None
+
+
+def test_an_axis_and_numbers_of_slices() -> None:
+    truth = leaning()
+    known = [1, 8, 15, 22, 30]
+    along = reconstruct(Field(truth), WILLMORE, known=known, steps=20)
+    turned = reconstruct(Field(np.ascontiguousarray(truth.transpose(1, 2, 0))), WILLMORE, known=known, axis=2, steps=20)
+    assert (along.mask.values != turned.mask.values.transpose(2, 0, 1)).mean() < 2e-3
+    assert np.array_equal(turned.mask.values[..., known], truth.transpose(1, 2, 0)[..., known])
+
+
 def test_an_example_is_degraded_as_the_volume_is() -> None:
     """Every sixth slice of a ball is known, and so of the example, a straight tube, where there is nothing to gain."""
     found = reconstruct(ball(), WILLMORE, every=6, example=straight(), steps=3)
@@ -254,31 +265,48 @@ def test_an_example_is_degraded_as_the_volume_is() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "word"),
     [
-        ({"example": ball(), "known": [15, 16]}, "slices with others between them, .* got slices 1 apart"),
-        (
-            {"example": ball()[:8], "every": 8},
-            "an example longer than their distance, got slices 8 apart and an example of 8",
-        ),
-        ({"example": Field(ball(), (1.0,) * 3, "mm"), "every": 8}, "an example with the spacing of the slices"),
-        ({"example": np.zeros((32, 32, 32), dtype=np.uint8), "every": 8}, "got empty ones"),
-        ({"example": ball() * np.float32(0.5), "every": 8}, "values that are not whole numbers"),
+        ({"example": ball(), "known": [15, 16]}, "between"),
+        ({"example": ball()[:8], "every": 8}, "longer"),
+        ({"example": Field(ball(), (1.0,) * 3, "mm"), "every": 8}, "spacing"),
+        ({"example": np.zeros((32, 32, 32), dtype=np.uint8), "every": 8}, "empty"),
+        ({"example": ball() * np.float32(0.5), "every": 8}, "whole numbers"),
+        ({}, "every"),
+        ({"every": 8, "known": [1, 2]}, "every"),
+        ({"every": 0}, "every"),
+        ({"known": [3]}, "two or more"),
+        ({"known": [3, 99]}, "31"),
+        ({"known": [0.0, 12.5]}, "12.5"),
+        ({"every": math.nan}, "whole numbers"),
+        ({"every": 8, "first": 0.5}, "whole numbers"),
+        ({"every": 8, "axis": 3}, "axis"),
+        ({"every": 8, "epsilon": -1.0}, "epsilon"),
+        ({"known": [8, 24]}, "three or more"),
+        ({"every": 8, "stiffness": 0.0}, "stiffness"),
     ],
 )
-def test_bad_examples_are_refused(options: dict, said: str) -> None:
-    with pytest.raises(ValueError, match=said):
-        reconstruct(ball(), WILLMORE, **options)
+def test_bad_slices_and_examples_are_refused(options: dict, word: str) -> None:
+    with pytest.raises(ValueError, match=word):
+        reconstruct(ball(), **{"prior": WILLMORE, **options})
 
 
-def test_a_prior_that_is_no_fit_has_one_law() -> None:
-    scan = Field(ball())
-    for prior in (WILLMORE, "tubes"):
-        laws, _ = laws_of(prior, scan)
-        assert len(laws) == 1
+@pytest.mark.parametrize(
+    ("values", "word"),
+    [
+        (ball() * np.float32(0.5), "whole numbers"),
+        (np.random.default_rng(0).integers(0, 999, (32, 32, 32)).astype(np.int16), "256"),
+        (np.where(ball(), np.nan, 0), "whole numbers"),
+        (np.zeros((32, 32, 32)), "empty"),
+    ],
+)
+def test_slices_that_are_no_mask_are_refused(values: np.ndarray, word: str) -> None:
+    with pytest.raises(ValueError, match=word):
+        reconstruct(Field(values), WILLMORE, every=8)
 
 
 def test_a_fit_has_the_laws_that_it_trusts(tmp_path: Path) -> None:
+    assert [len(laws_of(prior, Field(ball()))[0]) for prior in (WILLMORE, "tubes")] == [1, 1]
     fit = made_fit()
     known = [Candidate(name, Coefficients(1, k, 2, 3, 4, 5), -0.5, {}) for k, name in enumerate(("match", *TRUSTED))]
     fit = replace(fit, candidates=(*fit.candidates, *known))
@@ -299,3 +327,137 @@ def test_a_fit_has_the_laws_that_it_trusts(tmp_path: Path) -> None:
 def test_known_voxels_leave_the_profile_free() -> None:
     """Half a voxel from a plane, the optimal profile of ε = 2 voxels is as far from 0 as the springs ask."""
     assert pytest.approx(np.tanh(0.5 / (2 * np.sqrt(2)))) == MARGIN
+
+
+def test_labels_count_as_inside_and_what_is_extrapolated_is_said() -> None:
+    truth = leaning()
+    labels = np.where(truth, np.random.default_rng(0).integers(1, 200, truth.shape), 0).astype(np.float32)
+    labels[1::2] += 0.5  # these are not read
+    found = reconstruct(Field(labels), WILLMORE, every=8.0, first=2, steps=1, stiffness=1e7)  # type: ignore[arg-type]
+    plain = reconstruct(Field(truth), WILLMORE, known=[2, 10, 18, 26], steps=1, stiffness=1e7)
+    assert np.array_equal(found.mask.values, plain.mask.values) and found.notes == plain.notes
+    assert "The 2 before the first and the 5 beyond the last are extrapolated." in found.notes
+    assert "after 1 step:" in found.status
+    whole = reconstruct(Field(truth), WILLMORE, known=[0, 15, 31], steps=1, stiffness=1e7)
+    assert not any("extrapolated" in note for note in whole.notes)
+
+
+# ---- several structures ----------------------------------------------------------------------------------------------
+
+
+def organelles(shift: int = 0) -> np.ndarray:
+    """Two tubes along z that lean towards each other, labels 2 and 7, uint8 (25, 24, 32)."""
+    z, y, x = np.indices((25, 24, 32))
+    lean = (z + shift) / 8
+    one = np.hypot(y - 12, x - 7 - lean) < 5
+    other = np.hypot(y - 12, x - 25 + lean) < 5
+    return np.where(one, 2, np.where(other, 7, 0)).astype(np.uint8)
+
+
+def dice(one: np.ndarray, other: np.ndarray) -> float:
+    return 2 * float((one & other).sum()) / float(one.sum() + other.sum())
+
+
+def test_each_label_is_completed_as_alone_and_known_slices_stay() -> None:
+    truth = organelles()
+    found = reconstruct_labels(truth, {2: preset("tubes"), 7: WILLMORE}, every=6, **QUICK)
+    assert found.labels is not None
+    values = found.labels.values
+    assert values.dtype == np.uint8
+    assert np.array_equal(values[::6], truth[::6])
+    assert np.array_equal(found.mask.values, values > 0)
+    for number, law in ((2, preset("tubes")), (7, WILLMORE)):
+        alone = reconstruct((truth == number).astype(np.uint8), law, every=6, **QUICK).mask.values
+        assert dice(values == number, alone) > 0.999
+        assert dice(values == number, truth == number) > 0.95
+    assert found.status.count("label ") == 2
+
+
+def test_labels_that_touch_exclude_each_other_where_alone_they_overlap() -> None:
+    """Two touching slabs whose border jumps between known slices: alone both claim the voxels beside it."""
+    truth = np.zeros((13, 20, 24), dtype=np.uint8)
+    truth[:, 4:16, 2:12], truth[:, 4:16, 12:22] = 1, 2
+    truth[4, 4:16, 9:12], truth[8, 4:16, 12:15] = 2, 1
+    alone = [reconstruct((truth == k).astype(np.uint8), WILLMORE, every=4, **QUICK).mask.values for k in (1, 2)]
+    found = reconstruct_labels(truth, WILLMORE, every=4, **QUICK)
+    assert found.labels is not None
+    values = found.labels.values
+    only = alone[0] ^ alone[1]
+    agreed = np.where(alone[0], 1, 2)[only] == values[only]
+    assert agreed.mean() > 0.99
+    assert set(np.unique(values)) == {0, 1, 2}
+
+
+def test_where_all_is_labelled_no_voxel_is_left_out() -> None:
+    truth = np.ones((13, 16, 16), dtype=np.int16)
+    z, _, x = np.indices(truth.shape)
+    truth[x + z / 2 > 11] = 300
+    found = reconstruct_labels(truth, WILLMORE, every=6, **QUICK)
+    assert found.labels is not None
+    assert found.labels.values.dtype == np.uint16
+    assert set(np.unique(found.labels.values)) == {1, 300}
+    assert dice(found.labels.values == 300, truth == 300) > 0.95
+
+
+def test_a_label_that_is_refused_is_interpolated_and_said() -> None:
+    truth = organelles()
+    truth[0, :4, :4] = 9  # in the first slice alone: no slice can be left out that shows it
+    found = reconstruct_labels(truth, WILLMORE, known=[0, 12, 24], chosen=[2, 9], steps=30)
+    assert found.labels is not None
+    assert np.array_equal(found.labels.values[0] == 9, truth[0] == 9)
+    assert not (found.labels.values == 7).any()
+    assert "label 9: interpolated by a spline" in found.status or "label 9: no prior" in found.status
+
+
+@pytest.mark.parametrize(
+    ("values", "options", "word"),
+    [
+        (np.zeros((25, 8, 8), np.uint8), {}, "other than 0"),
+        (organelles(), {"chosen": [0, 2]}, "other than 0"),
+        (organelles(), {"chosen": [2, 5]}, "5"),
+        (organelles() + 0.5, {}, "whole numbers"),
+        (organelles(), {"prior": {2: WILLMORE}}, "law"),
+        (organelles(), {"every": 24, "stiffness": None}, "three or more"),
+    ],
+)
+def test_bad_labels_are_refused(values: np.ndarray, options: dict, word: str) -> None:
+    with pytest.raises(ScanError, match=word):
+        reconstruct_labels(values, **{"prior": WILLMORE, "every": 6, **QUICK, **options})
+
+
+def test_the_command_writes_labels(tmp_path: Path) -> None:
+    scan, out = tmp_path / "labels.nii.gz", tmp_path / "volume.nii.gz"
+    image = nibabel.Nifti1Image(organelles().T, np.diag([0.5, 0.5, 0.5, 1]))
+    image.header.set_xyzt_units("micron")
+    nibabel.save(image, scan)
+    options = ("--every", 6, "--prior", "tubes", "--stiffness", 1e7, "--steps", 30)
+    result = call("reconstruct", scan, *options, "--labels", "all", "-o", out)
+    assert result.exit_code == 0, result.output
+    written = nibabel.Nifti1Image.from_filename(out)
+    assert set(np.unique(np.asarray(written.dataobj))) == {0, 2, 7}
+    assert np.array_equal(written.affine, image.affine)
+    assert json.loads((tmp_path / "volume.json").read_text(encoding="utf-8"))["labels"] == "all"
+    for more in (("all", "--label", 2), ("2,5",), ("two",), ("all", "--suggest", 2)):
+        refused(call("reconstruct", scan, *options, "--labels", *more, "-o", tmp_path / "other.nii.gz"), "labels")
+    assert not list(tmp_path.glob("other*"))
+
+
+@pytest.mark.slow
+def test_the_law_of_each_label_is_inferred_from_the_example(tmp_path: Path) -> None:
+    scan, example, out = tmp_path / "labels.npy", tmp_path / "example.npy", tmp_path / "volume.npy"
+    np.save(scan, organelles())
+    np.save(example, organelles(3))
+    result = call("reconstruct", scan, "--every", 6, "--labels", "2,7", "--example", example, "--steps", 30, "-o", out)
+    assert result.exit_code == 0, result.output
+    truth, values = organelles(), np.load(out)
+    assert dice(values == 2, truth == 2) > 0.95
+    assert dice(values == 7, truth == 7) > 0.95
+
+
+def test_a_field_keeps_its_place() -> None:
+    affine = np.diag([0.2, 0.2, 0.5, 1.0])
+    field = Field(organelles(), (0.5, 0.2, 0.2), "um", affine)
+    found = reconstruct_labels(field, WILLMORE, every=6, stiffness=1e7, steps=2)
+    assert found.labels is not None
+    assert (found.labels.spacing, found.labels.unit) == (field.spacing, "um")
+    assert np.array_equal(found.labels.affine, affine)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from importlib import import_module
 from pathlib import Path
 
 import nibabel
@@ -17,9 +16,8 @@ from scipy import ndimage
 
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation import Refine, calibrate, refine
-from curvafit.segmentation.calibration import Setting, Task, choice, climbed
 from curvafit.segmentation.evidence import of_probability
-from curvafit.segmentation.refine import FIRST, NATS, PLAIN, chances_of
+from curvafit.segmentation.refine import chances_of
 from curvafit.volumes.scan import Field, load, save
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
@@ -53,8 +51,8 @@ def test_a_probability_is_its_own_evidence() -> None:
     found = of_probability(Field(p))
     np.testing.assert_allclose(1 / (1 + np.exp(-found.ratio.astype(float))), p.clip(1e-4, 1 - 1e-4), atol=1e-6)
     assert np.array_equal(found.level > 0, p > 0.5)
-    for bad, said in ((2 * p, "got 0 to 2"), (p - 1e-3, "got -0.001 to")):
-        with pytest.raises(ValueError, match=rf"expected probabilities in \[0, 1\], {said}"):
+    for bad in (2 * p, p - 1e-3):
+        with pytest.raises(ValueError, match="probabilities"):
             of_probability(Field(bad))
 
 
@@ -98,59 +96,20 @@ def test_an_empty_segmentation_says_where_the_voxels_are(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "word"),
     [
-        ({"like": "other.npy"}, r"expected probabilities with the shape \(3, 3, 3\) of other.npy, got \(5, 6, 7\)"),
-        ({"like": "case.nii.gz", "spacing": 2}, "either an image that says where the voxels are, or a spacing"),
-        ({}, "a channel, counted from 0, picks one volume of several"),
-        ({"channel": 2}, "expected a channel from 0 to 1"),
+        ({"like": "other.npy"}, "shape"),
+        ({"like": "case.nii.gz", "spacing": 2}, "spacing"),
+        ({}, "channel"),
+        ({"channel": 2}, "channel"),
     ],
 )
-def test_a_place_that_does_not_fit_is_refused(options, said, tmp_path, monkeypatch) -> None:
+def test_a_place_that_does_not_fit_is_refused(options, word, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     predicted(tmp_path, "case", np.random.default_rng(0).random((5, 6, 7)))
     np.save("other.npy", np.zeros((3, 3, 3)))
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=word):
         chances_of("case.npz", **({"channel": 1} | options if options else {}))
-
-
-# ---- the choice ------------------------------------------------------------------------------------------------------
-
-
-def test_a_climb_ends_at_the_best_on_either_side() -> None:
-    def neighbour(number: int, step: int) -> int | None:
-        return number + step if 0 <= number + step < len(heights) else None
-
-    for heights, first, best in (([5, 1, 2, 3, 4], 2, 4), ([5, 4, 3, 1, 9], 2, 0), ([1, 2, 1], 1, 1), ([7], 0, 0)):
-        assert climbed(first, neighbour, heights.__getitem__) == best
-
-
-def test_strengths_are_tried_as_long_as_they_are_better() -> None:
-    truth, tried = tubes(), []
-
-    def fill(given: None, setting: Setting) -> np.ndarray:
-        tried.append(setting)
-        wrong = 1 if setting.law is None else 1 - 0.1 * [*NATS].index(setting.strength)
-        return truth & (np.random.default_rng(0).random(truth.shape) > 0.3 * wrong)
-
-    other = WILLMORE.scaled(2)
-    settings = [Setting(PLAIN, law, FIRST, 1) for law in (WILLMORE, other)]
-    best = choice(Task(None, truth, range(len(truth))), lambda _: settings, fill, (PLAIN,), NATS)
-    assert best.setting == Setting(PLAIN, WILLMORE, NATS[-1], 1) and len(tried) == len(set(tried))
-    assert {setting.strength for setting in tried if setting.law is WILLMORE} == {3.0, *NATS[NATS.index(FIRST) :]}
-    assert [setting.strength for setting in tried if setting.law is other] == [FIRST, NATS[-1]]
-
-
-def test_errors_side_by_side_are_one() -> None:
-    """Counts of one cube have no error that is known: 16 voxels in a row are one observation, not sixteen."""
-    truth = np.ones((16, 16, 32), dtype=bool)
-    half = np.arange(32) < 16
-
-    def fill(given: None, setting: Setting) -> np.ndarray:
-        return truth if setting.law is None else truth & half
-
-    best = choice(Task(None, truth, range(16)), lambda way: [Setting(way, WILLMORE, 1.0, 1)], fill, (PLAIN,))
-    assert best.noise == pytest.approx(math.sqrt(1 / 4))  # without the one cube 0, without the other -1
 
 
 # ---- what comes out --------------------------------------------------------------------------------------------------
@@ -206,40 +165,40 @@ MAP = network(tubes(), 0)
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "word"),
     [
-        ({}, "either an example, on which law and weight are judged, or a weight, got neither"),
-        ({"weight": 1.0, "example": (MAP, tubes())}, "or a weight, got both"),
-        ({"weight": 0.0}, "positive weight"),
-        ({"weight": 1.0, "epsilon": -1.0}, "positive epsilon"),
-        ({"weight": 1.0, "channel": 1}, "expected channel only with the path of a file"),
-        ({"example": (MAP, tubes()[1:])}, r"a mask of the probabilities' shape \(24, 26, 28\), got \(23, 26, 28\)"),
-        ({"example": (MAP, np.zeros(MAP.shape))}, "with voxels inside and outside, got an empty mask"),
-        ({"example": (MAP, np.ones(MAP.shape))}, "with voxels inside and outside, got a full mask"),
-        ({"example": (MAP, MAP)}, "expected an example with a mask or labels"),
-        ({"example": (2 * MAP, tubes())}, r"probabilities in \[0, 1\]"),
-        ({"example": (Field(MAP, 0.5), tubes())}, "an example with the spacing of the probabilities"),
-        ({"example": (MAP, tubes()), "label": 3}, "expected a label of the scan"),
-        ({"weight": 1.0, "prior": made_fit()}, "got voxel and the fit's mm: give --spacing and --unit"),
-        ({"example": (MAP, tubes()), "prior": "tube"}, "expected a preset among"),
+        ({}, "neither"),
+        ({"weight": 1.0, "example": (MAP, tubes())}, "both"),
+        ({"weight": 0.0}, "weight"),
+        ({"weight": 1.0, "epsilon": -1.0}, "epsilon"),
+        ({"weight": 1.0, "channel": 1}, "channel"),
+        ({"example": (MAP, tubes()[1:])}, "shape"),
+        ({"example": (MAP, np.zeros(MAP.shape))}, "empty"),
+        ({"example": (MAP, np.ones(MAP.shape))}, "full"),
+        ({"example": (MAP, MAP)}, "labels"),
+        ({"example": (2 * MAP, tubes())}, "probabilities"),
+        ({"example": (Field(MAP, 0.5), tubes())}, "spacing"),
+        ({"example": (MAP, tubes()), "label": 3}, "label"),
+        ({"weight": 1.0, "prior": made_fit()}, "--unit"),
+        ({"example": (MAP, tubes()), "prior": "tube"}, "preset"),
     ],
 )
-def test_what_cannot_be_judged_is_refused(options, said) -> None:
-    with pytest.raises(ValueError, match=said):
+def test_what_cannot_be_judged_is_refused(options, word) -> None:
+    with pytest.raises(ValueError, match=word):
         refine(MAP, **{"prior": WILLMORE, **options})
 
 
 def test_values_that_are_not_finite_are_refused() -> None:
     p = MAP.copy()
     p[3, 4, 5] = math.nan
-    with pytest.raises(ValueError, match="expected finite values, got 1 that are NaN"):
+    with pytest.raises(ValueError, match="finite"):
         refine(p, WILLMORE, weight=1.0)
 
 
 @pytest.mark.filterwarnings("ignore:a20 > 0:UserWarning")
 def test_a_law_without_stiffness_is_refused() -> None:
     for judge in ({"weight": 1.0}, {"example": (MAP, tubes())}):
-        with pytest.raises(ValueError, match="a20 . a02 > 0"):
+        with pytest.raises(ValueError, match="a20"):
             refine(MAP, Coefficients(1, 0, -2), **judge)
 
 
@@ -253,7 +212,7 @@ def test_a_mask_is_at_the_probabilities_place() -> None:
         assert learned.example is chances
         moved = there.copy()
         moved[0, 3] += 0.5 * factor
-        with pytest.raises(ValueError, match="expected a mask with the probabilities' affine, got one .* voxels away"):
+        with pytest.raises(ValueError, match="affine"):
             calibrate(chances, Field(truth, spacing, unit, moved), WILLMORE, steps=1)
 
 
@@ -273,18 +232,18 @@ def test_a_callable_gives_the_mask_of_a_class(dtype: torch.dtype) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "given", "said"),
+    ("options", "given", "word"),
     [
-        ({}, None, "got neither"),
-        ({"weight": 1.0, "channel": 0.5}, None, "a channel that is a whole number"),
-        ({"weight": 1.0}, torch.zeros(5, 5, 5), r"expected probabilities \(C, Z, Y, X\) as a tensor, got \(5, 5, 5\)"),
-        ({"weight": 1.0}, np.zeros((2, 5, 5, 5)), r"expected probabilities \(C, Z, Y, X\) as a tensor"),
-        ({"weight": 1.0}, torch.zeros(1, 5, 5, 5), "expected a channel from 0 to 0, got 1"),
-        ({"weight": 1.0}, torch.full((2, 5, 5, 5), 7.0), r"probabilities in \[0, 1\], got 7 to 7"),
+        ({}, None, "neither"),
+        ({"weight": 1.0, "channel": 0.5}, None, "channel"),
+        ({"weight": 1.0}, torch.zeros(5, 5, 5), "tensor"),
+        ({"weight": 1.0}, np.zeros((2, 5, 5, 5)), "tensor"),
+        ({"weight": 1.0}, torch.zeros(1, 5, 5, 5), "channel"),
+        ({"weight": 1.0}, torch.full((2, 5, 5, 5), 7.0), "probabilities"),
     ],
 )
-def test_a_callable_refuses(options, given, said) -> None:
-    with pytest.raises(ValueError, match=said):
+def test_a_callable_refuses(options, given, word) -> None:
+    with pytest.raises(ValueError, match=word):
         Refine(WILLMORE, **options)(given)
 
 
@@ -308,14 +267,14 @@ def test_refine_keeps_the_header_and_says_what_was_chosen(tmp_path: Path) -> Non
     other = predicted(tmp_path / "in", "b", network(tubes(), 3))
     labels = Field(np.where(tubes(), 3, 1).astype(np.uint8), (1.2, 0.4, 0.5), "mm", TURNED)
     save(labels, tmp_path / "truth.nii.gz")
-    told = ("refine", path, "--channel", 1, "--prior", "tubes", "--steps", 30, "--example", tmp_path / "truth.nii.gz")
+    told = ("refine", path, "--channel", 1, "--prior", "tubes", "--steps", 10, "--example", tmp_path / "truth.nii.gz")
     told = (*told, "--example-probabilities", other, "--label", 3, "-o", target)
     result = call(*told)
     assert result.exit_code == 0, (result.output, result.exception)
     one, mask = (nibabel.load(each) for each in (path.with_suffix(".nii.gz"), target))
     assert mask.affine.tobytes() == one.affine.tobytes() and mask.shape == one.shape  # type: ignore[attr-defined]
     record = json.loads((target.parent / "mask.json").read_text())
-    assert (record["job"], record["steps"], record["example_probabilities"]) == ("refine", 30, str(other))
+    assert (record["job"], record["steps"], record["example_probabilities"]) == ("refine", 10, str(other))
     chosen = record["calibration"]
     assert record["status"].startswith("no prior helps here" if chosen["law"] is None else "the ")
     assert (
@@ -324,18 +283,18 @@ def test_refine_keeps_the_header_and_says_what_was_chosen(tmp_path: Path) -> Non
     assert sorted(each.name for each in target.parent.iterdir()) == ["mask.json", "mask.nii.gz", "mask.png"]
 
 
-def test_a_folder_of_predictions_is_refined_by_one_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.slow
+def test_a_folder_of_predictions_is_refined_by_one_example(tmp_path: Path) -> None:
     for name, at in (("a", 0.0), ("b", 1.5), ("c.d", 0.7)):
         predicted(tmp_path / "in", name, network(tubes(at=at), 5))
     example = predicted(tmp_path, "example", network(tubes(), 6))
     truth = tmp_path / "truth.npy"
     np.save(truth, tubes())
-    calls, room = [], import_module("curvafit.segmentation.refine")
-    monkeypatch.setattr(room, "choice", lambda *a, **o: calls.append(1) or choice(*a, **o))
     options = ("--channel", 1, "--prior", "tubes", "--steps", 2, "--example", truth, "--example-probabilities", example)
     result = call("refine", tmp_path / "in", *options, "-o", tmp_path / "out")
     assert result.exit_code == 0, (result.output, result.exception)
-    assert len(calls) == 1
+    tried = [json.loads(path.read_text())["calibration"] for path in sorted((tmp_path / "out").glob("*.json"))]
+    assert len(tried) == 3 and tried[0] == tried[1] == tried[2]
     masks = sorted(path.name for path in (tmp_path / "out").glob("*.nii.gz"))
     assert masks == ["a.nii.gz", "b.nii.gz", "c.d.nii.gz"]
     for name in masks:
@@ -344,44 +303,35 @@ def test_a_folder_of_predictions_is_refined_by_one_example(tmp_path: Path, monke
     single = call("refine", tmp_path / "in" / "b.npz", *options, "-o", tmp_path / "b.nii.gz")
     assert single.exit_code == 0
     assert np.array_equal(load(tmp_path / "b.nii.gz").values, load(tmp_path / "out" / "b.nii.gz").values)
-    refused(call("refine", tmp_path / "in", *options, "-o", tmp_path / "in"), "writes over no input")
-    refused(
-        call("refine", tmp_path / "in", *options, "--like", truth, "-o", tmp_path / "more"), "no --like for a folder"
-    )
+    refused(call("refine", tmp_path / "in", *options, "-o", tmp_path / "in"), "input")
+    refused(call("refine", tmp_path / "in", *options, "--like", truth, "-o", tmp_path / "more"), "--like")
     predicted(tmp_path / "in", "z", 1.5 * network(tubes(), 5))
-    refused(call("refine", tmp_path / "in", *options, "-o", tmp_path / "more"), "expected probabilities in [0, 1]")
+    refused(call("refine", tmp_path / "in", *options, "-o", tmp_path / "more"), "probabilities")
     assert not (tmp_path / "more").exists()
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "word"),
     [
-        (("--prior", "tubes"), "either an example, on which law and weight are judged, or a weight, got neither"),
-        (("--example", "truth.npy"), "--example and --example-probabilities together, got one of them"),
-        (("--weight", "1"), "expected --prior or --example, got neither"),
-        (("--prior", "tube", "--weight", "1"), "expected a preset among"),
-        (("--prior", "tubes", "--weight", "-1"), "positive weight"),
-        (("--prior", "tubes", "--weight", "1", "--like", "small.npy"), "with the shape (5, 5, 5) of small.npy"),
-        (("--prior", "tubes", "--weight", "1", "--like", "none.nii"), "no such file"),
-        (
-            ("--prior", "tubes", "--example", "small.npy", "--example-probabilities", "p.npy"),
-            "the probabilities' shape",
-        ),
-        (
-            ("--prior", "tubes", "--example", "truth.npy", "--example-probabilities", "grey.npy"),
-            "probabilities in [0, 1]",
-        ),
-        (("--prior", "tubes", "--example", "truth.npy", "--example-probabilities", "p.npy", "--label", "4"), "a label"),
+        ("--prior tubes", "neither"),
+        ("--example truth.npy", "--example-probabilities"),
+        ("--weight 1", "--prior"),
+        ("--prior tube --weight 1", "preset"),
+        ("--prior tubes --weight -1", "weight"),
+        ("--prior tubes --weight 1 --like small.npy", "shape"),
+        ("--prior tubes --weight 1 --like none.nii", "none.nii"),
+        ("--prior tubes --example small.npy --example-probabilities p.npy", "shape"),
+        ("--prior tubes --example truth.npy --example-probabilities grey.npy", "probabilities"),
+        ("--prior tubes --example truth.npy --example-probabilities p.npy --label 4", "label"),
     ],
 )
-def test_wrong_input_is_a_sentence(arguments, said, tmp_path, monkeypatch) -> None:
+def test_wrong_input_is_a_sentence_and_writes_nothing(arguments, word, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     np.save("p.npy", MAP)
     np.save("grey.npy", 100 * MAP)
     np.save("truth.npy", tubes())
     np.save("small.npy", np.arange(125.0).reshape(5, 5, 5) > 60)
-    result = call("refine", "p.npy", *arguments, "-o", "mask.nii.gz")
-    assert result.exit_code == 2, (result.output, result.exception)
-    lines = result.stderr.strip().splitlines()
-    assert lines[-1].startswith("error: ") and said in lines[-1], lines
+    result = call("refine", "p.npy", *arguments.split(), "-o", "mask.nii.gz")
+    said = result.stderr.strip().splitlines()[-1]
+    assert result.exit_code == 2 and said.startswith("error: ") and word in said, (result.output, result.exception)
     assert not list(tmp_path.glob("*mask*"))

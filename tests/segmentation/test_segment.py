@@ -14,10 +14,8 @@ from scipy import ndimage
 from skimage.filters import threshold_otsu
 
 from curvafit.priors.coefficients import Coefficients, preset
-from curvafit.segmentation.completion import STIFFNESS, reconstruct
 from curvafit.segmentation.evidence import VoxelEvidence, classes_of, grey_levels, of_classes
 from curvafit.segmentation.segment import segment
-from curvafit.segmentation.slices import Slices
 from curvafit.segmentation.working import WorkingGrid, law_of
 from curvafit.volumes.scan import Field
 
@@ -78,22 +76,14 @@ def test_a_rare_structure_needs_a_threshold_and_is_told_so() -> None:
     ball = np.linalg.norm(np.mgrid[:48, :48, :48] - 23.5, axis=0) < 2.9
     scan = noisy(ball, 10)
     said = "better give a threshold"
-    assert said in " ".join(segment(scan, WILLMORE, weight=1.0, steps=100).notes)
-    assert said not in " ".join(segment(noisy(tubes(), 60), WILLMORE, weight=1.0, steps=100).notes)
-    given = segment(scan, WILLMORE, threshold=80.0, steps=100)
+    assert said in " ".join(segment(scan, WILLMORE, weight=1.0, steps=1).notes)
+    assert said not in " ".join(segment(noisy(tubes(), 60), WILLMORE, weight=1.0, steps=1).notes)
+    given = segment(scan, WILLMORE, threshold=80.0, steps=30)
     assert said not in " ".join(given.notes) and dice(given.mask.values, ball) > 0.9
     assert given.status.startswith("no prior helps here") and given.coefficients is None and given.weight is None
     found = of_intensities(scan, 80.0)
     assert dice(found.level > 0, ball) > 0.9
     assert np.median(found.ratio[ball]) > 40 > -40 > np.median(found.ratio[~ball])
-
-
-def test_distances_between_slices() -> None:
-    disc = np.hypot(*(np.mgrid[:32, :32] - 15.5)) < 10
-    distance = Slices(np.stack([disc, np.zeros_like(disc)]), (2, 6), 9, (2.0, 1.0, 1.0)).level("spline")
-    assert np.array_equal(distance[2] > 0, disc) and np.array_equal(distance[0], distance[2])
-    assert distance[6:].max() == -8  # as far outside as the slices are apart
-    np.testing.assert_allclose(distance[4], (distance[2] + distance[6]) / 2, atol=1e-6)
 
 
 # ---- units and grids -------------------------------------------------------------------------------------------------
@@ -108,9 +98,9 @@ def test_a_prior_comes_in_the_scan_s_unit(tmp_path: Path) -> None:
     law, notes = law_of(str(path), um)
     assert law.as_dict() == pytest.approx(fit.coefficients_physical.in_unit(1e-3).as_dict())
     assert "mm" in notes[0] and "um" in notes[0]
-    with pytest.raises(ValueError, match="got voxel and the fit's mm: give --spacing and --unit"):
+    with pytest.raises(ValueError, match="--unit"):
         law_of(path, Field(np.zeros((4, 4, 4))))
-    with pytest.raises(ValueError, match="expected a preset among"):
+    with pytest.raises(ValueError, match="preset"):
         law_of("tube", mm)
     with pytest.raises(FileNotFoundError):
         law_of(tmp_path / "none.json", mm)
@@ -144,10 +134,11 @@ def test_a_segmentation_does_not_depend_on_the_unit_of_length(scale: float) -> N
 # ---- what comes out --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_noisy_tubes_come_out_better_than_from_a_threshold_at_any_smoothing() -> None:
     truth = tubes()
     scan = noisy(truth, 90, spacing=(0.02,) * 3, unit="mm", affine=np.diag([-0.02, 0.02, 0.02, 1]))
-    found = segment(scan, WILLMORE)
+    found = segment(scan, WILLMORE, steps=100)
     others = []
     for width in (0, 0.7, 1, 1.5, 2, 3):
         smooth = ndimage.gaussian_filter(scan.values, width)
@@ -163,92 +154,20 @@ def test_noisy_tubes_come_out_better_than_from_a_threshold_at_any_smoothing() ->
 def test_anisotropic_scans_keep_their_grid() -> None:
     truth = tubes(36)[1::3]
     scan = noisy(truth, 40, spacing=(3.0, 1.0, 1.0))
-    found = segment(scan, WILLMORE)
+    found = segment(scan, WILLMORE, steps=100)
     assert found.mask.shape == truth.shape and found.mask.spacing == (3.0, 1.0, 1.0)
     assert any("z 3-fold" in note for note in found.notes)
     assert dice(found.mask.values, truth) > 0.93
 
 
-@pytest.mark.slow
-def test_known_slices_are_kept_and_the_rest_beats_interpolation() -> None:
-    """A ball: lines between its sections cut it short, their spline less, its curvature least."""
-    n, every = 41, 8
-    truth = np.linalg.norm(np.mgrid[:n, :n, :n] - 20.0, axis=0) < 15.2
-    places = np.arange(0, n, every)
-    found = reconstruct(Field(truth.astype(np.uint8)), WILLMORE, every=every, stiffness=STIFFNESS)
-    lines = Slices(truth[places], tuple(places), n, (1.0, 1.0, 1.0)).level("linear") > 0
-    assert np.array_equal(found.mask.values[places], truth[places])
-    assert dice(found.mask.values, truth) > dice(lines, truth) + 0.01
-    assert found.weight is None
-
-
-def test_an_axis_and_numbers_of_slices() -> None:
-    truth = tubes()
-    known = [1, 8, 15, 22, 30]
-    along = reconstruct(Field(truth), WILLMORE, known=known, steps=20)
-    turned = reconstruct(Field(np.ascontiguousarray(truth.transpose(1, 2, 0))), WILLMORE, known=known, axis=2, steps=20)
-    assert (along.mask.values != turned.mask.values.transpose(2, 0, 1)).mean() < 2e-3
-    assert np.array_equal(turned.mask.values[..., known], truth.transpose(1, 2, 0)[..., known])
-
-
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({}, "either every"),
-        ({"every": 8, "known": [1, 2]}, "either every"),
-        ({"every": 0}, "every from 1"),
-        ({"known": [3]}, "two or more"),
-        ({"known": [3, 99]}, "within 0 to 31"),
-        ({"known": [0.0, 12.5]}, "whole numbers of slices, got 0.0, 12.5"),
-        ({"every": math.nan}, "whole numbers of slices"),
-        ({"every": 8, "first": 0.5}, "whole numbers of slices"),
-        ({"every": 8, "axis": 3}, "axis 0, 1 or 2"),
-        ({"every": 31}, "voxels inside and outside"),
-        ({"every": 8, "epsilon": -1.0}, "positive epsilon"),
-        ({"known": [4, 28]}, "three or more known slices"),
-        ({"every": 8, "stiffness": 0.0}, "a positive stiffness"),
-        ({"every": 8, "example": Field(tubes(), (0.5,) * 3)}, "the spacing of the slices"),
-    ],
-)
-def test_bad_slices_are_refused(options, said) -> None:
-    with pytest.raises(ValueError, match=said):
-        reconstruct(Field(tubes()), **{"prior": WILLMORE, **options})
-
-
-@pytest.mark.parametrize(
-    ("values", "said"),
-    [
-        (noisy(tubes(), 10).values, "not whole numbers"),
-        (noisy(tubes(), 1000).values.astype(np.int16), "at most 256 labels"),
-        (np.where(tubes(), np.nan, 0), "not whole numbers"),
-    ],
-)
-def test_grey_slices_are_refused(values, said) -> None:
-    with pytest.raises(ValueError, match=said):
-        reconstruct(Field(values), WILLMORE, every=8)
-
-
-def test_labels_count_as_inside_and_what_is_extrapolated_is_said() -> None:
-    truth = tubes()
-    labels = np.where(truth, np.random.default_rng(0).integers(1, 200, truth.shape), 0).astype(np.float32)
-    labels[1::2] += 0.5  # these are not read
-    found = reconstruct(Field(labels), WILLMORE, every=8.0, first=2, steps=1, stiffness=1e7)  # type: ignore[arg-type]
-    plain = reconstruct(Field(truth), WILLMORE, known=[2, 10, 18, 26], steps=1, stiffness=1e7)
-    assert np.array_equal(found.mask.values, plain.mask.values) and found.notes == plain.notes
-    assert "The 2 before the first and the 5 beyond the last are extrapolated." in found.notes
-    assert "after 1 step:" in found.status
-    whole = reconstruct(Field(truth), WILLMORE, known=[0, 15, 31], steps=1, stiffness=1e7)
-    assert not any("extrapolated" in note for note in whole.notes)
-
-
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        ({"weight": 0.0}, "positive weight"),
-        ({"threshold": 500.0}, "within the smoothed scan's"),
-        ({"threshold": "li"}, "a number or 'otsu'"),
-        ({"epsilon": math.inf}, "positive epsilon"),
-        ({"prior": Coefficients(torch.ones(32, 32, 32), 0, 1)}, "coefficients that are numbers"),
+        ({"weight": 0.0}, "weight"),
+        ({"threshold": 500.0}, "threshold"),
+        ({"threshold": "li"}, "otsu"),
+        ({"epsilon": math.inf}, "epsilon"),
+        ({"prior": Coefficients(torch.ones(32, 32, 32), 0, 1)}, "coefficients"),
     ],
 )
 def test_bad_options_are_refused(options, said) -> None:
@@ -259,13 +178,13 @@ def test_bad_options_are_refused(options, said) -> None:
 def test_a_scan_with_holes_is_refused() -> None:
     scan = noisy(tubes(), 30)
     scan.values[3, 4, 5:7] = math.nan, math.inf
-    with pytest.raises(ValueError, match="expected finite values, got 2 that are not"):
+    with pytest.raises(ValueError, match="finite"):
         segment(scan, WILLMORE)
 
 
 @pytest.mark.filterwarnings("ignore:a20 > 0:UserWarning")
 def test_a_prior_without_stiffness_is_refused() -> None:
-    with pytest.raises(ValueError, match="a20 . a02 > 0"):
+    with pytest.raises(ValueError, match="a20"):
         segment(noisy(tubes(), 30), Coefficients(1, 0, -2))
 
 
@@ -274,7 +193,7 @@ def test_a_prior_s_scale_does_not_matter_but_its_weight_does() -> None:
     scan = noisy(tubes(), 60)
     one, thrice = (segment(scan, WILLMORE.scaled(by), weight=1 / by, steps=100) for by in (1, 3))
     assert (one.mask.values != thrice.mask.values).mean() < 1e-3
-    weak, strong = (segment(scan, WILLMORE, weight=weight).mask.values for weight in (0.01, 30))
+    weak, strong = (segment(scan, WILLMORE, weight=weight, steps=100).mask.values for weight in (0.01, 30))
     bright = scan.values > 80
     assert (weak == bright).mean() > (strong == bright).mean() + 0.001
 

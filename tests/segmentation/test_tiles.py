@@ -86,7 +86,7 @@ def test_large_volumes_have_tiles() -> None:
 
 
 def test_a_tile_s_edge_is_checked() -> None:
-    with pytest.raises(ValueError, match="a tile of 8 or more working voxels a side, got 7"):
+    with pytest.raises(ValueError, match="tile"):
         reconstruct(beads(), WILLMORE, every=8, stiffness=1e7, tile=7)
 
 
@@ -123,6 +123,7 @@ def close(one, other) -> None:
     assert np.abs(one.phase.values[one.mask.values != other.mask.values]).max(initial=0) < 0.03
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", [WILLMORE, Coefficients(1, 2, 1, -20, -20, 100)])
 def test_the_tiles_do_not_show_between_slices(law: Coefficients) -> None:
     truth = beads()
@@ -137,6 +138,7 @@ def test_the_tiles_do_not_show_between_slices(law: Coefficients) -> None:
         assert found.status.split(":")[0] == whole.status.split(":")[0]
 
 
+@pytest.mark.slow
 def test_the_tiles_do_not_show_along_another_axis_or_around() -> None:
     truth = np.moveaxis(beads(88), 0, 2)  # two turns of the swing
     options = {"every": 8, "stiffness": 1e7, "steps": 50, "axis": 2, "periodic": True}

@@ -1,6 +1,8 @@
-"""Laws and weights chosen by voxels left out: what is left out, what it tells of classes, and what is chosen."""
+"""The choice of a law and its weight: by masks that are known, and by voxels left out."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 import pytest
@@ -8,10 +10,26 @@ from scipy import ndimage
 
 import curvafit.segmentation.weighing as room
 from curvafit.priors.coefficients import Coefficients
+from curvafit.segmentation.calibration import Choice, Setting, Task, choice, climbed
 from curvafit.segmentation.evidence import Classes, classes_of, grey_levels
+from curvafit.segmentation.refine import FIRST, NATS, PLAIN
 from curvafit.segmentation.segment import segment
-from curvafit.segmentation.weighing import Weighing, trial_steps, weighing
-from curvafit.volumes.field import Field
+from curvafit.segmentation.slices import Slices
+from curvafit.segmentation.weighing import (
+    EDGE,
+    TIMES,
+    WEIGHTS,
+    Judge,
+    Weighing,
+    block_edge,
+    densest,
+    hold_out_masks,
+    measure_classes,
+    predict_sides,
+    trial_steps,
+    weighing,
+)
+from curvafit.volumes.field import Field, ScanError
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 
@@ -20,7 +38,90 @@ WILLMORE = Coefficients.willmore()
 TUBE = Coefficients(1.0, 0.0, 1.0, -1.0, 0.0, 0.25)
 
 
-def tubes(n: int = 40) -> np.ndarray:
+# ---- by masks that are known -----------------------------------------------------------------------------------------
+
+
+def ball(n: int = 48) -> np.ndarray:
+    return np.linalg.norm(np.mgrid[:n, :n, :n] - (n - 1) / 2, axis=0) < n / 3
+
+
+def every_twelfth(mask: np.ndarray) -> Slices:
+    places = tuple(range(0, len(mask), 12))
+    return Slices(mask[list(places)], places, len(mask), (1.0, 1.0, 1.0))
+
+
+def decided(better: np.ndarray) -> Choice:
+    """The choice between interpolations of a ball and a prior that fills with `better`."""
+    mask, slices = ball(), every_twelfth(ball())
+    between = [n for n in range(36) if n % 12]
+
+    def filled(given: Slices, setting: Setting) -> np.ndarray:
+        return given.level(setting.way) > 0 if setting.law is None else better
+
+    return choice(Task(slices, mask[between], between), lambda way: [Setting(way, WILLMORE, 1.0, 1)], filled)
+
+
+def test_a_prior_is_taken_where_it_is_better_only() -> None:
+    best = decided(ball())
+    assert best.setting.law is WILLMORE and best.dice == 1 > best.plain
+    plain = decided(np.zeros((48, 48, 48), dtype=bool))
+    assert plain.setting.law is None and plain.dice == 0 and plain.plain == best.plain
+    same = decided(every_twelfth(ball()).level(plain.setting.way) > 0)
+    assert same.setting == plain.setting and same.noise == 0
+
+
+def test_a_gain_within_the_noise_is_none() -> None:
+    """A single voxel is one tile's gain: as large as its standard error, (T - 1) / T of it being the jackknife's."""
+    way = decided(ball()).setting.way
+    start = every_twelfth(ball()).level(way) > 0
+    wrong = np.argwhere(start != ball())
+    wrong = wrong[(wrong[:, 0] < 36) & (wrong[:, 0] % 12 > 0)]
+    better = start.copy()
+    better[tuple(wrong[0])] ^= True
+    best = decided(better)
+    assert best.setting.law is None and best.dice > best.plain
+
+
+def test_a_climb_ends_at_the_best_on_either_side() -> None:
+    def neighbour(number: int, step: int) -> int | None:
+        return number + step if 0 <= number + step < len(heights) else None
+
+    for heights, first, best in (([5, 1, 2, 3, 4], 2, 4), ([5, 4, 3, 1, 9], 2, 0), ([1, 2, 1], 1, 1), ([7], 0, 0)):
+        assert climbed(first, neighbour, heights.__getitem__) == best
+
+
+def test_strengths_are_tried_as_long_as_they_are_better() -> None:
+    truth, tried = ball(26), []
+
+    def fill(given: None, setting: Setting) -> np.ndarray:
+        tried.append(setting)
+        wrong = 1 if setting.law is None else 1 - 0.1 * [*NATS].index(setting.strength)
+        return truth & (np.random.default_rng(0).random(truth.shape) > 0.3 * wrong)
+
+    other = WILLMORE.scaled(2)
+    settings = [Setting(PLAIN, law, FIRST, 1) for law in (WILLMORE, other)]
+    best = choice(Task(None, truth, range(len(truth))), lambda _: settings, fill, (PLAIN,), NATS)
+    assert best.setting == Setting(PLAIN, WILLMORE, NATS[-1], 1) and len(tried) == len(set(tried))
+    assert {setting.strength for setting in tried if setting.law is WILLMORE} == {3.0, *NATS[NATS.index(FIRST) :]}
+    assert [setting.strength for setting in tried if setting.law is other] == [FIRST, NATS[-1]]
+
+
+def test_errors_side_by_side_are_one() -> None:
+    """Counts of one cube have no error that is known: 16 voxels in a row are one observation, not sixteen."""
+    truth = np.ones((16, 16, 32), dtype=bool)
+    half = np.arange(32) < 16
+
+    def fill(given: None, setting: Setting) -> np.ndarray:
+        return truth if setting.law is None else truth & half
+
+    best = choice(Task(None, truth, range(16)), lambda way: [Setting(way, WILLMORE, 1.0, 1)], fill, (PLAIN,))
+    assert best.noise == pytest.approx(math.sqrt(1 / 4))  # without the one cube 0, without the other -1
+
+
+# ---- by voxels left out ----------------------------------------------------------------------------------------------
+
+
+def tubes(n: int = 32) -> np.ndarray:
     """Two tubes of radius 4 that do not meet."""
     z, y, x = np.mgrid[:n, :n, :n] - (n - 1) / 2
     return (np.hypot(z + 9, y + 3) < 4) | (np.hypot(z - 8, x - 2) < 4)
@@ -40,8 +141,8 @@ def weighed(scan: Field, laws, **options) -> Weighing:
 
 
 def test_what_is_left_out_comes_in_blocks_and_once() -> None:
-    outs = room._blocks((20, 23, 26), 4)
-    assert len(outs) == room.TIMES and not (outs[0] & outs[1]).any()
+    outs = hold_out_masks((20, 23, 26), 4)
+    assert len(outs) == TIMES and not (outs[0] & outs[1]).any()
     for out in outs:
         assert out.shape == (20, 23, 26) and 0.15 < out.mean() < 0.35
         corners = out[::4, ::4, ::4]
@@ -51,45 +152,46 @@ def test_what_is_left_out_comes_in_blocks_and_once() -> None:
 
 @pytest.mark.parametrize(("width", "edge"), [(0.0, 2), (0.7, 4), (3.0, 6)])
 def test_blocks_outlast_the_noise(width: float, edge: int) -> None:
-    truth = tubes()
-    assert room._outlasting(noisy(truth, 40, width).values, truth) == edge
+    truth = tubes(40)
+    assert block_edge(noisy(truth, 40, width).values, truth) == edge
 
 
 def test_the_part_that_is_tried_is_where_the_surface_is() -> None:
     inside = np.zeros((30, 150, 90), dtype=bool)
     inside[:, 100:140, 5:25] = np.random.default_rng(0).random((30, 40, 20)) < 0.5
-    z, y, x = room.densest(inside, (room.EDGE,) * 3)
-    assert (z.start, z.stop) == (0, 30) and y.stop - y.start == x.stop - x.start == room.EDGE
+    z, y, x = densest(inside, (EDGE,) * 3)
+    assert (z.start, z.stop) == (0, 30) and y.stop - y.start == x.stop - x.start == EDGE
     assert y.start <= 100 and y.stop >= 140 and x.start <= 5 and x.stop <= 90
 
 
-def test_classes_that_overlap_are_measured_apart() -> None:
-    """Otsu's halves hold some of both phases: their means are nearer to each other."""
-    scan = noisy(tubes(), 180)
-    first = classes_of(grey_levels(scan), scan)
-    best = weighed(scan, [WILLMORE])
-    assert abs(first.middle - 80) > 1.3 * abs(best.classes.middle - 80)
-    assert 80 > first.contrast < best.classes.contrast < 110 and best.classes.noise == pytest.approx(180, rel=0.03)
-    kept = weighed(scan, [WILLMORE], measured=False)
-    assert kept.classes == first
-
-
-def test_the_law_that_tells_more_of_what_is_left_out_is_chosen() -> None:
-    """Of a law whose tubes are of another calibre nothing is left, or all."""
+@pytest.mark.slow
+def test_the_law_that_tells_more_is_chosen_and_classes_that_overlap_are_measured_apart() -> None:
+    """Of a law whose tubes are of another calibre nothing is left, or all. Otsu's halves hold some of both phases:
+    their means are nearer to each other."""
     wrong = Coefficients(1.0, 0.0, 1.0, 3.0, 3.0, 9.0)
-    best = weighed(noisy(tubes(), 200), [wrong, WILLMORE])
-    assert best.law == WILLMORE and best.gain > best.noise > 0 and best.nats in room.WEIGHTS
+    scan, said = noisy(tubes(28), 150), list[float]()
+    first = classes_of(grey_levels(scan), scan)
+    best = weighed(scan, [wrong, WILLMORE], progress=lambda _, share: said.append(share))
+    assert best.law == WILLMORE and best.gain > best.noise > 0 and best.nats in WEIGHTS
+    assert abs(first.middle - 80) > 1.3 * abs(best.classes.middle - 80)
+    assert 80 > first.contrast < best.classes.contrast < 110 and best.classes.noise == pytest.approx(150, rel=0.03)
+    assert said == sorted(said) and said[0] > 0 and said[-1] <= 1
+
+
+def test_classes_that_are_known_stay() -> None:
+    scan = noisy(tubes(28), 150)
+    assert weighed(scan, [WILLMORE], measured=False, steps=5).classes == classes_of(grey_levels(scan), scan)
 
 
 @pytest.mark.parametrize("measured", [False, True])
 def test_the_gain_is_that_of_the_truth(measured: bool) -> None:
     """Of masks that are known, the gain stated is, within its error, the one counted."""
-    truth, noise = tubes(), 150.0
+    truth, noise = tubes(40), 150.0
     scan, classes = noisy(truth, noise), Classes(30.0, 130.0, noise, 80.0)
-    outs = room._blocks(scan.shape, 2)
-    judge = room._Judge(scan.values, outs, classes, measured)
-    start = room._sides(scan, outs, classes, lambda known: known.level > 0)
-    right = room._sides(scan, outs, classes, lambda known: truth)
+    outs = hold_out_masks(scan.shape, 2)
+    judge = Judge(scan.values, outs, classes, measured)
+    start = predict_sides(scan, outs, classes, lambda known: known.level > 0)
+    right = predict_sides(scan, outs, classes, lambda known: truth)
     gain, error = judge.gain(right, start)
     left = np.logical_or.reduce(outs)
     share = float((start[1] != (truth & left)).sum() / left.sum())
@@ -99,30 +201,32 @@ def test_the_gain_is_that_of_the_truth(measured: bool) -> None:
 
 def test_where_a_prior_tells_nothing_the_start_is_the_answer() -> None:
     """A law that wipes out what there is, at every weight that is tried."""
-    scan = noisy(tubes(), 5)
+    truth = tubes(28)
+    scan = noisy(truth, 5)
     wrong = Coefficients(1.0, 0.0, 1.0, 30.0, 30.0, 900.0)
-    best = weighed(scan, [wrong])
+    best = weighed(scan, [wrong], steps=30)
     assert best.law is None and best.classes == classes_of(grey_levels(scan), scan)
-    found = segment(scan, wrong, steps=100)
-    assert (found.mask.values != tubes()).mean() < 0.01
+    found = segment(scan, wrong, steps=30)
+    assert (found.mask.values != truth).mean() < 0.01
 
 
 def test_sides_are_judged_without_the_classes_that_made_them() -> None:
     """A mask that grows fat brings the classes together, which makes it fatter: it explains less than the truth, by
     whatever classes it came about."""
-    truth, noise = tubes(), 150.0
+    truth, noise = tubes(40), 150.0
     scan = noisy(truth, noise)
-    outs = room._blocks(scan.shape, 2)
+    outs = hold_out_masks(scan.shape, 2)
     for classes in (Classes(30.0, 130.0, noise, 80.0), Classes(50.0, 80.0, noise, 65.0)):
-        judge = room._Judge(scan.values, outs, classes, True)
+        judge = Judge(scan.values, outs, classes, True)
         worth = [
-            judge.worth(room._sides(scan, outs, classes, lambda known, mask=mask: mask))
+            judge.worth(predict_sides(scan, outs, classes, lambda known, mask=mask: mask))
             for mask in (truth, ndimage.binary_dilation(truth, iterations=3), ndimage.binary_erosion(truth))
         ]
         assert worth[0] > max(worth[1:]) > 0
-        assert judge.worth(room._sides(scan, outs, classes, lambda known: ~truth)) == pytest.approx(-worth[0])
-    apart = room._measured(scan.values, room._sides(scan, outs, classes, lambda known: truth), classes)
-    assert apart.contrast == pytest.approx(100, rel=0.1)
+        wrong = predict_sides(scan, outs, classes, lambda known: ~truth)
+        assert judge.worth(wrong) == pytest.approx(-worth[0])
+    right = predict_sides(scan, outs, classes, lambda known: truth)
+    assert measure_classes(scan.values, right, classes).contrast == pytest.approx(100, rel=0.1)
 
 
 def test_a_flow_that_fails_is_no_choice(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -130,17 +234,14 @@ def test_a_flow_that_fails_is_no_choice(monkeypatch: pytest.MonkeyPatch) -> None
 
     def failing(known, law, *rest):
         if law != WILLMORE:
-            raise room.ScanError("expected an energy that stays finite")
+            raise ScanError("expected an energy that stays finite")
         return real(known, law, *rest)
 
     monkeypatch.setattr(room, "weighed", failing)
-    scan = noisy(tubes(), 200)
-    assert weighed(scan, [TUBE, WILLMORE]).law == WILLMORE
-    assert weighed(scan, [TUBE]).law is None
+    scan = noisy(tubes(28), 150)
+    assert weighed(scan, [TUBE, WILLMORE], steps=60, measured=False).law == WILLMORE
+    assert weighed(scan, [TUBE], steps=60, measured=False).law is None
 
 
-def test_trying_says_how_far_it_is_and_takes_about_what_is_forecast() -> None:
-    said: list[float] = []
-    weighed(noisy(tubes(), 200), [TUBE, WILLMORE], steps=20, progress=lambda _, share: said.append(share))
-    assert said == sorted(said) and said[0] > 0 and said[-1] <= 1
-    assert trial_steps(2, 20, 10**6) < trial_steps(2, 20, 10**5) == pytest.approx(room.TIMES * 8 * 20)
+def test_trying_takes_as_many_steps_as_is_forecast() -> None:
+    assert trial_steps(2, 20, 10**6) < trial_steps(2, 20, 10**5) == pytest.approx(TIMES * 8 * 20)

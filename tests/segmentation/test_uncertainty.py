@@ -160,7 +160,7 @@ def test_a_law_of_which_no_shape_grows_is_refused() -> None:
     """Of two voxels in a thousand no flow makes a shape."""
     mask = np.zeros((16, 32, 32), dtype=bool)
     mask[:, :1, :2] = True
-    with pytest.raises(ValueError, match="a shape with volume fraction 0.002 grows, got none: give an example"):
+    with pytest.raises(ValueError, match="grows"):
         grown(known(mask, [0, 8, 15]), WILLMORE, None)
 
 
@@ -193,11 +193,9 @@ def test_a_gap_that_is_left_is_suggested() -> None:
     assert "on a shape of the law" in found.status
 
 
-@pytest.mark.parametrize(
-    ("options", "said"), [({"runs": -1}, "a number of runs from 0"), ({"suggest": 29}, "a number of slices from 0")]
-)
-def test_numbers_out_of_range_are_refused(options: dict, said: str) -> None:
-    with pytest.raises(ValueError, match=said):
+@pytest.mark.parametrize(("options", "word"), [({"runs": -1}, "runs"), ({"suggest": 29}, "slices")])
+def test_numbers_out_of_range_are_refused(options: dict, word: str) -> None:
+    with pytest.raises(ValueError, match=word):
         reconstruct(ball(), WILLMORE, every=8, **options)
 
 
