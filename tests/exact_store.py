@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-import curvafit.atlas_map.map_files as atlas_files
+import curvafit.atlas_map.files as atlas_files
 from curvafit.data_synth.atlas.design import boxed
 from curvafit.data_synth.atlas.record import Record, Settings
 from curvafit.data_synth.atlas.store import Store, open_store

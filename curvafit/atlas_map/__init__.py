@@ -9,8 +9,8 @@ from curvafit.core.faces import offer
 if TYPE_CHECKING:
     from curvafit.atlas_map.describe import describe
     from curvafit.atlas_map.extract import extract
+    from curvafit.atlas_map.files import write_map
     from curvafit.atlas_map.layout import AtlasMap, map_atlas
-    from curvafit.atlas_map.map_files import write_map
 
 __all__ = [
     "AtlasMap",
@@ -25,7 +25,7 @@ _HOMES = {
     "describe": "curvafit.atlas_map.describe",
     "extract": "curvafit.atlas_map.extract",
     "map_atlas": "curvafit.atlas_map.layout",
-    "write_map": "curvafit.atlas_map.map_files",
+    "write_map": "curvafit.atlas_map.files",
 }
 
 offer(__name__, _HOMES)

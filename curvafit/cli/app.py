@@ -11,20 +11,20 @@ from typing import Annotated
 import typer
 
 from curvafit.cli.atlas import atlas_app
+from curvafit.cli.console import say
 from curvafit.cli.generate import EXAMPLES as GENERATE_EXAMPLES
 from curvafit.cli.generate import generate, presets
-from curvafit.cli.hosts import EXAMPLE as NNUNET_EXAMPLE
-from curvafit.cli.hosts import nnunet
 from curvafit.cli.infer import EXAMPLES as INFER_EXAMPLES
 from curvafit.cli.infer import infer
 from curvafit.cli.measure import EXAMPLES as MEASURE_EXAMPLES
 from curvafit.cli.measure import measure
+from curvafit.cli.nnunet import EXAMPLE as NNUNET_EXAMPLE
+from curvafit.cli.nnunet import nnunet
 from curvafit.cli.refine import EXAMPLES as REFINE_EXAMPLES
 from curvafit.cli.refine import refine
 from curvafit.cli.refusal import Commands
 from curvafit.cli.samples import samples_app
 from curvafit.cli.segment import RECONSTRUCT_EXAMPLES, SEGMENT_EXAMPLES, reconstruct, segment
-from curvafit.cli.support import say
 from curvafit.cli.synth import EXAMPLES as SYNTH_EXAMPLES
 from curvafit.cli.synth import synth
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from curvafit.cli.support import (
+from curvafit.cli.console import (
     OverwriteOption,
     command_line,
     device_of,
@@ -234,7 +234,7 @@ def map_atlas(
     """Draw a map of the shapes of stores: a picture, and a page to explore the shapes and to place scans."""
     with plainly():
         with kept(), stages() as progress:
-            from curvafit.atlas_map.map_files import check_map, write_map
+            from curvafit.atlas_map.files import check_map, write_map
 
             check_map(out, stores, overwrite)
             options = {"device": device_of(device), "command": command_line(), "overwrite": overwrite}

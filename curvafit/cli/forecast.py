@@ -12,7 +12,7 @@ import time
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from curvafit.cli.support import error_console, say
+from curvafit.cli.console import error_console, say
 from curvafit.core.units import number
 from curvafit.generation import memory
 

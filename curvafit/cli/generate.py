@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli.forecast import FLOW, say_forecast
-from curvafit.cli.support import (
+from curvafit.cli.console import (
     OverwriteOption,
     command_line,
     device_of,
@@ -24,12 +23,13 @@ from curvafit.cli.support import (
     whole_numbers,
     whole_triple,
 )
+from curvafit.cli.forecast import FLOW, say_forecast
 from curvafit.core.interrupts import exit_code
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from curvafit.drawing.shape_files import Output
+    from curvafit.drawing.shapes import Output
     from curvafit.generation.flow import Flow
     from curvafit.priors.grid import Grid
     from curvafit.priors.law import Texture
@@ -131,7 +131,7 @@ def generate(
         how = _output(texture, grid, spacing, unit, tile, cap)
         saving = _checkpoint(checkpoint, checkpoint_every)
         options |= {"grid": grid, "seed": seed, **saving}
-        from curvafit.drawing.shape_files import check_target
+        from curvafit.drawing.shapes import check_target
         from curvafit.generation.schedule import schedule as named
 
         options["schedule"] = plan = named(schedule, steps)
@@ -145,7 +145,7 @@ def generate(
         flow = _flow({**options, "device": device_of(device)})
         more = {"orientation": Q if Q is None else Q.tolist(), "maps": maps if maps is None else str(maps)}
         more |= {"origin": texture.origin, "wanted_volume_fraction": volume_fraction, "command": command_line()}
-        from curvafit.drawing.shape_files import shape_record
+        from curvafit.drawing.shapes import shape_record
 
         record = shape_record(flow, mass=options["mass"], output=how, snapshots=list(flow.snapshots), **more)
         _write(flow, out, record, output=how, **writing)
@@ -226,7 +226,7 @@ def _output(
         raise ValueError(f"expected --spacing of cubic voxels, one number, got {spacing!r}")
     if tile is not None and not grid.periodic:
         raise ValueError(f"expected --tile with a periodic boundary, got {grid.boundary!r}")
-    from curvafit.drawing.shape_files import Output
+    from curvafit.drawing.shapes import Output
 
     repeats = (1, 1, 1) if tile is None else whole_triple(tile, "--tile")
     how = Output(edges[0], unit or fit_unit, repeats, cap is not False)
@@ -293,7 +293,7 @@ def _discard(checkpoint: Path | None) -> None:
 
 def _write(flow: Flow, out: Path, record: dict[str, Any], **how: Any) -> None:
     """Write the files, and print the flow's status and the paths."""
-    from curvafit.drawing.shape_files import step_path, write_shape
+    from curvafit.drawing.shapes import step_path, write_shape
 
     notes = [] if flow.viability.viable else [flow.status]
     files = write_shape(flow, out, record=record, **how)

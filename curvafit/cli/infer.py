@@ -8,9 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli.forecast import INFERENCE, say_forecast
-from curvafit.cli.reading import Reading, Volume, reads_volume
-from curvafit.cli.support import (
+from curvafit.cli.console import (
     OverwriteOption,
     command_line,
     output,
@@ -20,6 +18,8 @@ from curvafit.cli.support import (
     stages,
     threshold_of,
 )
+from curvafit.cli.forecast import INFERENCE, say_forecast
+from curvafit.cli.options import Reading, Volume, reads_volume
 
 if TYPE_CHECKING:
     from curvafit.inference.infer import Inference

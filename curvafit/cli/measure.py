@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli.reading import Reading, reads_volume
-from curvafit.cli.support import OverwriteOption, output, plainly, say, say_notes, stages, threshold_of
+from curvafit.cli.console import OverwriteOption, output, plainly, say, say_notes, stages, threshold_of
+from curvafit.cli.options import Reading, reads_volume
 
 if TYPE_CHECKING:
     from curvafit.studies.measure import Measures, Quantity

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli.reading import Reading, reads_volume
+from curvafit.cli.console import OverwriteOption, plainly, say_notes
+from curvafit.cli.options import Reading, reads_volume
 from curvafit.cli.segment import STEPS, Epsilon, OwnPrior, Steps, TileOption, Weight, WorkersOption, inferred, run_job
-from curvafit.cli.support import OverwriteOption, plainly, say_notes
 
 if TYPE_CHECKING:
     from curvafit.core.progress import Progress

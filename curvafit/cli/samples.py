@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from curvafit.cli.support import OverwriteOption, error_console, output, plainly, say
+from curvafit.cli.console import OverwriteOption, error_console, output, plainly, say
 
 #: The sample that needs no network, and its line in the list.
 SYNTHETIC = "synthetic"

@@ -11,9 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli.forecast import SEGMENTATION, say_forecast
-from curvafit.cli.reading import Reading, Volume, reads_volume
-from curvafit.cli.support import (
+from curvafit.cli.console import (
     OverwriteOption,
     command_line,
     kept,
@@ -24,6 +22,8 @@ from curvafit.cli.support import (
     threshold_of,
     whole_numbers,
 )
+from curvafit.cli.forecast import SEGMENTATION, say_forecast
+from curvafit.cli.options import Reading, Volume, reads_volume
 
 if TYPE_CHECKING:
     from curvafit.core.progress import Progress

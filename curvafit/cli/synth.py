@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli.reading import reading_of
-from curvafit.cli.support import error_console, numbers, plainly, say, say_notes, whole_triple
+from curvafit.cli.console import error_console, numbers, plainly, say, say_notes, whole_triple
+from curvafit.cli.options import reading_of
 from curvafit.cli.workers import Crew, DashboardOption, SchedulerOption, WorkersOption
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
+from curvafit.cli.console import kept, stages
 from curvafit.cli.forecast import FLOW, say_forecast
-from curvafit.cli.support import kept, stages
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

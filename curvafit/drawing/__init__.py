@@ -9,7 +9,7 @@ from curvafit.core.faces import offer
 if TYPE_CHECKING:
     from curvafit.drawing.plot import diagram_figure, slice_figure, surface_figure, write_picture
     from curvafit.drawing.render import View, render, view
-    from curvafit.drawing.shape_files import write_field, write_shape
+    from curvafit.drawing.shapes import write_field, write_shape
 
 __all__ = [
     "View",
@@ -30,9 +30,9 @@ _HOMES = {
     "slice_figure": "curvafit.drawing.plot",
     "surface_figure": "curvafit.drawing.plot",
     "view": "curvafit.drawing.render",
-    "write_field": "curvafit.drawing.shape_files",
+    "write_field": "curvafit.drawing.shapes",
     "write_picture": "curvafit.drawing.plot",
-    "write_shape": "curvafit.drawing.shape_files",
+    "write_shape": "curvafit.drawing.shapes",
 }
 
 offer(__name__, _HOMES)

@@ -18,8 +18,8 @@ from scipy.spatial.distance import cdist
 
 import curvafit.atlas_map.layout as atlas_map
 from curvafit.atlas_map.extract import extract
+from curvafit.atlas_map.files import write_map
 from curvafit.atlas_map.layout import NOISE, AtlasMap, embed, find_clusters, map_atlas
-from curvafit.atlas_map.map_files import write_map
 from curvafit.atlas_map.picture import _assigned, _slots, spread_out
 from curvafit.atlas_map.shapes import CUT, LEVELS, regrow_command, shown, small_volume
 from curvafit.generation.flow import generate

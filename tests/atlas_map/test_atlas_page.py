@@ -19,7 +19,7 @@ from found import made_fit
 from PIL import Image
 
 from curvafit.atlas_map.extract import extract
-from curvafit.atlas_map.map_files import write_map
+from curvafit.atlas_map.files import write_map
 from curvafit.cli.app import app
 from curvafit.inference.atlas import Atlas
 from curvafit.inference.fit import Fit
@@ -65,7 +65,7 @@ def atlas_page(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Atlas]:
     exact_store(folder / "s.zarr", COUNT)
     with pytest.MonkeyPatch.context() as patch:
         quick_map(patch)
-        patch.setattr("curvafit.atlas_map.map_files.map_picture", lambda mapped, field, path: path)
+        patch.setattr("curvafit.atlas_map.files.map_picture", lambda mapped, field, path: path)
         _, page = write_map([folder / "s.zarr"], folder / "map")
     return page.as_uri(), extract([folder / "s.zarr"])
 

@@ -50,7 +50,7 @@ def test_a_failure_while_writing_leaves_nothing(tmp_path: Path, monkeypatch: pyt
     def full(*_: Any, **__: Any) -> None:
         raise OSError(28, "No space left on device", "out")
 
-    monkeypatch.setattr("curvafit.drawing.shape_files.write_field", full)
+    monkeypatch.setattr("curvafit.drawing.shapes.write_field", full)
     result = call("generate", *QUICK, "-o", tmp_path / "out.zarr")
     assert result.exit_code == 2 and "no space left" in result.stderr
     assert list(tmp_path.iterdir()) == []
@@ -93,7 +93,7 @@ def test_a_checkpoint_outlives_a_write_that_fails(tmp_path: Path, monkeypatch: p
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as broken:
-        broken.setattr("curvafit.drawing.shape_files.write_field", full)
+        broken.setattr("curvafit.drawing.shapes.write_field", full)
         assert call(*command).exit_code == 2
     assert [path.name for path in tmp_path.iterdir()] == ["run.pt"]
     assert call(*command).exit_code == 0

@@ -9,8 +9,8 @@ import pytest
 from calling import LAW, call, refused
 from exact_store import exact_store
 
+from curvafit.cli.console import error_console, stages
 from curvafit.cli.refusal import LONGEST, sentence, writable
-from curvafit.cli.support import error_console, stages
 from curvafit.volumes.scan import Field, save
 
 SYNTH = ["--presets", "tubes", "--modality", "confocal", "--workers", "0", "--count", "1"]

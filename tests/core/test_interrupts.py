@@ -141,11 +141,11 @@ SLOW = """
 import signal, sys, time
 for number in (signal.SIGINT, signal.SIGTERM):  # a program in the background ignores Ctrl-C
     signal.signal(number, signal.SIG_DFL)
-import curvafit.drawing.shape_files
+import curvafit.drawing.shapes
 def slow(*_):
     print("writing", file=sys.stderr, flush=True)
     time.sleep(60)
-curvafit.drawing.shape_files.write_field = slow
+curvafit.drawing.shapes.write_field = slow
 from curvafit.__main__ import main
 main()
 """

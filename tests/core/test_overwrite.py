@@ -12,7 +12,7 @@ from disk import tree
 from exact_store import exact_store, quick_map
 from found import made_inference
 
-from curvafit.atlas_map.map_files import check_map, write_map
+from curvafit.atlas_map.files import check_map, write_map
 from curvafit.data_synth.atlas.store import open_store
 from curvafit.report.page import FILES, write_inference
 from curvafit.volumes.scan import Field, load, save
@@ -150,7 +150,7 @@ def test_atlases_leave_other_peoples_files(tmp_path: Path, monkeypatch: pytest.M
     for _ in range(2):
         assert call("atlas", "extract", store, "-o", tmp_path / "new.npz").exit_code == 0
     quick_map(monkeypatch)
-    monkeypatch.setattr("curvafit.atlas_map.map_files.map_picture", lambda mapped, field, path: path.write_bytes(b""))
+    monkeypatch.setattr("curvafit.atlas_map.files.map_picture", lambda mapped, field, path: path.write_bytes(b""))
     for _ in range(2):
         write_map([store], tmp_path / "map")
     check_map(tmp_path / "map", [store])

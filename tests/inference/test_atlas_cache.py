@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from exact_store import exact_field, exact_store, quick_map
 
-import curvafit.atlas_map.map_files as atlas_files
-from curvafit.atlas_map.map_files import write_map
+import curvafit.atlas_map.files as atlas_files
+from curvafit.atlas_map.files import write_map
 from curvafit.data_synth.atlas.record import Record
 
 

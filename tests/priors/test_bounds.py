@@ -15,7 +15,7 @@ from curvafit.data_synth.atlas.workers import check_workers
 from curvafit.data_synth.imaging.modalities import MODALITIES
 from curvafit.data_synth.sets.case import Recipe
 from curvafit.data_synth.sets.sources import Generated
-from curvafit.drawing.shape_files import Output
+from curvafit.drawing.shapes import Output
 from curvafit.generation import Schedule, descend, generate, generate_batch, white_noise
 from curvafit.generation.memory import check_memory, memory
 from curvafit.priors.coefficients import Coefficients, preset

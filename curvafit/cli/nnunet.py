@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from curvafit.cli.support import plainly, say
+from curvafit.cli.console import plainly, say
 
 EXAMPLE = """[bold]Example[/bold]
 

@@ -13,7 +13,7 @@ from exact import Sphere, centres
 from torch import Tensor
 
 from curvafit.core.records import sibling
-from curvafit.drawing.shape_files import Output, step_path, write_field
+from curvafit.drawing.shapes import Output, step_path, write_field
 from curvafit.priors.grid import Grid
 from curvafit.volumes.scan import load
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from curvafit.cli.support import plainly, triple, whole_triple
+from curvafit.cli.console import plainly, triple, whole_triple
 
 _read = partial(typer.Option, rich_help_panel="How to read the file")
 
