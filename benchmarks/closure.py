@@ -1,63 +1,48 @@
-"""Parameters read back from shapes whose parameters are known: errors, widths and calibration of each method.
+"""Parameters read back from shapes whose parameters are known: R², errors, widths and calibration of each method.
 
-    python -m benchmarks.closure TABLE.npz [--cache FOLDER] [--views field,mask,crop,scan] [--folds 5]
-    python -m benchmarks.closure TABLE.npz --curve 100,200,400          # R² by number of training shapes
-    python -m benchmarks.closure TABLE.npz --ablation                   # R² without each block, and with it alone
-    CURVAFIT_DATA=… python -m benchmarks.closure TABLE.npz --gallery    # the author's volumes, as masks
-    python -m benchmarks.closure TABLE.npz --misfit                     # how often the check alarms at p < .05
-
-TABLE is made by `curvafit atlas describe`. Each shape is answered for by what was trained on the other folds alone, all
-its views being in one fold. Answers are kept in the cache's folder, so that a stopped run goes on.
-
-Methods: `match`, the nearest training shape by the curvature block; `ridge`, linear regression on all columns;
+`--table TABLE.npz` is made by `curvafit atlas describe`. Each shape is answered for by what was trained on the other
+folds alone, all its views being in one fold. Methods: `match`, the nearest training shape by the curvature block;
 `process`, a Gaussian process for each parameter on principal components; `posterior`, the ensemble of flows; `refined`,
-the emulator's best parameters from the posterior's draws, with the covariance there.
+the emulator's best fit from the posterior's draws.
 
-- error: median |error| in deviations of the prior; R²: 1 - mean square error / variance.
-- in 50, in 90: part of the true values in the central 50 and 90 % intervals; wide 90: their mean width in deviations of
-  the prior (a uniform prior's is 3.1).
-- ranks: p-value that the ranks of the truth among draws are uniform (SBC: χ² of 10 bins, the least of six times six).
-- TARP: greatest difference of expected and stated coverage of balls around random points (Lemos et al. 2023):
-  about 0.05 for exact draws and 400 queries, 0.1 for intervals a fifth too wide.
+- R²: 1 - mean square error / variance of a parameter. Error: median |error| in deviations of the prior.
+- in 90: part of the true values in the central 90 % intervals; width: their mean width in deviations of the prior.
+- ranks: p that ranks of the truth among draws are uniform (SBC: χ² of 10 bins, the least of six, times six).
+- TARP: greatest difference of expected and stated coverage of balls around random points (Lemos et al. 2023), and its
+  p: the part of as many exact draws that differ by more.
+
+`--gallery` ($CURVAFIT_DATA) asks the packaged posterior for the author's volumes as masks.
 """
 
 from __future__ import annotations
 
 import argparse
-import hashlib
 import os
 import re
-import time
 import warnings
 import zlib
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-import nibabel
 import numpy as np
 from scipy import stats
 
-from curvafit.geometry.descriptors import BLOCKS, descriptors
-from curvafit.inference.check import amortised_p
+from benchmarks.harness import Cases, Figure, Values, show
+from curvafit.geometry.descriptors import descriptors
 from curvafit.inference.compression import compression_of
 from curvafit.inference.emulator import optimum
-from curvafit.inference.posterior import Architecture, Posterior, load_posterior, save_posterior
+from curvafit.inference.posterior import Architecture, Posterior, load_posterior
 from curvafit.inference.posterior_training import train_posterior
 from curvafit.inference.table import PARAMETERS, Table, column_names, load_table, parameters_of
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
 
-DRAWS = 400
-#: Draws from which the best parameters are looked for.
-STARTS = 16
-#: Flows of a posterior; in curve and ablation, which compare, a single one.
-MEMBERS = 4
+DRAWS, STARTS, MEMBERS, FOLDS = 400, 16, 4, 5
 
 
 class Answers(NamedTuple):
-    """What a method says of N queries: means `(N, 6)`, draws `(N, DRAWS, 6)`, none of a method without width."""
+    """What a method says of N queries: means `(N, 6)`; draws `(N, DRAWS, 6)`, none of a method without width."""
 
     mean: np.ndarray
     draws: np.ndarray | None
@@ -66,76 +51,52 @@ class Answers(NamedTuple):
 Method = Callable[[Table, Table], Answers]
 
 
+# ---- methods ---------------------------------------------------------------------------------------------------------
+
+
+def by_view(training: Table, queries: Table, answer: Callable[[Table, Table], np.ndarray]) -> np.ndarray:
+    """Return a method's means, of each view by the training rows of that view."""
+    mean = np.empty((len(queries), len(PARAMETERS)))
+    for view in set(queries.views.tolist()):
+        mine = queries.views == view
+        mean[mine] = answer(training.of([view]), queries.rows(mine))
+    return mean
+
+
 def match(training: Table, queries: Table) -> Answers:
-    """The parameters of the training row of the same view whose curvature block is nearest."""
     columns = np.array(column_names()) == "curvature"
-    mean = np.empty((len(queries), len(PARAMETERS)))
-    for view in set(queries.views.tolist()):
-        mine, rows = queries.views == view, training.of([view])
-        apart = rows.descriptors[None, :, columns] - queries.descriptors[mine][:, None, columns]
-        mean[mine] = rows.parameters[np.square(apart).sum(-1).argmin(1)]
-    return Answers(mean, None)
 
+    def nearest(rows: Table, asked: Table) -> np.ndarray:
+        apart = rows.descriptors[None, :, columns] - asked.descriptors[:, None, columns]
+        return rows.parameters[np.square(apart).sum(-1).argmin(1)]
 
-def ridge(training: Table, queries: Table) -> Answers:
-    from sklearn.linear_model import RidgeCV
-    from sklearn.preprocessing import StandardScaler
-
-    mean = np.empty((len(queries), len(PARAMETERS)))
-    for view in set(queries.views.tolist()):
-        mine, rows = queries.views == view, training.of([view])
-        scaler = StandardScaler().fit(rows.descriptors)
-        model = RidgeCV(np.logspace(0, 5, 16)).fit(scaler.transform(rows.descriptors), rows.parameters)
-        mean[mine] = model.predict(np.clip(scaler.transform(queries.descriptors[mine]), -6, 6))
-    return Answers(mean, None)
+    return Answers(by_view(training, queries, nearest), None)
 
 
 def process(training: Table, queries: Table) -> Answers:
-    """Independent Gaussian processes for the six parameters, one for each view."""
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
-    mean, spread = np.empty((2, len(queries), len(PARAMETERS)))
-    for view in set(queries.views.tolist()):
-        mine, rows = queries.views == view, training.of([view])
+    spread = np.empty((len(queries), len(PARAMETERS)))
+
+    def predict(rows: Table, asked: Table) -> np.ndarray:
         compression = compression_of(rows.descriptors, Architecture().components)
-        x, asked = compression(rows.descriptors), compression(queries.descriptors[mine])
+        x, at, found = compression(rows.descriptors), compression(asked.descriptors), []
         for k, y in enumerate(rows.parameters.T):
             kernel = ConstantKernel(1.0) * RBF(5.0, (0.3, 1e3)) + WhiteKernel(0.1)
             model = GaussianProcessRegressor(kernel).fit(x, (y - y.mean()) / y.std())
-            told, width = model.predict(asked, return_std=True)
-            mean[mine, k], spread[mine, k] = told * y.std() + y.mean(), width * y.std()
+            mean, width = model.predict(at, return_std=True)
+            found.append(mean * y.std() + y.mean())
+            spread[queries.views == asked.views[0], k] = width * y.std()
+        return np.stack(found, 1)
+
+    mean = by_view(training, queries, predict)
     noise = np.random.default_rng(0).standard_normal((len(queries), DRAWS, len(PARAMETERS)))
     return Answers(mean, mean[:, None] + spread[:, None] * noise)
 
 
-def posterior(training: Table, queries: Table, cache: Path) -> Answers:
-    return asked(learnt(training, cache), queries)
-
-
-def refined(training: Table, queries: Table, cache: Path) -> Answers:
-    """The best parameters by the emulator, with normal draws about them, cut at the box."""
-    trained, rng = learnt(training, cache), np.random.default_rng(0)
-    mean, draws = np.empty((len(queries), len(PARAMETERS))), np.empty((len(queries), DRAWS, len(PARAMETERS)))
-    for k, (row, view) in enumerate(zip(queries.descriptors, queries.views.tolist(), strict=True)):
-        best = optimum(trained.emulator, row, view, trained.sample(row, view, STARTS))
-        mean[k] = best.parameters
-        draws[k] = np.clip(rng.multivariate_normal(best.parameters, best.covariance, DRAWS), *trained.box.T)
-    return Answers(mean, draws)
-
-
-def learnt(training: Table, cache: Path) -> Posterior:
-    """The posterior of a table, trained once for all that ask it."""
-    path = cache / f"{key_of(training)}-posterior{MEMBERS}.npz"
-    if not path.exists():
-        cache.mkdir(parents=True, exist_ok=True)
-        save_posterior(train_posterior(training, members=MEMBERS), path)
-    return load_posterior(path)
-
-
-def lone(training: Table, queries: Table) -> Answers:
-    """The posterior as one flow."""
-    return asked(train_posterior(training, members=1), queries)
+def posterior(training: Table, queries: Table) -> Answers:
+    return asked(train_posterior(training, members=MEMBERS), queries)
 
 
 def asked(trained: Posterior, queries: Table) -> Answers:
@@ -146,244 +107,168 @@ def asked(trained: Posterior, queries: Table) -> Answers:
     return Answers(draws.mean(1), draws)
 
 
-def methods(cache: Path) -> dict[str, Method]:
-    trained = {"posterior": partial(posterior, cache=cache), "refined": partial(refined, cache=cache)}
-    return {"match": match, "ridge": ridge, "process": process} | trained
+def refined(training: Table, queries: Table) -> Answers:
+    return best_fits(train_posterior(training, members=1), queries)
 
 
-# ---- folds -----------------------------------------------------------------------------------------------------------
-
-
-def fold_of(table: Table, folds: int) -> np.ndarray:
-    """The fold of each row, by its shape's name: a shape stays in its fold as a table grows."""
-    return np.array([zlib.crc32(shape.encode()) % folds for shape in table.shapes])
-
-
-def cross_answers(table: Table, method: Method, folds: int, cache: Path | None = None, name: str = "") -> Answers:
-    """What a method says of each row, trained on the shapes of the other folds."""
-    fold, parts = fold_of(table, folds), {}
-    for k in range(folds):
-        queries, training = table.rows(fold == k), table.rows(fold != k)
-        path = cache / f"{key_of(table)}-{name}-{k}of{folds}.npz" if cache else None
-        if path is not None and path.exists():
-            content = np.load(path)
-            parts[k] = Answers(content["mean"], content.get("draws"))
-            continue
-        parts[k] = method(training, queries)
-        if path is not None:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            np.savez(path, **{n: v for n, v in parts[k]._asdict().items() if v is not None})
-    mean = np.empty((len(table), len(PARAMETERS)))
-    draws = None if parts[0].draws is None else np.empty((len(table), DRAWS, len(PARAMETERS)))
-    for k, part in parts.items():
-        mean[fold == k] = part.mean
-        if draws is not None:
-            draws[fold == k] = part.draws
+def best_fits(trained: Posterior, queries: Table) -> Answers:
+    """Return the emulator's best parameters, with normal draws about them, cut at the box."""
+    random, shape = np.random.default_rng(0), (len(queries), DRAWS, len(PARAMETERS))
+    mean, draws = np.empty(shape[::2]), np.empty(shape)
+    for k, (row, view) in enumerate(zip(queries.descriptors, queries.views.tolist(), strict=True)):
+        found = optimum(trained.emulator, row, view, trained.sample(row, view, STARTS))
+        mean[k] = found.parameters
+        draws[k] = np.clip(random.multivariate_normal(found.parameters, found.covariance, DRAWS), *trained.box.T)
     return Answers(mean, draws)
 
 
-def key_of(table: Table) -> str:
-    names = "\n".join(f"{shape} {view}" for shape, view in zip(table.shapes, table.views, strict=True))
-    return hashlib.sha256(names.encode() + table.descriptors.tobytes()).hexdigest()[:12]
+METHODS: dict[str, Method] = {
+    "match": match, "process": process, "posterior": posterior, "refined": refined
+}  # fmt: skip
+
+
+def cross_answers(table: Table, name: str, folds: int, cases: Cases) -> Answers:
+    """Return what a method says of each row, trained on the shapes of the other folds; a shape keeps its fold."""
+    fold = np.array([zlib.crc32(shape.encode()) % folds for shape in table.shapes])
+    mean, draws = np.empty((len(table), len(PARAMETERS))), None
+    key = f"{zlib.crc32(table.descriptors.tobytes()):08x}"
+    for k in range(folds):
+
+        def make(k: int = k) -> np.ndarray:
+            found = METHODS[name](table.rows(fold != k), table.rows(fold == k))
+            return found.mean[:, None] if found.draws is None else found.draws
+
+        part = cases.array(f"{name}-{key}-{k}of{folds}", make)
+        mean[fold == k] = part.mean(1)
+        if part.shape[1] > 1:
+            draws = np.empty((len(table), *part.shape[1:])) if draws is None else draws
+            draws[fold == k] = part
+    return Answers(mean, draws)
 
 
 # ---- figures ---------------------------------------------------------------------------------------------------------
 
 
-def r_squared(truth: np.ndarray, mean: np.ndarray) -> np.ndarray:
-    return 1 - np.square(mean - truth).mean(0) / truth.var(0)
-
-
-def ranks(truth: np.ndarray, draws: np.ndarray) -> np.ndarray:
-    """The part of the draws below the truth, `(N, 6)`."""
-    return (draws < truth[:, None]).mean(1)
-
-
-def coverage(truth: np.ndarray, draws: np.ndarray, level: float) -> np.ndarray:
-    return (np.abs(ranks(truth, draws) - 0.5) <= level / 2).mean(0)
-
-
-def width(draws: np.ndarray, level: float) -> np.ndarray:
-    low, high = np.quantile(draws, [(1 - level) / 2, (1 + level) / 2], axis=1)
-    return (high - low).mean(0)
-
-
-def rank_p(truth: np.ndarray, draws: np.ndarray, bins: int = 10) -> np.ndarray:
-    """p-values that ranks are uniform."""
-    counts = [np.histogram(column, bins, (0, 1 + 1e-9))[0] for column in ranks(truth, draws).T]
-    return np.array([stats.chisquare(each).pvalue for each in counts])
-
-
-def tarp(truth: np.ndarray, draws: np.ndarray, seed: int = 0) -> float:
-    """Greatest difference between the part of truths nearer to random points than a part of the draws, and that."""
-    low, high = truth.min(0), truth.max(0)
-    points = np.random.default_rng(seed).uniform(low, high, truth.shape)
-    scale = truth.std(0)
-    apart = np.linalg.norm((draws - points[:, None]) / scale, axis=-1)
-    true = np.linalg.norm((truth - points) / scale, axis=-1)
-    nearer = (apart < true[:, None]).mean(1)
-    levels = np.linspace(0.05, 0.95, 19)
-    return float(np.abs([(nearer < level).mean() - level for level in levels]).max())
-
-
-def show(label: str, values: Sequence[float] | np.ndarray, extra: str = "") -> None:
-    print(f"    {label:10} " + " ".join(f"{value:8.2f}" for value in values) + f"  {extra}", flush=True)
-
-
-def show_answers(name: str, truth: np.ndarray, answers: Answers, prior: np.ndarray) -> None:
-    print(f"  {name}")
-    show("R²", r_squared(truth, answers.mean))
-    show("error", np.median(np.abs(answers.mean - truth), axis=0) / prior)
+def judged(truth: np.ndarray, answers: Answers, prior: np.ndarray) -> Values:
+    """Return the figures of a method on queries of one view."""
+    error = answers.mean - truth
+    found: Values = {"R²": (1 - np.square(error).mean(0) / truth.var(0)).tolist()}
+    found["error"] = (np.median(np.abs(error), axis=0) / prior).tolist()
     if answers.draws is not None:
-        show("in 50", coverage(truth, answers.draws, 0.5))
-        show("in 90", coverage(truth, answers.draws, 0.9), f"all {coverage(truth, answers.draws, 0.9).mean():.3f}")
-        show("wide 90", width(answers.draws, 0.9) / prior)
-        least = min(1.0, len(PARAMETERS) * rank_p(truth, answers.draws).min())
-        print(f"    ranks: p {least:.2g}; TARP {tarp(truth, answers.draws):.3f}", flush=True)
+        ranks = (answers.draws < truth[:, None]).mean(1)
+        low, high = np.quantile(answers.draws, (0.05, 0.95), axis=1)
+        found["in 90"] = (np.abs(ranks - 0.5) <= 0.45).mean(0).tolist()
+        found["width"] = ((high - low).mean(0) / prior).tolist()
+        counts = [np.histogram(column, 10, (0, 1 + 1e-9))[0] for column in ranks.T]
+        found["ranks p"] = min(1.0, 6 * min(stats.chisquare(each).pvalue for each in counts))
+        found["TARP"], found["TARP p"] = tarp(truth, answers.draws)
+    return found
+
+
+def tarp(truth: np.ndarray, draws: np.ndarray) -> tuple[float, float]:
+    """Return the greatest difference between the part of truths nearer to random points than a part of the draws, and
+    that part; and the part of as many exact queries whose difference is greater."""
+    random, levels = np.random.default_rng(0), np.linspace(0.05, 0.95, 19)
+    points, scale = random.uniform(truth.min(0), truth.max(0), truth.shape), truth.std(0)
+    away = np.linalg.norm((truth - points) / scale, axis=-1)
+    nearer = (np.linalg.norm((draws - points[:, None]) / scale, axis=-1) < away[:, None]).mean(1)
+
+    def greatest(parts: np.ndarray) -> float:
+        return float(np.abs((parts[:, None] < levels).mean(0) - levels).max())
+
+    exact = [greatest(random.integers(0, draws.shape[1] + 1, len(truth)) / draws.shape[1]) for _ in range(1000)]
+    return greatest(nearer), float(np.mean(np.array(exact) > greatest(nearer)))
+
+
+# ---- the author's volumes --------------------------------------------------------------------------------------------
+
+
+def author_paths() -> dict[str, Path]:
+    folder = Path(os.environ["CURVAFIT_DATA"]) / "gallery"
+    return {path.name.partition(" coeffs")[0].replace(" ", ""): path for path in sorted(folder.glob("*coeffs*.nii.gz"))}
+
+
+def truth_of(path: Path) -> tuple[Coefficients, float]:
+    """Return the law and mass in an author's file's name."""
+    law, mass = re.search(r"\[(.*?)\]", path.name), re.search(r" m (-?[\d.]+)\.nii", path.name)
+    assert law is not None
+    assert mass is not None
+    return Coefficients(*map(float, law[1].split())), float(mass[1])
+
+
+def author_values(path: Path) -> np.ndarray:
+    import nibabel
+
+    return np.asarray(nibabel.Nifti1Image.from_filename(path).dataobj, dtype=np.float32)
+
+
+def author_table(cases: Cases, names: list[str]) -> Table:
+    """Return the author's volumes, measured as masks."""
+    paths = {name: author_paths()[name] for name in names}
+
+    def row(path: Path) -> np.ndarray:
+        mask = np.ascontiguousarray(author_values(path) > 0)
+        return descriptors(mask, Grid(mask.shape)).vector()
+
+    rows = [cases.array(f"author-{name}", lambda path=path: row(path)) for name, path in paths.items()]
+    parameters = np.array([parameters_of(*truth_of(path)) for path in paths.values()])
+    return Table(np.array(names), np.array(["mask"] * len(names)), parameters, np.array(rows), {})
+
+
+def on_gallery(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
+    names = list(author_paths())[: 2 if options.quick else None]
+    queries, trained = author_table(cases, names), load_posterior()
+    prior = np.ptp(trained.box, axis=1) / np.sqrt(12)
+    jobs = {
+        "gallery-posterior": lambda: judged(queries.parameters, asked(trained, queries), prior),
+        "gallery-refined": lambda: judged(queries.parameters, best_fits(trained, queries), prior),
+    }
+    found = cases.all(jobs)
+    rows = [[f"{name}, {key}", *row[key]] for name, row in found.items() for key in ("error", "in 90")]
+    show(["", *PARAMETERS], rows, f"{len(names)} of the author's volumes, as masks")
+    return {f"gallery.{name.partition('-')[2]}.{parameter}": Figure(value) for name, row in found.items()
+            for parameter, value in zip(SLUGS, row["error"], strict=True)}  # fmt: skip
 
 
 # ---- runs ------------------------------------------------------------------------------------------------------------
 
+#: Names of the parameters in the ledger.
+SLUGS = ("a11", "log_a02", "a10", "a01", "a00", "m0")
 
-def closure(table: Table, views: Sequence[str], folds: int, cache: Path) -> None:
-    for name, method in methods(cache).items():
-        begun = time.perf_counter()
-        answers = cross_answers(table, method, folds, cache, f"{name}-{'-'.join(views)}")
-        print(f"{name}: {time.perf_counter() - begun:.0f} s")
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--table", type=Path)
+    parser.add_argument("--views", default="mask,crop,scan")
+    parser.add_argument("--methods", default=",".join(METHODS))
+    parser.add_argument("--gallery", action="store_true")
+
+
+def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
+    warnings.filterwarnings("ignore", module="sklearn")
+    if options.gallery:
+        return on_gallery(options, cases)
+    if options.table is None:
+        raise SystemExit("name a table with --table (curvafit atlas describe makes one), or --gallery")
+    views, folds = options.views.split(","), 2 if options.quick else FOLDS
+    table = load_table(options.table).visible.of(views)
+    figures: dict[str, Figure] = {}
+    for name in ["match"] if options.quick else options.methods.split(","):
+        answers = cross_answers(table, name, folds, cases)
+        jobs = {}
         for view in views:
             mine = table.views == view
             part = Answers(answers.mean[mine], None if answers.draws is None else answers.draws[mine])
-            show_answers(view, table.parameters[mine], part, table.parameters.std(0))
-
-
-def curve(table: Table, counts: Sequence[int], folds: int, cache: Path) -> None:
-    """R² by the number of training shapes, of the process and of one flow."""
-    for count in counts:
-
-        def fewer(method: Method, count: int = count) -> Method:
-            def learn(training: Table, queries: Table) -> Answers:
-                shapes = np.unique(training.shapes)
-                chosen = np.random.default_rng(0).permutation(shapes)[:count]
-                return method(training.rows(np.isin(training.shapes, chosen)), queries)
-
-            return learn
-
-        for name, method in (("process", process), ("flow", lone)):
-            answers = cross_answers(table, fewer(method), folds, cache, f"{name}-first{count}")
-            for view in sorted(set(table.views.tolist())):
-                mine = table.views == view
-                values = r_squared(table.parameters[mine], answers.mean[mine])
-                show(f"{count} {view}", values, f"mean {values.mean():.3f}, {name}")
-
-
-def ablation(table: Table, folds: int, cache: Path) -> None:
-    """R² of one flow from all blocks, without each, and from the curvature block with each alone."""
-    every = tuple(BLOCKS)
-    cases = {"all": every} | {f"no {name}": tuple(b for b in every if b != name) for name in every}
-    cases["curvature"] = ("curvature",)
-    cases |= {f"+ {name}": ("curvature", name) for name in every if name != "curvature"}
-    for label, blocks in cases.items():
-
-        def learn(training: Table, queries: Table, blocks: tuple[str, ...] = blocks) -> Answers:
-            return asked(train_posterior(training, Architecture(blocks=blocks), members=1), queries)
-
-        answers = cross_answers(table, learn, folds, cache, f"flow-{label.replace(' ', '_')}")
-        values = r_squared(table.parameters, answers.mean)
-        print(f"  {label:16} " + " ".join(f"{v:6.2f}" for v in values) + f"   mean {values.mean():.3f}", flush=True)
-
-
-def misfit(table: Table, folds: int, cache: Path) -> None:
-    """How often shapes of the model raise an alarm, by view: the p-values of each fold by what the others taught."""
-    fold, p = fold_of(table, folds), np.empty(len(table))
-    for k in range(folds):
-        path, mine = cache / f"{key_of(table)}-misfit-{k}of{folds}.npy", np.flatnonzero(fold == k)
-        if not path.exists():
-            trained = learnt(table.rows(fold != k), cache)
-            cache.mkdir(parents=True, exist_ok=True)
-            np.save(path, [p_of(trained, table, row) for row in mine])
-        p[mine] = np.load(path)
-    for view in sorted(set(table.views.tolist())):
-        mine = p[table.views == view]
-        print(
-            f"  {view:10} alarms at .05: {(mine < 0.05).mean():.3f}, at .01: {(mine < 0.01).mean():.3f}, of {len(mine)}"
-        )
-
-
-def p_of(trained: Posterior, table: Table, row: int | np.integer) -> float:
-    descriptors, view = table.descriptors[row], str(table.views[row])
-    starts = trained.sample(descriptors, view, STARTS)
-    return amortised_p(trained, view, optimum(trained.emulator, descriptors, view, starts).misfit)
-
-
-def gallery(table: Table, folder: Path, cache: Path) -> None:
-    """The author's volumes as masks, by what was trained on the whole table."""
-    queries = author_table(folder, cache)
-    trained = learnt(table, cache)
-    prior = table.parameters.std(0)
-    answers = {name: method(table, queries) for name, method in methods(cache).items() if name != "ridge"}
-    alarms = [p_of(trained, queries, k) for k in range(len(queries))]
-    print("misfit: " + ", ".join(f"{n} {p:.3f}" for n, p in zip(queries.shapes, alarms, strict=True)))
-    for name, each in answers.items():
-        error = (each.mean - queries.parameters) / prior
-        print(f"{name}: error in deviations of the prior")
-        for shape, row in zip(queries.shapes, error, strict=True):
-            show(shape[:10], row)
-        show("median", np.median(np.abs(error), axis=0))
-        if each.draws is not None:
-            show("in 90", coverage(queries.parameters, each.draws, 0.9))
-            show("wide 90", width(each.draws, 0.9) / prior)
-
-
-def truth_of(path: Path) -> np.ndarray:
-    """The parameters in an author's file's name."""
-    law, mass = re.search(r"\[(.*?)\]", path.name), re.search(r" m (-?[\d.]+)\.nii", path.name)
-    assert law is not None
-    assert mass is not None
-    return parameters_of(Coefficients(*map(float, law[1].split())), float(mass[1]))
-
-
-def author_table(folder: Path, cache: Path) -> Table:
-    """The author's volumes, measured as masks; the parameters are in the names of the files."""
-    names, parameters, rows = [], [], []
-    for path in sorted(folder.glob("*coeffs*.nii.gz")):
-        names.append(path.name.partition(" coeffs")[0].replace(" ", ""))
-        parameters.append(truth_of(path))
-        kept = cache / f"author-{names[-1]}.npy"
-        if not kept.exists():
-            mask = np.ascontiguousarray(np.asarray(nibabel.load(path).dataobj) > 0)  # type: ignore[attr-defined]
-            cache.mkdir(parents=True, exist_ok=True)
-            np.save(kept, descriptors(mask, Grid(mask.shape)).vector())
-        rows.append(np.load(kept))
-    return Table(np.array(names), np.array(["mask"] * len(names)), np.array(parameters), np.array(rows), {})
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("table", type=Path)
-    parser.add_argument("--cache", type=Path, default=Path("closure_cache"))
-    parser.add_argument("--views", default=None)
-    parser.add_argument("--folds", type=int, default=5)
-    parser.add_argument("--curve", default=None)
-    parser.add_argument("--ablation", action="store_true")
-    parser.add_argument("--gallery", action="store_true")
-    parser.add_argument("--misfit", action="store_true")
-    options = parser.parse_args()
-    warnings.filterwarnings("ignore", module="sklearn")
-    table = load_table(options.table).visible
-    views = sorted(set(table.views.tolist())) if options.views is None else options.views.split(",")
-    table = table.of(views)
-    print(f"{len(np.unique(table.shapes))} shapes; columns: {', '.join(PARAMETERS)}", flush=True)
-    if options.curve is not None:
-        curve(table, [int(n) for n in options.curve.split(",")], options.folds, options.cache)
-    elif options.ablation:
-        ablation(table, options.folds, options.cache)
-    elif options.misfit:
-        misfit(table, options.folds, options.cache)
-    elif options.gallery:
-        gallery(table, Path(os.environ["CURVAFIT_DATA"]) / "gallery", options.cache)
-    else:
-        closure(table, views, options.folds, options.cache)
-
-
-if __name__ == "__main__":
-    main()
+            truth = table.parameters[mine]
+            jobs[f"{name}-{view}-{folds}"] = lambda t=truth, p=part: judged(t, p, table.parameters.std(0))
+        found = cases.all(jobs)
+        rows = [[f"{view}: {key}", *row[key]] for view, row in zip(views, found.values(), strict=True)
+                for key in ("R²", "error", "in 90", "width") if key in row]  # fmt: skip
+        show([name, *PARAMETERS], rows, f"{len(np.unique(table.shapes))} shapes, {folds} folds")
+        for view, row in zip(views, found.values(), strict=True):
+            figures |= {f"r2_{view}.{name}.{slug}": Figure(value) for slug, value in zip(SLUGS, row["R²"], strict=True)}
+            if "TARP" in row:
+                print(f"  {view}: ranks p {row['ranks p']:.2g}; TARP {row['TARP']:.3f}, p {row['TARP p']:.3f}")
+                figures |= {f"calibrated.{name}_{view}.{key}": Figure(value) for key, value in
+                            (("in90", float(np.mean(row["in 90"]))), ("tarp", row["TARP"]), ("tarp_p", row["TARP p"]),
+                             ("ranks_p", row["ranks p"]))}  # fmt: skip
+    return figures

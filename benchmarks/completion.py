@@ -1,160 +1,319 @@
-"""The volume between known slices: plain interpolations and F_ε, on generated shapes.
+"""The volume between known slices: plain interpolations and F_ε, on generated shapes and on real structures.
 
-    python -m benchmarks.completion [--laws tubes,trabec,…] [--every 4,8,12,16] [--target 0] [--ways …] [-o completion]
-
-A shape of 64³ is known at every so many slices, as a box that repeats and as a crop (the same box, not told to repeat).
-The law is inferred from the mask of another seed, without growing anything. Dice and the sum of the Betti numbers'
-errors count between the first and the last known slice only.
+`--on shapes`: a shape of 64³ is known at every so many slices, as a crop (not told to repeat) and as a box that
+repeats; the law is inferred by `infer --fast` from the mask of another seed. `--on scans` ($CURVAFIT_DATA): blocks of
+real masks; law and example are of the other volume, or of the other half.
 
 - `spline`, `linear`, `nearest`, `ITK` (its morphological contour interpolation, where its package is installed): plain
-  interpolations; the best of them *in hindsight* is what the others are held to.
-- `calibrated`: `reconstruct` with the inferred fit, tried out on slices left out; `example`: on the other seed's mask.
-- `optimum`, `posterior`, `match`, `true`, `Willmore`: a law, not calibrated; `short`: the setting before (150 steps, no
-  blur, and springs that squeeze the profile).
+  interpolations. Gains are held to the best of them *in hindsight*, case by case.
+- `calibrated`: `reconstruct` with the inferred fit, tried out on slices left out; `example`: on another seed's mask, or
+  on the other side's fullest block.
+- `posterior`, `match`, `true`, `Willmore`: one law, not tried out.
 
-Finished cases stay in the folder: a second run goes on. `--seconds` ends a run early. The table has medians over laws.
-`--picture LAW` draws three slices of a crop's truth, spline and completed volume in place of the table.
+Dice, the sum of the Betti numbers' errors, and on scans the error of the mean thickness in voxels count between the
+first and the last known slice only. Settings were chosen on seeds 0 and 1 of tubes, trabec and sponge.
 """
 
 from __future__ import annotations
 
 import argparse
-import time
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cache
+from importlib.util import find_spec
 from itertools import product
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy import ndimage
 
-from benchmarks.completion_ways import ITK, baselines, draw, interpolated, scores, stored
-from curvafit.core.files import write_atomically, write_content
-from curvafit.generation import data
-from curvafit.generation.flow import descend, generate
+from benchmarks.harness import Cases, Figure, Values, bootstrap, scores, show
+from curvafit.generation.flow import generate
+from curvafit.geometry.morphometry import local_thickness
 from curvafit.inference.fit import Fit
 from curvafit.inference.infer import infer
 from curvafit.priors.coefficients import Coefficients, preset
-from curvafit.priors.profile import optimal_profile
 from curvafit.segmentation.completion import STIFFNESS, reconstruct
-from curvafit.segmentation.engine import stiff
 from curvafit.segmentation.slices import WAYS, Slices
-from curvafit.segmentation.working import WorkingGrid
+from curvafit.volumes.scan import Field, load
 
 LAWS = ("tubes", "trabec", "sponge", "metatubes", "pearls", "sieve", "flow", "bilayers")
 EDGE = 64
-PRIORS = ("calibrated", "example", "optimum", "posterior", "match", "true", "Willmore", "short")
+ITK = "ITK"
+#: What is not a plain interpolation.
+PRIORS = ("calibrated", "example", "posterior", "match", "true", "Willmore")
+#: Slices of a block along its first axis below which those along the second are known.
+FEW = 48
 
 
-def shape(law: str, seed: int, folder: Path) -> np.ndarray:
-    """A mask of a law, made once."""
-    path = folder / f"{law}-{seed}.npy"
-    if not path.exists():
-        mask = generate(law, grid=EDGE, schedule="deep", seed=seed).field.numpy() > 0
-        write_atomically(path, lambda temporary: np.save(temporary, np.packbits(mask)))
-    return np.unpackbits(np.load(path)).reshape(EDGE, EDGE, EDGE) > 0
+# ---- plain ways ------------------------------------------------------------------------------------------------------
 
 
-def fitted(law: str, seed: int, folder: Path) -> Fit:
-    """The fit of a mask, made once."""
-    path = folder / f"fit-{law}-{seed}.json"
-    if not path.exists():
-        mask = shape(law, seed, folder).astype(np.uint8)
-        write_content(path, infer(mask, kind="mask", fast=True, periodic=True).fit.to_json())
-    return Fit.load(path)
+def plain_ways() -> tuple[str, ...]:
+    """Return the plain interpolations; ITK's where its package is installed."""
+    if find_spec("itk") is not None:
+        return (*WAYS, ITK)
+    print("no ITK: install itk-morphologicalcontourinterpolation, or the extra 'bench'")
+    return tuple(WAYS)
 
 
-def completed(way: str, law: str, seed: int, every: int, periodic: bool, folder: Path) -> tuple[np.ndarray, str]:
-    """A way's mask, and what it says of itself."""
-    truth, places = shape(law, seed, folder), range(0, EDGE, every)
-    slices = Slices(truth[places], tuple(places), EDGE, (1.0, 1.0, 1.0), periodic=periodic)
-    if way in (*WAYS, ITK):
-        return interpolated(slices, way), ""
-    fit = fitted(law, seed + 1, folder)
-    known = {"every": every, "periodic": periodic}
-    if way in ("calibrated", "example"):
-        other = {"example": shape(law, seed + 1, folder).astype(np.uint8)} if way == "example" else {}
-        found = reconstruct(truth.astype(np.uint8), fit, **known, **other)
-    else:
-        prior = {"true": preset(law), "Willmore": Coefficients.willmore(), "short": fit}.get(way)
-        prior = replace(fit, chosen=way) if prior is None else prior
-        if way == "short":
-            return _short(slices, fit), ""
-        found = reconstruct(truth.astype(np.uint8), prior, stiffness=STIFFNESS, **known)
-    return found.mask.values, found.status
+def interpolated(slices: Slices, way: str) -> np.ndarray:
+    """Return the mask of a plain interpolation; ITK's has nothing beyond the known slices, and does not go around."""
+    if way != ITK:
+        return slices.level(way) > 0
+    import itk
 
-
-def _short(slices: Slices, fit: Fit) -> np.ndarray:
-    """The mask of the setting before: 150 steps without a blur, known voxels held at ±1 or beyond."""
-    place = WorkingGrid.of(slices.frame, None)
-    pull = np.zeros(slices.frame.shape, dtype=np.float32)
-    pull[list(slices.places)] = np.where(slices.inside, 1e6, -1e6)
-    start = optimal_profile(place.finer(slices.level("spline")), place.epsilon)
-    law, spring = stiff(fit.to_prior().coefficients), data.Hinge(place.spread(pull, centre=0))
-    options = {"optimiser": "adam", "steps": 150, "blur": 0.0, "data": spring}
-    mask = place.back(descend(start, law, place.grid, **options).field) > 0
+    labels = np.zeros((slices.length, *slices.inside.shape[1:]), dtype=np.uint8)
+    labels[list(slices.places)] = slices.inside
+    interpolator = itk.MorphologicalContourInterpolator.New(itk.image_from_array(labels))  # type: ignore[attr-defined]
+    interpolator.SetAxis(2)  # ITK counts axes from the last
+    interpolator.Update()
+    mask = itk.array_from_image(interpolator.GetOutput()) > 0
     mask[list(slices.places)] = slices.inside
     return mask
 
 
-def case(way: str, law: str, seed: int, every: int, periodic: bool, folder: Path) -> dict:
-    """A way's scores between the first and the last known slice, made once."""
-
-    def make() -> dict:
-        begun = time.process_time()
-        mask, status = completed(way, law, seed, every, periodic, folder)
-        between = slice(0, (EDGE - 1) // every * every + 1)
-        found = scores(mask[between], shape(law, seed, folder)[between])
-        return {**found, "status": status, "seconds": time.process_time() - begun}
-
-    return stored(folder / f"case-{way}-{law}-{seed}-{every}-{'box' if periodic else 'crop'}.json", make)
+# ---- generated shapes ------------------------------------------------------------------------------------------------
 
 
-def table(cases: dict[tuple, dict], laws: list[str], levels: list[int], ways: list[str]) -> None:
-    """Medians over laws of Dice, of what it gains on the best interpolation, and of the Betti errors."""
-    for periodic, every in product((True, False), levels):
-        rows = {way: [cases.get((way, law, every, periodic)) for law in laws] for way in ways}
-        whole = [k for k in range(len(laws)) if all(row[k] for row in rows.values())]
-        if not whole:
-            continue
-        best = [max(row[k]["dice"] for way, row in rows.items() if way not in PRIORS) for k in whole]
-        print(f"\n{'boxes' if periodic else 'crops'}, every {every}: {', '.join(laws[k] for k in whole)}")
-        for way, row in rows.items():
-            dice = np.array([row[k]["dice"] for k in whole])
-            gains, betti = 100 * (dice - best), np.median([row[k]["betti"] for k in whole])
-            each = " ".join(f"{gain:+6.1f}" for gain in gains)
-            print(f"{way:11}{np.median(dice):7.3f}{np.median(gains):+7.1f}{betti:7.1f}   {each}", flush=True)
+def shape(law: str, seed: int, cases: Cases) -> np.ndarray:
+    """Return a mask of a law, grown once."""
+
+    def grow() -> np.ndarray:
+        return np.packbits(generate(law, grid=EDGE, schedule="deep", seed=seed).field.numpy() > 0)
+
+    return np.unpackbits(cases.array(f"shape-{law}-{seed}", grow)).reshape(EDGE, EDGE, EDGE) > 0
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--laws", default=",".join(LAWS))
-    parser.add_argument("--every", default="4,8,12,16")
-    parser.add_argument("--target", type=int, default=0, help="seed of the target; the law's is the next")
-    parser.add_argument("--ways", default=",".join(PRIORS), help="besides the interpolations")
-    parser.add_argument("--boxes", default="box,crop")
-    parser.add_argument("--seconds", type=float, default=1e9)
-    parser.add_argument("--picture", metavar="LAW", help="at the first distance of --every")
-    parser.add_argument("-o", "--output", type=Path, default=Path("completion"))
-    options = parser.parse_args()
-    options.output.mkdir(parents=True, exist_ok=True)
-    laws, levels = options.laws.split(","), [int(n) for n in options.every.split(",")]
-    if options.picture:
-        crop = options.picture, options.target, levels[0], False, options.output
-        masks = {title: completed(way, *crop)[0] for title, way in (("spline",) * 2, ("reconstruct", "calibrated"))}
-        path = options.output / f"{options.picture}.png"
-        draw(shape(options.picture, options.target, options.output), masks, levels[0], path)
-        return
-    ways, boxes = (
-        [*baselines(), *filter(None, options.ways.split(","))],
-        [box == "box" for box in options.boxes.split(",")],
+def fitted(law: str, seed: int, cases: Cases) -> Fit:
+    """Return the fit of a mask, inferred once without growing anything."""
+    mask = shape(law, seed, cases).astype(np.uint8)
+    return Fit.load(
+        cases.text(f"fit-{law}-{seed}.json", lambda: infer(mask, kind="mask", fast=True, periodic=True).fit.to_json())
     )
-    cases, begun = {}, time.monotonic()
-    for every, law, periodic, way in product(levels, laws, boxes, ways):
-        if time.monotonic() - begun > options.seconds:
-            break
-        found = cases[way, law, every, periodic] = case(way, law, options.target, every, periodic, options.output)
-        print(f"{way} {law} {every} {periodic}: {found['dice']:.4f} {found['betti']:.0f} {found['status']}", flush=True)
-    table(cases, laws, levels, ways)
 
 
-if __name__ == "__main__":
-    main()
+def completed(way: str, law: str, seed: int, every: int, periodic: bool, cases: Cases) -> tuple[np.ndarray, str]:
+    """Return a way's mask, and what it says of itself."""
+    truth, places = shape(law, seed, cases), range(0, EDGE, every)
+    if way in (*WAYS, ITK):
+        return interpolated(Slices(truth[places], tuple(places), EDGE, (1.0, 1.0, 1.0), periodic=periodic), way), ""
+    known: dict[str, Any] = {"every": every, "periodic": periodic}
+    prior = fitted(law, seed + 1, cases)
+    if way == "example":
+        known["example"] = shape(law, seed + 1, cases).astype(np.uint8)
+    elif way != "calibrated":
+        known["stiffness"] = STIFFNESS
+        prior = {"true": preset(law), "Willmore": Coefficients.willmore()}.get(way) or replace(prior, chosen=way)
+    found = reconstruct(truth.astype(np.uint8), prior, **known)
+    return found.mask.values > 0, found.status
+
+
+def shape_case(way: str, law: str, seed: int, every: int, periodic: bool, cases: Cases) -> Values:
+    mask, status = completed(way, law, seed, every, periodic, cases)
+    between = slice(0, (EDGE - 1) // every * every + 1)
+    return {**scores(mask[between], shape(law, seed, cases)[between]), "status": status}
+
+
+def on_shapes(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
+    ways = [*plain_ways(), *(way for way in options.ways.split(",") if way in PRIORS)]
+    laws, every, seed = options.laws.split(","), options.every, options.target
+    if options.quick:
+        laws, ways = laws[:1], ["spline", "true"]
+    figures: dict[str, Figure] = {}
+    for kind in ("crop", "box")[: 1 if options.quick else 2]:
+        jobs = {
+            f"{kind}-{way}-{law}-{seed}-{every}": lambda w=way, a=law, p=kind == "box": shape_case(
+                w, a, seed, every, p, cases
+            )
+            for law, way in product(laws, ways)
+        }
+        found = cases.all(jobs, seed)
+        rows = {
+            law: {way: found[name] for way in ways if (name := f"{kind}-{way}-{law}-{seed}-{every}") in found}
+            for law in laws
+        }
+        figures |= gains(f"{kind}s, every {every}", rows, ways, f"shapes.{{way}}.{kind}_{{key}}")
+    return figures if (every, seed) == (8, 2) else {}
+
+
+def gains(title: str, rows: Mapping[str, Mapping[str, Values]], ways: Sequence[str], key: str) -> dict[str, Figure]:
+    """Print and return, of each way, median Dice and Betti error and the gains on the best plain way, case by case."""
+    whole = [name for name, row in rows.items() if all(way in row for way in ways)]
+    if not whole:
+        return {}
+    best = np.array([max(row["dice"] for way, row in rows[name].items() if way not in PRIORS) for name in whole])
+    table, figures = [], {}
+    for way in ways:
+        dice = np.array([rows[name][way]["dice"] for name in whole])
+        gain = 100 * (dice - best)
+        betti = float(np.median([rows[name][way]["betti"] for name in whole]))
+        each = " ".join(f"{value:+.1f}" for value in gain)
+        table.append([way, float(np.median(dice)), bootstrap(gain), f"{gain.min():+.1f}", betti, each])
+        found = {"dice": bootstrap(dice), "gain": bootstrap(gain), "least": Figure(float(gain.min()))}
+        figures |= {key.format(way=way.lower(), key=name): figure for name, figure in found.items()}
+        figures[key.format(way=way.lower(), key="betti")] = Figure(betti)
+    show(["way", "Dice", "gain, points", "least", "Betti", ", ".join(whole)], table, title)
+    return figures
+
+
+# ---- real structures -------------------------------------------------------------------------------------------------
+
+
+class Structure(NamedTuple):
+    """Two files, or one that is cut in two along its last axis; voxels of a block, and how many blocks a side has.
+
+    A gap is left out between the halves, in voxels of the file.
+    """
+
+    files: tuple[str, ...]
+    block: tuple[int, int, int]
+    targets: int
+    reading: Mapping[str, Any] = {}
+    mask: str = "labels"
+    coarser: int = 1
+    gap: int = 0
+
+
+_CELL = ("urocell_mito_fib1-0-0-0.nii.gz", "urocell_mito_fib1-3-2-1.nii.gz")
+_NANOMETRES = {"spacing": 16.0, "unit": "nm"}
+#: The two stacks of Poon show one field of view: one is enough.
+_POON, _FINE = ("vesselNN/poon2015_BBB_noLeakage_label.tif",), {"spacing": (5, 0.994, 0.994), "unit": "um"}
+STRUCTURES = {
+    "mitochondria-32": Structure(_CELL, (128, 64, 64), 4, _NANOMETRES, coarser=2),
+    "mitochondria-16": Structure(_CELL, (128, 64, 64), 3, _NANOMETRES),
+    "bone": Structure(("lhdl_trabecular_200_otsu_mask.tif",), (100, 100, 100), 2),
+    "minivess": Structure(
+        ("minivess_mv68_mask.nii.gz",), (106, 64, 64), 2, {"spacing": (2, 0.994, 0.994), "unit": "um"}
+    ),
+    "membranes": Structure(("plantseg_sample_ovule.h5",), (32, 128, 64), 1, {"key": "label"}, "boundaries"),
+    "felt": Structure(("fiberform_100.tif",), (100, 50, 50), 2, {"spacing": 1.0, "unit": "voxel"}, "grey"),
+    "poon": Structure(_POON, (25, 96, 64), 2, _FINE, gap=32),
+}
+
+
+@cache
+def sides(name: str) -> tuple[Field, Field]:
+    """Return the masks of a structure's two sides."""
+    structure = STRUCTURES[name]
+    folder = Path(os.environ["CURVAFIT_DATA"]) / "scans"
+    volumes = [_mask(load(folder / file, **structure.reading), structure) for file in structure.files]
+    if len(volumes) == 1:
+        (whole,) = volumes
+        middle, margin = whole.shape[2] // 2, structure.gap // 2
+        halves = (slice(middle - margin), slice(-middle + margin, None))
+        volumes = [whole.crop((slice(None), slice(None), half)) for half in halves]
+    return volumes[0], volumes[1]
+
+
+def _mask(volume: Field, structure: Structure) -> Field:
+    """Return the mask of a file; coarser voxels are inside where half of them is."""
+    from skimage.filters import threshold_otsu
+    from skimage.segmentation import find_boundaries
+
+    values = volume.values
+    if structure.mask == "grey":
+        smooth = ndimage.gaussian_filter(values.astype(np.float32), 1.0)
+        values = smooth > threshold_otsu(smooth)
+    elif structure.mask == "boundaries":
+        values = find_boundaries(values)
+    n = structure.coarser
+    parts = np.asarray(values > 0).reshape([m for size in values.shape for m in (size // n, n)])
+    inside = (parts.mean(axis=(1, 3, 5)) >= 0.5).astype(np.uint8)
+    return replace(volume, values=inside, spacing=tuple(n * h for h in volume.spacing), affine=None)
+
+
+@cache
+def blocks(name: str, side: int) -> list[Field]:
+    """Return the blocks of a side, the fullest first."""
+    whole, size = sides(name)[side], STRUCTURES[name].block
+    starts = product(*(range(0, n - m + 1, m) for n, m in zip(whole.shape, size, strict=True)))
+    boxes = [tuple(slice(a, a + m) for a, m in zip(start, size, strict=True)) for start in starts]
+    return sorted((whole.crop(box) for box in boxes), key=lambda block: -int(block.values.sum()))
+
+
+def scan_mask(name: str, side: int, block: int, every: int, way: str, cases: Cases) -> tuple[np.ndarray, str]:
+    """Return a way's mask of a block, and what it says of itself."""
+    target = blocks(name, side)[block]
+    axis = int(target.shape[0] < FEW)
+    if way in (*WAYS, ITK):
+        first = np.moveaxis(target.values > 0, axis, 0)
+        edges = (target.spacing[axis], *(h for k, h in enumerate(target.spacing) if k != axis))
+        places = range(0, len(first), every)
+        slices = Slices(first[places], tuple(places), len(first), edges, target.unit)
+        return np.moveaxis(interpolated(slices, way), 0, axis), ""
+    fit = cases.text(
+        f"fit-{name}-{1 - side}.json", lambda: infer(sides(name)[1 - side], kind="mask", fast=True).fit.to_json()
+    )
+    example = blocks(name, 1 - side)[0] if way == "example" else None
+    found = reconstruct(target, Fit.load(fit), every=every, axis=axis, example=example)
+    return found.mask.values > 0, found.status
+
+
+def scan_case(name: str, side: int, block: int, every: int, way: str, cases: Cases) -> Values:
+    target = blocks(name, side)[block]
+    axis, statuses = int(target.shape[0] < FEW), [""]
+
+    def make() -> np.ndarray:
+        mask, statuses[0] = scan_mask(name, side, block, every, way, cases)
+        return np.packbits(mask)
+
+    packed = cases.array(f"mask-{name}-{side}-{block}-{every}-{way}", make)
+    mask = np.unpackbits(packed, count=target.values.size).reshape(target.shape) > 0
+    last = (target.shape[axis] - 1) // every * every
+    between = (*[slice(None)] * axis, slice(0, last + 1))
+    mask, truth = mask[between], target.values[between] > 0
+    edges = tuple(h / min(target.spacing) for h in target.spacing)
+    thickness = [float(local_thickness(each, edges)[each].mean()) for each in (mask, truth)]
+    return {**scores(mask, truth), "thickness": abs(thickness[0] - thickness[1]), "status": statuses[0]}
+
+
+def on_scans(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
+    if "CURVAFIT_DATA" not in os.environ:
+        raise SystemExit("set CURVAFIT_DATA to the folder that holds scans/")
+    chosen = ["example"] if options.ways == ",".join(PRIORS) else options.ways.split(",")
+    ways, every = [*plain_ways(), *(way for way in chosen if way in PRIORS)], options.every
+    figures: dict[str, Figure] = {}
+    for name in options.only.split(","):
+        blocks_of = list(product((0, 1), range(STRUCTURES[name].targets)))
+        if options.quick:
+            blocks_of, ways = blocks_of[:1], ["spline"]
+        jobs = {
+            f"{name}-{side}-{block}-{every}-{way}": lambda s=side, b=block, w=way, n=name: scan_case(
+                n, s, b, every, w, cases
+            )
+            for (side, block), way in product(blocks_of, ways)
+        }
+        found = cases.all(jobs)
+        rows = {
+            f"{side}-{block}": {way: found[k] for way in ways if (k := f"{name}-{side}-{block}-{every}-{way}") in found}
+            for side, block in blocks_of
+        }
+        key = f"structures.{name}.{{way}}_{{key}}"
+        mine = gains(f"{name}, every {every}", rows, ways, key)
+        best = [max((row[way]["dice"] for way in ways if way not in PRIORS), default=0) for row in rows.values() if row]
+        mine[f"structures.{name}.plain"] = bootstrap(best)
+        for way in ways:
+            mine[key.format(way=way.lower(), key="thickness")] = Figure(
+                float(np.median([row[way]["thickness"] for row in rows.values() if way in row]))
+            )
+        figures |= {k.replace(".example_", "."): figure for k, figure in mine.items()}
+    return figures if every == 8 else {}
+
+
+# ---- runs ------------------------------------------------------------------------------------------------------------
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--on", choices=("shapes", "scans"), default="shapes")
+    parser.add_argument("--laws", default=",".join(LAWS), help="of shapes")
+    parser.add_argument("--only", default=",".join(STRUCTURES), help="structures of scans")
+    parser.add_argument("--every", type=int, default=8)
+    parser.add_argument("--target", type=int, default=2, help="seed of the shapes; their laws are of the next")
+    parser.add_argument("--ways", default=",".join(PRIORS), help="besides the interpolations")
+
+
+def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
+    return on_scans(options, cases) if options.on == "scans" else on_shapes(options, cases)

@@ -1,7 +1,5 @@
 """F_ε / σ against ∫p dA on the exact torus, monomial by monomial: orders in ε and in Δx, and a limit that fails.
 
-    python -m benchmarks.convergence [--quick]
-
 The field is tanh(d / √2 ε) of the exact distance to a torus with radii 2 and 1, sampled on one octant of its box (the
 rest is its mirror image) and differenced like any field. Three sweeps:
 
@@ -18,6 +16,7 @@ import math
 import numpy as np
 import torch
 
+from benchmarks.harness import Cases, Figure, Values, show
 from curvafit.priors.curvature import Jet, jet
 from curvafit.priors.energy import energy_terms
 from curvafit.priors.grid import Grid
@@ -77,31 +76,34 @@ def ratio_sweep(widths: list[float], ratio: float = 2.0) -> tuple[list[tuple[flo
     return pairs, np.stack([grid_integrals(*pair) for pair in pairs]) - TORUS.integrals()
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="orders of convergence of F_ε on the exact torus")
-    parser.add_argument("--quick", action="store_true", help="coarser sweeps: seconds instead of minutes")
-    quick = parser.parse_args().quick
-    torch.set_default_dtype(torch.float64)
-    print("∫p dA, torus with radii 2 and 1:", _row(TORUS.integrals(), "{:9.4f}"))
-    pairs, errors = limit_sweep([1 / 4, 1 / 6, 1 / 8] if quick else [1 / 4, 1 / 6, 1 / 8, 1 / 10])
-    _table("1. error of F_ε/σ, Δx = ε²", pairs, errors, [ε for ε, _ in pairs], "ε")
-    pairs, errors = spacing_sweep(1 / 8, [2, 3, 4] if quick else [2, 3, 4, 6, 8])
-    _table("2. error of F_ε/σ against its continuum value, ε = 1/8", pairs, errors, [h for _, h in pairs], "Δx")
-    pairs, errors = ratio_sweep([1 / 4, 1 / 8, 1 / 16] if quick else [1 / 4, 1 / 8, 1 / 16, 1 / 32])
-    _table("3. error of F_ε/σ, Δx = ε/2: no convergence", pairs, errors, [ε for ε, _ in pairs], "ε")
+def sweep(kind: str, sizes: list[float]) -> Values:
+    """Return the errors `(len(sizes), 6)` of a sweep, and their orders."""
+    with torch.no_grad():
+        before = torch.get_default_dtype()
+        torch.set_default_dtype(torch.float64)
+        try:
+            pairs, errors = {
+                "limit": lambda: limit_sweep(sizes),
+                "spacing": lambda: spacing_sweep(1 / 8, sizes),
+                "ratio": lambda: ratio_sweep(sizes),
+            }[kind]()
+        finally:
+            torch.set_default_dtype(before)
+    steps = [pair[kind == "spacing"] for pair in pairs]
+    return {"pairs": pairs, "errors": errors.tolist(), "orders": order(steps, errors).tolist()}
 
 
-def _table(title: str, pairs: list[tuple[float, float]], errors: np.ndarray, steps: list[float], name: str) -> None:
-    print(f"\n{title}\n{'ε':>8} {'Δx':>8} " + " ".join(f"{m:>10}" for m in MONOMIALS))
-    for (ε, h), row in zip(pairs, errors, strict=True):
-        print(f"{ε:8.4f} {h:8.4f} {_row(row, '{:10.2e}')}")
-    print(f"{'order in ' + name:>17} {_row(order(steps, errors), '{:10.2f}')}")
-    print(f"{'of the last two':>17} {_row(order(steps[-2:], errors[-2:]), '{:10.2f}')}")
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--fine", action="store_true", help="one more size of each sweep: minutes")
 
 
-def _row(values: np.ndarray, form: str) -> str:
-    return " ".join(form.format(v) for v in values)
-
-
-if __name__ == "__main__":
-    main()
+def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
+    sizes = {"limit": [1 / 4, 1 / 6, 1 / 8, 1 / 10], "spacing": [2, 3, 4, 6], "ratio": [1 / 4, 1 / 8, 1 / 16, 1 / 32]}
+    count = 2 if options.quick else 4 if options.fine else 3
+    jobs = {f"{kind}-{count}": lambda k=kind, s=each: sweep(k, s[:count]) for kind, each in sizes.items()}
+    found = dict(zip(sizes, cases.all(jobs).values(), strict=True))
+    for kind, values in found.items():
+        rows = [[f"{ε:.4f}", f"{h:.4f}", *row] for (ε, h), row in zip(values["pairs"], values["errors"], strict=True)]
+        show(["ε", "Δx", *MONOMIALS], [*rows, ["order", "", *values["orders"]]], f"error of F_ε / σ: {kind}")
+    orders = found["limit"]["orders"]
+    return {"convergence.least": Figure(min(orders)), "convergence.most": Figure(max(orders))}

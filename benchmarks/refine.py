@@ -1,110 +1,165 @@
-"""Parameters recovered from the author's volumes, against those that made them: from fields, and from their masks.
+"""Masks from probabilities, and probabilities of completed volumes, on generated shapes.
 
-    CURVAFIT_DATA=… python -m benchmarks.refine [--fields sponge,tubes,bilayers] [--masks tubes,sponge,exp-0366]
+`--what probabilities`: a shape of 64³ is blurred, under Gaussian noise; the network is a random forest on Gaussian
+features that learns from three slices of another seed's scan, made as sure as networks are. `p > 1/2` is its own mask;
+`smoothing` and `TV` of p, and the `walker` on p, take the best setting *in hindsight*; `refine` and `Willmore` choose
+their weight on an example (another seed), blind.
 
-1. Fields, by stationarity: the whole periodic box, a crop of 64³, and the whole box rounded to 1/100 for comparison.
-2. Masks {u > 0}, a crop of 64³, by the fixed point of a short flow from the nearest shapes of the packaged atlas. The
-   residual (voxels) is given at the truth, at each start, and at the end.
+`--what calibration`: crops, every 8th slice known, 8 runs of `reconstruct`; the probabilities are fitted on a shape
+grown from the inferred law (`grown`) or on another seed's mask (`example`). Expected calibration error within 3 voxels
+of the surface of probability 1/2 (`error`) and of the true one (`true`), what `reconstruct` states, and Dice.
 
-`±` is the deviation that the method states.
+Chosen on target 2, reported on target 4.
 """
 
 from __future__ import annotations
 
 import argparse
-import os
-import time
-from pathlib import Path
+import warnings
+from itertools import product
 
 import numpy as np
-import torch
+from scipy import ndimage
+from skimage.restoration import denoise_tv_chambolle
+from skimage.segmentation import random_walker
 
-from benchmarks.gallery import author_volume
-from curvafit.geometry.diagram import diagram
-from curvafit.inference.atlas import load_atlas
-from curvafit.inference.fixed_point import ShortFlow, _parameters, fixed_point
-from curvafit.inference.match import nearest
-from curvafit.inference.refinement import Refinement
-from curvafit.inference.stationarity import stationarity
-from curvafit.priors.coefficients import NAMES, Coefficients, preset
-from curvafit.priors.grid import WORKING_EPSILON, Grid
-from curvafit.priors.profile import phase_field
+from benchmarks.completion import EDGE, fitted, shape
+from benchmarks.harness import Cases, Figure, Values, best, dice, scores, show
+from curvafit.priors.coefficients import Coefficients
+from curvafit.segmentation.completion import reconstruct
+from curvafit.segmentation.ensemble import near
+from curvafit.segmentation.probability import calibration_error
+from curvafit.segmentation.refine import refine
 
-CROP = 64
-STARTS = 3
-
-
-def cropped(u: torch.Tensor) -> tuple[torch.Tensor, Grid]:
-    """The middle 64³ of a volume."""
-    inner = tuple(slice((n - CROP) // 2, (n + CROP) // 2) for n in u.shape)
-    return u[inner].contiguous(), Grid((CROP,) * 3, boundary="replicate")
-
-
-def row(label: str, coefficients: Coefficients, mass: float, extra: str = "") -> None:
-    values = " ".join(f"{float(value):9.2f}" for value in list(coefficients)[1:])
-    print(f"  {label:26} {values} {mass:8.3f}  {extra}", flush=True)
-
-
-def found_rows(label: str, found: Refinement, seconds: float, unit: str) -> None:
-    row(label, found.coefficients, found.mass, f"{found.residual:.2e} {unit}, {seconds:.0f} s")
-    print(f"  {'±':26} " + " ".join(f"{found.uncertainty[name]:9.2f}" for name in NAMES[1:]), flush=True)
+LAWS = {
+    "probabilities": ("tubes", "trabec", "sponge", "metatubes"),
+    "calibration": ("tubes", "sponge", "trabec", "pearls"),
+}
+WAYS = ("p > 1/2", "smoothing", "TV", "walker", "Willmore", "refine")
+#: Deviation of the scan's noise in contrasts, and of its blur in voxels.
+NOISE, BLUR = 2.5, 0.7
+#: Widths of the forest's features in voxels, and the slices that it learns from.
+FEATURES, LEARNT = (0.7, 1.0, 1.6, 2.5, 4.0), (16, 32, 48)
+WIDTHS, WEIGHTS, BETAS = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8), (0.1, 0.2, 0.4, 0.8, 1.6, 3.2), (1, 10, 130, 1000)
+#: Distance of a probability from 0 and 1 that makes a seed of the random walker.
+SURE = 0.1
+EVERY, RUNS = 8, 8
 
 
-def field_table(folder: Path, name: str) -> None:
-    u = author_volume(folder, name)
-    truth = preset(name).coefficients
-    print(
-        f"{name}: stationarity of the field (a20 = 1; a11 a02 a10 a01 a00, mass; field error that explains the misfit)"
-    )
-    row("truth", truth.scaled(1 / truth.a20), preset(name).mass)
-    cases = {
-        "whole box": (u, Grid(tuple(u.shape))),
-        f"crop of {CROP}³": cropped(u),
-        "rounded to 1/100": (torch.floor(100 * u) / 100, Grid(tuple(u.shape))),
+# ---- masks from probabilities ----------------------------------------------------------------------------------------
+
+
+def features(law: str, seed: int, cases: Cases) -> np.ndarray:
+    """Return smoothed levels, gradients and Laplacians of a shape's scan at each width, (voxels, features)."""
+    clear = ndimage.gaussian_filter(shape(law, seed, cases).astype(np.float32), BLUR, mode="nearest")
+    values = clear + NOISE * np.random.default_rng(1000 + seed).standard_normal(clear.shape).astype(np.float32)
+    filters = (ndimage.gaussian_filter, ndimage.gaussian_gradient_magnitude, ndimage.gaussian_laplace)
+    return np.stack([each(values, width).ravel() for width, each in product(FEATURES, filters)], axis=1)
+
+
+def probabilities(law: str, seed: int, trained: int, cases: Cases) -> np.ndarray:
+    """Return the forest's probabilities (Z, Y, X) for a seed's scan, learnt from another's."""
+
+    def make() -> np.ndarray:
+        from sklearn.ensemble import RandomForestClassifier
+
+        known = np.zeros((EDGE,) * 3, dtype=bool)
+        known[list(LEARNT)] = True
+        forest = RandomForestClassifier(60, min_samples_leaf=3, random_state=0)
+        forest.fit(features(law, trained, cases)[known.ravel()], shape(law, trained, cases)[known])
+        p = np.asarray(forest.predict_proba(features(law, seed, cases)))[:, 1].reshape(known.shape)
+        odds = (p / np.maximum(1 - p, 1e-6)).clip(1e-6, 1e6) ** 3  # as sure as networks are
+        return (odds / (1 + odds)).astype(np.float16)
+
+    return cases.array(f"p-{law}-{seed}-{trained}", make).astype(np.float32)
+
+
+def walked(p: np.ndarray, beta: float) -> np.ndarray:
+    """Return skimage's random walker's mask, from seeds where p is sure."""
+    seeds = np.where(p > 1 - SURE, 1, np.where(p < SURE, 2, 0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of probabilities a little beyond [0, 1]
+        return random_walker(p, seeds, beta=beta, mode="cg_j", tol=1e-3) == 1
+
+
+def way_case(way: str, law: str, seed: int, cases: Cases) -> Values:
+    """Return the scores of a way; the example has the next seed, and the network learns from the one after."""
+    p, truth, status = probabilities(law, seed, seed + 2, cases), shape(law, seed, cases), ""
+    if way == "p > 1/2":
+        mask = p > 0.5
+    elif way == "smoothing":
+        mask = best((ndimage.gaussian_filter(p, width) > 0.5 for width in WIDTHS), truth)
+    elif way == "TV":
+        mask = best((denoise_tv_chambolle(p, weight) > 0.5 for weight in WEIGHTS), truth)
+    elif way == "walker":
+        mask = best((walked(p, beta) for beta in BETAS), truth)
+    else:
+        prior = Coefficients.willmore() if way == "Willmore" else fitted(law, seed + 1, cases)
+        other = shape(law, seed + 1, cases).astype(np.uint8)
+        found = refine(p, prior, example=(probabilities(law, seed + 1, seed + 2, cases), other))
+        mask, status = found.mask.values > 0, found.status
+    return {**scores(mask, truth), "status": status}
+
+
+# ---- how sure, and what to annotate next -----------------------------------------------------------------------------
+
+
+def calibration_case(way: str, law: str, seed: int, cases: Cases) -> Values:
+    truth = shape(law, seed, cases)
+    other = {"example": shape(law, seed + 1, cases).astype(np.uint8)} if way == "example" else {}
+    found = reconstruct(truth.astype(np.uint8), fitted(law, seed + 1, cases), every=EVERY, runs=RUNS, **other)
+    p, between = found.probability.values, [n for n in range((EDGE - 1) // EVERY * EVERY) if n % EVERY]
+    bands = {"error": near(p > 0.5), "true": near(truth)}
+    errors = {
+        name: float(calibration_error(p[between][band[between]], truth[between][band[between]]))
+        for name, band in bands.items()
     }
-    for label, (values, grid) in cases.items():
-        begin = time.perf_counter()
-        found = stationarity(values, grid, WORKING_EPSILON)
-        found_rows(label, found, time.perf_counter() - begin, "rms")
-        if label == "whole box":
-            print("  singular values            " + " ".join(f"{value:.3g}" for value in found.singular_values))
+    masks = {"mask": found.mask.values > 0, "half": p > 0.5}
+    return {
+        **errors,
+        "stated": float(found.uncertainty.calibration_error),
+        **{name: dice(mask[between], truth[between]) for name, mask in masks.items()},
+        "status": found.status,
+    }
 
 
-def mask_table(folder: Path, name: str) -> None:
-    u, grid = cropped(author_volume(folder, name))
-    phase = phase_field(u > 0, grid, WORKING_EPSILON)
-    truth = preset(name).coefficients.scaled(1 / preset(name).coefficients.a20)
-    matches = nearest(diagram(phase, grid, WORKING_EPSILON), load_atlas(), seen_as="mask", count=STARTS)
-    starts = [match.coefficients for match in matches]
-    flow = ShortFlow(phase, grid, WORKING_EPSILON, starts[0])
-    print(f"{name}: fixed point of a short flow from the mask (a20 = 1; a11 a02 a10 a01 a00, mass; residual)")
-    row("truth", truth, preset(name).mass, _residual(flow, truth))
-    for k, match in enumerate(matches):
-        row(f"match {k + 1}", match.coefficients, match.mass, _residual(flow, match.coefficients))
-    begin = time.perf_counter()
-    found = fixed_point(phase, grid, WORKING_EPSILON, starts=starts)
-    found_rows("fit", found, time.perf_counter() - begin, f"voxels, {found.evaluations} flows")
-    print("  ends from the starts       " + " ".join(f"{residual:.2f}" for _, residual in found.starts))
-    print("  singular values            " + " ".join(f"{value:.3g}" for value in found.singular_values))
+# ---- runs ------------------------------------------------------------------------------------------------------------
 
 
-def _residual(flow: ShortFlow, coefficients: Coefficients) -> str:
-    return f"{np.linalg.norm(flow.residual(_parameters(coefficients))):.2f} voxels"
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--what", choices=tuple(LAWS), default="probabilities")
+    parser.add_argument("--laws")
+    parser.add_argument("--target", type=int, default=4, help="seed; the law's and example's, the network's are next")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--fields", default="sponge,tubes,bilayers")
-    parser.add_argument("--masks", default="tubes,sponge,exp-0366")
-    options = parser.parse_args()
-    folder = Path(os.environ.get("CURVAFIT_DATA", "")) / "gallery"
-    if not folder.is_dir():
-        parser.error(f"expected $CURVAFIT_DATA to hold a folder gallery/, found none at {folder}")
-    for name in filter(None, options.fields.split(",")):
-        field_table(folder, name)
-    for name in filter(None, options.masks.split(",")):
-        mask_table(folder, name)
-
-
-if __name__ == "__main__":
-    main()
+def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
+    what, seed = options.what, options.target
+    laws = options.laws.split(",") if options.laws else LAWS[what]
+    if options.quick:
+        laws = laws[:1]
+    if what == "probabilities":
+        ways = WAYS[:2] if options.quick else WAYS
+        jobs = {f"{way.replace('/', '')}-{law}-{seed}": lambda w=way, a=law: way_case(w, a, seed, cases)
+                for law, way in product(laws, ways)}  # fmt: skip
+        keys = ("dice", "betti")
+    else:
+        ways = ("grown", "example")
+        jobs = {f"{way}-{law}-{seed}": lambda w=way, a=law: calibration_case(w, a, seed, cases)
+                for law, way in product(laws, ways)}  # fmt: skip
+        keys = ("error", "true", "stated", "mask", "half")
+    found = cases.all(jobs, seed)
+    show(["case", *keys], [[name, *(row[key] for key in keys)] for name, row in found.items()])
+    if seed != 4:
+        return {}
+    figures = {}
+    for name, row in found.items():
+        way, law = name.split("-")[:2]
+        if what == "probabilities":
+            slug = "half" if way.startswith("p >") else way.lower()
+            figures |= {
+                f"probabilities.{slug}.{law}": Figure(row["dice"]),
+                f"probability_betti.{slug}.{law}": Figure(row["betti"]),
+            }
+        else:
+            figures |= {f"calibration.{law}_{way}.{key}": Figure(row[key]) for key in keys}
+    return figures

@@ -1,40 +1,32 @@
-"""Time to texture: a schedule against the published one, in seconds, energy and curvature diagram.
+"""Textures of a schedule against the published one's, and against the author's volumes.
 
-    python -m benchmarks.texture [--presets tubes,seeds,…] [--schedule fast] [--seeds 3] [--first 0] [--edge 100]
-                                 [-o texture] [--start]
-
-For each preset and schedule: the mean energy, and the seconds of one shape. Distances are those of geometric diagrams:
-`noise` between two seeds of `paper`, `cross` from a seed of the schedule to one of `paper`, `bias` between the two
-pooled diagrams (all seeds' surfaces together), which is what a schedule changes on top of a seed's noise; between twice
-three shapes of one schedule it is some 0.6 of the noise. `--first` is the first seed: choose a schedule on some, report
-it on others. Shapes are kept in the folder with the commit and the schedule that made them: a killed run begins with
-the shape it was at, and a second one only prints.
-
-`--start` times the command line, start-up included, against 8000 steps of plain torch (timed over a few).
+For each preset, by geometric curvature diagrams: `noise`, the mean distance between two seeds of `paper`; `bias`, the
+distance between the pooled diagrams of a schedule and of `paper` (all seeds' surfaces together), over the noise, some
+0.6 between twice three shapes of one schedule; `author`, where $CURVAFIT_DATA has the author's volume of the preset,
+√(d² - noise²) / noise of the mean distance d of our seeds to it, and the noise between the schedule's own seeds (two
+draws of one law are a noise apart, so 0 is no fault). Where the author's file is floored to 1/100 our fields are too.
+`--first` is the first seed: choose a schedule on some, report it on others.
 """
 
 from __future__ import annotations
 
 import argparse
-import subprocess
-import sys
-import tempfile
+import hashlib
+import math
+import os
 import time
-from itertools import combinations, product
+from itertools import combinations
 from pathlib import Path
-from typing import NamedTuple
 
-import numba
 import numpy as np
 import torch
-from rich.progress import Progress
 
-from benchmarks.step import plain_stepper
-from curvafit.core.files import write_atomically
+from benchmarks.harness import Cases, Figure, Values, show
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import SCHEDULES
 from curvafit.geometry.diagram import Diagram, diagram
 from curvafit.geometry.transport import wasserstein
+from curvafit.priors.coefficients import preset_name
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 
 #: Tubes of three kinds, layers, spheres of two kinds, sponges of two kinds, trabeculae, metatubes, the paper's flow.
@@ -42,137 +34,100 @@ PRESETS = (
     "tubes", "seeds", "bilinear-tubes", "bilayers", "bilinear-spheres", "pearls", "sponge", "sieve", "trabec",
     "metatubes", "flow",
 )  # fmt: skip
+#: The author's volumes: 100³.
+EDGE = 100
 
 
-class Shape(NamedTuple):
-    """What is kept of a generated shape: F_ε, seconds, whether it is viable, diagram, commit."""
-
-    energy: float
-    seconds: float
-    viable: bool
-    diagram: Diagram
-    commit: str
+def author_volumes() -> dict[str, Path]:
+    """Return the author's files by preset."""
+    folder = Path(os.environ.get("CURVAFIT_DATA", "")) / "gallery"
+    names = {path: preset_name(path.name.partition(" coeffs")[0]) for path in sorted(folder.glob("*coeffs*.nii.gz"))}
+    return {name: path for path, name in names.items() if name is not None}
 
 
-class Row(NamedTuple):
-    """A preset's comparison."""
+def author_field(name: str) -> torch.Tensor:
+    import nibabel
 
-    energies: tuple[float, float]
-    seconds: tuple[float, float]
-    noise: float
-    cross: float
-    bias: float
+    return torch.from_numpy(
+        np.asarray(nibabel.Nifti1Image.from_filename(author_volumes()[name]).dataobj, dtype=np.float32)
+    )
 
 
-def shape_of(name: str, schedule: str, seed: int, edge: int, folder: Path, *, floored: bool = False) -> Shape:
-    """Generate and measure, or read what an earlier run kept; `floored` rounds u down to 1/100 first."""
-    stem = f"{name}-{schedule}-{edge}-{seed}{'-floored' * floored}"
-    path, plan = folder / f"{stem}.npz", repr(SCHEDULES[schedule])
-    if not path.exists() or _plan(path) != plan:
-        grid = Grid((edge,) * 3)
+def is_floored(u: torch.Tensor) -> bool:
+    """Whether a volume is rounded to 1/100."""
+    return bool((100 * u - (100 * u).round()).abs().max() < 1e-3)
+
+
+def field_of(name: str, schedule: str, seed: int, edge: int) -> torch.Tensor:
+    u = generate(name, grid=Grid((edge,) * 3), schedule=schedule, seed=seed).field
+    floored = edge == EDGE and name in author_volumes() and is_floored(author_field(name))
+    return torch.floor(100 * u) / 100 if floored else u
+
+
+def diagram_of(name: str, schedule: str, seed: int, edge: int, cases: Cases) -> Diagram:
+    """Return the diagram of a grown shape, from its file where it is there."""
+
+    def make() -> np.ndarray:
         begun = time.perf_counter()
-        with Progress(transient=True) as progress:
-            task = progress.add_task(path.stem)
-            flow = generate(
-                name,
-                grid=grid,
-                schedule=schedule,
-                seed=seed,
-                callbacks=[lambda made, total, state: progress.update(task, completed=made, total=total)],
-            )
-        seconds = time.perf_counter() - begun
-        u = torch.floor(flow.field * 100) / 100 if floored else flow.field
-        found = diagram(u, grid, WORKING_EPSILON)
-        figures = np.array([flow.history.energy[-1], seconds, flow.viability.viable])
-        kept = {"figures": figures, "points": found.points, "weights": found.weights, "commit": _commit(), "plan": plan}
-        write_atomically(path, lambda temporary: np.savez_compressed(temporary, **kept))
-    with np.load(path) as kept:
-        energy, seconds, viable = kept["figures"]
-        found = Diagram(kept["points"], kept["weights"])
-        return Shape(float(energy), float(seconds), bool(viable), found, str(kept["commit"]))
+        found = diagram(field_of(name, schedule, seed, edge), Grid((edge,) * 3), WORKING_EPSILON)
+        print(f"  {name} by {schedule}, seed {seed}: {time.perf_counter() - begun:.0f} s", flush=True)
+        return np.column_stack([found.points, found.weights])
+
+    plan = hashlib.sha256(repr(SCHEDULES[schedule]).encode()).hexdigest()[:8]
+    table = cases.array(f"{name}-{schedule}-{plan}-{edge}-{seed}", make)
+    return Diagram(table[:, :2], table[:, 2])
 
 
-def _plan(path: Path) -> str:
-    """The schedule that made a kept shape; nothing in files that do not say."""
-    with np.load(path) as kept:
-        return str(kept.get("plan", ""))
+def noise_of(diagrams: list[Diagram]) -> float:
+    """Return the mean distance between two seeds."""
+    return float(np.mean([wasserstein(a, b) for a, b in combinations(diagrams, 2)]))
 
 
-def _commit() -> str:
-    asked = subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True, check=False)
-    return asked.stdout.strip() or "unknown"
-
-
-def compare(paper: list[Shape], other: list[Shape]) -> Row:
-    """Distances within and between two schedules' shapes."""
-    cross = np.mean([wasserstein(a.diagram, b.diagram) for a, b in product(other, paper)])
-    bias = wasserstein(_pooled(other), _pooled(paper))
-    energies = tuple(float(np.mean([shape.energy for shape in shapes])) for shapes in (paper, other))
-    seconds = tuple(float(np.median([shape.seconds for shape in shapes])) for shapes in (paper, other))
-    return Row(energies, seconds, noise_of(paper), float(cross), float(bias))
-
-
-def noise_of(shapes: list[Shape]) -> float:
-    """Mean distance between two seeds."""
-    return float(np.mean([wasserstein(a.diagram, b.diagram) for a, b in combinations(shapes, 2)]))
-
-
-def _pooled(shapes: list[Shape]) -> Diagram:
-    parts = [shape.diagram.normalised for shape in shapes]
+def pooled(diagrams: list[Diagram]) -> Diagram:
+    parts = [each.normalised for each in diagrams]
     return Diagram(np.concatenate([d.points for d in parts]), np.concatenate([d.weights for d in parts]))
 
 
-def start_up(edge: int) -> tuple[float, float]:
-    """Seconds of `curvafit generate`, from the shell and back, and of 8000 steps in plain torch."""
-    plain = plain_stepper(edge)
-    plain.step(1e-3)
-    begun = time.perf_counter()
-    for _ in range(3):
-        plain.step(1e-3)
-    slow = (time.perf_counter() - begun) / 3 * SCHEDULES["paper"].steps
-    with tempfile.TemporaryDirectory() as folder:
-        begun = time.perf_counter()
-        out = f"{folder}/tubes.nii.gz"
-        command = [sys.executable, "-m", "curvafit", "generate", "--preset", "tubes", "--shape", str(edge), "-o", out]
-        subprocess.run(command, check=True, capture_output=True)
-        return time.perf_counter() - begun, slow
+def compare(name: str, options: argparse.Namespace, cases: Cases) -> Values:
+    """Compare a schedule's shapes with those of `paper`, and with the author's volume."""
+    seeds = range(options.first, options.first + options.seeds)
+    paper, other = (
+        [diagram_of(name, plan, seed, options.edge, cases) for seed in seeds] for plan in ("paper", options.schedule)
+    )
+    found = {"noise": noise_of(paper), "own_noise": noise_of(other)}
+    found["bias"] = wasserstein(pooled(other), pooled(paper)) / found["noise"]
+    if options.edge == EDGE and name in author_volumes():
+        author = diagram(author_field(name), Grid((EDGE,) * 3), WORKING_EPSILON)
+        for key, mine, noise in (("paper", paper, found["noise"]), ("excess", other, found["own_noise"])):
+            distance = float(np.mean([wasserstein(author, each) for each in mine]))
+            found[key] = math.sqrt(max((distance / noise) ** 2 - 1, 0))
+    return {key: float(value) for key, value in found.items()}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--presets", default=",".join(PRESETS))
     parser.add_argument("--schedule", choices=[name for name in SCHEDULES if name != "paper"], default="fast")
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--edge", type=int, default=100)
-    parser.add_argument("--start", action="store_true", help="only time a start from the shell")
-    parser.add_argument("-o", "--output", type=Path, default=Path("texture"))
-    options = parser.parse_args()
-    if options.start:
-        ours, plain = start_up(options.edge)
-        print(
-            f"{options.edge}³: curvafit generate {ours:.1f} s, 8000 plain steps {plain:.0f} s, {plain / ours:.0f} times"
-        )
-        return
-    options.output.mkdir(parents=True, exist_ok=True)
-    pair, seeds = ("paper", options.schedule), range(options.first, options.first + options.seeds)
-    plans = ", ".join(f"{name} {SCHEDULES[name].steps}" for name in pair)
-    threads = numba.get_num_threads()
-    print(f"{options.edge}³, seeds {[*seeds]}; steps: {plans}; {threads} threads; {_commit()}")
-    names = (*(f"E {name}" for name in pair), "noise", "cross", "bias", "/noise", *(f"s {name}" for name in pair))
-    print(f"{'preset':17}" + "".join(f"{name:>9}" for name in names))
-    for name in options.presets.split(","):
-        paper, other = ([shape_of(name, plan, k, options.edge, options.output) for k in seeds] for plan in pair)
-        row = compare(paper, other)
-        distances = (row.noise, row.cross, row.bias, row.bias / row.noise)
-        print(
-            f"{name:17}"
-            + "".join(f"{energy:9.1f}" for energy in row.energies)
-            + "".join(f"{distance:9.2f}" for distance in distances)
-            + "".join(f"{seconds:9.1f}" for seconds in row.seconds),
-            flush=True,
-        )
+    parser.add_argument("--first", type=int, default=10)
+    parser.add_argument("--edge", type=int, default=EDGE)
 
 
-if __name__ == "__main__":
-    main()
+def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
+    if options.quick:
+        options.presets, options.edge, options.seeds = "tubes", 32, 2
+    names, first = options.presets.split(","), options.first
+    plan = f"{options.schedule}-{options.edge}-{first}-{options.seeds}"
+    found = cases.all({f"{name}-{plan}": lambda name=name: compare(name, options, cases) for name in names}, seed=first)
+    rows = [
+        [name, row["noise"], row["bias"], row.get("paper", ""), row.get("excess", "")] for name, row in found.items()
+    ]
+    show(["preset", "noise", "bias / noise", "author: paper", "author: schedule"], rows)
+    if (options.schedule, options.edge, first, options.seeds) != ("fast", EDGE, 10, 3):
+        return {}
+    figures = {f"texture.{name.rsplit('-', 4)[0]}.bias": Figure(row["bias"]) for name, row in found.items()}
+    return figures | {
+        f"author.{name.rsplit('-', 4)[0]}.{key}": Figure(row[key])
+        for name, row in found.items()
+        for key in ("paper", "excess")
+        if key in row
+    }
