@@ -4,7 +4,7 @@ import gc
 import os
 import warnings
 
-from curvafit.core.interrupts import exit_code, leave, listen
+from curvafit.core.runtime import exit_code, leave, listen
 
 
 def main() -> None:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.core.progress import Progress, silent
+from curvafit.core.runtime import Progress, silent
 from curvafit.data_synth.atlas.draws import versions
 from curvafit.data_synth.atlas.store import Store, open_store
 from curvafit.data_synth.atlas.workers import Here, Workers

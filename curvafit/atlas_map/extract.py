@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from curvafit.core.progress import Progress, silent
+from curvafit.core.runtime import Progress, silent
 from curvafit.data_synth.atlas.design import boxed
 from curvafit.data_synth.atlas.draws import versions
 from curvafit.data_synth.atlas.store import Record, Store, open_store

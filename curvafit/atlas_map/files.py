@@ -20,8 +20,8 @@ from curvafit.atlas_map.page import page_html
 from curvafit.atlas_map.picture import map_picture
 from curvafit.atlas_map.shapes import Shown, regrow_command, shown
 from curvafit.core.files import bears, check_folder, check_free, is_empty, write_content
-from curvafit.core.progress import Progress, part, silent
 from curvafit.core.records import read_archive
+from curvafit.core.runtime import Progress, part, silent
 from curvafit.data_synth.atlas.census import census
 from curvafit.data_synth.atlas.record import Record
 from curvafit.data_synth.atlas.store import Store, open_store

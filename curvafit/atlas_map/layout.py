@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.core.progress import Progress, silent
+from curvafit.core.runtime import Progress, silent
 from curvafit.geometry.diagram import BIN_WIDTH, Diagram
 from curvafit.geometry.family import FAMILIES, family_of, family_shares, half_thickness, leading_family
 from curvafit.geometry.pairwise import pairwise

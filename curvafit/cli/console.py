@@ -20,7 +20,7 @@ from rich.table import Table
 from rich.text import Text
 
 from curvafit.cli.refusal import sentence, writable
-from curvafit.core.interrupts import Terminated, exit_code
+from curvafit.core.runtime import Terminated, exit_code
 
 #: Whether files of other programs, or of other commands, may be replaced.
 OverwriteOption = Annotated[

@@ -24,7 +24,7 @@ from curvafit.cli.console import (
     whole_triple,
 )
 from curvafit.cli.forecast import FLOW, say_forecast
-from curvafit.core.interrupts import exit_code
+from curvafit.core.runtime import exit_code
 
 if TYPE_CHECKING:
     from torch import Tensor

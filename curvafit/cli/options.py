@@ -42,9 +42,9 @@ def reading_of(
         If an option does not have the form that its help states.
     """
     if unit is not None:
-        from curvafit.volumes.formats import normalise_unit
+        from curvafit.core.units import parse_unit
 
-        normalise_unit(unit)
+        parse_unit(unit)
     if crop is not None:
         from curvafit.volumes.formats.part import box_of
 

@@ -13,7 +13,7 @@ from curvafit.cli.options import Reading, reads_volume
 from curvafit.cli.segment import STEPS, Epsilon, OwnPrior, Steps, TileOption, Weight, WorkersOption, inferred, run_job
 
 if TYPE_CHECKING:
-    from curvafit.core.progress import Progress
+    from curvafit.core.runtime import Progress
     from curvafit.segmentation.result import Segmentation
     from curvafit.volumes.boxes import Boxes
 
@@ -79,7 +79,7 @@ def refine(
 
         def learn(volume: Boxes, progress: Progress) -> None:
             """Try the prior out on the example, once."""
-            from curvafit.core.progress import part
+            from curvafit.core.runtime import part
             from curvafit.volumes.scan import load
 
             chances, mask = chances_of(example_probabilities, **others), load(example, **place)  # type: ignore[arg-type]

@@ -9,8 +9,7 @@ import typer
 from rich.console import Console
 from typer.core import TyperGroup
 
-from curvafit.core.interrupts import exit_code
-from curvafit.core.messages import one_line
+from curvafit.core.runtime import exit_code, one_line
 
 #: Most characters of a sentence; a longer one is cut in its middle.
 LONGEST = 700

@@ -26,7 +26,7 @@ from curvafit.cli.forecast import SEGMENTATION, say_forecast
 from curvafit.cli.options import Reading, Volume, reads_volume
 
 if TYPE_CHECKING:
-    from curvafit.core.progress import Progress
+    from curvafit.core.runtime import Progress
     from curvafit.inference.infer import Inference
     from curvafit.segmentation.lowering import Workers
     from curvafit.segmentation.result import Segmentation

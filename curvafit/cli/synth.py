@@ -138,10 +138,10 @@ def synth(
         placed = {"spacing": spacing, "unit": None if spacing is None else unit}  # a unit alone is that of --voxel
         reading = reading_of(**placed, crop=crop, channel=channel, label=label, strict=strict)
         kind = _modality(modality, like, like_mask, visible, reading)
+        from curvafit.core.units import convert_length
         from curvafit.data_synth.sets.case import Recipe
         from curvafit.data_synth.sets.sets import Order
         from curvafit.data_synth.sets.sources import voxel_of
-        from curvafit.volumes.formats.base import convert_length
 
         edge = voxel_of(names, kind) if voxel is None else convert_length(voxel, unit, kind.base.unit)
         low, high = numbers(calibres, "--calibres", 2)

@@ -14,7 +14,7 @@ from curvafit.cli.forecast import FLOW, say_forecast
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from curvafit.core.progress import Progress
+    from curvafit.core.runtime import Progress
     from curvafit.data_synth.atlas.workers import Workers
 
 WorkersOption = Annotated[

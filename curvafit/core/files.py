@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from curvafit.core.interrupts import undisturbed
+from curvafit.core.runtime import undisturbed
 
 #: Key, in a Zarr group's attributes, of the kind of a group.
 MARK = "curvafit"

@@ -23,7 +23,7 @@ import numpy as np
 
 from curvafit.core.checks import quoted
 from curvafit.core.files import MARK, check_folder, check_free, is_empty, write_content
-from curvafit.core.machine import memory
+from curvafit.core.runtime import memory
 
 Content = TypeVar("Content")
 

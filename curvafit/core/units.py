@@ -1,16 +1,54 @@
-"""Units of length and numbers as text, with a fitting unit and a fitting number of digits."""
+"""Units of length: how files name them, and lengths as text in a fitting unit and number of digits."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 
+from curvafit.core.checks import quoted
+
 #: Metres in each unit of length that files name, small to large.
 METRES = {"nm": 1e-9, "um": 1e-6, "mm": 1e-3, "m": 1.0}
+#: Name of a unit in a file -> (our name, factor to it).
+_UNITS: dict[str, tuple[str, float]] = {
+    **dict.fromkeys(("", "voxel", "voxels", "pixel", "pixels", "px", "unknown", "none", "null"), ("voxel", 1.0)),
+    **dict.fromkeys(("nm", "nanometer", "nanometers", "nanometre", "nanometres"), ("nm", 1.0)),
+    **dict.fromkeys(("a", "å", "angstrom", "angstroms", "ångström"), ("nm", 0.1)),
+    **dict.fromkeys(
+        ("um", "µm", "μm", "\\u00b5m", "micron", "microns", "micrometer", "micrometers", "micrometre", "micrometres"),
+        ("um", 1.0),
+    ),
+    **dict.fromkeys(("mm", "millimeter", "millimeters", "millimetre", "millimetres"), ("mm", 1.0)),
+    **dict.fromkeys(("cm", "centimeter", "centimeters", "centimetre", "centimetres"), ("mm", 10.0)),
+    **dict.fromkeys(("inch", "inches", "in"), ("mm", 25.4)),
+    **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), ("m", 1.0)),
+}
 #: The page that explains words with a special meaning, each under its own anchor.
 GLOSSARY = "https://curvafit.readthedocs.io/en/latest/glossary/"
 #: A space at which no line breaks.
 _GLUE = "\u00a0"
+
+
+def parse_unit(unit: str | None) -> tuple[str, float]:
+    """Return this package's name of a length unit, and the factor to it: `"cm"` gives `("mm", 10.0)`.
+
+    Raises
+    ------
+    ValueError
+        If the unit is unknown.
+    """
+    name = "" if unit is None else unit.strip().casefold() if isinstance(unit, str) else None
+    if name not in _UNITS:
+        raise ValueError(f"expected a unit of voxel, nm, um, mm or m, got {quoted(unit)}")
+    return _UNITS[name]
+
+
+def convert_length(length: float, unit: str | None, to: str | None) -> float:
+    """Return a length in `unit` converted to the unit `to`; where one of them is the voxel, it counts as the other."""
+    (name, factor), (target, target_factor) = parse_unit(unit), parse_unit(to)
+    if "voxel" in (name, target):
+        return length * factor
+    return length * factor * METRES[name] / (METRES[target] * target_factor)
 
 
 def number(value: float | None, digits: int = 3) -> str:

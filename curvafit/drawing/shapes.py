@@ -17,8 +17,9 @@ from torch import Tensor
 
 from curvafit.core.checks import LONGEST, SHORTEST, as_tuple, check_float, check_int, check_type
 from curvafit.core.files import move_together, remove, staged
-from curvafit.core.interrupts import undisturbed
 from curvafit.core.records import Format, can_write, sibling
+from curvafit.core.runtime import undisturbed
+from curvafit.core.units import parse_unit
 from curvafit.generation.flow import Flow
 from curvafit.generation.memory import FILE, check_memory
 from curvafit.geometry.mesh import NoSurface, Surface, solid_surface, surface
@@ -27,7 +28,7 @@ from curvafit.priors.coefficients import NAMES
 from curvafit.priors.curvature import geometric_curvatures, jet
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.priors.profile import profile_distance
-from curvafit.volumes.formats import normalise_unit, pick_writer
+from curvafit.volumes.formats import pick_writer
 from curvafit.volumes.scan import WRITABLE, Field, save
 
 #: What a record beside a shape says that it is.
@@ -62,7 +63,7 @@ class Output:
 
     def __post_init__(self) -> None:
         check_type(self.unit, str, "a unit as text")
-        unit, factor = normalise_unit(self.unit)
+        unit, factor = parse_unit(self.unit)
         object.__setattr__(self, "unit", unit)
         edge = check_float(self.voxel, "a positive voxel edge", SHORTEST, LONGEST)
         object.__setattr__(self, "voxel", edge * factor)

@@ -17,7 +17,7 @@ from filelock import FileLock, Timeout
 from torch import Tensor
 
 from curvafit.core.files import sweep, write_content
-from curvafit.core.interrupts import undisturbed
+from curvafit.core.runtime import undisturbed
 from curvafit.priors.coefficients import Coefficients
 
 #: First words of a checkpoint, before the SHA-256 of its content.

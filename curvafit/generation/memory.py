@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from curvafit.core.machine import memory as installed
+from curvafit.core.runtime import memory as installed
 
 if TYPE_CHECKING:
     import torch

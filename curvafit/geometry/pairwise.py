@@ -15,8 +15,8 @@ import torch
 
 from curvafit.core.checks import quoted
 from curvafit.core.files import write_atomically
-from curvafit.core.progress import Progress, silent
 from curvafit.core.records import parse_json, read_archive
+from curvafit.core.runtime import Progress, silent
 from curvafit.geometry.diagram import BIN_WIDTH, Diagram
 from curvafit.geometry.sinkhorn import Measures, costs, packed, pair_halvings
 from curvafit.geometry.transport import comparable

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from curvafit.core.progress import Progress, silent
+from curvafit.core.runtime import Progress, silent
 from curvafit.inference.compression import Compression
 from curvafit.inference.emulator import FAINTEST, Emulator, Layer, misfits
 from curvafit.inference.learning import Plan, learn

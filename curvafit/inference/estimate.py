@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.core.progress import Progress, part, silent
+from curvafit.core.runtime import Progress, part, silent
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import LEARNED
 from curvafit.geometry.descriptors import BLOCKS, Descriptors, descriptors

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from curvafit.core.progress import Progress, silent
+from curvafit.core.runtime import Progress, silent
 from curvafit.generation.flow import relax
 from curvafit.generation.schedule import Schedule
 from curvafit.inference.refinement import Refinement, called, double_precision_on_cpu, import_jax, named

@@ -15,7 +15,7 @@ import torch
 
 from curvafit.core.checks import SEEDS, check_int, check_type
 from curvafit.core.pictures import Pictured
-from curvafit.core.progress import Progress, part, silent
+from curvafit.core.runtime import Progress, part, silent
 from curvafit.core.units import number
 from curvafit.generation.schedule import LEARNED, SCHEDULES
 from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram

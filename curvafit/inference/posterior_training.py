@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from curvafit.core.checks import check_int, seed_of
-from curvafit.core.progress import Progress, silent
+from curvafit.core.runtime import Progress, silent
 from curvafit.inference.compression import compression_of
 from curvafit.inference.emulator_training import train_emulator
 from curvafit.inference.learning import Plan, batch_of, learn

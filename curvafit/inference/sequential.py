@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import linalg
 
-from curvafit.core.progress import Progress, silent
+from curvafit.core.runtime import Progress, silent
 from curvafit.inference.emulator import Emulator
 from curvafit.inference.simulation import Simulate, Simulations
 from curvafit.inference.table import row_of

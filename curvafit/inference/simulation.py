@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from curvafit.core.checks import check_int
-from curvafit.core.progress import Progress, silent
+from curvafit.core.runtime import Progress, silent
 from curvafit.geometry.descriptors import Descriptors
 from curvafit.inference.table import row_of
 

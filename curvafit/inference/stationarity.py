@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from curvafit.core.progress import Progress, silent
+from curvafit.core.runtime import Progress, silent
 from curvafit.inference.refinement import (
     Refinement,
     admissible,

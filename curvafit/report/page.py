@@ -11,7 +11,7 @@ from string import Template
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from curvafit.core.files import bears, check_folder, check_free, move_together, own_record, staged, write_content
-from curvafit.core.interrupts import undisturbed
+from curvafit.core.runtime import undisturbed
 from curvafit.core.units import density, length, number, per_unit, percent, unit_name
 from curvafit.inference.candidates import TITLES, Candidate, noise_of
 from curvafit.priors.coefficients import NAMES

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from curvafit.core.checks import check_float, check_int
-from curvafit.core.progress import Progress, silent
+from curvafit.core.runtime import Progress, silent
 from curvafit.generation import data
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from curvafit.core.progress import Progress, part, silent
+from curvafit.core.runtime import Progress, part, silent
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.profile import profile_distance
 from curvafit.segmentation.calibration import Setting, Task

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from curvafit.core.progress import Progress, silent
+from curvafit.core.runtime import Progress, silent
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import LEARNED
 from curvafit.priors.coefficients import Coefficients

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from curvafit.core.progress import Progress, part, silent
+from curvafit.core.runtime import Progress, part, silent
 from curvafit.generation.data import Data
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.engine import completed

@@ -12,8 +12,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from curvafit.core.files import move_together, remove, staged
-from curvafit.core.interrupts import undisturbed
 from curvafit.core.records import Format, can_write, sibling
+from curvafit.core.runtime import undisturbed
 from curvafit.drawing.plot import DPI
 from curvafit.drawing.sections import section_figure
 from curvafit.segmentation.probability import entropy

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from curvafit.core.checks import check_float
-from curvafit.core.progress import Progress, part, silent
+from curvafit.core.runtime import Progress, part, silent
 from curvafit.generation.data import Evidence
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.engine import BENDING, STEPS, bending, likelihood, started

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from curvafit.core.checks import SEEDS, check_int
-from curvafit.core.progress import Progress, part, silent
+from curvafit.core.runtime import Progress, part, silent
 from curvafit.priors.loss import RESOLVED
 from curvafit.priors.profile import optimal_profile
 from curvafit.segmentation.completion import known_places, reconstruct

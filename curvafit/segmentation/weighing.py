@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import ndimage
 
-from curvafit.core.progress import Progress, silent
+from curvafit.core.runtime import Progress, silent
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.calibration import BEYOND, climbed
 from curvafit.segmentation.engine import HALO, weighed

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from curvafit.core.progress import Progress, silent
+from curvafit.core.runtime import Progress, silent
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.family import FAMILIES, families
 from curvafit.geometry.mesh import area_vectors

@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from curvafit.core.checks import SEEDS, check_int, quoted
-from curvafit.core.messages import one_line
 from curvafit.core.pictures import Pictured
-from curvafit.core.units import sampling
-from curvafit.volumes.formats.base import ScanError, normalise_unit
+from curvafit.core.runtime import one_line
+from curvafit.core.units import parse_unit, sampling
+from curvafit.volumes.formats.base import ScanError
 from curvafit.volumes.formats.part import Crop, box_of, fitted
 
 __all__ = ["Field", "ScanError", "positive_triple"]
@@ -57,7 +57,7 @@ class Field(Pictured):
         if (kind := np.asarray(self.values).dtype).kind not in "biuf":
             raise ScanError(f"expected real numbers, got values of type {kind}")
         spacing = positive_triple(self.spacing)
-        unit, factor = normalise_unit(self.unit)
+        unit, factor = parse_unit(self.unit)
         object.__setattr__(self, "values", np.asarray(self.values))
         object.__setattr__(self, "spacing", tuple(h * factor for h in spacing))
         object.__setattr__(self, "unit", unit)

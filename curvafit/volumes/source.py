@@ -13,8 +13,9 @@ import numpy as np
 import torch
 
 from curvafit.core.checks import quoted
+from curvafit.core.units import parse_unit
 from curvafit.volumes.field import Field, positive_triple
-from curvafit.volumes.formats import Raw, ScanError, normalise_unit
+from curvafit.volumes.formats import Raw, ScanError
 from curvafit.volumes.formats.guard import read_file
 from curvafit.volumes.formats.part import Crop, Part, box_of, selected
 
@@ -220,10 +221,10 @@ def _check_finite(values: np.ndarray, place: object) -> tuple[float, float]:
 def placed(raw: Raw, source: str, spacing: Sequence[float] | float | None, unit: str | None) -> Field:
     """Return the values in native byte order, with the spacing and unit of the caller or, by default, of the file."""
     notes = [*raw.gaps, *raw.notes, *(() if spacing is not None or unit is not None else raw.guesses)]
-    file_unit, factor = ("voxel", 1.0) if spacing is not None and unit is not None else normalise_unit(raw.unit)
+    file_unit, factor = ("voxel", 1.0) if spacing is not None and unit is not None else _unit(raw.unit)
     native = None if raw.spacing is None else _scaled(raw.spacing, factor)
     affine = None if raw.affine is None else np.diag([factor, factor, factor, 1.0]) @ raw.affine
-    target_unit, target_factor = (file_unit, 1.0) if unit is None else normalise_unit(unit)
+    target_unit, target_factor = (file_unit, 1.0) if unit is None else _unit(unit)
     edges = positive_triple(1.0 if native is None and spacing is None else native if spacing is None else spacing)
     if native is None and spacing is None:
         counted = "counted in voxels" if target_unit == "voxel" else f"those of voxels of 1 {target_unit}"
@@ -236,6 +237,14 @@ def placed(raw: Raw, source: str, spacing: Sequence[float] | float | None, unit:
         affine = None if affine is None else np.diag([target_factor] * 3 + [1.0]) @ affine
     values = np.ascontiguousarray(raw.values, dtype=raw.values.dtype.newbyteorder("="))
     return Field(values, edges, target_unit, affine, source, tuple(notes))
+
+
+def _unit(unit: str | None) -> tuple[str, float]:
+    """Return this package's name of a unit and the factor to it, or raise ScanError where it is unknown."""
+    try:
+        return parse_unit(unit)
+    except ValueError as reason:
+        raise ScanError(str(reason)) from None
 
 
 def _scaled(spacing: tuple[object, ...], factor: float) -> tuple[object, ...]:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from curvafit.core.interrupts import Terminated
+from curvafit.core.runtime import Terminated
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import schedule
 from curvafit.inference.fixed_point import ShortFlow, _minimiser, _parameters, fixed_point, sharpened

@@ -17,7 +17,7 @@ import zarr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from curvafit.volumes.formats import normalise_unit
+from curvafit.core.units import parse_unit
 from curvafit.volumes.formats.tiff import natural_key
 from curvafit.volumes.scan import Field, ScanError, load, save
 
@@ -179,7 +179,7 @@ def test_arguments_override_the_file_and_the_affine_follows(stated, given_spacin
     with tempfile.TemporaryDirectory() as folder:
         path = save(Field(ramp(), stated, file_unit), Path(folder) / "scan.nii")
         field = load(path, spacing=given_spacing, unit=unit)
-    name, factor = (file_unit, 1.0) if unit is None else normalise_unit(unit)
+    name, factor = (file_unit, 1.0) if unit is None else parse_unit(unit)
     assert field.unit == name
     assert field.spacing == pytest.approx(tuple(h * factor for h in given_spacing))
     assert np.linalg.norm(field.affine[:3, :3], axis=0)[::-1] == pytest.approx(field.spacing, rel=1e-5)
@@ -198,7 +198,7 @@ def test_arguments_override_the_file_and_the_affine_follows(stated, given_spacin
     ],
 )
 def test_units_have_one_name(name: str | None, expected: tuple[str, float]) -> None:
-    assert normalise_unit(name) == expected
+    assert parse_unit(name) == expected
 
 
 # ---- the extra formats -----------------------------------------------------------------------------------------------

@@ -65,7 +65,7 @@ def test_what_counts_for_nothing_is_refused(source, options: dict, complaint: st
     if complaint is None:
         assert field_of(source, **options).unit == "voxel"
         return
-    with pytest.raises(ScanError, match=complaint):
+    with pytest.raises(ValueError, match=complaint):
         field_of(source, **options)
 
 

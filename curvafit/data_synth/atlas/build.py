@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from curvafit.core.checks import check_int, check_type, seed_of
-from curvafit.core.progress import Progress, silent
+from curvafit.core.runtime import Progress, silent
 from curvafit.data_synth.atlas.design import Design, boxed
 from curvafit.data_synth.atlas.draws import make
 from curvafit.data_synth.atlas.store import Settings, Store, open_store

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from curvafit.core.progress import Progress, silent
+from curvafit.core.runtime import Progress, silent
 from curvafit.data_synth.atlas.design import Design
 from curvafit.data_synth.atlas.draws import flows, versions
 from curvafit.data_synth.atlas.record import Record

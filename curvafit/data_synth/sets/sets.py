@@ -17,9 +17,8 @@ import numpy as np
 
 from curvafit.core.checks import as_tuple, check_choice, check_int, check_type, quoted
 from curvafit.core.files import remove, write_content
-from curvafit.core.interrupts import undisturbed
-from curvafit.core.progress import Progress, silent
 from curvafit.core.records import parse_json
+from curvafit.core.runtime import Progress, silent, undisturbed
 from curvafit.data_synth.atlas.draws import versions
 from curvafit.data_synth.atlas.workers import Here, Workers
 from curvafit.data_synth.labels.centreline import centreline

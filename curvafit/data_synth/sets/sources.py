@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Protocol, TypeVar, get_args, get_origin
 import numpy as np
 
 from curvafit.core.checks import as_tuple
-from curvafit.core.units import METRES
+from curvafit.core.units import METRES, convert_length
 from curvafit.data_synth.atlas.design import PARAMETERS, Design
 from curvafit.data_synth.atlas.draws import one_thread
 from curvafit.data_synth.atlas.store import Store, open_store
@@ -27,7 +27,6 @@ from curvafit.generation.viability import well_formed
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.priors.law import Law, Texture, textures_of
-from curvafit.volumes.formats.base import convert_length
 
 #: Seeds that a shape gets to become well-formed.
 TRIES = 8

@@ -6,8 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from curvafit.core.units import parse_unit
 from curvafit.volumes.formats.arrays import read_hdf5, read_npy, read_npz, read_raw, write_npy
-from curvafit.volumes.formats.base import Raw, ScanError, normalise_unit
+from curvafit.volumes.formats.base import Raw, ScanError
 from curvafit.volumes.formats.medical import check_mrc, is_dicom, read_dicom, read_itk, read_mrc, read_nrrd, write_mrc
 from curvafit.volumes.formats.ngff import read_zarr, write_zarr
 from curvafit.volumes.formats.nifti import read_nifti, write_nifti
@@ -19,7 +20,7 @@ __all__ = [
     "WRITERS",
     "Raw",
     "ScanError",
-    "normalise_unit",
+    "parse_unit",
     "pick_reader",
     "pick_writer",
 ]

@@ -13,23 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from curvafit.core.checks import quoted
-from curvafit.core.messages import one_line
-from curvafit.core.units import METRES
-
-#: Name of a unit in a file -> (our name, factor to it).
-_UNITS: dict[str, tuple[str, float]] = {
-    **dict.fromkeys(("", "voxel", "voxels", "pixel", "pixels", "px", "unknown", "none", "null"), ("voxel", 1.0)),
-    **dict.fromkeys(("nm", "nanometer", "nanometers", "nanometre", "nanometres"), ("nm", 1.0)),
-    **dict.fromkeys(("a", "å", "angstrom", "angstroms", "ångström"), ("nm", 0.1)),
-    **dict.fromkeys(
-        ("um", "µm", "μm", "\\u00b5m", "micron", "microns", "micrometer", "micrometers", "micrometre", "micrometres"),
-        ("um", 1.0),
-    ),
-    **dict.fromkeys(("mm", "millimeter", "millimeters", "millimetre", "millimetres"), ("mm", 1.0)),
-    **dict.fromkeys(("cm", "centimeter", "centimeters", "centimetre", "centimetres"), ("mm", 10.0)),
-    **dict.fromkeys(("inch", "inches", "in"), ("mm", 25.4)),
-    **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), ("m", 1.0)),
-}
+from curvafit.core.runtime import one_line
 
 
 class ScanError(ValueError):
@@ -85,28 +69,6 @@ def complaints(logger: str | None = None) -> Iterator[list[str]]:
         finally:
             source.setLevel(level)
             source.removeFilter(collect)
-
-
-def normalise_unit(unit: str | None) -> tuple[str, float]:
-    """Return our name of a length unit and the factor from `unit` to it: `"cm"` gives `("mm", 10.0)`.
-
-    Raises
-    ------
-    ScanError
-        If the unit is unknown.
-    """
-    name = "" if unit is None else unit.strip().casefold() if isinstance(unit, str) else None
-    if name not in _UNITS:
-        raise ScanError(f"expected a unit of voxel, nm, um, mm or m, got {quoted(unit)}")
-    return _UNITS[name]
-
-
-def convert_length(length: float, unit: str | None, to: str | None) -> float:
-    """Return a length in `unit` converted to `to`; where one of them is the voxel, it counts as the other."""
-    (name, factor), (target, target_factor) = normalise_unit(unit), normalise_unit(to)
-    if "voxel" in (name, target):
-        return length * factor
-    return length * factor * METRES[name] / (METRES[target] * target_factor)
 
 
 def pick_key(keys: list[str], key: str | None, path: object) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from curvafit.core.checks import quoted
-from curvafit.core.messages import one_line
+from curvafit.core.runtime import one_line
 from curvafit.volumes.formats import KEYED, pick_reader
 from curvafit.volumes.formats.base import Damaged, Raw, ScanError, complaints
 from curvafit.volumes.formats.part import Part

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.volumes.formats.base import Damaged, Raw, ScanError, complaints, convert_length, extra, pick_key
+from curvafit.core.units import convert_length
+from curvafit.volumes.formats.base import Damaged, Raw, ScanError, complaints, extra, pick_key
 from curvafit.volumes.formats.headers import meta_numbers, nrrd_values, read_meta
 from curvafit.volumes.formats.streams import opened, read_numbers, skip
 

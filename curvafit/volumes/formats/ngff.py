@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from curvafit.core.files import MARK
-from curvafit.core.interrupts import undisturbed
+from curvafit.core.runtime import undisturbed
 from curvafit.volumes.formats.base import Raw, pick_key, stated
 from curvafit.volumes.formats.chunks import check_store, missing_chunks
 from curvafit.volumes.formats.part import Part, fitting, part_of

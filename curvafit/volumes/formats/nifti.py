@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.volumes.formats.base import Raw, ScanError, complaints, normalise_unit
+from curvafit.core.units import parse_unit
+from curvafit.volumes.formats.base import Raw, ScanError, complaints
 from curvafit.volumes.formats.part import Part, part_of
 from curvafit.volumes.formats.streams import mapped, read_numbers
 
@@ -146,13 +147,13 @@ def _own_unit(header: Any) -> tuple[str, float] | None:
     match = re.match(r"curvafit unit=(\w+)", bytes(header["descrip"]).decode("latin-1"))
     if match is None:
         return None
-    unit, _ = normalise_unit(match[1])
+    unit, _ = parse_unit(match[1])
     return unit, 1 / _TO_FILE[unit][1]
 
 
 def _rename(header: Any, unit: str) -> None:
     """Rename the unit of the lengths that `read_nifti` reads from a header."""
-    name, factor = normalise_unit(unit)
+    name, factor = parse_unit(unit)
     code, into = _TO_FILE[name]
     own = _own_unit(header)
     scale = factor * into * (own[1] if own else 1.0)

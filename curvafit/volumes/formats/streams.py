@@ -15,7 +15,7 @@ from typing import IO, Any
 import numpy as np
 
 from curvafit.core import records
-from curvafit.core.machine import memory
+from curvafit.core.runtime import memory
 from curvafit.volumes.formats.base import Damaged, ScanError
 
 #: Bytes of one read.

@@ -11,7 +11,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from curvafit.volumes.formats.base import Damaged, Raw, ScanError, complaints, convert_length, normalise_unit
+from curvafit.core.units import convert_length, parse_unit
+from curvafit.volumes.formats.base import Damaged, Raw, ScanError, complaints
 from curvafit.volumes.formats.streams import check_array, check_regular
 
 if TYPE_CHECKING:
@@ -210,7 +211,7 @@ def _from_imagej(
     """
     y, x = _pixels_per_unit(file)
     unit = description.get("unit")
-    if normalise_unit(unit)[0] == "voxel":
+    if parse_unit(unit)[0] == "voxel":
         sizes = (abs(float(description.get("spacing", 1 / x))) * x, x / y, 1.0)
         return (None if np.allclose(sizes, 1) else sizes), None, ()
     z = abs(float(description.get("spacing", 1 / x)))
@@ -228,7 +229,7 @@ def _from_tags(file: tifffile.TiffFile) -> tuple[tuple[float, ...] | None, str |
     dots = x * (2.54 if unit == "cm" else 1.0)
     if any(abs(dots - screen) < 0.51 for screen in _SCREEN):
         return None, None, ()
-    _, factor = normalise_unit(unit)
+    _, factor = parse_unit(unit)
     notes = ("The file states no distance of slices: it is taken as the pixel's.",)
     return (factor / x, factor / y, factor / x), "mm", notes
 

@@ -1,16 +1,71 @@
-"""Ctrl-C, SIGTERM and a closed terminal as exceptions, which clean up on their way and wait while files change.
+"""The program that runs: its progress, its messages on one line, the machine's memory, and the signals that end it.
 
-The program listens from its first line (`listen`); the library changes no signal's handler.
+Ctrl-C, SIGTERM and a closed terminal become exceptions, which clean up on their way and wait while files change. The
+program listens from its first line (`listen`); the library changes no signal's handler.
 """
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import FrameType
+
+# ---- progress and messages -------------------------------------------------------------------------------------------
+
+#: Called with a sentence on the present step, and with the share of the work that is done, from 0 to 1.
+Progress = Callable[[str, float], None]
+
+
+def silent(text: str, share: float) -> None:
+    """Say nothing: the default progress."""
+
+
+def part(progress: Progress, start: float, stop: float) -> Progress:
+    """Return the progress of a part of the work, from one share of the whole to another."""
+    return lambda text, share: progress(text, start + (stop - start) * share)
+
+
+def one_line(text: str) -> str:
+    """Return a text on one line; signs that do not show, such as a line break in a name, are escaped."""
+    return "".join(_visible(sign) for sign in text)
+
+
+def _visible(sign: str) -> str:
+    if sign.isprintable():
+        return sign
+    spaces = {"\u00a0": " ", "\u202f": " "}
+    return spaces.get(sign) or sign.encode("unicode_escape").decode()
+
+
+# ---- memory ----------------------------------------------------------------------------------------------------------
+
+
+def memory() -> int:
+    """Return the bytes of memory of this machine, or of its container; `sys.maxsize` where neither is known."""
+    return min(_installed(), _allowed())
+
+
+def _installed() -> int:
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        return sys.maxsize
+
+
+def _allowed() -> int:
+    """Return the bytes that a container may use."""
+    try:
+        return int(Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii"))
+    except (OSError, ValueError):
+        return sys.maxsize
+
+
+# ---- signals ---------------------------------------------------------------------------------------------------------
 
 #: Signals that end the program besides Ctrl-C, where the platform has them.
 _ENDS = ("SIGTERM", "SIGHUP")

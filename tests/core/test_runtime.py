@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from curvafit.core.files import move_together, staged
-from curvafit.core.interrupts import Terminated, exit_code, listen, undisturbed
+from curvafit.core.runtime import Terminated, exit_code, listen, undisturbed
 
 ROOT = Path(__file__).resolve().parents[2]
 HEARD = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
