@@ -1,7 +1,8 @@
-"""Batches of shapes over laws, masses and seeds: one after another or, on an NVIDIA device, together."""
+"""Batches of shapes over laws, masses and seeds: one after another or, in plain torch, together."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from numbers import Real
 from typing import Any, NamedTuple
@@ -12,23 +13,23 @@ from torch import Tensor
 from curvafit.core.checks import as_tuple, check_choice, check_int
 from curvafit.generation.cost import Cost
 from curvafit.generation.flow import WORKING_BLUR, Backend, generate
-from curvafit.generation.fused import CudaStepper
 from curvafit.generation.initial import white_noise
 from curvafit.generation.loop import Orders, run
-from curvafit.generation.memory import DEVICE, check_memory
+from curvafit.generation.memory import EAGER, check_memory, memory
 from curvafit.generation.parametrization import DivergenceForm
 from curvafit.generation.result import Flow
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.schedule import schedule as named_schedule
-from curvafit.generation.setup import base_of, kind_of
+from curvafit.generation.setup import BACKENDS, base_of, check_device
+from curvafit.generation.stepper import TorchStepper
 from curvafit.priors import kernels
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.law import Law, textures_of
 from curvafit.priors.shapes import Float
 
-#: Shapes that a device makes together by default.
-TOGETHER = 64
+#: The most shapes that a device makes together by default.
+MOST_TOGETHER = 64
 
 
 def generate_batch(
@@ -43,7 +44,7 @@ def generate_batch(
     orientation: Float[Tensor, "3 3"] | None = None,
     snapshots: Sequence[int] = (),
     reject_early: bool = False,
-    together: int = TOGETHER,
+    together: int | None = None,
     backend: Backend = "auto",
     device: torch.device | str = "cpu",
 ) -> Iterator[Flow]:
@@ -55,8 +56,8 @@ def generate_batch(
         A law, a mass and a seed for all shapes, or sequences of one length with one for each shape. None takes the
         laws' masses. A mass that is a tensor varies in space, for all shapes.
     together
-        How many shapes an NVIDIA device makes at once; each takes some 70 bytes for each voxel. A processor makes one
-        shape at a time.
+        How many shapes advance in the same steps, where there is no fused step; None takes as many as fit into half of
+        the device's memory, at most 64, and one on a processor.
 
     The other arguments are those of `generate`, for all shapes.
 
@@ -65,18 +66,29 @@ def generate_batch(
     ValueError
         At once if the sequences differ in length; otherwise as `generate` does, when the shape is made.
     """
-    together = check_int(together, "at least one shape at a time", 1, 10**6)
     jobs, plan = _jobs(laws, masses, seeds), named_schedule(schedule)
     grid = grid if isinstance(grid, Grid) else Grid(grid)  # type: ignore[arg-type]
     options = {
         "schedule": plan, "epsilon": epsilon, "blur": blur, "orientation": orientation,
         "snapshots": snapshots, "reject_early": reject_early, "backend": backend, "device": device,
     }  # fmt: skip
-    check_choice(backend, ("auto", "torch", "fused"), "a backend 'auto', 'torch' or 'fused'")
-    if kind_of(device) == "cuda" and backend != "torch" and kernels.fused(device):
-        groups = [jobs[first : first + together] for first in range(0, len(jobs), together)]
-        return (flow for group in groups for flow in _joint_flows(group, grid, options))
-    return (generate(job.coefficients, job.mass, grid, seed=job.seed, **options) for job in jobs)
+    check_choice(backend, BACKENDS, f"a backend among {', '.join(BACKENDS)}")
+    check_device(device)
+    size = 1
+    if backend in ("torch", "compiled") or not kernels.fused(device):
+        size = _fitting(grid, device) if together is None else together
+    size = check_int(size, "at least one shape at a time", 1, 10**6)
+    if size == 1:
+        return (generate(job.coefficients, job.mass, grid, seed=job.seed, **options) for job in jobs)
+    groups = [jobs[first : first + size] for first in range(0, len(jobs), size)]
+    return (flow for group in groups for flow in _joint_flows(group, grid, options))
+
+
+def _fitting(grid: Grid, device: torch.device | str) -> int:
+    """Return how many shapes fit into half of a device's memory; one on a processor, where threads share a shape."""
+    if torch.device(device).type == "cpu":
+        return 1
+    return max(1, min(MOST_TOGETHER, memory(device) // (2 * EAGER * math.prod(grid.shape))))
 
 
 class _Job(NamedTuple):
@@ -104,16 +116,30 @@ def _jobs(laws, masses, seeds) -> list[_Job]:
 
 
 def _joint_flows(jobs: list[_Job], grid: Grid, options: dict[str, Any]) -> list[Flow]:
-    """Make shapes together, in the same steps of a device."""
-    plan = options["schedule"]
-    check_memory((len(jobs), *grid.shape), DEVICE, "a batch", options["device"])
-    costs = [Cost(job.coefficients, grid, options["epsilon"], options["orientation"], options["blur"]) for job in jobs]
-    forms = [
-        DivergenceForm.of(grid, options["blur"], base_of(job.mass, None, grid), kernels.gaussian_blur) for job in jobs
-    ]
-    starts = [white_noise(grid, job.seed) for job in jobs]
-    coefficients = [job.coefficients for job in jobs]
-    bases = [form.base for form in forms]
-    stepper = CudaStepper(starts, bases, costs[0], coefficients, plan.betas, None, options["device"])
+    """Make shapes together, in the same steps."""
+    plan, device, width = options["schedule"], options["device"], options["blur"]
+    check_memory((len(jobs), *grid.shape), EAGER, "a batch", device)
+    costs = [Cost(job.coefficients, grid, options["epsilon"], options["orientation"], width) for job in jobs]
+    bases = [DivergenceForm.of(grid, width, base_of(job.mass, None, grid)).base for job in jobs]
+    coefficients = Coefficients(*(_stack(values) for values in zip(*(job.coefficients for job in jobs), strict=True)))
+    stepper = TorchStepper(
+        torch.stack([white_noise(grid, job.seed) for job in jobs]),
+        DivergenceForm(grid, costs[0].blur, _stack(bases)),
+        coefficients,
+        costs[0].epsilon,
+        plan.betas,
+        None,
+        device,
+        orientation=costs[0].orientation,
+        compiled=options["backend"] == "compiled",
+        count=len(jobs),
+    )
     shared = {name: options[name] for name in ("snapshots", "reject_early")}
     return run(stepper, [Orders(cost, plan, **shared) for cost in costs], [job.seed for job in jobs])
+
+
+def _stack(values: Sequence[float | Tensor]) -> Tensor:
+    """Return one number or field `(Z, Y, X)` for each shape, as `(count, 1, 1, 1)` or `(count, Z, Y, X)`."""
+    fields = torch.broadcast_tensors(*(torch.as_tensor(value, dtype=torch.float32) for value in values))
+    stack = torch.stack(fields)
+    return stack.reshape(len(fields), *(1,) * (4 - stack.dim()), *stack.shape[1:])

@@ -31,7 +31,7 @@ WORKING_BLUR = 0.02
 #: Seconds between two checkpoints by default.
 CHECKPOINT_EVERY = 60.0
 
-Backend = Literal["auto", "torch", "fused"]
+Backend = Literal["auto", "torch", "fused", "compiled"]
 
 
 def generate(
@@ -91,9 +91,11 @@ def generate(
     keep_checkpoint
         Whether the file stays at the end too, for the caller to remove once the result is safe.
     backend
-        `"auto"` takes a fused step where there is one, else plain torch; `"torch"` and `"fused"` take only that step.
+        `"auto"` takes the fused step on processors and plain torch elsewhere; `"torch"` and `"fused"` take only that
+        step. `"compiled"` passes the plain step through `torch.compile`; where that fails, a warning says so and the
+        step stays plain.
     device
-        Where torch runs.
+        Where torch runs, such as `"cpu"` or `"cuda"`.
 
     Returns
     -------

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 #: The least number of bytes for each voxel of a flow: A, Adam's two moments and the start, three float32 numbers each;
 #: u, the gradient, and the field between two passes of the blur.
 FLOW = 60
-#: Bytes for each voxel of a flow on an NVIDIA device.
-DEVICE = 70
+#: Bytes for each voxel of a flow in plain torch, where autograd stores what the energy's gradient needs.
+EAGER = 400
 #: Bytes for each voxel of a field that is written: the field and a copy in the file's layout.
 FILE = 8
 #: Bytes for each voxel of a field.

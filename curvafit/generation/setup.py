@@ -12,13 +12,16 @@ from curvafit.core.checks import check_choice, check_float, check_open_interval,
 from curvafit.generation import fraction
 from curvafit.generation.checkpoint import Checkpoint, identity
 from curvafit.generation.cost import Cost, check_shape
-from curvafit.generation.fused import CudaStepper, FusedStepper
+from curvafit.generation.fused import FusedStepper
 from curvafit.generation.loop import Orders
 from curvafit.generation.parametrization import Blur, DivergenceForm, Form
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.stepper import LbfgsStepper, Stepper, TorchStepper
 from curvafit.priors import kernels, stencils
 from curvafit.priors.grid import Grid
+
+#: The ways to run a flow: see `generate`.
+BACKENDS = ("auto", "torch", "fused", "compiled")
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,7 @@ class Execution:
     keep: bool = False
 
     def __post_init__(self) -> None:
-        check_choice(self.backend, ("auto", "torch", "fused"), "a backend 'auto', 'torch' or 'fused'")
+        check_choice(self.backend, BACKENDS, f"a backend among {', '.join(BACKENDS)}")
         check_device(self.device)
         if self.checkpoint is not None:
             check_type(self.checkpoint, (str, Path), "a path for the checkpoint")
@@ -47,7 +50,8 @@ class Execution:
     @property
     def blur(self) -> Blur:
         """The function that blurs in forms."""
-        return stencils.gaussian_blur if self.backend == "torch" else kernels.gaussian_blur
+        plain = self.backend in ("torch", "compiled")
+        return stencils.gaussian_blur if plain else kernels.gaussian_blur
 
     def stepper(
         self, start: Tensor, form: Form, cost: Cost, plan: Schedule, optimiser: str, frozen: Tensor | None
@@ -62,14 +66,13 @@ class Execution:
         check_choice(optimiser, ("adam", "lbfgs"), "an optimiser 'adam' or 'lbfgs'")
         able, betas = kernels.fused(self.device), plan.betas
         if self.backend == "fused" and not able:
-            raise ValueError(f"expected a device with fused kernels (and numba or triton), got {self.device}")
-        plain = self.backend == "torch"
+            raise ValueError(f"expected a device with fused kernels (a processor, with numba), got {self.device}")
+        plain = self.backend in ("torch", "compiled")
         if able and not plain and cost.data is None and optimiser == "adam" and isinstance(form, DivergenceForm):
-            if torch.device(self.device).type == "cuda":
-                return CudaStepper([start], [form.base], cost, [cost.coefficients], betas, frozen, self.device)
             return FusedStepper(start, form, cost, betas, frozen)
         kind = LbfgsStepper if optimiser == "lbfgs" else TorchStepper
         options = {"orientation": cost.orientation, "fused": not plain, "data": cost.data}
+        options["compiled"] = self.backend == "compiled"
         return kind(start, form, cost.coefficients, cost.epsilon, betas, frozen, self.device, **options)
 
     def checkpoint_file(self, stepper: Stepper, cost: Cost, orders: Orders, **start: object) -> Checkpoint | None:
@@ -79,20 +82,6 @@ class Execution:
         job = {"schedule": orders.plan, "volume_fraction": orders.volume_fraction, "snapshots": [*orders.snapshots]}
         place = {"stepper": type(stepper).__name__, "backend": self.backend, "device": self.device}
         return Checkpoint(self.checkpoint, self.every, identity(**vars(cost), **job, **place, **start), self.keep)
-
-
-def kind_of(device: torch.device | str) -> str:
-    """Return the kind of a device: `"cpu"`, `"cuda"`, …
-
-    Raises
-    ------
-    ValueError
-        If the device has no known name.
-    """
-    try:
-        return torch.device(device).type
-    except (RuntimeError, TypeError, ValueError) as error:
-        raise ValueError(f"expected a device, such as 'cpu' or 'cuda', got {quoted(device)}") from error
 
 
 def check_device(device: torch.device | str) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -12,6 +13,7 @@ from curvafit.generation.data import Data
 from curvafit.generation.parametrization import Form
 from curvafit.priors import kernels
 from curvafit.priors.coefficients import Coefficients
+from curvafit.priors.energy import energy
 
 #: The number that Adam adds to the root, as published instead of the usual 1e-8; shapes depend on it.
 ADAM_EPS = 1e-2
@@ -87,10 +89,40 @@ class Stepper(Protocol):
         ...
 
 
-class TorchStepper(Stepper):
-    """`torch.optim.Adam` on the parameters of a form.
+def adam(
+    parameters: Tensor, slope: Tensor, first: Tensor, second: Tensor, betas: tuple[float, float], lengths: Tensor
+) -> None:
+    """Make one step of Adam in place, the one of `torch.optim.Adam`.
 
-    With `fused` the energy's gradient comes from a fused kernel where there is one, else from autograd, the definition.
+    `lengths` are two numbers on the device, so that a step neither waits for the host nor is compiled anew: minus the
+    step's length over the first moment's bias correction, and the root of the second moment's correction.
+    """
+    momentum, memory = betas
+    first.lerp_(slope, 1 - momentum)
+    second.mul_(memory).addcmul_(slope, slope, value=1 - memory)
+    parameters.addcdiv_(first * lengths[0], second.sqrt().div_(lengths[1]).add_(ADAM_EPS))
+
+
+class TorchStepper(Stepper):
+    """Adam on the parameters of a form, on any device, where its whole state stays.
+
+    Parameters
+    ----------
+    start
+        The parameters of one shape, or of `count` shapes that advance together: then the first axis counts the shapes,
+        and the form's base and the coefficients broadcast with `(count, Z, Y, X)`.
+    form, coefficients, epsilon, orientation, data
+        The functional: u as a function of the parameters, F_ε, and the data term, which takes one shape.
+    betas
+        Adam's decay rates.
+    frozen
+        Voxels `(Z, Y, X)` whose parameters stay.
+    fused
+        Whether the energy's gradient comes from a fused kernel where there is one, else from autograd, the definition.
+    compiled
+        Whether the step runs through `torch.compile`, where that works.
+    count
+        Number of shapes; None where the parameters have no axis for them.
     """
 
     def __init__(
@@ -105,36 +137,41 @@ class TorchStepper(Stepper):
         *,
         orientation: Tensor | None = None,
         fused: bool = False,
+        compiled: bool = False,
         data: Data | None = None,
+        count: int | None = None,
     ) -> None:
         def on_device(value):
             return value.to(device, torch.float32) if isinstance(value, Tensor) and value.dim() > 0 else value
 
-        self._form, self._offset = form.to(device), 0.0
+        self._form, self._betas, self._count = form.to(device), betas, count
         self._data = None if data is None else data.to(device)
-        self._cost = (
-            Coefficients(*map(on_device, coefficients)),
-            form.grid,
-            on_device(epsilon),
-            on_device(orientation),
-        )
+        self._cost = [*map(on_device, coefficients)], form.grid, on_device(epsilon), on_device(orientation)
         self._slope_of = kernels.energy_gradient if fused else kernels.plain_energy_gradient
         self._free = None if frozen is None else ~torch.as_tensor(frozen, dtype=torch.bool, device=device)
         self._parameters = start.to(device).clone()
-        self._optimiser = self._optimiser_of(betas)
-        self._value, self._u, self._slope = 0.0, self._parameters, self._parameters
+        self._value: Tensor | float = 0.0
+        self._u = self._slope = self._parameters
+        self._offset = torch.zeros((count, 1, 1, 1) if count else (), device=device)
+        self._statistics: list[Statistics] | None = None
+        self._evaluate, self._adam = self._evaluate_plainly, adam
+        if compiled:
+            self._slope_of, switch = _differentiate, _Compiled()
+            self._evaluate, self._adam = switch(self._evaluate_plainly), switch(adam)
+        self._begin()
+
+    def _begin(self) -> None:
+        """Set the optimiser's state before its first step."""
+        self._moments = torch.zeros_like(self._parameters), torch.zeros_like(self._parameters)
+        self._taken = 0
 
     @property
     def shapes(self) -> Sequence[ShapeView]:
-        return (self,)
+        return [_Shape(self, k) for k in range(self._count or 1)]
 
-    def _optimiser_of(self, betas: tuple[float, float]) -> torch.optim.Optimizer:
-        """Return the optimiser of the parameters."""
-        return torch.optim.Adam([self._parameters], betas=betas, eps=ADAM_EPS)
-
-    def _evaluate(self) -> tuple[float, Tensor, Tensor]:
-        """Return the energy, u, and the gradient with respect to the parameters."""
-        u = self._form.field(self._parameters) + self._offset
+    def _evaluate_plainly(self, parameters: Tensor, offset: Tensor) -> tuple[Tensor | float, Tensor, Tensor]:
+        """Return the energies, u, and the gradient with respect to the parameters."""
+        u = self._form.field(parameters) + offset
         value, slope = self._slope_of(u, *self._cost)
         if self._data is not None:
             data_value, data_slope = self._data.slope(u, self._form.grid)
@@ -143,51 +180,124 @@ class TorchStepper(Stepper):
         return value, u, slope if self._free is None else slope * self._free
 
     def step(self, rate: float | None) -> None:
-        self._value, self._u, self._slope = self._evaluate()
+        self._statistics = None
         if rate is not None:
-            self._parameters.grad = self._slope
-            self._optimiser.param_groups[0]["lr"] = rate
-            self._optimiser.step()
+            self.run([rate])
+        else:
+            self._value, self._u, self._slope = self._evaluate(self._parameters, self._offset)
+
+    def run(self, rates: Sequence[float]) -> int:
+        """Make steps without statistics, and return their number; nothing waits for the device."""
+        momentum, memory = self._betas
+        taken = range(self._taken + 1, self._taken + len(rates) + 1)
+        lengths = [(-rate / (1 - momentum**k), (1 - memory**k) ** 0.5) for rate, k in zip(rates, taken, strict=True)]
+        for numbers in torch.tensor(lengths, dtype=torch.float32).to(self._parameters.device):
+            self._value, self._u, self._slope = self._evaluate(self._parameters, self._offset)
+            self._adam(self._parameters, self._slope, *self._moments, self._betas, numbers)
+        self._taken += len(rates)
+        return len(rates)
 
     def set_betas(self, betas: tuple[float, float]) -> None:
-        self._optimiser.param_groups[0]["betas"] = betas
+        self._betas = betas
 
-    def statistics(self) -> Statistics:
-        size = self._slope.abs()
-        count = size.numel() if self._free is None else int(self._free.expand_as(size).sum())
-        return Statistics(self._value, float(size.max()), float(size.sum(dtype=torch.float64)) / max(1, count))
+    def statistics(self) -> list[Statistics]:
+        """Return the statistics of every shape before the last `step` moved it."""
+        if self._statistics is None:
+            size = self._slope.abs().reshape(self._count or 1, -1)
+            free = self._slope[0] if self._count else self._slope
+            count = free.numel() if self._free is None else int(self._free.expand_as(free).sum())
+            means = size.sum(1, dtype=torch.float64) / max(1, count)
+            columns = torch.as_tensor(self._value).reshape(-1).tolist(), size.amax(1).tolist(), means.tolist()
+            self._statistics = [Statistics(*row) for row in zip(*columns, strict=True)]
+        return self._statistics
 
-    def field(self) -> Tensor:
-        return self._u.to("cpu", torch.float32)
+    def field(self, k: int) -> Tensor:
+        """Return the last u of shape `k`, float32 `(Z, Y, X)` on the processor."""
+        return self._u[k].to("cpu", torch.float32, copy=True) if self._count else self._u.to("cpu", torch.float32)
 
-    def mass(self) -> float:
-        return float(self._u.mean(dtype=torch.float64))
+    def mass(self, k: int) -> float:
+        """Return the mean of the last u of shape `k`."""
+        return float((self._u[k] if self._count else self._u).mean(dtype=torch.float64))
 
-    def shift(self, amount: float) -> None:
-        self._offset += amount
+    def shift(self, k: int, amount: float) -> None:
+        """Add a constant to u of shape `k` from the next step on."""
+        self._offset = self._offset.clone()
+        self._offset.view(-1)[k] += amount
 
     def state(self) -> dict[str, Any]:
-        state = self._optimiser.state_dict()["state"]
         point = {"parameters": self._parameters, "offset": self._offset, "stalled": self.stalled}
-        return {**point, "optimiser": state}
+        return {**point, "moments": list(self._moments), "taken": self._taken}
 
     def restore(self, state: dict[str, Any]) -> None:
         self._parameters.copy_(state["parameters"])
-        self._offset, self.stalled = state["offset"], state["stalled"]
-        groups = self._optimiser.state_dict()["param_groups"]
-        self._optimiser.load_state_dict({"state": state["optimiser"], "param_groups": groups})
+        self._offset, self.stalled = state["offset"].to(self._offset.device), state["stalled"]
+        for moment, saved in zip(self._moments, state["moments"], strict=True):
+            moment.copy_(saved)
+        self._taken = state["taken"]
+
+
+class _Shape:
+    """One shape of a `TorchStepper`."""
+
+    def __init__(self, stepper: TorchStepper, k: int) -> None:
+        self._stepper, self._k = stepper, k
+
+    def statistics(self) -> Statistics:
+        return self._stepper.statistics()[self._k]
+
+    def field(self) -> Tensor:
+        return self._stepper.field(self._k)
+
+    def mass(self) -> float:
+        return self._stepper.mass(self._k)
+
+    def shift(self, amount: float) -> None:
+        self._stepper.shift(self._k, amount)
+
+
+class _Compiled:
+    """A maker of compiled functions. Once compilation fails, one warning says so and all run as they are written."""
+
+    failed: bool = False
+
+    def __call__(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        compiled: list[Callable[..., Any]] = []
+
+        def call(*arguments: Any) -> Any:
+            if not self.failed:
+                try:
+                    compiled[:] = compiled or [torch.compile(function)]
+                    return compiled[0](*arguments)
+                except Exception as error:  # a compiler fails in many ways, and none of them is the flow's
+                    self.failed = True
+                    reason = f"{type(error).__name__}: {error}".splitlines()[0]
+                    warnings.warn(f"torch.compile failed, so the flow runs in plain torch ({reason})", stacklevel=2)
+            return function(*arguments)
+
+        return call
+
+
+def _differentiate(u: Tensor, *cost: Any) -> tuple[Tensor, Tensor]:
+    """Return the energies of fields and their gradients, as `kernels.plain_energy_gradient`, for a compiler to read."""
+
+    def total(u: Tensor) -> tuple[Tensor, Tensor]:
+        values = energy(u, *cost)
+        return values.sum(), values
+
+    gradients, values = torch.func.grad(total, has_aux=True)(u)
+    return values, gradients
 
 
 class LbfgsStepper(TorchStepper):
-    """`torch.optim.LBFGS` on the parameters of a form: a step is one iteration with a strong Wolfe line search.
+    """`torch.optim.LBFGS` on the parameters of one shape: a step is one iteration with a strong Wolfe line search.
 
     The last evaluation is cached, since the next iteration begins at that point. Near the minimum a line search fails
     in float32, where rounding hides the decrease: the parameters then stay, and the stepper is stalled.
     """
 
-    def _optimiser_of(self, betas: tuple[float, float]) -> torch.optim.Optimizer:
-        self._cached: tuple[Tensor, tuple[float, Tensor, Tensor]] | None = None
-        return torch.optim.LBFGS(
+    def _begin(self) -> None:
+        self._cached: tuple[Tensor, tuple[Tensor | float, Tensor, Tensor]] | None = None
+        self._optimiser = torch.optim.LBFGS(
             [self._parameters],
             max_iter=1,
             max_eval=1 + LINE_SEARCH,
@@ -197,13 +307,15 @@ class LbfgsStepper(TorchStepper):
             line_search_fn="strong_wolfe",
         )
 
-    def _evaluate(self) -> tuple[float, Tensor, Tensor]:
+    def _look(self) -> tuple[Tensor | float, Tensor, Tensor]:
+        """Return the evaluation at the parameters, which is the cached one where they have not moved."""
         if self._cached is None or not torch.equal(self._cached[0], self._parameters):
-            self._cached = self._parameters.clone(), super()._evaluate()
+            self._cached = self._parameters.clone(), self._evaluate(self._parameters, self._offset)
         return self._cached[1]
 
     def step(self, rate: float | None) -> None:
-        self._value, self._u, self._slope = self._evaluate()
+        self._statistics = None
+        self._value, self._u, self._slope = self._look()
         if rate is None:
             return
         first = not self._optimiser.state
@@ -212,6 +324,9 @@ class LbfgsStepper(TorchStepper):
         self._optimiser.step(self._closure)
         self.stalled = torch.equal(before, self._parameters)
 
+    def run(self, rates: Sequence[float]) -> int:
+        return Stepper.run(self, rates)
+
     def _first_length(self) -> float:
         """Return a factor that replaces torch's first length, min(1, 1 / Σ|slope|), lost by float32 on large grids."""
         size = self._slope.abs()
@@ -219,9 +334,19 @@ class LbfgsStepper(TorchStepper):
 
     def _closure(self) -> float:
         """Return the energy and set the parameters' gradient, as torch's line search asks."""
-        value, _, self._parameters.grad = self._evaluate()
-        return value
+        value, _, self._parameters.grad = self._look()
+        return float(value)
 
-    def shift(self, amount: float) -> None:
-        super().shift(amount)
+    def shift(self, k: int, amount: float) -> None:
+        super().shift(k, amount)
         self._cached = None
+
+    def state(self) -> dict[str, Any]:
+        point = {"parameters": self._parameters, "offset": self._offset, "stalled": self.stalled}
+        return {**point, "optimiser": self._optimiser.state_dict()["state"]}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        self._parameters.copy_(state["parameters"])
+        self._offset, self.stalled = state["offset"].to(self._offset.device), state["stalled"]
+        groups = self._optimiser.state_dict()["param_groups"]
+        self._optimiser.load_state_dict({"state": state["optimiser"], "param_groups": groups})

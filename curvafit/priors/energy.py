@@ -6,7 +6,7 @@ Every energy is a sum over voxels times the voxel's volume. Fields are `(..., Z,
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor
@@ -22,7 +22,7 @@ from curvafit.priors.stencils import gradient
 
 def energy(
     u: Float[Tensor, "*batch z y x"],
-    coefficients: Coefficients,
+    coefficients: Iterable[float | Tensor],
     grid: Grid,
     epsilon: float | Tensor,
     orientation: Float[Tensor, "3 3"] | None = None,
@@ -35,7 +35,7 @@ def energy(
     u
         Phase field, about +1 inside and -1 outside.
     coefficients
-        Numbers, or tensors that broadcast with `u` (`(batch, 1, 1, 1)` for one set per field).
+        `Coefficients`, or six numbers, or tensors that broadcast with `u` (`(batch, 1, 1, 1)` for one set per field).
     grid, epsilon
         The sampling, and the interface parameter in spacing's unit: a number, or a tensor that broadcasts with `u`.
     orientation

@@ -10,7 +10,6 @@ difference of another continuation: periodic, or mirrored with a sign along the 
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -111,7 +110,6 @@ def check_blur(grid: Grid, width: float) -> None:
         raise ValueError(f"expected a blur from 0 to the box's longest side, {grid.longest:g}, got {width:g}")
 
 
-@lru_cache(maxsize=64)
 def gaussian_taps(deviation: float) -> tuple[float, ...]:
     """Return the 2⌈4σ⌉ + 1 weights of the one-dimensional blur, whose sum is one; the deviation σ is in voxels.
 

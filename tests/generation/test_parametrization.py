@@ -160,7 +160,8 @@ def test_lbfgs_stalls_where_nothing_is_lower(monkeypatch):
         if moved.stalled:
             break
     assert moved.stalled
-    assert moved.statistics().energy == pytest.approx(-10, abs=1e-6)
+    (shape,) = moved.shapes
+    assert shape.statistics().energy == pytest.approx(-10, abs=1e-6)
     assert len(count) < 100
 
 

@@ -48,7 +48,7 @@ def test_constraints_hold_every_requirement() -> None:
     pins = {canonicalize_name(name): version for name, version in pins.items()}
     groups = [project()["dependencies"], *project()["optional-dependencies"].values()]
     for requirement in (Requirement(text) for group in groups for text in group):
-        if requirement.name not in ("curvafit", "triton"):  # a torch for CUDA brings the triton that it wants
+        if requirement.name != "curvafit":
             assert requirement.specifier.contains(pins[canonicalize_name(requirement.name)]), requirement
 
 

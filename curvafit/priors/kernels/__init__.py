@@ -3,29 +3,24 @@
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Iterable
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from curvafit.priors import stencils
-from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.energy import energy
 from curvafit.priors.grid import Grid
 
 
 def fused(device: torch.device | str) -> bool:
-    """Return whether there is a fused kernel for float32 fields on a device."""
-    kind = torch.device(device).type
-    if kind == "cuda":
-        from curvafit.priors.kernels import cuda
-
-        return cuda.available(device)
-    return kind == "cpu" and importlib.util.find_spec("numba") is not None
+    """Return whether there is a fused kernel for float32 fields on a device: on processors, where numba is."""
+    return torch.device(device).type == "cpu" and importlib.util.find_spec("numba") is not None
 
 
 def on_processor(
-    coefficients: Coefficients, grid: Grid, epsilon: float | Tensor, orientation: Tensor | None
+    coefficients: Iterable[float | Tensor], grid: Grid, epsilon: float | Tensor, orientation: Tensor | None
 ) -> tuple[list[float | np.ndarray], float | np.ndarray, np.ndarray | None]:
     """Return a cost as `cpu` takes it: numbers, or arrays `(Z, Y, X)` where they vary in space."""
 
@@ -38,20 +33,14 @@ def on_processor(
     return [number(value) for value in coefficients], number(epsilon), Q
 
 
-def stacked(coefficients: Coefficients, grid: Grid) -> Tensor:
-    """Return coefficients as `cuda` takes them, in float64: `(6,)`, or `(6, Z, Y, X)` where any varies in space."""
-    a = coefficients.tensor()
-    return a if a.dim() == 1 else a.reshape(6, *(1,) * (4 - a.dim()), *a.shape[1:]).expand(6, *grid.shape)
-
-
 def energy_gradient(
     u: Tensor,
-    coefficients: Coefficients,
+    coefficients: Iterable[float | Tensor],
     grid: Grid,
     epsilon: float | Tensor,
     orientation: Tensor | None = None,
     mask: Tensor | None = None,
-) -> tuple[float, Tensor]:
+) -> tuple[Tensor, Tensor]:
     """Return `energy` of a field `(Z, Y, X)` and its gradient with respect to every voxel, in the field's type.
 
     Raises
@@ -61,33 +50,28 @@ def energy_gradient(
     """
     if u.dtype != torch.float32 or not fused(u.device):
         return plain_energy_gradient(u, coefficients, grid, epsilon, orientation, mask)
-    if u.device.type == "cuda":
-        from curvafit.priors.kernels import cuda
-
-        energies, gradient = cuda.energy_gradient(u, stacked(coefficients, grid), grid, epsilon, orientation, mask)
-        return float(energies), gradient
     from curvafit.priors.kernels import cpu
 
     a, ε, Q = on_processor(coefficients, grid, epsilon, orientation)
     kept = None if mask is None else mask.detach().numpy()
     value, slope = cpu.energy_gradient(u.detach().numpy(), a, grid, ε, Q, kept)
-    return value, torch.from_numpy(slope)
+    return torch.tensor(value, dtype=torch.float64), torch.from_numpy(slope)
 
 
 def plain_energy_gradient(
     u: Tensor,
-    coefficients: Coefficients,
+    coefficients: Iterable[float | Tensor],
     grid: Grid,
     epsilon: float | Tensor,
     orientation: Tensor | None = None,
     mask: Tensor | None = None,
-) -> tuple[float, Tensor]:
-    """Return the energy and its gradient by autograd, the definition."""
+) -> tuple[Tensor, Tensor]:
+    """Return the energies of fields `(..., Z, Y, X)` and their gradients by autograd, the definition, on any device."""
     free = u.detach().requires_grad_()
     with torch.enable_grad():
-        value = energy(free, coefficients, grid, epsilon, orientation, mask)
-        (gradient,) = torch.autograd.grad(value, free)
-    return float(value.detach()), gradient
+        values = energy(free, coefficients, grid, epsilon, orientation, mask)
+        (gradients,) = torch.autograd.grad(values.sum(), free)
+    return values.detach(), gradients
 
 
 def gaussian_blur(u: Tensor, grid: Grid, width: float) -> Tensor:

@@ -1,12 +1,13 @@
-"""F_ε of a batch of fields, differentiable: the fused kernels as an operator that is opaque to compilers."""
+"""F_ε of a batch of fields, differentiable: the energy and its gradient as an operator opaque to compilers."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor
 
 from curvafit.priors import kernels
-from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.energy import energy
 from curvafit.priors.grid import Grid
 from curvafit.priors.shapes import Float
@@ -15,16 +16,17 @@ from curvafit.priors.stencils import gradient
 
 def energies(
     u: Float[Tensor, "batch z y x"],
-    coefficients: Coefficients,
+    coefficients: Iterable[float | Tensor],
     grid: Grid,
     epsilon: float,
     mask: Float[Tensor, "#batch z y x"],
 ) -> Float[Tensor, " batch"]:
     """Return `energy` of every field, with its density multiplied by a mask.
 
-    Float32 takes the fused kernel where there is one. The kernel returns the gradient with the value, so that a first
-    derivative, in reverse or forward mode, is a multiplication; a second derivative raises a RuntimeError. Other fields
-    take the definition.
+    Float32 computes the gradient together with the value, by the fused kernel where there is one and else by autograd,
+    field by field: two numbers for each voxel wait for a backward pass, where autograd alone stores thirty. It has
+    first derivatives only, and a second one raises a RuntimeError. Float64, a compiler without a kernel, and a call
+    that asks for no gradient take the definition.
 
     Parameters
     ----------
@@ -40,49 +42,32 @@ def energies(
     ValueError
         If the mask requires a gradient.
     """
-    _check_mask(mask)
-    if u.dtype != torch.float32 or not kernels.fused(u.device):
+    if mask.requires_grad:
+        raise ValueError("expected a mask that asks for no gradient, got one that does: detach it")
+    compiling, fused = torch.compiler.is_compiling(), kernels.fused(u.device)
+    if u.dtype != torch.float32 or not (fused or (torch.is_grad_enabled() and not compiling)):
         return energy(u, coefficients, grid, epsilon, mask=mask)
-    return _first_derivatives(u, mask, [float(value) for value in coefficients], grid, epsilon)
+    given = u, mask.to(u).expand(u.shape), [float(value) for value in coefficients], list(grid.spacing), epsilon
+    # A compiler sees the operator; `torch.func` transforms the function.
+    return (_energies(*given) if compiling else _Energies.apply(*given))[0]  # type: ignore[index]
 
 
 def areas(
     u: Float[Tensor, "batch z y x"], grid: Grid, epsilon: float, mask: Float[Tensor, "#batch z y x"]
 ) -> Float[Tensor, " batch"]:
     """Return ∫ ε|∇u|² of every field, the term of F_ε that a00 multiplies, about σ × area, as `energies` does."""
-    _check_mask(mask)
-    if u.dtype != torch.float32 or not kernels.fused(u.device):
-        slope2 = gradient(u, grid).square().sum(-4)
-        return epsilon * (slope2 * mask.to(u)).sum((-3, -2, -1)) * grid.voxel_volume
-    return _first_derivatives(u, mask, [0.0] * 5 + [1.0], grid, epsilon)
-
-
-def _check_mask(mask: Tensor) -> None:
-    if mask.requires_grad:
-        raise ValueError("expected a mask that asks for no gradient, got one that does: detach it")
-
-
-def _first_derivatives(u: Tensor, mask: Tensor, a: list[float], grid: Grid, epsilon: float) -> Tensor:
-    """The energies by the operator that a compiler sees, else by the function that `torch.func` transforms too."""
-    given = u, mask.to(u).expand(u.shape), a, list(grid.spacing), epsilon
-    return (_energies(*given) if torch.compiler.is_compiling() else _Energies.apply(*given))[0]  # type: ignore[index]
+    if u.dtype == torch.float32 and kernels.fused(u.device):
+        return energies(u, (0.0, 0.0, 0.0, 0.0, 0.0, 1.0), grid, epsilon, mask)
+    slope2 = gradient(u, grid).square().sum(-4)
+    return epsilon * (slope2 * mask.to(u)).sum((-3, -2, -1)) * grid.voxel_volume
 
 
 def _computed(u, mask, a, spacing, epsilon) -> tuple[Tensor, Tensor]:
-    """The energies, and their gradient."""
+    """Return the energies and their gradient."""
     grid = Grid(tuple(u.shape[1:]), tuple(spacing), "replicate")
-    u, mask = u.detach(), mask.detach()
-    if u.device.type == "cuda":
-        from curvafit.priors.kernels import cuda
-
-        values, slopes = cuda.energy_gradient(u, torch.tensor(a), grid, epsilon, mask=mask)
-        return values.to(u), slopes
-    from curvafit.priors.kernels import cpu
-
     values, slopes = u.new_empty((u.shape[0],)), torch.empty_like(u, memory_format=torch.contiguous_format)
     for k in range(len(u)):
-        value, slope = cpu.energy_gradient(u[k].numpy(), a, grid, epsilon, mask=mask[k].numpy())
-        values[k], slopes[k] = value, torch.from_numpy(slope)
+        values[k], slopes[k] = kernels.energy_gradient(u[k].detach(), a, grid, epsilon, mask=mask[k].detach())
     return values, slopes
 
 
