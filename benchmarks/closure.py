@@ -30,11 +30,10 @@ from scipy import stats
 
 from benchmarks.harness import Cases, Figure, Values, show
 from curvafit.geometry.descriptors import descriptors
-from curvafit.inference.compression import compression_of
 from curvafit.inference.emulator import optimum
 from curvafit.inference.posterior import Architecture, Posterior, load_posterior
-from curvafit.inference.posterior_training import train_posterior
-from curvafit.inference.table import PARAMETERS, Table, column_names, load_table, parameters_of
+from curvafit.inference.table import PARAMETERS, Table, column_names, compression_of, load_table, parameters_of
+from curvafit.inference.training import train_posterior
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
 

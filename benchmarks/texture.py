@@ -25,7 +25,7 @@ from benchmarks.harness import Cases, Figure, Values, show
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import SCHEDULES
 from curvafit.geometry.diagram import Diagram, diagram
-from curvafit.geometry.transport import wasserstein
+from curvafit.geometry.distances import wasserstein
 from curvafit.priors.coefficients import preset_name
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 

@@ -25,16 +25,16 @@ if TYPE_CHECKING:
     from curvafit.generation.flow import descend, generate
     from curvafit.generation.result import Flow
     from curvafit.geometry.diagram import Diagram, diagram
-    from curvafit.geometry.transport import wasserstein
+    from curvafit.geometry.distances import wasserstein
     from curvafit.inference.fit import Fit
     from curvafit.inference.infer import Inference, infer
     from curvafit.priors.coefficients import Coefficients, preset
     from curvafit.priors.grid import Grid
+    from curvafit.scan.measure import Measures, measure
     from curvafit.segmentation.completion import reconstruct
     from curvafit.segmentation.refine import refine
     from curvafit.segmentation.result import Segmentation
     from curvafit.segmentation.segment import segment
-    from curvafit.studies.measure import Measures, measure
     from curvafit.volumes.scan import Field, load, save
 
 __version__ = "0.1.0"
@@ -73,7 +73,7 @@ _HOMES = {
     "Flow": "curvafit.generation.result",
     "Grid": "curvafit.priors.grid",
     "Inference": "curvafit.inference.infer",
-    "Measures": "curvafit.studies.measure",
+    "Measures": "curvafit.scan.measure",
     "Segmentation": "curvafit.segmentation.result",
     "descend": "curvafit.generation.flow",
     "diagram": "curvafit.geometry.diagram",
@@ -81,13 +81,13 @@ _HOMES = {
     "generate_batch": "curvafit.generation.batch",
     "infer": "curvafit.inference.infer",
     "load": "curvafit.volumes.scan",
-    "measure": "curvafit.studies.measure",
+    "measure": "curvafit.scan.measure",
     "preset": "curvafit.priors.coefficients",
     "reconstruct": "curvafit.segmentation.completion",
     "refine": "curvafit.segmentation.refine",
     "save": "curvafit.volumes.scan",
     "segment": "curvafit.segmentation.segment",
-    "wasserstein": "curvafit.geometry.transport",
+    "wasserstein": "curvafit.geometry.distances",
 }
 
 #: The function that draws each type with a picture, as `module:function`; see `curvafit.core.pictures`.

@@ -15,8 +15,8 @@ from curvafit.drawing.plot import write_picture
 from curvafit.generation.flow import Flow, generate
 from curvafit.generation.viability import viability
 from curvafit.geometry.diagram import Diagram, diagram
+from curvafit.geometry.distances import wasserstein
 from curvafit.geometry.mesh import NoSurface
-from curvafit.geometry.transport import wasserstein
 from curvafit.priors.coefficients import preset
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from curvafit.drawing.plot import write_picture
 from curvafit.geometry.diagram import Diagram, diagram
-from curvafit.geometry.transport import wasserstein
+from curvafit.geometry.distances import wasserstein
 from curvafit.priors.coefficients import PRESETS
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 

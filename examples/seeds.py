@@ -4,7 +4,7 @@ python examples/seeds.py [--small] [--edge 100] [--count 100] [--schedule fast] 
 
 Five seeds of preset `seeds`, a = (1, -0.35, 1.02, -40, 100, 1600), m₀ = -0.69; viable shapes of the random law, each
 from its own noise; and the mean distance between the former over the mean distance between the latter, all pairs of
-each. The distance is the paper's, by `curvafit.geometry.pairwise`: the square root of geomloss's Sinkhorn divergence
+each. The distance is the paper's, by `curvafit.geometry.distances`: the square root of geomloss's Sinkhorn divergence
 with p = 2, blur 1 and reach 20. Finished shapes are kept: a killed run goes on where it was.
 """
 
@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 
 from curvafit.data_synth.atlas.design import boxed
 from curvafit.drawing.plot import CONTOUR, DIAGONAL, write_picture
-from curvafit.geometry.pairwise import pairwise
+from curvafit.geometry.distances import pairwise
 from curvafit.priors.coefficients import preset
 
 SEEDS = 5

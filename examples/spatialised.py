@@ -23,8 +23,8 @@ from curvafit.drawing.plot import INK, diagram_on, shared_limits, surface_on, wr
 from curvafit.drawing.render import view
 from curvafit.generation.flow import Flow, generate
 from curvafit.geometry.diagram import Diagram, diagram
+from curvafit.geometry.distances import wasserstein
 from curvafit.geometry.mesh import NoSurface
-from curvafit.geometry.transport import wasserstein
 from curvafit.priors.coefficients import Coefficients, preset
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from curvafit.geometry.descriptors import BLOCKS
-from curvafit.inference.compression import Compression
 from curvafit.inference.emulator import Emulator, Layer
+from curvafit.inference.table import Compression
 
 LOW, HIGH = np.array([-4, -2.7, -200, -200, -3000, -0.75]), np.array([4, 2.7, 200, 200, 3000, -0.15])
 BOX = np.stack([LOW, HIGH], 1)

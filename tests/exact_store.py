@@ -13,7 +13,7 @@ from curvafit.data_synth.atlas.design import boxed
 from curvafit.data_synth.atlas.record import Record, Settings
 from curvafit.data_synth.atlas.store import Store, open_store
 from curvafit.generation.viability import Viability
-from curvafit.geometry.transport import sliced_embedding
+from curvafit.geometry.distances import sliced_embedding
 from curvafit.priors.coefficients import Coefficients
 
 SHAPE = 24

@@ -11,13 +11,10 @@ from matplotlib.figure import Figure
 
 from curvafit.geometry.diagram import Diagram, diagram
 from curvafit.geometry.morphometry import Morphometry
-from curvafit.inference.candidates import Candidate
-from curvafit.inference.draws import Draws
-from curvafit.inference.fit import Fit
+from curvafit.inference.atlas import Match
+from curvafit.inference.candidates import Candidate, Misfit, Twin
+from curvafit.inference.fit import Draws, Fit
 from curvafit.inference.infer import Inference
-from curvafit.inference.match import Match
-from curvafit.inference.misfit import Misfit
-from curvafit.inference.twins import Twin
 from curvafit.priors import Coefficients, Grid, preset
 from curvafit.scan.prepare import Prepared
 from curvafit.volumes.scan import Field

@@ -20,8 +20,7 @@ from curvafit.data_synth.atlas.workers import Here, Workers
 from curvafit.generation.viability import well_formed
 from curvafit.geometry.descriptors import Descriptors, descriptors
 from curvafit.geometry.mesh import NoSurface
-from curvafit.inference.table import Table, load_table, parameters_of, row_of, save_table
-from curvafit.inference.views import VIEWS
+from curvafit.inference.table import VIEWS, Table, load_table, parameters_of, row_of, save_table
 from curvafit.priors.grid import Grid
 from curvafit.volumes.scan import ScanError
 

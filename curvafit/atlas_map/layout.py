@@ -13,9 +13,16 @@ from typing import Any
 import numpy as np
 
 from curvafit.core.runtime import Progress, silent
-from curvafit.geometry.diagram import BIN_WIDTH, Diagram
-from curvafit.geometry.family import FAMILIES, family_of, family_shares, half_thickness, leading_family
-from curvafit.geometry.pairwise import pairwise
+from curvafit.geometry.diagram import (
+    BIN_WIDTH,
+    FAMILIES,
+    Diagram,
+    family_of,
+    family_shares,
+    half_thickness,
+    leading_family,
+)
+from curvafit.geometry.distances import pairwise
 from curvafit.inference.atlas import Atlas
 
 #: The paper's settings (Experiment 4): of UMAP, of HDBSCAN on the embedded points, of the distances.

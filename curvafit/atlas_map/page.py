@@ -23,8 +23,7 @@ from curvafit.atlas_map.layout import NOISE, AtlasMap
 from curvafit.atlas_map.picture import CLUSTER_COLOURS, FAMILY_COLOURS
 from curvafit.atlas_map.shapes import CUT, LEVELS, Shown, small_shape
 from curvafit.drawing.plot import DENSITY, shared_limits
-from curvafit.geometry.diagram import Diagram
-from curvafit.geometry.family import FAMILIES
+from curvafit.geometry.diagram import FAMILIES, Diagram
 from curvafit.inference.atlas import VIEWS
 from curvafit.priors.coefficients import NAMES
 from curvafit.priors.fit_schema import FIT_SCHEMA

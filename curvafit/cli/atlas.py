@@ -178,8 +178,7 @@ def describe_atlas(
     """Measure each shape of stores as field, mask, crop and scan: the table that `atlas train` reads."""
     with plainly():
         from curvafit.atlas_map.describe import describe
-        from curvafit.inference.table import ARCHIVE
-        from curvafit.inference.views import VIEWS
+        from curvafit.inference.table import ARCHIVE, VIEWS
 
         _check_archive(out, ARCHIVE, stores, overwrite)
         crew = Crew(workers, scheduler, dashboard)
@@ -205,8 +204,8 @@ def train_atlas(
     """Train the posterior of the parameters, given descriptors, on a table of them."""
     with plainly():
         from curvafit.inference.posterior import ARCHIVE, save_posterior
-        from curvafit.inference.posterior_training import train_posterior
         from curvafit.inference.table import load_table
+        from curvafit.inference.training import train_posterior
 
         _check_archive(out, ARCHIVE, [table], overwrite)
         content = load_table(table)

@@ -246,7 +246,7 @@ def _check(out: Path, checkpoint: Path | None, cap: bool | None) -> None:
     """Refuse a checkpoint at the place of an output, and options of a surface where a volume is written."""
     from curvafit.core.files import check_folder
     from curvafit.core.records import sibling
-    from curvafit.geometry.mesh_files import SUFFIXES
+    from curvafit.geometry.mesh import SUFFIXES
 
     if cap is not None and not out.name.lower().endswith(SUFFIXES):
         option = "--cap" if cap else "--no-cap"

@@ -90,12 +90,12 @@ def _inferred(scan: str, out: Path, options: dict[str, Any], overwrite: bool) ->
 def _say_forecast(prepared: Prepared) -> None:
     """Print the forecast of an inference: the flows of its twins and of the draws that are grown."""
     from curvafit.generation.schedule import LEARNED, SCHEDULES
-    from curvafit.inference.estimate import SIMULATIONS, simulation_grid
-    from curvafit.inference.sequential import BATCH, ROUNDS
-    from curvafit.inference.twins import twin_grid
+    from curvafit.inference.candidates import twin_grid
+    from curvafit.inference.estimate import simulation_grid
+    from curvafit.inference.simulate import BATCH, Effort
 
     window = [edge.stop - edge.start for edge in prepared.windows[0]]
-    grown = TWINS * math.prod(twin_grid(prepared).shape) + (SIMULATIONS + ROUNDS * BATCH) * math.prod(
+    grown = TWINS * math.prod(twin_grid(prepared).shape) + (Effort().simulations + Effort().rounds * BATCH) * math.prod(
         simulation_grid(prepared).shape
     )
     steps = math.ceil(SCHEDULES[LEARNED].steps * grown / math.prod(window))

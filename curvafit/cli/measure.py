@@ -11,7 +11,7 @@ from curvafit.cli.console import OverwriteOption, output, plainly, say, say_note
 from curvafit.cli.options import Reading, reads_volume
 
 if TYPE_CHECKING:
-    from curvafit.studies.measure import Measures, Quantity
+    from curvafit.scan.measure import Measures, Quantity
 
 EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
     (
@@ -42,7 +42,7 @@ def measure(
         options: dict[str, Any] = {"kind": kind, "periodic": periodic, "threshold": threshold_of(threshold)}
         options |= {"dark": dark, **reading}
         with stages() as progress:
-            from curvafit.studies.measure import measure as measure_scan
+            from curvafit.scan.measure import measure as measure_scan
             from curvafit.studies.tables import check_table, write_table
 
             if out is not None:

@@ -22,8 +22,7 @@ from curvafit.core.runtime import undisturbed
 from curvafit.core.units import parse_unit
 from curvafit.generation.flow import Flow
 from curvafit.generation.memory import FILE, check_memory
-from curvafit.geometry.mesh import NoSurface, Surface, solid_surface, surface
-from curvafit.geometry.mesh_files import SUFFIXES, write_surface
+from curvafit.geometry.mesh import SUFFIXES, NoSurface, Surface, solid_surface, surface, write_surface
 from curvafit.priors.coefficients import NAMES
 from curvafit.priors.curvature import geometric_curvatures, jet
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid

@@ -8,8 +8,17 @@ from curvafit.core.faces import offer
 
 if TYPE_CHECKING:
     from curvafit.geometry.descriptors import Descriptors, descriptors
-    from curvafit.geometry.diagram import Diagram, SurfaceCurvatures, diagram, diagrams, surface_curvatures
-    from curvafit.geometry.family import family_of, family_shares, half_thickness
+    from curvafit.geometry.diagram import (
+        Diagram,
+        SurfaceCurvatures,
+        diagram,
+        diagrams,
+        family_of,
+        family_shares,
+        half_thickness,
+        surface_curvatures,
+    )
+    from curvafit.geometry.distances import one_to_many, pairwise, sinkhorn_divergence, sliced_embedding, wasserstein
     from curvafit.geometry.mesh import (
         NoSurface,
         Surface,
@@ -18,12 +27,10 @@ if TYPE_CHECKING:
         solid_surface,
         surface,
         volume,
+        write_surface,
     )
-    from curvafit.geometry.mesh_files import write_surface
     from curvafit.geometry.morphometry import Morphometry, local_thickness, morphometry
-    from curvafit.geometry.pairwise import one_to_many, pairwise
     from curvafit.geometry.topology import betti_numbers, components, euler_number
-    from curvafit.geometry.transport import sinkhorn_divergence, sliced_embedding, wasserstein
 
 __all__ = [
     "Descriptors",
@@ -72,21 +79,21 @@ _HOMES = {
     "diagram": "curvafit.geometry.diagram",
     "diagrams": "curvafit.geometry.diagram",
     "euler_number": "curvafit.geometry.topology",
-    "family_of": "curvafit.geometry.family",
-    "family_shares": "curvafit.geometry.family",
-    "half_thickness": "curvafit.geometry.family",
+    "family_of": "curvafit.geometry.diagram",
+    "family_shares": "curvafit.geometry.diagram",
+    "half_thickness": "curvafit.geometry.diagram",
     "local_thickness": "curvafit.geometry.morphometry",
     "morphometry": "curvafit.geometry.morphometry",
-    "one_to_many": "curvafit.geometry.pairwise",
-    "pairwise": "curvafit.geometry.pairwise",
-    "sinkhorn_divergence": "curvafit.geometry.transport",
-    "sliced_embedding": "curvafit.geometry.transport",
+    "one_to_many": "curvafit.geometry.distances",
+    "pairwise": "curvafit.geometry.distances",
+    "sinkhorn_divergence": "curvafit.geometry.distances",
+    "sliced_embedding": "curvafit.geometry.distances",
     "solid_surface": "curvafit.geometry.mesh",
     "surface": "curvafit.geometry.mesh",
     "surface_curvatures": "curvafit.geometry.diagram",
     "volume": "curvafit.geometry.mesh",
-    "wasserstein": "curvafit.geometry.transport",
-    "write_surface": "curvafit.geometry.mesh_files",
+    "wasserstein": "curvafit.geometry.distances",
+    "write_surface": "curvafit.geometry.mesh",
 }
 
 offer(__name__, _HOMES)

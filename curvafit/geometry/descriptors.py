@@ -18,9 +18,9 @@ from torch import Tensor
 
 from curvafit.core.checks import check_type
 from curvafit.geometry.diagram import Diagram, surface_curvatures
+from curvafit.geometry.distances import sliced_embedding
 from curvafit.geometry.mesh import NoSurface, area_vectors, surface
 from curvafit.geometry.topology import euler_shares
-from curvafit.geometry.transport import sliced_embedding
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.profile import phase_field, signed_distance
 

@@ -4,17 +4,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
+import torch
 
-from curvafit.geometry.diagram import Diagram
-from curvafit.geometry.morphometry import Morphometry
-from curvafit.geometry.pairwise import one_to_many
-from curvafit.inference.twins import Twin
+from curvafit.core.units import number
+from curvafit.generation.flow import Flow, generate
+from curvafit.generation.schedule import LEARNED, Schedule
+from curvafit.geometry.diagram import Diagram, diagram
+from curvafit.geometry.distances import one_to_many
+from curvafit.geometry.mesh import NoSurface
+from curvafit.geometry.morphometry import Morphometry, morphometry
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.fit_file import six_of
+from curvafit.priors.grid import WORKING_EPSILON, Grid
+from curvafit.priors.profile import phase_field
+from curvafit.scan.prepare import Prepared
+from curvafit.volumes.scan import ScanError
 
 #: Greatest mass of either sign: a rare structure's field lies a little beyond ±1 in the mean.
 RARE = 1 - 1e-6
@@ -30,6 +38,20 @@ TITLES = {
     "stationarity": "refined by stationarity",
     "match": "nearest match",
 }
+#: Longest edge, in working voxels, of the boxes in which twins grow.
+LONGEST_EDGE = 100
+#: Beyond `CLOSE`, twins within so many seeds' distances whose familiar numbers are the scan's are near, and so are
+#: those that are close but for one familiar number; others are no twins.
+FURTHEST = 5.0
+#: What a verdict begins with where no law is the scan's, and where it is not known.
+UNBELIEVED, UNDECIDED = "No believable twin", "Undecided"
+#: Seeds further apart than this (1 / working unit) tell no texture: those of the presets lie .3 to 1.3 apart at 100³.
+TELLING = 2.0
+#: Familiar numbers in which twins may differ from the scan, and the part by which all of them must to be named.
+FAMILIAR = {"thickness": "thickness_mean", "spacing": "spacing_mean", "connectivity": "connectivity_density"}
+NEAR = 0.15
+#: A scan made by the model lies as far out as this with probability 0.01: beyond, no twin is believable.
+UNBELIEVABLE = 0.01
 
 
 @dataclass(frozen=True)
@@ -125,3 +147,157 @@ def noise_of(candidates: Sequence[Candidate]) -> float | None:
     best = best_of(candidates)
     known = [each.seed_noise for each in candidates if each.seed_noise is not None]
     return best.seed_noise if best is not None and best.seed_noise is not None else next(iter(known), None)
+
+
+@dataclass(frozen=True, eq=False)
+class Twin:
+    """A shape grown from a law, or why none grew: its field and mass; its curvature diagram and familiar numbers as the
+    scan would show them, of a window where the scan is one: what its faces hide is hidden of the twin as well."""
+
+    phase: np.ndarray | None
+    mass: float
+    diagram: Diagram | None
+    morphometry: Morphometry | None
+    reason: str = ""
+
+
+def twin(
+    coefficients: Coefficients, mass: float, prepared: Prepared, seed: int, schedule: Schedule | str = LEARNED
+) -> Twin:
+    """Grow a shape of a law in a box of the scan's main window, at most `LONGEST_EDGE` voxels a side.
+
+    Of a mask or an image it fills the same part of its box as the structure (`Prepared.true_share`), since a mask does
+    not state a mass; where nothing grows so, it has the law's own mass.
+    """
+    grid, told = twin_grid(prepared), {"schedule": schedule, "seed": seed, "reject_early": True}
+    if prepared.kind != "field":
+        share = prepared.true_share
+        flow = generate(coefficients, mass, grid, volume_fraction=share, **told)
+        if (grown := _measured(flow, prepared, seed)).phase is not None:
+            return grown
+    return _measured(generate(coefficients, mass, grid, **told), prepared, seed)
+
+
+def twin_grid(prepared: Prepared) -> Grid:
+    """Return the periodic box in which a scan's twins grow."""
+    z, y, x = (min(edge.stop - edge.start, LONGEST_EDGE) for edge in prepared.windows[0])
+    return Grid((z, y, x), prepared.grid.spacing, "periodic")
+
+
+def _measured(flow: Flow, prepared: Prepared, seed: int) -> Twin:
+    """Return a flow's shape with its diagram and numbers, as the scan would show it."""
+    if not flow.viability.viable:
+        return Twin(None, flow.mass, None, None, flow.viability.reason)
+    try:
+        mask, field = flow.field.numpy() > 0, flow.field
+        window = Grid(flow.grid.shape, flow.grid.spacing, prepared.grid.boundary)
+        if prepared.kind != "field":
+            mask = prepared.seen(mask, seed)
+            field = phase_field(torch.from_numpy(mask), window, WORKING_EPSILON)
+        curvature = diagram(field, window, WORKING_EPSILON)
+    except (NoSurface, ScanError) as error:
+        return Twin(None, flow.mass, None, None, str(error))
+    numbers = morphometry(mask, prepared.working_voxel, prepared.unit, periodic=window.periodic)
+    return Twin(flow.field.numpy(), flow.mass, curvature, numbers)
+
+
+def verdict(
+    candidates: Sequence[Candidate], misfit: Misfit | None, scan: Morphometry, *, fast: bool = False
+) -> tuple[str | None, str]:
+    """Return the name of the best supported law and the verdict on a scan of these familiar numbers; no name where
+    nothing grew.
+
+    A law that is not believable is still named: it is the nearest that there is, and the verdict says that it is not
+    the scan's.
+    """
+    if fast:
+        return candidates[0].name, _joined(_unusual(misfit), "Nothing was grown to check the law (--fast).")
+    best = best_of(candidates)
+    if best is None or best.distance is None:
+        return None, _joined("No law: nothing grew from any candidate.", candidates[0].status)
+    noise = noise_of(candidates)
+    title = TITLES[best.name]
+    apart = f"its twins lie {best.distance:.1f} from the scan's curvature diagram"
+    apart += f", {noise:.1f} from each other." if noise else "."
+    ratio, other = 0.0 if not noise else best.distance / noise, unlike(scan, best.twins)
+    familiar = f"Twins over scan: {', '.join(other)}." if other else ""
+    strange = misfit is not None and misfit.probability < UNBELIEVABLE
+    allowed = 1 if ratio <= CLOSE else 0
+    if strange or ratio > FURTHEST or len(other) > allowed:
+        far = f"Twins should lie some {noise:.1f} from it." if ratio > CLOSE else ""
+        reason = _unusual(misfit) if strange else far
+        return best.name, _joined(f"{UNBELIEVED}: of the nearest law ({title}), {apart}", reason, familiar)
+    word, doubt = "Supported", ""
+    if ratio > CLOSE:
+        word, doubt = "Near", "They have its thickness, spacing and connectivity, and another law may come nearer."
+    elif noise is None:
+        word, doubt = UNDECIDED, "No law grew twice, so it is not known how far apart two seeds lie."
+    elif noise > TELLING:
+        word, doubt = (
+            "Undecided",
+            "Seeds so far apart tell no texture: this law makes none, or the volume holds too little.",
+        )
+    elif familiar:
+        word, doubt = "Near", "That is near enough."
+    return best.name, _joined(f"{word} ({title}): {apart}", doubt, familiar, _unusual(misfit), best.status)
+
+
+def _joined(*sentences: str) -> str:
+    """Return the sentences that are not empty, one after the other."""
+    return " ".join(filter(None, sentences))
+
+
+def unlike(scan: Morphometry, twins: Sequence[Morphometry]) -> list[str]:
+    """Return the familiar numbers in which all twins differ from the scan the same way, with their ratios, as words.
+
+    They differ by more than `NEAR`; connectivities also by more than chance lets two counts of so many bodies and
+    tunnels differ, twice the root of their sum.
+    """
+    apart = []
+    for word, name in FAMILIAR.items():
+        own = getattr(scan, name)
+        ratios = np.array([getattr(each, name) / own for each in twins] if own else [])
+        count = abs(1 - scan.euler) if name == "connectivity_density" else math.inf
+        reach = np.maximum(NEAR, 2 * np.sqrt((1 + np.abs(ratios)) / max(count, 1)))
+        if len(ratios) and ((ratios > 1 + reach).all() or (ratios < 1 - reach).all()):
+            ratio = float(ratios.mean())
+            apart.append(f"{word} of the other sign" if ratio < 0 else f"{word} {number(ratio, 2)}")
+    return apart
+
+
+def _unusual(misfit: Misfit | None) -> str:
+    """Return how usual the scan's descriptors are for the model, as a sentence."""
+    if misfit is None:
+        return ""
+    p = number(misfit.probability, 2)
+    if misfit.probability >= UNBELIEVABLE:
+        return f"The scan's descriptors are of a kind that the model makes (p = {p})."
+    names = ", ".join(misfit.strangest) or "none by itself"
+    direction = "The scan has a direction (fabric), and the model has none." if "fabric" in misfit.strangest else ""
+    return _joined(f"The model does not make such descriptors (p = {p}); the strangest: {names}.", direction)
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """Part of shapes of the model that lie as far out as the scan does: in all descriptors together
+    (`probability`), and by block of descriptors (`blocks`). `method` says against what."""
+
+    probability: float
+    blocks: dict[str, float]
+    method: str
+
+    @property
+    def strangest(self) -> tuple[str, ...]:
+        """Return the blocks that are unbelievable by themselves, the strangest first."""
+        order = sorted(self.blocks, key=self.blocks.__getitem__)
+        return tuple(name for name in order if self.blocks[name] < UNBELIEVABLE)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the misfit in JSON's types."""
+        return asdict(self)
+
+    @staticmethod
+    def from_dict(content: Mapping[str, Any]) -> Misfit:
+        """Return what `as_dict` wrote."""
+        blocks = {str(name): float(value) for name, value in content["blocks"].items()}
+        return Misfit(float(content["probability"]), blocks, str(content["method"]))

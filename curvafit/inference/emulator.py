@@ -15,9 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from curvafit.core.units import number
-from curvafit.inference.compression import Compression
-from curvafit.inference.refinement import double_precision_on_cpu
-from curvafit.inference.table import PARAMETERS
+from curvafit.inference.stationarity import double_precision_on_cpu
+from curvafit.inference.table import PARAMETERS, Compression
 
 #: Most steps from a start.
 STEPS = 60

@@ -18,34 +18,28 @@ from curvafit.core.pictures import Pictured
 from curvafit.core.runtime import Progress, part, silent
 from curvafit.core.units import number
 from curvafit.generation.schedule import LEARNED, SCHEDULES
-from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram
-from curvafit.geometry.family import family_of
+from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram, family_of
 from curvafit.geometry.morphometry import Morphometry, morphometry
-from curvafit.inference.atlas import Atlas, load_atlas
-from curvafit.inference.candidates import TITLES, Candidate, best_of
+from curvafit.inference.atlas import Atlas, Match, load_atlas, mirrored, nearest
+from curvafit.inference.candidates import TITLES, Candidate, Twin, best_of, twin, verdict
+from curvafit.inference.drift import drift
 from curvafit.inference.estimate import Estimate, estimate
 from curvafit.inference.fit import Fit
-from curvafit.inference.fixed_point import drift
-from curvafit.inference.match import Match, mirrored, nearest
-from curvafit.inference.measure import scan_diagram
 from curvafit.inference.posterior import Posterior, load_posterior
-from curvafit.inference.stationarity import is_rounded, stationarity
-from curvafit.inference.twins import Twin, twin
-from curvafit.inference.verdict import verdict
+from curvafit.inference.simulate import Effort
+from curvafit.inference.stationarity import stationarity
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.fit_file import Prior
 from curvafit.priors.grid import WORKING_EPSILON, Grid
-from curvafit.scan.phases import check_options
-from curvafit.scan.prepare import HALF, Prepared, prepare
-from curvafit.scan.texture import NOISE, untextured
+from curvafit.scan.measure import scan_diagram
+from curvafit.scan.prepare import HALF, NOISE, Prepared, prepare, untextured
+from curvafit.scan.structure import check_options, is_rounded
 from curvafit.volumes.field import Field
 from curvafit.volumes.formats.part import Crop
 from curvafit.volumes.source import Source, field_of
 
 #: Number of nearest shapes, and of those from which stationarity starts.
 MATCHES, STARTS = 5, 3
-#: Twins of the best law, and shapes that may be grown to find which it is.
-TWINS, REGROWN = 3, 6
 #: The parts of a fit where they are not known.
 _BARE: dict[str, Any] = {
     "candidates": (), "chosen": None, "draws": None, "weak_directions": (), "misfit": None, "drift": None,
@@ -114,6 +108,7 @@ def infer(
     label: int | None = None,
     crop: Crop | None = None,
     seed: int = 0,
+    effort: Effort = Effort(),  # noqa: B008
     watch: Callable[[Prepared], None] | None = None,
     progress: Progress = silent,
     **reading: Any,
@@ -141,6 +136,8 @@ def infer(
         How the structure is told from the background: see `curvafit.scan.prepare.prepare`.
     label, crop
         The voxels of one value as a mask; a box of voxels, of the scan and of `roi`: see `curvafit.load`.
+    effort
+        How many shapes are grown, of how many steps.
     watch
         Called with the `Prepared` scan before the long part begins; an exception of it ends the inference.
     progress
@@ -175,11 +172,11 @@ def infer(
     reason = NOISE if measured is None else untextured(prepared, measured)
     if measured is None or reason:
         return Inference(volume, prepared, measured, {}, _fit(prepared, measured, numbers, provenance, reason))
-    estimated = estimate(prepared, posterior, seed=seed, fast=fast, progress=part(progress, 0.1, 0.5))
+    estimated = estimate(prepared, posterior, seed=seed, fast=fast, effort=effort, progress=part(progress, 0.1, 0.5))
     progress("searching the atlas", 0.5)
     matches = _matches(prepared, measured, atlas)
     laws = _laws(prepared, estimated, matches, seed, part(progress, 0.5, 0.6))
-    laws, twins = (laws, {}) if fast else _grown(laws, measured, prepared, seed, part(progress, 0.6, 1.0))
+    laws, twins = (laws, {}) if fast else _grown(laws, measured, prepared, seed, effort, part(progress, 0.6, 1.0))
     chosen, status = verdict(laws, None if estimated is None else estimated.misfit, numbers, fast=fast)
     law = next((each.coefficients for each in laws if each.name == chosen), None)
     moved = None if law is None else drift(*_window(prepared), WORKING_EPSILON, law)
@@ -229,23 +226,23 @@ def _window(prepared: Prepared) -> tuple[torch.Tensor, Grid]:
 
 
 def _grown(
-    laws: tuple[Candidate, ...], measured: Diagram, prepared: Prepared, seed: int, progress: Progress
+    laws: tuple[Candidate, ...], measured: Diagram, prepared: Prepared, seed: int, effort: Effort, progress: Progress
 ) -> tuple[tuple[Candidate, ...], dict[str, tuple[Twin, ...]]]:
-    """Grow a twin of each law, and `TWINS` of the best: of the nearest, and of the first that is as near."""
+    """Grow a twin of each law, and `effort.twins` of the best: of the nearest, and of the first that is as near."""
     twins: dict[str, tuple[Twin, ...]] = {}
 
     def grow(law: Candidate, share: float) -> Candidate:
         """Grow another twin of a law."""
         start = seed + len(twins.get(law.name, ()))
         progress(f"growing: {TITLES[law.name]}, seed {start}", share)
-        twins[law.name] = (*twins.get(law.name, ()), twin(law.coefficients, law.mass, prepared, start))
+        twins[law.name] = (*twins.get(law.name, ()), twin(law.coefficients, law.mass, prepared, start, effort.schedule))
         return law.grown(measured, twins[law.name])
 
     laws = tuple(grow(law, 0.7 * k / len(laws)) for k, law in enumerate(laws))
-    for k in range(REGROWN):
+    for k in range(effort.regrown):
         best = best_of(laws)
-        if best is not None and len(twins[best.name]) < TWINS:
-            laws = tuple(grow(law, 0.7 + 0.3 * k / REGROWN) if law is best else law for law in laws)
+        if best is not None and len(twins[best.name]) < effort.twins:
+            laws = tuple(grow(law, 0.7 + 0.3 * k / effort.regrown) if law is best else law for law in laws)
     return laws, twins
 
 

@@ -8,15 +8,14 @@ from typing import Any
 
 import numpy as np
 import torch
-import zuko
 from torch import Tensor, nn
 
 from curvafit.core.checks import check_float, check_int, quoted
+from curvafit.core.extras import require
 from curvafit.geometry.descriptors import BLOCKS, Descriptors
 from curvafit.inference.archive import Archive
-from curvafit.inference.compression import Compression
 from curvafit.inference.emulator import Emulator, Layer
-from curvafit.inference.table import PARAMETERS, column_names
+from curvafit.inference.table import PARAMETERS, Compression, column_names
 
 ARCHIVE = Archive("a posterior", "a posterior", "curvafit posterior", 3, "train it again", {"blocks": BLOCKS})
 #: Largest size of a flow, and most flows of an ensemble.
@@ -67,6 +66,7 @@ class Member(nn.Module):
         super().__init__()
         context = architecture.components + views
         sizes, splines = architecture.hidden, architecture.transforms
+        zuko = require("zuko", "infer", "reading a posterior")
         self.flow = zuko.flows.NSF(
             len(PARAMETERS), context, bins=architecture.bins, transforms=splines, hidden_features=sizes
         )

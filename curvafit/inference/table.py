@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy import ndimage
 
 from curvafit.geometry.descriptors import BLOCKS, Descriptors
 from curvafit.inference.archive import Archive, encode
 from curvafit.priors.coefficients import Coefficients
+from curvafit.priors.grid import Grid
+from curvafit.scan.grids import centre_distance, median_thickness, resample, without_specks
+from curvafit.scan.prepare import KEPT_THICKNESS, THINNEST, smallest_piece
+from curvafit.scan.structure import split
+from curvafit.volumes.scan import Field, ScanError
 
 ARCHIVE = Archive(
     "a table of descriptors",
@@ -24,6 +31,21 @@ ARCHIVE = Archive(
 )
 #: What is inferred, with a20 = 1 as the gauge, in working units.
 PARAMETERS = ("a11", "log a02", "a10", "a01", "a00", "m0")
+#: Part of each side that a crop keeps.
+WINDOW = 0.75
+#: Least and greatest voxel of a resampled shape, in voxels of the field.
+SCALES = (0.5, 2.0)
+#: A degraded scan: deviation of the blur in voxels, contrast over the noise's deviation, and voxels a slice is thick.
+BLUR, SNR, SLICE = 1.0, 5.0, 2
+#: Blocks of lengths and parts, whose logarithm is taken; and least value of which it is.
+LOGARITHMIC = ("fraction", "chords", "gaps", "depths", "clearances")
+LEAST = 1e-3
+#: Densities of ∫H and χ are sinh of what is compressed, in these units; that of area is its exponential.
+BENDS, EULERS = 50.0, 100.0
+#: Furthest that a column may lie from its mean, in its deviations.
+FURTHEST = 6.0
+#: Deviations that blocks have before compression, 1 where none is named.
+WEIGHTS = {"curvature": 3.0}
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,3 +162,139 @@ def _table(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Table:
     if arrays["descriptors"].dtype.kind != "f" or not isinstance(header["provenance"], dict):
         raise ValueError("descriptors that are no numbers, or no provenance")
     return Table(shapes, views, arrays["parameters"], arrays["descriptors"], header["provenance"])
+
+
+class View(NamedTuple):
+    """A phase field (float32) or a mask (bool) `(Z, Y, X)`, and its grid: not periodic where it is a part."""
+
+    shape: np.ndarray
+    grid: Grid
+
+
+def field(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
+    """Return the phase field itself."""
+    return View(u, grid)
+
+
+def mask(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
+    """Return {u > 0} on the field's own voxels."""
+    return View(u > 0, grid)
+
+
+def crop(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
+    """Return {u > 0} in a window of three quarters of each side, anywhere in the repeated box."""
+    turned = np.roll(u > 0, [int(rng.integers(n)) for n in u.shape], (0, 1, 2))
+    nz, ny, nx = (round(WINDOW * n) for n in u.shape)
+    part = np.ascontiguousarray(turned[:nz, :ny, :nx])
+    if part.all() or not part.any():
+        raise ScanError("expected a window with an inside and an outside, got one of them only")
+    return View(part, Grid((nz, ny, nx), grid.spacing, "replicate"))
+
+
+def resampled(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
+    """Return a crop that was a mask on other voxels, on which it was 5 to 16 thick, brought back by signed distances.
+
+    Back on the voxels of the field, as a scan's mask is brought to the working grid.
+    """
+    part, window = crop(u, grid, rng)
+    thickness = _thickness(part)
+    scale = float(np.clip(thickness / math.exp(rng.uniform(*np.log(KEPT_THICKNESS))), *SCALES))
+    coarse = [round(n / scale) for n in part.shape]
+    zoom = [n / m for n, m in zip(part.shape, coarse, strict=True)]
+    other = resample(centre_distance(part, (1.0,) * 3, 8.0), zoom, (0, 0, 0), coarse) > 0
+    distance = centre_distance(other, zoom, 8.0)
+    back = resample(distance, [1 / z for z in zoom], (0, 0, 0), part.shape) > 0
+    return View(without_specks(back, smallest_piece(thickness), False)[0], window)
+
+
+def scan(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
+    """Return a crop scanned badly, split by Otsu's threshold: blurred, slices two voxels thick, noise at SNR 5.
+
+    Prepared as `infer` prepares an image: smoothed by a voxel, split, interpolated to cubic voxels, cleared of specks.
+    """
+    part, window = crop(u, grid, rng)
+    inside = split(degraded(part, rng), part.shape)
+    return View(without_specks(inside, smallest_piece(_thickness(inside)), False)[0], window)
+
+
+def degraded(part: np.ndarray, rng: np.random.Generator) -> Field:
+    """Return a mask as a bad scan shows it: blurred, slices two voxels thick, noise at SNR 5."""
+    grey = ndimage.gaussian_filter(part.astype(np.float32), BLUR, mode="nearest")
+    whole = np.pad(grey, ((0, -len(grey) % SLICE), (0, 0), (0, 0)), mode="edge")
+    grey = whole.reshape(-1, SLICE, *grey.shape[1:]).mean(1)
+    grey += rng.standard_normal(grey.shape, dtype=np.float32) / SNR
+    return Field(grey, (float(SLICE), 1.0, 1.0), "voxel")
+
+
+def _thickness(part: np.ndarray) -> float:
+    """Return the median thickness in voxels, or raise ScanError where `infer` refuses a structure as too thin."""
+    if not part.any():
+        raise ScanError("expected a structure in the window, got none")
+    thickness, thick = median_thickness(part, (1.0, 1.0, 1.0), False)
+    if thick < THINNEST - 0.5:
+        raise ScanError(f"expected a structure {THINNEST:g} voxels thick, got one of {thick:.2g}")
+    return thickness
+
+
+#: Views by name.
+VIEWS: dict[str, Callable[[np.ndarray, Grid, np.random.Generator], View]] = {
+    "field": field,
+    "mask": mask,
+    "crop": crop,
+    "resampled": resampled,
+    "scan": scan,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Compression:
+    """From descriptors to their principal components: means and scales by column `(c,)`, basis `(k, c)`."""
+
+    blocks: tuple[str, ...]
+    mean: np.ndarray
+    scale: np.ndarray
+    basis: np.ndarray
+
+    def __call__(self, descriptors: np.ndarray) -> np.ndarray:
+        """Return the components `(N, k)`, their mean square 1, of descriptors `(N, 351)`."""
+        columns = columns_of(descriptors, self.blocks)
+        return np.clip((columns - self.mean) / self.scale, -FURTHEST, FURTHEST) @ self.basis.T
+
+
+def compression_of(descriptors: np.ndarray, components: int, blocks: tuple[str, ...] = tuple(BLOCKS)) -> Compression:
+    """Return the principal components of some descriptors: columns in deviations (the curvature block in one for all
+    its columns, as its distance asks), blocks in `WEIGHTS`.
+
+    A component's deviation is the square root of what it would be in the columns, and their mean square is 1: of 365
+    shapes, as masks, a Gaussian process reads R² .66 on average (.64 where all are 1, .64 where they are as they come).
+    """
+    names = np.array(column_names())
+    names = names[np.isin(names, blocks)]
+    columns = columns_of(descriptors, blocks)
+    mean, scale = columns.mean(0), columns.std(0) + 1e-9
+    weight = np.ones(len(names))
+    for block in set(names.tolist()):
+        mine = names == block
+        weight[mine] = WEIGHTS.get(block, 1.0) / np.sqrt(mine.sum())
+        if block == "curvature":
+            scale[mine] = np.sqrt((scale[mine] ** 2).mean())
+    plain = Compression(blocks, mean, scale, np.diag(weight))
+    weighed = plain(descriptors)
+    values, vectors = np.linalg.eigh(weighed.T @ weighed / len(weighed))
+    order = np.argsort(-values)[:components]
+    basis = (vectors[:, order] / (values[order] + 1e-12) ** (1 / 4)).T * weight
+    basis /= np.sqrt(np.mean(np.sqrt(values[order])))
+    return Compression(blocks, mean, scale, basis)
+
+
+def columns_of(descriptors: np.ndarray, blocks: Sequence[str]) -> np.ndarray:
+    """Return the columns of some blocks, lengths and densities as logarithms."""
+    names = np.array(column_names())
+    columns = np.array(descriptors, dtype=np.float64)
+    chosen = np.isin(names, LOGARITHMIC)
+    columns[:, chosen] = np.log(np.maximum(columns[:, chosen], LEAST))
+    area, bend, euler = np.flatnonzero(names == "densities")
+    columns[:, area] = np.log(np.maximum(columns[:, area], LEAST))
+    columns[:, bend] = np.arcsinh(columns[:, bend] / BENDS)
+    columns[:, euler] = np.arcsinh(columns[:, euler] / EULERS)
+    return columns[:, np.isin(names, list(blocks))]

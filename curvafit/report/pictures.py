@@ -12,9 +12,8 @@ from matplotlib.figure import Figure
 from curvafit.core.units import length, number
 from curvafit.drawing.corner import bands_figure, corner_figure
 from curvafit.drawing.plot import diagram_figure, gallery_figure, png, shared_limits, slice_figure, surface_figure
-from curvafit.inference.candidates import TITLES, Candidate
+from curvafit.inference.candidates import TITLES, UNBELIEVED, UNDECIDED, Candidate
 from curvafit.inference.table import parameters_of
-from curvafit.inference.verdict import UNBELIEVED, UNDECIDED
 
 if TYPE_CHECKING:
     from curvafit.geometry.diagram import Diagram

@@ -12,10 +12,10 @@ from typing import Literal
 import numpy as np
 import torch
 
+from curvafit.geometry.diagram import Diagram
+from curvafit.geometry.topology import betti_numbers
 from curvafit.priors import WORKING_EPSILON, WORKING_SPACING, Grid, phase_field
-from curvafit.scan.imaging import Imaging, imaging_of, voxelised
-from curvafit.scan.phases import Kind, Level, find_level, is_noise, region_of_interest
-from curvafit.scan.regrid import (
+from curvafit.scan.grids import (
     Window,
     bounding_box,
     centre_distance,
@@ -25,9 +25,17 @@ from curvafit.scan.regrid import (
     surface_voxels,
     without_specks,
 )
+from curvafit.scan.structure import (
+    Imaging,
+    Kind,
+    Level,
+    find_level,
+    imaging_of,
+    is_noise,
+    region_of_interest,
+    voxelised,
+)
 from curvafit.volumes.scan import Field, ScanError
-
-__all__ = ["KEPT_THICKNESS", "LARGEST_BOX", "LARGEST_WINDOW", "WORKING_THICKNESS", "Prepared", "prepare"]
 
 #: Median thickness, in voxels, of an isotropic scan whose grid is kept; and the one a scan is resampled to.
 KEPT_THICKNESS = (5.0, 16.0)
@@ -43,6 +51,9 @@ HALF = 0.5
 MOSTLY = "The structure fills {:.0%} of the volume: if the other phase was meant, turn the two round (--dark)."
 #: Coarsening stops where a side would have fewer working voxels than this.
 FEWEST = 32
+#: Least mean of √(κ1² + κ2²) times the window's edge at which a surface is not flat; a ball that fits has 2.8.
+FLATTEST = 2.0
+NOISE = "No law: the scan is noise, its voxels have nothing to do with those a few voxels away."
 
 
 @dataclass(frozen=True, eq=False)
@@ -370,3 +381,20 @@ def _profiled(mask: np.ndarray, grid: Grid) -> np.ndarray:
 
 def _times(shape: Iterable[int]) -> str:
     return " x ".join(str(n) for n in shape)
+
+
+def untextured(prepared: Prepared, diagram: Diagram) -> str:
+    """Return why a scan shows no texture whose law could be read, as a sentence; empty where it may."""
+    edge = max(s.stop - s.start for s in prepared.windows[0]) * prepared.grid.spacing[0]
+    bend = np.average(np.hypot(*np.asarray(diagram.points).T), weights=np.asarray(diagram.weights)) * edge
+    if bend < FLATTEST:
+        return "No law: the surface is flat, and a flat surface says nothing of how it would bend."
+    if is_ball(prepared.mask) or is_ball(~prepared.mask):
+        return "No law: the scan shows a single ball-like body, and a texture is many alike."
+    return ""
+
+
+def is_ball(mask: np.ndarray) -> bool:
+    """Return whether a structure is one body, away from the box's faces, without handles or cavities."""
+    faces = (mask.take(end, axis) for axis in range(3) for end in (0, -1))
+    return not any(face.any() for face in faces) and betti_numbers(mask) == (1, 0, 0)

@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING
 from curvafit.core.faces import offer
 
 if TYPE_CHECKING:
-    from curvafit.studies.measure import Measures, Quantity, measure
+    from curvafit.scan.measure import Measures, Quantity, measure
     from curvafit.studies.tables import write_table
 
 __all__ = ["Measures", "Quantity", "measure", "write_table"]
 
 _HOMES = {
-    "Measures": "curvafit.studies.measure",
-    "Quantity": "curvafit.studies.measure",
-    "measure": "curvafit.studies.measure",
+    "Measures": "curvafit.scan.measure",
+    "Quantity": "curvafit.scan.measure",
+    "measure": "curvafit.scan.measure",
     "write_table": "curvafit.studies.tables",
 }
 

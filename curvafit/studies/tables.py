@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from curvafit.core.files import bears, check_free, own_record, write_atomically, write_content
-from curvafit.studies.measure import Measures
+from curvafit.scan.measure import Measures
 
 __all__ = ["SUFFIXES", "check_table", "rows_of", "write_table"]
 

@@ -23,7 +23,7 @@ from curvafit.atlas_map.layout import NOISE, AtlasMap, embed, find_clusters, map
 from curvafit.atlas_map.picture import _assigned, _slots, spread_out
 from curvafit.atlas_map.shapes import CUT, LEVELS, regrow_command, shown, small_volume
 from curvafit.generation.flow import generate
-from curvafit.geometry.transport import wasserstein
+from curvafit.geometry.distances import wasserstein
 from curvafit.priors import Coefficients, Grid
 from curvafit.volumes.scan import load
 

@@ -21,9 +21,8 @@ from PIL import Image
 from curvafit.atlas_map.extract import extract
 from curvafit.atlas_map.files import write_map
 from curvafit.cli.app import app
-from curvafit.inference.atlas import Atlas
+from curvafit.inference.atlas import Atlas, Match
 from curvafit.inference.fit import Fit
-from curvafit.inference.match import Match
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
 pytestmark = [pytest.mark.slow, pytest.mark.long]

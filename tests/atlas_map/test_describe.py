@@ -16,8 +16,19 @@ from curvafit.cli.app import app
 from curvafit.data_synth.atlas.workers import cluster
 from curvafit.geometry.descriptors import BLOCKS, descriptors
 from curvafit.geometry.mesh import NoSurface
-from curvafit.inference.table import PARAMETERS, Table, column_names, law_of, load_table, parameters_of, save_table
-from curvafit.inference.views import BLUR, SNR, VIEWS, View
+from curvafit.inference.table import (
+    BLUR,
+    PARAMETERS,
+    SNR,
+    VIEWS,
+    Table,
+    View,
+    column_names,
+    law_of,
+    load_table,
+    parameters_of,
+    save_table,
+)
 from curvafit.priors.coefficients import Coefficients, preset
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile

@@ -118,6 +118,7 @@ def test_lengths_are_in_the_grid_s_unit() -> None:
         assert getattr(again, name) == pytest.approx(block, rel=1e-4, abs=1e-4 * np.abs(block).max()), name
 
 
+@pytest.mark.slow
 def test_crops_estimate_the_whole() -> None:
     """Windows of 32³ voxels, half of whose chords are cut short, of a box of 96³: the mean of all 27."""
     mask = random_mask(96, width=2.5)
@@ -144,8 +145,8 @@ def test_vector_holds_the_blocks_in_order() -> None:
 
 
 def test_refusals() -> None:
-    with pytest.raises(ValueError, match="expected cubic voxels, got"):
+    with pytest.raises(ValueError, match="cubic"):
         descriptors(random_mask(16), Grid((16, 16, 16), (1.0, 1.0, 2.0)))
     for full in (torch.ones((16, 16, 16)), np.zeros((16, 16, 16), dtype=bool)):
-        with pytest.raises(NoSurface, match="an inside and an outside"):
+        with pytest.raises(NoSurface, match="inside"):
             descriptors(full, Grid((16, 16, 16)))

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from curvafit.geometry.diagram import Diagram
-from curvafit.geometry.family import family_of, family_shares, half_thickness
+from curvafit.geometry.diagram import Diagram, family_of, family_shares, half_thickness
 
 RADIUS = 0.04
 

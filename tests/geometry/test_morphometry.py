@@ -101,7 +101,7 @@ def test_euler_numbers_of_known_shapes() -> None:
 
 @pytest.mark.parametrize("mask", [np.zeros((5, 5, 5)), np.ones((5, 5, 5)), np.eye(5)])
 def test_masks_without_two_phases_are_refused(mask: np.ndarray) -> None:
-    with pytest.raises(ValueError, match="expected a (3D mask|mask with voxels inside and outside), got"):
+    with pytest.raises(ValueError, match="mask"):
         morphometry(mask)
 
 

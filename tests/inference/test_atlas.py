@@ -6,6 +6,7 @@ import dataclasses
 import io
 import json
 import types
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -62,9 +63,23 @@ def balls(monkeypatch):
     return stand_in
 
 
-@pytest.fixture
-def atlas(tmp_path, balls) -> Atlas:
-    return extract([building.build(tmp_path / "s.zarr", 6, SHAPE, seed=2)], command=["then this"])
+@pytest.fixture(scope="module")
+def store(tmp_path_factory) -> building.Store:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(draws, "generate_batch", Balls())
+        return building.build(tmp_path_factory.mktemp("balls") / "s.zarr", 6, SHAPE, seed=2)
+
+
+@pytest.fixture(scope="module")
+def atlas(store) -> Atlas:
+    return extract([store], command=["then this"])
+
+
+@pytest.fixture(scope="module")
+def saved(atlas, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("atlas") / "a.npz"
+    save_atlas(atlas, path)
+    return path
 
 
 def test_building_draws_in_order_until_enough_are_viable(tmp_path, balls):
@@ -113,18 +128,17 @@ def test_a_real_draw_is_what_its_record_says(tmp_path):
 
 
 def test_wrong_counts_and_other_settings_are_refused(tmp_path, balls):
-    with pytest.raises(ValueError, match="expected a count of at least 1 shape, got 0"):
+    with pytest.raises(ValueError, match="count"):
         building.build(tmp_path / "s.zarr", 0, SHAPE)
-    with pytest.raises(ValueError, match="expected a seed that is a whole number from 0, got -1"):
+    with pytest.raises(ValueError, match="seed"):
         building.build(tmp_path / "s.zarr", 1, SHAPE, seed=-1)
     assert not list(tmp_path.iterdir())
     building.build(tmp_path / "s.zarr", 1, SHAPE)
-    with pytest.raises(ValueError, match="expected the settings of .*, got another seed: 3 for 0"):
+    with pytest.raises(ValueError, match="seed"):
         building.build(tmp_path / "s.zarr", 1, SHAPE, seed=3)
 
 
-def test_an_atlas_holds_what_the_store_does(tmp_path, atlas):
-    store = open_store(tmp_path / "s.zarr")
+def test_an_atlas_holds_what_the_store_does(store, atlas):
     viable = [r for r in map(store.record, store.indices()) if r.viability.viable]
     assert atlas.ids == tuple(f"s-{r.index:05d}" for r in viable)
     assert [atlas.shape_coefficients(i) for i in range(6)] == [r.coefficients for r in viable]
@@ -155,10 +169,10 @@ def test_an_atlas_of_two_stores_holds_both(tmp_path, balls):
 
 def test_stores_of_one_name_or_of_two_grids_make_no_atlas(tmp_path, balls):
     one = building.build(tmp_path / "one.zarr", 1, SHAPE)
-    with pytest.raises(ValueError, match="expected stores with names of their own, got one, one"):
+    with pytest.raises(ValueError, match="names"):
         extract([one, one])
     larger = open_store(tmp_path / "larger.zarr", _settings(Grid((24, 20, 20)), schedule("fast")))
-    with pytest.raises(ValueError, match="expected stores of one grid and ε, got 2: 20 x 20 x 20, 24 x 20 x 20 voxels"):
+    with pytest.raises(ValueError, match="grid"):
         extract([one, larger])
 
 
@@ -171,9 +185,8 @@ def test_faint_and_over_sharp_shapes_stay_in_the_store_and_out_of_the_atlas(tmp_
     assert whole.provenance["stores"]["s"]["viable"] == 4
 
 
-def test_an_atlas_file_comes_back_within_its_stated_rounding(tmp_path, atlas):
-    save_atlas(atlas, tmp_path / "a.npz")
-    back = load_atlas(tmp_path / "a.npz")
+def test_an_atlas_file_comes_back_within_its_stated_rounding(saved, atlas):
+    back = load_atlas(saved)
     assert (back.ids, back.format_version) == (atlas.ids, VERSION)
     assert back.provenance == json.loads(json.dumps(atlas.provenance))
     for name in ("coefficients", "masses", "seeds", "volume_fractions"):
@@ -183,38 +196,35 @@ def test_an_atlas_file_comes_back_within_its_stated_rounding(tmp_path, atlas):
             assert np.all(np.abs(one.points - other.points) <= 2**-11 * np.abs(one.points) + 2**-24)
             np.testing.assert_allclose(other.weights, one.weights, rtol=2**-23)
             assert other.spread == pytest.approx(one.spread)
-    assert [path.name for path in tmp_path.glob("*.npz*")] == ["a.npz"]
+    assert [path.name for path in saved.parent.iterdir()] == ["a.npz"]
 
 
-def test_an_atlas_of_another_version_is_refused(tmp_path, atlas):
-    save_atlas(atlas, tmp_path / "a.npz")
-    with np.load(tmp_path / "a.npz") as archive:
+def test_an_atlas_of_another_version_is_refused(tmp_path, saved):
+    with np.load(saved) as archive:
         arrays = dict(archive)
     header = json.loads(arrays["header"].tobytes()) | {"version": VERSION + 1}
     arrays["header"] = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
     np.savez(tmp_path / "b.npz", **arrays)
-    sentence = f"expected an atlas of version {VERSION}, got version {VERSION + 1} in .*b.npz"
-    with pytest.raises(ValueError, match=sentence):
+    with pytest.raises(ValueError, match="version"):
         load_atlas(tmp_path / "b.npz")
 
 
-def test_a_damaged_atlas_is_refused_wherever_it_is_cut(tmp_path, atlas):
-    save_atlas(atlas, tmp_path / "a.npz")
-    whole = (tmp_path / "a.npz").read_bytes()
+def test_a_damaged_atlas_is_refused_wherever_it_is_cut(tmp_path, saved):
+    whole = saved.read_bytes()
     for length in (0, 1, 50, len(whole) // 2, len(whole) - 1):
         (tmp_path / "cut.npz").write_bytes(whole[:length])
-        with pytest.raises(ValueError, match=r"expected an atlas file, got .*cut.npz, which is truncated"):
+        with pytest.raises(ValueError, match="truncated"):
             load_atlas(tmp_path / "cut.npz")
     for start in range(100, len(whole) - 100, len(whole) // 20):
         (tmp_path / "cut.npz").write_bytes(whole[:start] + bytes(64) + whole[start + 64 :])
-        with pytest.raises(ValueError, match=r"expected an atlas file|expected a whole atlas"):
+        with pytest.raises(ValueError, match="atlas"):
             load_atlas(tmp_path / "cut.npz")
 
 
 def test_other_files_are_no_atlas(tmp_path):
-    with pytest.raises(FileNotFoundError, match="expected an atlas file, got .*none.npz, where there is none"):
+    with pytest.raises(FileNotFoundError, match="none.npz"):
         load_atlas(tmp_path / "none.npz")
-    with pytest.raises(FileNotFoundError, match="expected an atlas file, got the folder .*: `curvafit atlas extract`"):
+    with pytest.raises(FileNotFoundError, match="folder"):
         load_atlas(tmp_path)
     buffer = io.BytesIO()
     np.savez(buffer, a=np.zeros(3))
@@ -223,7 +233,7 @@ def test_other_files_are_no_atlas(tmp_path):
     (tmp_path / "array.npz").write_bytes(buffer.getvalue())
     np.save(tmp_path / "array.npy", np.zeros(3))
     for name in ("other.npz", "array.npz", "array.npy"):
-        with pytest.raises(ValueError, match="expected an atlas file, got .* something else"):
+        with pytest.raises(ValueError, match="something else"):
             load_atlas(tmp_path / name)
 
 
@@ -238,27 +248,26 @@ def test_other_files_are_no_atlas(tmp_path):
         ("header", lambda values: np.frombuffer(b"[" * 100_000, np.uint8)),
     ],
 )
-def test_an_atlas_with_damaged_arrays_is_one_sentence(tmp_path, atlas, name, change):
-    save_atlas(atlas, tmp_path / "atlas.npz")
-    with np.load(tmp_path / "atlas.npz") as archive:
+def test_an_atlas_with_damaged_arrays_is_one_sentence(tmp_path, saved, name, change):
+    with np.load(saved) as archive:
         arrays = dict(archive)
     np.savez(tmp_path / "atlas.npz", **arrays | {name: change(arrays[name])})
-    with pytest.raises(ValueError, match=r"^expected an? (whole )?atlas [^\n]{1,400}$"):
+    with pytest.raises(ValueError, match=r"^[^\n]*atlas[^\n]{1,400}$"):
         load_atlas(tmp_path / "atlas.npz")
 
 
 def test_arrays_that_do_not_fit_together_are_refused(atlas):
-    with pytest.raises(ValueError, match=r"expected masses of shape \(6,\), got \(5,\)"):
+    with pytest.raises(ValueError, match="masses"):
         dataclasses.replace(atlas, masses=atlas.masses[1:])
-    with pytest.raises(ValueError, match="expected a field and a mask diagram for each of at least one shape"):
+    with pytest.raises(ValueError, match="diagram"):
         dataclasses.replace(atlas, mask_diagrams=atlas.mask_diagrams[1:])
-    with pytest.raises(ValueError, match="expected shapes seen as 'field' or 'mask', got 'image'"):
+    with pytest.raises(ValueError, match="image"):
         atlas.diagrams("image")
 
 
 def test_a_store_without_well_formed_shapes_gives_no_atlas(tmp_path):
     store = open_store(tmp_path / "s.zarr", _settings(Grid((16,) * 3), schedule("fast")))
-    with pytest.raises(ValueError, match="expected at least one well-formed shape in .*, got none in 0 draws"):
+    with pytest.raises(ValueError, match="well-formed"):
         extract([store])
 
 

@@ -9,18 +9,26 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-import curvafit.inference.emulator_training as emulator_training
-import curvafit.inference.posterior_training as training
+import curvafit.inference.training as training
 from curvafit.cli.app import app
 from curvafit.geometry.descriptors import BLOCKS
-from curvafit.inference.compression import columns_of, compression_of
 from curvafit.inference.posterior import Architecture, Posterior, load_posterior, save_posterior
-from curvafit.inference.posterior_training import train_posterior
-from curvafit.inference.table import Table, column_names, law_of, mirrored, parameters_of, save_table
+from curvafit.inference.table import (
+    Table,
+    column_names,
+    columns_of,
+    compression_of,
+    law_of,
+    mirrored,
+    parameters_of,
+    save_table,
+)
+from curvafit.inference.training import PLANS, Plans, train_posterior
 
 LOW, HIGH = np.array([-4, -2.7, -200, -200, -3000, -0.75]), np.array([4, 2.7, 200, 200, 3000, -0.15])
 SMALL = Architecture(components=4, hidden=(64,), transforms=1, dropout=0.0)
 NOISE = 0.2
+ONCE = Plans(*(plan._replace(epochs=1) for plan in PLANS))
 #: Which column of the curvature block tells which parameter; the others are not told.
 TOLD = {0: 0, 100: 2}
 
@@ -43,13 +51,17 @@ def table(shapes: int = 400, seed: int = 0) -> Table:
 
 @pytest.fixture(scope="module")
 def posterior() -> Posterior:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(training, "RATE", 1e-2)
-        patch.setattr(training, "EPOCHS", 60)
-        patch.setattr(emulator_training, "EPOCHS", 20)
-        return train_posterior(table(800), SMALL, members=2)
+    plans = Plans(PLANS.flows._replace(rate=1e-2, epochs=60), PLANS.emulator._replace(epochs=20))
+    return train_posterior(table(800), SMALL, members=2, plans=plans)
 
 
+@pytest.fixture(scope="module")
+def raw() -> Posterior:
+    """The packaged one: what a file holds, what is refused."""
+    return load_posterior()
+
+
+@pytest.mark.slow
 def test_it_tells_what_the_descriptors_hold_and_no_more(posterior: Posterior) -> None:
     """Of a uniform parameter seen in Gaussian noise of a fifth of its deviation nearly all, of the others nothing."""
     fresh, spread = table(200, seed=1), (HIGH - LOW) / np.sqrt(12)
@@ -65,16 +77,16 @@ def test_it_tells_what_the_descriptors_hold_and_no_more(posterior: Posterior) ->
         assert 0.86 < inside < 0.94  # 1200 ranks: 0.9 ± 0.01, and what 800 shapes leave unlearnt
 
 
-def test_what_tells_the_mass_is_not_hidden_by_dropout(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.slow
+def test_what_tells_the_mass_is_not_hidden_by_dropout() -> None:
     """A line of the descriptors, rising in one view and falling in the other, tells the mass but for a tenth."""
-    monkeypatch.setattr(training, "EPOCHS", 20)
-    monkeypatch.setattr(emulator_training, "EPOCHS", 1)
+    plans = ONCE._replace(flows=PLANS.flows._replace(epochs=20))
     rows, spread = table(500), (HIGH - LOW)[5] / np.sqrt(12)
     mass = (rows.parameters[:, 5] - (LOW + HIGH)[5] / 2) / spread
     told = np.where(rows.views == "mask", mass, -mass) + 0.1 * np.random.default_rng(3).standard_normal(len(rows))
     rows.descriptors[:, 40:80] = 5 + told[:, None]
     known = np.isin(rows.shapes, np.unique(rows.shapes)[:400])
-    learnt = train_posterior(rows.rows(known), dataclasses.replace(SMALL, dropout=0.5), members=1)
+    learnt = train_posterior(rows.rows(known), dataclasses.replace(SMALL, dropout=0.5), members=1, plans=plans)
     for view in ("mask", "crop"):
         fresh = rows.rows(~known).of([view])
         draws = learnt.sample(fresh.descriptors, view, 200)[..., 5]
@@ -82,17 +94,19 @@ def test_what_tells_the_mass_is_not_hidden_by_dropout(monkeypatch: pytest.Monkey
         assert draws.std(1).mean() < 0.25 * spread
 
 
-def test_draws_lie_in_the_box_and_come_back(posterior: Posterior) -> None:
+def test_draws_lie_in_the_box_and_come_back(raw: Posterior) -> None:
     row = table(1, seed=2).of(["mask"]).descriptors
-    draws = posterior.sample(row[0], "mask", 500, seed=3)
-    rim = 0.025 * (HIGH - LOW)
+    draws = raw.sample(row[0], "mask", 500, seed=3)
+    low, high = raw.box.T
+    rim = 0.025 * (high - low)
     assert draws.shape == (500, 6)
-    assert ((draws > LOW - rim) & (draws < HIGH + rim)).all()
-    assert np.array_equal(draws, posterior.sample(row, "mask", 500, seed=3)[0])
-    assert not np.array_equal(draws, posterior.sample(row[0], "mask", 500, seed=4))
-    assert posterior.bounded(posterior.unbounded(draws)) == pytest.approx(draws, rel=1e-4)
+    assert ((draws > low - rim) & (draws < high + rim)).all()
+    assert np.array_equal(draws, raw.sample(row, "mask", 500, seed=3)[0])
+    assert not np.array_equal(draws, raw.sample(row[0], "mask", 500, seed=4))
+    assert raw.bounded(raw.unbounded(draws)) == pytest.approx(draws, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_the_density_is_one_over_the_box(posterior: Posterior) -> None:
     """Its mean over uniform draws is 1 / volume; the crop's is wide, so a mean of draws will do."""
     row = table(1, seed=2).of(["crop"]).descriptors
@@ -106,60 +120,55 @@ def test_the_density_is_one_over_the_box(posterior: Posterior) -> None:
         assert np.array_equal(posterior.log_density(outside, np.repeat(row, 6, 0), "crop"), np.full(6, -np.inf))
 
 
-def test_views_that_it_does_not_know_are_refused(posterior: Posterior) -> None:
-    with pytest.raises(ValueError, match="expected views among crop, mask, got field"):
-        posterior.sample(np.ones(sum(BLOCKS.values())), "field")
+def test_views_that_it_does_not_know_are_refused(raw: Posterior) -> None:
+    with pytest.raises(ValueError, match="ghost"):
+        raw.sample(np.ones(sum(BLOCKS.values())), "ghost")
 
 
-def test_descriptors_that_are_not_finite_are_refused(posterior: Posterior) -> None:
+def test_descriptors_that_are_not_finite_are_refused(raw: Posterior) -> None:
     rows = table(2, seed=2).of(["mask"]).descriptors
     rows[1, 5] = np.nan
-    for ask in (posterior.sample, lambda *given: posterior.log_density(np.tile(LOW, (2, 1)), *given)):
-        with pytest.raises(ValueError, match="expected descriptors that are finite, got 1 of 2 rows with others"):
+    for ask in (raw.sample, lambda *given: raw.log_density(np.tile(LOW, (2, 1)), *given)):
+        with pytest.raises(ValueError, match="finite"):
             ask(rows, "mask")
 
 
-def test_a_file_holds_it(posterior: Posterior, tmp_path: Path) -> None:
+def test_a_file_holds_it(raw: Posterior, tmp_path: Path) -> None:
     path = tmp_path / "posterior.npz"
-    save_posterior(posterior, path)
+    save_posterior(raw, path)
     again, row = load_posterior(path), table(1, seed=2).descriptors[0]
-    assert np.array_equal(again.sample(row, "mask", 50), posterior.sample(row, "mask", 50))
-    assert again.provenance == posterior.provenance
+    assert np.array_equal(again.sample(row, "mask", 50), raw.sample(row, "mask", 50))
+    assert again.provenance == raw.provenance
     content = path.read_bytes()
     path.write_bytes(content[:1000])
-    with pytest.raises(ValueError, match="damaged or something else"):
+    with pytest.raises(ValueError, match="damaged"):
         load_posterior(path)
     path.write_bytes(content)
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(BLOCKS, "another", 2)
         with pytest.raises(ValueError, match="train it again"):
             load_posterior(path)
-    with pytest.raises(FileNotFoundError, match="expected a posterior"):
+    with pytest.raises(FileNotFoundError, match="nowhere"):
         load_posterior(tmp_path / "nowhere.npz")
 
 
 @pytest.mark.parametrize("name", ["mean", "basis", "box", "0.flow.transform.transforms.0.hyper.0.weight"])
-def test_a_file_with_arrays_of_other_shapes_is_refused(posterior: Posterior, tmp_path: Path, name: str) -> None:
+def test_a_file_with_arrays_of_other_shapes_is_refused(raw: Posterior, tmp_path: Path, name: str) -> None:
     path = tmp_path / "posterior.npz"
-    save_posterior(posterior, path)
+    save_posterior(raw, path)
     arrays = dict(np.load(path))
     arrays[name] = arrays[name][:-1]
     np.savez(path, **arrays)
-    with pytest.raises(ValueError, match="expected a whole posterior, got"):
+    with pytest.raises(ValueError, match="posterior"):
         load_posterior(path)
 
 
 @pytest.mark.parametrize(
-    ("sizes", "words"),
-    [
-        ({"components": 0}, "whole numbers"),
-        ({"hidden": (10**9,)}, "whole numbers"),
-        ({"dropout": 1.5}, "a dropout"),
-        ({"blocks": ("ghost",)}, "expected blocks among"),
-    ],
+    ("sizes", "word"),
+    [({"hidden": (10**9,)}, "whole numbers"), ({"dropout": 1.5}, "dropout"), ({"blocks": ("ghost",)}, "blocks")],
 )
-def test_an_architecture_has_bounds(sizes: dict, words: str) -> None:
-    with pytest.raises(ValueError, match=words):
+def test_an_architecture_has_bounds(sizes: dict, word: str) -> None:
+    with pytest.raises(ValueError, match=word):
         Architecture(**sizes)
 
 
@@ -179,13 +188,13 @@ def test_blocks_are_chosen_by_name() -> None:
 
 
 def test_too_few_shapes_are_refused() -> None:
-    with pytest.raises(ValueError, match="expected at least 8 shapes"):
+    with pytest.raises(ValueError, match="8 shapes"):
         train_posterior(table(7), SMALL)
 
 
+@pytest.mark.slow
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(training, "EPOCHS", 1)
-    monkeypatch.setattr(emulator_training, "EPOCHS", 1)
+    monkeypatch.setattr(training, "PLANS", ONCE)
     source, out = tmp_path / "table.npz", tmp_path / "posterior.npz"
     save_table(table(80), source)
     options = ["--views", "mask", "--members", "1"]
@@ -196,36 +205,36 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("arguments", "word"),
     [
-        (["nothing.npz", "-o", "posterior.npz"], "expected a table of descriptors"),
-        (["table.npz", "-o", "posterior.pt"], "expected a name ending in .npz"),
-        (["table.npz", "-o", "table.npz"], "expected an output that writes over no input"),
-        (["table.npz", "-o", "posterior.npz", "--views", "ghost"], "expected views among crop, mask, got ghost"),
-        (["table.npz", "-o", "posterior.npz"], "shapes to train on, got 5"),
+        (["nothing.npz", "-o", "posterior.npz"], "nothing.npz"),
+        (["table.npz", "-o", "posterior.pt"], ".npz"),
+        (["table.npz", "-o", "table.npz"], "input"),
+        (["table.npz", "-o", "posterior.npz", "--views", "ghost"], "ghost"),
+        (["table.npz", "-o", "posterior.npz"], "shapes"),
     ],
 )
-def test_the_command_refuses_in_one_sentence(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], words: str
+def test_the_command_refuses_and_writes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], word: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
     save_table(table(5), "table.npz")
     result = CliRunner().invoke(app, ["atlas", "train", *arguments])
     assert result.exit_code == 2
-    assert words in " ".join(result.stderr.split())
+    assert word in result.stderr
     assert not (tmp_path / "posterior.npz").exists()
 
 
 @pytest.mark.parametrize("members", [0, 65])
 def test_a_number_of_flows_has_bounds(members: int) -> None:
-    with pytest.raises(ValueError, match="expected a number of flows"):
+    with pytest.raises(ValueError, match="flows"):
         train_posterior(table(20), SMALL, members=members)
 
 
 def test_a_parameter_that_does_not_vary_is_named() -> None:
     fixed = table(20)
     fixed.parameters[:, 2] = 7.0
-    with pytest.raises(ValueError, match="expected shapes whose parameters all vary, got a10 the same in all"):
+    with pytest.raises(ValueError, match="a10"):
         train_posterior(fixed, SMALL)
 
 

@@ -10,9 +10,9 @@ import torch
 
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import schedule
-from curvafit.inference.refinement import admissible, in_gauge, units
-from curvafit.inference.stationarity import _tested, energy_gradients, is_rounded, stationarity
+from curvafit.inference.stationarity import _tested, admissible, energy_gradients, in_gauge, stationarity, units
 from curvafit.priors import WORKING_EPSILON, Coefficients, Grid, energy_terms, jet, preset
+from curvafit.scan.structure import is_rounded
 
 EDGE = 36
 GRID = Grid((EDGE,) * 3)

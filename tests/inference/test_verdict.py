@@ -11,10 +11,19 @@ import pytest
 from found import NUMBERS
 
 from curvafit.geometry.diagram import Diagram
-from curvafit.inference.candidates import CLOSE, Candidate, best_of, noise_of
-from curvafit.inference.misfit import UNBELIEVABLE, Misfit
-from curvafit.inference.twins import Twin
-from curvafit.inference.verdict import FURTHEST, TELLING, unlike, verdict
+from curvafit.inference.candidates import (
+    CLOSE,
+    FURTHEST,
+    TELLING,
+    UNBELIEVABLE,
+    Candidate,
+    Misfit,
+    Twin,
+    best_of,
+    noise_of,
+    unlike,
+    verdict,
+)
 from curvafit.priors.coefficients import Coefficients
 
 LAW = Coefficients(1, 2, 6, -40, -40, 400)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from found import made_fit
 
-from curvafit.inference.draws import Draws
+from curvafit.inference.fit import Draws
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.calibration import Setting, Task
 from curvafit.segmentation.completion import reconstruct

@@ -13,9 +13,8 @@ from calling import call, refused
 
 from curvafit.geometry.morphometry import morphometry
 from curvafit.geometry.topology import euler_number, euler_shares
+from curvafit.scan.measure import LEAST, QUANTITIES, Blocks, Measures, errors, measure
 from curvafit.studies import tables
-from curvafit.studies.blocks import LEAST, Blocks, errors
-from curvafit.studies.measure import QUANTITIES, Measures, measure
 from curvafit.studies.tables import COLUMNS, rows_of, write_table
 from curvafit.volumes.scan import Field
 

@@ -8,19 +8,22 @@ tells which parameters to simulate next (Gutmann & Corander 2016).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from scipy import linalg
 
+from curvafit.core.checks import check_int
 from curvafit.core.runtime import Progress, silent
+from curvafit.generation.schedule import LEARNED, Schedule
+from curvafit.geometry.descriptors import Descriptors
 from curvafit.inference.emulator import Emulator
-from curvafit.inference.simulation import Simulate, Simulations
 from curvafit.inference.table import row_of
 
-#: Rounds, and simulations in each; and how often at most the likeliest is looked for that grows.
-ROUNDS, BATCH, LAST = 7, 3, 4
+#: Simulations in a round; and how often at most the likeliest is looked for that grows.
+BATCH, LAST = 3, 4
 #: Parameters are also chosen around so many of the nearest simulations, so many at each of these deviations, in those
 #: of the prior.
 NEAREST, AROUND, WIDTHS = 4, 300, (0.15, 0.4)
@@ -29,6 +32,74 @@ NEAREST, AROUND, WIDTHS = 4, 300, (0.15, 0.4)
 LENGTHS, VARIANCES, NOISES = (0.5, 1.0, 2.0, 4.0), (0.1, 0.3, 1.0, 3.0), (0.05, 0.1, 0.2, 0.4, 0.8)
 #: Parameters that grew nothing are avoided by as much, as far around, in deviations of the prior.
 BARREN, REACH = 50.0, 0.3
+
+
+class Effort(NamedTuple):
+    """How much an inference grows: draws of the posterior; rounds of three shapes that are chosen by those before;
+    shapes of the best law, and most shapes to find which law that is; steps of each shape."""
+
+    simulations: int = 16
+    rounds: int = 7
+    twins: int = 3
+    regrown: int = 6
+    schedule: Schedule | str = LEARNED
+
+
+class Simulations(NamedTuple):
+    """Parameters `(n, 6)`, seeds `(n,)` and descriptors `(n, 351)` of the simulations that grew a shape, and how many
+    there were."""
+
+    parameters: np.ndarray
+    seeds: np.ndarray
+    descriptors: np.ndarray
+    count: int
+
+    def joined(self, parameters: np.ndarray, seeds: np.ndarray, descriptors: np.ndarray, count: int) -> Simulations:
+        """Return these simulations and others, of which there were `count`."""
+        return Simulations(
+            np.concatenate([self.parameters, parameters]),
+            np.concatenate([self.seeds, seeds]),
+            np.concatenate([self.descriptors, descriptors]),
+            self.count + count,
+        )
+
+
+#: From parameters `(6,)` and a seed to the descriptors of what they grow, measured as the query is; None where nothing
+#: grows.
+Simulate = Callable[[np.ndarray, int], Descriptors | None]
+
+
+def simulations(
+    draws: np.ndarray,
+    simulate: Simulate,
+    count: int,
+    *,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> Simulations:
+    """Grow a shape from each of some of a posterior's draws `(n, 6)`, each with a seed of its own.
+
+    Parameters
+    ----------
+    count
+        Number of draws that are simulated.
+    seed
+        The k-th simulation has the seed `seed` + k.
+
+    Raises
+    ------
+    ValueError
+        If the count is not from 1 to the number of draws.
+    """
+    count = check_int(count, "a number of simulations", 1, len(draws))
+    chosen = draws[np.random.default_rng(seed).choice(len(draws), count, replace=False)]
+    rows = []
+    for k, parameters in enumerate(chosen):
+        rows.append(row_of(simulate(parameters, seed + k)))
+        progress(f"simulated {k + 1} of {count}", (k + 1) / count)
+    descriptors = np.array(rows)
+    grown = np.isfinite(descriptors).all(1)
+    return Simulations(chosen[grown], seed + np.flatnonzero(grown), descriptors[grown], count)
 
 
 class Process(NamedTuple):
@@ -99,7 +170,7 @@ class Search:
         simulated: Simulations,
         simulate: Simulate,
         *,
-        rounds: int = ROUNDS,
+        rounds: int = Effort().rounds,
         seed: int = 0,
         progress: Progress = silent,
     ) -> tuple[np.ndarray, Simulations]:

@@ -2,35 +2,40 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+from scipy import ndimage, stats
 
 from curvafit.core.runtime import Progress, silent
-from curvafit.geometry.diagram import Diagram
-from curvafit.geometry.family import FAMILIES, families
-from curvafit.geometry.mesh import area_vectors
+from curvafit.geometry.descriptors import Descriptors, descriptors
+from curvafit.geometry.diagram import FAMILIES, MARGIN, Diagram, SurfaceCurvatures, families, surface_curvatures
+from curvafit.geometry.mesh import NoSurface, area_vectors
 from curvafit.geometry.morphometry import connectivity_of, local_thickness, smooth_surface
 from curvafit.geometry.topology import euler_shares
-from curvafit.inference.measure import scan_curvatures
-from curvafit.priors.grid import WORKING_SPACING
-from curvafit.scan.phases import check_options, find_level
-from curvafit.scan.prepare import Prepared, prepare, smallest_piece
-from curvafit.scan.regrid import median_thickness, without_specks
-from curvafit.studies.blocks import LEAST, Blocks, errors
+from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
+from curvafit.scan.grids import median_thickness, without_specks
+from curvafit.scan.prepare import LARGEST_WINDOW, Prepared, prepare, smallest_piece
+from curvafit.scan.structure import check_options, find_level, is_rounded
 from curvafit.volumes.scan import Field, ScanError
 from curvafit.volumes.source import Source, field_of
-
-__all__ = ["Measures", "Quantity", "measure"]
 
 #: What is summed over blocks, in powers of the scan's unit; normals are the six parts of n⊗n, zz zy zx yy yx xx.
 SUMS = ("volume", "inside", "thickness", "thickness²", "gap", "χ", "area", *(f"n{k}" for k in range(6)))
 SUMS += ("curved", "H", "H²", "K", "κ1", "κ2", "C", *FAMILIES)
 _UPPER = np.triu_indices(3)
 Sums = Mapping[str, np.ndarray]
+#: Least edge, in working voxels, of a cube whose descriptors are measured.
+SMALLEST_CUBE = 24
+#: The fewest blocks, and the most along an axis; the length of a block in periods of the structure.
+LEAST, MOST, PERIODS = 8, 6, 1.0
+#: How sure intervals are.
+SURE = 0.95
 
 
 @dataclass(frozen=True)
@@ -136,7 +141,7 @@ def measure(
 
     Volume fraction, thickness, spacing, connectivity, surface and fabric are those of the structure on the scan's own
     voxels, all of them. Curvature is that of the scan on the working grid, as `infer` reads it. Intervals are 95 %, by
-    a jackknife over blocks of a period (thickness and spacing) of the structure (`studies.blocks.errors`); a scan with
+    a jackknife over blocks of a period (thickness and spacing) of the structure (`errors`); a scan with
     fewer than eight has none.
 
     Parameters
@@ -274,3 +279,151 @@ def _anisotropy(sums: Sums) -> np.ndarray:
     known = np.asarray(np.isfinite(tensor).all(axis=(-1, -2)))[..., None]
     spectrum = np.where(known, np.linalg.eigvalsh(np.where(known[..., None], tensor, 0)), np.nan)
     return 1 - spectrum[..., 0] / spectrum[..., 2]
+
+
+def scan_diagram(prepared: Prepared) -> Diagram:
+    """Return the geometric curvature diagram of a prepared scan."""
+    curvatures = scan_curvatures(prepared)
+    return Diagram(curvatures.points, curvatures.areas, excluded=curvatures.excluded)
+
+
+def scan_curvatures(prepared: Prepared) -> SurfaceCurvatures:
+    """Return the geometric curvatures of a prepared scan's surface; of a large one tile by tile, each cell in one tile.
+
+    Centres are in working units from the centre of the grid's first voxel.
+    """
+    grid = prepared.grid
+    cuts = [[slice(None)] if grid.periodic else _tiles(n) for n in grid.shape]
+    parts: list[SurfaceCurvatures] = []
+    for tile in itertools.product(*cuts):
+        with contextlib.suppress(NoSurface):
+            parts.append(_tile_curvatures(prepared, tile))
+    if not parts:
+        raise ValueError("expected a surface inside the scan, got none away from its borders")
+    centres, points, areas = (np.concatenate(each) for each in zip(*(part[:3] for part in parts), strict=True))
+    lost = sum(part.excluded * float(part.areas.sum()) for part in parts) / areas.sum()
+    return SurfaceCurvatures(centres, points, areas, float(lost))
+
+
+def _tiles(n: int) -> list[slice]:
+    """Return stretches of at most a window's length; their interiors (`MARGIN` voxels in) share end planes alone."""
+    count = math.ceil((n - 2 * MARGIN) / (LARGEST_WINDOW - 2 * MARGIN))
+    ends = np.linspace(MARGIN, n - 1 - MARGIN, count + 1).astype(int)
+    return [slice(a - MARGIN, b + MARGIN + 1) for a, b in itertools.pairwise(ends)]
+
+
+def _tile_curvatures(prepared: Prepared, tile: tuple[slice, ...]) -> SurfaceCurvatures:
+    phase = np.ascontiguousarray(prepared.phase[tile])
+    z, y, x = phase.shape
+    grid = Grid((z, y, x), prepared.grid.spacing, prepared.grid.boundary)
+    where = None if prepared.roi is None else ndimage.binary_erosion(prepared.roi, iterations=MARGIN)[tile]
+    found = surface_curvatures(phase, grid, WORKING_EPSILON, where=where)
+    corner = np.array([edge.start or 0 for edge in tile]) * np.array(grid.spacing)
+    return found._replace(centres=found.centres + corner)
+
+
+def scan_descriptors(prepared: Prepared) -> tuple[Descriptors, str] | None:
+    """Measure a scan's descriptors, and name the kind of view that it is (`curvafit.inference.table`).
+
+    They are those of the main window, or of the largest cube within the region of interest. None where that cube is
+    smaller than `SMALLEST_CUBE` voxels, or shows no surface.
+    """
+    where = prepared.windows[0] if prepared.roi is None else _largest_cube(prepared.roi)
+    if where is None:
+        return None
+    mask, grid = np.ascontiguousarray(prepared.mask[where]), prepared.part(where)
+    view = _view(prepared, grid)
+    try:
+        return descriptors(prepared.phase if view == "field" else mask, grid), view
+    except NoSurface:
+        return None
+
+
+def _view(prepared: Prepared, grid: Grid) -> str:
+    """Return what a posterior takes a window for: a field of a part is read as its mask is, a clean image as a mask."""
+    if prepared.imaging is not None and prepared.imaging.degraded:
+        return "scan"
+    if grid.periodic:
+        return "field" if prepared.kind == "field" and not is_rounded(prepared.phase) else "mask"
+    return "crop" if prepared.scale == (1.0, 1.0, 1.0) else "resampled"
+
+
+def _largest_cube(region: np.ndarray) -> tuple[slice, slice, slice] | None:
+    """Return the largest cube within a region, of at most a window's edge; None where it is too small."""
+    inside = np.asarray(ndimage.distance_transform_cdt(np.pad(region, 1), metric="chessboard"))[1:-1, 1:-1, 1:-1]
+    reach = min(int(inside.max()), LARGEST_WINDOW // 2) - 1
+    if 2 * reach + 1 < SMALLEST_CUBE:
+        return None
+    z, y, x = (int(i) for i in np.unravel_index(int(inside.argmax()), inside.shape))
+    return slice(z - reach, z + reach + 1), slice(y - reach, y + reach + 1), slice(x - reach, x + reach + 1)
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """A division of a volume (Z, Y, X) into blocks: the first voxel of each along (z, y, x)."""
+
+    shape: tuple[int, int, int]
+    starts: tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]
+
+    @classmethod
+    def of(cls, shape: Sequence[int], spacing: Sequence[float], period: float) -> Blocks:
+        """Divide a volume into blocks of `PERIODS` periods of its structure, and at most `MOST` along an axis."""
+        counts = [min(max(int(n * h / (PERIODS * period)), 1), MOST) for n, h in zip(shape, spacing, strict=True)]
+        starts = [tuple(n * k // count for k in range(count)) for n, count in zip(shape, counts, strict=True)]
+        return cls((shape[0], shape[1], shape[2]), (starts[0], starts[1], starts[2]))
+
+    @property
+    def counts(self) -> tuple[int, int, int]:
+        """Return the number of blocks along each axis."""
+        z, y, x = map(len, self.starts)
+        return z, y, x
+
+    @property
+    def count(self) -> int:
+        """Return the number of blocks."""
+        return math.prod(self.counts)
+
+    def sums(self, values: np.ndarray) -> np.ndarray:
+        """Return the sum of a volume (Z, Y, X) over each block, float64 (N,)."""
+        kind = np.float64 if values.dtype.kind == "f" else np.int64
+        for axis, starts in enumerate(self.starts):
+            values = np.add.reduceat(values, starts, axis=axis, dtype=kind)
+        return values.ravel().astype(np.float64)
+
+    def gathered(self, places: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Return sums over each block, (N, …), of weights (M, …) at places (M, 3) in voxels from the first centre."""
+        numbers = np.zeros(len(places), dtype=np.int64)
+        for axis, starts in enumerate(self.starts):
+            voxels = np.clip(np.rint(places[:, axis]), 0, self.shape[axis] - 1)
+            numbers = numbers * len(starts) + np.searchsorted(starts, voxels, side="right") - 1
+        columns = weights.reshape(len(weights), -1)
+        sums = [np.bincount(numbers, column, minlength=self.count) for column in columns.T]
+        return np.stack(sums, axis=1).reshape(self.count, *weights.shape[1:])
+
+
+def errors(sums: np.ndarray, blocks: Blocks, figures: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Return half the width of the `SURE` interval of each figure, (K,), by a jackknife over neighbours that correlate.
+
+    With ψ the change of a figure when a block is left out, the variance is ψᵀ W ψ: W has 1 on its diagonal, and ½ for
+    each axis along which two blocks are neighbours (Bartlett's kernel, as Newey & West 1987 for series). Were blocks
+    independent, ψᵀ W ψ would be σ² tr(P W P) / n², P taking the mean off: that sets its scale, and with tr² / tr(·²)
+    the degrees of freedom of Student's t. A bootstrap over single blocks would take neighbours for independent.
+
+    Parameters
+    ----------
+    sums
+        Sums over each block, (N, C), of what is additive.
+    figures
+        Returns figures (…, K) of sums (…, C).
+    """
+    count = len(sums)
+    kernel = np.ones((1, 1))
+    for n in blocks.counts:
+        kernel = np.kron(kernel, np.eye(n) + (np.eye(n, k=1) + np.eye(n, k=-1)) / 2)
+    centred = np.eye(count) - 1 / count
+    form = centred @ kernel @ centred
+    freedom = np.trace(form) ** 2 / (form**2).sum()
+    total = sums.sum(0)
+    change = (figures(total) - figures(total - sums)) * (count - 1) / count
+    variance = (change * (kernel @ change)).sum(0) * count / np.trace(form)
+    return float(stats.t.ppf((1 + SURE) / 2, freedom)) * np.sqrt(np.maximum(variance, 0))

@@ -7,9 +7,9 @@ import pytest
 from scipy import ndimage
 
 from curvafit import Field
-from curvafit.scan.imaging import Imaging, imaging_of, voxelised
+from curvafit.scan.grids import centre_distance
 from curvafit.scan.prepare import prepare
-from curvafit.scan.regrid import centre_distance
+from curvafit.scan.structure import Imaging, imaging_of, voxelised
 
 CUBIC = (1.0, 1.0, 1.0)
 

@@ -10,17 +10,6 @@ from scipy import ndimage
 
 from curvafit.geometry.morphometry import local_thickness
 
-__all__ = [
-    "Window",
-    "bounding_box",
-    "centre_distance",
-    "median_thickness",
-    "resample",
-    "rich_boxes",
-    "surface_voxels",
-    "without_specks",
-]
-
 Window = tuple[slice, slice, slice]
 
 #: Thickness is measured in a box of at most this many voxels a side.

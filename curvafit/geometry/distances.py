@@ -1,0 +1,557 @@
+"""Distances between curvature diagrams: Sinkhorn's divergence of two, of one and many, of every pair.
+
+`sinkhorn_divergence` is geomloss's and differentiable. Many distances at once are numba's loops over the same steps in
+float32; `wasserstein` needs geomloss for float64 and takes these loops where geomloss is not installed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import time
+from collections.abc import Iterator, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numba import njit, prange
+from torch import Tensor
+
+from curvafit.core.checks import quoted
+from curvafit.core.extras import require
+from curvafit.core.files import write_atomically
+from curvafit.core.records import parse_json, read_archive
+from curvafit.core.runtime import Progress, silent
+from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram
+from curvafit.priors.kernels import threads
+
+#: Pairs that are taken at once: a few seconds on a processor.
+BLOCK = 8192
+#: Seconds between two saves.
+EVERY = 30.0
+FORMAT = "curvafit distances"
+#: Goes up when distances change: rows of another version are never reused.
+VERSION = 2
+#: All of fast-math but the leave to assume that no value is NaN or infinite.
+_SERIAL = {
+    "cache": True,
+    "fastmath": {"reassoc", "contract", "arcp", "nsz", "afn"},
+    "error_model": "numpy",
+    "nogil": True,
+}
+_PARALLEL = {**_SERIAL, "parallel": True}
+#: A sum over the plan is trusted between these; outside, what it adds may have left float32's range.
+_LEAST, _MOST = np.float32(1e-25), np.float32(1e30)
+_LN2 = math.log(2.0)
+#: Entries of a batch's cost matrices.
+_ENTRIES = 1 << 26
+_LOW, _HIGH = np.float32(-126), np.float32(127)
+_ZERO, _ONE = np.float32(0), np.float32(1)
+#: 2^r on [-½, ½] to 3e-7 of itself: Taylor's coefficients from the fifth to the first.
+_C5, _C4, _C3, _C2, _C1 = (np.float32(_LN2**k / math.factorial(k)) for k in (5, 4, 3, 2, 1))
+
+
+def pairwise(
+    diagrams: Sequence[Diagram],
+    *,
+    blur: float = 1.0,
+    reach: float | None = 20.0,
+    bin_width: float = BIN_WIDTH,
+    device: torch.device | str = "cpu",
+    checkpoint: str | Path | None = None,
+    progress: Progress = silent,
+) -> np.ndarray:
+    """Return `wasserstein` of every pair of N diagrams: `(N, N)` float64, symmetric, with a zero diagonal.
+
+    `wasserstein` is met to 1e-4 of itself, or 1e-5 where that is less than 0.1: the steps are the same, in float32.
+
+    Parameters
+    ----------
+    diagrams
+        In one unit.
+    blur, reach, bin_width
+        As `wasserstein` takes them.
+    device
+        `"cpu"` runs on numba's threads, half a millisecond a pair; `"cuda"` takes pairs in batches.
+    checkpoint
+        File (`.npz`) that is replaced every half minute and at the end. Where it exists, what it holds of pairs among
+        these diagrams is taken from it: a killed run goes on, a longer list costs its new rows. Diagrams are known by
+        their content, so order and position do not matter; rows of diagrams that are not listed any more go.
+    progress
+        Called after every block of pairs with a sentence and the share done.
+
+    Raises
+    ------
+    ValueError
+        If a diagram is empty, the units differ, a parameter is out of range, or the checkpoint is something else or was
+        made with other parameters.
+    OSError
+        If the checkpoint cannot be written; before anything is computed.
+    """
+    measures = _measures(diagrams, blur, reach, bin_width)
+    file = _File(checkpoint, {"blur": blur, "reach": reach, "bin_width": bin_width}, _keys(measures))
+    distances = file.read()
+    first, second = np.nonzero(np.triu(np.isnan(distances)))
+    order = np.random.default_rng(0).permutation(len(first))  # so that threads get pairs of like sizes
+    first, second = first[order], second[order]
+    total = len(distances) * (len(distances) - 1) // 2
+    file.write(distances)
+    blocks = _distances(measures, first, second, blur=blur, reach=reach, device=device)
+    try:
+        for start, block in zip(range(0, len(first), BLOCK), blocks, strict=True):
+            i, j = first[start : start + BLOCK], second[start : start + BLOCK]
+            distances[i, j] = distances[j, i] = block
+            progress(f"comparing {total} pairs", (total - len(first) + start + len(block)) / total)
+            if file.due():
+                file.write(distances)
+    finally:
+        file.write(distances)
+    return distances
+
+
+def one_to_many(
+    query: Diagram,
+    diagrams: Sequence[Diagram],
+    *,
+    blur: float = 1.0,
+    reach: float | None = 20.0,
+    bin_width: float = BIN_WIDTH,
+    device: torch.device | str = "cpu",
+) -> np.ndarray:
+    """Return the distances `(N,)` of one diagram to each of N; `pairwise` says what is taken and raised."""
+    measures = _measures([query, *diagrams], blur, reach, bin_width)
+    others = np.arange(1, len(diagrams) + 1)
+    blocks = _distances(measures, np.zeros_like(others), others, blur=blur, reach=reach, device=device)
+    return np.concatenate([np.empty(0), *blocks])
+
+
+def _measures(diagrams: Sequence[Diagram], blur: float, reach: float | None, bin_width: float) -> Measures:
+    reduced = comparable(diagrams, blur, reach, bin_width)
+    return packed([d.points for d in reduced], [d.weights for d in reduced])
+
+
+def _distances(measures: Measures, first: np.ndarray, second: np.ndarray, **options: Any) -> Iterator[np.ndarray]:
+    """Yield the distances of the pairs, block by block.
+
+    Half of what a measure costs with itself, in as many steps as the pair's, is what debiasing takes off. That depends
+    on the pair by the number of steps alone, of which there are two or three, and is computed once for each.
+    """
+    falls = pair_halvings(measures, first, second, options["blur"])
+    keys = np.concatenate([np.stack([ends, falls], axis=1) for ends in (first, second)])
+    distinct, places = np.unique(keys, axis=0, return_inverse=True)
+    own = costs(measures, distinct[:, 0], distinct[:, 0], distinct[:, 1], **options)
+    bias = own[places.reshape(2, -1)].sum(0) / 2
+    for start in range(0, len(first), BLOCK):
+        block = slice(start, start + BLOCK)
+        divergence = costs(measures, first[block], second[block], falls[block], **options) - bias[block]
+        yield np.sqrt(np.maximum(divergence, 0))
+
+
+def _keys(measures: Measures) -> list[str]:
+    """Return a digest of each measure's points and weights."""
+    rows = np.stack([measures.x, measures.y, measures.log2], axis=1)
+    parts = (rows[start:end] for start, end in zip(measures.bounds[:-1], measures.bounds[1:], strict=True))
+    return [hashlib.sha256(part.tobytes()).hexdigest() for part in parts]
+
+
+class _File:
+    """Where distances are kept: a header, the digests of N measures, and `(N, N)` distances, NaN where not known yet.
+
+    Without a path nothing is kept.
+    """
+
+    def __init__(self, path: str | Path | None, settings: dict[str, Any], keys: list[str]) -> None:
+        self._path = None if path is None else Path(path)
+        self._header = {"format": FORMAT, "version": VERSION, **settings}
+        self._keys, self._written = keys, time.monotonic()
+
+    def read(self) -> np.ndarray:
+        """Return what the file knows of the distances between the measures."""
+        distances = np.full((len(self._keys),) * 2, np.nan)
+        if self._path is not None and self._path.exists():
+            keys, known = self._content(self._path)
+            place = {key: number for number, key in enumerate(keys)}
+            here = [number for number, key in enumerate(self._keys) if key in place]
+            there = [place[self._keys[number]] for number in here]
+            distances[np.ix_(here, here)] = known[np.ix_(there, there)]
+        np.fill_diagonal(distances, 0)
+        return distances
+
+    def due(self) -> bool:
+        return time.monotonic() - self._written > EVERY
+
+    def write(self, distances: np.ndarray) -> None:
+        if self._path is not None:
+            write_atomically(self._path, lambda path: self._save(path, distances))
+            self._written = time.monotonic()
+
+    def _save(self, path: Path, distances: np.ndarray) -> None:
+        header = np.frombuffer(json.dumps(self._header).encode(), dtype=np.uint8)
+        with open(path, "wb") as file:
+            np.savez(file, header=header, keys=np.array(self._keys, dtype="S64"), distances=distances)
+            file.flush()
+            os.fsync(file.fileno())
+
+    def _content(self, path: Path) -> tuple[list[str], np.ndarray]:
+        """Return the digests and distances of a file that was made with the same settings."""
+        try:
+            arrays = read_archive(path)
+            header = parse_json(arrays["header"].tobytes(), "a file of distances", path)
+            keys, distances = arrays["keys"].astype(str).tolist(), arrays["distances"]
+            theirs = {name: header.get(name) for name in self._header}
+            if distances.shape != (len(keys),) * 2 or distances.dtype != np.float64:
+                raise ValueError(f"expected distances of {len(keys)} diagrams, got shape {distances.shape}")
+        except (ValueError, KeyError, AttributeError, TypeError) as error:
+            raise ValueError(f"expected a file of distances, got {path}, which is something else") from error
+        names = [name for name, value in self._header.items() if theirs[name] != value]
+        if names:
+            parts = (f"{name} {quoted(theirs[name])} instead of {self._header[name]}" for name in names)
+            raise ValueError(f"expected distances of this kind, got {path} with {'; '.join(parts)}")
+        return keys, distances
+
+
+def wasserstein(
+    a: Diagram, b: Diagram, *, blur: float = 1.0, reach: float | None = 20.0, bin_width: float = BIN_WIDTH
+) -> float:
+    """Return the Wasserstein distance of two curvature diagrams, as the paper takes it.
+
+    It is the root of the debiased unbalanced Sinkhorn divergence of the diagrams with total weight 1, cost ½|x - y|²,
+    blur 1 and reach 20 (in 1 / grid's unit), on binned diagrams instead of random triangles. Two diagrams that differ
+    by a small shift s are |s| / √2 apart; far apart, the distance levels off.
+
+    geomloss computes it in float64; where geomloss is not installed, `one_to_many` does in float32, which is the same
+    to 1e-4 of it, or 1e-5. Matches, the atlas's map and reports take `one_to_many` and `pairwise` always.
+
+    Parameters
+    ----------
+    a, b
+        Diagrams in the same unit.
+    reach
+        How far area is moved before it is cheaper to destroy it; None moves all.
+    bin_width
+        Edge of the bins, widened in the tails (`Diagram.thinned`); 0 compares the points as they are. On published
+        fields and their masks (distances of 0.4 to 7), bins of 1, 2 and 3 changed a distance by at most 0.01, 0.03 and
+        0.1.
+
+    Raises
+    ------
+    ValueError
+        If a diagram is empty, the units differ, or a parameter is out of range.
+    """
+    first, second = comparable([a, b], blur, reach, bin_width)
+    if find_spec("geomloss") is None:
+        return float(one_to_many(first, [second], blur=blur, reach=reach, bin_width=0)[0])
+    tensors = (torch.from_numpy(part) for d in (first, second) for part in (d.points, d.weights))
+    with torch.no_grad():
+        return math.sqrt(max(0.0, float(sinkhorn_divergence(*tensors, blur=blur, reach=reach))))
+
+
+def sinkhorn_divergence(
+    points_a: Tensor, weights_a: Tensor, points_b: Tensor, weights_b: Tensor, *, blur: float, reach: float | None
+) -> Tensor:
+    """Return the debiased unbalanced Sinkhorn divergence of two measures, cost ½|x - y|²: a scalar tensor.
+
+    Its square root is `wasserstein`; descend the divergence itself, as the root's slope is infinite at 0. It is
+    differentiable once in points and weights. The gradient is geomloss's, that of the last step with the potentials
+    before it held, which would be exact at convergence (unbalanced: to blur² / 2 reach² of it). The steps stop short of
+    that, so that the gradient leads down but its length may differ from the value's own slope by a third.
+
+    Parameters
+    ----------
+    points_a, points_b
+        `(N, 2)` and `(M, 2)`, of one floating-point type. Differences of near measures want float64.
+    weights_a, weights_b
+        `(N,)` and `(M,)`, of at least 0, each with a total of 1.
+    blur, reach
+        As `wasserstein` takes them, in the points' unit.
+    """
+    boxes = [points[weights > 0].detach().float().double().cpu().numpy() for points, weights in
+             ((points_a, weights_a), (points_b, weights_b))]  # fmt: skip
+    falls = halvings(np.ptp(np.concatenate(boxes), axis=0), blur)
+    diameter = blur * 2.0 ** (float(falls) - 0.5)
+    SamplesLoss = require("geomloss", "infer", "a divergence with a gradient").SamplesLoss
+    loss = SamplesLoss("sinkhorn", p=2, blur=blur, reach=reach, diameter=diameter, debias=True, backend="tensorized")
+    with torch.set_grad_enabled(torch.is_grad_enabled()):  # geomloss leaves it switched on
+        return loss(weights_a, points_a, weights_b, points_b)
+
+
+def comparable(diagrams: Sequence[Diagram], blur: float, reach: float | None, bin_width: float) -> list[Diagram]:
+    """Return the diagrams as distances take them: of total weight 1, in bins.
+
+    Raises
+    ------
+    ValueError
+        As `wasserstein`.
+    """
+    if not blur > 0 or not (reach is None or reach > 0) or bin_width < 0:
+        raise ValueError(f"expected positive blur and reach, got blur {blur}, reach {reach}, bin width {bin_width}")
+    for other in diagrams:
+        if other.unit != diagrams[0].unit:
+            raise ValueError(f"expected diagrams in one unit, got {diagrams[0].unit} and {other.unit}")
+    whole = (diagram.normalised for diagram in diagrams)
+    return [each.thinned(bin_width, TAIL_SHARE) if bin_width else each for each in whole]
+
+
+def sliced_embedding(diagram: Diagram, directions: int = 12, quantiles: int = 24) -> np.ndarray:
+    """Return quantiles of a diagram's projections on lines through the origin, `(directions · quantiles,)`.
+
+    Scaled so that the Euclidean distance of two embeddings is their sliced W₂, the mean over directions of the squared
+    one-dimensional distances: |s| / √2 for a shift by s, as in `wasserstein`.
+    """
+    whole = diagram.normalised
+    angles = np.pi * np.arange(directions) / directions
+    levels = (np.arange(quantiles) + 0.5) / quantiles
+    lines = whole.points @ np.stack([np.cos(angles), np.sin(angles)])
+    rows = []
+    for values in lines.T:
+        order = np.argsort(values, kind="stable")
+        reached = np.cumsum(whole.weights[order]) - whole.weights[order] / 2
+        rows.append(np.interp(levels, reached, values[order]))
+    return np.concatenate(rows) / math.sqrt(directions * quantiles)
+
+
+class Measures(NamedTuple):
+    """N weighted point sets, one after another, in float32: number i is rows bounds[i] to bounds[i + 1] of `x`, `y` and
+    `log2` (of the weights); `low` and `high` are the corners of its box `(N, 2)`."""
+
+    x: np.ndarray
+    y: np.ndarray
+    log2: np.ndarray
+    bounds: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+def packed(points: Sequence[np.ndarray], weights: Sequence[np.ndarray]) -> Measures:
+    """Pack point sets `(n, 2)` with weights `(n,)`, some of each above 0; points without weight are left out."""
+    heavy = [w > 0 for w in weights]
+    points = [p[k].astype(np.float32) for p, k in zip(points, heavy, strict=True)]
+    flat = np.concatenate([np.empty((0, 2), np.float32), *points])
+    log2 = np.concatenate([np.empty(0), *(np.log2(w[k]) for w, k in zip(weights, heavy, strict=True))])
+    low, high = (np.array([end(p, axis=0) for p in points], np.float64).reshape(-1, 2) for end in (np.min, np.max))
+    bounds = np.cumsum([0, *map(len, points)])
+    x, y = np.ascontiguousarray(flat.T)
+    return Measures(x, y, log2.astype(np.float32), bounds, low, high)
+
+
+def halvings(size: np.ndarray, blur: float) -> np.ndarray:
+    """Return n, the times that √ε halves: blur · 2^(n - ½) is the least such diameter that holds boxes of `size`.
+
+    Parameters
+    ----------
+    size
+        Edges of the box that holds both measures of a pair, `(…, 2)`.
+    """
+    diameter = np.maximum(np.hypot(size[..., 0], size[..., 1]), blur)
+    return np.ceil(np.log2(diameter / blur) + 0.5).astype(np.int64)
+
+
+def pair_halvings(measures: Measures, first: np.ndarray, second: np.ndarray, blur: float) -> np.ndarray:
+    """Return `halvings` of the box that holds both measures of each pair, `(K,)`."""
+    high = np.maximum(measures.high[first], measures.high[second])
+    return halvings(high - np.minimum(measures.low[first], measures.low[second]), blur)
+
+
+def costs(
+    measures: Measures,
+    first: np.ndarray,
+    second: np.ndarray,
+    falls: np.ndarray,
+    *,
+    blur: float,
+    reach: float | None,
+    device: torch.device | str = "cpu",
+) -> np.ndarray:
+    """Return the entropic, unbalanced cost OT_ε of each pair of measures, ½|x - y|² a unit moved, `(K,)` float64.
+
+    The debiased divergence is the pair's cost less half of each measure's with itself (Séjourné et al. 2019).
+
+    Parameters
+    ----------
+    first, second
+        Numbers of the measures of each pair, `(K,)`.
+    falls
+        How often √ε halves for each pair, `(K,)`: see `halvings`.
+    blur, reach
+        √ε at the end, and √ρ of the penalty on what is not moved, in the points' unit; no reach moves everything.
+    device
+        `"cpu"` takes numba's loops on its threads, any other one batches of tensors there.
+    """
+    first, second = (np.asarray(numbers, dtype=np.int64) for numbers in (first, second))
+    ε, shares = schedule(falls, blur)
+    ρ = math.inf if reach is None else reach**2
+    if torch.device(device).type != "cpu":
+        return batched(measures, first, second, ε, shares, ρ, device)
+    values = np.empty(len(first))
+    threads.start()
+    _costs(measures, first, second, ε, shares, ρ, values)
+    return values
+
+
+def batched(measures: Measures, first, second, ε: np.ndarray, shares: np.ndarray, ρ: float, device) -> np.ndarray:
+    """Return the costs by torch, several pairs at a time, each padded to the batch's largest by weightless points."""
+    values = np.empty(len(first))
+    for pairs, size in _batches(np.diff(measures.bounds), first, second):
+        (x, log_a), (y, log_b) = (_padded(measures, numbers[pairs], size, device) for numbers in (first, second))
+        cost = (x[:, :, None] - y[:, None]).square_().sum(-1) / 2
+        f, g = torch.zeros_like(log_a), torch.zeros_like(log_b)
+        for εs, keep in zip(ε[pairs].T, shares[pairs].T, strict=True):
+            step, keep = (torch.tensor(v, dtype=f.dtype, device=device)[:, None] for v in (εs, keep))
+            damping, scaled = step / (1 + step / ρ), cost / step[..., None]
+            to_f = -damping * torch.logsumexp((log_b + g / step)[:, None] - scaled, 2)
+            to_g = -damping * torch.logsumexp((log_a + f / step)[:, :, None] - scaled, 1)
+            f, g = keep * f + (1 - keep) * to_f, keep * g + (1 - keep) * to_g
+        value = _dual(log_a, f, ε[0, -1], ρ) + _dual(log_b, g, ε[0, -1], ρ)
+        values[pairs] = value.cpu().numpy()
+    return values
+
+
+def schedule(falls: np.ndarray, blur: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return ε of every step of every pair, and the share of its potentials that a step keeps, `(K, T)`: 1 before a
+    pair begins, 0 at its first step and its last, ½ between."""
+    falls = np.asarray(falls, dtype=np.int64)[:, None]
+    steps = falls + 4
+    longest = int(steps.max(initial=0))
+    place = np.arange(longest) - (longest - steps)
+    ε = np.where(place >= falls + 2, blur**2, (blur * 2.0 ** (falls - 0.5 - np.maximum(place - 2, 0))) ** 2)
+    ends = (place == 0) | (place == steps - 1)
+    return ε, np.where(ends, 0.0, np.where(place < 0, 1.0, 0.5))
+
+
+def _batches(sizes: np.ndarray, first: np.ndarray, second: np.ndarray) -> Iterator[tuple[np.ndarray, int]]:
+    """Yield pairs of like size, and the size that all their measures are padded to."""
+    larger = np.maximum(sizes[first], sizes[second])
+    order = np.argsort(-larger, kind="stable")
+    start = 0
+    while start < len(order):
+        size = int(larger[order[start]])
+        end = start + max(1, _ENTRIES // size**2)
+        yield order[start:end], size
+        start = end
+
+
+def _padded(measures: Measures, numbers: np.ndarray, size: int, device) -> tuple[Tensor, Tensor]:
+    """Return points `(B, size, 2)` and natural logarithms of their weights `(B, size)`."""
+    start, count = measures.bounds[numbers], np.diff(measures.bounds)[numbers]
+    place = np.arange(size)
+    real = place < count[:, None]
+    rows = start[:, None] + np.where(real, place, 0)
+    points = np.stack([measures.x[rows], measures.y[rows]], axis=-1)
+    logs = np.where(real, measures.log2[rows] * np.float32(_LN2), -np.inf)
+    return torch.from_numpy(points).to(device), torch.from_numpy(logs.astype(np.float32)).to(device)
+
+
+def _dual(log_weights: Tensor, potentials: Tensor, ε: float, ρ: float) -> Tensor:
+    """Return the potentials' part of the cost, `(B,)`: ∑ a (ρ + ε/2) (1 - exp(-f/ρ)), or ∑ a f where all is moved."""
+    weights, f = log_weights.double().exp(), potentials.double()
+    return (weights * (f if math.isinf(ρ) else -(ρ + ε / 2) * torch.expm1(-f / ρ))).sum(1)
+
+
+@njit(**_PARALLEL)
+def _costs(measures, first, second, ε, shares, ρ, values):
+    """Write the cost of every pair into `values`."""
+    for k in prange(len(first)):
+        a, b = _points(measures, first[k]), _points(measures, second[k])
+        values[k] = _cost(a, b, ε[k], shares[k], ρ)
+
+
+@njit(**_SERIAL)
+def _points(measures, number):
+    """Return x, y and the weights' log2 of one measure."""
+    rows = slice(measures.bounds[number], measures.bounds[number + 1])
+    return measures.x[rows], measures.y[rows], measures.log2[rows]
+
+
+@njit(**_SERIAL)
+def _cost(a, b, ε, shares, ρ):
+    """Return the cost of one pair."""
+    (x, y, log_a), (X, Y, log_b) = a, b
+    n, m = len(x), len(X)
+    f, g = np.zeros(n), np.zeros(m)
+    F, G = np.empty(n, np.float32), np.empty(m, np.float32)
+    to_f, to_g = np.empty(n, np.float32), np.empty(m, np.float32)
+    for t in range(len(ε)):
+        if shares[t] == 1:
+            continue
+        unit = ε[t] * _LN2
+        h = np.float32(0.5 / unit)
+        for i in range(n):
+            F[i] = f[i] / unit + log_a[i]
+        for j in range(m):
+            G[j] = g[j] / unit + log_b[j]
+        here, there = (x, y, F), (X, Y, G)
+        _plan_sums(here, there, h, to_f, to_g)
+        _transformed(here, there, h, to_f)
+        _transformed(there, here, h, to_g)
+        moved = (1 - shares[t]) * unit / (1 + ε[t] / ρ)
+        for i in range(n):
+            f[i] = shares[t] * f[i] - moved * to_f[i]
+        for j in range(m):
+            g[j] = shares[t] * g[j] - moved * to_g[j]
+    return _part(log_a, f, ε[-1], ρ) + _part(log_b, g, ε[-1], ρ)
+
+
+@njit(**_SERIAL)
+def _plan_sums(here, there, h, rows, columns):
+    """Write the sums of the plan 2^(F + G - h d²) over its second and over its first index."""
+    (x, y, F), (X, Y, G) = here, there
+    columns[:] = _ZERO
+    for i in range(len(x)):
+        xi, yi, Fi = x[i], y[i], F[i]
+        total = _ZERO
+        for j in range(len(X)):
+            dx, dy = xi - X[j], yi - Y[j]
+            part = _exp2(Fi + G[j] - h * (dx * dx + dy * dy))
+            total += part
+            columns[j] += part
+        rows[i] = total
+
+
+@njit(**_SERIAL)
+def _transformed(here, there, h, sums):
+    """Write log2 ∑ 2^(G - h d²) of every row in place of the sums over the plan's rows."""
+    x, y, F = here
+    for i in range(len(x)):
+        if _LEAST < sums[i] < _MOST:
+            sums[i] = np.log2(sums[i]) - F[i]
+        else:
+            sums[i] = _log_sum(x[i], y[i], there, h)
+
+
+@njit(**_SERIAL)
+def _log_sum(x, y, there, h):
+    """Return log2 ∑ 2^(G - h d²) of one row, with its largest term taken out."""
+    X, Y, G = there
+    top = np.float32(-np.inf)
+    for j in range(len(X)):
+        dx, dy = x - X[j], y - Y[j]
+        top = max(top, G[j] - h * (dx * dx + dy * dy))
+    total = _ZERO
+    for j in range(len(X)):
+        dx, dy = x - X[j], y - Y[j]
+        total += _exp2(G[j] - h * (dx * dx + dy * dy) - top)
+    return top + np.log2(total)
+
+
+@njit(inline="always")
+def _exp2(t):
+    """Return 2^t in float32 to 3e-7 of itself: a polynomial, and the whole part put into the exponent's bits."""
+    t = min(max(t, _LOW), _HIGH)
+    whole = np.rint(t)
+    r = t - whole
+    value = _ONE + r * (_C1 + r * (_C2 + r * (_C3 + r * (_C4 + r * _C5))))
+    return value * np.int32((np.int32(whole) + np.int32(127)) << np.int32(23)).view(np.float32)
+
+
+@njit(**_SERIAL)
+def _part(log_weights, f, ε, ρ):
+    """Return `_dual` of one measure."""
+    total = 0.0
+    for i in range(len(f)):
+        value = f[i] if np.isinf(ρ) else -(ρ + ε / 2) * math.expm1(-f[i] / ρ)
+        total += 2.0 ** np.float64(log_weights[i]) * value
+    return total

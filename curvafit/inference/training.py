@@ -1,0 +1,357 @@
+"""Train a posterior, with the emulator that it holds, on a table of descriptors."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from curvafit.core.checks import check_int, seed_of
+from curvafit.core.runtime import Progress, silent
+from curvafit.inference.emulator import FAINTEST, Emulator, Layer, misfits
+from curvafit.inference.posterior import MASS, MOST, Architecture, Member, Posterior
+from curvafit.inference.table import PARAMETERS, Compression, Table, compression_of
+
+#: Part of the shapes, of all of whose views a member learns nothing: they tell when it has learnt enough.
+VALIDATION = 0.1
+#: How much steep lines of the mass are shunned, in rows.
+RIDGE = 3.0
+#: Most steps of a flow, which bound the time that a large table takes.
+STEPS = 12_000
+#: Part of the time that the emulator takes.
+EMULATOR_PART = 0.2
+#: Networks of the mean, of which each leaves out another part of the shapes, and of the deviations.
+FOLDS = 5
+#: Widths of the hidden layers.
+HIDDEN = (96, 96)
+#: Most rows of a view whose misfits are kept.
+REFERENCE = 400
+#: Least and most rows of a step, and steps that an epoch has between the two.
+BATCH, PACE = (64, 512), 100
+#: Largest norm of a step's gradient.
+STEEPEST = 5.0
+
+Network = TypeVar("Network", bound=nn.Module)
+
+
+class Plan(NamedTuple):
+    """First step length, weight decay, most epochs, and epochs without a better validation."""
+
+    rate: float
+    decay: float
+    epochs: int
+    patience: int
+
+
+class Plans(NamedTuple):
+    """How the flows of a posterior learn, and how the networks of its emulator do."""
+
+    flows: Plan = Plan(1e-3, 1e-3, 300, 20)
+    emulator: Plan = Plan(3e-3, 1e-2, 200, 15)
+
+
+PLANS = Plans()
+
+
+def train_posterior(
+    table: Table,
+    architecture: Architecture | None = None,
+    *,
+    members: int = 4,
+    seed: int = 0,
+    plans: Plans | None = None,
+    progress: Progress = silent,
+) -> Posterior:
+    """Fit an ensemble of flows to the parameters of a table's rows, and an emulator to the descriptors.
+
+    Of 423 shapes left out in fifths, seen as masks, it reads R² .66 on average: one flow .64, four with twice the
+    dropout .65 (and m₀'s intervals too wide), Gaussian processes .67; flows for masks alone read .01 less.
+
+    Each member starts from other weights, and stops where the likelihood of its own tenth of the shapes, which it does
+    not learn from, is highest: all views of a shape are on one side.
+
+    Parameters
+    ----------
+    table
+        Rows without a surface are left out.
+    architecture
+        Sizes of the flows.
+    members
+        Number of flows.
+    plans
+        How long and how fast networks learn; by default `PLANS`.
+    progress
+        Called after each epoch with a sentence and the share of the epochs that are done at most.
+
+    Raises
+    ------
+    ValueError
+        If the table has too few shapes, or a parameter that does not vary, or an argument is out of range.
+    """
+    members, seed = check_int(members, "a number of flows", 1, MOST), seed_of(seed)
+    sizes, table = architecture or Architecture(), table.visible
+    shapes, number = np.unique(table.shapes, return_inverse=True)
+    if len(shapes) < 2 * sizes.components:
+        raise ValueError(f"expected at least {2 * sizes.components} shapes to train on, got {len(shapes)}")
+    views = tuple(sorted(set(table.views.tolist())))
+    box = np.stack([table.parameters.min(0), table.parameters.max(0)], axis=1)
+    if fixed := [name for name, (low, high) in zip(PARAMETERS, box, strict=True) if low == high]:
+        raise ValueError(f"expected shapes whose parameters all vary, got {', '.join(fixed)} the same in all")
+    compression = compression_of(table.descriptors, sizes.components, sizes.blocks)
+    part = EMULATOR_PART
+
+    def first(text: str, share: float) -> None:
+        progress(text, part * share)
+
+    plans = plans or PLANS
+    emulator, left = train_emulator(table, compression, box, seed=seed, plan=plans.emulator, progress=first)
+    posterior = Posterior(
+        sizes, (), compression, views, box, np.zeros(len(PARAMETERS)), np.ones(len(PARAMETERS)), emulator, left,
+        _provenance(table, len(shapes), members, seed),
+    )  # fmt: skip
+    free = posterior.unbounded(table.parameters)
+    centre, spread = free.mean(0), free.std(0)
+    target = torch.from_numpy((free - centre) / spread).float()
+    context = posterior.context(table.descriptors, table.views)
+    flows = []
+    for k in range(members):
+        rng = np.random.default_rng([seed, k])
+        holdout = rng.permutation(len(shapes))[: max(1, round(VALIDATION * len(shapes)))]
+        validation = torch.from_numpy(np.isin(number, holdout))
+
+        def report(text: str, share: float, k: int = k) -> None:
+            """Say how far a member is, as part of them all."""
+            progress(f"member {k + 1} of {members}: {text}", part + (1 - part) * (k + share) / members)
+
+        with torch.random.fork_rng():
+            torch.manual_seed(int(rng.integers(2**31)))
+            flows.append(_fit(Member(sizes, len(views)), context, target, validation, plans.flows, report))
+    return dataclasses.replace(posterior, members=tuple(flows), centre=centre, spread=spread)
+
+
+def _fit(member: Member, context: Tensor, target: Tensor, validation: Tensor, plan: Plan, progress: Progress) -> Member:
+    """Fit a flow to all rows but those of a mask, and return it as it was where the likelihood of those was highest."""
+    _draw_lines(member, context[~validation], target[~validation, MASS])
+    rows = int((~validation).sum())
+    epochs = min(plan.epochs, STEPS * batch_of(rows) // rows + 1)
+
+    def report(epoch: int, best: float) -> None:
+        """Say which epoch has ended."""
+        progress(f"epoch {epoch}, {best:.3f} nats", epoch / epochs)
+
+    return learn(member, (context, target), validation, _nats, plan._replace(epochs=epochs), report)
+
+
+def _draw_lines(member: Member, context: Tensor, mass: Tensor) -> None:
+    """Give a flow the straight lines, one for each view, that the mass is nearest to, and its deviations from them."""
+    for view in range(len(member.width)):
+        mine = context[:, view - len(member.width)] == 1
+        x, y = context[mine].double(), mass[mine].double()
+        slope = torch.linalg.solve(x.T @ x + RIDGE * torch.eye(x.shape[1]), x.T @ y)
+        member.slope[view], member.width[view] = slope, (y - x @ slope).std()
+
+
+def _nats(member: Member, context: Tensor, target: Tensor) -> Tensor:
+    """Return the mean negative logarithm of the density of parameters."""
+    return -member(context).log_prob(target).mean()
+
+
+def _provenance(table: Table, shapes: int, members: int, seed: int) -> dict[str, Any]:
+    """Return what a posterior's file says of its training."""
+    return {"table": table.provenance, "shapes": shapes, "rows": len(table), "members": members, "seed": seed}
+
+
+class Trained(NamedTuple):
+    """An emulator, and by view what it leaves unexplained of shapes that its networks did not learn from: sums of
+    squares, of `REFERENCE` rows at most, as `emulator.misfits` has them."""
+
+    emulator: Emulator
+    misfits: dict[str, np.ndarray]
+
+
+def train_emulator(
+    table: Table,
+    compression: Compression,
+    box: np.ndarray,
+    *,
+    seed: int = 0,
+    plan: Plan = PLANS.emulator,
+    progress: Progress = silent,
+) -> Trained:
+    """Fit networks to the compressed descriptors of a table's rows, given their parameters, and others to the
+    deviations of what the first miss of shapes that they did not learn from.
+
+    Of 424 shapes left out in fifths, seen as masks, a quarter of the components' variance is missed; of cubic
+    polynomials .37, of Gaussian processes .39.
+    """
+    views = tuple(sorted(set(table.views.tolist())))
+    target = compression(table.descriptors)
+    shapes, number = np.unique(table.shapes, return_inverse=True)
+    part = np.random.default_rng(seed).permutation(len(shapes))[number] % FOLDS
+    none = (Layer(np.zeros((1, 1, 1)), np.zeros((1, 1))),)
+    blank = Emulator(compression, views, box, none, none, np.eye(target.shape[1]), 1.0)
+    inputs = np.empty((len(table), 6 + len(views)))
+    for view in views:
+        mine = table.views == view
+        inputs[mine] = blank.inputs(table.parameters[mine], view)
+    x, y = torch.from_numpy(inputs).float(), torch.from_numpy(target).float()
+
+    def told(first: float) -> Callable[[int], Progress]:
+        return lambda k: lambda text, share: progress(f"emulator, {text}", first + (k + share) / FOLDS / 2)
+
+    means = _ensemble(x, y, part, _squares, plan, seed, told(0.0))
+    missed = y - _apart(means, x, part)
+    values, vectors = np.linalg.eigh(np.cov(missed.double().numpy().T))
+    basis = (vectors / np.sqrt(np.maximum(values, 1e-9 * values.max()))).T[::-1].astype(np.float32)
+    whitened = missed @ torch.from_numpy(basis).T
+    spreads = _ensemble(x, whitened, part, _normal_nats, plan, seed, told(0.5))
+    deviation = torch.exp(_apart(spreads, x, part)).clamp(min=FAINTEST)
+    emulator = Emulator(compression, views, box, _layers(means), _layers(spreads), basis, 1.0)
+    left = (whitened / deviation).double().numpy()
+    emulator = dataclasses.replace(emulator, inflation=_inflation(emulator, table, left))
+    rows = [[np.flatnonzero((table.views == view) & (part == k)) for k in range(FOLDS)] for view in views]
+    least = min(REFERENCE // FOLDS, *(len(each) for parts in rows for each in parts))
+    if not least:
+        raise ValueError(f"expected many shapes in each of the views {', '.join(views)}, got few in one")
+    left = [[_misfits(emulator, k, table.rows(parts[k][:least])) for k in range(FOLDS)] for parts in rows]
+    return Trained(emulator, {view: np.sort(np.concatenate(each)) for view, each in zip(views, left, strict=True)})
+
+
+def _misfits(emulator: Emulator, number: int, rows: Table) -> np.ndarray:
+    """Return what one network, which did not learn from them, leaves unexplained of rows of one view."""
+    mean, spread = (
+        tuple(Layer(*(each[number : number + 1] for each in layer)) for layer in layers)
+        for layers in (emulator.mean, emulator.spread)
+    )
+    apart = dataclasses.replace(emulator, mean=mean, spread=spread)
+    return misfits(apart, rows.descriptors, str(rows.views[0]), rows.parameters[:, None])
+
+
+def _inflation(emulator: Emulator, table: Table, left: np.ndarray) -> float:
+    """Return the mean square of what is left along the directions of the parameters, each as firm as it is with a prior
+    of deviation 1, over what it would be if all that is left were uncorrelated."""
+    squared, expected = 0.0, 0.0
+    for view in emulator.views:
+        mine = table.views == view
+        slopes = emulator.slopes(table.parameters[mine], view)
+        pulls = np.einsum("nkd,nk->nd", slopes, left[mine])
+        firmness = np.einsum("nkd,nke->nde", slopes, slopes)
+        covariance = np.linalg.inv(firmness + np.eye(len(PARAMETERS)))
+        squared += np.einsum("nd,nde,ne->", pulls, covariance, pulls)
+        expected += np.einsum("nde,ned->", covariance, firmness)
+    return float(squared / expected)
+
+
+def _squares(network: nn.Module, x: Tensor, target: Tensor) -> Tensor:
+    """Return the mean square of what a network's outputs miss."""
+    return (network(x) - target).square().mean()
+
+
+def _normal_nats(network: nn.Module, x: Tensor, target: Tensor) -> Tensor:
+    """Return the mean negative logarithm of normal densities whose deviations' logarithms are a network's outputs."""
+    output = network(x).clamp(min=float(np.log(FAINTEST)))
+    return (0.5 * (target * torch.exp(-output)).square() + output).mean()
+
+
+def _ensemble(
+    x: Tensor,
+    y: Tensor,
+    part: np.ndarray,
+    cost: Callable[[nn.Module, Tensor, Tensor], Tensor],
+    plan: Plan,
+    seed: int,
+    progress: Callable[[int], Progress],
+) -> list[nn.Sequential]:
+    """Return networks; each learns until its own part of the rows, which it does not learn from, is fit best."""
+    networks = []
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        for k in range(FOLDS):
+            network, own = _network(x.shape[1], y.shape[1]), torch.from_numpy(part == k)
+            networks.append(learn(network, (x, y), own, cost, plan, _epochs(progress(k), plan.epochs)))
+    return networks
+
+
+def _epochs(progress: Progress, epochs: int) -> Callable[[int, float], None]:
+    """Return what reports epochs as progress."""
+    return lambda epoch, _: progress(f"epoch {epoch}", epoch / epochs)
+
+
+def _network(inputs: int, outputs: int) -> nn.Sequential:
+    """Return a network as it is before it learns."""
+    sizes = (inputs, *HIDDEN)
+    layers = [layer for n, m in zip(sizes, HIDDEN, strict=False) for layer in (nn.Linear(n, m), nn.SiLU())]
+    return nn.Sequential(*layers, nn.Linear(HIDDEN[-1], outputs))
+
+
+def _apart(networks: list[nn.Sequential], x: Tensor, part: np.ndarray) -> Tensor:
+    """Return each row's outputs by the network that did not learn from it."""
+    with torch.no_grad():
+        outputs = torch.stack([network(x) for network in networks])
+    return outputs[torch.from_numpy(part), torch.arange(len(x))]
+
+
+def _layers(networks: list[nn.Sequential]) -> tuple[Layer, ...]:
+    """Return the weights of networks, stacked."""
+    linear = [[layer for layer in network if isinstance(layer, nn.Linear)] for network in networks]
+    return tuple(
+        Layer(
+            np.stack([layer.weight.detach().numpy() for layer in level]),
+            np.stack([layer.bias.detach().numpy() for layer in level]),
+        )
+        for level in zip(*linear, strict=True)
+    )
+
+
+def batch_of(rows: int) -> int:
+    """Return how many rows of a table a step sees."""
+    return min(max(rows // PACE, BATCH[0]), BATCH[1])
+
+
+def learn(
+    network: Network,
+    rows: tuple[Tensor, Tensor],
+    validation: Tensor,
+    cost: Callable[[Network, Tensor, Tensor], Tensor],
+    plan: Plan,
+    report: Callable[[int, float], object],
+) -> Network:
+    """Fit a network to all rows but those of a mask, and return it as it was where those cost least.
+
+    Parameters
+    ----------
+    rows
+        Inputs and targets.
+    cost
+        Of the network, inputs and targets: the mean over rows.
+    report
+        Called with the number of each epoch, from 1, and the least cost so far.
+    """
+    optimiser = torch.optim.AdamW(network.parameters(), lr=plan.rate, weight_decay=plan.decay)
+    slower = torch.optim.lr_scheduler.ReduceLROnPlateau(optimiser, factor=0.5, patience=plan.patience // 3)
+    (x, y), apart = [each[~validation] for each in rows], [each[validation] for each in rows]
+    best, state, waited = np.inf, copy.deepcopy(network.state_dict()), 0
+    for epoch in range(plan.epochs):
+        network.train()
+        for chosen in torch.randperm(len(x)).split(batch_of(len(x))):
+            optimiser.zero_grad()
+            cost(network, x[chosen], y[chosen]).backward()
+            nn.utils.clip_grad_norm_(network.parameters(), STEEPEST)
+            optimiser.step()
+        network.eval()
+        with torch.no_grad():
+            value = float(cost(network, *apart))
+        slower.step(value)
+        waited = 0 if value < best else waited + 1
+        if value < best:
+            best, state = value, copy.deepcopy(network.state_dict())
+        report(epoch + 1, best)
+        if waited > plan.patience:
+            break
+    network.load_state_dict(state)
+    return network.eval()
