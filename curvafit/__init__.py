@@ -18,77 +18,33 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from curvafit.core.faces import offer
+from curvafit.core.faces import attach_lazy_names
 
 if TYPE_CHECKING:
-    from curvafit.generation.batch import generate_batch
-    from curvafit.generation.flow import descend, generate
-    from curvafit.generation.result import Flow
-    from curvafit.geometry.diagram import Diagram, diagram
-    from curvafit.geometry.distances import wasserstein
-    from curvafit.inference.fit import Fit
-    from curvafit.inference.infer import Inference, infer
-    from curvafit.priors.coefficients import Coefficients, preset
-    from curvafit.priors.grid import Grid
-    from curvafit.scan.measure import Measures, measure
-    from curvafit.segmentation.completion import reconstruct
-    from curvafit.segmentation.refine import refine
-    from curvafit.segmentation.result import Segmentation
-    from curvafit.segmentation.segment import segment
-    from curvafit.volumes.scan import Field, load, save
+    from curvafit.generation.batch import generate_batch as generate_batch
+    from curvafit.generation.flow import descend as descend
+    from curvafit.generation.flow import generate as generate
+    from curvafit.generation.result import Flow as Flow
+    from curvafit.geometry.diagram import Diagram as Diagram
+    from curvafit.geometry.diagram import diagram as diagram
+    from curvafit.geometry.distances import wasserstein as wasserstein
+    from curvafit.inference.fit import Fit as Fit
+    from curvafit.inference.infer import Inference as Inference
+    from curvafit.inference.infer import infer as infer
+    from curvafit.priors.coefficients import Coefficients as Coefficients
+    from curvafit.priors.coefficients import preset as preset
+    from curvafit.priors.grid import Grid as Grid
+    from curvafit.scan.measure import Measures as Measures
+    from curvafit.scan.measure import measure as measure
+    from curvafit.segmentation.completion import reconstruct as reconstruct
+    from curvafit.segmentation.refine import refine as refine
+    from curvafit.segmentation.result import Segmentation as Segmentation
+    from curvafit.segmentation.segment import segment as segment
+    from curvafit.volumes.scan import Field as Field
+    from curvafit.volumes.scan import load as load
+    from curvafit.volumes.scan import save as save
 
 __version__ = "0.1.0"
-
-__all__ = [
-    "Coefficients",
-    "Diagram",
-    "Field",
-    "Fit",
-    "Flow",
-    "Grid",
-    "Inference",
-    "Measures",
-    "Segmentation",
-    "__version__",
-    "descend",
-    "diagram",
-    "generate",
-    "generate_batch",
-    "infer",
-    "load",
-    "measure",
-    "preset",
-    "reconstruct",
-    "refine",
-    "save",
-    "segment",
-    "wasserstein",
-]
-
-_HOMES = {
-    "Coefficients": "curvafit.priors.coefficients",
-    "Diagram": "curvafit.geometry.diagram",
-    "Field": "curvafit.volumes.scan",
-    "Fit": "curvafit.inference.fit",
-    "Flow": "curvafit.generation.result",
-    "Grid": "curvafit.priors.grid",
-    "Inference": "curvafit.inference.infer",
-    "Measures": "curvafit.scan.measure",
-    "Segmentation": "curvafit.segmentation.result",
-    "descend": "curvafit.generation.flow",
-    "diagram": "curvafit.geometry.diagram",
-    "generate": "curvafit.generation.flow",
-    "generate_batch": "curvafit.generation.batch",
-    "infer": "curvafit.inference.infer",
-    "load": "curvafit.volumes.scan",
-    "measure": "curvafit.scan.measure",
-    "preset": "curvafit.priors.coefficients",
-    "reconstruct": "curvafit.segmentation.completion",
-    "refine": "curvafit.segmentation.refine",
-    "save": "curvafit.volumes.scan",
-    "segment": "curvafit.segmentation.segment",
-    "wasserstein": "curvafit.geometry.distances",
-}
 
 #: The function that draws each type with a picture, as `module:function`; see `curvafit.core.pictures`.
 _FIGURES = {
@@ -100,4 +56,4 @@ _FIGURES = {
     "Segmentation": "curvafit.segmentation.mask_files:segmentation_figure",
 }
 
-offer(__name__, _HOMES)
+attach_lazy_names(__name__)

@@ -1,26 +1,32 @@
-"""The face of a package: its public names, loaded at their first use."""
+"""The face of a room: its public names, each loaded at its first use."""
 
 from __future__ import annotations
 
+import ast
 import sys
-from collections.abc import Mapping
 from importlib import import_module
+from inspect import getsource
 from types import ModuleType
 from typing import Any
 
 
-def offer(package: str, homes: Mapping[str, str]) -> None:
-    """Let a package offer names of its modules; a module is imported at the first use of a name.
+def attach_lazy_names(package: str) -> None:
+    """Offer the names that a package imports under `if TYPE_CHECKING:`; each module is imported at their first use.
+
+    The imports stand once, as `from room.module import name as name`, where type checkers and editors read them; here
+    they are read from the source of the package's `__init__.py`.
 
     Parameters
     ----------
     package
         `__name__` of the package.
-    homes
-        The module of each name.
     """
     face = sys.modules[package]
-    face.__dict__["_homes"] = dict(homes)
+    blocks = (node for node in ast.parse(getsource(face)).body if isinstance(node, ast.If))
+    imports = [node for block in blocks for node in block.body if isinstance(node, ast.ImportFrom)]
+    homes = {alias.name: node.module for node in imports for alias in node.names if alias.asname == alias.name}
+    face.__dict__["_homes"] = homes
+    face.__dict__["__all__"] = sorted([*homes, *({"__version__"} & face.__dict__.keys())])
     face.__class__ = _Face
 
 

@@ -7,96 +7,39 @@ if __name__ != "curvafit.data_synth":
 
 from typing import TYPE_CHECKING
 
-from curvafit.core.faces import offer
+from curvafit.core.faces import attach_lazy_names
 
 if TYPE_CHECKING:
-    from curvafit.data_synth.atlas.build import build, extend
-    from curvafit.data_synth.atlas.design import INTERVALS, Design, Draw, around, boxed
-    from curvafit.data_synth.atlas.design_file import read_design
-    from curvafit.data_synth.atlas.record import Record, Settings
-    from curvafit.data_synth.atlas.store import Store, open_store
-    from curvafit.data_synth.atlas.workers import Cluster, cluster
-    from curvafit.data_synth.imaging.modalities import MODALITIES, modality
-    from curvafit.data_synth.imaging.modality import Modality
-    from curvafit.data_synth.imaging.parameters import (
-        Contrast,
-        Detector,
-        Illumination,
-        Imaging,
-        Noise,
-        Optics,
-        Specimen,
-    )
-    from curvafit.data_synth.labels.labels import Labels, labels_of
-    from curvafit.data_synth.sets.training import TextureDataset, as_dict, as_monai, as_subject
-    from curvafit.geometry.diagram import diagrams
+    from curvafit.data_synth.atlas.build import build as build
+    from curvafit.data_synth.atlas.build import extend as extend
+    from curvafit.data_synth.atlas.design import INTERVALS as INTERVALS
+    from curvafit.data_synth.atlas.design import Design as Design
+    from curvafit.data_synth.atlas.design import Draw as Draw
+    from curvafit.data_synth.atlas.design import around as around
+    from curvafit.data_synth.atlas.design import boxed as boxed
+    from curvafit.data_synth.atlas.design_file import read_design as read_design
+    from curvafit.data_synth.atlas.record import Record as Record
+    from curvafit.data_synth.atlas.record import Settings as Settings
+    from curvafit.data_synth.atlas.store import Store as Store
+    from curvafit.data_synth.atlas.store import open_store as open_store
+    from curvafit.data_synth.atlas.workers import Cluster as Cluster
+    from curvafit.data_synth.atlas.workers import cluster as cluster
+    from curvafit.data_synth.imaging.modalities import MODALITIES as MODALITIES
+    from curvafit.data_synth.imaging.modalities import modality as modality
+    from curvafit.data_synth.imaging.modality import Modality as Modality
+    from curvafit.data_synth.imaging.parameters import Contrast as Contrast
+    from curvafit.data_synth.imaging.parameters import Detector as Detector
+    from curvafit.data_synth.imaging.parameters import Illumination as Illumination
+    from curvafit.data_synth.imaging.parameters import Imaging as Imaging
+    from curvafit.data_synth.imaging.parameters import Noise as Noise
+    from curvafit.data_synth.imaging.parameters import Optics as Optics
+    from curvafit.data_synth.imaging.parameters import Specimen as Specimen
+    from curvafit.data_synth.labels.labels import Labels as Labels
+    from curvafit.data_synth.labels.labels import labels_of as labels_of
+    from curvafit.data_synth.sets.training import TextureDataset as TextureDataset
+    from curvafit.data_synth.sets.training import as_dict as as_dict
+    from curvafit.data_synth.sets.training import as_monai as as_monai
+    from curvafit.data_synth.sets.training import as_subject as as_subject
+    from curvafit.geometry.diagram import diagrams as diagrams
 
-__all__ = [
-    "INTERVALS",
-    "MODALITIES",
-    "Cluster",
-    "Contrast",
-    "Design",
-    "Detector",
-    "Draw",
-    "Illumination",
-    "Imaging",
-    "Labels",
-    "Modality",
-    "Noise",
-    "Optics",
-    "Record",
-    "Settings",
-    "Specimen",
-    "Store",
-    "TextureDataset",
-    "around",
-    "as_dict",
-    "as_monai",
-    "as_subject",
-    "boxed",
-    "build",
-    "cluster",
-    "diagrams",
-    "extend",
-    "labels_of",
-    "modality",
-    "open_store",
-    "read_design",
-]
-
-_HOMES = {
-    "Cluster": "curvafit.data_synth.atlas.workers",
-    "Contrast": "curvafit.data_synth.imaging.parameters",
-    "Design": "curvafit.data_synth.atlas.design",
-    "Detector": "curvafit.data_synth.imaging.parameters",
-    "Draw": "curvafit.data_synth.atlas.design",
-    "INTERVALS": "curvafit.data_synth.atlas.design",
-    "Illumination": "curvafit.data_synth.imaging.parameters",
-    "Imaging": "curvafit.data_synth.imaging.parameters",
-    "Labels": "curvafit.data_synth.labels.labels",
-    "MODALITIES": "curvafit.data_synth.imaging.modalities",
-    "Modality": "curvafit.data_synth.imaging.modality",
-    "Noise": "curvafit.data_synth.imaging.parameters",
-    "Optics": "curvafit.data_synth.imaging.parameters",
-    "Record": "curvafit.data_synth.atlas.record",
-    "Settings": "curvafit.data_synth.atlas.record",
-    "Specimen": "curvafit.data_synth.imaging.parameters",
-    "Store": "curvafit.data_synth.atlas.store",
-    "TextureDataset": "curvafit.data_synth.sets.training",
-    "around": "curvafit.data_synth.atlas.design",
-    "as_dict": "curvafit.data_synth.sets.training",
-    "as_monai": "curvafit.data_synth.sets.training",
-    "as_subject": "curvafit.data_synth.sets.training",
-    "boxed": "curvafit.data_synth.atlas.design",
-    "build": "curvafit.data_synth.atlas.build",
-    "cluster": "curvafit.data_synth.atlas.workers",
-    "diagrams": "curvafit.geometry.diagram",
-    "extend": "curvafit.data_synth.atlas.build",
-    "labels_of": "curvafit.data_synth.labels.labels",
-    "modality": "curvafit.data_synth.imaging.modalities",
-    "open_store": "curvafit.data_synth.atlas.store",
-    "read_design": "curvafit.data_synth.atlas.design_file",
-}
-
-offer(__name__, _HOMES)
+attach_lazy_names(__name__)

@@ -4,35 +4,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from curvafit.core.faces import offer
+from curvafit.core.faces import attach_lazy_names
 
 if TYPE_CHECKING:
-    from curvafit.drawing.plot import diagram_figure, slice_figure, surface_figure, write_picture
-    from curvafit.drawing.render import View, render, view
-    from curvafit.drawing.shapes import write_field, write_shape
+    from curvafit.drawing.plot import diagram_figure as diagram_figure
+    from curvafit.drawing.plot import slice_figure as slice_figure
+    from curvafit.drawing.plot import surface_figure as surface_figure
+    from curvafit.drawing.plot import write_picture as write_picture
+    from curvafit.drawing.render import View as View
+    from curvafit.drawing.render import render as render
+    from curvafit.drawing.render import view as view
+    from curvafit.drawing.shapes import write_field as write_field
+    from curvafit.drawing.shapes import write_shape as write_shape
 
-__all__ = [
-    "View",
-    "diagram_figure",
-    "render",
-    "slice_figure",
-    "surface_figure",
-    "view",
-    "write_field",
-    "write_picture",
-    "write_shape",
-]
-
-_HOMES = {
-    "View": "curvafit.drawing.render",
-    "diagram_figure": "curvafit.drawing.plot",
-    "render": "curvafit.drawing.render",
-    "slice_figure": "curvafit.drawing.plot",
-    "surface_figure": "curvafit.drawing.plot",
-    "view": "curvafit.drawing.render",
-    "write_field": "curvafit.drawing.shapes",
-    "write_picture": "curvafit.drawing.plot",
-    "write_shape": "curvafit.drawing.shapes",
-}
-
-offer(__name__, _HOMES)
+attach_lazy_names(__name__)

@@ -7,49 +7,22 @@ if __name__ != "curvafit.generation":
 
 from typing import TYPE_CHECKING
 
-from curvafit.core.faces import offer
+from curvafit.core.faces import attach_lazy_names
 
 if TYPE_CHECKING:
-    from curvafit.generation.batch import generate_batch
-    from curvafit.generation.data import Data, Evidence, Hinge
-    from curvafit.generation.flow import descend, generate, relax
-    from curvafit.generation.initial import white_noise
-    from curvafit.generation.result import Flow, History, State
-    from curvafit.generation.schedule import SCHEDULES, Schedule
-    from curvafit.generation.viability import Viability
+    from curvafit.generation.batch import generate_batch as generate_batch
+    from curvafit.generation.data import Data as Data
+    from curvafit.generation.data import Evidence as Evidence
+    from curvafit.generation.data import Hinge as Hinge
+    from curvafit.generation.flow import descend as descend
+    from curvafit.generation.flow import generate as generate
+    from curvafit.generation.flow import relax as relax
+    from curvafit.generation.initial import white_noise as white_noise
+    from curvafit.generation.result import Flow as Flow
+    from curvafit.generation.result import History as History
+    from curvafit.generation.result import State as State
+    from curvafit.generation.schedule import SCHEDULES as SCHEDULES
+    from curvafit.generation.schedule import Schedule as Schedule
+    from curvafit.generation.viability import Viability as Viability
 
-__all__ = [
-    "SCHEDULES",
-    "Data",
-    "Evidence",
-    "Flow",
-    "Hinge",
-    "History",
-    "Schedule",
-    "State",
-    "Viability",
-    "descend",
-    "generate",
-    "generate_batch",
-    "relax",
-    "white_noise",
-]
-
-_HOMES = {
-    "Data": "curvafit.generation.data",
-    "Evidence": "curvafit.generation.data",
-    "Flow": "curvafit.generation.result",
-    "Hinge": "curvafit.generation.data",
-    "History": "curvafit.generation.result",
-    "SCHEDULES": "curvafit.generation.schedule",
-    "Schedule": "curvafit.generation.schedule",
-    "State": "curvafit.generation.result",
-    "Viability": "curvafit.generation.viability",
-    "descend": "curvafit.generation.flow",
-    "generate": "curvafit.generation.flow",
-    "generate_batch": "curvafit.generation.batch",
-    "relax": "curvafit.generation.flow",
-    "white_noise": "curvafit.generation.initial",
-}
-
-offer(__name__, _HOMES)
+attach_lazy_names(__name__)

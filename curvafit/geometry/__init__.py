@@ -4,96 +4,37 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from curvafit.core.faces import offer
+from curvafit.core.faces import attach_lazy_names
 
 if TYPE_CHECKING:
-    from curvafit.geometry.descriptors import Descriptors, descriptors
-    from curvafit.geometry.diagram import (
-        Diagram,
-        SurfaceCurvatures,
-        diagram,
-        diagrams,
-        family_of,
-        family_shares,
-        half_thickness,
-        surface_curvatures,
-    )
-    from curvafit.geometry.distances import one_to_many, pairwise, sinkhorn_divergence, sliced_embedding, wasserstein
-    from curvafit.geometry.mesh import (
-        NoSurface,
-        Surface,
-        areas,
-        capped_surface,
-        solid_surface,
-        surface,
-        volume,
-        write_surface,
-    )
-    from curvafit.geometry.morphometry import Morphometry, local_thickness, morphometry
-    from curvafit.geometry.topology import betti_numbers, components, euler_number
+    from curvafit.geometry.descriptors import Descriptors as Descriptors
+    from curvafit.geometry.descriptors import descriptors as descriptors
+    from curvafit.geometry.diagram import Diagram as Diagram
+    from curvafit.geometry.diagram import SurfaceCurvatures as SurfaceCurvatures
+    from curvafit.geometry.diagram import diagram as diagram
+    from curvafit.geometry.diagram import diagrams as diagrams
+    from curvafit.geometry.diagram import family_of as family_of
+    from curvafit.geometry.diagram import family_shares as family_shares
+    from curvafit.geometry.diagram import half_thickness as half_thickness
+    from curvafit.geometry.diagram import surface_curvatures as surface_curvatures
+    from curvafit.geometry.distances import one_to_many as one_to_many
+    from curvafit.geometry.distances import pairwise as pairwise
+    from curvafit.geometry.distances import sinkhorn_divergence as sinkhorn_divergence
+    from curvafit.geometry.distances import sliced_embedding as sliced_embedding
+    from curvafit.geometry.distances import wasserstein as wasserstein
+    from curvafit.geometry.mesh import NoSurface as NoSurface
+    from curvafit.geometry.mesh import Surface as Surface
+    from curvafit.geometry.mesh import areas as areas
+    from curvafit.geometry.mesh import capped_surface as capped_surface
+    from curvafit.geometry.mesh import solid_surface as solid_surface
+    from curvafit.geometry.mesh import surface as surface
+    from curvafit.geometry.mesh import volume as volume
+    from curvafit.geometry.mesh import write_surface as write_surface
+    from curvafit.geometry.morphometry import Morphometry as Morphometry
+    from curvafit.geometry.morphometry import local_thickness as local_thickness
+    from curvafit.geometry.morphometry import morphometry as morphometry
+    from curvafit.geometry.topology import betti_numbers as betti_numbers
+    from curvafit.geometry.topology import components as components
+    from curvafit.geometry.topology import euler_number as euler_number
 
-__all__ = [
-    "Descriptors",
-    "Diagram",
-    "Morphometry",
-    "NoSurface",
-    "Surface",
-    "SurfaceCurvatures",
-    "areas",
-    "betti_numbers",
-    "capped_surface",
-    "components",
-    "descriptors",
-    "diagram",
-    "diagrams",
-    "euler_number",
-    "family_of",
-    "family_shares",
-    "half_thickness",
-    "local_thickness",
-    "morphometry",
-    "one_to_many",
-    "pairwise",
-    "sinkhorn_divergence",
-    "sliced_embedding",
-    "solid_surface",
-    "surface",
-    "surface_curvatures",
-    "volume",
-    "wasserstein",
-    "write_surface",
-]
-
-_HOMES = {
-    "Descriptors": "curvafit.geometry.descriptors",
-    "Diagram": "curvafit.geometry.diagram",
-    "Morphometry": "curvafit.geometry.morphometry",
-    "NoSurface": "curvafit.geometry.mesh",
-    "Surface": "curvafit.geometry.mesh",
-    "SurfaceCurvatures": "curvafit.geometry.diagram",
-    "areas": "curvafit.geometry.mesh",
-    "betti_numbers": "curvafit.geometry.topology",
-    "capped_surface": "curvafit.geometry.mesh",
-    "components": "curvafit.geometry.topology",
-    "descriptors": "curvafit.geometry.descriptors",
-    "diagram": "curvafit.geometry.diagram",
-    "diagrams": "curvafit.geometry.diagram",
-    "euler_number": "curvafit.geometry.topology",
-    "family_of": "curvafit.geometry.diagram",
-    "family_shares": "curvafit.geometry.diagram",
-    "half_thickness": "curvafit.geometry.diagram",
-    "local_thickness": "curvafit.geometry.morphometry",
-    "morphometry": "curvafit.geometry.morphometry",
-    "one_to_many": "curvafit.geometry.distances",
-    "pairwise": "curvafit.geometry.distances",
-    "sinkhorn_divergence": "curvafit.geometry.distances",
-    "sliced_embedding": "curvafit.geometry.distances",
-    "solid_surface": "curvafit.geometry.mesh",
-    "surface": "curvafit.geometry.mesh",
-    "surface_curvatures": "curvafit.geometry.diagram",
-    "volume": "curvafit.geometry.mesh",
-    "wasserstein": "curvafit.geometry.distances",
-    "write_surface": "curvafit.geometry.mesh",
-}
-
-offer(__name__, _HOMES)
+attach_lazy_names(__name__)

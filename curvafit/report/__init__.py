@@ -4,24 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from curvafit.core.faces import offer
+from curvafit.core.faces import attach_lazy_names
 
 if TYPE_CHECKING:
-    from curvafit.report.page import report_html, write_inference, write_report
-    from curvafit.report.wording import describe
+    from curvafit.report.page import report_html as report_html
+    from curvafit.report.page import write_inference as write_inference
+    from curvafit.report.page import write_report as write_report
+    from curvafit.report.wording import describe as describe
 
-__all__ = [
-    "describe",
-    "report_html",
-    "write_inference",
-    "write_report",
-]
-
-_HOMES = {
-    "describe": "curvafit.report.wording",
-    "report_html": "curvafit.report.page",
-    "write_inference": "curvafit.report.page",
-    "write_report": "curvafit.report.page",
-}
-
-offer(__name__, _HOMES)
+attach_lazy_names(__name__)

@@ -4,36 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from curvafit.core.faces import offer
+from curvafit.core.faces import attach_lazy_names
 
 if TYPE_CHECKING:
-    from curvafit.segmentation.completion import reconstruct
-    from curvafit.segmentation.postprocessing import Refine
-    from curvafit.segmentation.refine import Calibration, calibrate, refine
-    from curvafit.segmentation.result import Segmentation
-    from curvafit.segmentation.segment import segment
-    from curvafit.segmentation.several import reconstruct_labels
+    from curvafit.segmentation.completion import reconstruct as reconstruct
+    from curvafit.segmentation.postprocessing import Refine as Refine
+    from curvafit.segmentation.refine import Calibration as Calibration
+    from curvafit.segmentation.refine import calibrate as calibrate
+    from curvafit.segmentation.refine import refine as refine
+    from curvafit.segmentation.result import Segmentation as Segmentation
+    from curvafit.segmentation.segment import segment as segment
+    from curvafit.segmentation.several import reconstruct_labels as reconstruct_labels
 
-__all__ = [
-    "Calibration",
-    "Refine",
-    "Segmentation",
-    "calibrate",
-    "reconstruct",
-    "reconstruct_labels",
-    "refine",
-    "segment",
-]
-
-_HOMES = {
-    "Calibration": "curvafit.segmentation.refine",
-    "Refine": "curvafit.segmentation.postprocessing",
-    "Segmentation": "curvafit.segmentation.result",
-    "calibrate": "curvafit.segmentation.refine",
-    "reconstruct": "curvafit.segmentation.completion",
-    "reconstruct_labels": "curvafit.segmentation.several",
-    "refine": "curvafit.segmentation.refine",
-    "segment": "curvafit.segmentation.segment",
-}
-
-offer(__name__, _HOMES)
+attach_lazy_names(__name__)

@@ -4,19 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from curvafit.core.faces import offer
+from curvafit.core.faces import attach_lazy_names
 
 if TYPE_CHECKING:
-    from curvafit.scan.measure import Measures, Quantity, measure
-    from curvafit.studies.tables import write_table
+    from curvafit.scan.measure import Measures as Measures
+    from curvafit.scan.measure import Quantity as Quantity
+    from curvafit.scan.measure import measure as measure
+    from curvafit.studies.tables import write_table as write_table
 
-__all__ = ["Measures", "Quantity", "measure", "write_table"]
-
-_HOMES = {
-    "Measures": "curvafit.scan.measure",
-    "Quantity": "curvafit.scan.measure",
-    "measure": "curvafit.scan.measure",
-    "write_table": "curvafit.studies.tables",
-}
-
-offer(__name__, _HOMES)
+attach_lazy_names(__name__)

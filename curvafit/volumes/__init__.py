@@ -4,33 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from curvafit.core.faces import offer
+from curvafit.core.faces import attach_lazy_names
 
 if TYPE_CHECKING:
-    from curvafit.volumes.field import Field
-    from curvafit.volumes.formats.base import ScanError
-    from curvafit.volumes.parameter_maps import read_maps
-    from curvafit.volumes.scan import save
-    from curvafit.volumes.source import Source, field_of, load
+    from curvafit.volumes.field import Field as Field
+    from curvafit.volumes.formats.base import ScanError as ScanError
+    from curvafit.volumes.parameter_maps import read_maps as read_maps
+    from curvafit.volumes.scan import save as save
+    from curvafit.volumes.source import Source as Source
+    from curvafit.volumes.source import field_of as field_of
+    from curvafit.volumes.source import load as load
 
-__all__ = [
-    "Field",
-    "ScanError",
-    "Source",
-    "field_of",
-    "load",
-    "read_maps",
-    "save",
-]
-
-_HOMES = {
-    "Field": "curvafit.volumes.field",
-    "ScanError": "curvafit.volumes.formats.base",
-    "Source": "curvafit.volumes.source",
-    "field_of": "curvafit.volumes.source",
-    "load": "curvafit.volumes.source",
-    "read_maps": "curvafit.volumes.parameter_maps",
-    "save": "curvafit.volumes.scan",
-}
-
-offer(__name__, _HOMES)
+attach_lazy_names(__name__)
