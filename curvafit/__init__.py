@@ -49,9 +49,9 @@ __version__ = "0.1.0"
 #: The function that draws each type with a picture, as `module:function`; see `curvafit.core.pictures`.
 _FIGURES = {
     "Diagram": "curvafit.drawing.plot:diagram_figure",
-    "Field": "curvafit.drawing.sections:field_figure",
-    "Fit": "curvafit.drawing.figures:fit_figure",
-    "Flow": "curvafit.drawing.figures:flow_figure",
+    "Field": "curvafit.drawing.plot:field_figure",
+    "Fit": "curvafit.drawing.plot:fit_figure",
+    "Flow": "curvafit.drawing.plot:flow_figure",
     "Inference": "curvafit.report.pictures:inference_figure",
     "Segmentation": "curvafit.segmentation.mask_files:segmentation_figure",
 }

@@ -15,7 +15,7 @@ from matplotlib.figure import FigureBase
 from curvafit.core.files import write_atomically
 from curvafit.data_synth.atlas.draws import versions
 from curvafit.drawing.plot import diagram_on, shared_limits, surface_on
-from curvafit.drawing.surfaces import QUIET
+from curvafit.drawing.render import QUIET
 from curvafit.generation.flow import Flow, generate
 from curvafit.generation.schedule import Schedule, schedule
 from curvafit.geometry.diagram import Diagram, diagram

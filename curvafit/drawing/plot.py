@@ -10,6 +10,7 @@ import io
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,12 +19,15 @@ from matplotlib.colors import LinearSegmentedColormap, LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle
 from matplotlib.patheffects import withStroke
+from matplotlib.ticker import MaxNLocator
 from scipy.ndimage import gaussian_filter
 
 from curvafit.core.files import write_content
 from curvafit.core.units import unit_name
-from curvafit.drawing.surfaces import DPI, QUIET, boxed
+from curvafit.drawing.render import DPI, QUIET, boxed
+from curvafit.generation.result import Flow
 from curvafit.geometry.diagram import Diagram
+from curvafit.volumes.field import Field
 
 #: Colours that stay apart for the colour-blind (Okabe & Ito 2008).
 CONTOUR, DIAGONAL, INK = "#E69F00", "#C8372D", "#22262B"
@@ -33,6 +37,10 @@ DENSITY = LinearSegmentedColormap.from_list(
 )
 #: Bins along each axis of a drawn diagram, and decades that its colours span.
 BINS, DECADES = 72, 3.0
+#: The colour of draws, and the width in inches of one square of a corner plot.
+_DRAWN, _SQUARE = "#2B6FA8", 1.25
+#: Percent of the voxels that are drawn black, white; most voxels along an axis of which these are taken.
+TAILS, THIN = (0.5, 99.5), 256
 
 Spacing = tuple[float, float, float]
 Limits = tuple[float, float]
@@ -249,6 +257,188 @@ def _name_families(axes: Axes, limits: Limits) -> None:
         axes.text(end, -end + pad, "saddles", rotation=-45, rotation_mode="anchor", ha="right", va="bottom", **style)
 
 
+# ---- three middle slices ---------------------------------------------------------------------------------------------
+
+
+def field_figure(field: Field) -> Figure:
+    """Return a figure of a field's middle slices.
+
+    Raises
+    ------
+    ValueError
+        If the field has no voxels, or a value is not finite.
+    """
+    return section_figure([(field.values, None)], field.spacing)
+
+
+def section_figure(
+    rows: Sequence[tuple[np.ndarray, np.ndarray | None]],
+    spacing: Sequence[float],
+    places: Sequence[int] | None = None,
+) -> Figure:
+    """Return a figure of slices across z, y and x.
+
+    Parameters
+    ----------
+    rows
+        Values (Z, Y, X) for each row of pictures, and the mask that is outlined over them, or None.
+    spacing
+        Voxel edges (z, y, x).
+    places
+        Number of the slice across each axis; by default the middle one.
+
+    Raises
+    ------
+    ValueError
+        If there are no voxels, or a value is not finite.
+    """
+    figure = _figure(7.2, 2.5 * len(rows), layout="constrained")
+    axes = figure.subplots(len(rows), 3, squeeze=False)
+    places = [n // 2 for n in rows[0][0].shape] if places is None else places
+    for row, (values, mask) in zip(axes, rows, strict=True):
+        if not values.size or (values.dtype.kind == "f" and not np.isfinite(values).all()):
+            raise ValueError("a volume to draw needs voxels, all of finite values")
+        thinned = values[tuple(slice(None, None, -(-n // THIN)) for n in values.shape)]
+        low, high = np.percentile(thinned.astype(np.float32), TAILS)
+        for axis in range(3):
+            plane = np.take(values, places[axis], axis)
+            outline = None if mask is None else np.take(mask, places[axis], axis)
+            edges = [spacing[other] for other in range(3) if other != axis]
+            _section_on(row[axis], plane, outline, (low, high), edges[0] / edges[1])
+    for axis, name in enumerate("zyx"):
+        rows_name, columns_name = (other for other in "zyx" if other != name)
+        axes[0, axis].set_title(f"{name} = {places[axis]}", fontsize=9)
+        axes[-1, axis].set_xlabel(columns_name)
+        axes[-1, axis].set_ylabel(rows_name, rotation=0, labelpad=6)
+    return figure
+
+
+def _section_on(
+    axes, plane: np.ndarray, outline: np.ndarray | None, levels: tuple[float, float], aspect: float
+) -> None:
+    """Draw a slice."""
+    low, high = levels
+    plane, high = plane.astype(np.float32), max(high, low + 1e-6)
+    axes.imshow(plane, cmap="gray", vmin=low, vmax=high, aspect=aspect, interpolation="nearest")
+    axes.set(xticks=[], yticks=[])
+    if outline is not None and outline.any() and not outline.all() and min(outline.shape) > 1:
+        axes.contour(outline, [0.5], colors=CONTOUR, linewidths=1.0)
+
+
+# ---- draws, and bands ------------------------------------------------------------------------------------------------
+
+
+def corner_figure(
+    draws: np.ndarray, names: Sequence[str], limits: Sequence[tuple[float, float]], marks: Mapping[str, np.ndarray]
+) -> Figure:
+    """Return a corner plot of draws `(n, d)`: histograms of each parameter on the diagonal, pairs below it.
+
+    `limits` are the axes of the parameters, the prior's box; `marks` are points `(d,)` to mark, by name, at most three.
+    """
+    d = draws.shape[1]
+    figure = _figure(_SQUARE * d + 0.7, _SQUARE * d + 0.6)
+    grid = figure.add_gridspec(d, d, left=0.09, right=0.985, bottom=0.085, top=0.985, wspace=0.09, hspace=0.09)
+    for row in range(d):
+        for column in range(row + 1):
+            axes = figure.add_subplot(grid[row, column])
+            axes.set_xlim(limits[column])
+            if row == column:
+                axes.hist(draws[:, row], bins=np.linspace(*limits[row], 31).tolist(), color=_DRAWN, linewidth=0)
+                axes.set_yticks([])
+            else:
+                axes.set_ylim(limits[row])
+                axes.scatter(
+                    draws[:, column], draws[:, row], s=3, color=_DRAWN, alpha=0.35, linewidth=0, rasterized=True
+                )
+            _mark(axes, marks, column, None if row == column else row)
+            _label(axes, names, row, column, last=row == d - 1)
+    handles, labels = figure.axes[1].get_legend_handles_labels() if d > 1 else ([], [])
+    if handles:
+        figure.legend(handles, labels, loc="upper right", bbox_to_anchor=(0.98, 0.98), frameon=False, fontsize=11)
+    return figure
+
+
+def _mark(axes: Axes, marks: Mapping[str, np.ndarray], column: int, row: int | None) -> None:
+    """Draw the marked points: a line in a histogram, a symbol in a pair."""
+    styles = zip(marks.items(), ((CONTOUR, "o"), (INK, "x"), (QUIET, "+")), strict=False)
+    for (name, point), (colour, symbol) in styles:
+        if row is None:
+            axes.axvline(point[column], color=colour, linewidth=1.6)
+        else:
+            axes.plot(point[column], point[row], symbol, color=colour, markersize=6, markeredgewidth=1.8, label=name)
+
+
+def _label(axes: Axes, names: Sequence[str], row: int, column: int, *, last: bool) -> None:
+    """Write ticks and names at the left and the bottom of the whole alone."""
+    axes.spines[:].set_color(QUIET)
+    axes.tick_params(length=2, labelsize=8)
+    axes.xaxis.set_major_locator(MaxNLocator(2, prune="both"))
+    if row != column:
+        axes.yaxis.set_major_locator(MaxNLocator(2, prune="both"))
+    if last:
+        axes.set_xlabel(names[column], fontsize=11)
+    else:
+        axes.set_xticklabels([])
+    if column == 0 and row > 0:
+        axes.set_ylabel(names[row], fontsize=11)
+    elif row != column:
+        axes.set_yticklabels([])
+
+
+def bands_figure(blocks: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
+    """Return a picture of blocks of numbers, each the scan's `(k,)` on the band of simulated ones `(n, k)`.
+
+    The bands hold 50 and 90 % of the simulated numbers; a block of one number is a dot on a bar. Each block has its own
+    scale.
+    """
+    columns = 3
+    rows = -(-len(blocks) // columns)
+    figure = _figure(10.0, 1.95 * rows, layout="constrained")
+    for place, (name, (own, others)) in enumerate(blocks.items(), 1):
+        axes = figure.add_subplot(rows, columns, place)
+        at = np.arange(len(own))
+        for share, shade in ((90, DENSITY(0.12)), (50, DENSITY(0.35))):
+            low, high = np.percentile(others, (50 - share / 2, 50 + share / 2), axis=0)
+            if len(own) > 3:
+                axes.fill_between(at, low, high, color=shade, linewidth=0)
+            else:
+                axes.vlines(at, low, high, color=shade, linewidth=14)
+        axes.plot(at, own, "-" if len(own) > 3 else "o", color=CONTOUR, linewidth=1.8, markersize=6)
+        axes.set_title(name, fontsize=10)
+        axes.set_xlim(-0.5, len(own) - 0.5)
+        axes.set_xticks([])
+        axes.tick_params(length=2, labelsize=8)
+        axes.spines[:].set_color(QUIET)
+    return figure
+
+
+# ---- figures of results ----------------------------------------------------------------------------------------------
+
+
+def fit_figure(fit: Any, **options: Any) -> Figure:
+    """Return a figure of the curvature diagram of a fit's scan; `options` are those of `diagram_figure`.
+
+    Raises
+    ------
+    ValueError
+        If the fit holds no diagram.
+    """
+    if fit.diagram is None:
+        raise ValueError("this fit holds no curvature diagram to draw")
+    return diagram_figure(fit.diagram, **options)
+
+
+def flow_figure(flow: Flow, **options: Any) -> Figure:
+    """Return a figure of a flow's surface; `options` are those of `surface_figure`.
+
+    Raises
+    ------
+    ValueError
+        If the field has no surface or is not finite.
+    """
+    return surface_figure(flow.field.numpy(), spacing=flow.grid.spacing, **options)
+
+
 # ---- files -----------------------------------------------------------------------------------------------------------
 
 
@@ -264,7 +454,7 @@ def write_picture(figure: Figure, path: str | Path) -> Path:
     return write_content(Path(path), png(figure))
 
 
-def _figure(width: float, height: float) -> Figure:
-    figure = Figure(figsize=(width, height), facecolor="white")
+def _figure(width: float, height: float, **options: Any) -> Figure:
+    figure = Figure(figsize=(width, height), facecolor="white", **options)
     FigureCanvasAgg(figure)
     return figure

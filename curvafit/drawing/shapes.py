@@ -20,6 +20,7 @@ from curvafit.core.files import move_together, remove, staged
 from curvafit.core.records import Format, can_write, sibling
 from curvafit.core.runtime import undisturbed
 from curvafit.core.units import parse_unit
+from curvafit.drawing.render import surface_picture
 from curvafit.generation.flow import Flow
 from curvafit.generation.memory import FILE, check_memory
 from curvafit.geometry.mesh import SUFFIXES, NoSurface, Surface, solid_surface, surface, write_surface
@@ -80,7 +81,7 @@ class Output:
             If they do not fit into memory, or the box is not periodic and to be repeated.
         """
         if not grid.periodic and self.tile != (1, 1, 1):
-            raise ValueError(f"expected a periodic box to repeat, got boundary {grid.boundary!r}")
+            raise ValueError(f"only a periodic box can be repeated, this one has boundary {grid.boundary!r}")
         shape = tuple(n * times for n, times in zip(grid.shape, self.tile, strict=True))
         check_memory(shape, FILE, "a file")
         return shape
@@ -95,29 +96,26 @@ def check_target(
     inputs: Iterable[str | Path] = (),
     overwrite: bool = False,
 ) -> Path:
-    """Return the path, if a shape can be written there by its suffix; for a check before the work.
+    """Return the path if a shape can be written there, with its record, picture and snapshots; call it before the work.
 
     Parameters
     ----------
     steps
-        Of the snapshots that go beside it.
-    picture
-        Whether a picture goes beside it.
+        Steps of the snapshots that go beside it.
     inputs
-        What is read, and must stay.
+        Files that are read: they are never written over.
     overwrite
         Whether files that no such command wrote may be replaced.
 
     Raises
     ------
     ValueError
-        If the suffix is neither a volume's nor a surface's, its format cannot hold the output's unit, the place cannot
-        be written to, or something else stands where the shape, a snapshot, the record or the picture goes.
+        If the suffix is unknown, its format cannot hold the output's unit, or one of the files cannot be written.
     """
     target = Path(path)
     known = (*WRITABLE, *SUFFIXES)
     if not target.name.lower().endswith(known):
-        raise ValueError(f"expected a name ending in one of {', '.join(known)}, got {target.name!r}")
+        raise ValueError(f"the name of a shape must end in one of {', '.join(known)}, got {target.name!r}")
     if not target.name.lower().endswith(SUFFIXES):
         pick_writer(target, (output or Output()).unit)
     more = [sibling(target, ".json"), *(step_path(target, step) for step in steps)]
@@ -142,17 +140,12 @@ def write_shape(
 ) -> tuple[Path, ...]:
     """Write a flow's field as a volume or a surface, by suffix, with a record and a picture of one box.
 
-    The picture is drawn once the other files are in place. Where that fails, a warning says so, and the record does
-    not list it; a former one goes.
+    The picture is drawn last. Where that fails, a warning says so, the record does not list it, and a former one goes.
 
     Parameters
     ----------
-    output
-        See `Output`.
     record
         What to write into the JSON beside it; see `shape_record`.
-    picture
-        Whether to draw one.
     overwrite
         Whether files that no such call wrote may be replaced.
 
@@ -164,8 +157,7 @@ def write_shape(
     Raises
     ------
     ValueError
-        If the suffix is unknown, the field has no surface, a box that is not periodic is to be repeated, or something
-        else stands where one of the files goes.
+        As `check_target` does, or if the field has no surface.
     """
     target = check_target(path, output, steps=flow.snapshots, picture=picture, overwrite=overwrite)
     image = sibling(target, ".png")
@@ -195,8 +187,6 @@ def write_shape(
 
 def _picture(flow: Flow, path: Path) -> tuple[Path, ...]:
     """Draw a flow's surface; where that fails, warn and return no path."""
-    from curvafit.drawing.surfaces import surface_picture
-
     try:
         surface_picture(flow.field.numpy(), path)
     except (OSError, ValueError, MemoryError) as error:

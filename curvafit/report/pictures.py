@@ -10,8 +10,16 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from curvafit.core.units import length, number
-from curvafit.drawing.corner import bands_figure, corner_figure
-from curvafit.drawing.plot import diagram_figure, gallery_figure, png, shared_limits, slice_figure, surface_figure
+from curvafit.drawing.plot import (
+    bands_figure,
+    corner_figure,
+    diagram_figure,
+    gallery_figure,
+    png,
+    shared_limits,
+    slice_figure,
+    surface_figure,
+)
 from curvafit.inference.candidates import TITLES, UNBELIEVED, UNDECIDED, Candidate
 from curvafit.inference.table import parameters_of
 

@@ -14,8 +14,7 @@ from matplotlib.figure import Figure
 from curvafit.core.files import move_together, remove, staged
 from curvafit.core.records import Format, can_write, sibling
 from curvafit.core.runtime import undisturbed
-from curvafit.drawing.plot import DPI
-from curvafit.drawing.sections import section_figure
+from curvafit.drawing.plot import DPI, section_figure
 from curvafit.segmentation.probability import entropy
 from curvafit.segmentation.result import Segmentation, Uncertainty
 from curvafit.volumes.formats import pick_writer

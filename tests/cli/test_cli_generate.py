@@ -29,7 +29,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 def undrawn(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
     """Empty pictures, but where a test is named after its own."""
     if "picture" not in request.node.name:
-        monkeypatch.setattr("curvafit.drawing.surfaces.surface_picture", lambda u, path: path.write_bytes(b""))
+        monkeypatch.setattr("curvafit.drawing.shapes.surface_picture", lambda u, path: path.write_bytes(b""))
 
 
 def test_generate_writes_a_field_a_picture_and_a_record(tmp_path: Path) -> None:

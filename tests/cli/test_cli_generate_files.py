@@ -21,7 +21,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 
 @pytest.fixture(autouse=True)
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("curvafit.drawing.surfaces.surface_picture", lambda u, path: path.write_bytes(b""))
+    monkeypatch.setattr("curvafit.drawing.shapes.surface_picture", lambda u, path: path.write_bytes(b""))
 
 
 def test_an_interrupted_run_goes_on_from_its_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -65,7 +65,7 @@ def test_a_picture_that_fails_is_one_line_and_undoes_nothing(tmp_path: Path, mon
         raise OSError(28, "No space left on device", "out")
 
     made(*QUICK, "-o", tmp_path / "out.npy")
-    monkeypatch.setattr("curvafit.drawing.surfaces.surface_picture", full)
+    monkeypatch.setattr("curvafit.drawing.shapes.surface_picture", full)
     result = call("generate", *QUICK, "--seed", 1, "-o", tmp_path / "out.npy")
     assert result.exit_code == 0 and result.stderr.startswith("note: ") and "picture" in result.stderr
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out.json", "out.npy"]

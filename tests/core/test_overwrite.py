@@ -25,7 +25,7 @@ MASK = Field((np.indices((12, 12, 12)).sum(0) % 12 < 6).astype(np.uint8))
 
 @pytest.fixture(autouse=True)
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("curvafit.drawing.surfaces.surface_picture", lambda u, path: path.write_bytes(b""))
+    monkeypatch.setattr("curvafit.drawing.shapes.surface_picture", lambda u, path: path.write_bytes(b""))
 
 
 def thesis(folder: Path) -> Path:

@@ -11,9 +11,10 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from curvafit.drawing.corner import bands_figure, corner_figure
 from curvafit.drawing.plot import (
     DIAGONAL,
+    bands_figure,
+    corner_figure,
     diagram_figure,
     gallery_picture,
     png,
@@ -21,8 +22,7 @@ from curvafit.drawing.plot import (
     shared_limits,
     slice_figure,
 )
-from curvafit.drawing.render import render, view
-from curvafit.drawing.surfaces import surface_picture
+from curvafit.drawing.render import render, surface_picture, view
 from curvafit.geometry.diagram import Diagram
 
 

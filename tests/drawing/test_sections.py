@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 import curvafit
 from curvafit import Field, segment
-from curvafit.drawing.sections import section_figure
+from curvafit.drawing.plot import section_figure
 
 VALUES = np.arange(5 * 6 * 7, dtype=np.float32).reshape(5, 6, 7)
 
