@@ -12,6 +12,8 @@ import typer
 
 from curvafit.cli.atlas import atlas_app
 from curvafit.cli.console import say
+from curvafit.cli.demo import EXAMPLES as DEMO_EXAMPLES
+from curvafit.cli.demo import demo
 from curvafit.cli.generate import EXAMPLES as GENERATE_EXAMPLES
 from curvafit.cli.generate import generate, presets
 from curvafit.cli.infer import EXAMPLES as INFER_EXAMPLES
@@ -39,6 +41,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
     cls=Commands,
 )
+app.command(epilog=DEMO_EXAMPLES)(demo)
 app.command(epilog=INFER_EXAMPLES)(infer)
 app.command(epilog=MEASURE_EXAMPLES)(measure)
 app.command(epilog=GENERATE_EXAMPLES)(generate)

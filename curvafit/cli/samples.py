@@ -40,7 +40,7 @@ def get_sample(
 ) -> None:
     """Download a sample once, check it, and print its path."""
     with plainly():
-        from curvafit.data_synth.samples import fetch, samples
+        from curvafit.data_synth.samples import samples
 
         about = {each.name: (each.description, each.licence, each.source) for each in samples()}
         about[SYNTHETIC] = _SYNTHETIC_ABOUT
@@ -48,14 +48,16 @@ def get_sample(
             raise ValueError(f"expected a sample named {', '.join(about)}, got {name!r}")
         what, licence, source = about[name]
         say(f"{name}: {what}; licence {licence}; {source}", to=error_console())
-        path = _synthetic() if name == SYNTHETIC else fetch(name)
+        path = fetch_or_make(name)
         say(str(path if out is None else _copied(path, out, overwrite)))
 
 
-def _synthetic() -> Path:
-    """Return the path of the synthetic scan, which is made once."""
-    from curvafit.data_synth.samples import cache_folder, synthetic_scan
+def fetch_or_make(name: str) -> Path:
+    """Return the path of a sample: fetched, or, of the synthetic scan, made once."""
+    from curvafit.data_synth.samples import cache_folder, fetch, synthetic_scan
 
+    if name != SYNTHETIC:
+        return fetch(name)
     path = cache_folder() / "synthetic.nii.gz"
     return path if path.is_file() else synthetic_scan(path)
 

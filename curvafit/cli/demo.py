@@ -1,0 +1,37 @@
+"""The command that shows what the package does, on a real scan."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from curvafit.cli.console import OverwriteOption, plainly, say, stages
+
+EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(("curvafit demo", "curvafit demo shell -o shell_out"))
+
+
+def demo(
+    sample: Annotated[str, typer.Argument(help="Name of a sample (curvafit samples).")] = "bone",
+    out: Annotated[Path, typer.Option("-o", "--output", help="Folder for demo.html and what it rests on.")] = Path(
+        "demo_out"
+    ),
+    seed: Annotated[int, typer.Option(help="Seed of the reading.")] = 0,
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Measure a real scan, fill it from every 8th slice, and read its texture: one page, in minutes."""
+    with plainly():
+        with stages() as progress:
+            from curvafit.cli.samples import fetch_or_make
+            from curvafit.report.demo import write_demo
+            from curvafit.volumes.scan import load
+
+            progress(f"fetching {sample}", 0.0)
+            path = fetch_or_make(sample)
+            title = f"A first look: {sample}"
+            found = write_demo(load(path), out, title=title, seed=seed, overwrite=overwrite, progress=progress)
+        dice, every = found.completion.dice, found.completion.every
+        say(f"Filled from every {every}th slice: Dice {dice['curvafit']:.3f} with the slices that were left out.")
+        say(f"Read: {found.fit.status}")
+        say(str(found.page))
