@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
 from curvafit.core.files import bears, check_free, write_content
-from curvafit.core.progress import Progress, part, silent
+from curvafit.core.runtime import Progress, part, silent
 from curvafit.core.units import unit_name
 from curvafit.drawing.plot import INK, diagram_on, gallery_figure, png, shared_limits
 from curvafit.geometry.family import FAMILIES, family_of, half_thickness
