@@ -20,26 +20,25 @@ from curvafit.core.files import bears, check_free, write_content
 from curvafit.core.runtime import Progress, part, silent
 from curvafit.core.units import unit_name
 from curvafit.drawing.plot import INK, diagram_on, gallery_figure, png, shared_limits
-from curvafit.geometry.family import FAMILIES, family_of, half_thickness
-from curvafit.geometry.transport import sliced_embedding
+from curvafit.geometry.diagram import FAMILIES, family_of, half_thickness
+from curvafit.geometry.distances import sliced_embedding
 from curvafit.inference.atlas import load_atlas
 from curvafit.inference.infer import infer
 from curvafit.inference.posterior import load_posterior
 from curvafit.priors.coefficients import Coefficients
 from curvafit.report.page import check_report, write_inference
 from curvafit.report.pictures import SYMBOLS
-from curvafit.scan.phases import find_level
+from curvafit.scan.measure import measure
+from curvafit.scan.structure import find_level
 from curvafit.segmentation.completion import reconstruct
 from curvafit.segmentation.slices import WAYS, Slices
-from curvafit.studies.measure import measure
 from curvafit.volumes.scan import Field
 
 if TYPE_CHECKING:
     from curvafit.inference.atlas import Atlas
-    from curvafit.inference.draws import Draws
-    from curvafit.inference.fit import Fit
+    from curvafit.inference.fit import Draws, Fit
     from curvafit.inference.infer import Inference
-    from curvafit.studies.measure import Measures
+    from curvafit.scan.measure import Measures
 
 #: The page's name in its folder, and the mark by which it is known as ours.
 PAGE, _MARK = "demo.html", '<meta name="generator" content="curvafit'

@@ -20,8 +20,7 @@ FLOORS = (
     ("data_synth",),
     ("segmentation",),
     ("atlas_map",),
-    ("studies",),
-    ("report",),
+    ("studies", "report"),
     ("cli", "nnunet"),
     ("__main__",),
 )
