@@ -149,7 +149,7 @@ def counts(predicted: np.ndarray, true: np.ndarray) -> list[list[int]]:
     thin, true_thin = skeletonize(predicted), skeletonize(true)
     volumes = (predicted & true, predicted, true, thin & true, thin, true_thin & predicted, true_thin)
     sums = [[int(block.sum()) for block in blocks(volume)] for volume in volumes]
-    masks = (without_specks(predicted), without_specks(true), predicted, true)
+    masks = (remove_specks(predicted), remove_specks(true), predicted, true)
     return sums + [[components(block)[1] for block in blocks(mask)] for mask in masks]
 
 
@@ -163,7 +163,7 @@ def components(mask: np.ndarray) -> tuple[np.ndarray, int]:
     return labels, count
 
 
-def without_specks(mask: np.ndarray) -> np.ndarray:
+def remove_specks(mask: np.ndarray) -> np.ndarray:
     labels, _ = components(mask)
     large = np.bincount(labels.ravel()) >= SPECK
     large[0] = False

@@ -78,7 +78,7 @@ def diagram_of(name: str, schedule: str, seed: int, edge: int, cases: Cases) -> 
     return Diagram(table[:, :2], table[:, 2])
 
 
-def noise_of(diagrams: list[Diagram]) -> float:
+def seed_noise_of(diagrams: list[Diagram]) -> float:
     """Return the mean distance between two seeds."""
     return float(np.mean([wasserstein(a, b) for a, b in combinations(diagrams, 2)]))
 
@@ -94,7 +94,7 @@ def compare(name: str, options: argparse.Namespace, cases: Cases) -> Values:
     paper, other = (
         [diagram_of(name, plan, seed, options.edge, cases) for seed in seeds] for plan in ("paper", options.schedule)
     )
-    found = {"noise": noise_of(paper), "own_noise": noise_of(other)}
+    found = {"noise": seed_noise_of(paper), "own_noise": seed_noise_of(other)}
     found["bias"] = wasserstein(pooled(other), pooled(paper)) / found["noise"]
     if options.edge == EDGE and name in author_volumes():
         author = diagram(author_field(name), Grid((EDGE,) * 3), WORKING_EPSILON)

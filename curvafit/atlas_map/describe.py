@@ -20,7 +20,7 @@ from curvafit.data_synth.atlas.workers import Here, Workers
 from curvafit.generation.viability import well_formed
 from curvafit.geometry.descriptors import Descriptors, descriptors
 from curvafit.geometry.mesh import NoSurface
-from curvafit.inference.table import VIEWS, Table, load_table, parameters_of, row_of, save_table
+from curvafit.inference.table import VIEWS, Table, load_table, parameters_of, save_table, to_row
 from curvafit.priors.grid import Grid
 from curvafit.volumes.scan import ScanError
 
@@ -159,7 +159,7 @@ class _Rows:
             self.shapes.append(shape["shape"])
             self.views.append(view)
             self.parameters.append(shape["parameters"])
-            self.descriptors.append(row_of(blocks).astype(np.float32))
+            self.descriptors.append(to_row(blocks).astype(np.float32))
 
     def table(self) -> Table:
         """Return the rows as a table."""

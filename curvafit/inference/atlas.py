@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from curvafit.geometry.diagram import Diagram
-from curvafit.geometry.distances import one_to_many, sliced_embedding
+from curvafit.geometry.distances import one_to_many, sliced_embedding, wasserstein
 from curvafit.inference.archive import Archive
 from curvafit.priors.coefficients import Coefficients
 
@@ -167,18 +167,22 @@ class Match:
     seed: int
 
 
-def mirrored(match: Match) -> Match:
+def mirror_match(match: Match) -> Match:
     """Return a match's shape with inside and outside exchanged, in the gauge a20 = 1."""
     six = match.coefficients.mirrored()
     return replace(match, coefficients=six.scaled(1 / float(six.a20)), mass=-match.mass)
 
 
 def nearest(
-    diagram: Diagram, atlas: Atlas, *, seen_as: str = "field", count: int = 5, shortlist: int = 40
+    diagram: Diagram,
+    atlas: Atlas,
+    *,
+    seen_as: str = "field",
+    count: int = 5,
+    shortlist: int = 40,
+    exact: bool = False,
 ) -> tuple[Match, ...]:
     """Return the `count` shapes nearest to a diagram, nearest first.
-
-    Distances are those of `curvafit.geometry.distances`, taken on the `shortlist` shapes nearest in sliced distance.
 
     Parameters
     ----------
@@ -191,8 +195,9 @@ def nearest(
     count
         How many; all of them where the atlas has fewer.
     shortlist
-        How many exact distances to take; at least `count` are. Among 430 diagrams, 10 held the nearest in 99 % and 20
-        always; all of the nearest five were among 20 in 99 %, among 40 in 99.95 % (`benchmarks.distances --match`).
+        How many shapes, nearest in sliced distance, have their Wasserstein distance computed; at least `count` have.
+    exact
+        Compute the distances of the matches by geomloss in float64 (`wasserstein`), and not in float32.
 
     Raises
     ------
@@ -204,27 +209,17 @@ def nearest(
     candidates = atlas.diagrams(seen_as)
     if not float(diagram.weights.sum()) > 0:
         raise ValueError("expected a diagram with area, got an empty one")
-    near = _shortlist(np.asarray(sliced_embedding(diagram)), atlas.embeddings(seen_as), max(count, shortlist))
-    return _sorted(diagram, atlas, candidates, near)[:count]
-
-
-def _shortlist(query: np.ndarray, embeddings: np.ndarray, length: int) -> list[int]:
-    """Return the positions of the embeddings nearest to the query's, nearest first."""
-    distances = np.linalg.norm(embeddings - query, axis=1)
-    return np.argsort(distances, kind="stable")[:length].tolist()
-
-
-def _sorted(diagram: Diagram, atlas: Atlas, candidates: tuple[Diagram, ...], near: list[int]) -> tuple[Match, ...]:
-    """Return the matches at the given positions of the atlas, by increasing distance."""
-    distances = one_to_many(diagram, [candidates[i] for i in near]).tolist()
-    matches = (
+    away = np.linalg.norm(atlas.embeddings(seen_as) - np.asarray(sliced_embedding(diagram)), axis=1)
+    near = np.argsort(away, kind="stable")[: max(count, shortlist)].tolist()
+    distances = one_to_many(diagram, [candidates[i] for i in near])
+    matches = [
         Match(
-            id=atlas.ids[i],
-            distance=distance,
-            coefficients=atlas.shape_coefficients(i),
-            mass=float(atlas.masses[i]),
-            seed=int(atlas.seeds[i]),
+            id=atlas.ids[near[k]],
+            distance=wasserstein(diagram, candidates[near[k]]) if exact else float(distances[k]),
+            coefficients=atlas.shape_coefficients(near[k]),
+            mass=float(atlas.masses[near[k]]),
+            seed=int(atlas.seeds[near[k]]),
         )
-        for i, distance in zip(near, distances, strict=True)
-    )
+        for k in np.argsort(distances, kind="stable")[:count]
+    ]
     return tuple(sorted(matches, key=lambda match: match.distance))

@@ -125,7 +125,7 @@ def morphometry_of(content: Mapping[str, Any]) -> Morphometry:
     return Morphometry(**numbers)
 
 
-def best_of(candidates: Sequence[Candidate]) -> Candidate | None:
+def best_candidate(candidates: Sequence[Candidate]) -> Candidate | None:
     """Return the first candidate within seed noise of the one nearest to the scan; None where nothing grew.
 
     The noise is that of the nearest one's twins; where they are fewer than two, the nearest is the best. Of those
@@ -142,9 +142,9 @@ def best_of(candidates: Sequence[Candidate]) -> Candidate | None:
     return next(close, within[0])
 
 
-def noise_of(candidates: Sequence[Candidate]) -> float | None:
+def seed_noise_of(candidates: Sequence[Candidate]) -> float | None:
     """Return the distance between two twins of the best candidate; of another one where it has fewer than two."""
-    best = best_of(candidates)
+    best = best_candidate(candidates)
     known = [each.seed_noise for each in candidates if each.seed_noise is not None]
     return best.seed_noise if best is not None and best.seed_noise is not None else next(iter(known), None)
 
@@ -166,12 +166,12 @@ def twin(
 ) -> Twin:
     """Grow a shape of a law in a box of the scan's main window, at most `LONGEST_EDGE` voxels a side.
 
-    Of a mask or an image it fills the same part of its box as the structure (`Prepared.true_share`), since a mask does
-    not state a mass; where nothing grows so, it has the law's own mass.
+    A mask or an image does not state a mass: the shape fills as much of its box as the structure does
+    (`Prepared.true_volume_fraction`), or has the law's own mass where nothing grows so.
     """
     grid, told = twin_grid(prepared), {"schedule": schedule, "seed": seed, "reject_early": True}
     if prepared.kind != "field":
-        share = prepared.true_share
+        share = prepared.true_volume_fraction
         flow = generate(coefficients, mass, grid, volume_fraction=share, **told)
         if (grown := _measured(flow, prepared, seed)).phase is not None:
             return grown
@@ -192,7 +192,7 @@ def _measured(flow: Flow, prepared: Prepared, seed: int) -> Twin:
         mask, field = flow.field.numpy() > 0, flow.field
         window = Grid(flow.grid.shape, flow.grid.spacing, prepared.grid.boundary)
         if prepared.kind != "field":
-            mask = prepared.seen(mask, seed)
+            mask = prepared.rescan(mask, seed)
             field = phase_field(torch.from_numpy(mask), window, WORKING_EPSILON)
         curvature = diagram(field, window, WORKING_EPSILON)
     except (NoSurface, ScanError) as error:
@@ -212,14 +212,14 @@ def verdict(
     """
     if fast:
         return candidates[0].name, _joined(_unusual(misfit), "Nothing was grown to check the law (--fast).")
-    best = best_of(candidates)
+    best = best_candidate(candidates)
     if best is None or best.distance is None:
         return None, _joined("No law: nothing grew from any candidate.", candidates[0].status)
-    noise = noise_of(candidates)
+    noise = seed_noise_of(candidates)
     title = TITLES[best.name]
     apart = f"its twins lie {best.distance:.1f} from the scan's curvature diagram"
     apart += f", {noise:.1f} from each other." if noise else "."
-    ratio, other = 0.0 if not noise else best.distance / noise, unlike(scan, best.twins)
+    ratio, other = 0.0 if not noise else best.distance / noise, differences(scan, best.twins)
     familiar = f"Twins over scan: {', '.join(other)}." if other else ""
     strange = misfit is not None and misfit.probability < UNBELIEVABLE
     allowed = 1 if ratio <= CLOSE else 0
@@ -247,7 +247,7 @@ def _joined(*sentences: str) -> str:
     return " ".join(filter(None, sentences))
 
 
-def unlike(scan: Morphometry, twins: Sequence[Morphometry]) -> list[str]:
+def differences(scan: Morphometry, twins: Sequence[Morphometry]) -> list[str]:
     """Return the familiar numbers in which all twins differ from the scan the same way, with their ratios, as words.
 
     They differ by more than `NEAR`; connectivities also by more than chance lets two counts of so many bodies and

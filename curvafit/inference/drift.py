@@ -17,7 +17,7 @@ from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
 from curvafit.priors.shapes import Float
 from curvafit.priors.stencils import gaussian_blur, gradient
-from curvafit.scan.grids import rich_boxes, surface_voxels
+from curvafit.scan.grids import boxes_by_surface, surface_voxels
 
 #: The short flow: Adam steps of 1e-3 as published.
 SHORT_FLOW = Schedule("short", 150, 1e-3, 1e-3, "constant")
@@ -51,7 +51,7 @@ class ShortFlow:
     def __init__(self, phase: Tensor, grid: Grid, epsilon: float, reference: Coefficients) -> None:
         values, self.grid = _box(phase.detach().to("cpu", torch.float32), grid)
         self.epsilon, self._voxel = epsilon, grid.spacing[0]
-        self.start = sharpened(values, self.grid, epsilon)
+        self.start = deblur(values, self.grid, epsilon)
         self._before = gaussian_blur(self.start, self.grid, epsilon)
         halo = 0 if self.grid.periodic else HALO
         inside = tuple(slice(halo, n - halo) for n in self.grid.shape)
@@ -89,7 +89,7 @@ class ShortFlow:
         return float(np.linalg.norm(self._forces * law.tensor().numpy()))
 
 
-def sharpened(phase: Tensor, grid: Grid, width: float) -> Tensor:
+def deblur(phase: Tensor, grid: Grid, width: float) -> Tensor:
     """Return v₀ with k ∗ v₀ close to `phase`, by two Van Cittert steps."""
     v = phase
     for _ in range(2):
@@ -101,6 +101,6 @@ def _box(phase: Tensor, grid: Grid) -> tuple[Tensor, Grid]:
     """Return the whole, or the part of at most `LARGEST_BOX` voxels a side that is richest in surface."""
     if max(grid.shape) <= LARGEST_BOX:
         return phase, grid
-    windows = rich_boxes(surface_voxels((phase > 0).numpy()), LARGEST_BOX)
+    windows = boxes_by_surface(surface_voxels((phase > 0).numpy()), LARGEST_BOX)
     part = phase[windows[0]].contiguous()
     return part, Grid(tuple(part.shape), grid.spacing, "replicate")  # type: ignore[arg-type]

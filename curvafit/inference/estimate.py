@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -14,12 +14,21 @@ from curvafit.generation.flow import generate
 from curvafit.generation.schedule import Schedule
 from curvafit.geometry.descriptors import BLOCKS, Descriptors, descriptors
 from curvafit.geometry.mesh import NoSurface
+from curvafit.inference.atlas import Match
 from curvafit.inference.candidates import Candidate, Misfit
 from curvafit.inference.emulator import Optimum, misfits, optimum
 from curvafit.inference.fit import Draws
 from curvafit.inference.posterior import Posterior
 from curvafit.inference.simulate import Effort, Search, Simulate, Simulations, simulations
-from curvafit.inference.table import PARAMETERS, VIEWS, column_names, columns_of, law_of, mirrored
+from curvafit.inference.table import (
+    PARAMETERS,
+    VIEWS,
+    column_names,
+    columns_of,
+    law_of,
+    mirror_parameters,
+    parameters_of,
+)
 from curvafit.priors.grid import Grid
 from curvafit.scan.measure import scan_descriptors
 from curvafit.scan.prepare import HALF, Prepared
@@ -83,8 +92,7 @@ def estimate(
     effort: Effort = Effort(),  # noqa: B008
     progress: Progress = silent,
 ) -> Estimate | None:
-    """Read a scan's law from its descriptors: draws from the posterior, some of them grown for the scan to be compared
-    with.
+    """Read the law of a scan from its descriptors: draw from the posterior, grow some, compare them with the scan.
 
     Parameters
     ----------
@@ -102,14 +110,14 @@ def estimate(
     """
     progress("measuring descriptors", 0.0)
     turned = prepared.volume_fraction > HALF
-    seen = prepared.turned if turned else prepared
+    seen = prepared.inverted if turned else prepared
     if (measured := scan_descriptors(seen)) is None:
         return None
     row, view = measured[0].vector(), measured[1]
     progress("reading the posterior", 0.1)
     parameters = posterior.sample(row, view, DRAWS, seed)
     best = optimum(posterior.emulator, row, view, parameters[:STARTS])
-    reading = _Reading(posterior, row, view, parameters, best, mirrored if turned else np.asarray)
+    reading = _Reading(posterior, row, view, parameters, best, mirror_parameters if turned else np.asarray)
     if not fast:
         simulate = _simulator(seen, view, effort.schedule)
         grown = simulations(parameters, simulate, effort.simulations, seed=seed, progress=part(progress, 0.15, 0.45))
@@ -122,8 +130,24 @@ def estimate(
             near = every.parameters[search.nearest(every)[0]]
             return _checked(reading, grown, {"refined": likeliest, "simulation": near})
     draws = reading.draws(parameters, METHOD)
-    misfit = Misfit(amortised_p(posterior, view, best.misfit), {}, "by the best fit, nothing grown")
+    misfit = Misfit(tail_probability(posterior, view, best.misfit), {}, "by the best fit, nothing grown")
     return Estimate(draws, reading.weak, misfit, (reading.middle(draws), reading.optimum))
+
+
+def refine_matches(prepared: Prepared, posterior: Posterior, matches: Sequence[Match]) -> Candidate | None:
+    """Refine the parameters of the nearest matches until the emulated descriptors fit the scan's best.
+
+    Levenberg and Marquardt's method, by optimistix, starts from each match, with the exact derivatives of the emulator.
+    None where the descriptors of the scan cannot be measured.
+    """
+    turned = prepared.volume_fraction > HALF
+    if (measured := scan_descriptors(prepared.inverted if turned else prepared)) is None:
+        return None
+    row, view = measured[0].vector(), measured[1]
+    turn = mirror_parameters if turned else np.asarray
+    starts = turn(np.stack([parameters_of(each.coefficients, each.mass) for each in matches]))
+    best = optimum(posterior.emulator, row, view, starts)
+    return _Reading(posterior, row, view, starts, best, turn).optimum
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,8 +210,10 @@ def simulation_grid(prepared: Prepared) -> Grid:
 
 
 def _simulator(prepared: Prepared, view: str, schedule: Schedule | str) -> Simulate:
-    """Return what grows parameters and measures them as the scan is: seen as it would show them, in a window where it
-    is one."""
+    """Return a function that grows a shape from parameters and measures its descriptors as the scan's were measured.
+
+    Blur, noise and window are the scan's own.
+    """
     grid = simulation_grid(prepared)
     window = VIEWS["mask" if prepared.part(prepared.windows[0]).periodic else "crop"]
 
@@ -199,7 +225,7 @@ def _simulator(prepared: Prepared, view: str, schedule: Schedule | str) -> Simul
         try:
             if view == "field":
                 return descriptors(field, grid)
-            return descriptors(*window(prepared.seen(field > 0, seed), grid, np.random.default_rng(seed)))
+            return descriptors(*window(prepared.rescan(field > 0, seed), grid, np.random.default_rng(seed)))
         except (ScanError, NoSurface):
             return None
 
@@ -223,11 +249,8 @@ class Check(NamedTuple):
     count: int
 
 
-def amortised_p(posterior: Posterior, view: str, misfit: float) -> float:
+def tail_probability(posterior: Posterior, view: str, misfit: float) -> float:
     """Return the part of shapes that fit worse than a query, each by its best parameters from `STARTS` draws.
-
-    Of 801 masks left out in thirds, 5.4 % are below .05; of level cuts of Gaussian random fields with a shape's volume
-    and two-point function 20 of 20, of cuts with a Gaussian two-point function, nearly shapes of the model, 1 of 8.
 
     Parameters
     ----------
@@ -242,7 +265,7 @@ def check(posterior: Posterior, descriptors: np.ndarray, view: str, simulated: n
     """Compare a row of descriptors `(351,)` with those of simulations of the posterior's draws `(n, 351)`.
 
     Probabilities of blocks are of what the posterior's mean given a row, by linear regression, does not tell of the
-    block. They are cautious: of 180 blocks of 20 masks of the model's own, 1 % are below .05.
+    block; they are cautious.
 
     Raises
     ------
@@ -270,8 +293,10 @@ def _tail(values: np.ndarray) -> float:
 
 
 def _distances(rows: np.ndarray, summaries: np.ndarray) -> np.ndarray:
-    """Return how far each row lies from what a regression of the others, but for the first, makes of its summary:
-    logarithms of mean squares of columns, in deviations of the others."""
+    """Return the leave-one-out residual of each row, regressed on its summary; the query, row 0, is never in the fit.
+
+    It is the logarithm of the mean square over columns, in deviations of the other rows.
+    """
     values = []
     for k in range(len(rows)):
         rest = np.delete(np.arange(1, len(rows)), k - 1) if k else np.arange(1, len(rows))

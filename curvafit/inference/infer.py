@@ -13,17 +13,17 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from curvafit.core.checks import SEEDS, check_int, check_type
+from curvafit.core.checks import SEEDS, check_choice, check_int, check_type
 from curvafit.core.pictures import Pictured
 from curvafit.core.runtime import Progress, part, silent
 from curvafit.core.units import number
 from curvafit.generation.schedule import LEARNED, SCHEDULES
 from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram, family_of
 from curvafit.geometry.morphometry import Morphometry, morphometry
-from curvafit.inference.atlas import Atlas, Match, load_atlas, mirrored, nearest
-from curvafit.inference.candidates import TITLES, Candidate, Twin, best_of, twin, verdict
+from curvafit.inference.atlas import Atlas, Match, load_atlas, mirror_match, nearest
+from curvafit.inference.candidates import TITLES, Candidate, Twin, best_candidate, twin, verdict
 from curvafit.inference.drift import drift
-from curvafit.inference.estimate import Estimate, estimate
+from curvafit.inference.estimate import estimate, refine_matches
 from curvafit.inference.fit import Fit
 from curvafit.inference.posterior import Posterior, load_posterior
 from curvafit.inference.simulate import Effort
@@ -32,7 +32,7 @@ from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.fit_file import Prior
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.scan.measure import scan_diagram
-from curvafit.scan.prepare import HALF, NOISE, Prepared, prepare, untextured
+from curvafit.scan.prepare import HALF, NOISE, Prepared, prepare, why_no_texture
 from curvafit.scan.structure import check_options, is_rounded
 from curvafit.volumes.field import Field
 from curvafit.volumes.formats.part import Crop
@@ -101,6 +101,7 @@ def infer(
     periodic: bool = False,
     atlas: str | Path | Atlas | None = None,
     posterior: str | Path | Posterior | None = None,
+    method: Literal["posterior", "match"] = "posterior",
     fast: bool = False,
     threshold: float | Literal["otsu"] = "otsu",
     dark: bool = False,
@@ -118,6 +119,10 @@ def infer(
     A posterior of the parameters is read from the scan's descriptors; laws drawn from it, the nearest shape of the
     atlas and, of a phase field, its stationarity are grown, and what grows is compared with the scan.
 
+    With `method="match"` a law is inferred as the paper's author would: the shape of the atlas whose curvature diagram
+    is nearest in Wasserstein distance (geomloss), then gradient refinement from it by Levenberg and Marquardt's method
+    (optimistix): of a phase field by its stationarity, of a mask or image by its descriptors.
+
     Parameters
     ----------
     scan
@@ -130,6 +135,8 @@ def infer(
         The shapes to match against; by default the packaged ones.
     posterior
         What reads the descriptors; by default the packaged one (`curvafit atlas train` makes others).
+    method
+        `"posterior"`, or `"match"`: nearest match, then gradient refinement. A match alone has no intervals.
     fast
         Grow nothing: seconds instead of minutes, but nothing is checked by a twin.
     threshold, dark, roi
@@ -151,6 +158,7 @@ def infer(
         If the volume cannot be read or measured, or an argument is out of range.
     """
     check_options(kind, threshold, label)
+    check_choice(method, ("posterior", "match"), "method posterior or match")
     if atlas is not None:
         check_type(atlas, (str, Path, Atlas), "an atlas, as the path of a file or as Atlas")
     if posterior is not None:
@@ -169,13 +177,19 @@ def infer(
     measured = None if prepared.noise else scan_diagram(prepared)
     numbers = morphometry(prepared.mask, prepared.working_voxel, prepared.unit, periodic=prepared.grid.periodic)
     provenance = _provenance(volume, atlas, posterior, seed)
-    reason = NOISE if measured is None else untextured(prepared, measured)
+    reason = NOISE if measured is None else why_no_texture(prepared, measured)
     if measured is None or reason:
         return Inference(volume, prepared, measured, {}, _fit(prepared, measured, numbers, provenance, reason))
-    estimated = estimate(prepared, posterior, seed=seed, fast=fast, effort=effort, progress=part(progress, 0.1, 0.5))
+    estimated = None
+    if method == "posterior":
+        estimated = estimate(
+            prepared, posterior, seed=seed, fast=fast, effort=effort, progress=part(progress, 0.1, 0.5)
+        )
     progress("searching the atlas", 0.5)
-    matches = _matches(prepared, measured, atlas)
-    laws = _laws(prepared, estimated, matches, seed, part(progress, 0.5, 0.6))
+    matches = _matches(prepared, measured, atlas, exact=method == "match")
+    refined = refine_matches(prepared, posterior, matches) if method == "match" else None
+    drawn = (() if refined is None else (refined,)) if estimated is None else estimated.candidates
+    laws = _laws(prepared, drawn, matches, seed, part(progress, 0.5, 0.6))
     laws, twins = (laws, {}) if fast else _grown(laws, measured, prepared, seed, effort, part(progress, 0.6, 1.0))
     chosen, status = verdict(laws, None if estimated is None else estimated.misfit, numbers, fast=fast)
     law = next((each.coefficients for each in laws if each.name == chosen), None)
@@ -190,20 +204,24 @@ def infer(
     return Inference(volume, prepared, measured, twins, fit, simulated)
 
 
-def _matches(prepared: Prepared, measured: Diagram, atlas: Atlas) -> tuple[Match, ...]:
-    """Return the nearest shapes of the atlas; of a structure that fills most of the volume, those of its background,
-    with inside and outside exchanged: an atlas holds shapes that fill less than half."""
+def _matches(prepared: Prepared, measured: Diagram, atlas: Atlas, exact: bool) -> tuple[Match, ...]:
+    """Return the nearest shapes of the atlas.
+
+    An atlas holds shapes that fill less than half: of a structure that fills more, the background is matched, and
+    inside and outside of its matches are exchanged.
+    """
     seen_as = "field" if prepared.kind == "field" else "mask"
-    if prepared.volume_fraction <= HALF:
-        return nearest(measured, atlas, seen_as=seen_as, count=MATCHES)
-    return tuple(map(mirrored, nearest(measured.mirrored, atlas, seen_as=seen_as, count=MATCHES)))
+    inverted = prepared.volume_fraction > HALF
+    query = measured.mirrored if inverted else measured
+    found = nearest(query, atlas, seen_as=seen_as, count=MATCHES, exact=exact)
+    return tuple(map(mirror_match, found)) if inverted else found
 
 
 def _laws(
-    prepared: Prepared, estimated: Estimate | None, matches: tuple[Match, ...], seed: int, progress: Progress
+    prepared: Prepared, drawn: tuple[Candidate, ...], matches: tuple[Match, ...], seed: int, progress: Progress
 ) -> tuple[Candidate, ...]:
-    """Return the laws to grow, the most trusted first."""
-    drawn = () if estimated is None else estimated.candidates
+    """Return the laws to grow, the most trusted first: of a phase field its stationarity, those that were drawn, and
+    the nearest match."""
     match = Candidate("match", matches[0].coefficients, matches[0].mass, {})
     if prepared.kind != "field" or is_rounded(prepared.phase):
         return (*drawn, match)
@@ -240,7 +258,7 @@ def _grown(
 
     laws = tuple(grow(law, 0.7 * k / len(laws)) for k, law in enumerate(laws))
     for k in range(effort.regrown):
-        best = best_of(laws)
+        best = best_candidate(laws)
         if best is not None and len(twins[best.name]) < effort.twins:
             laws = tuple(grow(law, 0.7 + 0.3 * k / effort.regrown) if law is best else law for law in laws)
     return laws, twins

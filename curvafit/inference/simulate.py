@@ -20,7 +20,7 @@ from curvafit.core.runtime import Progress, silent
 from curvafit.generation.schedule import LEARNED, Schedule
 from curvafit.geometry.descriptors import Descriptors
 from curvafit.inference.emulator import Emulator
-from curvafit.inference.table import row_of
+from curvafit.inference.table import to_row
 
 #: Simulations in a round; and how often at most the likeliest is looked for that grows.
 BATCH, LAST = 3, 4
@@ -95,7 +95,7 @@ def simulations(
     chosen = draws[np.random.default_rng(seed).choice(len(draws), count, replace=False)]
     rows = []
     for k, parameters in enumerate(chosen):
-        rows.append(row_of(simulate(parameters, seed + k)))
+        rows.append(to_row(simulate(parameters, seed + k)))
         progress(f"simulated {k + 1} of {count}", (k + 1) / count)
     descriptors = np.array(rows)
     grown = np.isfinite(descriptors).all(1)
@@ -198,7 +198,7 @@ class Search:
             others = rng.choice(len(candidates), BATCH - 1 if k < rounds else 0, p=likelihood / likelihood.sum())
             chosen = candidates[[int(deviance.argmin()), *others]]
             seeds = seed + simulated.count + np.arange(len(chosen))
-            rows = np.array([row_of(simulate(each, int(start))) for each, start in zip(chosen, seeds, strict=True)])
+            rows = np.array([to_row(simulate(each, int(start))) for each, start in zip(chosen, seeds, strict=True)])
             grown = np.isfinite(rows).all(1)
             barren = np.concatenate([barren, chosen[~grown]])
             simulated = simulated.joined(chosen[grown], seeds[grown], rows[grown], len(chosen))

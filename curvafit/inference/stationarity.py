@@ -118,12 +118,12 @@ def stationarity(
     problem, size, trials = _with_error(values, gradients, _triangle(octants), grid, epsilon, width, seed)
     progress("solving", 0.8)
     tls, singular = _total_least_squares(problem)
-    matches = [np.array([float(value) for value in start]) / units(epsilon) for start in starts]
-    origins = np.stack([admissible(start) for start in (tls, *matches)])
+    matches = [np.array([float(value) for value in start]) / unit_factors(epsilon) for start in starts]
+    origins = np.stack([clip_to_domain(start) for start in (tls, *matches)])
     solutions, residuals = _solve([problem] * len(origins), origins)
     order = np.argsort(residuals)
-    coefficients, fixed = in_gauge(solutions[order[0]] * units(epsilon))
-    replicas = _replicas(octants, problem.error, solutions[order[0]]) * units(epsilon)
+    coefficients, fixed = fix_gauge(solutions[order[0]] * unit_factors(epsilon))
+    replicas = _replicas(octants, problem.error, solutions[order[0]]) * unit_factors(epsilon)
     deviations = _jackknife_deviation(replicas / replicas[:, fixed : fixed + 1])
     residual = float(size * residuals[order[0]])
     progress("solved", 1.0)
@@ -131,10 +131,10 @@ def stationarity(
         method="stationarity",
         coefficients=coefficients,
         mass=float(values.mean()),
-        uncertainty=named(deviations),
+        uncertainty=by_name(deviations),
         singular_values=tuple(float(value) for value in singular),
         residual=residual,
-        starts=tuple((in_gauge(origins[k] * units(epsilon))[0], float(size * residuals[k])) for k in order),
+        starts=tuple((fix_gauge(origins[k] * unit_factors(epsilon))[0], float(size * residuals[k])) for k in order),
         status=_status(coefficients, deviations, fixed, residual, is_rounded(values.numpy())),
         evaluations=1 + trials,
     )
@@ -177,7 +177,7 @@ def _tested(columns: Tensor, grid: Grid, epsilon: float, width: float) -> np.nda
             raise ValueError(f"expected a test width under {n / 8 - 1:.1f} voxels in a crop of {n}, got {width}")
         core.append(slice(margin, n - margin, _STRIDE))
     tested = [gaussian_blur(column, grid, deviation)[tuple(core)].numpy() for column in columns]
-    return np.stack(tested) * units(epsilon).reshape(6, 1, 1, 1)
+    return np.stack(tested) * unit_factors(epsilon).reshape(6, 1, 1, 1)
 
 
 def _compressed(columns: np.ndarray) -> np.ndarray:
@@ -320,25 +320,25 @@ class Refinement:
     evaluations: int
 
 
-def units(epsilon: float) -> np.ndarray:
+def unit_factors(epsilon: float) -> np.ndarray:
     """Return the factors `(6,)` from dimensionless coefficients (lengths in ε) to those in spacing's unit."""
     return np.array([1, 1, 1, 1 / epsilon, 1 / epsilon, 1 / epsilon**2])
 
 
-def in_gauge(values: np.ndarray) -> tuple[Coefficients, int]:
+def fix_gauge(values: np.ndarray) -> tuple[Coefficients, int]:
     """Return the coefficients with a20 = 1 and 0; or with a02 = 1 and 2, where a20 is under a thousandth of a02."""
     fixed = 0 if values[0] > 1e-3 * values[2] else 2
     return Coefficients(*(float(value) for value in values / values[fixed])), fixed
 
 
-def admissible(values: np.ndarray) -> np.ndarray:
+def clip_to_domain(values: np.ndarray) -> np.ndarray:
     """Return the nearest six with a20 + a02 = 2 and both positive, away from the edge."""
     share = np.clip(values[0] / max(values[0] + values[2], 1e-12), _EDGE, 1 - _EDGE)
     scaled = 2 * values / max(values[0] + values[2], 1e-12)
     return np.concatenate(([2 * share, scaled[1], 2 - 2 * share], scaled[3:]))
 
 
-def named(deviations: Sequence[float] | np.ndarray) -> dict[str, float]:
+def by_name(deviations: Sequence[float] | np.ndarray) -> dict[str, float]:
     """Return the deviations by the coefficients' names."""
     return {name: float(value) for name, value in zip(NAMES, deviations, strict=True)}
 

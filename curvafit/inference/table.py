@@ -16,7 +16,7 @@ from curvafit.geometry.descriptors import BLOCKS, Descriptors
 from curvafit.inference.archive import Archive, encode
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
-from curvafit.scan.grids import centre_distance, median_thickness, resample, without_specks
+from curvafit.scan.grids import centre_distance, median_thickness, remove_specks, resample
 from curvafit.scan.prepare import KEPT_THICKNESS, THINNEST, smallest_piece
 from curvafit.scan.structure import split
 from curvafit.volumes.scan import Field, ScanError
@@ -114,7 +114,7 @@ def law_of(parameters: Sequence[float] | np.ndarray) -> tuple[Coefficients, floa
     return Coefficients(1.0, a11, float(np.exp(log_a02)), a10, a01, a00), mass
 
 
-def mirrored(parameters: np.ndarray) -> np.ndarray:
+def mirror_parameters(parameters: np.ndarray) -> np.ndarray:
     """Return the parameters `(…, 6)` of the same shapes with inside and outside exchanged (`Coefficients.mirrored`)."""
     a11, log_a02, a10, a01, a00, mass = np.moveaxis(np.asarray(parameters, dtype=np.float64), -1, 0)
     a02 = np.exp(log_a02)
@@ -126,7 +126,7 @@ def column_names() -> list[str]:
     return [name for name, length in BLOCKS.items() for _ in range(length)]
 
 
-def row_of(view: Descriptors | None) -> np.ndarray:
+def to_row(view: Descriptors | None) -> np.ndarray:
     """Return the row of a view's descriptors; NaN where there are none."""
     return np.full(sum(BLOCKS.values()), np.nan) if view is None else view.vector()
 
@@ -204,7 +204,7 @@ def resampled(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
     other = resample(centre_distance(part, (1.0,) * 3, 8.0), zoom, (0, 0, 0), coarse) > 0
     distance = centre_distance(other, zoom, 8.0)
     back = resample(distance, [1 / z for z in zoom], (0, 0, 0), part.shape) > 0
-    return View(without_specks(back, smallest_piece(thickness), False)[0], window)
+    return View(remove_specks(back, smallest_piece(thickness), False)[0], window)
 
 
 def scan(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
@@ -214,7 +214,7 @@ def scan(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
     """
     part, window = crop(u, grid, rng)
     inside = split(degraded(part, rng), part.shape)
-    return View(without_specks(inside, smallest_piece(_thickness(inside)), False)[0], window)
+    return View(remove_specks(inside, smallest_piece(_thickness(inside)), False)[0], window)
 
 
 def degraded(part: np.ndarray, rng: np.random.Generator) -> Field:

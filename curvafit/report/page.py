@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from curvafit.core.files import bears, check_folder, check_free, move_together, own_record, staged, write_content
 from curvafit.core.runtime import undisturbed
 from curvafit.core.units import density, length, number, per_unit, percent, unit_name
-from curvafit.inference.candidates import TITLES, Candidate, noise_of
+from curvafit.inference.candidates import TITLES, Candidate, seed_noise_of
 from curvafit.priors.coefficients import NAMES
 from curvafit.priors.fit_file import FORMAT
 from curvafit.report.pictures import (
@@ -305,7 +305,7 @@ def _distance_unit(inference: Inference) -> str:
 
 
 def _distances_say(inference: Inference) -> str:
-    noise = noise_of(inference.fit.candidates)
+    noise = seed_noise_of(inference.fit.candidates)
     if noise is None:
         return "The same parameters could not be grown twice, so it is not known how far apart two seeds lie."
     return f"Two seeds of the same parameters lie {number(noise, 2)} apart: smaller differences mean nothing."
@@ -314,7 +314,7 @@ def _distances_say(inference: Inference) -> str:
 def _bars(inference: Inference) -> str:
     fit = inference.fit
     rows = [(title_of(each), each.distance, each.name == fit.chosen) for each in shown(inference)]
-    noise = noise_of(fit.candidates)
+    noise = seed_noise_of(fit.candidates)
     longest = max([value for _, value, _ in rows if value is not None] + [noise or 0.0]) or 1.0
     parts = []
     for name, value, best in (*rows, ("Two seeds", noise, None)):

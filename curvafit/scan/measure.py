@@ -19,7 +19,7 @@ from curvafit.geometry.mesh import NoSurface, area_vectors
 from curvafit.geometry.morphometry import connectivity_of, local_thickness, smooth_surface
 from curvafit.geometry.topology import euler_shares
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
-from curvafit.scan.grids import median_thickness, without_specks
+from curvafit.scan.grids import median_thickness, remove_specks
 from curvafit.scan.prepare import LARGEST_WINDOW, Prepared, prepare, smallest_piece
 from curvafit.scan.structure import check_options, find_level, is_rounded
 from curvafit.volumes.scan import Field, ScanError
@@ -202,7 +202,7 @@ def _structure(field: Field, kind: str, options: dict[str, Any]) -> tuple[np.nda
     if level.kind == "image":
         thickness, _ = median_thickness(mask, field.spacing, options["periodic"])
         smallest = smallest_piece(thickness) / math.prod(field.spacing)
-        mask, specks, holes = without_specks(mask, smallest, options["periodic"])
+        mask, specks, holes = remove_specks(mask, smallest, options["periodic"])
         if specks or holes:
             notes = (
                 *notes,
@@ -341,7 +341,7 @@ def scan_descriptors(prepared: Prepared) -> tuple[Descriptors, str] | None:
 
 def _view(prepared: Prepared, grid: Grid) -> str:
     """Return what a posterior takes a window for: a field of a part is read as its mask is, a clean image as a mask."""
-    if prepared.imaging is not None and prepared.imaging.degraded:
+    if prepared.quality is not None and prepared.quality.degraded:
         return "scan"
     if grid.periodic:
         return "field" if prepared.kind == "field" and not is_rounded(prepared.phase) else "mask"

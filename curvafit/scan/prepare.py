@@ -18,22 +18,22 @@ from curvafit.priors import WORKING_EPSILON, WORKING_SPACING, Grid, phase_field
 from curvafit.scan.grids import (
     Window,
     bounding_box,
+    boxes_by_surface,
     centre_distance,
     median_thickness,
+    remove_specks,
     resample,
-    rich_boxes,
     surface_voxels,
-    without_specks,
 )
 from curvafit.scan.structure import (
-    Imaging,
     Kind,
     Level,
+    Quality,
     find_level,
-    imaging_of,
     is_noise,
+    measure_quality,
     region_of_interest,
-    voxelised,
+    voxelise,
 )
 from curvafit.volumes.scan import Field, ScanError
 
@@ -109,7 +109,7 @@ class Prepared:
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     roi: np.ndarray | None = None
     noise: bool = False
-    imaging: Imaging | None = None
+    quality: Quality | None = None
 
     @property
     def volume_fraction(self) -> float:
@@ -121,23 +121,27 @@ class Prepared:
         """Return the volume, in working voxels, of the smallest piece that counts as structure."""
         return smallest_piece(self.thickness)
 
-    def seen(self, mask: np.ndarray, seed: int) -> np.ndarray:
-        """Return a periodic mask `(Z, Y, X)` on working voxels as it would come from this scan: from grey levels as
-        blurred and noisy as its own, with noise of a seed, or from a mask on its voxels."""
-        if self.imaging is not None:
-            return self.imaging.seen(mask, self.scale, self.smallest, seed)
-        return mask if self.scale == (1.0, 1.0, 1.0) else voxelised(mask, self.scale, self.smallest)
+    def rescan(self, mask: np.ndarray, seed: int) -> np.ndarray:
+        """Scan a periodic mask `(Z, Y, X)` on working voxels as this scan was made; return the mask that comes back.
+
+        An image is as blurred and noisy as this one, with noise of a seed; a mask is one on this scan's voxels.
+        """
+        if self.quality is not None:
+            return self.quality.rescan(mask, self.scale, self.smallest, seed)
+        return mask if self.scale == (1.0, 1.0, 1.0) else voxelise(mask, self.scale, self.smallest)
 
     @cached_property
-    def true_share(self) -> float:
-        """Return the part of the volume that the structure fills, of an image without what noise and blur change it by:
-        by as much as they change the structure of the main window, without what they fattened it by."""
-        if self.imaging is None:
+    def true_volume_fraction(self) -> float:
+        """Return the structure's volume fraction, corrected for the bias of blur and noise.
+
+        The bias is estimated by scanning the main window's structure once more (`rescan`).
+        """
+        if self.quality is None:
             return self.volume_fraction
         mask = self.mask[self.windows[0]]
-        inside = centre_distance(mask, (1.0, 1.0, 1.0), 4.0) > self.imaging.fat / max(self.scale)
+        inside = centre_distance(mask, (1.0, 1.0, 1.0), 4.0) > self.quality.boundary_shift / max(self.scale)
         try:
-            seen = np.count_nonzero(self.seen(inside, 0))
+            seen = np.count_nonzero(self.rescan(inside, 0))
         except ScanError:
             return self.volume_fraction
         share = self.volume_fraction * np.count_nonzero(inside) / max(seen, 1)
@@ -150,7 +154,7 @@ class Prepared:
         return Grid((z, y, x), self.grid.spacing, self.grid.boundary if whole else "replicate")
 
     @property
-    def turned(self) -> Prepared:
+    def inverted(self) -> Prepared:
         """Return the same scan with structure and background exchanged."""
         mask = ~self.mask if self.roi is None else ~self.mask & self.roi
         return replace(self, mask=mask, phase=-self.phase)
@@ -207,7 +211,7 @@ def prepare(
     prepared = _on_working_grid(scan)
     if level.kind == "image":
         grey = -part.values if dark else part.values
-        prepared = replace(prepared, imaging=imaging_of(grey, level.mask, part.spacing))
+        prepared = replace(prepared, quality=measure_quality(grey, level.mask, part.spacing))
     corner = tuple(s.start + o for s, o in zip(where, prepared.origin, strict=True))
     return replace(prepared, unit=field.unit, origin=corner)  # type: ignore[arg-type]
 
@@ -258,7 +262,7 @@ def _on_working_grid(scan: _Scan) -> Prepared:
         "periodic" if scan.periodic and not cut else "replicate",
     )
     mask, dropped = _structure(scan.level.kind, values, region, thickness / edge, grid.periodic)
-    windows = rich_boxes(surface_voxels(mask), LARGEST_WINDOW)
+    windows = boxes_by_surface(surface_voxels(mask), LARGEST_WINDOW)
     filled = float((mask if region is None else mask[region]).mean())
     inverted = (MOSTLY.format(filled),) if filled > HALF else ()
     if not windows:
@@ -331,7 +335,7 @@ def _working_box(
         return (0, 0, 0), (full[0], full[1], full[2]), ()
     sides = [min(n, LARGEST_BOX) for n in full]
     size = [math.ceil(n * s) for n, s in zip(sides, scale, strict=True)]
-    boxes = rich_boxes(surface_voxels(scan.counted), size)
+    boxes = boxes_by_surface(surface_voxels(scan.counted), size)
     corner = boxes[0] if boxes else tuple(slice(0, n) for n in size)
     start = [min(int(c.start / s), n - m) for c, s, n, m in zip(corner, scale, full, sides, strict=True)]
     note = f"Of {_times(full)} working voxels, {_times(sides)} from {tuple(start)} on are used."
@@ -362,7 +366,7 @@ def _structure(
     mask = values > 0 if region is None else (values > 0) & region
     if kind == "field":
         return mask, ()
-    cleaned, specks, pinholes = without_specks(mask, smallest_piece(thickness), periodic)
+    cleaned, specks, pinholes = remove_specks(mask, smallest_piece(thickness), periodic)
     if not specks and not pinholes:
         return mask, ()
     counts = f"specks: {specks}, pinholes: {pinholes}, {(cleaned != mask).mean():.2g} of the volume"
@@ -383,7 +387,7 @@ def _times(shape: Iterable[int]) -> str:
     return " x ".join(str(n) for n in shape)
 
 
-def untextured(prepared: Prepared, diagram: Diagram) -> str:
+def why_no_texture(prepared: Prepared, diagram: Diagram) -> str:
     """Return why a scan shows no texture whose law could be read, as a sentence; empty where it may."""
     edge = max(s.stop - s.start for s in prepared.windows[0]) * prepared.grid.spacing[0]
     bend = np.average(np.hypot(*np.asarray(diagram.points).T), weights=np.asarray(diagram.weights)) * edge

@@ -1,4 +1,8 @@
-"""What in a scan is structure: the kind of the scan, its threshold, its sign."""
+"""What in a scan is structure, how blurred it is and how noisy.
+
+`find_level` decides the kind of a scan and splits structure from background. `Quality` is how the scan blurs and how
+noisy it is, measured from its grey levels (`measure_quality`), and scans a grown shape alike (`Quality.rescan`).
+"""
 
 from __future__ import annotations
 
@@ -13,7 +17,7 @@ from scipy import ndimage
 from skimage.filters import threshold_otsu
 
 from curvafit.core.checks import SEEDS, check_choice, check_float, check_int
-from curvafit.scan.grids import centre_distance, resample, rich_boxes, surface_voxels, without_specks
+from curvafit.scan.grids import boxes_by_surface, centre_distance, remove_specks, resample, surface_voxels
 from curvafit.volumes.scan import Field, ScanError, load
 
 Kind = Literal["field", "mask", "image"]
@@ -24,8 +28,8 @@ _NOISE = 0.045
 _LAGS, _UNCORRELATED = (4, 5, 6, 7, 8), 0.06
 #: Blurs that are tried, in voxels of the finest axis.
 _BLURS = (0.0, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0)
-#: Fat that is tried, in voxels of the finest axis.
-_FAT = (-0.5, -0.25, 0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5)
+#: Shifts of the boundary that are tried, in voxels of the finest axis.
+_SHIFTS = (-0.5, -0.25, 0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5)
 #: Grains that are tried, in voxels of the finest axis.
 _GRAINS = (0.0, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.2, 1.4, 1.7, 2.0, 2.5, 3.0)
 #: Edge of the box in which a scan's noise and blur are measured.
@@ -177,8 +181,10 @@ def _signed(mask: np.ndarray, dark: bool, note: str) -> Level:
 
 
 def _between_phases(values: np.ndarray) -> float:
-    """Return the middle of the means of the two phases that Otsu's threshold splits: his threshold, but for phases of
-    sharp levels, which any threshold between them splits alike, and of which his is the lowest.
+    """Return the middle of the means of the two phases that Otsu's threshold splits.
+
+    That is Otsu's own threshold, but for phases of sharp levels: any threshold between those splits them alike, and
+    Otsu's is the lowest.
     """
     high = values > threshold_otsu(values)
     return float(values[high].mean(dtype=np.float64) + values[~high].mean(dtype=np.float64)) / 2
@@ -212,8 +218,8 @@ def _image_level(
 
 
 @dataclass(frozen=True)
-class Imaging:
-    """A scan's noise and blur.
+class Quality:
+    """Blur and noise of a scan.
 
     Attributes
     ----------
@@ -224,7 +230,7 @@ class Imaging:
     grain
         Deviation of the Gaussian that makes such noise of white noise, in voxels of the finest axis.
     fat
-        How far the structure that was split off reaches beyond what was blurred, in voxels of the finest axis.
+        How far the structure that was split off reaches beyond the one that was blurred, in voxels of the finest axis.
     spacing
         Voxel edges (z, y, x) of the scan.
     """
@@ -232,13 +238,15 @@ class Imaging:
     blur: float
     noise: float
     grain: float
-    fat: float
+    boundary_shift: float
     spacing: tuple[float, float, float]
 
     @property
     def smoothed(self) -> float:
-        """Return the noise that is left by the smoothing by a voxel of the finest axis with which an image is split; of
-        white noise on cubic voxels it leaves 0.15."""
+        """Return the noise, over the contrast, that is left once the image is smoothed to be split.
+
+        Smoothing by a voxel of the finest axis leaves 0.15 of white noise on cubic voxels.
+        """
         return self.noise * _left(self.grain, self.spacing)
 
     @property
@@ -246,11 +254,11 @@ class Imaging:
         """Return whether a texture is harder to read from the scan than from a mask."""
         return self.smoothed > NOISY or max(self.spacing) > SLICED * min(self.spacing)
 
-    def seen(self, mask: np.ndarray, scale: Sequence[float], smallest: float, seed: int) -> np.ndarray:
-        """Return a periodic mask as it would come from such a scan.
+    def rescan(self, mask: np.ndarray, scale: Sequence[float], smallest: float, seed: int) -> np.ndarray:
+        """Scan a periodic mask as this scan was made, and return the mask that comes back.
 
-        It is blurred, sampled on the scan's voxels, made noisy, and prepared as an image is: smoothed, split by Otsu's
-        threshold, brought back to its own grid, cleared of specks.
+        The mask is blurred, sampled on the scan's voxels, made noisy, and prepared as an image is: smoothed, split by
+        Otsu's threshold, brought back to its own grid, cleared of specks.
 
         Parameters
         ----------
@@ -276,7 +284,7 @@ class Imaging:
         noise = ndimage.gaussian_filter(noise, [self.grain * min(voxel) / h for h in voxel], mode="wrap")
         grey += np.float32(self.noise) * noise / noise.std()
         edges = (voxel[0], voxel[1], voxel[2])
-        return without_specks(split(Field(grey, edges, "voxel"), mask.shape, periodic=True), smallest, True)[0]
+        return remove_specks(split(Field(grey, edges, "voxel"), mask.shape, periodic=True), smallest, True)[0]
 
 
 def split(scan: Field, shape: Sequence[int], *, periodic: bool = False) -> np.ndarray:
@@ -285,15 +293,18 @@ def split(scan: Field, shape: Sequence[int], *, periodic: bool = False) -> np.nd
     return resample(values, [1 / h for h in scan.spacing], (0, 0, 0), shape, periodic=periodic) > 0
 
 
-def voxelised(mask: np.ndarray, scale: Sequence[float], smallest: float) -> np.ndarray:
-    """Return a periodic mask `(Z, Y, X)` as it would come from a mask on a scan's voxels, of which a working voxel is
-    `scale` long (z, y, x): by signed distances there and back, without pieces of under `smallest` working voxels."""
+def voxelise(mask: np.ndarray, scale: Sequence[float], smallest: float) -> np.ndarray:
+    """Return a periodic mask `(Z, Y, X)` as it comes back from a mask on the voxels of a scan.
+
+    It is resampled there and back by signed distances, and pieces of under `smallest` working voxels are dropped.
+    `scale` is a working voxel in scan voxels (z, y, x).
+    """
     shape, voxel = _sampling(mask.shape, scale)
     distance = centre_distance(mask, (1.0, 1.0, 1.0), 4 * max(voxel), periodic=True)
     coarse = resample(distance, voxel, (0, 0, 0), shape, periodic=True) > 0
     distance = centre_distance(coarse, voxel, 4 * max(1.0, *voxel), periodic=True)
     inside = resample(distance, [1 / h for h in voxel], (0, 0, 0), mask.shape, periodic=True) > 0
-    return without_specks(inside, smallest, True)[0]
+    return remove_specks(inside, smallest, True)[0]
 
 
 def _sampling(shape: Sequence[int], scale: Sequence[float]) -> tuple[list[int], list[float]]:
@@ -302,15 +313,14 @@ def _sampling(shape: Sequence[int], scale: Sequence[float]) -> tuple[list[int], 
     return voxels, [n / m for n, m in zip(shape, voxels, strict=True)]
 
 
-def imaging_of(image: np.ndarray, mask: np.ndarray, spacing: tuple[float, float, float]) -> Imaging:
-    """Measure the noise and blur of a scan from its structure.
+def measure_quality(image: np.ndarray, mask: np.ndarray, spacing: tuple[float, float, float]) -> Quality:
+    """Measure blur and noise of a scan from its structure.
 
-    The blur, with the contrast, is the one of `_BLURS` with which the structure, blurred, explains the grey levels best
-    (least squares); with it is found by how much the structure that was split off is too fat, as thin ones are where
-    noise shifts the threshold. The noise is what grey levels vary by deep within the phases, where uneven lighting is
-    taken off.
-    Where nothing lies deep it is taken for white and read from third-order differences, which neither the structure nor
-    the lighting passes (Immerkær 1996, along three axes).
+    Blur, contrast and shift of the boundary are those with which the structure, blurred, explains the grey levels best
+    (least squares over `_BLURS` and `_SHIFTS`); thin structures come out too fat where noise shifts the threshold. The
+    noise is the deviation of grey levels deep within the phases, less uneven lighting. Where nothing lies deep, the
+    noise is taken for white and read from second differences along three axes, which neither structure nor lighting
+    passes (Immerkær 1996).
 
     Parameters
     ----------
@@ -324,37 +334,35 @@ def imaging_of(image: np.ndarray, mask: np.ndarray, spacing: tuple[float, float,
     ScanError
         If the grey levels have no contrast between structure and background.
     """
-    box = next(iter(rich_boxes(surface_voxels(mask), _MEASURED)), (slice(None),) * 3)
+    box = next(iter(boxes_by_surface(surface_voxels(mask), _MEASURED)), (slice(None),) * 3)
     image, mask = image[box].astype(np.float32), mask[box]
     levels = image - image.mean()
     edges = [h / min(spacing) for h in spacing]
-    blur, contrast, fat = _blur_of(levels, mask, edges)
+    blur, contrast, shift = _blur_of(levels, mask, edges)
     if not contrast > 0:
         raise ScanError("expected grey levels that tell structure from background, got none that do")
     noise, left = _deep_noise(levels, mask, edges) or (_white_noise(levels), 0.0)
     grain = min(_GRAINS, key=lambda width: abs(_left(width, spacing) - left))
-    return Imaging(blur, noise / contrast, grain, fat, spacing)
+    return Quality(blur, noise / contrast, grain, shift, spacing)
 
 
 def _blur_of(levels: np.ndarray, mask: np.ndarray, edges: Sequence[float]) -> tuple[float, float, float]:
-    """Return the blur, the contrast, and by how much the structure is fatter than what was blurred, of levels of mean 0
-    on voxels with edges in units of the finest."""
+    """Return blur, contrast and boundary shift of levels of mean 0 on voxels with edges in units of the finest."""
     distance = centre_distance(mask, edges, 4.0)
     explained = []
-    for fat in _FAT:
-        filled = np.clip(distance - fat + 0.5, 0, 1)
+    for shift in _SHIFTS:
+        filled = np.clip(distance - shift + 0.5, 0, 1)
         for blur in _BLURS:
             model = ndimage.gaussian_filter(filled, [blur / h for h in edges])
             model -= model.mean()
             product, square = float((model * levels).mean()), float(np.square(model).mean())
             if square > 0:
-                explained.append((product * abs(product) / square, blur, product / square, fat))
+                explained.append((product * abs(product) / square, blur, product / square, shift))
     return max(explained)[1:]
 
 
 def _deep_noise(levels: np.ndarray, mask: np.ndarray, edges: Sequence[float]) -> tuple[float, float] | None:
-    """Return the deviation of levels deep within the phases, and the part of it that smoothing leaves; None where too
-    little lies deep."""
+    """Return the deviation of levels deep within the phases and the share of it that smoothing leaves, or None."""
     smoothing, uneven = ([width / h for h in edges] for width in (1.0, _UNEVEN))
     both = (levels, ndimage.gaussian_filter(levels, smoothing))
     squares, count = np.zeros(2), 0

@@ -10,7 +10,7 @@ from emulated import BOX, HIGH, LOW, NOISE, linear, row, told
 
 from curvafit.geometry.descriptors import BLOCKS, Descriptors
 from curvafit.inference.emulator import misfits
-from curvafit.inference.estimate import LEVELS, STARTS, amortised_p, check
+from curvafit.inference.estimate import LEVELS, STARTS, check, tail_probability
 from curvafit.inference.posterior import Posterior
 from curvafit.inference.simulate import simulations
 from curvafit.inference.table import PARAMETERS, column_names
@@ -78,8 +78,8 @@ def test_without_simulations_the_reference_tells() -> None:
     rows = grown(np.random.default_rng(3), 2)
     rows[1, 2] += 5
     left = misfits(POSTERIOR.emulator, rows, "mask", POSTERIOR.sample(rows, "mask", STARTS))
-    assert amortised_p(POSTERIOR, "mask", left[0]) > 1e-2
-    assert amortised_p(POSTERIOR, "mask", left[1]) == pytest.approx(1 / 401)
+    assert tail_probability(POSTERIOR, "mask", left[0]) > 1e-2
+    assert tail_probability(POSTERIOR, "mask", left[1]) == pytest.approx(1 / 401)
 
 
 def test_few_simulations_are_refused() -> None:

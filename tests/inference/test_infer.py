@@ -16,13 +16,14 @@ from curvafit.generation.schedule import LEARNED, SCHEDULES, schedule
 from curvafit.geometry.descriptors import BLOCKS, descriptors
 from curvafit.geometry.diagram import diagram
 from curvafit.geometry.distances import wasserstein
+from curvafit.inference.atlas import load_atlas
 from curvafit.inference.candidates import TITLES
 from curvafit.inference.estimate import DRAWS
 from curvafit.inference.fit import COLUMNS, Fit
 from curvafit.inference.infer import Inference, infer
 from curvafit.inference.posterior import load_posterior
 from curvafit.inference.simulate import Effort
-from curvafit.inference.table import law_of, mirrored, parameters_of
+from curvafit.inference.table import law_of, mirror_parameters, parameters_of
 from curvafit.priors.coefficients import preset
 from curvafit.priors.fit_file import read_fit
 from curvafit.priors.fit_schema import FORMAT
@@ -30,7 +31,7 @@ from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.report.page import write_inference
 from curvafit.scan.measure import scan_descriptors, scan_diagram
 from curvafit.scan.prepare import prepare
-from curvafit.scan.structure import Imaging
+from curvafit.scan.structure import Quality
 from curvafit.volumes.scan import Field
 
 GRID = Grid((32, 32, 32))
@@ -156,7 +157,9 @@ def test_inside_for_outside_is_the_mirrored_law(tubes: np.ndarray, straight: Fit
     """And the note says how to turn it round."""
     other = quick(tubes <= 0)
     assert straight.draws is not None and other.draws is not None
-    np.testing.assert_allclose(other.draws.parameters, mirrored(straight.draws.parameters), rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(
+        other.draws.parameters, mirror_parameters(straight.draws.parameters), rtol=1e-5, atol=1e-5
+    )
     own, law = straight.to_prior(), other.to_prior()
     six = own.coefficients.mirrored()
     assert tuple(law.coefficients) == pytest.approx(tuple(six.scaled(1 / float(six.a20))), rel=1e-6)
@@ -279,12 +282,12 @@ def test_a_scan_is_seen_as_a_kind_of_view() -> None:
         "mask": {"kind": "mask"},
         "crop": {"grid": Grid(grid.shape, grid.spacing, "replicate")},
         "resampled": {"grid": Grid(grid.shape, grid.spacing, "replicate"), "scale": (1.0, 1.0, 2.0)},
-        "scan": {"kind": "image", "imaging": Imaging(1.0, 0.3, 0.0, 0.0, (1.0, 1.0, 1.0))},
+        "scan": {"kind": "image", "quality": Quality(1.0, 0.3, 0.0, 0.0, (1.0, 1.0, 1.0))},
     }
     for view, changes in parts.items():
         seen = scan_descriptors(dataclasses.replace(whole, **changes))
         assert seen is not None and seen[1] == view, view
-    clean = dataclasses.replace(whole, kind="image", imaging=Imaging(1.0, 0.05, 0.0, 0.0, (1.0, 1.0, 1.0)))
+    clean = dataclasses.replace(whole, kind="image", quality=Quality(1.0, 0.05, 0.0, 0.0, (1.0, 1.0, 1.0)))
     assert (seen := scan_descriptors(clean)) is not None and seen[1] == "mask"
     rounded = scan_descriptors(dataclasses.replace(whole, phase=np.round(whole.phase, 2)))
     assert rounded is not None and rounded[1] == "mask"
@@ -295,3 +298,23 @@ def _quantile(measured, direction: np.ndarray, share: float) -> float:
     order = np.argsort(values)
     cumulated = np.cumsum(measured.weights[order]) / measured.area
     return float(values[order][np.searchsorted(cumulated, share)])
+
+
+# ---- as the paper's author would -------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_the_nearest_match_is_refined_by_gradients(tubes: np.ndarray) -> None:
+    """By its descriptors as a mask, by its stationarity as a field; distances are geomloss's."""
+    mask = Field((tubes > 0).astype(np.uint8), (1.0,) * 3, "um")
+    for scan, name in ((mask, "optimum"), (Field(tubes, (1.0,) * 3, "um"), "stationarity")):
+        inference = infer(scan, periodic=True, method="match", fast=True)
+        fit = inference.fit
+        assert fit.chosen == name and [each.name for each in fit.candidates][-1] == "match" and fit.draws is None
+        assert fit.best is not None and fit.best.uncertainty and fit.best.coefficients.a20 == pytest.approx(1)
+        seen_as = "mask" if name == "optimum" else "field"
+        k = load_atlas().ids.index(fit.matches[0].id)
+        assert inference.diagram is not None
+        assert fit.matches[0].distance == wasserstein(inference.diagram, load_atlas().diagrams(seen_as)[k])
+    with pytest.raises(ValueError, match="method"):
+        infer(mask, method="nearest")  # type: ignore[arg-type]

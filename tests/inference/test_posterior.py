@@ -19,7 +19,7 @@ from curvafit.inference.table import (
     columns_of,
     compression_of,
     law_of,
-    mirrored,
+    mirror_parameters,
     parameters_of,
     save_table,
 )
@@ -240,8 +240,8 @@ def test_a_parameter_that_does_not_vary_is_named() -> None:
 
 def test_mirrored_parameters_are_those_of_the_mirrored_law() -> None:
     rows = np.random.default_rng(0).uniform(LOW, HIGH, (20, 6))
-    assert mirrored(mirrored(rows)) == pytest.approx(rows)
+    assert mirror_parameters(mirror_parameters(rows)) == pytest.approx(rows)
     for row in rows:
         six, mass = law_of(row)
         other = six.mirrored()
-        assert mirrored(row) == pytest.approx(parameters_of(other.scaled(1 / float(other.a20)), -mass))
+        assert mirror_parameters(row) == pytest.approx(parameters_of(other.scaled(1 / float(other.a20)), -mass))

@@ -11,7 +11,7 @@ import torch
 from emulated import BOX, linear, row
 from shapes import grown
 
-from curvafit.inference.drift import ShortFlow, drift, sharpened
+from curvafit.inference.drift import ShortFlow, deblur, drift
 from curvafit.inference.emulator import optimum
 from curvafit.inference.stationarity import stationarity
 from curvafit.priors.coefficients import Coefficients, preset
@@ -56,7 +56,7 @@ def test_only_the_direction_of_a_counts(mask_phase: torch.Tensor) -> None:
 
 def test_sharpening_undoes_most_of_the_blur(mask_phase: torch.Tensor) -> None:
     blurred = gaussian_blur(mask_phase, GRID, WORKING_EPSILON)
-    kept = gaussian_blur(sharpened(mask_phase, GRID, WORKING_EPSILON), GRID, WORKING_EPSILON)
+    kept = gaussian_blur(deblur(mask_phase, GRID, WORKING_EPSILON), GRID, WORKING_EPSILON)
     assert (kept - mask_phase).abs().mean() < 0.35 * (blurred - mask_phase).abs().mean()
     assert float(kept.double().mean()) == pytest.approx(float(mask_phase.double().mean()), abs=1e-5)
 

@@ -10,7 +10,14 @@ import torch
 
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import schedule
-from curvafit.inference.stationarity import _tested, admissible, energy_gradients, in_gauge, stationarity, units
+from curvafit.inference.stationarity import (
+    _tested,
+    clip_to_domain,
+    energy_gradients,
+    fix_gauge,
+    stationarity,
+    unit_factors,
+)
 from curvafit.priors import WORKING_EPSILON, Coefficients, Grid, energy_terms, jet, preset
 from curvafit.scan.structure import is_rounded
 
@@ -133,11 +140,11 @@ def test_a_rounded_field_is_told(sponge: torch.Tensor) -> None:
 
 
 def test_gauge_and_domain() -> None:
-    coefficients, fixed = in_gauge(np.array([2.0, 4, 8, -20, 6, 100]))
+    coefficients, fixed = fix_gauge(np.array([2.0, 4, 8, -20, 6, 100]))
     assert list(coefficients) == [1, 2, 4, -10, 3, 50] and fixed == 0
-    coefficients, fixed = in_gauge(np.array([1e-5, 4, 2.0, 0, 0, 0]))
+    coefficients, fixed = fix_gauge(np.array([1e-5, 4, 2.0, 0, 0, 0]))
     assert coefficients.a02 == 1 and fixed == 2
-    inside = admissible(np.array([-0.2, 1.0, 4.2, 1, 1, 1]))
+    inside = clip_to_domain(np.array([-0.2, 1.0, 4.2, 1, 1, 1]))
     assert inside[0] > 0 and inside[2] > 0 and inside[0] + inside[2] == pytest.approx(2)
     a = Coefficients(1, 2, 3, 4, 5, 6)
-    assert np.array(list(a)) / units(0.5) == pytest.approx(list(a.in_unit(0.5)))
+    assert np.array(list(a)) / unit_factors(0.5) == pytest.approx(list(a.in_unit(0.5)))

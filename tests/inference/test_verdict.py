@@ -19,9 +19,9 @@ from curvafit.inference.candidates import (
     Candidate,
     Misfit,
     Twin,
-    best_of,
-    noise_of,
-    unlike,
+    best_candidate,
+    differences,
+    seed_noise_of,
     verdict,
 )
 from curvafit.priors.coefficients import Coefficients
@@ -58,15 +58,15 @@ def test_the_first_within_seed_noise_of_the_nearest_is_the_best() -> None:
         ((barren,), None),
         ((), None),
     ):
-        assert best_of(order) == best
+        assert best_candidate(order) == best
 
 
 def test_seed_noise_is_the_best_one_s_or_another_s() -> None:
     best, other = law("simulation", 2.0, 0.5), law("match", 5.0, 1.5)
-    assert noise_of((other, best)) == 0.5
-    assert noise_of((law("posterior", 1.0), other)) == 1.5
-    assert noise_of((law("posterior", 1.0), law("optimum"))) is None
-    assert noise_of(()) is None
+    assert seed_noise_of((other, best)) == 0.5
+    assert seed_noise_of((law("posterior", 1.0), other)) == 1.5
+    assert seed_noise_of((law("posterior", 1.0), law("optimum"))) is None
+    assert seed_noise_of(()) is None
 
 
 def test_what_grew_is_measured_against_the_scan() -> None:
@@ -183,20 +183,22 @@ def test_few_tunnels_may_differ_by_the_root_of_their_count() -> None:
     ):
         scan = dataclasses.replace(NUMBERS, euler=1 - tunnels)
         other = dataclasses.replace(scan, connectivity_density=ratio * scan.connectivity_density)
-        assert unlike(scan, (other,)) == words
+        assert differences(scan, (other,)) == words
 
 
 def test_familiar_numbers_that_differ_are_named() -> None:
     """Where all twins differ by more than 15 %, the same way; none that the scan does not have."""
     near = dataclasses.replace(NUMBERS, thickness_mean=1.14 * NUMBERS.thickness_mean)
-    assert unlike(NUMBERS, (NUMBERS, near)) == unlike(NUMBERS, (near,)) == unlike(NUMBERS, ()) == []
+    assert differences(NUMBERS, (NUMBERS, near)) == differences(NUMBERS, (near,)) == differences(NUMBERS, ()) == []
     far = dataclasses.replace(NUMBERS, thickness_mean=3 * NUMBERS.thickness_mean, connectivity_density=0.0)
     further = dataclasses.replace(far, thickness_mean=5 * NUMBERS.thickness_mean)
-    assert unlike(NUMBERS, (far, further)) == ["thickness 4.0", "connectivity 0"]
-    assert unlike(NUMBERS, (NUMBERS, far)) == []
+    assert differences(NUMBERS, (far, further)) == ["thickness 4.0", "connectivity 0"]
+    assert differences(NUMBERS, (NUMBERS, far)) == []
     thin = dataclasses.replace(NUMBERS, thickness_mean=0.5 * NUMBERS.thickness_mean)
-    assert unlike(NUMBERS, (thin, dataclasses.replace(far, connectivity_density=NUMBERS.connectivity_density))) == []
+    assert (
+        differences(NUMBERS, (thin, dataclasses.replace(far, connectivity_density=NUMBERS.connectivity_density))) == []
+    )
     pieces = dataclasses.replace(NUMBERS, connectivity_density=-NUMBERS.connectivity_density)
-    assert unlike(NUMBERS, (pieces,)) == ["connectivity of the other sign"]
-    assert unlike(dataclasses.replace(NUMBERS, thickness_mean=math.nan), (NUMBERS,)) == []
-    assert unlike(dataclasses.replace(NUMBERS, connectivity_density=0.0), (NUMBERS,)) == []
+    assert differences(NUMBERS, (pieces,)) == ["connectivity of the other sign"]
+    assert differences(dataclasses.replace(NUMBERS, thickness_mean=math.nan), (NUMBERS,)) == []
+    assert differences(dataclasses.replace(NUMBERS, connectivity_density=0.0), (NUMBERS,)) == []

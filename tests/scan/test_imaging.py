@@ -9,7 +9,7 @@ from scipy import ndimage
 from curvafit import Field
 from curvafit.scan.grids import centre_distance
 from curvafit.scan.prepare import prepare
-from curvafit.scan.structure import Imaging, imaging_of, voxelised
+from curvafit.scan.structure import Quality, measure_quality, voxelise
 
 CUBIC = (1.0, 1.0, 1.0)
 
@@ -36,27 +36,27 @@ def image(mask: np.ndarray, blur: float, noise: float) -> np.ndarray:
 @pytest.mark.parametrize("blur", [0.5, 1.0, 1.5])
 def test_blur_and_noise_are_read_from_grey_levels(blur: float, noise: float) -> None:
     mask = bodies()
-    imaging = imaging_of(image(mask, blur, noise), mask, CUBIC)
-    assert imaging.blur == pytest.approx(blur, abs=0.5)  # a step of those tried, and a mask's own stairs
-    assert imaging.noise == pytest.approx(noise, rel=0.15, abs=0.01)
-    assert imaging.degraded == (noise > 0.2)
-    assert imaging.grain <= 0.6  # white noise has none; a blur of 1.5 reaches into what lies deep
-    assert abs(imaging.fat) <= 0.5  # stairs
+    quality = measure_quality(image(mask, blur, noise), mask, CUBIC)
+    assert quality.blur == pytest.approx(blur, abs=0.5)  # a step of those tried, and a mask's own stairs
+    assert quality.noise == pytest.approx(noise, rel=0.15, abs=0.01)
+    assert quality.degraded == (noise > 0.2)
+    assert quality.grain <= 0.6  # white noise has none; a blur of 1.5 reaches into what lies deep
+    assert abs(quality.boundary_shift) <= 0.5  # stairs
 
 
 def test_what_smoothing_leaves_of_white_noise() -> None:
-    assert Imaging(0.5, 1.0, 0.0, 0.0, CUBIC).smoothed == pytest.approx((2 * np.sqrt(np.pi)) ** -1.5, rel=1e-3)
+    assert Quality(0.5, 1.0, 0.0, 0.0, CUBIC).smoothed == pytest.approx((2 * np.sqrt(np.pi)) ** -1.5, rel=1e-3)
     levels = np.random.default_rng(0).standard_normal((48, 96, 96))
     smooth = ndimage.gaussian_filter(levels, (0.5, 1.0, 1.0))
-    assert Imaging(0.5, 1.0, 0.0, 0.0, (2.0, 1.0, 1.0)).smoothed == pytest.approx(smooth.std(), rel=0.05)
+    assert Quality(0.5, 1.0, 0.0, 0.0, (2.0, 1.0, 1.0)).smoothed == pytest.approx(smooth.std(), rel=0.05)
 
 
 @pytest.mark.parametrize("spacing", [CUBIC, (2.0, 1.0, 1.0)])
 def test_noise_is_read_on_slices_that_are_thicker(spacing: tuple[float, float, float]) -> None:
     mask = bodies()[:: int(spacing[0])]
-    imaging = imaging_of(image(mask, 0.7, 0.2), mask, spacing)
-    assert imaging.noise == pytest.approx(0.2, rel=0.15)
-    assert imaging.grain <= 0.5
+    quality = measure_quality(image(mask, 0.7, 0.2), mask, spacing)
+    assert quality.noise == pytest.approx(0.2, rel=0.15)
+    assert quality.grain <= 0.5
 
 
 @pytest.mark.parametrize("grain", [0.7, 1.2])
@@ -64,67 +64,67 @@ def test_noise_that_neighbours_share_is_read_with_its_grain(grain: float) -> Non
     mask = bodies()
     noise = ndimage.gaussian_filter(np.random.default_rng(1).standard_normal(mask.shape), grain)
     levels = image(mask, 1.0, 0.0) + 50 * 0.1 * noise / noise.std()
-    imaging = imaging_of(levels, mask, CUBIC)
-    assert imaging.noise == pytest.approx(0.1, rel=0.2)
-    assert imaging.grain == pytest.approx(grain, rel=0.25)
+    quality = measure_quality(levels, mask, CUBIC)
+    assert quality.noise == pytest.approx(0.1, rel=0.2)
+    assert quality.grain == pytest.approx(grain, rel=0.25)
 
 
 @pytest.mark.parametrize("fat", [1, 2])
 def test_a_mask_that_is_too_fat_is_known_as_such(fat: int) -> None:
     """And does not lower the contrast, by which the noise would seem too great."""
     mask = bodies()
-    imaging = imaging_of(image(mask, 1.0, 0.2), ndimage.binary_dilation(mask, iterations=fat), CUBIC)
-    assert imaging.fat == pytest.approx(
+    quality = measure_quality(image(mask, 1.0, 0.2), ndimage.binary_dilation(mask, iterations=fat), CUBIC)
+    assert quality.boundary_shift == pytest.approx(
         min(0.8 * fat, 1.5), abs=0.5
     )  # of faces' neighbours: less than a voxel in the mean
-    assert imaging.noise == pytest.approx(0.2, rel=0.15)
+    assert quality.noise == pytest.approx(0.2, rel=0.15)
 
 
 def test_thin_structures_have_their_noise_read_from_differences() -> None:
     mask = np.zeros((32, 32, 32), dtype=bool)
     mask[::6] = mask[1::6] = True
-    assert imaging_of(image(mask, 0.5, 0.1), mask, CUBIC).noise == pytest.approx(0.1, rel=0.2)
+    assert measure_quality(image(mask, 0.5, 0.1), mask, CUBIC).noise == pytest.approx(0.1, rel=0.2)
 
 
 def test_thick_slices_are_worse_than_a_mask() -> None:
-    assert Imaging(0.5, 0.02, 0.0, 0.0, (2.0, 1.0, 1.0)).degraded
-    assert not Imaging(0.5, 0.02, 0.0, 0.0, CUBIC).degraded
+    assert Quality(0.5, 0.02, 0.0, 0.0, (2.0, 1.0, 1.0)).degraded
+    assert not Quality(0.5, 0.02, 0.0, 0.0, CUBIC).degraded
 
 
 def test_a_sharp_clean_scan_shows_the_shape() -> None:
     mask = bodies()
-    seen = Imaging(0.5, 0.01, 0.0, 0.0, CUBIC).seen(mask, CUBIC, 4.0, 0)
+    seen = Quality(0.5, 0.01, 0.0, 0.0, CUBIC).rescan(mask, CUBIC, 4.0, 0)
     beside = np.abs(centre_distance(mask, CUBIC, 3.0, periodic=True)) <= 1.5
     assert np.array_equal(seen[~beside], mask[~beside])
     assert seen.mean() == pytest.approx(mask.mean(), rel=0.05)
 
 
 def test_noise_moves_the_surface_and_seeds_move_it_differently() -> None:
-    mask, noisy = bodies(), Imaging(1.0, 0.4, 0.0, 0.0, CUBIC)
-    first, second = (noisy.seen(mask, CUBIC, 20.0, seed) for seed in (0, 1))
-    clean = Imaging(1.0, 0.0, 0.0, 0.0, CUBIC).seen(mask, CUBIC, 20.0, 0)
+    mask, noisy = bodies(), Quality(1.0, 0.4, 0.0, 0.0, CUBIC)
+    first, second = (noisy.rescan(mask, CUBIC, 20.0, seed) for seed in (0, 1))
+    clean = Quality(1.0, 0.0, 0.0, 0.0, CUBIC).rescan(mask, CUBIC, 20.0, 0)
     assert np.count_nonzero(first != clean) > 100
     assert np.count_nonzero(first != second) > 100
 
 
 @pytest.mark.parametrize("scale", [CUBIC, (0.5, 1.0, 1.0)])
 def test_what_a_scan_without_noise_shows_moves_with_the_shape(scale: tuple[float, float, float]) -> None:
-    mask, sharp = bodies(), Imaging(1.0, 0.0, 0.0, 0.0, (1 / scale[0], 1.0, 1.0))
+    mask, sharp = bodies(), Quality(1.0, 0.0, 0.0, 0.0, (1 / scale[0], 1.0, 1.0))
     steps = (6, 5, 11)
     moved = np.roll(mask, steps, (0, 1, 2))
-    for show in (lambda shape: sharp.seen(shape, scale, 4.0, 0), lambda shape: voxelised(shape, scale, 4.0)):
+    for show in (lambda shape: sharp.rescan(shape, scale, 4.0, 0), lambda shape: voxelise(shape, scale, 4.0)):
         difference = show(moved) != np.roll(show(mask), steps, (0, 1, 2))
         assert difference.mean() < 1e-4  # ties at the threshold
 
 
 def test_voxelised_on_the_same_voxels_is_the_mask() -> None:
-    assert np.array_equal(voxelised(bodies(), CUBIC, 4.0), bodies())
+    assert np.array_equal(voxelise(bodies(), CUBIC, 4.0), bodies())
 
 
 def test_thick_slices_lose_a_thin_plate() -> None:
     mask = bodies()
     mask[3] = True
-    kept = voxelised(mask, (0.25, 1.0, 1.0), 4.0)
+    kept = voxelise(mask, (0.25, 1.0, 1.0), 4.0)
     assert not kept[3].all()
 
 
@@ -141,11 +141,11 @@ def test_an_image_knows_its_imaging_and_a_mask_has_none() -> None:
     grey = image(mask, 1.0, 0.1)
     scan = prepare(Field(grey, CUBIC, "voxel"), kind="image", periodic=True)
     dark = prepare(Field(-grey, CUBIC, "voxel"), kind="image", periodic=True, dark=True)
-    assert scan.imaging is not None
-    assert dark.imaging is not None
-    assert dark.imaging.blur == scan.imaging.blur
-    assert dark.imaging.noise == pytest.approx(scan.imaging.noise, rel=0.01)
-    assert prepare(Field(mask, CUBIC, "voxel"), periodic=True).imaging is None
+    assert scan.quality is not None
+    assert dark.quality is not None
+    assert dark.quality.blur == scan.quality.blur
+    assert dark.quality.noise == pytest.approx(scan.quality.noise, rel=0.01)
+    assert prepare(Field(mask, CUBIC, "voxel"), periodic=True).quality is None
 
 
 @pytest.mark.parametrize("noise", [0.05, 0.1, 0.2, 0.3])
@@ -156,6 +156,6 @@ def test_the_true_share_is_without_what_imaging_adds(blur: float, noise: float) 
     truth = np.minimum(z**2 + y**2, np.minimum(y**2 + x**2, z**2 + x**2)) < 3.2**2
     scan = prepare(Field(image(truth, blur, noise), CUBIC, "voxel"), kind="image")
     full = truth.mean()
-    assert abs(scan.true_share - full) < 0.5 * abs(scan.volume_fraction - full)
+    assert abs(scan.true_volume_fraction - full) < 0.5 * abs(scan.volume_fraction - full)
     mask = prepare(Field(truth.astype(np.uint8), CUBIC, "voxel"))
-    assert mask.true_share == mask.volume_fraction
+    assert mask.true_volume_fraction == mask.volume_fraction

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from curvafit.priors import Grid, phase_field
-from curvafit.scan.grids import median_thickness, resample, rich_boxes, without_specks
+from curvafit.scan.grids import boxes_by_surface, median_thickness, remove_specks, resample
 from curvafit.scan.prepare import LARGEST_WINDOW, WORKING_THICKNESS, Prepared, is_ball, prepare
 from curvafit.scan.structure import find_level, is_noise
 from curvafit.volumes.scan import Field, ScanError, load, save
@@ -111,8 +111,8 @@ def test_a_structure_and_its_background_get_one_working_grid(radius: float) -> N
 
 def test_a_scan_turned_round_twice_is_itself() -> None:
     own = prepare(Field(tube_mask((24, 24, 24), (1, 1, 1), 5)))
-    assert np.array_equal(own.turned.mask, ~own.mask) and np.array_equal(own.turned.phase, -own.phase)
-    assert np.array_equal(own.turned.turned.mask, own.mask) and own.turned.grid == own.grid
+    assert np.array_equal(own.inverted.mask, ~own.mask) and np.array_equal(own.inverted.phase, -own.phase)
+    assert np.array_equal(own.inverted.inverted.mask, own.mask) and own.inverted.grid == own.grid
 
 
 def test_only_the_region_of_interest_is_filled_or_turned() -> None:
@@ -122,8 +122,8 @@ def test_only_the_region_of_interest_is_filled_or_turned() -> None:
     own = prepare(Field(mask), roi=region)
     assert own.roi is not None
     assert own.volume_fraction == own.mask[own.roi].mean() > 0.5
-    assert not own.turned.mask[~own.roi].any()
-    assert own.turned.volume_fraction == pytest.approx(1 - own.volume_fraction)
+    assert not own.inverted.mask[~own.roi].any()
+    assert own.inverted.volume_fraction == pytest.approx(1 - own.volume_fraction)
     assert any("of the background" in note for note in own.notes)
 
 
@@ -228,8 +228,8 @@ def test_specks_and_pinholes_are_dropped() -> None:
     assert any("specks: 2, pinholes: 1" in note for note in prepared.notes)
     seam = np.zeros((12, 12, 12), bool)
     seam[0, 5, 5] = seam[6, 6, 6] = True
-    assert without_specks(seam, 4, periodic=True)[0].nonzero()[0].tolist() == [0]
-    assert without_specks(seam, 4, periodic=False)[0].sum() == 0
+    assert remove_specks(seam, 4, periodic=True)[0].nonzero()[0].tolist() == [0]
+    assert remove_specks(seam, 4, periodic=False)[0].sum() == 0
 
 
 def test_only_the_region_of_interest_counts(tmp_path) -> None:
@@ -260,7 +260,7 @@ def test_only_the_region_of_interest_counts(tmp_path) -> None:
 @settings(max_examples=40, deadline=None)
 def test_boxes_cover_what_there_is(shape, size: int, seed: int) -> None:
     content = np.random.default_rng(seed).random(shape) < 0.01
-    boxes = rich_boxes(content, size)
+    boxes = boxes_by_surface(content, size)
     seen = np.zeros(shape, bool)
     for box in boxes:
         assert all(s.stop - s.start == min(n, size) for s, n in zip(box, shape, strict=True))
@@ -271,11 +271,11 @@ def test_boxes_cover_what_there_is(shape, size: int, seed: int) -> None:
 
 def test_the_middle_comes_first_unless_it_is_poor() -> None:
     content = np.ones((40, 40, 40), bool)
-    assert rich_boxes(content, 20)[0] == (slice(10, 30),) * 3
+    assert boxes_by_surface(content, 20)[0] == (slice(10, 30),) * 3
     content[8:32, 8:32, 8:32] = False
     content[:20, :20, :20] = True
-    assert rich_boxes(content, 20)[0] == (slice(0, 20),) * 3
-    assert rich_boxes(np.zeros((9, 9, 9), bool), 20) == []
+    assert boxes_by_surface(content, 20)[0] == (slice(0, 20),) * 3
+    assert boxes_by_surface(np.zeros((9, 9, 9), bool), 20) == []
 
 
 # ---- refusals --------------------------------------------------------------------------------------------------------
