@@ -35,7 +35,7 @@ from curvafit.geometry.morphometry import local_thickness
 from curvafit.inference.fit import Fit
 from curvafit.inference.infer import infer
 from curvafit.priors.coefficients import Coefficients, preset
-from curvafit.segmentation.completion import STIFFNESS, reconstruct
+from curvafit.segmentation.reconstruct import STIFFNESS, reconstruct
 from curvafit.segmentation.slices import WAYS, Slices
 from curvafit.volumes.scan import Field, load
 

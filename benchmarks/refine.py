@@ -26,10 +26,9 @@ from skimage.segmentation import random_walker
 from benchmarks.completion import EDGE, fitted, shape
 from benchmarks.harness import Cases, Figure, Values, best, dice, scores, show
 from curvafit.priors.coefficients import Coefficients
-from curvafit.segmentation.completion import reconstruct
-from curvafit.segmentation.ensemble import near
-from curvafit.segmentation.probability import calibration_error
+from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.refine import refine
+from curvafit.segmentation.uncertainty import calibration_error, near
 
 LAWS = {
     "probabilities": ("tubes", "trabec", "sponge", "metatubes"),

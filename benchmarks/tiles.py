@@ -21,7 +21,7 @@ import numpy as np
 
 from benchmarks.completion import EDGE, shape
 from benchmarks.harness import Cases, Figure, Values, dice, show
-from curvafit.segmentation.completion import STIFFNESS, reconstruct
+from curvafit.segmentation.reconstruct import STIFFNESS, reconstruct
 
 EVERY, WHOLE, CORE = 8, 88, 32
 DISTANCES = (8, 12, 16, 24)

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from curvafit.priors.grid import Grid as Grid
     from curvafit.scan.measure import Measures as Measures
     from curvafit.scan.measure import measure as measure
-    from curvafit.segmentation.completion import reconstruct as reconstruct
+    from curvafit.segmentation.reconstruct import reconstruct as reconstruct
     from curvafit.segmentation.refine import refine as refine
     from curvafit.segmentation.result import Segmentation as Segmentation
     from curvafit.segmentation.segment import segment as segment
@@ -53,7 +53,7 @@ _FIGURES = {
     "Fit": "curvafit.drawing.plot:fit_figure",
     "Flow": "curvafit.drawing.plot:flow_figure",
     "Inference": "curvafit.report.pictures:inference_figure",
-    "Segmentation": "curvafit.segmentation.mask_files:segmentation_figure",
+    "Segmentation": "curvafit.segmentation.result:segmentation_figure",
 }
 
 attach_lazy_names(__name__)

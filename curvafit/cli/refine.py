@@ -59,9 +59,9 @@ def refine(
     NPZ files --channel takes the class; a folder of them becomes a folder of masks. --label is the example's.
     """
     with plainly():
-        from curvafit.segmentation.known import check_spacing
         from curvafit.segmentation.refine import calibrate, chances_of, check_judge, image_beside, trial_steps
         from curvafit.segmentation.refine import refine as refine_map
+        from curvafit.segmentation.slices import check_spacing
 
         if (example is None) != (example_probabilities is None):
             raise ValueError("expected --example and --example-probabilities together, got one of them")
@@ -127,8 +127,8 @@ def _files(source: str, out: Path) -> list[tuple[str, Path]]:
 def _check(files: list[tuple[str, Path]], more: list[Path | None], reading: dict[str, Any], overwrite: bool) -> None:
     """Read all maps and check all targets before the first is worked on."""
     from curvafit.segmentation.evidence import of_probability
-    from curvafit.segmentation.mask_files import check_mask_target
     from curvafit.segmentation.refine import chances_of
+    from curvafit.segmentation.result import check_mask_target
 
     inputs = [*(source for source, _ in files), *(path for path in more if path is not None)]
     for source, target in files:

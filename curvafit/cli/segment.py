@@ -28,9 +28,8 @@ from curvafit.cli.options import Reading, Volume, reads_volume
 if TYPE_CHECKING:
     from curvafit.core.runtime import Progress
     from curvafit.inference.infer import Inference
-    from curvafit.segmentation.lowering import Workers
     from curvafit.segmentation.result import Segmentation
-    from curvafit.segmentation.tiles import Tiling
+    from curvafit.segmentation.tiles import Tiling, Workers
     from curvafit.volumes.boxes import Boxes
     from curvafit.volumes.scan import Field
 
@@ -119,7 +118,7 @@ def segment(
             return segment_scan(volume, prior, steps=steps, progress=progress, **tools, **options)
 
         def tried(laws: int, voxels: int) -> float:
-            from curvafit.segmentation.weighing import trial_steps
+            from curvafit.segmentation.trials import trial_steps
 
             return trial_steps(laws + 1, steps, voxels) if weight is None else 0.0
 
@@ -171,7 +170,7 @@ def reconstruct(
         options |= {"runs": runs, "suggest": suggest}
 
         def compute(volume: Boxes, progress: Progress, **tools: Any) -> Segmentation:
-            from curvafit.segmentation.completion import reconstruct as fill
+            from curvafit.segmentation.reconstruct import reconstruct as fill
             from curvafit.volumes.boxes import whole_of
             from curvafit.volumes.scan import load
 
@@ -180,7 +179,7 @@ def reconstruct(
             say_notes(() if whole is None else whole.notes)
             slices = whole_of(volume)
             if labels is not None:
-                from curvafit.segmentation.several import reconstruct_labels
+                from curvafit.segmentation.reconstruct import reconstruct_labels
 
                 laws = prior if prior is not None else inferred_of_each(whole, several, progress)
                 one = {name: value for name, value in options.items() if name not in ("runs", "suggest")}
@@ -210,7 +209,7 @@ def inferred_of_each(example: Field | None, chosen: list[int] | None, progress: 
     from dataclasses import replace
 
     from curvafit.priors.coefficients import Coefficients
-    from curvafit.segmentation.several import labels_of
+    from curvafit.segmentation.reconstruct import labels_of
     from curvafit.volumes.scan import ScanError
 
     laws: dict[int, Any] = {}
@@ -253,9 +252,9 @@ def run_job(
     from curvafit.core.files import remove
     from curvafit.priors.coefficients import preset_name
     from curvafit.priors.law import texture_of
-    from curvafit.segmentation.mask_files import check_mask_target, write_mask
+    from curvafit.segmentation.engine import laws_of
+    from curvafit.segmentation.result import check_mask_target, write_mask
     from curvafit.segmentation.tiles import Tiling
-    from curvafit.segmentation.working import laws_of
     from curvafit.volumes.boxes import boxes_of, whole_of
 
     law_file = None if preset_name(prior) else prior

@@ -30,7 +30,7 @@ from curvafit.report.page import check_report, write_inference
 from curvafit.report.pictures import SYMBOLS
 from curvafit.scan.measure import measure
 from curvafit.scan.structure import find_level
-from curvafit.segmentation.completion import reconstruct
+from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.slices import WAYS, Slices
 from curvafit.volumes.scan import Field
 

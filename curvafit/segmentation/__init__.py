@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 from curvafit.core.faces import attach_lazy_names
 
 if TYPE_CHECKING:
-    from curvafit.segmentation.completion import reconstruct as reconstruct
-    from curvafit.segmentation.postprocessing import Refine as Refine
+    from curvafit.segmentation.reconstruct import reconstruct as reconstruct
+    from curvafit.segmentation.reconstruct import reconstruct_labels as reconstruct_labels
     from curvafit.segmentation.refine import Calibration as Calibration
+    from curvafit.segmentation.refine import Refine as Refine
     from curvafit.segmentation.refine import calibrate as calibrate
     from curvafit.segmentation.refine import refine as refine
     from curvafit.segmentation.result import Segmentation as Segmentation
     from curvafit.segmentation.segment import segment as segment
-    from curvafit.segmentation.several import reconstruct_labels as reconstruct_labels
 
 attach_lazy_names(__name__)

@@ -2,20 +2,47 @@
 
 from __future__ import annotations
 
-import numpy as np
-from torch import Tensor
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from os import PathLike
 
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from curvafit.core.checks import LONGEST, SHORTEST, check_float, check_type
 from curvafit.core.runtime import Progress, silent
+from curvafit.core.units import METRES
 from curvafit.generation.data import Data, Evidence
 from curvafit.generation.flow import WORKING_BLUR, Flow, descend
-from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.grid import WORKING_EPSILON
+from curvafit.priors.coefficients import NAMES, Coefficients
+from curvafit.priors.fit_file import Prior, fit_bytes, parse_fit, six_of
+from curvafit.priors.fit_schema import FIT_SCHEMA
+from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
+from curvafit.priors.law import Law, texture_of
+from curvafit.priors.loss import RESOLVED, upsampling
 from curvafit.priors.profile import phase_field
+from curvafit.priors.refined import refined
 from curvafit.segmentation.evidence import VoxelEvidence
-from curvafit.segmentation.working import WorkingGrid
-from curvafit.volumes.field import ScanError
+from curvafit.volumes.field import Field, ScanError
 
-__all__ = ["BENDING", "HALO", "STEPS", "bending", "completed", "likelihood", "started", "stiff", "weighed"]
+__all__ = [
+    "BENDING",
+    "HALO",
+    "STEPS",
+    "Law",
+    "WorkingGrid",
+    "bending",
+    "completed",
+    "drawn_laws",
+    "law_of",
+    "laws_of",
+    "likelihood",
+    "started",
+    "stiff",
+    "weighed",
+]
 
 #: Default steps of Adam.
 STEPS = 400
@@ -109,3 +136,178 @@ def bending(law: Coefficients) -> float:
 def stiff(law: Coefficients) -> Coefficients:
     """Return a law scaled to a20 + a02 = `BENDING`; raise ScanError as `bending`."""
     return law.scaled(BENDING / bending(law))
+
+
+#: Whether there is a halo before and beyond the voxels, along each axis.
+Ends = tuple[tuple[bool, bool], tuple[bool, bool], tuple[bool, bool]]
+
+#: Candidates of a fit that are laws of their own: the nearest match's destroys.
+TRUSTED = ("refined", "posterior", "simulation", "optimum")
+
+
+def law_of(prior: Law, scan: Field) -> tuple[Coefficients, tuple[str, ...]]:
+    """Return a law's coefficients with lengths in the scan's unit, and sentences on their origin.
+
+    Raises
+    ------
+    ValueError
+        If there is no preset of that name, or the units of a `fit.json` and the scan cannot be compared.
+    FileNotFoundError
+        If there is no such file.
+    """
+    check_type(scan, Field, "a scan as Field")
+    texture = texture_of(prior)
+    if texture.prior is None:
+        note = f"The {texture.origin}, at a working voxel of one scan voxel."
+        return texture.in_unit(scan.unit, min(scan.spacing)), (note,) if texture.working else ()
+    try:
+        law = texture.in_unit(scan.unit, min(scan.spacing))
+    except ValueError as reason:
+        mend = ": give --spacing and --unit" if texture.unit in METRES else ""
+        raise ScanError(f"{reason}{mend}") from None
+    note = f"The prior's lengths, in {texture.unit}, are converted to {scan.unit}."
+    return law, () if texture.unit == scan.unit else (note,)
+
+
+def laws_of(prior: Law, scan: Field) -> tuple[tuple[Coefficients, ...], tuple[str, ...]]:
+    """Return the laws that a prior trusts, with lengths in the scan's unit, and sentences on their origin.
+
+    The first is that of `law_of`. A fit has others, which were read from the same descriptors (`TRUSTED`).
+    """
+    law, notes = law_of(prior, scan)
+    fitted = texture_of(prior).prior
+    if fitted is None:
+        return (law,), notes
+    others = (each for each in _candidates(prior) if each != fitted.coefficients)
+    return (law, *_in_scan(others, fitted, scan)), notes
+
+
+def drawn_laws(prior: Law, scan: Field, count: int) -> tuple[Coefficients, ...]:
+    """Return so many laws drawn from the posterior of a fit, with lengths in the scan's unit; none of other priors."""
+    fitted = texture_of(prior).prior
+    rows = np.empty((0, 5)) if fitted is None else _draws(prior)
+    if fitted is None or not len(rows):
+        return ()
+    some = rows[np.linspace(0, len(rows) - 1, count).astype(int)]
+    return _in_scan((Coefficients(1.0, *map(float, row)) for row in some), fitted, scan)
+
+
+def _in_scan(laws: Iterable[Coefficients], fitted: Prior, scan: Field) -> tuple[Coefficients, ...]:
+    """Return laws in a fit's working units with lengths in the scan's unit."""
+    scale = WORKING_SPACING / fitted.working_voxel
+    priors = (fitted._replace(coefficients=each, physical=each.in_unit(scale)) for each in laws)
+    return tuple(law_of(each, scan)[0] for each in priors)
+
+
+def _draws(prior: Law) -> np.ndarray:
+    """Return a fit's draws of the coefficients but a20 = 1, (N, 5), from the fit or its file; N = 0 without draws."""
+    if isinstance(prior, (str, PathLike)):
+        posterior = parse_fit(fit_bytes(prior), prior, FIT_SCHEMA).get("posterior") or {"draws": {}}
+        columns = [posterior["draws"].get(name, ()) for name in NAMES[1:]]
+        if len({len(column) for column in columns}) > 1:
+            raise ScanError(f"expected draws of one length in the posterior of {prior}, got {[*map(len, columns)]}")
+        return np.array(columns, dtype=np.float64).T
+    draws = getattr(getattr(prior, "fit", prior), "draws", None)
+    return np.empty((0, 5)) if draws is None else draws.values[:, :5]
+
+
+def _candidates(prior: Law) -> list[Coefficients]:
+    """Return the trusted candidates of a fit or its file, in working units; none of a law without candidates."""
+    if isinstance(prior, (str, PathLike)):
+        rows = parse_fit(fit_bytes(prior), prior, FIT_SCHEMA).get("candidates", ())
+        return [six_of(row["coefficients"]) for row in rows if row["name"] in TRUSTED]
+    candidates = getattr(getattr(prior, "fit", prior), "candidates", ())
+    return [each.coefficients for each in candidates if each.name in TRUSTED]
+
+
+@dataclass(frozen=True)
+class WorkingGrid:
+    """The grid of a flow: working units, axes refined until ε spans two voxels, and a halo without data.
+
+    Attributes
+    ----------
+    grid
+        The grid in working units, halo included; the boundary replicates, unless the scan repeats.
+    times
+        The number of parts of a scan voxel along each axis.
+    unit, epsilon
+        A working length of 1, and ε, in the scan's unit.
+    halo, ends
+        Voxels of the grid around the scan, on the sides that have a halo.
+    """
+
+    grid: Grid
+    times: tuple[int, int, int]
+    unit: float
+    epsilon: float
+    halo: int = 0
+    ends: Ends = ((True, True), (True, True), (True, True))
+
+    @classmethod
+    def of(cls, scan: Field, epsilon: float | None, *, halo: int = 0, periodic: bool = False) -> WorkingGrid:
+        """Return the working grid of a scan; ε is twice the smallest voxel edge by default.
+
+        A scan that repeats has no halo.
+
+        Raises
+        ------
+        ScanError
+            If ε is not positive or the scan is too small.
+        """
+        form = f"a positive epsilon in {scan.unit}"
+        ε = RESOLVED * min(scan.spacing) if epsilon is None else check_float(epsilon, form, SHORTEST, LONGEST)
+        if min(scan.shape) < 4:
+            raise ScanError(f"expected at least 4 voxels along each axis, got {scan.shape}")
+        times, unit = upsampling(scan.spacing, ε), ε / WORKING_EPSILON
+        halo = 0 if periodic else halo
+        shape = tuple(n * t + 2 * halo for n, t in zip(scan.shape, times, strict=True))
+        spacing = tuple(h / t / unit for h, t in zip(scan.spacing, times, strict=True))
+        grid = Grid(shape, spacing, "periodic" if periodic else "replicate")  # type: ignore[arg-type]
+        return cls(grid, times, unit, ε, halo)  # type: ignore[arg-type]
+
+    def part(self, shape: Sequence[int], ends: Ends) -> WorkingGrid:
+        """Return the grid of a box of scan voxels, with the halo on these sides; a box does not repeat."""
+        pairs = zip(shape, self.times, ends, strict=True)
+        edges = tuple(n * times + self.halo * sum(sides) for n, times, sides in pairs)
+        return replace(self, grid=Grid(edges, self.grid.spacing, "replicate"), ends=ends)  # type: ignore[arg-type]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Return a sentence on the axes that are refined, or none."""
+        if max(self.times) == 1:
+            return ()
+        axes = ", ".join(f"{axis} {n}-fold" for axis, n in zip("zyx", self.times, strict=True) if n > 1)
+        return (f"ε spans fewer than 2 voxels on some axes: the flow ran on a grid refined {axes}.",)
+
+    def finer(self, values: np.ndarray) -> Tensor:
+        """Return a smooth volume interpolated to the flow's grid, and continued into the halo by its last values."""
+        u = torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
+        for axis, n in enumerate(self.times):
+            u = refined(u, axis, n)
+        return pad(u[None, None], self._sides, mode="replicate")[0, 0]
+
+    def spread(self, values: np.ndarray, centre: int | None = None) -> Tensor:
+        """Return the evidence of voxels shared among their parts, none in the halo; along axis `centre` only the middle
+        parts get it.
+        """
+        u = torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
+        for axis, n in enumerate(self.times):
+            share = torch.full((n,), 1 / n)
+            if axis == centre:
+                share = (torch.arange(n) - (n - 1) / 2).abs().lt(1).float()
+            u = u.unsqueeze(axis + 1) * share.reshape(-1, *(1,) * (2 - axis))
+            u = u.flatten(axis, axis + 1)
+        return pad(u, self._sides)
+
+    def back(self, u: Tensor) -> np.ndarray:
+        """Return the mean of each scan voxel's parts, without the halo."""
+        for axis, (before, beyond) in enumerate(self.ends):
+            u = u.narrow(axis, self.halo * before, u.shape[axis] - self.halo * (before + beyond))
+        for axis, n in enumerate(self.times):
+            u = u.unflatten(axis, (-1, n)).mean(axis + 1)
+        return u.numpy()
+
+    @property
+    def _sides(self) -> tuple[int, ...]:
+        """The voxels of the halo on each side, the last axis first, as torch pads."""
+        return tuple(self.halo * side for sides in reversed(self.ends) for side in sides)

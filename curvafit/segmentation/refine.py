@@ -9,27 +9,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from curvafit.core.checks import check_float
+from curvafit.core.checks import SEEDS, check_float, check_int, quoted
 from curvafit.core.runtime import Progress, part, silent
 from curvafit.generation.data import Evidence
 from curvafit.priors.coefficients import Coefficients
-from curvafit.segmentation.calibration import Choice, Setting, Task, choice
-from curvafit.segmentation.engine import BENDING, HALO, STEPS, bending, likelihood
+from curvafit.segmentation.engine import BENDING, HALO, STEPS, Law, WorkingGrid, bending, laws_of, likelihood
 from curvafit.segmentation.evidence import VoxelEvidence, of_probability
-from curvafit.segmentation.known import check_place, check_spacing, labels
-from curvafit.segmentation.lowering import Workers, lowered
 from curvafit.segmentation.result import Segmentation, ending, filled, result_of
 from curvafit.segmentation.segment import TRIALS, WEIGHTS, WILLMORE
-from curvafit.segmentation.tiles import Tiling
-from curvafit.segmentation.weighing import densest
-from curvafit.segmentation.working import Law, WorkingGrid, laws_of
+from curvafit.segmentation.slices import check_place, check_spacing, labels
+from curvafit.segmentation.tiles import Tiling, Workers, lowered
+from curvafit.segmentation.trials import Choice, Setting, Task, choice, densest
 from curvafit.volumes.boxes import digest_of
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.part import Box, Crop
 from curvafit.volumes.source import Source, field_of, place_of
 
-__all__ = ["Calibration", "calibrate", "chances_of", "check_judge", "image_beside", "refine", "trial_steps"]
+__all__ = ["Calibration", "Refine", "calibrate", "chances_of", "check_judge", "image_beside", "refine", "trial_steps"]
 
 #: The plain way from probabilities to a mask.
 PLAIN = "p > 1/2"
@@ -314,3 +313,67 @@ def _filled(
     problem = _Chances(evidence, setting)
     found = lowered(problem, tiling, progress=progress, **tools)
     return found.mask, found.phase, filled(found.mask) if problem.law is None else ending(found)
+
+
+class Refine:
+    """A callable that refines one class of a network's probabilities, for MONAI's `Compose` after the softmax.
+
+    Parameters
+    ----------
+    prior
+        As in `refine`.
+    weight
+        As in `refine`, in place of an example.
+    example
+        Probabilities and true mask (Z, Y, X) of another volume, which are tried out now; or a `Calibration`.
+    channel
+        The class, counted from 0.
+    spacing, unit
+        Voxel edges along the tensor's three axes, or one for all, and their unit.
+    epsilon, steps
+        As in `refine`.
+
+    Raises
+    ------
+    ValueError
+        As `refine`.
+    """
+
+    def __init__(
+        self,
+        prior: Law,
+        *,
+        weight: float | None = None,
+        example: tuple[Source, Source] | Calibration | None = None,
+        channel: int = 1,
+        spacing: Sequence[float] | float = 1.0,
+        unit: str = "voxel",
+        epsilon: float | None = None,
+        steps: int = STEPS,
+    ) -> None:
+        check_judge(example, weight)
+        self.channel = check_int(channel, "a channel that is a whole number from 0", 0, SEEDS)
+        self.place = {"spacing": spacing, "unit": unit}
+        if isinstance(example, tuple):
+            example = calibrate(*example, prior, epsilon=epsilon, steps=steps, **self.place)
+        self.prior, self.example = prior, example
+        self.options = {"weight": weight, "epsilon": epsilon, "steps": steps}
+
+    def __call__(self, probabilities: Tensor) -> Tensor:
+        """Return the mask (1, Z, Y, X) of probabilities (C, Z, Y, X), 0 and 1, of their type and on their device.
+
+        Raises
+        ------
+        ValueError
+            If the probabilities are not a tensor of four axes with such a channel, or as `refine`.
+        """
+        if not isinstance(probabilities, Tensor) or probabilities.ndim != 4:
+            got = tuple(probabilities.shape) if isinstance(probabilities, Tensor) else quoted(probabilities)
+            raise ScanError(f"expected probabilities (C, Z, Y, X) as a tensor, got {got}")
+        if self.channel >= len(probabilities):
+            raise ScanError(f"expected a channel from 0 to {len(probabilities) - 1}, got {self.channel}")
+        field = field_of(probabilities[self.channel].as_subclass(Tensor), **self.place)
+        found = refine(field, self.prior, example=self.example, **self.options)
+        mask = torch.zeros_like(probabilities[:1])
+        mask[0] = torch.from_numpy(found.mask.values)
+        return mask

@@ -2,17 +2,42 @@
 
 from __future__ import annotations
 
+import datetime
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from curvafit.core.files import move_together, remove, staged
 from curvafit.core.pictures import Pictured
+from curvafit.core.records import Format, can_write, sibling
+from curvafit.core.runtime import undisturbed
 from curvafit.core.units import sampling
 from curvafit.priors.coefficients import Coefficients
-from curvafit.segmentation.lowering import Lowered
+from curvafit.segmentation.tiles import Lowered
+from curvafit.segmentation.uncertainty import entropy
 from curvafit.volumes.field import Field
+from curvafit.volumes.formats import pick_writer
+from curvafit.volumes.formats.nifti import write_nifti_like
+from curvafit.volumes.scan import save
 
-__all__ = ["Segmentation", "Uncertainty", "ending", "filled", "result_of"]
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = [
+    "FORMAT",
+    "Segmentation",
+    "Uncertainty",
+    "check_mask_target",
+    "ending",
+    "filled",
+    "result_of",
+    "segmentation_figure",
+    "write_mask",
+]
 
 #: A flow has settled where its last ten steps lower the energy by less than this share.
 SETTLED = 0.001
@@ -116,3 +141,154 @@ def result_of(
     """Return the segmentation of a scan from its arrays (Z, Y, X)."""
     fields = [replace(scan, values=values, source=scan.source, notes=()) for values in (mask, u)]
     return Segmentation(fields[0], fields[1], weight, law, epsilon, status, (*scan.notes, *notes), uncertainty)
+
+
+#: `format` of the record beside a mask.
+FORMAT = Format("curvafit-mask-1", title="the record of a mask")
+
+_NIFTI = (".nii", ".nii.gz")
+
+
+def check_mask_target(
+    path: str | Path,
+    unit: str | None = None,
+    inputs: Iterable[str | Path] = (),
+    overwrite: bool = False,
+    *,
+    probability: bool = False,
+) -> Path:
+    """Return the path, or raise ValueError where a mask in `unit` cannot be written there; called before the work.
+
+    `inputs` are the files, or folders, that are read: none may be overwritten. `overwrite` says whether files of other
+    origin may be replaced, `probability` whether a map goes beside the mask.
+
+    Raises
+    ------
+    ValueError
+        If the suffix is not a volume's, its format needs a unit, the folder cannot be written to, or one of the files
+        would replace an input or another file.
+    """
+    target = Path(path)
+    pick_writer(target, unit or "mm")
+    more = [sibling(target, ".json"), sibling(target, ".png"), *([_map_path(target)] if probability else [])]
+    return can_write(target, FORMAT, more=more, inputs=inputs, overwrite=overwrite)
+
+
+def write_mask(
+    segmentation: Segmentation,
+    scan: Field,
+    path: str | Path,
+    *,
+    like: str | Path | None = None,
+    unit: str | None = None,
+    record: dict[str, Any] | None = None,
+    overwrite: bool = False,
+) -> tuple[Path, ...]:
+    """Write the mask (0 and 1, uint8) or labels, a picture, a record, and the probability where there is one.
+
+    The picture shows the middle slices, or the most uncertain ones with their uncertainty.
+
+    Parameters
+    ----------
+    scan
+        The scan, for the picture's grey levels.
+    like
+        The scan's file. If this file and the target are NIfTI, the mask gets the same header but for type and range.
+    unit
+        The unit of the lengths in `like`, by default the one of its header.
+    record
+        Entries to add to the record.
+    overwrite
+        Whether files of other origin may be replaced.
+
+    Returns
+    -------
+    The paths of mask, picture (`.png`), record (`.json`) and probability (`mask_probability.nii.gz` beside
+    `mask.nii.gz`), which appear together once all are whole. A former probability goes.
+    """
+    from curvafit.drawing.plot import DPI
+
+    chances = segmentation.probability
+    inputs = () if like is None else (like,)
+    target = check_mask_target(path, scan.unit, inputs, overwrite, probability=chances is not None)
+    former = _map_path(target).name in FORMAT.companions(target)
+
+    def write(values: np.ndarray, place: Path) -> Path:
+        if like is not None and all(str(each).lower().endswith(_NIFTI) for each in (like, target)):
+            write_nifti_like(values, Path(like), place, unit)
+        else:
+            save(Field(values, scan.spacing, scan.unit, scan.affine), place, kind=FORMAT.name)
+        return place
+
+    with staged(target) as work:
+        temporary = work / target.name
+        mask, labels = segmentation.mask.values, segmentation.labels
+        write(mask.view(np.uint8) if labels is None else labels.values, temporary)
+        picture, note = sibling(temporary, ".png"), sibling(temporary, ".json")
+        rows = [(scan.values, None), (scan.values, mask) if labels is None else (labels.values, None)]
+        _figure(rows, segmentation).savefig(picture, dpi=DPI)
+        parts = [temporary, picture, note]
+        if chances is not None:
+            parts.append(write(chances.values, _map_path(temporary)))
+        content = {**_record(segmentation, scan, record or {}), "files": [part.name for part in parts]}
+        FORMAT.write(note, content)
+        with undisturbed():
+            files = move_together(parts, target.parent)
+            if former and chances is None:
+                remove(_map_path(target))
+        return files
+
+
+def segmentation_figure(segmentation: Segmentation) -> Figure:
+    """Return a figure of the phase field's middle slices with the mask's outline, or of the most uncertain slices.
+
+    Raises
+    ------
+    ValueError
+        If the phase field is not finite.
+    """
+    return _figure([(segmentation.phase.values, segmentation.mask.values)], segmentation)
+
+
+def _figure(rows: list[tuple[np.ndarray, np.ndarray | None]], segmentation: Segmentation) -> Figure:
+    """Return a figure of the middle slices; of a probability its entropy too, and the most uncertain slices."""
+    from curvafit.drawing.plot import section_figure
+
+    chances, mask = segmentation.probability, segmentation.mask
+    if chances is None:
+        return section_figure(rows, mask.spacing)
+    unsure = entropy(chances.values)
+    places = [int(unsure.sum(tuple({0, 1, 2} - {axis})).argmax()) for axis in range(3)]
+    return section_figure([*rows, (unsure, mask.values)], mask.spacing, places)
+
+
+def _map_path(target: Path) -> Path:
+    """Return where the probability goes: `mask_probability.nii.gz` beside `mask.nii.gz`."""
+    return sibling(target, f"_probability{target.name.removeprefix(sibling(target, '').name)}")
+
+
+def _doubts(uncertain: Uncertainty | None) -> dict[str, Any]:
+    if uncertain is None:
+        return {}
+    names = ("seeds", "calibration_error", "suggestions")
+    return {name: getattr(uncertain, name) for name in names} | {"runs": len(uncertain.seeds)}
+
+
+def _record(segmentation: Segmentation, scan: Field, more: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "status": segmentation.status,
+        **more,
+        "scan": scan.source,
+        "shape": list(scan.shape),
+        "spacing": list(scan.spacing),
+        "unit": scan.unit,
+        "coefficients": None if segmentation.coefficients is None else segmentation.coefficients.as_dict(),
+        "epsilon": segmentation.epsilon,
+        "weight": segmentation.weight,
+        "volume_fraction": float(segmentation.mask.values.mean()),
+        **_doubts(segmentation.uncertainty),
+        "notes": list(segmentation.notes),
+        "curvafit": version("curvafit"),
+        "torch": version("torch"),
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+    }

@@ -13,13 +13,11 @@ from curvafit.core.checks import check_float
 from curvafit.core.runtime import Progress, part, silent
 from curvafit.generation.data import Evidence
 from curvafit.priors.coefficients import Coefficients
-from curvafit.segmentation.engine import BENDING, STEPS, bending, likelihood, started
+from curvafit.segmentation.engine import BENDING, STEPS, Law, WorkingGrid, bending, laws_of, likelihood, started
 from curvafit.segmentation.evidence import Classes, VoxelEvidence, bounds_of, classes_of, grey_levels, of_classes
-from curvafit.segmentation.lowering import Workers, lowered
 from curvafit.segmentation.result import Segmentation, ending, filled, result_of
-from curvafit.segmentation.tiles import Tiling
-from curvafit.segmentation.weighing import Weighing, busiest, weighing
-from curvafit.segmentation.working import Law, WorkingGrid, laws_of
+from curvafit.segmentation.tiles import Tiling, Workers, lowered
+from curvafit.segmentation.trials import Weighing, busiest, weighing
 from curvafit.volumes.boxes import Boxes, boxes_of, extent, thinned
 from curvafit.volumes.field import ScanError
 from curvafit.volumes.formats.part import Box, Crop

@@ -2,18 +2,46 @@
 
 from __future__ import annotations
 
+import json
 import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise, product
+from os import PathLike
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from filelock import FileLock, Timeout
 
 from curvafit.core.checks import check_int
+from curvafit.core.files import write_content
+from curvafit.core.runtime import Progress, part, silent
+from curvafit.generation.checkpoint import identity
+from curvafit.generation.data import Data
+from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import MOST
-from curvafit.segmentation.engine import HALO
-from curvafit.segmentation.working import Ends, WorkingGrid
+from curvafit.segmentation.engine import HALO, Ends, WorkingGrid, completed
 from curvafit.volumes.field import Field
 from curvafit.volumes.formats.part import Box
 
-__all__ = ["EDGE", "OVERLAP", "WHOLE", "Tile", "Tiling"]
+__all__ = [
+    "EDGE",
+    "OVERLAP",
+    "WHOLE",
+    "FolderStore",
+    "Lowered",
+    "MemoryStore",
+    "Piece",
+    "Problem",
+    "Tile",
+    "Tiling",
+    "Workers",
+    "folder_store",
+    "lowered",
+]
 
 #: Working voxels beyond a tile that are lowered with it: at that distance the cut is not felt any more.
 OVERLAP = 24
@@ -126,3 +154,263 @@ class Tiling:
             box = slice(0 if ends[0] else first, n if ends[1] else last)
             tiles.append((slice(start, stop), box, ends))
         return tiles
+
+
+#: Files of a folder: what it belongs to, the volume's arrays, and the lock of the run that uses it.
+_RUN, _MASK, _PHASE, _LOCK = "run.json", "mask.npy", "phase.npy", "lock"
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """What a tile gives: its number, mask and phase field on the core, and the last two energies of its flow."""
+
+    number: int
+    mask: np.ndarray
+    phase: np.ndarray
+    energies: tuple[float, ...]
+
+
+class MemoryStore:
+    """Tiles of a volume of a shape, in memory."""
+
+    def __init__(self, shape: tuple[int, int, int]) -> None:
+        self._mask, self._phase = np.empty(shape, dtype=bool), np.empty(shape, dtype=np.float32)
+        self._energies: dict[int, tuple[float, ...]] = {}
+
+    def has(self, number: int) -> bool:
+        """Return whether a tile is there."""
+        return number in self._energies
+
+    def write(self, core: Box, piece: Piece) -> None:
+        """Add a tile."""
+        self._mask[core], self._phase[core] = piece.mask, piece.phase
+        self._energies[piece.number] = piece.energies
+
+    def energies(self, number: int) -> tuple[float, ...]:
+        """Return the last two energies of a tile's flow."""
+        return self._energies[number]
+
+    def volume(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the mask and the phase field."""
+        return self._mask, self._phase
+
+
+class FolderStore:
+    """Tiles of a volume in a folder; open with `folder_store`.
+
+    The arrays are files of the volume's size, which are mapped. A tile has a note, `000012.json`, which is written once
+    the tile's voxels are on the disk: a killed run loses the tile it was at and nothing else.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def has(self, number: int) -> bool:
+        """Return whether a tile is there."""
+        return self._note(number).exists()
+
+    def write(self, core: Box, piece: Piece) -> None:
+        """Add a tile."""
+        for name, values in ((_MASK, piece.mask), (_PHASE, piece.phase)):
+            array = np.load(self._folder / name, mmap_mode="r+")
+            array[core] = values
+            array.flush()
+        write_content(self._note(piece.number), json.dumps(piece.energies))
+
+    def energies(self, number: int) -> tuple[float, ...]:
+        """Return the last two energies of a tile's flow."""
+        return tuple(json.loads(self._note(number).read_bytes()))
+
+    def volume(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the mask and the phase field, mapped: they are read where they are used."""
+        mask, phase = (np.load(self._folder / name, mmap_mode="r") for name in (_MASK, _PHASE))
+        return mask, phase
+
+    def _note(self, number: int) -> Path:
+        return self._folder / f"{number:06d}.json"
+
+
+@contextmanager
+def folder_store(
+    folder: str | PathLike[str], shape: tuple[int, int, int], run: Mapping[str, Any]
+) -> Iterator[FolderStore]:
+    """Open the tiles of a run, or make a folder for them.
+
+    Parameters
+    ----------
+    shape
+        Voxels of the volume.
+    run
+        What two runs that share tiles have in common; see `generation.checkpoint.identity`.
+
+    Raises
+    ------
+    ValueError
+        If the folder has other things or the tiles of another run, or another run uses it.
+    """
+    place = Path(folder)
+    there = {path.name for path in place.iterdir()} if place.is_dir() else set()
+    if (_RUN not in there and there - {_MASK, _PHASE, _LOCK}) or (place.exists() and not place.is_dir()):
+        raise ValueError(f"expected a new folder for tiles, got {place}, which holds something else")
+    place.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(place / _LOCK)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise ValueError(f"expected tiles that no other run uses, got {place}, which is in use") from None
+    try:
+        _prepare(place, shape, identity(**run))
+        yield FolderStore(place)
+    finally:
+        lock.release()
+
+
+def _prepare(place: Path, shape: tuple[int, int, int], run: dict[str, str]) -> None:
+    """Make the arrays of a new folder; raise ValueError where an old one is another run's."""
+    if (place / _RUN).exists():
+        other = json.loads((place / _RUN).read_bytes())
+        names = [name for name in {**other, **run} if other.get(name) != run.get(name)]
+        if names:
+            parts = "; ".join(f"{name} {other.get(name)} instead of {run.get(name)}" for name in names)
+            raise ValueError(f"expected tiles of this run, got some with {parts}: delete {place} to start again")
+        return
+    for name, kind in ((_MASK, np.bool_), (_PHASE, np.float32)):
+        np.lib.format.open_memmap(place / name, mode="w+", dtype=kind, shape=shape).flush()
+    write_content(place / _RUN, json.dumps(run, indent=2))
+
+
+_LOWERING = "lowering the energy"
+
+
+class Problem(Protocol):
+    """What is lowered, and from where: the same voxels whatever the box."""
+
+    @property
+    def law(self) -> Coefficients | None:
+        """Coefficients with lengths in the scan's unit; None for the start itself."""
+        ...
+
+    @property
+    def steps(self) -> int:
+        """Steps of the flow."""
+        ...
+
+    @property
+    def parts(self) -> dict[str, object]:
+        """What tells the problem from others, by name."""
+        ...
+
+    def given(self, box: Box, place: WorkingGrid) -> tuple[np.ndarray, Data]:
+        """Return the start and the data term on a box."""
+        ...
+
+    def plain(self, level: np.ndarray, place: WorkingGrid) -> np.ndarray:
+        """Return the phase field of a start, on the scan's voxels."""
+        ...
+
+    def mask(self, phase: np.ndarray, box: Box) -> np.ndarray:
+        """Return the mask, bool (Z, Y, X), of a phase field on a box."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Lowered:
+    """A volume's mask (Z, Y, X), bool, and phase field, float32, the last two energies of its flow, and its steps."""
+
+    mask: np.ndarray
+    phase: np.ndarray
+    energies: tuple[float, ...]
+    steps: int
+
+
+class Workers(Protocol):
+    """Whoever lowers tiles, several at once: `curvafit.data_synth.atlas.workers`."""
+
+    @property
+    def places(self) -> int:
+        """Return how many tiles may be asked for at once."""
+        ...
+
+    def submit(self, make: Callable[[Path, Sequence[int]], list[Any]], path: Path, indices: Sequence[int]) -> None:
+        """Ask for tiles by their numbers."""
+        ...
+
+    def done(self) -> list[Any]:
+        """Wait for some of what was asked for, and return the pieces."""
+        ...
+
+
+def lowered(
+    problem: Problem,
+    tiling: Tiling,
+    *,
+    store: str | PathLike[str] | None = None,
+    workers: Workers | None = None,
+    progress: Progress = silent,
+) -> Lowered:
+    """Lower a problem on each tile of a volume, and return the whole.
+
+    Parameters
+    ----------
+    store
+        A folder in which finished tiles stay, those of an earlier, killed run too; by default they are in memory.
+    workers
+        Whoever lowers the tiles, by default this process, one after another.
+
+    Raises
+    ------
+    ScanError
+        As `engine.completed`.
+    ValueError
+        If the store has the tiles of another problem, or another run uses it.
+    """
+    run = {**problem.parts, "law": problem.law, "steps": problem.steps, "tiles": tiling.counts, "place": tiling.place}
+    pieces = nullcontext(MemoryStore(tiling.shape)) if store is None else folder_store(store, tiling.shape, run)
+    with pieces as stored:
+        tiles = tiling.tiles
+        rest = [tile for tile in tiles if not stored.has(tile.number)]
+        made = _in_turn(problem, tiling, rest, progress) if workers is None else _by(workers, problem, tiling, rest)
+        for count, piece in enumerate(made, tiling.count - len(rest) + 1):
+            stored.write(tiles[piece.number].core, piece)
+            progress(_LOWERING, count / tiling.count)
+        energies = [stored.energies(tile.number) for tile in tiles]
+        mask, phase = stored.volume()
+    return Lowered(mask, phase, tuple(map(sum, zip(*energies, strict=True))), problem.steps)
+
+
+def _in_turn(problem: Problem, tiling: Tiling, tiles: Sequence[Tile], progress: Progress) -> Iterator[Piece]:
+    """Lower tiles one after another."""
+    total = tiling.count
+    for count, tile in enumerate(tiles, total - len(tiles)):
+        yield _piece(problem, tiling, tile, part(progress, count / total, (count + 1) / total))
+
+
+def _by(workers: Workers, problem: Problem, tiling: Tiling, tiles: Sequence[Tile]) -> Iterator[Piece]:
+    """Lower tiles by workers, in any order."""
+    waiting, asked = list(tiles), 0
+    while waiting or asked:
+        while waiting and asked < workers.places:
+            workers.submit(partial(_pieces, problem, tiling), Path(), [waiting.pop(0).number])
+            asked += 1
+        pieces = workers.done()
+        asked -= len(pieces)
+        yield from pieces
+
+
+def _pieces(problem: Problem, tiling: Tiling, _: Path, numbers: Sequence[int]) -> list[Piece]:
+    """Lower tiles by their numbers, as workers do."""
+    tiles = tiling.tiles
+    return [_piece(problem, tiling, tiles[number], silent) for number in numbers]
+
+
+def _piece(problem: Problem, tiling: Tiling, tile: Tile, progress: Progress) -> Piece:
+    """Lower a tile."""
+    place, energies = tiling.place_of(tile), ()
+    level, term = problem.given(tile.box, place)
+    if problem.law is None:
+        phase = problem.plain(level, place)
+    else:
+        flow = completed(level, problem.law, term, place, problem.steps, progress)
+        phase, energies = place.back(flow.field), tuple(map(float, flow.history.energy[-2:]))
+    phase = np.ascontiguousarray(phase[tile.inner])
+    return Piece(tile.number, problem.mask(phase, tile.core), phase, energies)

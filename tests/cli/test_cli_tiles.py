@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from calling import call, refused
 
-from curvafit.segmentation.tile_store import FolderStore
+from curvafit.segmentation.tiles import FolderStore
 from curvafit.volumes import load, save
 from curvafit.volumes.field import Field
 

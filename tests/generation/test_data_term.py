@@ -17,8 +17,8 @@ from curvafit.generation.flow import descend
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
-from curvafit.segmentation.completion import reconstruct
 from curvafit.segmentation.evidence import of_probability
+from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.refine import refine
 from curvafit.volumes.scan import Field
 

@@ -16,16 +16,12 @@ from found import made_fit
 
 from curvafit.inference.candidates import Candidate
 from curvafit.priors.coefficients import Coefficients, preset
-from curvafit.segmentation.calibration import ODDS, Setting, left_out
-from curvafit.segmentation.completion import MARGIN, STIFFNESS, SlicesProblem, reconstruct
-from curvafit.segmentation.engine import stiff
-from curvafit.segmentation.example import Example
-from curvafit.segmentation.lowering import lowered
-from curvafit.segmentation.odds import Odds
-from curvafit.segmentation.several import reconstruct_labels
+from curvafit.segmentation.engine import TRUSTED, WorkingGrid, law_of, laws_of, stiff
+from curvafit.segmentation.examples import Example, Odds
+from curvafit.segmentation.reconstruct import MARGIN, STIFFNESS, SlicesProblem, reconstruct, reconstruct_labels
 from curvafit.segmentation.slices import WAYS, Slices
-from curvafit.segmentation.tiles import Tiling
-from curvafit.segmentation.working import TRUSTED, WorkingGrid, law_of, laws_of
+from curvafit.segmentation.tiles import Tiling, lowered
+from curvafit.segmentation.trials import ODDS, Setting, left_out
 from curvafit.volumes.field import Field, ScanError
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
@@ -143,12 +139,12 @@ def test_each_half_of_an_example_is_judged_by_the_other() -> None:
 
 def test_laws_are_lowered_on_a_box_of_an_example(monkeypatch: pytest.MonkeyPatch) -> None:
     """Odds are counted on all of it, and a box of it is judged by the half that it does not lie in."""
-    monkeypatch.setattr("curvafit.segmentation.example.PART", 20)
+    monkeypatch.setattr("curvafit.segmentation.examples.PART", 20)
     mask = np.concatenate([pancakes(1, seed=2), pancakes(3, seed=3)], axis=2)
     example = Example.of(Field(mask.astype(np.uint8)), range(0, 33, 8), axis=0)
     given, box = example.part.given, example.box
     assert given.shape == (33, 20, 20) and example.whole.given.shape == mask.shape and not example.notes
-    monkeypatch.setattr("curvafit.segmentation.example.LARGEST", 32)
+    monkeypatch.setattr("curvafit.segmentation.examples.LARGEST", 32)
     smaller = Example.of(Field(mask.astype(np.uint8)), range(0, 33, 8), axis=0)
     assert smaller.notes == ("Of the example 33 x 32 x 32 voxels are read, where most of its surface is.",)
     assert np.array_equal(given.inside, mask[box][::8])

@@ -14,9 +14,9 @@ from scipy import ndimage
 from skimage.filters import threshold_otsu
 
 from curvafit.priors.coefficients import Coefficients, preset
+from curvafit.segmentation.engine import WorkingGrid, law_of
 from curvafit.segmentation.evidence import VoxelEvidence, classes_of, grey_levels, of_classes
 from curvafit.segmentation.segment import segment
-from curvafit.segmentation.working import WorkingGrid, law_of
 from curvafit.volumes.scan import Field
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")

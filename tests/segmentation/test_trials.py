@@ -8,20 +8,24 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-import curvafit.segmentation.weighing as room
+import curvafit.segmentation.trials as room
 from curvafit.priors.coefficients import Coefficients
-from curvafit.segmentation.calibration import Choice, Setting, Task, choice, climbed
 from curvafit.segmentation.evidence import Classes, classes_of, grey_levels
 from curvafit.segmentation.refine import FIRST, NATS, PLAIN
 from curvafit.segmentation.segment import segment
 from curvafit.segmentation.slices import Slices
-from curvafit.segmentation.weighing import (
+from curvafit.segmentation.trials import (
     EDGE,
     TIMES,
     WEIGHTS,
+    Choice,
     Judge,
+    Setting,
+    Task,
     Weighing,
     block_edge,
+    choice,
+    climbed,
     densest,
     hold_out_masks,
     measure_classes,

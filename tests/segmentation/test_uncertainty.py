@@ -11,14 +11,24 @@ from found import made_fit
 
 from curvafit.inference.fit import Draws
 from curvafit.priors.coefficients import Coefficients
-from curvafit.segmentation.calibration import Setting, Task
-from curvafit.segmentation.completion import reconstruct
-from curvafit.segmentation.ensemble import RUNS, chances, near
-from curvafit.segmentation.grown import grown
-from curvafit.segmentation.probability import BINS, calibration_error, entropy, evidence, fitted, probability
+from curvafit.segmentation.engine import drawn_laws
+from curvafit.segmentation.examples import grown
+from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.slices import Slices, reach
-from curvafit.segmentation.suggestion import remaining, suggestions
-from curvafit.segmentation.working import drawn_laws
+from curvafit.segmentation.trials import Setting, Task
+from curvafit.segmentation.uncertainty import (
+    BINS,
+    RUNS,
+    calibration_error,
+    chances,
+    entropy,
+    evidence,
+    fitted,
+    near,
+    probability,
+    remaining,
+    suggestions,
+)
 from curvafit.volumes.field import Field
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")

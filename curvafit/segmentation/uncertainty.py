@@ -8,15 +8,30 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from scipy import ndimage
+from scipy.optimize import minimize
+from scipy.special import entr, expit, logit
 
 from curvafit.core.runtime import Progress, part, silent
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.profile import profile_distance
-from curvafit.segmentation.calibration import Setting, Task
-from curvafit.segmentation.probability import calibration_error, evidence, fitted, probability
-from curvafit.segmentation.slices import Slices, plane_distances
+from curvafit.segmentation.slices import Slices, plane_distances, reach
+from curvafit.segmentation.trials import Setting, Task
 
-__all__ = ["NEAR", "RUNS", "Chances", "Flow", "chances", "near"]
+__all__ = [
+    "NEAR",
+    "RUNS",
+    "Chances",
+    "Flow",
+    "calibration_error",
+    "chances",
+    "entropy",
+    "evidence",
+    "fitted",
+    "near",
+    "probability",
+    "remaining",
+    "suggestions",
+]
 
 #: Default number of runs.
 RUNS = 8
@@ -154,3 +169,105 @@ def _wave(slices: Slices, seed: int) -> np.ndarray:
     mode = "wrap" if slices.periodic else "reflect"
     wave = ndimage.gaussian_filter(noise, slices.gap * edges[0] / edges / 4, mode=mode)
     return wave / wave.std()
+
+
+#: Greatest weight: where all is right it would grow without end.
+STRONGEST = 20.0
+#: Most voxels that the weights are fitted to.
+MOST = 1_000_000
+#: Bins of the calibration error.
+BINS = 15
+
+
+def evidence(votes: np.ndarray, runs: int, depth: np.ndarray) -> np.ndarray:
+    """Return two kinds of evidence for the inside, float64 (N, 2): log odds, and the depth below the surface.
+
+    Parameters
+    ----------
+    votes
+        How many of the runs have a voxel inside, (N,). The odds are those of votes + 1/2 to the others + 1/2.
+    depth
+        The runs' mean signed distance to the surface over the error that a distance of this voxel has, positive inside.
+    """
+    odds = logit((votes.astype(np.float64) + 0.5) / (runs + 1))
+    return np.stack([odds, depth.astype(np.float64)], axis=-1)
+
+
+def fitted(evidence: np.ndarray, inside: np.ndarray) -> np.ndarray:
+    """Return the weights under which evidence (N, 2) makes what is inside (N,) most likely: one for each kind, from 0,
+    and a constant, by which runs are too thick or too thin.
+    """
+    stride = -(-len(inside) // MOST)
+    signed = np.where(inside[::stride, None], 1.0, -1.0) * _with_constant(evidence[::stride])
+
+    def cost(weights: np.ndarray) -> tuple[float, np.ndarray]:
+        margin = signed @ weights
+        return float(np.logaddexp(0, -margin).mean()), -(expit(-margin) @ signed) / len(signed)
+
+    bounds = [(0, STRONGEST), (0, STRONGEST), (-STRONGEST, STRONGEST)]
+    return minimize(cost, np.array([1.0, 1.0, 0.0]), jac=True, method="L-BFGS-B", bounds=bounds).x
+
+
+def probability(evidence: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the probability of the inside, float64 (N,)."""
+    return expit(_with_constant(evidence) @ weights)
+
+
+def calibration_error(probability: np.ndarray, inside: np.ndarray, bins: int = BINS) -> float:
+    """Return the expected calibration error: how far shares inside are from what probabilities say, on average.
+
+    Voxels are sorted into bins of equal width by their probability; the mean over voxels is taken of the difference,
+    in a voxel's bin, between the share that is inside and the mean probability. 0 where there are no voxels.
+    """
+    where = np.minimum((probability * bins).astype(int), bins - 1)
+    excess = np.bincount(where, inside - probability.astype(np.float64), minlength=bins)
+    return float(np.abs(excess).sum() / max(len(where), 1))
+
+
+def entropy(probability: np.ndarray) -> np.ndarray:
+    """Return the entropy of each probability of two outcomes, in nats."""
+    p = probability.astype(np.float64)
+    return entr(p) + entr(1 - p)
+
+
+def _with_constant(evidence: np.ndarray) -> np.ndarray:
+    return np.concatenate([evidence, np.ones_like(evidence[:, :1])], axis=1)
+
+
+def suggestions(entropies: np.ndarray, places: Sequence[int], count: int, periodic: bool = False) -> tuple[int, ...]:
+    """Return the slices to annotate next, the most telling first, each chosen as if those before it were known.
+
+    There are fewer where no other slice would tell anything.
+
+    Parameters
+    ----------
+    entropies
+        The entropy of each slice, in nats, (Z,).
+    places
+        The numbers of the known slices.
+    periodic
+        Whether the last slice is followed by the first.
+    """
+    known, left = set(places), np.asarray(entropies, dtype=np.float64)
+    chosen: list[int] = []
+    for _ in range(count):
+        unknown = [n for n in range(len(left)) if n not in known]
+        after = [remaining(left, known, n, periodic) for n in unknown]
+        sums = [each.sum() for each in after]
+        if not sums or min(sums) >= left.sum():
+            break
+        best = int(np.argmin(sums))
+        left = after[best]
+        chosen.append(unknown[best])
+        known.add(unknown[best])
+    return tuple(chosen)
+
+
+def remaining(entropies: np.ndarray, places: Sequence[int] | set[int], new: int, periodic: bool = False) -> np.ndarray:
+    """Return the entropies (Z,) of the slices once a new one is known.
+
+    The uncertain layer of a slice is as thick as its `reach`: in that proportion the entropy falls. A new slice tells
+    nothing about slices beyond other known ones.
+    """
+    before, after = (reach(sorted(known), len(entropies), periodic) for known in (places, {*places, new}))
+    return entropies * np.divide(after, before, out=np.zeros_like(before), where=before > 0)
