@@ -37,7 +37,8 @@ from curvafit.inference.infer import infer
 from curvafit.priors.coefficients import Coefficients, preset
 from curvafit.segmentation.reconstruct import STIFFNESS, reconstruct
 from curvafit.segmentation.slices import WAYS, Slices
-from curvafit.volumes.scan import Field, load
+from curvafit.volumes.field import Field
+from curvafit.volumes.read import load
 
 LAWS = ("tubes", "trabec", "sponge", "metatubes", "pearls", "sieve", "flow", "bilayers")
 EDGE = 64

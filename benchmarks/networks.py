@@ -29,7 +29,7 @@ from torch.nn import functional
 from benchmarks.harness import Cases, Figure, Values, show
 from curvafit.inference.infer import infer
 from curvafit.priors import CombinedLoss, CurvaturePrior
-from curvafit.volumes.scan import Field
+from curvafit.volumes.field import Field
 
 STACKS, SPACING = ("noLeakage", "Leakage"), (5.0, 0.994, 0.994)
 PARTS = {"fit": np.s_[:, :368, :240], "validation": np.s_[:, 384:, :240], "test": np.s_[:, :, 272:]}

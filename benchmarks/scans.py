@@ -23,7 +23,8 @@ import numpy as np
 from benchmarks.harness import Cases, Figure, Values, show
 from curvafit.inference.infer import infer
 from curvafit.inference.posterior import load_posterior
-from curvafit.volumes.scan import Field, ScanError, load
+from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.read import load
 
 #: Numbers of a scan's twins over those of the scan.
 RATIOS = ("volume_fraction", "thickness_mean", "spacing_mean", "connectivity_density", "surface_to_volume")

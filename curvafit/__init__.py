@@ -40,9 +40,9 @@ if TYPE_CHECKING:
     from curvafit.segmentation.refine import refine as refine
     from curvafit.segmentation.result import Segmentation as Segmentation
     from curvafit.segmentation.segment import segment as segment
-    from curvafit.volumes.scan import Field as Field
-    from curvafit.volumes.scan import load as load
-    from curvafit.volumes.scan import save as save
+    from curvafit.volumes.field import Field as Field
+    from curvafit.volumes.read import load as load
+    from curvafit.volumes.write import save as save
 
 __version__ = "0.1.0"
 

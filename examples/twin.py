@@ -22,7 +22,7 @@ from curvafit.generation.flow import generate
 from curvafit.inference.infer import Inference, infer
 from curvafit.priors.coefficients import preset
 from curvafit.priors.grid import Grid
-from curvafit.volumes.scan import Field
+from curvafit.volumes.field import Field
 
 PRESET = "sponge"
 #: A typical micro-CT image: levels of grey, blur in µm, uneven light and rings as shares, noise in grey levels.

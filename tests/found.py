@@ -17,7 +17,7 @@ from curvafit.inference.fit import Draws, Fit
 from curvafit.inference.infer import Inference
 from curvafit.priors import Coefficients, Grid, preset
 from curvafit.scan.prepare import Prepared
-from curvafit.volumes.scan import Field
+from curvafit.volumes.field import Field
 
 EPSILON = 0.02
 RADIUS = 5.0

@@ -22,7 +22,7 @@ from curvafit.geometry.descriptors import Descriptors, descriptors
 from curvafit.geometry.mesh import NoSurface
 from curvafit.inference.table import VIEWS, Table, load_table, parameters_of, save_table, to_row
 from curvafit.priors.grid import Grid
-from curvafit.volumes.scan import ScanError
+from curvafit.volumes.field import ScanError
 
 #: Seconds between two writings of a table that grows.
 PAUSE = 60.0

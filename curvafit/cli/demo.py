@@ -25,7 +25,7 @@ def demo(
         with stages() as progress:
             from curvafit.cli.samples import fetch_or_make
             from curvafit.report.demo import write_demo
-            from curvafit.volumes.scan import load
+            from curvafit.volumes.read import load
 
             progress(f"fetching {sample}", 0.0)
             path = fetch_or_make(sample)

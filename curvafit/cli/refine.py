@@ -80,7 +80,7 @@ def refine(
         def learn(volume: Boxes, progress: Progress) -> None:
             """Try the prior out on the example, once."""
             from curvafit.core.runtime import part
-            from curvafit.volumes.scan import load
+            from curvafit.volumes.read import load
 
             chances, mask = chances_of(example_probabilities, **others), load(example, **place)  # type: ignore[arg-type]
             check_spacing(chances, volume.frame, "the probabilities")

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from curvafit.segmentation.result import Segmentation
     from curvafit.segmentation.tiles import Tiling, Workers
     from curvafit.volumes.boxes import Boxes
-    from curvafit.volumes.scan import Field
+    from curvafit.volumes.field import Field
 
 SEGMENT_EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
     (
@@ -172,7 +172,7 @@ def reconstruct(
         def compute(volume: Boxes, progress: Progress, **tools: Any) -> Segmentation:
             from curvafit.segmentation.reconstruct import reconstruct as fill
             from curvafit.volumes.boxes import whole_of
-            from curvafit.volumes.scan import load
+            from curvafit.volumes.read import load
 
             alike = {name: reading[name] for name in ("spacing", "unit", "label", "strict")}
             whole = None if example is None else load(example, **alike)
@@ -210,7 +210,7 @@ def inferred_of_each(example: Field | None, chosen: list[int] | None, progress: 
 
     from curvafit.priors.coefficients import Coefficients
     from curvafit.segmentation.reconstruct import labels_of
-    from curvafit.volumes.scan import ScanError
+    from curvafit.volumes.field import ScanError
 
     laws: dict[int, Any] = {}
     for number in labels_of(example.values, chosen):  # type: ignore[union-attr]

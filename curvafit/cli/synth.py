@@ -207,7 +207,7 @@ def _modality(
 
         return _visible(modality(str(name)), visible)
     from curvafit.data_synth.imaging import estimate
-    from curvafit.volumes.scan import load
+    from curvafit.volumes.read import load
 
     if reading["label"] is not None and mask is None:
         raise ValueError("expected --like-mask beside --label, which is a value of that mask, got none")

@@ -19,7 +19,8 @@ from curvafit.core.files import write_content
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import schedule
 from curvafit.priors import Grid, preset
-from curvafit.volumes.scan import Field, save
+from curvafit.volumes.field import Field
+from curvafit.volumes.write import save
 
 __all__ = ["SampleScan", "SampleUnavailable", "cache_folder", "fetch", "samples", "synthetic_scan"]
 

@@ -28,8 +28,8 @@ from curvafit.priors.coefficients import NAMES
 from curvafit.priors.curvature import geometric_curvatures, jet
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.priors.profile import profile_distance
-from curvafit.volumes.formats import pick_writer
-from curvafit.volumes.scan import WRITABLE, Field, save
+from curvafit.volumes.field import Field
+from curvafit.volumes.write import WRITABLE, pick_writer, save
 
 #: What a record beside a shape says that it is.
 FORMAT = Format("curvafit-shape-1", title="the record of a shape")

@@ -22,7 +22,7 @@ from curvafit.priors.fit_file import six_of
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.profile import phase_field
 from curvafit.scan.prepare import Prepared
-from curvafit.volumes.scan import ScanError
+from curvafit.volumes.field import ScanError
 
 #: Greatest mass of either sign: a rare structure's field lies a little beyond ±1 in the mean.
 RARE = 1 - 1e-6

@@ -32,7 +32,7 @@ from curvafit.inference.table import (
 from curvafit.priors.grid import Grid
 from curvafit.scan.measure import scan_descriptors
 from curvafit.scan.prepare import HALF, Prepared
-from curvafit.volumes.scan import ScanError
+from curvafit.volumes.field import ScanError
 
 #: Draws from the posterior, and those among which more are chosen to be grown.
 DRAWS, POOL = 400, 2000

@@ -36,7 +36,7 @@ from curvafit.scan.prepare import HALF, NOISE, Prepared, prepare, why_no_texture
 from curvafit.scan.structure import check_options, is_rounded
 from curvafit.volumes.field import Field
 from curvafit.volumes.formats.part import Crop
-from curvafit.volumes.source import Source, field_of
+from curvafit.volumes.read import Source, field_of
 
 #: Number of nearest shapes, and of those from which stationarity starts.
 MATCHES, STARTS = 5, 3

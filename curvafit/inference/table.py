@@ -19,7 +19,7 @@ from curvafit.priors.grid import Grid
 from curvafit.scan.grids import centre_distance, median_thickness, remove_specks, resample
 from curvafit.scan.prepare import KEPT_THICKNESS, THINNEST, smallest_piece
 from curvafit.scan.structure import split
-from curvafit.volumes.scan import Field, ScanError
+from curvafit.volumes.field import Field, ScanError
 
 ARCHIVE = Archive(
     "a table of descriptors",

@@ -32,7 +32,7 @@ from curvafit.scan.measure import measure
 from curvafit.scan.structure import find_level
 from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.slices import WAYS, Slices
-from curvafit.volumes.scan import Field
+from curvafit.volumes.field import Field
 
 if TYPE_CHECKING:
     from curvafit.inference.atlas import Atlas

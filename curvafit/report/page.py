@@ -27,7 +27,8 @@ from curvafit.report.pictures import (
     window_framed,
 )
 from curvafit.report.wording import describe, glossary_link
-from curvafit.volumes.scan import Field, save
+from curvafit.volumes.field import Field
+from curvafit.volumes.write import save
 
 if TYPE_CHECKING:
     from curvafit.geometry.morphometry import Morphometry

@@ -22,8 +22,8 @@ from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.scan.grids import median_thickness, remove_specks
 from curvafit.scan.prepare import LARGEST_WINDOW, Prepared, prepare, smallest_piece
 from curvafit.scan.structure import check_options, find_level, is_rounded
-from curvafit.volumes.scan import Field, ScanError
-from curvafit.volumes.source import Source, field_of
+from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.read import Source, field_of
 
 #: What is summed over blocks, in powers of the scan's unit; normals are the six parts of n⊗n, zz zy zx yy yx xx.
 SUMS = ("volume", "inside", "thickness", "thickness²", "gap", "χ", "area", *(f"n{k}" for k in range(6)))

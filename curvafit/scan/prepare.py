@@ -35,7 +35,7 @@ from curvafit.scan.structure import (
     region_of_interest,
     voxelise,
 )
-from curvafit.volumes.scan import Field, ScanError
+from curvafit.volumes.field import Field, ScanError
 
 #: Median thickness, in voxels, of an isotropic scan whose grid is kept; and the one a scan is resampled to.
 KEPT_THICKNESS = (5.0, 16.0)

@@ -18,7 +18,8 @@ from skimage.filters import threshold_otsu
 
 from curvafit.core.checks import SEEDS, check_choice, check_float, check_int
 from curvafit.scan.grids import boxes_by_surface, centre_distance, remove_specks, resample, surface_voxels
-from curvafit.volumes.scan import Field, ScanError, load
+from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.read import load
 
 Kind = Literal["field", "mask", "image"]
 

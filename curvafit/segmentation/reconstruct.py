@@ -30,7 +30,7 @@ from curvafit.segmentation.uncertainty import RUNS, Chances, chances, entropy, s
 from curvafit.volumes.boxes import digest_of
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.part import Box
-from curvafit.volumes.source import Source, field_of
+from curvafit.volumes.read import Source, field_of
 
 __all__ = ["SlicesProblem", "known_places", "labels_of", "reconstruct", "reconstruct_labels"]
 

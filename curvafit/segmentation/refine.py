@@ -26,7 +26,7 @@ from curvafit.segmentation.trials import Choice, Setting, Task, choice, densest
 from curvafit.volumes.boxes import digest_of
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.part import Box, Crop
-from curvafit.volumes.source import Source, field_of, place_of
+from curvafit.volumes.read import Source, field_of, place_of
 
 __all__ = ["Calibration", "Refine", "calibrate", "chances_of", "check_judge", "image_beside", "refine", "trial_steps"]
 

@@ -20,9 +20,8 @@ from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.tiles import Lowered
 from curvafit.segmentation.uncertainty import entropy
 from curvafit.volumes.field import Field
-from curvafit.volumes.formats import pick_writer
 from curvafit.volumes.formats.nifti import write_nifti_like
-from curvafit.volumes.scan import save
+from curvafit.volumes.write import pick_writer, save
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -21,7 +21,7 @@ from curvafit.segmentation.trials import Weighing, busiest, weighing
 from curvafit.volumes.boxes import Boxes, boxes_of, extent, thinned
 from curvafit.volumes.field import ScanError
 from curvafit.volumes.formats.part import Box, Crop
-from curvafit.volumes.source import Source
+from curvafit.volumes.read import Source
 
 __all__ = ["segment"]
 

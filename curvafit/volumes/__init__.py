@@ -10,9 +10,9 @@ if TYPE_CHECKING:
     from curvafit.volumes.field import Field as Field
     from curvafit.volumes.formats.base import ScanError as ScanError
     from curvafit.volumes.parameter_maps import read_maps as read_maps
-    from curvafit.volumes.scan import save as save
-    from curvafit.volumes.source import Source as Source
-    from curvafit.volumes.source import field_of as field_of
-    from curvafit.volumes.source import load as load
+    from curvafit.volumes.read import Source as Source
+    from curvafit.volumes.read import field_of as field_of
+    from curvafit.volumes.read import load as load
+    from curvafit.volumes.write import save as save
 
 attach_lazy_names(__name__)

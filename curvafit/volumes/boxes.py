@@ -14,14 +14,12 @@ from typing import Any, Protocol
 import numpy as np
 
 from curvafit.volumes.field import Field, ScanError
-from curvafit.volumes.formats import pick_reader
 from curvafit.volumes.formats.arrays import read_hdf5, read_npy, read_raw
-from curvafit.volumes.formats.guard import read_file
-from curvafit.volumes.formats.ngff import read_zarr
 from curvafit.volumes.formats.nifti import read_nifti
 from curvafit.volumes.formats.part import Box, Crop, Part, box_of, fitted, selected
 from curvafit.volumes.formats.streams import check_array
-from curvafit.volumes.source import Source, field_of, located, placed
+from curvafit.volumes.formats.zarr import read_zarr
+from curvafit.volumes.read import Source, field_of, located, pick_reader, placed, read_file
 
 __all__ = ["Boxes", "boxes_of", "digest_of", "extent", "frame_of", "thinned", "whole_of"]
 

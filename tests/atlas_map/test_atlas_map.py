@@ -25,7 +25,7 @@ from curvafit.atlas_map.shapes import CUT, LEVELS, regrow_command, shown, small_
 from curvafit.generation.flow import generate
 from curvafit.geometry.distances import wasserstein
 from curvafit.priors import Coefficients, Grid
-from curvafit.volumes.scan import load
+from curvafit.volumes.read import load
 
 COUNT = 16
 

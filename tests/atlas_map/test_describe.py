@@ -32,7 +32,7 @@ from curvafit.inference.table import (
 from curvafit.priors.coefficients import Coefficients, preset
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
-from curvafit.volumes.scan import ScanError
+from curvafit.volumes.field import ScanError
 
 FAST = ("field", "mask")
 

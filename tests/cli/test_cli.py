@@ -12,7 +12,8 @@ import pytest
 from calling import QUICK, call, refused
 from found import made_inference, without_drawing
 
-from curvafit.volumes.scan import Field, save
+from curvafit.volumes.field import Field
+from curvafit.volumes.write import save
 
 # ---- help ------------------------------------------------------------------------------------------------------------
 

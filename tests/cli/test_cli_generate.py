@@ -20,7 +20,7 @@ from curvafit.generation.schedule import schedule
 from curvafit.priors.coefficients import preset
 from curvafit.priors.energy import orientation
 from curvafit.priors.grid import Grid
-from curvafit.volumes.scan import load
+from curvafit.volumes.read import load
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 

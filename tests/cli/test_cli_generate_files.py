@@ -14,7 +14,7 @@ import tifffile
 from calling import QUICK, call, made, refused
 from found import made_fit
 
-from curvafit.volumes.scan import load
+from curvafit.volumes.read import load
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 

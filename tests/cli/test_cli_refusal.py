@@ -11,7 +11,8 @@ from exact_store import exact_store
 
 from curvafit.cli.console import error_console, stages
 from curvafit.cli.refusal import LONGEST, sentence, writable
-from curvafit.volumes.scan import Field, save
+from curvafit.volumes.field import Field
+from curvafit.volumes.write import save
 
 SYNTH = ["--presets", "tubes", "--modality", "confocal", "--workers", "0", "--count", "1"]
 

@@ -11,7 +11,9 @@ import pytest
 from calling import call, refused
 from found import made_fit
 
-from curvafit.volumes.scan import Field, load, save
+from curvafit.volumes.field import Field
+from curvafit.volumes.read import load
+from curvafit.volumes.write import save
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 

@@ -11,7 +11,9 @@ from calling import call, refused
 from exact_store import exact_store
 
 from curvafit.priors.fit_schema import FORMAT
-from curvafit.volumes.scan import Field, load, save
+from curvafit.volumes.field import Field
+from curvafit.volumes.read import load
+from curvafit.volumes.write import save
 
 QUICK = ["--count", "2", "--shape", "8,16,16", "--workers", "0", "--voxel", "0.5"]
 

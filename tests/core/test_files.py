@@ -23,7 +23,9 @@ from curvafit.core.files import (
     write_atomically,
     write_content,
 )
-from curvafit.volumes.scan import Field, load, save
+from curvafit.volumes.field import Field
+from curvafit.volumes.read import load
+from curvafit.volumes.write import save
 
 
 def test_a_file_is_the_new_one_or_the_old_one(tmp_path: Path) -> None:

@@ -15,7 +15,9 @@ from found import made_inference
 from curvafit.atlas_map.files import check_map, write_map
 from curvafit.data_synth.atlas.store import open_store
 from curvafit.report.page import FILES, write_inference
-from curvafit.volumes.scan import Field, load, save
+from curvafit.volumes.field import Field
+from curvafit.volumes.read import load
+from curvafit.volumes.write import save
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 

@@ -16,7 +16,8 @@ from curvafit.data_synth.imaging.imaging import image, regrid
 from curvafit.data_synth.imaging.parameters import Contrast, Detector, Imaging, Noise, Optics
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
-from curvafit.volumes.scan import Field, load
+from curvafit.volumes.field import Field
+from curvafit.volumes.read import load
 
 pytestmark = pytest.mark.slow
 

@@ -13,7 +13,7 @@ import pytest
 
 import curvafit.data_synth.samples as module
 from curvafit.data_synth.samples import SampleUnavailable, cache_folder, fetch, samples, synthetic_scan
-from curvafit.volumes.scan import load
+from curvafit.volumes.read import load
 
 CONTENT = b"a volume"
 

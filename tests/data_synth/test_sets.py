@@ -17,7 +17,7 @@ from curvafit.data_synth.sets import sets
 from curvafit.data_synth.sets.case import Recipe
 from curvafit.data_synth.sets.picture import write_preview
 from curvafit.data_synth.sets.sets import Order, build_set, make_cases, read_order
-from curvafit.volumes.scan import load, read_values
+from curvafit.volumes.read import load, read_values
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from torch import Tensor
 from curvafit.core.records import sibling
 from curvafit.drawing.shapes import Output, step_path, write_field
 from curvafit.priors.grid import Grid
-from curvafit.volumes.scan import load
+from curvafit.volumes.read import load
 
 
 def ball(boundary) -> tuple[Tensor, Grid]:

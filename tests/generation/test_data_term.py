@@ -20,7 +20,7 @@ from curvafit.priors.profile import optimal_profile
 from curvafit.segmentation.evidence import of_probability
 from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.refine import refine
-from curvafit.volumes.scan import Field
+from curvafit.volumes.field import Field
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 

@@ -7,7 +7,7 @@ import pytest
 from scipy import ndimage
 
 from curvafit.geometry.morphometry import local_thickness, morphometry
-from curvafit.volumes.scan import load
+from curvafit.volumes.read import load
 
 
 def distance_from_axes(n: int, axes: int) -> np.ndarray:

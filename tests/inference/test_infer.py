@@ -32,7 +32,7 @@ from curvafit.report.page import write_inference
 from curvafit.scan.measure import scan_descriptors, scan_diagram
 from curvafit.scan.prepare import prepare
 from curvafit.scan.structure import Quality
-from curvafit.volumes.scan import Field
+from curvafit.volumes.field import Field
 
 GRID = Grid((32, 32, 32))
 

@@ -23,7 +23,7 @@ from curvafit.priors.fit_file import FORMAT, read_fit
 from curvafit.report.page import parameter_table, report_html, with_command, write_inference
 from curvafit.report.pictures import bands, scan_box
 from curvafit.report.wording import describe, family_radius
-from curvafit.volumes.scan import load
+from curvafit.volumes.read import load
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}
 

@@ -12,7 +12,9 @@ from curvafit.priors import Grid, phase_field
 from curvafit.scan.grids import boxes_by_surface, median_thickness, remove_specks, resample
 from curvafit.scan.prepare import LARGEST_WINDOW, WORKING_THICKNESS, Prepared, is_ball, prepare
 from curvafit.scan.structure import find_level, is_noise
-from curvafit.volumes.scan import Field, ScanError, load, save
+from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.read import load
+from curvafit.volumes.write import save
 
 
 def tube_mask(shape: tuple[int, int, int], spacing: tuple[float, float, float], radius: float) -> np.ndarray:

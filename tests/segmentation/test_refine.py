@@ -18,7 +18,9 @@ from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation import Refine, calibrate, refine
 from curvafit.segmentation.evidence import of_probability
 from curvafit.segmentation.refine import chances_of
-from curvafit.volumes.scan import Field, load, save
+from curvafit.volumes.field import Field
+from curvafit.volumes.read import load
+from curvafit.volumes.write import save
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 

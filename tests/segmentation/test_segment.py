@@ -17,7 +17,7 @@ from curvafit.priors.coefficients import Coefficients, preset
 from curvafit.segmentation.engine import WorkingGrid, law_of
 from curvafit.segmentation.evidence import VoxelEvidence, classes_of, grey_levels, of_classes
 from curvafit.segmentation.segment import segment
-from curvafit.volumes.scan import Field
+from curvafit.volumes.field import Field
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 

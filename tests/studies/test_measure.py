@@ -16,7 +16,7 @@ from curvafit.geometry.topology import euler_number, euler_shares
 from curvafit.scan.measure import LEAST, QUANTITIES, Blocks, Measures, errors, measure
 from curvafit.studies import tables
 from curvafit.studies.tables import COLUMNS, rows_of, write_table
-from curvafit.volumes.scan import Field
+from curvafit.volumes.field import Field
 
 N = 48
 

@@ -18,8 +18,10 @@ pytest.importorskip("mrcfile")
 
 from damage import CHECKED, COUNTED, OTHERS, VALUES, damaged, files_of, gzipped
 
+from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.parameter_maps import read_maps
-from curvafit.volumes.scan import Field, ScanError, load, save
+from curvafit.volumes.read import load
+from curvafit.volumes.write import save
 
 CASES = 30
 

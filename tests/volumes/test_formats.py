@@ -18,8 +18,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from curvafit.core.units import parse_unit
+from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.tiff import natural_key
-from curvafit.volumes.scan import Field, ScanError, load, save
+from curvafit.volumes.read import load
+from curvafit.volumes.write import save
 
 UNITS = ("voxel", "nm", "um", "mm", "m")
 

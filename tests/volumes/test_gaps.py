@@ -13,7 +13,9 @@ import tifffile
 import zarr
 from calling import call
 
-from curvafit.volumes.scan import Field, ScanError, load, read_values, save
+from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.read import load, read_values
+from curvafit.volumes.write import save
 
 VALUES = (np.random.default_rng(0).random((9, 10, 11)) * 200 + 1).astype(np.uint16)
 

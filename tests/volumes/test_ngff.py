@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 import zarr
 
-from curvafit.volumes.scan import Field, load, save
+from curvafit.volumes.field import Field
+from curvafit.volumes.read import load
+from curvafit.volumes.write import save
 
 
 def image(path: Path) -> dict:

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from curvafit.volumes.field import Field
 from curvafit.volumes.parameter_maps import map_shape, read_maps
-from curvafit.volumes.scan import Field, save
+from curvafit.volumes.write import save
 
 RAMP = np.linspace(1, 2, 4 * 5 * 6).reshape(4, 5, 6)
 

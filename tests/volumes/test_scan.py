@@ -15,7 +15,9 @@ import tifffile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from curvafit.volumes.scan import READABLE, Field, ScanError, load, save
+from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.read import READABLE, load
+from curvafit.volumes.write import save
 
 TYPES = ("bool", "uint8", "int16", "uint16", "int32", "float32", "float64")
 UNITS = ("voxel", "nm", "um", "mm", "m")
@@ -198,7 +200,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch, suffix:
         target.write_bytes(b"half")
         raise RuntimeError("disk full")
 
-    monkeypatch.setitem(sys.modules["curvafit.volumes.scan"].WRITERS, suffix, fails)
+    monkeypatch.setitem(sys.modules["curvafit.volumes.write"].WRITERS, suffix, fails)
     with pytest.raises(RuntimeError, match="disk full"):
         save(Field(ramp()), path)
     assert np.array_equal(load(path).values, ramp() + 1)

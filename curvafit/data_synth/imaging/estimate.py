@@ -15,7 +15,7 @@ from curvafit.data_synth.imaging.modality import Modality
 from curvafit.data_synth.imaging.noise_estimate import NoiseEstimate, background_of, covariance, noise_of
 from curvafit.data_synth.imaging.optics import blur
 from curvafit.data_synth.imaging.parameters import Contrast, Detector, Illumination, Imaging, Noise, Optics
-from curvafit.volumes.scan import Field
+from curvafit.volumes.field import Field
 
 #: Share of the mean brightness from which on the structure's brightness counts for its texture.
 DIMMEST = 0.1

@@ -14,7 +14,7 @@ from curvafit.data_synth.sets.layouts import LAYOUTS
 from curvafit.data_synth.sets.sets import RECORDS, case_name, cases_of, read_order
 from curvafit.drawing.plot import CONTOUR, write_picture
 from curvafit.priors.fit_schema import violation
-from curvafit.volumes.scan import read_values
+from curvafit.volumes.read import read_values
 
 #: Cases in the picture, and in a row of it.
 SHOWN, ROW = 8, 4

@@ -27,7 +27,8 @@ from curvafit.data_synth.labels.labels import NAMES, labels_of
 from curvafit.data_synth.sets.case import Case, Recipe
 from curvafit.data_synth.sets.layouts import LAYOUTS, About
 from curvafit.priors.grid import Grid
-from curvafit.volumes.scan import Field, save
+from curvafit.volumes.field import Field
+from curvafit.volumes.write import save
 
 FORMAT = "curvafit set"
 VERSION = 2

@@ -1,22 +1,37 @@
-"""Writing a `Field` to a volume file; reading is in `curvafit.volumes.source`."""
+"""Writing of volumes: `save` chooses the format by the suffix."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from curvafit.core.files import check_free, write_atomically
 from curvafit.core.records import is_own_zarr
-from curvafit.volumes.field import Field
-from curvafit.volumes.formats import READERS, WRITERS, ScanError, pick_writer
-from curvafit.volumes.formats.ngff import mark
-from curvafit.volumes.source import Source, field_of, load, read_values
+from curvafit.volumes.formats.arrays import write_npy
+from curvafit.volumes.formats.base import ScanError
+from curvafit.volumes.formats.medical import check_mrc, write_mrc
+from curvafit.volumes.formats.nifti import write_nifti
+from curvafit.volumes.formats.tiff import write_ome_tiff, write_tiff
+from curvafit.volumes.formats.zarr import mark, write_zarr
+from curvafit.volumes.read import Source, field_of
 
-__all__ = ["READABLE", "WRITABLE", "Field", "ScanError", "load", "read_values", "save"]
+__all__ = ["WRITABLE", "pick_writer", "save"]
 
-#: Suffixes that `load` and `save` know.
-READABLE = tuple(READERS)
+#: Suffix -> writer(field, path).
+WRITERS: dict[str, Callable[[Any, Path], None]] = {
+    ".nii": write_nifti,
+    ".nii.gz": write_nifti,
+    **dict.fromkeys((".ome.tif", ".ome.tiff"), write_ome_tiff),
+    ".tif": write_tiff,
+    ".tiff": write_tiff,
+    ".npy": write_npy,
+    ".mrc": write_mrc,
+    **dict.fromkeys((".zarr", ".ome.zarr"), write_zarr),
+}
+
+#: Suffixes that `save` knows.
 WRITABLE = tuple(WRITERS)
 
 
@@ -67,3 +82,19 @@ def save(
             mark(temporary, kind)
 
     return write_atomically(target, write)
+
+
+def pick_writer(path: Path, unit: str) -> Callable[[Any, Path], None]:
+    """Return the writer of a file by its suffix, if the format can hold lengths in `unit`.
+
+    Raises
+    ------
+    ScanError
+        If the suffix is unknown, the format needs a unit and there is none, or its library is not installed.
+    """
+    suffix = next((known for known in WRITERS if path.name.lower().endswith(known)), None)
+    if suffix is None:
+        raise ScanError(f"expected a name ending in one of {', '.join(WRITERS)}, got {path.name!r}")
+    if suffix == ".mrc":
+        check_mrc(unit)
+    return WRITERS[suffix]

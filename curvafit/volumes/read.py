@@ -1,11 +1,14 @@
-"""Sources of a volume: the path of a file, an array, or a `Field`."""
+"""Reading of volumes: `load` for files, `field_of` for any source of a volume.
+
+The suffix of a file chooses its reader. Any fault of a file becomes one sentence, and libraries print nothing.
+"""
 
 from __future__ import annotations
 
 import math
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,64 +16,44 @@ import numpy as np
 import torch
 
 from curvafit.core.checks import quoted
+from curvafit.core.runtime import one_line
 from curvafit.core.units import parse_unit
 from curvafit.volumes.field import Field, positive_triple
-from curvafit.volumes.formats import Raw, ScanError
-from curvafit.volumes.formats.guard import read_file
+from curvafit.volumes.formats.arrays import read_hdf5, read_npy, read_npz, read_raw
+from curvafit.volumes.formats.base import Damaged, Raw, ScanError, complaints
+from curvafit.volumes.formats.medical import is_dicom, read_dicom, read_itk, read_mrc, read_nrrd
+from curvafit.volumes.formats.nifti import read_nifti
 from curvafit.volumes.formats.part import Crop, Part, box_of, selected
+from curvafit.volumes.formats.streams import check_regular
+from curvafit.volumes.formats.tiff import SLICES, read_slices, read_tiff
+from curvafit.volumes.formats.zarr import read_zarr
 
-__all__ = ["Source", "field_of", "load", "located", "place_of", "placed", "read_values"]
+__all__ = ["READABLE", "Source", "field_of", "load", "located", "place_of", "placed", "read_file", "read_values"]
 
 #: A volume as a caller gives it.
 Source = str | os.PathLike[str] | Field | np.ndarray | torch.Tensor
 
+#: Suffix -> reader(path, key=, raw_shape=, dtype=).
+READERS: dict[str, Callable[..., Raw]] = {
+    **dict.fromkeys((".nii", ".nii.gz"), read_nifti),
+    **dict.fromkeys((".tif", ".tiff"), read_tiff),
+    ".npy": read_npy,
+    ".npz": read_npz,
+    **dict.fromkeys((".h5", ".hdf5"), read_hdf5),
+    **dict.fromkeys((".raw", ".bin", ".vol"), read_raw),
+    ".zarr": read_zarr,
+    ".nrrd": read_nrrd,
+    ".nhdr": read_nrrd,
+    ".mha": read_itk,
+    ".mhd": read_itk,
+    **dict.fromkeys((".mrc", ".map", ".rec"), read_mrc),
+}
 
-def field_of(
-    source: Source,
-    *,
-    spacing: Sequence[float] | float | None = None,
-    unit: str | None = None,
-    label: int | None = None,
-    crop: Crop | None = None,
-    **reading: Any,
-) -> Field:
-    """Return the `Field` of any source of a volume.
+#: Readers of formats that can hold several arrays, by key.
+KEYED = (read_npz, read_hdf5, read_zarr, read_dicom)
 
-    Parameters
-    ----------
-    source
-        The path of a file, which is read; a `Field`, which is taken as it is; or an array or tensor (Z, Y, X).
-    spacing, unit
-        Voxel edges (z, y, x), or one for all, and their unit. For a file, they replace what the file says; for an array
-        the default is one voxel. A `Field` has its own.
-    label, crop
-        The voxels of one value, as a mask; a box of voxels: see `Field.label` and `Field.crop`.
-    reading
-        Options of reading a file: see `load`.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ScanError
-        A `ValueError`: if the source is none of these, an option does not apply to it, or `load` refuses the file.
-    """
-    if isinstance(source, str | os.PathLike):
-        return load(source, spacing=spacing, unit=unit, label=label, crop=crop, **reading)
-    return _part(_field_of(source, spacing, unit, reading), label, crop)
-
-
-def _field_of(source: Any, spacing: Sequence[float] | float | None, unit: str | None, reading: dict[str, Any]) -> Field:
-    """Return the `Field` of a volume in memory."""
-    if isinstance(source, Field):
-        _refuse({"spacing": spacing, "unit": unit}, "a file or an array", "a Field, which has its own")
-        _refuse(reading, "the path of a file", "a Field, which is read already")
-        return source
-    if isinstance(source, np.ndarray | torch.Tensor):
-        _refuse(reading, "the path of a file", "an array")
-        values = _array(source)
-        return Field(values, positive_triple(1.0 if spacing is None else spacing), "voxel" if unit is None else unit)
-    raise ScanError(f"expected a volume as the path of a file, a Field, an array or a tensor, got {quoted(source)}")
+#: Suffixes that `load` knows.
+READABLE = tuple(READERS)
 
 
 def load(
@@ -130,6 +113,54 @@ def load(
     return _part(field if part.crop is None else field.moved(start), label)
 
 
+def field_of(
+    source: Source,
+    *,
+    spacing: Sequence[float] | float | None = None,
+    unit: str | None = None,
+    label: int | None = None,
+    crop: Crop | None = None,
+    **reading: Any,
+) -> Field:
+    """Return the `Field` of any source of a volume.
+
+    Parameters
+    ----------
+    source
+        The path of a file, which is read; a `Field`, which is taken as it is; or an array or tensor (Z, Y, X).
+    spacing, unit
+        Voxel edges (z, y, x), or one for all, and their unit. For a file, they replace what the file says; for an array
+        the default is one voxel. A `Field` has its own.
+    label, crop
+        The voxels of one value, as a mask; a box of voxels: see `Field.label` and `Field.crop`.
+    reading
+        Options of reading a file: see `load`.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ScanError
+        A `ValueError`: if the source is none of these, an option does not apply to it, or `load` refuses the file.
+    """
+    if isinstance(source, str | os.PathLike):
+        return load(source, spacing=spacing, unit=unit, label=label, crop=crop, **reading)
+    return _part(_field_of(source, spacing, unit, reading), label, crop)
+
+
+def _field_of(source: Any, spacing: Sequence[float] | float | None, unit: str | None, reading: dict[str, Any]) -> Field:
+    """Return the `Field` of a volume in memory."""
+    if isinstance(source, Field):
+        _refuse({"spacing": spacing, "unit": unit}, "a file or an array", "a Field, which has its own")
+        _refuse(reading, "the path of a file", "a Field, which is read already")
+        return source
+    if isinstance(source, np.ndarray | torch.Tensor):
+        _refuse(reading, "the path of a file", "an array")
+        values = _array(source)
+        return Field(values, positive_triple(1.0 if spacing is None else spacing), "voxel" if unit is None else unit)
+    raise ScanError(f"expected a volume as the path of a file, a Field, an array or a tensor, got {quoted(source)}")
+
+
 def place_of(path: str | os.PathLike[str]) -> Field:
     """Return the content of a volume file for its place: spacing, unit and affine; its values are not checked.
 
@@ -164,6 +195,51 @@ def read_values(path: str | os.PathLike[str]) -> np.ndarray:
     while values.ndim > 3 and values.shape[0] == 1:
         values = values[0]
     return values
+
+
+def read_file(
+    path: Path,
+    key: str | None = None,
+    raw_shape: Sequence[int] | None = None,
+    dtype: str | None = None,
+    part: Part | None = None,
+) -> Raw:
+    """Return the content of a file or a folder, by the reader that `pick_reader` chooses.
+
+    From some formats only the part is read: see `Raw.whole`.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ScanError
+        If the path is neither a file nor a folder, the suffix is unknown, the file is damaged, or a key is given for a
+        format without keys.
+    """
+    if not path.exists():
+        raise FileNotFoundError(one_line(f"expected a volume file, got no such file: {path}"))
+    reader = pick_reader(check_regular(path), raw_shape is not None)
+    if key is not None and reader not in KEYED:
+        raise ScanError(f"expected a key only for NPZ, HDF5, Zarr and DICOM, got {quoted(key)} for {path}")
+    return _guarded(reader, path, key=key, raw_shape=raw_shape, dtype=dtype, part=part)
+
+
+def pick_reader(path: Path, shape_given: bool = False) -> Callable[..., Raw]:
+    """Return the reader of a file by its suffix, or of a folder by its content.
+
+    Raises
+    ------
+    ScanError
+        If the suffix is unknown and the caller gives no shape of a RAW file, or the folder holds no slices.
+    """
+    if path.is_dir():
+        return _pick_folder(path)
+    for suffix in sorted(READERS, key=len, reverse=True):
+        if path.name.lower().endswith(suffix):
+            return READERS[suffix]
+    if shape_given:
+        return read_raw
+    raise ScanError(f"expected a file ending in one of {', '.join(READERS)}, got {path.name!r}")
 
 
 def _part(field: Field, label: int | None, crop: Crop | None = None) -> Field:
@@ -250,3 +326,37 @@ def _unit(unit: str | None) -> tuple[str, float]:
 def _scaled(spacing: tuple[object, ...], factor: float) -> tuple[object, ...]:
     """Return a file's spacing times a factor; entries that are not numbers stay as they are."""
     return tuple(h * factor if isinstance(h, (int, float)) else h for h in spacing)
+
+
+def _guarded(reader: Callable[..., Raw], path: Path, **options: object) -> Raw:
+    """Return what a reader returns, and turn a library's own exceptions into one sentence.
+
+    Raises
+    ------
+    ScanError
+        If the reader raises.
+    """
+    try:
+        with complaints():
+            return reader(path, **options)
+    except ScanError:
+        raise
+    except MemoryError as reason:
+        raise ScanError(f"expected a volume that fits into memory, got {path}, which does not") from reason
+    except (Damaged, ValueError) as reason:
+        cause, text = reason, str(reason)
+    except Exception as reason:  # every library has its own way to say that a file is damaged
+        cause, text = reason, f"{type(reason).__name__}: {reason}"
+    text = " ".join(text[:2000].split())[:200]
+    raise ScanError(f"expected a whole, readable file, got {path} that cannot be read ({text})") from cause
+
+
+def _pick_folder(path: Path) -> Callable[..., Raw]:
+    inside = [p for p in path.iterdir() if not p.name.startswith(".")]
+    if any(p.name in ("zarr.json", ".zarray", ".zgroup") for p in path.iterdir()) or path.suffix == ".zarr":
+        return read_zarr
+    if any(p.suffix.lower() in SLICES for p in inside):
+        return read_slices
+    if any(p.is_file() and is_dicom(p) for p in inside):
+        return read_dicom
+    raise ScanError(f"expected a folder of TIFF or DICOM slices or a Zarr store, got {path} with none")
