@@ -1,9 +1,10 @@
 # Needs Python 3.11 or newer, and make.
-#   make demo   install; take a real CT volume of bone to its parameters and a report
-#   make test   install with the test tools; run all tests but the few of make test-long
-#   make test-hostile   damaged files, odd options, failing disks: all cases; make test-hostile-quick: some of each kind
-#   make lint   ruff and the type checker
-#   make docs   the documentation, into site/ (open site/index.html); every warning is an error
+#   make demo       install; a real CT volume of bone, filled, measured and read, on one page
+#   make test       install with the test tools; every quick test
+#   make test-all   every test, the quick part of the hostile suite and the examples too
+#   make test-hostile   damaged files, odd options, failing disks: all cases
+#   make lint       ruff and the type checker
+#   make docs       the documentation, into site/ (open site/index.html); every warning is an error
 # A CPU-only torch, several GB smaller on Linux: make demo TORCH_INDEX=https://download.pytorch.org/whl/cpu
 
 PYTHON ?= python3
@@ -11,25 +12,22 @@ TORCH_INDEX ?=
 
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
+# Modules stay whole on one worker, so that what they share is made once.
+PYTEST := OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(BIN)/python -m pytest -q -n 2 --dist loadscope
 
-.PHONY: demo test test-long test-hostile test-hostile-quick lint docs clean
+.PHONY: demo test test-all test-hostile lint docs clean
 
 demo: .venv/installed
-	@scan=$$($(BIN)/curvafit samples get bone) \
-	|| { echo "bone can't be had: taking the synthetic scan"; scan=$$($(BIN)/curvafit samples get synthetic); } \
-	&& $(BIN)/curvafit infer "$$scan" -o demo_out
+	@$(BIN)/curvafit demo -o demo_out
 
 test: .venv/installed-dev
-	OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(BIN)/python -m pytest -q -n 2 --dist worksteal -m "not long"
+	$(PYTEST) -m "not slow"
 
-test-long: .venv/installed-dev
-	OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(BIN)/python -m pytest -q -n 2 --dist worksteal -m long
+test-all: .venv/installed-dev
+	$(PYTEST) --durations=25
 
 test-hostile: .venv/installed-dev
 	$(BIN)/python -m tests.hostile
-
-test-hostile-quick: .venv/installed-dev
-	$(BIN)/python -m tests.hostile --quick
 
 lint: .venv/installed-dev
 	$(BIN)/ruff check .
@@ -42,7 +40,7 @@ docs: .venv/installed-dev
 clean:
 	rm -rf .venv demo_out build dist site
 
-.venv/installed: EXTRAS :=
+.venv/installed: EXTRAS := [infer]
 .venv/installed-dev: EXTRAS := [dev]
 .venv/installed .venv/installed-dev: pyproject.toml constraints.txt | $(BIN)/python
 	@echo "installing curvafit$(EXTRAS) into .venv (some minutes the first time)"
@@ -51,5 +49,5 @@ clean:
 	@touch $@
 
 $(BIN)/python:
-	@$(PYTHON) -c 'import sys; v = sys.version.split()[0]; sys.exit(None if sys.version_info >= (3, 11) else "expected Python 3.11 or newer, got " + v + "; name another with make PYTHON=...")'
+	@$(PYTHON) -c 'import sys; v = sys.version.split()[0]; sys.exit(None if sys.version_info >= (3, 11) else "needs Python 3.11 or newer, this is " + v + "; name another with make PYTHON=...")'
 	@$(PYTHON) -m venv .venv || { rm -rf .venv; exit 1; }

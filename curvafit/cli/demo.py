@@ -7,13 +7,16 @@ from typing import Annotated
 
 import typer
 
-from curvafit.cli.console import OverwriteOption, plainly, say, stages
+from curvafit.cli.console import OverwriteOption, error_console, plainly, say, stages
 
 EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(("curvafit demo", "curvafit demo shell -o shell_out"))
 
 
 def demo(
-    sample: Annotated[str, typer.Argument(help="Name of a sample (curvafit samples).")] = "bone",
+    sample: Annotated[
+        str | None,
+        typer.Argument(help="Name of a sample; by default bone, or else the synthetic scan."),
+    ] = None,
     out: Annotated[Path, typer.Option("-o", "--output", help="Folder for demo.html and what it rests on.")] = Path(
         "demo_out"
     ),
@@ -23,13 +26,22 @@ def demo(
     """Measure a real scan, fill it from every 8th slice, and read its texture: one page, in minutes."""
     with plainly():
         with stages() as progress:
-            from curvafit.cli.samples import fetch_or_make
+            from curvafit.cli.samples import SYNTHETIC, fetch_or_make
+            from curvafit.data_synth.samples import SampleUnavailable
             from curvafit.report.demo import write_demo
             from curvafit.volumes.read import load
 
-            progress(f"fetching {sample}", 0.0)
-            path = fetch_or_make(sample)
-            title = f"A first look: {sample}"
+            name = sample or "bone"
+            progress(f"fetching {name}", 0.0)
+            try:
+                path = fetch_or_make(name)
+            except SampleUnavailable as error:
+                if sample is not None:
+                    raise
+                say(f"{error}; taking the synthetic scan", to=error_console())
+                name = SYNTHETIC
+                path = fetch_or_make(name)
+            title = f"A first look: {name}"
             found = write_demo(load(path), out, title=title, seed=seed, overwrite=overwrite, progress=progress)
         dice, every = found.completion.dice, found.completion.every
         say(f"Filled from every {every}th slice: Dice {dice['curvafit']:.3f} with the slices that were left out.")

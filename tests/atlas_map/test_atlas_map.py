@@ -79,7 +79,6 @@ def test_a_cluster_is_named_by_the_diagrams_of_its_shapes(mapped: AtlasMap, monk
 
 
 @pytest.mark.slow
-@pytest.mark.long
 def test_umap_keeps_apart_what_is_far_and_takes_few_shapes() -> None:
     rng = np.random.default_rng(0)
     groups = np.repeat(np.arange(3), 30)

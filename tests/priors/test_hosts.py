@@ -174,7 +174,6 @@ def test_it_trains_under_monai_s_deep_supervision():
 
 
 @pytest.mark.slow
-@pytest.mark.long
 def test_the_monai_example_runs(tmp_path):
     pytest.importorskip("monai", reason="monai is not installed: pip install monai")
     command = [sys.executable, str(ROOT / "examples" / "monai_training.py"), "--small", "-o", str(tmp_path)]
