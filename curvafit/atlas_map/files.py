@@ -65,7 +65,6 @@ def write_map(
     stores: Sequence[str | Path | Store],
     directory: str | Path,
     *,
-    device: str = "cpu",
     command: str = "",
     overwrite: bool = False,
     progress: Progress = silent,
@@ -91,7 +90,7 @@ def write_map(
     (folder / CACHE).mkdir(parents=True, exist_ok=True)
     write_content(folder / CACHE / TAG, f"{_TAGGED}\n")
     atlas, draws, shapes, commands = _measures(sources, folder / CACHE, progress)
-    mapped = _mapped(atlas, folder / CACHE, device, progress)
+    mapped = _mapped(atlas, folder / CACHE, progress)
     progress("drawing", 0.95)
     picture = map_picture(mapped, lambda k: draws[k][0].field(draws[k][1]), folder / "atlas.png")
     text = page_html(mapped, shapes, commands, _account(mapped, sources, command))
@@ -136,10 +135,10 @@ def _diagram(cached: _Arrays, view: str) -> Diagram:
     return Diagram(cached[f"{view}_points"], cached[f"{view}_weights"], spread=spread, excluded=excluded)
 
 
-def _mapped(atlas: Atlas, cache: Path, device: str, progress: Progress) -> AtlasMap:
+def _mapped(atlas: Atlas, cache: Path, progress: Progress) -> AtlasMap:
     """Return the map of an atlas, its distances and places from the cache where they are there."""
     saved, comparing = cache / "distances.npz", part(progress, 0.6, 0.85)
-    compare = partial(diagram_distances, atlas.field_diagrams, device=device, progress=comparing, saved=saved)
+    compare = partial(diagram_distances, atlas.field_diagrams, progress=comparing, saved=saved)
     try:
         distances = compare()
     except ValueError:  # a file that is damaged, or of other settings

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from curvafit.core.records import Format
 from curvafit.core.runtime import Progress, silent
 from curvafit.geometry.diagram import (
     BIN_WIDTH,
@@ -22,13 +23,15 @@ from curvafit.geometry.diagram import (
     half_thickness,
     leading_family,
 )
-from curvafit.geometry.distances import pairwise
+from curvafit.geometry.distances import digests, pairwise
 from curvafit.inference.atlas import Atlas
 
 #: The paper's settings (Experiment 4): of UMAP, of HDBSCAN on the embedded points, of the distances.
 UMAP: dict[str, Any] = {"n_neighbors": 25, "min_dist": 0.05, "spread": 1.0, "random_state": 1}
 HDBSCAN: dict[str, Any] = {"min_cluster_size": 10, "min_samples": 10}
 DISTANCE: dict[str, Any] = {"blur": 1.0, "reach": 20.0, "bin_width": BIN_WIDTH}
+#: Files of distances; the version goes up when distances change.
+DISTANCES = Format("curvafit distances", 2, "a file of distances", fixed=DISTANCE)
 #: Below this, there is nothing to lay out.
 LEAST_SHAPES = 5
 #: What HDBSCAN calls a point of no cluster.
@@ -103,15 +106,49 @@ def map_atlas(atlas: Atlas, distances: np.ndarray, positions: np.ndarray | None 
 
 
 def diagram_distances(
-    diagrams: Sequence[Diagram],
-    *,
-    device: str = "cpu",
-    progress: Progress = silent,
-    saved: Path | None = None,
+    diagrams: Sequence[Diagram], *, progress: Progress = silent, saved: Path | None = None
 ) -> np.ndarray:
-    """Return the Wasserstein distances of all pairs `(N, N)`, with the paper's settings: `pairwise`, with its progress
-    and its checkpoint `saved`."""
-    return pairwise(diagrams, **DISTANCE, device=device, progress=progress, checkpoint=saved)
+    """Return the Wasserstein distances of all pairs `(N, N)`, with the paper's settings.
+
+    Parameters
+    ----------
+    saved
+        File (`.npz`) that is replaced every half minute and at the end. What it holds of pairs among these diagrams is
+        taken from it: a run that was stopped goes on, a longer list costs its new rows, and rows of diagrams that are
+        not listed any more go. Diagrams are known by their content, whatever their order.
+
+    Raises
+    ------
+    ValueError
+        As `pairwise`; or if the file is something else, or was made with other settings.
+    OSError
+        If the file cannot be written; before anything is computed.
+    """
+    if saved is None:
+        return pairwise(diagrams, **DISTANCE, progress=progress)
+    keys = digests(diagrams, **DISTANCE)
+    known = np.full((len(keys),) * 2, np.nan)
+    if saved.exists():
+        there, distances = DISTANCES.read(saved, _table)
+        place = {key: number for number, key in enumerate(there)}
+        mine = [number for number, key in enumerate(keys) if key in place]
+        theirs = [place[keys[number]] for number in mine]
+        known[np.ix_(mine, mine)] = distances[np.ix_(theirs, theirs)]
+
+    def save(distances: np.ndarray) -> None:
+        """Replace the file."""
+        arrays = {"keys": np.array(keys, dtype="S64"), "distances": distances}
+        DISTANCES.write(saved, {}, arrays, compress=False)
+
+    return pairwise(diagrams, **DISTANCE, known=known, save=save, progress=progress)
+
+
+def _table(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> tuple[list[str], np.ndarray]:
+    """Return the digests and the distances of a file."""
+    keys, distances = arrays["keys"].astype(str).tolist(), arrays["distances"]
+    if distances.shape != (len(keys),) * 2 or distances.dtype != np.float64:
+        raise ValueError(f"distances of shape {distances.shape} for {len(keys)} diagrams")
+    return keys, distances
 
 
 def embed(distances: np.ndarray) -> np.ndarray:

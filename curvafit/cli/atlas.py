@@ -10,7 +10,6 @@ import typer
 from curvafit.cli.console import (
     OverwriteOption,
     command_line,
-    device_of,
     error_console,
     kept,
     plainly,
@@ -21,8 +20,8 @@ from curvafit.cli.console import (
 from curvafit.cli.workers import Crew, DashboardOption, SchedulerOption, WorkersOption
 
 if TYPE_CHECKING:
+    from curvafit.core.records import Format
     from curvafit.data_synth.atlas.design import Design
-    from curvafit.inference.archive import Archive
 
 atlas_app = typer.Typer(help="Collections of generated shapes to match scans against.", no_args_is_help=True)
 
@@ -150,9 +149,9 @@ def extract_atlas(
     """Measure the shapes of stores, and write the atlas that `infer --atlas` reads."""
     with plainly():
         from curvafit.atlas_map.extract import extract
-        from curvafit.inference.atlas import ARCHIVE, save_atlas
+        from curvafit.inference.atlas import ATLAS_FILE, save_atlas
 
-        _check_archive(out, ARCHIVE, stores, overwrite)
+        _check_archive(out, ATLAS_FILE, stores, overwrite)
         with stages() as progress:
             atlas = extract(stores, [command_line()], progress=progress)
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -178,9 +177,9 @@ def describe_atlas(
     """Measure each shape of stores as field, mask, crop and scan: the table that `atlas train` reads."""
     with plainly():
         from curvafit.atlas_map.describe import describe
-        from curvafit.inference.table import ARCHIVE, VIEWS
+        from curvafit.inference.table import TABLE_FILE, VIEWS
 
-        _check_archive(out, ARCHIVE, stores, overwrite)
+        _check_archive(out, TABLE_FILE, stores, overwrite)
         crew = Crew(workers, scheduler, dashboard)
         crew.check()
         names = tuple(VIEWS) if views is None else tuple(views.split(","))
@@ -203,11 +202,11 @@ def train_atlas(
 ) -> None:
     """Train the posterior of the parameters, given descriptors, on a table of them."""
     with plainly():
-        from curvafit.inference.posterior import ARCHIVE, save_posterior
+        from curvafit.inference.posterior import POSTERIOR_FILE, save_posterior
         from curvafit.inference.table import load_table
         from curvafit.inference.training import train_posterior
 
-        _check_archive(out, ARCHIVE, [table], overwrite)
+        _check_archive(out, POSTERIOR_FILE, [table], overwrite)
         content = load_table(table)
         if views is not None:
             content = content.of(views.split(","))
@@ -227,7 +226,6 @@ def train_atlas(
 def map_atlas(
     stores: Annotated[list[Path], typer.Argument(help="Stores made by `curvafit atlas build`, of one grid.")],
     out: Annotated[Path, typer.Option("-o", "--output", help="Folder for atlas.html, atlas.png and a cache.")],
-    device: Annotated[str, typer.Option(help="Device for the distances: cpu, cuda, cuda:1 …")] = "cpu",
     overwrite: OverwriteOption = False,
 ) -> None:
     """Draw a map of the shapes of stores: a picture, and a page to explore the shapes and to place scans."""
@@ -236,20 +234,20 @@ def map_atlas(
             from curvafit.atlas_map.files import check_map, write_map
 
             check_map(out, stores, overwrite)
-            options = {"device": device_of(device), "command": command_line(), "overwrite": overwrite}
+            options = {"command": command_line(), "overwrite": overwrite}
             files = write_map(stores, out, **options, progress=progress)
         for path in files:
             say(str(path))
 
 
-def _check_archive(out: Path, archive: Archive, inputs: list[Path], overwrite: bool) -> None:
+def _check_archive(out: Path, kind: Format, inputs: list[Path], overwrite: bool) -> None:
     """Refuse a target that is no `.npz`, cannot be written, is an input, or is a file of another kind."""
     from curvafit.core.files import check_folder, check_free
 
     if out.suffix.lower() != ".npz":
         raise ValueError(f"expected a name ending in .npz, got {out.name!r}")
     check_folder(out.parent)
-    check_free([out], archive.bears, inputs, overwrite)
+    check_free([out], kind.owns, inputs, overwrite)
 
 
 def _design(name: str, around: str | None, spread: float | None) -> Design:

@@ -7,13 +7,11 @@ float32; `wasserstein` needs geomloss for float64 and takes these loops where ge
 from __future__ import annotations
 
 import hashlib
-import json
+import itertools
 import math
-import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,10 +19,7 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
-from curvafit.core.checks import quoted
 from curvafit.core.extras import require
-from curvafit.core.files import write_atomically
-from curvafit.core.records import parse_json, read_archive
 from curvafit.core.runtime import Progress, silent
 from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram
 from curvafit.priors.kernels import threads
@@ -33,9 +28,6 @@ from curvafit.priors.kernels import threads
 BLOCK = 8192
 #: Seconds between two saves.
 EVERY = 30.0
-FORMAT = "curvafit distances"
-#: Goes up when distances change: rows of another version are never reused.
-VERSION = 2
 #: All of fast-math but the leave to assume that no value is NaN or infinite.
 _SERIAL = {
     "cache": True,
@@ -47,8 +39,6 @@ _PARALLEL = {**_SERIAL, "parallel": True}
 #: A sum over the plan is trusted between these; outside, what it adds may have left float32's range.
 _LEAST, _MOST = np.float32(1e-25), np.float32(1e30)
 _LN2 = math.log(2.0)
-#: Entries of a batch's cost matrices.
-_ENTRIES = 1 << 26
 _LOW, _HIGH = np.float32(-126), np.float32(127)
 _ZERO, _ONE = np.float32(0), np.float32(1)
 #: 2^r on [-½, ½] to 3e-7 of itself: Taylor's coefficients from the fifth to the first.
@@ -61,13 +51,14 @@ def pairwise(
     blur: float = 1.0,
     reach: float | None = 20.0,
     bin_width: float = BIN_WIDTH,
-    device: torch.device | str = "cpu",
-    checkpoint: str | Path | None = None,
+    known: np.ndarray | None = None,
+    save: Callable[[np.ndarray], object] | None = None,
     progress: Progress = silent,
 ) -> np.ndarray:
     """Return `wasserstein` of every pair of N diagrams: `(N, N)` float64, symmetric, with a zero diagonal.
 
-    `wasserstein` is met to 1e-4 of itself, or 1e-5 where that is less than 0.1: the steps are the same, in float32.
+    `wasserstein` is met to 1e-4 of itself, or 1e-5 where that is less than 0.1: the steps are the same, in float32. A
+    pair takes half a millisecond, on numba's threads.
 
     Parameters
     ----------
@@ -75,41 +66,40 @@ def pairwise(
         In one unit.
     blur, reach, bin_width
         As `wasserstein` takes them.
-    device
-        `"cpu"` runs on numba's threads, half a millisecond a pair; `"cuda"` takes pairs in batches.
-    checkpoint
-        File (`.npz`) that is replaced every half minute and at the end. Where it exists, what it holds of pairs among
-        these diagrams is taken from it: a killed run goes on, a longer list costs its new rows. Diagrams are known by
-        their content, so order and position do not matter; rows of diagrams that are not listed any more go.
+    known
+        Distances of before, NaN where there is none: only these are computed.
+    save
+        Called with the distances so far, NaN where there is none yet: before the first pair, about every `EVERY`
+        seconds, and at the end, also where an exception is the end.
     progress
         Called after every block of pairs with a sentence and the share done.
 
     Raises
     ------
     ValueError
-        If a diagram is empty, the units differ, a parameter is out of range, or the checkpoint is something else or was
-        made with other parameters.
-    OSError
-        If the checkpoint cannot be written; before anything is computed.
+        If a diagram is empty, the units differ, or a parameter is out of range.
     """
     measures = _measures(diagrams, blur, reach, bin_width)
-    file = _File(checkpoint, {"blur": blur, "reach": reach, "bin_width": bin_width}, _keys(measures))
-    distances = file.read()
+    distances = np.full((len(diagrams),) * 2, np.nan) if known is None else known.copy()
+    np.fill_diagonal(distances, 0)
     first, second = np.nonzero(np.triu(np.isnan(distances)))
     order = np.random.default_rng(0).permutation(len(first))  # so that threads get pairs of like sizes
     first, second = first[order], second[order]
     total = len(distances) * (len(distances) - 1) // 2
-    file.write(distances)
-    blocks = _distances(measures, first, second, blur=blur, reach=reach, device=device)
+    save = save or (lambda distances: None)
+    save(distances)
+    saved = time.monotonic()
+    blocks = _distances(measures, first, second, blur=blur, reach=reach)
     try:
         for start, block in zip(range(0, len(first), BLOCK), blocks, strict=True):
             i, j = first[start : start + BLOCK], second[start : start + BLOCK]
             distances[i, j] = distances[j, i] = block
             progress(f"comparing {total} pairs", (total - len(first) + start + len(block)) / total)
-            if file.due():
-                file.write(distances)
+            if time.monotonic() - saved > EVERY:
+                save(distances)
+                saved = time.monotonic()
     finally:
-        file.write(distances)
+        save(distances)
     return distances
 
 
@@ -120,12 +110,11 @@ def one_to_many(
     blur: float = 1.0,
     reach: float | None = 20.0,
     bin_width: float = BIN_WIDTH,
-    device: torch.device | str = "cpu",
 ) -> np.ndarray:
     """Return the distances `(N,)` of one diagram to each of N; `pairwise` says what is taken and raised."""
     measures = _measures([query, *diagrams], blur, reach, bin_width)
     others = np.arange(1, len(diagrams) + 1)
-    blocks = _distances(measures, np.zeros_like(others), others, blur=blur, reach=reach, device=device)
+    blocks = _distances(measures, np.zeros_like(others), others, blur=blur, reach=reach)
     return np.concatenate([np.empty(0), *blocks])
 
 
@@ -151,67 +140,14 @@ def _distances(measures: Measures, first: np.ndarray, second: np.ndarray, **opti
         yield np.sqrt(np.maximum(divergence, 0))
 
 
-def _keys(measures: Measures) -> list[str]:
-    """Return a digest of each measure's points and weights."""
+def digests(
+    diagrams: Sequence[Diagram], *, blur: float = 1.0, reach: float | None = 20.0, bin_width: float = BIN_WIDTH
+) -> list[str]:
+    """Return a text for each diagram that is the same where `pairwise` sees the same points and weights."""
+    measures = _measures(diagrams, blur, reach, bin_width)
     rows = np.stack([measures.x, measures.y, measures.log2], axis=1)
-    parts = (rows[start:end] for start, end in zip(measures.bounds[:-1], measures.bounds[1:], strict=True))
+    parts = (rows[start:end] for start, end in itertools.pairwise(measures.bounds))
     return [hashlib.sha256(part.tobytes()).hexdigest() for part in parts]
-
-
-class _File:
-    """Where distances are kept: a header, the digests of N measures, and `(N, N)` distances, NaN where not known yet.
-
-    Without a path nothing is kept.
-    """
-
-    def __init__(self, path: str | Path | None, settings: dict[str, Any], keys: list[str]) -> None:
-        self._path = None if path is None else Path(path)
-        self._header = {"format": FORMAT, "version": VERSION, **settings}
-        self._keys, self._written = keys, time.monotonic()
-
-    def read(self) -> np.ndarray:
-        """Return what the file knows of the distances between the measures."""
-        distances = np.full((len(self._keys),) * 2, np.nan)
-        if self._path is not None and self._path.exists():
-            keys, known = self._content(self._path)
-            place = {key: number for number, key in enumerate(keys)}
-            here = [number for number, key in enumerate(self._keys) if key in place]
-            there = [place[self._keys[number]] for number in here]
-            distances[np.ix_(here, here)] = known[np.ix_(there, there)]
-        np.fill_diagonal(distances, 0)
-        return distances
-
-    def due(self) -> bool:
-        return time.monotonic() - self._written > EVERY
-
-    def write(self, distances: np.ndarray) -> None:
-        if self._path is not None:
-            write_atomically(self._path, lambda path: self._save(path, distances))
-            self._written = time.monotonic()
-
-    def _save(self, path: Path, distances: np.ndarray) -> None:
-        header = np.frombuffer(json.dumps(self._header).encode(), dtype=np.uint8)
-        with open(path, "wb") as file:
-            np.savez(file, header=header, keys=np.array(self._keys, dtype="S64"), distances=distances)
-            file.flush()
-            os.fsync(file.fileno())
-
-    def _content(self, path: Path) -> tuple[list[str], np.ndarray]:
-        """Return the digests and distances of a file that was made with the same settings."""
-        try:
-            arrays = read_archive(path)
-            header = parse_json(arrays["header"].tobytes(), "a file of distances", path)
-            keys, distances = arrays["keys"].astype(str).tolist(), arrays["distances"]
-            theirs = {name: header.get(name) for name in self._header}
-            if distances.shape != (len(keys),) * 2 or distances.dtype != np.float64:
-                raise ValueError(f"expected distances of {len(keys)} diagrams, got shape {distances.shape}")
-        except (ValueError, KeyError, AttributeError, TypeError) as error:
-            raise ValueError(f"expected a file of distances, got {path}, which is something else") from error
-        names = [name for name, value in self._header.items() if theirs[name] != value]
-        if names:
-            parts = (f"{name} {quoted(theirs[name])} instead of {self._header[name]}" for name in names)
-            raise ValueError(f"expected distances of this kind, got {path} with {'; '.join(parts)}")
-        return keys, distances
 
 
 def wasserstein(
@@ -364,7 +300,6 @@ def costs(
     *,
     blur: float,
     reach: float | None,
-    device: torch.device | str = "cpu",
 ) -> np.ndarray:
     """Return the entropic, unbalanced cost OT_ε of each pair of measures, ½|x - y|² a unit moved, `(K,)` float64.
 
@@ -378,35 +313,13 @@ def costs(
         How often √ε halves for each pair, `(K,)`: see `halvings`.
     blur, reach
         √ε at the end, and √ρ of the penalty on what is not moved, in the points' unit; no reach moves everything.
-    device
-        `"cpu"` takes numba's loops on its threads, any other one batches of tensors there.
     """
     first, second = (np.asarray(numbers, dtype=np.int64) for numbers in (first, second))
     ε, shares = schedule(falls, blur)
     ρ = math.inf if reach is None else reach**2
-    if torch.device(device).type != "cpu":
-        return batched(measures, first, second, ε, shares, ρ, device)
     values = np.empty(len(first))
     threads.start()
     _costs(measures, first, second, ε, shares, ρ, values)
-    return values
-
-
-def batched(measures: Measures, first, second, ε: np.ndarray, shares: np.ndarray, ρ: float, device) -> np.ndarray:
-    """Return the costs by torch, several pairs at a time, each padded to the batch's largest by weightless points."""
-    values = np.empty(len(first))
-    for pairs, size in _batches(np.diff(measures.bounds), first, second):
-        (x, log_a), (y, log_b) = (_padded(measures, numbers[pairs], size, device) for numbers in (first, second))
-        cost = (x[:, :, None] - y[:, None]).square_().sum(-1) / 2
-        f, g = torch.zeros_like(log_a), torch.zeros_like(log_b)
-        for εs, keep in zip(ε[pairs].T, shares[pairs].T, strict=True):
-            step, keep = (torch.tensor(v, dtype=f.dtype, device=device)[:, None] for v in (εs, keep))
-            damping, scaled = step / (1 + step / ρ), cost / step[..., None]
-            to_f = -damping * torch.logsumexp((log_b + g / step)[:, None] - scaled, 2)
-            to_g = -damping * torch.logsumexp((log_a + f / step)[:, :, None] - scaled, 1)
-            f, g = keep * f + (1 - keep) * to_f, keep * g + (1 - keep) * to_g
-        value = _dual(log_a, f, ε[0, -1], ρ) + _dual(log_b, g, ε[0, -1], ρ)
-        values[pairs] = value.cpu().numpy()
     return values
 
 
@@ -420,35 +333,6 @@ def schedule(falls: np.ndarray, blur: float) -> tuple[np.ndarray, np.ndarray]:
     ε = np.where(place >= falls + 2, blur**2, (blur * 2.0 ** (falls - 0.5 - np.maximum(place - 2, 0))) ** 2)
     ends = (place == 0) | (place == steps - 1)
     return ε, np.where(ends, 0.0, np.where(place < 0, 1.0, 0.5))
-
-
-def _batches(sizes: np.ndarray, first: np.ndarray, second: np.ndarray) -> Iterator[tuple[np.ndarray, int]]:
-    """Yield pairs of like size, and the size that all their measures are padded to."""
-    larger = np.maximum(sizes[first], sizes[second])
-    order = np.argsort(-larger, kind="stable")
-    start = 0
-    while start < len(order):
-        size = int(larger[order[start]])
-        end = start + max(1, _ENTRIES // size**2)
-        yield order[start:end], size
-        start = end
-
-
-def _padded(measures: Measures, numbers: np.ndarray, size: int, device) -> tuple[Tensor, Tensor]:
-    """Return points `(B, size, 2)` and natural logarithms of their weights `(B, size)`."""
-    start, count = measures.bounds[numbers], np.diff(measures.bounds)[numbers]
-    place = np.arange(size)
-    real = place < count[:, None]
-    rows = start[:, None] + np.where(real, place, 0)
-    points = np.stack([measures.x[rows], measures.y[rows]], axis=-1)
-    logs = np.where(real, measures.log2[rows] * np.float32(_LN2), -np.inf)
-    return torch.from_numpy(points).to(device), torch.from_numpy(logs.astype(np.float32)).to(device)
-
-
-def _dual(log_weights: Tensor, potentials: Tensor, ε: float, ρ: float) -> Tensor:
-    """Return the potentials' part of the cost, `(B,)`: ∑ a (ρ + ε/2) (1 - exp(-f/ρ)), or ∑ a f where all is moved."""
-    weights, f = log_weights.double().exp(), potentials.double()
-    return (weights * (f if math.isinf(ρ) else -(ρ + ε / 2) * torch.expm1(-f / ρ))).sum(1)
 
 
 @njit(**_PARALLEL)
@@ -549,7 +433,7 @@ def _exp2(t):
 
 @njit(**_SERIAL)
 def _part(log_weights, f, ε, ρ):
-    """Return `_dual` of one measure."""
+    """Return the potential's part of the cost: ∑ a (ρ + ε/2) (1 - exp(-f/ρ)), or ∑ a f where all is moved."""
     total = 0.0
     for i in range(len(f)):
         value = f[i] if np.isinf(ρ) else -(ρ + ε / 2) * math.expm1(-f[i] / ρ)

@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from curvafit.core.records import Format
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.distances import one_to_many, sliced_embedding, wasserstein
-from curvafit.inference.archive import Archive
+from curvafit.inference.table import packaged
 from curvafit.priors.coefficients import Coefficients
 
 VERSION = 1
-ARCHIVE = Archive("an atlas", "an atlas file", "curvafit atlas", VERSION, "extract it again from its store")
+ATLAS_FILE = Format("curvafit atlas", VERSION, "an atlas file", remedy="extract it again from its store")
 #: How a shape can be seen: as its phase field, or as the mask {u > 0} re-profiled.
 VIEWS = ("field", "mask")
 
@@ -91,7 +92,7 @@ def save_atlas(atlas: Atlas, path: str | Path) -> None:
     arrays = {name: getattr(atlas, name) for name in ("coefficients", "masses", "seeds", "volume_fractions")}
     for view in VIEWS:
         arrays |= {f"{view}_{name}": value for name, value in _packed(atlas.diagrams(view)).items()}
-    ARCHIVE.save(path, arrays, ids=list(atlas.ids), provenance=atlas.provenance)
+    ATLAS_FILE.write(path, {"ids": list(atlas.ids), "provenance": atlas.provenance}, arrays)
 
 
 def load_atlas(path: str | Path | None = None) -> Atlas:
@@ -105,12 +106,12 @@ def load_atlas(path: str | Path | None = None) -> Atlas:
         If it is not an atlas, is truncated, or has another format version.
     """
     if path is None:
-        return ARCHIVE.packaged("atlas.npz", _atlas)
+        return ATLAS_FILE.read(packaged("atlas.npz"), _atlas, place="the packaged atlas")
     if Path(path).is_dir():
         raise FileNotFoundError(
             f"expected an atlas file, got the folder {path}: `curvafit atlas extract` makes one of it"
         )
-    return ARCHIVE.load(path, _atlas)
+    return ATLAS_FILE.read(path, _atlas)
 
 
 def _packed(diagrams: tuple[Diagram, ...]) -> dict[str, np.ndarray]:

@@ -12,12 +12,12 @@ from torch import Tensor, nn
 
 from curvafit.core.checks import check_float, check_int, quoted
 from curvafit.core.extras import require
+from curvafit.core.records import Format
 from curvafit.geometry.descriptors import BLOCKS, Descriptors
-from curvafit.inference.archive import Archive
 from curvafit.inference.emulator import Emulator, Layer
-from curvafit.inference.table import PARAMETERS, Compression, column_names
+from curvafit.inference.table import PARAMETERS, Compression, column_names, packaged
 
-ARCHIVE = Archive("a posterior", "a posterior", "curvafit posterior", 3, "train it again", {"blocks": BLOCKS})
+POSTERIOR_FILE = Format("curvafit posterior", 3, "a posterior", "train it again", {"blocks": BLOCKS})
 #: Largest size of a flow, and most flows of an ensemble.
 WIDEST, MOST = 2048, 64
 #: Which of the parameters is the mass.
@@ -216,15 +216,14 @@ def save_posterior(posterior: Posterior, path: str | Path) -> None:
             arrays |= {f"emulator.{name}.{level}.{part}": value for part, value in layer._asdict().items()}
     arrays["emulator.basis"] = posterior.emulator.basis.astype(np.float32)
     arrays |= {f"misfits.{view}": values.astype(np.float32) for view, values in posterior.misfits.items()}
-    ARCHIVE.save(
-        path,
-        arrays,
-        architecture=asdict(posterior.architecture),
-        members=len(posterior.members),
-        inflation=posterior.emulator.inflation,
-        views=posterior.views,
-        provenance=posterior.provenance,
-    )
+    header = {
+        "architecture": asdict(posterior.architecture),
+        "members": len(posterior.members),
+        "inflation": posterior.emulator.inflation,
+        "views": posterior.views,
+        "provenance": posterior.provenance,
+    }
+    POSTERIOR_FILE.write(path, header, arrays)
 
 
 def load_posterior(path: str | Path | None = None) -> Posterior:
@@ -237,7 +236,9 @@ def load_posterior(path: str | Path | None = None) -> Posterior:
     ValueError
         If it is not a posterior, is damaged, or has another format version or other blocks.
     """
-    return ARCHIVE.packaged("posterior.npz", _posterior) if path is None else ARCHIVE.load(path, _posterior)
+    if path is None:
+        return POSTERIOR_FILE.read(packaged("posterior.npz"), _posterior, place="the packaged posterior")
+    return POSTERIOR_FILE.read(path, _posterior)
 
 
 def _posterior(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Posterior:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.resources
+import io
 import json
 import math
 from collections.abc import Callable, Sequence
@@ -12,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import ndimage
 
+from curvafit.core.records import Format, encode
 from curvafit.geometry.descriptors import BLOCKS, Descriptors
-from curvafit.inference.archive import Archive, encode
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
 from curvafit.scan.grids import centre_distance, median_thickness, remove_specks, resample
@@ -21,11 +23,10 @@ from curvafit.scan.prepare import KEPT_THICKNESS, THINNEST, smallest_piece
 from curvafit.scan.structure import split
 from curvafit.volumes.field import Field, ScanError
 
-ARCHIVE = Archive(
-    "a table of descriptors",
-    "a table of descriptors",
+TABLE_FILE = Format(
     "curvafit descriptors",
     1,
+    "a table of descriptors",
     "describe the stores into another file, or with --overwrite",
     {"blocks": BLOCKS},
 )
@@ -138,7 +139,7 @@ def save_table(table: Table, path: str | Path) -> None:
         "parameters": table.parameters,
         "descriptors": table.descriptors.astype(np.float32),
     }
-    ARCHIVE.save(path, arrays, provenance=table.provenance)
+    TABLE_FILE.write(path, {"provenance": table.provenance}, arrays)
 
 
 def load_table(path: str | Path) -> Table:
@@ -151,7 +152,12 @@ def load_table(path: str | Path) -> Table:
     ValueError
         If it is not a table, is damaged, or has another format version or other blocks.
     """
-    return ARCHIVE.load(path, _table)
+    return TABLE_FILE.read(path, _table)
+
+
+def packaged(name: str) -> io.BytesIO:
+    """Return a file of this package, in `inference/data`, as an open file."""
+    return io.BytesIO((importlib.resources.files("curvafit.inference") / "data" / name).read_bytes())
 
 
 def _table(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Table:

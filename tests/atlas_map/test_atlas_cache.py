@@ -3,6 +3,7 @@ nothing."""
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 from pathlib import Path
@@ -13,7 +14,9 @@ from exact_store import exact_field, exact_store, quick_map
 
 import curvafit.atlas_map.files as atlas_files
 from curvafit.atlas_map.files import write_map
+from curvafit.atlas_map.layout import diagram_distances
 from curvafit.data_synth.atlas.record import Record
+from curvafit.geometry.diagram import Diagram
 
 
 def test_nothing_is_measured_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -98,3 +101,40 @@ def test_a_map_of_two_stores_shows_the_shapes_of_both(tmp_path: Path, monkeypatc
         np.testing.assert_array_equal(u, exact_field(int(name.split("-")[1])))
     said = page.read_text()
     assert all(f"<dt>{name}: draws</dt>" in said for name in ("one", "other"))
+
+
+# ---- distances in a file ---------------------------------------------------------------------------------------------
+
+
+def clouds() -> list[Diagram]:
+    """Five sets of points with weights over six orders of magnitude."""
+    rng = np.random.default_rng(0)
+    return [Diagram(rng.normal(4 * k, 10.0, (30 + k, 2)), 10 ** rng.uniform(-6, 0, 30 + k)) for k in range(5)]
+
+
+def interrupt(text: str, share: float) -> None:
+    raise KeyboardInterrupt
+
+
+def test_rows_in_a_file_follow_their_diagrams(tmp_path: Path) -> None:
+    """In another order, without some, and with one changed by a single weight or point."""
+    path, every, order = tmp_path / "distances.npz", clouds(), [3, 1, 4]
+    truth = diagram_distances(every, saved=path)
+    assert [each.name for each in tmp_path.iterdir()] == ["distances.npz"]
+    again = diagram_distances([every[k] for k in order], saved=path, progress=interrupt)
+    np.testing.assert_array_equal(again, truth[np.ix_(order, order)])
+    for change in ({"points": every[3].points + 1}, {"weights": every[3].weights[::-1].copy()}):
+        changed = [every[1], dataclasses.replace(every[3], **change), every[4]]
+        np.testing.assert_allclose(
+            diagram_distances(changed, saved=path), diagram_distances(changed), rtol=1e-5, atol=0.01
+        )
+
+
+def test_a_file_of_other_distances_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "distances.npz"
+    diagram_distances(clouds()[:2], saved=path)
+    path.write_bytes(path.read_bytes()[:300])
+    with pytest.raises(ValueError, match="distances"):
+        diagram_distances(clouds()[:2], saved=path)
+    with pytest.raises(OSError):
+        diagram_distances(clouds()[:2], saved=path / "below" / "distances.npz", progress=interrupt)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -53,19 +51,6 @@ def test_costs_are_geomloss_s(blur: float, reach: float | None) -> None:
     truth = [cost(CLOUDS[i], CLOUDS[j], blur, reach, n) for i, j, n in zip(first, second, falls, strict=True)]
     values = module.costs(measures(CLOUDS), first, second, falls, blur=blur, reach=reach)
     np.testing.assert_allclose(values, truth, rtol=2e-5, atol=1e-4)
-
-
-@pytest.mark.parametrize("reach", [20.0, None])
-def test_batches_cost_what_single_pairs_do(reach: float | None, monkeypatch: pytest.MonkeyPatch) -> None:
-    packed = measures(CLOUDS)
-    first, second = np.triu_indices(len(CLOUDS))
-    falls = module.pair_halvings(packed, first, second, 1.0)
-    truth = module.costs(packed, first, second, falls, blur=1.0, reach=reach)
-    ε, shares = module.schedule(falls, 1.0)
-    for entries in (1, 3 * 70**2, 1 << 26):
-        monkeypatch.setattr(module, "_ENTRIES", entries)
-        values = module.batched(packed, first, second, ε, shares, math.inf if reach is None else reach**2, "cpu")
-        np.testing.assert_allclose(values, truth, rtol=2e-5, atol=1e-4)
 
 
 @pytest.mark.parametrize("edge", [1.0, 0.3, 3.7, 181.0, 181.1, 1e5])
@@ -128,52 +113,24 @@ def test_points_without_weight_do_not_count() -> None:
     assert one_to_many(a, [more], bin_width=0)[0] == 0
 
 
-def interrupt(text: str, share: float) -> None:
-    raise KeyboardInterrupt
-
-
-def test_an_interrupted_run_goes_on_and_a_longer_list_costs_its_new_rows(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_known_distances_are_not_computed_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What an interrupted run saved is taken by the next, and a longer list costs its new rows."""
     monkeypatch.setattr(module, "BLOCK", 2)
-    path, truth = tmp_path / "distances.npz", pairwise(CLOUDS)
+    truth, saved, shares = pairwise(CLOUDS), [], []
+
+    def interrupt(text: str, share: float) -> None:
+        raise KeyboardInterrupt
+
     with pytest.raises(KeyboardInterrupt):
-        pairwise(CLOUDS[:4], checkpoint=path, progress=interrupt)
-    shares: list[float] = []
-    resumed = pairwise(CLOUDS[:4], checkpoint=path, progress=lambda text, share: shares.append(share))
+        pairwise(CLOUDS[:4], save=lambda distances: saved.append(distances.copy()), progress=interrupt)
+    assert np.isnan(saved[0]).sum() == 12 and np.isnan(saved[-1]).sum() == 8
+    resumed = pairwise(CLOUDS[:4], known=saved[-1], progress=lambda text, share: shares.append(share))
     assert shares == pytest.approx([4 / 6, 1])
     np.testing.assert_allclose(resumed, truth[:4, :4], rtol=1e-5)
-    shares.clear()
-    longer = pairwise(CLOUDS, checkpoint=path, progress=lambda text, share: shares.append(share))
-    np.testing.assert_allclose(longer, truth, rtol=1e-5)
-    assert shares == pytest.approx([0.8, 1])
-    np.testing.assert_array_equal(pairwise(CLOUDS, checkpoint=path, progress=interrupt), longer)
-    assert [each.name for each in tmp_path.iterdir()] == ["distances.npz"]
+    np.testing.assert_array_equal(pairwise(CLOUDS[:4], known=resumed, progress=interrupt), resumed)
 
 
-def test_rows_follow_their_diagrams(tmp_path: Path) -> None:
-    """In another order, without some, and with one changed by a single weight or point."""
-    path = tmp_path / "distances.npz"
-    truth = pairwise(CLOUDS, checkpoint=path)
-    order = [3, 1, 4]
-    np.testing.assert_array_equal(
-        pairwise([CLOUDS[k] for k in order], checkpoint=path, progress=interrupt), truth[np.ix_(order, order)]
-    )
-    for change in ({"points": CLOUDS[3].points + 1}, {"weights": CLOUDS[3].weights[::-1].copy()}):
-        changed = [CLOUDS[1], dataclasses.replace(CLOUDS[3], **change), CLOUDS[4]]
-        np.testing.assert_allclose(pairwise(changed, checkpoint=path), pairwise(changed), rtol=1e-5, atol=0.01)
-
-
-def test_bad_input_is_one_sentence(tmp_path: Path) -> None:
-    path = tmp_path / "distances.npz"
-    pairwise(CLOUDS[:2], checkpoint=path)
-    with pytest.raises(ValueError, match="blur"):
-        pairwise(CLOUDS[:2], blur=2.0, checkpoint=path)
-    path.write_bytes(path.read_bytes()[:300])
-    with pytest.raises(ValueError, match="distances"):
-        pairwise(CLOUDS[:2], checkpoint=path)
-    with pytest.raises(OSError):
-        pairwise(CLOUDS[:2], checkpoint=path / "below" / "distances.npz", progress=interrupt)
+def test_bad_input_is_one_sentence() -> None:
     with pytest.raises(ValueError, match="positive"):
         pairwise(CLOUDS[:2], reach=0.0)
     with pytest.raises(ValueError, match="unit"):
