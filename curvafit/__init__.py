@@ -52,7 +52,7 @@ _FIGURES = {
     "Field": "curvafit.drawing.plot:field_figure",
     "Fit": "curvafit.drawing.plot:fit_figure",
     "Flow": "curvafit.drawing.plot:flow_figure",
-    "Inference": "curvafit.report.pictures:inference_figure",
+    "Inference": "curvafit.report.page:inference_figure",
     "Segmentation": "curvafit.segmentation.result:segmentation_figure",
 }
 

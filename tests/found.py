@@ -103,7 +103,7 @@ def made_fit(chosen: str | None = "posterior", lost: bool = False) -> Fit:
 
 def without_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reports with empty pictures, where their text is what matters. What cannot be drawn is still refused."""
-    import curvafit.report.pictures as pictures
+    import curvafit.report.page as pictures
 
     def blank(u: np.ndarray) -> Figure:
         if not np.isfinite(u).all():

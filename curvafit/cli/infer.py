@@ -106,8 +106,7 @@ def _show(inference: Inference) -> None:
     """Print the description, the verdict and a small table."""
     from curvafit.core.units import length, number
     from curvafit.inference.candidates import TITLES
-    from curvafit.report.page import parameter_table
-    from curvafit.report.wording import describe
+    from curvafit.report.page import describe, parameter_table
 
     fit = inference.fit
     say(f"{describe(inference)}.", style="bold")

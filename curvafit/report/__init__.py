@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 from curvafit.core.faces import attach_lazy_names
 
 if TYPE_CHECKING:
+    from curvafit.report.page import describe as describe
     from curvafit.report.page import report_html as report_html
     from curvafit.report.page import write_inference as write_inference
     from curvafit.report.page import write_report as write_report
-    from curvafit.report.wording import describe as describe
 
 attach_lazy_names(__name__)

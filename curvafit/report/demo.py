@@ -26,8 +26,7 @@ from curvafit.inference.atlas import load_atlas
 from curvafit.inference.infer import infer
 from curvafit.inference.posterior import load_posterior
 from curvafit.priors.coefficients import Coefficients
-from curvafit.report.page import check_report, write_inference
-from curvafit.report.pictures import SYMBOLS
+from curvafit.report.page import SYMBOLS, check_report, write_inference
 from curvafit.scan.measure import measure
 from curvafit.scan.structure import find_level
 from curvafit.segmentation.reconstruct import reconstruct

@@ -1,64 +1,93 @@
-"""What an inference leaves behind: one self-contained page, `fit.json`, the regenerated volume."""
+"""The report of an inference: one self-contained page, `fit.json`, the regenerated volume.
+
+The page is `templates/report.html`, filled by jinja2 with all text escaped; pictures are inside it.
+"""
 
 from __future__ import annotations
 
+import base64
 import dataclasses
+import math
 from collections.abc import Callable, Iterable, Mapping
-from html import escape
-from importlib.resources import files
 from pathlib import Path
-from string import Template
 from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from matplotlib.figure import Figure
 
 from curvafit.core.files import bears, check_folder, check_free, move_together, own_record, staged, write_content
 from curvafit.core.runtime import undisturbed
-from curvafit.core.units import density, length, number, per_unit, percent, unit_name
-from curvafit.inference.candidates import TITLES, Candidate, seed_noise_of
-from curvafit.priors.coefficients import NAMES
-from curvafit.priors.fit_file import FORMAT
-from curvafit.report.pictures import (
-    bands,
-    corner,
-    diagram_figures,
-    shown,
-    slice_figures,
-    surface_figures,
-    title_of,
-    window_framed,
+from curvafit.core.units import GLOSSARY, density, length, number, per_unit, percent, unit_name
+from curvafit.drawing.plot import (
+    bands_figure,
+    corner_figure,
+    diagram_figure,
+    gallery_figure,
+    png,
+    shared_limits,
+    slice_figure,
+    surface_figure,
 )
-from curvafit.report.wording import describe, glossary_link
+from curvafit.inference.candidates import TITLES, UNBELIEVED, UNDECIDED, Candidate, seed_noise_of
+from curvafit.inference.table import parameters_of
+from curvafit.priors.fit_file import FORMAT
 from curvafit.volumes.field import Field
 from curvafit.volumes.write import save
 
 if TYPE_CHECKING:
-    from curvafit.geometry.morphometry import Morphometry
+    from curvafit.geometry.diagram import Diagram
     from curvafit.inference.infer import Inference
 
 #: The mark by which a page is known as this program's.
 _MARK = '<meta name="generator" content="curvafit'
 #: What an inference writes into its folder.
 FILES = ("fit.json", "report.html", "regenerated.nii.gz")
-
-
-class _Term(NamedTuple):
-    """A parameter as it is written, what it multiplies, and the power of 1/length that it carries."""
-
-    symbol: str
-    factor: str
-    power: int
-
-
-#: Each coefficient as it is written, what it multiplies, and the power of 1/length that it carries in physical units.
+#: Each parameter as it is written, what it multiplies, and the power of 1/length that it carries in physical units.
 _TERMS = {
-    "a20": _Term("a₂₀", "κ₁²", 0),
-    "a11": _Term("a₁₁", "κ₁κ₂", 0),
-    "a02": _Term("a₀₂", "κ₂²", 0),
-    "a10": _Term("a₁₀", "κ₁", 1),
-    "a01": _Term("a₀₁", "κ₂", 1),
-    "a00": _Term("a₀₀", "1", 2),
-    "mass": _Term("m₀", "mass", 0),
+    "a20": ("a₂₀", "κ₁²", 0),
+    "a11": ("a₁₁", "κ₁κ₂", 0),
+    "a02": ("a₀₂", "κ₂²", 0),
+    "a10": ("a₁₀", "κ₁", 1),
+    "a01": ("a₀₁", "κ₂", 1),
+    "a00": ("a₀₀", "1", 2),
+    "mass": ("m₀", "mass", 0),
 }
-_NUMERIC = ' class="n"'
+#: The parameters as a corner plot names them.
+SYMBOLS = ("a₁₁", "log a₀₂", "a₁₀", "a₀₁", "a₀₀", "m₀")
+_AXES = "zyx"
+#: tan 22.5°: how far in direction a point may lie from a family's ideal one.
+_NARROW = math.tan(math.pi / 8)
+_Radii = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+#: For each round family: which points (κ1, κ2) are its own, and the curvature that its radius is one over.
+_ROUND: dict[str, _Radii] = {
+    "spheres": lambda k1, k2: (k2 > _NARROW * k1, (k1 + k2) / 2),
+    "tubes": lambda k1, k2: ((k1 > 0) & (np.abs(k2) < _NARROW * k1), k1),
+    "tubular cavities": lambda k1, k2: ((k2 < 0) & (np.abs(k1) < -_NARROW * k2), -k2),
+    "bubbles": lambda k1, k2: ((k1 < 0) & (-k1 > -_NARROW * k2), -(k1 + k2) / 2),
+}
+#: The sentence for each family.
+_SIZES = {
+    "layers": "{family}, {thickness} thick, {share} of the volume",
+    "sponge": "{family}, struts {thickness} thick, {share} of the volume",
+    "spheres": "{family}, radius {radius}, {share} of the volume",
+    "tubes": "{family}, radius {radius}, {share} of the volume",
+    "tubular cavities": "{family}, radius {radius}, in a phase that is {share} of the volume",
+    "bubbles": "{family}, radius {radius}, in a phase that is {share} of the volume",
+}
+
+
+class Picture(NamedTuple):
+    """A picture in the page: its PNG in base64, None where no shape grew, and the words below it."""
+
+    data: str | None
+    alt: str
+    title: str = ""
+    text: str = ""
+    badge: str = ""
+
+
+# ---- files -----------------------------------------------------------------------------------------------------------
 
 
 def check_report(directory: str | Path, inputs: Iterable[str | Path] = (), overwrite: bool = False) -> Path:
@@ -109,23 +138,6 @@ def with_command(inference: Inference, command: str) -> Inference:
     return dataclasses.replace(inference, fit=dataclasses.replace(inference.fit, provenance=provenance))
 
 
-def parameter_table(inference: Inference) -> list[tuple[str, str, str, str, str]]:
-    """Return rows of name, chosen value, its own deviation, the posterior's 90 % interval, and the physical value; no
-    rows where there is no law."""
-    fit, best, physical = inference.fit, inference.fit.best, inference.fit.coefficients_physical
-    if best is None or physical is None:
-        return []
-    intervals = {} if fit.draws is None else fit.draws.intervals()
-    values = {**best.coefficients.as_dict(), "mass": best.mass}
-    rows = []
-    for name, value in values.items():
-        power = _TERMS[name].power
-        unit = f" {per_unit(fit.length_unit, power)}" if power else ""
-        scaled = "" if name == "mass" else number(physical.as_dict()[name]) + unit
-        rows.append((name, number(value), _deviation(best, name), _interval(intervals.get(name), "90"), scaled))
-    return rows
-
-
 def write_report(inference: Inference, path: str | Path) -> Path:
     """Write the report of an inference as one HTML page without outside parts, and return its path."""
     page = report_html(inference)
@@ -134,224 +146,163 @@ def write_report(inference: Inference, path: str | Path) -> Path:
 
 def report_html(inference: Inference) -> str:
     """Return the page itself."""
-    template = Template(files("curvafit.report").joinpath("templates", "report.html").read_text(encoding="utf-8"))
-    sections = (_shapes, _diagrams, _numbers, _law, _unusual, _matches, _more)
-    sentence = escape(describe(inference))
-    return template.substitute(
-        version=escape(str(inference.fit.provenance.get("curvafit", ""))),
-        title=f"{sentence} · curvafit",
-        sentence=sentence + ".",
+    page = Environment(
+        loader=PackageLoader("curvafit.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    fit = inference.fit
+    return page.get_template("report.html").render(
+        version=fit.provenance.get("curvafit", ""),
+        glossary=GLOSSARY,
+        number=number,
+        fit=fit,
+        sentence=describe(inference),
         scan=_scan_line(inference),
-        verdict=escape(inference.fit.status),
-        slices=slice_figures(inference),
-        frame=" The dashed frame is the main window." if window_framed(inference) else "",
-        notes=_list(inference.fit.notes),
-        sections="\n".join(part for part in (section(inference) for section in sections) if part),
-        provenance=_provenance(inference),
+        slices=_slices(inference),
+        framed=_is_framed(inference),
+        shapes=_shapes(inference) if inference.twins else [],
+        diagrams=[] if inference.diagram is None else _diagrams(inference),
+        bars=_bars(inference) if inference.twins else [],
+        unit=length(fit.length, fit.length_unit, 3),
+        noise=seed_noise_of(fit.candidates),
+        twins=0 if fit.best is None else len(fit.best.twins),
+        numbers=_number_rows(inference),
+        law=_law(inference),
+        corner=_corner(inference),
+        bands=bands(inference),
+        symbols=[symbol for symbol, _, _ in _TERMS.values()],
+        matches=[(each.id, _match_cells(each)) for each in fit.matches],
+        provenance=[(str(name).replace("_", " "), _plain(value)) for name, value in fit.provenance.items()],
     )
 
 
-def _section(title: str, *parts: str) -> str:
-    body = "\n".join(part for part in parts if part)
-    return f"<section>\n<h2>{escape(title)}</h2>\n{body}\n</section>\n"
+# ---- words and numbers -----------------------------------------------------------------------------------------------
 
 
-def _shapes(inference: Inference) -> str:
-    """Return the section of the scan and what grew from each candidate."""
-    if not inference.twins:
-        return ""
-    say = (
-        "All but the first were grown from random noise, with nothing but six coefficients and a mass. They should "
-        "have the scan's texture; they are not copies of it."
-    )
-    return _section("Scanned and regrown", f"<p>{say}</p>", f'<div class="row">{surface_figures(inference)}</div>')
-
-
-def _diagrams(inference: Inference) -> str:
-    """Return the section of curvature diagrams and their distances."""
-    if inference.diagram is None:
-        return ""
-    say = (
-        "How the surface's area is spread over its two principal curvatures κ₁ ≥ κ₂: the darker, the more area "
-        "(logarithmic, over three decades). All have the same axes; nothing can lie above the red line κ₁ = κ₂."
-    )
-    parts = [f"<p>{say}</p>", f'<div class="row">{diagram_figures(inference)}</div>']
-    if inference.twins:
-        parts.append(
-            "<p>The Wasserstein distance from the scan's diagram to that of each regrown shape, in "
-            f"{_distance_unit(inference)}. {_distances_say(inference)}</p>"
-        )
-        parts.append(f'<div class="bars">{_bars(inference)}</div>')
-    return _section("Curvature diagrams", *parts)
-
-
-def _numbers(inference: Inference) -> str:
-    """Return the section of familiar numbers: the scan's beside its twins'."""
-    fit, best = inference.fit, inference.fit.best
-    twins = () if best is None else best.twins
-    head = ""
-    if twins:
-        among = f"{len(twins)} twins" if len(twins) > 1 else "a twin"
-        head = (
-            '<thead><tr><th></th><th></th><th class="n">the scan</th>'
-            f'<th class="n">{among}</th><th class="n">twins over scan</th></tr></thead>'
-        )
-    euler = f"Euler number {fit.morphometry.euler} in the box"
-    note = f"Thickness and spacing are the mean diameters of the largest balls that fit; {euler}."
-    if twins and fit.kind != "field":
-        note += " The twins were grown at the scan's volume fraction."
-    table = f'<div class="wide"><table>{head}<tbody>{_number_rows(fit.morphometry, twins)}</tbody></table></div>'
-    return _section("Familiar numbers", table, f'<p class="small">{note}</p>')
-
-
-def _law(inference: Inference) -> str:
-    """Return the section of the parameters and how well they are known; empty where there is no law."""
-    fit, best = inference.fit, inference.fit.best
-    if best is None:
-        return ""
-    heads = ("coefficient", "of", "chosen", "±", "median", "50 % interval", "90 % interval", "chosen, physical", "unit")
-    head = "".join(f'<th scope="col"{_NUMERIC if k > 1 and k != 8 else ""}>{name}</th>' for k, name in enumerate(heads))
-    parts = [
-        f"<p>Six coefficients and a mass are the scan's {glossary_link('law')}: its shapes have little energy "
-        "∫ p(κ₁, κ₂) dA for their volume, where p = a₂₀ κ₁² + a₁₁ κ₁κ₂ + a₀₂ κ₂² + a₁₀ κ₁ + a₀₁ κ₂ + a₀₀. Only the "
-        f"ratios of the six matter: {_scale_say(best)}.</p>",
-        f'<div class="wide"><table><thead><tr>{head}</tr></thead>',
-        f"<tbody>{_parameter_rows(inference)}</tbody></table></div>",
-        f'<p class="small">{_parameters_say(inference)}</p>',
-    ]
-    if fit.drift is not None:
-        parts.append(
-            "<p>Started at the scan, a short flow of the chosen law moves its surface by "
-            f"{number(fit.drift, 2)} voxels: the less, the more the scan is a shape of this law.</p>"
-        )
-    if fit.weak_directions:
-        parts.append("<p>What the scan leaves open:</p>" + _list(fit.weak_directions))
-    if fit.draws is not None:
-        parts.append(
-            f'<div class="corner">{corner(inference)}</div><p class="small">{len(fit.draws.values)} draws of the '
-            "posterior, two parameters at a time, in working units. A long thin cloud is a direction that the scan "
-            "does not tell apart.</p>"
-        )
-    return _section("The law, and how well it is known", *parts)
-
-
-def _unusual(inference: Inference) -> str:
-    """Return the section of how usual the scan's descriptors are for the model."""
-    misfit = inference.fit.misfit
-    if misfit is None:
-        return ""
-    say = (
-        f"p is the part of shapes of this model ({escape(misfit.method)}) that lie as far out as the scan does. All "
-        f"descriptors together: p = {number(misfit.probability, 2)}."
-    )
-    return _section("Could this model have made the scan?", f"<p>{say}</p>", bands(inference))
-
-
-def _matches(inference: Inference) -> str:
-    """Return the section of the nearest shapes of the atlas."""
-    if not inference.fit.matches:
-        return ""
-    heads = ("shape", "distance", *(_TERMS[name].symbol for name in (*NAMES, "mass")), "seed")
-    head = "".join(f'<th scope="col"{_NUMERIC if k else ""}>{name}</th>' for k, name in enumerate(heads))
-    return _section(
-        "Nearest shapes of the atlas",
-        f'<div class="wide"><table class="ids"><thead><tr>{head}</tr></thead>'
-        f"<tbody>{_match_rows(inference)}</tbody></table></div>",
-        '<p class="small">The nearest is the baseline: its parameters are what the nearest curvature diagram says, '
-        "without any uncertainty. These distances are to the diagrams that the atlas holds; those above are to shapes "
-        "regrown in a box of the scan's size.</p>",
+def describe(inference: Inference) -> str:
+    """Return the sentence that a report opens with: family, size, share of the volume."""
+    fit, numbers = inference.fit, inference.fit.morphometry
+    radius = None if inference.diagram is None else family_radius(inference.diagram, fit.family)
+    physical = numbers.thickness_mean / 2 if radius is None else radius * fit.length
+    pattern = _SIZES.get(fit.family, "{family}, {thickness} thick, {share} of the volume")
+    return pattern.format(
+        family=fit.family.capitalize(),
+        radius=length(physical, fit.length_unit),
+        thickness=length(numbers.thickness_mean, fit.length_unit),
+        share=percent(numbers.volume_fraction),
     )
 
 
-def _more(inference: Inference) -> str:
-    """Return the section of how to grow more of a scan's texture."""
-    if inference.fit.best is None:
-        return ""
-    command = escape("curvafit generate --prior fit.json --shape 100 --seed 1 -o more.nii.gz")
-    say = (
-        "Either of these grows a volume of the same texture: of any size, and another one for each seed. "
-        "<code>fit.json</code> lies beside this page."
-    )
-    return _section("Make more of it", f"<p>{say}</p>", f"<pre>{command}</pre>", f"<pre>{_PYTHON}</pre>")
-
-
-_PYTHON = escape(
-    """import curvafit
-from curvafit.priors import read_fit
-
-fit = read_fit("fit.json")
-flow = curvafit.generate(fit.coefficients, fit.mass, 100, schedule="deep", seed=1)"""
-)
+def family_radius(diagram: Diagram, family: str) -> float | None:
+    """Return the median radius over the area that a round family holds, in the diagram's unit; None for the others."""
+    if family not in _ROUND:
+        return None
+    own, kappa = _ROUND[family](*np.asarray(diagram.points).T)
+    own = own & (kappa > 0)
+    if not own.any():
+        return None
+    order = np.argsort(kappa[own])
+    cumulated = np.cumsum(np.asarray(diagram.weights)[own][order])
+    middle = min(int(np.searchsorted(cumulated, cumulated[-1] / 2)), len(order) - 1)
+    return float(1 / kappa[own][order][middle])
 
 
 def _scan_line(inference: Inference) -> str:
+    """Return what was read: name, kind, voxels and their size."""
     scan, fit = inference.scan, inference.fit
     shape = " × ".join(str(n) for n in scan.values.shape)
-    kind = {"field": "phase field", "mask": "mask", "image": "image"}.get(fit.kind, fit.kind)
+    kind = "phase field" if fit.kind == "field" else fit.kind
     same = len({round(h / scan.spacing[0], 6) for h in scan.spacing}) == 1
     spacing = (scan.spacing[0],) if same else scan.spacing
     voxel = " × ".join(f"{h:.4g}" for h in spacing) + f" {unit_name(scan.unit, spacing[0])}"
-    name = Path(scan.source).name or "a volume"
-    line = f"{name}: {kind} of {shape} voxels (z, y, x), voxel edge {voxel}."
-    return escape(line) + f" Measured on voxels of {escape(length(fit.working_voxel, fit.length_unit, 3))}."
+    line = f"{Path(scan.source).name or 'a volume'}: {kind} of {shape} voxels (z, y, x), voxel edge {voxel}."
+    return f"{line} Measured on voxels of {length(fit.working_voxel, fit.length_unit, 3)}."
 
 
-def _list(notes: tuple[str, ...]) -> str:
-    return '<ul class="small">' + "".join(f"<li>{escape(note)}</li>" for note in notes) + "</ul>" if notes else ""
+def _bars(inference: Inference) -> list[dict[str, Any]]:
+    """Return a bar for the distance of each candidate's shape, and one for that of two seeds."""
+    fit, noise = inference.fit, seed_noise_of(inference.fit.candidates)
+    rows = [(_title(each), each.distance, "best" if each.name == fit.chosen else "") for each in _in_order(inference)]
+    rows.append(("Two seeds", noise, "noise"))
+    longest = max((value for _, value, _ in rows if value is not None), default=0.0) or 1.0
+    bars = []
+    for name, value, kind in rows:
+        text = number(value, 2) if value is not None else "not known" if kind == "noise" else "nothing grew"
+        width = None if value is None else f"{100 * value / longest:.1f}"
+        bars.append({"name": name, "kind": kind, "text": text, "width": width})
+    return bars
 
 
-def _distance_unit(inference: Inference) -> str:
-    voxel = length(inference.fit.length, inference.fit.length_unit, 3)
-    return f"1/{glossary_link('working unit')} (100 working voxels, {escape(voxel)})"
+def _number_rows(inference: Inference) -> list[tuple[str, str, list[str]]]:
+    """Return rows of the scan's familiar numbers, the twins' mean and extremes, and the ratio of the two."""
+    scan, best = inference.fit.morphometry, inference.fit.best
+    twins, unit = () if best is None else best.twins, scan.unit
+    kinds: tuple[tuple[str, str, str, Callable[[float], str]], ...] = (
+        ("Volume fraction", "BV/TV", "volume_fraction", percent),
+        ("Mean thickness", "Tb.Th", "thickness_mean", lambda x: length(x, unit)),
+        ("Mean spacing", "Tb.Sp", "spacing_mean", lambda x: length(x, unit)),
+        ("Connectivity density", "Conn.D", "connectivity_density", lambda x: density(x, unit, 3)),
+        ("Surface to volume", "BS/BV", "surface_to_volume", lambda x: density(x, unit, 1)),
+    )
+    rows = []
+    for name, short, key, text in kinds:
+        own, values = float(getattr(scan, key)), [float(getattr(each, key)) for each in twins]
+        cells = [text(own)]
+        if values:
+            mean = sum(values) / len(values)
+            extremes = f" ({text(min(values))} to {text(max(values))})" if len(values) > 1 else ""
+            cells += [text(mean) + extremes, number(mean / own, 2) if own else "–"]
+        rows.append((name, short, cells))
+    return rows
 
 
-def _distances_say(inference: Inference) -> str:
-    noise = seed_noise_of(inference.fit.candidates)
-    if noise is None:
-        return "The same parameters could not be grown twice, so it is not known how far apart two seeds lie."
-    return f"Two seeds of the same parameters lie {number(noise, 2)} apart: smaller differences mean nothing."
+def parameter_table(inference: Inference) -> list[tuple[str, str, str, str, str]]:
+    """Return rows of name, chosen value, its own deviation, the posterior's 90 % interval, and the physical value.
+
+    Without a law there are no rows.
+    """
+    rows = []
+    for name, (value, deviation, _, _, interval, physical), unit in _parameters(inference):
+        rows.append((name, value, deviation, interval, f"{physical} {unit}".strip()))
+    return rows
 
 
-def _bars(inference: Inference) -> str:
-    fit = inference.fit
-    rows = [(title_of(each), each.distance, each.name == fit.chosen) for each in shown(inference)]
-    noise = seed_noise_of(fit.candidates)
-    longest = max([value for _, value, _ in rows if value is not None] + [noise or 0.0]) or 1.0
-    parts = []
-    for name, value, best in (*rows, ("Two seeds", noise, None)):
-        style = "noise" if best is None else "best" if best else ""
-        bar = "" if value is None else f'<span class="bar {style}" style="width:{100 * value / longest:.1f}%"></span>'
-        bold = ' class="chosen"' if best else ""
-        text = number(value, 2) if value is not None else "not known" if best is None else "nothing grew"
-        parts.append(f"<span{bold}>{escape(name)}</span><span>{bar}</span><span{bold}>{text}</span>")
-    return "\n".join(parts)
-
-
-def _scale_say(candidate: Candidate) -> str:
-    fixed = [name for name in ("a20", "a02") if abs(candidate.coefficients.as_dict()[name] - 1) < 1e-9]
-    return f"here {_TERMS[fixed[0]].symbol} = 1" if fixed else "all six may be multiplied by one factor"
-
-
-def _parameter_rows(inference: Inference) -> str:
+def _parameters(inference: Inference) -> list[tuple[str, tuple[str, ...], str]]:
+    """Return the name, the cells and the unit of each parameter of the chosen law."""
     fit, best, physical = inference.fit, inference.fit.best, inference.fit.coefficients_physical
-    assert best is not None and physical is not None
+    if best is None or physical is None:
+        return []
     intervals = {} if fit.draws is None else fit.draws.intervals()
     rows = []
     for name, value in {**best.coefficients.as_dict(), "mass": best.mass}.items():
-        term, known = _TERMS[name], intervals.get(name)
+        known, power = intervals.get(name), _TERMS[name][2]
         median = number(known["median"]) if known else ""
         scaled = "" if name == "mass" else number(physical.as_dict()[name])
-        unit = per_unit(fit.length_unit, term.power) if term.power else ""
-        cells = (
-            number(value), _deviation(best, name), median, _interval(known, "50"), _interval(known, "90"), scaled
-        )  # fmt: skip
-        columns = "".join(
-            f'<td class="n{" chosen" if k in (0, 5) else ""}">{cell}</td>' for k, cell in enumerate(cells)
-        )
-        rows.append(f'<tr><th scope="row">{term.symbol}</th><td>{term.factor}</td>{columns}<td>{unit}</td></tr>')
-    epsilon = f'<td class="n">0.02</td>{"<td></td>" * 4}<td class="n">{number(fit.epsilon_physical)}</td>'
-    rows.append(f'<tr><th scope="row">ε</th><td>interface</td>{epsilon}<td>{unit_name(fit.length_unit, 2)}</td></tr>')
-    return "\n".join(rows)
+        ranges = _interval(known, "50"), _interval(known, "90")
+        cells = (number(value), _deviation(best, name), median, *ranges, scaled)
+        rows.append((name, cells, per_unit(fit.length_unit, power) if power else ""))
+    return rows
+
+
+def _law(inference: Inference) -> dict[str, Any] | None:
+    """Return what the page says of the chosen law; None without one."""
+    fit, best = inference.fit, inference.fit.best
+    if best is None:
+        return None
+    rows = [(*_TERMS[name][:2], cells, unit) for name, cells, unit in _parameters(inference)]
+    width = ("0.02", "", "", "", "", number(fit.epsilon_physical))
+    fixed = [name for name in ("a20", "a02") if abs(best.coefficients.as_dict()[name] - 1) < 1e-9]
+    return {
+        "rows": [*rows, ("ε", "interface", width, unit_name(fit.length_unit, 2))],
+        "gauge": f"here {_TERMS[fixed[0]][0]} = 1" if fixed else "all six may be multiplied by one factor",
+        "voxel": length(fit.working_voxel, fit.length_unit, 3),
+        "title": TITLES.get(best.name, best.name),
+        "own": bool(best.uncertainty),
+    }
 
 
 def _deviation(candidate: Candidate, name: str) -> str:
@@ -364,65 +315,163 @@ def _interval(known: Mapping[str, Any] | None, level: str) -> str:
     return "" if known is None else " to ".join(number(end) for end in known[level])
 
 
-def _parameters_say(inference: Inference) -> str:
-    fit, best = inference.fit, inference.fit.best
-    assert best is not None
-    voxel = length(fit.working_voxel, fit.length_unit, 3)
-    own = (
-        f"± is its own standard deviation ({TITLES.get(best.name, best.name)})."
-        if best.uncertainty
-        else "It has no uncertainty of its own."
-    )
-    rest = f" Median and intervals are the posterior's ({escape(fit.draws.method)})." if fit.draws else ""
-    return (
-        f"In {glossary_link('working unit', 's')} (voxel 0.01, ε 0.02); a working voxel is {escape(voxel)}. Bold: the "
-        f"chosen law ({TITLES.get(best.name, best.name)}), which fit.json holds. {own}{rest}"
-    )
-
-
-def _number_rows(scan: Morphometry, twins: tuple[Morphometry, ...]) -> str:
-    """Return rows of the scan's familiar numbers, the twins' mean and extremes, and the ratio of the two."""
-    unit = scan.unit
-    rows: tuple[tuple[str, str, str, Callable[[float], str]], ...] = (
-        ("Volume fraction", "BV/TV", "volume_fraction", percent),
-        ("Mean thickness", "Tb.Th", "thickness_mean", lambda x: length(x, unit)),
-        ("Mean spacing", "Tb.Sp", "spacing_mean", lambda x: length(x, unit)),
-        ("Connectivity density", "Conn.D", "connectivity_density", lambda x: density(x, unit, 3)),
-        ("Surface to volume", "BS/BV", "surface_to_volume", lambda x: density(x, unit, 1)),
-    )
-    parts = []
-    for name, short, key, text in rows:
-        own = float(getattr(scan, key))
-        cells = [text(own)]
-        if twins:
-            values = [float(getattr(each, key)) for each in twins]
-            mean = sum(values) / len(values)
-            band = f" ({text(min(values))} to {text(max(values))})" if len(values) > 1 else ""
-            cells += [text(mean) + band, number(mean / own, 2) if own else "–"]
-        columns = "".join(f'<td class="n">{escape(cell)}</td>' for cell in cells)
-        parts.append(f'<tr><th scope="row">{name}</th><td class="small">{short}</td>{columns}</tr>')
-    return "\n".join(parts)
-
-
-def _match_rows(inference: Inference) -> str:
-    rows = []
-    for match in inference.fit.matches:
-        cells = [number(match.distance, 2), *map(number, match.coefficients.as_dict().values()), number(match.mass)]
-        columns = "".join(f'<td class="n">{cell}</td>' for cell in (*cells, str(match.seed)))
-        rows.append(f'<tr><th scope="row">{escape(str(match.id))}</th>{columns}</tr>')
-    return "\n".join(rows)
-
-
-def _provenance(inference: Inference) -> str:
-    return "\n".join(
-        f"<dt>{escape(str(name).replace('_', ' '))}</dt><dd>{escape(_plain(value))}</dd>"
-        for name, value in inference.fit.provenance.items()
-    )
+def _match_cells(match: Any) -> list[str]:
+    values = (*match.coefficients.as_dict().values(), match.mass)
+    return [number(match.distance, 2), *map(number, values), str(match.seed)]
 
 
 def _plain(value: object) -> str:
+    """Return a value of JSON's types as words."""
     if isinstance(value, dict):
         return ", ".join(f"{name} {_plain(part)}" for name, part in value.items())
-    if isinstance(value, (list, tuple)):
-        return ", ".join(_plain(part) for part in value)
-    return str(value)
+    return ", ".join(map(_plain, value)) if isinstance(value, (list, tuple)) else str(value)
+
+
+def _in_order(inference: Inference) -> list[Candidate]:
+    """Return the candidates as the page shows them: the chosen one first."""
+    return sorted(inference.fit.candidates, key=lambda each: each.name != inference.fit.chosen)
+
+
+def _title(candidate: Candidate) -> str:
+    """Return a candidate's title, with a capital."""
+    title = TITLES.get(candidate.name, candidate.name)
+    return title[0].upper() + title[1:]
+
+
+# ---- pictures --------------------------------------------------------------------------------------------------------
+
+
+def inference_figure(inference: Inference, **options: Any) -> Figure:
+    """Return a figure of the scan's surface beside its regrown twin.
+
+    Where no twin grew, the scan is alone. `options` are those of `gallery_figure`.
+    """
+    shapes = {"the scan": scan_box(inference)}
+    if inference.best is not None:
+        shapes[f"regrown: {TITLES[str(inference.fit.chosen)]}"] = inference.best
+    return gallery_figure(shapes, **{"columns": 2, "width": 900, **options})
+
+
+def _picture(figure: Figure, alt: str, **words: str) -> Picture:
+    return Picture(base64.b64encode(png(figure)).decode("ascii"), alt, **words)
+
+
+def _slices(inference: Inference) -> list[Picture]:
+    """Return slices across z, y and x through the main window's middle: the scan's grey values, the contour on top."""
+    values, prepared = inference.scan.values, inference.prepared
+    sample = np.asarray(values[:: max(1, values.shape[0] // 64)], dtype=np.float32)
+    low, high = (float(v) for v in np.percentile(sample, (0.5, 99.5)))
+    limits = (low, high) if high > low else (float(sample.min()), float(sample.max()))
+    middle = [(edge.start + edge.stop) // 2 for edge in prepared.windows[0]]
+    return [_slice(inference, axis, middle[axis], limits) for axis in range(3)]
+
+
+def _slice(inference: Inference, axis: int, index: int, limits: tuple[float, float]) -> Picture:
+    """Return one slice: the scan and the structure are placed by their voxels' edges, in the scan's unit."""
+    scan, prepared = inference.scan, inference.prepared
+    down, across = (k for k in range(3) if k != axis)
+    place = prepared.origin[axis] + (index + 0.5) * prepared.scale[axis]
+    row = int(np.clip(place, 0, scan.values.shape[axis] - 1))
+    start, step = np.array(prepared.origin) * scan.spacing, np.array(prepared.scale) * scan.spacing
+    stop = start + step * prepared.phase.shape
+    first = start + step * [edge.start for edge in prepared.windows[0]]
+    last = start + step * [edge.stop for edge in prepared.windows[0]]
+    size = np.array(scan.values.shape) * scan.spacing
+    framed = (first[across], last[across], last[down], first[down]) if _is_framed(inference) else None
+    figure = slice_figure(
+        np.asarray(scan.values.take(row, axis), dtype=np.float32),
+        prepared.phase.take(index, axis),
+        image_extent=(0.0, size[across], size[down], 0.0),
+        extent=(start[across], stop[across], stop[down], start[down]),
+        limits=limits,
+        unit=scan.unit,
+        axes_names=(_AXES[down], _AXES[across]),
+        window=framed,
+    )
+    depth = length((row + 0.5) * scan.spacing[axis], scan.unit)
+    title, text = f"Across {_AXES[axis]}", f"Slice {row} of {scan.values.shape[axis]}, at {depth}"
+    return _picture(figure, f"Slice across {_AXES[axis]} with the surface's outline", title=title, text=text)
+
+
+def _is_framed(inference: Inference) -> bool:
+    """Return whether the main window is smaller than what the slices show."""
+    shape = inference.prepared.phase.shape
+    return any(edge.stop - edge.start < n for edge, n in zip(inference.prepared.windows[0], shape, strict=True))
+
+
+def _shapes(inference: Inference) -> list[Picture]:
+    """Return pictures of the scan's surface and of what grew from each candidate, in boxes of one size."""
+    fit = inference.fit
+    word = "the nearest" if fit.status.startswith((UNBELIEVED, UNDECIDED)) else "best supported"
+    pictures = [_shape(inference, "The scan", scan_box(inference))]
+    for each in _in_order(inference):
+        distance = "" if each.distance is None else f"; distance {each.distance:.1f}"
+        badge = word if each.name == fit.chosen else ""
+        u = inference.shape_of(each.name)
+        pictures.append(_shape(inference, f"{_title(each)}, regrown", u, distance, badge))
+    return pictures
+
+
+def _shape(inference: Inference, title: str, u: np.ndarray | None, more: str = "", badge: str = "") -> Picture:
+    if u is None:
+        return Picture(None, "", title, badge=badge)
+    edges = [length(n * inference.fit.working_voxel, inference.fit.length_unit, 3) for n in u.shape]
+    box = f"edge {edges[0]}" if len(set(edges)) == 1 else " × ".join(edges)
+    return _picture(surface_figure(u), f"Surface: {title}", title=title, text=box + more, badge=badge)
+
+
+def scan_box(inference: Inference) -> np.ndarray:
+    """Return the main window's phase field, cut to the regenerated boxes' size so that all three have one scale."""
+    phase = inference.prepared.phase[inference.prepared.windows[0]]
+    other = inference.best
+    if other is None:
+        return phase
+    starts = [(n - min(n, m)) // 2 for n, m in zip(phase.shape, other.shape, strict=True)]
+    return phase[tuple(slice(s, s + m) for s, m in zip(starts, other.shape, strict=True))]
+
+
+def _diagrams(inference: Inference) -> list[Picture]:
+    """Return curvature diagrams with shared axes, in the scan's unit: the scan's, the chosen law's, the match's."""
+    diagrams: list[tuple[str, Diagram | None]] = [("The scan", inference.diagram)]
+    for each in _in_order(inference):
+        if each.name in (inference.fit.chosen, "match"):
+            grown = (twin.diagram for twin in inference.twins.get(each.name, ()) if twin.diagram)
+            diagrams.append((f"{_title(each)}, regrown", next(grown, None)))
+    λ, unit = inference.fit.length, inference.fit.length_unit
+    limits = shared_limits([diagram for _, diagram in diagrams if diagram is not None], length=λ)
+    return [
+        Picture(None, "", title)
+        if diagram is None
+        else _picture(
+            diagram_figure(diagram, limits=limits, unit=unit, length=λ), f"Curvature diagram: {title}", title=title
+        )
+        for title, diagram in diagrams
+    ]
+
+
+def _corner(inference: Inference) -> Picture | None:
+    """Return the corner plot of the posterior's draws in working units, the chosen law and the match marked."""
+    draws = inference.fit.draws
+    if draws is None or inference.fit.best is None:
+        return None
+    shown = [each for each in inference.fit.candidates if each.name in (inference.fit.chosen, "match")]
+    marks = {_title(each): parameters_of(each.coefficients, each.mass) for each in shown}
+    rows = [np.percentile(draws.parameters, (0.5, 99.5), axis=0), *(mark[None] for mark in marks.values())]
+    low, high = np.concatenate(rows).min(0), np.concatenate(rows).max(0)
+    rim = 0.06 * np.maximum(high - low, 1e-6)
+    limits = list(zip((low - rim).tolist(), (high + rim).tolist(), strict=True))
+    return _picture(corner_figure(draws.parameters, SYMBOLS, limits, marks), "Draws of the parameters, two by two")
+
+
+def bands(inference: Inference) -> Picture | None:
+    """Return the scan's descriptors on the bands of simulated ones, block by block; None where none were made."""
+    misfit = inference.fit.misfit
+    if inference.simulated is None or misfit is None:
+        return None
+    titles = {name: f"{name}, p = {number(misfit.blocks.get(name), 2)}" for name in inference.simulated}
+    return _picture(
+        bands_figure({titles[name]: block for name, block in inference.simulated.items()}),
+        "The scan's descriptors on the bands of simulated shapes",
+        text="Orange: the scan. Bands: 50 and 90 % of shapes grown from draws of the posterior, seen as the scan is. "
+        "Lengths in working units; quantiles from the least to the greatest.",
+    )

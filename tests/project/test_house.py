@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -16,7 +17,7 @@ WINGS = ("priors", "generation", "data_synth")
 ROOMS = [
     f"curvafit.{path.parent.name}"
     for path in sorted(PACKAGE.glob("*/__init__.py"))
-    if "__all__" in path.read_text("utf-8")
+    if re.search(r"__all__|attach_lazy_names", path.read_text("utf-8"))
 ]
 PRIORS = [
     ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")

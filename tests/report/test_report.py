@@ -20,9 +20,16 @@ from curvafit.geometry.diagram import diagram
 from curvafit.inference.infer import Inference
 from curvafit.priors import Grid
 from curvafit.priors.fit_file import FORMAT, read_fit
-from curvafit.report.page import parameter_table, report_html, with_command, write_inference
-from curvafit.report.pictures import bands, scan_box
-from curvafit.report.wording import describe, family_radius
+from curvafit.report.page import (
+    bands,
+    describe,
+    family_radius,
+    parameter_table,
+    report_html,
+    scan_box,
+    with_command,
+    write_inference,
+)
 from curvafit.volumes.read import load
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}
@@ -111,11 +118,11 @@ def test_a_law_that_is_not_believed_is_not_called_supported(undrawn: None) -> No
 
 def test_each_block_stands_on_the_band_of_its_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[list[str]] = []
-    monkeypatch.setattr("curvafit.report.pictures.bands_figure", lambda blocks: drawn.append(list(blocks)) or Figure())
+    monkeypatch.setattr("curvafit.report.page.bands_figure", lambda blocks: drawn.append(list(blocks)) or Figure())
     rng = np.random.default_rng(0)
     blocks = {"curvature": (rng.random(8), rng.random((12, 8))), "fabric": (rng.random(3), rng.random((12, 3)))}
-    assert bands(made_inference()) == "" and drawn == []
-    assert "<figure" in bands(dataclasses.replace(made_inference(), simulated=blocks))
+    assert bands(made_inference()) is None and drawn == []
+    assert bands(dataclasses.replace(made_inference(), simulated=blocks)) is not None
     assert drawn == [["curvature, p = 0.30", "fabric, p = 0.0040"]]
 
 
@@ -195,7 +202,7 @@ def test_an_inference_is_written_whole(tmp_path: Path, undrawn: None) -> None:
     volume = load(report.parent / "regenerated.nii.gz")
     assert volume.unit == "mm" and volume.spacing == pytest.approx((SCALE,) * 3)
     assert np.array_equal(volume.values, found.best)
-    assert "curvafit infer &#x27;a b.tif&#x27; -o out" in report.read_text(encoding="utf-8")
+    assert "curvafit infer &#39;a b.tif&#39; -o out" in report.read_text(encoding="utf-8")
 
 
 def test_a_failure_leaves_what_was_there(tmp_path: Path, undrawn: None) -> None:
