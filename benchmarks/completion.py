@@ -34,7 +34,8 @@ from curvafit.generation.flow import generate
 from curvafit.geometry.morphometry import local_thickness
 from curvafit.inference.fit import Fit
 from curvafit.inference.infer import infer
-from curvafit.priors.coefficients import Coefficients, preset
+from curvafit.priors.coefficients import Coefficients
+from curvafit.priors.law import preset
 from curvafit.segmentation.reconstruct import STIFFNESS, reconstruct
 from curvafit.segmentation.slices import WAYS, Slices
 from curvafit.volumes.field import Field

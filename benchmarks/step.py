@@ -23,9 +23,9 @@ from curvafit.generation.initial import white_noise
 from curvafit.generation.parametrization import DivergenceForm
 from curvafit.generation.schedule import SCHEDULES
 from curvafit.generation.stepper import ADAM_EPS, TorchStepper
-from curvafit.priors.coefficients import preset
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.kernels.cpu import FusedFlow
+from curvafit.priors.law import preset
 
 BLUR = 0.02
 #: Floats of the array that is copied to measure bandwidth: more than any cache holds.

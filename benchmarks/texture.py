@@ -26,8 +26,8 @@ from curvafit.generation.flow import generate
 from curvafit.generation.schedule import SCHEDULES
 from curvafit.geometry.diagram import Diagram, diagram
 from curvafit.geometry.distances import wasserstein
-from curvafit.priors.coefficients import preset_name
 from curvafit.priors.grid import WORKING_EPSILON, Grid
+from curvafit.priors.law import preset_name
 
 #: Tubes of three kinds, layers, spheres of two kinds, sponges of two kinds, trabeculae, metatubes, the paper's flow.
 PRESETS = (

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from curvafit.inference.infer import Inference as Inference
     from curvafit.inference.infer import infer as infer
     from curvafit.priors.coefficients import Coefficients as Coefficients
-    from curvafit.priors.coefficients import preset as preset
     from curvafit.priors.grid import Grid as Grid
+    from curvafit.priors.law import preset as preset
     from curvafit.scan.measure import Measures as Measures
     from curvafit.scan.measure import measure as measure
     from curvafit.segmentation.reconstruct import reconstruct as reconstruct

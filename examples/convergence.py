@@ -17,8 +17,8 @@ from curvafit.generation.viability import viability
 from curvafit.geometry.diagram import Diagram, diagram
 from curvafit.geometry.distances import wasserstein
 from curvafit.geometry.mesh import NoSurface
-from curvafit.priors.coefficients import preset
 from curvafit.priors.grid import WORKING_EPSILON, Grid
+from curvafit.priors.law import preset
 
 #: Numbers of steps in the table, and those that the paper shows.
 MARKS = (10, 30, 100, 300, 1000, 2000, 4000, 8000)

@@ -19,8 +19,8 @@ from matplotlib.figure import Figure
 from curvafit.drawing.plot import write_picture
 from curvafit.geometry.diagram import Diagram, diagram
 from curvafit.geometry.distances import wasserstein
-from curvafit.priors.coefficients import PRESETS
 from curvafit.priors.grid import WORKING_EPSILON, Grid
+from curvafit.priors.law import PRESETS
 
 NAMES = tuple(name for name, shape in PRESETS.items() if "gallery" in shape.source)
 #: The author's files that were saved as they are; the others were floored to 1/100, and so are ours beside them.
@@ -34,7 +34,7 @@ def main() -> None:
     compared = bool(os.environ.get("CURVAFIT_DATA")) and folder.is_dir()
     lines, shapes = [HEAD + (AGAINST if compared else "")], {}
     for name in NAMES:
-        a, mass, _ = PRESETS[name]
+        a, mass = PRESETS[name].coefficients, PRESETS[name].mass
         shapes[name] = grown(options.output / f"{name}.npz", a, mass, options)
         line = row(name, shapes[name])
         if compared:

@@ -18,7 +18,8 @@ from matplotlib.figure import Figure
 from curvafit.drawing.plot import diagram_on, shared_limits, surface_on, write_picture
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.distances import wasserstein
-from curvafit.priors.coefficients import Coefficients, preset
+from curvafit.priors.coefficients import Coefficients
+from curvafit.priors.law import preset
 
 #: Presets at the table's corners (0, 0), (0, 1), (1, 0) and (1, 1), row by row.
 CORNERS = ("layers", "spheres", "sponges", "tubes")

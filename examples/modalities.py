@@ -17,8 +17,8 @@ from curvafit.data_synth.imaging.modalities import MODALITIES
 from curvafit.data_synth.imaging.modality import Modality
 from curvafit.drawing.plot import CONTOUR, write_picture
 from curvafit.generation.flow import generate
-from curvafit.priors.coefficients import preset
 from curvafit.priors.grid import Grid
+from curvafit.priors.law import preset
 
 #: The preset whose shape each modality images.
 SHAPES = {"micro-ct": "trabec", "em-membrane": "bilayers"}

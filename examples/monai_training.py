@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import schedule
 from curvafit.priors import WORKING_SPACING, CombinedLoss, CurvaturePrior, Grid
-from curvafit.priors.law import texture_of
+from curvafit.priors.law import Law
 from curvafit.priors.stencils import gaussian_blur
 
 EXAMPLES = """examples:
@@ -50,7 +50,7 @@ class Annotated(nn.Module):
 
 def scan(law: str, edge: int, seed: int, steps: int | None, every: int) -> dict[str, Tensor]:
     """Return an image and its labels, of all slices and of one in `every`, `(1, Z, Y, X)` each."""
-    texture = texture_of(law)
+    texture = Law.of(law)
     grid, plan = Grid((edge, edge, edge)), schedule("cosine", steps)
     field = generate(texture.coefficients, texture.mass, grid, seed=seed, schedule=plan).field
     truth = (field > 0).float()
@@ -106,7 +106,7 @@ def main() -> None:
     edge, steps, patch = options.edge, options.steps, options.patch
     *scans, test = [scan(options.prior, edge, seed, options.grow, options.every) for seed in range(3)]
     base = Annotated(DiceCELoss(sigmoid=True))
-    in_voxels = texture_of(options.prior).coefficients.in_unit(WORKING_SPACING)
+    in_voxels = Law.of(options.prior).coefficients.in_unit(WORKING_SPACING)
     prior = CurvaturePrior(in_voxels, sigmoid=True)
     panels = {"image": test["image"], "truth": test["truth"]}
     for name, share in (("Dice + CE", 0.0), ("with the prior", options.share)):

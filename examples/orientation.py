@@ -19,9 +19,9 @@ from matplotlib.figure import Figure
 from curvafit.drawing.plot import DIAGONAL, write_picture
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.mesh import area_vectors, surface
-from curvafit.priors.coefficients import preset
 from curvafit.priors.energy import orientation
 from curvafit.priors.grid import Grid
+from curvafit.priors.law import preset
 
 #: θ along (z, y, x).
 DIRECTION = (1, 0, 0)
@@ -48,7 +48,8 @@ def main() -> None:
     options = parser(__doc__, "orientation").parse_args()
     shapes, lines = {}, [HEAD]
     for case in CASES:
-        a, mass, _ = preset(case.preset)
+        law = preset(case.preset)
+        a, mass = law.coefficients, law.mass
         Q = orientation(DIRECTION, case.strength) if case.strength else None
         shape = shapes[case] = grown(options.output / f"{case.name}.npz", a, mass, options, orientation=Q)
         line = f"{case.name:14} {case.strength:5g} {lean(shape.field):9.3f}"

@@ -13,8 +13,9 @@ import numpy as np
 from curvafit.core.files import write_atomically
 from curvafit.drawing.plot import gallery_picture
 from curvafit.generation.flow import generate
-from curvafit.priors.coefficients import NAMES, PRESETS
+from curvafit.priors.coefficients import NAMES
 from curvafit.priors.grid import Grid
+from curvafit.priors.law import PRESETS
 
 
 def main() -> None:

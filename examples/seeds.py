@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from curvafit.data_synth.atlas.design import boxed
 from curvafit.drawing.plot import CONTOUR, DIAGONAL, write_picture
 from curvafit.geometry.distances import pairwise
-from curvafit.priors.coefficients import preset
+from curvafit.priors.law import preset
 
 SEEDS = 5
 
@@ -29,7 +29,8 @@ def main() -> None:
     takes = parser(__doc__, "seeds")
     takes.add_argument("--count", type=int, default=100, help="random viable shapes")
     options = takes.parse_args()
-    a, mass, _ = preset("seeds")
+    law = preset("seeds")
+    a, mass = law.coefficients, law.mass
     seeds = [options.seed + k for k in range(SEEDS)]
     same = [grown(options.output / f"seed-{seed}.npz", a, mass, options, seed=seed) for seed in seeds]
     if not all(shape.diagrams for shape in same):

@@ -25,8 +25,9 @@ from curvafit.generation.flow import Flow, generate
 from curvafit.geometry.diagram import Diagram, diagram
 from curvafit.geometry.distances import wasserstein
 from curvafit.geometry.mesh import NoSurface
-from curvafit.priors.coefficients import Coefficients, preset
+from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, Grid
+from curvafit.priors.law import preset
 
 #: The preset in the middle of each cube; the first and the last cube are cropped.
 ORDER = (1, 1, 2, 3, 4, 4)
@@ -39,7 +40,10 @@ def main() -> None:
     options.output.mkdir(parents=True, exist_ok=True)
     about = {"order": ORDER, "edge": options.edge, "plan": vars(plan_of(options)), "seed": options.seed}
     whole = kept(options.output / "spatialised.npz", about, lambda: made(options))
-    pure = {n: grown(options.output / f"spatial-{n}.npz", *preset(f"spatial-{n}")[:2], options) for n in ORDER[1:-1]}
+    pure = {}
+    for n in ORDER[1:-1]:
+        law = preset(f"spatial-{n}")
+        pure[n] = grown(options.output / f"spatial-{n}.npz", law.coefficients, law.mass, options)
     parts = {n: middle(whole, k, options) for k, n in enumerate(ORDER) if 0 < k < len(ORDER) - 1}
     lines = [HEAD, *(row(n, *parts[n], pure[n], options.curvature) for n in pure), whole.facts["status"]]
     write_table(options, "spatialised", lines, [shape.facts["program"] for shape in (whole, *pure.values())])

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from curvafit.drawing.plot import gallery_picture
 from curvafit.generation.flow import generate
-from curvafit.priors.coefficients import preset
 from curvafit.priors.grid import Grid
+from curvafit.priors.law import preset
 
 NAMES = ("tubes", "sponge", "bilayers", "pearls", "trabec", "metatubes", "exp-0366", "weird")
 

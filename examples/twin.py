@@ -20,8 +20,8 @@ from curvafit.data_synth.imaging.modalities import MICRO_CT
 from curvafit.drawing.plot import surface_on, write_picture
 from curvafit.generation.flow import generate
 from curvafit.inference.infer import Inference, infer
-from curvafit.priors.coefficients import preset
 from curvafit.priors.grid import Grid
+from curvafit.priors.law import preset
 from curvafit.volumes.field import Field
 
 PRESET = "sponge"
@@ -73,7 +73,7 @@ def main() -> None:
     print(inference.fit.status)
     if inference.best is None:
         raise SystemExit(f"expected a shape from the inferred parameters: {inference.fit.status}")
-    for name, value in inference.to_prior().coefficients.as_dict().items():
+    for name, value in inference.to_law().coefficients.as_dict().items():
         print(f"{name} {value:.3g}, truth {preset(PRESET).coefficients.as_dict()[name]:.3g}")
     draw(inference, inference.best, options.output)
     print(options.output)

@@ -211,8 +211,7 @@ class Calls:
             "refine": lambda: curvafit.refine(0.1 + 0.8 * self.ball, "tubes", weight=1.0, steps=2),
             "infer": self._infer,
             "measure": lambda: curvafit.measure(self.ball.astype(np.uint8)),
-            "read_fit": lambda: priors.read_fit(self.folder / "fit.json"),
-            "texture_of": lambda: [priors.texture_of(law) for law in ("tubes", self.a, self.folder / "fit.json")],
+            "read_laws": lambda: priors.read_laws(["tubes", self.a, self.folder / "fit.json"]),
         }
 
     def _train(self, loss) -> None:

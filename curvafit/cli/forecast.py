@@ -74,8 +74,8 @@ def step_time(device: str = "cpu") -> float:
     """Return the seconds per voxel of a flow's step, measured now on this machine."""
     from curvafit.generation.flow import generate
     from curvafit.generation.schedule import schedule
-    from curvafit.priors.coefficients import preset
     from curvafit.priors.grid import Grid
+    from curvafit.priors.law import preset
 
     law, grid, times = preset("tubes"), Grid((EDGE, EDGE, EDGE)), []
     for steps in (STEPS[0], *STEPS):  # the first loads and compiles

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from curvafit.drawing.shapes import Output
     from curvafit.generation.flow import Flow
     from curvafit.priors.grid import Grid
-    from curvafit.priors.law import Texture
+    from curvafit.priors.law import Law
 
     #: Parameters that vary in space, by name; see `volumes.parameter_maps`.
     Maps3D = dict[str, float | Tensor]
@@ -137,7 +137,7 @@ def generate(
         options["schedule"] = plan = named(schedule, steps)
         options["snapshots"] = () if snapshots is None else (*map(plan.among, whole_numbers(snapshots, "--snapshots")),)
         options["orientation"] = Q = None if orientation is None else _orientation(orientation)
-        law_file = None if texture.prior is None else prior or preset
+        law_file = None if not texture.fitted else prior or preset
         inputs = [str(path) for path in (law_file, maps) if path is not None]
         _check(out, saving["checkpoint"], cap)
         writing = {"picture": picture, "overwrite": overwrite}
@@ -155,7 +155,8 @@ def generate(
 def presets() -> None:
     """List the published shapes: coefficients in working units, mass, source."""
     with plainly():
-        from curvafit.priors.coefficients import NAMES, PRESETS
+        from curvafit.priors.coefficients import NAMES
+        from curvafit.priors.law import PRESETS
 
         rows = [
             (name, *(f"{value:g}" for value in entry.coefficients.as_dict().values()), f"{entry.mass:g}", entry.source)
@@ -164,21 +165,21 @@ def presets() -> None:
         output(("name", *NAMES, "mass", "source"), rows, right=range(1, 8))
 
 
-def _texture(preset: str | None, six: str | None, prior: str | None, maps: Maps3D) -> Texture:
+def _texture(preset: str | None, six: str | None, prior: str | None, maps: Maps3D) -> Law:
     """Return the texture of the one law among the options, or of six maps of coefficients."""
     from curvafit.priors.coefficients import NAMES, Coefficients
-    from curvafit.priors.law import Texture, texture_of
+    from curvafit.priors.law import Law
 
     laws = [value for value in (preset, six, prior) if value is not None]
     if len(laws) > 1 or (not laws and not set(NAMES) <= maps.keys()):
         raise ValueError(f"expected one of --preset, --coefficients and --prior, got {len(laws)} of them")
     if not laws:
-        return Texture(Coefficients(1, 0, 1), None, "maps")
-    return texture_of(laws[0] if six is None else Coefficients(*numbers(six, "--coefficients", 6)))
+        return Law(Coefficients(1, 0, 1), None, "maps")
+    return Law.of(laws[0] if six is None else Coefficients(*numbers(six, "--coefficients", 6)))
 
 
 def _parameters(
-    texture: Texture,
+    texture: Law,
     maps: Maps3D,
     mass: float | None,
     share: float | None,
@@ -214,13 +215,12 @@ def _checkpoint(file: Path | None, every: float | None) -> dict[str, Any]:
 
 
 def _output(
-    texture: Texture, grid: Grid, spacing: str | None, unit: str | None, tile: str | None, cap: bool | None
+    texture: Law, grid: Grid, spacing: str | None, unit: str | None, tile: str | None, cap: bool | None
 ) -> Output:
     """Return how to write the shape, with the voxel of the options, else the fit's."""
     if unit is not None and spacing is None:
         raise ValueError("expected --spacing beside --unit, got none")
-    prior = texture.prior
-    edge, fit_unit = (1.0, "voxel") if prior is None else (prior.working_voxel, prior.unit)
+    edge, fit_unit = texture.working_voxel or 1.0, texture.length_unit or "voxel"
     edges = (edge,) * 3 if spacing is None else triple(spacing, "--spacing")
     if len(set(edges)) > 1:
         raise ValueError(f"expected --spacing of cubic voxels, one number, got {spacing!r}")

@@ -35,14 +35,13 @@ def nnunet(
     Lengths of nnU-Net are in mm: a fit in another physical unit is converted.
     """
     with plainly():
-        from curvafit.priors.coefficients import PRESETS, preset_name
-        from curvafit.priors.fit_file import read_fit
+        from curvafit.priors.law import PRESETS, Law, preset_name
 
         name = preset_name(prior)
         if name is None:
             if not prior.endswith(".json"):
                 raise ValueError(f"expected --prior to be a fit.json or a preset ({', '.join(PRESETS)}), got {prior!r}")
-            read_fit(prior).in_unit("mm")
+            Law.load(prior).in_unit("mm")
         prior = name or str(Path(prior).resolve())
         if share is not None and weight is not None:
             raise ValueError("expected either --share or --weight, got both")

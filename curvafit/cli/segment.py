@@ -250,8 +250,7 @@ def run_job(
         The file whose header the mask gets; by default the source.
     """
     from curvafit.core.files import remove
-    from curvafit.priors.coefficients import preset_name
-    from curvafit.priors.law import texture_of
+    from curvafit.priors.law import Law, preset_name
     from curvafit.segmentation.engine import laws_of
     from curvafit.segmentation.result import check_mask_target, write_mask
     from curvafit.segmentation.tiles import Tiling
@@ -262,7 +261,7 @@ def run_job(
     more: dict[str, Any] = {"overwrite": overwrite, "probability": bool(record.get("runs") or record.get("suggest"))}
     check_mask_target(out, inputs=inputs, **more)
     if prior is not None:
-        texture_of(prior)
+        Law.of(prior)
     with stages() as progress:
         progress("reading", 0.0)
         boxes = boxes_of(source, **reading) if read is None else boxes_of(read(source, **reading))

@@ -25,7 +25,7 @@ from curvafit.generation.stepper import TorchStepper
 from curvafit.priors import kernels
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, Grid
-from curvafit.priors.law import Law, textures_of
+from curvafit.priors.law import LawLike, read_laws
 from curvafit.priors.shapes import Float
 
 #: The most shapes that a device makes together by default.
@@ -33,7 +33,7 @@ MOST_TOGETHER = 64
 
 
 def generate_batch(
-    laws: Law | Sequence[Law],
+    laws: LawLike | Sequence[LawLike],
     masses: float | Tensor | Sequence[float | Tensor] | None = None,
     grid: Grid | int | tuple[int, int, int] = 100,
     *,
@@ -102,7 +102,7 @@ class _Job(NamedTuple):
 def _jobs(laws, masses, seeds) -> list[_Job]:
     """Return one job for each shape."""
     columns = [
-        textures_of(laws),
+        read_laws(laws),
         [masses] if masses is None or isinstance(masses, (Real, Tensor)) else as_tuple(masses, "masses"),
         [seeds] if isinstance(seeds, Real) else as_tuple(seeds, "seeds"),
     ]

@@ -21,7 +21,7 @@ from curvafit.generation.schedule import Schedule
 from curvafit.generation.schedule import schedule as named_schedule
 from curvafit.generation.setup import Execution, base_of
 from curvafit.priors.grid import WORKING_EPSILON, Grid
-from curvafit.priors.law import Law, texture_of
+from curvafit.priors.law import Law, LawLike
 from curvafit.priors.shapes import Bool, Float
 
 __all__ = ["RECORD_EVERY", "WORKING_BLUR", "Flow", "History", "State", "descend", "generate", "relax"]
@@ -35,7 +35,7 @@ Backend = Literal["auto", "torch", "fused", "compiled"]
 
 
 def generate(
-    law: Law,
+    law: LawLike,
     mass: float | Tensor | None = None,
     grid: Grid | int | tuple[int, int, int] = 100,
     *,
@@ -59,8 +59,8 @@ def generate(
     Parameters
     ----------
     law
-        `Coefficients`: numbers, or tensors that broadcast with the voxels `(Z, Y, X)` and vary in space. Or a preset or
-        a preset's name, the path of a `fit.json`, or a fit, all in working units.
+        `Coefficients`: numbers, or tensors that broadcast with the voxels `(Z, Y, X)` and vary in space. Or a `Law`, a
+        preset's name, the path of a `fit.json`, or a fit, all in working units.
     mass
         m₀, the mean of u, in (-1, 1), exact to 1e-6 at every step. A tensor is m(x): u = k ∗ (div A + m). None takes
         the law's mass, or the mass that the volume fraction needs.
@@ -109,12 +109,12 @@ def generate(
         If the mass is outside (-1, 1), ε is not positive or the blur negative, a tensor does not broadcast with the
         voxels, a name is unknown, a file is not this run's checkpoint, or there is no fused step for the device.
     """
-    texture = texture_of(law)
-    mass = texture.mass if mass is None and volume_fraction is None else mass
+    known = Law.of(law)
+    mass = known.mass if mass is None and volume_fraction is None else mass
     grid, seed = grid if isinstance(grid, Grid) else Grid(grid), seed_of(seed)  # type: ignore[arg-type]
     execution = Execution(backend, device, checkpoint, checkpoint_every, keep_checkpoint)
     plan = named_schedule(schedule)
-    cost = Cost(texture.coefficients, grid, epsilon, orientation, blur)
+    cost = Cost(known.coefficients, grid, epsilon, orientation, blur)
     orders = Orders(cost, plan, callbacks, snapshots, reject_early, volume_fraction)
     orders.check_memory(device)
     base = base_of(mass, volume_fraction, grid)
@@ -126,7 +126,7 @@ def generate(
 
 def relax(
     field: Float[Tensor, "z y x"],
-    law: Law,
+    law: LawLike,
     grid: Grid,
     *,
     schedule: str | Schedule,
@@ -152,7 +152,7 @@ def relax(
         If the field or the mask does not have the grid's shape, or the field is not finite; otherwise as `generate`
         does.
     """
-    cost = Cost(texture_of(law).coefficients, grid, epsilon, orientation, blur)
+    cost = Cost(Law.of(law).coefficients, grid, epsilon, orientation, blur)
     execution = Execution(backend, device, checkpoint, checkpoint_every)
     orders = Orders(cost, named_schedule(schedule), callbacks, snapshots)
     return _from_field(field, cost, execution, "h-1", "adam", frozen, orders)
@@ -160,7 +160,7 @@ def relax(
 
 def descend(
     field: Float[Tensor, "z y x"],
-    law: Law,
+    law: LawLike,
     grid: Grid,
     *,
     flow: Literal["l2", "mass", "h-1"] = "l2",
@@ -212,7 +212,7 @@ def descend(
     if isinstance(optimiser, str) and optimiser == "lbfgs":
         plan = Schedule("lbfgs", steps, 1.0, 1.0, "constant")
     width = min(grid.spacing) if blur is None and isinstance(grid, Grid) else blur
-    cost = Cost(texture_of(law).coefficients, grid, epsilon, orientation, width, data)  # type: ignore[arg-type]
+    cost = Cost(Law.of(law).coefficients, grid, epsilon, orientation, width, data)  # type: ignore[arg-type]
     execution = Execution(backend, device, checkpoint, checkpoint_every)
     orders = Orders(cost, plan, callbacks, snapshots)
     return _from_field(field, cost, execution, flow, optimiser, None, orders)

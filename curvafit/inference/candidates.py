@@ -18,7 +18,7 @@ from curvafit.geometry.distances import one_to_many
 from curvafit.geometry.mesh import NoSurface
 from curvafit.geometry.morphometry import Morphometry, morphometry
 from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.fit_file import six_of
+from curvafit.priors.fit_schema import six_of
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.profile import phase_field
 from curvafit.scan.prepare import Prepared

@@ -19,9 +19,9 @@ from curvafit.geometry.morphometry import Morphometry
 from curvafit.inference.atlas import Match
 from curvafit.inference.candidates import Candidate, Misfit, content_of, morphometry_of
 from curvafit.priors.coefficients import NAMES, POWERS, Coefficients
-from curvafit.priors.fit_file import Prior, fit_bytes, parse_fit, six_of
-from curvafit.priors.fit_schema import FORMAT, WHOLE_FIT, violation
+from curvafit.priors.fit_schema import FORMAT, WHOLE_FIT, fit_bytes, parse_fit, six_of, violation
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
+from curvafit.priors.law import Law
 
 _SEEN = {"field": "a phase field", "mask": "a mask", "image": "an image"}
 #: What is drawn, in the order of the columns; a20 = 1 is the gauge.
@@ -121,19 +121,21 @@ class Fit(Pictured):
     def epsilon_physical(self) -> float:
         return WORKING_EPSILON * self.length
 
-    def to_prior(self) -> Prior:
-        """Return what `read_fit` reads from the fit's file: the fit as a law.
+    def to_law(self) -> Law:
+        """Return what `Law.load` reads from the fit's file: the fit as a law.
 
         Raises
         ------
         ValueError
             If the fit has none.
         """
-        six, mass, physical = self.coefficients, self.mass, self.coefficients_physical
-        if six is None or mass is None or physical is None:
+        six, mass = self.coefficients, self.mass
+        if six is None or mass is None:
             raise ValueError(f"expected a fit with a law, got one without: {self.status}")
         filled = self.morphometry.volume_fraction
-        return Prior(six, mass, physical, self.epsilon_physical, self.working_voxel, self.length_unit, filled)
+        width = self.epsilon_physical * WORKING_SPACING / self.working_voxel
+        own = {"working_voxel": self.working_voxel, "length_unit": self.length_unit, "volume_fraction": filled}
+        return Law(six, mass, "prior", epsilon=width, schedule="deep", **own)  # type: ignore[arg-type]
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers, strings, lists and dicts, as `fit.json` holds them."""

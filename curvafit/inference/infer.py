@@ -29,8 +29,8 @@ from curvafit.inference.posterior import Posterior, load_posterior
 from curvafit.inference.simulate import Effort
 from curvafit.inference.stationarity import stationarity
 from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.fit_file import Prior
 from curvafit.priors.grid import WORKING_EPSILON, Grid
+from curvafit.priors.law import Law
 from curvafit.scan.measure import scan_diagram
 from curvafit.scan.prepare import HALF, NOISE, Prepared, prepare, why_no_texture
 from curvafit.scan.structure import check_options, is_rounded
@@ -89,9 +89,9 @@ class Inference(Pictured):
         """Return the first shape grown from a candidate's law; None where none grew."""
         return next((each.phase for each in self.twins.get(name or "", ()) if each.phase is not None), None)
 
-    def to_prior(self) -> Prior:
+    def to_law(self) -> Law:
         """Return the fit as a law, so that an inference is taken wherever a law is."""
-        return self.fit.to_prior()
+        return self.fit.to_law()
 
 
 def infer(

@@ -3,13 +3,12 @@
 if __name__ != "curvafit.priors":
     raise ImportError("import curvafit.priors, not priors: the folder at the project's root is a link into the package")
 
-from curvafit.priors.coefficients import PRESETS, Coefficients, Preset, preset
+from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.combined import CombinedLoss
 from curvafit.priors.curvature import diffuse_curvatures, geometric_curvatures, jet
 from curvafit.priors.energy import cahn_hilliard_area, discrepancy_ratio, energy, energy_terms, orientation
-from curvafit.priors.fit_file import Prior, read_fit
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
-from curvafit.priors.law import Law, Texture, texture_of
+from curvafit.priors.law import PRESETS, Law, LawLike, preset, read_laws
 from curvafit.priors.loss import curvature_prior
 from curvafit.priors.profile import SIGMA, optimal_profile, phase_field, profile_distance, signed_distance
 from curvafit.priors.segmentation import CurvaturePrior
@@ -24,9 +23,7 @@ __all__ = [
     "CurvaturePrior",
     "Grid",
     "Law",
-    "Preset",
-    "Prior",
-    "Texture",
+    "LawLike",
     "cahn_hilliard_area",
     "curvature_prior",
     "diffuse_curvatures",
@@ -40,7 +37,6 @@ __all__ = [
     "phase_field",
     "preset",
     "profile_distance",
-    "read_fit",
+    "read_laws",
     "signed_distance",
-    "texture_of",
 ]

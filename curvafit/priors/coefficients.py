@@ -1,16 +1,16 @@
-"""The six coefficients of the curvature polynomial, the ways to state them, and the published ones by name."""
+"""The six coefficients of the curvature polynomial, and the ways to state them."""
 
 from __future__ import annotations
 
 import dataclasses
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from curvafit.core.checks import LONGEST, SHORTEST, check_float, plain_name, quoted
+from curvafit.core.checks import LONGEST, SHORTEST, check_float, quoted
 
 #: Names in the paper's order: κ1², κ1κ2, κ2², κ1, κ2, 1.
 NAMES = ("a20", "a11", "a02", "a10", "a01", "a00")
@@ -120,6 +120,11 @@ class Coefficients:
         """Return Willmore's H² (eq. `Willmore`)."""
         return cls(1, 2, 1)
 
+    @classmethod
+    def from_dict(cls, values: Mapping[str, float]) -> Coefficients:
+        """Return the coefficients of a dictionary that `as_dict` made."""
+        return cls(*(float(values[name]) for name in NAMES))
+
     def as_dict(self) -> dict[str, float]:
         """Return a dictionary from names to numbers, for coefficients that do not vary."""
         return {name: float(value) for name, value in dataclasses.asdict(self).items()}
@@ -131,66 +136,3 @@ def check_strength(name: str, value: float | Tensor, power: int, epsilon: float 
     if not size <= STRONGEST:
         of = {0: "", 1: " epsilon", 2: " epsilon²"}[power]
         raise ValueError(f"expected |{name}|{of} of at most {STRONGEST:g}, got {size:.3g}")
-
-
-class Preset(NamedTuple):
-    """Coefficients (in working units) and mass m₀ of a published shape, and the source that published them."""
-
-    coefficients: Coefficients
-    mass: float
-    source: str
-
-
-_GALLERY = "curvatubes results/gallery"
-_TABLE_3, _TABLE_4 = "paper, Table 'four shapes'", "paper, Table 'spatialized'"
-_PUBLISHED: dict[str, tuple[tuple[float, ...], float, str]] = {
-    "bilayers": ((1, 1, 1, 0, 0, 0), -0.4, _GALLERY),
-    "exp-0366": ((1, -0.238, 11.988, -175.909, -27.167, 2117.037), -0.648, _GALLERY),
-    "exp-0556": ((1, 3.225, 10.87, -146.309, 143.487, -2920.302), -0.499, _GALLERY),
-    "exp-0625": ((1, 2.869, 9.711, -116.933, 61.261, 577.676), -0.657, _GALLERY),
-    "exp-0830": ((1, 3.725, 0.649, -39.994, 64.093, 2758.058), -0.568, _GALLERY),
-    "metatubes": ((0.924, 1.352, 2.932, 8.29, 61.066, 297.722), -0.53, _GALLERY),
-    "pearls": ((1, 3.55, 1, -56, -56, 784), -0.77, _GALLERY),
-    "sieve": ((0.946, 3.959, 1.942, 18.329, 28.008, 113.771), -0.534, _GALLERY),
-    "sponge": ((1, 2.8, 2, -10, -10, 25), -0.25, _GALLERY),
-    "trabec": ((2, 1.823, 12, -166, -14, 3548), -0.512, _GALLERY),
-    "tubes": ((1, 2, 6, -40, -40, 400), -0.6, _GALLERY),
-    "weird": ((1, 0.396, 1.095, -28.64, 190.906, 2062.082), -0.598, _GALLERY),
-    "flow": ((1, 2.4, 9, 30, 170, -195), -0.66, "paper, Fig. 'cvg_1'"),
-    "seeds": ((1, -0.35, 1.02, -40, 100, 1600), -0.69, "paper, Fig. 'var_1'"),
-    "bilinear-layers": ((2, 2, 2, 0, 0, 0), -0.3, _TABLE_3),
-    "bilinear-spheres": ((2, 2, 2, -75, -75, 937.5), -0.6, _TABLE_3),
-    "bilinear-tubes": ((2, 2, 11, -100, -50, 1250), -0.7, _TABLE_3),
-    "bilinear-sponges": ((1, 2.8, 2, -10, -10, 25), -0.25, _TABLE_3),
-    "spatial-1": ((2, 2, 2, 0, 0, 0), -0.4, _TABLE_4),
-    "spatial-2": ((1, 2, 6, -40, -40, 400), -0.6, _TABLE_4),
-    "spatial-3": ((2, 2, 2, -75, -75, 937.5), -0.7, _TABLE_4),
-    "spatial-4": ((2, 2, 11, -180, -90, 4050), -0.7, _TABLE_4),
-}
-
-#: The published shapes by name.
-PRESETS: dict[str, Preset] = {
-    name: Preset(Coefficients(*values), mass, source) for name, (values, mass, source) in _PUBLISHED.items()
-}
-
-
-def preset(name: str) -> Preset:
-    """Return the parameters of a published shape.
-
-    Capitals do not matter, and spaces, underscores and hyphens are alike: `Bilinear_Tubes` is `bilinear-tubes`.
-
-    Raises
-    ------
-    ValueError
-        If the name is not one of `PRESETS`.
-    """
-    key = preset_name(name)
-    if key is None:
-        raise ValueError(f"expected a preset among {', '.join(PRESETS)}, got {quoted(name)}")
-    return PRESETS[key]
-
-
-def preset_name(name: object) -> str | None:
-    """Return the name in `PRESETS` that a text spells (see `preset`), None where there is no such name."""
-    key = plain_name(name) if isinstance(name, str) else None
-    return key if key in PRESETS else None

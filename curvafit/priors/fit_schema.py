@@ -9,15 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from os import PathLike
+from pathlib import Path
 from typing import Any
 
-from curvafit.core.checks import quoted
+from curvafit.core.records import parse_json, quoted
 from curvafit.core.units import METRES
-from curvafit.priors.coefficients import NAMES
-
-FORMAT = "curvafit-fit-2"
-#: Formats whose law can be read.
-FORMATS = (FORMAT, "curvafit-fit-1")
+from curvafit.priors.coefficients import NAMES, Coefficients
+from curvafit.priors.law import FORMAT
 
 _NUMBER = {"type": "number", "description": "a finite number"}
 _POSITIVE = {"type": "number", "exclusiveMinimum": 0, "description": "a positive number"}
@@ -132,7 +131,7 @@ FIT_SCHEMA: dict[str, Any] = {
         "length_unit",
     ],
     "properties": {
-        "format": {"enum": list(FORMATS), "description": " or ".join(FORMATS)},
+        "format": {"enum": [FORMAT], "description": FORMAT},
         "kind": {"enum": ["field", "mask", "image"], "description": "field, mask or image"},
         "family": _TEXT,
         "coefficients": _SIX_OR_NONE,
@@ -174,7 +173,6 @@ def _whole(schema: Mapping[str, Any], **others: Any) -> dict[str, Any]:
 #: The whole fit of an inference, as `Fit` writes and reads it; a law needs less (`FIT_SCHEMA`).
 WHOLE_FIT = _whole(
     FIT_SCHEMA,
-    format={"enum": [FORMAT], "description": FORMAT},
     matches={**FIT_SCHEMA["properties"]["matches"], "items": _whole(_MATCH)},
     morphometry=_whole(_MORPHOMETRY),
 )
@@ -226,3 +224,45 @@ def _type(value: Any) -> str | None:
         return "number" if math.isfinite(value) else None
     names = {type(None): "null", str: "string", list: "array", dict: "object"}
     return next((name for kind, name in names.items() if isinstance(value, kind)), None)
+
+
+def fit_bytes(path: str | PathLike[str]) -> bytes:
+    """Return the content of a `fit.json` as bytes.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    """
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"expected a fit.json, found no file {path}")
+    return Path(path).read_bytes()
+
+
+def parse_fit(text: str | bytes, place: object, schema: Mapping[str, Any]) -> dict[str, Any]:
+    """Parse a `fit.json` and check it against a schema.
+
+    Parameters
+    ----------
+    place
+        Name of the text's file, for messages.
+
+    Raises
+    ------
+    ValueError
+        If the text is not JSON, has another format, or violates the schema.
+    """
+    expected = "a fit.json written by `curvafit infer`"
+    content = parse_json(text, expected, place)
+    version = content.get("format", FORMAT) if isinstance(content, dict) else FORMAT
+    if version not in schema["properties"]["format"]["enum"]:
+        got = f"got {quoted(version)} in {place}: run `curvafit infer` again"
+        raise ValueError(f"expected a fit.json of format {FORMAT}, {got}")
+    if fault := violation(content, schema):
+        raise ValueError(f"expected {expected} with {fault} in {place}")
+    return content
+
+
+def six_of(values: Mapping[str, float]) -> Coefficients:
+    """Return coefficients made of six numbers by name."""
+    return Coefficients(*(float(values[name]) for name in NAMES))

@@ -1,68 +1,129 @@
-"""A law in any of its forms, and the texture that it describes: six coefficients, the mass, and the fit's units."""
+"""A law of shapes: six coefficients and a mass, their units, what they are meant for, and all the ways to state it."""
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from os import PathLike
-from typing import Protocol, runtime_checkable
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
 
 from torch import Tensor
 
-from curvafit.core.checks import quoted
-from curvafit.priors.coefficients import PRESETS, Coefficients, Preset, preset_name
-from curvafit.priors.fit_file import Prior, read_fit
-from curvafit.priors.grid import WORKING_SPACING
+from curvafit.core.checks import plain_name
+from curvafit.core.records import parse_json, quoted
+from curvafit.core.units import METRES
+from curvafit.priors.coefficients import NAMES, Coefficients
+from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
 
-
-@runtime_checkable
-class Inferred(Protocol):
-    """A result that holds a prior: an inference, or its `Fit`."""
-
-    def to_prior(self) -> Prior:
-        """Return coefficients and mass, with the lengths that relate them to the scan."""
-        ...
-
-
-#: A law: coefficients, a preset or its name, the path of a `fit.json`, or what `read_fit` returns for one, or a fit.
-Law = Coefficients | Preset | str | PathLike[str] | Prior | Inferred
-_LAWS = (Coefficients, Preset, str, PathLike, Prior, Inferred)
+#: The format of a `fit.json`.
+FORMAT = "curvafit-fit-2"
 
 
 @dataclass(frozen=True)
-class Texture:
-    """Coefficients and mass of a law.
+class Law:
+    """What shapes of one texture are grown by: coefficients and mass, in which units, and for which ε and schedule.
 
     Attributes
     ----------
     coefficients
-        In working units, or, where the law is `Coefficients`, in the unit of the grid or scan that uses them.
+        In working units where `working` is True; else in the unit of the grid or scan that uses them.
     mass
-        m₀ of a preset or a fit, None for bare coefficients.
+        m₀, the mean of u; None where the law states none.
     origin
         Where the law comes from, in a few words: `preset tubes`, `prior bone/fit.json`, `coefficients`.
     working
         Whether the coefficients are in working units.
-    prior
-        The content of a `fit.json`; None for other laws.
+    epsilon
+        The ε that the coefficients are meant for, in their own unit.
+    schedule
+        The name, in `generation.SCHEDULES`, of the steps by which shapes of this law were made; None where unknown.
+    working_voxel, length_unit
+        A fit's edge of a working voxel, and the unit that it is in: they make lengths of the law physical. Else None.
+    volume_fraction
+        Share of a fit's scan inside the structure; None where it is unknown.
+    source
+        The publication of a preset.
     """
 
     coefficients: Coefficients
-    mass: float | None
-    origin: str
+    mass: float | None = None
+    origin: str = field(default="coefficients", compare=False)
     working: bool = True
-    prior: Prior | None = None
+    epsilon: float = WORKING_EPSILON
+    schedule: str | None = None
+    working_voxel: float | None = None
+    length_unit: str | None = None
+    volume_fraction: float | None = None
+    source: str = field(default="", compare=False)
+
+    @classmethod
+    def of(cls, law: LawLike) -> Law:
+        """Return a law, however it is stated; every argument and option that takes a law is read here.
+
+        Parameters
+        ----------
+        law
+            A `Law`, `Coefficients`, the name of a preset, the path of a `fit.json`, or a fit or an inference.
+
+        Raises
+        ------
+        FileNotFoundError, ValueError
+            If there is no preset of that name and no such file, the file holds no law, or the value states none.
+        """
+        if isinstance(law, Law):
+            return law
+        if isinstance(law, Coefficients):
+            return cls(law, working=False)
+        if (name := preset_name(law)) is not None:
+            return PRESETS[name]
+        if isinstance(law, str) and not (law.endswith(".json") or os.path.isfile(law)):
+            raise ValueError(f"expected a preset among {', '.join(PRESETS)}, or a fit.json, got {quoted(law)}")
+        if isinstance(law, (str, PathLike)):
+            return cls.load(law)
+        if isinstance(law, HasLaw):
+            return law.to_law()
+        raise ValueError(f"expected a law (Coefficients, a preset or its name, a fit.json or a fit), got {quoted(law)}")
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> Law:
+        """Read the law in a `fit.json`, whatever else the file holds.
+
+        Raises
+        ------
+        FileNotFoundError, ValueError
+            If there is no such file, it is no `fit.json` of this format, or it has no law.
+        """
+        if not Path(path).is_file():
+            raise FileNotFoundError(f"expected a fit.json, found no file {path}")
+        expected = "a fit.json written by `curvafit infer`"
+        content = parse_json(Path(path).read_bytes(), expected, path)
+        if not isinstance(content, Mapping):
+            raise ValueError(f"expected {expected}, got {quoted(content)} in {path}")
+        if (version := content.get("format", FORMAT)) != FORMAT:
+            got = f"got {quoted(version)} in {path}: run `curvafit infer` again"
+            raise ValueError(f"expected a fit.json of format {FORMAT}, {got}")
+        try:
+            return _read(content, f"prior {os.fspath(path)}")
+        except ValueError as error:
+            raise ValueError(f"expected {expected}, but {error} in {path}") from None
 
     @property
-    def epsilon(self) -> float | None:
-        """ε of the fit in `unit`; None where the law is not a fit."""
-        return None if self.prior is None else self.prior.epsilon
+    def fitted(self) -> bool:
+        """Whether the law was inferred from a scan, so that its lengths are physical too."""
+        return self.working_voxel is not None
 
     @property
-    def unit(self) -> str | None:
-        """The unit of the fit's lengths; None where the law is not a fit."""
-        return None if self.prior is None else self.prior.unit
+    def physical(self) -> Coefficients:
+        """A fit's coefficients with lengths in `length_unit`: quadratic part unchanged, linear / λ, constant / λ²."""
+        return self.coefficients.in_unit(1 / self._length)
+
+    @property
+    def epsilon_physical(self) -> float:
+        """A fit's ε in `length_unit`."""
+        return self.epsilon * self._length
 
     @property
     def point(self) -> tuple[float, ...]:
@@ -77,18 +138,18 @@ class Texture:
             raise ValueError(f"expected a preset or a fit, which have a mass, got {self.origin}")
         return (*map(float, self._numbers()), float(self.mass))  # type: ignore[arg-type]
 
-    def in_unit(self, unit: str | None, edge: float) -> Coefficients:
+    def in_unit(self, unit: str | None, edge: float | None = None) -> Coefficients:
         """Return the coefficients with lengths in the unit of a scan or a training patch.
 
-        A fit is converted to `unit`, or stays in the fit's unit where `unit` is None. A preset's working voxel is
-        taken to be `edge` long. `Coefficients` stay as they are.
+        A fit is converted to `unit`, or stays in its own where `unit` is None. A preset's working voxel is taken to be
+        `edge` long. Coefficients that are not in working units stay as they are.
 
         Parameters
         ----------
         unit
             nm, um, mm or m.
         edge
-            The smallest edge of a voxel, in `unit`.
+            The smallest edge of a voxel, in `unit`; needed for presets alone.
 
         Raises
         ------
@@ -96,9 +157,22 @@ class Texture:
             If the coefficients vary in space, or the two units cannot be compared.
         """
         numbers = self._numbers()
-        if self.prior is not None:
-            return self.prior.in_unit(unit)
-        return numbers.in_unit(WORKING_SPACING / edge) if self.working else numbers
+        if not self.fitted:
+            return numbers.in_unit(WORKING_SPACING / edge) if self.working and edge is not None else numbers
+        if unit is None or unit == self.length_unit:
+            return self.physical
+        if unit not in METRES or self.length_unit not in METRES:
+            mend = ": run `curvafit infer` again with --spacing and --unit" if self.length_unit not in METRES else ""
+            units = f"{unit} and the fit's {self.length_unit}"
+            raise ValueError(f"expected two units among {', '.join(METRES)}, got {units}{mend}")
+        return self.physical.in_unit(METRES[unit] / METRES[self.length_unit])
+
+    @property
+    def _length(self) -> float:
+        """λ: a working length of 1 in `length_unit`; raise ValueError where the law is no fit."""
+        if self.working_voxel is None:
+            raise ValueError(f"expected a fit, whose lengths are physical, got {self.origin}")
+        return self.working_voxel / WORKING_SPACING
 
     def _numbers(self) -> Coefficients:
         """Return the coefficients; raise ValueError where they vary in space."""
@@ -107,44 +181,125 @@ class Texture:
         return self.coefficients
 
 
-def texture_of(law: Law) -> Texture:
-    """Return the texture of a law; every argument and option that takes a law is read here.
+@runtime_checkable
+class HasLaw(Protocol):
+    """A result that holds a law: a fit, or the inference that made it."""
+
+    def to_law(self) -> Law:
+        """Return the law."""
+        ...
+
+
+#: All that states a law: see `Law.of`.
+LawLike = Law | Coefficients | str | PathLike[str] | HasLaw
+#: The same as types, for `isinstance`.
+LAW_TYPES = (Law, Coefficients, str, PathLike, HasLaw)
+
+
+def read_laws(laws: LawLike | Iterable[LawLike]) -> tuple[Law, ...]:
+    """Return one law or several, however they are stated.
 
     Raises
     ------
     FileNotFoundError, ValueError
-        If there is no preset of that name and no such file, the file is not a `fit.json` (`read_fit`), or the value is
-        not a law.
+        As `Law.of` does.
     """
-    if isinstance(law, Coefficients):
-        return Texture(law, None, "coefficients", working=False)
-    if isinstance(law, Preset):
-        return Texture(law.coefficients, law.mass, f"preset of {law.source}")
-    if (name := preset_name(law)) is not None:
-        return Texture(PRESETS[name].coefficients, PRESETS[name].mass, f"preset {name}")
-    if isinstance(law, str) and not (law.endswith(".json") or os.path.isfile(law)):
-        raise ValueError(f"expected a preset among {', '.join(PRESETS)}, or a fit.json, got {quoted(law)}")
-    if isinstance(law, (str, PathLike)):
-        return _fitted(read_fit(law), f"prior {os.fspath(law)}")
-    if isinstance(law, Prior):
-        return _fitted(law, "prior")
-    if isinstance(law, Inferred):
-        return _fitted(law.to_prior(), "prior")
-    raise ValueError(f"expected a law (Coefficients, a preset or its name, a fit.json or a fit), got {quoted(law)}")
+    single = isinstance(laws, LAW_TYPES) or not isinstance(laws, Iterable)
+    return (Law.of(laws),) if single else tuple(map(Law.of, laws))  # type: ignore[arg-type]
 
 
-def textures_of(laws: Law | Iterable[Law]) -> tuple[Texture, ...]:
-    """Return the textures of one law or of several.
+def _read(content: Mapping[str, Any], origin: str) -> Law:
+    """Return the law in the content of a `fit.json`."""
+    status = content.get("status", "no reason")
+    keys = ("coefficients", "mass", "coefficients_physical")
+    if any(name in content and content[name] is None for name in keys):
+        raise ValueError(f"it has no law: {status}")
+    six = _six(content, "coefficients")
+    _six(content, "coefficients_physical")
+    mass = _number(content, "mass", -1, 1)
+    epsilon, voxel = (_number(content, name, 0) for name in ("epsilon_physical", "working_voxel"))
+    unit = content.get("length_unit")
+    if unit not in ("voxel", *METRES):
+        raise ValueError(f"length_unit must be one of voxel, {', '.join(METRES)}, got {quoted(unit)}")
+    morphometry = content.get("morphometry") or {}
+    if not isinstance(morphometry, Mapping):
+        raise ValueError(f"morphometry must be an object, got {quoted(morphometry)}")
+    share = morphometry.get("volume_fraction")
+    if share is not None and not 0 <= (share := _number(morphometry, "morphometry.volume_fraction")) <= 1:
+        raise ValueError(f"morphometry.volume_fraction must be a number from 0 to 1, got {share:g}")
+    width = epsilon * WORKING_SPACING / voxel
+    own = {"working_voxel": voxel, "length_unit": unit, "volume_fraction": share}
+    return Law(six, mass, origin, epsilon=width, schedule="deep", **own)
+
+
+def _six(content: Mapping[str, Any], name: str) -> Coefficients:
+    """Return the six coefficients of that name."""
+    values = content.get(name)
+    if not isinstance(values, Mapping):
+        raise ValueError(f"{name} must be an object of six coefficients, got {quoted(values)}")
+    return Coefficients(*(_number(values, f"{name}.{key}") for key in NAMES))
+
+
+def _number(content: Mapping[str, Any], name: str, low: float = -math.inf, high: float = math.inf) -> float:
+    """Return the number of that name, which lies between two bounds."""
+    value = content.get(name.rpartition(".")[2])
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low < value < high:
+        bounds = "" if math.isinf(low) else f" above {low:g}" if math.isinf(high) else f" between {low:g} and {high:g}"
+        raise ValueError(f"{name} must be a number{bounds}, got {quoted(value)}")
+    return float(value)
+
+
+_GALLERY = "curvatubes results/gallery"
+_TABLE_3, _TABLE_4 = "paper, Table 'four shapes'", "paper, Table 'spatialized'"
+_PUBLISHED: dict[str, tuple[tuple[float, ...], float, str]] = {
+    "bilayers": ((1, 1, 1, 0, 0, 0), -0.4, _GALLERY),
+    "exp-0366": ((1, -0.238, 11.988, -175.909, -27.167, 2117.037), -0.648, _GALLERY),
+    "exp-0556": ((1, 3.225, 10.87, -146.309, 143.487, -2920.302), -0.499, _GALLERY),
+    "exp-0625": ((1, 2.869, 9.711, -116.933, 61.261, 577.676), -0.657, _GALLERY),
+    "exp-0830": ((1, 3.725, 0.649, -39.994, 64.093, 2758.058), -0.568, _GALLERY),
+    "metatubes": ((0.924, 1.352, 2.932, 8.29, 61.066, 297.722), -0.53, _GALLERY),
+    "pearls": ((1, 3.55, 1, -56, -56, 784), -0.77, _GALLERY),
+    "sieve": ((0.946, 3.959, 1.942, 18.329, 28.008, 113.771), -0.534, _GALLERY),
+    "sponge": ((1, 2.8, 2, -10, -10, 25), -0.25, _GALLERY),
+    "trabec": ((2, 1.823, 12, -166, -14, 3548), -0.512, _GALLERY),
+    "tubes": ((1, 2, 6, -40, -40, 400), -0.6, _GALLERY),
+    "weird": ((1, 0.396, 1.095, -28.64, 190.906, 2062.082), -0.598, _GALLERY),
+    "flow": ((1, 2.4, 9, 30, 170, -195), -0.66, "paper, Fig. 'cvg_1'"),
+    "seeds": ((1, -0.35, 1.02, -40, 100, 1600), -0.69, "paper, Fig. 'var_1'"),
+    "bilinear-layers": ((2, 2, 2, 0, 0, 0), -0.3, _TABLE_3),
+    "bilinear-spheres": ((2, 2, 2, -75, -75, 937.5), -0.6, _TABLE_3),
+    "bilinear-tubes": ((2, 2, 11, -100, -50, 1250), -0.7, _TABLE_3),
+    "bilinear-sponges": ((1, 2.8, 2, -10, -10, 25), -0.25, _TABLE_3),
+    "spatial-1": ((2, 2, 2, 0, 0, 0), -0.4, _TABLE_4),
+    "spatial-2": ((1, 2, 6, -40, -40, 400), -0.6, _TABLE_4),
+    "spatial-3": ((2, 2, 2, -75, -75, 937.5), -0.7, _TABLE_4),
+    "spatial-4": ((2, 2, 11, -180, -90, 4050), -0.7, _TABLE_4),
+}
+
+#: The published laws by name, in working units.
+PRESETS: dict[str, Law] = {
+    name: Law(Coefficients(*values), mass, f"preset {name}", schedule="paper", source=source)
+    for name, (values, mass, source) in _PUBLISHED.items()
+}
+
+
+def preset(name: str) -> Law:
+    """Return the law of a published shape.
+
+    Capitals do not matter, and spaces, underscores and hyphens are alike: `Bilinear_Tubes` is `bilinear-tubes`.
 
     Raises
     ------
-    FileNotFoundError, ValueError
-        As `texture_of` does.
+    ValueError
+        If the name is not one of `PRESETS`.
     """
-    single = isinstance(laws, _LAWS) or not isinstance(laws, Iterable)
-    return (texture_of(laws),) if single else tuple(map(texture_of, laws))  # type: ignore[arg-type]
+    key = preset_name(name)
+    if key is None:
+        raise ValueError(f"expected a preset among {', '.join(PRESETS)}, got {quoted(name)}")
+    return PRESETS[key]
 
 
-def _fitted(prior: Prior, origin: str) -> Texture:
-    """Return the texture of a fit."""
-    return Texture(prior.coefficients, prior.mass, origin, prior=prior)
+def preset_name(name: object) -> str | None:
+    """Return the name in `PRESETS` that a text spells (see `preset`), None where there is no such name."""
+    key = plain_name(name) if isinstance(name, str) else None
+    return key if key in PRESETS else None

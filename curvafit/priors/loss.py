@@ -12,7 +12,7 @@ from torch import Tensor
 from curvafit.priors.coefficients import NAMES, POWERS, Coefficients, check_strength
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.kernels.differentiable import areas, energies
-from curvafit.priors.law import Law, texture_of
+from curvafit.priors.law import Law, LawLike
 from curvafit.priors.refined import refined
 from curvafit.priors.shapes import Float
 from curvafit.priors.stencils import gaussian_blur
@@ -27,7 +27,7 @@ COARSEST = 10_000
 
 def curvature_prior(
     probability: Float[Tensor, "batch z y x"],
-    law: Law,
+    law: LawLike,
     spacing: tuple[float, float, float],
     epsilon: float,
     *,
@@ -70,7 +70,7 @@ def curvature_prior(
             f"expected a volume of at least {least} voxels along each axis, got {shape}, which has no interior"
         )
     times = upsampling(spacing, epsilon)
-    coefficients = texture_of(law).in_unit(None, min(spacing))
+    coefficients = Law.of(law).in_unit(None, min(spacing))
     check_numbers(coefficients, epsilon)
     check_lengths(epsilon, blur, max(n * h for n, h in zip(shape, spacing, strict=True)))
     unit = epsilon / WORKING_EPSILON

@@ -14,7 +14,7 @@ from curvafit.core.checks import check_float, check_int, quoted
 from curvafit.core.units import METRES
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
-from curvafit.priors.law import Law, Texture, textures_of
+from curvafit.priors.law import Law, LawLike, read_laws
 from curvafit.priors.loss import COARSEST, MOST, RESOLVED, check_numbers, curvature_prior, upsampling
 from curvafit.priors.values import number_of, plain
 
@@ -37,8 +37,8 @@ class CurvaturePrior(nn.Module):
     Parameters
     ----------
     law
-        `Coefficients` with lengths in spacing's unit; a preset or its name, in working units, where the smallest voxel
-        edge is 0.01; the path of a `fit.json`, or a fit. Or a sequence of laws, one for each class.
+        `Coefficients` with lengths in spacing's unit; a `Law`, or a preset's name, in working units, where the smallest
+        voxel edge is 0.01; the path of a `fit.json`, or a fit. Or a sequence of laws, one for each class.
     sigmoid, softmax
         Whether the input is logits, to which this function is applied first. Without either the input is
         probabilities; a warning says where it has other values.
@@ -84,7 +84,7 @@ class CurvaturePrior(nn.Module):
 
     def __init__(
         self,
-        law: Law | Sequence[Law],
+        law: LawLike | Sequence[LawLike],
         *,
         sigmoid: bool = False,
         softmax: bool = False,
@@ -119,9 +119,9 @@ class CurvaturePrior(nn.Module):
         self.shape = None if shape is None else Grid(shape, self.spacing).shape  # type: ignore[arg-type]
         self.weight = _weights(weight)
         edge = min(self.spacing)
-        self.coefficients = tuple(_numbers(texture, edge, unit, self.epsilon) for texture in textures_of(law))
-        for law in self.coefficients:
-            check_numbers(law, self.epsilon)
+        self.coefficients = tuple(_numbers(each, edge, unit, self.epsilon) for each in read_laws(law))
+        for numbers in self.coefficients:
+            check_numbers(numbers, self.epsilon)
         _warn_of_interpolation(self.spacing, self.epsilon)
 
     def extra_repr(self) -> str:
@@ -283,14 +283,14 @@ def _weights(weight: float | Sequence[float]) -> tuple[float, ...]:
     return values
 
 
-def _numbers(texture: Texture, edge: float, unit: str | None, epsilon: float) -> Coefficients:
+def _numbers(law: Law, edge: float, unit: str | None, epsilon: float) -> Coefficients:
     """Return coefficients with lengths in spacing's unit; warn where ε is far from the fit's."""
-    numbers = texture.in_unit(unit, edge)
-    if texture.prior is None:
+    numbers = law.in_unit(unit, edge)
+    if law.length_unit is None:
         if unit is not None and unit not in METRES:
             raise ValueError(f"expected a unit among {', '.join(METRES)}, got {quoted(unit)}")
         return numbers
-    width, fit_unit = texture.prior.epsilon, texture.prior.unit
+    width, fit_unit = law.epsilon_physical, law.length_unit
     unit = unit or fit_unit
     width *= 1 if unit == fit_unit else METRES[fit_unit] / METRES[unit]
     if not 1 / 4 <= epsilon / width <= 4:

@@ -31,7 +31,7 @@ from curvafit.drawing.plot import (
 )
 from curvafit.inference.candidates import TITLES, UNBELIEVED, UNDECIDED, Candidate, seed_noise_of
 from curvafit.inference.table import parameters_of
-from curvafit.priors.fit_file import FORMAT
+from curvafit.priors.law import FORMAT
 from curvafit.volumes.field import Field
 from curvafit.volumes.write import save
 

@@ -17,10 +17,9 @@ from curvafit.core.units import METRES
 from curvafit.generation.data import Data, Evidence
 from curvafit.generation.flow import WORKING_BLUR, Flow, descend
 from curvafit.priors.coefficients import NAMES, Coefficients
-from curvafit.priors.fit_file import Prior, fit_bytes, parse_fit, six_of
-from curvafit.priors.fit_schema import FIT_SCHEMA
-from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
-from curvafit.priors.law import Law, texture_of
+from curvafit.priors.fit_schema import FIT_SCHEMA, fit_bytes, parse_fit, six_of
+from curvafit.priors.grid import WORKING_EPSILON, Grid
+from curvafit.priors.law import Law, LawLike
 from curvafit.priors.loss import RESOLVED, upsampling
 from curvafit.priors.profile import phase_field
 from curvafit.priors.refined import refined
@@ -145,7 +144,7 @@ Ends = tuple[tuple[bool, bool], tuple[bool, bool], tuple[bool, bool]]
 TRUSTED = ("refined", "posterior", "simulation", "optimum")
 
 
-def law_of(prior: Law, scan: Field) -> tuple[Coefficients, tuple[str, ...]]:
+def law_of(prior: LawLike, scan: Field) -> tuple[Coefficients, tuple[str, ...]]:
     """Return a law's coefficients with lengths in the scan's unit, and sentences on their origin.
 
     Raises
@@ -156,50 +155,48 @@ def law_of(prior: Law, scan: Field) -> tuple[Coefficients, tuple[str, ...]]:
         If there is no such file.
     """
     check_type(scan, Field, "a scan as Field")
-    texture = texture_of(prior)
-    if texture.prior is None:
+    texture = Law.of(prior)
+    if not texture.fitted:
         note = f"The {texture.origin}, at a working voxel of one scan voxel."
         return texture.in_unit(scan.unit, min(scan.spacing)), (note,) if texture.working else ()
     try:
         law = texture.in_unit(scan.unit, min(scan.spacing))
     except ValueError as reason:
-        mend = ": give --spacing and --unit" if texture.unit in METRES else ""
+        mend = ": give --spacing and --unit" if texture.length_unit in METRES else ""
         raise ScanError(f"{reason}{mend}") from None
-    note = f"The prior's lengths, in {texture.unit}, are converted to {scan.unit}."
-    return law, () if texture.unit == scan.unit else (note,)
+    note = f"The prior's lengths, in {texture.length_unit}, are converted to {scan.unit}."
+    return law, () if texture.length_unit == scan.unit else (note,)
 
 
-def laws_of(prior: Law, scan: Field) -> tuple[tuple[Coefficients, ...], tuple[str, ...]]:
+def laws_of(prior: LawLike, scan: Field) -> tuple[tuple[Coefficients, ...], tuple[str, ...]]:
     """Return the laws that a prior trusts, with lengths in the scan's unit, and sentences on their origin.
 
     The first is that of `law_of`. A fit has others, which were read from the same descriptors (`TRUSTED`).
     """
     law, notes = law_of(prior, scan)
-    fitted = texture_of(prior).prior
-    if fitted is None:
+    fitted = Law.of(prior)
+    if not fitted.fitted:
         return (law,), notes
     others = (each for each in _candidates(prior) if each != fitted.coefficients)
     return (law, *_in_scan(others, fitted, scan)), notes
 
 
-def drawn_laws(prior: Law, scan: Field, count: int) -> tuple[Coefficients, ...]:
+def drawn_laws(prior: LawLike, scan: Field, count: int) -> tuple[Coefficients, ...]:
     """Return so many laws drawn from the posterior of a fit, with lengths in the scan's unit; none of other priors."""
-    fitted = texture_of(prior).prior
-    rows = np.empty((0, 5)) if fitted is None else _draws(prior)
-    if fitted is None or not len(rows):
+    fitted = Law.of(prior)
+    rows = _draws(prior) if fitted.fitted else np.empty((0, 5))
+    if not len(rows):
         return ()
     some = rows[np.linspace(0, len(rows) - 1, count).astype(int)]
     return _in_scan((Coefficients(1.0, *map(float, row)) for row in some), fitted, scan)
 
 
-def _in_scan(laws: Iterable[Coefficients], fitted: Prior, scan: Field) -> tuple[Coefficients, ...]:
+def _in_scan(laws: Iterable[Coefficients], fitted: Law, scan: Field) -> tuple[Coefficients, ...]:
     """Return laws in a fit's working units with lengths in the scan's unit."""
-    scale = WORKING_SPACING / fitted.working_voxel
-    priors = (fitted._replace(coefficients=each, physical=each.in_unit(scale)) for each in laws)
-    return tuple(law_of(each, scan)[0] for each in priors)
+    return tuple(law_of(replace(fitted, coefficients=each), scan)[0] for each in laws)
 
 
-def _draws(prior: Law) -> np.ndarray:
+def _draws(prior: LawLike) -> np.ndarray:
     """Return a fit's draws of the coefficients but a20 = 1, (N, 5), from the fit or its file; N = 0 without draws."""
     if isinstance(prior, (str, PathLike)):
         posterior = parse_fit(fit_bytes(prior), prior, FIT_SCHEMA).get("posterior") or {"draws": {}}
@@ -211,7 +208,7 @@ def _draws(prior: Law) -> np.ndarray:
     return np.empty((0, 5)) if draws is None else draws.values[:, :5]
 
 
-def _candidates(prior: Law) -> list[Coefficients]:
+def _candidates(prior: LawLike) -> list[Coefficients]:
     """Return the trusted candidates of a fit or its file, in working units; none of a law without candidates."""
     if isinstance(prior, (str, PathLike)):
         rows = parse_fit(fit_bytes(prior), prior, FIT_SCHEMA).get("candidates", ())

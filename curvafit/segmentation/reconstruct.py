@@ -20,7 +20,7 @@ from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
 from curvafit.priors.loss import RESOLVED
 from curvafit.priors.profile import optimal_profile
-from curvafit.segmentation.engine import STEPS, Law, WorkingGrid, drawn_laws, laws_of
+from curvafit.segmentation.engine import STEPS, LawLike, WorkingGrid, drawn_laws, laws_of
 from curvafit.segmentation.examples import Example, grown, slices_of, within
 from curvafit.segmentation.result import Segmentation, Uncertainty, ending, filled, result_of
 from curvafit.segmentation.slices import WAYS, Slices, check_spacing, labels
@@ -49,7 +49,7 @@ PULLS = (1e4, 3e4)
 
 def reconstruct(
     slices: Source,
-    prior: Law,
+    prior: LawLike,
     *,
     every: int | None = None,
     first: int = 0,
@@ -292,7 +292,7 @@ FORM = "labels that are whole numbers"
 
 def reconstruct_labels(
     slices: Source,
-    prior: Law | Mapping[int, Law],
+    prior: LawLike | Mapping[int, LawLike],
     *,
     chosen: Sequence[int] | None = None,
     every: int | None = None,
@@ -408,7 +408,13 @@ class _Part:
 
 
 def _completed(
-    volume: Field, number: int, law: Law, places: list[int], axis: int, example: Field | None, options: dict[str, Any]
+    volume: Field,
+    number: int,
+    law: LawLike,
+    places: list[int],
+    axis: int,
+    example: Field | None,
+    options: dict[str, Any],
 ) -> tuple[np.ndarray, _Part]:
     """Return a label's phase field, as `reconstruct` fills it, or interpolated where that refuses."""
     name, notes, shown = f"label {number}", (), None

@@ -16,7 +16,7 @@ from curvafit.core.checks import SEEDS, check_float, check_int, quoted
 from curvafit.core.runtime import Progress, part, silent
 from curvafit.generation.data import Evidence
 from curvafit.priors.coefficients import Coefficients
-from curvafit.segmentation.engine import BENDING, HALO, STEPS, Law, WorkingGrid, bending, laws_of, likelihood
+from curvafit.segmentation.engine import BENDING, HALO, STEPS, LawLike, WorkingGrid, bending, laws_of, likelihood
 from curvafit.segmentation.evidence import VoxelEvidence, of_probability
 from curvafit.segmentation.result import Segmentation, ending, filled, result_of
 from curvafit.segmentation.segment import TRIALS, WEIGHTS, WILLMORE
@@ -81,7 +81,7 @@ class Calibration:
 
 def refine(
     probabilities: Source,
-    prior: Law,
+    prior: LawLike,
     *,
     example: tuple[Source, Source] | Calibration | None = None,
     weight: float | None = None,
@@ -157,7 +157,7 @@ def refine(
 def calibrate(
     probabilities: Source,
     mask: Source,
-    prior: Law,
+    prior: LawLike,
     *,
     label: int | None = None,
     epsilon: float | None = None,
@@ -341,7 +341,7 @@ class Refine:
 
     def __init__(
         self,
-        prior: Law,
+        prior: LawLike,
         *,
         weight: float | None = None,
         example: tuple[Source, Source] | Calibration | None = None,

@@ -13,7 +13,7 @@ from curvafit.core.checks import check_float
 from curvafit.core.runtime import Progress, part, silent
 from curvafit.generation.data import Evidence
 from curvafit.priors.coefficients import Coefficients
-from curvafit.segmentation.engine import BENDING, STEPS, Law, WorkingGrid, bending, laws_of, likelihood, started
+from curvafit.segmentation.engine import BENDING, STEPS, LawLike, WorkingGrid, bending, laws_of, likelihood, started
 from curvafit.segmentation.evidence import Classes, VoxelEvidence, bounds_of, classes_of, grey_levels, of_classes
 from curvafit.segmentation.result import Segmentation, ending, filled, result_of
 from curvafit.segmentation.tiles import Tiling, Workers, lowered
@@ -37,7 +37,7 @@ WEIGHTS = (1e-9, 1e9)
 
 def segment(
     scan: Source | Boxes,
-    prior: Law,
+    prior: LawLike,
     *,
     weight: float | None = None,
     threshold: float | str = "otsu",

@@ -29,8 +29,9 @@ from curvafit.inference.table import (
     parameters_of,
     save_table,
 )
-from curvafit.priors.coefficients import Coefficients, preset
+from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
+from curvafit.priors.law import preset
 from curvafit.priors.profile import optimal_profile
 from curvafit.volumes.field import ScanError
 

@@ -7,7 +7,7 @@ import pytest
 
 from curvafit.data_synth.atlas.design import INTERVALS, PARAMETERS, Design, around, boxed
 from curvafit.data_synth.atlas.design_file import read_design
-from curvafit.priors.coefficients import preset
+from curvafit.priors.law import preset
 
 
 def written(tmp_path, text: str):

@@ -9,8 +9,9 @@ import torch
 from curvafit.generation.batch import generate_batch
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import Schedule
-from curvafit.priors.coefficients import Coefficients, preset
+from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
+from curvafit.priors.law import preset
 
 GRID, PLAN = Grid((12, 13, 14)), Schedule("test", 45, 1e-2, 1e-3, "cosine")
 TUBES, SPONGE = preset("tubes"), preset("sponge")

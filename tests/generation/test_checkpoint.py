@@ -18,8 +18,9 @@ import torch
 from curvafit.generation.checkpoint import Checkpoint, identity
 from curvafit.generation.flow import descend, generate, relax
 from curvafit.generation.schedule import SCHEDULES, Schedule
-from curvafit.priors.coefficients import Coefficients, preset
+from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
+from curvafit.priors.law import preset
 
 ROOT = Path(__file__).resolve().parents[2]
 TUBES, MASS = preset("tubes").coefficients, preset("tubes").mass

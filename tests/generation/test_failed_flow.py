@@ -19,8 +19,8 @@ from curvafit.generation.cost import Cost
 from curvafit.generation.loop import Orders, run
 from curvafit.generation.stepper import Statistics, Stepper
 from curvafit.generation.viability import viability
-from curvafit.priors.coefficients import preset
 from curvafit.priors.grid import Grid
+from curvafit.priors.law import preset
 from curvafit.priors.profile import optimal_profile
 
 TUBES, MASS = preset("tubes").coefficients, preset("tubes").mass

@@ -16,11 +16,11 @@ from curvafit.generation.initial import white_noise
 from curvafit.generation.parametrization import DivergenceForm
 from curvafit.generation.schedule import SCHEDULES, Phase, Schedule, present_name, schedule
 from curvafit.generation.viability import viability
-from curvafit.priors.coefficients import Coefficients, preset
+from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.energy import energy
-from curvafit.priors.fit_file import read_fit
 from curvafit.priors.grid import Grid
 from curvafit.priors.kernels import plain_energy_gradient
+from curvafit.priors.law import Law, preset
 from curvafit.priors.profile import optimal_profile
 from curvafit.priors.stencils import gaussian_blur
 
@@ -328,7 +328,7 @@ def test_every_law_grows_the_same_shape(tmp_path) -> None:
     fit = made_fit()
     path.write_text(fit.to_json(), encoding="utf-8")
     stated = generate(fit.coefficients, fit.mass, 12, schedule=brief).field
-    for law in (fit, path, str(path), read_fit(path)):
+    for law in (fit, path, str(path), Law.load(path)):
         assert torch.equal(generate(law, grid=12, schedule=brief).field, stated)
 
 

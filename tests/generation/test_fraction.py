@@ -11,8 +11,9 @@ from curvafit.generation.flow import generate
 from curvafit.generation.fraction import first_mass
 from curvafit.generation.schedule import Schedule, schedule
 from curvafit.generation.setup import base_of
-from curvafit.priors.coefficients import Coefficients, preset
+from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
+from curvafit.priors.law import preset
 
 
 def share(u: torch.Tensor) -> float:

@@ -13,9 +13,10 @@ from curvafit.generation.parametrization import FORMS, DivergenceForm, MassProje
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.stepper import LbfgsStepper
 from curvafit.priors import kernels
-from curvafit.priors.coefficients import Coefficients, preset
+from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.energy import energy, orientation
 from curvafit.priors.grid import Grid
+from curvafit.priors.law import preset
 from curvafit.priors.profile import SIGMA, optimal_profile
 from curvafit.priors.stencils import gaussian_blur
 

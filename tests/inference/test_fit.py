@@ -13,7 +13,7 @@ from found import lattice, made_fit, measured
 
 from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE
 from curvafit.inference.fit import COLUMNS, Draws, Fit
-from curvafit.priors import read_fit
+from curvafit.priors import Law
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +76,7 @@ def test_a_fit_without_a_law_is_none(fit: Fit) -> None:
     assert (none.coefficients, none.mass, none.coefficients_physical, none.uncertainty) == (None, None, None, {})
     assert fields(Fit.from_json(none.to_json())) == fields(none)
     with pytest.raises(ValueError, match="law"):
-        none.to_prior()
+        none.to_law()
 
 
 def test_a_law_chosen_from_nowhere_is_refused(fit: Fit) -> None:
@@ -125,12 +125,12 @@ def test_draws_of_several_lengths_are_refused(fit: Fit) -> None:
 def test_a_file_is_read_as_a_fit_and_as_a_prior(tmp_path: Path, fit: Fit) -> None:
     path = fit.save(tmp_path / "fit.json")
     assert fields(Fit.load(path)) == fields(fit)
-    assert read_fit(path) == fit.to_prior() == Fit.load(path).to_prior()
+    assert Law.load(path) == fit.to_law() == Fit.load(path).to_law()
     content = json.loads(path.read_text()) | {"format": "curvafit-fit-1"}
     path.write_text(json.dumps(content))
-    assert read_fit(path) == fit.to_prior()  # of the format before, the law
-    with pytest.raises(ValueError, match="again"):
-        Fit.load(path)
+    for load in (Law.load, Fit.load):
+        with pytest.raises(ValueError, match="again"):
+            load(path)
     with pytest.raises(FileNotFoundError, match="no file"):
         Fit.load(tmp_path / "none.json")
 
@@ -154,7 +154,7 @@ def test_a_law_alone_is_no_whole_fit(tmp_path: Path, fit: Fit, name: str, value:
         Fit.from_json(json.dumps(content))
     if value is None:
         (tmp_path / "fit.json").write_text(json.dumps(content))
-        assert read_fit(tmp_path / "fit.json") == fit.to_prior()
+        assert Law.load(tmp_path / "fit.json") == fit.to_law()
 
 
 def test_columns_of_several_lengths_are_refused(fit: Fit) -> None:

@@ -24,10 +24,9 @@ from curvafit.inference.infer import Inference, infer
 from curvafit.inference.posterior import load_posterior
 from curvafit.inference.simulate import Effort
 from curvafit.inference.table import law_of, mirror_parameters, parameters_of
-from curvafit.priors.coefficients import preset
-from curvafit.priors.fit_file import read_fit
 from curvafit.priors.fit_schema import FORMAT
 from curvafit.priors.grid import WORKING_EPSILON, Grid
+from curvafit.priors.law import Law, preset
 from curvafit.report.page import write_inference
 from curvafit.scan.measure import scan_descriptors, scan_diagram
 from curvafit.scan.prepare import prepare
@@ -106,11 +105,11 @@ def test_fit_json_holds_what_the_generator_needs(inference: Inference, tmp_path)
     kept = content["diagram"]
     assert kept["seen_as"] == "mask" and sum(kept["share"]) == pytest.approx(1, abs=1e-4)
     assert len(kept["kappa1"]) == len(kept["share"]) and path.read_text().count("\n") < 1000
-    prior, law = read_fit(path), fit.to_prior()
+    prior, law = Law.load(path), fit.to_law()
     assert tuple(prior.coefficients) == pytest.approx(tuple(law.coefficients))
     assert tuple(prior.physical) == pytest.approx(tuple(law.physical))
-    assert (prior.mass, prior.epsilon) == pytest.approx((law.mass, law.epsilon))
-    assert (prior.working_voxel, prior.unit) == (fit.working_voxel, fit.length_unit)
+    assert (prior.mass, prior.epsilon_physical) == pytest.approx((law.mass, fit.epsilon_physical))
+    assert (prior.working_voxel, prior.length_unit) == (fit.working_voxel, fit.length_unit)
 
 
 # ---- laws ------------------------------------------------------------------------------------------------------------
@@ -148,7 +147,7 @@ def test_a_law_does_not_know_its_axes(tubes: np.ndarray, straight: Fit) -> None:
 def test_a_law_in_another_unit_is_the_same_law(tubes: np.ndarray, straight: Fit) -> None:
     other = quick(tubes > 0, spacing=0.003, unit="mm")
     np.testing.assert_allclose(places(other), places(straight), atol=1e-9)
-    mine, theirs = straight.to_prior(), other.to_prior()
+    mine, theirs = straight.to_law(), other.to_law()
     assert tuple(mine.in_unit("um")) == pytest.approx(tuple(theirs.in_unit("um").in_unit(3.0)), rel=1e-9)
 
 
@@ -160,7 +159,7 @@ def test_inside_for_outside_is_the_mirrored_law(tubes: np.ndarray, straight: Fit
     np.testing.assert_allclose(
         other.draws.parameters, mirror_parameters(straight.draws.parameters), rtol=1e-5, atol=1e-5
     )
-    own, law = straight.to_prior(), other.to_prior()
+    own, law = straight.to_law(), other.to_law()
     six = own.coefficients.mirrored()
     assert tuple(law.coefficients) == pytest.approx(tuple(six.scaled(1 / float(six.a20))), rel=1e-6)
     assert law.mass == pytest.approx(-own.mass)
@@ -194,7 +193,7 @@ def test_what_is_no_texture_has_no_law(shape, said: str, tmp_path: Path) -> None
     assert json.loads((report.parent / "fit.json").read_text())["coefficients"] is None
     assert said in report.read_text(encoding="utf-8")
     with pytest.raises(ValueError, match="law"):
-        inference.to_prior()
+        inference.to_law()
 
 
 def test_grey_noise_is_noise_and_a_texture_under_it_is_not(tubes: np.ndarray) -> None:
@@ -204,17 +203,17 @@ def test_grey_noise_is_noise_and_a_texture_under_it_is_not(tubes: np.ndarray) ->
     assert not prepare(Field(grey + 60 * (tubes > 0), (1.0,) * 3, "um"), kind="image").noise
 
 
-def test_read_fit_refuses_what_is_no_fit(tmp_path) -> None:
+def test_what_is_no_fit_is_refused(tmp_path) -> None:
     with pytest.raises(FileNotFoundError, match="no file"):
-        read_fit(tmp_path / "none.json")
+        Law.load(tmp_path / "none.json")
     path = tmp_path / "fit.json"
     for text in ("{", "[]", "{}", '{"format": "curvafit-fit-2"}'):
         path.write_text(text)
         with pytest.raises(ValueError, match="fit.json"):
-            read_fit(path)
+            Law.load(path)
     path.write_text('{"format": "curvafit-fit-0"}')
     with pytest.raises(ValueError, match="format"):
-        read_fit(path)
+        Law.load(path)
 
 
 def test_tiles_measure_what_the_whole_box_measures(tubes: np.ndarray) -> None:

@@ -14,8 +14,9 @@ from shapes import grown
 from curvafit.inference.drift import ShortFlow, deblur, drift
 from curvafit.inference.emulator import optimum
 from curvafit.inference.stationarity import stationarity
-from curvafit.priors.coefficients import Coefficients, preset
+from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, Grid
+from curvafit.priors.law import preset
 from curvafit.priors.profile import phase_field
 from curvafit.priors.stencils import gaussian_blur
 

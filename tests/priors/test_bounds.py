@@ -18,9 +18,10 @@ from curvafit.data_synth.sets.sources import Generated
 from curvafit.drawing.shapes import Output
 from curvafit.generation import Schedule, descend, generate, generate_batch, white_noise
 from curvafit.generation.memory import check_memory, memory
-from curvafit.priors.coefficients import Coefficients, preset
+from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.energy import orientation
 from curvafit.priors.grid import Grid
+from curvafit.priors.law import preset
 
 TUBES, MASS = preset("tubes").coefficients, preset("tubes").mass
 BRIEF = Schedule("brief", 2, 1e-3, 1e-3, "constant")

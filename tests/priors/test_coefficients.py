@@ -9,8 +9,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from curvafit.priors.coefficients import PRESETS, Coefficients, preset, preset_name
-from curvafit.priors.law import texture_of
+from curvafit.priors.coefficients import Coefficients
+from curvafit.priors.law import PRESETS, Law, preset, preset_name
 
 finite = st.floats(-50, 50, allow_subnormal=False)
 positive = st.floats(0.1, 50)
@@ -93,7 +93,7 @@ def test_presets_are_the_published_values() -> None:
 @pytest.mark.parametrize("text", ["bilinear-tubes", "Bilinear_Tubes", "BILINEAR TUBES", " bilinear tubes "])
 def test_a_preset_is_known_by_any_spelling_of_its_name(text: str) -> None:
     assert preset(text) is PRESETS["bilinear-tubes"]
-    assert texture_of(text).origin == "preset bilinear-tubes"
+    assert Law.of(text).origin == "preset bilinear-tubes"
 
 
 def test_every_name_of_a_preset_spells_that_preset() -> None:

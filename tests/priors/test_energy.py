@@ -10,7 +10,7 @@ import torch
 from exact import Torus, centres, diffuse_integrals, exact_jet, profile
 
 from benchmarks import convergence
-from curvafit.priors.coefficients import Coefficients, preset
+from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.curvature import Jet, jet, second_form
 from curvafit.priors.energy import (
     cahn_hilliard_area,
@@ -23,6 +23,7 @@ from curvafit.priors.energy import (
     unsimplified_energy,
 )
 from curvafit.priors.grid import Grid
+from curvafit.priors.law import preset
 from curvafit.priors.profile import SIGMA, double_well_derivative, optimal_profile
 from curvafit.priors.stencils import divergence, gaussian_blur
 
@@ -100,7 +101,7 @@ def test_forms_part_on_the_gallerys_fields(data) -> None:
 
 def short_flow(grid: Grid, ε: float) -> torch.Tensor:
     """Eighty Adam steps down F_ε of `tubes` from noise, mass held by a divergence."""
-    a, mass, _ = preset("tubes")
+    a, mass = preset("tubes").coefficients, preset("tubes").mass
     A = 0.4 * torch.rand(3, *grid.shape, generator=torch.Generator().manual_seed(0))
     A.requires_grad_()
     optimiser = torch.optim.Adam([A], lr=1e-2, eps=1e-2)

@@ -11,9 +11,10 @@ import torch
 from curvafit.generation.flow import generate
 from curvafit.generation.initial import white_noise
 from curvafit.generation.schedule import Schedule
-from curvafit.priors.coefficients import Coefficients, preset
+from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.energy import energy, orientation
 from curvafit.priors.grid import Grid
+from curvafit.priors.law import preset
 from curvafit.priors.stencils import divergence, gaussian_blur, gradient
 
 TUBES, MASS = preset("tubes").coefficients, preset("tubes").mass

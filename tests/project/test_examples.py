@@ -15,7 +15,7 @@ import pytest
 import trimesh
 
 from curvafit.geometry.mesh import surface
-from curvafit.priors.coefficients import preset
+from curvafit.priors.law import preset
 
 pytestmark = pytest.mark.slow
 

@@ -19,7 +19,7 @@ from curvafit.core.units import GLOSSARY, density, length, number
 from curvafit.geometry.diagram import diagram
 from curvafit.inference.infer import Inference
 from curvafit.priors import Grid
-from curvafit.priors.fit_file import FORMAT, read_fit
+from curvafit.priors.law import FORMAT, Law
 from curvafit.report.page import (
     bands,
     describe,
@@ -160,7 +160,7 @@ def test_a_scan_without_a_law_has_a_page_all_the_same(tmp_path: Path, undrawn: N
     content = json.loads((report.parent / "fit.json").read_text())
     assert content["coefficients"] is None and content["mass"] is None and content["chosen"] is None
     with pytest.raises(ValueError, match="law"):
-        read_fit(report.parent / "fit.json")
+        Law.load(report.parent / "fit.json")
 
 
 def test_an_inference_shows_the_scan_beside_its_twin() -> None:

@@ -15,7 +15,8 @@ from calling import call, refused
 from found import made_fit
 
 from curvafit.inference.candidates import Candidate
-from curvafit.priors.coefficients import Coefficients, preset
+from curvafit.priors.coefficients import Coefficients
+from curvafit.priors.law import preset
 from curvafit.segmentation.engine import TRUSTED, WorkingGrid, law_of, laws_of, stiff
 from curvafit.segmentation.examples import Example, Odds
 from curvafit.segmentation.reconstruct import MARGIN, STIFFNESS, SlicesProblem, reconstruct, reconstruct_labels

@@ -13,7 +13,8 @@ from found import made_fit
 from scipy import ndimage
 from skimage.filters import threshold_otsu
 
-from curvafit.priors.coefficients import Coefficients, preset
+from curvafit.priors.coefficients import Coefficients
+from curvafit.priors.law import preset
 from curvafit.segmentation.engine import WorkingGrid, law_of
 from curvafit.segmentation.evidence import VoxelEvidence, classes_of, grey_levels, of_classes
 from curvafit.segmentation.segment import segment

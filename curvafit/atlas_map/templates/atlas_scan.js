@@ -62,7 +62,7 @@ function placed(fit, file) {
   return { fit, file, diagram, seenAs, near, place, spread };
 }
 
-/** Whether a fit has a law, as `read_fit` asks. */
+/** Whether a fit has a law, as `Law.load` asks. */
 const lawful = (fit) => [fit.coefficients, fit.mass, fit.coefficients_physical].every((part) => part !== null);
 
 /** Whether a diagram's three columns are of one length, with some area. */

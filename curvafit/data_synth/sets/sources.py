@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, TypeVar, get_args, get_origin
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from curvafit.generation.schedule import schedule as named_schedule
 from curvafit.generation.viability import well_formed
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
-from curvafit.priors.law import Law, Texture, textures_of
+from curvafit.priors.law import Law, LawLike, read_laws
 
 #: Seeds that a shape gets to become well-formed.
 TRIES = 8
@@ -35,7 +35,6 @@ CROPS = 32
 #: Names of schedules in the records of version 0.1, which held no more of them, and the names today.
 _NAMES_0_1 = {"fast": "cosine", "paper": "paper"}
 #: The types of one law or one store.
-LAWS = tuple(get_origin(kind) or kind for kind in get_args(Law))
 
 _Crop = TypeVar("_Crop", bound=tuple[Any, ...])
 
@@ -140,7 +139,7 @@ class Generated:
         )
 
     @staticmethod
-    def of(laws: Iterable[Law], fraction: float | None = None) -> Generated:
+    def of(laws: Iterable[LawLike], fraction: float | None = None) -> Generated:
         """Return the source of the shapes of one law or several.
 
         Parameters
@@ -151,11 +150,11 @@ class Generated:
         Raises
         ------
         FileNotFoundError, ValueError
-            If a law cannot be read (`texture_of`), or states neither a mass nor a volume fraction.
+            If a law cannot be read (`Law.of`), or states neither a mass nor a volume fraction.
         """
         stated = tuple(laws)
-        textures = textures_of(stated)
-        shares = {None if each.prior is None else each.prior.volume_fraction for each in textures}
+        textures = read_laws(stated)
+        shares = {each.volume_fraction for each in textures}
         if fraction is None and len(shares) == 1:
             (fraction,) = shares
         points = tuple(_point(each, fraction) for each in textures)
@@ -294,7 +293,7 @@ def source_of(content: dict[str, Any]) -> ShapeSource:
     return Generated(tuple(map(tuple, content["points"])), tuple(content["names"]), plan, content["fraction"])
 
 
-def voxel_of(laws: Iterable[Law], kind: Modality) -> float:
+def voxel_of(laws: Iterable[LawLike], kind: Modality) -> float:
     """Return the edge of a shape's voxel in a modality's unit: that of a law that is a fit, else the modality's own.
 
     A fit in voxels tells no edge of images in a unit of length.
@@ -302,18 +301,17 @@ def voxel_of(laws: Iterable[Law], kind: Modality) -> float:
     Raises
     ------
     FileNotFoundError, ValueError
-        If a law cannot be read (`texture_of`), or the laws are several fits of different edges.
+        If a law cannot be read (`Law.of`), or the laws are several fits of different edges.
     """
     unit = kind.base.unit
-    fits = [each.prior for each in textures_of(laws) if each.prior is not None]
-    known = [fit for fit in fits if fit.unit in METRES or fit.unit == unit]
-    edges = {convert_length(fit.working_voxel, fit.unit, unit) for fit in known}
+    fits = [(law.working_voxel, law.length_unit) for law in read_laws(laws) if law.working_voxel and law.length_unit]
+    edges = {convert_length(voxel, own, unit) for voxel, own in fits if own in METRES or own == unit}
     if len(edges) > 1:
         raise ValueError(f"expected fits of one voxel's edge, or a voxel beside them, got edges of {sorted(edges)}")
     return edges.pop() if edges else kind.voxel
 
 
-def _point(texture: Texture, fraction: float | None) -> tuple[float, ...]:
+def _point(texture: Law, fraction: float | None) -> tuple[float, ...]:
     """Return the seven numbers of a law; a mass that it does not state is that of the volume fraction."""
     if texture.mass is None and fraction is not None:
         return replace(texture, mass=first_mass(fraction)).point
