@@ -15,9 +15,9 @@ import numpy as np
 
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.arrays import read_hdf5, read_npy, read_raw
+from curvafit.volumes.formats.base import check_array
 from curvafit.volumes.formats.nifti import read_nifti
 from curvafit.volumes.formats.part import Box, Crop, Part, box_of, fitted, selected
-from curvafit.volumes.formats.streams import check_array
 from curvafit.volumes.formats.zarr import read_zarr
 from curvafit.volumes.read import Source, field_of, located, pick_reader, placed, read_file
 

@@ -20,11 +20,10 @@ from curvafit.core.runtime import one_line
 from curvafit.core.units import parse_unit
 from curvafit.volumes.field import Field, positive_triple
 from curvafit.volumes.formats.arrays import read_hdf5, read_npy, read_npz, read_raw
-from curvafit.volumes.formats.base import Damaged, Raw, ScanError, complaints
-from curvafit.volumes.formats.medical import is_dicom, read_dicom, read_itk, read_mrc, read_nrrd
+from curvafit.volumes.formats.base import Damaged, Raw, ScanError, check_regular, complaints
+from curvafit.volumes.formats.medical import is_dicom, read_dicom, read_metaimage, read_mrc, read_nrrd
 from curvafit.volumes.formats.nifti import read_nifti
 from curvafit.volumes.formats.part import Crop, Part, box_of, selected
-from curvafit.volumes.formats.streams import check_regular
 from curvafit.volumes.formats.tiff import SLICES, read_slices, read_tiff
 from curvafit.volumes.formats.zarr import read_zarr
 
@@ -44,8 +43,8 @@ READERS: dict[str, Callable[..., Raw]] = {
     ".zarr": read_zarr,
     ".nrrd": read_nrrd,
     ".nhdr": read_nrrd,
-    ".mha": read_itk,
-    ".mhd": read_itk,
+    ".mha": read_metaimage,
+    ".mhd": read_metaimage,
     **dict.fromkeys((".mrc", ".map", ".rec"), read_mrc),
 }
 
@@ -339,7 +338,7 @@ def _guarded(reader: Callable[..., Raw], path: Path, **options: object) -> Raw:
     try:
         with complaints():
             return reader(path, **options)
-    except ScanError:
+    except (ScanError, ImportError):  # a library that is not installed says so itself
         raise
     except MemoryError as reason:
         raise ScanError(f"expected a volume that fits into memory, got {path}, which does not") from reason

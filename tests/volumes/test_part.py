@@ -225,7 +225,7 @@ def test_a_crop_outside_is_refused(tmp_path: Path, name: str, crop: str) -> None
 @pytest.mark.parametrize("name", ["scan.nii", "scan.npy", "scan.raw", "scan.zarr", "scan.h5"])
 def test_no_more_than_the_crop_needs_memory(tmp_path: Path, name: str, monkeypatch) -> None:
     path, options = written(tmp_path / name)
-    monkeypatch.setattr("curvafit.volumes.formats.streams.memory", lambda: VALUES.nbytes // 2)
+    monkeypatch.setattr("curvafit.volumes.formats.base.memory", lambda: VALUES.nbytes // 2)
     part = load(path, crop="0:2,:,:", **options)
     assert np.array_equal(part.values, VALUES[:2])
     if name != "scan.raw":

@@ -12,9 +12,8 @@ import numpy as np
 
 from curvafit.core.checks import quoted
 from curvafit.core.records import read_array, read_array_header
-from curvafit.volumes.formats.base import Raw, ScanError, pick_key, stated
+from curvafit.volumes.formats.base import Raw, ScanError, check_regular, mapped, pick_key, read_numbers, stated
 from curvafit.volumes.formats.part import Part, part_of
-from curvafit.volumes.formats.streams import check_regular, mapped, read_numbers
 
 #: Attributes that may state a spacing or its unit.
 _ATTRIBUTES = ("element_size_um", "spacing", "voxel_size", "unit", "units")

@@ -1,19 +1,23 @@
-"""The result and the errors of every reader, and the names of length units."""
+"""What every reader shares: its result and errors, a library's complaints, keys, attributes, and a file's numbers."""
 
 from __future__ import annotations
 
-import importlib
+import bz2
+import gzip
 import logging
+import math
 import threading
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 
+from curvafit.core import records
 from curvafit.core.checks import quoted
-from curvafit.core.runtime import one_line
+from curvafit.core.runtime import memory, one_line
 
 
 class ScanError(ValueError):
@@ -101,9 +105,77 @@ def _listed(value: Any) -> tuple[Any, ...]:
     return tuple(each.decode(errors="replace") if isinstance(each, bytes) else each for each in entries)
 
 
-def extra(module: str, what: str) -> Any:
-    """Return a library of the extra `[io]`, or raise ScanError with the line that installs it."""
-    try:
-        return importlib.import_module(module)
-    except ImportError as reason:
-        raise ScanError(f'expected {module} for {what}, got none: pip install "curvafit[io]"') from reason
+# ---- numbers of a file -----------------------------------------------------------------------------------------------
+
+
+def read_numbers(stream: Any, shape: Sequence[int], dtype: np.dtype, place: object) -> np.ndarray:
+    """Return the array of a stream, as `records.read_numbers` does.
+
+    Raises
+    ------
+    ScanError
+        If the array does not fit into memory.
+    """
+    check_array(shape, dtype, place)
+    return records.read_numbers(stream, shape, dtype)
+
+
+def mapped(path: Path, start: int, shape: Sequence[int], dtype: np.dtype) -> np.ndarray:
+    """Return the array, last axis fastest, from a byte of a file to its end, mapped rather than read.
+
+    Raises
+    ------
+    ScanError
+        If the values are not numbers.
+    Damaged
+        If the file is shorter or longer.
+    """
+    check_array([0], dtype, path)
+    nbytes, size = math.prod(shape) * dtype.itemsize, path.stat().st_size - start
+    if nbytes != size:
+        raise Damaged(f"{nbytes} bytes of values by its header, {size} in the file")
+    return np.memmap(path, dtype, "r", start, tuple(shape)) if size else np.empty(tuple(shape), dtype)
+
+
+def check_array(shape: Sequence[int], dtype: np.dtype, place: object) -> None:
+    """Raise ScanError where the array of a header cannot be read, before memory is allocated.
+
+    Raises
+    ------
+    ScanError
+        If the type is one of objects or records, an axis is negative, or the array is larger than the machine's
+        memory.
+    """
+    if dtype.kind in "OV":
+        raise ScanError(f"expected numbers, got values of type {str(dtype)[:80]} in {place}")
+    size = math.prod(int(n) for n in shape) * dtype.itemsize
+    if min(shape, default=1) < 0:
+        raise ScanError(f"expected a shape of positive whole numbers, got {tuple(shape)} in {place}")
+    if size > memory():
+        raise ScanError(f"expected a volume that fits into memory, got {size:.3g} bytes by the header of {place}")
+
+
+def check_regular(path: Path) -> Path:
+    """Return the path of a file or a folder, or raise ScanError: reading anything else may never end.
+
+    Raises
+    ------
+    ScanError
+        If the path is a pipe, a socket or a device.
+    """
+    if path.exists() and not path.is_file() and not path.is_dir():
+        raise ScanError(f"expected a file or a folder, got {path}, which is neither")
+    return path
+
+
+def decompressed(stream: IO[bytes], encoding: str) -> Any:
+    """Return a stream of the decompressed rest of one in `"gzip"` or `"bzip2"`, or the stream itself."""
+    if encoding == "gzip":
+        return gzip.GzipFile(fileobj=stream)
+    return bz2.BZ2File(stream) if encoding == "bzip2" else stream
+
+
+def skip(stream: Any, count: int) -> None:
+    """Read and forget `count` bytes, or all where there are fewer."""
+    while count > 0 and (piece := stream.read(min(count, 1 << 22))):
+        count -= len(piece)

@@ -1,29 +1,61 @@
-"""NRRD, MHA/MHD, MRC and DICOM folders, through the libraries of the extra `[io]`."""
+"""NRRD, MetaImage, MRC and folders of DICOM slices; all but MetaImage with a library of the extra `[io]`."""
 
 from __future__ import annotations
 
+import io
+import math
+import os
+import zlib
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
+from curvafit.core.extras import require
 from curvafit.core.units import convert_length
-from curvafit.volumes.formats.base import Damaged, Raw, ScanError, complaints, extra, pick_key
-from curvafit.volumes.formats.headers import meta_numbers, nrrd_values, read_meta
-from curvafit.volumes.formats.streams import opened, read_numbers, skip
+from curvafit.volumes.formats.base import (
+    Damaged,
+    Raw,
+    ScanError,
+    check_array,
+    check_regular,
+    complaints,
+    decompressed,
+    pick_key,
+    read_numbers,
+    skip,
+)
 
 #: Suffixes of files that must be DICOM's.
 _DICOM = (".dcm", ".dicom", ".ima")
+#: NRRD's encodings with a count or a checksum.
+_NRRD_ENCODINGS = {"raw": "raw", "gzip": "gzip", "gz": "gzip", "bzip2": "bzip2", "bz2": "bzip2"}
+#: MetaImage's types -> numpy's.
+_META_TYPES = {
+    "MET_CHAR": "i1",
+    "MET_UCHAR": "u1",
+    "MET_SHORT": "i2",
+    "MET_USHORT": "u2",
+    **dict.fromkeys(("MET_INT", "MET_LONG"), "i4"),
+    **dict.fromkeys(("MET_UINT", "MET_ULONG"), "u4"),
+    "MET_LONG_LONG": "i8",
+    "MET_ULONG_LONG": "u8",
+    "MET_FLOAT": "f4",
+    "MET_DOUBLE": "f8",
+}
+#: Most bytes of a MetaImage's header.
+_HEADER = 1 << 16
 #: From DICOM's and ITK's patient frame (left, posterior, superior) to NIfTI's (right, anterior, superior).
 _LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
 def read_nrrd(path: Path, **_: object) -> Raw:
     """Read an NRRD file; lengths along space directions without a unit are in mm."""
-    nrrd = extra("nrrd", "NRRD files")
+    nrrd = require("nrrd", "io", "reading NRRD files")
     with path.open("rb") as file:
         header = nrrd.read_header(file)
-        values = nrrd_values(nrrd, header, file, path)
+        values = _nrrd_values(nrrd, header, file, path)
     channels = _channel_axis(header)
     units = header.get("space units") or header.get("units")
     unit = next((u for u in units if u), None) if units is not None else None
@@ -41,6 +73,40 @@ def read_nrrd(path: Path, **_: object) -> Raw:
     return Raw(values, channels=channels)
 
 
+def _nrrd_values(nrrd: Any, header: dict[str, Any], file: IO[bytes], path: Path) -> np.ndarray:
+    """Return the values, z first, of an NRRD file that is read to the end of its header, or of the file it names.
+
+    pynrrd reads only the first part of a compressed stream, and not the checksum at its end.
+    """
+    name = header.pop("data file", header.pop("datafile", None))
+    if name is not None:
+        with check_regular(path.parent / str(name)).open("rb") as data:
+            return _nrrd_values(nrrd, header, data, path)
+    if header["dimension"] != len(header["sizes"]):
+        raise Damaged(f"{len(header['sizes'])} sizes for {header['dimension']} axes")
+    shape, encoding = [int(n) for n in header["sizes"]][::-1], str(header.get("encoding")).lower()
+    nothing = {
+        "type": header["type"],
+        "endian": header.get("endian", "little"),
+        "dimension": 1,
+        "sizes": np.zeros(1, int),
+    }
+    dtype = nrrd.read_data({**nothing, "encoding": "raw"}, io.BytesIO()).dtype
+    check_array(shape, dtype, path)
+    if encoding not in _NRRD_ENCODINGS:
+        if math.prod(shape) > os.fstat(file.fileno()).st_size:
+            raise Damaged(f"{math.prod(shape)} numbers by its header, fewer bytes in the file")
+        return nrrd.read_data(header, file, str(path), index_order="C")
+    for _ in range(int(header.get("line skip", header.get("lineskip", 0)))):
+        file.readline()
+    stream, start = decompressed(file, _NRRD_ENCODINGS[encoding]), header.get("byte skip", header.get("byteskip", 0))
+    if int(start) < 0:
+        stream.seek(-math.prod(shape) * dtype.itemsize, 2)
+    else:
+        skip(stream, int(start))
+    return read_numbers(stream, shape, dtype, path)
+
+
 def _channel_axis(header: dict[str, Any]) -> int | None:
     """Return the one axis, of the values with z first, that is not an axis of space; None without one."""
     axes = int(header["dimension"])
@@ -52,56 +118,105 @@ def _channel_axis(header: dict[str, Any]) -> int | None:
     return axes - 1 - other.index(True) if sum(other) == 1 and len(other) == axes else None
 
 
-def read_itk(path: Path, **_: object) -> Raw:
-    """Read a MetaImage, whose unit is the millimetre; ITK reads values in text or in several files."""
-    itk = extra("SimpleITK", "MHA and MHD files")
-    header, values = read_meta(path)
-    if values is None:
-        return _itk_image(itk, path)
-    axes = len(header["DimSize"].split())
-    spacing = meta_numbers(header, "ElementSpacing", "ElementSize")
-    spacing = np.ones(axes) if spacing is None else spacing
-    matrix = meta_numbers(header, "TransformMatrix", "Rotation", "Orientation")
-    origin = meta_numbers(header, "Offset", "Position", "Origin")
-    directions = np.eye(axes) if matrix is None else matrix.reshape(axes, axes).T
-    return _in_millimetres(values, spacing, directions, np.zeros(axes) if origin is None else origin)
+def read_metaimage(path: Path, **_: object) -> Raw:
+    """Read a MetaImage (MHA, or MHD with the file of values that it names), whose unit is the millimetre."""
+    with path.open("rb") as file:
+        header = _meta_header(file)
+        name = header["ElementDataFile"]
+        if name.upper() == "LOCAL":
+            return _meta_image(header, file, path)
+    with check_regular(path.parent / name).open("rb") as file:
+        return _meta_image(header, file, path)
 
 
-def _itk_image(itk: Any, path: Path) -> Raw:
-    display = itk.ProcessObject.GetGlobalWarningDisplay()
-    itk.ProcessObject.SetGlobalWarningDisplay(False)
-    try:
-        image = itk.ReadImage(str(path))
-    finally:
-        itk.ProcessObject.SetGlobalWarningDisplay(display)
-    spacing, axes = np.array(image.GetSpacing()), image.GetDimension()
-    directions = np.array(image.GetDirection()).reshape(axes, axes)
-    return _in_millimetres(itk.GetArrayFromImage(image), spacing, directions, np.array(image.GetOrigin()))
+def _meta_header(file: IO[bytes]) -> dict[str, str]:
+    """Return the lines `name = value` up to the one that says where the values are."""
+    header: dict[str, str] = {}
+    while "ElementDataFile" not in header and file.tell() < _HEADER and (line := file.readline(_HEADER)):
+        name, _, value = line.decode("latin-1").partition("=")
+        header[name.strip()] = value.strip()
+    return header
 
 
-def _in_millimetres(values: np.ndarray, spacing: np.ndarray, directions: np.ndarray, origin: np.ndarray) -> Raw:
-    """Return values placed as ITK places them, with an affine where three axes, or three and channels, have a place.
+def _meta_image(header: dict[str, str], file: IO[bytes], path: Path) -> Raw:
+    """Return a MetaImage placed as ITK places it, with the values from the file's position to its end.
 
     The axis of channels is the last one where ITK does not count it, otherwise the first of four.
     """
-    affine, axes = None, len(spacing)
+    shape = [int(n) for n in header["DimSize"].split()]
+    axes, channels = len(shape), int(header.get("ElementNumberOfChannels", 1))
+    if header.get("ObjectType", "Image") != "Image" or str(axes) != header["NDims"] or min(shape) < 1:
+        raise Damaged(f"an image of {header['NDims'][:20]} axes with the sizes {shape[:9]}")
+    spacing = _meta_numbers(header, ("ElementSpacing", "ElementSize"), np.ones(axes))
+    origin = _meta_numbers(header, ("Offset", "Position", "Origin"), np.zeros(axes))
+    matrix = _meta_numbers(header, ("TransformMatrix", "Rotation", "Orientation"), np.eye(axes).ravel())
+    shape = [*shape[::-1], *([channels] if channels != 1 else [])]
+    values, affine = _meta_values(header, shape, file, path), None
     if axes in (3, 4):
         affine = np.eye(4)
-        affine[:3, :3] = directions[:3, :3] * spacing[:3]
+        affine[:3, :3] = matrix.reshape(axes, axes).T[:3, :3] * spacing[:3]
         affine[:3, 3] = origin[:3]
         affine = _LPS_TO_RAS @ affine
-    channels = axes if values.ndim > axes else 0 if axes == 4 else None
-    return Raw(values, tuple(float(h) for h in spacing[::-1]), "mm", affine, channels=channels)
+    channel_axis = axes if values.ndim > axes else 0 if axes == 4 else None
+    return Raw(values, tuple(spacing[::-1].tolist()), "mm", affine, channels=channel_axis)
+
+
+def _meta_values(header: dict[str, str], shape: list[int], file: IO[bytes], path: Path) -> np.ndarray:
+    """Return the values from the file's position to its end.
+
+    SimpleITK would read them too, but compares no checksum of a compressed file, and prints what it does not like.
+    """
+    kind = header.get("ElementType", "")
+    if kind not in _META_TYPES:
+        raise ScanError(f"expected an element type among {', '.join(_META_TYPES)}, got {kind[:40]!r} in {path}")
+    order = header.get("BinaryDataByteOrderMSB", header.get("ElementByteOrderMSB", "False"))
+    dtype = np.dtype(_META_TYPES[kind]).newbyteorder(">" if _meta_truth(order) else "<")
+    check_array(shape, dtype, path)
+    if not _meta_truth(header.get("BinaryData", "True")):
+        raise ScanError(f"expected a MetaImage of binary values, got {path} with values in text")
+    nbytes, head = math.prod(shape) * dtype.itemsize, int(header.get("HeaderSize", 0))
+    size = os.fstat(file.fileno()).st_size
+    file.seek(max(0, size - nbytes) if head < 0 else file.tell() + head)
+    if not _meta_truth(header.get("CompressedData", "False")):
+        return read_numbers(file, shape, dtype, path)
+    rest = size - file.tell()
+    if int(header.get("CompressedDataSize", rest)) != rest:
+        raise Damaged(f"{header['CompressedDataSize']} compressed bytes by its header, {rest} in the file")
+    inflate = zlib.decompressobj()
+    content = inflate.decompress(file.read(), nbytes + 1)
+    if len(content) != nbytes or not inflate.eof or inflate.unused_data:
+        raise Damaged(f"{nbytes} bytes of values by its header, not so many in the file")
+    return np.frombuffer(bytearray(content), dtype).reshape(shape)
+
+
+def _meta_numbers(header: dict[str, str], names: Sequence[str], default: np.ndarray) -> np.ndarray:
+    """Return the numbers of the first of these lines in a MetaImage's header, or the default, of as many numbers."""
+    for name in names:
+        if name in header:
+            numbers = np.array(header[name].split(), dtype=np.float64)
+            if len(numbers) != len(default):
+                raise Damaged(f"{name} of {len(numbers)} numbers, not {len(default)}")
+            return numbers
+    return default
+
+
+def _meta_truth(text: str) -> bool:
+    if text.lower() not in ("true", "false", "t", "f", "1", "0"):
+        raise Damaged(f"{text[:20]!r} for True or False")
+    return text.lower() in ("true", "t", "1")
 
 
 def read_mrc(path: Path, **_: object) -> Raw:
     """Read an MRC file or a CCP4 map, whose voxel sizes are in Å."""
-    mrcfile = extra("mrcfile", "MRC files")
+    mrcfile = require("mrcfile", "io", "reading and writing MRC files")
     with mrcfile.open(path, mode="r", header_only=True) as file:
         header, size = file.header, file.voxel_size
         shape, dtype = mrcfile.utils.data_shape_from_header(header), mrcfile.utils.data_dtype_from_header(header)
         start = header.nbytes + int(header.nsymbt)
-    with opened(path) as stream:
+    with path.open("rb") as file:
+        mark = file.read(3)
+        file.seek(0)
+        stream = decompressed(file, "gzip" if mark[:2] == b"\x1f\x8b" else "bzip2" if mark == b"BZh" else "raw")
         skip(stream, start)
         values = read_numbers(stream, [int(n) for n in shape], dtype, path)
     spacing = (float(size.z), float(size.y), float(size.x))
@@ -110,7 +225,7 @@ def read_mrc(path: Path, **_: object) -> Raw:
 
 def check_mrc(unit: str) -> None:
     """Raise ScanError where `write_mrc` cannot write: lengths have no unit, or its library is missing."""
-    extra("mrcfile", "MRC files")
+    require("mrcfile", "io", "reading and writing MRC files")
     if unit == "voxel":
         raise ScanError("expected a unit of nm, um, mm or m for an MRC file, which holds voxel sizes in Å, got none")
 
@@ -122,13 +237,13 @@ def write_mrc(field: Any, path: Path) -> None:
     values = field.values if kind is None else field.values.astype(kind)
     if values.dtype.name not in ("int8", "int16", "uint16", "float16", "float32"):
         raise ScanError(f"expected whole numbers of at most 16 bits or floats for an MRC file, got {values.dtype}")
-    with extra("mrcfile", "MRC files").new(path, values, overwrite=True) as file:
+    with require("mrcfile", "io", "reading and writing MRC files").new(path, values, overwrite=True) as file:
         file.voxel_size = tuple(convert_length(h, field.unit, "angstrom") for h in field.spacing[::-1])
 
 
 def read_dicom(path: Path, *, key: str | None = None, **_: object) -> Raw:
     """Read a folder of slices in the order of their positions; `key` is the UID of one series of several."""
-    pydicom = extra("pydicom", "DICOM folders")
+    pydicom = require("pydicom", "io", "reading DICOM folders")
     files = sorted(p for p in path.iterdir() if p.is_file() and (is_dicom(p) or p.suffix.lower() in _DICOM))
     with complaints("pydicom"):
         images = [image for file in files if (image := _image(pydicom, file)) is not None]

@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 
 from curvafit.core.units import parse_unit
-from curvafit.volumes.formats.base import Raw, ScanError, complaints
+from curvafit.volumes.formats.base import Raw, ScanError, complaints, mapped, read_numbers
 from curvafit.volumes.formats.part import Part, part_of
-from curvafit.volumes.formats.streams import mapped, read_numbers
 
 #: Bytes that are compressed together.
 MEMBER = 2**28

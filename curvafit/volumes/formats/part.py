@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from curvafit.core.checks import SEEDS, check_int, quoted
-from curvafit.volumes.formats.base import Raw, ScanError
-from curvafit.volumes.formats.streams import check_array
+from curvafit.volumes.formats.base import Raw, ScanError, check_array
 
 __all__ = ["Box", "Crop", "Part", "box_of", "fitted", "fitting", "part_of", "selected"]
 

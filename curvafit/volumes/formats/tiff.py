@@ -12,8 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from curvafit.core.units import convert_length, parse_unit
-from curvafit.volumes.formats.base import Damaged, Raw, ScanError, complaints
-from curvafit.volumes.formats.streams import check_array, check_regular
+from curvafit.volumes.formats.base import Damaged, Raw, ScanError, check_array, check_regular, complaints
 
 if TYPE_CHECKING:
     import tifffile
