@@ -46,9 +46,9 @@ def reading_of(
 
         parse_unit(unit)
     if crop is not None:
-        from curvafit.volumes.formats.part import box_of
+        from curvafit.volumes.formats.part import parse_box
 
-        box_of(crop)
+        parse_box(crop)
     return {
         "spacing": None if spacing is None else triple(spacing, "--spacing"),
         "unit": unit,

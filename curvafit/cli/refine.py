@@ -90,12 +90,12 @@ def refine(
             learned["example"], record["calibration"] = tried, tried.as_dict()
 
         def compute(volume: Boxes, progress: Progress, **tools: Any) -> Segmentation:
-            from curvafit.volumes.boxes import whole_of
+            from curvafit.volumes.boxes import read_whole
 
             if example is not None and not learned:
                 learn(volume, progress)
             told = learned or {"prior": prior, "weight": weight}
-            return refine_map(whole_of(volume), progress=progress, **told, **tools, **options)
+            return refine_map(read_whole(volume), progress=progress, **told, **tools, **options)
 
         def tried(laws: int, voxels: int) -> float:
             return 0.0 if learned or example is None else trial_steps(laws + 1, steps, voxels)

@@ -171,13 +171,13 @@ def reconstruct(
 
         def compute(volume: Boxes, progress: Progress, **tools: Any) -> Segmentation:
             from curvafit.segmentation.reconstruct import reconstruct as fill
-            from curvafit.volumes.boxes import whole_of
+            from curvafit.volumes.boxes import read_whole
             from curvafit.volumes.read import load
 
             alike = {name: reading[name] for name in ("spacing", "unit", "label", "strict")}
             whole = None if example is None else load(example, **alike)
             say_notes(() if whole is None else whole.notes)
-            slices = whole_of(volume)
+            slices = read_whole(volume)
             if labels is not None:
                 from curvafit.segmentation.reconstruct import reconstruct_labels
 
@@ -254,7 +254,7 @@ def run_job(
     from curvafit.segmentation.engine import laws_of
     from curvafit.segmentation.result import check_mask_target, write_mask
     from curvafit.segmentation.tiles import Tiling
-    from curvafit.volumes.boxes import boxes_of, whole_of
+    from curvafit.volumes.boxes import boxes_of, read_whole
 
     law_file = None if preset_name(prior) else prior
     inputs = [each for each in (source, law_file, image, *map(record.get, EXAMPLES)) if each is not None]
@@ -276,7 +276,7 @@ def run_job(
         content = {"command": command_line(), "prior": prior, **record}
         place = ("spacing", "crop") if image else ("spacing", "crop", "channel")
         like = (image or source) if all(reading[name] is None for name in place) else None
-        whole = whole_of(boxes)
+        whole = read_whole(boxes)
         files = write_mask(result, whole, out, like=like, unit=reading["unit"], record=content, overwrite=overwrite)
         if store is not None:
             remove(store)

@@ -18,7 +18,7 @@ from curvafit.segmentation.evidence import Classes, VoxelEvidence, bounds_of, cl
 from curvafit.segmentation.result import Segmentation, ending, filled, result_of
 from curvafit.segmentation.tiles import Tiling, Workers, lowered
 from curvafit.segmentation.trials import Weighing, busiest, weighing
-from curvafit.volumes.boxes import Boxes, boxes_of, extent, thinned
+from curvafit.volumes.boxes import Boxes, boxes_of, subsample, value_range
 from curvafit.volumes.field import ScanError
 from curvafit.volumes.formats.part import Box, Crop
 from curvafit.volumes.read import Source
@@ -102,8 +102,8 @@ def segment(
         weight = check_float(weight, "a positive weight", *WEIGHTS)
     if not (isinstance(threshold, str) and threshold == "otsu"):
         check_float(threshold, "a threshold that is a number or 'otsu'")
-    extent(boxes)
-    sample, blocks = thinned(boxes)
+    value_range(boxes)
+    sample, blocks = subsample(boxes)
     values, bounds = grey_levels(sample, threshold), bounds_of(sample.values.astype(np.float32), threshold)
     classes = classes_of(values, sample, threshold, dark)
     _check_phases(_Grey(boxes, bounds, classes), tiling)

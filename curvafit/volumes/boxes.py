@@ -17,11 +17,11 @@ from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.arrays import read_hdf5, read_npy, read_raw
 from curvafit.volumes.formats.base import check_array
 from curvafit.volumes.formats.nifti import read_nifti
-from curvafit.volumes.formats.part import Box, Crop, Part, box_of, fitted, selected
+from curvafit.volumes.formats.part import Box, Crop, Part, parse_box, resolve_box, take_part
 from curvafit.volumes.formats.zarr import read_zarr
-from curvafit.volumes.read import Source, field_of, located, pick_reader, placed, read_file
+from curvafit.volumes.read import Source, field_of, pick_reader, read_file, split_key, to_field
 
-__all__ = ["Boxes", "boxes_of", "digest_of", "extent", "frame_of", "thinned", "whole_of"]
+__all__ = ["Boxes", "boxes_of", "digest_of", "frame_of", "read_whole", "subsample", "value_range"]
 
 #: Readers that read a box alone.
 _BY_BOX = (read_zarr, read_hdf5, read_npy, read_raw, read_nifti)
@@ -76,7 +76,7 @@ def boxes_of(
         return source
     options: dict[str, Any] = {"spacing": spacing, "unit": unit, "crop": crop, **reading}
     if label is None and isinstance(source, str | os.PathLike):
-        path, key = located(source, reading.get("key"))
+        path, key = split_key(source, reading.get("key"))
         if _by_box(path, reading.get("raw_shape")):
             return _stored(path, key, options)
     return _Whole(field_of(source, label=label, **options))  # type: ignore[arg-type]
@@ -87,13 +87,13 @@ def frame_of(field: Field) -> Field:
     return replace(field, values=np.broadcast_to(np.zeros((), field.values.dtype), field.shape))
 
 
-def whole_of(boxes: Boxes) -> Field:
+def read_whole(boxes: Boxes) -> Field:
     """Return the volume in memory, in its own type."""
     z, y, x = (slice(0, n) for n in boxes.frame.shape)
     return replace(boxes.frame, values=boxes.part((z, y, x)))
 
 
-def extent(boxes: Boxes) -> tuple[float, float]:
+def value_range(boxes: Boxes) -> tuple[float, float]:
     """Return the least and the greatest value.
 
     Raises
@@ -110,7 +110,7 @@ def extent(boxes: Boxes) -> tuple[float, float]:
     return lowest, highest
 
 
-def thinned(boxes: Boxes) -> tuple[Field, list[Box]]:
+def subsample(boxes: Boxes) -> tuple[Field, list[Box]]:
     """Return a sample of a volume, without an affine, and the boxes of it within which voxels are neighbours.
 
     The sample is the volume itself where it is short; along an axis of more than `RUNS` x `LONG` voxels it has so many
@@ -209,10 +209,10 @@ def _stored(path: Path, key: str | None, options: dict[str, Any]) -> _Stored:
     corner, shape = _read(path, reading, Part(channel, _CORNER, some=options["crop"] is None))
     if options.get("strict") and corner.gaps:
         raise ScanError(f"expected a whole volume, got {path}: {corner.gaps[0]}")
-    box = fitted(box_of(options["crop"]), shape, path)
+    box = resolve_box(parse_box(options["crop"]), shape, path)
     first, size = [edge.start for edge in box], [edge.stop - edge.start for edge in box]
     check_array(size, corner.values.dtype, path)  # a mask is written from memory
-    field = placed(corner, f"{path}::{key}" if key else str(path), options["spacing"], options["unit"])
+    field = to_field(corner, f"{path}::{key}" if key else str(path), options["spacing"], options["unit"])
     frame = replace(field, values=np.broadcast_to(field.values, size))
     frame = frame_of(frame if options["crop"] is None else frame.moved(first))
     return _Stored(frame, path, reading, channel, tuple(first))
@@ -224,4 +224,4 @@ def _read(path: Path, reading: dict[str, Any], part: Part) -> tuple[Any, tuple[i
     assert read.whole is not None
     shape = read.whole
     space = part.index(shape, read.channels, path)[1]
-    return selected(read, part, path)[0], tuple(shape[axis] for axis in space)
+    return take_part(read, part, path)[0], tuple(shape[axis] for axis in space)

@@ -13,7 +13,7 @@ from curvafit.core.pictures import Pictured
 from curvafit.core.runtime import one_line
 from curvafit.core.units import parse_unit, sampling
 from curvafit.volumes.formats.base import ScanError
-from curvafit.volumes.formats.part import Crop, box_of, fitted
+from curvafit.volumes.formats.part import Crop, parse_box, resolve_box
 
 __all__ = ["Field", "ScanError", "positive_triple"]
 
@@ -92,7 +92,7 @@ class Field(Pictured):
         ScanError
             If the crop is not a box, or leaves the volume.
         """
-        box = fitted(box_of(crop), self.shape, self.source or "the volume")
+        box = resolve_box(parse_box(crop), self.shape, self.source or "the volume")
         return replace(self, values=self.values[box]).moved([edge.start for edge in box])
 
     def label(self, label: int) -> Field:

@@ -20,14 +20,14 @@ from curvafit.core.runtime import one_line
 from curvafit.core.units import parse_unit
 from curvafit.volumes.field import Field, positive_triple
 from curvafit.volumes.formats.arrays import read_hdf5, read_npy, read_npz, read_raw
-from curvafit.volumes.formats.base import Damaged, Raw, ScanError, check_regular, complaints
+from curvafit.volumes.formats.base import Damaged, Raw, ScanError, check_regular, collect_complaints
 from curvafit.volumes.formats.medical import is_dicom, read_dicom, read_metaimage, read_mrc, read_nrrd
 from curvafit.volumes.formats.nifti import read_nifti
-from curvafit.volumes.formats.part import Crop, Part, box_of, selected
+from curvafit.volumes.formats.part import Crop, Part, parse_box, take_part
 from curvafit.volumes.formats.tiff import SLICES, read_slices, read_tiff
 from curvafit.volumes.formats.zarr import read_zarr
 
-__all__ = ["READABLE", "Source", "field_of", "load", "located", "place_of", "placed", "read_file", "read_values"]
+__all__ = ["READABLE", "Source", "field_of", "load", "place_of", "read_file", "read_values", "split_key", "to_field"]
 
 #: A volume as a caller gives it.
 Source = str | os.PathLike[str] | Field | np.ndarray | torch.Tensor
@@ -101,14 +101,14 @@ def load(
         not 3D, not finite, constant or larger than memory, the spacing is not positive, or the file has no such
         channel, label or crop.
     """
-    location, key = located(path, key)
-    part = Part(channel, box_of(crop))
+    location, key = split_key(path, key)
+    part = Part(channel, parse_box(crop))
     read = read_file(location, key, raw_shape, dtype, None if part.whole else part)
-    raw, start = selected(read, part, location)
+    raw, start = take_part(read, part, location)
     if strict and raw.gaps:
         raise ScanError(f"expected a whole volume, got {location}: {raw.gaps[0]}")
     _check_values(raw.values, location)
-    field = placed(raw, f"{location}::{key}" if key else str(location), spacing, unit)
+    field = to_field(raw, f"{location}::{key}" if key else str(location), spacing, unit)
     return _part(field if part.crop is None else field.moved(start), label)
 
 
@@ -170,9 +170,9 @@ def place_of(path: str | os.PathLike[str]) -> Field:
     ScanError
         If the suffix is unknown, the file is damaged, or the volume is not 3D.
     """
-    location, key = located(path, None)
-    raw, _ = selected(read_file(location, key), Part(), location)
-    return placed(raw, str(location), None, None)
+    location, key = split_key(path, None)
+    raw, _ = take_part(read_file(location, key), Part(), location)
+    return to_field(raw, str(location), None, None)
 
 
 def read_values(path: str | os.PathLike[str]) -> np.ndarray:
@@ -266,7 +266,7 @@ def _array(source: np.ndarray | torch.Tensor) -> np.ndarray:
     return source
 
 
-def located(path: str | os.PathLike[str], key: str | None) -> tuple[Path, str | None]:
+def split_key(path: str | os.PathLike[str], key: str | None) -> tuple[Path, str | None]:
     """Return the file of a path, and the name of the array in the file, which the path may state after `::`."""
     path = os.fspath(path)
     if "::" in path and Path(path).exists():
@@ -293,7 +293,7 @@ def _check_finite(values: np.ndarray, place: object) -> tuple[float, float]:
     return lowest, highest
 
 
-def placed(raw: Raw, source: str, spacing: Sequence[float] | float | None, unit: str | None) -> Field:
+def to_field(raw: Raw, source: str, spacing: Sequence[float] | float | None, unit: str | None) -> Field:
     """Return the values in native byte order, with the spacing and unit of the caller or, by default, of the file."""
     notes = [*raw.gaps, *raw.notes, *(() if spacing is not None or unit is not None else raw.guesses)]
     file_unit, factor = ("voxel", 1.0) if spacing is not None and unit is not None else _unit(raw.unit)
@@ -336,7 +336,7 @@ def _guarded(reader: Callable[..., Raw], path: Path, **options: object) -> Raw:
         If the reader raises.
     """
     try:
-        with complaints():
+        with collect_complaints():
             return reader(path, **options)
     except (ScanError, ImportError):  # a library that is not installed says so itself
         raise

@@ -17,7 +17,7 @@ from filelock import FileLock
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation import Segmentation, reconstruct, segment
 from curvafit.volumes import ScanError, load, save
-from curvafit.volumes.boxes import boxes_of, extent, thinned
+from curvafit.volumes.boxes import boxes_of, subsample, value_range
 from curvafit.volumes.field import Field
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
@@ -185,7 +185,7 @@ def test_boxes_of_a_file_are_those_of_the_loaded_volume(tmp_path: Path) -> None:
             assert (frame.affine is None) == (loaded.affine is None)
             if frame.affine is not None and loaded.affine is not None:
                 np.testing.assert_allclose(frame.affine, loaded.affine)
-            assert extent(boxes) == (loaded.values.min(), loaded.values.max())
+            assert value_range(boxes) == (loaded.values.min(), loaded.values.max())
             assert boxes_of(boxes) is boxes
 
 
@@ -219,9 +219,9 @@ def test_values_that_are_not_finite_are_refused_wherever_they_are(tmp_path: Path
 
 def test_a_sample_of_a_long_volume_has_runs_of_neighbours() -> None:
     values = np.arange(1000)[:, None, None] * np.ones((1, 5, 6))
-    sample, blocks = thinned(boxes_of(values))
+    sample, blocks = subsample(boxes_of(values))
     assert sample.shape == (256, 5, 6) and len(blocks) == 4
     for block, start in zip(blocks, (93, 343, 593, 843), strict=True):
         np.testing.assert_array_equal(sample.values[block][:, 0, 0], np.arange(start, start + 64))
-    whole, (block,) = thinned(boxes_of(values[:256]))
+    whole, (block,) = subsample(boxes_of(values[:256]))
     assert np.array_equal(whole.values, values[:256]) and whole.values[block].shape == (256, 5, 6)

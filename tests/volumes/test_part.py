@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from curvafit.volumes import Field, ScanError, field_of, load, save
-from curvafit.volumes.formats.part import box_of
+from curvafit.volumes.formats.part import parse_box
 
 SHAPE = (6, 7, 8)
 VALUES = np.arange(np.prod(SHAPE), dtype=np.float32).reshape(SHAPE)
@@ -197,9 +197,9 @@ texts = st.tuples(*[st.tuples(edges, edges)] * 3)
 def test_a_crop_is_what_python_s_slices_are_or_refused(ends) -> None:
     text = ",".join(":".join("" if edge is None else str(edge) for edge in pair) for pair in ends)
     slices = tuple(slice(*pair) for pair in ends)
-    assert box_of(text) == slices == box_of(slices)
+    assert parse_box(text) == slices == parse_box(slices)
     of_numpy = tuple(slice(*(None if edge is None else np.int64(edge) for edge in pair)) for pair in ends)
-    assert box_of(of_numpy) == slices
+    assert parse_box(of_numpy) == slices
     try:
         part = Field(VALUES).crop(text)
     except ScanError as error:

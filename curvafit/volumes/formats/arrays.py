@@ -12,8 +12,8 @@ import numpy as np
 
 from curvafit.core.checks import quoted
 from curvafit.core.records import read_array, read_array_header
-from curvafit.volumes.formats.base import Raw, ScanError, check_regular, mapped, pick_key, read_numbers, stated
-from curvafit.volumes.formats.part import Part, part_of
+from curvafit.volumes.formats.base import Raw, ScanError, check_regular, mapped, pick_key, read_numbers, spacing_of
+from curvafit.volumes.formats.part import Part, read_part
 
 #: Attributes that may state a spacing or its unit.
 _ATTRIBUTES = ("element_size_um", "spacing", "voxel_size", "unit", "units")
@@ -29,7 +29,7 @@ def read_npy(path: Path, *, part: Part | None = None, **_: object) -> Raw:
             values = read_numbers(stream, order, dtype, path)
             return Raw(values.T if fortran else values)
         values = mapped(path, stream.tell(), order, dtype)
-    return part_of(values.T if fortran else values, part, path)
+    return read_part(values.T if fortran else values, part, path)
 
 
 def write_npy(field: Any, path: Path) -> None:
@@ -60,9 +60,9 @@ def read_hdf5(path: Path, *, key: str | None = None, part: Part | None = None, *
         if dataset.shape is None:
             raise ScanError(f"expected a 3D volume, got no values in {path}")
         attributes = {name: dataset.attrs[name] for name in _ATTRIBUTES if name in dataset.attrs}
-        spacing, unit = stated(attributes, dataset.ndim)
+        spacing, unit = spacing_of(attributes, dataset.ndim)
         gaps = tuple(_gaps(dataset, path))
-        return part_of(dataset, part, path)._replace(spacing=spacing, unit=unit, gaps=gaps)
+        return read_part(dataset, part, path)._replace(spacing=spacing, unit=unit, gaps=gaps)
 
 
 def _gaps(dataset: Any, path: Path) -> Iterator[str]:
@@ -108,4 +108,4 @@ def read_raw(
         raise ScanError(f"expected {nbytes} bytes for shape {shape} of {kind}, got {size} in {path}")
     if part is None:
         return Raw(np.fromfile(path, dtype=kind).reshape(shape))
-    return part_of(mapped(path, 0, shape, kind), part, path)
+    return read_part(mapped(path, 0, shape, kind), part, path)

@@ -52,7 +52,7 @@ class Raw(NamedTuple):
 
 
 @contextmanager
-def complaints(logger: str | None = None) -> Iterator[list[str]]:
+def collect_complaints(logger: str | None = None) -> Iterator[list[str]]:
     """Collect what a library logs in this thread, away from the host's streams, and silence warnings."""
     messages: list[str] = []
     thread, source = threading.get_ident(), logging.getLogger(logger or __name__)
@@ -88,7 +88,7 @@ def pick_key(keys: list[str], key: str | None, path: object) -> str:
     return name
 
 
-def stated(attributes: Mapping[str, Any], ndim: int) -> tuple[tuple[Any, ...] | None, Any]:
+def spacing_of(attributes: Mapping[str, Any], ndim: int) -> tuple[tuple[Any, ...] | None, Any]:
     """Return spacing and unit of an array's attributes, unchecked; one number counts for all axes."""
     for name, fixed_unit in (("element_size_um", "um"), ("spacing", None), ("voxel_size", None)):
         if name in attributes:

@@ -20,7 +20,7 @@ from curvafit.volumes.formats.base import (
     ScanError,
     check_array,
     check_regular,
-    complaints,
+    collect_complaints,
     decompressed,
     pick_key,
     read_numbers,
@@ -245,7 +245,7 @@ def read_dicom(path: Path, *, key: str | None = None, **_: object) -> Raw:
     """Read a folder of slices in the order of their positions; `key` is the UID of one series of several."""
     pydicom = require("pydicom", "io", "reading DICOM folders")
     files = sorted(p for p in path.iterdir() if p.is_file() and (is_dicom(p) or p.suffix.lower() in _DICOM))
-    with complaints("pydicom"):
+    with collect_complaints("pydicom"):
         images = [image for file in files if (image := _image(pydicom, file)) is not None]
     series = sorted({str(image.get("SeriesInstanceUID", "")) for image in images})
     uid = pick_key(series, key, path)
@@ -253,7 +253,7 @@ def read_dicom(path: Path, *, key: str | None = None, **_: object) -> Raw:
     rows, columns = np.array(slices[0].ImageOrientationPatient, dtype=float).reshape(2, 3)
     normal = np.cross(rows, columns)
     slices.sort(key=lambda image: float(np.dot(normal, np.array(image.ImagePositionPatient, dtype=float))))
-    with complaints("pydicom"):
+    with collect_complaints("pydicom"):
         values = np.stack([_rescaled(image) for image in slices])
     z, origin = _slice_distance(slices, normal, path)
     y, x = (float(h) for h in slices[0].PixelSpacing)

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from curvafit.core.units import parse_unit
-from curvafit.volumes.formats.base import Raw, ScanError, complaints, mapped, read_numbers
-from curvafit.volumes.formats.part import Part, part_of
+from curvafit.volumes.formats.base import Raw, ScanError, collect_complaints, mapped, read_numbers
+from curvafit.volumes.formats.part import Part, read_part
 
 #: Bytes that are compressed together.
 MEMBER = 2**28
@@ -31,7 +31,7 @@ def read_nifti(path: Path, *, part: Part | None = None, **_: object) -> Raw:
     """Read values, zooms, unit and affine; zooms other than 1 without a unit are in mm, as for NIfTI's readers."""
     import nibabel
 
-    with complaints("nibabel.global") as repairs:
+    with collect_complaints("nibabel.global") as repairs:
         image: Any = nibabel.load(path)
         raw = _values(image, path, part)
     zooms = tuple(float(f"{h:.7g}") for h in image.header.get_zooms())[:3]  # stored as float32
@@ -69,7 +69,7 @@ def _values(image: Any, path: Path, part: Part | None) -> Raw:
     long = [axis for axis, n in enumerate(shape[:-3]) if n != 1]
     channels = long[0] if len(long) == 1 else None
     if part is not None and not compression:
-        raw = part_of(mapped(path, proxy.offset, shape, proxy.dtype), part, path, channels)
+        raw = read_part(mapped(path, proxy.offset, shape, proxy.dtype), part, path, channels)
     else:
         with gzip.open(path) if compression else path.open("rb") as stream:
             stream.seek(proxy.offset)
@@ -111,7 +111,7 @@ def write_nifti_like(values: np.ndarray, like: Path, path: Path, unit: str | Non
     """
     import nibabel
 
-    with complaints("nibabel.global"):
+    with collect_complaints("nibabel.global"):
         image: Any = nibabel.load(like)
     header = image.header.copy()
     if math.prod(image.shape) != values.size:

@@ -13,7 +13,7 @@ import numpy as np
 from curvafit.core.checks import SEEDS, check_int, quoted
 from curvafit.volumes.formats.base import Raw, ScanError, check_array
 
-__all__ = ["Box", "Crop", "Part", "box_of", "fitted", "fitting", "part_of", "selected"]
+__all__ = ["Box", "Crop", "Part", "index_of", "parse_box", "read_part", "resolve_box", "take_part"]
 
 #: A box of voxels along (z, y, x).
 Box = tuple[slice, slice, slice]
@@ -65,7 +65,7 @@ class Part:
         index = [slice(0, n) for n in shape]
         if channels is not None and self.channel is not None:
             index[channels] = slice(self.channel, self.channel + 1)
-        box = fitted(self.crop, [shape[axis] for axis in space], place)
+        box = resolve_box(self.crop, [shape[axis] for axis in space], place)
         for axis, edge in zip(space, box, strict=True):
             index[axis] = edge
         return tuple(index), tuple(space)
@@ -91,21 +91,21 @@ class Part:
         return channels
 
 
-def part_of(array: Any, part: Part | None, place: object, channels: int | None = None) -> Raw:
+def read_part(array: Any, part: Part | None, place: object, channels: int | None = None) -> Raw:
     """Read an array that is not in memory (a dataset, a mapped file), or a part of it.
 
     Raises
     ------
     ScanError
-        As `fitting`.
+        As `index_of`.
     """
-    index = fitting(array, part, place, channels)
+    index = index_of(array, part, place, channels)
     if part is None:
         return Raw(np.asarray(array[index]), channels=channels)
     return Raw(np.array(array[index]), channels=channels, whole=tuple(array.shape))
 
 
-def fitting(array: Any, part: Part | None, place: object, channels: int | None = None) -> Any:
+def index_of(array: Any, part: Part | None, place: object, channels: int | None = None) -> Any:
     """Return the index of a part of an array, or of all of it, once it is sure to fit into memory.
 
     Raises
@@ -123,7 +123,7 @@ def fitting(array: Any, part: Part | None, place: object, channels: int | None =
     return index
 
 
-def selected(raw: Raw, part: Part, place: object) -> tuple[Raw, tuple[int, ...]]:
+def take_part(raw: Raw, part: Part, place: object) -> tuple[Raw, tuple[int, ...]]:
     """Return a part of a file's content, with three axes and their spacing, and its first voxel (z, y, x).
 
     Raises
@@ -143,7 +143,7 @@ def selected(raw: Raw, part: Part, place: object) -> tuple[Raw, tuple[int, ...]]
     return raw._replace(values=volume, spacing=spacing, notes=notes), tuple(index[axis].start for axis in space)
 
 
-def box_of(crop: Crop | None) -> Box | None:
+def parse_box(crop: Crop | None) -> Box | None:
     """Return a crop as three slices.
 
     Raises
@@ -159,7 +159,7 @@ def box_of(crop: Crop | None) -> Box | None:
     return parts[0], parts[1], parts[2]
 
 
-def fitted(box: Box | None, shape: Sequence[int], place: object) -> Box:
+def resolve_box(box: Box | None, shape: Sequence[int], place: object) -> Box:
     """Return a box in a volume of a shape (z, y, x), with all its ends counted from the first voxel.
 
     Raises

@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from curvafit.core.units import convert_length, parse_unit
-from curvafit.volumes.formats.base import Damaged, Raw, ScanError, check_array, check_regular, complaints
+from curvafit.volumes.formats.base import Damaged, Raw, ScanError, check_array, check_regular, collect_complaints
 
 if TYPE_CHECKING:
     import tifffile
@@ -43,7 +43,7 @@ def read_tiff(path: Path, **_: object) -> Raw:
     """Read the first series of a file, or raise Damaged where one of its strips or pages is missing."""
     import tifffile
 
-    with complaints("tifffile") as messages, tifffile.TiffFile(path) as file:
+    with collect_complaints("tifffile") as messages, tifffile.TiffFile(path) as file:
         series = file.series[0]
         check_array(series.shape, series.dtype or np.dtype("V1"), path)
         _check_pages(file, series)

@@ -13,8 +13,8 @@ import numpy as np
 
 from curvafit.core.files import MARK
 from curvafit.core.runtime import undisturbed
-from curvafit.volumes.formats.base import Damaged, Raw, ScanError, pick_key, stated
-from curvafit.volumes.formats.part import Part, fitting, part_of
+from curvafit.volumes.formats.base import Damaged, Raw, ScanError, pick_key, spacing_of
+from curvafit.volumes.formats.part import Part, index_of, read_part
 
 #: Edge of a chunk, and of the largest volume that is not halved any more, in voxels.
 CHUNK = 64
@@ -35,7 +35,7 @@ def read_zarr(path: Path, *, key: str | None = None, part: Part | None = None, *
     _check_store(path)
     node: Any = zarr.open(path, mode="r")
     if isinstance(node, zarr.Array):
-        return _raw(node, path, (*stated(node.attrs.asdict(), node.ndim), None), part)
+        return _raw(node, path, (*spacing_of(node.attrs.asdict(), node.ndim), None), part)
     arrays = _arrays(node)
     attributes = node.attrs.asdict()
     scales = _multiscales(attributes)
@@ -43,16 +43,16 @@ def read_zarr(path: Path, *, key: str | None = None, part: Part | None = None, *
         key = next(iter(scales))
     name = pick_key(sorted(arrays), key, path)
     array = arrays[name]
-    place = scales.get(name) or (*stated({**attributes, **array.attrs.asdict()}, array.ndim), None)
+    place = scales.get(name) or (*spacing_of({**attributes, **array.attrs.asdict()}, array.ndim), None)
     return _raw(array, path / array.path, place, part)
 
 
 def _raw(array: Any, folder: Path, place: _Place, part: Part | None) -> Raw:
     """Return the values of an array in a folder, with sentences on chunks that are not stored."""
     spacing, unit, channels = place
-    fitting(array, part, folder, channels)  # before chunks are counted: a header may claim any number of them
+    index_of(array, part, folder, channels)  # before chunks are counted: a header may claim any number of them
     gaps = _missing_chunks(array, folder)
-    return part_of(array, part, folder, channels)._replace(spacing=spacing, unit=unit, gaps=gaps)
+    return read_part(array, part, folder, channels)._replace(spacing=spacing, unit=unit, gaps=gaps)
 
 
 def write_zarr(field: Any, path: Path) -> None:
@@ -65,7 +65,7 @@ def write_zarr(field: Any, path: Path) -> None:
         "name": "volume",
         "axes": [{"name": name, **kind} for name in "zyx"],
         "datasets": [
-            {"path": str(k), "coordinateTransformations": _placed(field.spacing, 2**k, first)}
+            {"path": str(k), "coordinateTransformations": _transforms(field.spacing, 2**k, first)}
             for k, (_, first) in enumerate(levels)
         ],
     }
@@ -115,7 +115,7 @@ def _halvings(values: np.ndarray) -> Iterator[tuple[np.ndarray, float]]:
         yield values, first
 
 
-def _placed(spacing: tuple[float, float, float], factor: int, first: float) -> list[dict[str, Any]]:
+def _transforms(spacing: tuple[float, float, float], factor: int, first: float) -> list[dict[str, Any]]:
     """Return the scale and, where the first centre is off the origin, the translation, in the axes' unit."""
     transforms: list[dict[str, Any]] = [{"type": "scale", "scale": [factor * h for h in spacing]}]
     if first:
