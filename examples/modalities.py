@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from curvafit.data_synth.imaging.imaging import image, regrid
+from curvafit.data_synth.imaging.image import image, regrid
 from curvafit.data_synth.imaging.modalities import MODALITIES
 from curvafit.data_synth.imaging.modality import Modality
 from curvafit.drawing.plot import CONTOUR, write_picture

@@ -17,7 +17,7 @@ from common import CELL, DIAGRAM, KINDS, SURFACE, Shape, draw, grown, parser, wr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from curvafit.data_synth.atlas.design import boxed
+from curvafit.data_synth.design import boxed
 from curvafit.drawing.plot import CONTOUR, DIAGONAL, write_picture
 from curvafit.geometry.distances import pairwise
 from curvafit.priors.law import preset

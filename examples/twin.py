@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter
 
-from curvafit.data_synth.imaging.imaging import image
+from curvafit.data_synth.imaging.image import image
 from curvafit.data_synth.imaging.modalities import MICRO_CT
 from curvafit.drawing.plot import surface_on, write_picture
 from curvafit.generation.flow import generate

@@ -6,10 +6,10 @@ from pathlib import Path
 
 from exact_store import exact_store
 
+from curvafit.data_synth.case import Recipe
 from curvafit.data_synth.imaging.modality import Modality
 from curvafit.data_synth.imaging.parameters import Detector, Imaging, Optics
-from curvafit.data_synth.sets.case import Recipe
-from curvafit.data_synth.sets.sources import Stored
+from curvafit.data_synth.sources import Stored
 
 FLAT = Modality(
     "flat",

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from curvafit.core.runtime import Progress, silent
-from curvafit.data_synth.atlas.draws import versions
-from curvafit.data_synth.atlas.store import Store, open_store
-from curvafit.data_synth.atlas.workers import Here, Workers
+from curvafit.core.workers import Here, Workers
+from curvafit.data_synth.draws import versions
+from curvafit.data_synth.store import Store, open_store
 from curvafit.generation.viability import well_formed
 from curvafit.geometry.descriptors import Descriptors, descriptors
 from curvafit.geometry.mesh import NoSurface

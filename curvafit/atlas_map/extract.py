@@ -13,9 +13,9 @@ import numpy as np
 import torch
 
 from curvafit.core.runtime import Progress, silent
-from curvafit.data_synth.atlas.design import boxed
-from curvafit.data_synth.atlas.draws import versions
-from curvafit.data_synth.atlas.store import Record, Store, open_store
+from curvafit.data_synth.design import boxed
+from curvafit.data_synth.draws import versions
+from curvafit.data_synth.store import Record, Store, open_store
 from curvafit.generation.schedule import SCHEDULES, present_name
 from curvafit.generation.viability import FORMED, well_formed
 from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram, diagrams

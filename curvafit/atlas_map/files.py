@@ -22,9 +22,9 @@ from curvafit.atlas_map.shapes import Shown, regrow_command, shown
 from curvafit.core.files import bears, check_folder, check_free, is_empty, write_content
 from curvafit.core.records import read_archive
 from curvafit.core.runtime import Progress, part, silent
-from curvafit.data_synth.atlas.census import census
-from curvafit.data_synth.atlas.record import Record
-from curvafit.data_synth.atlas.store import Store, open_store
+from curvafit.data_synth.census import census
+from curvafit.data_synth.record import Record
+from curvafit.data_synth.store import Store, open_store
 from curvafit.generation.viability import well_formed
 from curvafit.geometry.diagram import Diagram
 from curvafit.inference.atlas import Atlas

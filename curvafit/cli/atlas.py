@@ -21,7 +21,7 @@ from curvafit.cli.workers import Crew, DashboardOption, SchedulerOption, Workers
 
 if TYPE_CHECKING:
     from curvafit.core.records import Format
-    from curvafit.data_synth.atlas.design import Design
+    from curvafit.data_synth.design import Design
 
 atlas_app = typer.Typer(help="Collections of generated shapes to match scans against.", no_args_is_help=True)
 
@@ -59,8 +59,8 @@ def build_atlas(
         box = whole_triple(shape, "--shape")
         law = _design(design, around, spread)
         from curvafit.core.files import check_folder
-        from curvafit.data_synth.atlas.build import build, check_count, settings_of
-        from curvafit.data_synth.atlas.store import open_store
+        from curvafit.data_synth.atlas import build, check_count, settings_of
+        from curvafit.data_synth.store import open_store
         from curvafit.generation.schedule import schedule as named
 
         check_count(count, 1)
@@ -88,8 +88,8 @@ def extend_atlas(
 ) -> None:
     """Add shapes to a store, with the design and the settings of the store."""
     with plainly():
-        from curvafit.data_synth.atlas.build import check_count, extend
-        from curvafit.data_synth.atlas.store import open_store
+        from curvafit.data_synth.atlas import check_count, extend
+        from curvafit.data_synth.store import open_store
 
         check_count(count, 0)
         crew = Crew(workers, scheduler, dashboard)
@@ -108,8 +108,8 @@ def extend_atlas(
 def atlas_info(store: _Store) -> None:
     """Show the content of a store, and how it was made."""
     with plainly():
-        from curvafit.data_synth.atlas.census import census
-        from curvafit.data_synth.atlas.store import open_store
+        from curvafit.data_synth.census import census
+        from curvafit.data_synth.store import open_store
 
         for name, value in census(open_store(store)).items():
             say(f"{name}: {value}")
@@ -123,7 +123,7 @@ def verify_atlas(
 ) -> None:
     """Check every draw of a store; exit with code 1 where one is lost, torn, doubled or differs from its record."""
     with plainly():
-        from curvafit.data_synth.atlas.census import verify
+        from curvafit.data_synth.census import verify
 
         with stages() as progress:
             verdict = verify(store, regenerate, seed, progress)
@@ -252,7 +252,7 @@ def _check_archive(out: Path, kind: Format, inputs: list[Path], overwrite: bool)
 
 def _design(name: str, around: str | None, spread: float | None) -> Design:
     """Return the design that the options name."""
-    from curvafit.data_synth.atlas import design, design_file
+    from curvafit.data_synth import design, design_file
 
     if around is not None:
         if name not in ("random", "sobol"):

@@ -310,7 +310,7 @@ def _crew(workers: int | None, tiling: Tiling) -> Iterator[Workers | None]:
     if not workers or tiling.count == 1:
         yield None
         return
-    from curvafit.data_synth.atlas.workers import cluster
+    from curvafit.core.workers import cluster
 
     with cluster(workers) as crew:
         yield _OneThread(crew)
@@ -334,7 +334,7 @@ class _OneThread:
 
 
 def _on_one_thread(make: Callable[..., list[Any]], path: Path, indices: Sequence[int]) -> list[Any]:
-    from curvafit.data_synth.atlas.draws import one_thread
+    from curvafit.data_synth.draws import one_thread
 
     with one_thread():
         return make(path, indices)

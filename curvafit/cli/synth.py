@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     import numpy as np
 
     from curvafit.data_synth.imaging.modality import Modality
-    from curvafit.data_synth.sets.sets import Order
-    from curvafit.data_synth.sets.sources import ShapeSource
+    from curvafit.data_synth.sets import Order
+    from curvafit.data_synth.sources import ShapeSource
 
 EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
     (
@@ -139,9 +139,9 @@ def synth(
         reading = reading_of(**placed, crop=crop, channel=channel, label=label, strict=strict)
         kind = _modality(modality, like, like_mask, visible, reading)
         from curvafit.core.units import convert_length
-        from curvafit.data_synth.sets.case import Recipe
-        from curvafit.data_synth.sets.sets import Order
-        from curvafit.data_synth.sets.sources import voxel_of
+        from curvafit.data_synth.case import Recipe
+        from curvafit.data_synth.sets import Order
+        from curvafit.data_synth.sources import voxel_of
 
         edge = voxel_of(names, kind) if voxel is None else convert_length(voxel, unit, kind.base.unit)
         low, high = numbers(calibres, "--calibres", 2)
@@ -152,8 +152,8 @@ def synth(
 def _build(out: Path, order: Order, count: int, crew: Crew) -> None:
     from curvafit.core.checks import check_int
     from curvafit.core.files import check_folder
-    from curvafit.data_synth.sets.picture import write_preview
-    from curvafit.data_synth.sets.sets import MOST, build_set, cases_of, check_set
+    from curvafit.data_synth.picture import write_preview
+    from curvafit.data_synth.sets import MOST, build_set, cases_of, check_set
     from curvafit.generation.schedule import schedule
 
     check_int(count, "a count of at least 1 case", 1, MOST)
@@ -176,7 +176,7 @@ def _source(laws: list[str], atlas: Path | None, filled: float | None) -> ShapeS
     """Return the source of shapes that the options name."""
     if bool(laws) == (atlas is not None):
         raise ValueError(f"expected either --prior (or --preset) or --atlas, got {'both' if laws else 'neither'}")
-    from curvafit.data_synth.sets.sources import Generated, Stored
+    from curvafit.data_synth.sources import Generated, Stored
 
     if atlas is None:
         return Generated.of(laws, filled)
@@ -206,7 +206,7 @@ def _modality(
         from curvafit.data_synth.imaging.modalities import modality
 
         return _visible(modality(str(name)), visible)
-    from curvafit.data_synth.imaging import estimate
+    from curvafit.data_synth.imaging import like as estimate
     from curvafit.volumes.read import load
 
     if reading["label"] is not None and mask is None:
@@ -229,7 +229,7 @@ def _mask(values: np.ndarray) -> np.ndarray:
 def _visible(kind: Modality, share_text: str | None) -> Modality:
     if share_text is None:
         return kind
-    from curvafit.data_synth.imaging.imaging import visible_share
+    from curvafit.data_synth.imaging.image import visible_share
 
     share = visible_share(kind.base) if share_text == "auto" else numbers(share_text, "--visible", 1)[0]
     return replace(kind, base=replace(kind.base, visible=share))

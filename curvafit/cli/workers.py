@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from curvafit.core.runtime import Progress
-    from curvafit.data_synth.atlas.workers import Workers
+    from curvafit.core.workers import Workers
 
 WorkersOption = Annotated[
     int | None,
@@ -39,7 +39,7 @@ class Crew(NamedTuple):
 
     def check(self, shape: Sequence[int] | None = None) -> None:
         """Raise ValueError where the options contradict each other, or a shape does not fit into memory."""
-        from curvafit.data_synth.atlas.workers import check_workers
+        from curvafit.core.workers import check_workers
         from curvafit.generation.memory import FLOW, check_memory
 
         check_workers(self.workers, self.scheduler)
@@ -48,8 +48,8 @@ class Crew(NamedTuple):
 
     def say_forecast(self, name: str, shape: Sequence[int], steps: float) -> None:
         """Print the forecast of flows that workers on this machine share; a scheduler's machines are unknown."""
-        from curvafit.data_synth.atlas.draws import device, one_thread
-        from curvafit.data_synth.atlas.workers import processes
+        from curvafit.core.workers import processes
+        from curvafit.data_synth.draws import device, one_thread
 
         if self.scheduler is None:
             share = {"workers": processes(self.workers), "device": device()}
@@ -59,7 +59,7 @@ class Crew(NamedTuple):
     @contextmanager
     def at_work(self, again: Callable[[], str] = lambda: "the same command") -> Iterator[tuple[Workers, Progress]]:
         """Start the workers and their progress bar; `again` returns the command that resumes after an interrupt."""
-        from curvafit.data_synth.atlas.workers import cluster
+        from curvafit.core.workers import cluster
 
         with kept(again), stages() as progress:
             progress("starting workers", 0.0)

@@ -10,20 +10,20 @@ from typing import TYPE_CHECKING
 from curvafit.core.faces import attach_lazy_names
 
 if TYPE_CHECKING:
-    from curvafit.data_synth.atlas.build import build as build
-    from curvafit.data_synth.atlas.build import extend as extend
-    from curvafit.data_synth.atlas.design import INTERVALS as INTERVALS
-    from curvafit.data_synth.atlas.design import Design as Design
-    from curvafit.data_synth.atlas.design import Draw as Draw
-    from curvafit.data_synth.atlas.design import around as around
-    from curvafit.data_synth.atlas.design import boxed as boxed
-    from curvafit.data_synth.atlas.design_file import read_design as read_design
-    from curvafit.data_synth.atlas.record import Record as Record
-    from curvafit.data_synth.atlas.record import Settings as Settings
-    from curvafit.data_synth.atlas.store import Store as Store
-    from curvafit.data_synth.atlas.store import open_store as open_store
-    from curvafit.data_synth.atlas.workers import Cluster as Cluster
-    from curvafit.data_synth.atlas.workers import cluster as cluster
+    from curvafit.core.workers import Cluster as Cluster
+    from curvafit.core.workers import cluster as cluster
+    from curvafit.data_synth.atlas import build as build
+    from curvafit.data_synth.atlas import extend as extend
+    from curvafit.data_synth.dataset import TextureDataset as TextureDataset
+    from curvafit.data_synth.dataset import as_dict as as_dict
+    from curvafit.data_synth.dataset import as_monai as as_monai
+    from curvafit.data_synth.dataset import as_subject as as_subject
+    from curvafit.data_synth.design import INTERVALS as INTERVALS
+    from curvafit.data_synth.design import Design as Design
+    from curvafit.data_synth.design import Draw as Draw
+    from curvafit.data_synth.design import around as around
+    from curvafit.data_synth.design import boxed as boxed
+    from curvafit.data_synth.design_file import read_design as read_design
     from curvafit.data_synth.imaging.modalities import MODALITIES as MODALITIES
     from curvafit.data_synth.imaging.modalities import modality as modality
     from curvafit.data_synth.imaging.modality import Modality as Modality
@@ -34,12 +34,12 @@ if TYPE_CHECKING:
     from curvafit.data_synth.imaging.parameters import Noise as Noise
     from curvafit.data_synth.imaging.parameters import Optics as Optics
     from curvafit.data_synth.imaging.parameters import Specimen as Specimen
-    from curvafit.data_synth.labels.labels import Labels as Labels
-    from curvafit.data_synth.labels.labels import labels_of as labels_of
-    from curvafit.data_synth.sets.training import TextureDataset as TextureDataset
-    from curvafit.data_synth.sets.training import as_dict as as_dict
-    from curvafit.data_synth.sets.training import as_monai as as_monai
-    from curvafit.data_synth.sets.training import as_subject as as_subject
+    from curvafit.data_synth.labels import Labels as Labels
+    from curvafit.data_synth.labels import labels_of as labels_of
+    from curvafit.data_synth.record import Record as Record
+    from curvafit.data_synth.record import Settings as Settings
+    from curvafit.data_synth.store import Store as Store
+    from curvafit.data_synth.store import open_store as open_store
     from curvafit.geometry.diagram import diagrams as diagrams
 
 attach_lazy_names(__name__)

@@ -79,7 +79,7 @@ def segment(
         to 256³ working voxels; larger ones have tiles of 192³.
     store, workers
         A folder in which finished tiles stay: the same call goes on with them after a kill, and the result's arrays are
-        mapped files there. Whoever lowers the tiles, such as `curvafit.data_synth.atlas.workers.cluster`.
+        mapped files there. Whoever lowers the tiles, such as `curvafit.core.workers.cluster`.
     crop
         A box of voxels: see `curvafit.load`.
     progress

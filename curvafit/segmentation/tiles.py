@@ -324,7 +324,7 @@ class Lowered:
 
 
 class Workers(Protocol):
-    """Whoever lowers tiles, several at once: `curvafit.data_synth.atlas.workers`."""
+    """Whoever lowers tiles, several at once: `curvafit.core.workers`."""
 
     @property
     def places(self) -> int:

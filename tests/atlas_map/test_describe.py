@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from curvafit.atlas_map.describe import describe
 from curvafit.cli.app import app
-from curvafit.data_synth.atlas.workers import cluster
+from curvafit.core.workers import cluster
 from curvafit.geometry.descriptors import BLOCKS, descriptors
 from curvafit.geometry.mesh import NoSurface
 from curvafit.inference.table import (

@@ -89,7 +89,7 @@ def test_worker_processes_make_the_same_mask(scan: Path, tmp_path: Path) -> None
 
 
 def test_workers_without_dask_are_told_what_to_install(scan: Path, tmp_path: Path, monkeypatch) -> None:
-    workers = import_module("curvafit.data_synth.atlas.workers")
+    workers = import_module("curvafit.core.workers")
 
     def missing(name: str) -> None:
         raise ImportError(name)

@@ -13,7 +13,7 @@ from exact_store import exact_store, quick_map
 from found import made_inference
 
 from curvafit.atlas_map.files import check_map, write_map
-from curvafit.data_synth.atlas.store import open_store
+from curvafit.data_synth.store import open_store
 from curvafit.report.page import FILES, write_inference
 from curvafit.volumes.field import Field
 from curvafit.volumes.read import load
@@ -163,7 +163,7 @@ def test_a_store_may_begin_in_an_empty_folder(tmp_path: Path) -> None:
     told = ["atlas", "build", tmp_path / "s.zarr", "--count", 1, "--shape", 12, "--around", "sponge", "--workers", 0]
     monkey = pytest.MonkeyPatch()
     with monkey.context() as patch:
-        patch.setattr("curvafit.data_synth.atlas.build.build", lambda *_, **__: None)
+        patch.setattr("curvafit.data_synth.atlas.build", lambda *_, **__: None)
         assert call(*told).exit_code == 0
     assert open_store(tmp_path / "s.zarr").indices() == []
 
@@ -172,7 +172,7 @@ def test_a_store_records_the_number_of_steps_that_was_asked_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plans = []
-    monkeypatch.setattr("curvafit.data_synth.atlas.build.build", lambda *settings, **_: plans.append(settings[4]))
+    monkeypatch.setattr("curvafit.data_synth.atlas.build", lambda *settings, **_: plans.append(settings[4]))
     told = ["atlas", "build", tmp_path / "s.zarr", "--count", 1, "--shape", 12, "--workers", 0, "--schedule", "paper"]
     assert call(*told, "--steps", 700).exit_code == 0
     assert [(plan.name, plan.steps) for plan in plans] == [("paper", 700)]

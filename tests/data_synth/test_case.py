@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from flat_recipe import SHAPE, flat_recipe
 
+from curvafit.data_synth.case import Recipe
 from curvafit.data_synth.imaging.modality import Modality
 from curvafit.data_synth.imaging.parameters import Imaging
-from curvafit.data_synth.sets.case import Recipe
-from curvafit.data_synth.sets.sources import Generated, PhaseField, source_of
+from curvafit.data_synth.sources import Generated, PhaseField, source_of
 from curvafit.generation import fraction as steering
 from curvafit.generation.schedule import SCHEDULES
 

@@ -9,8 +9,8 @@ import shutil
 import pytest
 
 from curvafit.data_synth import build, extend
-from curvafit.data_synth.atlas.census import census, verify
-from curvafit.data_synth.atlas.store import Store, open_store
+from curvafit.data_synth.census import census, verify
+from curvafit.data_synth.store import Store, open_store
 from curvafit.generation.schedule import schedule
 
 QUICK = schedule("cosine", steps=40)
@@ -137,7 +137,7 @@ def test_a_draw_in_another_place_is_found(path):
 
 
 def test_a_field_that_does_not_come_out_again_is_found(path, monkeypatch):
-    monkeypatch.setattr("curvafit.data_synth.atlas.census.flows", wrong_flows)
+    monkeypatch.setattr("curvafit.data_synth.census.flows", wrong_flows)
     found = verify(path, 20)
     said = [f"draw {index} came out otherwise when it was made again" for index in viable(path)]
     assert set(said) <= set(found.problems) and len(set(found.problems)) == len(found.problems)
@@ -145,6 +145,6 @@ def test_a_field_that_does_not_come_out_again_is_found(path, monkeypatch):
 
 def wrong_flows(settings, indices):
     """The flows of the draws one further."""
-    from curvafit.data_synth.atlas.draws import flows
+    from curvafit.data_synth.draws import flows
 
     return flows(settings, [index + 1 for index in indices])

@@ -13,9 +13,9 @@ import torch
 from exact import Sphere, Torus, Tubes, centres, helix, optimal_profile
 from scipy import ndimage
 
-from curvafit.data_synth.labels.centreline import centreline, cycle_rank
-from curvafit.data_synth.labels.centreline_files import write_graphml, write_swc
-from curvafit.data_synth.labels.labels import labels_of
+from curvafit.data_synth.centreline import centreline, cycle_rank
+from curvafit.data_synth.centreline_files import write_graphml, write_swc
+from curvafit.data_synth.labels import labels_of
 from curvafit.geometry.topology import betti_numbers
 from curvafit.priors.grid import Grid
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from curvafit.data_synth.atlas.design import INTERVALS, Design, boxed
+from curvafit.data_synth.design import INTERVALS, Design, boxed
 
 #: (a20 … a00, m₀, noise seed) of draw 0 of seed 0.
 FIRST_DRAW = (

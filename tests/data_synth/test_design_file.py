@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from curvafit.data_synth.atlas.design import INTERVALS, PARAMETERS, Design, around, boxed
-from curvafit.data_synth.atlas.design_file import read_design
-from curvafit.priors.law import preset
+from curvafit.data_synth.design import INTERVALS, PARAMETERS, Design, around, boxed
+from curvafit.data_synth.design_file import read_design
+from curvafit.priors.coefficients import preset
 
 
 def written(tmp_path, text: str):

@@ -10,7 +10,7 @@ import torch
 from exact import Cylinder, Sphere, centres
 
 from curvafit.data_synth.imaging import degrade
-from curvafit.data_synth.imaging.imaging import field_shape, image, image_shape, regrid, visible, visible_share
+from curvafit.data_synth.imaging.image import field_shape, image, image_shape, regrid, visible, visible_share
 from curvafit.data_synth.imaging.modalities import MODALITIES, modality
 from curvafit.data_synth.imaging.modality import Modality
 from curvafit.data_synth.imaging.parameters import Contrast, Imaging, Optics

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from curvafit.data_synth.sets.moves import SYMMETRIES, any_crop, cropped, rotated, turned
+from curvafit.data_synth.moves import SYMMETRIES, any_crop, cropped, rotated, turned
 
 VALUES = np.random.default_rng(0).random((3, 4, 5))
 

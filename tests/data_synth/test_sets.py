@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from flat_recipe import FLAT, SHAPE, flat_recipe
 
+from curvafit.data_synth import sets
+from curvafit.data_synth.case import Recipe
 from curvafit.data_synth.imaging.parameters import Imaging
-from curvafit.data_synth.sets import sets
-from curvafit.data_synth.sets.case import Recipe
-from curvafit.data_synth.sets.picture import write_preview
-from curvafit.data_synth.sets.sets import Order, build_set, make_cases, read_order
+from curvafit.data_synth.picture import write_preview
+from curvafit.data_synth.sets import Order, build_set, make_cases, read_order
 from curvafit.volumes.read import load, read_values
 
 

@@ -16,7 +16,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from curvafit.data_synth.atlas.store import Record, Settings, Store, open_store
+from curvafit.data_synth.store import Record, Settings, Store, open_store
 from curvafit.generation.viability import Viability
 from curvafit.priors.coefficients import Coefficients
 
@@ -113,7 +113,7 @@ def test_a_process_killed_while_writing_loses_only_its_own_draw(tmp_path):
         import os, signal, sys
         sys.path.insert(0, sys.argv[2])
         import test_store
-        from curvafit.data_synth.atlas import store as module
+        from curvafit.data_synth import store as module
         store = module.open_store(sys.argv[1])
         store.write(test_store.record(1), test_store.field(1))
         module._publish = lambda partial, place: os.kill(os.getpid(), signal.SIGKILL)

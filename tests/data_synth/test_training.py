@@ -16,13 +16,13 @@ from exact_store import exact_store
 from found import made_fit
 from torch.utils.data import DataLoader
 
-from curvafit.data_synth.atlas.store import open_store
+from curvafit.data_synth import dataset as training
+from curvafit.data_synth.dataset import Sample, TextureDataset, as_dict, as_monai, as_subject
 from curvafit.data_synth.imaging.modality import Modality
 from curvafit.data_synth.imaging.parameters import Contrast, Imaging, Noise, Optics
-from curvafit.data_synth.sets import training
-from curvafit.data_synth.sets.moves import cropped, rotated, turned
-from curvafit.data_synth.sets.sources import voxel_of
-from curvafit.data_synth.sets.training import Sample, TextureDataset, as_dict, as_monai, as_subject
+from curvafit.data_synth.moves import cropped, rotated, turned
+from curvafit.data_synth.sources import voxel_of
+from curvafit.data_synth.store import open_store
 from curvafit.priors import preset
 
 QUIET = Modality("quiet", "for tests", 1.0, Imaging(optics=Optics(blur=(0.5, 0.5, 0.5)), noise=Noise(gaussian=1.0)))

@@ -17,7 +17,7 @@ from unittest.mock import MagicMock
 import pytest
 
 from curvafit.data_synth import build, cluster, open_store
-from curvafit.data_synth.atlas.census import verify
+from curvafit.data_synth.census import verify
 from curvafit.generation.schedule import schedule
 
 distributed = pytest.importorskip("distributed", reason="needs dask.distributed")
@@ -86,7 +86,7 @@ def test_a_build_killed_at_random_goes_on_to_the_same_store(tmp_path, serial):
 
 
 def test_a_scheduler_that_is_not_there_and_too_few_workers_are_one_sentence(monkeypatch):
-    monkeypatch.setattr("curvafit.data_synth.atlas.workers.PATIENCE", 1)
+    monkeypatch.setattr("curvafit.core.workers.PATIENCE", 1)
     nowhere = "tcp://127.0.0.1:9"
     with pytest.raises(OSError, match=nowhere):
         cluster(scheduler=nowhere).__enter__()
@@ -126,7 +126,7 @@ def test_without_dask_the_line_to_type_is_said(monkeypatch):
 
 
 def test_a_barren_design_ends(tmp_path, monkeypatch):
-    monkeypatch.setattr("curvafit.data_synth.atlas.build.BARREN", 3)
+    monkeypatch.setattr("curvafit.data_synth.atlas.BARREN", 3)
     from curvafit.data_synth import Design
 
     empty = Design("list", points=((1.0, 0.0, 1.0, 0.0, 0.0, 1e9, -0.9),))
@@ -136,7 +136,7 @@ def test_a_barren_design_ends(tmp_path, monkeypatch):
 
 
 def test_a_full_disk_is_named_and_what_is_made_is_kept(tmp_path, serial, monkeypatch):
-    from curvafit.data_synth.atlas import store as storing
+    from curvafit.data_synth import store as storing
 
     store = build(tmp_path / "s.zarr", 2, EDGE, 1, PLAN)
     monkeypatch.setattr(storing, "_publish", full)

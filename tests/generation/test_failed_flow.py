@@ -12,8 +12,8 @@ from calling import LAW, call
 from exact import Sphere, centres
 from torch import Tensor
 
-from curvafit.data_synth.atlas import build as atlas
-from curvafit.data_synth.atlas.store import open_store
+from curvafit.data_synth import atlas
+from curvafit.data_synth.store import open_store
 from curvafit.generation import SCHEDULES, Schedule, descend, generate_batch, relax
 from curvafit.generation.cost import Cost
 from curvafit.generation.loop import Orders, run

@@ -13,10 +13,10 @@ import pytest
 import torch
 
 from curvafit.atlas_map.extract import extract
-from curvafit.data_synth.atlas import build as building
-from curvafit.data_synth.atlas import draws
-from curvafit.data_synth.atlas.design import INTERVALS, Design, boxed
-from curvafit.data_synth.atlas.store import open_store
+from curvafit.data_synth import atlas as building
+from curvafit.data_synth import draws
+from curvafit.data_synth.design import INTERVALS, Design, boxed
+from curvafit.data_synth.store import open_store
 from curvafit.generation.schedule import LEARNED, present_name, schedule
 from curvafit.generation.viability import Viability
 from curvafit.inference.atlas import VERSION, Atlas, load_atlas, save_atlas

@@ -10,11 +10,11 @@ import pytest
 import torch
 
 from curvafit.core.checks import SHOWN, check_float, check_int, quoted
-from curvafit.data_synth.atlas.design import Design, around, boxed
-from curvafit.data_synth.atlas.workers import check_workers
+from curvafit.core.workers import check_workers
+from curvafit.data_synth.case import Recipe
+from curvafit.data_synth.design import Design, around, boxed
 from curvafit.data_synth.imaging.modalities import MODALITIES
-from curvafit.data_synth.sets.case import Recipe
-from curvafit.data_synth.sets.sources import Generated
+from curvafit.data_synth.sources import Generated
 from curvafit.drawing.shapes import Output
 from curvafit.generation import Schedule, descend, generate, generate_batch, white_noise
 from curvafit.generation.memory import check_memory, memory

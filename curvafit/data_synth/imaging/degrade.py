@@ -5,7 +5,7 @@ Volumes are `(B, 1, Z, Y, X)` tensors of a floating type, on any device; lengths
 whatever else is applied. `curvafit.data_synth.imaging.modality.image` chains them.
 """
 
-from curvafit.data_synth.imaging.artefacts import bias, clutter, dropout, rings, stripes
+from curvafit.data_synth.imaging.effects import bias, clutter, dropout, rings, stripes
 from curvafit.data_synth.imaging.noise import digitised, gaussian_noise, poisson, poisson_gaussian, rician
 from curvafit.data_synth.imaging.optics import EPSILON, blur, blur_with_depth, intensities, occupancy, sample, texture
 

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from curvafit.data_synth.imaging.maths import checked, triple
 from curvafit.data_synth.imaging.randomness import grainy
-from curvafit.data_synth.imaging.separable import checked, triple
 from curvafit.priors.shapes import Float
 
 #: Below this mean a Poisson quantile is summed up; above it, Giles's expansion is within a count.

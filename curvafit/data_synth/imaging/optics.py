@@ -13,8 +13,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from curvafit.data_synth.imaging.maths import along, checked, edges, gaussian, sampling, triple
 from curvafit.data_synth.imaging.randomness import correlated
-from curvafit.data_synth.imaging.separable import along, checked, edges, gaussian, sampling, triple
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
 from curvafit.priors.profile import profile_distance
 from curvafit.priors.shapes import Float

@@ -12,7 +12,7 @@ from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
 
 from curvafit.core.checks import check_float, quoted
 from curvafit.core.units import METRES
-from curvafit.data_synth.imaging.separable import Triple
+from curvafit.data_synth.imaging.maths import Triple
 
 
 class Range(NamedTuple):

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from curvafit.data_synth.imaging.separable import along, bell, gaussian
+from curvafit.data_synth.imaging.maths import along, bell, gaussian
 from curvafit.priors.shapes import Float
 
 

@@ -14,8 +14,8 @@ import numba
 import torch
 from llvmlite import binding
 
-from curvafit.data_synth.atlas.design import Design, Draw
-from curvafit.data_synth.atlas.store import Record, Settings, Store, open_store
+from curvafit.data_synth.design import Design, Draw
+from curvafit.data_synth.store import Record, Settings, Store, open_store
 from curvafit.generation.batch import generate_batch
 from curvafit.generation.result import Flow
 from curvafit.generation.schedule import Schedule

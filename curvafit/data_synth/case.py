@@ -11,11 +11,11 @@ import numpy as np
 import torch
 
 from curvafit.core.checks import LONGEST, SHORTEST, as_tuple, check_float, check_int, check_type, quoted, seed_of
-from curvafit.data_synth.atlas.draws import one_thread
-from curvafit.data_synth.imaging.imaging import field_shape, image, regrid, visible
+from curvafit.data_synth.draws import one_thread
+from curvafit.data_synth.imaging.image import field_shape, image, regrid, visible
 from curvafit.data_synth.imaging.modality import Modality
 from curvafit.data_synth.imaging.parameters import Imaging
-from curvafit.data_synth.sets.sources import ShapeSource, source_of
+from curvafit.data_synth.sources import ShapeSource, source_of
 
 #: Shapes that a case gets until one is seen on the image's voxels, which may be coarse.
 TRIES = 8

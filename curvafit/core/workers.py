@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from curvafit.core.checks import check_int
-from curvafit.data_synth.atlas.draws import device
+from curvafit.data_synth.draws import device
 
 if TYPE_CHECKING:
     from distributed import Client

@@ -14,13 +14,13 @@ from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
 from curvafit.core.checks import LONGEST, SHORTEST, as_tuple, check_choice, check_float, check_int, seed_of
-from curvafit.data_synth.imaging.imaging import field_shape
+from curvafit.data_synth.case import check_calibres, check_crop, drawn_voxel, edges_of, imaged
+from curvafit.data_synth.imaging.image import field_shape
 from curvafit.data_synth.imaging.modalities import modality
 from curvafit.data_synth.imaging.modality import Modality
 from curvafit.data_synth.imaging.randomness import correlated
-from curvafit.data_synth.sets.case import check_calibres, check_crop, drawn_voxel, edges_of, imaged
-from curvafit.data_synth.sets.sources import Generated, Pool, Stored, voxel_of
-from curvafit.priors.law import LAW_TYPES, LawLike
+from curvafit.data_synth.sources import LAWS, Generated, Pool, Stored, voxel_of
+from curvafit.priors.law import Law
 
 #: Length over which one texture gives way to another, as a share of the crop's longest edge.
 BLEND_LENGTH = 0.5
@@ -90,7 +90,7 @@ class TextureDataset(IterableDataset):
 
     def __init__(
         self,
-        source: LawLike | Sequence[LawLike],
+        source: Law | Sequence[Law],
         modalities: str | Modality | Sequence[str | Modality],
         size: int | Sequence[int],
         *,
@@ -110,7 +110,7 @@ class TextureDataset(IterableDataset):
         self.size = edges_of((size,) * 3 if isinstance(size, (int, Real)) else size)
         self.length, self.seed, self.blend = int(length), seed_of(seed), blend
         self.calibres, self.normalise, self.transform = calibres, _normalisation(normalise), transform
-        sources: list[Any] = [source] if isinstance(source, LAW_TYPES) else list(as_tuple(source, "laws or stores"))
+        sources: list[Any] = [source] if isinstance(source, LAWS) else list(as_tuple(source, "laws or stores"))
         self._check(sources)
         stores = all(map(_is_store, sources))
         edge = None if voxel is None else check_float(voxel, "a shape's voxel of positive length", SHORTEST, LONGEST)

@@ -14,11 +14,11 @@ import numpy as np
 
 from curvafit.core.checks import as_tuple
 from curvafit.core.units import METRES, convert_length
-from curvafit.data_synth.atlas.design import PARAMETERS, Design
-from curvafit.data_synth.atlas.draws import one_thread
-from curvafit.data_synth.atlas.store import Store, open_store
+from curvafit.data_synth.design import PARAMETERS, Design
+from curvafit.data_synth.draws import one_thread
 from curvafit.data_synth.imaging.modality import Modality
-from curvafit.data_synth.sets.moves import any_crop
+from curvafit.data_synth.moves import any_crop
+from curvafit.data_synth.store import Store, open_store
 from curvafit.generation.flow import generate
 from curvafit.generation.fraction import first_mass
 from curvafit.generation.schedule import SCHEDULES, Schedule

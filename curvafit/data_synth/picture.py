@@ -10,8 +10,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from curvafit.core.records import parse_json
-from curvafit.data_synth.sets.layouts import LAYOUTS
-from curvafit.data_synth.sets.sets import RECORDS, case_name, cases_of, read_order
+from curvafit.data_synth.layouts import LAYOUTS
+from curvafit.data_synth.sets import RECORDS, case_name, cases_of, read_order
 from curvafit.drawing.plot import CONTOUR, write_picture
 from curvafit.priors.fit_schema import violation
 from curvafit.volumes.read import read_values

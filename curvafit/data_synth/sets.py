@@ -19,13 +19,13 @@ from curvafit.core.checks import as_tuple, check_choice, check_int, check_type, 
 from curvafit.core.files import remove, write_content
 from curvafit.core.records import parse_json
 from curvafit.core.runtime import Progress, silent, undisturbed
-from curvafit.data_synth.atlas.draws import versions
-from curvafit.data_synth.atlas.workers import Here, Workers
-from curvafit.data_synth.labels.centreline import centreline
-from curvafit.data_synth.labels.centreline_files import write_graphml, write_swc
-from curvafit.data_synth.labels.labels import NAMES, labels_of
-from curvafit.data_synth.sets.case import Case, Recipe
-from curvafit.data_synth.sets.layouts import LAYOUTS, About
+from curvafit.core.workers import Here, Workers
+from curvafit.data_synth.case import Case, Recipe
+from curvafit.data_synth.centreline import centreline
+from curvafit.data_synth.centreline_files import write_graphml, write_swc
+from curvafit.data_synth.draws import versions
+from curvafit.data_synth.labels import NAMES, labels_of
+from curvafit.data_synth.layouts import LAYOUTS, About
 from curvafit.priors.grid import Grid
 from curvafit.volumes.field import Field
 from curvafit.volumes.write import save

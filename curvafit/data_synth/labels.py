@@ -11,8 +11,8 @@ import torch
 from skimage.segmentation import watershed
 from torch import Tensor
 
-from curvafit.data_synth.labels.distance import field_distance
-from curvafit.data_synth.labels.skeleton import skeleton_of
+from curvafit.data_synth.distance import field_distance
+from curvafit.data_synth.skeleton import skeleton_of
 from curvafit.geometry.diagram import LEAST_SLOPE, MARGIN, resolved
 from curvafit.geometry.mesh import NoSurface
 from curvafit.geometry.morphometry import local_thickness

@@ -33,7 +33,7 @@ from curvafit.core.checks import quoted
 from curvafit.core.files import staged, write_content
 from curvafit.core.records import parse_json
 from curvafit.core.runtime import undisturbed
-from curvafit.data_synth.atlas.record import Record, Settings, attributes_of, digest, record_of
+from curvafit.data_synth.record import Record, Settings, attributes_of, digest, record_of
 from curvafit.generation.schedule import Schedule, present_name
 from curvafit.priors.grid import Grid
 

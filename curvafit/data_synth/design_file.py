@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from curvafit.core.checks import check_float, quoted
-from curvafit.data_synth.atlas.design import PARAMETERS, Design, around, boxed
-from curvafit.data_synth.atlas.yaml_text import parse_yaml
-from curvafit.priors.law import Law
+from curvafit.data_synth.design import PARAMETERS, Design, around, boxed
+from curvafit.data_synth.yaml_text import parse_yaml
+from curvafit.priors.law import texture_of
 
 #: The kinds of design, and the keys that may stand beside each.
 KEYS = {"box": {"law", "log"}, "around": {"law", "spread"}, "list": set()}
@@ -45,7 +45,7 @@ def point_of(source: Any, folder: Path = Path()) -> tuple[float, ...]:
         If it is none of these, or a number is missing.
     """
     if isinstance(source, str):
-        return Law.of(folder / source if source.endswith(".json") else source).point
+        return texture_of(folder / source if source.endswith(".json") else source).point
     if not isinstance(source, Mapping) or set(source) != set(PARAMETERS):
         raise ValueError(f"expected a preset, a fit.json or {', '.join(PARAMETERS)}, got {quoted(source)}")
     try:

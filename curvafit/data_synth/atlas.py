@@ -8,10 +8,10 @@ from pathlib import Path
 
 from curvafit.core.checks import check_int, check_type, seed_of
 from curvafit.core.runtime import Progress, silent
-from curvafit.data_synth.atlas.design import Design, boxed
-from curvafit.data_synth.atlas.draws import make
-from curvafit.data_synth.atlas.store import Settings, Store, open_store
-from curvafit.data_synth.atlas.workers import Here, Workers
+from curvafit.core.workers import Here, Workers
+from curvafit.data_synth.design import Design, boxed
+from curvafit.data_synth.draws import make
+from curvafit.data_synth.store import Settings, Store, open_store
 from curvafit.generation.flow import WORKING_BLUR
 from curvafit.generation.memory import FILE, FLOW, check_memory
 from curvafit.generation.schedule import Schedule

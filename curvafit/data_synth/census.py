@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from curvafit.core.runtime import Progress, silent
-from curvafit.data_synth.atlas.design import Design
-from curvafit.data_synth.atlas.draws import flows, versions
-from curvafit.data_synth.atlas.record import Record
-from curvafit.data_synth.atlas.store import Store, open_store
+from curvafit.data_synth.design import Design
+from curvafit.data_synth.draws import flows, versions
+from curvafit.data_synth.record import Record
+from curvafit.data_synth.store import Store, open_store
 from curvafit.generation.schedule import present_name
 
 

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 import torch
 
 from curvafit.data_synth.imaging import degrade
+from curvafit.data_synth.imaging.maths import Triple, sampled
 from curvafit.data_synth.imaging.optics import EPSILON
 from curvafit.data_synth.imaging.parameters import Imaging
 from curvafit.data_synth.imaging.randomness import seeds_of
-from curvafit.data_synth.imaging.separable import Triple, sampled
 from curvafit.priors.shapes import Bool, Float
 
 

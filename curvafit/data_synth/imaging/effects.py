@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from curvafit.data_synth.imaging.maths import bell, checked, edges
 from curvafit.data_synth.imaging.randomness import correlated, seeds_of, stream, uniform
-from curvafit.data_synth.imaging.separable import bell, checked, edges
 from curvafit.priors.shapes import Float
 
 #: How fast the stain fades at the end of a lost stretch: a part of the random field's deviation.

@@ -1,1 +1,0 @@
-"""Atlases: which parameters to draw, who makes the shapes, and the store that keeps them."""

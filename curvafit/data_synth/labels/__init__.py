@@ -1,1 +1,0 @@
-"""What is exactly known of a generated shape: masks, distances, skeletons, centrelines."""

@@ -1,1 +1,0 @@
-"""Training sets: cases from shapes and images, on disk or drawn as they are asked for."""
