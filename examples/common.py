@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import FigureBase
 
 from curvafit.core.files import write_atomically
-from curvafit.data_synth.draws import versions
+from curvafit.data_synth.atlas import versions
 from curvafit.drawing.plot import diagram_on, shared_limits, surface_on
 from curvafit.drawing.render import QUIET
 from curvafit.generation.flow import Flow, generate

@@ -13,8 +13,7 @@ import torch
 from matplotlib.figure import Figure
 
 from curvafit.data_synth.imaging.image import image, regrid
-from curvafit.data_synth.imaging.modalities import MODALITIES
-from curvafit.data_synth.imaging.modality import Modality
+from curvafit.data_synth.imaging.modality import MODALITIES, Modality
 from curvafit.drawing.plot import CONTOUR, write_picture
 from curvafit.generation.flow import generate
 from curvafit.priors.grid import Grid

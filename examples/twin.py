@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter
 
 from curvafit.data_synth.imaging.image import image
-from curvafit.data_synth.imaging.modalities import MICRO_CT
+from curvafit.data_synth.imaging.modality import modality
 from curvafit.drawing.plot import surface_on, write_picture
 from curvafit.generation.flow import generate
 from curvafit.inference.infer import Inference, infer
@@ -40,8 +40,9 @@ def scan(edge: int) -> Field:
     """Return the micro-CT image of the preset's shape, by the voxel that the modality gives it."""
     truth = preset(PRESET)
     flow = generate(truth.coefficients, truth.mass, Grid((edge, edge, edge)), seed=0)
-    imaging = MICRO_CT.base.assign(IMAGING)
-    values = image(flow.field[None, None], MICRO_CT.voxel, [imaging], [0])[0, 0].numpy()
+    kind = modality("micro-ct")
+    imaging = kind.base.assign(IMAGING)
+    values = image(flow.field[None, None], kind.voxel, [imaging], [0])[0, 0].numpy()
     return Field(values, imaging.spacing, imaging.unit)
 
 

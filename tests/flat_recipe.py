@@ -7,8 +7,7 @@ from pathlib import Path
 from exact_store import exact_store
 
 from curvafit.data_synth.case import Recipe
-from curvafit.data_synth.imaging.modality import Modality
-from curvafit.data_synth.imaging.parameters import Detector, Imaging, Optics
+from curvafit.data_synth.imaging.modality import Detector, Imaging, Modality, Optics
 from curvafit.data_synth.sources import Stored
 
 FLAT = Modality(

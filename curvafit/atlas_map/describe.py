@@ -15,7 +15,7 @@ import numpy as np
 
 from curvafit.core.runtime import Progress, silent
 from curvafit.core.workers import Here, Workers
-from curvafit.data_synth.draws import versions
+from curvafit.data_synth.atlas import versions
 from curvafit.data_synth.store import Store, open_store
 from curvafit.generation.viability import well_formed
 from curvafit.geometry.descriptors import Descriptors, descriptors

@@ -13,8 +13,8 @@ import numpy as np
 import torch
 
 from curvafit.core.runtime import Progress, silent
+from curvafit.data_synth.atlas import versions
 from curvafit.data_synth.design import boxed
-from curvafit.data_synth.draws import versions
 from curvafit.data_synth.store import Record, Store, open_store
 from curvafit.generation.schedule import SCHEDULES, present_name
 from curvafit.generation.viability import FORMED, well_formed

@@ -22,9 +22,8 @@ from curvafit.atlas_map.shapes import Shown, regrow_command, shown
 from curvafit.core.files import bears, check_folder, check_free, is_empty, write_content
 from curvafit.core.records import read_archive
 from curvafit.core.runtime import Progress, part, silent
-from curvafit.data_synth.census import census
-from curvafit.data_synth.record import Record
-from curvafit.data_synth.store import Store, open_store
+from curvafit.data_synth.atlas import summarise
+from curvafit.data_synth.store import Record, Store, open_store
 from curvafit.generation.viability import well_formed
 from curvafit.geometry.diagram import Diagram
 from curvafit.inference.atlas import Atlas
@@ -178,7 +177,7 @@ def _account(mapped: AtlasMap, stores: Sequence[Store], command: str) -> list[tu
         **{
             f"{store.name}: {name}" if several else name: words
             for store in stores
-            for name, words in census(store).items()
+            for name, words in summarise(store).items()
         },
         "distances": _listed(settings["distances"]),
         "UMAP": _listed(settings["umap"]),

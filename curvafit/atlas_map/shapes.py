@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 from scipy.signal import resample
 
-from curvafit.data_synth.record import Record, Settings
+from curvafit.data_synth.store import Record, Settings
 from curvafit.drawing.render import render
 from curvafit.generation.flow import WORKING_BLUR
 from curvafit.generation.schedule import SCHEDULES, present_name

@@ -108,25 +108,21 @@ def extend_atlas(
 def atlas_info(store: _Store) -> None:
     """Show the content of a store, and how it was made."""
     with plainly():
-        from curvafit.data_synth.census import census
+        from curvafit.data_synth.atlas import summarise
         from curvafit.data_synth.store import open_store
 
-        for name, value in census(open_store(store)).items():
+        for name, value in summarise(open_store(store)).items():
             say(f"{name}: {value}")
 
 
-@atlas_app.command("verify", epilog="[bold]Example[/bold]\n\ncurvafit atlas verify store.zarr --regenerate 5")
-def verify_atlas(
-    store: _Store,
-    regenerate: Annotated[int, typer.Option(help="Number of draws to generate again and to compare.")] = 3,
-    seed: Annotated[int, typer.Option(help="Seed that chooses these draws.")] = 0,
-) -> None:
-    """Check every draw of a store; exit with code 1 where one is lost, torn, doubled or differs from its record."""
+@atlas_app.command("verify", epilog="[bold]Example[/bold]\n\ncurvafit atlas verify store.zarr")
+def verify_atlas(store: _Store) -> None:
+    """Check every draw of a store; exit with code 1 where one is missing, torn or changed."""
     with plainly():
-        from curvafit.data_synth.census import verify
+        from curvafit.data_synth.atlas import verify
 
         with stages() as progress:
-            verdict = verify(store, regenerate, seed, progress)
+            verdict = verify(store, progress)
         for note in verdict.notes:
             say(f"note: {note}")
         for problem in verdict.problems:
@@ -252,15 +248,15 @@ def _check_archive(out: Path, kind: Format, inputs: list[Path], overwrite: bool)
 
 def _design(name: str, around: str | None, spread: float | None) -> Design:
     """Return the design that the options name."""
-    from curvafit.data_synth import design, design_file
+    from curvafit.data_synth import design
 
     if around is not None:
         if name not in ("random", "sobol"):
             raise ValueError(f"expected either --around or the file of a design, got {around} and {name}")
-        share = design_file.SPREAD if spread is None else spread
-        return design.around(design_file.point_of(around), share, name)  # type: ignore[arg-type]
+        share = design.SPREAD if spread is None else spread
+        return design.around(design.point_of(around), share, name)  # type: ignore[arg-type]
     if spread is not None:
         raise ValueError("expected --around beside --spread, got none")
     if name in ("random", "sobol"):
         return design.boxed(name)  # type: ignore[arg-type]
-    return design_file.read_design(name)
+    return design.read_design(name)

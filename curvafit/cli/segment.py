@@ -334,7 +334,7 @@ class _OneThread:
 
 
 def _on_one_thread(make: Callable[..., list[Any]], path: Path, indices: Sequence[int]) -> list[Any]:
-    from curvafit.data_synth.draws import one_thread
+    from curvafit.priors.kernels.threads import one_thread
 
     with one_thread():
         return make(path, indices)

@@ -152,8 +152,7 @@ def synth(
 def _build(out: Path, order: Order, count: int, crew: Crew) -> None:
     from curvafit.core.checks import check_int
     from curvafit.core.files import check_folder
-    from curvafit.data_synth.picture import write_preview
-    from curvafit.data_synth.sets import MOST, build_set, cases_of, check_set
+    from curvafit.data_synth.sets import MOST, build_set, cases_of, check_set, write_preview
     from curvafit.generation.schedule import schedule
 
     check_int(count, "a count of at least 1 case", 1, MOST)
@@ -203,7 +202,7 @@ def _modality(
         extras = [key for key, value in reading.items() if value is not None and value is not False]
         if extras or mask is not None:
             raise ValueError(f"expected --like beside {f'--{extras[0]}' if extras else '--like-mask'}, got none")
-        from curvafit.data_synth.imaging.modalities import modality
+        from curvafit.data_synth.imaging.modality import modality
 
         return _visible(modality(str(name)), visible)
     from curvafit.data_synth.imaging import like as estimate

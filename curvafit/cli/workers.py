@@ -49,12 +49,11 @@ class Crew(NamedTuple):
     def say_forecast(self, name: str, shape: Sequence[int], steps: float) -> None:
         """Print the forecast of flows that workers on this machine share; a scheduler's machines are unknown."""
         from curvafit.core.workers import processes
-        from curvafit.data_synth.draws import device, one_thread
+        from curvafit.priors.kernels.threads import one_thread
 
         if self.scheduler is None:
-            share = {"workers": processes(self.workers), "device": device()}
             with one_thread():
-                say_forecast(name, shape, steps, FLOW, what="voxels a shape", **share)
+                say_forecast(name, shape, steps, FLOW, what="voxels a shape", workers=processes(self.workers))
 
     @contextmanager
     def at_work(self, again: Callable[[], str] = lambda: "the same command") -> Iterator[tuple[Workers, Progress]]:

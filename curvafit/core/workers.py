@@ -1,4 +1,4 @@
-"""Where draws and cases are made: in this process, or by the workers of a dask cluster."""
+"""Who makes the parts of a job: this process, or the workers of a dask cluster."""
 
 from __future__ import annotations
 
@@ -6,18 +6,15 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from curvafit.core.checks import check_int
-from curvafit.data_synth.draws import device
+from curvafit.core.extras import require
 
 if TYPE_CHECKING:
     from distributed import Client
 
-#: Draws that a worker with an NVIDIA device makes together.
-TOGETHER = 32
 #: Where workers on this machine listen.
 LOOPBACK = "127.0.0.1"
 #: Processes that may be asked for on this machine.
@@ -31,71 +28,63 @@ _ENVIRONMENT = {
     "MALLOC_TRIM_THRESHOLD_": 1 << 28,
     "MALLOC_MMAP_THRESHOLD_": 1 << 25,
 }
-#: What a worker on this machine runs first: Ctrl-C in the terminal is for the build, which ends its workers.
-_DEAF = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
+#: What a worker on this machine runs first: Ctrl-C in the terminal is for the main process, which ends its workers.
+_IGNORE_INTERRUPTS = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
 
-
-#: Makes some things of a folder, by their indices, and returns one result each; a function that has a module's name.
+#: Makes some parts of a folder, by their indices, and returns one result each; a function that has a module's name.
 Make = Callable[[Path, Sequence[int]], list[Any]]
 
 
 class Workers(Protocol):
-    """Whoever makes draws, or cases of a set."""
-
-    #: How many are made together.
-    chunk: int
+    """Whoever makes the parts of a job, such as the draws of an atlas."""
 
     @property
     def places(self) -> int:
-        """Return how many chunks may be asked for at once."""
+        """Return how many requests may wait at once."""
         ...
 
     def submit(self, make: Make, path: Path, indices: Sequence[int]) -> None:
-        """Ask for some of a folder."""
+        """Ask for some parts of a folder."""
         ...
 
     def done(self) -> list[Any]:
-        """Wait for some of what was asked for, and return what was made of it."""
+        """Wait for one of the requests, and return its results."""
         ...
 
 
 class Here:
-    """This process."""
+    """This process, as the only worker."""
 
     places: int = 1
 
     def __init__(self) -> None:
-        self.chunk = TOGETHER if device() == "cuda" else 1
-        self._asked: list[tuple[Make, Path, Sequence[int]]] = []
+        self._requests: list[tuple[Make, Path, Sequence[int]]] = []
 
     def submit(self, make: Make, path: Path, indices: Sequence[int]) -> None:
-        self._asked.append((make, path, indices))
+        self._requests.append((make, path, indices))
 
     def done(self) -> list[Any]:
-        make, path, indices = self._asked.pop(0)
+        make, path, indices = self._requests.pop(0)
         return make(path, indices)
 
 
 class Cluster:
     """The workers of a dask cluster, which must see the folder under the same name.
 
-    Each always has a chunk to go on with. A chunk whose worker dies is given to another.
+    Each worker always has a request to go on with. A request whose worker dies goes to another.
     """
 
     def __init__(self, client: Client) -> None:
         from distributed import as_completed
 
-        devices = set(client.run(device).values())  # type: ignore
-        if not devices:
-            raise OSError(f"expected a scheduler with workers, got none at {client.scheduler.address}")  # type: ignore
+        if not client.nthreads():
+            raise OSError(f"the scheduler at {client.scheduler.address} has no workers")  # type: ignore
         self._client = client
         self._futures = as_completed()
-        self.chunk = TOGETHER if "cuda" in devices else 1
 
     @property
     def places(self) -> int:
-        """Return two chunks a thread, of as many threads as there are now; one where all workers are gone, for those to
-        come."""
+        """Return two requests a thread, of as many threads as there are now; at least one, for workers to come."""
         return max(1, 2 * sum(self._client.nthreads().values()))  # type: ignore
 
     def submit(self, make: Make, path: Path, indices: Sequence[int]) -> None:
@@ -108,7 +97,7 @@ class Cluster:
         try:
             return first.result()
         except KilledWorker as error:
-            raise OSError(f"expected workers to survive their work, got one that killed several: {error}") from error
+            raise OSError(f"a part of the work killed several workers: {error}") from error
 
 
 def check_workers(count: int | None, scheduler: str | None) -> None:
@@ -116,18 +105,18 @@ def check_workers(count: int | None, scheduler: str | None) -> None:
     if count is not None:
         check_int(count, "a number of workers from 0", 0, MOST)
         if scheduler is not None:
-            raise ValueError(f"expected either workers or a scheduler, got {count} and {scheduler}")
+            raise ValueError(f"give either a number of workers or a scheduler, got {count} and {scheduler}")
 
 
 def processes(count: int | None) -> int:
-    """Return how many processes make draws on this machine: the number of workers, or by default one per core.
+    """Return how many processes work on this machine: the number of workers, or by default one per core.
 
     Cores are those that a container or the scheduler leaves to this process. 0 workers are this process.
 
     Raises
     ------
     ImportError
-        If dask.distributed is not installed and cores are to be counted.
+        If dask is not installed and cores are to be counted.
     """
     return max(1, _dask("dask.system").CPU_COUNT if count is None else count)
 
@@ -161,15 +150,11 @@ def cluster(count: int | None = None, scheduler: str | None = None, dashboard: i
 
 
 def _dask(name: str) -> Any:
-    """Return a module of dask or of dask.distributed."""
-    try:
-        return import_module(name)
-    except ImportError as error:
-        raise ImportError('expected dask.distributed: pip install "curvafit[atlas]"', name="distributed") from error
+    return require(name, "synth", "work by several processes")
 
 
 @contextmanager
-def _local(distributed, count: int, dashboard: int | None) -> Iterator[Client]:
+def _local(distributed: Any, count: int, dashboard: int | None) -> Iterator[Client]:
     here = distributed.LocalCluster(
         n_workers=count,
         threads_per_worker=1,
@@ -179,22 +164,22 @@ def _local(distributed, count: int, dashboard: int | None) -> Iterator[Client]:
         scheduler_kwargs={"dashboard": dashboard is not None},
         memory_limit=0,
         silence_logs=logging.ERROR,
-        preload=_DEAF,
+        preload=_IGNORE_INTERRUPTS,
     )
     with here, distributed.Client(here) as client:
         yield client
 
 
 @contextmanager
-def _connected(distributed, address: str) -> Iterator[Client]:
+def _connected(distributed: Any, address: str) -> Iterator[Client]:
     from distributed.comm.core import CommClosedError
 
     try:
         client = distributed.Client(address, timeout=PATIENCE)
     except (OSError, ValueError) as error:
-        raise OSError(f"expected a dask scheduler at {address}, got none within {PATIENCE} s") from error
+        raise OSError(f"found no dask scheduler at {address} within {PATIENCE} s") from error
     with client:
         try:
             yield client
         except (CommClosedError, CancelledError) as error:
-            raise OSError(f"expected the dask scheduler at {address} to stay, got none any more: {error}") from error
+            raise OSError(f"the dask scheduler at {address} is gone: {error}") from error

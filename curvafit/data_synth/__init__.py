@@ -23,21 +23,21 @@ if TYPE_CHECKING:
     from curvafit.data_synth.design import Draw as Draw
     from curvafit.data_synth.design import around as around
     from curvafit.data_synth.design import boxed as boxed
-    from curvafit.data_synth.design_file import read_design as read_design
-    from curvafit.data_synth.imaging.modalities import MODALITIES as MODALITIES
-    from curvafit.data_synth.imaging.modalities import modality as modality
+    from curvafit.data_synth.design import read_design as read_design
+    from curvafit.data_synth.imaging.modality import MODALITIES as MODALITIES
+    from curvafit.data_synth.imaging.modality import Contrast as Contrast
+    from curvafit.data_synth.imaging.modality import Detector as Detector
+    from curvafit.data_synth.imaging.modality import Illumination as Illumination
+    from curvafit.data_synth.imaging.modality import Imaging as Imaging
     from curvafit.data_synth.imaging.modality import Modality as Modality
-    from curvafit.data_synth.imaging.parameters import Contrast as Contrast
-    from curvafit.data_synth.imaging.parameters import Detector as Detector
-    from curvafit.data_synth.imaging.parameters import Illumination as Illumination
-    from curvafit.data_synth.imaging.parameters import Imaging as Imaging
-    from curvafit.data_synth.imaging.parameters import Noise as Noise
-    from curvafit.data_synth.imaging.parameters import Optics as Optics
-    from curvafit.data_synth.imaging.parameters import Specimen as Specimen
+    from curvafit.data_synth.imaging.modality import Noise as Noise
+    from curvafit.data_synth.imaging.modality import Optics as Optics
+    from curvafit.data_synth.imaging.modality import Specimen as Specimen
+    from curvafit.data_synth.imaging.modality import modality as modality
     from curvafit.data_synth.labels import Labels as Labels
     from curvafit.data_synth.labels import labels_of as labels_of
-    from curvafit.data_synth.record import Record as Record
-    from curvafit.data_synth.record import Settings as Settings
+    from curvafit.data_synth.store import Record as Record
+    from curvafit.data_synth.store import Settings as Settings
     from curvafit.data_synth.store import Store as Store
     from curvafit.data_synth.store import open_store as open_store
     from curvafit.geometry.diagram import diagrams as diagrams

@@ -1,27 +1,42 @@
-"""Build an atlas: draw parameters, generate, keep what is viable, and measure the fields and their masks."""
+"""Build an atlas, a store of generated shapes; say what it holds, and whether it is whole."""
 
 from __future__ import annotations
 
+import importlib.metadata
 import itertools
-from collections.abc import Iterator, Sequence
+import math
+import os
+import platform
+import time
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
+from llvmlite import binding
 
 from curvafit.core.checks import check_int, check_type, seed_of
 from curvafit.core.runtime import Progress, silent
 from curvafit.core.workers import Here, Workers
-from curvafit.data_synth.design import Design, boxed
-from curvafit.data_synth.draws import make
-from curvafit.data_synth.store import Settings, Store, open_store
-from curvafit.generation.flow import WORKING_BLUR
+from curvafit.data_synth.design import Design, Draw, boxed
+from curvafit.data_synth.store import Record, Settings, Store, open_store
+from curvafit.generation.flow import WORKING_BLUR, generate
 from curvafit.generation.memory import FILE, FLOW, check_memory
-from curvafit.generation.schedule import Schedule
+from curvafit.generation.result import Flow
+from curvafit.generation.schedule import Schedule, present_name
 from curvafit.generation.schedule import schedule as named_schedule
 from curvafit.priors.grid import WORKING_EPSILON, Grid
+from curvafit.priors.kernels.threads import one_thread
 
 #: A design is given up when none of its first so many draws was viable, or fewer than one in so many.
 BARREN = 200
 #: Shapes that a store may be asked for.
 MOST = 10**7
+
+
+# ---- build -----------------------------------------------------------------------------------------------------------
 
 
 def build(
@@ -67,27 +82,22 @@ def build(
     if workers is None:
         check_memory(Grid(shape).shape, FLOW, "a shape")  # type: ignore[arg-type]
     settings = settings_of(shape, seed, schedule, design)
-    return _filled(open_store(store_path, settings), count, workers or Here(), progress)
+    return _fill(open_store(store_path, settings), count, workers or Here(), progress)
 
 
 def extend(store_path: str | Path, count: int, progress: Progress = silent, *, workers: Workers | None = None) -> Store:
     """Go on with a store, by its own settings, until it has `count` more viable shapes than were asked of it so far.
 
-    With 0, what was stopped is brought to its end.
-
-    Raises
-    ------
-    FileNotFoundError, ValueError, OSError
-        If there is no store, or as `build`.
+    A count of 0 finishes a build that was stopped. Raises FileNotFoundError where there is no store, and as `build`.
     """
     check_count(count, 0)
     store = open_store(store_path)
-    return _filled(store, store.wanted + count, workers or Here(), progress)
+    return _fill(store, store.wanted + count, workers or Here(), progress)
 
 
 def check_count(count: int, least: int) -> None:
     """Raise ValueError where a number of shapes is none, under the least or over 10 million."""
-    check_int(count, "a count of at least 1 shape" if least else "a count of shapes from 0", least, MOST)
+    check_int(count, f"a count of shapes from {least}", least, MOST)
 
 
 def settings_of(
@@ -98,33 +108,165 @@ def settings_of(
     check_memory(grid.shape, FILE, "a shape")
     if design is not None:
         check_type(design, Design, "a Design")
-    plan, law = named_schedule(schedule).as_dict(), design or boxed()
-    law.draw(seed, 0)  # refuses a wrong seed, before a store is made
-    return Settings(grid.shape, grid.spacing, WORKING_EPSILON, WORKING_BLUR, law.as_dict(), seed_of(seed), plan)
+    plan, design = named_schedule(schedule).as_dict(), design or boxed()
+    design.draw(seed, 0)  # refuses a wrong seed, before a store is made
+    return Settings(grid.shape, grid.spacing, WORKING_EPSILON, WORKING_BLUR, design.as_dict(), seed_of(seed), plan)
 
 
-def _filled(store: Store, count: int, workers: Workers, progress: Progress) -> Store:
+def _fill(store: Store, count: int, workers: Workers, progress: Progress) -> Store:
     """Ask for draws in order, never for more than may still be wanted: nothing is made beyond the last viable one."""
     store.want(count)
     viable = {index: store.viable(index) for index in store.indices()}
     pending = 0
     todo = (index for index in itertools.count() if index not in viable)
     while (total := sum(viable.values())) < count:
-        while chunk := _chunk(todo, min(workers.chunk, count - total - pending), pending, workers):
-            workers.submit(make, store.path, chunk)
-            pending += len(chunk)
+        while pending < min(workers.places, count - total):
+            workers.submit(make_draws, store.path, [next(todo)])
+            pending += 1
         for record in workers.done():
             pending -= 1
             viable[record.index] = record.viability.viable
             progress(f"{sum(viable.values())} viable of {len(viable)} draws", sum(viable.values()) / count)
         if len(viable) > BARREN * (1 + sum(viable.values())):
             raise ValueError(
-                f"expected a design with viable shapes, got {sum(viable.values())} of {len(viable)} draws: "
+                f"hardly any draw of this design is viable: {sum(viable.values())} of {len(viable)}; "
                 f"the last was not, as {record.status}"
             )
     return store
 
 
-def _chunk(todo: Iterator[int], most: int, pending: int, workers: Workers) -> list[int]:
-    """Return the next indices to ask for; none where the workers have enough."""
-    return list(itertools.islice(todo, most)) if most > 0 and pending < workers.places * workers.chunk else []
+# ---- draws -----------------------------------------------------------------------------------------------------------
+
+
+def make_draws(path: str | Path, indices: Sequence[int]) -> list[Record]:
+    """Make the draws of a store that are not there yet, write each as soon as it is done, and return all records.
+
+    This is a worker's part of `build`. Each draw is made on one thread, so that a field depends on nothing but its
+    store's settings, its index and the kind of processor.
+    """
+    store = open_store(path)
+    try:
+        for index in indices:
+            if not store.has(index):
+                _make_draw(store, index)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror or str(error), error.filename or str(store.path)) from error
+    return [store.record(index) for index in indices]
+
+
+def _make_draw(store: Store, index: int) -> None:
+    settings, began = store.settings, time.perf_counter()
+    draw = Design.from_dict(settings.design).draw(settings.seed, index)
+    with one_thread():
+        flow = generate(
+            draw.coefficients,
+            draw.mass,
+            Grid(settings.shape, settings.spacing),
+            seed=draw.seed,
+            schedule=Schedule(**settings.schedule),
+            epsilon=settings.epsilon,
+            blur=settings.blur,
+            reject_early=True,
+        )
+    record = _record(index, draw, flow, time.perf_counter() - began)
+    store.write(record, flow.field.numpy().astype("float32") if record.viability.viable else None)
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that a generated field's bits depend on: Python, libraries, processor."""
+    names = ("curvafit", "torch", "numpy", "numba")
+    machine = {"python": platform.python_version(), "processor": binding.get_host_cpu_name()}
+    return machine | {name: _version(name) for name in names}
+
+
+def _record(index: int, draw: Draw, flow: Flow, seconds: float) -> Record:
+    return Record(
+        index=index,
+        coefficients=draw.coefficients,
+        mass=draw.mass,
+        seed=draw.seed,
+        steps=int(flow.history.step[-1]) if len(flow.history.step) else 0,
+        viability=flow.viability,
+        energy=float(flow.history.energy[-1]) if len(flow.history.energy) else math.nan,
+        status=flow.status,
+        versions=versions(),
+        seconds=seconds,
+    )
+
+
+def _version(name: str) -> str:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
+
+
+# ---- look ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What is wrong with a store, a sentence each; what is only remarkable; and a sentence in all."""
+
+    problems: tuple[str, ...]
+    notes: tuple[str, ...]
+    status: str
+
+
+def verify(path: str | Path, progress: Progress = silent) -> Verdict:
+    """Check that every draw of a store is there and has the checksum that was written.
+
+    Draws that are missing from a store whose build was stopped are a note, from a finished one a problem. Raises
+    FileNotFoundError or ValueError where there is no store of this version.
+    """
+    store = open_store(path)
+    indices, problems, notes, viable = store.indices(), [], [], 0
+    for k, index in enumerate(indices):
+        progress(f"{k} of {len(indices)} draws checked", k / len(indices))
+        viable += store.viable(index)
+        if not store.intact(index):
+            problems.append(
+                f"draw {index} is not what was written: its checksum differs (delete draws/{index:06d}, and a build "
+                "makes it again)"
+            )
+    there = {int(entry.name) for entry in (store.path / "draws").iterdir() if entry.name.isdigit()}
+    torn = sorted(index for index in there - set(indices) if not store.has(index))  # a build may add some meanwhile
+    problems += [f"draw {index} is torn: a part is missing, or it is another draw" for index in torn]
+    missing = sorted(set(range(max(there, default=-1) + 1)) - there)
+    lost = f"{len(missing)} draws are missing: {', '.join(map(str, missing[:9]))}"
+    if missing and viable >= store.wanted:
+        problems.append(lost)
+    elif viable < store.wanted:
+        notes.append(f"{viable} of {store.wanted} shapes are made" + f"; {lost}" * bool(missing))
+    finding = "nothing is wrong" if not problems else f"{len(problems)} things are wrong"
+    return Verdict(tuple(problems), tuple(notes), f"{len(indices)} draws, {viable} shapes checked: {finding}")
+
+
+def summarise(store: Store) -> dict[str, str]:
+    """Return the facts about a store, in words, by name."""
+    records = [store.record(index) for index in store.indices()]
+    settings, viable = store.settings, sum(record.viability.viable for record in records)
+    makers = Counter(", ".join(f"{name} {version}" for name, version in each.versions.items()) for each in records)
+    return {
+        "shapes": str(viable),
+        "wanted": str(store.wanted),
+        "draws": str(len(records)),
+        "voxels": " x ".join(map(str, settings.shape)),
+        "epsilon": f"{settings.epsilon:g} (voxel edges {', '.join(f'{edge:g}' for edge in settings.spacing)})",
+        "design": str(Design.from_dict(settings.design)),
+        "seed": str(settings.seed),
+        "schedule": f"{present_name(settings.schedule)}, {settings.schedule['steps']} steps",
+        "made with": "; ".join(f"{text} ({count})" for text, count in makers.items()),
+        "seconds a draw": f"{np.mean([record.seconds for record in records]):.2f}" if records else "none",
+        "size": f"{_size(store.path) / 1e6:.1f} MB",
+    }
+
+
+def _size(folder: Path) -> int:
+    """Return the bytes of a folder's files; those that a build takes away meanwhile do not count."""
+    total = 0
+    for place, _, names in os.walk(folder):
+        for name in names:
+            with suppress(FileNotFoundError):
+                total += os.stat(os.path.join(place, name)).st_size
+    return total

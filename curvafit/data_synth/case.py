@@ -11,11 +11,10 @@ import numpy as np
 import torch
 
 from curvafit.core.checks import LONGEST, SHORTEST, as_tuple, check_float, check_int, check_type, quoted, seed_of
-from curvafit.data_synth.draws import one_thread
 from curvafit.data_synth.imaging.image import field_shape, image, regrid, visible
-from curvafit.data_synth.imaging.modality import Modality
-from curvafit.data_synth.imaging.parameters import Imaging
+from curvafit.data_synth.imaging.modality import Imaging, Modality
 from curvafit.data_synth.sources import ShapeSource, source_of
+from curvafit.priors.kernels.threads import one_thread
 
 #: Shapes that a case gets until one is seen on the image's voxels, which may be coarse.
 TRIES = 8
@@ -52,12 +51,6 @@ class Recipe:
         Edge of a shape's voxels, in the modality's unit: how large the texture is in the images.
     calibres
         How much thinner and thicker than that it may be: every case draws its own factor in between.
-
-    Raises
-    ------
-    ValueError
-        If the shape is not 3 whole numbers above 0, the voxel or a calibre is not positive, or the seed is not a whole
-        number from 0.
     """
 
     source: ShapeSource
@@ -70,11 +63,10 @@ class Recipe:
     def __post_init__(self) -> None:
         check_type(self.modality, Modality, "a Modality")
         if not callable(getattr(self.source, "shape", None)):
-            raise ValueError(f"expected a source of shapes, got {quoted(self.source)}")
+            raise ValueError(f"the source must be a source of shapes, got {quoted(self.source)}")
         object.__setattr__(self, "shape", edges_of(self.shape))
-        object.__setattr__(
-            self, "voxel", check_float(self.voxel, "a shape's voxel of positive length", SHORTEST, LONGEST)
-        )
+        voxel = check_float(self.voxel, "a shape's voxel of positive length", SHORTEST, LONGEST)
+        object.__setattr__(self, "voxel", voxel)
         object.__setattr__(self, "seed", seed_of(self.seed))
         check_calibres(self.calibres)
         for factor in self.calibres:
@@ -86,30 +78,26 @@ class Recipe:
         return field_shape(self.shape, self.voxel * self.calibres[0], self.modality.base)
 
     def case(self, index: int) -> Case:
-        """Return case number `index`, made on one thread.
-
-        Raises
-        ------
-        ValueError
-            If no shape can be had, or none is seen on the image's voxels.
-        """
+        """Return case number `index`, made on one thread; ValueError where no shape is seen on the image's voxels."""
         for_shape, for_imaging, for_image = np.random.SeedSequence(self.seed, spawn_key=(index,)).spawn(3)
         imaging = self.modality.draw(_number(for_imaging))
         rng = np.random.default_rng(for_shape)
-        voxel = drawn_voxel(self.voxel, self.calibres, rng)
+        voxel = draw_voxel(self.voxel, self.calibres, rng)
         voxels = field_shape(self.shape, voxel, imaging)
         seed = _number(for_image)
         with one_thread():
             for _ in range(TRIES):
                 phase_field = self.source.shape(voxels, index, rng)
                 u = torch.from_numpy(phase_field.values)
-                parts = imaged(u, phase_field.epsilon, voxel, imaging, seed, self.shape)
-                grey, sampled, mask = (each.numpy() for each in parts)
+                parts = image_and_labels(u, phase_field.epsilon, voxel, imaging, seed, self.shape)
+                grey, sampled, mask = (part.numpy() for part in parts)
                 if sampled.min() <= 0 < sampled.max() and mask.any() and not mask.all():
                     break
             else:
                 edges = " x ".join(map(str, self.shape))
-                raise ValueError(f"expected structure and background on {edges} voxels, got one {TRIES} times")
+                raise ValueError(
+                    f"{TRIES} shapes showed no structure on {edges} voxels, or nothing else: take more voxels"
+                )
         record = {"index": index, "source": phase_field.origin, "imaging": imaging.as_dict(), "image_seed": seed}
         record |= {
             "voxel": voxel,
@@ -135,7 +123,7 @@ class Recipe:
         return Recipe(source, modality, (z, y, x), content["voxel"], content["seed"], (low, high))
 
 
-def imaged(
+def image_and_labels(
     field: torch.Tensor, epsilon: float, voxel: float, imaging: Imaging, seed: int, shape: Sequence[int]
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Return the image of a phase field (Z, Y, X), the field on the image's voxels, and its mask there, all of `shape`.
@@ -146,7 +134,7 @@ def imaged(
     u, (z, y, x) = field[None, None], shape
     grey, sampled = image(u, voxel, [imaging], [seed], epsilon), regrid(u, voxel, [imaging])
     mask = visible(u, voxel, [imaging], epsilon) if imaging.visible else sampled > 0
-    grey, sampled, mask = (each[0, 0, :z, :y, :x].contiguous() for each in (grey, sampled, mask))
+    grey, sampled, mask = (part[0, 0, :z, :y, :x].contiguous() for part in (grey, sampled, mask))
     return grey, sampled, mask
 
 
@@ -157,7 +145,7 @@ def edges_of(shape: Sequence[int]) -> tuple[int, int, int]:
     return z, y, x
 
 
-def drawn_voxel(voxel: float, calibres: Sequence[float], rng: np.random.Generator) -> float:
+def draw_voxel(voxel: float, calibres: Sequence[float], rng: np.random.Generator) -> float:
     """Return the edge of a shape's voxel times a factor, drawn evenly in the logarithm; none is drawn where there is
     one."""
     low, high = calibres
@@ -176,24 +164,18 @@ def check_crop(within: float, shape: Sequence[int], voxel: float, modality: Moda
     """Raise ValueError where images of `shape` need crops that are larger than a source's shapes (`within`) or than
     memory, or too small to be shapes; or where they are too large or too small themselves."""
     need = field_shape(shape, voxel, modality.base)
+    images, crops = " x ".join(map(str, shape)), " x ".join(map(str, need))
     if not 1 < math.prod(shape) <= MOST:
-        raise ValueError(f"expected images of 2 to {MOST:.0e} voxels, got {' x '.join(map(str, shape))}")
-    if (min if within == math.inf else max)(need) < FEWEST:
-        edges, unit = " x ".join(map(str, need)), modality.base.unit
+        raise ValueError(f"images must have 2 to {MOST:.0e} voxels, got {images}")
+    if (min if within == math.inf else max)(need) < FEWEST or math.prod(need) > MOST:
         raise ValueError(
-            f"expected images that span {FEWEST} voxels of a shape or more, got {edges}: "
-            f"is a voxel of {voxel:g} {unit} meant?"
-        )
-    if math.prod(need) > MOST:
-        edges, unit = " x ".join(map(str, need)), modality.base.unit
-        raise ValueError(
-            f"expected shapes of at most {MOST:.0e} voxels, got {edges}: is a voxel of {voxel:g} {unit} meant?"
+            f"shapes must have from {FEWEST} voxels along an edge to {MOST:.0e} in all, but images of {images} voxels "
+            f"need {crops}: is a voxel of {voxel:g} {modality.base.unit} meant?"
         )
     if max(need) > within:
-        images, crops = (" x ".join(map(str, each)) for each in (shape, need))
         raise ValueError(
-            f"expected crops within the {within} voxels of the stored shapes, but {images} voxels of "
-            f"{modality.name} need {crops}: take fewer, or build a store with a larger --shape"
+            f"the stored shapes have {within} voxels along an edge, but images of {images} voxels of {modality.name} "
+            f"need {crops}: take smaller images, or build a store with a larger --shape"
         )
 
 

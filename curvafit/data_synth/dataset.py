@@ -1,4 +1,4 @@
-"""Training pairs without end: random crops of generated shapes, turned, blended and imaged as they are asked for."""
+"""Training pairs without end: random crops of generated shapes, turned, blended and imaged on demand."""
 
 from __future__ import annotations
 
@@ -14,13 +14,12 @@ from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
 from curvafit.core.checks import LONGEST, SHORTEST, as_tuple, check_choice, check_float, check_int, seed_of
-from curvafit.data_synth.case import check_calibres, check_crop, drawn_voxel, edges_of, imaged
+from curvafit.data_synth.case import check_calibres, check_crop, draw_voxel, edges_of, image_and_labels
 from curvafit.data_synth.imaging.image import field_shape
-from curvafit.data_synth.imaging.modalities import modality
-from curvafit.data_synth.imaging.modality import Modality
-from curvafit.data_synth.imaging.randomness import correlated
-from curvafit.data_synth.sources import LAWS, Generated, Pool, Stored, voxel_of
-from curvafit.priors.law import Law
+from curvafit.data_synth.imaging.maths import correlated
+from curvafit.data_synth.imaging.modality import Modality, modality
+from curvafit.data_synth.sources import Generated, Pool, Stored, voxel_of
+from curvafit.priors.law import LAW_TYPES, LawLike
 
 #: Length over which one texture gives way to another, as a share of the crop's longest edge.
 BLEND_LENGTH = 0.5
@@ -80,17 +79,11 @@ class TextureDataset(IterableDataset):
         default as the law's mass or scan has it.
     transform
         What to make of each `Sample`: `as_dict`, `as_monai`, `as_subject`, or your own function.
-
-    Raises
-    ------
-    ValueError
-        If there is no source, modality or well-formed shape, a crop would be larger than a shape, or a number is out of
-        range.
     """
 
     def __init__(
         self,
-        source: Law | Sequence[Law],
+        source: LawLike | Sequence[LawLike],
         modalities: str | Modality | Sequence[str | Modality],
         size: int | Sequence[int],
         *,
@@ -110,14 +103,14 @@ class TextureDataset(IterableDataset):
         self.size = edges_of((size,) * 3 if isinstance(size, (int, Real)) else size)
         self.length, self.seed, self.blend = int(length), seed_of(seed), blend
         self.calibres, self.normalise, self.transform = calibres, _normalisation(normalise), transform
-        sources: list[Any] = [source] if isinstance(source, LAWS) else list(as_tuple(source, "laws or stores"))
+        sources: list[Any] = [source] if isinstance(source, LAW_TYPES) else list(as_tuple(source, "laws or stores"))
         self._check(sources)
         stores = all(map(_is_store, sources))
         edge = None if voxel is None else check_float(voxel, "a shape's voxel of positive length", SHORTEST, LONGEST)
         self.voxels = [edge or voxel_of([] if stores else sources, kind) for kind in self.modalities]
         if stores:
             if volume_fraction is not None:
-                raise ValueError("expected a volume fraction beside laws, got stores of shapes")
+                raise ValueError("volume_fraction applies to laws only; the source is a store of shapes")
             self.source = Stored(tuple(map(Path, sources)), rotate=rotate)
         else:
             self.source = self._pool(Generated.of(sources, volume_fraction), shapes, rotate)
@@ -165,10 +158,10 @@ class TextureDataset(IterableDataset):
         rng, (for_imaging, for_image, for_blend) = np.random.default_rng(words), map(int, words.generate_state(3))
         turn = int(rng.integers(len(self.modalities)))
         kind = self.modalities[turn]
-        imaging, voxel = kind.draw(for_imaging), drawn_voxel(self.voxels[turn], self.calibres, rng)
+        imaging, voxel = kind.draw(for_imaging), draw_voxel(self.voxels[turn], self.calibres, rng)
         voxels = field_shape(self.size, voxel, imaging)
         u, epsilon, origin = self._shape(voxels, rng, for_blend)
-        grey, _, mask = imaged(u, epsilon, voxel, imaging, for_image, self.size)
+        grey, _, mask = image_and_labels(u, epsilon, voxel, imaging, for_image, self.size)
         record = {"number": number, "source": origin, "modality": kind.name, "imaging": imaging.as_dict()}
         record |= {"image_seed": for_image, "voxel": voxel}
         image = grey[None].float()
@@ -201,11 +194,9 @@ class TextureDataset(IterableDataset):
 
     def _check(self, sources: list[Any]) -> None:
         if not (sources and self.modalities):
-            raise ValueError(
-                f"expected at least one source and one modality, got {len(sources)} and {len(self.modalities)}"
-            )
+            raise ValueError(f"give a source and a modality, got {len(sources)} and {len(self.modalities)}")
         if self.length < 1 or not 0 <= self.blend <= 1:
-            raise ValueError(f"expected a length above 0 and a blend in [0, 1], got {self.length} and {self.blend}")
+            raise ValueError(f"length must be above 0 and blend in [0, 1], got {self.length} and {self.blend}")
         check_calibres(self.calibres)
 
 
@@ -215,33 +206,23 @@ def as_dict(sample: Sample) -> dict[str, Tensor]:
 
 
 def as_monai(sample: Sample) -> dict[str, Any]:
-    """Return MONAI's dictionary: `image` and `label` as `MetaTensor` with an affine; array axes are z, y, x.
-
-    Raises
-    ------
-    ImportError
-        If MONAI is not installed.
-    """
+    """Return MONAI's dictionary: `image` and `label` as `MetaTensor` with an affine; array axes are z, y, x."""
     try:
         from monai.data.meta_tensor import MetaTensor
     except ImportError as error:
-        raise ImportError("expected MONAI: pip install monai", name="monai") from error
+        raise ImportError("as_monai needs MONAI: pip install monai", name="monai") from error
     affine = torch.diag(torch.tensor([*sample.spacing, 1.0], dtype=torch.float64))
     return {name: MetaTensor(values, affine=affine) for name, values in as_dict(sample).items()}
 
 
 def as_subject(sample: Sample) -> Any:
-    """Return a TorchIO `Subject` with `image` and `label`; its array axes are x, y, z.
-
-    Raises
-    ------
-    ImportError
-        If TorchIO is not installed.
-    """
+    """Return a TorchIO `Subject` with `image` and `label`; its array axes are x, y, z."""
     try:
         import torchio  # pyright: ignore[reportMissingImports]
     except ImportError as error:
-        raise ImportError("expected TorchIO: pip install torchio", name="torchio") from error
+        raise ImportError(
+            "as_subject needs TorchIO, which is not installed: pip install torchio", name="torchio"
+        ) from error
     affine = np.diag([*sample.spacing[::-1], 1.0])
     image, label = (values.permute(0, 3, 2, 1).contiguous() for values in (sample.image, sample.label))
     return torchio.Subject(

@@ -1,18 +1,23 @@
-"""Which parameters to draw: Experiment 4's random law, other boxes, Sobol's sequence, lists; one stream a draw."""
+"""Which parameters an atlas draws, in turn: designs (boxes, lists, surroundings of a point), and their YAML files."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Real
+from os import PathLike
+from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
+import yaml
 from scipy.stats import qmc
 
 from curvafit.core.checks import SEEDS, as_tuple, check_choice, check_float, check_int, quoted, seed_of
 from curvafit.priors.coefficients import NAMES, POWERS, Coefficients, check_strength
 from curvafit.priors.grid import WORKING_EPSILON
+from curvafit.priors.law import Law
 
 #: Open intervals of the uniform law, in working units; a20 = 1 is the gauge (paper, "Experiment 4").
 INTERVALS: dict[str, tuple[float, float]] = {
@@ -27,7 +32,13 @@ INTERVALS: dict[str, tuple[float, float]] = {
 PARAMETERS: tuple[str, ...] = (*NAMES, "mass")
 #: Least and greatest spread of a box around a point.
 SPREADS = (1e-9, 100.0)
-Law = Literal["random", "sobol", "list"]
+#: Share of Experiment 4's intervals that the surroundings of a point span.
+SPREAD = 0.1
+#: The kinds of file, and the keys that may stand beside each.
+KEYS: dict[str, tuple[str, ...]] = {"box": ("law", "log"), "around": ("law", "spread"), "list": ()}
+
+#: How the points of a design are chosen.
+Sampling = Literal["random", "sobol", "list"]
 
 
 class Draw(NamedTuple):
@@ -44,7 +55,7 @@ class Design:
 
     Parameters
     ----------
-    law
+    sampling
         `"random"`: uniform and independent in a box. `"sobol"`: the same box, filled evenly by a scrambled Sobol
         sequence. `"list"`: the points in turn, again and again with other noise.
     box
@@ -57,76 +68,67 @@ class Design:
     Raises
     ------
     ValueError
-        If the law has another name, there is no box or no point, an interval is not one, m₀ leaves (-1, 1), or no flow
-        takes a coefficient that large (`generation.cost`).
+        If the sampling has another name, there is no box or no point, an interval is not one, m₀ leaves (-1, 1), or no
+        flow takes a coefficient that large (`generation.cost`).
     """
 
-    law: Law
+    sampling: Sampling
     box: tuple[tuple[float, float], ...] = ()
     points: tuple[tuple[float, ...], ...] = ()
     log: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        check_choice(self.law, get_args(Law), f"a law among {', '.join(get_args(Law))}")
+        check_choice(self.sampling, get_args(Sampling), f"a sampling among {', '.join(get_args(Sampling))}")
         for name in ("box", "points"):
             rows = (as_tuple(row, f"numbers in each row of {name}") for row in as_tuple(getattr(self, name), name))
             object.__setattr__(self, name, tuple(rows))
         if any(len(interval) != 2 for interval in self.box):
-            raise ValueError("expected intervals of two numbers in a box, got one of another length")
-        rows = self.points if self.law == "list" else tuple(zip(*self.box, strict=True))
+            raise ValueError("an interval in a box must be two numbers")
+        rows = self.points if self.sampling == "list" else tuple(zip(*self.box, strict=True))
         if not rows or any(len(row) != len(PARAMETERS) for row in rows):
-            raise ValueError(f"expected {len(PARAMETERS)} parameters ({', '.join(PARAMETERS)}) for a {self.law} design")
+            raise ValueError(f"a {self.sampling} design needs {len(PARAMETERS)} parameters ({', '.join(PARAMETERS)})")
         for value in (value for row in rows for value in row):
             check_float(value, "finite parameters in a design")
         for name, interval in zip(PARAMETERS, self.box, strict=False):
             if interval[0] > interval[1]:
-                raise ValueError(f"expected an interval of {name} from low to high, got {list(interval)}")
+                raise ValueError(f"the interval of {name} must go from low to high, got {list(interval)}")
         object.__setattr__(self, "log", _logarithmic(self.log, self.box))
         for row in rows:
             if not -1 < row[-1] < 1:
-                raise ValueError(f"expected masses in (-1, 1), got {row[-1]}")
+                raise ValueError(f"masses must be in (-1, 1), got {row[-1]}")
             for name, value in zip(NAMES, row, strict=False):
                 check_strength(name, value, POWERS[name], WORKING_EPSILON)
 
     def draw(self, seed: int, index: int) -> Draw:
-        """Draw `index` of a seed, both whole numbers from 0.
-
-        Raises
-        ------
-        ValueError
-            If the seed or the index is not a whole number from 0.
-        """
+        """Draw parameters number `index` of a seed, both whole numbers from 0."""
         start = int(_stream(seed, index, "start").generate_state(1)[0])
-        if self.law == "list":
+        if self.sampling == "list":
             values = self.points[index % len(self.points)]
         else:
             values = list(map(self._value, PARAMETERS, self.box, self._shares(seed, index)))
         return Draw(Coefficients(*map(float, values[:-1])), float(values[-1]), start)
 
+    def __str__(self) -> str:
+        """Return the sampling with the number of points, or with the box."""
+        points = f"of {len(self.points)} points"
+        return f"{self.sampling} {points if self.points else f'in {[list(interval) for interval in self.box]}'}"
+
     def as_dict(self) -> dict[str, Any]:
         """Return the design in JSON's types, for a store's record."""
-        rows = {"points": self.points} if self.law == "list" else {"box": self.box}
+        rows = {"points": self.points} if self.sampling == "list" else {"box": self.box}
         log = {"log": list(self.log)} if self.log else {}
-        return {"law": self.law} | {name: [list(row) for row in value] for name, value in rows.items()} | log
+        return {"law": self.sampling} | {name: [list(row) for row in value] for name, value in rows.items()} | log
 
     @staticmethod
     def from_dict(content: Mapping[str, Any]) -> Design:
-        """Return what `as_dict` wrote.
-
-        Raises
-        ------
-        ValueError
-            If it is none.
-        """
+        """Return the design that `as_dict` wrote, or raise ValueError."""
         try:
             box, points = (tuple(map(tuple, content.get(name, ()))) for name in ("box", "points"))
-            sound = all(len(row) == 2 for row in box) and all(
-                map(_is_number, [each for row in box + points for each in row])
-            )
+            sound = all(len(row) == 2 for row in box) and all(map(_is_number, itertools.chain(*box, *points)))
         except (TypeError, AttributeError):
             box, points, sound = (), (), False
         if not sound or "law" not in content:
-            raise ValueError(f"expected a design's law and box or points, got {quoted(content)}")
+            raise ValueError(f"a design has a law and a box or points, got {quoted(content)}")
         return Design(content["law"], box, points, content.get("log", ()))
 
     def _value(self, name: str, interval: tuple[float, float], share: float) -> float:
@@ -137,7 +139,7 @@ class Design:
     def _shares(self, seed: int, index: int) -> list[float]:
         """Return how far into each interval the draw lies, 0 to 1. A fixed parameter takes no random number."""
         free = [low < high for low, high in self.box]
-        if self.law == "random":
+        if self.sampling == "random":
             values = np.random.default_rng(_stream(seed, index, "parameters")).random(sum(free))
         else:
             engine = qmc.Sobol(sum(free), scramble=True, rng=np.random.default_rng(_stream(seed, 0, "parameters")))
@@ -146,7 +148,7 @@ class Design:
         return [next(shares) if moves else 0.0 for moves in free]
 
 
-def boxed(law: Law = "random", log: Sequence[str] = (), /, **intervals: float | Sequence[float]) -> Design:
+def boxed(sampling: Sampling = "random", log: Sequence[str] = (), /, **intervals: float | Sequence[float]) -> Design:
     """Return a box: Experiment 4's, but for the intervals or fixed values that are given by name; uniform in the
     logarithm of the parameters in `log`.
 
@@ -157,13 +159,13 @@ def boxed(law: Law = "random", log: Sequence[str] = (), /, **intervals: float | 
     """
     unknown = set(intervals) - set(PARAMETERS)
     if unknown:
-        raise ValueError(f"expected parameters among {', '.join(PARAMETERS)}, got {', '.join(sorted(unknown))}")
+        raise ValueError(f"parameters are {', '.join(PARAMETERS)}, got {', '.join(sorted(unknown))}")
     asked = {name: _interval(name, value) for name, value in intervals.items()}
     whole: dict[str, tuple[float, float]] = {"a20": (1.0, 1.0), **INTERVALS, **asked}
-    return Design(law, tuple(whole[name] for name in PARAMETERS), log=log)  # type: ignore[arg-type]
+    return Design(sampling, tuple(whole[name] for name in PARAMETERS), log=log)  # type: ignore[arg-type]
 
 
-def around(point: Sequence[float], spread: float, law: Law = "random") -> Design:
+def around(point: Sequence[float], spread: float, sampling: Sampling = "random") -> Design:
     """Return a box around seven numbers, brought to a20 = 1: `spread` times as wide as Experiment 4's; a02 and m₀ in
     range.
 
@@ -175,14 +177,15 @@ def around(point: Sequence[float], spread: float, law: Law = "random") -> Design
     spread = check_float(spread, "a positive spread", *SPREADS)
     point = as_tuple(point, "seven numbers as a point")
     if len(point) != len(PARAMETERS):
-        raise ValueError(f"expected a point of {len(PARAMETERS)} numbers ({', '.join(PARAMETERS)}), got {len(point)}")
+        raise ValueError(f"a point is {len(PARAMETERS)} numbers ({', '.join(PARAMETERS)}), got {len(point)}")
     check_float(point[0], "a point with a20 > 0", 1e-6, 1e6)
     centre = dict(zip(PARAMETERS, (*(value / point[0] for value in point[:-1]), point[-1]), strict=True))
-    box = {name: _near(centre[name], spread * (high - low) / 2) for name, (low, high) in INTERVALS.items()}
+    half = {name: spread * (high - low) / 2 for name, (low, high) in INTERVALS.items()}
+    box = {name: (centre[name] - half[name], centre[name] + half[name]) for name in INTERVALS}
     least = INTERVALS["a02"][0]
     box["a02"] = (max(box["a02"][0], least), max(box["a02"][1], least))
     box["mass"] = (max(box["mass"][0], -0.99), min(box["mass"][1], 0.99))
-    return boxed(law, **box)
+    return boxed(sampling, **box)
 
 
 def _logarithmic(names: Sequence[str], box: Sequence[tuple[float, float]]) -> tuple[str, ...]:
@@ -191,18 +194,14 @@ def _logarithmic(names: Sequence[str], box: Sequence[tuple[float, float]]) -> tu
     positive = [name for name, (low, _) in zip(PARAMETERS, box, strict=False) if low > 0]
     for name in names:
         if name not in positive:
-            raise ValueError(f"expected in log parameters whose interval is above 0, got {quoted(name)}")
+            raise ValueError(f"log must name parameters whose interval is above 0, got {quoted(name)}")
     return tuple(names)
-
-
-def _near(centre: float, half: float) -> tuple[float, float]:
-    return centre - half, centre + half
 
 
 def _interval(name: str, value: Any) -> tuple[float, float]:
     pair = [value, value] if isinstance(value, Real) else value
     if not isinstance(pair, (list, tuple)) or len(pair) != 2 or not all(_is_number(end) for end in pair):
-        raise ValueError(f"expected {name} as a number or two of them, got {quoted(value)}")
+        raise ValueError(f"{name} must be a number or two of them, got {quoted(value)}")
     return float(pair[0]), float(pair[1])
 
 
@@ -213,3 +212,87 @@ def _is_number(value: Any) -> bool:
 def _stream(seed: int, index: int, purpose: str) -> np.random.SeedSequence:
     index = check_int(index, "an index that is a whole number from 0", 0, SEEDS - 1)
     return np.random.SeedSequence(seed_of(seed), spawn_key=(index, ("parameters", "start").index(purpose)))
+
+
+# ---- files -----------------------------------------------------------------------------------------------------------
+
+
+def read_design(path: str | PathLike[str]) -> Design:
+    """Read a design from a YAML file; docs/howto/atlas.md has its keys.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        If there is no such file, or it is not YAML, has unknown keys, or is no design (`Design`).
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"found no file {path}")
+    try:
+        content = yaml.safe_load(path.read_bytes().decode().removeprefix("\ufeff"))
+    except RecursionError as error:
+        raise ValueError(f"{path} is not a design: it is nested too deeply") from error
+    except (yaml.YAMLError, ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:
+        # the last five are what the values of wrong tags raise
+        raise ValueError(f"{path} is not YAML: {' '.join(str(error).split())[:200]}") from error
+    try:
+        return _design(content, path.parent)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def point_of(source: Any, folder: Path = Path()) -> tuple[float, ...]:
+    """Return the seven numbers of a law: of a preset's name, of a `fit.json` (beside `folder` where its path is
+    relative), or by name.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        If it is none of these, or a number is missing.
+    """
+    if isinstance(source, str):
+        return Law.of(folder / source if source.endswith(".json") else source).point
+    if not isinstance(source, Mapping) or set(source) != set(PARAMETERS):
+        raise ValueError(f"a point is a preset, a fit.json or {', '.join(PARAMETERS)}, got {quoted(source)}")
+    return tuple(check_float(_number(source[name]), f"a number for {name}") for name in PARAMETERS)
+
+
+def _design(content: Any, folder: Path) -> Design:
+    kind = _kind(content)
+    if kind == "list":
+        points = as_tuple(content["list"], "points in list")
+        return Design("list", points=tuple(point_of(point, folder) for point in points))
+    sampling = content.get("law", "random")
+    if sampling not in ("random", "sobol"):
+        raise ValueError(f"law must be random or sobol, got {quoted(sampling)}")
+    if kind == "around":
+        spread = check_float(_number(content.get("spread", SPREAD)), "a spread that is a number")
+        return around(point_of(content["around"], folder), spread, sampling)
+    if not isinstance(content["box"], Mapping):
+        raise ValueError(f"box must hold names and intervals, got {quoted(content['box'])}")
+    intervals = {str(name): _number(value) for name, value in content["box"].items()}
+    return boxed(sampling, content.get("log", ()), **intervals)
+
+
+def _kind(content: Any) -> str:
+    """Return which of the three a file is; every key must be known."""
+    if not isinstance(content, Mapping):
+        raise ValueError(f"a design has one of the keys {', '.join(KEYS)}, got {quoted(content)}")
+    kinds = [key for key in KEYS if key in content]
+    if unknown := [key for key in content if key not in {*KEYS, *itertools.chain(*KEYS.values())}]:
+        raise ValueError(f"a design has no key {quoted(unknown[0])}")
+    if len(kinds) != 1:
+        raise ValueError(f"a design has one of the keys {', '.join(KEYS)}, got {' and '.join(kinds) or 'none'}")
+    if strange := sorted(set(content) - {kinds[0], *KEYS[kinds[0]]}):
+        raise ValueError(f"a design with the key {kinds[0]} has no key {strange[0]}")
+    return kinds[0]
+
+
+def _number(value: Any) -> Any:
+    """Return the value, but for numbers that YAML takes for text, such as 1e3."""
+    if isinstance(value, list):
+        return [_number(end) for end in value]
+    try:
+        return float(value) if isinstance(value, str) else value
+    except ValueError:
+        return value

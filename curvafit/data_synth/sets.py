@@ -2,36 +2,36 @@
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import itertools
 import json
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
-from curvafit.core.checks import as_tuple, check_choice, check_int, check_type, quoted
+from curvafit.core.checks import as_tuple, check_choice, check_int, check_type
 from curvafit.core.files import remove, write_content
-from curvafit.core.records import parse_json
+from curvafit.core.records import Format, parse_json
 from curvafit.core.runtime import Progress, silent, undisturbed
 from curvafit.core.workers import Here, Workers
+from curvafit.data_synth.atlas import versions
 from curvafit.data_synth.case import Case, Recipe
-from curvafit.data_synth.centreline import centreline
-from curvafit.data_synth.centreline_files import write_graphml, write_swc
-from curvafit.data_synth.draws import versions
+from curvafit.data_synth.centreline import centreline, write_graphml
 from curvafit.data_synth.labels import NAMES, labels_of
-from curvafit.data_synth.layouts import LAYOUTS, About
+from curvafit.drawing.plot import CONTOUR, write_picture
 from curvafit.priors.grid import Grid
 from curvafit.volumes.field import Field
+from curvafit.volumes.read import read_values
 from curvafit.volumes.write import save
 
-FORMAT = "curvafit set"
-VERSION = 2
+SET = Format("curvafit set", 2, "a set of curvafit", remedy="begin it anew in another folder")
 #: The set's own record, and the folder of the cases'.
 HEADER, RECORDS = "curvafit.json", "cases"
 #: What the layout's readers want.
@@ -42,17 +42,33 @@ MOST = 10**7
 PARTS = (*(name for name in NAMES if name != "mask"), "centreline")
 #: Seconds between two lists of the cases.
 LISTED_EVERY = 1.0
+#: Cases in the picture, and in a row of it.
+SHOWN, ROW = 8, 4
+
+
+class Layout(NamedTuple):
+    """Where images, labels and further labels are, with `{case}` for a case's name and `{part}` for a label's; and
+    whether the list of cases is nnU-Net's, else the decathlon's."""
+
+    image: str
+    label: str
+    part: str
+    nnunet: bool = False
+
+
+#: nnU-Net v2's raw data sets; the Medical Segmentation Decathlon's, which MONAI reads; OME-Zarr with that list.
+LAYOUTS: dict[str, Layout] = {
+    "nnunet": Layout(
+        "imagesTr/{case}_0000.nii.gz", "labelsTr/{case}.nii.gz", "parts/{part}/{case}.nii.gz", nnunet=True
+    ),
+    "monai": Layout("imagesTr/{case}.nii.gz", "labelsTr/{case}.nii.gz", "parts/{part}/{case}.nii.gz"),
+    "zarr": Layout("images/{case}.zarr", "labels/{case}.zarr", "parts/{part}/{case}.zarr"),
+}
 
 
 @dataclass(frozen=True)
 class Order:
-    """What a set is to be: its recipe, layout (a name of `LAYOUTS`) and labels besides the mask (names of `PARTS`).
-
-    Raises
-    ------
-    ValueError
-        If a name is unknown.
-    """
+    """What a set is to be: its recipe, layout (a name of `LAYOUTS`) and labels besides the mask (names of `PARTS`)."""
 
     recipe: Recipe
     layout: str = "nnunet"
@@ -66,10 +82,13 @@ class Order:
             check_choice(part, PARTS, f"labels among {', '.join(PARTS)}")
         if self.parts and min(self.recipe.shape) < 4:
             edges = " x ".join(map(str, self.recipe.shape))
-            raise ValueError(f"expected images of at least 4 voxels along each axis beside --labels, got {edges}")
+            raise ValueError(f"labels need images of at least 4 voxels along each axis, got {edges}")
 
     def as_dict(self) -> dict[str, Any]:
         return {"recipe": self.recipe.as_dict(), "layout": self.layout, "parts": list(self.parts)}
+
+
+# ---- build -----------------------------------------------------------------------------------------------------------
 
 
 def build_set(
@@ -78,7 +97,8 @@ def build_set(
     """Make cases 0 to `count` - 1 of a set, those that are not there yet, and the list that its readers want.
 
     Case i depends on the order and i alone, so that its voxels are the same whenever and by however many workers it is
-    made. What is written is a valid set at any time, but for the list of one that was killed: the next run mends that.
+    made. The folder holds a valid set at any time; a list that a killed run or a full disk left behind lacks cases,
+    and the next run completes it.
 
     Parameters
     ----------
@@ -93,14 +113,13 @@ def build_set(
         If the folder can't be written, or the workers are gone. The cases that were made are kept.
     """
     count = check_int(count, "a count of at least 1 case", 1, MOST)
-    folder, workers = Path(folder), workers or Here()
+    folder = Path(folder)
     with _begun(folder, order):
-        return _filled(folder, order, count, progress, workers)
+        return _fill(folder, order, count, progress, workers or Here())
 
 
-def _filled(folder: Path, order: Order, count: int, progress: Progress, workers: Workers) -> Path:
-    before = set(cases_of(folder))
-    cases = set(before)
+def _fill(folder: Path, order: Order, count: int, progress: Progress, workers: Workers) -> Path:
+    cases = set(cases_of(folder))
     todo = iter([index for index in range(count) if index not in cases])
     pending, listed = 0, -LISTED_EVERY
     try:
@@ -114,20 +133,14 @@ def _filled(folder: Path, order: Order, count: int, progress: Progress, workers:
             pending -= 1
             progress(f"{min(len(cases), count)} of {count} cases", min(len(cases), count) / count)
             if time.monotonic() > listed + LISTED_EVERY:
-                _list(folder, order, cases)
+                _list(folder, order)
                 listed = time.monotonic()
     finally:
-        _list_what_is_there(folder, order, before)
+        _list(folder, order)
 
 
 def make_cases(folder: str | Path, indices: Sequence[int]) -> list[int]:
-    """Make some cases of a set that is begun; what a worker does.
-
-    Raises
-    ------
-    OSError
-        If they can't be written; what was written of such a case is removed.
-    """
+    """Make some cases of a set that is begun, a worker's part of `build_set`; a case that fails leaves nothing."""
     folder = Path(folder)
     order = read_order(folder)
     try:
@@ -139,27 +152,16 @@ def make_cases(folder: str | Path, indices: Sequence[int]) -> list[int]:
 
 
 def read_order(folder: str | Path) -> Order:
-    """Return the order that a set was begun with.
+    """Return the order that a set was begun with, or raise ValueError."""
 
-    Raises
-    ------
-    ValueError
-        If the folder holds no set of this version.
-    """
-    try:
-        header = parse_json((Path(folder) / HEADER).read_bytes(), "a set", folder)
-        version = header["version"] if header["format"] == FORMAT else None
-    except (OSError, ValueError, KeyError, TypeError):
-        version = None
-    if version != VERSION:
-        came = "none" if version is None else f"version {quoted(version)}: begin it anew in another folder"
-        raise ValueError(f"expected a set of version {VERSION} in {folder}, got {came}")
-    try:
+    def decode(header: dict[str, Any], _: dict[str, np.ndarray]) -> Order:
         content = header["order"]
         return Order(Recipe.from_dict(content["recipe"]), content["layout"], tuple(content["parts"]))
-    except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
-        reason = quoted(str(error))
-        raise ValueError(f"expected a whole set in {folder}, got one with a damaged {HEADER} ({reason})") from error
+
+    try:
+        return SET.read(Path(folder) / HEADER, decode)
+    except FileNotFoundError as error:
+        raise ValueError(f"{folder} is not a set of curvafit: it has no {HEADER}") from error
 
 
 def cases_of(folder: Path) -> list[int]:
@@ -173,12 +175,30 @@ def case_name(index: int) -> str:
     return f"case_{index:05d}"
 
 
+def check_set(folder: Path, order: Order) -> None:
+    """Raise ValueError where a folder holds other things than a set of this order: it may be new, or empty."""
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"{folder} is a file: name a folder for the set")
+    if not (folder / HEADER).exists():
+        if folder.is_dir() and any(folder.iterdir()):
+            raise ValueError(f"{folder} holds other things than a set: name a new or an empty folder")
+        return
+    stored, wanted = read_order(folder).as_dict(), order.as_dict()
+    if stored != wanted:
+        name, was, now = _difference(stored, wanted)
+        raise ValueError(f"{folder} was begun with {name} {was} and not {now}: choose another folder, or delete it")
+
+
 @contextmanager
 def _begun(folder: Path, order: Order) -> Iterator[None]:
-    """Begin a set; where the first case can't be had, remove what was begun."""
+    """Begin a set; where the first case can't be made, remove what was begun."""
     new = [place for place in (folder, *folder.absolute().parents) if not place.exists()]
+    check_set(folder, order)
     anew = not (folder / HEADER).exists()
-    _begin(folder, order)
+    if anew:
+        SET.write(folder / HEADER, {"versions": versions(), "order": order.as_dict()})
+        check_set(folder, order)  # another process may have begun it meanwhile
+    (folder / RECORDS).mkdir(exist_ok=True)
     try:
         yield
     except ValueError:
@@ -192,106 +212,75 @@ def _begun(folder: Path, order: Order) -> Iterator[None]:
         raise
 
 
-def _begin(folder: Path, order: Order) -> None:
-    if not (folder / HEADER).exists():
-        check_set(folder, order)
-        header = {"format": FORMAT, "version": VERSION, "versions": versions(), "order": order.as_dict()}
-        _write_json(folder / HEADER, header)
-    check_set(folder, order)  # another process may have begun it
-    (folder / RECORDS).mkdir(exist_ok=True)
-
-
-def check_set(folder: Path, order: Order) -> None:
-    """Raise ValueError where a folder holds other things than a set of this order: it may be new, or empty."""
-    if folder.exists() and not folder.is_dir():
-        raise ValueError(f"expected a folder for the set, got the file {folder}")
-    if not (folder / HEADER).exists():
-        if folder.is_dir() and any(folder.iterdir()):
-            raise ValueError(f"expected a new or empty folder, or a set to go on with, got {folder} with other things")
-        return
-    stored, wanted = read_order(folder).as_dict(), order.as_dict()
-    if stored != wanted:
-        name, was, now = _difference(stored, wanted)
-        state = f"got another {name}: {now} for {was}; choose another folder, or delete this one"
-        raise ValueError(f"expected what {folder} was begun with, {state}")
-
-
-def _list(folder: Path, order: Order, cases: set[int]) -> None:
-    """Write what the layout's readers want."""
-    about, names = About(folder.resolve().name, order.recipe.modality.name), list(map(case_name, sorted(cases)))
-    _write_json(folder / LIST, LAYOUTS[order.layout].listing(names, about))
-
-
-def _list_what_is_there(folder: Path, order: Order, before: set[int]) -> None:
-    """Write the list; where the disk is too full for it, without the last cases, which make room.
-
-    Cases that were there before this run stay.
-    """
-    cases = set(cases_of(folder))
-    while True:
-        try:
-            return _list(folder, order, cases)
-        except OSError as error:
-            if error.errno not in (errno.ENOSPC, errno.EDQUOT) or cases <= before:
-                raise
-            last = max(cases - before)
-            _remove_case(folder, order, case_name(last))
-            cases.remove(last)
-
-
-def _remove_case(folder: Path, order: Order, name: str) -> None:
-    """Remove a case, its record first: files without a record are no case."""
-    layout = LAYOUTS[order.layout]
-    places = [
-        folder / RECORDS / f"{name}.json",
-        *(folder / part.format(case=name) for part in (layout.label, layout.image)),
-    ]
-    for place in [*places, *(folder / "parts").glob(f"*/{name}.*")]:
-        remove(place)
+def _list(folder: Path, order: Order) -> None:
+    """Write the list of the complete cases that the layout's readers want."""
+    names, layout = list(map(case_name, cases_of(folder))), LAYOUTS[order.layout]
+    pairs = [{"image": layout.image.format(case=name), "label": layout.label.format(case=name)} for name in names]
+    about = {"name": folder.resolve().name, "description": "synthetic; made by curvafit", "numTraining": len(names)}
+    channel = {"0": order.recipe.modality.name}
+    if layout.nnunet:  # by name: what else lies in the folders, such as a killed run's temporary files, does not count
+        listed = {
+            "channel_names": channel,
+            "labels": {"background": 0, "structure": 1},
+            "file_ending": ".nii.gz",
+            **about,
+            "dataset": {
+                name: {"images": [pair["image"]], "label": pair["label"]}
+                for name, pair in zip(names, pairs, strict=True)
+            },
+        }
+    else:
+        listed = {
+            **about,
+            "tensorImageSize": "3D",
+            "modality": channel,
+            "labels": {"0": "background", "1": "structure"},
+            "numTest": 0,
+            "training": pairs,
+            "test": [],
+        }
+    _write_json(folder / LIST, listed)
 
 
 def _write_case(folder: Path, order: Order, index: int, case: Case) -> None:
     """Write labels, image and record of a case, in this order, all or none; with its record a case is complete."""
     layout, name = LAYOUTS[order.layout], case_name(index)
     record = folder / RECORDS / f"{name}.json"
-    places = [folder / layout.label.format(case=name), folder / layout.image.format(case=name)]
-    parts = folder / layout.part
     if record.exists():
         return
+    places: list[Path] = []
     try:
-        known = _write_parts(order, case, lambda part: Path(str(parts).format(part=part, case=name)), places)
+        known = _write_parts(folder, order, name, case, places)
         mask = case.mask.astype(np.uint8)
-        for values, place in zip((mask, case.image), places, strict=False):
-            save(Field(values, case.spacing, case.unit), place)
+        for values, pattern in ((mask, layout.label), (case.image, layout.image)):
+            places.append(folder / pattern.format(case=name))
+            save(Field(values, case.spacing, case.unit), places[-1])
         sums = {"image": _digest(case.image), "label": _digest(mask)}
         _write_json(record, case.record | known | {"sha256": sums, "versions": versions()})
     except BaseException:
         with undisturbed():
-            for place in () if record.exists() else places:
+            for place in () if record.exists() else places:  # another process may have completed the case
                 remove(place)
         raise
 
 
-def _write_parts(order: Order, case: Case, place: Callable[[str], Path], places: list[Path]) -> dict[str, Any]:
-    """Return the labels besides the mask; what is no volume goes into the record."""
+def _write_parts(folder: Path, order: Order, name: str, case: Case, places: list[Path]) -> dict[str, Any]:
+    """Write the labels besides the mask, append their files to `places`, and return those that are no volumes."""
     if not order.parts:
         return {}
     grid, known = Grid(case.image.shape, case.spacing, "replicate"), {}  # type: ignore[arg-type]
     wanted = set(order.parts) - {"centreline"} | ({"skeleton", "distance"} if "centreline" in order.parts else set())
-    labels = labels_of(case.field, grid, case.epsilon, wanted) if wanted else None
+    labels = labels_of(case.field, grid, case.epsilon, wanted)
     for part in order.parts:
-        if part == "centreline":
-            graph = centreline(labels.skeleton, labels.distance, grid)  # type: ignore[union-attr,arg-type]
-            for suffix, write in ((".graphml", write_graphml), (".swc", write_swc)):
-                target = place(part)
-                target = target.with_name(target.name.partition(".")[0] + suffix)
-                places.append(target)
-                write(graph, target, case.unit)
-        elif part == "betti":
-            known[part] = list(labels.betti)  # type: ignore[union-attr,arg-type]
+        place = folder / LAYOUTS[order.layout].part.format(part=part, case=name)
+        if part == "betti":
+            known[part] = list(labels.betti)  # type: ignore[arg-type]
+        elif part == "centreline":
+            places.append(place.with_name(f"{name}.graphml"))
+            write_graphml(centreline(labels.skeleton, labels.distance, grid), places[-1], case.unit)  # type: ignore[arg-type]
         else:
-            places.append(place(part))
-            save(Field(getattr(labels, part), case.spacing, case.unit), place(part))
+            places.append(place)
+            save(Field(getattr(labels, part), case.spacing, case.unit), place)
     return known
 
 
@@ -310,3 +299,44 @@ def _difference(stored: Any, wanted: Any, name: str = "order") -> tuple[str, Any
             if stored[key] != wanted[key]:
                 return _difference(stored[key], wanted[key], key)
     return name, stored, wanted
+
+
+# ---- picture ---------------------------------------------------------------------------------------------------------
+
+
+def write_preview(folder: str | Path) -> Path:
+    """Write `preview.png` of a set into its folder: of the first cases the slice with most of the structure, with and
+    without the label's outline."""
+    folder = Path(folder)
+    layout = LAYOUTS[read_order(folder).layout]
+    names = [case_name(index) for index in cases_of(folder)[:SHOWN]]
+    columns, rows = min(ROW, len(names)), -(-len(names) // ROW)
+    figure = Figure(figsize=(2.4 * columns, 5.0 * rows + 0.3), facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = np.atleast_2d(figure.subplots(2 * rows, columns, squeeze=False))
+    for axis in axes.flat:
+        axis.set_axis_off()
+    for k, name in enumerate(names):
+        image, label = (read_values(folder / part.format(case=name)) for part in (layout.image, layout.label))
+        source, (height, width) = _shown_of(folder / RECORDS / f"{name}.json")
+        row, column = 2 * (k // ROW), k % ROW
+        plane = int(np.argmax((label > 0).sum((1, 2))))
+        low, high = np.percentile(image[plane], (0.5, 99.5))
+        for axis in (axes[row, column], axes[row + 1, column]):
+            axis.imshow(image[plane], cmap="gray", vmin=low, vmax=max(high, low + 1e-6), aspect=height / width)
+        if 0 < label[plane].sum() < label[plane].size:
+            axes[row + 1, column].contour(label[plane], [0.5], colors=CONTOUR, linewidths=0.8)
+        axes[row, column].set_title(f"{name}\n{source}"[:60], fontsize=8)
+    return write_picture(figure, folder / "preview.png")
+
+
+def _shown_of(path: Path) -> tuple[str, tuple[float, float]]:
+    """Return what the picture takes from a case's record: its source's name, and its voxels' edges (y, x)."""
+    try:
+        record = parse_json(path.read_bytes(), "a case's record", path)
+        _, height, width = map(float, record["imaging"]["spacing"])
+        if not height > 0 < width:
+            raise ValueError("its spacing is not positive")
+        return str(record["source"]["name"]), (height, width)
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} is not the record of a case: {error}") from error

@@ -1,4 +1,4 @@
-"""Where the shapes of a training set come from: parameters, from which each is generated, or a store of fields."""
+"""Where the shapes of a training set come from: laws, by which shapes are grown, or stores, of which they are crops."""
 
 from __future__ import annotations
 
@@ -11,30 +11,32 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
 
 from curvafit.core.checks import as_tuple
+from curvafit.core.extras import require
 from curvafit.core.units import METRES, convert_length
 from curvafit.data_synth.design import PARAMETERS, Design
-from curvafit.data_synth.draws import one_thread
 from curvafit.data_synth.imaging.modality import Modality
-from curvafit.data_synth.moves import any_crop
 from curvafit.data_synth.store import Store, open_store
 from curvafit.generation.flow import generate
 from curvafit.generation.fraction import first_mass
-from curvafit.generation.schedule import SCHEDULES, Schedule
+from curvafit.generation.schedule import Schedule
 from curvafit.generation.schedule import schedule as named_schedule
 from curvafit.generation.viability import well_formed
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
+from curvafit.priors.kernels.threads import one_thread
 from curvafit.priors.law import Law, LawLike, read_laws
 
 #: Seeds that a shape gets to become well-formed.
 TRIES = 8
 #: Crops that are looked at for one with both structure and background.
 CROPS = 32
-#: Names of schedules in the records of version 0.1, which held no more of them, and the names today.
-_NAMES_0_1 = {"fast": "cosine", "paper": "paper"}
-#: The types of one law or one store.
+#: Rotations and reflections of the cube: orders of the three axes times their directions.
+SYMMETRIES = 48
+_ORDERS = ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0))
 
 _Crop = TypeVar("_Crop", bound=tuple[Any, ...])
 
@@ -66,7 +68,7 @@ class ShapeSource(Protocol):
 
 @dataclass(frozen=True)
 class Generated:
-    """Shapes generated at points of seven numbers (`PARAMETERS`, working units), in turn.
+    """Shapes grown from points of seven numbers (`PARAMETERS`, working units), in turn.
 
     Parameters
     ----------
@@ -78,11 +80,6 @@ class Generated:
         Share of the volume that shapes fill, instead of the points' masses, as near as `generate` gets: a shape's
         `origin` says where it is missed.
 
-    Raises
-    ------
-    ValueError
-        If there is no point, one is no parameters of a shape (`Design`), the names are not as many, the schedule is
-        unknown, or the fraction is not within (0, 1).
     """
 
     points: tuple[tuple[float, ...], ...]
@@ -93,7 +90,7 @@ class Generated:
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", as_tuple(self.names, "names"))
         if len(self.names) != len(as_tuple(self.points, "points")):
-            raise ValueError(f"expected a name for each of {len(self.points)} points, got {len(self.names)}")
+            raise ValueError(f"each of {len(self.points)} points needs a name, got {len(self.names)} names")
         if self.fraction is not None:
             first_mass(self.fraction)
         object.__setattr__(self, "schedule", named_schedule(self.schedule))
@@ -105,13 +102,7 @@ class Generated:
         return math.inf
 
     def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> PhaseField:
-        """Return a well-formed shape, of the first of some seeds that gives one.
-
-        Raises
-        ------
-        ValueError
-            If no seed gives one.
-        """
+        """Return a well-formed shape, of the first of some seeds that gives one; ValueError where none does."""
         turn = index % len(self.points)
         *six, mass = self.points[turn]
         grid, status = Grid(tuple(voxels)), ""  # type: ignore[arg-type]
@@ -134,8 +125,7 @@ class Generated:
                 return PhaseField(flow.field.numpy(), WORKING_EPSILON / WORKING_SPACING, origin)
             status = flow.status
         raise ValueError(
-            f"expected {self.names[turn]} to grow from one of {TRIES} seeds, got none: {status}; "
-            "try another volume fraction or law"
+            f"{self.names[turn]} grew from none of {TRIES} seeds ({status}): try another volume fraction or law"
         )
 
     @staticmethod
@@ -146,21 +136,16 @@ class Generated:
         ----------
         fraction
             As above; by default the volume fraction of the scan, where the laws are fits and agree on it.
-
-        Raises
-        ------
-        FileNotFoundError, ValueError
-            If a law cannot be read (`Law.of`), or states neither a mass nor a volume fraction.
         """
         stated = tuple(laws)
-        textures = read_laws(stated)
-        shares = {each.volume_fraction for each in textures}
+        known = read_laws(stated)
+        shares = {law.volume_fraction for law in known}
         if fraction is None and len(shares) == 1:
             (fraction,) = shares
-        points = tuple(_point(each, fraction) for each in textures)
+        points = tuple(_point(law, fraction) for law in known)
         names = (
-            Path(law).name if isinstance(law, (str, PathLike)) else texture.origin
-            for law, texture in zip(stated, textures, strict=True)
+            Path(source).name if isinstance(source, (str, PathLike)) else law.origin
+            for source, law in zip(stated, known, strict=True)
         )
         return Generated(points, tuple(names), fraction=fraction)
 
@@ -185,11 +170,6 @@ class Stored:
         is another source.
     rotate
         Whether crops are turned by any rotation, besides the symmetries of the cube.
-
-    Raises
-    ------
-    FileNotFoundError, ValueError
-        If there is no store, or one has no well-formed shape.
     """
 
     paths: tuple[Path, ...]
@@ -201,22 +181,14 @@ class Stored:
             object.__setattr__(self, "draws", len(_formed(self.paths)))
 
     def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> PhaseField:
-        """Return a crop of any of the stores' shapes that shows both structure and background.
-
-        Raises
-        ------
-        ValueError
-            If it is larger than these, the stores have grown, or many crops show only one.
-        """
+        """Return a crop of any of the stores' shapes that shows both structure and background."""
         draws = _formed(self.paths)
         if len(draws) != self.draws:
-            raise ValueError(
-                f"expected stores of {self.draws} well-formed shapes as before, got {len(draws)}: they grew"
-            )
+            raise ValueError(f"the stores had {self.draws} well-formed shapes and grew to {len(draws)}: begin anew")
 
         def crop() -> tuple[np.ndarray, dict[str, Any], Store, int]:
             store, draw = draws[int(rng.integers(len(draws)))]
-            return *any_crop(store.field(draw), voxels, rng, self.rotate), store, draw
+            return *random_crop(store.field(draw), voxels, rng, self.rotate), store, draw
 
         field, move, store, draw = _two_phases(crop, voxels)
         record, settings = store.record(draw), store.settings
@@ -268,17 +240,11 @@ class Pool:
         return f"{self.count} shapes of {', '.join(self.generated.names)}"
 
     def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> PhaseField:
-        """Return a crop of any of the pool's shapes that shows both structure and background.
-
-        Raises
-        ------
-        ValueError
-            If it is larger than these, a shape cannot be had, or many crops show only one.
-        """
+        """Return a crop of any of the pool's shapes that shows both structure and background."""
 
         def crop() -> tuple[np.ndarray, dict[str, Any], PhaseField]:
             whole = _pooled(self.generated, int(rng.integers(self.count)), self.within)
-            return *any_crop(whole.values, voxels, rng, self.rotate), whole
+            return *random_crop(whole.values, voxels, rng, self.rotate), whole
 
         values, move, whole = _two_phases(crop, voxels)
         return PhaseField(values, whole.epsilon, whole.origin | move)
@@ -288,34 +254,28 @@ def source_of(content: dict[str, Any]) -> ShapeSource:
     """Return the source that `ShapeSource.as_dict` wrote."""
     if content["kind"] == "stored":
         return Stored(tuple(map(Path, content["paths"])), content["draws"], content["rotate"])
-    plan = content["schedule"]
-    plan = SCHEDULES[_NAMES_0_1[plan]] if isinstance(plan, str) else Schedule(**plan)
-    return Generated(tuple(map(tuple, content["points"])), tuple(content["names"]), plan, content["fraction"])
+    points, plan = tuple(map(tuple, content["points"])), Schedule(**content["schedule"])
+    return Generated(points, tuple(content["names"]), plan, content["fraction"])
 
 
 def voxel_of(laws: Iterable[LawLike], kind: Modality) -> float:
     """Return the edge of a shape's voxel in a modality's unit: that of a law that is a fit, else the modality's own.
 
-    A fit in voxels tells no edge of images in a unit of length.
-
-    Raises
-    ------
-    FileNotFoundError, ValueError
-        If a law cannot be read (`Law.of`), or the laws are several fits of different edges.
+    A fit in voxels tells no edge of images in a unit of length. Raises ValueError where fits differ in their edges.
     """
     unit = kind.base.unit
     fits = [(law.working_voxel, law.length_unit) for law in read_laws(laws) if law.working_voxel and law.length_unit]
     edges = {convert_length(voxel, own, unit) for voxel, own in fits if own in METRES or own == unit}
     if len(edges) > 1:
-        raise ValueError(f"expected fits of one voxel's edge, or a voxel beside them, got edges of {sorted(edges)}")
+        raise ValueError(f"the fits' voxels have edges of {sorted(edges)}: give one voxel")
     return edges.pop() if edges else kind.voxel
 
 
-def _point(texture: Law, fraction: float | None) -> tuple[float, ...]:
+def _point(law: Law, fraction: float | None) -> tuple[float, ...]:
     """Return the seven numbers of a law; a mass that it does not state is that of the volume fraction."""
-    if texture.mass is None and fraction is not None:
-        return replace(texture, mass=first_mass(fraction)).point
-    return texture.point
+    if law.mass is None and fraction is not None:
+        return replace(law, mass=first_mass(fraction)).point
+    return law.point
 
 
 def _two_phases(crop: Callable[[], _Crop], voxels: Sequence[int]) -> _Crop:
@@ -325,7 +285,7 @@ def _two_phases(crop: Callable[[], _Crop], voxels: Sequence[int]) -> _Crop:
         if parts[0].min() < 0 < parts[0].max():
             return parts
     edges = " x ".join(map(str, voxels))
-    raise ValueError(f"expected structure and background in crops of {edges} voxels, got one {CROPS} times")
+    raise ValueError(f"{CROPS} crops of {edges} voxels show no structure, or nothing else: take larger ones")
 
 
 @lru_cache(maxsize=256)
@@ -340,6 +300,72 @@ def _formed(paths: tuple[Path, ...]) -> list[tuple[Store, int]]:
     for store in map(open_store, paths):
         formed = [(store, index) for index in store.indices() if well_formed(store.record(index).viability)]
         if not formed:
-            raise ValueError(f"expected a store with well-formed shapes, got none in {store.path}")
+            raise ValueError(f"the store {store.path} has no well-formed shapes")
         draws += formed
     return draws
+
+
+# ---- crops -----------------------------------------------------------------------------------------------------------
+
+
+def apply_symmetry(values: np.ndarray, symmetry: int) -> np.ndarray:
+    """Return a volume (…, Z, Y, X) under one of the cube's symmetries, 0 to 47; 0 leaves it as it is. A view."""
+    if not 0 <= symmetry < SYMMETRIES:
+        raise ValueError(f"a symmetry is a number from 0 to {SYMMETRIES - 1}, got {symmetry}")
+    order, flips = divmod(symmetry, 8)
+    lead = values.ndim - 3
+    axes = (*range(lead), *(lead + axis for axis in _ORDERS[order]))
+    moved = values.transpose(axes)
+    return moved[(..., *(slice(None, None, -1 if flips >> axis & 1 else 1) for axis in range(3)))]
+
+
+def crop_periodic(values: np.ndarray, corner: Sequence[int], shape: Sequence[int]) -> np.ndarray:
+    """Return the part (z, y, x) of a periodic volume (Z, Y, X) that begins at a corner, across its faces if need be.
+
+    A part that is larger than the volume repeats it.
+    """
+    for axis, (first, part) in enumerate(zip(corner, shape, strict=True)):
+        values = np.take(values, np.arange(first, first + part) % values.shape[axis], axis)
+    return values
+
+
+def crop_rotated(
+    values: np.ndarray, corner: Sequence[int], shape: Sequence[int], quaternion: Sequence[float]
+) -> np.ndarray:
+    """Return a part as `crop_periodic` does, turned about its middle by any rotation, interpolated linearly.
+
+    Parameters
+    ----------
+    quaternion
+        Of the rotation (x, y, z, w): where the volume's axes go, in the order (z, y, x).
+    """
+    kornia = require("kornia.geometry.transform", "synth", "rotating crops")
+    turn = Rotation.from_quat(quaternion).as_matrix()
+    half = (np.array(shape) - 1) / 2
+    margin = np.ceil(np.abs(turn.T) @ half - half).astype(int) + 1
+    around = crop_periodic(values, np.array(corner) - margin, np.array(shape) + 2 * margin)
+    move = np.column_stack([turn, half - turn @ (half + margin)])
+    matrix = torch.from_numpy(np.concatenate([move[::-1, 2::-1], move[::-1, 3:]], axis=1)[None]).float()
+    volume = torch.from_numpy(around)[None, None].float()
+    depth, height, width = (max(int(n), 2) for n in shape)  # grids of one voxel are not defined there
+    part = kornia.warp_affine3d(volume, matrix, (depth, height, width), align_corners=True)[0, 0].numpy()
+    return part[tuple(slice(n) for n in shape)]
+
+
+def random_crop(
+    values: np.ndarray, shape: Sequence[int], rng: np.random.Generator, rotate: bool = False
+) -> tuple[np.ndarray, dict[str, Any]]:
+    """Return a random crop of a periodic volume under a random symmetry, and which; with `rotate` under any rotation.
+
+    Such a crop has the texture of the whole.
+    """
+    symmetry = int(rng.integers(SYMMETRIES))
+    moved = apply_symmetry(values, symmetry)
+    if any(part > whole for part, whole in zip(shape, moved.shape, strict=True)):
+        raise ValueError(f"the crop must be within the shape's {moved.shape} voxels, got {tuple(shape)}")
+    corner = [int(rng.integers(whole)) for whole in moved.shape]
+    move = {"symmetry": symmetry, "corner": corner}
+    if not rotate:
+        return np.ascontiguousarray(crop_periodic(moved, corner, shape)), move
+    quaternion = rng.normal(size=4).tolist()
+    return crop_rotated(moved, corner, shape, quaternion), move | {"quaternion": quaternion}

@@ -8,8 +8,8 @@ Layout, version 2 (every attribute is JSON in a group's `zarr.json`)::
                            and the SHA-256 of all that and the field
     STORE/draws/000012/field   the phase field, float32 (Z, Y, X), one checksummed chunk; absent where not viable
 
-A draw is written beside its place, flushed to disk and renamed into it, so a killed process loses the draw it was
-at and nothing else. Draws that were not viable keep their record: a resumed build does not make them again.
+A draw is written beside its place, flushed to disk and renamed into it, so that a killed process loses no more than the
+draw it was at. Draws that were not viable keep their record: a resumed build does not make them again.
 
 Fields are float32, not float16: the stationarity fit reads Hess u where |u| is near 1 and ∇u near 0, and there
 float16's half step of 2.4e-4 is a second difference of up to 1e-3 / Δx² = 10 in working units.
@@ -18,10 +18,13 @@ float16's half step of 2.4e-4 is a second difference of up to 1e-3 / Δx² = 10 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
+import math
 import os
 import shutil
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,8 +36,9 @@ from curvafit.core.checks import quoted
 from curvafit.core.files import staged, write_content
 from curvafit.core.records import parse_json
 from curvafit.core.runtime import undisturbed
-from curvafit.data_synth.record import Record, Settings, attributes_of, digest, record_of
-from curvafit.generation.schedule import Schedule, present_name
+from curvafit.generation.schedule import Schedule
+from curvafit.generation.viability import Viability
+from curvafit.priors.coefficients import NAMES, Coefficients
 from curvafit.priors.grid import Grid
 
 FORMAT = "curvafit shapes"
@@ -43,6 +47,37 @@ VERSION = 2
 PARTIAL = "partial"
 #: A draw's folder is written in less than this; an older one was left by a killed process.
 _STALE_SECONDS = 600.0
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What all draws of a store share: sampling (z, y, x), ε and blur in spacing's unit, the design (`Design.as_dict`)
+    and its seed, and the schedule's fields (name, steps, rates)."""
+
+    shape: tuple[int, int, int]
+    spacing: tuple[float, float, float]
+    epsilon: float
+    blur: float
+    design: dict[str, Any]
+    seed: int
+    schedule: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Record:
+    """One draw: its index, parameters, noise seed, the steps made (fewer where rejected early), viability figures,
+    final energy F_ε, the flow's status sentence, the software versions and the seconds it took."""
+
+    index: int
+    coefficients: Coefficients
+    mass: float
+    seed: int
+    steps: int
+    viability: Viability
+    energy: float
+    status: str
+    versions: dict[str, str]
+    seconds: float
 
 
 class Store:
@@ -59,16 +94,19 @@ class Store:
     @property
     def wanted(self) -> int:
         """Return how many viable shapes the store is to have."""
-        attributes = _group_attributes(self.path)
+        attributes = _read_attributes(self.path)
         return 0 if attributes is None else int(attributes["wanted"])
 
     def want(self, count: int) -> None:
-        """Set how many are wanted, where it is more than before; one process at a time."""
+        """Set how many viable shapes are wanted, where it is more than before; for one process at a time."""
         if count > self.wanted:
-            _rewrite(self.path, {"wanted": count})
+            file = self.path / "zarr.json"
+            text = parse_json(file.read_bytes(), "a Zarr group", self.path)
+            text["attributes"]["wanted"] = count
+            write_content(file, json.dumps(text, indent=2))
 
     def indices(self) -> list[int]:
-        """Draws with a complete record, in increasing order."""
+        """Return the draws with a complete record, in increasing order."""
         names = (entry.name for entry in (self.path / "draws").iterdir())
         return sorted(int(name) for name in names if name.isdigit() and self.has(int(name)))
 
@@ -77,40 +115,22 @@ class Store:
         return self._attributes(index) is not None
 
     def record(self, index: int) -> Record:
-        """Return the record of a draw.
-
-        Raises
-        ------
-        KeyError, ValueError
-            If the draw is missing or incomplete, or its record damaged.
-        """
+        """Return the record of a draw; KeyError where the draw is missing, ValueError where it is damaged."""
         attributes = self._complete(index)
         try:
-            return record_of(attributes)
-        except ValueError as error:
+            return _decode(attributes)
+        except (KeyError, TypeError, AttributeError, ValueError) as error:
             raise self._damaged("record", index, error) from error
 
     def viable(self, index: int) -> bool:
-        """Return whether a draw is recorded as a shape.
-
-        Raises
-        ------
-        KeyError
-            If the draw is missing or incomplete.
-        """
+        """Return whether a draw is recorded as a shape; KeyError where the draw is missing."""
         return self._complete(index)["viability"]["viable"]
 
     def field(self, index: int) -> np.ndarray:
-        """Return the phase field of a viable draw, float32 (Z, Y, X).
-
-        Raises
-        ------
-        KeyError, ValueError
-            If the draw is missing, incomplete or was not viable, or its field damaged.
-        """
+        """Return the phase field of a viable draw, float32 (Z, Y, X); KeyError and ValueError as for `record`."""
         folder = self._place(index) / "field"
         if not self.has(index) or not folder.is_dir():
-            raise KeyError(f"expected a viable draw {index} in {self.path}, got none")
+            raise KeyError(f"{self.path} has no viable draw {index}")
         try:
             array = zarr.open_array(store=str(folder), mode="r")
             if array.shape != self.settings.shape or array.dtype != np.float32:
@@ -120,32 +140,26 @@ class Store:
             raise self._damaged("field", index, error) from error
 
     def intact(self, index: int) -> bool:
-        """Return whether a draw's record and field are, bit for bit, what was written.
-
-        Raises
-        ------
-        KeyError
-            If the draw is missing or incomplete.
-        """
+        """Return whether a draw's record and field have the checksum that was written; KeyError where it is missing."""
         attributes = self._complete(index)
         try:
             field = self.field(index) if attributes["viability"]["viable"] else None
         except ValueError:  # a chunk that is truncated, or whose own checksum is wrong
             return False
-        return digest(attributes, field) == attributes["sha256"]
+        return _digest(attributes, field) == attributes["sha256"]
 
     def write(self, record: Record, field: np.ndarray | None) -> bool:
         """Add a draw, whole or not at all; False where it was there already (nothing is then changed).
 
-        Raises
-        ------
-        ValueError
-            If the field is missing for a viable record, present for another, or not float32 of the store's shape.
+        Parameters
+        ----------
+        field
+            Phase field, float32 of the store's shape; None where the draw is not viable.
         """
         if record.viability.viable != (field is not None):
-            raise ValueError(f"expected a field exactly for viable draws, got viable = {record.viability.viable}")
+            raise ValueError(f"a viable draw has a field and another has none, got viable={record.viability.viable}")
         if field is not None and (field.dtype != np.float32 or field.shape != self.settings.shape):
-            raise ValueError(f"expected a float32 field {self.settings.shape}, got {field.dtype} {field.shape}")
+            raise ValueError(f"the field must be float32 {self.settings.shape}, got {field.dtype} {field.shape}")
         place = self._place(record.index)
         if self.has(record.index):
             return False
@@ -159,31 +173,32 @@ class Store:
             shutil.rmtree(place)  # what is there is torn
             return _publish(partial / place.name, place)
 
-    def _damaged(self, what: str, index: int, error: Exception) -> ValueError:
-        state = f"got a damaged one ({quoted(str(error))}): `curvafit atlas verify` lists such draws"
-        return ValueError(f"expected a whole {what} of draw {index} in {self.path}, {state}")
+    def _damaged(self, part: str, index: int, error: Exception) -> ValueError:
+        return ValueError(
+            f"the {part} of draw {index} in {self.path} is damaged ({quoted(str(error))}): "
+            "`curvafit atlas verify` lists such draws"
+        )
 
-    def _complete(self, index: int) -> dict:
+    def _complete(self, index: int) -> dict[str, Any]:
         attributes = self._attributes(index)
         if attributes is None:
-            raise KeyError(f"expected a complete draw {index} in {self.path}, got none")
+            raise KeyError(f"{self.path} has no complete draw {index}")
         return attributes
 
     def _place(self, index: int) -> Path:
         return self.path / "draws" / f"{index:06d}"
 
-    def _attributes(self, index: int) -> dict | None:
+    def _attributes(self, index: int) -> dict[str, Any] | None:
         """Return a draw's attributes, None where anything of it is missing; a field's bytes are checked when it is
         read."""
         place = self._place(index)
-        attributes = _group_attributes(place)
+        attributes = _read_attributes(place)
         if attributes is None or attributes.get("index") != index or "sha256" not in attributes:
             return None
         viability = attributes.get("viability")
         if not isinstance(viability, dict) or not isinstance(viability.get("viable"), bool):
             return None
-        complete = not attributes["viability"]["viable"] or (place / "field" / "c" / "0" / "0" / "0").is_file()
-        return attributes if complete else None
+        return attributes if not viability["viable"] or (place / "field/c/0/0/0").is_file() else None
 
     def _clear_stale(self) -> None:
         for left in (self.path / "draws").glob(f".{PARTIAL}*"):
@@ -204,44 +219,42 @@ def open_store(path: str | Path, settings: Settings | None = None) -> Store:
     path = Path(path)
     if not path.exists() or (settings is not None and path.is_dir() and not any(path.iterdir())):
         if settings is None:
-            raise FileNotFoundError(f"expected a store of shapes at {path}, got nothing there")
+            raise FileNotFoundError(f"found no store of shapes at {path}")
         _create(path, settings)
-    attributes = _group_attributes(path)
+    attributes = _read_attributes(path)
     if attributes is None or attributes.get("format") != FORMAT:
-        raise ValueError(f"expected a store of shapes at {path}, got something else")
+        raise ValueError(f"{path} is not a store of shapes")
     if (version := attributes.get("version")) != VERSION:
-        raise ValueError(f"expected a store of version {VERSION} at {path}, got version {quoted(version)}")
-    stored = _settings(path, attributes)
-    if settings is not None and _today(settings) != _today(stored):
-        raise ValueError(f"expected the settings of {path}, got another {_difference(stored, settings)}")
+        raise ValueError(f"{path} is a store of version {quoted(version)}; this curvafit reads version {VERSION}")
+    try:
+        stored = _decode_settings(attributes)
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise ValueError(f"the header of the store {path} is damaged ({quoted(str(error))})") from error
+    if settings is not None and (difference := _difference(stored, settings)):
+        raise ValueError(f"{path} was made with another {difference}: choose another folder")
     return Store(path, stored)
 
 
-def _settings(path: Path, attributes: dict[str, Any]) -> Settings:
-    """Return the settings in a store's header; its other entry is how many shapes are wanted."""
-    try:
-        values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in attributes["settings"].items()}
-        settings = Settings(**values)
-        Grid(settings.shape, settings.spacing)
-        sound = len(settings.shape) == len(settings.spacing) == 3 and bool(Schedule(**settings.schedule).steps)
-        if not (
-            sound
-            and settings.epsilon > 0
-            and settings.blur >= 0
-            and settings.seed >= 0
-            and int(attributes["wanted"]) >= 0
-        ):
-            raise ValueError("a setting is missing or negative")
-    except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        state = f"got one with a damaged header ({quoted(str(error))})"
-        raise ValueError(f"expected a whole store of shapes at {path}, {state}") from error
+def _decode_settings(attributes: dict[str, Any]) -> Settings:
+    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in attributes["settings"].items()}
+    settings = Settings(**values)
+    Grid(settings.shape, settings.spacing)
+    sound = len(settings.shape) == len(settings.spacing) == 3 and bool(Schedule(**settings.schedule).steps)
+    least = min(settings.blur, settings.seed, int(attributes["wanted"]))
+    if not (sound and settings.epsilon > 0 and least >= 0):
+        raise ValueError("a setting is missing or negative")
     return settings
 
 
-def _today(settings: Settings) -> Settings:
-    """Return the settings with the schedule's name of today."""
-    plan = settings.schedule
-    return dataclasses.replace(settings, schedule=plan | {"name": present_name(plan)})
+def _difference(stored: Settings, wanted: Settings) -> str:
+    """Return the first setting that differs, with both values; the name of a schedule is none of the draws'."""
+    for name, value in vars(stored).items():
+        other = getattr(wanted, name)
+        if name == "schedule":
+            value, other = ({**plan, "name": ""} for plan in (value, other))
+        if other != value:
+            return f"{name} ({value} and not {other})"
+    return ""
 
 
 def _create(path: Path, settings: Settings) -> None:
@@ -260,8 +273,9 @@ def _create(path: Path, settings: Settings) -> None:
 
 @undisturbed()  # Zarr writes in threads of its own, which would go on beside what cleans up
 def _write_draw(folder: Path, record: Record, field: np.ndarray | None) -> None:
-    attributes = attributes_of(record)
-    zarr.create_group(store=str(folder), attributes=attributes | {"sha256": digest(attributes, field)})
+    attributes = dataclasses.asdict(record) | {"coefficients": record.coefficients.as_dict()}
+    attributes = _without_nan(attributes | {"viability": _without_nan(attributes["viability"])})
+    zarr.create_group(store=str(folder), attributes=attributes | {"sha256": _digest(attributes, field)})
     if field is None:
         return
     array = zarr.create_array(
@@ -273,13 +287,6 @@ def _write_draw(folder: Path, record: Record, field: np.ndarray | None) -> None:
         dimension_names=("z", "y", "x"),
     )
     array[...] = field
-
-
-def _rewrite(folder: Path, attributes: dict[str, Any]) -> None:
-    """Change attributes of the Zarr group in a folder, all at once."""
-    text = parse_json((folder / "zarr.json").read_bytes(), "a Zarr group", folder)
-    text["attributes"] |= attributes
-    write_content(folder / "zarr.json", json.dumps(text, indent=2))
 
 
 def _publish(partial: Path, place: Path) -> bool:
@@ -297,7 +304,7 @@ def _publish(partial: Path, place: Path) -> bool:
     return True
 
 
-def _group_attributes(folder: Path) -> dict | None:
+def _read_attributes(folder: Path) -> dict[str, Any] | None:
     """Return the attributes of the Zarr group in a folder, None where there is no readable one."""
     try:
         text = parse_json((folder / "zarr.json").read_bytes(), "a Zarr group", folder)
@@ -307,10 +314,41 @@ def _group_attributes(folder: Path) -> dict | None:
     return attributes if known and isinstance(attributes := text.get("attributes"), dict) else None
 
 
-def _difference(stored: Settings, wanted: Settings) -> str:
-    """Return the first setting that differs, with both values."""
-    for name, value in dataclasses.asdict(stored).items():
-        other = getattr(wanted, name)
-        if other != value:
-            return f"{name}: {other} for {value}"
-    return "one"
+def _digest(attributes: dict[str, Any], field: np.ndarray | None) -> str:
+    """Return the SHA-256 of a record as canonical JSON, and of the field's bytes."""
+    content = {name: value for name, value in attributes.items() if name != "sha256"}
+    checksum = hashlib.sha256(json.dumps(content, sort_keys=True).encode())
+    checksum.update(b"" if field is None else np.ascontiguousarray(field).tobytes())
+    return checksum.hexdigest()
+
+
+def _without_nan(values: dict[str, Any]) -> dict[str, Any]:
+    """Return values in JSON's types: plain numbers, and null for those that are not finite."""
+    plain = {name: value.item() if isinstance(value, np.generic) else value for name, value in values.items()}
+    return {name: None if isinstance(v, float) and not math.isfinite(v) else v for name, v in plain.items()}
+
+
+def _decode(attributes: dict[str, Any]) -> Record:
+    """Return the record in a draw's attributes; further attributes are left out."""
+    viability = {field.name: attributes["viability"][field.name] for field in dataclasses.fields(Viability)}
+    numbers = {name: value for name, value in viability.items() if name not in ("viable", "reason")}
+    return Record(
+        **{name: _count(attributes[name]) for name in ("index", "seed", "steps")},
+        **{name: _number(attributes[name]) for name in ("mass", "energy", "seconds")},
+        coefficients=Coefficients(*(_number(attributes["coefficients"][name]) for name in NAMES)),
+        viability=Viability(**viability | {name: _number(value) for name, value in numbers.items()}),
+        status=str(attributes["status"]),
+        versions=dict(attributes["versions"]),
+    )
+
+
+def _number(value: Any) -> Any:
+    if value is not None and (isinstance(value, bool) or not isinstance(value, (int, float))):
+        raise ValueError(f"{quoted(value)} is no number")
+    return math.nan if value is None else value
+
+
+def _count(value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**63:
+        raise ValueError(f"{quoted(value)} is no whole number from 0")
+    return value

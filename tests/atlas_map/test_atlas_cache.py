@@ -15,7 +15,7 @@ from exact_store import exact_field, exact_store, quick_map
 import curvafit.atlas_map.files as atlas_files
 from curvafit.atlas_map.files import write_map
 from curvafit.atlas_map.layout import diagram_distances
-from curvafit.data_synth.record import Record
+from curvafit.data_synth.store import Record
 from curvafit.geometry.diagram import Diagram
 
 

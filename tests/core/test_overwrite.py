@@ -138,7 +138,7 @@ def test_atlases_leave_other_peoples_files(tmp_path: Path, monkeypatch: pytest.M
     exact_store(store, 7)
     (tmp_path / "atlas.npz").write_text("mine")
     before = tree(tmp_path)
-    refused(call("atlas", "build", folder, "--count", 1, "--workers", 0), "got something else")
+    refused(call("atlas", "build", folder, "--count", 1, "--workers", 0), "store")
     refused(call("atlas", "extract", store, "-o", tmp_path / "atlas.npz"), TAKEN)
     refused(call("atlas", "map", store, "-o", store), "over no input")
     for name in ("atlas.html", "atlas.png"):

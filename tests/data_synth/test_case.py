@@ -10,11 +10,9 @@ import pytest
 from flat_recipe import SHAPE, flat_recipe
 
 from curvafit.data_synth.case import Recipe
-from curvafit.data_synth.imaging.modality import Modality
-from curvafit.data_synth.imaging.parameters import Imaging
+from curvafit.data_synth.imaging.modality import Imaging, Modality
 from curvafit.data_synth.sources import Generated, PhaseField, source_of
 from curvafit.generation import fraction as steering
-from curvafit.generation.schedule import SCHEDULES
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +57,6 @@ def test_shapes_fill_the_share_that_is_asked_for(monkeypatch):
     assert (made.values > 0).mean() == 0.15 and made.origin["parameters"]["mass"] != -0.5
     assert "after 1500 steps" in made.origin["status"] and "volume fraction" not in made.origin["status"]
     assert source_of(source.as_dict()) == source
-    assert source_of(source.as_dict() | {"schedule": "fast"}).schedule == SCHEDULES["cosine"]  # as version 0.1 wrote it
     with pytest.raises(ValueError, match="fraction"):
         Generated((point,), ("tubes",), fraction=1.5)
     monkeypatch.setattr(steering, "LAST", -1.0)

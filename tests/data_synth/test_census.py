@@ -9,7 +9,7 @@ import shutil
 import pytest
 
 from curvafit.data_synth import build, extend
-from curvafit.data_synth.census import census, verify
+from curvafit.data_synth.atlas import summarise, verify
 from curvafit.data_synth.store import Store, open_store
 from curvafit.generation.schedule import schedule
 
@@ -40,19 +40,19 @@ def changed(path, index: int, **attributes) -> None:
 
 
 def test_nothing_is_wrong_with_a_sound_store(path):
-    found = verify(path, regenerate=2)
+    found = verify(path)
     assert (found.problems, found.notes) == ((), ())
-    assert found.status.endswith("2 made again: nothing is wrong")
-    told = census(open_store(path))
+    assert found.status.endswith("nothing is wrong")
+    told = summarise(open_store(path))
     assert (told["shapes"], told["wanted"], told["voxels"]) == ("4", "4", "16 x 16 x 16")
     assert told["schedule"] == "cosine, 40 steps"
 
 
-def test_a_census_names_schedules_as_they_are_named_today(path):
+def test_a_summary_names_schedules_as_they_are_named_today(path):
     """Version 0.1 called `fast` what is `cosine` now."""
     settings = open_store(path).settings
     old = dataclasses.replace(settings, schedule=settings.schedule | {"name": "fast"})
-    assert census(Store(path, old))["schedule"] == "cosine (named fast then), 40 steps"
+    assert summarise(Store(path, old))["schedule"] == "cosine, 40 steps"
 
 
 def test_an_extended_store_is_as_if_built_at_once(path, tmp_path):
@@ -62,31 +62,30 @@ def test_an_extended_store_is_as_if_built_at_once(path, tmp_path):
     whole = build(tmp_path / "whole.zarr", 6, 16, seed=1, schedule=QUICK)
     assert longer.indices() == whole.indices() and longer.wanted == whole.wanted == 6
     assert all((longer.field(i) == whole.field(i)).all() for i in viable(path))
-    assert verify(path, 0).problems == ()
+    assert verify(path).problems == ()
 
 
 def test_a_lost_draw_is_found_and_made_again(path):
     shutil.rmtree(path / "draws" / f"{viable(path)[1]:06d}")
-    found = verify(path, 0)
-    assert found.problems == () and "1 draws are not there" in found.notes[0]  # as if the build had been stopped
+    found = verify(path)
+    assert found.problems == () and "1 draws are missing" in found.notes[0]  # as if the build had been stopped
     build(path, 4, 16, seed=1, schedule=QUICK)
-    assert verify(path, 0).notes == ()
+    assert verify(path).notes == ()
 
 
 def test_a_draw_lost_from_a_whole_store_is_a_problem(path):
     store = open_store(path)
     barren = next(index for index in store.indices() if not store.record(index).viability.viable)
     shutil.rmtree(path / "draws" / f"{barren:06d}")
-    assert "1 draws are not there" in verify(path, 0).problems[0]
+    assert "1 draws are missing" in verify(path).problems[0]
 
 
-def test_torn_and_foreign_folders_are_found(path):
-    torn = f"{viable(path)[0]:06d}"
-    (path / "draws" / torn / "field" / "c" / "0" / "0" / "0").unlink()
-    (path / "draws" / "notes").mkdir()
+def test_a_torn_draw_is_found(path):
+    torn = viable(path)[0]
+    (path / "draws" / f"{torn:06d}" / "field" / "c" / "0" / "0" / "0").unlink()
     (path / "draws" / ".partial-killed").mkdir()
-    problems = verify(path, 0).problems
-    assert problems == (f"draws/{torn} is torn, or no draw", "draws/notes is torn, or no draw")
+    (problem,) = verify(path).problems
+    assert f"draw {torn} is torn" in problem
 
 
 def test_a_draw_that_a_build_adds_meanwhile_is_no_stranger(path, tmp_path):
@@ -97,8 +96,8 @@ def test_a_draw_that_a_build_adds_meanwhile_is_no_stranger(path, tmp_path):
         if (tmp_path / last.name).exists():
             (tmp_path / last.name).rename(last)
 
-    assert not any("torn" in problem for problem in verify(path, 0, progress=add).problems)
-    assert last.exists() and verify(path, 0).problems == ()
+    assert not any("torn" in problem for problem in verify(path, progress=add).problems)
+    assert last.exists() and verify(path).problems == ()
 
 
 def test_changed_bytes_and_numbers_are_found(path):
@@ -108,7 +107,7 @@ def test_changed_bytes_and_numbers_are_found(path):
     content[len(content) // 2] ^= 1
     chunk.write_bytes(content)
     changed(path, second, mass=-0.1)
-    problems = verify(path, 0).problems
+    problems = verify(path).problems
     assert [
         f"draw {index} is not what was written" in each for index, each in zip((first, second), problems, strict=True)
     ]
@@ -118,33 +117,12 @@ def test_a_record_that_has_lost_a_name_is_found(path):
     for index, name in zip(viable(path), ("mass", "sha256", "viability"), strict=False):
         file = path / "draws" / f"{index:06d}" / "zarr.json"
         file.write_text(file.read_text().replace(f'"{name}"', '"lost"'))
-    problems = verify(path, 0).problems
+    problems = verify(path).problems
     assert ["not what was written" in each or "is torn" in each for each in problems] == [True] * 3
-
-
-def test_negative_numbers_are_refused(path):
-    with pytest.raises(ValueError, match="expected a number of draws to make again from 0, got -1"):
-        verify(path, -1)
-    with pytest.raises(ValueError, match="expected a seed from 0, got -1"):
-        verify(path, 0, -1)
 
 
 def test_a_draw_in_another_place_is_found(path):
     one, other = (path / "draws" / f"{index:06d}" for index in viable(path)[:2])
     shutil.rmtree(other)
     shutil.copytree(one, other)
-    assert any(f"draws/{other.name} is torn, or no draw" in each for each in verify(path, 0).problems)
-
-
-def test_a_field_that_does_not_come_out_again_is_found(path, monkeypatch):
-    monkeypatch.setattr("curvafit.data_synth.census.flows", wrong_flows)
-    found = verify(path, 20)
-    said = [f"draw {index} came out otherwise when it was made again" for index in viable(path)]
-    assert set(said) <= set(found.problems) and len(set(found.problems)) == len(found.problems)
-
-
-def wrong_flows(settings, indices):
-    """The flows of the draws one further."""
-    from curvafit.data_synth.draws import flows
-
-    return flows(settings, [index + 1 for index in indices])
+    assert any(f"draw {int(other.name)} is torn" in each for each in verify(path).problems)

@@ -13,8 +13,8 @@ from kornia.filters import filter3d, get_gaussian_kernel1d
 from scipy import stats
 from torch import Tensor
 
-from curvafit.data_synth.imaging import degrade
-from curvafit.data_synth.imaging.noise import poisson_quantile
+from curvafit.data_synth.imaging import effects
+from curvafit.data_synth.imaging.effects import poisson_quantile
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
 
@@ -24,7 +24,7 @@ MIDDLE = (N / 2, N / 2, N / 2)
 
 
 def field(shape) -> Tensor:
-    return optimal_profile(shape.distance(centres(GRID)), degrade.EPSILON)[None, None]
+    return optimal_profile(shape.distance(centres(GRID)), effects.EPSILON)[None, None]
 
 
 def flat(value: float, *shape: int) -> Tensor:
@@ -32,26 +32,26 @@ def flat(value: float, *shape: int) -> Tensor:
 
 
 TUBE = field(Cylinder(5.0, (1, 0.3, 0.2), MIDDLE))
-FULL = degrade.occupancy(TUBE)
+FULL = effects.occupancy(TUBE)
 
 #: Each random function of seeds, with strong parameters.
 RANDOM: dict[str, Callable[[Tensor, list[int]], Tensor]] = {
-    "texture": lambda v, seeds: degrade.texture(v, 1.0, 0.4, 3.0, seeds),
-    "bias": lambda v, seeds: degrade.bias(v, 1.0, 0.4, 20.0, seeds),
-    "stripes": lambda v, seeds: degrade.stripes(v, 1.0, 0.2, 2.0, seeds),
-    "rings": lambda v, seeds: degrade.rings(v, 1.0, 0.2, 1.5, seeds),
-    "dropout": lambda v, seeds: degrade.dropout(v, 1.0, 0.3, 6.0, 0.9, seeds),
-    "clutter": lambda v, seeds: degrade.clutter(v, 1.0, 1e-3, 1.5, seeds),
-    "poisson": lambda v, seeds: degrade.poisson(20 * v, seeds, 0.7),
-    "few photons": lambda v, seeds: degrade.poisson(v, seeds),
-    "gaussian noise": lambda v, seeds: degrade.gaussian_noise(v, 2.0, seeds),
-    "rician": lambda v, seeds: degrade.rician(v, 2.0, seeds),
+    "texture": lambda v, seeds: effects.texture(v, 1.0, 0.4, 3.0, seeds),
+    "bias": lambda v, seeds: effects.bias(v, 1.0, 0.4, 20.0, seeds),
+    "stripes": lambda v, seeds: effects.stripes(v, 1.0, 0.2, 2.0, seeds),
+    "rings": lambda v, seeds: effects.rings(v, 1.0, 0.2, 1.5, seeds),
+    "dropout": lambda v, seeds: effects.dropout(v, 1.0, 0.3, 6.0, 0.9, seeds),
+    "clutter": lambda v, seeds: effects.clutter(v, 1.0, 1e-3, 1.5, seeds),
+    "poisson": lambda v, seeds: effects.poisson(20 * v, seeds, 0.7),
+    "few photons": lambda v, seeds: effects.poisson(v, seeds),
+    "gaussian noise": lambda v, seeds: effects.gaussian_noise(v, 2.0, seeds),
+    "rician": lambda v, seeds: effects.rician(v, 2.0, seeds),
 }
 
 
 @pytest.mark.parametrize("name", RANDOM)
 def test_a_sample_has_its_seed_alone(name: str) -> None:
-    other = degrade.occupancy(field(Sphere(9.0, MIDDLE)))
+    other = effects.occupancy(field(Sphere(9.0, MIDDLE)))
     alone, again, differently = (RANDOM[name](FULL, [seed]) for seed in (7, 7, 8))
     assert torch.equal(alone, again) and not torch.equal(alone, differently)
     batch = RANDOM[name](torch.cat([other, FULL, FULL]), [3, 7, 8])
@@ -73,7 +73,7 @@ def test_seeds_are_whole_numbers_one_a_sample(name: str) -> None:
 def test_occupancy_holds_the_volume() -> None:
     """Too large, by the curvature that a ramp over the distance leaves out: about 1 / 4R² of it, in voxels."""
     for radius in (4.3, 8.0):
-        volume = float(degrade.occupancy(field(Sphere(radius, MIDDLE))).sum())
+        volume = float(effects.occupancy(field(Sphere(radius, MIDDLE))).sum())
         assert 0 < volume / (4 / 3 * math.pi * radius**3) - 1 < 0.5 / radius**2
 
 
@@ -83,21 +83,15 @@ def test_occupancy_of_a_plane(normal: tuple[float, float, float]) -> None:
     plane, side = Plane(normal, (5.2, 5.2, 5.2)), 10
     fine = Grid((10 * side,) * 3, (0.1,) * 3)
     inside = (plane.distance(centres(fine)) > 0).double().reshape(side, 10, side, 10, side, 10).mean((1, 3, 5))
-    u = optimal_profile(plane.distance(centres(Grid((side,) * 3, (1.0,) * 3))), degrade.EPSILON)[None, None]
-    error = (degrade.occupancy(u)[0, 0] - inside).abs().max()
+    u = optimal_profile(plane.distance(centres(Grid((side,) * 3, (1.0,) * 3))), effects.EPSILON)[None, None]
+    error = (effects.occupancy(u)[0, 0] - inside).abs().max()
     assert error < (0.051 if normal == (0, 0, 1) else 0.1)
-
-
-def test_classes() -> None:
-    light = degrade.intensities(FULL, (10, 50))
-    assert light[FULL == 0].unique().tolist() == [10] and light[FULL == 1].unique().tolist() == [50]
-    assert degrade.intensities(FULL, (50, 10), stain=torch.zeros_like(FULL)).unique().tolist() == [50]
 
 
 @pytest.mark.parametrize("length", [0.1, 2.0, 5.0])
 def test_texture(length: float) -> None:
     """Mean 1, the deviation; the logarithm's correlation one length away is e^-½, two away e^-2."""
-    factor = torch.cat([degrade.texture(flat(0), (2, 1, 1), 0.3, length, [seed]) for seed in range(8)])
+    factor = torch.cat([effects.texture(flat(0), (2, 1, 1), 0.3, length, [seed]) for seed in range(8)])
     assert float(factor.amin()) > 0
     assert float(factor.mean()) == pytest.approx(1, abs=0.01 + 0.006 * length)
     assert float(factor.std()) == pytest.approx(0.3, rel=0.06)
@@ -123,7 +117,7 @@ def test_blur_has_its_widths() -> None:
     point = flat(0)
     point[0, 0, N // 2, N // 2, N // 2] = 1
     spacing, widths = (2.0, 1.0, 0.5), (4.0, 1.5, 1.0)
-    seen = degrade.blur(point, spacing, widths)
+    seen = effects.blur(point, spacing, widths)
     assert float(seen.sum()) == pytest.approx(1)
     assert moments(seen, spacing) == pytest.approx(widths, rel=2e-3)
 
@@ -134,12 +128,12 @@ def test_blur_is_kornias_within() -> None:
     for shape in ((1, 11, 1, 1), (1, 1, 11, 1), (1, 1, 1, 11)):
         expected = filter3d(expected, kernel.reshape(shape))
     inner = (..., slice(7, -7), slice(7, -7), slice(7, -7))
-    torch.testing.assert_close(degrade.blur(image, 1.0, 1.4)[inner], expected[inner], rtol=0, atol=1e-5)
+    torch.testing.assert_close(effects.blur(image, 1.0, 1.4)[inner], expected[inner], rtol=0, atol=1e-5)
 
 
 def test_blur_keeps_a_uniform_image_to_its_faces() -> None:
-    torch.testing.assert_close(degrade.blur(flat(3), 1.0, (3, 2, 1)), flat(3))
-    deep = degrade.blur_with_depth(flat(3), 1.0, (3, 2, 0), 0.05, 0.02)
+    torch.testing.assert_close(effects.blur(flat(3), 1.0, (3, 2, 1)), flat(3))
+    deep = effects.blur_with_depth(flat(3), 1.0, (3, 2, 0), 0.05, 0.02)
     torch.testing.assert_close(deep[0, 0, :, 3, 5], 3 * torch.exp(-0.02 * (torch.arange(N) + 0.5)).double())
 
 
@@ -147,7 +141,7 @@ def test_blur_with_depth_widens_as_it_says() -> None:
     for z in (6, 20, 33):
         line = flat(0, N, 60, 60)
         line[0, 0, z, 30, 30] = 1
-        seen = degrade.blur_with_depth(line, (2.0, 1.0, 1.0), (0.0, 1.2, 0.8), 0.03)
+        seen = effects.blur_with_depth(line, (2.0, 1.0, 1.0), (0.0, 1.2, 0.8), 0.03)
         _, y, x = moments(seen, (2.0, 1.0, 1.0))
         wider = 1 + 0.03 * 2 * (z + 0.5)
         assert (y, x) == pytest.approx((1.2 * wider, 0.8 * wider), rel=0.01)
@@ -155,11 +149,11 @@ def test_blur_with_depth_widens_as_it_says() -> None:
 
 def test_slices_are_means_over_their_thickness() -> None:
     steps = torch.linspace(0, 1, 12, dtype=torch.float64)[None, None, :, None, None].expand(1, 1, 12, 4, 4) ** 2
-    thick = degrade.sample(steps, 1.0, (3, 1, 1), (3, 0, 0))
+    thick = effects.sample(steps, 1.0, (3, 1, 1), (3, 0, 0))
     torch.testing.assert_close(thick, steps.reshape(1, 1, 4, 3, 4, 4).mean(3))
-    points = degrade.sample(steps, 1.0, (3, 1, 1))
+    points = effects.sample(steps, 1.0, (3, 1, 1))
     torch.testing.assert_close(points, steps[:, :, 1::3])
-    overlapping = degrade.sample(steps, 1.0, (2, 1, 1), (4, 0, 0))
+    overlapping = effects.sample(steps, 1.0, (2, 1, 1), (4, 0, 0))
     torch.testing.assert_close(
         overlapping[0, 0, 1:-1], torch.stack([steps[0, 0, k - 1 : k + 3].mean(0) for k in (2, 4, 6, 8)])
     )
@@ -168,7 +162,7 @@ def test_slices_are_means_over_their_thickness() -> None:
 
 def test_sampling_between_voxels_is_linear() -> None:
     ramp = torch.arange(10, dtype=torch.float64)[None, None, None, None].expand(1, 1, 4, 4, 10)
-    finer = degrade.sample(ramp, 1.0, (1.0, 1.0, 0.4))
+    finer = effects.sample(ramp, 1.0, (1.0, 1.0, 0.4))
     assert finer.shape == (1, 1, 4, 4, 25)
     expected = (0.4 * (torch.arange(25) + 0.5) - 0.5).clamp(0, 9).double()
     torch.testing.assert_close(finer[0, 0, 0, 0], expected)
@@ -191,7 +185,7 @@ def test_poisson_quantiles_are_poissons(mean: float) -> None:
 def test_variance_is_a_line_over_the_mean(width: float) -> None:
     gain, read, offset = 3.0, 4.0, 100.0
     for photons in (0.0, 1.0, 5.0, 40.0, 300.0):
-        counts = degrade.poisson_gaussian(flat(photons), gain, read, offset, [5], width)
+        counts = effects.poisson_gaussian(flat(photons), gain, read, offset, [5], width)
         assert float(counts.mean()) == pytest.approx(
             offset + gain * photons, abs=0.05 * (1 + width * 8) * (1 + photons**0.5)
         )
@@ -199,7 +193,7 @@ def test_variance_is_a_line_over_the_mean(width: float) -> None:
 
 
 def test_grain_of_the_noise() -> None:
-    noise = degrade.gaussian_noise(flat(0, 60, 60, 60), 5.0, [1], (0, 1.0, 1.0))[0, 0]
+    noise = effects.gaussian_noise(flat(0, 60, 60, 60), 5.0, [1], (0, 1.0, 1.0))[0, 0]
     assert float(noise.std()) == pytest.approx(5, rel=0.02)
     assert float((noise[..., 1:] * noise[..., :-1]).mean() / 25) == pytest.approx(math.exp(-1 / 4), abs=0.02)
     assert float((noise[1:] * noise[:-1]).mean() / 25) == pytest.approx(0, abs=0.02)
@@ -208,7 +202,7 @@ def test_grain_of_the_noise() -> None:
 @pytest.mark.parametrize("signal", [0.0, 1.0, 3.0, 10.0])
 def test_rician_moments(signal: float) -> None:
     σ = 2.0
-    seen = degrade.rician(flat(signal * σ, 60, 60, 60), σ, [2])
+    seen = effects.rician(flat(signal * σ, 60, 60, 60), σ, [2])
     law = stats.rice(signal, scale=σ)
     assert float(seen.mean()) == pytest.approx(law.mean(), abs=0.02)
     assert float(seen.var()) == pytest.approx(law.var(), rel=0.02)
@@ -217,4 +211,4 @@ def test_rician_moments(signal: float) -> None:
 
 def test_digitised() -> None:
     values = torch.tensor([-3.0, 0.4, 7.6, 300.0]).reshape(1, 1, 1, 1, 4)
-    assert degrade.digitised(values, 255).flatten().tolist() == [0, 0, 8, 255]
+    assert effects.digitised(values, 255).flatten().tolist() == [0, 0, 8, 255]

@@ -10,10 +10,10 @@ import pytest
 import torch
 from exact import Cylinder, centres
 
-from curvafit.data_synth.imaging.degrade import EPSILON
+from curvafit.data_synth.imaging.effects import EPSILON
 from curvafit.data_synth.imaging.image import image, regrid
 from curvafit.data_synth.imaging.like import like
-from curvafit.data_synth.imaging.parameters import Contrast, Detector, Imaging, Noise, Optics
+from curvafit.data_synth.imaging.modality import Contrast, Detector, Imaging, Noise, Optics
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
 from curvafit.volumes.field import Field

@@ -8,9 +8,8 @@ import torch
 from exact import Cylinder, Plane, Shape, Sphere, Torus, Tubes, centres, profile
 from scipy.spatial import cKDTree
 
-from curvafit.data_synth.distance import field_distance
-from curvafit.data_synth.labels import NAMES, Labels, instances_of, labels_of
-from curvafit.data_synth.skeleton import skeleton_of
+from curvafit.data_synth.centreline import skeleton_of
+from curvafit.data_synth.labels import NAMES, Labels, field_distance, instances_of, labels_of
 from curvafit.geometry.diagram import MARGIN
 from curvafit.geometry.mesh import surface
 from curvafit.geometry.topology import betti_numbers

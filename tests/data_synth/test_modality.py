@@ -9,18 +9,16 @@ import pytest
 import torch
 from exact import Cylinder, Sphere, centres
 
-from curvafit.data_synth.imaging import degrade
+from curvafit.data_synth.imaging import effects
 from curvafit.data_synth.imaging.image import field_shape, image, image_shape, regrid, visible, visible_share
-from curvafit.data_synth.imaging.modalities import MODALITIES, modality
-from curvafit.data_synth.imaging.modality import Modality
-from curvafit.data_synth.imaging.parameters import Contrast, Imaging, Optics
+from curvafit.data_synth.imaging.modality import MODALITIES, Contrast, Imaging, Modality, Optics, modality
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
 
 N = 32
 POINTS = centres(Grid((N, N, N), (1.0, 1.0, 1.0)))
 SHAPES = [Cylinder(5.0, (0.3, 1, 0.2), (16, 16, 16)), Sphere(9.0, (16, 16, 16))]
-FIELDS = torch.stack([optimal_profile(shape.distance(POINTS), degrade.EPSILON).float()[None] for shape in SHAPES])
+FIELDS = torch.stack([optimal_profile(shape.distance(POINTS), effects.EPSILON).float()[None] for shape in SHAPES])
 
 PLAIN = Imaging(contrast=Contrast(background=10, foreground=60))
 
@@ -54,7 +52,7 @@ def test_an_image_is_its_own(name: str) -> None:
 
 def test_without_effects_an_image_is_its_occupancy() -> None:
     seen = image(FIELDS, 1.0, [PLAIN, PLAIN], [0, 0])
-    torch.testing.assert_close(seen, 10 + 50 * degrade.occupancy(FIELDS))
+    torch.testing.assert_close(seen, 10 + 50 * effects.occupancy(FIELDS))
 
 
 @pytest.mark.parametrize(

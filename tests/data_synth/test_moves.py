@@ -6,43 +6,43 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from curvafit.data_synth.moves import SYMMETRIES, any_crop, cropped, rotated, turned
+from curvafit.data_synth.sources import SYMMETRIES, apply_symmetry, crop_periodic, crop_rotated, random_crop
 
 VALUES = np.random.default_rng(0).random((3, 4, 5))
 
 
 def test_the_48_symmetries_differ_and_the_first_is_none():
     cube = np.arange(27).reshape(3, 3, 3)
-    moved = {turned(cube, k).tobytes() for k in range(SYMMETRIES)}
+    moved = {apply_symmetry(cube, k).tobytes() for k in range(SYMMETRIES)}
     assert len(moved) == 48
-    assert (turned(cube, 0) == cube).all()
+    assert (apply_symmetry(cube, 0) == cube).all()
 
 
 def test_symmetries_are_a_group():
     cube = np.arange(27).reshape(3, 3, 3)
-    all_of_them = {turned(cube, k).tobytes() for k in range(SYMMETRIES)}
-    twice = {turned(turned(cube, j), k).tobytes() for j in range(SYMMETRIES) for k in range(SYMMETRIES)}
+    all_of_them = {apply_symmetry(cube, k).tobytes() for k in range(SYMMETRIES)}
+    twice = {apply_symmetry(apply_symmetry(cube, j), k).tobytes() for j in range(SYMMETRIES) for k in range(SYMMETRIES)}
     assert twice == all_of_them
 
 
 def test_symmetries_move_the_last_three_axes():
     pair = np.stack([VALUES, 2 * VALUES])
     for k in range(0, SYMMETRIES, 7):
-        assert (turned(pair, k)[1] == 2 * turned(VALUES, k)).all()
+        assert (apply_symmetry(pair, k)[1] == 2 * apply_symmetry(VALUES, k)).all()
 
 
 def test_a_crop_goes_on_across_the_faces():
     tiled = np.tile(VALUES, (2, 2, 2))
     for corner in ((0, 0, 0), (2, 3, 4), (1, 3, 0)):
         z, y, x = corner
-        assert (cropped(VALUES, corner, (3, 2, 4)) == tiled[z : z + 3, y : y + 2, x : x + 4]).all()
+        assert (crop_periodic(VALUES, corner, (3, 2, 4)) == tiled[z : z + 3, y : y + 2, x : x + 4]).all()
 
 
 def test_a_crop_of_the_whole_is_a_shift():
-    found, how = any_crop(VALUES, (3, 3, 3), np.random.default_rng(5))
-    again, _ = any_crop(VALUES, (3, 3, 3), np.random.default_rng(5))
+    found, how = random_crop(VALUES, (3, 3, 3), np.random.default_rng(5))
+    again, _ = random_crop(VALUES, (3, 3, 3), np.random.default_rng(5))
     assert found.shape == (3, 3, 3) and (found == again).all() and found.flags["C_CONTIGUOUS"]
-    assert (cropped(turned(VALUES, how["symmetry"]), how["corner"], (3, 3, 3)) == found).all()
+    assert (crop_periodic(apply_symmetry(VALUES, how["symmetry"]), how["corner"], (3, 3, 3)) == found).all()
 
 
 def test_a_rotation_by_a_quarter_is_a_symmetry():
@@ -51,8 +51,8 @@ def test_a_rotation_by_a_quarter_is_a_symmetry():
     half = np.sqrt(0.5)
     for k, plane in enumerate(((1, 2), (2, 0), (0, 1))):
         quaternion = [half * (k == axis) for axis in range(3)] + [half]
-        found = rotated(cube, (2, 1, 3), (5, 5, 5), quaternion)
-        np.testing.assert_allclose(found, np.rot90(cropped(cube, (2, 1, 3), (5, 5, 5)), 1, plane), atol=1e-4)
+        found = crop_rotated(cube, (2, 1, 3), (5, 5, 5), quaternion)
+        np.testing.assert_allclose(found, np.rot90(crop_periodic(cube, (2, 1, 3), (5, 5, 5)), 1, plane), atol=1e-4)
 
 
 def test_a_rotated_plane_is_the_plane_rotated():
@@ -66,14 +66,14 @@ def test_a_rotated_plane_is_the_plane_rotated():
     turn = Rotation.from_quat(quaternion).as_matrix()
     own = np.stack(np.meshgrid(*(np.arange(n) - (n - 1) / 2 for n in shape), indexing="ij"), -1)
     exact = np.tanh(own @ (turn @ normal) / (np.sqrt(2) * epsilon))
-    error = np.abs(rotated(profile, corner, shape, quaternion) - exact).max()
+    error = np.abs(crop_rotated(profile, corner, shape, quaternion) - exact).max()
     assert error < 0.385 / epsilon**2 / 8 + 1e-3
     assert np.abs(profile[18:30, 16:32, 14:34] - exact).max() > 0.5
-    assert rotated(profile, corner, (1, 4, 4), quaternion).shape == (1, 4, 4)
+    assert crop_rotated(profile, corner, (1, 4, 4), quaternion).shape == (1, 4, 4)
 
 
 def test_what_cannot_be():
     with pytest.raises(ValueError, match="crop"):
-        any_crop(VALUES, (6, 6, 6), np.random.default_rng(0))
+        random_crop(VALUES, (6, 6, 6), np.random.default_rng(0))
     with pytest.raises(ValueError, match="symmetry"):
-        turned(VALUES, 48)
+        apply_symmetry(VALUES, 48)

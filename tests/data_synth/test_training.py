@@ -18,10 +18,8 @@ from torch.utils.data import DataLoader
 
 from curvafit.data_synth import dataset as training
 from curvafit.data_synth.dataset import Sample, TextureDataset, as_dict, as_monai, as_subject
-from curvafit.data_synth.imaging.modality import Modality
-from curvafit.data_synth.imaging.parameters import Contrast, Imaging, Noise, Optics
-from curvafit.data_synth.moves import cropped, rotated, turned
-from curvafit.data_synth.sources import voxel_of
+from curvafit.data_synth.imaging.modality import Contrast, Imaging, Modality, Noise, Optics
+from curvafit.data_synth.sources import apply_symmetry, crop_periodic, crop_rotated, voxel_of
 from curvafit.data_synth.store import open_store
 from curvafit.priors import preset
 
@@ -51,7 +49,8 @@ def test_a_pair_is_a_crop_of_a_shape_and_its_image(store):
         assert image.dtype == torch.float32 and label.dtype == torch.uint8 and spacing == (1.0, 1.0, 1.0)
         (origin,) = record["source"]
         draw = int(origin["name"].split()[-1])
-        field = cropped(turned(open_store(store).field(draw), origin["symmetry"]), origin["corner"], SHAPE)
+        whole = apply_symmetry(open_store(store).field(draw), origin["symmetry"])
+        field = crop_periodic(whole, origin["corner"], SHAPE)
         assert (label[0].numpy() == (field > 0)).all()
         assert np.corrcoef(image.numpy().ravel(), field.ravel())[0, 1] > 0.9
 
@@ -112,8 +111,8 @@ def test_a_blend_holds_both_textures(store):
     assert len(sample.record["source"]) == 2
     fields = []
     for origin in sample.record["source"]:
-        whole = turned(open_store(store).field(int(origin["name"].split()[-1])), origin["symmetry"])
-        fields.append(cropped(whole, origin["corner"], (16, 16, 16)) > 0)
+        whole = apply_symmetry(open_store(store).field(int(origin["name"].split()[-1])), origin["symmetry"])
+        fields.append(crop_periodic(whole, origin["corner"], (16, 16, 16)) > 0)
     label = sample.label[0].numpy() > 0
     assert (label[fields[0] & fields[1]]).all() and not label[~fields[0] & ~fields[1]].any()
     assert (label != fields[0]).any() and (label != fields[1]).any()
@@ -162,10 +161,10 @@ def test_shapes_turned_by_any_angle(store):
     dataset = TextureDataset(store, QUIET, SHAPE, blend=0.0, rotate=True)
     image, label, _, record = dataset[3]
     (origin,) = record["source"]
-    whole = turned(open_store(store).field(int(origin["name"].split()[-1])), origin["symmetry"])
-    field = rotated(whole, origin["corner"], SHAPE, origin["quaternion"])
+    whole = apply_symmetry(open_store(store).field(int(origin["name"].split()[-1])), origin["symmetry"])
+    field = crop_rotated(whole, origin["corner"], SHAPE, origin["quaternion"])
     assert ((label[0].numpy() > 0) == (field > 0)).all() and not (
-        field == cropped(whole, origin["corner"], SHAPE)
+        field == crop_periodic(whole, origin["corner"], SHAPE)
     ).all()
     assert np.corrcoef(image.numpy().ravel(), field.ravel())[0, 1] > 0.9
 

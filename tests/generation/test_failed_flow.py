@@ -107,7 +107,7 @@ def test_the_command_writes_nothing_of_it(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_the_atlas_records_it_as_not_viable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(atlas, "BARREN", 1)
-    with pytest.raises(ValueError, match="expected a design with viable shapes, got 0 of 2 draws.*not finite"):
+    with pytest.raises(ValueError, match="not finite"):
         atlas.build(tmp_path / "s.zarr", 1, 12, schedule=RUNAWAY)
     store = open_store(tmp_path / "s.zarr")
     records = [store.record(index) for index in store.indices()]

@@ -100,7 +100,7 @@ DOCUMENTS: dict[str, Document] = {
     ),
     "store-info": Document("store.zarr/zarr.json", ("atlas", "info", "store.zarr"), taking("store.zarr"), 26),
     "store-verify": Document(
-        "store.zarr/zarr.json", ("atlas", "verify", "store.zarr", "--regenerate", "1"), taking("store.zarr"), 10,
+        "store.zarr/zarr.json", ("atlas", "verify", "store.zarr"), taking("store.zarr"), 10,
         whole=False,
     ),
     "store-extend": Document(
@@ -110,7 +110,7 @@ DOCUMENTS: dict[str, Document] = {
     "draw-info": Document("store.zarr/draws/000000/zarr.json", ("atlas", "info", "store.zarr"), taking("store.zarr"),
         34),
     "draw-verify": Document(
-        "store.zarr/draws/000000/zarr.json", ("atlas", "verify", "store.zarr", "--regenerate", "1"),
+        "store.zarr/draws/000000/zarr.json", ("atlas", "verify", "store.zarr"),
         taking("store.zarr"), 16, whole=False,
     ),
     "draw-extract": Document(

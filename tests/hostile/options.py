@@ -147,8 +147,7 @@ COMMANDS: dict[str, Command] = {
         ("atlas", "extend", "store.zarr", "--count", "0", "--workers", "0"),
         "count workers", "count workers", taking("store.zarr"), changes=_STORE,
     ),
-    "verify": Command(("atlas", "verify", "store.zarr", "--regenerate", "1"), "regenerate seed", "",
-        taking("store.zarr")),
+    "verify": Command(("atlas", "verify", "store.zarr"), "", "", taking("store.zarr")),
     "map": Command(("atlas", "map", "store.zarr", "-o", "map"), "device", "", taking("store.zarr"), each=3),
     "synth": Command(
         ("synth", "-o", "set", "--atlas", "{larder}/store.zarr", "--modality", "confocal", "--shape", "6", "--count",

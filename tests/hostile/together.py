@@ -32,11 +32,10 @@ SCENES: dict[str, tuple[tuple[str, ...], tuple[str, ...], Setup, tuple[str, ...]
     "resumed": (("generate", *LONG, "-o", "long.npy"), ("run.pt",), taking("run.pt"), ()),
     "segment": (("segment", "{larder}/scan.nii.gz", "--prior", "tubes", "--steps", "2", "-o", "out.zarr"), (),
         nothing, ()),
-    "build": ((*BUILD, "--count", "3"), ("store.zarr",), nothing, ("atlas", "verify", "store.zarr", "--regenerate",
-        "0")),
+    "build": ((*BUILD, "--count", "3"), ("store.zarr",), nothing, ("atlas", "verify", "store.zarr")),
     "extend": (
         ("atlas", "extend", "store.zarr", "--count", "2", "--workers", "0"), ("store.zarr",), taking("store.zarr"),
-        ("atlas", "verify", "store.zarr", "--regenerate", "0"),
+        ("atlas", "verify", "store.zarr"),
     ),
     "extract": (("atlas", "extract", "{larder}/store.zarr", "-o", "out.npz"), (), nothing, ()),
     "synth": ((*_SET, "--count", "4"), ("set",), nothing, ()),

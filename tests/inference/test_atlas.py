@@ -14,7 +14,6 @@ import torch
 
 from curvafit.atlas_map.extract import extract
 from curvafit.data_synth import atlas as building
-from curvafit.data_synth import draws
 from curvafit.data_synth.design import INTERVALS, Design, boxed
 from curvafit.data_synth.store import open_store
 from curvafit.generation.schedule import LEARNED, present_name, schedule
@@ -34,18 +33,15 @@ def ball(radius: float) -> torch.Tensor:
 
 
 class Balls:
-    """Stands for `generate_batch`: a ball sized by the mass, viable where a11 > 0; remembers, may be stopped."""
+    """Stands for `generate`: a ball sized by the mass, viable where a11 > 0; remembers, may be stopped."""
 
     def __init__(self, stop_after: int | None = None) -> None:
         self.seeds: list[int] = []
         self.stop_after = stop_after
         self.highest = 1.0
 
-    def __call__(self, coefficients, masses, grid, *, seeds, reject_early, **options):
+    def __call__(self, coefficients, mass, grid, *, seed, reject_early, **options):
         assert reject_early
-        return (self._made(*job) for job in zip(coefficients, masses, seeds, strict=True))
-
-    def _made(self, coefficients, mass, seed):
         if len(self.seeds) == self.stop_after:
             raise KeyboardInterrupt
         self.seeds.append(seed)
@@ -59,14 +55,14 @@ class Balls:
 @pytest.fixture
 def balls(monkeypatch):
     stand_in = Balls()
-    monkeypatch.setattr(draws, "generate_batch", stand_in)
+    monkeypatch.setattr(building, "generate", stand_in)
     return stand_in
 
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory) -> building.Store:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(draws, "generate_batch", Balls())
+        patch.setattr(building, "generate", Balls())
         return building.build(tmp_path_factory.mktemp("balls") / "s.zarr", 6, SHAPE, seed=2)
 
 
@@ -99,12 +95,12 @@ def test_building_draws_in_order_until_enough_are_viable(tmp_path, balls):
 
 def test_an_interrupted_build_resumes_to_the_same_store_and_makes_no_draw_twice(tmp_path, monkeypatch):
     whole, first, second = Balls(), Balls(stop_after=4), Balls()
-    monkeypatch.setattr(draws, "generate_batch", whole)
+    monkeypatch.setattr(building, "generate", whole)
     straight = building.build(tmp_path / "straight.zarr", 5, SHAPE)
-    monkeypatch.setattr(draws, "generate_batch", first)
+    monkeypatch.setattr(building, "generate", first)
     with pytest.raises(KeyboardInterrupt):
         building.build(tmp_path / "s.zarr", 5, SHAPE)
-    monkeypatch.setattr(draws, "generate_batch", second)
+    monkeypatch.setattr(building, "generate", second)
     resumed = building.build(tmp_path / "s.zarr", 5, SHAPE)
     assert len(first.seeds) == 4 and first.seeds + second.seeds == whole.seeds
     assert resumed.indices() == straight.indices()
@@ -120,8 +116,8 @@ def test_a_real_draw_is_what_its_record_says(tmp_path):
     quick = dataclasses.replace(schedule("fast"), name="quick", steps=30)
     grid = Grid((16,) * 3)
     store = open_store(tmp_path / "s.zarr", _settings(grid, quick))
-    (record,) = draws.make(store.path, [0])
-    assert store.record(0) == record and record.versions == draws.versions()
+    (record,) = building.make_draws(store.path, [0])
+    assert store.record(0) == record and record.versions == building.versions()
     assert 0 < record.steps <= 30 and np.isfinite(record.energy)
     if record.viability.viable:
         assert float(store.field(0).mean()) == pytest.approx(record.mass, abs=1e-6)

@@ -7,11 +7,10 @@ from collections.abc import Sequence
 
 import torch
 
-from curvafit.data_synth.imaging import degrade
-from curvafit.data_synth.imaging.maths import Triple, sampled
-from curvafit.data_synth.imaging.optics import EPSILON
-from curvafit.data_synth.imaging.parameters import Imaging
-from curvafit.data_synth.imaging.randomness import seeds_of
+from curvafit.data_synth.imaging import effects
+from curvafit.data_synth.imaging.effects import EPSILON
+from curvafit.data_synth.imaging.maths import Triple, sampled, seeds_of
+from curvafit.data_synth.imaging.modality import Imaging
 from curvafit.priors.shapes import Bool, Float
 
 
@@ -37,11 +36,6 @@ def image(
     Returns
     -------
     Of the shape `regrid` gives.
-
-    Raises
-    ------
-    ValueError
-        If a field is not finite, there is not one imaging and one seed a field, or the images' spacings differ.
     """
     _alike(shapes, imaging)
     every = zip(shapes.split(1), imaging, seeds_of(seeds, len(shapes)), strict=True)
@@ -51,28 +45,16 @@ def image(
 def regrid(
     shapes: Float[torch.Tensor, "b 1 z y x"], spacing: float, imaging: Sequence[Imaging]
 ) -> Float[torch.Tensor, "b 1 Z Y X"]:
-    """Return the phase fields at the centres of their images' voxels, interpolated linearly: what labels are made of.
-
-    Raises
-    ------
-    ValueError
-        As `image` does.
-    """
+    """Return the phase fields at the centres of their images' voxels, interpolated linearly; for labels."""
     _alike(shapes, imaging)
-    return degrade.sample(shapes, spacing, imaging[0].spacing)
+    return effects.sample(shapes, spacing, imaging[0].spacing)
 
 
 def visible(
     shapes: Float[torch.Tensor, "b 1 z y x"], spacing: float, imaging: Sequence[Imaging], epsilon: float = EPSILON
 ) -> Bool[torch.Tensor, "b 1 Z Y X"]:
     """Return the images' voxels that a share of the structure's light reaches (`Imaging.visible`), evenly stained as it
-    is.
-
-    Raises
-    ------
-    ValueError
-        As `image` does.
-    """
+    is."""
     _alike(shapes, imaging)
     return torch.cat([_reached(one, spacing, how, epsilon) for one, how in zip(shapes.split(1), imaging, strict=True)])
 
@@ -98,9 +80,9 @@ def image_shape(shape: Sequence[int], spacing: float, imaging: Imaging) -> tuple
 
 
 def _image(shape: torch.Tensor, spacing: float, how: Imaging, seeds: list[int], epsilon: float) -> torch.Tensor:
-    occupied = degrade.occupancy(shape, epsilon)
+    occupied = effects.occupancy(shape, epsilon)
     light = _blurred(_emitted(occupied, spacing, how, seeds), spacing, how)
-    light = _lit(degrade.sample(light, spacing, how.spacing, _window(how)), how, seeds)
+    light = _lit(effects.sample(light, spacing, how.spacing, _window(how)), how, seeds)
     return _detected(light, how, seeds)
 
 
@@ -108,27 +90,27 @@ def _lit(light: torch.Tensor, how: Imaging, seeds: list[int]) -> torch.Tensor:
     """Return the light under uneven illumination."""
     lamp = how.illumination
     if lamp.bias:
-        light = light * degrade.bias(light, how.spacing, lamp.bias, lamp.bias_length, seeds)
+        light = light * effects.bias(light, how.spacing, lamp.bias, lamp.bias_length, seeds)
     if lamp.stripes:
-        light = light * degrade.stripes(light, how.spacing, lamp.stripes, lamp.stripe_width, seeds)
+        light = light * effects.stripes(light, how.spacing, lamp.stripes, lamp.stripe_width, seeds)
     return light
 
 
 def _detected(light: torch.Tensor, how: Imaging, seeds: list[int]) -> torch.Tensor:
     """Return the counts that a detector makes of light."""
     detector, noise, contrast = how.detector, how.noise, how.contrast
-    counts = degrade.poisson_gaussian(light, detector.gain, noise.gaussian, detector.offset, seeds, noise.width)
+    counts = effects.poisson_gaussian(light, detector.gain, noise.gaussian, detector.offset, seeds, noise.width)
     if noise.rician:
-        counts = degrade.rician(counts, noise.rician, seeds, noise.width)
+        counts = effects.rician(counts, noise.rician, seeds, noise.width)
     if detector.rings:
         strength = detector.rings * abs(contrast.foreground - contrast.background) * (detector.gain or 1)
-        counts = counts + degrade.rings(counts, how.spacing, strength, detector.ring_width, seeds)
-    return counts if detector.ceiling is None else degrade.digitised(counts, detector.ceiling)
+        counts = counts + effects.rings(counts, how.spacing, strength, detector.ring_width, seeds)
+    return counts if detector.ceiling is None else effects.digitised(counts, detector.ceiling)
 
 
 def _reached(shape: torch.Tensor, spacing: float, how: Imaging, epsilon: float) -> torch.Tensor:
-    light = degrade.blur_with_depth(degrade.occupancy(shape, epsilon), spacing, how.optics.blur, how.optics.growth)
-    return degrade.sample(light, spacing, how.spacing, _window(how)) > how.visible
+    light = effects.blur_with_depth(effects.occupancy(shape, epsilon), spacing, how.optics.blur, how.optics.growth)
+    return effects.sample(light, spacing, how.spacing, _window(how)) > how.visible
 
 
 def _window(how: Imaging) -> Triple:
@@ -141,32 +123,32 @@ def _emitted(occupied: torch.Tensor, spacing: float, how: Imaging, seeds: list[i
     inside = occupied
     if specimen.dropout:
         lost = specimen.dropout, specimen.dropout_length, specimen.dropout_loss
-        inside = occupied * degrade.dropout(occupied, spacing, *lost, seeds)
+        inside = occupied * effects.dropout(occupied, spacing, *lost, seeds)
     below = above = torch.ones_like(occupied[..., :1, :1, :1])
     if contrast.background_texture:
         grain = contrast.background_texture, contrast.background_length
-        below = degrade.texture(occupied, spacing, *grain, seeds, "background texture")
+        below = effects.texture(occupied, spacing, *grain, seeds, "background texture")
     if contrast.foreground_texture:
         grain = contrast.foreground_texture, contrast.foreground_length
-        above = degrade.texture(occupied, spacing, *grain, seeds, "foreground texture")
+        above = effects.texture(occupied, spacing, *grain, seeds, "foreground texture")
     base = contrast.background * below
     light = base + inside * (contrast.foreground * above - base)
     if specimen.clutter:
         height = specimen.clutter_height * (contrast.foreground - contrast.background)
-        light = light + height * degrade.clutter(occupied, spacing, specimen.clutter, specimen.clutter_radius, seeds)
+        light = light + height * effects.clutter(occupied, spacing, specimen.clutter, specimen.clutter_radius, seeds)
     return light.clamp_min(0)
 
 
 def _blurred(light: torch.Tensor, spacing: float, how: Imaging) -> torch.Tensor:
     optics = how.optics
     if optics.growth or optics.attenuation:
-        return degrade.blur_with_depth(light, spacing, optics.blur, optics.growth, optics.attenuation)
-    return degrade.blur(light, spacing, optics.blur)
+        return effects.blur_with_depth(light, spacing, optics.blur, optics.growth, optics.attenuation)
+    return effects.blur(light, spacing, optics.blur)
 
 
 def _alike(shapes: torch.Tensor, imaging: Sequence[Imaging]) -> None:
     if len(imaging) != len(shapes) or not imaging:
-        raise ValueError(f"expected one imaging a field, {len(shapes)}, got {len(imaging)}")
+        raise ValueError(f"each of {len(shapes)} fields needs its imaging, got {len(imaging)}")
     grids = {how.spacing for how in imaging}
     if len(grids) > 1:
-        raise ValueError(f"expected images of one spacing in a batch, got {sorted(grids)}")
+        raise ValueError(f"images of a batch must have one spacing, got {sorted(grids)}")

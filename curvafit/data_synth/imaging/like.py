@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -11,10 +12,8 @@ import torch
 from scipy import ndimage, optimize
 from skimage.filters import threshold_otsu
 
-from curvafit.data_synth.imaging.modality import Modality
-from curvafit.data_synth.imaging.noise_estimate import NoiseEstimate, background_of, covariance, noise_of
-from curvafit.data_synth.imaging.optics import blur
-from curvafit.data_synth.imaging.parameters import Contrast, Detector, Illumination, Imaging, Noise, Optics
+from curvafit.data_synth.imaging.effects import blur
+from curvafit.data_synth.imaging.modality import Contrast, Detector, Illumination, Imaging, Modality, Noise, Optics
 from curvafit.volumes.field import Field
 
 #: Share of the mean brightness from which on the structure's brightness counts for its texture.
@@ -24,7 +23,7 @@ MOST = 2_000_000
 #: Deviation, in voxels of the finest edge, of the window that the structure's brightness is averaged in.
 WINDOW = 4.0
 #: Correlation lengths of that brightness, in the same, that are looked at: what a dozen lags can tell apart.
-LENGTHS = np.geomspace(WINDOW, 6 * WINDOW, 50)
+BRIGHTNESS_LENGTHS = np.geomspace(WINDOW, 6 * WINDOW, 50)
 #: Deviation, in the same, of the smoothing before voxels are told apart.
 SMOOTH = 0.8
 #: What a drawn parameter is the estimate's, low and high.
@@ -38,6 +37,17 @@ SPREAD: dict[str, tuple[float, float]] = {
     "detector.gain": (0.7, 1.4),
     "noise.gaussian": (0.7, 1.4),
 }
+#: Deviations (voxels) of smoothings that count as the noise's own, and correlation lengths that count as texture.
+GRAINS = (0.0, 0.4, 0.5, 0.6, 0.75, 0.9, 1.1)
+TEXTURE_LENGTHS = (3.0, 4.0, 6.0, 8.0, 12.0, 20.0)
+#: Lags, in voxels, that the background's correlation is looked at.
+LAGS = 12
+#: Bins of the mean that the variance is looked at in, and voxels that a bin needs.
+BINS, LEAST = 24, 50
+#: How much larger than the background's the structure's variance is, where noise is said to grow with the signal.
+GROWS = 1.3
+#: Second differences along both axes of the plane: no plane passes, and nothing else that a blur lets through much.
+RESIDUAL = np.outer((1, -2, 1), (1, -2, 1)).astype(np.float32)[None]
 
 
 class Structure(NamedTuple):
@@ -69,18 +79,12 @@ def like(scan: Field, mask: np.ndarray | None = None) -> Modality:
     -------
     Modality
         `base` holds the estimates, `ranges` their surroundings (`SPREAD`); `voxel` is the finest edge of the scan's.
-
-    Raises
-    ------
-    ValueError
-        If the scan is under eight voxels along an axis, not finite or constant, or the mask is of another shape, empty
-        or full.
     """
     values, given = _middle(scan, mask)
     steps = np.array(scan.spacing)
     inside = bright(values, steps) if given is None else given
     if not inside.any() or inside.all():
-        raise ValueError("expected a mask with voxels inside and outside, got an empty or a full one")
+        raise ValueError("the mask must have voxels inside and outside, got an empty or a full one")
     ground = background_of(values, inside, steps)
     structure = _structure(values, inside, steps, ground.level)
     noise = noise_of(values, inside, ground, steps, ground.level + structure.contrast)
@@ -128,16 +132,16 @@ def _imaging(scan: Field, structure: Structure, noise: NoiseEstimate) -> Imaging
 
 def _middle(scan: Field, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
     if min(scan.shape) < 8:
-        raise ValueError(f"expected a scan of at least 8 voxels along each axis, got {scan.shape}")
+        raise ValueError(f"the scan must have at least 8 voxels along each axis, got {scan.shape}")
     if mask is not None and np.shape(mask) != scan.shape:
-        raise ValueError(f"expected a mask of the scan's shape {scan.shape}, got {np.shape(mask)}")
+        raise ValueError(f"the mask must have the scan's shape {scan.shape}, got {np.shape(mask)}")
     sides = list(scan.shape)
     while math.prod(sides) > MOST:
         sides[int(np.argmax(sides))] -= 8
     box = tuple(slice((n - side) // 2, (n - side) // 2 + side) for n, side in zip(scan.shape, sides, strict=True))
     values = scan.values[box].astype(np.float32)
     if not np.isfinite(values).all() or values.min() == values.max():
-        raise ValueError("expected a scan of finite values that vary, got NaN, infinity or one value")
+        raise ValueError("the scan must hold finite values that vary, got NaN, infinity or one value")
     return values, None if mask is None else np.asarray(mask)[box].astype(bool)
 
 
@@ -199,8 +203,8 @@ def _texture(relative: np.ndarray, inside: np.ndarray, steps: np.ndarray) -> tup
         [np.arange(len(each)) * h / steps.min() for each, h in ((first, steps[1]), (second, steps[2]))]
     )
     share = covariances / max(covariances[0], 1e-12)
-    misfit = [np.square(share - np.exp(-0.5 * (lags / length) ** 2)).sum() for length in LENGTHS]
-    width = float(LENGTHS[int(np.argmin(misfit))])
+    misfit = [np.square(share - np.exp(-0.5 * (lags / length) ** 2)).sum() for length in BRIGHTNESS_LENGTHS]
+    width = float(BRIGHTNESS_LENGTHS[int(np.argmin(misfit))])
     length = math.sqrt(max(width**2 - 2 * WINDOW**2, WINDOW**2))
     return math.sqrt(math.expm1(float(covariances[0]) * max(width / length, 1.0))), length
 
@@ -209,3 +213,140 @@ def _around(value: Any, low: float, high: float) -> tuple[Any, Any]:
     if isinstance(value, tuple):
         return tuple(low * each for each in value), tuple(high * each for each in value)
     return low * value, high * value
+
+
+# ---- noise and background --------------------------------------------------------------------------------------------
+
+
+class Background(NamedTuple):
+    """Where the background is seen, its level; variance and width (z, y, x) of its noise in voxels; deviation, length
+    of its texture; range of its uneven light."""
+
+    where: np.ndarray
+    level: float
+    noise: float
+    width: tuple[float, float, float]
+    texture: float
+    length: float
+    bias: float
+
+
+class NoiseEstimate(NamedTuple):
+    """Of counts: gain, read noise, offset; the rest as the background has it."""
+
+    gain: float
+    read_noise: float
+    offset: float
+    width: tuple[float, float, float]
+    level: float
+    texture: float
+    length: float
+    bias: float
+
+
+def background_of(values: np.ndarray, inside: np.ndarray, steps: np.ndarray) -> Background:
+    """Return the background's level and correlations, some voxels away from the structure.
+
+    Its covariance over the lag is the sum of a short part, noise smoothed by up to a voxel, and a long one, texture.
+    """
+    finest = steps.min() / steps
+    away = ndimage.distance_transform_edt(~inside, sampling=steps) > 4 * steps.min()
+    where = away if away.mean() > 0.02 else ~inside
+    smooth = ndimage.gaussian_filter(values, 2 * finest)
+    where = where & (smooth <= np.quantile(smooth[where], 0.98))
+    level = float(values[where].mean())
+    weight = where.astype(np.float32)
+    rest = (values - level) * weight
+    covariances = [covariance(rest, weight, axis) for axis in range(3)]
+    lags = min(map(len, covariances[1:]))
+    plane = (covariances[1][:lags] + covariances[2][:lags]) / 2
+    noise, lateral, texture, length = _split(plane)
+    _, axial, _, _ = _split(covariances[0])
+    bias = _bias(rest, weight, level, values.shape)
+    return Background(
+        where, level, noise, (axial, lateral, lateral), math.sqrt(texture), length * float(steps[2]), bias
+    )
+
+
+def noise_of(
+    values: np.ndarray, inside: np.ndarray, ground: Background, steps: np.ndarray, high: float
+) -> NoiseEstimate:
+    """Return the line of variance over mean through the residuals' bins and the background, if it rises by the
+    structure.
+
+    The line is gain · mean + rest. A negative rest is an offset, -rest / gain, a positive one read noise: of the two
+    that a line cannot tell apart, the smaller. The offset is no brighter than the background's darkest voxels: fine
+    structure that passes for noise makes no steeper line. Where it does not rise, noise is the background's everywhere.
+    """
+    rest = ground.level, ground.texture, ground.length, ground.bias
+    lines = _bins(values, inside, ground, steps)
+    gain = 0.0
+    if len(lines) > 2:
+        mean, variance, count = np.array(lines).T
+        rise = count * (mean - ground.level)
+        slope = float((rise * (variance - ground.noise)).sum()), float((rise * (mean - ground.level)).sum())
+        gain = max(slope[0] / slope[1], 0.0) if slope[1] else 0.0
+    darkest = float(np.quantile(values[ground.where], 0.001))
+    gain = min(gain, ground.noise / max(ground.level - darkest, 1e-12))
+    if not gain or gain * abs(high - ground.level) < (GROWS - 1) * ground.noise:
+        floor = 0.0 if ground.level > 2 * ground.texture else ground.level - abs(high - ground.level)
+        return NoiseEstimate(0.0, math.sqrt(ground.noise), floor, ground.width, *rest)
+    constant = ground.noise - gain * ground.level
+    offset = max(-constant / gain, 0.0)
+    return NoiseEstimate(gain, math.sqrt(max(constant, 0.0)), offset, ground.width, *rest)
+
+
+def covariance(rest: np.ndarray, weight: np.ndarray, axis: int) -> np.ndarray:
+    """Return the covariance at lags from 0, of pairs of which both are background."""
+    a, w = np.moveaxis(rest, axis, 0), np.moveaxis(weight, axis, 0)
+    lags = min(LAGS, len(a) // 3)
+    sums = [(float((a[: len(a) - k] * a[k:]).sum()), float((w[: len(w) - k] * w[k:]).sum())) for k in range(lags + 1)]
+    return np.array([product / max(pairs, 1.0) for product, pairs in sums])
+
+
+def _split(covariances: np.ndarray) -> tuple[float, float, float, float]:
+    """Return the variance and width of the noise, variance and length of the texture, in voxels, by non-negative least
+    squares."""
+    lag = np.arange(len(covariances))
+    short = [np.exp(-((lag / (2 * w)) ** 2)) if w else (lag == 0).astype(float) for w in GRAINS]
+    long = [np.exp(-0.5 * (lag / length) ** 2) for length in TEXTURE_LENGTHS]
+    flat = np.ones(len(lag))
+    parts, _ = optimize.nnls(np.stack([*short, *long, flat], 1), covariances)
+    noise, texture = parts[: len(GRAINS)], parts[len(GRAINS) : -1]
+    total, spread = float(noise.sum()), float(texture.sum())
+    width = float(noise @ GRAINS / total) if total else 0.0
+    length = float(texture @ TEXTURE_LENGTHS / spread) if spread else TEXTURE_LENGTHS[0]
+    return total, width, spread, length
+
+
+def _bias(rest: np.ndarray, weight: np.ndarray, level: float, shape: tuple[int, ...]) -> float:
+    """Return half the range of the background's slow variation, relative to its level."""
+    widths = [n / 8 for n in shape]
+    slow = ndimage.gaussian_filter(rest, widths) / np.maximum(ndimage.gaussian_filter(weight, widths), 1e-3)
+    low, high = np.quantile(slow, (0.01, 0.99))
+    return float(high - low) / 2 / max(abs(level), 1e-9)
+
+
+def _bins(
+    values: np.ndarray, inside: np.ndarray, ground: Background, steps: np.ndarray
+) -> list[tuple[float, float, int]]:
+    """Return the mean, the variance of the noise and count, by bins of the mean over the structure."""
+    residual = ndimage.convolve(values, RESIDUAL)
+    mean = ndimage.gaussian_filter(values, 1.5 * steps.min() / steps)
+    top = values.max()
+    used = inside & (ndimage.maximum_filter(values, 3) < top) if (values == top).mean() > 1e-5 else inside
+    passed = max(_variance(residual[ground.where]), 1e-12) / max(ground.noise, 1e-12)
+    found = []
+    edges = np.quantile(mean[used], np.linspace(0, 1, BINS + 1)) if used.any() else np.zeros(1)
+    for low, high in itertools.pairwise(edges):
+        bin_ = used & (mean >= low) & (mean <= high)
+        if (count := int(bin_.sum())) >= LEAST:
+            found.append((float(values[bin_].mean()), _variance(residual[bin_]) / passed, count))
+    return found
+
+
+def _variance(residual: np.ndarray) -> float:
+    """Return the mean and the deviation of what lies within four deviations, by the median's."""
+    square = np.square(residual)
+    near = square < 16 * np.median(square) / 0.455
+    return float(square[near].mean() if near.any() else square.mean())

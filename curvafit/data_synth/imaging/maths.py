@@ -1,15 +1,18 @@
-"""Linear maps along one axis at a time, as small dense matrices: blurs, samplings, random textures.
+"""The mathematics of images: linear maps along one axis at a time, and random fields by seed.
 
-A volume is `(B, 1, Z, Y, X)`. At the sizes of training crops three matrix products take a sixth of the time of three
+A map is a small dense matrix: at the sizes of training crops three matrix products take a sixth of the time of three
 passes of a convolution, and the width may change from one voxel to the next. Near the faces of the box a map's weights
-are divided by their sum: what lies beyond counts as what lies within.
+are divided by their sum: what lies beyond counts as what lies within. Random numbers depend on a sample's seed and on
+their purpose alone, whatever batch the sample is in. A volume is `(B, 1, Z, Y, X)`.
 """
 
 from __future__ import annotations
 
 import math
+import zlib
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -77,19 +80,13 @@ def sampled(count: int, spacing: float, onto: float) -> int:
 
 
 def checked(volume: Tensor, name: str = "a volume") -> Tensor:
-    """Return the volume, if it is `(B, 1, Z, Y, X)`, of a floating type and finite.
-
-    Raises
-    ------
-    ValueError
-        If it is not.
-    """
+    """Return the volume, if it is `(B, 1, Z, Y, X)`, of a floating type and finite."""
     if volume.ndim != 5 or volume.shape[1] != 1 or not volume.numel():
-        raise ValueError(f"expected {name} of shape (B, 1, Z, Y, X), got {tuple(volume.shape)}")
+        raise ValueError(f"{name} must be of shape (B, 1, Z, Y, X), got {tuple(volume.shape)}")
     if not volume.dtype.is_floating_point:
-        raise ValueError(f"expected {name} of a floating type, got {volume.dtype}")
+        raise ValueError(f"{name} must be of a floating type, got {volume.dtype}")
     if not torch.isfinite(volume.sum()) and not torch.isfinite(volume).all():
-        raise ValueError(f"expected {name} of finite values, got NaN or infinity")
+        raise ValueError(f"{name} must be finite, got NaN or infinity")
     return volume
 
 
@@ -97,7 +94,7 @@ def triple(value: float | Sequence[float], name: str) -> Triple:
     """Return three numbers (z, y, x) from 0, or one for all."""
     numbers = (value,) * 3 if isinstance(value, (int, float)) else tuple(value)
     if len(numbers) != 3 or not all(math.isfinite(h) and h >= 0 for h in numbers):
-        raise ValueError(f"expected {name} of 3 numbers (z, y, x) from 0, got {value!r}")
+        raise ValueError(f"{name} must be 3 numbers (z, y, x) from 0, got {value!r}")
     return float(numbers[0]), float(numbers[1]), float(numbers[2])
 
 
@@ -105,5 +102,88 @@ def edges(spacing: float | Sequence[float]) -> Triple:
     """Return a spacing: three lengths above 0, or one for all."""
     steps = triple(spacing, "a spacing")
     if not all(steps):
-        raise ValueError(f"expected a spacing of 3 positive numbers (z, y, x), got {spacing!r}")
+        raise ValueError(f"the spacing must be 3 positive numbers (z, y, x), got {spacing!r}")
     return steps
+
+
+# ---- random fields ---------------------------------------------------------------------------------------------------
+
+
+def stream(seed: int, purpose: str, device: torch.device | str = "cpu") -> torch.Generator:
+    """Return the generator of a sample for one purpose; another device draws other numbers."""
+    words = np.random.SeedSequence(seed, spawn_key=(zlib.crc32(purpose.encode()),))
+    return torch.Generator(device).manual_seed(int(words.generate_state(1)[0]))
+
+
+def white(like: Float[Tensor, "b 1 z y x"], seeds: Sequence[int], purpose: str) -> Float[Tensor, "b 1 z y x"]:
+    """Return independent standard normal numbers."""
+    return _drawn(tuple(like.shape[2:]), like, seeds, purpose)
+
+
+def correlated(
+    like: Float[Tensor, "b 1 z y x"], lengths: Sequence[float], seeds: Sequence[int], purpose: str
+) -> Float[Tensor, "b 1 z y x"]:
+    """Return a Gaussian random field of mean 0 and variance 1 whose correlation over a distance d is exp(-½ Σ
+    (d/length)²).
+
+    White noise on nodes, interpolated by Gaussians; each row's weights have a sum of squares of one, so that the
+    variance is one everywhere, near the faces too.
+
+    Parameters
+    ----------
+    lengths
+        Along (z, y, x), in voxels. Under half a voxel there is no correlation left; infinity means constant.
+    """
+    shape = like.shape[2:]
+    maps = [_interpolation(n, length, like) for n, length in zip(shape, lengths, strict=True)]
+    nodes = tuple(n if weights is None else weights.shape[-1] for n, weights in zip(shape, maps, strict=True))
+    return along(_drawn(nodes, like, seeds, purpose), *maps)
+
+
+def grainy(
+    like: Float[Tensor, "b 1 z y x"], widths: Sequence[float], seeds: Sequence[int], purpose: str
+) -> Float[Tensor, "b 1 z y x"]:
+    """Return standard normal numbers, smoothed by a Gaussian of deviations `widths` (voxels): `correlated` by √2
+    widths."""
+    if not any(widths):
+        return white(like, seeds, purpose)
+    maps = [gaussian(n, width, like) for n, width in zip(like.shape[2:], widths, strict=True)]
+    units = [None if weights is None else weights / weights.square().sum(-1, keepdim=True).sqrt() for weights in maps]
+    return along(white(like, seeds, purpose), *units)
+
+
+def uniform(count: int, seed: int, purpose: str, like: Tensor) -> Tensor:
+    """Return `count` numbers in [0, 1) of a sample."""
+    generator = stream(seed, purpose, like.device)
+    return torch.rand(count, generator=generator, device=like.device, dtype=like.dtype)
+
+
+def seeds_of(seeds: Sequence[int], count: int) -> list[int]:
+    """Return the seeds, if there is one a sample and all are whole numbers from 0."""
+    sound = [isinstance(seed, (int, np.integer)) and not isinstance(seed, bool) and seed >= 0 for seed in seeds]
+    if len(sound) != count or not all(sound):
+        raise ValueError(f"seeds must be {count} whole numbers from 0, one a sample, got {list(seeds)!r:.80}")
+    return [int(seed) for seed in seeds]
+
+
+def _drawn(shape: tuple[int, ...], like: Tensor, seeds: Sequence[int], purpose: str) -> Tensor:
+    drawn = [
+        torch.randn((1, *shape), generator=stream(seed, purpose, like.device), device=like.device, dtype=like.dtype)
+        for seed in seeds_of(seeds, len(like))
+    ]
+    return torch.stack(drawn)
+
+
+def _interpolation(count: int, length: float, like: Tensor) -> Tensor | None:
+    """Return (count, nodes) weights; nodes are a deviation apart, at least a voxel, and go four deviations beyond the
+    box."""
+    if math.isinf(length):
+        return torch.ones((count, 1), device=like.device, dtype=like.dtype)
+    if length < 0.5:
+        return None
+    width = length / math.sqrt(2)
+    step, beyond = max(width, 1.0), math.ceil(4 * width)
+    nodes = torch.arange(0, count + 2 * beyond, step, device=like.device, dtype=like.dtype) - beyond
+    place = torch.arange(count, device=like.device, dtype=like.dtype)
+    weight = bell((place[:, None] - nodes) / width)
+    return weight / weight.square().sum(-1, keepdim=True).sqrt()

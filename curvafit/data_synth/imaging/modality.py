@@ -1,16 +1,270 @@
-"""Kinds of image: what all images of a kind have in common, and the intervals that the rest is drawn from."""
+"""The parameters of an image, grouped by the physics that they belong to; and modalities, which draw them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from functools import cache
+from importlib.resources import files
+from operator import attrgetter
+from types import NoneType
+from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
 
 import numpy as np
+import yaml
 
-from curvafit.core.checks import LONGEST, SHORTEST, check_float
-from curvafit.data_synth.imaging.parameters import Imaging
-from curvafit.data_synth.imaging.randomness import seeds_of
+from curvafit.core.checks import LONGEST, SHORTEST, check_float, plain_name, quoted
+from curvafit.core.units import METRES
+from curvafit.data_synth.imaging.maths import Triple, seeds_of
+
+
+class Range(NamedTuple):
+    """The numbers that a parameter may be, in words and as bounds."""
+
+    words: str
+    least: float
+    most: float = math.inf
+
+
+FINITE = Range("a finite number", -math.inf)
+FROM_ZERO = Range("a number from 0", 0.0)
+ABOVE_ZERO = Range("a number above 0", math.ulp(0.0))
+SHARE = Range("a share", 0.0, 1.0)
+PARTIAL = Range("a share below 1", 0.0, math.nextafter(1.0, 0.0))
+
+
+class Checked:
+    """Parameters that are turned into floats, or refused, when they are given: those whose annotation has a `Range`."""
+
+    def __post_init__(self) -> None:
+        for name, (kind, allowed) in _ranges(type(self)).items():
+            object.__setattr__(self, name, _number(name, getattr(self, name), kind, allowed))
+
+
+@cache
+def _ranges(part: type) -> dict[str, tuple[Any, Range]]:
+    """Return the kind and the range of each parameter of a part."""
+    hints = {name: get_args(hint) for name, hint in get_type_hints(part, include_extras=True).items()}
+    return {name: (each[0], each[1]) for name, each in hints.items() if len(each) == 2 and isinstance(each[1], Range)}
+
+
+def _number(name: str, value: Any, kind: Any, allowed: Range) -> Any:
+    """Return the value as a float or a triple of floats; None where the kind allows it."""
+    if value is None and NoneType in get_args(kind):
+        return None
+    words = f"{name} as 3 numbers (z, y, x), each {allowed.words}" if kind is Triple else f"{name} as {allowed.words}"
+    values = value if kind is Triple else (value,)
+    if not isinstance(values, (tuple, list)) or (kind is Triple and len(values) != 3):
+        values = (None,)  # which no number is
+    numbers = tuple(check_float(number, words, allowed.least, allowed.most, of=value) for number in values)
+    return numbers if kind is Triple else numbers[0]
+
+
+@dataclass(frozen=True)
+class Contrast(Checked):
+    """The levels of background and structure, and how uneven each is.
+
+    Parameters
+    ----------
+    background, foreground
+        Levels of the two classes, in photons (grey values where the detector's gain is 0).
+    background_texture, background_length, foreground_texture, foreground_length
+        Relative deviation of each class, and the length over which the deviation is correlated.
+    """
+
+    background: Annotated[float, FROM_ZERO] = 10.0
+    foreground: Annotated[float, FROM_ZERO] = 100.0
+    background_texture: Annotated[float, FROM_ZERO] = 0.0
+    background_length: Annotated[float, ABOVE_ZERO] = 1.0
+    foreground_texture: Annotated[float, FROM_ZERO] = 0.0
+    foreground_length: Annotated[float, ABOVE_ZERO] = 1.0
+
+
+@dataclass(frozen=True)
+class Specimen(Checked):
+    """The flaws of the specimen: stain that is lost, specks that are not the structure.
+
+    Parameters
+    ----------
+    dropout, dropout_length, dropout_loss
+        Share of the structure whose stain is lost, the length of the lost stretches, and how much of the stain goes.
+    clutter, clutter_radius, clutter_height
+        Specks per unit of volume, their half-width, and their height as a part of the contrast.
+    """
+
+    dropout: Annotated[float, SHARE] = 0.0
+    dropout_length: Annotated[float, ABOVE_ZERO] = 1.0
+    dropout_loss: Annotated[float, SHARE] = 1.0
+    clutter: Annotated[float, FROM_ZERO] = 0.0
+    clutter_radius: Annotated[float, ABOVE_ZERO] = 1.0
+    clutter_height: Annotated[float, FROM_ZERO] = 1.0
+
+
+@dataclass(frozen=True)
+class Optics(Checked):
+    """The Gaussian point-spread function, and the light lost on the way.
+
+    Parameters
+    ----------
+    blur
+        Deviations of the point-spread function (z, y, x) at depth 0.
+    growth
+        Relative growth of the deviations per unit of depth.
+    attenuation
+        Loss of light per unit of depth.
+    """
+
+    blur: Annotated[Triple, FROM_ZERO] = (0.0, 0.0, 0.0)
+    growth: Annotated[float, FROM_ZERO] = 0.0
+    attenuation: Annotated[float, FROM_ZERO] = 0.0
+
+
+@dataclass(frozen=True)
+class Illumination(Checked):
+    """The unevenness of the light.
+
+    Parameters
+    ----------
+    bias, bias_length
+        A smooth factor between 1 - bias and 1 + bias, and the length over which it is correlated.
+    stripes, stripe_width
+        Relative deviation of stripes along x, and their width.
+    """
+
+    bias: Annotated[float, SHARE] = 0.0
+    bias_length: Annotated[float, ABOVE_ZERO] = 1.0
+    stripes: Annotated[float, FROM_ZERO] = 0.0
+    stripe_width: Annotated[float, ABOVE_ZERO] = 1.0
+
+
+@dataclass(frozen=True)
+class Noise(Checked):
+    """The noise besides that of the photons, which the detector's gain brings.
+
+    Parameters
+    ----------
+    gaussian
+        Deviation of the noise that does not depend on the signal (read noise), in counts.
+    rician
+        Deviation of the noise of each channel of a magnitude, in counts.
+    width
+        Deviations (z, y, x) of the Gaussian that smooths the noise, in voxels of the image.
+    """
+
+    gaussian: Annotated[float, FROM_ZERO] = 0.0
+    rician: Annotated[float, FROM_ZERO] = 0.0
+    width: Annotated[Triple, FROM_ZERO] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Detector(Checked):
+    """How light becomes counts.
+
+    Parameters
+    ----------
+    gain
+        Counts per photon; 0 means that levels are counts already and no photon is counted.
+    offset
+        Counts in the dark.
+    rings, ring_width
+        Deviation of rings about z, as a part of the contrast, and their width.
+    ceiling
+        Counts are whole numbers and end here; they are real numbers where it is None.
+    """
+
+    gain: Annotated[float, FROM_ZERO] = 0.0
+    offset: Annotated[float, FINITE] = 0.0
+    rings: Annotated[float, FROM_ZERO] = 0.0
+    ring_width: Annotated[float, ABOVE_ZERO] = 1.0
+    ceiling: Annotated[float | None, ABOVE_ZERO] = None
+
+
+@dataclass(frozen=True)
+class Imaging(Checked):
+    """The parameters of one image; an effect whose strength is 0 is left out.
+
+    Parameters
+    ----------
+    unit
+        Of all lengths: a unit of length, or voxel.
+    spacing, thickness
+        Edges of the image's voxels (z, y, x); the thickness over which a slice averages (0: a point on z, as optical
+        sections have).
+    contrast, specimen, optics, illumination, noise, detector
+        The parts, in the order of the physics.
+    visible
+        What masks hold: voxels that this share of a structure's light reaches, as an annotator sees them, or, at 0, the
+        structure itself.
+
+    Raises
+    ------
+    ValueError
+        If a number is out of range or the unit has no known name.
+    """
+
+    unit: str = "um"
+    spacing: Annotated[Triple, ABOVE_ZERO] = (1.0, 1.0, 1.0)
+    thickness: Annotated[float, FROM_ZERO] = 0.0
+    contrast: Contrast = Contrast()
+    specimen: Specimen = Specimen()
+    optics: Optics = Optics()
+    illumination: Illumination = Illumination()
+    noise: Noise = Noise()
+    detector: Detector = Detector()
+    visible: Annotated[float, PARTIAL] = 0.0
+
+    def __post_init__(self) -> None:
+        if self.unit not in (*METRES, "voxel"):
+            raise ValueError(f"the unit must be {', '.join(METRES)} or voxel, got {quoted(self.unit)}")
+        for own in fields(self):
+            part, kind = getattr(self, own.name), type(own.default)
+            if is_dataclass(own.default) and not isinstance(part, kind):
+                raise ValueError(f"{own.name} must be of type {kind.__name__}, got {quoted(part)}")
+        super().__post_init__()
+
+    def __getitem__(self, name: str) -> Any:
+        """Return the value of a parameter by its name, `optics.blur` or `spacing`."""
+        return attrgetter(name)(self)
+
+    def assign(self, values: Mapping[str, Any]) -> Imaging:
+        """Return a copy with other values, by name: `imaging.assign({"optics.blur": (3, 1, 1), "visible": 0.1})`."""
+        if unknown := sorted(set(values) - set(NAMES)):
+            raise ValueError(f"an image has parameters such as optics.blur, got {', '.join(map(quoted, unknown))}")
+        parts: dict[str, dict[str, Any]] = {}
+        for name, value in values.items():
+            part, _, leaf = name.rpartition(".")
+            parts.setdefault(part, {})[leaf] = value
+        own = parts.pop("", {})
+        return replace(self, **own, **{name: replace(getattr(self, name), **part) for name, part in parts.items()})
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all parameters in JSON's types, each part an object of its own."""
+        return _in_lists(asdict(self))
+
+    @staticmethod
+    def from_dict(content: Mapping[str, Any]) -> Imaging:
+        """Return the image's parameters that `as_dict` wrote; those that are missing are as in `Imaging()`."""
+        return Imaging().assign(dict(_leaves(content)))
+
+
+def _leaves(content: Mapping[str, Any], part: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield names, with their part's before a dot, and values of nested objects."""
+    for name, value in content.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{part}{name}.")
+        else:
+            yield f"{part}{name}", value
+
+
+def _in_lists(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _in_lists(part) for name, part in value.items()}
+    return list(value) if isinstance(value, tuple) else value
+
+
+#: The names of all parameters, those of a part as `optics.blur`.
+NAMES = tuple(name for name, _ in _leaves(asdict(Imaging())))
 
 
 @dataclass(frozen=True)
@@ -48,7 +302,7 @@ class Modality:
         }
         for name, (low, high) in ranges.items():
             if np.any(np.asarray(low) > np.asarray(high)):
-                raise ValueError(f"expected a range of {name} from low to high, got {low} to {high}")
+                raise ValueError(f"the range of {name} must go from low to high, got {low} to {high}")
         object.__setattr__(self, "ranges", ranges)
 
     def draw(self, seed: int) -> Imaging:
@@ -79,3 +333,20 @@ def _between(low: Any, high: Any, share: float) -> Any:
     positive = bool(np.all(a > 0) and np.all(b > 0))
     value = np.exp(np.log(a) + share * (np.log(b) - np.log(a))) if positive else a + share * (b - a)
     return tuple(value.tolist()) if value.ndim else float(value)
+
+
+def _load_modalities() -> dict[str, Modality]:
+    content = yaml.safe_load(files("curvafit.data_synth.imaging").joinpath("modalities.yaml").read_text("utf-8"))
+    return {name: Modality.from_dict({"name": name, **part}) for name, part in content.items()}
+
+
+#: The presets of `modalities.yaml` by name, as at the command line.
+MODALITIES = _load_modalities()
+
+
+def modality(name: str) -> Modality:
+    """Return the preset of a name; capitals, spaces and underscores do not count: `two-photon` is `Two_Photon`."""
+    plain = plain_name(str(name))
+    if plain not in MODALITIES:
+        raise ValueError(f"a modality is one of {', '.join(MODALITIES)}, got {quoted(name)}")
+    return MODALITIES[plain]

@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
 
+import torch
 from numba import get_num_threads, set_num_threads
 
 
@@ -40,3 +41,15 @@ def limited(threads: int) -> Iterator[None]:
         yield
     finally:
         set_num_threads(before)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Give torch and numba one thread: sums, and so voxels, do not depend on the number of threads."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with limited(1):
+            yield
+    finally:
+        torch.set_num_threads(before)
