@@ -29,7 +29,7 @@ LEVELS = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.95, 0.98)
 #: Radii of the two-point function, and how far distances to the surface are measured, in voxels.
 RADII = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 16.0, 20.0)
 DEPTH = 20.0
-#: Length of chords, in voxels, beyond which they are not told apart.
+#: Chords longer than this, in voxels, all count as this long.
 LONGEST = 40.0
 #: Edge of the bins of curvature, in 1 / (100 voxels): binning moves an embedding by 0.06, seeds move it by 0.6 or more.
 _CURVATURE_BIN = 0.5
@@ -155,7 +155,7 @@ def _chord_quantiles(phase: np.ndarray, periodic: bool) -> np.ndarray:
     """Return quantiles, in voxels, of the lengths of the runs of a phase along the three axes.
 
     Of a window, each run counts from its ends that are seen: up to the other end, or as longer than what is seen.
-    Quantiles beyond `LONGEST` are that: a small window cannot tell them, and all windows are to be told alike.
+    Quantiles are at most `LONGEST`: a small window does not show longer runs, and all windows are measured alike.
     """
     longest = max(phase.shape)
     events, runs = np.zeros((2, longest + 1))

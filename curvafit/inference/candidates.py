@@ -45,7 +45,7 @@ LONGEST_EDGE = 100
 FURTHEST = 5.0
 #: What a verdict begins with where no law is the scan's, and where it is not known.
 UNBELIEVED, UNDECIDED = "No believable twin", "Undecided"
-#: Seeds further apart than this (1 / working unit) tell no texture: those of the presets lie .3 to 1.3 apart at 100³.
+#: Twins of two seeds further from each other than this (1 / working unit) define no texture; presets' lie .3 to 1.3.
 TELLING = 2.0
 #: Familiar numbers in which twins may differ from the scan, and the part by which all of them must to be named.
 FAMILIAR = {"thickness": "thickness_mean", "spacing": "spacing_mean", "connectivity": "connectivity_density"}
@@ -169,13 +169,13 @@ def twin(
     A mask or an image does not state a mass: the shape fills as much of its box as the structure does
     (`Prepared.true_volume_fraction`), or has the law's own mass where nothing grows so.
     """
-    grid, told = twin_grid(prepared), {"schedule": schedule, "seed": seed, "reject_early": True}
+    grid, options = twin_grid(prepared), {"schedule": schedule, "seed": seed, "reject_early": True}
     if prepared.kind != "field":
         share = prepared.true_volume_fraction
-        flow = generate(coefficients, mass, grid, volume_fraction=share, **told)
+        flow = generate(coefficients, mass, grid, volume_fraction=share, **options)
         if (grown := _measured(flow, prepared, seed)).phase is not None:
             return grown
-    return _measured(generate(coefficients, mass, grid, **told), prepared, seed)
+    return _measured(generate(coefficients, mass, grid, **options), prepared, seed)
 
 
 def twin_grid(prepared: Prepared) -> Grid:
@@ -217,8 +217,8 @@ def verdict(
         return None, _joined("No law: nothing grew from any candidate.", candidates[0].status)
     noise = seed_noise_of(candidates)
     title = TITLES[best.name]
-    apart = f"its twins lie {best.distance:.1f} from the scan's curvature diagram"
-    apart += f", {noise:.1f} from each other." if noise else "."
+    distances = f"its twins lie {best.distance:.1f} from the scan's curvature diagram"
+    distances += f", {noise:.1f} from each other." if noise else "."
     ratio, other = 0.0 if not noise else best.distance / noise, differences(scan, best.twins)
     familiar = f"Twins over scan: {', '.join(other)}." if other else ""
     strange = misfit is not None and misfit.probability < UNBELIEVABLE
@@ -226,7 +226,7 @@ def verdict(
     if strange or ratio > FURTHEST or len(other) > allowed:
         far = f"Twins should lie some {noise:.1f} from it." if ratio > CLOSE else ""
         reason = _unusual(misfit) if strange else far
-        return best.name, _joined(f"{UNBELIEVED}: of the nearest law ({title}), {apart}", reason, familiar)
+        return best.name, _joined(f"{UNBELIEVED}: of the nearest law ({title}), {distances}", reason, familiar)
     word, doubt = "Supported", ""
     if ratio > CLOSE:
         word, doubt = "Near", "They have its thickness, spacing and connectivity, and another law may come nearer."
@@ -239,7 +239,7 @@ def verdict(
         )
     elif familiar:
         word, doubt = "Near", "That is near enough."
-    return best.name, _joined(f"{word} ({title}): {apart}", doubt, familiar, _unusual(misfit), best.status)
+    return best.name, _joined(f"{word} ({title}): {distances}", doubt, familiar, _unusual(misfit), best.status)
 
 
 def _joined(*sentences: str) -> str:
@@ -253,7 +253,7 @@ def differences(scan: Morphometry, twins: Sequence[Morphometry]) -> list[str]:
     They differ by more than `NEAR`; connectivities also by more than chance lets two counts of so many bodies and
     tunnels differ, twice the root of their sum.
     """
-    apart = []
+    words = []
     for word, name in FAMILIAR.items():
         own = getattr(scan, name)
         ratios = np.array([getattr(each, name) / own for each in twins] if own else [])
@@ -261,8 +261,8 @@ def differences(scan: Morphometry, twins: Sequence[Morphometry]) -> list[str]:
         reach = np.maximum(NEAR, 2 * np.sqrt((1 + np.abs(ratios)) / max(count, 1)))
         if len(ratios) and ((ratios > 1 + reach).all() or (ratios < 1 - reach).all()):
             ratio = float(ratios.mean())
-            apart.append(f"{word} of the other sign" if ratio < 0 else f"{word} {number(ratio, 2)}")
-    return apart
+            words.append(f"{word} of the other sign" if ratio < 0 else f"{word} {number(ratio, 2)}")
+    return words
 
 
 def _unusual(misfit: Misfit | None) -> str:

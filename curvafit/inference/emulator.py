@@ -1,8 +1,8 @@
-"""What parameters make of the descriptors: their mean and covariance between seeds, and the parameters that fit best.
+"""The emulator: from parameters to the descriptors of the shapes that they grow; and the parameters that fit best.
 
-The mean is an ensemble of small networks; the covariance is that of what they miss, in each direction as large as
-parameters and view have it. So the likelihood of descriptors has exact derivatives, which the posterior's flows do not
-offer for sets of parameters, and says along which directions a texture does not tell its parameters.
+It states a mean, by an ensemble of small networks, and a covariance between seeds, from what the networks miss. So the
+likelihood of descriptors has exact derivatives by the parameters, and says in which directions a texture leaves its
+parameters open.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from curvafit.inference.table import PARAMETERS, Compression
 STEPS = 60
 #: Least deviation between seeds, of a direction whose mean one is 1.
 FAINTEST = 0.05
-#: A direction is weak where what descriptors say leaves more than this part of the prior's deviation.
+#: A direction is weak where the descriptors leave more than this part of the prior's deviation open.
 WEAK = 0.7
 #: A direction's least share of a parameter that is named, and normal deviations of a 90 % interval.
 NAMED, NINETY = 0.35, 1.645
@@ -36,8 +36,8 @@ class Layer(NamedTuple):
 
 
 class Emulated(NamedTuple):
-    """Compressed descriptors of parameters: mean `(N, k)`, and deviations `(N, k)` along the rows of a basis `(k, k)`
-    of directions in which what parameters leave open is uncorrelated."""
+    """Compressed descriptors that parameters lead to: mean `(N, k)`, and deviations `(N, k)` along the rows of a basis
+    `(k, k)`, directions in which seeds differ independently."""
 
     mean: np.ndarray
     deviation: np.ndarray
@@ -67,8 +67,8 @@ class Emulator:
     basis
         `(k, k)`: rows are directions in which what the mean misses is uncorrelated.
     inflation
-        What the mean misses along directions in which parameters move it, squared, over what the deviations say: the
-        means of rows miss alike where shapes are few.
+        Mean square of what the mean misses along directions in which parameters move it, over what the deviations
+        state: where shapes are few, the means of rows miss alike.
     """
 
     compression: Compression
@@ -166,8 +166,9 @@ class Optimum:
 
 
 def optimum(emulator: Emulator, descriptors: np.ndarray, view: str, starts: np.ndarray) -> Optimum:
-    """Find the parameters of greatest posterior density given a row of descriptors, by Levenberg and Marquardt's
-    method from many starts, with exact derivatives in float64.
+    """Find the parameters of greatest posterior density given a row of descriptors.
+
+    Levenberg and Marquardt's method from many starts, with exact derivatives in float64, by optimistix.
 
     Parameters
     ----------
@@ -184,8 +185,10 @@ def optimum(emulator: Emulator, descriptors: np.ndarray, view: str, starts: np.n
 
 
 def misfits(emulator: Emulator, descriptors: np.ndarray, view: str, starts: np.ndarray) -> np.ndarray:
-    """Return what the best parameters leave unexplained `(N,)` of rows of descriptors `(N, 351)`, by starts `(N, n,
-    6)` of each: sums of the squares of whitened descriptors."""
+    """Return the sums of squares `(N,)` of whitened descriptors that the best parameters leave unexplained.
+
+    Rows of descriptors are `(N, 351)`, the starts of each `(N, n, 6)`.
+    """
     ends = _solved(emulator, descriptors, view, starts)
     return ends.misfit[np.arange(len(descriptors)), ends.value.argmin(1)]
 
@@ -257,7 +260,12 @@ def _minimiser() -> Callable[..., Any]:
     import jax.numpy as jnp
     import optimistix
 
+    # The solver moves logits `free` of the parameters' shares of the box, so that no step leaves it. It minimises twice
+    # the negative log posterior as a sum of squares: |whitened misfit|² from the likelihood, and what the prior,
+    # uniform in the box, becomes for logits.
+
     def scaled(free):
+        # From logits to parameters in deviations of the prior: a uniform share has deviation 1 / √12.
         return np.sqrt(12) * (jax.nn.sigmoid(free) - 0.5)
 
     def unexplained(place, args):
@@ -267,6 +275,8 @@ def _minimiser() -> Callable[..., Any]:
 
     def uniform(free):
         """Return what squares to twice the negative logarithm of a uniform prior's density in logits."""
+        # With s = sigmoid(x), ds/dx = s (1 - s) = 1 / (4 cosh²(x/2)), so that -2 log density = 4 log cosh(x/2) + const.
+        # Its root is sign(x) · 2 √(log cosh(x/2)), and x / √2 near 0, where the root of a rounded 0 has no slope.
         near = jnp.abs(free) < 1e-2
         far = jnp.where(near, 1.0, free)
         cosh = jnp.logaddexp(far / 2, -far / 2) - np.log(2)
@@ -288,6 +298,8 @@ def _minimiser() -> Callable[..., Any]:
 
 
 def _summary(emulator: Emulator, parameters: np.ndarray, jacobian: np.ndarray, misfit: float, starts: np.ndarray):
+    # Laplace's approximation in deviations of the prior, whose own precision is 1. In direction v of singular value s
+    # the posterior's deviation is 1 / √(1 + s²): a direction that the descriptors do not see keeps the prior's.
     firmness = jacobian.T @ jacobian
     covariance = np.linalg.inv(firmness + np.eye(len(PARAMETERS)))
     squares, columns = np.linalg.eigh(firmness)

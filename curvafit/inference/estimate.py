@@ -19,7 +19,7 @@ from curvafit.inference.candidates import Candidate, Misfit
 from curvafit.inference.emulator import Optimum, misfits, optimum
 from curvafit.inference.fit import Draws
 from curvafit.inference.posterior import Posterior
-from curvafit.inference.simulate import Effort, Search, Simulate, Simulations, simulations
+from curvafit.inference.simulate import Effort, Search, Simulate, Simulations, simulate_draws
 from curvafit.inference.table import (
     PARAMETERS,
     VIEWS,
@@ -120,7 +120,7 @@ def estimate(
     reading = _Reading(posterior, row, view, parameters, best, mirror_parameters if turned else np.asarray)
     if not fast:
         simulate = _simulator(seen, view, effort.schedule)
-        grown = simulations(parameters, simulate, effort.simulations, seed=seed, progress=part(progress, 0.15, 0.45))
+        grown = simulate_draws(parameters, simulate, effort.simulations, seed=seed, progress=part(progress, 0.15, 0.45))
         if len(grown.parameters) >= FEWEST:
             pool = posterior.sample(row, view, POOL, seed)
             search = Search(posterior.emulator, view, row)
@@ -301,10 +301,11 @@ def _distances(rows: np.ndarray, summaries: np.ndarray) -> np.ndarray:
     for k in range(len(rows)):
         rest = np.delete(np.arange(1, len(rows)), k - 1) if k else np.arange(1, len(rows))
         mean, scale = summaries[rest].mean(0), summaries[rest].std(0) + 1e-9
-        told = (summaries - mean) / scale
+        regressors = (summaries - mean) / scale
         away = rows - rows[rest].mean(0)
-        slope = np.linalg.solve(told[rest].T @ told[rest] + RIDGE * np.eye(len(PARAMETERS)), told[rest].T @ away[rest])
-        left = away - told @ slope
+        X = regressors[rest]
+        slope = np.linalg.solve(X.T @ X + RIDGE * np.eye(len(PARAMETERS)), X.T @ away[rest])
+        left = away - regressors @ slope
         deviation = left[rest].std(0, ddof=1)
         deviation = np.maximum(deviation, FAINTEST * deviation.mean() + 1e-12)
         values.append(np.log(np.square(left[k] / deviation).mean() + 1e-12))

@@ -140,7 +140,7 @@ def infer(
     fast
         Grow nothing: seconds instead of minutes, but nothing is checked by a twin.
     threshold, dark, roi
-        How the structure is told from the background: see `curvafit.scan.prepare.prepare`.
+        How structure and background are split: see `curvafit.scan.prepare.prepare`.
     label, crop
         The voxels of one value as a mask; a box of voxels, of the scan and of `roi`: see `curvafit.load`.
     effort

@@ -1,9 +1,7 @@
-"""Parameters whose shapes are nearest to a query, by simulations that are chosen one after another.
+"""Simulations: shapes grown from parameters and measured as a scan is, and a search for the likeliest parameters.
 
-Draws of a posterior that few shapes have trained grow shapes that are told from the query at a glance: of six masks the
-middle of the draws regrew a curvature diagram 1.6 to 86 times as far from the query's as the truth regrown. What is
-simulated near the query says where the emulator errs there: a Gaussian process of what it misses is added to it, and
-tells which parameters to simulate next (Gutmann & Corander 2016).
+The emulator errs where few shapes have trained it. Simulations near a query tell how: a Gaussian process of what the
+emulator misses is added to it, and tells which parameters to simulate next (Gutmann & Corander 2016).
 """
 
 from __future__ import annotations
@@ -35,8 +33,19 @@ BARREN, REACH = 50.0, 0.3
 
 
 class Effort(NamedTuple):
-    """How much an inference grows: draws of the posterior; rounds of three shapes that are chosen by those before;
-    shapes of the best law, and most shapes to find which law that is; steps of each shape."""
+    """How many shapes an inference grows, and by which steps.
+
+    Attributes
+    ----------
+    simulations
+        Draws of the posterior.
+    rounds
+        Rounds of three shapes whose parameters the shapes before them suggest.
+    twins, regrown
+        Shapes of the best law, and the most shapes that may be grown to find which law that is.
+    schedule
+        Steps of each shape.
+    """
 
     simulations: int = 16
     rounds: int = 7
@@ -46,8 +55,7 @@ class Effort(NamedTuple):
 
 
 class Simulations(NamedTuple):
-    """Parameters `(n, 6)`, seeds `(n,)` and descriptors `(n, 351)` of the simulations that grew a shape, and how many
-    there were."""
+    """Parameters `(n, 6)`, seeds `(n,)` and descriptors `(n, 351)` of those simulations, of `count`, that grew."""
 
     parameters: np.ndarray
     seeds: np.ndarray
@@ -69,7 +77,7 @@ class Simulations(NamedTuple):
 Simulate = Callable[[np.ndarray, int], Descriptors | None]
 
 
-def simulations(
+def simulate_draws(
     draws: np.ndarray,
     simulate: Simulate,
     count: int,
@@ -103,8 +111,10 @@ def simulations(
 
 
 class Process(NamedTuple):
-    """A Gaussian process, alike for each column: places `(n, d)`, the Cholesky factor of its covariance there, what it
-    adds to the mean for a unit of covariance `(n, k)`, and its length and variances."""
+    """A Gaussian process of values `(n, k)` at places `(n, d)`, the same for each column.
+
+    `factor` is the Cholesky factor of the covariance K + noise there, `coefficients` (K + noise)⁻¹ values.
+    """
 
     places: np.ndarray
     factor: np.ndarray
@@ -138,13 +148,13 @@ class Process(NamedTuple):
     def __call__(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the means `(m, k)` and variances `(m,)`, with the noise, at places `(m, d)`."""
         near = self.variance * _alike(places, self.places, self.length)
-        told = np.square(linalg.solve_triangular(self.factor, near.T, lower=True)).sum(0)
-        return near @ self.coefficients, self.variance - told + self.noise
+        explained = np.square(linalg.solve_triangular(self.factor, near.T, lower=True)).sum(0)
+        return near @ self.coefficients, self.variance - explained + self.noise
 
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """A search for the parameters whose shapes are like a query.
+    """A search for the parameters whose shapes have the descriptors of a query.
 
     Attributes
     ----------
@@ -226,8 +236,8 @@ class Search:
         basis, deviation = self.emulator.basis, emulated.deviation.mean(0)
         missed = (self._components(simulated.descriptors) - emulated.mean @ basis.T) / deviation
         mean, variance = Process.of(self._scaled(simulated.parameters), missed)(self._scaled(candidates))
-        told = self.emulator(candidates, self.view).mean @ basis.T / deviation + mean
-        left = self._components(self.query[None]) / deviation - told
+        expected = self.emulator(candidates, self.view).mean @ basis.T / deviation + mean
+        left = self._components(self.query[None]) / deviation - expected
         return np.square(left).sum(1) / variance + left.shape[1] * np.log(variance)
 
     def _components(self, descriptors: np.ndarray) -> np.ndarray:

@@ -271,8 +271,7 @@ def compression_of(descriptors: np.ndarray, components: int, blocks: tuple[str, 
     """Return the principal components of some descriptors: columns in deviations (the curvature block in one for all
     its columns, as its distance asks), blocks in `WEIGHTS`.
 
-    A component's deviation is the square root of what it would be in the columns, and their mean square is 1: of 365
-    shapes, as masks, a Gaussian process reads R² .66 on average (.64 where all are 1, .64 where they are as they come).
+    A component's deviation is the square root of what it would be in the columns, and the components' mean square is 1.
     """
     names = np.array(column_names())
     names = names[np.isin(names, blocks)]

@@ -69,9 +69,6 @@ def train_posterior(
 ) -> Posterior:
     """Fit an ensemble of flows to the parameters of a table's rows, and an emulator to the descriptors.
 
-    Of 423 shapes left out in fifths, seen as masks, it reads R² .66 on average: one flow .64, four with twice the
-    dropout .65 (and m₀'s intervals too wide), Gaussian processes .67; flows for masks alone read .01 less.
-
     Each member starts from other weights, and stops where the likelihood of its own tenth of the shapes, which it does
     not learn from, is highest: all views of a shape are on one side.
 
@@ -183,11 +180,9 @@ def train_emulator(
     plan: Plan = PLANS.emulator,
     progress: Progress = silent,
 ) -> Trained:
-    """Fit networks to the compressed descriptors of a table's rows, given their parameters, and others to the
-    deviations of what the first miss of shapes that they did not learn from.
+    """Fit networks to the compressed descriptors of a table's rows, given their parameters.
 
-    Of 424 shapes left out in fifths, seen as masks, a quarter of the components' variance is missed; of cubic
-    polynomials .37, of Gaussian processes .39.
+    Other networks are fitted to the deviations of what the first miss of shapes that they did not learn from.
     """
     views = tuple(sorted(set(table.views.tolist())))
     target = compression(table.descriptors)
@@ -201,16 +196,16 @@ def train_emulator(
         inputs[mine] = blank.inputs(table.parameters[mine], view)
     x, y = torch.from_numpy(inputs).float(), torch.from_numpy(target).float()
 
-    def told(first: float) -> Callable[[int], Progress]:
+    def report(first: float) -> Callable[[int], Progress]:
         return lambda k: lambda text, share: progress(f"emulator, {text}", first + (k + share) / FOLDS / 2)
 
-    means = _ensemble(x, y, part, _squares, plan, seed, told(0.0))
-    missed = y - _apart(means, x, part)
+    means = _ensemble(x, y, part, _squares, plan, seed, report(0.0))
+    missed = y - _held_out(means, x, part)
     values, vectors = np.linalg.eigh(np.cov(missed.double().numpy().T))
     basis = (vectors / np.sqrt(np.maximum(values, 1e-9 * values.max()))).T[::-1].astype(np.float32)
     whitened = missed @ torch.from_numpy(basis).T
-    spreads = _ensemble(x, whitened, part, _normal_nats, plan, seed, told(0.5))
-    deviation = torch.exp(_apart(spreads, x, part)).clamp(min=FAINTEST)
+    spreads = _ensemble(x, whitened, part, _normal_nats, plan, seed, report(0.5))
+    deviation = torch.exp(_held_out(spreads, x, part)).clamp(min=FAINTEST)
     emulator = Emulator(compression, views, box, _layers(means), _layers(spreads), basis, 1.0)
     left = (whitened / deviation).double().numpy()
     emulator = dataclasses.replace(emulator, inflation=_inflation(emulator, table, left))
@@ -228,8 +223,8 @@ def _misfits(emulator: Emulator, number: int, rows: Table) -> np.ndarray:
         tuple(Layer(*(each[number : number + 1] for each in layer)) for layer in layers)
         for layers in (emulator.mean, emulator.spread)
     )
-    apart = dataclasses.replace(emulator, mean=mean, spread=spread)
-    return misfits(apart, rows.descriptors, str(rows.views[0]), rows.parameters[:, None])
+    single = dataclasses.replace(emulator, mean=mean, spread=spread)
+    return misfits(single, rows.descriptors, str(rows.views[0]), rows.parameters[:, None])
 
 
 def _inflation(emulator: Emulator, table: Table, left: np.ndarray) -> float:
@@ -289,7 +284,7 @@ def _network(inputs: int, outputs: int) -> nn.Sequential:
     return nn.Sequential(*layers, nn.Linear(HIDDEN[-1], outputs))
 
 
-def _apart(networks: list[nn.Sequential], x: Tensor, part: np.ndarray) -> Tensor:
+def _held_out(networks: list[nn.Sequential], x: Tensor, part: np.ndarray) -> Tensor:
     """Return each row's outputs by the network that did not learn from it."""
     with torch.no_grad():
         outputs = torch.stack([network(x) for network in networks])
@@ -334,7 +329,7 @@ def learn(
     """
     optimiser = torch.optim.AdamW(network.parameters(), lr=plan.rate, weight_decay=plan.decay)
     slower = torch.optim.lr_scheduler.ReduceLROnPlateau(optimiser, factor=0.5, patience=plan.patience // 3)
-    (x, y), apart = [each[~validation] for each in rows], [each[validation] for each in rows]
+    (x, y), held_out = [part[~validation] for part in rows], [part[validation] for part in rows]
     best, state, waited = np.inf, copy.deepcopy(network.state_dict()), 0
     for epoch in range(plan.epochs):
         network.train()
@@ -345,7 +340,7 @@ def learn(
             optimiser.step()
         network.eval()
         with torch.no_grad():
-            value = float(cost(network, *apart))
+            value = float(cost(network, *held_out))
         slower.step(value)
         waited = 0 if value < best else waited + 1
         if value < best:

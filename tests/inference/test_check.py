@@ -12,7 +12,7 @@ from curvafit.geometry.descriptors import BLOCKS, Descriptors
 from curvafit.inference.emulator import misfits
 from curvafit.inference.estimate import LEVELS, STARTS, check, tail_probability
 from curvafit.inference.posterior import Posterior
-from curvafit.inference.simulate import simulations
+from curvafit.inference.simulate import simulate_draws
 from curvafit.inference.table import PARAMETERS, column_names
 
 NAMES = np.array(column_names())
@@ -97,7 +97,7 @@ def described(parameters: np.ndarray, seed: int) -> Descriptors | None:
 
 def test_simulations_are_of_draws_each_with_its_seed() -> None:
     draws = np.random.default_rng(5).uniform(LOW, HIGH, (40, 6))
-    grown = simulations(draws, described, 9, seed=3)
+    grown = simulate_draws(draws, described, 9, seed=3)
     assert grown.count == 9
     assert grown.seeds.tolist() == [4, 5, 7, 8, 10, 11]
     assert np.array_equal(grown.descriptors[:, :6], grown.parameters)
@@ -110,11 +110,11 @@ def test_simulations_are_of_draws_each_with_its_seed() -> None:
 @pytest.mark.parametrize("count", [0, 41])
 def test_a_number_of_simulations_has_bounds(count: int) -> None:
     with pytest.raises(ValueError, match="simulations"):
-        simulations(np.zeros((40, 6)), described, count)
+        simulate_draws(np.zeros((40, 6)), described, count)
 
 
 def test_nothing_grown_is_no_row() -> None:
-    grown = simulations(np.zeros((40, 6)), lambda parameters, seed: None, 3)
+    grown = simulate_draws(np.zeros((40, 6)), lambda parameters, seed: None, 3)
     assert grown.descriptors.shape == (0, sum(BLOCKS.values()))
     assert len(grown.parameters) == len(grown.seeds) == 0
 

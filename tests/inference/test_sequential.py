@@ -7,7 +7,7 @@ import pytest
 from emulated import BOX, HIGH, LOW, NOISE, linear, row, told
 
 from curvafit.geometry.descriptors import BLOCKS, Descriptors
-from curvafit.inference.simulate import BATCH, LAST, Effort, Process, Search, Simulate, Simulations, simulations
+from curvafit.inference.simulate import BATCH, LAST, Effort, Process, Search, Simulate, Simulations, simulate_draws
 
 #: What the emulator misses of each of the five sums, in deviations of the prior.
 MISSED = np.array([0.4, -0.3, 0.3, 0.2, -0.4])
@@ -34,7 +34,7 @@ def searched(simulate: Simulate) -> tuple[np.ndarray, Simulations, np.ndarray]:
     """The parameters, all simulations, and the draws: those of a posterior that the emulator leads astray."""
     rng = np.random.default_rng(0)
     draws = np.clip(TRUTH + (0.1 + 0.15 * rng.standard_normal((400, 6))) * (HIGH - LOW), LOW, HIGH)
-    first = simulations(draws, simulate, 12)
+    first = simulate_draws(draws, simulate, 12)
     return *Search(linear(), "mask", QUERY).parameters(draws, first, simulate), draws
 
 
@@ -67,7 +67,7 @@ def test_where_nothing_grows_is_avoided() -> None:
 
 def test_the_answer_grows_or_is_the_nearest_that_did() -> None:
     """Nothing grows after the first simulations: the nearest of those is the answer."""
-    first = simulations(np.random.default_rng(0).uniform(LOW, HIGH, (400, 6)), simulator(), 12)
+    first = simulate_draws(np.random.default_rng(0).uniform(LOW, HIGH, (400, 6)), simulator(), 12)
     search = Search(linear(), "mask", QUERY)
     parameters, every = search.parameters(first.parameters, first, lambda *_: None)
     assert every.count == 12 + Effort().rounds * BATCH + LAST and len(every.parameters) == 12
