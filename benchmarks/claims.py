@@ -1,21 +1,23 @@
 """The ledger: each figure that README or docs print, and each bar of the work at hand, is a claim, and data.
 
 `claims.toml` holds groups of claims. A group has `claims`, a list, or `columns` and `rows`, a table of them, whose ids
-are group.row.column; what a claim does not say its group says: `topic`, `command` (and `at`, the commit at which the
-command runs where it is not today's), `format`, `bar`, `chosen_on`, `reported_on`, `processor`, `note`. A value in the
-file is one that was measured before the ledger was. `record` writes a value measured since into
-`benchmarks/results/TOPIC.json`, which has the last word. A `page` prints its group between the marks
-`<!-- ledger: GROUP -->` and `<!-- end -->`; a `list` prints claims of several groups so. `prose` are sentences of pages
-with figures in them, which are compared and never rewritten.
+are group.row.column. What a claim does not say its group says: `topic`, `command`, `format`, `bar`, `chosen_on`,
+`reported_on`, `processor`, `note`; and of a value that was measured before the ledger was, `at`, its commit, and
+`then`, the command there if it is another one today. `record` writes a value that was measured since into
+`benchmarks/results/TOPIC.json`, which has the last word.
+
+A `page` prints its group between the marks `<!-- ledger: GROUP -->` and `<!-- end -->`; a `list` prints claims of
+several groups so. `prose` are sentences of pages with figures in them, which are compared and never rewritten.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import re
 import tomllib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -24,7 +26,7 @@ from benchmarks.harness import RESULTS, ROOT, Figure, markdown, provenance, show
 
 LEDGER = ROOT / "benchmarks" / "claims.toml"
 #: What a claim takes from its group where it does not say it.
-INHERITED = ("topic", "command", "at", "format", "bar", "chosen_on", "reported_on", "processor", "note")
+INHERITED = ("topic", "command", "then", "at", "format", "bar", "chosen_on", "reported_on", "processor", "note")
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,7 @@ class Claim:
     figure: Figure | None
     topic: str
     command: str = ""
+    then: str = ""
     at: str = ""
     format: str = "{:g}"
     bar: str = ""
@@ -64,18 +67,19 @@ class Claim:
         if self.figure is None:
             return ""
         value, low, high = self.figure
-        text = _signed(self.format.format(value))
-        if self.bar and not meets(value, self.bar):
-            text = f"**{text}**"
+        text, span = _signed(self.format.format(value)), ""
         if low is not None and high is not None:
             number = re.sub(r".*(\{.*\}).*", r"\1", self.format)
-            text += f" ({_signed(number.format(low))} to {_signed(number.format(high))})"
-        return text
+            span = f"{_signed(number.format(low))} to {_signed(number.format(high))}"
+        if math.isnan(value):
+            return span
+        text = f"**{text}**" if self.bar and not meets(value, self.bar) else text
+        return f"{text} ({span})" if span else text
 
     @property
     def call(self) -> str:
         """The command, and the commit at which it runs where that is not today's."""
-        return f"`{self.command}`" + (f" at {self.at}" if self.at else "") if self.command else ""
+        return _call(self.then or self.command, self.at) if self.at else _call(self.command, "")
 
 
 def meets(value: float, bar: str) -> bool:
@@ -84,6 +88,10 @@ def meets(value: float, bar: str) -> bool:
         return float(match[1]) <= value <= float(match[2])
     sign, number = bar.split()
     return {">=": value >= float(number), "<=": value <= float(number), "=": value == float(number)}[sign]
+
+
+def _call(command: str, at: str) -> str:
+    return f"`{command}`" + (f" at {at}" if at else "") if command else ""
 
 
 def _signed(text: str) -> str:
@@ -111,12 +119,14 @@ class Ledger:
 
     def print(self, topic: str | None, as_markdown: bool) -> None:
         """Print the ledger, or what concerns one topic."""
-        columns = ["claim", "what", "value", "bar", "state", "command", "chosen on", "reported on", "commit, processor"]
-        rows = [
-            [c.id, c.says, c.text, c.bar, c.state, c.call, c.chosen_on, c.reported_on, _origin(c)]
-            for c in self.of(topic)
-        ]
-        print(markdown(columns, rows)) if as_markdown else show(columns, rows)
+        columns = ["claim", "value", "bar", "state", "command"]
+        rows = [[c.id, c.text, c.bar, c.state, c.call] for c in self.of(topic)]
+        if as_markdown:
+            columns += ["what", "chosen on", "reported on", "commit, processor"]
+            more = [[c.says, c.chosen_on, c.reported_on, _origin(c)] for c in self.of(topic)]
+            print(markdown(columns, [a + b for a, b in zip(rows, more, strict=True)]))
+        else:
+            show(columns, [[cell[:70] for cell in row] for row in rows])
         states = [claim.state for claim in self.of(topic)]
         counts = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(states))
         print(f"\n{len(states)} claims: {counts}")
@@ -135,11 +145,15 @@ class Ledger:
     def _table(self, group: Mapping[str, Any]) -> str:
         if "columns" not in group:
             return _listed(group.get("head", "what"), [self.claims[claim["id"]] for claim in group["claims"]])
-        rows = []
-        for key, label, *_ in group["rows"]:
-            cells = (self.claims.get(f"{group['id']}.{key}.{column}") for column in group["keys"])
-            rows.append([label, *("" if claim is None else claim.text for claim in cells)])
-        return markdown([group.get("head", ""), *group["columns"]], rows)
+        rows, formats = [], group.get("formats", ["{}"] * len(group["keys"]))
+        for key, label, *cells in group["rows"]:
+            claims = [self.claims.get(f"{group['id']}.{key}.{column}") for column in group["keys"]]
+            parts = zip(claims, cells, formats, strict=True)
+            texts = [cell if claim is None else replace(claim, format=form).text for claim, cell, form in parts]
+            rows.append([label, *texts])
+        first = next(claim for claim in claims if claim is not None)
+        told = "; ".join(filter(None, (first.call, group.get("reported_on"), group.get("note"))))
+        return markdown([group.get("head", ""), *group["columns"]], rows) + (f"\n\n*{told}.*" if told else "")
 
     def pages(self, *, write: bool) -> list[str]:
         """Return what pages print otherwise than the ledger; or rewrite their tables, and return what is left."""
@@ -194,7 +208,7 @@ def _claims_of(group: Mapping[str, Any]) -> Iterator[Claim]:
     for key, label, *cells in group.get("rows", []):
         for k, (cell, column) in enumerate(zip(cells, group["keys"], strict=True)):
             own = {name: group[f"{name}s"][k] for name in ("format", "bar") if f"{name}s" in group}
-            if cell != "":
+            if not isinstance(cell, str) or cell == "?":
                 says = ", ".join(filter(None, (group.get("title", ""), label, group["columns"][k])))
                 yield _claim(f"{group['id']}.{key}.{column}", says, cell, common | own)
 
