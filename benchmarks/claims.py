@@ -3,7 +3,7 @@
 `claims.toml` holds groups of claims. A group has `claims`, a list, or `columns` and `rows`, a table of them, whose ids
 are group.row.column. What a claim does not say its group says: `topic`, `command`, `format`, `bar`, `chosen_on`,
 `reported_on`, `processor`, `note`; and of a value that was measured before the ledger was, `at`, its commit, and
-`then`, the command there if it is another one today. `record` writes a value that was measured since into
+`then`, the command there if today's is another or none. `record` writes a value that was measured since into
 `benchmarks/results/TOPIC.json`, which has the last word.
 
 A `page` prints its group between the marks `<!-- ledger: GROUP -->` and `<!-- end -->`; a `list` prints claims of
@@ -78,8 +78,8 @@ class Claim:
 
     @property
     def call(self) -> str:
-        """The command, and the commit at which it runs where that is not today's."""
-        return _call(self.then or self.command, self.at) if self.at else _call(self.command, "")
+        """The command of today, or the one of the commit at which there was one."""
+        return f"`{self.command}`" if self.command else f"`{self.then}` at {self.at}" if self.then else ""
 
 
 def meets(value: float, bar: str) -> bool:
@@ -88,10 +88,6 @@ def meets(value: float, bar: str) -> bool:
         return float(match[1]) <= value <= float(match[2])
     sign, number = bar.split()
     return {">=": value >= float(number), "<=": value <= float(number), "=": value == float(number)}[sign]
-
-
-def _call(command: str, at: str) -> str:
-    return f"`{command}`" + (f" at {at}" if at else "") if command else ""
 
 
 def _signed(text: str) -> str:
@@ -152,7 +148,8 @@ class Ledger:
             texts = [cell if claim is None else replace(claim, format=form).text for claim, cell, form in parts]
             rows.append([label, *texts])
         first = next(claim for claim in claims if claim is not None)
-        told = "; ".join(filter(None, (first.call, group.get("reported_on"), group.get("note"))))
+        since = f"not run again since {first.at}" if first.at and first.command else ""
+        told = "; ".join(filter(None, (first.call, since, group.get("reported_on"), group.get("note"))))
         return markdown([group.get("head", ""), *group["columns"]], rows) + (f"\n\n*{told}.*" if told else "")
 
     def pages(self, *, write: bool) -> list[str]:

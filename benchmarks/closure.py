@@ -2,8 +2,7 @@
 
 `--table TABLE.npz` is made by `curvafit atlas describe`. Each shape is answered for by what was trained on the other
 folds alone, all its views being in one fold. Methods: `match`, the nearest training shape by the curvature block;
-`process`, a Gaussian process for each parameter on principal components; `posterior`, the ensemble of flows; `refined`,
-the emulator's best fit from the posterior's draws.
+`process`, a Gaussian process for each parameter on principal components; `posterior`, the ensemble of flows.
 
 - R²: 1 - mean square error / variance of a parameter. Error: median |error| in deviations of the prior.
 - in 90: part of the true values in the central 90 % intervals; width: their mean width in deviations of the prior.
@@ -11,7 +10,8 @@ the emulator's best fit from the posterior's draws.
 - TARP: greatest difference of expected and stated coverage of balls around random points (Lemos et al. 2023), and its
   p: the part of as many exact draws that differ by more.
 
-`--gallery` ($CURVAFIT_DATA) asks the packaged posterior for the author's volumes as masks.
+`--gallery` ($CURVAFIT_DATA) asks the packaged posterior, and its emulator's best fit, for the author's
+volumes as masks; the deviations are those of its box.
 """
 
 from __future__ import annotations
@@ -106,10 +106,6 @@ def asked(trained: Posterior, queries: Table) -> Answers:
     return Answers(draws.mean(1), draws)
 
 
-def refined(training: Table, queries: Table) -> Answers:
-    return best_fits(train_posterior(training, members=1), queries)
-
-
 def best_fits(trained: Posterior, queries: Table) -> Answers:
     """Return the emulator's best parameters, with normal draws about them, cut at the box."""
     random, shape = np.random.default_rng(0), (len(queries), DRAWS, len(PARAMETERS))
@@ -121,9 +117,7 @@ def best_fits(trained: Posterior, queries: Table) -> Answers:
     return Answers(mean, draws)
 
 
-METHODS: dict[str, Method] = {
-    "match": match, "process": process, "posterior": posterior, "refined": refined
-}  # fmt: skip
+METHODS: dict[str, Method] = {"match": match, "process": process, "posterior": posterior}
 
 
 def cross_answers(table: Table, name: str, folds: int, cases: Cases) -> Answers:
@@ -217,7 +211,7 @@ def author_table(cases: Cases, names: list[str]) -> Table:
 def on_gallery(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     names = list(author_paths())[: 2 if options.quick else None]
     queries, trained = author_table(cases, names), load_posterior()
-    prior = np.ptp(trained.box, axis=1) / np.sqrt(12)
+    prior = trained.emulator.deviation
     jobs = {
         "gallery-posterior": lambda: judged(queries.parameters, asked(trained, queries), prior),
         "gallery-refined": lambda: judged(queries.parameters, best_fits(trained, queries), prior),

@@ -20,7 +20,7 @@ import argparse
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from importlib.util import find_spec
 from itertools import product
 from pathlib import Path
@@ -46,6 +46,8 @@ EDGE = 64
 ITK = "ITK"
 #: What is not a plain interpolation.
 PRIORS = ("calibrated", "example", "posterior", "match", "true", "Willmore")
+#: What is kept of each case; the thickness of real structures alone.
+FIGURES = ("dice", "betti", "thickness")
 #: Slices of a block along its first axis below which those along the second are known.
 FEW = 48
 
@@ -81,20 +83,22 @@ def interpolated(slices: Slices, way: str) -> np.ndarray:
 
 
 def shape(law: str, seed: int, cases: Cases) -> np.ndarray:
-    """Return a mask of a law, grown once."""
+    """Return a mask of a law, grown once for all topics."""
 
     def grow() -> np.ndarray:
         return np.packbits(generate(law, grid=EDGE, schedule="deep", seed=seed).field.numpy() > 0)
 
-    return np.unpackbits(cases.array(f"shape-{law}-{seed}", grow)).reshape(EDGE, EDGE, EDGE) > 0
+    packed = cases.of("completion").array(f"shape-{law}-{seed}", grow)
+    return np.unpackbits(packed).reshape(EDGE, EDGE, EDGE) > 0
 
 
 def fitted(law: str, seed: int, cases: Cases) -> Fit:
     """Return the fit of a mask, inferred once without growing anything."""
-    mask = shape(law, seed, cases).astype(np.uint8)
-    return Fit.load(
-        cases.text(f"fit-{law}-{seed}.json", lambda: infer(mask, kind="mask", fast=True, periodic=True).fit.to_json())
-    )
+
+    def read() -> str:
+        return infer(shape(law, seed, cases).astype(np.uint8), kind="mask", fast=True, periodic=True).fit.to_json()
+
+    return Fit.load(cases.of("completion").text(f"fit-{law}-{seed}.json", read))
 
 
 def completed(way: str, law: str, seed: int, every: int, periodic: bool, cases: Cases) -> tuple[np.ndarray, str]:
@@ -126,38 +130,38 @@ def on_shapes(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
         laws, ways = laws[:1], ["spline", "true"]
     figures: dict[str, Figure] = {}
     for kind in ("crop", "box")[: 1 if options.quick else 2]:
+        names = {(law, way): f"{kind}-{way}-{law}-{seed}-{every}" for law, way in product(laws, ways)}
         jobs = {
-            f"{kind}-{way}-{law}-{seed}-{every}": lambda w=way, a=law, p=kind == "box": shape_case(
-                w, a, seed, every, p, cases
-            )
-            for law, way in product(laws, ways)
+            name: partial(shape_case, way, law, seed, every, kind == "box", cases) for (law, way), name in names.items()
         }
-        found = cases.all(jobs, seed)
-        rows = {
-            law: {way: found[name] for way in ways if (name := f"{kind}-{way}-{law}-{seed}-{every}") in found}
-            for law in laws
-        }
-        figures |= gains(f"{kind}s, every {every}", rows, ways, f"shapes.{{way}}.{kind}_{{key}}")
+        figures |= gains(
+            f"{kind}s, every {every}", names, cases.all(jobs, seed), ways, f"shapes.{{way}}.{kind}_{{key}}"
+        )
     return figures if (every, seed) == (8, 2) else {}
 
 
-def gains(title: str, rows: Mapping[str, Mapping[str, Values]], ways: Sequence[str], key: str) -> dict[str, Figure]:
-    """Print and return, of each way, median Dice and Betti error and the gains on the best plain way, case by case."""
-    whole = [name for name, row in rows.items() if all(way in row for way in ways)]
-    if not whole:
+def gains(
+    title: str, names: Mapping[tuple[str, str], str], cases: Mapping[str, Values], ways: Sequence[str], key: str
+) -> dict[str, Figure]:
+    """Print and return, of each way, medians and the gains on the best plain way, case by case.
+
+    `names` are the names of the cases by what they are of, and by way.
+    """
+    things = list(dict.fromkeys(thing for thing, _ in names))
+    rows = {t: {w: cases[names[t, w]] for w in ways} for t in things if all(names[t, w] in cases for w in ways)}
+    if not rows:
         return {}
-    best = np.array([max(row["dice"] for way, row in rows[name].items() if way not in PRIORS) for name in whole])
-    table, figures = [], {}
+    best = np.array([max(row[way]["dice"] for way in ways if way not in PRIORS) for row in rows.values()])
+    table, figures = [], {key.format(way="best", key="plain"): bootstrap(best)}
     for way in ways:
-        dice = np.array([rows[name][way]["dice"] for name in whole])
-        gain = 100 * (dice - best)
-        betti = float(np.median([rows[name][way]["betti"] for name in whole]))
+        mine = {figure: np.array([row[way].get(figure, np.nan) for row in rows.values()]) for figure in FIGURES}
+        gain = 100 * (mine["dice"] - best)
+        found = {figure: bootstrap(values) for figure, values in mine.items()} | {"gain": bootstrap(gain)}
+        found["least"] = Figure(float(gain.min()))
         each = " ".join(f"{value:+.1f}" for value in gain)
-        table.append([way, float(np.median(dice)), bootstrap(gain), f"{gain.min():+.1f}", betti, each])
-        found = {"dice": bootstrap(dice), "gain": bootstrap(gain), "least": Figure(float(gain.min()))}
+        table.append([way, found["dice"].value, found["gain"], found["least"].value, found["betti"].value, each])
         figures |= {key.format(way=way.lower(), key=name): figure for name, figure in found.items()}
-        figures[key.format(way=way.lower(), key="betti")] = Figure(betti)
-    show(["way", "Dice", "gain, points", "least", "Betti", ", ".join(whole)], table, title)
+    show(["way", "Dice", "gain, points", "least", "Betti", ", ".join(rows)], table, title)
     return figures
 
 
@@ -279,30 +283,15 @@ def on_scans(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     ways, every = [*plain_ways(), *(way for way in chosen if way in PRIORS)], options.every
     figures: dict[str, Figure] = {}
     for name in options.only.split(","):
-        blocks_of = list(product((0, 1), range(STRUCTURES[name].targets)))
+        parts = [f"{side}-{block}" for side, block in product((0, 1), range(STRUCTURES[name].targets))]
         if options.quick:
-            blocks_of, ways = blocks_of[:1], ["spline"]
-        jobs = {
-            f"{name}-{side}-{block}-{every}-{way}": lambda s=side, b=block, w=way, n=name: scan_case(
-                n, s, b, every, w, cases
-            )
-            for (side, block), way in product(blocks_of, ways)
-        }
-        found = cases.all(jobs)
-        rows = {
-            f"{side}-{block}": {way: found[k] for way in ways if (k := f"{name}-{side}-{block}-{every}-{way}") in found}
-            for side, block in blocks_of
-        }
-        key = f"structures.{name}.{{way}}_{{key}}"
-        mine = gains(f"{name}, every {every}", rows, ways, key)
-        best = [max((row[way]["dice"] for way in ways if way not in PRIORS), default=0) for row in rows.values() if row]
-        mine[f"structures.{name}.plain"] = bootstrap(best)
-        for way in ways:
-            mine[key.format(way=way.lower(), key="thickness")] = Figure(
-                float(np.median([row[way]["thickness"] for row in rows.values() if way in row]))
-            )
-        figures |= {k.replace(".example_", "."): figure for k, figure in mine.items()}
-    return figures if every == 8 else {}
+            parts, ways = parts[:1], ["spline"]
+        names = {(each, way): f"{name}-{each}-{every}-{way}" for each, way in product(parts, ways)}
+        jobs = {case: partial(scan_case, name, *map(int, each.split("-")), every, way, cases)
+                for (each, way), case in names.items()}  # fmt: skip
+        figures |= gains(f"{name}, every {every}", names, cases.all(jobs), ways, f"structures.{name}.{{way}}_{{key}}")
+    short = {key.replace(".example_", ".").replace(".best_", "."): figure for key, figure in figures.items()}
+    return short if every == 8 else {}
 
 
 # ---- runs ------------------------------------------------------------------------------------------------------------

@@ -77,7 +77,7 @@ def ratio_sweep(widths: list[float], ratio: float = 2.0) -> tuple[list[tuple[flo
 
 
 def sweep(kind: str, sizes: list[float]) -> Values:
-    """Return the errors `(len(sizes), 6)` of a sweep, and their orders."""
+    """Return the errors `(len(sizes), 6)` of a sweep, and the orders of the last two."""
     with torch.no_grad():
         before = torch.get_default_dtype()
         torch.set_default_dtype(torch.float64)
@@ -90,16 +90,16 @@ def sweep(kind: str, sizes: list[float]) -> Values:
         finally:
             torch.set_default_dtype(before)
     steps = [pair[kind == "spacing"] for pair in pairs]
-    return {"pairs": pairs, "errors": errors.tolist(), "orders": order(steps, errors).tolist()}
+    return {"pairs": pairs, "errors": errors.tolist(), "orders": order(steps[-2:], errors[-2:]).tolist()}
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--fine", action="store_true", help="one more size of each sweep: minutes")
+    del parser
 
 
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     sizes = {"limit": [1 / 4, 1 / 6, 1 / 8, 1 / 10], "spacing": [2, 3, 4, 6], "ratio": [1 / 4, 1 / 8, 1 / 16, 1 / 32]}
-    count = 2 if options.quick else 4 if options.fine else 3
+    count = 2 if options.quick else 4
     jobs = {f"{kind}-{count}": lambda k=kind, s=each: sweep(k, s[:count]) for kind, each in sizes.items()}
     found = dict(zip(sizes, cases.all(jobs).values(), strict=True))
     for kind, values in found.items():

@@ -42,6 +42,7 @@ def batch(count):
     list(generate_batch("tubes", schedule=schedule("fast", steps=count), seeds=range(8), **options))
 if what == "loss":
     prior = CurvaturePrior("tubes", sigmoid=True).to(device)
+    prior = torch.compile(prior) if backend == "compiled" else prior
     logits = torch.randn((2, 1, size, size, size), device=device).requires_grad_()
     def loss():
         prior(logits).backward()

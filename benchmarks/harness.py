@@ -33,6 +33,8 @@ LONG = 600.0
 FRAME = ("benchmarks.harness", "benchmarks.claims", "benchmarks.__main__")
 
 Values = dict[str, Any]
+#: Shared files that this process has made.
+_RENEWED: set[Path] = set()
 
 
 class Figure(NamedTuple):
@@ -74,21 +76,25 @@ class Cases:
             found[name] = record["values"]
         return found
 
+    def of(self, topic: str) -> Cases:
+        """Return the cases of another topic, whose arrays and texts are shared."""
+        return Cases(topic, quick=self.quick, fresh=self.fresh)
+
     def array(self, name: str, make: Callable[[], np.ndarray]) -> np.ndarray:
         """Return an array that cases share, such as a grown mask, from its file in the ignored folder."""
-        path = self.folder / f"{name}.npz"
-        if not path.exists():
-            value = make()
-            write_whole(path, lambda temporary: np.savez_compressed(temporary, value=value))
+        path = self._kept(f"{name}.npz", lambda path: np.savez_compressed(path, value=make()))
         with np.load(path) as kept:
             return kept["value"]
 
     def text(self, name: str, make: Callable[[], str]) -> Path:
         """Return the file in the ignored folder of a text that cases share, such as a fit."""
+        return self._kept(name, lambda path: path.write_text(make(), encoding="utf-8"))
+
+    def _kept(self, name: str, write: Callable[[Path], object]) -> Path:
         path = self.folder / name
-        if not path.exists():
-            content = make()
-            write_whole(path, lambda temporary: temporary.write_text(content, encoding="utf-8"))
+        if not path.exists() or (self.fresh and path not in _RENEWED):
+            write_whole(path, write)
+            _RENEWED.add(path)
         return path
 
     @property

@@ -22,7 +22,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy import ndimage
+from skimage.measure import label
+from skimage.morphology import skeletonize
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -94,8 +95,8 @@ def trained(loss: str, weight: float, seed: int, stack: str, steps: int, law: st
     from monai.networks.nets.dynunet import DynUNet
 
     torch.manual_seed(seed)
-    image, label = part(stack, "fit")
-    target, strides = sparse(label), [1, (1, 2, 2), 2, 2]
+    image, truth = part(stack, "fit")
+    target, strides = sparse(truth), [1, (1, 2, 2), 2, 2]
     # Slices are five times thicker than pixels, so the first level stays in the plane. Instance normalisation would
     # forget how bright a patch is.
     net = DynUNet(3, 1, 1, [(1, 3, 3), 3, 3, 3], strides, strides[1:], filters=(8, 16, 32, 48), norm_name="batch")
@@ -144,13 +145,11 @@ def predict(net: nn.Module, image: np.ndarray) -> np.ndarray:
 
 def counts(predicted: np.ndarray, true: np.ndarray) -> list[list[int]]:
     """Return what the scores are made of, for every block of the plane `(11, blocks)`."""
-    from skimage.morphology import skeletonize
-
     thin, true_thin = skeletonize(predicted), skeletonize(true)
     volumes = (predicted & true, predicted, true, thin & true, thin, true_thin & predicted, true_thin)
     sums = [[int(block.sum()) for block in blocks(volume)] for volume in volumes]
     masks = (remove_specks(predicted), remove_specks(true), predicted, true)
-    return sums + [[components(block)[1] for block in blocks(mask)] for mask in masks]
+    return sums + [[int(np.max(label(block, connectivity=3))) for block in blocks(mask)] for mask in masks]
 
 
 def blocks(volume: np.ndarray) -> list[np.ndarray]:
@@ -158,13 +157,8 @@ def blocks(volume: np.ndarray) -> list[np.ndarray]:
     return [volume[:, y : y + BLOCK[0], x : x + BLOCK[1]] for y, x in starts]
 
 
-def components(mask: np.ndarray) -> tuple[np.ndarray, int]:
-    labels, count = ndimage.label(mask, np.ones((3, 3, 3)))  # type: ignore[misc]
-    return labels, count
-
-
 def remove_specks(mask: np.ndarray) -> np.ndarray:
-    labels, _ = components(mask)
+    labels = np.asarray(label(mask, connectivity=3))
     large = np.bincount(labels.ravel()) >= SPECK
     large[0] = False
     return large[labels]

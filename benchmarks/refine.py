@@ -109,17 +109,11 @@ def calibration_case(way: str, law: str, seed: int, cases: Cases) -> Values:
     found = reconstruct(truth.astype(np.uint8), fitted(law, seed + 1, cases), every=EVERY, runs=RUNS, **other)
     p, between = found.probability.values, [n for n in range((EDGE - 1) // EVERY * EVERY) if n % EVERY]
     bands = {"error": near(p > 0.5), "true": near(truth)}
-    errors = {
-        name: float(calibration_error(p[between][band[between]], truth[between][band[between]]))
-        for name, band in bands.items()
-    }
+    errors = {name: float(calibration_error(p[between][band[between]], truth[between][band[between]]))
+              for name, band in bands.items()}  # fmt: skip
     masks = {"mask": found.mask.values > 0, "half": p > 0.5}
-    return {
-        **errors,
-        "stated": float(found.uncertainty.calibration_error),
-        **{name: dice(mask[between], truth[between]) for name, mask in masks.items()},
-        "status": found.status,
-    }
+    more = {name: dice(mask[between], truth[between]) for name, mask in masks.items()}
+    return {**errors, **more, "stated": float(found.uncertainty.calibration_error), "status": found.status}
 
 
 # ---- runs ------------------------------------------------------------------------------------------------------------
@@ -155,10 +149,8 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
         way, law = name.split("-")[:2]
         if what == "probabilities":
             slug = "half" if way.startswith("p >") else way.lower()
-            figures |= {
-                f"probabilities.{slug}.{law}": Figure(row["dice"]),
-                f"probability_betti.{slug}.{law}": Figure(row["betti"]),
-            }
+            figures[f"probabilities.{slug}.{law}"] = Figure(row["dice"])
+            figures[f"probability_betti.{slug}.{law}"] = Figure(row["betti"])
         else:
             figures |= {f"calibration.{law}_{way}.{key}": Figure(row[key]) for key in keys}
     return figures

@@ -107,9 +107,8 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     found = cases.all({name: lambda name=name: report(name) for name in names})
     columns = ("share", "thickness", "spacing", "p", *RATIOS, "verdict")
     show(["scan", *columns], [[name, *(row.get(key, "") for key in columns)] for name, row in found.items()])
-    figures = {
-        f"scans.{name}.{key}": Figure(row[key]) for name, row in found.items() for key in columns[:-1] if key in row
-    }
+    figures = {f"scans.{name}.{key}": Figure(row[key]) for name, row in found.items()
+               for key in columns[:-1] if key in row}  # fmt: skip
     if len(found) == len(SCANS):
         supported = sum(row["verdict"] == "Supported" for row in found.values())
         figures["scans.supported"] = Figure(float(supported))

@@ -46,11 +46,9 @@ def author_volumes() -> dict[str, Path]:
 
 
 def author_field(name: str) -> torch.Tensor:
-    import nibabel
+    from curvafit.volumes.scan import load
 
-    return torch.from_numpy(
-        np.asarray(nibabel.Nifti1Image.from_filename(author_volumes()[name]).dataobj, dtype=np.float32)
-    )
+    return torch.from_numpy(load(author_volumes()[name]).values.astype(np.float32))
 
 
 def is_floored(u: torch.Tensor) -> bool:

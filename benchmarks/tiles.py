@@ -89,8 +89,5 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     show(["case", "figures"], [[name, " ".join(f"{k} {v:.3g}" for k, v in row.items())] for name, row in found.items()])
     if options.what != "overlap":
         return {}
-    return {
-        f"tiles.{distance}.{law}": Figure(row["1 - Dice"])
-        for name, row in found.items()
-        for _, law, distance in [name.split("-")]
-    }
+    parts = {name: name.split("-") for name in found}
+    return {f"tiles.{distance}.{law}": Figure(found[name]["1 - Dice"]) for name, (_, law, distance) in parts.items()}
