@@ -72,7 +72,7 @@ class Claim:
             number = re.sub(r".*(\{.*\}).*", r"\1", self.format)
             span = f"{_signed(number.format(low))} to {_signed(number.format(high))}"
         if math.isnan(value):
-            return span
+            return f"{_signed(number.format(low))} to {_signed(self.format.format(high))}"
         text = f"**{text}**" if self.bar and not meets(value, self.bar) else text
         return f"{text} ({span})" if span else text
 
@@ -160,7 +160,7 @@ class Ledger:
             begin, end = f"<!-- ledger: {mark} -->", "<!-- end -->"
             pattern = re.compile(rf"{re.escape(begin)}\n(.*?){end}", re.DOTALL)
             found = pattern.search(page)
-            wanted = f"\n{text}\n\n"
+            wanted = f"\n{text}\n\n" if text else ""
             if found is None:
                 wrong.append(f"{path.relative_to(ROOT)}: no mark {begin}")
             elif found[1] != wanted and write:
@@ -225,7 +225,8 @@ def _recorded(topic: str) -> dict[str, Any]:
 
 
 def _listed(head: str, claims: list[Claim]) -> str:
-    return markdown([head, "figure", "command"], [[claim.says, claim.text, claim.call] for claim in claims])
+    rows = [[claim.says, claim.text, claim.call] for claim in claims if claim.figure is not None]
+    return markdown([head, "figure", "command"], rows) if rows else ""
 
 
 def _origin(claim: Claim) -> str:
