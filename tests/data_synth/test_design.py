@@ -1,4 +1,4 @@
-"""The random law of Experiment 4: its intervals, its uniformity, one stream a draw."""
+"""Designs: Experiment 4's random law, Sobol's sequence, lists, surroundings; their YAML."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from curvafit.data_synth.design import INTERVALS, Design, boxed
+from curvafit.data_synth.design import INTERVALS, PARAMETERS, Design, around, boxed, read_design
+from curvafit.priors.law import preset
 
 #: (a20 … a00, m₀, noise seed) of draw 0 of seed 0.
 FIRST_DRAW = (
@@ -76,3 +77,123 @@ def test_wrong_seeds_are_refused():
     for seed, index in ((-1, 0), (0, -1), (0.5, 0), (0, "1"), (True, 0)):
         with pytest.raises(ValueError, match="seed|index"):
             boxed().draw(seed, index)
+
+
+def written(tmp_path, text: str):
+    path = tmp_path / "design.yaml"
+    path.write_text(text)
+    return path
+
+
+def table(design: Design, count: int, seed: int = 0) -> np.ndarray:
+    return np.array([[*draw.coefficients, draw.mass] for draw in (design.draw(seed, i) for i in range(count))])
+
+
+def test_a_sobol_sequence_fills_the_box_more_evenly_than_chance():
+    values = (table(boxed("sobol"), 256)[:, 1:] - [low for low, _ in INTERVALS.values()]) / [
+        high - low for low, high in INTERVALS.values()
+    ]
+    for column in values.T:  # one point in every 256th part of every interval: a (0, m, s)-net seen from one side
+        assert sorted(np.floor(256 * column).astype(int)) == list(range(256))
+    assert not np.array_equal(table(boxed("sobol"), 4), table(boxed("sobol"), 4, seed=1))
+
+
+def test_a_draw_of_any_design_depends_on_seed_and_index_alone():
+    for design in (
+        boxed(),
+        boxed("sobol"),
+        around(table(boxed(), 1)[0], 0.1),
+        Design("list", points=((1.0,) * 6 + (0.0,),)),
+    ):
+        assert design.draw(3, 17) == design.draw(3, 17)
+        assert Design.from_dict(design.as_dict()) == design
+        assert len({design.draw(0, index).seed for index in range(20)}) == 20
+
+
+def test_a_box_in_yaml_changes_some_intervals_and_fixes_others(tmp_path):
+    design = read_design(written(tmp_path, "law: sobol\nbox:\n  a11: [1, 2]\n  a02: 6\n"))
+    found = table(design, 50)
+    assert design.sampling == "sobol"
+    assert (found[:, PARAMETERS.index("a02")] == 6).all() and (found[:, 0] == 1).all()
+    a11, a00 = found[:, 1], found[:, 5]
+    assert a11.min() > 1 and a11.max() < 2 and a00.min() < -2000 and a00.max() > 2000
+
+
+def test_a_box_in_yaml_holds_some_parameters_in_logarithms(tmp_path):
+    assert read_design(written(tmp_path, "log: [a02]\nbox: {a11: 2}\n")) == boxed("random", ["a02"], a11=2)
+
+
+def test_numbers_that_yaml_takes_for_text_are_numbers(tmp_path):
+    plain = read_design(written(tmp_path, "box: {a00: [-1000, 1000], a02: 0.06}"))
+    assert read_design(written(tmp_path, "box: {a00: [-1e3, 1e3], a02: 6e-2}")) == plain
+
+
+def test_surroundings_hold_their_point_and_have_the_asked_for_width(tmp_path):
+    tubes = preset("tubes")
+    found = table(read_design(written(tmp_path, "around: tubes\nspread: 0.2\n")), 300)
+    for column, centre, (low, high) in zip(
+        found[:, 1:].T, [*tubes.coefficients, tubes.mass][1:], INTERVALS.values(), strict=True
+    ):
+        assert column.min() < centre < column.max()
+        assert np.ptp(column) == pytest.approx(0.2 * (high - low), rel=0.05)
+    scaled = around([2 * value for value in tubes.coefficients] + [tubes.mass], 0.2)
+    np.testing.assert_allclose(table(scaled, 5), table(around([*tubes.coefficients, tubes.mass], 0.2), 5))
+
+
+def test_a_list_comes_in_turn_with_other_noise(tmp_path):
+    text = "list:\n  - sponge\n  - {a20: 1, a11: 2, a02: 3, a10: -4, a01: 5, a00: 6, mass: -0.3}\n"
+    draws = [read_design(written(tmp_path, text)).draw(0, index) for index in range(4)]
+    assert draws[0].coefficients == draws[2].coefficients == preset("sponge").coefficients
+    assert [*draws[1].coefficients, draws[1].mass] == [1, 2, 3, -4, 5, 6, -0.3]
+    assert draws[0].seed != draws[2].seed
+
+
+#: Aliases of aliases: nine to the power of twelve values, in half a kilobyte.
+BOMB = "a0: &a0 [1]\n" + "".join(f"a{k + 1}: &a{k + 1} [{', '.join([f'*a{k}'] * 9)}]\n" for k in range(12))
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        ("box: {a11: [1, 2]", "YAML"),
+        ("- 1", "keys"),
+        ("bxo: {a11: 3}", "bxo"),
+        ("law: sobol", "box"),
+        ("box: {}\nlist: []", "list"),
+        ("list: []\nlaw: sobol", "law"),
+        ("list: []", "7 parameters"),
+        ("box: {\n", "line 2"),
+        ("box: {a12: [1, 2]}", "a12"),
+        ("box: {a11: [2, 1]}", "a11"),
+        ("box: {a11: [1, two]}", "a11"),
+        ("box: {a11: .nan}", "finite"),
+        ("log: [a11]\nbox: {}", "a11"),
+        ("log: [[a02]]\nbox: {}", "a02"),
+        ("log: a02\nbox: {}", "a02"),
+        ("log: [a02]\naround: tubes", "log"),
+        ("box: {mass: [-2, 0]}", "-2"),
+        ("law: even\nbox: {}", "even"),
+        ("box: !!bool abc", "abc"),
+        ("box: !!python/object:os.system {}", "YAML"),
+        (f"box: {{a11: 1{'0' * 5000}}}", "digits"),
+        ("[" * 100_000, "nested"),
+        ("box: &a [*a]", "box"),
+        (BOMB, "a0"),
+        (f"box: {'x' * 100_000}", "x"),
+        ("around: tubs", "preset"),
+        ("around: nowhere/fit.json", "nowhere"),
+        ("around: tubes\nspread: wide", "spread"),
+        ("around: tubes\nspread: 0", "spread"),
+        ("list:\n - {a20: 1}", "a20"),
+    ],
+)
+def test_wrong_yaml_is_one_sentence(tmp_path, text, word):
+    with pytest.raises((ValueError, FileNotFoundError), match=word) as error:
+        read_design(written(tmp_path, text))
+    assert "\n" not in str(error.value) and len(str(error.value)) < 600
+
+
+def test_a_byte_order_mark_is_skipped_and_no_file_is_told(tmp_path):
+    assert read_design(written(tmp_path, "\ufeffbox: {a11: 2}")) == boxed(a11=2)
+    with pytest.raises(FileNotFoundError, match="none.yaml"):
+        read_design(tmp_path / "none.yaml")

@@ -161,14 +161,14 @@ def test_lost_stain_does_not_decide_the_texture(shape: torch.Tensor) -> None:
 def test_bad_scans_are_told() -> None:
     values = np.random.default_rng(0).normal(size=(12, 12, 12)).astype(np.float32)
     field = Field(values, (1.0, 1.0, 1.0), "um")
-    for call, said in (
-        (lambda: like(Field(values[:4])), "expected a scan of at least 8 voxels along each axis"),
-        (lambda: like(Field(np.zeros((9, 9, 9)))), "expected a scan of finite values that vary"),
-        (lambda: like(Field(values * np.nan)), "expected a scan of finite values that vary"),
-        (lambda: like(field, np.ones((3, 3, 3), bool)), "expected a mask of the scan's shape"),
-        (lambda: like(field, np.ones(values.shape, bool)), "expected a mask with voxels inside and outside"),
+    for call, word in (
+        (lambda: like(Field(values[:4])), "8 voxels"),
+        (lambda: like(Field(np.zeros((9, 9, 9)))), "finite"),
+        (lambda: like(Field(values * np.nan)), "finite"),
+        (lambda: like(field, np.ones((3, 3, 3), bool)), "shape"),
+        (lambda: like(field, np.ones(values.shape, bool)), "mask"),
     ):
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(ValueError, match=word):
             call()
 
 
