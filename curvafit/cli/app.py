@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from curvafit.cli.atlas import atlas_app
-from curvafit.cli.console import say
+from curvafit.cli.console import Commands, say
 from curvafit.cli.demo import EXAMPLES as DEMO_EXAMPLES
 from curvafit.cli.demo import demo
 from curvafit.cli.generate import EXAMPLES as GENERATE_EXAMPLES
@@ -24,7 +24,6 @@ from curvafit.cli.nnunet import EXAMPLE as NNUNET_EXAMPLE
 from curvafit.cli.nnunet import nnunet
 from curvafit.cli.refine import EXAMPLES as REFINE_EXAMPLES
 from curvafit.cli.refine import refine
-from curvafit.cli.refusal import Commands
 from curvafit.cli.samples import samples_app
 from curvafit.cli.segment import RECONSTRUCT_EXAMPLES, SEGMENT_EXAMPLES, reconstruct, segment
 from curvafit.cli.synth import EXAMPLES as SYNTH_EXAMPLES

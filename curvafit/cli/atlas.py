@@ -7,17 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from curvafit.cli.console import (
-    OverwriteOption,
-    command_line,
-    error_console,
-    kept,
-    plainly,
-    say,
-    stages,
-    whole_triple,
-)
-from curvafit.cli.workers import Crew, DashboardOption, SchedulerOption, WorkersOption
+from curvafit.cli.console import command_line, error_console, kept, plainly, say, stages
+from curvafit.cli.options import Crew, DashboardOption, OverwriteOption, SchedulerOption, WorkersOption, whole_triple
 
 if TYPE_CHECKING:
     from curvafit.core.records import Format
@@ -71,8 +62,6 @@ def build_atlas(
         if store.exists():
             open_store(store, settings)
         check_folder(store.parent)
-        if not store.exists():
-            crew.say_forecast("atlas build", box, count * plan.steps)
         with crew.at_work() as (makers, progress):
             build(store, count, box, seed, plan, progress, design=law, workers=makers)
         say(str(store))
@@ -241,7 +230,7 @@ def _check_archive(out: Path, kind: Format, inputs: list[Path], overwrite: bool)
     from curvafit.core.files import check_folder, check_free
 
     if out.suffix.lower() != ".npz":
-        raise ValueError(f"expected a name ending in .npz, got {out.name!r}")
+        raise ValueError(f"the output's name must end in .npz, got {out.name!r}")
     check_folder(out.parent)
     check_free([out], kind.owns, inputs, overwrite)
 
@@ -252,11 +241,11 @@ def _design(name: str, around: str | None, spread: float | None) -> Design:
 
     if around is not None:
         if name not in ("random", "sobol"):
-            raise ValueError(f"expected either --around or the file of a design, got {around} and {name}")
+            raise ValueError(f"give either --around or the file of a design, got {around} and {name}")
         share = design.SPREAD if spread is None else spread
         return design.around(design.point_of(around), share, name)  # type: ignore[arg-type]
     if spread is not None:
-        raise ValueError("expected --around beside --spread, got none")
+        raise ValueError("--spread needs --around")
     if name in ("random", "sobol"):
         return design.boxed(name)  # type: ignore[arg-type]
     return design.read_design(name)

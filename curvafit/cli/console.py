@@ -1,8 +1,7 @@
-"""Parsing, progress and plain errors for the command line."""
+"""What commands print: results, notes, progress, and one sentence with exit code 2 for every expected error."""
 
 from __future__ import annotations
 
-import math
 import os
 import re
 import shlex
@@ -11,25 +10,59 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-from typing import Annotated
+from typing import Any, NoReturn
 
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
+from typer.core import TyperGroup
 
-from curvafit.cli.refusal import sentence, writable
-from curvafit.core.runtime import Terminated, exit_code
+from curvafit.core.runtime import Terminated, exit_code, one_line
 
-#: Whether files of other programs, or of other commands, may be replaced.
-OverwriteOption = Annotated[
-    bool, typer.Option("--overwrite", help="Replace files or folders of the output's names, whatever wrote them.")
-]
 #: The environment variable that lets an error keep its traceback.
 DEBUG = "CURVAFIT_DEBUG"
+#: Most characters of a sentence; a longer one is cut in its middle.
+LONGEST = 700
 #: Signs that look better on a page than in a terminal, where they are copied and some encodings lack them.
 _PLAIN = str.maketrans({"\u2212": "-", "\u2013": "-", "\u202f": " ", "\u00a0": " "})
+#: The exception of an option that typer cannot parse; its name and module change with typer's versions.
+_Refusal: type[Exception] = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
+
+
+# ---- errors ----------------------------------------------------------------------------------------------------------
+
+
+class Commands(TyperGroup):
+    """A group of commands whose usage errors are one line, as all other errors."""
+
+    def main(self, *args: Any, standalone_mode: bool = True, **more: Any) -> Any:
+        """Run a command and exit, as `click.Group.main` does."""
+        if not standalone_mode:
+            return super().main(*args, standalone_mode=False, **more)
+        try:
+            code = super().main(*args, standalone_mode=False, **more)
+        except _Refusal as error:
+            if type(error).__name__ == "NoArgsIsHelpError":
+                error.show()  # type: ignore[attr-defined]
+                sys.exit(2)
+            _leave(error)
+        except typer.Abort as error:  # a signal while no command was at work
+            signal = error.__cause__
+            sys.exit(exit_code(signal) if isinstance(signal, KeyboardInterrupt) else 1)
+        sys.exit(code if isinstance(code, int) else 0)
+
+
+def _leave(error: Any) -> NoReturn:
+    """Print the usage error of typer with the command whose help tells more, and exit with code 2."""
+    text = error.format_message().rstrip(".")
+    context = getattr(error, "ctx", None)
+    more = "" if context is None else f" (see {' '.join(['curvafit', *context.command_path.split()[1:], '--help'])})"
+    console = Console(stderr=True, highlight=False)
+    line = writable(sentence(f"{text[:1].lower()}{text[1:]}{more}"), console)
+    console.print(line, markup=False, soft_wrap=True)
+    sys.exit(2)
 
 
 @contextmanager
@@ -48,7 +81,7 @@ def plainly() -> Iterator[None]:
         _say_notes(notes)
         raise
     except KeyboardInterrupt as signal:
-        say(f"{_ended(signal)}: nothing is left half-written", to=error_console())
+        say(f"{_ending(signal)}: nothing is left half-written", to=error_console())
         raise typer.Exit(exit_code(signal)) from None
     except (ValueError, OSError, ImportError, MemoryError, RuntimeError) as error:
         if os.environ.get(DEBUG) or not _expected(error):
@@ -63,11 +96,11 @@ def kept(again: Callable[[], str] = lambda: "the same command") -> Iterator[None
     try:
         yield
     except KeyboardInterrupt as signal:
-        say(f"{_ended(signal)}: what is made is kept, and {again()} goes on with it", to=error_console())
+        say(f"{_ending(signal)}: finished parts are saved. Run {again()} to resume", to=error_console())
         raise typer.Exit(exit_code(signal)) from None
 
 
-def _ended(signal: KeyboardInterrupt) -> str:
+def _ending(signal: KeyboardInterrupt) -> str:
     return "terminated" if isinstance(signal, Terminated) else "interrupted"
 
 
@@ -80,7 +113,7 @@ def _expected(error: Exception) -> bool:
 
 def _sentence(error: Exception) -> str:
     if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "memory" in str(error).lower()):
-        return "error: expected a volume that fits into memory, got a larger one"
+        return "error: the volume does not fit into memory"
     if isinstance(error, OSError) and error.strerror:
         return sentence(f"{error.strerror.lower()}: {error.filename or ''}")
     return sentence(str(error) or type(error).__name__)
@@ -101,71 +134,25 @@ def command_line() -> str:
     return shlex.join(["curvafit", *sys.argv[1:]])
 
 
-# ---- parsing ---------------------------------------------------------------------------------------------------------
-
-
-def numbers(text: str, option: str, count: int) -> tuple[float, ...]:
-    """Return a text as `count` finite numbers between commas."""
-    try:
-        values = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        values = ()
-    if len(values) != count or not all(math.isfinite(value) for value in values):
-        what = "a number" if count == 1 else f"{count} numbers between commas"
-        raise ValueError(f"expected {option} as {what}, got {text!r}")
-    return values
-
-
-def triple(text: str, option: str) -> tuple[float, float, float]:
-    """Return a text as three positive numbers; one counts for all axes."""
-    values = numbers(text, option, 1) * 3 if "," not in text else numbers(text, option, 3)
-    if min(values) <= 0:
-        raise ValueError(f"expected {option} as positive numbers, got {text!r}")
-    return values  # type: ignore[return-value]
-
-
-def whole_triple(text: str, option: str) -> tuple[int, int, int]:
-    """Return a text as three positive whole numbers; one counts for all axes."""
-    values = triple(text, option)
-    if any(value != int(value) for value in values):
-        raise ValueError(f"expected {option} as whole numbers, got {text!r}")
-    return tuple(int(value) for value in values)  # type: ignore[return-value]
-
-
-def whole_numbers(text: str, option: str) -> tuple[int, ...]:
-    """Return a text as whole numbers from 0."""
-    values = numbers(text, option, text.count(",") + 1)
-    if min(values) < 0 or any(value != int(value) for value in values):
-        raise ValueError(f"expected {option} as whole numbers from 0, got {text!r}")
-    return tuple(int(value) for value in values)
-
-
-def device_of(text: str) -> str:
-    """Return the name of a device, or raise ValueError where this machine does not have it."""
-    import torch
-
-    try:
-        kind = torch.device(text).type
-    except RuntimeError:
-        kind = ""
-    devices = {"cpu": True, "cuda": torch.cuda.is_available()}
-    if not devices.get(kind):
-        names = ", ".join(name for name, available in devices.items() if available)
-        raise ValueError(f"expected --device to be one of this machine's ({names}), got {text!r}")
-    return text
-
-
-def threshold_of(text: str) -> float | str:
-    """Return a text as a grey level, or `"otsu"`."""
-    return text.lower() if text.lower() == "otsu" else numbers(text, "--threshold", 1)[0]
-
-
 # ---- printing --------------------------------------------------------------------------------------------------------
 
 
 def error_console() -> Console:
     """Return a console on the error stream."""
     return Console(stderr=True, highlight=False)
+
+
+def sentence(text: str, start: str = "error") -> str:
+    """Return a message on one line of limited length, in signs that show; others are escaped."""
+    line = one_line(" ".join(text.split()))
+    if len(line) > LONGEST:
+        line = f"{line[: LONGEST * 2 // 3]} … {line[-LONGEST // 3 :]}"
+    return f"{start}: {line}"
+
+
+def writable(text: str, console: Console) -> str:
+    """Return a text in signs that a stream can encode; others are escaped."""
+    return text.encode(console.encoding, "backslashreplace").decode(console.encoding)
 
 
 def say(text: str, *, to: Console | None = None, style: str | None = None) -> None:
@@ -218,7 +205,12 @@ def stages() -> Iterator[Callable[[str, float], None]]:
             say(line, to=console)
         return
     with Progress(
-        TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=console, transient=True
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        console=console,
+        transient=True,
     ) as bar:
         task = bar.add_task("starting", total=1.0)
         yield lambda text, share: bar.update(task, description=text, completed=share)

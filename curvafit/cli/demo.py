@@ -7,9 +7,10 @@ from typing import Annotated
 
 import typer
 
-from curvafit.cli.console import OverwriteOption, error_console, plainly, say, stages
+from curvafit.cli.console import error_console, plainly, say, stages
+from curvafit.cli.options import OverwriteOption, examples
 
-EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(("curvafit demo", "curvafit demo shell -o shell_out"))
+EXAMPLES = examples("curvafit demo", "curvafit demo shell -o shell_out")
 
 
 def demo(

@@ -9,21 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli.console import (
-    OverwriteOption,
-    command_line,
-    device_of,
-    error_console,
-    flow_progress,
-    numbers,
-    output,
-    plainly,
-    say,
-    triple,
-    whole_numbers,
-    whole_triple,
-)
-from curvafit.cli.forecast import FLOW, say_forecast
+from curvafit.cli.console import command_line, error_console, flow_progress, output, plainly, say
+from curvafit.cli.options import OverwriteOption, device_of, examples, numbers, triple, whole_numbers, whole_triple
 from curvafit.core.runtime import exit_code
 
 if TYPE_CHECKING:
@@ -40,16 +27,14 @@ if TYPE_CHECKING:
 #: Number of voxels along an edge by default.
 EDGE = 100
 
-EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
-    (
-        "curvafit generate --preset tubes -o tubes.nii.gz",
-        "curvafit generate --preset tubes --spacing 0.0195 --unit mm -o tubes.stl",
-        "curvafit generate --preset sponge --volume-fraction 0.3 --shape 64,64,128 --tile 1,2,2 -o sponge.zarr",
-        "curvafit generate --coefficients 1,2,6,-40,-40,400 --mass -0.6 --orientation 0,0,1,50 -o lying.vtp",
-        "curvafit generate --prior bone/fit.json --shape 128 --seed 3 -o more_bone.tif",
-        "curvafit generate --preset tubes --maps maps.npz -o graded.nii.gz",
-        "curvafit generate --preset tubes --shape 300 --checkpoint run.pt --snapshots 10,100,1000 -o large.nii.gz",
-    )
+EXAMPLES = examples(
+    "curvafit generate --preset tubes -o tubes.nii.gz",
+    "curvafit generate --preset tubes --spacing 0.0195 --unit mm -o tubes.stl",
+    "curvafit generate --preset sponge --volume-fraction 0.3 --shape 64,64,128 --tile 1,2,2 -o sponge.zarr",
+    "curvafit generate --coefficients 1,2,6,-40,-40,400 --mass -0.6 --orientation 0,0,1,50 -o lying.vtp",
+    "curvafit generate --prior bone/fit.json --shape 128 --seed 3 -o more_bone.tif",
+    "curvafit generate --preset tubes --maps maps.npz -o graded.nii.gz",
+    "curvafit generate --preset tubes --shape 300 --checkpoint run.pt --snapshots 10,100,1000 -o large.nii.gz",
 )
 
 _what = partial(typer.Option, rich_help_panel="What to make")
@@ -172,7 +157,7 @@ def _texture(preset: str | None, six: str | None, prior: str | None, maps: Maps3
 
     laws = [value for value in (preset, six, prior) if value is not None]
     if len(laws) > 1 or (not laws and not set(NAMES) <= maps.keys()):
-        raise ValueError(f"expected one of --preset, --coefficients and --prior, got {len(laws)} of them")
+        raise ValueError(f"give one of --preset, --coefficients and --prior, got {len(laws)} of them")
     if not laws:
         return Law(Coefficients(1, 0, 1), None, "maps")
     return Law.of(laws[0] if six is None else Coefficients(*numbers(six, "--coefficients", 6)))
@@ -191,14 +176,14 @@ def _parameters(
 
     for option, value, name in (("--mass", mass, "mass"), ("--epsilon", epsilon, "epsilon")):
         if value is not None and name in maps:
-            raise ValueError(f"expected either {option} or a map of {name}, got both")
+            raise ValueError(f"give either {option} or a map of {name}, got both")
     mean = maps.get("mass", mass)
     if mean is not None and share is not None:
-        raise ValueError("expected either a mass or --volume-fraction, got both")
+        raise ValueError("give either a mass or --volume-fraction, got both")
     if mean is None and share is None:
         mean = texture.mass
     if mean is None and share is None:
-        raise ValueError("expected --mass or --volume-fraction beside the coefficients, got none")
+        raise ValueError("coefficients need --mass or --volume-fraction")
     law = replace(texture.coefficients, **{name: maps[name] for name in NAMES if name in maps})
     width = maps.get("epsilon", WORKING_EPSILON if epsilon is None else epsilon)
     return {"law": law, "mass": mean, "volume_fraction": share, "epsilon": width}
@@ -207,7 +192,7 @@ def _parameters(
 def _checkpoint(file: Path | None, every: float | None) -> dict[str, Any]:
     """Return the options of the checkpoint as `generate` takes them."""
     if file is None and every is not None:
-        raise ValueError(f"expected --checkpoint beside --checkpoint-every, got {every:g} alone")
+        raise ValueError(f"--checkpoint-every {every:g} needs --checkpoint")
     from curvafit.generation.checkpoint import place_of
 
     place = None if file is None else place_of(file)
@@ -219,13 +204,13 @@ def _output(
 ) -> Output:
     """Return how to write the shape, with the voxel of the options, else the fit's."""
     if unit is not None and spacing is None:
-        raise ValueError("expected --spacing beside --unit, got none")
+        raise ValueError("--unit needs --spacing")
     edge, fit_unit = texture.working_voxel or 1.0, texture.length_unit or "voxel"
     edges = (edge,) * 3 if spacing is None else triple(spacing, "--spacing")
     if len(set(edges)) > 1:
-        raise ValueError(f"expected --spacing of cubic voxels, one number, got {spacing!r}")
+        raise ValueError(f"--spacing must be one number, as voxels are cubes, got {spacing!r}")
     if tile is not None and not grid.periodic:
-        raise ValueError(f"expected --tile with a periodic boundary, got {grid.boundary!r}")
+        raise ValueError(f"--tile needs a periodic boundary, got {grid.boundary!r}")
     from curvafit.drawing.shapes import Output
 
     repeats = (1, 1, 1) if tile is None else whole_triple(tile, "--tile")
@@ -250,33 +235,25 @@ def _check(out: Path, checkpoint: Path | None, cap: bool | None) -> None:
 
     if cap is not None and not out.name.lower().endswith(SUFFIXES):
         option = "--cap" if cap else "--no-cap"
-        raise ValueError(f"expected {option} beside a surface ({', '.join(SUFFIXES)}), got {out.name!r}")
+        raise ValueError(f"{option} is for surfaces ({', '.join(SUFFIXES)}), got {out.name!r}")
     if checkpoint is not None:
         check_folder(checkpoint.parent)
         outputs = (out, sibling(out, ".json"), sibling(out, ".png"))
         if checkpoint in [path.resolve() for path in outputs]:
-            raise ValueError(f"expected a checkpoint that is not an output, got {checkpoint}")
+            raise ValueError(f"the checkpoint {checkpoint} would be written over by an output: choose another name")
 
 
 def _flow(options: dict[str, Any]) -> Flow:
     """Run the flow with progress; exit with code 1 where it failed or has no surface."""
     from curvafit.generation.flow import generate as make
 
-    starts: list[int] = []
-
-    def forecast(step: int, total: int, state: object) -> None:
-        """Say at the first step, after every check, how long the other steps take."""
-        if not starts:
-            starts.append(step)
-            say_forecast("generate", options["grid"].shape, total - step, FLOW, device=options["device"])
-
     with flow_progress(options["schedule"].steps) as watch:
         try:
-            flow = make(**options, callbacks=[forecast, watch], keep_checkpoint=True)
+            flow = make(**options, callbacks=[watch], keep_checkpoint=True)
         except KeyboardInterrupt as signal:
             if options["checkpoint"] is None or not options["checkpoint"].exists():
                 raise
-            say(f"interrupted: the same command goes on from {options['checkpoint']}", to=error_console())
+            say(f"interrupted: run the same command to resume from {options['checkpoint']}", to=error_console())
             raise typer.Exit(exit_code(signal)) from None
     if not (flow.finite and flow.viability.lowest < 0 < flow.viability.highest):
         _discard(options["checkpoint"])

@@ -2,39 +2,22 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli.console import (
-    OverwriteOption,
-    command_line,
-    output,
-    plainly,
-    say,
-    say_notes,
-    stages,
-    threshold_of,
-)
-from curvafit.cli.forecast import INFERENCE, say_forecast
-from curvafit.cli.options import Reading, Volume, reads_volume
+from curvafit.cli.console import command_line, output, plainly, say, say_notes, stages
+from curvafit.cli.options import OverwriteOption, Reading, Volume, examples, reads_volume, threshold_of
 
 if TYPE_CHECKING:
     from curvafit.inference.infer import Inference
-    from curvafit.scan.prepare import Prepared
 
-#: Twins that are grown: of four or five laws one, of the best another.
-TWINS = 6
-
-EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
-    (
-        "curvafit infer bone.tif --spacing 0.0195 --unit mm -o bone",
-        "curvafit infer vessels.nii.gz --kind mask -o vessels",
-        "curvafit infer cells.ome.zarr --channel 1 --crop 0:64,100:300,100:300 --dark --threshold 90 -o cells",
-        "curvafit infer fibres.raw --raw-shape 128,128,128 --dtype u1 -o fibres",
-    )
+EXAMPLES = examples(
+    "curvafit infer bone.tif --spacing 0.0195 --unit mm -o bone",
+    "curvafit infer vessels.nii.gz --kind mask -o vessels",
+    "curvafit infer cells.ome.zarr --channel 1 --crop 0:64,100:300,100:300 --dark --threshold 90 -o cells",
+    "curvafit infer fibres.raw --raw-shape 128,128,128 --dtype u1 -o fibres",
 )
 
 
@@ -79,27 +62,10 @@ def _inferred(scan: str, out: Path, options: dict[str, Any], overwrite: bool) ->
 
         inputs = [each for each in (scan, options["roi"], options["atlas"], options["posterior"]) if each is not None]
         check_report(out, inputs, overwrite)
-
-        watch = None if options["fast"] else _say_forecast
-        inference = infer_scan(scan, progress=progress, watch=watch, **options)
+        inference = infer_scan(scan, progress=progress, **options)
         progress("drawing the report", 1.0)
         say_notes(inference.scan.notes)
         return inference, write_inference(with_command(inference, command_line()), out, overwrite=overwrite)
-
-
-def _say_forecast(prepared: Prepared) -> None:
-    """Print the forecast of an inference: the flows of its twins and of the draws that are grown."""
-    from curvafit.generation.schedule import LEARNED, SCHEDULES
-    from curvafit.inference.candidates import twin_grid
-    from curvafit.inference.estimate import simulation_grid
-    from curvafit.inference.simulate import BATCH, Effort
-
-    window = [edge.stop - edge.start for edge in prepared.windows[0]]
-    grown = TWINS * math.prod(twin_grid(prepared).shape) + (Effort().simulations + Effort().rounds * BATCH) * math.prod(
-        simulation_grid(prepared).shape
-    )
-    steps = math.ceil(SCHEDULES[LEARNED].steps * grown / math.prod(window))
-    say_forecast("infer", window, steps, INFERENCE, what="working voxels")
 
 
 def _show(inference: Inference) -> None:

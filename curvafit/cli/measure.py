@@ -7,18 +7,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli.console import OverwriteOption, output, plainly, say, say_notes, stages, threshold_of
-from curvafit.cli.options import Reading, reads_volume
+from curvafit.cli.console import output, plainly, say, say_notes, stages
+from curvafit.cli.options import OverwriteOption, Reading, examples, reads_volume, threshold_of
 
 if TYPE_CHECKING:
     from curvafit.scan.measure import Measures, Quantity
 
-EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
-    (
-        "curvafit measure bone.tif --spacing 0.0195 --unit mm",
-        "curvafit measure mouse1.nii.gz mouse2.nii.gz mouse3.nii.gz -o measures.csv",
-        "curvafit measure cells.ome.zarr --channel 1 --dark --threshold 90 -o measures.parquet",
-    )
+EXAMPLES = examples(
+    "curvafit measure bone.tif --spacing 0.0195 --unit mm",
+    "curvafit measure mouse1.nii.gz mouse2.nii.gz mouse3.nii.gz -o measures.csv",
+    "curvafit measure cells.ome.zarr --channel 1 --dark --threshold 90 -o measures.parquet",
 )
 Scans = Annotated[
     list[str], typer.Argument(help="NIfTI, TIFF (or folder of slices), NPY, NPZ, HDF5 (file.h5::key), RAW, Zarr …")

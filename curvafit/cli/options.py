@@ -1,16 +1,35 @@
-"""The options of reading a volume file, the same for every command."""
+"""Options that several commands share, and the parsing of their texts."""
 
 from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from curvafit.cli.console import plainly, triple, whole_triple
+from curvafit.cli.console import kept, plainly, stages
+
+if TYPE_CHECKING:
+    from curvafit.core.runtime import Progress
+    from curvafit.core.workers import Workers
+
+#: Whether files of other programs, or of other commands, may be replaced.
+OverwriteOption = Annotated[
+    bool, typer.Option("--overwrite", help="Replace files or folders of the output's names, whatever wrote them.")
+]
+
+
+def examples(*lines: str) -> str:
+    """Return the end of a command's help."""
+    return "[bold]Examples[/bold]\n\n" + "\n\n".join(lines)
+
+
+# ---- reading a volume ------------------------------------------------------------------------------------------------
 
 _read = partial(typer.Option, rich_help_panel="How to read the file")
 
@@ -34,13 +53,7 @@ def reading_of(
     key: Annotated[str | None, _read(help="Name of the array in an NPZ, HDF5 or Zarr file.")] = None,
     strict: Annotated[bool, _read("--strict", help="Refuse a volume with missing chunks or slices.")] = False,
 ) -> Reading:
-    """Return the options as `curvafit.load` takes them.
-
-    Raises
-    ------
-    ValueError
-        If an option does not have the form that its help states.
-    """
+    """Return the options as `curvafit.load` takes them; raise ValueError where one is malformed."""
     if unit is not None:
         from curvafit.core.units import parse_unit
 
@@ -79,3 +92,104 @@ def reads_volume(command: Callable[..., None]) -> Callable[..., None]:
     )
     reader.__annotations__ = {each.name: each.annotation for each in parameters}
     return reader
+
+
+# ---- workers ---------------------------------------------------------------------------------------------------------
+
+WorkersOption = Annotated[
+    int | None,
+    typer.Option(help="Worker processes on this machine; by default one per core, 0 for this process alone."),
+]
+SchedulerOption = Annotated[
+    str | None, typer.Option(help="Address of a running dask scheduler, tcp://HOST:PORT, instead of --workers.")
+]
+DashboardOption = Annotated[
+    int | None,
+    typer.Option(help="Port of dask's dashboard on 127.0.0.1, for workers on this machine; by default none."),
+]
+
+
+class Crew(NamedTuple):
+    """The workers that the options ask for."""
+
+    workers: int | None
+    scheduler: str | None
+    dashboard: int | None
+
+    def check(self, shape: Sequence[int] | None = None) -> None:
+        """Raise ValueError where the options contradict each other, or a shape does not fit into memory."""
+        from curvafit.core.workers import check_workers
+        from curvafit.generation.memory import FLOW, check_memory
+
+        check_workers(self.workers, self.scheduler)
+        if shape is not None and self.scheduler is None:
+            check_memory(shape, FLOW, "a shape")
+
+    @contextmanager
+    def at_work(self, again: Callable[[], str] = lambda: "the same command") -> Iterator[tuple[Workers, Progress]]:
+        """Start the workers and their progress bar; `again` returns the command that resumes after an interrupt."""
+        from curvafit.core.workers import cluster
+
+        with kept(again), stages() as progress:
+            progress("starting workers", 0.0)
+            with cluster(*self) as workers:
+                yield workers, progress
+
+
+# ---- parsing ---------------------------------------------------------------------------------------------------------
+
+
+def numbers(text: str, option: str, count: int) -> tuple[float, ...]:
+    """Return a text as `count` finite numbers between commas."""
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != count or not all(math.isfinite(value) for value in values):
+        what = "a number" if count == 1 else f"{count} numbers between commas"
+        raise ValueError(f"{option} must be {what}, got {text!r}")
+    return values
+
+
+def triple(text: str, option: str) -> tuple[float, float, float]:
+    """Return a text as three positive numbers; one counts for all axes."""
+    values = numbers(text, option, 1) * 3 if "," not in text else numbers(text, option, 3)
+    if min(values) <= 0:
+        raise ValueError(f"{option} must be positive, got {text!r}")
+    return values  # type: ignore[return-value]
+
+
+def whole_triple(text: str, option: str) -> tuple[int, int, int]:
+    """Return a text as three positive whole numbers; one counts for all axes."""
+    values = triple(text, option)
+    if any(value != int(value) for value in values):
+        raise ValueError(f"{option} must be whole numbers, got {text!r}")
+    return tuple(int(value) for value in values)  # type: ignore[return-value]
+
+
+def whole_numbers(text: str, option: str) -> tuple[int, ...]:
+    """Return a text as whole numbers from 0."""
+    values = numbers(text, option, text.count(",") + 1)
+    if min(values) < 0 or any(value != int(value) for value in values):
+        raise ValueError(f"{option} must be whole numbers from 0, got {text!r}")
+    return tuple(int(value) for value in values)
+
+
+def device_of(text: str) -> str:
+    """Return the name of a device, or raise ValueError where this machine does not have it."""
+    import torch
+
+    try:
+        kind = torch.device(text).type
+    except RuntimeError:
+        kind = ""
+    devices = {"cpu": True, "cuda": torch.cuda.is_available()}
+    if not devices.get(kind):
+        names = ", ".join(name for name, available in devices.items() if available)
+        raise ValueError(f"--device must be one of this machine's ({names}), got {text!r}")
+    return text
+
+
+def threshold_of(text: str) -> float | str:
+    """Return a text as a grey level, or `"otsu"`."""
+    return text.lower() if text.lower() == "otsu" else numbers(text, "--threshold", 1)[0]

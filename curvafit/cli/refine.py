@@ -8,21 +8,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli.console import OverwriteOption, plainly, say_notes
-from curvafit.cli.options import Reading, reads_volume
-from curvafit.cli.segment import STEPS, Epsilon, OwnPrior, Steps, TileOption, Weight, WorkersOption, inferred, run_job
+from curvafit.cli.console import plainly, say_notes
+from curvafit.cli.options import OverwriteOption, Reading, examples, reads_volume
+from curvafit.cli.segment import Epsilon, Job, OwnPrior, Steps, TileOption, Weight, WorkersOption, run_job
 
 if TYPE_CHECKING:
     from curvafit.core.runtime import Progress
     from curvafit.segmentation.result import Segmentation
     from curvafit.volumes.boxes import Boxes
 
-EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
-    (
-        "curvafit refine p.nii.gz --example mask2.nii.gz --example-probabilities p2.nii.gz -o mask.nii.gz",
-        "curvafit refine case.npz --channel 1 --prior vessels/fit.json --weight 10 -o mask.nii.gz",
-        "curvafit refine predicted --channel 1 --example mask2.nii.gz --example-probabilities p2.npz -o refined",
-    )
+EXAMPLES = examples(
+    "curvafit refine p.nii.gz --example mask2.nii.gz --example-probabilities p2.nii.gz -o mask.nii.gz",
+    "curvafit refine case.npz --channel 1 --prior vessels/fit.json --weight 10 -o mask.nii.gz",
+    "curvafit refine predicted --channel 1 --example mask2.nii.gz --example-probabilities p2.npz -o refined",
 )
 
 _what = partial(typer.Option, rich_help_panel="What to do")
@@ -46,7 +44,7 @@ def refine(
     weight: Weight = None,
     epsilon: Epsilon = None,
     *,
-    steps: Steps = STEPS,
+    steps: Steps = 400,
     tile: TileOption = None,
     workers: WorkersOption = None,
     like: Like = None,
@@ -59,18 +57,18 @@ def refine(
     NPZ files --channel takes the class; a folder of them becomes a folder of masks. --label is the example's.
     """
     with plainly():
-        from curvafit.segmentation.refine import calibrate, chances_of, check_judge, image_beside, trial_steps
+        from curvafit.segmentation.refine import calibrate, chances_of, check_judge, image_beside
         from curvafit.segmentation.refine import refine as refine_map
         from curvafit.segmentation.slices import check_spacing
 
         if (example is None) != (example_probabilities is None):
-            raise ValueError("expected --example and --example-probabilities together, got one of them")
+            raise ValueError("--example and --example-probabilities go together, got one of them")
         check_judge(example, weight)
         if prior is None and example is None:
-            raise ValueError("expected --prior or --example, got neither")
+            raise ValueError("give --prior or --example: the law, or a mask from which it is inferred")
         files = _files(probabilities, out)
         if like is not None and len(files) > 1:
-            raise ValueError("expected no --like for a folder, where images lie beside the NPZ files, got one")
+            raise ValueError("--like is for one file; images of a folder lie beside its NPZ files")
         maps = {name: value for name, value in reading.items() if name != "label"}
         others = {name: value for name, value in maps.items() if name != "crop"}
         place = {name: reading[name] for name in ("spacing", "unit", "label", "strict")}
@@ -80,12 +78,13 @@ def refine(
         def learn(volume: Boxes, progress: Progress) -> None:
             """Try the prior out on the example, once."""
             from curvafit.core.runtime import part
+            from curvafit.segmentation.reconstruct import infer_law
             from curvafit.volumes.read import load
 
             chances, mask = chances_of(example_probabilities, **others), load(example, **place)  # type: ignore[arg-type]
             check_spacing(chances, volume.frame, "the probabilities")
             say_notes((*chances.notes, *mask.notes))
-            learned["prior"] = prior if prior is not None else inferred(mask, progress)
+            learned["prior"] = prior if prior is not None else infer_law(mask, progress)
             tried = calibrate(chances, mask, learned["prior"], progress=part(progress, 0.0, 0.7), **options)
             learned["example"], record["calibration"] = tried, tried.as_dict()
 
@@ -97,9 +96,6 @@ def refine(
             told = learned or {"prior": prior, "weight": weight}
             return refine_map(read_whole(volume), progress=progress, **told, **tools, **options)
 
-        def tried(laws: int, voxels: int) -> float:
-            return 0.0 if learned or example is None else trial_steps(laws + 1, steps, voxels)
-
         named = {"example": example, "example_probabilities": example_probabilities, "like": like}
         record: dict[str, Any] = {"job": "refine", "weight": weight, "tile": tile, **options}
         record |= {name: None if path is None else str(path) for name, path in named.items()}
@@ -107,10 +103,8 @@ def refine(
         if len(files) > 1:
             _check(files, [*images.values(), *named.values()], maps, overwrite)
         for source, target in files:
-            run_job(
-                source, target, prior, {**maps, "like": like}, compute, record,
-                overwrite=overwrite, tried=tried, workers=workers, read=chances_of, image=images[source],
-            )  # fmt: skip
+            job = Job(source, target, prior, {**maps, "like": like}, record, overwrite, workers, images[source])
+            run_job(job, compute, chances_of)
 
 
 def _unplaced(reading: dict[str, Any]) -> bool:

@@ -9,7 +9,8 @@ from typing import Annotated
 
 import typer
 
-from curvafit.cli.console import OverwriteOption, error_console, output, plainly, say
+from curvafit.cli.console import error_console, output, plainly, say
+from curvafit.cli.options import OverwriteOption
 
 #: The sample that needs no network, and its line in the list.
 SYNTHETIC = "synthetic"

@@ -10,9 +10,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli.console import error_console, numbers, plainly, say, say_notes, whole_triple
-from curvafit.cli.options import reading_of
-from curvafit.cli.workers import Crew, DashboardOption, SchedulerOption, WorkersOption
+from curvafit.cli.console import error_console, plainly, say, say_notes
+from curvafit.cli.options import (
+    Crew,
+    DashboardOption,
+    SchedulerOption,
+    WorkersOption,
+    examples,
+    numbers,
+    reading_of,
+    whole_triple,
+)
 
 if TYPE_CHECKING:
     import numpy as np
@@ -21,12 +29,10 @@ if TYPE_CHECKING:
     from curvafit.data_synth.sets import Order
     from curvafit.data_synth.sources import ShapeSource
 
-EXAMPLES = "[bold]Examples[/bold]\n\n" + "\n\n".join(
-    (
-        "curvafit synth -o Dataset101_Tubes --preset tubes,sponge --modality confocal --count 200 --shape 96",
-        "curvafit synth -o Dataset102_Bone --prior bone/fit.json --like bone.nii.gz --count 200 --shape 64",
-        "curvafit synth -o set --atlas store.zarr --modality micro-ct --layout monai --labels distance --shape 48",
-    )
+EXAMPLES = examples(
+    "curvafit synth -o Dataset101_Tubes --preset tubes,sponge --modality confocal --count 200 --shape 96",
+    "curvafit synth -o Dataset102_Bone --prior bone/fit.json --like bone.nii.gz --count 200 --shape 64",
+    "curvafit synth -o set --atlas store.zarr --modality micro-ct --layout monai --labels distance --shape 48",
 )
 
 _what = partial(typer.Option, rich_help_panel="Shapes: one of these")
@@ -128,11 +134,11 @@ def synth(
     with plainly():
         box = whole_triple(shape, "--shape")
         if count < 1:
-            raise ValueError(f"expected --count of at least 1, got {count}")
+            raise ValueError(f"--count must be at least 1, got {count}")
         crew = Crew(workers, scheduler, dashboard)
         crew.check()
         if unit is not None and spacing is None and voxel is None:
-            raise ValueError("expected --unit beside --spacing or --voxel, got neither")
+            raise ValueError("--unit needs --spacing or --voxel")
         names = [] if laws is None else laws.split(",")
         source = _source(names, atlas, volume_fraction)
         placed = {"spacing": spacing, "unit": None if spacing is None else unit}  # a unit alone is that of --voxel
@@ -153,15 +159,12 @@ def _build(out: Path, order: Order, count: int, crew: Crew) -> None:
     from curvafit.core.checks import check_int
     from curvafit.core.files import check_folder
     from curvafit.data_synth.sets import MOST, build_set, cases_of, check_set, write_preview
-    from curvafit.generation.schedule import schedule
 
     check_int(count, "a count of at least 1 case", 1, MOST)
     check_folder(out)
     check_set(out, order)
     if order.recipe.source.within == math.inf:
         crew.check(order.recipe.largest)
-        steps = (count - len(cases_of(out))) * schedule("fast").steps
-        crew.say_forecast("synth", order.recipe.largest, steps)
     with crew.at_work() as (makers, progress):
         build_set(out, order, count, progress, workers=makers)
     preview = write_preview(out)
@@ -174,14 +177,14 @@ def _build(out: Path, order: Order, count: int, crew: Crew) -> None:
 def _source(laws: list[str], atlas: Path | None, filled: float | None) -> ShapeSource:
     """Return the source of shapes that the options name."""
     if bool(laws) == (atlas is not None):
-        raise ValueError(f"expected either --prior (or --preset) or --atlas, got {'both' if laws else 'neither'}")
+        raise ValueError(f"give either --prior (or --preset) or --atlas, got {'both' if laws else 'neither'}")
     from curvafit.data_synth.sources import Generated, Stored
 
     if atlas is None:
         return Generated.of(laws, filled)
     if atlas.suffix.lower() != ".npz":
         if filled is not None:
-            raise ValueError("expected --volume-fraction beside shapes that are grown, got a store of shapes")
+            raise ValueError("--volume-fraction is for shapes that are grown, not for those of a store")
         return Stored((atlas.resolve(),))
     from curvafit.inference.atlas import load_atlas
 
@@ -197,11 +200,11 @@ def _modality(
 ) -> Modality:
     """Return the named kind of image, or one like a scan, with the share of light in masks."""
     if (name is None) == (like is None):
-        raise ValueError(f"expected either --modality or --like, got {'neither' if name is None else 'both'}")
+        raise ValueError(f"give either --modality or --like, got {'neither' if name is None else 'both'}")
     if like is None:
         extras = [key for key, value in reading.items() if value is not None and value is not False]
         if extras or mask is not None:
-            raise ValueError(f"expected --like beside {f'--{extras[0]}' if extras else '--like-mask'}, got none")
+            raise ValueError(f"{f'--{extras[0]}' if extras else '--like-mask'} needs --like")
         from curvafit.data_synth.imaging.modality import modality
 
         return _visible(modality(str(name)), visible)
@@ -209,7 +212,7 @@ def _modality(
     from curvafit.volumes.read import load
 
     if reading["label"] is not None and mask is None:
-        raise ValueError("expected --like-mask beside --label, which is a value of that mask, got none")
+        raise ValueError("--label needs --like-mask: it is a value of that mask")
     scan = load(like, **{**reading, "label": None})
     say_notes(scan.notes)
     inside = None if mask is None else _mask(load(mask, **{**reading, "channel": None}).values)
@@ -221,7 +224,7 @@ def _mask(values: np.ndarray) -> np.ndarray:
 
     kinds = len(np.unique(values))
     if kinds != 2:
-        raise ValueError(f"expected a mask of two values beside --like-mask, got {kinds} values")
+        raise ValueError(f"--like-mask must have two values, got {kinds}: choose one with --label")
     return values > values.min()
 
 

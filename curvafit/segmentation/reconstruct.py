@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -31,6 +31,9 @@ from curvafit.volumes.boxes import digest_of
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.part import Box
 from curvafit.volumes.read import Source, field_of
+
+if TYPE_CHECKING:
+    from curvafit.inference.infer import Inference
 
 __all__ = ["SlicesProblem", "known_places", "labels_of", "reconstruct", "reconstruct_labels"]
 
@@ -395,6 +398,28 @@ def labels_of(values: np.ndarray, chosen: Sequence[int] | None) -> list[int]:
     if missing := [each for each in numbers if each not in there]:
         raise ScanError(f"expected labels of the known slices ({listed}), got {', '.join(map(str, missing))}")
     return numbers
+
+
+def infer_law(example: Field, progress: Progress = silent) -> Inference:
+    """Return what `infer` reads of the law of an example's mask in seconds, without growing anything."""
+    from curvafit.inference.infer import infer
+
+    return infer(example, kind="mask", fast=True, progress=progress)
+
+
+def infer_laws(
+    example: Field, chosen: Sequence[int] | None = None, progress: Progress = silent
+) -> tuple[dict[int, Inference | Coefficients], tuple[str, ...]]:
+    """Return the law of each label of an example, and notes; the Willmore energy where no law can be read."""
+    laws: dict[int, Inference | Coefficients] = {}
+    notes = []
+    for label in labels_of(example.values, chosen):
+        try:
+            laws[label] = infer_law(replace(example, values=example.values == label), progress)
+        except ScanError as reason:
+            notes.append(f"Label {label} of the example has no law ({reason}): the Willmore energy is tried.")
+            laws[label] = Coefficients.willmore()
+    return laws, tuple(notes)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,8 +9,7 @@ import pytest
 from calling import LAW, call, refused
 from exact_store import exact_store
 
-from curvafit.cli.console import error_console, stages
-from curvafit.cli.refusal import LONGEST, sentence, writable
+from curvafit.cli.console import LONGEST, error_console, sentence, stages, writable
 from curvafit.volumes.field import Field
 from curvafit.volumes.write import save
 

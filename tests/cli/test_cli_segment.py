@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 from pathlib import Path
 
@@ -285,3 +286,11 @@ def test_no_input_is_written_over(arguments, target, tmp_path, monkeypatch) -> N
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     refused(call(*arguments, "-o", target), "input")
     assert before == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+
+
+def test_steps_are_those_of_the_library() -> None:
+    from curvafit.cli import refine, segment
+    from curvafit.segmentation.engine import STEPS
+
+    for command in (segment.segment, segment.reconstruct, refine.refine):
+        assert inspect.signature(command).parameters["steps"].default == STEPS
