@@ -239,7 +239,10 @@ class Calls:
             curvafit.save(curvafit.Field(self.ball.astype(np.uint8), (2.0, 1.0, 1.0), "um"), self.folder / name)
 
     def _infer(self) -> None:
-        found = curvafit.infer(curvafit.Field(self.flow.field.numpy()), kind="field", periodic=True)
+        from curvafit.inference.simulate import Effort
+
+        few = Effort(simulations=4, rounds=1, twins=2, regrown=2)
+        found = curvafit.infer(curvafit.Field(self.flow.field.numpy()), kind="field", periodic=True, effort=few)
         (self.folder / "fit.json").write_text(found.fit.to_json())
 
 

@@ -87,7 +87,7 @@ def test_a_place_that_is_taken_is_refused(what: str, tmp_path: Path) -> None:
         place.mkdir()
         (place / (".thesis" if what == "hidden" else "thesis")).write_text("mine")
     before = tree(tmp_path)
-    with pytest.raises(ValueError, match="a name that is free, got .*out, a .* that this command did not write"):
+    with pytest.raises(ValueError, match="overwrite"):
         check_free([place], lambda path: False)
     check_free([place], lambda path: path == place)
     check_free([place], lambda path: False, overwrite=True)
@@ -98,14 +98,14 @@ def test_nothing_is_free_and_an_empty_folder_where_a_folder_goes(tmp_path: Path)
     (tmp_path / "empty").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "empty")
     check_free([tmp_path / "none", tmp_path / "empty"], is_empty)
-    with pytest.raises(ValueError, match="expected a name that is free, got .*link, a folder"):
+    with pytest.raises(ValueError, match="folder"):
         check_free([tmp_path / "link"], is_empty)
 
 
 def test_devices_and_pipes_are_never_written_over(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     for place in (tmp_path / "pipe", Path(os.devnull)):
-        with pytest.raises(ValueError, match="expected the name of a file or a folder to write, got the device"):
+        with pytest.raises(ValueError, match="device"):
             check_free([place], lambda path: True, overwrite=True)
 
 
@@ -129,16 +129,16 @@ def test_an_input_is_never_written_over(overwrite: bool, tmp_path: Path) -> None
         ("link", "scan"),
     ]
     for read, written in cases:
-        with pytest.raises(ValueError, match="expected an output that writes over no input"):
+        with pytest.raises(ValueError, match="input"):
             check_free([tmp_path / written], lambda path: True, [tmp_path / read], overwrite)
-    with pytest.raises(ValueError, match="over no input"):
+    with pytest.raises(ValueError, match="input"):
         check_free([source / "0.tif"], lambda path: True, [f"{source / '0.tif'}::key"], overwrite)
     check_free([tmp_path / "scan2", tmp_path / "out.tif"], lambda path: True, [source, "none.tif"], overwrite)
 
 
 def test_a_folder_that_cannot_take_files_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(ValueError, match=r"expected a folder to write to, got .*file/deep, where .*file is a file"):
+    with pytest.raises(ValueError, match="is a file"):
         check_folder(tmp_path / "file" / "deep")
     assert check_folder(tmp_path / "new" / "deep") == tmp_path / "new" / "deep"
     assert sorted(tree(tmp_path)) == ["file"]
@@ -147,7 +147,7 @@ def test_a_folder_that_cannot_take_files_is_refused(tmp_path: Path, monkeypatch:
         raise OSError(30, "Read-only file system")
 
     monkeypatch.setattr("tempfile.TemporaryFile", read_only)
-    with pytest.raises(ValueError, match="expected a folder that can be written to"):
+    with pytest.raises(ValueError, match="written"):
         check_folder(tmp_path / "new")
 
 
@@ -171,10 +171,10 @@ def test_save_replaces_its_own_stores_alone(tmp_path: Path) -> None:
     for kind in ("volume", "volume"):
         save(FIELD, place, kind=kind)
     assert np.array_equal(load(place).values, FIELD.values)
-    with pytest.raises(ValueError, match="that this command did not write"):
+    with pytest.raises(ValueError, match="overwrite"):
         save(FIELD, place, kind="mask")
     (place / "notes.txt").write_text("mine")
-    with pytest.raises(ValueError, match="that this command did not write"):
+    with pytest.raises(ValueError, match="overwrite"):
         save(FIELD, place)
     assert (place / "notes.txt").read_text() == "mine"
     save(FIELD, place, overwrite=True)
@@ -191,7 +191,7 @@ def test_what_bears_no_mark_is_nobodys_to_replace(damage: str, tmp_path: Path) -
         text = {"another's": '{"attributes": {"curvafit": 3}}', "torn": '{"attri', "nested": "[" * 100_000}[damage]
         (place / "zarr.json").write_text(text)
     before = tree(tmp_path)
-    with pytest.raises(ValueError, match="that this command did not write"):
+    with pytest.raises(ValueError, match="overwrite"):
         save(FIELD, place)
     assert tree(tmp_path) == before
     shutil.rmtree(place)
