@@ -19,8 +19,8 @@ from curvafit.atlas_map.layout import AtlasMap, check_extra, check_size, diagram
 from curvafit.atlas_map.page import page_html
 from curvafit.atlas_map.picture import map_picture
 from curvafit.atlas_map.shapes import Shown, regrow_command, shown
-from curvafit.core.files import bears, check_folder, check_free, is_empty, write_content
-from curvafit.core.records import read_archive
+from curvafit.core.files import is_empty, write_content
+from curvafit.core.records import can_write, has_mark, read_archive
 from curvafit.core.runtime import Progress, part, silent
 from curvafit.data_synth.atlas import summarise
 from curvafit.data_synth.store import Record, Store, open_store
@@ -48,15 +48,15 @@ def check_map(directory: str | Path, stores: Sequence[str | Path], overwrite: bo
     ValueError
         If it is no folder that can be written to, lies in a store, or something else stands where a file goes.
     """
-    folder = check_folder(directory)
+    folder = Path(directory)
     page, cache = folder / "atlas.html", folder / CACHE
 
     def ours(path: Path) -> bool:
         if path == cache:
-            return is_empty(cache) or bears(cache / TAG, _TAGGED)
-        return path.is_file() and bears(page, _MARK)
+            return is_empty(cache) or has_mark(cache / TAG, _TAGGED)
+        return path.is_file() and has_mark(page, _MARK)
 
-    check_free([page, folder / "atlas.png", cache], ours, stores, overwrite)
+    can_write(page, ours, more=[folder / "atlas.png", cache], inputs=stores, overwrite=overwrite)
     return folder
 
 

@@ -227,12 +227,11 @@ def map_atlas(
 
 def _check_archive(out: Path, kind: Format, inputs: list[Path], overwrite: bool) -> None:
     """Refuse a target that is no `.npz`, cannot be written, is an input, or is a file of another kind."""
-    from curvafit.core.files import check_folder, check_free
+    from curvafit.core.records import can_write
 
     if out.suffix.lower() != ".npz":
         raise ValueError(f"the output's name must end in .npz, got {out.name!r}")
-    check_folder(out.parent)
-    check_free([out], kind.owns, inputs, overwrite)
+    can_write(out, kind, inputs=inputs, overwrite=overwrite)
 
 
 def _design(name: str, around: str | None, spread: float | None) -> Design:

@@ -65,13 +65,18 @@ def fetch_or_make(name: str) -> Path:
 
 def _copied(path: Path, target: Path, overwrite: bool) -> Path:
     """Copy a sample to a target, whose suffix must be the sample's."""
-    from curvafit.core.files import check_free, write_atomically
+    from curvafit.core.files import write_atomically
+    from curvafit.core.records import can_write
 
     target = target / path.name if target.is_dir() else target
     suffix = path.name[path.name.index(".") :]
     if not target.name.lower().endswith(suffix):
         raise ValueError(f"expected a name ending in {suffix} for this sample, got {target.name!r}")
-    check_free([target], lambda there: there.is_file() and filecmp.cmp(path, there, shallow=False), [path], overwrite)
+
+    def is_same(there: Path) -> bool:
+        return there.is_file() and filecmp.cmp(path, there, shallow=False)
+
+    can_write(target, is_same, inputs=[path], overwrite=overwrite)
     return write_atomically(target, lambda temporary: _copy(path, temporary))
 
 

@@ -1,9 +1,7 @@
-"""Writing of files and folders that are whole or absent, and that never replace those of another origin."""
+"""Writing of files and folders that are whole or absent."""
 
 from __future__ import annotations
 
-import io
-import json
 import os
 import re
 import shutil
@@ -14,14 +12,6 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from curvafit.core.runtime import undisturbed
-
-#: Key, in a Zarr group's attributes, of the kind of a group.
-MARK = "curvafit"
-#: Bytes of a file in which its mark must stand.
-_HEAD = 4096
-
-
-# ---- whole or not at all ---------------------------------------------------------------------------------------------
 
 
 def write_atomically(target: Path, write: Callable[[Path], object]) -> Path:
@@ -100,7 +90,7 @@ def remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-# ---- never another's -------------------------------------------------------------------------------------------------
+# ---- folders ---------------------------------------------------------------------------------------------------------
 
 
 def check_folder(path: str | Path) -> Path:
@@ -120,61 +110,9 @@ def check_folder(path: str | Path) -> Path:
     return folder
 
 
-def check_free(
-    targets: Iterable[Path], ours: Callable[[Path], bool], inputs: Iterable[str | Path] = (), overwrite: bool = False
-) -> None:
-    """Raise ValueError where writing to a target would replace what this program did not write.
-
-    Parameters
-    ----------
-    targets
-        Files or folders to write or to replace.
-    ours
-        Returns whether a target that exists may be replaced: a file or folder with this program's mark of the same
-        kind, or an empty folder.
-    inputs
-        Files or folders that are read, also as `file.h5::key`: no target may be an input, lie in one or contain one,
-        with or without `overwrite`.
-    overwrite
-        Whether any other file or folder may be replaced.
-    """
-    sources = [source for each in inputs if (source := Path(str(each).partition("::")[0])).exists()]
-    for target in targets:
-        for source in sources:
-            _check_apart(target, source)
-        if not (target.exists() or target.is_symlink()):
-            continue
-        if target.exists() and not (target.is_file() or target.is_dir()):
-            raise ValueError(f"expected the name of a file or a folder to write, got the device or pipe {target}")
-        if not (overwrite or ours(target)):
-            what = "folder" if target.is_dir() else "file"
-            raise ValueError(
-                f"expected a name that is free, got {target}, a {what} that this command did not write: choose another "
-                "name (or replace it with --overwrite; in Python, overwrite=True)"
-            )
-
-
 def is_empty(folder: Path) -> bool:
     """Return whether a path is an empty folder, and not a link to one."""
     return folder.is_dir() and not folder.is_symlink() and not any(folder.iterdir())
-
-
-def own_record(path: Path, kind: str) -> dict:
-    """Return the record in a JSON file whose `format` is `kind`; an empty one where there is none."""
-    try:
-        content = json.loads(path.read_bytes()) if path.is_file() else None
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return content if isinstance(content, dict) and content.get("format") == kind else {}
-
-
-def bears(path: Path, mark: str) -> bool:
-    """Return whether a file has a mark among its first bytes."""
-    try:
-        with path.open("rb") if path.is_file() else io.BytesIO() as file:
-            return mark.encode() in file.read(_HEAD)
-    except OSError:
-        return False
 
 
 def _some() -> str:
@@ -189,10 +127,3 @@ def _takes_files(folder: Path) -> bool:
             return True
     except OSError:
         return False
-
-
-def _check_apart(target: Path, source: Path) -> None:
-    read, place = source.resolve(), target.resolve()
-    same = target.exists() and target.samefile(source)
-    if same or place.is_relative_to(read) or read.is_relative_to(place):
-        raise ValueError(f"expected an output that writes over no input, got {target}, where {source} is read")

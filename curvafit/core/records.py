@@ -22,11 +22,15 @@ from typing import IO, Any, NamedTuple, TypeVar
 import numpy as np
 
 from curvafit.core.checks import quoted
-from curvafit.core.files import MARK, check_folder, check_free, is_empty, write_content
+from curvafit.core.files import check_folder, is_empty, write_content
 from curvafit.core.runtime import memory
 
 Content = TypeVar("Content")
 
+#: Key, in a Zarr group's attributes, of the kind of a group.
+MARK = "curvafit"
+#: Bytes of a file in which its mark must stand.
+_HEAD = 4096
 #: Suffixes of two parts; any other suffix is what follows the last dot.
 _DOUBLE = (".nii.gz", ".ome.tif", ".ome.tiff", ".ome.zarr")
 #: Files of a Zarr group of images that `curvafit.volumes` wrote.
@@ -215,7 +219,19 @@ def can_write(
     check_folder(target.parent)
     if target.is_dir() and not target.name.lower().endswith(".zarr"):
         raise ValueError(f"{target} is a folder: give the name of a file")
-    check_free([target, *more], _replaceable(ours, target), inputs, overwrite)
+    replaceable = _replaceable(ours, target)
+    sources = [source for name in inputs if (source := Path(str(name).partition("::")[0])).exists()]
+    for place in (target, *more):
+        for source in sources:
+            _check_apart(place, source)
+        if place.exists() and not (place.is_file() or place.is_dir()):
+            raise ValueError(f"expected the name of a file or a folder to write, got the device or pipe {place}")
+        if (place.exists() or place.is_symlink()) and not (overwrite or replaceable(place)):
+            what = "folder" if place.is_dir() else "file"
+            raise ValueError(
+                f"expected a name that is free, got {place}, a {what} that this command did not write: choose another "
+                "name (or replace it with --overwrite; in Python, overwrite=True)"
+            )
     return target
 
 
@@ -225,6 +241,24 @@ def _replaceable(ours: Format | Callable[[Path], bool], target: Path) -> Callabl
         return ours
     listed = ours.companions(target)
     return lambda path: (path.is_file() and path.name in listed) or (path == target and ours.owns(path))
+
+
+def _check_apart(target: Path, source: Path) -> None:
+    read, place = source.resolve(), target.resolve()
+    same = target.exists() and target.samefile(source)
+    if same or place.is_relative_to(read) or read.is_relative_to(place):
+        raise ValueError(f"expected an output that writes over no input, got {target}, where {source} is read")
+
+
+def has_mark(path: Path, mark: str) -> bool:
+    """Return whether a file has a text among its first bytes, by which a page or a table is known."""
+    try:
+        if not path.is_file():
+            return False
+        with path.open("rb") as file:
+            return mark.encode() in file.read(_HEAD)
+    except OSError:
+        return False
 
 
 def sibling(path: str | Path, ending: str) -> Path:

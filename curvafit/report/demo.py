@@ -16,7 +16,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
-from curvafit.core.files import bears, check_free, write_content
+from curvafit.core.files import write_content
+from curvafit.core.records import can_write, has_mark
 from curvafit.core.runtime import Progress, part, silent
 from curvafit.core.units import unit_name
 from curvafit.drawing.plot import INK, diagram_on, gallery_figure, png, shared_limits
@@ -118,7 +119,7 @@ def write_demo(
     """
     folder = check_report(directory, [scan.source] if scan.source else (), overwrite)
     page = folder / PAGE
-    check_free([page], lambda path: bears(path, _MARK), overwrite=overwrite)
+    can_write(page, lambda path: has_mark(path, _MARK), overwrite=overwrite)
     progress("measuring", 0.0)
     measures = measure(scan, progress=part(progress, 0.0, 0.1))
     inference = infer(scan, fast=True, seed=seed, progress=part(progress, 0.1, 0.3))

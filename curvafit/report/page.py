@@ -16,7 +16,8 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
-from curvafit.core.files import bears, check_folder, check_free, move_together, own_record, staged, write_content
+from curvafit.core.files import move_together, staged, write_content
+from curvafit.core.records import Format, can_write, has_mark
 from curvafit.core.runtime import undisturbed
 from curvafit.core.units import GLOSSARY, density, length, number, per_unit, percent, unit_name
 from curvafit.drawing.plot import (
@@ -101,9 +102,10 @@ def check_report(directory: str | Path, inputs: Iterable[str | Path] = (), overw
     ValueError
         If it is no folder that can be written to, or an input or another file stands where one of the three goes.
     """
-    folder = check_folder(directory)
-    ours = bool(own_record(folder / "fit.json", FORMAT)) and bears(folder / "report.html", _MARK)
-    check_free([folder / name for name in FILES], lambda _: ours, inputs, overwrite)
+    folder = Path(directory)
+    ours = Format(FORMAT).owns(folder / "fit.json") and has_mark(folder / "report.html", _MARK)
+    first, *more = (folder / name for name in FILES)
+    can_write(first, lambda _: ours, more=more, inputs=inputs, overwrite=overwrite)
     return folder
 
 

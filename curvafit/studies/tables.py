@@ -11,7 +11,8 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from curvafit.core.files import bears, check_free, own_record, write_atomically, write_content
+from curvafit.core.files import write_atomically, write_content
+from curvafit.core.records import Format, can_write, has_mark
 from curvafit.scan.measure import Measures
 
 __all__ = ["SUFFIXES", "check_table", "rows_of", "write_table"]
@@ -64,8 +65,7 @@ def check_table(path: str | PathLike[str], inputs: Sequence[str | Path] = (), ov
         raise ValueError(f"expected a table to write as {', '.join(SUFFIXES)}, got {target}")
     if target.suffix.lower() == ".parquet":
         _pandas()
-    check_free([target], _ours, inputs, overwrite)
-    return target
+    return can_write(target, _ours, inputs=inputs, overwrite=overwrite)
 
 
 def write_table(measures: Sequence[Measures], path: str | PathLike[str], *, overwrite: bool = False) -> Path:
@@ -96,8 +96,8 @@ def write_table(measures: Sequence[Measures], path: str | PathLike[str], *, over
 def _ours(target: Path) -> bool:
     """Return whether a file is a table of this program."""
     if target.suffix.lower() == ".csv":
-        return bears(target, ",".join(COLUMNS))
-    return target.suffix.lower() == ".json" and bool(own_record(target, FORMAT))
+        return has_mark(target, ",".join(COLUMNS))
+    return target.suffix.lower() == ".json" and Format(FORMAT).owns(target)
 
 
 def _unit(unit: str, power: int) -> str:

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from curvafit.core.files import check_free, write_atomically
-from curvafit.core.records import is_own_zarr
+from curvafit.core.files import write_atomically
+from curvafit.core.records import can_write, is_own_zarr
 from curvafit.volumes.formats.arrays import write_npy
 from curvafit.volumes.formats.base import ScanError
 from curvafit.volumes.formats.medical import check_mrc, write_mrc
@@ -74,7 +74,7 @@ def save(
     field = field_of(source, spacing=spacing, unit=unit)
     target = Path(path)
     writer = pick_writer(target, field.unit)
-    check_free([target], lambda there: not there.is_dir() or is_own_zarr(there, kind), overwrite=overwrite)
+    can_write(target, lambda there: not there.is_dir() or is_own_zarr(there, kind), overwrite=overwrite)
 
     def write(temporary: Path) -> None:
         writer(field, temporary)

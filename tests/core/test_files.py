@@ -11,18 +11,16 @@ import pytest
 from disk import tree
 
 from curvafit.core.files import (
-    bears,
     check_folder,
-    check_free,
     is_empty,
     move_together,
-    own_record,
     remove,
     staged,
     sweep,
     write_atomically,
     write_content,
 )
+from curvafit.core.records import Format, can_write, has_mark
 from curvafit.volumes.field import Field
 from curvafit.volumes.read import load
 from curvafit.volumes.write import save
@@ -88,30 +86,30 @@ def test_a_place_that_is_taken_is_refused(what: str, tmp_path: Path) -> None:
         (place / (".thesis" if what == "hidden" else "thesis")).write_text("mine")
     before = tree(tmp_path)
     with pytest.raises(ValueError, match="overwrite"):
-        check_free([place], lambda path: False)
-    check_free([place], lambda path: path == place)
-    check_free([place], lambda path: False, overwrite=True)
+        can_write(tmp_path / "new", lambda path: False, more=[place])
+    can_write(tmp_path / "new", lambda path: path == place, more=[place])
+    can_write(tmp_path / "new", lambda path: False, more=[place], overwrite=True)
     assert tree(tmp_path) == before
 
 
 def test_nothing_is_free_and_an_empty_folder_where_a_folder_goes(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "empty")
-    check_free([tmp_path / "none", tmp_path / "empty"], is_empty)
+    can_write(tmp_path / "none", is_empty, more=[tmp_path / "empty"])
     with pytest.raises(ValueError, match="folder"):
-        check_free([tmp_path / "link"], is_empty)
+        can_write(tmp_path / "none", is_empty, more=[tmp_path / "link"])
 
 
 def test_devices_and_pipes_are_never_written_over(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     for place in (tmp_path / "pipe", Path(os.devnull)):
         with pytest.raises(ValueError, match="device"):
-            check_free([place], lambda path: True, overwrite=True)
+            can_write(place, lambda path: True, overwrite=True)
 
 
 def test_a_pipe_is_no_record_and_is_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "out.json")
-    assert own_record(tmp_path / "out.json", "ours") == {} and not bears(tmp_path / "out.json", "x")
+    assert not Format("ours").owns(tmp_path / "out.json") and not has_mark(tmp_path / "out.json", "x")
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
@@ -130,10 +128,13 @@ def test_an_input_is_never_written_over(overwrite: bool, tmp_path: Path) -> None
     ]
     for read, written in cases:
         with pytest.raises(ValueError, match="input"):
-            check_free([tmp_path / written], lambda path: True, [tmp_path / read], overwrite)
+            inputs = [tmp_path / read]
+            can_write(
+                tmp_path / "new", lambda path: True, more=[tmp_path / written], inputs=inputs, overwrite=overwrite
+            )
     with pytest.raises(ValueError, match="input"):
-        check_free([source / "0.tif"], lambda path: True, [f"{source / '0.tif'}::key"], overwrite)
-    check_free([tmp_path / "scan2", tmp_path / "out.tif"], lambda path: True, [source, "none.tif"], overwrite)
+        can_write(source / "0.tif", lambda path: True, inputs=[f"{source / '0.tif'}::key"], overwrite=overwrite)
+    can_write(tmp_path / "out.tif", lambda path: True, inputs=[source, "none.tif"], overwrite=overwrite)
 
 
 def test_a_folder_that_cannot_take_files_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -149,15 +150,6 @@ def test_a_folder_that_cannot_take_files_is_refused(tmp_path: Path, monkeypatch:
     monkeypatch.setattr("tempfile.TemporaryFile", read_only)
     with pytest.raises(ValueError, match="written"):
         check_folder(tmp_path / "new")
-
-
-def test_a_record_is_of_its_kind(tmp_path: Path) -> None:
-    note = tmp_path / "a.json"
-    for content in ("", "[]", "{", '"x"', '{"format": "other"}', "[" * 100_000):
-        note.write_text(content)
-        assert own_record(note, "ours") == {}
-    note.write_text('{"format": "ours", "files": ["a"]}')
-    assert own_record(note, "ours")["files"] == ["a"] and own_record(tmp_path / "b.json", "ours") == {}
 
 
 # ---- Zarr stores -----------------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.core.files import MARK
+from curvafit.core.records import MARK
 from curvafit.core.runtime import undisturbed
 from curvafit.volumes.formats.base import Damaged, Raw, ScanError, pick_key, spacing_of
 from curvafit.volumes.formats.part import Part, index_of, read_part
