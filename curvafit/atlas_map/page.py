@@ -25,8 +25,8 @@ from curvafit.atlas_map.shapes import CUT, LEVELS, Shown, small_shape
 from curvafit.drawing.plot import DENSITY, shared_limits
 from curvafit.geometry.diagram import FAMILIES, Diagram
 from curvafit.inference.atlas import VIEWS
+from curvafit.inference.fit import FIT_SCHEMA
 from curvafit.priors.coefficients import NAMES
-from curvafit.priors.fit_schema import FIT_SCHEMA
 
 #: How many nearest shapes are shown beside one, and how many a scan is placed by.
 NEIGHBOURS, PLACED_BY = 8, 5

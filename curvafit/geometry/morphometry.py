@@ -10,12 +10,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numba import njit
 from scipy import ndimage
 from skimage import measure
 
+from curvafit.core.schema import Rule
 from curvafit.geometry.mesh import Surface, areas
 from curvafit.geometry.topology import euler_number, euler_of_window
 
@@ -24,18 +26,20 @@ __all__ = ["Morphometry", "connectivity_of", "local_thickness", "morphometry", "
 #: How far a periodic box is continued before distances are taken, in voxels.
 _WRAPPED = 32
 
+Length = Annotated[float, Rule(least=0, unknown=True)]
+
 
 @dataclass(frozen=True)
 class Morphometry:
     """Numbers in powers of `unit`; thickness and spacing are ball diameters, NaN where a phase is missing."""
 
-    volume_fraction: float
-    thickness_mean: float
-    thickness_std: float
-    spacing_mean: float
-    connectivity_density: float
+    volume_fraction: Annotated[float, Rule(least=0, most=1, unknown=True)]
+    thickness_mean: Length
+    thickness_std: Length
+    spacing_mean: Length
+    connectivity_density: Annotated[float, Rule(unknown=True)]
     euler: int
-    surface_to_volume: float
+    surface_to_volume: Length
     unit: str
 
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from curvafit.core.records import Format
+from curvafit.core.schema import Rule
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.distances import one_to_many, sliced_embedding, wasserstein
 from curvafit.inference.table import packaged
@@ -162,10 +163,10 @@ class Match:
     parameters that made it (coefficients in working units, mass m₀, noise seed)."""
 
     id: str
-    distance: float
+    distance: Annotated[float, Rule(least=0)]
     coefficients: Coefficients
-    mass: float
-    seed: int
+    mass: Annotated[float, Rule(above=-1, below=1)]
+    seed: Annotated[int, Rule(least=0)]
 
 
 def mirror_match(match: Match) -> Match:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 import torch
 
+from curvafit.core.schema import Rule
 from curvafit.core.units import number
 from curvafit.generation.flow import Flow, generate
 from curvafit.generation.schedule import LEARNED, Schedule
@@ -17,8 +18,7 @@ from curvafit.geometry.diagram import Diagram, diagram
 from curvafit.geometry.distances import one_to_many
 from curvafit.geometry.mesh import NoSurface
 from curvafit.geometry.morphometry import Morphometry, morphometry
-from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.fit_schema import six_of
+from curvafit.priors.coefficients import NAMES, Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.profile import phase_field
 from curvafit.scan.prepare import Prepared
@@ -54,6 +54,11 @@ NEAR = 0.15
 UNBELIEVABLE = 0.01
 
 
+NotNegative = Annotated[float, Rule(least=0)]
+#: Standard deviations by coefficient, and of the mass.
+Deviations = Annotated[dict[str, float], Rule(keys=tuple((name, NotNegative) for name in (*NAMES, "mass")))]
+
+
 @dataclass(frozen=True)
 class Candidate:
     """A law that may have made a scan, in working units, and what grew from it.
@@ -79,10 +84,10 @@ class Candidate:
 
     name: str
     coefficients: Coefficients
-    mass: float
-    uncertainty: dict[str, float]
-    distance: float | None = None
-    seed_noise: float | None = None
+    mass: Annotated[float, Rule(above=-1, below=1)]
+    uncertainty: Deviations
+    distance: Annotated[float | None, Rule(least=0)] = None
+    seed_noise: Annotated[float | None, Rule(least=0)] = None
     twins: tuple[Morphometry, ...] = ()
     status: str = ""
 
@@ -98,31 +103,6 @@ class Candidate:
         mass = float(np.clip(np.mean([each.mass for each in twins if each.phase is not None]), -RARE, RARE))
         known = {name: value for name, value in self.uncertainty.items() if name != "mass" or mass == self.mass}
         return replace(self, mass=mass, uncertainty=known, distance=distance, seed_noise=noise, twins=numbers)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the candidate in JSON's types."""
-        numbers = list(map(content_of, self.twins))
-        return {**vars(self), "coefficients": self.coefficients.as_dict(), "twins": numbers}
-
-    @staticmethod
-    def from_dict(content: Mapping[str, Any]) -> Candidate:
-        """Return what `as_dict` wrote."""
-        twins = tuple(map(morphometry_of, content["twins"]))
-        deviations = {name: float(value) for name, value in content["uncertainty"].items()}
-        same = {name: content[name] for name in ("name", "distance", "seed_noise", "status")}
-        six, mass = six_of(content["coefficients"]), float(content["mass"])
-        return Candidate(**same, coefficients=six, mass=mass, uncertainty=deviations, twins=twins)
-
-
-def content_of(numbers: Morphometry) -> dict[str, Any]:
-    """Return familiar numbers in JSON's types, null for NaN."""
-    return {name: None if value != value else value for name, value in vars(numbers).items()}
-
-
-def morphometry_of(content: Mapping[str, Any]) -> Morphometry:
-    """Return the familiar numbers of a fit's content, NaN where it has null."""
-    numbers: dict[str, Any] = {name: math.nan if value is None else value for name, value in content.items()}
-    return Morphometry(**numbers)
 
 
 def best_candidate(candidates: Sequence[Candidate]) -> Candidate | None:
@@ -282,7 +262,7 @@ class Misfit:
     """Part of shapes of the model that lie as far out as the scan does: in all descriptors together
     (`probability`), and by block of descriptors (`blocks`). `method` says against what."""
 
-    probability: float
+    probability: Annotated[float, Rule(least=0, most=1)]
     blocks: dict[str, float]
     method: str
 
@@ -291,13 +271,3 @@ class Misfit:
         """Return the blocks that are unbelievable by themselves, the strangest first."""
         order = sorted(self.blocks, key=self.blocks.__getitem__)
         return tuple(name for name in order if self.blocks[name] < UNBELIEVABLE)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the misfit in JSON's types."""
-        return asdict(self)
-
-    @staticmethod
-    def from_dict(content: Mapping[str, Any]) -> Misfit:
-        """Return what `as_dict` wrote."""
-        blocks = {str(name): float(value) for name, value in content["blocks"].items()}
-        return Misfit(float(content["probability"]), blocks, str(content["method"]))

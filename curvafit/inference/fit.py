@@ -4,24 +4,26 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, get_type_hints
 
 import numpy as np
 
+from curvafit.core.checks import quoted
 from curvafit.core.files import write_content
 from curvafit.core.pictures import Pictured
+from curvafit.core.records import parse_json
+from curvafit.core.schema import Rule, decode, encode, schema_of, violation
+from curvafit.core.units import METRES
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.morphometry import Morphometry
 from curvafit.inference.atlas import Match
-from curvafit.inference.candidates import Candidate, Misfit, content_of, morphometry_of
+from curvafit.inference.candidates import Candidate, Deviations, Misfit, NotNegative
 from curvafit.priors.coefficients import NAMES, POWERS, Coefficients
-from curvafit.priors.fit_schema import FORMAT, WHOLE_FIT, fit_bytes, parse_fit, six_of, violation
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
-from curvafit.priors.law import Law
+from curvafit.priors.law import FORMAT, Law, LawLike
 
 _SEEN = {"field": "a phase field", "mask": "a mask", "image": "an image"}
 #: What is drawn, in the order of the columns; a20 = 1 is the gauge.
@@ -30,6 +32,63 @@ COLUMNS = ("a11", "a02", "a10", "a01", "a00", "mass")
 LEVELS = (50, 90)
 #: Significant digits of a draw in a file.
 _DIGITS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Draws:
+    """Draws `(n, 6)` of (a11, a02, a10, a01, a00, m₀) in working units, with a20 = 1.
+
+    Attributes
+    ----------
+    view
+        What the scan was taken for: a kind of view that the posterior was trained on.
+    method
+        How they were drawn, in words.
+    """
+
+    values: np.ndarray
+    view: str
+    method: str
+
+    def __post_init__(self) -> None:
+        if self.values.ndim != 2 or self.values.shape[1] != len(COLUMNS) or not np.isfinite(self.values).all():
+            raise ValueError(f"expected finite draws (n, {len(COLUMNS)}), got shape {self.values.shape}")
+
+    @staticmethod
+    def of(parameters: np.ndarray, view: str, method: str) -> Draws:
+        """Return the draws of parameters `(n, 6)` with log a02 for a02 (`table.PARAMETERS`)."""
+        values = np.array(parameters, dtype=np.float64)
+        values[:, 1] = np.exp(values[:, 1])
+        return Draws(values, view, method)
+
+    @property
+    def parameters(self) -> np.ndarray:
+        """Return the draws as `table.PARAMETERS` has them, with log a02."""
+        values = self.values.copy()
+        values[:, 1] = np.log(values[:, 1])
+        return values
+
+    @property
+    def deviations(self) -> dict[str, float]:
+        """Return the standard deviations by name, 0 for a20."""
+        return {"a20": 0.0} | {name: float(x) for name, x in zip(COLUMNS, self.values.std(0), strict=True)}
+
+    def middle(self, scale: np.ndarray) -> np.ndarray:
+        """Return the row of `parameters` nearest to the medians, in units of `scale` `(6,)`."""
+        rows = self.parameters
+        return rows[np.square((rows - np.median(rows, 0)) / scale).sum(1).argmin()]
+
+    def intervals(self, length: float = 1.0) -> dict[str, dict[str, Any]]:
+        """Return each parameter's median and central intervals, in the unit of which a working length is `length`."""
+        parts = {}
+        powers = (*(POWERS[name] for name in NAMES[1:]), 0)
+        for name, power, column in zip(COLUMNS, powers, self.values.T, strict=True):
+            values = column * length**-power
+            parts[name] = {"median": float(np.median(values))} | {
+                str(level): [float(x) for x in np.percentile(values, (50 - level / 2, 50 + level / 2))]
+                for level in LEVELS
+            }
+        return parts
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -139,34 +198,7 @@ class Fit(Pictured):
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers, strings, lists and dicts, as `fit.json` holds them."""
-        six, physical, draws = self.coefficients, self.coefficients_physical, self.draws
-        return {
-            "format": FORMAT,
-            "status": self.status,
-            "kind": self.kind,
-            "family": self.family,
-            "coefficients": None if six is None else six.as_dict(),
-            "mass": self.mass,
-            "uncertainty": self.uncertainty,
-            "chosen": self.chosen,
-            "scale": list(self.scale),
-            "working_voxel": self.working_voxel,
-            "length_unit": self.length_unit,
-            "coefficients_physical": None if physical is None else physical.as_dict(),
-            "epsilon_physical": self.epsilon_physical,
-            "intervals": None if draws is None else draws.intervals(),
-            "intervals_physical": None if draws is None else draws.intervals(self.length),
-            "weak_directions": list(self.weak_directions),
-            "misfit": None if self.misfit is None else self.misfit.as_dict(),
-            "drift": self.drift,
-            "candidates": [each.as_dict() for each in self.candidates],
-            "matches": [_match_dict(match) for match in self.matches],
-            "morphometry": content_of(self.morphometry),
-            "notes": list(self.notes),
-            "provenance": self.provenance,
-            "posterior": None if draws is None else draws.as_dict(),
-            "diagram": None if self.diagram is None else _diagram_dict(self.diagram, self.kind),
-        }
+        return encode(_file_of(self))
 
     def to_json(self) -> str:
         """Return the text of a `fit.json`: indented, but lists of numbers in one line.
@@ -177,7 +209,7 @@ class Fit(Pictured):
             If the fit is none that `from_json` takes.
         """
         content = self.as_dict()
-        if wrong := violation(content, WHOLE_FIT):
+        if wrong := violation(content, FIT_SCHEMA):
             raise ValueError(f"expected {wrong} in a fit")
         text = json.dumps(content, indent=2, allow_nan=False)
         return re.sub(r"\[\n\s+([-+.\de,\s]+?)\n\s+\]", lambda numbers: f"[{' '.join(numbers[1].split())}]", text)
@@ -189,9 +221,9 @@ class Fit(Pictured):
         Raises
         ------
         ValueError
-            If the text is no whole fit of this format (`priors.fit_schema.WHOLE_FIT`).
+            If the text is no whole fit of this format (`FIT_SCHEMA`).
         """
-        return _fit_of(parse_fit(text, "the text", WHOLE_FIT))
+        return _fit_of(_parse(text, "the text", FIT_SCHEMA))
 
     def save(self, path: str | PathLike[str]) -> Path:
         """Write a `fit.json`, whole or not at all, and return its path."""
@@ -206,137 +238,192 @@ class Fit(Pictured):
         FileNotFoundError, ValueError
             If there is no such file, or as `from_json`.
         """
-        return _fit_of(parse_fit(fit_bytes(path), path, WHOLE_FIT))
+        return _fit_of(_parse(_content(path), path, FIT_SCHEMA))
+
+
+# ---- the file --------------------------------------------------------------------------------------------------------
+
+Positive = Annotated[float, Rule(above=0)]
+
+Column = Annotated[tuple[float, ...], Rule(filled=True)]
+
+
+@dataclass(frozen=True)
+class _DrawColumns:
+    """Columns of draws, in the order of `COLUMNS`."""
+
+    a11: Column
+    a02: Column
+    a10: Column
+    a01: Column
+    a00: Column
+    mass: Column
+
+
+@dataclass(frozen=True)
+class _Posterior:
+    """Draws with what was read: a kind of view, and how."""
+
+    view: str
+    method: str
+    draws: _DrawColumns
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Columns:
+    """A diagram: curvatures to 2 decimals (bins are 2 wide), shares of area, and what of an atlas compares with it."""
+
+    seen_as: Literal["field", "mask"] = "mask"
+    unit: str = "1/working unit"
+    kappa1: Column
+    kappa2: Column
+    share: Annotated[tuple[NotNegative, ...], Rule(filled=True)]
+    spread: NotNegative = 0.0
+    excluded: NotNegative = 0.0
+
+
+@dataclass(frozen=True)
+class _File:
+    """The content of a `fit.json`, entry by entry: a `Fit`, and what follows from it for other programs."""
+
+    format: Literal["curvafit-fit-2"]
+    status: str
+    kind: Literal["field", "mask", "image"]
+    family: str
+    coefficients: Coefficients | None
+    mass: Annotated[float | None, Rule(above=-1, below=1)]
+    uncertainty: Deviations
+    chosen: str | None
+    scale: tuple[Positive, Positive, Positive]
+    working_voxel: Positive
+    length_unit: Literal["voxel", *METRES]  # type: ignore[valid-type]
+    coefficients_physical: Coefficients | None
+    epsilon_physical: Positive
+    intervals: dict[str, Any] | None
+    intervals_physical: dict[str, Any] | None
+    weak_directions: tuple[str, ...]
+    misfit: Misfit | None
+    drift: Annotated[float | None, Rule(least=0)]
+    candidates: tuple[Candidate, ...]
+    matches: tuple[Match, ...]
+    morphometry: Morphometry
+    notes: tuple[str, ...]
+    provenance: Annotated[dict[str, Any], Rule(keys=(("scan", str | None),))]
+    posterior: _Posterior | None
+    diagram: _Columns | None
+
+
+#: What a `fit.json` must hold, in the words of JSON Schema.
+FIT_SCHEMA: dict[str, Any] = schema_of(_File)
+#: The fields that are the same in a `Fit` and its file.
+_SAME = tuple({field.name for field in fields(Fit)} & {field.name for field in fields(_File)} - {"diagram"})
+
+
+def load_draws_and_candidates(law: LawLike) -> tuple[Draws | None, tuple[Candidate, ...]]:
+    """Return the draws and the candidates of a fit, an inference or a `fit.json`; none of a law that has none.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        If there is no such file, or its draws or candidates are damaged.
+    """
+    if not isinstance(law, (str, PathLike)):
+        fit = getattr(law, "fit", law)
+        return getattr(fit, "draws", None), getattr(fit, "candidates", ())
+    parts = {name: FIT_SCHEMA["properties"][name] for name in ("posterior", "candidates", "format")}
+    content = _parse(_content(law), law, {**FIT_SCHEMA, "required": ["format"], "properties": parts})
+    hints = get_type_hints(_File, include_extras=True)
+    candidates = decode(hints["candidates"], content.get("candidates", []))
+    return _draws_of(decode(hints["posterior"], content.get("posterior"))), candidates
+
+
+def _content(path: str | PathLike[str]) -> bytes:
+    """Return the bytes of a `fit.json`."""
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"expected a fit.json, found no file {path}")
+    return Path(path).read_bytes()
+
+
+def _parse(text: str | bytes, place: object, schema: dict[str, Any]) -> dict[str, Any]:
+    """Return the content of a `fit.json`, checked; messages call the file `place`."""
+    expected = "a fit.json written by `curvafit infer`"
+    content = parse_json(text, expected, place)
+    version = content.get("format", FORMAT) if isinstance(content, dict) else FORMAT
+    if version != FORMAT:
+        got = f"got {quoted(version)} in {place}: run `curvafit infer` again"
+        raise ValueError(f"expected a fit.json of format {FORMAT}, {got}")
+    if fault := violation(content, schema):
+        raise ValueError(f"expected {expected} with {fault} in {place}")
+    return content
+
+
+def _file_of(fit: Fit) -> _File:
+    """Return the content of a fit's file."""
+    draws = fit.draws
+    return _File(
+        **{name: getattr(fit, name) for name in _SAME},
+        format=FORMAT,
+        coefficients=fit.coefficients,
+        mass=fit.mass,
+        uncertainty=fit.uncertainty,
+        coefficients_physical=fit.coefficients_physical,
+        epsilon_physical=fit.epsilon_physical,
+        intervals=None if draws is None else draws.intervals(),
+        intervals_physical=None if draws is None else draws.intervals(fit.length),
+        posterior=None if draws is None else _posterior_of(draws),
+        diagram=None if fit.diagram is None else _columns_of(fit.diagram, fit.kind),
+    )  # type: ignore[arg-type]
 
 
 def _fit_of(content: dict[str, Any]) -> Fit:
     """Return the fit of a checked content."""
-    same = ("kind", "family", "chosen", "drift", "length_unit", "status", "provenance")
-    fit = Fit(
-        **{name: content[name] for name in same},
-        candidates=tuple(map(Candidate.from_dict, content["candidates"])),
-        draws=None if content["posterior"] is None else Draws.from_dict(content["posterior"]),
-        weak_directions=tuple(content["weak_directions"]),
-        misfit=None if content["misfit"] is None else Misfit.from_dict(content["misfit"]),
-        scale=tuple(map(float, content["scale"])),  # type: ignore[arg-type]
-        working_voxel=float(content["working_voxel"]),
-        matches=tuple(map(_match_of, content["matches"])),
-        morphometry=morphometry_of(content["morphometry"]),
-        notes=tuple(content["notes"]),
-        diagram=None if content["diagram"] is None else _diagram_of(content["diagram"]),
-    )
+    file: _File = decode(_File, content)
+    same = {name: getattr(file, name) for name in _SAME}
+    fit = Fit(**same, draws=_draws_of(file.posterior), diagram=_diagram_of(file.diagram))
     if (fit.chosen is None) != (fit.best is None):
         raise ValueError(f"expected a chosen law among the fit's candidates, got {fit.chosen!r}")
     return fit
 
 
-def _diagram_dict(diagram: Diagram, kind: str) -> dict[str, Any]:
-    """Curvatures to 2 decimals (bins are 2 wide), shares of area, and which diagrams of an atlas it compares with."""
-    return {
-        "seen_as": "field" if kind == "field" else "mask",
-        "unit": diagram.unit,
-        "kappa1": diagram.points[:, 0].round(2).tolist(),
-        "kappa2": diagram.points[:, 1].round(2).tolist(),
-        "share": diagram.normalised.weights.round(7).tolist(),
-        "spread": diagram.spread,
-        "excluded": diagram.excluded,
-    }
+def _posterior_of(draws: Draws) -> _Posterior:
+    """Return draws as columns of `_DIGITS` digits."""
+    columns = [tuple(float(f"{x:.{_DIGITS}g}") for x in column) for column in draws.values.T]
+    return _Posterior(draws.view, draws.method, _DrawColumns(*columns))
 
 
-def _diagram_of(content: dict[str, Any]) -> Diagram:
-    """Return the diagram of its columns, with the shares of area for weights."""
-    columns = [content[name] for name in ("kappa1", "kappa2", "share")]
+def _draws_of(posterior: _Posterior | None) -> Draws | None:
+    """Return the draws of a file's columns."""
+    if posterior is None:
+        return None
+    columns = [getattr(posterior.draws, name) for name in COLUMNS]
+    _check_lengths(columns, "draws", "posterior")
+    return Draws(np.array(columns, dtype=np.float64).T, posterior.view, posterior.method)
+
+
+def _columns_of(diagram: Diagram, kind: str) -> _Columns:
+    """Return a diagram as columns."""
+    return _Columns(
+        seen_as="field" if kind == "field" else "mask",
+        unit=diagram.unit,
+        kappa1=tuple(diagram.points[:, 0].round(2).tolist()),
+        kappa2=tuple(diagram.points[:, 1].round(2).tolist()),
+        share=tuple(diagram.normalised.weights.round(7).tolist()),
+        spread=diagram.spread,
+        excluded=diagram.excluded,
+    )
+
+
+def _diagram_of(columns: _Columns | None) -> Diagram | None:
+    """Return the diagram of a file's columns, with the shares of area for weights."""
+    if columns is None:
+        return None
+    _check_lengths([columns.kappa1, columns.kappa2, columns.share], "kappa1, kappa2 and share", "diagram")
+    points = np.stack([columns.kappa1, columns.kappa2], 1)
+    return Diagram(points, np.array(columns.share), columns.unit, columns.spread, columns.excluded)
+
+
+def _check_lengths(columns: list[tuple[float, ...]], names: str, place: str) -> None:
+    """Raise ValueError where columns have several lengths."""
     if len({len(column) for column in columns}) > 1:
         lengths = ", ".join(str(len(column)) for column in columns)
-        raise ValueError(f"expected kappa1, kappa2 and share of one length in a fit's diagram, got {lengths}")
-    known = {name: content[name] for name in ("unit", "spread", "excluded") if name in content}
-    return Diagram(np.stack(columns[:2], 1), np.array(columns[2]), **known)
-
-
-def _match_dict(match: Match) -> dict[str, Any]:
-    return {**vars(match), "coefficients": match.coefficients.as_dict()}
-
-
-def _match_of(content: dict[str, Any]) -> Match:
-    six, mass = six_of(content["coefficients"]), float(content["mass"])
-    return Match(content["id"], float(content["distance"]), six, mass, int(content["seed"]))
-
-
-@dataclass(frozen=True, eq=False)
-class Draws:
-    """Draws `(n, 6)` of (a11, a02, a10, a01, a00, m₀) in working units, with a20 = 1.
-
-    Attributes
-    ----------
-    view
-        What the scan was taken for: a kind of view that the posterior was trained on.
-    method
-        How they were drawn, in words.
-    """
-
-    values: np.ndarray
-    view: str
-    method: str
-
-    def __post_init__(self) -> None:
-        if self.values.ndim != 2 or self.values.shape[1] != len(COLUMNS) or not np.isfinite(self.values).all():
-            raise ValueError(f"expected finite draws (n, {len(COLUMNS)}), got shape {self.values.shape}")
-
-    @staticmethod
-    def of(parameters: np.ndarray, view: str, method: str) -> Draws:
-        """Return the draws of parameters `(n, 6)` with log a02 for a02 (`table.PARAMETERS`)."""
-        values = np.array(parameters, dtype=np.float64)
-        values[:, 1] = np.exp(values[:, 1])
-        return Draws(values, view, method)
-
-    @property
-    def parameters(self) -> np.ndarray:
-        """Return the draws as `table.PARAMETERS` has them, with log a02."""
-        values = self.values.copy()
-        values[:, 1] = np.log(values[:, 1])
-        return values
-
-    @property
-    def deviations(self) -> dict[str, float]:
-        """Return the standard deviations by name, 0 for a20."""
-        return {"a20": 0.0} | {name: float(x) for name, x in zip(COLUMNS, self.values.std(0), strict=True)}
-
-    def middle(self, scale: np.ndarray) -> np.ndarray:
-        """Return the row of `parameters` nearest to the medians, in units of `scale` `(6,)`."""
-        rows = self.parameters
-        return rows[np.square((rows - np.median(rows, 0)) / scale).sum(1).argmin()]
-
-    def intervals(self, length: float = 1.0) -> dict[str, dict[str, Any]]:
-        """Return each parameter's median and central intervals, in the unit of which a working length is `length`."""
-        parts = {}
-        powers = (*(POWERS[name] for name in NAMES[1:]), 0)
-        for name, power, column in zip(COLUMNS, powers, self.values.T, strict=True):
-            values = column * length**-power
-            parts[name] = {"median": float(np.median(values))} | {
-                str(level): [float(x) for x in np.percentile(values, (50 - level / 2, 50 + level / 2))]
-                for level in LEVELS
-            }
-        return parts
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the draws in JSON's types, a column for each parameter."""
-        columns = {
-            name: [float(f"{x:.{_DIGITS}g}") for x in column]
-            for name, column in zip(COLUMNS, self.values.T, strict=True)
-        }
-        return {"view": self.view, "method": self.method, "draws": columns}
-
-    @staticmethod
-    def from_dict(content: Mapping[str, Any]) -> Draws:
-        """Return what `as_dict` wrote, to its digits.
-
-        Raises
-        ------
-        ValueError
-            If the columns have several lengths.
-        """
-        columns = [content["draws"][name] for name in COLUMNS]
-        if len({len(column) for column in columns}) > 1:
-            lengths = ", ".join(str(len(column)) for column in columns)
-            raise ValueError(f"expected draws of one length in a fit's posterior, got {lengths}")
-        return Draws(np.array(columns, dtype=np.float64).T, content["view"], content["method"])
+        raise ValueError(f"expected {names} of one length in a fit's {place}, got {lengths}")

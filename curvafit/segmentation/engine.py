@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from os import PathLike
 
 import numpy as np
 import torch
@@ -16,8 +15,8 @@ from curvafit.core.runtime import Progress, silent
 from curvafit.core.units import METRES
 from curvafit.generation.data import Data, Evidence
 from curvafit.generation.flow import WORKING_BLUR, Flow, descend
-from curvafit.priors.coefficients import NAMES, Coefficients
-from curvafit.priors.fit_schema import FIT_SCHEMA, fit_bytes, parse_fit, six_of
+from curvafit.inference.fit import load_draws_and_candidates
+from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.law import Law, LawLike
 from curvafit.priors.loss import RESOLVED, upsampling
@@ -198,22 +197,13 @@ def _in_scan(laws: Iterable[Coefficients], fitted: Law, scan: Field) -> tuple[Co
 
 def _draws(prior: LawLike) -> np.ndarray:
     """Return a fit's draws of the coefficients but a20 = 1, (N, 5), from the fit or its file; N = 0 without draws."""
-    if isinstance(prior, (str, PathLike)):
-        posterior = parse_fit(fit_bytes(prior), prior, FIT_SCHEMA).get("posterior") or {"draws": {}}
-        columns = [posterior["draws"].get(name, ()) for name in NAMES[1:]]
-        if len({len(column) for column in columns}) > 1:
-            raise ScanError(f"expected draws of one length in the posterior of {prior}, got {[*map(len, columns)]}")
-        return np.array(columns, dtype=np.float64).T
-    draws = getattr(getattr(prior, "fit", prior), "draws", None)
+    draws, _ = load_draws_and_candidates(prior)
     return np.empty((0, 5)) if draws is None else draws.values[:, :5]
 
 
 def _candidates(prior: LawLike) -> list[Coefficients]:
     """Return the trusted candidates of a fit or its file, in working units; none of a law without candidates."""
-    if isinstance(prior, (str, PathLike)):
-        rows = parse_fit(fit_bytes(prior), prior, FIT_SCHEMA).get("candidates", ())
-        return [six_of(row["coefficients"]) for row in rows if row["name"] in TRUSTED]
-    candidates = getattr(getattr(prior, "fit", prior), "candidates", ())
+    _, candidates = load_draws_and_candidates(prior)
     return [each.coefficients for each in candidates if each.name in TRUSTED]
 
 

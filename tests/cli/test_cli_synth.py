@@ -10,7 +10,7 @@ import pytest
 from calling import call, refused
 from exact_store import exact_store
 
-from curvafit.priors.fit_schema import FORMAT
+from curvafit.priors.law import FORMAT
 from curvafit.volumes.field import Field
 from curvafit.volumes.read import load
 from curvafit.volumes.write import save

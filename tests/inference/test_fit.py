@@ -24,7 +24,7 @@ def fit() -> Fit:
 
 def fields(fit: Fit) -> dict:
     """All but the diagram; the draws as a file has them."""
-    draws = None if fit.draws is None else fit.draws.as_dict()
+    draws = None if fit.draws is None else (fit.draws.view, fit.draws.method, fit.as_dict()["posterior"])
     return {name: value for name, value in vars(fit).items() if name != "diagram"} | {"draws": draws}
 
 
@@ -140,7 +140,7 @@ def test_a_file_is_read_as_a_fit_and_as_a_prior(tmp_path: Path, fit: Fit) -> Non
     [
         ("matches", None, "matches, got none"),
         ("status", None, "status, got none"),
-        ("chosen", 3, "chosen as a candidate's name, or null, got 3"),
+        ("chosen", 3, "chosen as a text, or null, got 3"),
         ("candidates", [{}], "candidates\\[0\\].name, got none"),
         ("misfit", {"probability": 2, "blocks": {}, "method": ""}, "misfit.probability as a number from 0 to 1, got 2"),
         ("scale", [1, 1], "scale as a list of 3 numbers"),

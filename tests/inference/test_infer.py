@@ -24,9 +24,8 @@ from curvafit.inference.infer import Inference, infer
 from curvafit.inference.posterior import load_posterior
 from curvafit.inference.simulate import Effort
 from curvafit.inference.table import law_of, mirror_parameters, parameters_of
-from curvafit.priors.fit_schema import FORMAT
 from curvafit.priors.grid import WORKING_EPSILON, Grid
-from curvafit.priors.law import Law, preset
+from curvafit.priors.law import FORMAT, Law, preset
 from curvafit.report.page import write_inference
 from curvafit.scan.measure import scan_descriptors, scan_diagram
 from curvafit.scan.prepare import prepare

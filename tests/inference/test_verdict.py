@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from found import NUMBERS
 
+from curvafit.core.schema import decode, encode
 from curvafit.geometry.diagram import Diagram
 from curvafit.inference.candidates import (
     CLOSE,
@@ -88,10 +89,10 @@ def test_what_grew_is_measured_against_the_scan() -> None:
 def test_a_candidate_comes_back_from_its_json() -> None:
     whole = dataclasses.replace(law("simulation", 2.0, 0.5, "Hm."), twins=(NUMBERS, NUMBERS))
     for each in (whole, law("match")):
-        assert Candidate.from_dict(json.loads(json.dumps(each.as_dict()))) == each
+        assert decode(Candidate, json.loads(json.dumps(encode(each)))) == each
     full = dataclasses.replace(whole, twins=(dataclasses.replace(NUMBERS, spacing_mean=math.nan),))
-    content = json.loads(json.dumps(full.as_dict(), allow_nan=False))
-    assert math.isnan(Candidate.from_dict(content).twins[0].spacing_mean)
+    content = json.loads(json.dumps(encode(full), allow_nan=False))
+    assert math.isnan(decode(Candidate, content).twins[0].spacing_mean)
 
 
 # ---- verdicts --------------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-// A check of a value against a schema, as `curvafit.priors.fit_schema` has it; the schema itself comes with the page's data.
+// A check of a value against a schema, as `curvafit.core.schema` has it; the schema itself comes with the page's data.
 
 const BOUNDS = {
   minimum: (value, bound) => value >= bound,

@@ -11,8 +11,8 @@ from broken_fits import BROKEN, broken
 from found import made_fit
 
 from curvafit.core.records import quoted
-from curvafit.inference.fit import Fit
-from curvafit.priors.fit_schema import FIT_SCHEMA, WHOLE_FIT, violation
+from curvafit.core.schema import violation
+from curvafit.inference.fit import FIT_SCHEMA, Fit
 
 SENTENCE = r"\Aexpected [^\n]{1,600}\Z"
 
@@ -64,11 +64,11 @@ def test_content_that_is_no_object_and_another_format(tmp_path: Path) -> None:
 
 
 def test_what_is_written_is_what_can_be_read() -> None:
-    assert violation(made_fit().as_dict()) is None
+    assert violation(made_fit().as_dict(), FIT_SCHEMA) is None
     heavy = dataclasses.replace(made_fit().candidates[0], mass=1.5)
-    with pytest.raises(ValueError, match="expected mass as a number between -1 and 1, or null, got 1.5 in a fit"):
+    with pytest.raises(ValueError, match="mass"):
         dataclasses.replace(made_fit(), candidates=(heavy,)).to_json()
-    with pytest.raises(ValueError, match="expected length_unit as one of voxel, nm, um, mm, m, got 'ell' in a fit"):
+    with pytest.raises(ValueError, match="length_unit"):
         dataclasses.replace(made_fit(), length_unit="ell").to_json()
 
 
@@ -80,9 +80,8 @@ def test_the_schema_is_plain_data_in_the_words_that_both_checks_know() -> None:
         for inner in [*schema.get("properties", {}).values(), *([schema["items"]] if "items" in schema else [])]:
             walk(inner)
 
-    for schema in (FIT_SCHEMA, WHOLE_FIT):
-        walk(schema)
-        assert json.loads(json.dumps(schema)) == schema
+    walk(FIT_SCHEMA)
+    assert json.loads(json.dumps(FIT_SCHEMA)) == FIT_SCHEMA
 
 
 def test_a_quotation_is_short() -> None:
