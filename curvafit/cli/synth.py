@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from curvafit.data_synth.imaging.modality import Modality
-    from curvafit.data_synth.sets import Order
+    from curvafit.data_synth.sets import SetSpec
     from curvafit.data_synth.sources import ShapeSource
 
 EXAMPLES = examples(
@@ -146,16 +146,16 @@ def synth(
         kind = _modality(modality, like, like_mask, visible, reading)
         from curvafit.core.units import convert_length
         from curvafit.data_synth.case import Recipe
-        from curvafit.data_synth.sets import Order
+        from curvafit.data_synth.sets import SetSpec
         from curvafit.data_synth.sources import voxel_of
 
         edge = voxel_of(names, kind) if voxel is None else convert_length(voxel, unit, kind.base.unit)
         low, high = numbers(calibres, "--calibres", 2)
         recipe = Recipe(source, kind, box, edge, seed, (low, high))
-        _build(out, Order(recipe, layout, tuple(labels.split(",")) if labels else ()), count, crew)
+        _build(out, SetSpec(recipe, layout, tuple(labels.split(",")) if labels else ()), count, crew)
 
 
-def _build(out: Path, order: Order, count: int, crew: Crew) -> None:
+def _build(out: Path, order: SetSpec, count: int, crew: Crew) -> None:
     from curvafit.core.checks import check_int
     from curvafit.core.files import check_folder
     from curvafit.data_synth.sets import MOST, build_set, cases_of, check_set, write_preview

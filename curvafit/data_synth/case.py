@@ -64,7 +64,7 @@ class Recipe:
         check_type(self.modality, Modality, "a Modality")
         if not callable(getattr(self.source, "shape", None)):
             raise ValueError(f"the source must be a source of shapes, got {quoted(self.source)}")
-        object.__setattr__(self, "shape", edges_of(self.shape))
+        object.__setattr__(self, "shape", check_shape(self.shape))
         voxel = check_float(self.voxel, "a shape's voxel of positive length", SHORTEST, LONGEST)
         object.__setattr__(self, "voxel", voxel)
         object.__setattr__(self, "seed", seed_of(self.seed))
@@ -138,7 +138,7 @@ def image_and_labels(
     return grey, sampled, mask
 
 
-def edges_of(shape: Sequence[int]) -> tuple[int, int, int]:
+def check_shape(shape: Sequence[int]) -> tuple[int, int, int]:
     """Return the voxels (z, y, x) of an image as whole numbers above 0, or raise ValueError."""
     words, edges = "3 whole numbers of voxels above 0 (z, y, x)", as_tuple(shape, "3 whole numbers of voxels")
     z, y, x = (check_int(n, words, 1, MOST, of=edges) for n in (edges if len(edges) == 3 else (None,) * 3))

@@ -14,9 +14,9 @@ from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
 from curvafit.core.checks import LONGEST, SHORTEST, as_tuple, check_choice, check_float, check_int, seed_of
-from curvafit.data_synth.case import check_calibres, check_crop, draw_voxel, edges_of, image_and_labels
+from curvafit.data_synth.case import check_calibres, check_crop, check_shape, draw_voxel, image_and_labels
 from curvafit.data_synth.imaging.image import field_shape
-from curvafit.data_synth.imaging.maths import correlated
+from curvafit.data_synth.imaging.maths import correlated_field
 from curvafit.data_synth.imaging.modality import Modality, modality
 from curvafit.data_synth.sources import Generated, Pool, Stored, voxel_of
 from curvafit.priors.law import LAW_TYPES, LawLike
@@ -100,7 +100,7 @@ class TextureDataset(IterableDataset):
     ) -> None:
         kinds = [modalities] if isinstance(modalities, (str, Modality)) else list(modalities)
         self.modalities = [modality(kind) if isinstance(kind, str) else kind for kind in kinds]
-        self.size = edges_of((size,) * 3 if isinstance(size, (int, Real)) else size)
+        self.size = check_shape((size,) * 3 if isinstance(size, (int, Real)) else size)
         self.length, self.seed, self.blend = int(length), seed_of(seed), blend
         self.calibres, self.normalise, self.transform = calibres, _normalisation(normalise), transform
         sources: list[Any] = [source] if isinstance(source, LAW_TYPES) else list(as_tuple(source, "laws or stores"))
@@ -181,7 +181,9 @@ class TextureDataset(IterableDataset):
         u = torch.from_numpy(one.values)
         if more:
             length = BLEND_LENGTH * max(voxels)
-            share = torch.sigmoid(BLEND_STEEPNESS * correlated(u[None, None], (length,) * 3, [seed], "blend"))[0, 0]
+            share = torch.sigmoid(BLEND_STEEPNESS * correlated_field(u[None, None], (length,) * 3, [seed], "blend"))[
+                0, 0
+            ]
             u = share * u + (1 - share) * torch.from_numpy(more[0].values)
         return u, one.epsilon, [shape.origin for shape in (one, *more)]
 

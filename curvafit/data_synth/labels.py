@@ -88,7 +88,7 @@ def labels_of(field: Tensor | np.ndarray, grid: Grid, epsilon: float, which: Col
     wanted = {which} if isinstance(which, str) else set(which)
     if unknown := sorted(wanted - set(NAMES)):
         raise ValueError(f"labels are {', '.join(NAMES)}, got {', '.join(unknown)}")
-    u = _checked(field, grid, epsilon)
+    u = _check_field(field, grid, epsilon)
     labels: dict[str, np.ndarray | tuple[int, int, int]] = {}
     mask = (u > 0).cpu().numpy()
     if wanted & {"distance", "skeleton", "instances", "radius"}:
@@ -129,7 +129,7 @@ def instances_of(distance: np.ndarray, grid: Grid, neck: float = NECK) -> np.nda
         if a != b and width >= neck * min(tops[a], tops[b]):
             owner[b] = a
             tops[a] = max(tops[a], tops[b])
-    return _renumbered(np.array([_root(owner, k) for k in range(len(owner))])[basins])
+    return _renumber(np.array([_root(owner, k) for k in range(len(owner))])[basins])
 
 
 def _necks(basins: np.ndarray, distance: np.ndarray, grid: Grid) -> list[tuple[float, int, int]]:
@@ -155,7 +155,7 @@ def _root(owner: np.ndarray, k: int) -> int:
     return int(k)
 
 
-def _renumbered(labels: np.ndarray) -> np.ndarray:
+def _renumber(labels: np.ndarray) -> np.ndarray:
     """Return the labels numbered 1, 2, … in the order of their first voxels; 0 stays."""
     values, first, index = np.unique(labels, return_index=True, return_inverse=True)
     rank = np.zeros(len(values), dtype=np.int32)
@@ -200,7 +200,7 @@ def _radius(distance: np.ndarray, grid: Grid) -> np.ndarray:
     return local_thickness(padded, grid.spacing)[inner] / 2
 
 
-def _checked(field: Tensor | np.ndarray, grid: Grid, epsilon: float) -> Tensor:
+def _check_field(field: Tensor | np.ndarray, grid: Grid, epsilon: float) -> Tensor:
     u = torch.as_tensor(field).detach().cpu()
     if tuple(u.shape) != grid.shape:
         raise ValueError(f"the field must have the shape {grid.shape}, got {tuple(u.shape)}")
@@ -232,18 +232,20 @@ def field_distance(field: Tensor, grid: Grid, epsilon: float) -> np.ndarray:
         raise NoSurface("the field is of one phase only, so that it has no surface to be distant from")
     near = profile_distance(field.detach().cpu().float(), epsilon).contiguous().numpy()
     edges = np.array(grid.spacing, dtype=np.float32)
-    shell, feet, distance = _at_surface(near, edges, grid.periodic)
+    shell, feet, distance = _near_surface(near, edges, grid.periodic)
     squared = np.where(shell, np.float32(0), np.float32(np.inf))
     seed = np.where(shell, np.arange(near.size, dtype=np.int32).reshape(near.shape), np.int32(-1))
     for axis in (2, 1, 0):
         rows = (np.ascontiguousarray(np.moveaxis(values, axis, -1)) for values in (squared, seed))
-        squared, seed = (np.moveaxis(values, -1, axis) for values in _along(*rows, edges[axis], grid.periodic))
-    _away(distance, near, np.ascontiguousarray(seed), feet, edges, grid.periodic)
+        squared, seed = (
+            np.moveaxis(values, -1, axis) for values in _nearest_along_axis(*rows, edges[axis], grid.periodic)
+        )
+    _fill_far(distance, near, np.ascontiguousarray(seed), feet, edges, grid.periodic)
     return distance
 
 
 @njit(cache=True)
-def _at_surface(near, edges, periodic):  # pragma: no cover
+def _near_surface(near, edges, periodic):  # pragma: no cover
     """Return the voxels that touch the other side; their offsets to the surface and its normals (…, 6); the distance of
     all voxels within one of it, NaN elsewhere."""
     shape, widest = near.shape, edges.max()
@@ -288,7 +290,7 @@ def _at_surface(near, edges, periodic):  # pragma: no cover
 
 
 @njit(cache=True)
-def _along(squared, seed, edge, periodic):  # pragma: no cover
+def _nearest_along_axis(squared, seed, edge, periodic):  # pragma: no cover
     """Take one axis (the last) of the squared distance and of the nearest seed: lower envelope of parabolas
     (Felzenszwalb and Huttenlocher 2012); a periodic row is taken from half a row before it to half a row after it."""
     rows, columns, n = squared.shape
@@ -327,7 +329,7 @@ def _along(squared, seed, edge, periodic):  # pragma: no cover
 
 
 @njit(cache=True)
-def _away(distance, near, seed, feet, edges, periodic):  # pragma: no cover
+def _fill_far(distance, near, seed, feet, edges, periodic):  # pragma: no cover
     """Fill in the distance where it is NaN: a along the seed's normal, and t beside it: a + t² / 2(a + `BEND`)."""
     nz, ny, nx = near.shape
     bend = np.float32(BEND * edges.max())

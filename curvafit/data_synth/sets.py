@@ -67,7 +67,7 @@ LAYOUTS: dict[str, Layout] = {
 
 
 @dataclass(frozen=True)
-class Order:
+class SetSpec:
     """What a set is to be: its recipe, layout (a name of `LAYOUTS`) and labels besides the mask (names of `PARTS`)."""
 
     recipe: Recipe
@@ -92,33 +92,33 @@ class Order:
 
 
 def build_set(
-    folder: str | Path, order: Order, count: int, progress: Progress = silent, *, workers: Workers | None = None
+    folder: str | Path, spec: SetSpec, count: int, progress: Progress = silent, *, workers: Workers | None = None
 ) -> Path:
     """Make cases 0 to `count` - 1 of a set, those that are not there yet, and the list that its readers want.
 
-    Case i depends on the order and i alone, so that its voxels are the same whenever and by however many workers it is
-    made. The folder holds a valid set at any time; a list that a killed run or a full disk left behind lacks cases,
-    and the next run completes it.
+    Case i depends on the specification and i alone, whenever and by however many workers it is made. The folder holds a
+    valid set at any time; a list that a killed run or a full disk left behind lacks cases, and the next run completes
+    it.
 
     Parameters
     ----------
     folder
-        Of the set; a new or an empty one, or a set of the same order to go on with.
+        Of the set; a new or an empty one, or a set of the same specification to go on with.
 
     Raises
     ------
     ValueError
-        If `count` is not positive, or the folder holds something else or a set of another order.
+        If `count` is not positive, or the folder holds something else or a set of another spec.
     OSError
         If the folder can't be written, or the workers are gone. The cases that were made are kept.
     """
     count = check_int(count, "a count of at least 1 case", 1, MOST)
     folder = Path(folder)
-    with _begun(folder, order):
-        return _fill(folder, order, count, progress, workers or Here())
+    with _begin(folder, spec):
+        return _fill(folder, spec, count, progress, workers or Here())
 
 
-def _fill(folder: Path, order: Order, count: int, progress: Progress, workers: Workers) -> Path:
+def _fill(folder: Path, spec: SetSpec, count: int, progress: Progress, workers: Workers) -> Path:
     cases = set(cases_of(folder))
     todo = iter([index for index in range(count) if index not in cases])
     pending, listed = 0, -LISTED_EVERY
@@ -133,30 +133,30 @@ def _fill(folder: Path, order: Order, count: int, progress: Progress, workers: W
             pending -= 1
             progress(f"{min(len(cases), count)} of {count} cases", min(len(cases), count) / count)
             if time.monotonic() > listed + LISTED_EVERY:
-                _list(folder, order)
+                _list(folder, spec)
                 listed = time.monotonic()
     finally:
-        _list(folder, order)
+        _list(folder, spec)
 
 
 def make_cases(folder: str | Path, indices: Sequence[int]) -> list[int]:
     """Make some cases of a set that is begun, a worker's part of `build_set`; a case that fails leaves nothing."""
     folder = Path(folder)
-    order = read_order(folder)
+    spec = read_spec(folder)
     try:
         for index in indices:
-            _write_case(folder, order, index, order.recipe.case(index))
+            _write_case(folder, spec, index, spec.recipe.case(index))
     except OSError as error:
         raise OSError(error.errno, error.strerror or str(error), error.filename or str(folder)) from error
     return list(indices)
 
 
-def read_order(folder: str | Path) -> Order:
-    """Return the order that a set was begun with, or raise ValueError."""
+def read_spec(folder: str | Path) -> SetSpec:
+    """Return what a set was begun with, or raise ValueError."""
 
-    def decode(header: dict[str, Any], _: dict[str, np.ndarray]) -> Order:
+    def decode(header: dict[str, Any], _: dict[str, np.ndarray]) -> SetSpec:
         content = header["order"]
-        return Order(Recipe.from_dict(content["recipe"]), content["layout"], tuple(content["parts"]))
+        return SetSpec(Recipe.from_dict(content["recipe"]), content["layout"], tuple(content["parts"]))
 
     try:
         return SET.read(Path(folder) / HEADER, decode)
@@ -175,29 +175,29 @@ def case_name(index: int) -> str:
     return f"case_{index:05d}"
 
 
-def check_set(folder: Path, order: Order) -> None:
-    """Raise ValueError where a folder holds other things than a set of this order: it may be new, or empty."""
+def check_set(folder: Path, spec: SetSpec) -> None:
+    """Raise ValueError where a folder holds other things than a set of this spec: it may be new, or empty."""
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder} is a file: name a folder for the set")
     if not (folder / HEADER).exists():
         if folder.is_dir() and any(folder.iterdir()):
             raise ValueError(f"{folder} holds other things than a set: name a new or an empty folder")
         return
-    stored, wanted = read_order(folder).as_dict(), order.as_dict()
+    stored, wanted = read_spec(folder).as_dict(), spec.as_dict()
     if stored != wanted:
         name, was, now = _difference(stored, wanted)
         raise ValueError(f"{folder} was begun with {name} {was} and not {now}: choose another folder, or delete it")
 
 
 @contextmanager
-def _begun(folder: Path, order: Order) -> Iterator[None]:
+def _begin(folder: Path, spec: SetSpec) -> Iterator[None]:
     """Begin a set; where the first case can't be made, remove what was begun."""
     new = [place for place in (folder, *folder.absolute().parents) if not place.exists()]
-    check_set(folder, order)
+    check_set(folder, spec)
     anew = not (folder / HEADER).exists()
     if anew:
-        SET.write(folder / HEADER, {"versions": versions(), "order": order.as_dict()})
-        check_set(folder, order)  # another process may have begun it meanwhile
+        SET.write(folder / HEADER, {"versions": versions(), "order": spec.as_dict()})
+        check_set(folder, spec)  # another process may have begun it meanwhile
     (folder / RECORDS).mkdir(exist_ok=True)
     try:
         yield
@@ -212,12 +212,12 @@ def _begun(folder: Path, order: Order) -> Iterator[None]:
         raise
 
 
-def _list(folder: Path, order: Order) -> None:
+def _list(folder: Path, spec: SetSpec) -> None:
     """Write the list of the complete cases that the layout's readers want."""
-    names, layout = list(map(case_name, cases_of(folder))), LAYOUTS[order.layout]
+    names, layout = list(map(case_name, cases_of(folder))), LAYOUTS[spec.layout]
     pairs = [{"image": layout.image.format(case=name), "label": layout.label.format(case=name)} for name in names]
     about = {"name": folder.resolve().name, "description": "synthetic; made by curvafit", "numTraining": len(names)}
-    channel = {"0": order.recipe.modality.name}
+    channel = {"0": spec.recipe.modality.name}
     if layout.nnunet:  # by name: what else lies in the folders, such as a killed run's temporary files, does not count
         listed = {
             "channel_names": channel,
@@ -242,15 +242,15 @@ def _list(folder: Path, order: Order) -> None:
     _write_json(folder / LIST, listed)
 
 
-def _write_case(folder: Path, order: Order, index: int, case: Case) -> None:
-    """Write labels, image and record of a case, in this order, all or none; with its record a case is complete."""
-    layout, name = LAYOUTS[order.layout], case_name(index)
+def _write_case(folder: Path, spec: SetSpec, index: int, case: Case) -> None:
+    """Write labels, image and record of a case, in this spec, all or none; with its record a case is complete."""
+    layout, name = LAYOUTS[spec.layout], case_name(index)
     record = folder / RECORDS / f"{name}.json"
     if record.exists():
         return
     places: list[Path] = []
     try:
-        known = _write_parts(folder, order, name, case, places)
+        known = _write_parts(folder, spec, name, case, places)
         mask = case.mask.astype(np.uint8)
         for values, pattern in ((mask, layout.label), (case.image, layout.image)):
             places.append(folder / pattern.format(case=name))
@@ -264,15 +264,15 @@ def _write_case(folder: Path, order: Order, index: int, case: Case) -> None:
         raise
 
 
-def _write_parts(folder: Path, order: Order, name: str, case: Case, places: list[Path]) -> dict[str, Any]:
+def _write_parts(folder: Path, spec: SetSpec, name: str, case: Case, places: list[Path]) -> dict[str, Any]:
     """Write the labels besides the mask, append their files to `places`, and return those that are no volumes."""
-    if not order.parts:
+    if not spec.parts:
         return {}
     grid, known = Grid(case.image.shape, case.spacing, "replicate"), {}  # type: ignore[arg-type]
-    wanted = set(order.parts) - {"centreline"} | ({"skeleton", "distance"} if "centreline" in order.parts else set())
+    wanted = set(spec.parts) - {"centreline"} | ({"skeleton", "distance"} if "centreline" in spec.parts else set())
     labels = labels_of(case.field, grid, case.epsilon, wanted)
-    for part in order.parts:
-        place = folder / LAYOUTS[order.layout].part.format(part=part, case=name)
+    for part in spec.parts:
+        place = folder / LAYOUTS[spec.layout].part.format(part=part, case=name)
         if part == "betti":
             known[part] = list(labels.betti)  # type: ignore[arg-type]
         elif part == "centreline":
@@ -308,7 +308,7 @@ def write_preview(folder: str | Path) -> Path:
     """Write `preview.png` of a set into its folder: of the first cases the slice with most of the structure, with and
     without the label's outline."""
     folder = Path(folder)
-    layout = LAYOUTS[read_order(folder).layout]
+    layout = LAYOUTS[read_spec(folder).layout]
     names = [case_name(index) for index in cases_of(folder)[:SHOWN]]
     columns, rows = min(ROW, len(names)), -(-len(names) // ROW)
     figure = Figure(figsize=(2.4 * columns, 5.0 * rows + 0.3), facecolor="white", layout="constrained")
@@ -318,7 +318,7 @@ def write_preview(folder: str | Path) -> Path:
         axis.set_axis_off()
     for k, name in enumerate(names):
         image, label = (read_values(folder / part.format(case=name)) for part in (layout.image, layout.label))
-        source, (height, width) = _shown_of(folder / RECORDS / f"{name}.json")
+        source, (height, width) = _read_caption(folder / RECORDS / f"{name}.json")
         row, column = 2 * (k // ROW), k % ROW
         plane = int(np.argmax((label > 0).sum((1, 2))))
         low, high = np.percentile(image[plane], (0.5, 99.5))
@@ -330,7 +330,7 @@ def write_preview(folder: str | Path) -> Path:
     return write_picture(figure, folder / "preview.png")
 
 
-def _shown_of(path: Path) -> tuple[str, tuple[float, float]]:
+def _read_caption(path: Path) -> tuple[str, tuple[float, float]]:
     """Return what the picture takes from a case's record: its source's name, and its voxels' edges (y, x)."""
     try:
         record = parse_json(path.read_bytes(), "a case's record", path)

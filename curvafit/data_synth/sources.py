@@ -79,7 +79,6 @@ class Generated:
     fraction
         Share of the volume that shapes fill, instead of the points' masses, as near as `generate` gets: a shape's
         `origin` says where it is missed.
-
     """
 
     points: tuple[tuple[float, ...], ...]
@@ -178,11 +177,11 @@ class Stored:
 
     def __post_init__(self) -> None:
         if self.draws is None:
-            object.__setattr__(self, "draws", len(_formed(self.paths)))
+            object.__setattr__(self, "draws", len(_well_formed_draws(self.paths)))
 
     def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> PhaseField:
         """Return a crop of any of the stores' shapes that shows both structure and background."""
-        draws = _formed(self.paths)
+        draws = _well_formed_draws(self.paths)
         if len(draws) != self.draws:
             raise ValueError(f"the stores had {self.draws} well-formed shapes and grew to {len(draws)}: begin anew")
 
@@ -190,7 +189,7 @@ class Stored:
             store, draw = draws[int(rng.integers(len(draws)))]
             return *random_crop(store.field(draw), voxels, rng, self.rotate), store, draw
 
-        field, move, store, draw = _two_phases(crop, voxels)
+        field, move, store, draw = _retry_crop(crop, voxels)
         record, settings = store.record(draw), store.settings
         point = dict(zip(PARAMETERS, (*map(float, record.coefficients), record.mass), strict=True))
         origin = {"name": f"{store.path.name} {draw}", "parameters": point, "seed": record.seed, **move}
@@ -212,7 +211,7 @@ class Stored:
     @property
     def within(self) -> int:
         """Return the least edge of the stores' shapes, in voxels: what a crop must be within."""
-        return min(min(store.settings.shape) for store, _ in _formed(self.paths))
+        return min(min(store.settings.shape) for store, _ in _well_formed_draws(self.paths))
 
 
 @dataclass(frozen=True)
@@ -243,10 +242,10 @@ class Pool:
         """Return a crop of any of the pool's shapes that shows both structure and background."""
 
         def crop() -> tuple[np.ndarray, dict[str, Any], PhaseField]:
-            whole = _pooled(self.generated, int(rng.integers(self.count)), self.within)
+            whole = _pool_shape(self.generated, int(rng.integers(self.count)), self.within)
             return *random_crop(whole.values, voxels, rng, self.rotate), whole
 
-        values, move, whole = _two_phases(crop, voxels)
+        values, move, whole = _retry_crop(crop, voxels)
         return PhaseField(values, whole.epsilon, whole.origin | move)
 
 
@@ -278,7 +277,7 @@ def _point(law: Law, fraction: float | None) -> tuple[float, ...]:
     return law.point
 
 
-def _two_phases(crop: Callable[[], _Crop], voxels: Sequence[int]) -> _Crop:
+def _retry_crop(crop: Callable[[], _Crop], voxels: Sequence[int]) -> _Crop:
     """Return the first crop that shows both structure and background."""
     for _ in range(CROPS):
         parts = crop()
@@ -289,12 +288,12 @@ def _two_phases(crop: Callable[[], _Crop], voxels: Sequence[int]) -> _Crop:
 
 
 @lru_cache(maxsize=256)
-def _pooled(generated: Generated, number: int, edge: int) -> PhaseField:
+def _pool_shape(generated: Generated, number: int, edge: int) -> PhaseField:
     return generated.shape((edge,) * 3, number, np.random.default_rng(number))
 
 
 @lru_cache(maxsize=16)
-def _formed(paths: tuple[Path, ...]) -> list[tuple[Store, int]]:
+def _well_formed_draws(paths: tuple[Path, ...]) -> list[tuple[Store, int]]:
     """Return the well-formed draws of some stores, each with its store."""
     draws = []
     for store in map(open_store, paths):

@@ -211,7 +211,7 @@ def test_rician_moments(signal: float) -> None:
 
 def test_digitised() -> None:
     values = torch.tensor([-3.0, 0.4, 7.6, 300.0]).reshape(1, 1, 1, 1, 4)
-    assert effects.digitised(values, 255).flatten().tolist() == [0, 0, 8, 255]
+    assert effects.digitise(values, 255).flatten().tolist() == [0, 0, 8, 255]
 
 
 # ---- artefacts -------------------------------------------------------------------------------------------------------
@@ -298,7 +298,7 @@ CHECKED: dict[str, Callable[[Tensor], Tensor]] = {
     "poisson": lambda v: effects.poisson(v, [1]),
     "gaussian noise": lambda v: effects.gaussian_noise(v, 1.0, [1]),
     "rician": lambda v: effects.rician(v, 1.0, [1]),
-    "digitised": lambda v: effects.digitised(v, 9.0),
+    "digitise": lambda v: effects.digitise(v, 9.0),
 }
 
 
@@ -322,7 +322,7 @@ def test_what_is_no_volume_is_refused(name: str) -> None:
         (lambda: effects.poisson(THIN - 1, [1]), "photons"),
         (lambda: effects.poisson_gaussian(THIN, -1, 1, 0, [1]), "gain"),
         (lambda: effects.rician(THIN, math.nan, [1]), "nan"),
-        (lambda: effects.digitised(THIN, 0), "ceiling"),
+        (lambda: effects.digitise(THIN, 0), "ceiling"),
         (lambda: effects.bias(THIN, 1.0, 1.5, 3.0, [1]), "bias"),
         (lambda: effects.stripes(THIN, 1.0, 0.1, 0.0, [1]), "stripes"),
         (lambda: effects.rings(THIN, 1.0, 0.1, 0.0, [1]), "rings"),

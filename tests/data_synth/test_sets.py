@@ -15,13 +15,13 @@ from flat_recipe import FLAT, SHAPE, flat_recipe
 from curvafit.data_synth import sets
 from curvafit.data_synth.case import Recipe
 from curvafit.data_synth.imaging.modality import Imaging
-from curvafit.data_synth.sets import Order, build_set, make_cases, read_order, write_preview
+from curvafit.data_synth.sets import SetSpec, build_set, make_cases, read_spec, write_preview
 from curvafit.volumes.read import load, read_values
 
 
 @pytest.fixture(scope="module")
-def order(tmp_path_factory: pytest.TempPathFactory) -> Order:
-    return Order(flat_recipe(tmp_path_factory.mktemp("shapes") / "s.zarr"))
+def order(tmp_path_factory: pytest.TempPathFactory) -> SetSpec:
+    return SetSpec(flat_recipe(tmp_path_factory.mktemp("shapes") / "s.zarr"))
 
 
 def sums(folder: Path) -> dict[str, dict[str, str]]:
@@ -52,7 +52,7 @@ def test_nnunet_s_layout(tmp_path, order):
 
 @pytest.mark.parametrize("layout", ["monai", "zarr"])
 def test_decathlon_s_list(tmp_path, order, layout):
-    folder = build_set(tmp_path / "set", Order(order.recipe, layout), 2)
+    folder = build_set(tmp_path / "set", SetSpec(order.recipe, layout), 2)
     listed = json.loads((folder / "dataset.json").read_text())
     assert listed["numTraining"] == len(listed["training"]) == 2
     for index, pair in enumerate(listed["training"]):
@@ -67,7 +67,7 @@ def test_monai_reads_it(tmp_path, order):
     data = pytest.importorskip("monai.data", reason="needs MONAI")
     from monai.transforms import LoadImaged
 
-    folder = build_set(tmp_path / "set", Order(order.recipe, "monai"), 2)
+    folder = build_set(tmp_path / "set", SetSpec(order.recipe, "monai"), 2)
     pairs = data.load_decathlon_datalist(str(folder / "dataset.json"), data_list_key="training")
     read = LoadImaged(keys=("image", "label"))(pairs[1])
     assert read["image"].shape == read["label"].shape == SHAPE[::-1]
@@ -160,7 +160,7 @@ def test_a_run_that_is_stopped_leaves_the_case_that_another_completed(tmp_path, 
 
 
 def test_labels_besides_the_mask(tmp_path, order):
-    asked = Order(order.recipe, parts=("distance", "instances", "kappa1", "betti", "centreline"))
+    asked = SetSpec(order.recipe, parts=("distance", "instances", "kappa1", "betti", "centreline"))
     folder = build_set(tmp_path / "set", asked, 1)
     case = asked.recipe.case(0)
     distance = load(folder / "parts" / "distance" / "case_00000.nii.gz")
@@ -176,7 +176,7 @@ def test_labels_besides_the_mask(tmp_path, order):
 def test_labels_are_what_an_image_shows_where_asked(tmp_path, order):
     modality = order.recipe.modality
     wide = replace(modality, base=modality.base.assign({"optics.blur": (1.5, 1.5, 1.5), "visible": 0.1}))
-    asked = Order(replace(order.recipe, modality=wide), parts=("distance",))
+    asked = SetSpec(replace(order.recipe, modality=wide), parts=("distance",))
     folder, case = build_set(tmp_path / "set", asked, 1), asked.recipe.case(0)
     inside = load(folder / "parts" / "distance" / "case_00000.nii.gz").values > 0
     label = read_values(folder / "labelsTr" / "case_00000.nii.gz") > 0
@@ -199,17 +199,17 @@ def test_bad_input(tmp_path, order):
     with pytest.raises(ValueError, match="voxel"):
         Recipe(recipe.source, FLAT, SHAPE, 0)
     with pytest.raises(ValueError, match="layout"):
-        Order(recipe, "bids")
+        SetSpec(recipe, "bids")
     with pytest.raises(ValueError, match="depth"):
-        Order(recipe, parts=("depth",))
+        SetSpec(recipe, parts=("depth",))
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "notes.txt").write_text("mine")
     with pytest.raises(ValueError, match="folder"):
         build_set(tmp_path / "taken", order, 1)
     with pytest.raises(ValueError, match="taken"):
-        read_order(tmp_path / "taken")
+        read_spec(tmp_path / "taken")
     folder = build_set(tmp_path / "set", order, 1)
-    other = Order(Recipe(recipe.source, FLAT, SHAPE, 0.5, seed=5))
+    other = SetSpec(Recipe(recipe.source, FLAT, SHAPE, 0.5, seed=5))
     with pytest.raises(ValueError, match="seed"):
         build_set(folder, other, 1)
     with pytest.raises(ValueError, match="nowhere"):
@@ -218,11 +218,11 @@ def test_bad_input(tmp_path, order):
 
 def test_what_others_began_is_left_alone(tmp_path, order):
     """A set whose first case is still being made may be another process's."""
-    folder, other = build_set(tmp_path / "set", order, 1), Order(replace(order.recipe, seed=5))
+    folder, other = build_set(tmp_path / "set", order, 1), SetSpec(replace(order.recipe, seed=5))
     (folder / "cases" / "case_00000.json").unlink()
     with pytest.raises(ValueError, match="seed"):
         build_set(folder, other, 1)
-    assert read_order(folder) == order
+    assert read_spec(folder) == order
     header = json.loads((folder / "curvafit.json").read_text())
     (folder / "curvafit.json").write_text(json.dumps(header | {"version": 1}))
     with pytest.raises(ValueError, match="version 1"):
@@ -240,11 +240,11 @@ def test_a_damaged_header_is_one_sentence(tmp_path, order):
         broken = header | {"order": header["order"] | {where: value}}
         (folder / "curvafit.json").write_text(json.dumps(broken))
         with pytest.raises(ValueError, match="curvafit.json"):
-            read_order(folder)
+            read_spec(folder)
     for bomb in ("[" * 100_000, '{"version": ' + "9" * 5000 + "}", '{"version": NaN}'):
         (folder / "curvafit.json").write_text(bomb)
         with pytest.raises(ValueError, match="curvafit.json"):
-            read_order(folder)
+            read_spec(folder)
 
 
 @pytest.mark.parametrize(

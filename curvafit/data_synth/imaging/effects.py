@@ -17,16 +17,16 @@ from torch import Tensor
 
 from curvafit.data_synth.imaging.maths import (
     along,
+    as_spacing,
+    as_triple,
     bell,
-    checked,
-    correlated,
-    edges,
+    check_volume,
+    correlated_field,
     gaussian,
-    grainy,
+    grainy_noise,
     sampling,
     seeds_of,
     stream,
-    triple,
     uniform,
 )
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
@@ -62,7 +62,7 @@ def occupancy(field: Float[Tensor, "b 1 z y x"], epsilon: float = EPSILON) -> Fl
     """
     if not epsilon > 0:
         raise ValueError(f"ε must be positive, in voxels, got {epsilon}")
-    return profile_distance(checked(field, "phase fields"), epsilon).add_(0.5).clamp_(0, 1)
+    return profile_distance(check_volume(field, "phase fields"), epsilon).add_(0.5).clamp_(0, 1)
 
 
 def texture(
@@ -70,20 +70,20 @@ def texture(
     seeds: Sequence[int], purpose: str = "texture",
 ) -> Float[Tensor, "b 1 z y x"]:  # fmt: skip
     """Return a positive random factor of mean 1: lognormal, of standard deviation `deviation`, its logarithm correlated
-    by `length` (`correlated`)."""
+    by `length` (`correlated_field`)."""
     if not 0 <= deviation < math.inf or not length > 0:
         raise ValueError(f"a texture needs a deviation from 0 and a positive length, got {deviation} and {length}")
     spread = math.sqrt(math.log1p(deviation**2))
-    lengths = [length / h for h in edges(spacing)]
-    return correlated(like, lengths, seeds, purpose).mul_(spread).sub_(spread**2 / 2).exp_()
+    lengths = [length / h for h in as_spacing(spacing)]
+    return correlated_field(like, lengths, seeds, purpose).mul_(spread).sub_(spread**2 / 2).exp_()
 
 
 def blur(
     image: Float[Tensor, "b 1 z y x"], spacing: float | Sequence[float], widths: float | Sequence[float]
 ) -> Float[Tensor, "b 1 z y x"]:
     """Return the image under a Gaussian point-spread function of standard deviations `widths` along (z, y, x)."""
-    checked(image, "an image")
-    steps, σ = edges(spacing), triple(widths, "a blur")
+    check_volume(image, "an image")
+    steps, σ = as_spacing(spacing), as_triple(widths, "a blur")
     return along(image, *(gaussian(n, s / h, image) for n, s, h in zip(image.shape[2:], σ, steps, strict=True)))
 
 
@@ -103,8 +103,8 @@ def blur_with_depth(
     """
     if not (0 <= growth < math.inf and 0 <= attenuation < math.inf):
         raise ValueError(f"growth and attenuation must be from 0, got {growth} and {attenuation}")
-    checked(image, "an image")
-    steps, σ = edges(spacing), triple(widths, "a blur")
+    check_volume(image, "an image")
+    steps, σ = as_spacing(spacing), as_triple(widths, "a blur")
     depth = (torch.arange(image.shape[2], device=image.device, dtype=image.dtype) + 0.5) * steps[0]
     wider = 1 + growth * depth[:, None]
     z, y, x = (s / h * wider if s else None for s, h in zip(σ, steps, strict=True))
@@ -124,8 +124,8 @@ def sample(
     The corners of both grids' first voxels coincide, and voxels that do not fit into the box are left out. Along an
     axis whose window is narrower than an old voxel, the value is interpolated linearly.
     """
-    checked(image, "an image")
-    old, new, wide = edges(spacing), edges(onto), triple(window, "a window")
+    check_volume(image, "an image")
+    old, new, wide = as_spacing(spacing), as_spacing(onto), as_triple(window, "a window")
     every = zip(image.shape[2:], old, new, wide, strict=True)
     return along(image, *(sampling(n, h, to, over, image) for n, h, to, over in every))
 
@@ -141,7 +141,7 @@ def bias(
     by `length`."""
     if not 0 <= strength <= 1 or not length > 0:
         raise ValueError(f"the bias must be in [0, 1] and its length positive, got {strength} and {length}")
-    field = correlated(like, [length / h for h in edges(spacing)], seeds, "bias")
+    field = correlated_field(like, [length / h for h in as_spacing(spacing)], seeds, "bias")
     low, high = field.amin((1, 2, 3, 4), keepdim=True), field.amax((1, 2, 3, 4), keepdim=True)
     middle, half = (high + low) / 2, ((high - low) / 2).clamp_min(torch.finfo(field.dtype).tiny)
     return (field - middle).mul_(strength / half).add_(1)
@@ -157,8 +157,8 @@ def stripes(
     """
     if not 0 <= strength < math.inf or not width > 0:
         raise ValueError(f"stripes need a strength from 0 and a width above 0, got {strength} and {width}")
-    z, y, _ = (width / h for h in edges(spacing))
-    field = correlated(like, (z, y, math.inf), seeds, "stripes")
+    z, y, _ = (width / h for h in as_spacing(spacing))
+    field = correlated_field(like, (z, y, math.inf), seeds, "stripes")
     return field.mul_(strength).add_(1).clamp_min_(0).expand(like.shape)
 
 
@@ -179,7 +179,7 @@ def rings(
     """
     if not 0 <= strength < math.inf or not width > 0:
         raise ValueError(f"rings need a strength from 0 and a width above 0, got {strength} and {width}")
-    steps = edges(spacing)
+    steps = as_spacing(spacing)
     terms = [_rings(like[k : k + 1], steps, width, seed, centre) for k, seed in enumerate(seeds_of(seeds, len(like)))]
     return torch.cat(terms) * strength
 
@@ -200,8 +200,8 @@ def dropout(
     if not (0 <= share <= 1 and 0 <= loss <= 1 and length > 0):
         given = f"{share}, {loss} and {length}"
         raise ValueError(f"dropout needs a share and a loss in [0, 1] and a length above 0, got {given}")
-    inside = checked(occupied, "an occupancy") >= 0.5
-    field = correlated(occupied, [length / h for h in edges(spacing)], seeds, "dropout")
+    inside = check_volume(occupied, "an occupancy") >= 0.5
+    field = correlated_field(occupied, [length / h for h in as_spacing(spacing)], seeds, "dropout")
     level = [_upper(values[within], share) for values, within in zip(field, inside, strict=True)]
     threshold = torch.stack(level)[:, None, None, None, None]
     return 1 - loss * torch.sigmoid((field - threshold) / FADING)
@@ -218,8 +218,8 @@ def clutter(
     """
     if not 0 <= density < math.inf or not radius > 0:
         raise ValueError(f"clutter needs a density from 0 and a positive radius, got {density} and {radius}")
-    checked(occupied, "an occupancy")
-    steps = edges(spacing)
+    check_volume(occupied, "an occupancy")
+    steps = as_spacing(spacing)
     samples = zip(occupied.split(1), seeds_of(seeds, len(occupied)), strict=True)
     return torch.cat([_specks(one, steps, density, radius, seed) for one, seed in samples]) * (1 - occupied)
 
@@ -236,7 +236,7 @@ def _rings(like: Tensor, steps: Sequence[float], width: float, seed: int, centre
     step = min(width, *steps[1:])
     radius = torch.hypot(y[:, None], x) / step
     count = int(radius.amax()) + 2
-    normal = correlated(like.new_empty(1, 1, depth, 1, count), (0, 0, width / step), [seed], "rings")[0, 0, :, 0]
+    normal = correlated_field(like.new_empty(1, 1, depth, 1, count), (0, 0, width / step), [seed], "rings")[0, 0, :, 0]
     profile = normal * normal.abs() / math.sqrt(3)
     near = radius.long()
     between = torch.lerp(profile[:, near], profile[:, near + 1], radius - near)
@@ -305,9 +305,9 @@ def poisson(
 ) -> Float[Tensor, "b 1 z y x"]:
     """Return numbers of photons: the Poisson quantiles of normal numbers (`poisson_quantile`), smoothed by `width`
     voxels."""
-    if checked(photons, "photons").amin() < 0:
+    if check_volume(photons, "photons").amin() < 0:
         raise ValueError(f"photons must be from 0, got {float(photons.amin()):g}")
-    return poisson_quantile(photons, grainy(photons, triple(width, "a width of noise"), seeds, "photons"))
+    return poisson_quantile(photons, grainy_noise(photons, as_triple(width, "a width of noise"), seeds, "photons"))
 
 
 def poisson_quantile(mean: Tensor, z: Tensor) -> Tensor:
@@ -334,9 +334,9 @@ def gaussian_noise(
     """Return the image plus normal noise of a standard deviation, smoothed by `width` voxels at that deviation."""
     if not 0 <= deviation < math.inf:
         raise ValueError(f"the noise's deviation must be from 0, got {deviation}")
-    checked(image, "an image")
-    widths = triple(width, "a width of noise")
-    return image + deviation * grainy(image, widths, seeds, "read noise") if deviation else image
+    check_volume(image, "an image")
+    widths = as_triple(width, "a width of noise")
+    return image + deviation * grainy_noise(image, widths, seeds, "read noise") if deviation else image
 
 
 def rician(
@@ -349,19 +349,19 @@ def rician(
     """
     if not 0 <= deviation < math.inf:
         raise ValueError(f"the noise's deviation must be from 0, got {deviation}")
-    checked(image, "an image")
-    widths = triple(width, "a width of noise")
+    check_volume(image, "an image")
+    widths = as_triple(width, "a width of noise")
     if not deviation:
         return image.abs()
-    real, imaginary = (grainy(image, widths, seeds, f"{each} channel") for each in ("real", "imaginary"))
+    real, imaginary = (grainy_noise(image, widths, seeds, f"{each} channel") for each in ("real", "imaginary"))
     return torch.hypot(image + deviation * real, deviation * imaginary)
 
 
-def digitised(image: Float[Tensor, "b 1 z y x"], ceiling: float) -> Float[Tensor, "b 1 z y x"]:
+def digitise(image: Float[Tensor, "b 1 z y x"], ceiling: float) -> Float[Tensor, "b 1 z y x"]:
     """Return whole counts from 0 to `ceiling`, where the instrument saturates."""
     if not ceiling > 0:
         raise ValueError(f"the ceiling must be above 0, got {ceiling}")
-    return checked(image, "an image").round().clamp_(0, ceiling)
+    return check_volume(image, "an image").round().clamp_(0, ceiling)
 
 
 def _few(mean: Tensor, z: Tensor) -> Tensor:

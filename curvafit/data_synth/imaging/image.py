@@ -9,7 +9,7 @@ import torch
 
 from curvafit.data_synth.imaging import effects
 from curvafit.data_synth.imaging.effects import EPSILON
-from curvafit.data_synth.imaging.maths import Triple, sampled, seeds_of
+from curvafit.data_synth.imaging.maths import Triple, count_samples, seeds_of
 from curvafit.data_synth.imaging.modality import Imaging
 from curvafit.priors.shapes import Bool, Float
 
@@ -37,7 +37,7 @@ def image(
     -------
     Of the shape `regrid` gives.
     """
-    _alike(shapes, imaging)
+    _check_batch(shapes, imaging)
     every = zip(shapes.split(1), imaging, seeds_of(seeds, len(shapes)), strict=True)
     return torch.cat([_image(one, spacing, how, [seed], epsilon) for one, how, seed in every])
 
@@ -46,7 +46,7 @@ def regrid(
     shapes: Float[torch.Tensor, "b 1 z y x"], spacing: float, imaging: Sequence[Imaging]
 ) -> Float[torch.Tensor, "b 1 Z Y X"]:
     """Return the phase fields at the centres of their images' voxels, interpolated linearly; for labels."""
-    _alike(shapes, imaging)
+    _check_batch(shapes, imaging)
     return effects.sample(shapes, spacing, imaging[0].spacing)
 
 
@@ -55,8 +55,8 @@ def visible(
 ) -> Bool[torch.Tensor, "b 1 Z Y X"]:
     """Return the images' voxels that a share of the structure's light reaches (`Imaging.visible`), evenly stained as it
     is."""
-    _alike(shapes, imaging)
-    return torch.cat([_reached(one, spacing, how, epsilon) for one, how in zip(shapes.split(1), imaging, strict=True)])
+    _check_batch(shapes, imaging)
+    return torch.cat([_visible(one, spacing, how, epsilon) for one, how in zip(shapes.split(1), imaging, strict=True)])
 
 
 def visible_share(imaging: Imaging) -> float:
@@ -75,18 +75,18 @@ def field_shape(shape: Sequence[int], spacing: float, imaging: Imaging) -> tuple
 
 def image_shape(shape: Sequence[int], spacing: float, imaging: Imaging) -> tuple[int, int, int]:
     """Return voxels (z, y, x) of the image of a field of `shape`."""
-    z, y, x = (sampled(n, spacing, h) for n, h in zip(shape, imaging.spacing, strict=True))
+    z, y, x = (count_samples(n, spacing, h) for n, h in zip(shape, imaging.spacing, strict=True))
     return z, y, x
 
 
 def _image(shape: torch.Tensor, spacing: float, how: Imaging, seeds: list[int], epsilon: float) -> torch.Tensor:
     occupied = effects.occupancy(shape, epsilon)
-    light = _blurred(_emitted(occupied, spacing, how, seeds), spacing, how)
-    light = _lit(effects.sample(light, spacing, how.spacing, _window(how)), how, seeds)
-    return _detected(light, how, seeds)
+    light = _blur(_emit(occupied, spacing, how, seeds), spacing, how)
+    light = _illuminate(effects.sample(light, spacing, how.spacing, _window(how)), how, seeds)
+    return _detect(light, how, seeds)
 
 
-def _lit(light: torch.Tensor, how: Imaging, seeds: list[int]) -> torch.Tensor:
+def _illuminate(light: torch.Tensor, how: Imaging, seeds: list[int]) -> torch.Tensor:
     """Return the light under uneven illumination."""
     lamp = how.illumination
     if lamp.bias:
@@ -96,7 +96,7 @@ def _lit(light: torch.Tensor, how: Imaging, seeds: list[int]) -> torch.Tensor:
     return light
 
 
-def _detected(light: torch.Tensor, how: Imaging, seeds: list[int]) -> torch.Tensor:
+def _detect(light: torch.Tensor, how: Imaging, seeds: list[int]) -> torch.Tensor:
     """Return the counts that a detector makes of light."""
     detector, noise, contrast = how.detector, how.noise, how.contrast
     counts = effects.poisson_gaussian(light, detector.gain, noise.gaussian, detector.offset, seeds, noise.width)
@@ -105,10 +105,10 @@ def _detected(light: torch.Tensor, how: Imaging, seeds: list[int]) -> torch.Tens
     if detector.rings:
         strength = detector.rings * abs(contrast.foreground - contrast.background) * (detector.gain or 1)
         counts = counts + effects.rings(counts, how.spacing, strength, detector.ring_width, seeds)
-    return counts if detector.ceiling is None else effects.digitised(counts, detector.ceiling)
+    return counts if detector.ceiling is None else effects.digitise(counts, detector.ceiling)
 
 
-def _reached(shape: torch.Tensor, spacing: float, how: Imaging, epsilon: float) -> torch.Tensor:
+def _visible(shape: torch.Tensor, spacing: float, how: Imaging, epsilon: float) -> torch.Tensor:
     light = effects.blur_with_depth(effects.occupancy(shape, epsilon), spacing, how.optics.blur, how.optics.growth)
     return effects.sample(light, spacing, how.spacing, _window(how)) > how.visible
 
@@ -117,7 +117,7 @@ def _window(how: Imaging) -> Triple:
     return how.thickness, *how.spacing[1:]
 
 
-def _emitted(occupied: torch.Tensor, spacing: float, how: Imaging, seeds: list[int]) -> torch.Tensor:
+def _emit(occupied: torch.Tensor, spacing: float, how: Imaging, seeds: list[int]) -> torch.Tensor:
     """Return the light that the specimen sends out."""
     contrast, specimen = how.contrast, how.specimen
     inside = occupied
@@ -139,14 +139,14 @@ def _emitted(occupied: torch.Tensor, spacing: float, how: Imaging, seeds: list[i
     return light.clamp_min(0)
 
 
-def _blurred(light: torch.Tensor, spacing: float, how: Imaging) -> torch.Tensor:
+def _blur(light: torch.Tensor, spacing: float, how: Imaging) -> torch.Tensor:
     optics = how.optics
     if optics.growth or optics.attenuation:
         return effects.blur_with_depth(light, spacing, optics.blur, optics.growth, optics.attenuation)
     return effects.blur(light, spacing, optics.blur)
 
 
-def _alike(shapes: torch.Tensor, imaging: Sequence[Imaging]) -> None:
+def _check_batch(shapes: torch.Tensor, imaging: Sequence[Imaging]) -> None:
     if len(imaging) != len(shapes) or not imaging:
         raise ValueError(f"each of {len(shapes)} fields needs its imaging, got {len(imaging)}")
     grids = {how.spacing for how in imaging}

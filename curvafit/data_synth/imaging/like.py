@@ -64,8 +64,8 @@ def like(scan: Field, mask: np.ndarray | None = None) -> Modality:
     """Return a modality whose images look like a scan: its spacing, levels, textures, blur, noise and uneven light.
 
     Assumed: two classes; a Gaussian blur, one width in the plane and one along z; noise whose variance is a line over
-    the mean (`noise_of`). Not seen: growth with depth, stripes, rings, lost stain and clutter, which stay 0. The blur
-    is the one that makes the mask, times a brightness averaged over some voxels, most like the scan.
+    the mean (`measure_noise`). Not seen: growth with depth, stripes, rings, lost stain and clutter, which stay 0. The
+    blur is the one that makes the mask, times a brightness averaged over some voxels, most like the scan.
 
     Parameters
     ----------
@@ -80,16 +80,16 @@ def like(scan: Field, mask: np.ndarray | None = None) -> Modality:
     Modality
         `base` holds the estimates, `ranges` their surroundings (`SPREAD`); `voxel` is the finest edge of the scan's.
     """
-    values, given = _middle(scan, mask)
+    values, given = _crop_middle(scan, mask)
     steps = np.array(scan.spacing)
     inside = bright(values, steps) if given is None else given
     if not inside.any() or inside.all():
         raise ValueError("the mask must have voxels inside and outside, got an empty or a full one")
-    ground = background_of(values, inside, steps)
-    structure = _structure(values, inside, steps, ground.level)
-    noise = noise_of(values, inside, ground, steps, ground.level + structure.contrast)
+    ground = measure_background(values, inside, steps)
+    structure = _measure_structure(values, inside, steps, ground.level)
+    noise = measure_noise(values, inside, ground, steps, ground.level + structure.contrast)
     base = _imaging(scan, structure, noise)
-    ranges = {name: _around(base[name], *ends) for name, ends in SPREAD.items() if np.any(base[name])}
+    ranges = {name: _spread(base[name], *ends) for name, ends in SPREAD.items() if np.any(base[name])}
     if bias := ranges.get("illumination.bias"):
         ranges["illumination.bias"] = bias[0], min(bias[1], 1.0)
     about = f"estimated from {scan.source or 'a scan'}, {'its mask' if given is not None else 'without a mask'}"
@@ -130,7 +130,7 @@ def _imaging(scan: Field, structure: Structure, noise: NoiseEstimate) -> Imaging
     )
 
 
-def _middle(scan: Field, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
+def _crop_middle(scan: Field, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
     if min(scan.shape) < 8:
         raise ValueError(f"the scan must have at least 8 voxels along each axis, got {scan.shape}")
     if mask is not None and np.shape(mask) != scan.shape:
@@ -163,7 +163,7 @@ def bright(values: np.ndarray, steps: np.ndarray | Sequence[float]) -> np.ndarra
     return np.logical_and(contrast > local / 2, ndimage.maximum_filter(above, size=3))
 
 
-def _structure(values: np.ndarray, inside: np.ndarray, steps: np.ndarray, level: float) -> Structure:
+def _measure_structure(values: np.ndarray, inside: np.ndarray, steps: np.ndarray, level: float) -> Structure:
     """Return the blur (z, and y = x) whose image of the mask is nearest to the scan around it; the brightness
     inside."""
     finest = steps.min() / steps
@@ -186,10 +186,10 @@ def _structure(values: np.ndarray, inside: np.ndarray, steps: np.ndarray, level:
     contrast = brightness(blur(mask, 1.0, tuple(widths)))[0, 0].numpy()
     mean = float(contrast[inside].mean())
     z, y, x = (np.sqrt(np.maximum(widths**2 - 1 / 12, 0)) * steps).tolist()
-    return Structure((z, y, x), mean, *_texture(contrast / mean, inside, steps))
+    return Structure((z, y, x), mean, *_measure_texture(contrast / mean, inside, steps))
 
 
-def _texture(relative: np.ndarray, inside: np.ndarray, steps: np.ndarray) -> tuple[float, float]:
+def _measure_texture(relative: np.ndarray, inside: np.ndarray, steps: np.ndarray) -> tuple[float, float]:
     """Return the deviation and the length, in voxels of the finest edge, of a brightness that was averaged over a
     window of `WINDOW`: by the covariance of its logarithm in the plane. The average lengthens the one, and along a tube
     it lessens the other. What has lost its light is not looked at: a logarithm would see little else."""
@@ -209,7 +209,7 @@ def _texture(relative: np.ndarray, inside: np.ndarray, steps: np.ndarray) -> tup
     return math.sqrt(math.expm1(float(covariances[0]) * max(width / length, 1.0))), length
 
 
-def _around(value: Any, low: float, high: float) -> tuple[Any, Any]:
+def _spread(value: Any, low: float, high: float) -> tuple[Any, Any]:
     if isinstance(value, tuple):
         return tuple(low * each for each in value), tuple(high * each for each in value)
     return low * value, high * value
@@ -244,7 +244,7 @@ class NoiseEstimate(NamedTuple):
     bias: float
 
 
-def background_of(values: np.ndarray, inside: np.ndarray, steps: np.ndarray) -> Background:
+def measure_background(values: np.ndarray, inside: np.ndarray, steps: np.ndarray) -> Background:
     """Return the background's level and correlations, some voxels away from the structure.
 
     Its covariance over the lag is the sum of a short part, noise smoothed by up to a voxel, and a long one, texture.
@@ -260,15 +260,15 @@ def background_of(values: np.ndarray, inside: np.ndarray, steps: np.ndarray) -> 
     covariances = [covariance(rest, weight, axis) for axis in range(3)]
     lags = min(map(len, covariances[1:]))
     plane = (covariances[1][:lags] + covariances[2][:lags]) / 2
-    noise, lateral, texture, length = _split(plane)
-    _, axial, _, _ = _split(covariances[0])
+    noise, lateral, texture, length = _split_covariance(plane)
+    _, axial, _, _ = _split_covariance(covariances[0])
     bias = _bias(rest, weight, level, values.shape)
     return Background(
         where, level, noise, (axial, lateral, lateral), math.sqrt(texture), length * float(steps[2]), bias
     )
 
 
-def noise_of(
+def measure_noise(
     values: np.ndarray, inside: np.ndarray, ground: Background, steps: np.ndarray, high: float
 ) -> NoiseEstimate:
     """Return the line of variance over mean through the residuals' bins and the background, if it rises by the
@@ -304,7 +304,7 @@ def covariance(rest: np.ndarray, weight: np.ndarray, axis: int) -> np.ndarray:
     return np.array([product / max(pairs, 1.0) for product, pairs in sums])
 
 
-def _split(covariances: np.ndarray) -> tuple[float, float, float, float]:
+def _split_covariance(covariances: np.ndarray) -> tuple[float, float, float, float]:
     """Return the variance and width of the noise, variance and length of the texture, in voxels, by non-negative least
     squares."""
     lag = np.arange(len(covariances))

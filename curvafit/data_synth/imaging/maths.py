@@ -64,7 +64,7 @@ def sampling(count: int, spacing: float, onto: float, window: float, like: Tenso
     then linear interpolations. `None` where nothing changes.
     """
     window = max(window, spacing)
-    fits = sampled(count, spacing, onto)
+    fits = count_samples(count, spacing, onto)
     if fits == count and math.isclose(spacing, onto) and math.isclose(window, spacing):
         return None
     centre = (torch.arange(fits, dtype=torch.float64)[:, None] + 0.5) * onto
@@ -74,12 +74,12 @@ def sampling(count: int, spacing: float, onto: float, window: float, like: Tenso
     return (weight / weight.sum(-1, keepdim=True)).to(like)
 
 
-def sampled(count: int, spacing: float, onto: float) -> int:
+def count_samples(count: int, spacing: float, onto: float) -> int:
     """Return how many voxels of edge `onto` fit into `count` of edge `spacing`; at least one."""
     return max(1, math.floor(count * spacing / onto + 1e-6))
 
 
-def checked(volume: Tensor, name: str = "a volume") -> Tensor:
+def check_volume(volume: Tensor, name: str = "a volume") -> Tensor:
     """Return the volume, if it is `(B, 1, Z, Y, X)`, of a floating type and finite."""
     if volume.ndim != 5 or volume.shape[1] != 1 or not volume.numel():
         raise ValueError(f"{name} must be of shape (B, 1, Z, Y, X), got {tuple(volume.shape)}")
@@ -90,7 +90,7 @@ def checked(volume: Tensor, name: str = "a volume") -> Tensor:
     return volume
 
 
-def triple(value: float | Sequence[float], name: str) -> Triple:
+def as_triple(value: float | Sequence[float], name: str) -> Triple:
     """Return three numbers (z, y, x) from 0, or one for all."""
     numbers = (value,) * 3 if isinstance(value, (int, float)) else tuple(value)
     if len(numbers) != 3 or not all(math.isfinite(h) and h >= 0 for h in numbers):
@@ -98,9 +98,9 @@ def triple(value: float | Sequence[float], name: str) -> Triple:
     return float(numbers[0]), float(numbers[1]), float(numbers[2])
 
 
-def edges(spacing: float | Sequence[float]) -> Triple:
+def as_spacing(spacing: float | Sequence[float]) -> Triple:
     """Return a spacing: three lengths above 0, or one for all."""
-    steps = triple(spacing, "a spacing")
+    steps = as_triple(spacing, "a spacing")
     if not all(steps):
         raise ValueError(f"the spacing must be 3 positive numbers (z, y, x), got {spacing!r}")
     return steps
@@ -115,12 +115,12 @@ def stream(seed: int, purpose: str, device: torch.device | str = "cpu") -> torch
     return torch.Generator(device).manual_seed(int(words.generate_state(1)[0]))
 
 
-def white(like: Float[Tensor, "b 1 z y x"], seeds: Sequence[int], purpose: str) -> Float[Tensor, "b 1 z y x"]:
+def white_noise(like: Float[Tensor, "b 1 z y x"], seeds: Sequence[int], purpose: str) -> Float[Tensor, "b 1 z y x"]:
     """Return independent standard normal numbers."""
     return _drawn(tuple(like.shape[2:]), like, seeds, purpose)
 
 
-def correlated(
+def correlated_field(
     like: Float[Tensor, "b 1 z y x"], lengths: Sequence[float], seeds: Sequence[int], purpose: str
 ) -> Float[Tensor, "b 1 z y x"]:
     """Return a Gaussian random field of mean 0 and variance 1 whose correlation over a distance d is exp(-½ Σ
@@ -140,16 +140,16 @@ def correlated(
     return along(_drawn(nodes, like, seeds, purpose), *maps)
 
 
-def grainy(
+def grainy_noise(
     like: Float[Tensor, "b 1 z y x"], widths: Sequence[float], seeds: Sequence[int], purpose: str
 ) -> Float[Tensor, "b 1 z y x"]:
-    """Return standard normal numbers, smoothed by a Gaussian of deviations `widths` (voxels): `correlated` by √2
+    """Return standard normal numbers, smoothed by a Gaussian of deviations `widths` (voxels): `correlated_field` by √2
     widths."""
     if not any(widths):
-        return white(like, seeds, purpose)
+        return white_noise(like, seeds, purpose)
     maps = [gaussian(n, width, like) for n, width in zip(like.shape[2:], widths, strict=True)]
     units = [None if weights is None else weights / weights.square().sum(-1, keepdim=True).sqrt() for weights in maps]
-    return along(white(like, seeds, purpose), *units)
+    return along(white_noise(like, seeds, purpose), *units)
 
 
 def uniform(count: int, seed: int, purpose: str, like: Tensor) -> Tensor:

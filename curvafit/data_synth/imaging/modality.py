@@ -312,7 +312,7 @@ class Modality:
         for name, (low, high) in self.ranges.items():
             key = tuple(name.encode())
             share = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key)).random()
-            drawn[name] = _between(low, high, share)
+            drawn[name] = _interpolate(low, high, share)
         return self.base.assign(drawn)
 
     def as_dict(self) -> dict[str, Any]:
@@ -328,7 +328,7 @@ class Modality:
         return Modality(content["name"], content["about"], content["voxel"], base, content["ranges"])
 
 
-def _between(low: Any, high: Any, share: float) -> Any:
+def _interpolate(low: Any, high: Any, share: float) -> Any:
     a, b = np.asarray(low, dtype=float), np.asarray(high, dtype=float)
     positive = bool(np.all(a > 0) and np.all(b > 0))
     value = np.exp(np.log(a) + share * (np.log(b) - np.log(a))) if positive else a + share * (b - a)
