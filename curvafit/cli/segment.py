@@ -24,8 +24,8 @@ from curvafit.cli.options import (
 
 if TYPE_CHECKING:
     from curvafit.core.runtime import Progress
+    from curvafit.core.workers import Workers
     from curvafit.segmentation.result import Segmentation
-    from curvafit.segmentation.tiles import Workers
     from curvafit.volumes.boxes import Boxes
     from curvafit.volumes.field import Field
 

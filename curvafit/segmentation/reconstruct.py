@@ -15,6 +15,7 @@ import torch
 
 from curvafit.core.checks import SEEDS, check_float, check_int
 from curvafit.core.runtime import Progress, part, silent
+from curvafit.core.workers import Workers
 from curvafit.generation import data
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
@@ -24,7 +25,7 @@ from curvafit.segmentation.engine import STEPS, LawLike, WorkingGrid, drawn_laws
 from curvafit.segmentation.examples import Example, grown, slices_of, within
 from curvafit.segmentation.result import Segmentation, Uncertainty, ending, filled, result_of
 from curvafit.segmentation.slices import WAYS, Slices, check_spacing, labels
-from curvafit.segmentation.tiles import Tiling, Workers, lowered
+from curvafit.segmentation.tiles import Tiling, lowered
 from curvafit.segmentation.trials import ODDS, Choice, Setting, Task, choice, left_out, plainest
 from curvafit.segmentation.uncertainty import RUNS, Chances, chances, entropy, suggestions
 from curvafit.volumes.boxes import digest_of

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from curvafit.core.checks import SEEDS, check_float, check_int, quoted
 from curvafit.core.runtime import Progress, part, silent
+from curvafit.core.workers import Workers
 from curvafit.generation.data import Evidence
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.engine import BENDING, HALO, STEPS, LawLike, WorkingGrid, bending, laws_of, likelihood
@@ -21,7 +22,7 @@ from curvafit.segmentation.evidence import VoxelEvidence, of_probability
 from curvafit.segmentation.result import Segmentation, ending, filled, result_of
 from curvafit.segmentation.segment import TRIALS, WEIGHTS, WILLMORE
 from curvafit.segmentation.slices import check_place, check_spacing, labels
-from curvafit.segmentation.tiles import Tiling, Workers, lowered
+from curvafit.segmentation.tiles import Tiling, lowered
 from curvafit.segmentation.trials import Choice, Setting, Task, choice, densest
 from curvafit.volumes.boxes import digest_of
 from curvafit.volumes.field import Field, ScanError

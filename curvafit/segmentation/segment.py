@@ -11,12 +11,13 @@ import numpy as np
 
 from curvafit.core.checks import check_float
 from curvafit.core.runtime import Progress, part, silent
+from curvafit.core.workers import Workers
 from curvafit.generation.data import Evidence
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.engine import BENDING, STEPS, LawLike, WorkingGrid, bending, laws_of, likelihood, started
 from curvafit.segmentation.evidence import Classes, VoxelEvidence, bounds_of, classes_of, grey_levels, of_classes
 from curvafit.segmentation.result import Segmentation, ending, filled, result_of
-from curvafit.segmentation.tiles import Tiling, Workers, lowered
+from curvafit.segmentation.tiles import Tiling, lowered
 from curvafit.segmentation.trials import Weighing, busiest, weighing
 from curvafit.volumes.boxes import Boxes, boxes_of, subsample, value_range
 from curvafit.volumes.field import ScanError

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -19,10 +19,12 @@ from filelock import FileLock, Timeout
 from curvafit.core.checks import check_int
 from curvafit.core.files import write_content
 from curvafit.core.runtime import Progress, part, silent
+from curvafit.core.workers import Workers
 from curvafit.generation.checkpoint import identity
 from curvafit.generation.data import Data
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import MOST
+from curvafit.priors.kernels.threads import one_thread
 from curvafit.segmentation.engine import HALO, Ends, WorkingGrid, completed
 from curvafit.volumes.field import Field
 from curvafit.volumes.formats.part import Box
@@ -38,7 +40,6 @@ __all__ = [
     "Problem",
     "Tile",
     "Tiling",
-    "Workers",
     "folder_store",
     "lowered",
 ]
@@ -323,23 +324,6 @@ class Lowered:
     steps: int
 
 
-class Workers(Protocol):
-    """Whoever lowers tiles, several at once: `curvafit.core.workers`."""
-
-    @property
-    def places(self) -> int:
-        """Return how many tiles may be asked for at once."""
-        ...
-
-    def submit(self, make: Callable[[Path, Sequence[int]], list[Any]], path: Path, indices: Sequence[int]) -> None:
-        """Ask for tiles by their numbers."""
-        ...
-
-    def done(self) -> list[Any]:
-        """Wait for some of what was asked for, and return the pieces."""
-        ...
-
-
 def lowered(
     problem: Problem,
     tiling: Tiling,
@@ -398,9 +382,10 @@ def _by(workers: Workers, problem: Problem, tiling: Tiling, tiles: Sequence[Tile
 
 
 def _pieces(problem: Problem, tiling: Tiling, _: Path, numbers: Sequence[int]) -> list[Piece]:
-    """Lower tiles by their numbers, as workers do."""
+    """Lower tiles by their numbers, as workers do, each on one thread: the workers share the cores."""
     tiles = tiling.tiles
-    return [_piece(problem, tiling, tiles[number], silent) for number in numbers]
+    with one_thread():
+        return [_piece(problem, tiling, tiles[number], silent) for number in numbers]
 
 
 def _piece(problem: Problem, tiling: Tiling, tile: Tile, progress: Progress) -> Piece:
