@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from curvafit.core.runtime import Progress, silent
-from curvafit.core.workers import Here, Workers
+from curvafit.core.workers import ThisProcess, Workers
 from curvafit.data_synth.atlas import versions
 from curvafit.data_synth.store import Store, open_store
 from curvafit.generation.viability import well_formed
@@ -74,7 +74,7 @@ def describe(
     names = [store.name for store in sources]
     if len(set(names)) < len(names):
         raise ValueError(f"expected stores with names of their own, got {', '.join(names)}")
-    path, crew = Path(out), workers or Here()
+    path, crew = Path(out), workers or ThisProcess()
     rows = _Rows(load_table(path) if path.exists() and not overwrite else None, sources, command)
     jobs = [job for store in sources for job in _jobs(store, views, rows)]
     if not jobs and not rows.shapes:
@@ -86,7 +86,7 @@ def describe(
                 store, index, missing = job
                 crew.submit(partial(measure, views=missing), store.path, [index])
                 pending += 1
-            for shape in crew.done():
+            for shape in crew.collect():
                 rows.add(shape)
                 count, pending = count + 1, pending - 1
                 progress(f"measured {count} of {len(jobs)} shapes", count / len(jobs))

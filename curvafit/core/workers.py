@@ -48,12 +48,12 @@ class Workers(Protocol):
         """Ask for some parts of a folder."""
         ...
 
-    def done(self) -> list[Any]:
+    def collect(self) -> list[Any]:
         """Wait for one of the requests, and return its results."""
         ...
 
 
-class Here:
+class ThisProcess:
     """This process, as the only worker."""
 
     places: int = 1
@@ -64,7 +64,7 @@ class Here:
     def submit(self, make: Make, path: Path, indices: Sequence[int]) -> None:
         self._requests.append((make, path, indices))
 
-    def done(self) -> list[Any]:
+    def collect(self) -> list[Any]:
         make, path, indices = self._requests.pop(0)
         return make(path, indices)
 
@@ -91,7 +91,7 @@ class Cluster:
     def submit(self, make: Make, path: Path, indices: Sequence[int]) -> None:
         self._futures.add(self._client.submit(make, path.resolve(), list(indices), pure=False))
 
-    def done(self) -> list[Any]:
+    def collect(self) -> list[Any]:
         from distributed import KilledWorker
 
         first = next(self._futures)
@@ -138,7 +138,7 @@ def cluster(count: int | None = None, scheduler: str | None = None, dashboard: i
     """
     check_workers(count, scheduler)
     if count == 0 and scheduler is None:
-        yield Here()
+        yield ThisProcess()
         return
     distributed, settings = _dask("distributed"), _dask("dask.config")
     if scheduler is not None:

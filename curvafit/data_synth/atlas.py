@@ -19,7 +19,7 @@ from llvmlite import binding
 
 from curvafit.core.checks import check_int, check_type, seed_of
 from curvafit.core.runtime import Progress, silent
-from curvafit.core.workers import Here, Workers
+from curvafit.core.workers import ThisProcess, Workers
 from curvafit.data_synth.design import Design, Draw, boxed
 from curvafit.data_synth.store import Record, Settings, Store, open_store
 from curvafit.generation.flow import WORKING_BLUR, generate
@@ -82,7 +82,7 @@ def build(
     if workers is None:
         check_memory(Grid(shape).shape, FLOW, "a shape")  # type: ignore[arg-type]
     settings = settings_of(shape, seed, schedule, design)
-    return _fill(open_store(store_path, settings), count, workers or Here(), progress)
+    return _fill(open_store(store_path, settings), count, workers or ThisProcess(), progress)
 
 
 def extend(store_path: str | Path, count: int, progress: Progress = silent, *, workers: Workers | None = None) -> Store:
@@ -92,7 +92,7 @@ def extend(store_path: str | Path, count: int, progress: Progress = silent, *, w
     """
     check_count(count, 0)
     store = open_store(store_path)
-    return _fill(store, store.wanted + count, workers or Here(), progress)
+    return _fill(store, store.wanted + count, workers or ThisProcess(), progress)
 
 
 def check_count(count: int, least: int) -> None:
@@ -123,7 +123,7 @@ def _fill(store: Store, count: int, workers: Workers, progress: Progress) -> Sto
         while pending < min(workers.places, count - total):
             workers.submit(make_draws, store.path, [next(todo)])
             pending += 1
-        for record in workers.done():
+        for record in workers.collect():
             pending -= 1
             viable[record.index] = record.viability.viable
             progress(f"{sum(viable.values())} viable of {len(viable)} draws", sum(viable.values()) / count)
@@ -246,7 +246,7 @@ def summarise(store: Store) -> dict[str, str]:
     """Return the facts about a store, in words, by name."""
     records = [store.record(index) for index in store.indices()]
     settings, viable = store.settings, sum(record.viability.viable for record in records)
-    makers = Counter(", ".join(f"{name} {version}" for name, version in each.versions.items()) for each in records)
+    makers = Counter(", ".join(f"{name} {version}" for name, version in record.versions.items()) for record in records)
     return {
         "shapes": str(viable),
         "wanted": str(store.wanted),

@@ -20,7 +20,7 @@ from curvafit.core.checks import as_tuple, check_choice, check_int, check_type
 from curvafit.core.files import remove, write_content
 from curvafit.core.records import Format, parse_json
 from curvafit.core.runtime import Progress, silent, undisturbed
-from curvafit.core.workers import Here, Workers
+from curvafit.core.workers import ThisProcess, Workers
 from curvafit.data_synth.atlas import versions
 from curvafit.data_synth.case import Case, Recipe
 from curvafit.data_synth.centreline import centreline, write_graphml
@@ -115,7 +115,7 @@ def build_set(
     count = check_int(count, "a count of at least 1 case", 1, MOST)
     folder = Path(folder)
     with _begin(folder, spec):
-        return _fill(folder, spec, count, progress, workers or Here())
+        return _fill(folder, spec, count, progress, workers or ThisProcess())
 
 
 def _fill(folder: Path, spec: SetSpec, count: int, progress: Progress, workers: Workers) -> Path:
@@ -129,7 +129,7 @@ def _fill(folder: Path, spec: SetSpec, count: int, progress: Progress, workers: 
                 pending += 1
             if not pending:
                 return folder
-            cases |= set(workers.done())
+            cases |= set(workers.collect())
             pending -= 1
             progress(f"{min(len(cases), count)} of {count} cases", min(len(cases), count) / count)
             if time.monotonic() > listed + LISTED_EVERY:

@@ -376,7 +376,7 @@ def _by(workers: Workers, problem: Problem, tiling: Tiling, tiles: Sequence[Tile
         while waiting and asked < workers.places:
             workers.submit(partial(_pieces, problem, tiling), Path(), [waiting.pop(0).number])
             asked += 1
-        pieces = workers.done()
+        pieces = workers.collect()
         asked -= len(pieces)
         yield from pieces
 

@@ -64,7 +64,7 @@ class Threads:
         self.numbers.extend(indices)
         self._asked.append(self._pool.submit(make, path, indices))
 
-    def done(self) -> list[Any]:
+    def collect(self) -> list[Any]:
         return self._asked.pop(-1).result()  # the last first: the order must not matter
 
 

@@ -353,7 +353,7 @@ def rician(
     widths = as_triple(width, "a width of noise")
     if not deviation:
         return image.abs()
-    real, imaginary = (grainy_noise(image, widths, seeds, f"{each} channel") for each in ("real", "imaginary"))
+    real, imaginary = (grainy_noise(image, widths, seeds, f"{part} channel") for part in ("real", "imaginary"))
     return torch.hypot(image + deviation * real, deviation * imaginary)
 
 

@@ -168,7 +168,7 @@ def _measure_structure(values: np.ndarray, inside: np.ndarray, steps: np.ndarray
     inside."""
     finest = steps.min() / steps
     window = tuple(WINDOW * finest)
-    signal, mask = (torch.from_numpy(each)[None, None].float() for each in (values - level, inside))
+    signal, mask = (torch.from_numpy(volume)[None, None].float() for volume in (values - level, inside))
     near = blur(mask, 1.0, tuple(2 * finest)) > 0.02
 
     def brightness(blurred: torch.Tensor) -> torch.Tensor:
@@ -199,9 +199,7 @@ def _measure_texture(relative: np.ndarray, inside: np.ndarray, steps: np.ndarray
     rest = (logs - logs[bright_part].mean()) * weight
     first, second = (covariance(rest, weight, axis) for axis in (1, 2))
     covariances = np.concatenate([first, second])
-    lags = np.concatenate(
-        [np.arange(len(each)) * h / steps.min() for each, h in ((first, steps[1]), (second, steps[2]))]
-    )
+    lags = np.concatenate([np.arange(len(first)) * steps[1], np.arange(len(second)) * steps[2]]) / steps.min()
     share = covariances / max(covariances[0], 1e-12)
     misfit = [np.square(share - np.exp(-0.5 * (lags / length) ** 2)).sum() for length in BRIGHTNESS_LENGTHS]
     width = float(BRIGHTNESS_LENGTHS[int(np.argmin(misfit))])
@@ -211,7 +209,7 @@ def _measure_texture(relative: np.ndarray, inside: np.ndarray, steps: np.ndarray
 
 def _spread(value: Any, low: float, high: float) -> tuple[Any, Any]:
     if isinstance(value, tuple):
-        return tuple(low * each for each in value), tuple(high * each for each in value)
+        return tuple(low * part for part in value), tuple(high * part for part in value)
     return low * value, high * value
 
 

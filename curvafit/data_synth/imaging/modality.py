@@ -46,7 +46,7 @@ class Checked:
 def _ranges(part: type) -> dict[str, tuple[Any, Range]]:
     """Return the kind and the range of each parameter of a part."""
     hints = {name: get_args(hint) for name, hint in get_type_hints(part, include_extras=True).items()}
-    return {name: (each[0], each[1]) for name, each in hints.items() if len(each) == 2 and isinstance(each[1], Range)}
+    return {name: (hint[0], hint[1]) for name, hint in hints.items() if len(hint) == 2 and isinstance(hint[1], Range)}
 
 
 def _number(name: str, value: Any, kind: Any, allowed: Range) -> Any:
