@@ -202,7 +202,8 @@ def _interval(name: str, value: Any) -> tuple[float, float]:
     pair = [value, value] if isinstance(value, Real) else value
     if not isinstance(pair, (list, tuple)) or len(pair) != 2 or not all(_is_number(end) for end in pair):
         raise ValueError(f"{name} must be a number or two of them, got {quoted(value)}")
-    return float(pair[0]), float(pair[1])
+    low, high = (check_float(end, f"{name} as finite numbers", of=value) for end in pair)
+    return low, high
 
 
 def _is_number(value: Any) -> bool:
@@ -289,8 +290,8 @@ def _kind(content: Any) -> str:
 
 
 def _number(value: Any) -> Any:
-    """Return the value, but for numbers that YAML takes for text, such as 1e3."""
-    if isinstance(value, list):
+    """Return the value or the interval, but for numbers that YAML takes for text, such as 1e3."""
+    if isinstance(value, list) and len(value) == 2 and not any(isinstance(end, list) for end in value):
         return [_number(end) for end in value]
     try:
         return float(value) if isinstance(value, str) else value
