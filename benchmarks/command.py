@@ -58,10 +58,10 @@ end(begun, gradient.numpy())
     "infer": """
 import subprocess, sys
 from curvafit import infer
-samples = [sys.executable, "-m", "curvafit", "samples", "get", "synthetic", "-o", "scan.tif"]
+samples = [sys.executable, "-m", "curvafit", "samples", "get", "synthetic", "-o", "scan.nii.gz"]
 subprocess.run(samples, check=True, stdout=subprocess.DEVNULL)
 begun = time.perf_counter()
-fit = infer("scan.tif", seed=0).fit
+fit = infer("scan.nii.gz", seed=0).fit
 end(begun, np.array([*fit.coefficients, fit.mass] if fit.coefficients else []))
 """,
 }
