@@ -225,7 +225,10 @@ def _recorded(topic: str) -> dict[str, Any]:
 
 
 def _listed(head: str, claims: list[Claim]) -> str:
+    """Return a table of claims; a command that all share stands below it."""
     rows = [[claim.says, claim.text, claim.call] for claim in claims if claim.figure is not None]
+    if len({row[2] for row in rows}) == 1:
+        return markdown([head, "figure"], [row[:2] for row in rows]) + f"\n\n*{rows[0][2]}.*"
     return markdown([head, "figure", "command"], rows) if rows else ""
 
 

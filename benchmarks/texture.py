@@ -51,15 +51,11 @@ def author_field(name: str) -> torch.Tensor:
     return torch.from_numpy(load(author_volumes()[name]).values.astype(np.float32))
 
 
-def is_floored(u: torch.Tensor) -> bool:
-    """Whether a volume is rounded to 1/100."""
-    return bool((100 * u - (100 * u).round()).abs().max() < 1e-3)
-
-
 def field_of(name: str, schedule: str, seed: int, edge: int) -> torch.Tensor:
+    """Return a grown field, rounded down to 1/100 where the author's is."""
     u = generate(name, grid=Grid((edge,) * 3), schedule=schedule, seed=seed).field
-    floored = edge == EDGE and name in author_volumes() and is_floored(author_field(name))
-    return torch.floor(100 * u) / 100 if floored else u
+    hundred = 100 * author_field(name) if edge == EDGE and name in author_volumes() else u
+    return torch.floor(100 * u) / 100 if bool((hundred - hundred.round()).abs().max() < 1e-3) else u
 
 
 def diagram_of(name: str, schedule: str, seed: int, edge: int, cases: Cases) -> Diagram:

@@ -3,8 +3,8 @@
 The shape is a generated one of 64³ that is repeated along each axis (it is periodic) and cut at the edge, every 8th
 slice known, the law the true one, not tried out.
 
-- `--what overlap`: a core of 32³ voxels, lowered in a tile cut on all six sides at some distance, against the same core
-  of a volume of 88³ that is lowered whole: 1 - Dice in the core, by the distance.
+- `--what overlap`: a core of 32³ voxels, interpolated and lowered in a part cut on all six sides at some distance,
+  against the same core of a volume of 88³ that is lowered whole: 1 - Dice in the core, by the distance.
 - `--what time`: `curvafit reconstruct` in a process of its own, from an NPY file to a Zarr store: seconds, and peak
   memory of the process and of its largest worker in GB.
 """
@@ -90,4 +90,4 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     if options.what != "overlap":
         return {}
     parts = {name: name.split("-") for name in found}
-    return {f"tiles.{distance}.{law}": Figure(found[name]["1 - Dice"]) for name, (_, law, distance) in parts.items()}
+    return {f"margin.{distance}.{law}": Figure(found[name]["1 - Dice"]) for name, (_, law, distance) in parts.items()}
