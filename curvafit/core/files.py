@@ -104,9 +104,9 @@ def check_folder(path: str | Path) -> Path:
     folder = Path(path)
     nearest = next(place for place in (folder, *folder.absolute().parents) if place.exists())
     if not nearest.is_dir():
-        raise ValueError(f"expected a folder to write to, got {folder}, where {nearest} is a file")
+        raise ValueError(f"cannot write to the folder {folder}: {nearest} is a file")
     if not os.access(nearest, os.W_OK | os.X_OK) or not _takes_files(nearest):
-        raise ValueError(f"expected a folder that can be written to, got {nearest}")
+        raise ValueError(f"the folder {nearest} cannot be written to")
     return folder
 
 

@@ -137,7 +137,7 @@ class Format:
         source = Path(source) if isinstance(source, str) else source
         place = place or str(source)
         if isinstance(source, Path) and not source.exists():
-            raise FileNotFoundError(f"{place} is not there: expected {self.title}")
+            raise FileNotFoundError(f"{self.title} is missing: there is no {place}")
         try:
             header, arrays = _read(source)
         except (OSError, *_FAULTS) as error:
@@ -225,12 +225,12 @@ def can_write(
         for source in sources:
             _check_apart(place, source)
         if place.exists() and not (place.is_file() or place.is_dir()):
-            raise ValueError(f"expected the name of a file or a folder to write, got the device or pipe {place}")
+            raise ValueError(f"{place} is a device or a pipe: give the name of a file")
         if (place.exists() or place.is_symlink()) and not (overwrite or replaceable(place)):
             what = "folder" if place.is_dir() else "file"
             raise ValueError(
-                f"expected a name that is free, got {place}, a {what} that this command did not write: choose another "
-                "name (or replace it with --overwrite; in Python, overwrite=True)"
+                f"the name {place} is not free, a {what} that this command did not write is there: choose another "
+                "name, or replace it with --overwrite (in Python, overwrite=True)"
             )
     return target
 
@@ -247,7 +247,7 @@ def _check_apart(target: Path, source: Path) -> None:
     read, place = source.resolve(), target.resolve()
     same = target.exists() and target.samefile(source)
     if same or place.is_relative_to(read) or read.is_relative_to(place):
-        raise ValueError(f"expected an output that writes over no input, got {target}, where {source} is read")
+        raise ValueError(f"the output {target} would write over the input {source}")
 
 
 def has_mark(path: Path, mark: str) -> bool:
@@ -322,7 +322,7 @@ def read_archive(source: Path | IO[bytes]) -> dict[str, np.ndarray]:
     except (OSError, ValueError):
         raise
     except Exception as reason:  # zipfile, zlib and numpy have a dozen ways to say so
-        raise ValueError(f"expected a whole NPZ file, got one that cannot be read ({quoted(str(reason))})") from reason
+        raise ValueError(f"the NPZ file cannot be read ({quoted(str(reason))})") from reason
 
 
 def _member(archive: zipfile.ZipFile, name: str) -> np.ndarray:

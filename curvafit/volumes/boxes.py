@@ -94,19 +94,13 @@ def read_whole(boxes: Boxes) -> Field:
 
 
 def value_range(boxes: Boxes) -> tuple[float, float]:
-    """Return the least and the greatest value.
-
-    Raises
-    ------
-    ScanError
-        If a value is not finite.
-    """
+    """Return the least and the greatest value."""
     lowest, highest, faults = np.inf, -np.inf, 0
     for values in _slabs(boxes):
         faults += np.count_nonzero(~np.isfinite(values)) if values.dtype.kind == "f" else 0
         lowest, highest = min(lowest, float(values.min())), max(highest, float(values.max()))
     if faults:
-        raise ScanError(f"expected finite values, got {faults} that are not")
+        raise ScanError(f"a volume must be finite, got {faults} values that are not")
     return lowest, highest
 
 
@@ -208,7 +202,7 @@ def _stored(path: Path, key: str | None, options: dict[str, Any]) -> _Stored:
     channel = options.get("channel")
     corner, shape = _read(path, reading, Part(channel, _CORNER, some=options["crop"] is None))
     if options.get("strict") and corner.gaps:
-        raise ScanError(f"expected a whole volume, got {path}: {corner.gaps[0]}")
+        raise ScanError(f"{path} is not whole: {corner.gaps[0]}")
     box = resolve_box(parse_box(options["crop"]), shape, path)
     first, size = [edge.start for edge in box], [edge.stop - edge.start for edge in box]
     check_array(size, corner.values.dtype, path)  # a mask is written from memory

@@ -53,9 +53,9 @@ class Field(Pictured):
 
     def __post_init__(self) -> None:
         if np.ndim(self.values) != 3:
-            raise ScanError(f"expected a 3D volume, got an array of shape {np.shape(self.values)}")
+            raise ScanError(f"a volume must be 3D, got an array of shape {np.shape(self.values)}")
         if (kind := np.asarray(self.values).dtype).kind not in "biuf":
-            raise ScanError(f"expected real numbers, got values of type {kind}")
+            raise ScanError(f"a volume must hold real numbers, got values of type {kind}")
         spacing = positive_triple(self.spacing)
         unit, factor = parse_unit(self.unit)
         object.__setattr__(self, "values", np.asarray(self.values))
@@ -64,7 +64,7 @@ class Field(Pictured):
         if self.affine is not None:
             affine = np.array(self.affine, dtype=np.float64)
             if affine.shape != (4, 4):
-                raise ScanError(f"expected an affine of shape (4, 4), got {affine.shape}")
+                raise ScanError(f"an affine must have the shape (4, 4), got {affine.shape}")
             affine[:3] *= factor
             object.__setattr__(self, "affine", affine)
 
@@ -110,8 +110,8 @@ class Field(Pictured):
         if mask.all() or not mask.any():
             values = np.unique(self.values)
             listed = ", ".join(f"{float(value):g}" for value in values[:12]) + (", …" if len(values) > 12 else "")
-            expected = "beside others" if mask.any() else "of the scan"
-            raise ScanError(f"expected a label {expected} ({listed}), got {label}")
+            fault = "is the only label" if mask.any() else "is no label"
+            raise ScanError(f"label {label} {fault} of the scan, which has {listed}")
         return replace(self, values=mask, notes=(*self.notes, f"The structure is label {label}."))
 
     def moved(self, start: Sequence[int]) -> Field:
@@ -135,5 +135,5 @@ def positive_triple(spacing: object) -> tuple[float, float, float]:
     except (TypeError, ValueError, OverflowError):
         triple = ()
     if len(triple) != 3 or any(not math.isfinite(h) or h <= 0 for h in triple):
-        raise ScanError(f"expected a spacing of 3 positive numbers (z, y, x), got {quoted(spacing)}")
+        raise ScanError(f"spacing must be 3 positive numbers (z, y, x), got {quoted(spacing)}")
     return triple  # type: ignore[return-value]

@@ -39,20 +39,20 @@ def read_maps(path: str | Path, shape: tuple[int, int, int] | None = None) -> di
     """
     place = Path(path)
     if not place.exists():
-        raise FileNotFoundError(f"expected a file or folder of maps, got no such file: {place}")
+        raise FileNotFoundError(f"no such file or folder of maps: {place}")
     arrays = _from_folder(place) if place.is_dir() else _from_npz(place)
     unknown = sorted(arrays.keys() - set(PARAMETERS))
     if unknown or not arrays:
         listed = ", ".join(unknown) or "none"
-        raise ValueError(f"expected maps named {', '.join(PARAMETERS)}, got {listed} in {place}")
+        raise ValueError(f"maps must be named {', '.join(PARAMETERS)}, got {listed} in {place}")
     for name, values in arrays.items():
         numbers = values.dtype.kind in "iuf"
         if not numbers or not np.isfinite(values).all() or np.abs(values).max(initial=0) > np.finfo(np.float32).max:
-            raise ValueError(f"expected finite numbers in the map {name}, got others in {place}")
+            raise ValueError(f"the map {name} must hold finite numbers, got others in {place}")
         if values.size > 1:
             shape = shape or values.shape  # type: ignore[assignment]
             if values.shape != shape or len(values.shape) != 3:
-                raise ValueError(f"expected the map {name} of shape {shape}, got {values.shape} in {place}")
+                raise ValueError(f"the map {name} must have the shape {shape}, got {values.shape} in {place}")
     return {
         name: float(values.reshape(())) if values.size == 1 else torch.from_numpy(values.astype(np.float32))
         for name, values in arrays.items()
@@ -69,7 +69,7 @@ def _from_npz(path: Path) -> dict[str, np.ndarray]:
     try:
         return read_archive(path)
     except (ValueError, OSError) as reason:
-        raise ValueError(f"expected an NPZ file or a folder of maps, got {path} that is neither") from reason
+        raise ValueError(f"{path} is neither an NPZ file nor a folder of maps") from reason
 
 
 def _from_folder(path: Path) -> dict[str, np.ndarray]:
@@ -79,6 +79,6 @@ def _from_folder(path: Path) -> dict[str, np.ndarray]:
     for file in files:
         name = file.name.split(".")[0]
         if name in arrays:
-            raise ScanError(f"expected one map {name}, got two in {path}")
+            raise ScanError(f"{path} holds two maps {name}")
         arrays[name] = read_values(file) if name in PARAMETERS else np.empty(0)
     return arrays

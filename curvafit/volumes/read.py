@@ -106,7 +106,7 @@ def load(
     read = read_file(location, key, raw_shape, dtype, None if part.whole else part)
     raw, start = take_part(read, part, location)
     if strict and raw.gaps:
-        raise ScanError(f"expected a whole volume, got {location}: {raw.gaps[0]}")
+        raise ScanError(f"{location} is not whole: {raw.gaps[0]}")
     _check_values(raw.values, location)
     field = to_field(raw, f"{location}::{key}" if key else str(location), spacing, unit)
     return _part(field if part.crop is None else field.moved(start), label)
@@ -157,19 +157,11 @@ def _field_of(source: Any, spacing: Sequence[float] | float | None, unit: str | 
         _refuse(reading, "the path of a file", "an array")
         values = _array(source)
         return Field(values, positive_triple(1.0 if spacing is None else spacing), "voxel" if unit is None else unit)
-    raise ScanError(f"expected a volume as the path of a file, a Field, an array or a tensor, got {quoted(source)}")
+    raise ScanError(f"a volume must be the path of a file, a Field, an array or a tensor, got {quoted(source)}")
 
 
 def place_of(path: str | os.PathLike[str]) -> Field:
-    """Return the content of a volume file for its place: spacing, unit and affine; its values are not checked.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ScanError
-        If the suffix is unknown, the file is damaged, or the volume is not 3D.
-    """
+    """Return the content of a volume file for its place: spacing, unit and affine; its values are not checked."""
     location, key = split_key(path, None)
     raw, _ = take_part(read_file(location, key), Part(), location)
     return to_field(raw, str(location), None, None)
@@ -179,13 +171,6 @@ def read_values(path: str | os.PathLike[str]) -> np.ndarray:
     """Return the array in a volume file, z first, without axes of length one before the last three.
 
     Values are not checked; a warning tells of parts that are not stored.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ScanError
-        If the suffix is unknown or the file damaged.
     """
     raw = read_file(Path(path))
     values = raw.values
@@ -206,31 +191,17 @@ def read_file(
     """Return the content of a file or a folder, by the reader that `pick_reader` chooses.
 
     From some formats only the part is read: see `Raw.whole`.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ScanError
-        If the path is neither a file nor a folder, the suffix is unknown, the file is damaged, or a key is given for a
-        format without keys.
     """
     if not path.exists():
-        raise FileNotFoundError(one_line(f"expected a volume file, got no such file: {path}"))
+        raise FileNotFoundError(one_line(f"no such file: {path}"))
     reader = pick_reader(check_regular(path), raw_shape is not None)
     if key is not None and reader not in KEYED:
-        raise ScanError(f"expected a key only for NPZ, HDF5, Zarr and DICOM, got {quoted(key)} for {path}")
+        raise ScanError(f"a key applies to NPZ, HDF5, Zarr and DICOM only, got {quoted(key)} for {path}")
     return _guarded(reader, path, key=key, raw_shape=raw_shape, dtype=dtype, part=part)
 
 
 def pick_reader(path: Path, shape_given: bool = False) -> Callable[..., Raw]:
-    """Return the reader of a file by its suffix, or of a folder by its content.
-
-    Raises
-    ------
-    ScanError
-        If the suffix is unknown and the caller gives no shape of a RAW file, or the folder holds no slices.
-    """
+    """Return the reader of a file by its suffix, or of a folder by its content."""
     if path.is_dir():
         return _pick_folder(path)
     for suffix in sorted(READERS, key=len, reverse=True):
@@ -238,7 +209,7 @@ def pick_reader(path: Path, shape_given: bool = False) -> Callable[..., Raw]:
             return READERS[suffix]
     if shape_given:
         return read_raw
-    raise ScanError(f"expected a file ending in one of {', '.join(READERS)}, got {path.name!r}")
+    raise ScanError(f"a volume's name must end in one of {', '.join(READERS)}, got {path.name!r}")
 
 
 def _part(field: Field, label: int | None, crop: Crop | None = None) -> Field:
@@ -251,7 +222,7 @@ def _refuse(options: dict[str, Any], expected: str, got: str) -> None:
     """Raise ScanError where an option would have no effect."""
     idle = next((name for name, value in options.items() if value is not None and value is not False), None)
     if idle is not None:
-        raise ScanError(f"expected {idle} only with {expected}, got it with {got}")
+        raise ScanError(f"{idle} applies to {expected} only, got it with {got}")
 
 
 def _array(source: np.ndarray | torch.Tensor) -> np.ndarray:
@@ -260,7 +231,7 @@ def _array(source: np.ndarray | torch.Tensor) -> np.ndarray:
         tensor = source.detach().cpu()
         source = (tensor.float() if tensor.dtype == torch.bfloat16 else tensor).numpy()
     if source.dtype.kind not in "biuf":
-        raise ScanError(f"expected numbers, got an array of type {source.dtype}")
+        raise ScanError(f"a volume must hold real numbers, got an array of type {source.dtype}")
     if source.size:
         _check_finite(source, "an array")
     return source
@@ -277,10 +248,10 @@ def split_key(path: str | os.PathLike[str], key: str | None) -> tuple[Path, str 
 
 def _check_values(values: np.ndarray, path: Path) -> None:
     if values.size == 0:
-        raise ScanError(f"expected a 3D volume, got no values (shape {values.shape}) in {path}")
+        raise ScanError(f"a volume must be 3D, got no values (shape {values.shape}) in {path}")
     lowest, highest = _check_finite(values, path)
     if lowest == highest:
-        raise ScanError(f"expected a volume that varies, got {lowest} everywhere in {path}")
+        raise ScanError(f"every voxel of {path} is {lowest}: a volume must vary")
 
 
 def _check_finite(values: np.ndarray, place: object) -> tuple[float, float]:
@@ -289,7 +260,7 @@ def _check_finite(values: np.ndarray, place: object) -> tuple[float, float]:
     if values.dtype.kind == "f" and not (math.isfinite(lowest) and math.isfinite(highest)):
         what = "NaN" if math.isnan(lowest) else "infinite"
         count = np.count_nonzero(np.isnan(values) if what == "NaN" else np.isinf(values))
-        raise ScanError(f"expected finite values, got {count} that are {what} in {place}")
+        raise ScanError(f"a volume must be finite, got {count} values that are {what} in {place}")
     return lowest, highest
 
 
@@ -328,26 +299,20 @@ def _scaled(spacing: tuple[object, ...], factor: float) -> tuple[object, ...]:
 
 
 def _guarded(reader: Callable[..., Raw], path: Path, **options: object) -> Raw:
-    """Return what a reader returns, and turn a library's own exceptions into one sentence.
-
-    Raises
-    ------
-    ScanError
-        If the reader raises.
-    """
+    """Return what a reader returns, and turn a library's own exceptions into one sentence."""
     try:
         with collect_complaints():
             return reader(path, **options)
     except (ScanError, ImportError):  # a library that is not installed says so itself
         raise
     except MemoryError as reason:
-        raise ScanError(f"expected a volume that fits into memory, got {path}, which does not") from reason
+        raise ScanError(f"{path} does not fit into memory") from reason
     except (Damaged, ValueError) as reason:
         cause, text = reason, str(reason)
     except Exception as reason:  # every library has its own way to say that a file is damaged
         cause, text = reason, f"{type(reason).__name__}: {reason}"
     text = " ".join(text[:2000].split())[:200]
-    raise ScanError(f"expected a whole, readable file, got {path} that cannot be read ({text})") from cause
+    raise ScanError(f"{path} cannot be read, it is damaged or something else ({text})") from cause
 
 
 def _pick_folder(path: Path) -> Callable[..., Raw]:
@@ -358,4 +323,4 @@ def _pick_folder(path: Path) -> Callable[..., Raw]:
         return read_slices
     if any(p.is_file() and is_dicom(p) for p in inside):
         return read_dicom
-    raise ScanError(f"expected a folder of TIFF or DICOM slices or a Zarr store, got {path} with none")
+    raise ScanError(f"the folder {path} holds neither TIFF or DICOM slices nor a Zarr store")

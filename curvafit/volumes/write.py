@@ -85,16 +85,10 @@ def save(
 
 
 def pick_writer(path: Path, unit: str) -> Callable[[Any, Path], None]:
-    """Return the writer of a file by its suffix, if the format can hold lengths in `unit`.
-
-    Raises
-    ------
-    ScanError
-        If the suffix is unknown, the format needs a unit and there is none, or its library is not installed.
-    """
+    """Return the writer of a file by its suffix, if the format can hold lengths in `unit`."""
     suffix = next((known for known in WRITERS if path.name.lower().endswith(known)), None)
     if suffix is None:
-        raise ScanError(f"expected a name ending in one of {', '.join(WRITERS)}, got {path.name!r}")
+        raise ScanError(f"a volume's name must end in one of {', '.join(WRITERS)}, got {path.name!r}")
     if suffix == ".mrc":
         check_mrc(unit)
     return WRITERS[suffix]

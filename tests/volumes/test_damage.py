@@ -170,7 +170,7 @@ def test_links_in_circles_and_strange_names(tmp_path: Path) -> None:
     with pytest.raises(ScanError, match="link"):
         load(tmp_path / "scan.zarr")
     np.save(tmp_path / "two\nlines.npy", np.zeros((2, 2, 2)))
-    with pytest.raises(ScanError, match=r"two\\nlines.npy$"):
+    with pytest.raises(ScanError, match=r"two\\nlines.npy"):
         load(tmp_path / "two\nlines.npy")
     np.save(tmp_path / "a::b.npy", VALUES)
     assert np.array_equal(load(tmp_path / "a::b.npy").values, VALUES)

@@ -124,7 +124,7 @@ def test_what_a_format_cannot_hold_is_refused(tmp_path: Path) -> None:
         save(Field(ramp()), tmp_path / "scan.mrc")
     with pytest.raises(ScanError, match="int32"):
         save(Field(ramp(dtype="int32"), 1.0, "nm"), tmp_path / "scan.mrc")
-    with pytest.raises(ScanError, match="ending"):
+    with pytest.raises(ScanError, match="must end"):
         save(Field(ramp()), tmp_path / "scan.xyz")
     assert list(tmp_path.iterdir()) == []
 

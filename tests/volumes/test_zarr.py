@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zarr
+from calling import call
 
 from curvafit.volumes import Field, ScanError, load, save
 from curvafit.volumes.read import read_values
@@ -125,3 +126,17 @@ def test_what_is_saved_has_all_its_chunks(tmp_path: Path) -> None:
     mask = np.zeros((70, 70, 70), np.uint8)
     mask[:5] = 1
     assert load(save(Field(mask, 1.0, "um"), tmp_path / "mask.zarr"), strict=True).notes == ()
+
+
+def test_the_command_line_says_it_and_takes_strict(tmp_path: Path) -> None:
+    z, y, x = np.indices((24, 24, 24)) - 11.5
+    ball = np.where(z**2 + y**2 + x**2 < 60, 200, 20).astype(np.uint8)
+    ball[3, 3, 3] = 21
+    path = tmp_path / "scan.zarr"
+    zarr.create_array(path, data=ball, chunks=(12, 12, 12), fill_value=20, attributes={"spacing": 1.0, "unit": "um"})
+    (path / "c" / "0" / "0" / "0").unlink()
+    options = ("--prior", "tubes", "--steps", "1", "-o", tmp_path / "mask.npy")
+    result = call("segment", path, *options)
+    assert result.exit_code == 0 and "1 of 8 chunks are not stored" in result.output
+    result = call("segment", path, *options, "--strict")
+    assert result.exit_code == 2 and result.stdout == "" and "chunks" in result.stderr

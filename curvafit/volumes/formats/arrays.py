@@ -56,9 +56,9 @@ def read_hdf5(path: Path, *, key: str | None = None, part: Part | None = None, *
         file.visititems(lambda name, item: keys.append(name) if isinstance(item, h5py.Dataset) else None)
         dataset: Any = file[pick_key(keys, key, path)]
         if dataset.external:
-            raise ScanError(f"expected values in the file itself, got {path} whose values lie in other files")
+            raise ScanError(f"the values of {path} lie in other files, which are not read")
         if dataset.shape is None:
-            raise ScanError(f"expected a 3D volume, got no values in {path}")
+            raise ScanError(f"a volume must be 3D, got no values in {path}")
         attributes = {name: dataset.attrs[name] for name in _ATTRIBUTES if name in dataset.attrs}
         spacing, unit = spacing_of(attributes, dataset.ndim)
         gaps = tuple(_gaps(dataset, path))
@@ -92,20 +92,20 @@ def read_raw(
 ) -> Raw:
     """Read bare numbers, x fastest; shape and type come from the caller (one byte per voxel needs no type)."""
     if raw_shape is None:
-        raise ScanError(f"expected --raw-shape Z,Y,X for the bare numbers in {path}, got none")
+        raise ScanError(f"{path} holds bare numbers: give raw_shape (--raw-shape Z,Y,X)")
     shape = tuple(int(n) for n in raw_shape)
     size = path.stat().st_size
     if len(shape) != 3 or min(shape) < 1:
-        raise ScanError(f"expected a raw shape of 3 positive whole numbers (z, y, x), got {tuple(raw_shape)}")
+        raise ScanError(f"raw_shape must be 3 positive whole numbers (z, y, x), got {tuple(raw_shape)}")
     if dtype is None and size != math.prod(shape):
-        raise ScanError(f"expected --dtype for {path} ({size / math.prod(shape):.4g} bytes a voxel), got none")
+        raise ScanError(f"{path} has {size / math.prod(shape):.4g} bytes a voxel: give dtype (--dtype)")
     try:
         kind = np.dtype(dtype or "uint8")
     except TypeError:
-        raise ScanError(f"expected a dtype such as {_RAW_TYPES}, got {quoted(dtype)}") from None
+        raise ScanError(f"dtype must be one of {_RAW_TYPES}, got {quoted(dtype)}") from None
     if size != math.prod(shape) * kind.itemsize:
         nbytes = math.prod(shape) * kind.itemsize
-        raise ScanError(f"expected {nbytes} bytes for shape {shape} of {kind}, got {size} in {path}")
+        raise ScanError(f"shape {shape} of {kind} takes {nbytes} bytes, got {size} in {path}")
     if part is None:
         return Raw(np.fromfile(path, dtype=kind).reshape(shape))
     return read_part(mapped(path, 0, shape, kind), part, path)

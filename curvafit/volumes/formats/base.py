@@ -81,10 +81,10 @@ def pick_key(keys: list[str], key: str | None, path: object) -> str:
     if key is None:
         if len(keys) == 1:
             return keys[0]
-        raise ScanError(f"expected a key as in {path}::KEY, got none, and {path} has {listed or 'no arrays'}")
+        raise ScanError(f"{path} needs a key, as in {path}::KEY; it has {listed or 'no arrays'}")
     name = key if key in keys else key.strip("/")
     if name not in keys:
-        raise ScanError(f"expected a key of {path}, got {quoted(key)}, and it has {listed or 'no arrays'}")
+        raise ScanError(f"{path} has no key {quoted(key)}; it has {listed or 'no arrays'}")
     return name
 
 
@@ -109,27 +109,13 @@ def _listed(value: Any) -> tuple[Any, ...]:
 
 
 def read_numbers(stream: Any, shape: Sequence[int], dtype: np.dtype, place: object) -> np.ndarray:
-    """Return the array of a stream, as `records.read_numbers` does.
-
-    Raises
-    ------
-    ScanError
-        If the array does not fit into memory.
-    """
+    """Return the array of a stream, as `records.read_numbers` does."""
     check_array(shape, dtype, place)
     return records.read_numbers(stream, shape, dtype)
 
 
 def mapped(path: Path, start: int, shape: Sequence[int], dtype: np.dtype) -> np.ndarray:
-    """Return the array, last axis fastest, from a byte of a file to its end, mapped rather than read.
-
-    Raises
-    ------
-    ScanError
-        If the values are not numbers.
-    Damaged
-        If the file is shorter or longer.
-    """
+    """Return the array, last axis fastest, from a byte of a file to its end, mapped rather than read."""
     check_array([0], dtype, path)
     nbytes, size = math.prod(shape) * dtype.itemsize, path.stat().st_size - start
     if nbytes != size:
@@ -138,33 +124,20 @@ def mapped(path: Path, start: int, shape: Sequence[int], dtype: np.dtype) -> np.
 
 
 def check_array(shape: Sequence[int], dtype: np.dtype, place: object) -> None:
-    """Raise ScanError where the array of a header cannot be read, before memory is allocated.
-
-    Raises
-    ------
-    ScanError
-        If the type is one of objects or records, an axis is negative, or the array is larger than the machine's
-        memory.
-    """
+    """Raise ScanError where the array of a header cannot be read, before memory is allocated."""
     if dtype.kind in "OV":
-        raise ScanError(f"expected numbers, got values of type {str(dtype)[:80]} in {place}")
+        raise ScanError(f"a volume must hold numbers, got values of type {str(dtype)[:80]} in {place}")
     size = math.prod(int(n) for n in shape) * dtype.itemsize
     if min(shape, default=1) < 0:
-        raise ScanError(f"expected a shape of positive whole numbers, got {tuple(shape)} in {place}")
+        raise ScanError(f"a shape must be positive, got {tuple(shape)} in {place}")
     if size > memory():
-        raise ScanError(f"expected a volume that fits into memory, got {size:.3g} bytes by the header of {place}")
+        raise ScanError(f"{place} does not fit into memory: its header says {size:.3g} bytes")
 
 
 def check_regular(path: Path) -> Path:
-    """Return the path of a file or a folder, or raise ScanError: reading anything else may never end.
-
-    Raises
-    ------
-    ScanError
-        If the path is a pipe, a socket or a device.
-    """
+    """Return the path of a file or a folder, or raise ScanError: reading anything else may never end."""
     if path.exists() and not path.is_file() and not path.is_dir():
-        raise ScanError(f"expected a file or a folder, got {path}, which is neither")
+        raise ScanError(f"{path} is neither a file nor a folder")
     return path
 
 

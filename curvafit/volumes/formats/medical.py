@@ -168,12 +168,12 @@ def _meta_values(header: dict[str, str], shape: list[int], file: IO[bytes], path
     """
     kind = header.get("ElementType", "")
     if kind not in _META_TYPES:
-        raise ScanError(f"expected an element type among {', '.join(_META_TYPES)}, got {kind[:40]!r} in {path}")
+        raise ScanError(f"{path} has the element type {kind[:40]!r}, none of {', '.join(_META_TYPES)}")
     order = header.get("BinaryDataByteOrderMSB", header.get("ElementByteOrderMSB", "False"))
     dtype = np.dtype(_META_TYPES[kind]).newbyteorder(">" if _meta_truth(order) else "<")
     check_array(shape, dtype, path)
     if not _meta_truth(header.get("BinaryData", "True")):
-        raise ScanError(f"expected a MetaImage of binary values, got {path} with values in text")
+        raise ScanError(f"{path} holds values in text, which are not read: write it with binary values")
     nbytes, head = math.prod(shape) * dtype.itemsize, int(header.get("HeaderSize", 0))
     size = os.fstat(file.fileno()).st_size
     file.seek(max(0, size - nbytes) if head < 0 else file.tell() + head)
@@ -227,7 +227,7 @@ def check_mrc(unit: str) -> None:
     """Raise ScanError where `write_mrc` cannot write: lengths have no unit, or its library is missing."""
     require("mrcfile", "io", "reading and writing MRC files")
     if unit == "voxel":
-        raise ScanError("expected a unit of nm, um, mm or m for an MRC file, which holds voxel sizes in Å, got none")
+        raise ScanError("an MRC file holds voxel sizes in Å: give the unit, nm, um, mm or m")
 
 
 def write_mrc(field: Any, path: Path) -> None:
@@ -236,7 +236,7 @@ def write_mrc(field: Any, path: Path) -> None:
     kind = {"bool": "int8", "float64": "float32", "uint8": "uint16"}.get(field.values.dtype.name)
     values = field.values if kind is None else field.values.astype(kind)
     if values.dtype.name not in ("int8", "int16", "uint16", "float16", "float32"):
-        raise ScanError(f"expected whole numbers of at most 16 bits or floats for an MRC file, got {values.dtype}")
+        raise ScanError(f"an MRC file holds whole numbers of at most 16 bits or floats, got {values.dtype}")
     with require("mrcfile", "io", "reading and writing MRC files").new(path, values, overwrite=True) as file:
         file.voxel_size = tuple(convert_length(h, field.unit, "angstrom") for h in field.spacing[::-1])
 
@@ -291,9 +291,9 @@ def _rescaled(image: Any) -> np.ndarray:
 def _slice_distance(slices: list[Any], normal: np.ndarray, path: Path) -> tuple[float, np.ndarray]:
     positions = np.array([image.ImagePositionPatient for image in slices], dtype=float)
     if len(slices) < 2:
-        raise ScanError(f"expected a DICOM series of several slices, got {len(slices)} in {path}")
+        raise ScanError(f"a DICOM series must have several slices, got {len(slices)} in {path}")
     steps = np.diff(positions @ normal)
     if steps.min() <= 0 or np.ptp(steps) > 0.05 * steps.mean():
         range_text = f"steps of {steps.min():.4g} to {steps.max():.4g} mm"
-        raise ScanError(f"expected evenly spaced DICOM slices, got {range_text} in {path}")
+        raise ScanError(f"DICOM slices must be evenly spaced, got {range_text} in {path}")
     return float(steps.mean()), positions[0]

@@ -36,7 +36,7 @@ def read_nifti(path: Path, *, part: Part | None = None, **_: object) -> Raw:
         raw = _values(image, path, part)
     zooms = tuple(float(f"{h:.7g}") for h in image.header.get_zooms())[:3]  # stored as float32
     if len(zooms) < 3:
-        raise ScanError(f"expected a 3D volume, got {len(image.shape)}D of shape {image.shape[::-1]} in {path}")
+        raise ScanError(f"a volume must be 3D, got {len(image.shape)}D of shape {image.shape[::-1]} in {path}")
     unit = image.header.get_xyzt_units()[0]
     affine = np.array(image.affine, dtype=np.float64)
     spacing: tuple[float, ...] | None = (1.0,) * (raw.values.ndim - 3) + zooms[::-1]
@@ -103,11 +103,6 @@ def write_nifti_like(values: np.ndarray, like: Path, path: Path, unit: str | Non
 
     Only type, scale, range and intent of the values are new, and the unit, if one is given: it renames the numbers of
     the header. NIfTI has neither nm nor cm: only these are converted.
-
-    Raises
-    ------
-    ScanError
-        If the other file has a different number of voxels.
     """
     import nibabel
 
@@ -115,7 +110,7 @@ def write_nifti_like(values: np.ndarray, like: Path, path: Path, unit: str | Non
         image: Any = nibabel.load(like)
     header = image.header.copy()
     if math.prod(image.shape) != values.size:
-        raise ScanError(f"expected values of the file's shape {image.shape[::-1]}, got {values.shape}")
+        raise ScanError(f"values must have the file's shape {image.shape[::-1]}, got {values.shape}")
     header.set_data_dtype(values.dtype)
     header.set_slope_inter(1, 0)
     header.set_intent("none")

@@ -20,8 +20,6 @@ Box = tuple[slice, slice, slice]
 #: A box as a caller gives it: `"z0:z1,y0:y1,x0:x1"`, or three slices.
 Crop = str | Sequence[slice]
 
-_FORM = 'a crop as "z0:z1,y0:y1,x0:x1" or three slices'
-
 
 @dataclass(frozen=True)
 class Part:
@@ -49,11 +47,6 @@ class Part:
         channels
             The axis of channels, if the file names it. Among four axes without names, it is the shorter one of the
             first and the last.
-
-        Raises
-        ------
-        ScanError
-            If the part does not have three axes, or the array has no such channel or box.
         """
         long = [axis for axis, n in enumerate(shape) if n != 1]
         channels = self._channel_axis(shape, channels, long, place)
@@ -61,7 +54,7 @@ class Part:
         if len(space) != 3:
             got = "no values" if 0 in shape else f"{len(space)}D of shape {tuple(shape)}"
             hint = "; a channel, counted from 0, picks one volume of several" if len(space) == 4 == len(long) else ""
-            raise ScanError(f"expected a 3D volume, got {got} in {place}{hint}")
+            raise ScanError(f"a volume must be 3D, got {got} in {place}{hint}")
         index = [slice(0, n) for n in shape]
         if channels is not None and self.channel is not None:
             index[channels] = slice(self.channel, self.channel + 1)
@@ -77,28 +70,20 @@ class Part:
         if self.channel is None:
             if channels in long:
                 count = shape[channels]  # type: ignore[index]
-                raise ScanError(
-                    f"expected a channel from 0 to {count - 1} of {place}, which holds {count} channels, got none"
-                )
+                raise ScanError(f"{place} holds {count} channels: choose a channel from 0 to {count - 1}")
             return channels
         if channels is None and len(long) == 4:
             channels = long[0] if shape[long[0]] <= shape[long[-1]] else long[-1]
         if channels is None:
-            raise ScanError(f"expected no channel of {place}, which holds a single one, got {quoted(self.channel)}")
+            raise ScanError(f"{place} holds a single channel, got channel {quoted(self.channel)}")
         count = shape[channels]
         if not 0 <= check_int(self.channel, "a channel that is a whole number from 0", -SEEDS, SEEDS) < count:
-            raise ScanError(f"expected a channel from 0 to {count - 1} of {place}, got {self.channel}")
+            raise ScanError(f"channel must be from 0 to {count - 1} for {place}, got {self.channel}")
         return channels
 
 
 def read_part(array: Any, part: Part | None, place: object, channels: int | None = None) -> Raw:
-    """Read an array that is not in memory (a dataset, a mapped file), or a part of it.
-
-    Raises
-    ------
-    ScanError
-        As `index_of`.
-    """
+    """Read an array that is not in memory (a dataset, a mapped file), or a part of it."""
     index = index_of(array, part, place, channels)
     if part is None:
         return Raw(np.asarray(array[index]), channels=channels)
@@ -106,13 +91,7 @@ def read_part(array: Any, part: Part | None, place: object, channels: int | None
 
 
 def index_of(array: Any, part: Part | None, place: object, channels: int | None = None) -> Any:
-    """Return the index of a part of an array, or of all of it, once it is sure to fit into memory.
-
-    Raises
-    ------
-    ScanError
-        If the array has no such part, the values are not numbers, or the part does not fit into memory.
-    """
+    """Return the index of a part of an array, or of all of it, once it is sure to fit into memory."""
     if part is None:
         check_array(array.shape, array.dtype, place)
         return ...
@@ -124,15 +103,9 @@ def index_of(array: Any, part: Part | None, place: object, channels: int | None 
 
 
 def take_part(raw: Raw, part: Part, place: object) -> tuple[Raw, tuple[int, ...]]:
-    """Return a part of a file's content, with three axes and their spacing, and its first voxel (z, y, x).
-
-    Raises
-    ------
-    ScanError
-        If the values are not numbers, there is no such part, or the part does not have three axes.
-    """
+    """Return a part of a file's content, with three axes and their spacing, and its first voxel (z, y, x)."""
     if raw.values.dtype.kind not in "biuf":
-        raise ScanError(f"expected numbers, got values of type {raw.values.dtype} in {place}")
+        raise ScanError(f"a volume must hold real numbers, got values of type {raw.values.dtype} in {place}")
     shape = raw.values.shape if raw.whole is None else raw.whole
     index, space = part.index(shape, raw.channels, place)
     values, spacing = raw.values[index] if raw.whole is None else raw.values, raw.spacing
@@ -144,29 +117,17 @@ def take_part(raw: Raw, part: Part, place: object) -> tuple[Raw, tuple[int, ...]
 
 
 def parse_box(crop: Crop | None) -> Box | None:
-    """Return a crop as three slices.
-
-    Raises
-    ------
-    ScanError
-        If the crop is neither such a text nor three slices of whole numbers without a step.
-    """
+    """Return a crop as three slices."""
     if crop is None:
         return None
     parts: list[Any] = list(map(_slice, crop.split(","))) if isinstance(crop, str) else [*_sequence(crop)]
     if len(parts) != 3 or not all(isinstance(part, slice) and _is_plain(part) for part in parts):
-        raise ScanError(f"expected {_FORM}, got {quoted(crop)}")
+        raise ScanError(f'crop must be "z0:z1,y0:y1,x0:x1" or three slices, got {quoted(crop)}')
     return parts[0], parts[1], parts[2]
 
 
 def resolve_box(box: Box | None, shape: Sequence[int], place: object) -> Box:
-    """Return a box in a volume of a shape (z, y, x), with all its ends counted from the first voxel.
-
-    Raises
-    ------
-    ScanError
-        If the box is empty or leaves the volume.
-    """
+    """Return a box in a volume of a shape (z, y, x), with all its ends counted from the first voxel."""
     whole_box = (slice(0, shape[0]), slice(0, shape[1]), slice(0, shape[2]))
     if box is None:
         return whole_box
@@ -175,7 +136,7 @@ def resolve_box(box: Box | None, shape: Sequence[int], place: object) -> Box:
         start, stop = (0 if edge.start is None else edge.start), (n if edge.stop is None else edge.stop)
         first, last = (start + n if start < 0 else start), (stop + n if stop < 0 else stop)
         if not 0 <= first < last <= n:
-            raise ScanError(f"expected a crop within 0:{n} along {name} of {place}, got {start}:{stop}")
+            raise ScanError(f"crop must lie within 0:{n} along {name} of {place}, got {start}:{stop}")
         edges.append(slice(first, last))
     return edges[0], edges[1], edges[2]
 

@@ -78,7 +78,7 @@ def read_slices(path: Path, **_: object) -> Raw:
         slices.append(plane)
         if plane.ndim != 2 + (raw.channels is not None) or plane.shape != slices[0].shape:
             raise ScanError(
-                f"expected 2D slices of one shape {slices[0].shape}, got {plane.shape} in {name.name} of {path}"
+                f"slices must be 2D and of one shape {slices[0].shape}, got {plane.shape} in {name.name} of {path}"
             )
     assert first is not None
     channels = None if first.channels is None else 3

@@ -154,25 +154,19 @@ def _check_store(folder: Path) -> None:
         for name in folders:
             path = Path(place, name)
             if path.is_symlink() and Path(os.path.realpath(place)).is_relative_to(path.resolve()):
-                raise ScanError(f"expected a Zarr store, got one whose link {path} leads back to a folder above it")
+                raise ScanError(f"the link {path} in a Zarr store leads back to a folder above it")
         for name in files:
             path = Path(place, name)
             if path.exists() and not path.is_file():
-                raise ScanError(f"expected files in a Zarr store, got {path}, which is none")
+                raise ScanError(f"{path} in a Zarr store is no file")
 
 
 def _missing_chunks(array: Any, folder: Path) -> tuple[str, ...]:
-    """Return a sentence on the chunks of an array that are not stored, within shards too, or none.
-
-    Raises
-    ------
-    ScanError
-        If the array has more than 10 million chunks.
-    """
+    """Return a sentence on the chunks of an array that are not stored, within shards too, or none."""
     outer = array.shards or array.chunks
     counts, chunks = _counts(array.shape, outer), math.prod(_counts(array.shape, array.chunks))
     if chunks > _MOST:
-        raise ScanError(f"expected at most {_MOST:,} chunks in a Zarr array, got {chunks:,} in {folder}")
+        raise ScanError(f"a Zarr array may have at most {_MOST:,} chunks, got {chunks:,} in {folder}")
     missing, blosc = 0, "blosc" in type(array.compressors[-1] if array.compressors else None).__name__.lower()
     for place in itertools.product(*map(range, counts)):
         path = folder / array.metadata.encode_chunk_key(place)
