@@ -38,7 +38,8 @@ generate = "generate --preset tubes --shape 24 --steps 30 -o made.nii.gz --no-pi
 for words in ("measure mask.nii.gz", "presets", generate):
     result = CliRunner().invoke(app, words.split())
     answers["core"][words.split()[0]] = [result.exit_code, repr(result.exception)]
-for words in ("infer mask.nii.gz -o out --fast",):
+synth = "synth -o set --preset tubes --modality micro-ct --count 1 --shape 16"
+for words in ("infer mask.nii.gz -o out --fast", synth):
     result = CliRunner().invoke(app, words.split())
     answers["missing"][words.split()[0]] = [result.exit_code, result.stderr]
 try:
@@ -64,7 +65,7 @@ def test_the_core_works_without_extras_and_names_the_one_to_install(tmp_path: Pa
     core = answers["core"]
     assert 0.1 < core.pop("fraction") < 0.9 and core.pop("reconstruct") is True
     assert core == {name: [0, "None"] for name in ("measure", "presets", "generate")}
-    assert set(answers["missing"]) == {"infer", "python"}
+    assert set(answers["missing"]) == {"infer", "synth", "python"}
     for name, (code, said) in answers["missing"].items():
         extra = "synth" if name == "synth" else "infer"
         assert code == 2 and f'pip install "curvafit[{extra}]"' in said, (name, said)
