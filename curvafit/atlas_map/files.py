@@ -16,9 +16,8 @@ import numpy as np
 
 from curvafit.atlas_map.extract import Measured, extract, measured, shape_id
 from curvafit.atlas_map.layout import AtlasMap, check_extra, check_size, diagram_distances, embed, map_atlas
-from curvafit.atlas_map.page import page_html
+from curvafit.atlas_map.page import Shown, page_html, regrow_command, shown
 from curvafit.atlas_map.picture import map_picture
-from curvafit.atlas_map.shapes import Shown, regrow_command, shown
 from curvafit.core.files import is_empty, write_content
 from curvafit.core.records import can_write, has_mark, read_archive
 from curvafit.core.runtime import Progress, part, silent

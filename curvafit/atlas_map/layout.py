@@ -96,7 +96,7 @@ def map_atlas(atlas: Atlas, distances: np.ndarray, positions: np.ndarray | None 
     check_extra()
     check_size(n := len(atlas))
     if distances.shape != (n, n) or not np.isfinite(distances).all() or not np.allclose(distances, distances.T):
-        raise ValueError(f"expected finite symmetric distances ({n}, {n}), got {distances.shape} or others")
+        raise ValueError(f"distances must be finite, symmetric and of shape ({n}, {n}), got {distances.shape}")
     positions = embed(distances) if positions is None else positions
     clusters = find_clusters(positions)
     families, shares = _families(atlas)
@@ -181,14 +181,14 @@ def find_clusters(positions: np.ndarray) -> np.ndarray:
 def check_size(count: int) -> None:
     """Raise ValueError if there are too few shapes for a map."""
     if count < LEAST_SHAPES:
-        raise ValueError(f"expected an atlas of at least {LEAST_SHAPES} shapes to map, got {count}")
+        raise ValueError(f"a map needs at least {LEAST_SHAPES} shapes, got {count}")
 
 
 def check_extra() -> None:
     """Raise ImportError with the line to type if the extra `[atlas]` is not installed."""
     for module in ("umap", "sklearn"):
         if find_spec(module) is None:
-            raise ImportError(f'expected {module} for a map, got none: pip install "curvafit[atlas]"')
+            raise ImportError(f'a map needs {module}: pip install "curvafit[atlas]"')
 
 
 def _families(atlas: Atlas) -> tuple[tuple[str, ...], np.ndarray]:

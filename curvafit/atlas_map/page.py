@@ -7,26 +7,35 @@ pieces of base64 in four more texts, found by their offsets and decoded when the
 from __future__ import annotations
 
 import base64
+import io
 import json
+import math
+import zlib
 from collections.abc import Iterable, Sequence
 from html import escape
 from importlib.resources import files
 from string import Template
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
+from PIL import Image
+from scipy.signal import resample
 from scipy.spatial.distance import cdist
 
 from curvafit.atlas_map.layout import NOISE, AtlasMap
 from curvafit.atlas_map.picture import CLUSTER_COLOURS, FAMILY_COLOURS
-from curvafit.atlas_map.shapes import CUT, LEVELS, Shown, small_shape
+from curvafit.data_synth.store import Record, Settings
 from curvafit.drawing.plot import DENSITY, shared_limits
+from curvafit.drawing.render import render
+from curvafit.generation.flow import WORKING_BLUR
+from curvafit.generation.schedule import SCHEDULES, present_name
 from curvafit.geometry.diagram import FAMILIES, Diagram
 from curvafit.inference.atlas import VIEWS
 from curvafit.inference.fit import FIT_SCHEMA
 from curvafit.priors.coefficients import NAMES
+from curvafit.priors.grid import WORKING_EPSILON
 
 #: How many nearest shapes are shown beside one, and how many a scan is placed by.
 NEIGHBOURS, PLACED_BY = 8, 5
@@ -42,6 +51,10 @@ _COLUMNS = {
     "volume": ("volume", "share of the box inside"),
 }
 _SCRIPTS = ("data", "chart", "moves", "diagram", "solid", "hands", "panel", "schema", "scan", "start")
+#: Width of a thumbnail in pixels, and the longest edge of a small volume in voxels.
+THUMBNAIL, EDGE = 144, 32
+#: A small volume holds u, cut off at ± this, in steps 0 to `LEVELS`: fine where the surface is, and it packs well.
+CUT, LEVELS = 0.5, 31
 
 
 def page_html(
@@ -53,8 +66,8 @@ def page_html(
     ----------
     shapes, commands
         What is shown of each shape, and the line that grows it again, in the atlas's order.
-    made
-        Rows of the account of how the map was made.
+    account
+        Rows that say how the map was made.
     """
     blobs = {
         "thumbnails": _joined(one.thumbnail for one in shapes),
@@ -165,3 +178,65 @@ def _joined(pieces: Iterable[bytes]) -> tuple[str, list[int]]:
 
 def _template(name: str) -> str:
     return files("curvafit.atlas_map").joinpath("templates", name).read_text(encoding="utf-8")
+
+
+# ---- one shape -------------------------------------------------------------------------------------------------------
+
+
+class Shown(NamedTuple):
+    """A shape's thumbnail (WebP) and small volume (zlib, one byte a voxel, z slowest, of `small_shape`)."""
+
+    thumbnail: bytes
+    volume: bytes
+
+
+def shown(u: np.ndarray) -> Shown:
+    """Return the thumbnail and the small volume of a periodic field `(Z, Y, X)`."""
+    buffer = io.BytesIO()
+    Image.fromarray(render(u, width=THUMBNAIL)[0]).save(buffer, "webp", quality=80, alpha_quality=80)
+    return Shown(buffer.getvalue(), zlib.compress(small_volume(u).tobytes(), 9))
+
+
+def small_shape(shape: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the shape of a small volume: at most `EDGE` voxels an edge, and in proportion."""
+    factor = min(1.0, EDGE / max(shape))
+    return tuple(max(2, round(n * factor)) for n in shape)
+
+
+def small_volume(u: np.ndarray) -> np.ndarray:
+    """Return a periodic field `(Z, Y, X)` in fewer voxels (its lower frequencies), uint8 from 0 to `LEVELS`."""
+    values = np.clip(u, -1, 1).astype(np.float64)
+    for axis, count in enumerate(small_shape(u.shape)):
+        if count < values.shape[axis]:
+            values = np.asarray(resample(values, count, axis=axis))
+    steps = (np.clip(values / CUT, -1, 1) + 1) / 2 * LEVELS
+    return np.rint(steps).astype(np.uint8)
+
+
+def regrow_command(record: Record, settings: Settings, name: str) -> str:
+    """Return the `curvafit generate` line that makes a draw's field again: with the same versions, processor and number
+    of threads (stores are made on one) bit for bit.
+
+    Raises
+    ------
+    ValueError
+        If the draw was made with a blur or a schedule that the command line does not offer.
+    """
+    options = [f"--coefficients {','.join(map(_plain, record.coefficients))}", f"--mass {_plain(record.mass)}"]
+    sizes = settings.shape[:1] if len(set(settings.shape)) == 1 else settings.shape
+    options += [f"--shape {','.join(map(str, sizes))}", f"--seed {record.seed}"]
+    plan = present_name(settings.schedule)
+    if plan not in SCHEDULES or not math.isclose(settings.blur, WORKING_BLUR):
+        raise ValueError(f"`curvafit generate` has no schedule {plan} with a blur of {settings.blur:g}")
+    options.append(f"--schedule {plan}")
+    if settings.schedule["steps"] != SCHEDULES[plan].steps:
+        options.append(f"--steps {settings.schedule['steps']}")
+    if not math.isclose(settings.epsilon, WORKING_EPSILON):
+        options.append(f"--epsilon {_plain(settings.epsilon)}")
+    return f"curvafit generate {' '.join(options)} -o {name}"
+
+
+def _plain(value: object) -> str:
+    """Return all digits of a number without trailing zeros."""
+    number = float(value)  # type: ignore[arg-type]
+    return str(int(number)) if number.is_integer() else repr(number)

@@ -71,10 +71,10 @@ def map_figure(mapped: AtlasMap, field: Callable[[int], np.ndarray]) -> Figure:
     axes.spines[:].set_visible(False)
     _name_families(axes, mapped)
     figure.draw_without_rendering()
-    slots = _slots()
+    slots = slot_places()
     sample = spread_out(mapped.positions, len(slots))
     places = axes.transData.transform(mapped.positions[sample]) / (figure.dpi * np.array([_WIDTH, _HEIGHT]))
-    for position, slot in zip(sample, slots[_assigned(places, slots)], strict=True):
+    for position, slot in zip(sample, slots[assign_slots(places, slots)], strict=True):
         _thumbnail(figure, axes, field(position), slot, mapped.positions[position], colours[position])
     _legend(figure, mapped)
     return figure
@@ -91,7 +91,7 @@ def spread_out(positions: np.ndarray, count: int) -> np.ndarray:
     return np.array(sample)
 
 
-def _slots() -> np.ndarray:
+def slot_places() -> np.ndarray:
     """Return the middles of the thumbnails' cells around the page, `(20, 2)` in figure coordinates."""
     low, high = (_CELL / 2 + 0.75) / _HEIGHT, 1 - (_CELL / 2 + 0.1) / _HEIGHT
     left, right = (_CELL / 2 + 0.1) / _WIDTH, 1 - (_CELL / 2 + 0.1) / _WIDTH
@@ -100,7 +100,7 @@ def _slots() -> np.ndarray:
     return np.array(across + down)
 
 
-def _assigned(places: np.ndarray, slots: np.ndarray) -> np.ndarray:
+def assign_slots(places: np.ndarray, slots: np.ndarray) -> np.ndarray:
     """Return a slot for each place, so that the lines are shortest in all: then no two of them cross."""
     inches = np.array([_WIDTH, _HEIGHT])
     return linear_sum_assignment(cdist(places * inches, slots * inches))[1]

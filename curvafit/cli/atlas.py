@@ -161,7 +161,7 @@ def describe_atlas(
 ) -> None:
     """Measure each shape of stores as field, mask, crop and scan: the table that `atlas train` reads."""
     with plainly():
-        from curvafit.atlas_map.describe import describe
+        from curvafit.atlas_map.extract import describe
         from curvafit.inference.table import TABLE_FILE, VIEWS
 
         _check_archive(out, TABLE_FILE, stores, overwrite)

@@ -20,8 +20,8 @@ import curvafit.atlas_map.layout as atlas_map
 from curvafit.atlas_map.extract import extract
 from curvafit.atlas_map.files import write_map
 from curvafit.atlas_map.layout import NOISE, AtlasMap, embed, find_clusters, map_atlas
-from curvafit.atlas_map.picture import _assigned, _slots, spread_out
-from curvafit.atlas_map.shapes import CUT, LEVELS, regrow_command, shown, small_volume
+from curvafit.atlas_map.page import CUT, LEVELS, regrow_command, shown, small_volume
+from curvafit.atlas_map.picture import assign_slots, slot_places, spread_out
 from curvafit.generation.flow import generate
 from curvafit.geometry.distances import wasserstein
 from curvafit.priors import Coefficients, Grid
@@ -110,11 +110,11 @@ def test_wrong_distances_and_too_few_shapes_are_refused(mapped: AtlasMap) -> Non
 
 
 def test_no_two_lines_of_the_picture_cross() -> None:
-    slots = _slots()
+    slots = slot_places()
     assert len(slots) == 20 and len({tuple(slot) for slot in slots.round(6)}) == 20
     for seed in range(20):
         places = np.random.default_rng(seed).uniform(0.2, 0.8, (20, 2))
-        ends = slots[_assigned(places, slots)]
+        ends = slots[assign_slots(places, slots)]
         assert not any(cross(places[i], ends[i], places[j], ends[j]) for i in range(20) for j in range(i))
 
 

@@ -11,7 +11,7 @@ from exact import Gyroid, centres
 from exact_store import exact_record, exact_store
 from typer.testing import CliRunner
 
-from curvafit.atlas_map.describe import describe
+from curvafit.atlas_map.extract import describe
 from curvafit.cli.app import app
 from curvafit.core.workers import cluster
 from curvafit.geometry.descriptors import BLOCKS, descriptors
