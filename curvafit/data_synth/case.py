@@ -27,8 +27,11 @@ CALIBRES = (1e-3, 1e3)
 
 
 class Case(NamedTuple):
-    """An image, the phase field of what it shows, and its mask, arrays (Z, Y, X) on one grid of `spacing`; ε in
-    spacing's unit; and what a record says of it, in JSON's types."""
+    """One case: an image, the phase field of what it shows, and its mask.
+
+    Arrays are (Z, Y, X) on one grid of `spacing`; ε is in spacing's unit; `record` says how the case came about, in
+    JSON's types.
+    """
 
     image: np.ndarray
     field: np.ndarray
@@ -146,8 +149,10 @@ def check_shape(shape: Sequence[int]) -> tuple[int, int, int]:
 
 
 def draw_voxel(voxel: float, calibres: Sequence[float], rng: np.random.Generator) -> float:
-    """Return the edge of a shape's voxel times a factor, drawn evenly in the logarithm; none is drawn where there is
-    one."""
+    """Draw the edge of a shape's voxel: `voxel` times a factor between the calibres, even in the logarithm.
+
+    Equal calibres take no random number.
+    """
     low, high = calibres
     return voxel * (low if low == high else math.exp(rng.uniform(math.log(low), math.log(high))))
 
@@ -161,8 +166,10 @@ def check_calibres(calibres: Sequence[float]) -> None:
 
 
 def check_crop(within: float, shape: Sequence[int], voxel: float, modality: Modality) -> None:
-    """Raise ValueError where images of `shape` need crops that are larger than a source's shapes (`within`) or than
-    memory, or too small to be shapes; or where they are too large or too small themselves."""
+    """Raise ValueError where a source cannot give the crops that images of `shape` need.
+
+    The crops may be larger than the source's shapes (`within`) or than memory, or too small to be shapes.
+    """
     need = field_shape(shape, voxel, modality.base)
     images, crops = " x ".join(map(str, shape)), " x ".join(map(str, need))
     if not 1 < math.prod(shape) <= MOST:

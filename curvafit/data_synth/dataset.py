@@ -34,8 +34,10 @@ ROUND = 8
 
 
 class Sample(NamedTuple):
-    """A training pair: image float32 and label uint8 (0, 1), both (1, Z, Y, X), voxel edges (z, y, x), and a record of
-    how the pair came about, in JSON's types."""
+    """A training pair, and a record of how it came about, in JSON's types.
+
+    The image is float32 and the label uint8 (0, 1), both (1, Z, Y, X); the spacing is the voxel's edges (z, y, x).
+    """
 
     image: Tensor
     label: Tensor

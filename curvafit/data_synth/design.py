@@ -149,8 +149,9 @@ class Design:
 
 
 def boxed(sampling: Sampling = "random", log: Sequence[str] = (), /, **intervals: float | Sequence[float]) -> Design:
-    """Return a box: Experiment 4's, but for the intervals or fixed values that are given by name; uniform in the
-    logarithm of the parameters in `log`.
+    """Return Experiment 4's box with other intervals, or fixed values, for the parameters that are given by name.
+
+    The box is uniform in the logarithm of the parameters in `log`.
 
     Raises
     ------
@@ -166,8 +167,9 @@ def boxed(sampling: Sampling = "random", log: Sequence[str] = (), /, **intervals
 
 
 def around(point: Sequence[float], spread: float, sampling: Sampling = "random") -> Design:
-    """Return a box around seven numbers, brought to a20 = 1: `spread` times as wide as Experiment 4's; a02 and m₀ in
-    range.
+    """Return a box around a point of seven numbers, `spread` times as wide as Experiment 4's.
+
+    The point is brought to a20 = 1; a02 and m₀ stay in range.
 
     Raises
     ------
@@ -243,8 +245,9 @@ def read_design(path: str | PathLike[str]) -> Design:
 
 
 def point_of(source: Any, folder: Path = Path()) -> tuple[float, ...]:
-    """Return the seven numbers of a law: of a preset's name, of a `fit.json` (beside `folder` where its path is
-    relative), or by name.
+    """Return the seven numbers of a law: a preset's name, a `fit.json`, or the numbers by name.
+
+    The path of a `fit.json` is relative to `folder`.
 
     Raises
     ------

@@ -157,8 +157,10 @@ def synthetic_scan(path: str | os.PathLike[str], *, edge: int = 96, seed: int = 
 
 
 def _ct_image(phase: np.ndarray, seed: int) -> np.ndarray:
-    """Return an image of grey levels 60 and 170, a blur of 0.8 voxels, cupping of 5 % to the faces, noise of 12 levels
-    over 0.6 voxels."""
+    """Return an image of grey levels 60 and 170, blurred, noisy and cupped.
+
+    The blur is 0.8 voxels, the cupping 5 % at the faces, the noise 12 levels over 0.6 voxels.
+    """
     generator = np.random.default_rng(seed)
     sharp = ndimage.gaussian_filter((phase > 0).astype(np.float32), 0.8, mode="wrap")
     radius = sum(axis**2 for axis in np.meshgrid(*(np.linspace(-1, 1, n) for n in phase.shape), indexing="ij"))

@@ -47,8 +47,10 @@ SHOWN, ROW = 8, 4
 
 
 class Layout(NamedTuple):
-    """Where images, labels and further labels are, with `{case}` for a case's name and `{part}` for a label's; and
-    whether the list of cases is nnU-Net's, else the decathlon's."""
+    """Where a set's files are, with `{case}` for a case's name and `{part}` for a further label's.
+
+    `nnunet` says that the list of cases is nnU-Net's, else it is the decathlon's.
+    """
 
     image: str
     label: str
@@ -277,7 +279,8 @@ def _write_parts(folder: Path, spec: SetSpec, name: str, case: Case, places: lis
             known[part] = list(labels.betti)  # type: ignore[arg-type]
         elif part == "centreline":
             places.append(place.with_name(f"{name}.graphml"))
-            write_graphml(centreline(labels.skeleton, labels.distance, grid), places[-1], case.unit)  # type: ignore[arg-type]
+            graph = centreline(labels.skeleton, labels.distance, grid)  # type: ignore[arg-type]
+            write_graphml(graph, places[-1], case.unit)
         else:
             places.append(place)
             save(Field(getattr(labels, part), case.spacing, case.unit), place)
@@ -305,8 +308,11 @@ def _difference(stored: Any, wanted: Any, name: str = "order") -> tuple[str, Any
 
 
 def write_preview(folder: str | Path) -> Path:
-    """Write `preview.png` of a set into its folder: of the first cases the slice with most of the structure, with and
-    without the label's outline."""
+    """Write `preview.png` into a set's folder: a slice of each of the first cases, with and without the label's
+    outline.
+
+    The slice is the one with most of the structure.
+    """
     folder = Path(folder)
     layout = LAYOUTS[read_spec(folder).layout]
     names = [case_name(index) for index in cases_of(folder)[:SHOWN]]

@@ -51,8 +51,11 @@ _STALE_SECONDS = 600.0
 
 @dataclass(frozen=True)
 class Settings:
-    """What all draws of a store share: sampling (z, y, x), ε and blur in spacing's unit, the design (`Design.as_dict`)
-    and its seed, and the schedule's fields (name, steps, rates)."""
+    """What all draws of a store share.
+
+    Sampling (z, y, x), ε and blur in spacing's unit, the design (`Design.as_dict`) and its seed, and the schedule's
+    fields (name, steps, rates).
+    """
 
     shape: tuple[int, int, int]
     spacing: tuple[float, float, float]
@@ -65,8 +68,11 @@ class Settings:
 
 @dataclass(frozen=True)
 class Record:
-    """One draw: its index, parameters, noise seed, the steps made (fewer where rejected early), viability figures,
-    final energy F_ε, the flow's status sentence, the software versions and the seconds it took."""
+    """One draw, as it is recorded.
+
+    Its index, parameters, noise seed, the steps made (fewer where rejected early), viability figures, final energy F_ε,
+    the flow's status sentence, the software versions and the seconds it took.
+    """
 
     index: int
     coefficients: Coefficients
@@ -189,8 +195,7 @@ class Store:
         return self.path / "draws" / f"{index:06d}"
 
     def _attributes(self, index: int) -> dict[str, Any] | None:
-        """Return a draw's attributes, None where anything of it is missing; a field's bytes are checked when it is
-        read."""
+        """Return a draw's attributes, None where anything of it is missing; a field's bytes are checked on reading."""
         place = self._place(index)
         attributes = _read_attributes(place)
         if attributes is None or attributes.get("index") != index or "sha256" not in attributes:

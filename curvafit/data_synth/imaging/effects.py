@@ -49,11 +49,11 @@ MOST = 12
 
 
 def occupancy(field: Float[Tensor, "b 1 z y x"], epsilon: float = EPSILON) -> Float[Tensor, "b 1 z y x"]:
-    """Return the share of each cubic voxel that is inside: partial volume, from the sub-voxel distance that the profile
-    holds.
+    """Return the share of each cubic voxel that is inside the shape (partial volume).
 
-    (d + ½) clipped to [0, 1], d = √2 ε artanh u in voxels: exact for a plane along an axis. A tilted plane's ramp is
-    longer with softer ends; its second moment is the same 1/12, and the difference nowhere over 0.05.
+    The profile holds the sub-voxel distance d = √2 ε artanh u, in voxels, and the share is d + ½ clipped to [0, 1]:
+    exact for a plane along an axis. A tilted plane's ramp is longer with softer ends; its second moment is the same
+    1/12, and the difference nowhere over 0.05.
 
     Parameters
     ----------
@@ -69,8 +69,10 @@ def texture(
     like: Float[Tensor, "b 1 z y x"], spacing: float | Sequence[float], deviation: float, length: float,
     seeds: Sequence[int], purpose: str = "texture",
 ) -> Float[Tensor, "b 1 z y x"]:  # fmt: skip
-    """Return a positive random factor of mean 1: lognormal, of standard deviation `deviation`, its logarithm correlated
-    by `length` (`correlated_field`)."""
+    """Return a random factor of mean 1 and standard deviation `deviation`, correlated by `length`.
+
+    The factor is lognormal; its logarithm is a `correlated_field`.
+    """
     if not 0 <= deviation < math.inf or not length > 0:
         raise ValueError(f"a texture needs a deviation from 0 and a positive length, got {deviation} and {length}")
     spread = math.sqrt(math.log1p(deviation**2))
@@ -91,8 +93,9 @@ def blur_with_depth(
     image: Float[Tensor, "b 1 z y x"], spacing: float | Sequence[float], widths: float | Sequence[float],
     growth: float, attenuation: float = 0.0,
 ) -> Float[Tensor, "b 1 z y x"]:  # fmt: skip
-    """Return the image under a point-spread function that widens with depth, as scatter and aberrations make it: σ(z) =
-    σ(0) (1 + growth z).
+    """Blur an image by a Gaussian that widens with depth, as scatter and aberrations make it.
+
+    Its deviations are σ(z) = σ(0) (1 + growth z).
 
     Parameters
     ----------
@@ -118,11 +121,11 @@ def sample(
     image: Float[Tensor, "b 1 z y x"], spacing: float | Sequence[float], onto: float | Sequence[float],
     window: float | Sequence[float] = 0.0,
 ) -> Float[Tensor, "b 1 Z Y X"]:  # fmt: skip
-    """Return values on a grid of voxels `onto`: means over a `window` (slice thickness, pixel) about each voxel's
-    centre.
+    """Sample an image on a grid of voxels `onto`, each the mean over a `window` about the voxel's centre.
 
-    The corners of both grids' first voxels coincide, and voxels that do not fit into the box are left out. Along an
-    axis whose window is narrower than an old voxel, the value is interpolated linearly.
+    The window is the slice's thickness and the pixel's size. The corners of both grids' first voxels coincide, and
+    voxels that do not fit into the box are left out. Along an axis whose window is narrower than an old voxel, the
+    value is interpolated linearly.
     """
     check_volume(image, "an image")
     old, new, wide = as_spacing(spacing), as_spacing(onto), as_triple(window, "a window")
@@ -137,8 +140,7 @@ def bias(
     like: Float[Tensor, "b 1 z y x"], spacing: float | Sequence[float], strength: float, length: float,
     seeds: Sequence[int],
 ) -> Float[Tensor, "b 1 z y x"]:  # fmt: skip
-    """Return the factor of uneven illumination: a smooth factor that goes from 1 - strength to 1 + strength, correlated
-    by `length`."""
+    """Return the factor of uneven illumination: smooth, from 1 - strength to 1 + strength, correlated by `length`."""
     if not 0 <= strength <= 1 or not length > 0:
         raise ValueError(f"the bias must be in [0, 1] and its length positive, got {strength} and {length}")
     field = correlated_field(like, [length / h for h in as_spacing(spacing)], seeds, "bias")
@@ -166,11 +168,10 @@ def rings(
     like: Float[Tensor, "b 1 z y x"], spacing: float | Sequence[float], strength: float, width: float,
     seeds: Sequence[int], centre: tuple[float, float] | None = None,
 ) -> Float[Tensor, "b 1 z y x"]:  # fmt: skip
-    """Return the rings about an axis along z, as defects of a CT detector leave: a term of mean 0 and deviation
-    `strength`.
+    """Return the rings about an axis along z that defects of a CT detector leave: a term of mean 0.
 
-    A slice's rings are its own, since a detector's row makes a slice. Few are strong: the profile over the radius is
-    g|g|/√3 of a normal g, correlated by `width`.
+    Its deviation is `strength`. A slice's rings are its own, since a detector's row makes a slice. Few are strong: the
+    profile over the radius is g|g|/√3 of a normal g, correlated by `width`.
 
     Parameters
     ----------
@@ -303,19 +304,18 @@ def poisson_gaussian(
 def poisson(
     photons: Float[Tensor, "b 1 z y x"], seeds: Sequence[int], width: float | Sequence[float] = 0.0
 ) -> Float[Tensor, "b 1 z y x"]:
-    """Return numbers of photons: the Poisson quantiles of normal numbers (`poisson_quantile`), smoothed by `width`
-    voxels."""
+    """Draw numbers of photons with these means, by quantiles (`poisson_quantile`) of noise of a grain `width`."""
     if check_volume(photons, "photons").amin() < 0:
         raise ValueError(f"photons must be from 0, got {float(photons.amin()):g}")
     return poisson_quantile(photons, grainy_noise(photons, as_triple(width, "a width of noise"), seeds, "photons"))
 
 
 def poisson_quantile(mean: Tensor, z: Tensor) -> Tensor:
-    """Return the quantile of Poisson's law that a standard normal number is of its own, so that one random number a
-    voxel makes a count.
+    """Turn standard normal numbers into Poisson numbers of the same quantile.
 
-    From a mean of `FEW` on by Giles's expansion Q̃_N3 ("Algorithm 955", ACM Trans. Math. Softw. 42, 2016), a count off
-    in at most 0.5 % of draws; below by summing the probabilities, exact to `MOST` counts.
+    So one random number a voxel makes a count, and smooth noise makes smooth counts. From a mean of `FEW` on by Giles's
+    expansion Q̃_N3 ("Algorithm 955", ACM Trans. Math. Softw. 42, 2016), a count off in at most 0.5 % of draws; below by
+    summing the probabilities, exact to `MOST` counts.
     """
     root = mean.clamp_min(FEW).sqrt_()
     w2 = z.square()
@@ -342,10 +342,9 @@ def gaussian_noise(
 def rician(
     image: Float[Tensor, "b 1 z y x"], deviation: float, seeds: Sequence[int], width: float | Sequence[float] = 0.0
 ) -> Float[Tensor, "b 1 z y x"]:
-    """Return the magnitude of a signal with normal noise in both channels: √((v + σ n₁)² + (σ n₂)²) (Gudbjartsson and
-    Patz 1995).
+    """Return the magnitude of a signal with normal noise in both channels: √((v + σ n₁)² + (σ n₂)²).
 
-    The mean square is v² + 2σ²; where there is no signal, the mean is σ √(π/2).
+    The mean square is v² + 2σ²; where there is no signal, the mean is σ √(π/2) (Gudbjartsson and Patz 1995).
     """
     if not 0 <= deviation < math.inf:
         raise ValueError(f"the noise's deviation must be from 0, got {deviation}")

@@ -53,16 +53,17 @@ def regrid(
 def visible(
     shapes: Float[torch.Tensor, "b 1 z y x"], spacing: float, imaging: Sequence[Imaging], epsilon: float = EPSILON
 ) -> Bool[torch.Tensor, "b 1 Z Y X"]:
-    """Return the images' voxels that a share of the structure's light reaches (`Imaging.visible`), evenly stained as it
-    is."""
+    """Return the images' voxels that a share of the structure's light reaches (`Imaging.visible`), of even stain."""
     _check_batch(shapes, imaging)
     return torch.cat([_visible(one, spacing, how, epsilon) for one, how in zip(shapes.split(1), imaging, strict=True)])
 
 
 def visible_share(imaging: Imaging) -> float:
-    """Return the share of the structure's light at which an annotator is taken to see it: where its level is midway
-    from the background's to its own in the logarithm, as contrast is seen. 1/2 at faint contrast, less where it is
-    strong."""
+    """Return the share of the structure's light at which an annotator is taken to see it.
+
+    There the level is midway from the background's to the structure's in the logarithm, as contrast is seen: 1/2 at
+    faint contrast, less where it is strong.
+    """
     below, above = imaging.contrast.background, imaging.contrast.foreground
     return 1 / (1 + math.sqrt(above / max(below, 1e-3 * above, 1e-12)))
 

@@ -51,8 +51,11 @@ RESIDUAL = np.outer((1, -2, 1), (1, -2, 1)).astype(np.float32)[None]
 
 
 class Structure(NamedTuple):
-    """What the mask's surroundings tell: blur in lengths (z, y, x), mean contrast, its relative deviation and the
-    length, in voxels of the finest edge, that it is correlated by."""
+    """What the surroundings of the mask tell.
+
+    The blur in lengths (z, y, x); the mean contrast, its relative deviation, and the length, in voxels of the finest
+    edge, by which it is correlated.
+    """
 
     blur: tuple[float, float, float]
     contrast: float
@@ -97,8 +100,10 @@ def like(scan: Field, mask: np.ndarray | None = None) -> Modality:
 
 
 def _imaging(scan: Field, structure: Structure, noise: NoiseEstimate) -> Imaging:
-    """Return the parameters of an image: levels in photons where the variance grows with the mean; textures as they
-    were before the blur."""
+    """Return the parameters of an image.
+
+    Levels are in photons where the variance grows with the mean; textures are those before the blur.
+    """
     unit = noise.gain or 1.0
     low = max(noise.level - noise.offset, 0.0) / unit
     high = max(noise.level + structure.contrast - noise.offset, 0.0) / unit
@@ -164,8 +169,7 @@ def bright(values: np.ndarray, steps: np.ndarray | Sequence[float]) -> np.ndarra
 
 
 def _measure_structure(values: np.ndarray, inside: np.ndarray, steps: np.ndarray, level: float) -> Structure:
-    """Return the blur (z, and y = x) whose image of the mask is nearest to the scan around it; the brightness
-    inside."""
+    """Return the blur (z, and y = x) with which the mask explains the scan around it best, and the contrast inside."""
     finest = steps.min() / steps
     window = tuple(WINDOW * finest)
     signal, mask = (torch.from_numpy(volume)[None, None].float() for volume in (values - level, inside))
@@ -190,9 +194,12 @@ def _measure_structure(values: np.ndarray, inside: np.ndarray, steps: np.ndarray
 
 
 def _measure_texture(relative: np.ndarray, inside: np.ndarray, steps: np.ndarray) -> tuple[float, float]:
-    """Return the deviation and the length, in voxels of the finest edge, of a brightness that was averaged over a
-    window of `WINDOW`: by the covariance of its logarithm in the plane. The average lengthens the one, and along a tube
-    it lessens the other. What has lost its light is not looked at: a logarithm would see little else."""
+    """Return the deviation and the correlation length, in voxels of the finest edge, of the brightness inside.
+
+    The brightness was averaged over a window of `WINDOW`: that lengthens the correlation, and along a tube it lessens
+    the deviation. Both come from the covariance of its logarithm in the plane. What has lost its light is not looked
+    at: a logarithm would see little else.
+    """
     bright_part = inside & (relative > DIMMEST)
     logs = np.log(np.where(bright_part, relative, 1.0))
     weight = bright_part.astype(np.float32)
@@ -217,8 +224,11 @@ def _spread(value: Any, low: float, high: float) -> tuple[Any, Any]:
 
 
 class Background(NamedTuple):
-    """Where the background is seen, its level; variance and width (z, y, x) of its noise in voxels; deviation, length
-    of its texture; range of its uneven light."""
+    """Where the background is seen, and how it varies.
+
+    Its level; variance and width (z, y, x), in voxels, of its noise; deviation and length of its texture; range of its
+    uneven light.
+    """
 
     where: np.ndarray
     level: float
@@ -303,8 +313,10 @@ def covariance(rest: np.ndarray, weight: np.ndarray, axis: int) -> np.ndarray:
 
 
 def _split_covariance(covariances: np.ndarray) -> tuple[float, float, float, float]:
-    """Return the variance and width of the noise, variance and length of the texture, in voxels, by non-negative least
-    squares."""
+    """Split a covariance over the lag into noise and texture, by non-negative least squares.
+
+    Returns variance and width of the noise, variance and length of the texture, in voxels.
+    """
     lag = np.arange(len(covariances))
     short = [np.exp(-((lag / (2 * w)) ** 2)) if w else (lag == 0).astype(float) for w in GRAINS]
     long = [np.exp(-0.5 * (lag / length) ** 2) for length in TEXTURE_LENGTHS]

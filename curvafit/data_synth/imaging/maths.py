@@ -51,8 +51,10 @@ def gaussian(count: int, width: float | Tensor, like: Tensor) -> Tensor | None:
 
 
 def bell(far: Tensor) -> Tensor:
-    """Return exp(-½ far²), and 0 where far is over four. It is clipped first: arithmetic with denormal numbers is
-    slow."""
+    """Return exp(-½ far²), and 0 where far is over four.
+
+    The square is clipped first: arithmetic with denormal numbers is slow.
+    """
     square = far.square().clamp_max_(CUT)
     return torch.exp(-0.5 * square).masked_fill_(square == CUT, 0)
 
@@ -143,8 +145,7 @@ def correlated_field(
 def grainy_noise(
     like: Float[Tensor, "b 1 z y x"], widths: Sequence[float], seeds: Sequence[int], purpose: str
 ) -> Float[Tensor, "b 1 z y x"]:
-    """Return standard normal numbers, smoothed by a Gaussian of deviations `widths` (voxels): `correlated_field` by √2
-    widths."""
+    """Return standard normal noise, smoothed by a Gaussian of deviations `widths` voxels: correlated by √2 widths."""
     if not any(widths):
         return white_noise(like, seeds, purpose)
     maps = [gaussian(n, width, like) for n, width in zip(like.shape[2:], widths, strict=True)]
@@ -175,8 +176,10 @@ def _drawn(shape: tuple[int, ...], like: Tensor, seeds: Sequence[int], purpose: 
 
 
 def _interpolation(count: int, length: float, like: Tensor) -> Tensor | None:
-    """Return (count, nodes) weights; nodes are a deviation apart, at least a voxel, and go four deviations beyond the
-    box."""
+    """Return the weights (count, nodes) that interpolate random nodes.
+
+    Nodes are a deviation apart, at least a voxel, and go four deviations beyond the box.
+    """
     if math.isinf(length):
         return torch.ones((count, 1), device=like.device, dtype=like.dtype)
     if length < 0.5:
