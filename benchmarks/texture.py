@@ -46,7 +46,7 @@ def author_volumes() -> dict[str, Path]:
 
 
 def author_field(name: str) -> torch.Tensor:
-    from curvafit.volumes.scan import load
+    from curvafit.volumes.read import load
 
     return torch.from_numpy(load(author_volumes()[name]).values.astype(np.float32))
 

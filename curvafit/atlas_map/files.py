@@ -20,7 +20,7 @@ from curvafit.atlas_map.page import Shown, page_html, regrow_command, shown
 from curvafit.atlas_map.picture import map_picture
 from curvafit.core.files import is_empty, write_content
 from curvafit.core.records import can_write, has_mark, read_archive
-from curvafit.core.runtime import Progress, part, silent
+from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.data_synth.atlas import summarise
 from curvafit.data_synth.store import Record, Store, open_store
 from curvafit.generation.viability import well_formed
@@ -112,7 +112,7 @@ def _measures(
         shapes.append(Shown(cached["thumbnail"].tobytes(), cached["volume"].tobytes()))
         return float(cached["fraction"]), _diagram(cached, "field"), _diagram(cached, "mask")
 
-    atlas = extract(stores, measure=look, progress=part(progress, 0.0, 0.6))
+    atlas = extract(stores, measure=look, progress=sub_progress(progress, 0.0, 0.6))
     return atlas, draws, shapes, commands
 
 
@@ -135,7 +135,7 @@ def _diagram(cached: _Arrays, view: str) -> Diagram:
 
 def _mapped(atlas: Atlas, cache: Path, progress: Progress) -> AtlasMap:
     """Return the map of an atlas, its distances and places from the cache where they are there."""
-    saved, comparing = cache / "distances.npz", part(progress, 0.6, 0.85)
+    saved, comparing = cache / "distances.npz", sub_progress(progress, 0.6, 0.85)
     compare = partial(diagram_distances, atlas.field_diagrams, progress=comparing, saved=saved)
     try:
         distances = compare()

@@ -70,7 +70,7 @@ def _inferred(scan: str, out: Path, options: dict[str, Any], overwrite: bool) ->
 
 def _show(inference: Inference) -> None:
     """Print the description, the verdict and a small table."""
-    from curvafit.core.units import length, number
+    from curvafit.core.units import format_length, format_number
     from curvafit.inference.candidates import TITLES
     from curvafit.report.page import describe, parameter_table
 
@@ -83,5 +83,7 @@ def _show(inference: Inference) -> None:
     for each in fit.weak_directions:
         say(each)
     if inference.twins:
-        apart = ", ".join(f"{TITLES.get(each.name, each.name)} {number(each.distance, 2)}" for each in fit.candidates)
-        say(f"Distances in 1/working unit ({length(fit.length, fit.length_unit, 3)}): {apart}.")
+        apart = ", ".join(
+            f"{TITLES.get(each.name, each.name)} {format_number(each.distance, 2)}" for each in fit.candidates
+        )
+        say(f"Distances in 1/working unit ({format_length(fit.length, fit.length_unit, 3)}): {apart}.")

@@ -71,8 +71,8 @@ def _show(measures: Measures, several: bool) -> None:
 
 def _cells(quantity: Quantity, unit: str) -> tuple[str, str, str]:
     """Return a number, its interval and its unit as text."""
-    from curvafit.core.units import number, per_unit, unit_name
+    from curvafit.core.units import format_number, per_unit, unit_name
 
     power = quantity.power
     name = "" if power == 0 else unit_name(unit) if power > 0 else per_unit(unit, -power)
-    return number(quantity.value, 4), f"± {number(quantity.half, 2)}", name
+    return format_number(quantity.value, 4), f"± {format_number(quantity.half, 2)}", name

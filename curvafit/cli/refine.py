@@ -77,7 +77,7 @@ def refine(
 
         def learn(volume: Boxes, progress: Progress) -> None:
             """Try the prior out on the example, once."""
-            from curvafit.core.runtime import part
+            from curvafit.core.runtime import sub_progress
             from curvafit.segmentation.reconstruct import infer_law
             from curvafit.volumes.read import load
 
@@ -85,7 +85,7 @@ def refine(
             check_spacing(chances, volume.frame, "the probabilities")
             say_notes((*chances.notes, *mask.notes))
             learned["prior"] = prior if prior is not None else infer_law(mask, progress)
-            tried = calibrate(chances, mask, learned["prior"], progress=part(progress, 0.0, 0.7), **options)
+            tried = calibrate(chances, mask, learned["prior"], progress=sub_progress(progress, 0.0, 0.7), **options)
             learned["example"], record["calibration"] = tried, tried.as_dict()
 
         def compute(volume: Boxes, progress: Progress, **tools: Any) -> Segmentation:

@@ -118,12 +118,12 @@ def check_choice(value: Any, names: Iterable[str], expected: str) -> None:
         raise ValueError(f"expected {expected}, got {quoted(value)}")
 
 
-def plain_name(name: str) -> str:
+def simplify_name(name: str) -> str:
     """Return a name in small letters, with `-` for spaces and underscores: `Bilinear_Tubes` is `bilinear-tubes`."""
     return re.sub(r"[\s_-]+", "-", name.strip().casefold())
 
 
-def seed_of(value: Any) -> int:
+def check_seed(value: Any) -> int:
     """Return a seed, a whole number from 0 that a signed 64-bit number holds.
 
     Raises

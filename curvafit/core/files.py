@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from curvafit.core.runtime import undisturbed
+from curvafit.core.runtime import hold_signals
 
 
 def write_atomically(target: Path, write: Callable[[Path], object]) -> Path:
@@ -22,7 +22,7 @@ def write_atomically(target: Path, write: Callable[[Path], object]) -> Path:
         write(temporary)
         return move_into_place(temporary, target)
     finally:
-        with undisturbed():
+        with hold_signals():
             remove(temporary)
 
 
@@ -39,7 +39,7 @@ def write_content(target: Path, *contents: str | bytes | memoryview) -> Path:
     return write_atomically(target, write)
 
 
-def sweep(target: Path) -> None:
+def remove_leftovers(target: Path) -> None:
     """Delete temporary files of a killed `write_atomically`; for the only process that writes this target."""
     name = re.compile(rf"\.[0-9a-f]{{8}}\.{re.escape(target.name)}")
     for path in target.parent.iterdir():
@@ -48,7 +48,7 @@ def sweep(target: Path) -> None:
 
 
 @contextmanager
-def staged(target: Path) -> Iterator[Path]:
+def temporary_folder(target: Path) -> Iterator[Path]:
     """Make a temporary folder beside `target`, and its parents; the folder and its content are deleted at the end."""
     target.parent.mkdir(parents=True, exist_ok=True)
     work = target.parent / f".{target.name[:200]}.{_some()}"
@@ -56,20 +56,20 @@ def staged(target: Path) -> Iterator[Path]:
         work.mkdir()
         yield work
     finally:
-        with undisturbed():
+        with hold_signals():
             shutil.rmtree(work, ignore_errors=True)
 
 
 def move_together(parts: Iterable[Path], folder: Path) -> tuple[Path, ...]:
     """Move finished files, or folders, into a folder on the same disk; a signal waits until all are there."""
-    with undisturbed():
+    with hold_signals():
         return tuple(move_into_place(part, folder / part.name) for part in parts)
 
 
 def move_into_place(temporary: Path, target: Path) -> Path:
     """Rename a finished file or folder to `target`, on the same disk, and delete the old one after that."""
     aside = target.with_name(f".{_some()}.old.{target.name}")
-    with undisturbed():
+    with hold_signals():
         if target.is_dir():
             os.replace(target, aside)
         try:

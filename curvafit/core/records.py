@@ -411,7 +411,7 @@ def parse_json(content: str | bytes, expected: str, place: object) -> Any:
     raise ValueError(f"expected {expected}, got {place}, {fault}")
 
 
-def repeated(names: Sequence[Any]) -> Any:
+def first_repeated(names: Sequence[Any]) -> Any:
     """Return the first name that occurs more than once, None where there is none."""
     if len(set(names)) == len(names):
         return None
@@ -440,6 +440,6 @@ def _constant(name: str) -> float:
 
 def _single(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """Return a dictionary of pairs whose keys all differ."""
-    if (name := repeated([name for name, _ in pairs])) is not None:
+    if (name := first_repeated([name for name, _ in pairs])) is not None:
         raise ValueError(f"the key {quoted(name)} twice")
     return dict(pairs)

@@ -25,7 +25,7 @@ def silent(text: str, share: float) -> None:
     """Say nothing: the default progress."""
 
 
-def part(progress: Progress, start: float, stop: float) -> Progress:
+def sub_progress(progress: Progress, start: float, stop: float) -> Progress:
     """Return the progress of a part of the work, from one share of the whole to another."""
     return lambda text, share: progress(text, start + (stop - start) * share)
 
@@ -113,7 +113,7 @@ def leave() -> None:
 
 
 @contextmanager
-def undisturbed() -> Iterator[None]:
+def hold_signals() -> Iterator[None]:
     """Hold back the signals that `listen` listens to until the block ends, for changes that are all or nothing."""
     if threading.current_thread() is not threading.main_thread():
         yield

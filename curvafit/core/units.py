@@ -51,7 +51,7 @@ def convert_length(length: float, unit: str | None, to: str | None) -> float:
     return length * factor * METRES[name] / (METRES[target] * target_factor)
 
 
-def number(value: float | None, digits: int = 3) -> str:
+def format_number(value: float | None, digits: int = 3) -> str:
     """Return a number to some significant digits, without an exponent where possible; a dash for None or NaN."""
     if value is None or math.isnan(value):
         return "–"
@@ -64,33 +64,33 @@ def number(value: float | None, digits: int = 3) -> str:
     return rounded.replace("-", "−")
 
 
-def sampling(shape: Sequence[int], spacing: Sequence[float], unit: str = "") -> str:
+def format_sampling(shape: Sequence[int], spacing: Sequence[float], unit: str = "") -> str:
     """Return the number and the size of voxels (z, y, x); one edge stands for three that are equal."""
     edges = " x ".join(f"{h:.4g}" for h in spacing[: 1 if len(set(spacing)) == 1 else 3])
     return f"{' x '.join(map(str, shape))} voxels of {edges} {unit}".rstrip()
 
 
-def percent(share: float) -> str:
+def format_percent(share: float) -> str:
     """Return a share in percent."""
-    return f"{number(100 * share, 2)}{_GLUE}%"
+    return f"{format_number(100 * share, 2)}{_GLUE}%"
 
 
-def length(value: float, unit: str, digits: int = 2) -> str:
+def format_length(value: float, unit: str, digits: int = 2) -> str:
     """Return a length in the unit in which it is 1 to 1000."""
     if unit not in METRES or not math.isfinite(value) or value <= 0:
-        return f"{number(value, digits)}{_GLUE}{unit_name(unit, value)}"
+        return f"{format_number(value, digits)}{_GLUE}{unit_name(unit, value)}"
     metres = value * METRES[unit]
     fitting = [name for name, size in METRES.items() if metres / size >= 0.9995]
     best = fitting[-1] if fitting else "nm"
-    return f"{number(metres / METRES[best], digits)}{_GLUE}{unit_name(best)}"
+    return f"{format_number(metres / METRES[best], digits)}{_GLUE}{unit_name(best)}"
 
 
-def density(value: float, unit: str, power: int, digits: int = 3) -> str:
+def format_density(value: float, unit: str, power: int, digits: int = 3) -> str:
     """Return a number per unit of length to a power, in another unit where it would be tiny or huge."""
     names = [unit, *(name for name in ("mm", "um", "nm", "m") if unit in METRES and name != unit)]
     scaled = {name: value * (METRES[name] / METRES[unit]) ** power if name != unit else value for name in names}
     best = next((name for name in names if 0.1 <= abs(scaled[name]) < 1e4), unit)
-    return f"{number(scaled[best], digits)}{_GLUE}{per_unit(best, power)[1:]}"
+    return f"{format_number(scaled[best], digits)}{_GLUE}{per_unit(best, power)[1:]}"
 
 
 def per_unit(unit: str, power: int) -> str:

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from llvmlite import binding
 
-from curvafit.core.checks import check_int, check_type, seed_of
+from curvafit.core.checks import check_int, check_seed, check_type
 from curvafit.core.runtime import Progress, silent
 from curvafit.core.workers import ThisProcess, Workers
 from curvafit.data_synth.design import Design, Draw, boxed
@@ -110,7 +110,7 @@ def settings_of(
         check_type(design, Design, "a Design")
     plan, design = named_schedule(schedule).as_dict(), design or boxed()
     design.draw(seed, 0)  # refuses a wrong seed, before a store is made
-    return Settings(grid.shape, grid.spacing, WORKING_EPSILON, WORKING_BLUR, design.as_dict(), seed_of(seed), plan)
+    return Settings(grid.shape, grid.spacing, WORKING_EPSILON, WORKING_BLUR, design.as_dict(), check_seed(seed), plan)
 
 
 def _fill(store: Store, count: int, workers: Workers, progress: Progress) -> Store:

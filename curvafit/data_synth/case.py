@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from curvafit.core.checks import LONGEST, SHORTEST, as_tuple, check_float, check_int, check_type, quoted, seed_of
+from curvafit.core.checks import LONGEST, SHORTEST, as_tuple, check_float, check_int, check_seed, check_type, quoted
 from curvafit.data_synth.imaging.image import field_shape, image, regrid, visible
 from curvafit.data_synth.imaging.modality import Imaging, Modality
 from curvafit.data_synth.sources import ShapeSource, source_of
@@ -70,7 +70,7 @@ class Recipe:
         object.__setattr__(self, "shape", check_shape(self.shape))
         voxel = check_float(self.voxel, "a shape's voxel of positive length", SHORTEST, LONGEST)
         object.__setattr__(self, "voxel", voxel)
-        object.__setattr__(self, "seed", seed_of(self.seed))
+        object.__setattr__(self, "seed", check_seed(self.seed))
         check_calibres(self.calibres)
         for factor in self.calibres:
             check_crop(self.source.within, self.shape, self.voxel * factor, self.modality)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
-from curvafit.core.checks import LONGEST, SHORTEST, as_tuple, check_choice, check_float, check_int, seed_of
+from curvafit.core.checks import LONGEST, SHORTEST, as_tuple, check_choice, check_float, check_int, check_seed
 from curvafit.data_synth.case import check_calibres, check_crop, check_shape, draw_voxel, image_and_labels
 from curvafit.data_synth.imaging.image import field_shape
 from curvafit.data_synth.imaging.maths import correlated_field
@@ -103,7 +103,7 @@ class TextureDataset(IterableDataset):
         kinds = [modalities] if isinstance(modalities, (str, Modality)) else list(modalities)
         self.modalities = [modality(kind) if isinstance(kind, str) else kind for kind in kinds]
         self.size = check_shape((size,) * 3 if isinstance(size, (int, Real)) else size)
-        self.length, self.seed, self.blend = int(length), seed_of(seed), blend
+        self.length, self.seed, self.blend = int(length), check_seed(seed), blend
         self.calibres, self.normalise, self.transform = calibres, _normalisation(normalise), transform
         sources: list[Any] = [source] if isinstance(source, LAW_TYPES) else list(as_tuple(source, "laws or stores"))
         self._check(sources)

@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 from scipy.stats import qmc
 
-from curvafit.core.checks import SEEDS, as_tuple, check_choice, check_float, check_int, quoted, seed_of
+from curvafit.core.checks import SEEDS, as_tuple, check_choice, check_float, check_int, check_seed, quoted
 from curvafit.priors.coefficients import NAMES, POWERS, Coefficients, check_strength
 from curvafit.priors.grid import WORKING_EPSILON
 from curvafit.priors.law import Law
@@ -214,7 +214,7 @@ def _is_number(value: Any) -> bool:
 
 def _stream(seed: int, index: int, purpose: str) -> np.random.SeedSequence:
     index = check_int(index, "an index that is a whole number from 0", 0, SEEDS - 1)
-    return np.random.SeedSequence(seed_of(seed), spawn_key=(index, ("parameters", "start").index(purpose)))
+    return np.random.SeedSequence(check_seed(seed), spawn_key=(index, ("parameters", "start").index(purpose)))
 
 
 # ---- files -----------------------------------------------------------------------------------------------------------

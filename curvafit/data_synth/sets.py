@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from curvafit.core.checks import as_tuple, check_choice, check_int, check_type
 from curvafit.core.files import remove, write_content
 from curvafit.core.records import Format, parse_json
-from curvafit.core.runtime import Progress, silent, undisturbed
+from curvafit.core.runtime import Progress, hold_signals, silent
 from curvafit.core.workers import ThisProcess, Workers
 from curvafit.data_synth.atlas import versions
 from curvafit.data_synth.case import Case, Recipe
@@ -260,7 +260,7 @@ def _write_case(folder: Path, spec: SetSpec, index: int, case: Case) -> None:
         sums = {"image": _digest(case.image), "label": _digest(mask)}
         _write_json(record, case.record | known | {"sha256": sums, "versions": versions()})
     except BaseException:
-        with undisturbed():
+        with hold_signals():
             for place in () if record.exists() else places:  # another process may have completed the case
                 remove(place)
         raise

@@ -33,9 +33,9 @@ import zarr
 from zarr.codecs import BloscCodec, Crc32cCodec
 
 from curvafit.core.checks import quoted
-from curvafit.core.files import staged, write_content
+from curvafit.core.files import temporary_folder, write_content
 from curvafit.core.records import parse_json
-from curvafit.core.runtime import undisturbed
+from curvafit.core.runtime import hold_signals
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.viability import Viability
 from curvafit.priors.coefficients import NAMES, Coefficients
@@ -170,7 +170,7 @@ class Store:
         if self.has(record.index):
             return False
         self._clear_stale()
-        with staged(self.path / "draws" / PARTIAL) as partial:
+        with temporary_folder(self.path / "draws" / PARTIAL) as partial:
             _write_draw(partial / place.name, record, field)
             if _publish(partial / place.name, place):
                 return True
@@ -264,9 +264,9 @@ def _difference(stored: Settings, wanted: Settings) -> str:
 
 def _create(path: Path, settings: Settings) -> None:
     there = path.is_dir()  # an empty folder, which may be another disk's
-    with staged(path / "store" if there else path) as partial:
+    with temporary_folder(path / "store" if there else path) as partial:
         header = {"format": FORMAT, "version": VERSION, "settings": dataclasses.asdict(settings), "wanted": 0}
-        with undisturbed():
+        with hold_signals():
             zarr.create_group(store=str(partial / "store"), attributes=header)
             zarr.create_group(store=str(partial / "store" / "draws"))
         if there:
@@ -276,7 +276,7 @@ def _create(path: Path, settings: Settings) -> None:
             _publish(partial / "store", path)
 
 
-@undisturbed()  # Zarr writes in threads of its own, which would go on beside what cleans up
+@hold_signals()  # Zarr writes in threads of its own, which would go on beside what cleans up
 def _write_draw(folder: Path, record: Record, field: np.ndarray | None) -> None:
     attributes = dataclasses.asdict(record) | {"coefficients": record.coefficients.as_dict()}
     attributes = _without_nan(attributes | {"viability": _without_nan(attributes["viability"])})

@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from curvafit.core.checks import LONGEST, SHORTEST, as_tuple, check_float, check_int, check_type
-from curvafit.core.files import move_together, remove, staged
+from curvafit.core.files import move_together, remove, temporary_folder
 from curvafit.core.records import Format, can_write, sibling
-from curvafit.core.runtime import undisturbed
+from curvafit.core.runtime import hold_signals
 from curvafit.core.units import parse_unit
 from curvafit.drawing.render import surface_picture
 from curvafit.generation.flow import Flow
@@ -162,7 +162,7 @@ def write_shape(
     target = check_target(path, output, steps=flow.snapshots, picture=picture, overwrite=overwrite)
     image = sibling(target, ".png")
     former = picture or image.name in FORMAT.companions(target)
-    with staged(target) as work:
+    with temporary_folder(target) as work:
         shape = write_field(flow.field, flow.grid, work / target.name, output)
         note = sibling(shape, ".json")
         parts = [shape, note]
@@ -172,7 +172,7 @@ def write_shape(
         content = {**(record or {}), "files": [part.name for part in parts]}
         drawing = content | {"files": [*content["files"], image.name]}
         FORMAT.write(note, drawing if picture else content)
-        with undisturbed():
+        with hold_signals():
             files = move_together(parts, target.parent)
             if former:
                 remove(image)

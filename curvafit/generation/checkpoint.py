@@ -16,8 +16,8 @@ import torch
 from filelock import FileLock, Timeout
 from torch import Tensor
 
-from curvafit.core.files import sweep, write_content
-from curvafit.core.runtime import undisturbed
+from curvafit.core.files import remove_leftovers, write_content
+from curvafit.core.runtime import hold_signals
 from curvafit.priors.coefficients import Coefficients
 
 #: First words of a checkpoint, before the SHA-256 of its content.
@@ -71,10 +71,10 @@ class Checkpoint:
                 "end, or name another file"
             ) from None
         try:
-            sweep(self.path)
+            remove_leftovers(self.path)
             yield
         finally:
-            with undisturbed():
+            with hold_signals():
                 with suppress(PermissionError):  # Windows deletes no file that is open
                     place.unlink(
                         missing_ok=True

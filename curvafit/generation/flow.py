@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from curvafit.core.checks import check_choice, quoted, seed_of
+from curvafit.core.checks import check_choice, check_seed, quoted
 from curvafit.generation.cost import Cost
 from curvafit.generation.data import Data
 from curvafit.generation.initial import white_noise
@@ -111,7 +111,7 @@ def generate(
     """
     known = Law.of(law)
     mass = known.mass if mass is None and volume_fraction is None else mass
-    grid, seed = grid if isinstance(grid, Grid) else Grid(grid), seed_of(seed)  # type: ignore[arg-type]
+    grid, seed = grid if isinstance(grid, Grid) else Grid(grid), check_seed(seed)  # type: ignore[arg-type]
     execution = Execution(backend, device, checkpoint, checkpoint_every, keep_checkpoint)
     plan = named_schedule(schedule)
     cost = Cost(known.coefficients, grid, epsilon, orientation, blur)

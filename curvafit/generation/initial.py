@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from curvafit.core.checks import check_float, check_type, seed_of
+from curvafit.core.checks import check_float, check_seed, check_type
 from curvafit.generation.memory import FIELD, check_memory
 from curvafit.priors.grid import Grid
 from curvafit.priors.shapes import Float
@@ -26,7 +26,7 @@ def white_noise(grid: Grid, seed: int, amplitude: float = AMPLITUDE) -> Float[to
     """
     check_type(grid, Grid, "a Grid")
     amplitude = check_float(amplitude, "a finite amplitude")
-    generator = torch.Generator().manual_seed(seed_of(seed))
+    generator = torch.Generator().manual_seed(check_seed(seed))
     check_memory((*grid.shape, 3), FIELD, "a box")
     noise = amplitude * torch.rand((3, *grid.shape), generator=generator, dtype=torch.float32)
     return noise if grid.periodic else noise - amplitude / 2

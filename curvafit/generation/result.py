@@ -10,7 +10,7 @@ import numpy as np
 from torch import Tensor
 
 from curvafit.core.pictures import Pictured
-from curvafit.core.units import sampling
+from curvafit.core.units import format_sampling
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.viability import Viability
 from curvafit.priors.coefficients import Coefficients
@@ -87,7 +87,10 @@ class Flow(Pictured):
 
     def __repr__(self) -> str:
         """Return one line with voxels, energy, viability and status."""
-        size, viable = sampling(self.grid.shape, self.grid.spacing), "viable" if self.viability.viable else "not viable"
+        size, viable = (
+            format_sampling(self.grid.shape, self.grid.spacing),
+            "viable" if self.viability.viable else "not viable",
+        )
         return f"Flow({size}, energy {self.history.energy[-1]:.4g}, {viable}: {self.status})"
 
     @property

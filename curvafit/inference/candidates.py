@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from curvafit.core.schema import Rule
-from curvafit.core.units import number
+from curvafit.core.units import format_number
 from curvafit.generation.flow import Flow, generate
 from curvafit.generation.schedule import LEARNED, Schedule
 from curvafit.geometry.diagram import Diagram, diagram
@@ -241,7 +241,7 @@ def differences(scan: Morphometry, twins: Sequence[Morphometry]) -> list[str]:
         reach = np.maximum(NEAR, 2 * np.sqrt((1 + np.abs(ratios)) / max(count, 1)))
         if len(ratios) and ((ratios > 1 + reach).all() or (ratios < 1 - reach).all()):
             ratio = float(ratios.mean())
-            words.append(f"{word} of the other sign" if ratio < 0 else f"{word} {number(ratio, 2)}")
+            words.append(f"{word} of the other sign" if ratio < 0 else f"{word} {format_number(ratio, 2)}")
     return words
 
 
@@ -249,7 +249,7 @@ def _unusual(misfit: Misfit | None) -> str:
     """Return how usual the scan's descriptors are for the model, as a sentence."""
     if misfit is None:
         return ""
-    p = number(misfit.probability, 2)
+    p = format_number(misfit.probability, 2)
     if misfit.probability >= UNBELIEVABLE:
         return f"The scan's descriptors are of a kind that the model makes (p = {p})."
     names = ", ".join(misfit.strangest) or "none by itself"

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from curvafit.core.units import number
+from curvafit.core.units import format_number
 from curvafit.inference.stationarity import double_precision_on_cpu
 from curvafit.inference.table import PARAMETERS, Compression
 
@@ -129,7 +129,8 @@ class WeakDirection(NamedTuple):
             int(np.abs(self.direction).argmax())
         ]
         ends = [
-            ", ".join(f"{PARAMETERS[k]} {number(float(end[k]), 2)}" for k in chosen) for end in (self.low, self.high)
+            ", ".join(f"{PARAMETERS[k]} {format_number(float(end[k]), 2)}" for k in chosen)
+            for end in (self.low, self.high)
         ]
         names = [PARAMETERS[k] for k in chosen]
         together = ", ".join(names[:-1]) + " and " + names[-1] if len(names) > 1 else names[0]

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import stats
 
-from curvafit.core.runtime import Progress, part, silent
+from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import Schedule
 from curvafit.geometry.descriptors import BLOCKS, Descriptors, descriptors
@@ -120,12 +120,14 @@ def estimate(
     reading = _Reading(posterior, row, view, parameters, best, mirror_parameters if turned else np.asarray)
     if not fast:
         simulate = _simulator(seen, view, effort.schedule)
-        grown = simulate_draws(parameters, simulate, effort.simulations, seed=seed, progress=part(progress, 0.15, 0.45))
+        grown = simulate_draws(
+            parameters, simulate, effort.simulations, seed=seed, progress=sub_progress(progress, 0.15, 0.45)
+        )
         if len(grown.parameters) >= FEWEST:
             pool = posterior.sample(row, view, POOL, seed)
             search = Search(posterior.emulator, view, row)
             likeliest, every = search.parameters(
-                pool, grown, simulate, rounds=effort.rounds, seed=seed, progress=part(progress, 0.45, 1.0)
+                pool, grown, simulate, rounds=effort.rounds, seed=seed, progress=sub_progress(progress, 0.45, 1.0)
             )
             near = every.parameters[search.nearest(every)[0]]
             return _checked(reading, grown, {"refined": likeliest, "simulation": near})

@@ -15,8 +15,8 @@ import torch
 
 from curvafit.core.checks import SEEDS, check_choice, check_int, check_type
 from curvafit.core.pictures import Pictured
-from curvafit.core.runtime import Progress, part, silent
-from curvafit.core.units import number
+from curvafit.core.runtime import Progress, silent, sub_progress
+from curvafit.core.units import format_number
 from curvafit.generation.schedule import LEARNED, SCHEDULES
 from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram, family_of
 from curvafit.geometry.morphometry import Morphometry, morphometry
@@ -77,7 +77,7 @@ class Inference(Pictured):
     def __repr__(self) -> str:
         fit = self.fit
         voxels = " x ".join(map(str, self.scan.values.shape))
-        near = ", ".join(f"{each.name} {number(each.distance, 2)}" for each in fit.candidates)
+        near = ", ".join(f"{each.name} {format_number(each.distance, 2)}" for each in fit.candidates)
         return f"Inference({fit.family} from {_ARTICLES[fit.kind]} of {voxels} voxels, distances: {near}. {fit.status})"
 
     @property
@@ -183,14 +183,16 @@ def infer(
     estimated = None
     if method == "posterior":
         estimated = estimate(
-            prepared, posterior, seed=seed, fast=fast, effort=effort, progress=part(progress, 0.1, 0.5)
+            prepared, posterior, seed=seed, fast=fast, effort=effort, progress=sub_progress(progress, 0.1, 0.5)
         )
     progress("searching the atlas", 0.5)
     matches = _matches(prepared, measured, atlas, exact=method == "match")
     refined = refine_matches(prepared, posterior, matches) if method == "match" else None
     drawn = (() if refined is None else (refined,)) if estimated is None else estimated.candidates
-    laws = _laws(prepared, drawn, matches, seed, part(progress, 0.5, 0.6))
-    laws, twins = (laws, {}) if fast else _grown(laws, measured, prepared, seed, effort, part(progress, 0.6, 1.0))
+    laws = _laws(prepared, drawn, matches, seed, sub_progress(progress, 0.5, 0.6))
+    laws, twins = (
+        (laws, {}) if fast else _grown(laws, measured, prepared, seed, effort, sub_progress(progress, 0.6, 1.0))
+    )
     chosen, status = verdict(laws, None if estimated is None else estimated.misfit, numbers, fast=fast)
     law = next((each.coefficients for each in laws if each.name == chosen), None)
     moved = None if law is None else drift(*_window(prepared), WORKING_EPSILON, law)

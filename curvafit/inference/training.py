@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from curvafit.core.checks import check_int, seed_of
+from curvafit.core.checks import check_int, check_seed
 from curvafit.core.runtime import Progress, silent
 from curvafit.inference.emulator import FAINTEST, Emulator, Layer, misfits
 from curvafit.inference.posterior import MASS, MOST, Architecture, Member, Posterior
@@ -90,7 +90,7 @@ def train_posterior(
     ValueError
         If the table has too few shapes, or a parameter that does not vary, or an argument is out of range.
     """
-    members, seed = check_int(members, "a number of flows", 1, MOST), seed_of(seed)
+    members, seed = check_int(members, "a number of flows", 1, MOST), check_seed(seed)
     sizes, table = architecture or Architecture(), table.visible
     shapes, number = np.unique(table.shapes, return_inverse=True)
     if len(shapes) < 2 * sizes.components:

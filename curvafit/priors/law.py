@@ -12,7 +12,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from torch import Tensor
 
-from curvafit.core.checks import plain_name
+from curvafit.core.checks import simplify_name
 from curvafit.core.records import parse_json, quoted
 from curvafit.core.units import METRES
 from curvafit.priors.coefficients import NAMES, Coefficients
@@ -301,5 +301,5 @@ def preset(name: str) -> Law:
 
 def preset_name(name: object) -> str | None:
     """Return the name in `PRESETS` that a text spells (see `preset`), None where there is no such name."""
-    key = plain_name(name) if isinstance(name, str) else None
+    key = simplify_name(name) if isinstance(name, str) else None
     return key if key in PRESETS else None

@@ -18,7 +18,7 @@ from matplotlib.patheffects import withStroke
 
 from curvafit.core.files import write_content
 from curvafit.core.records import can_write, has_mark
-from curvafit.core.runtime import Progress, part, silent
+from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.core.units import unit_name
 from curvafit.drawing.plot import INK, diagram_on, gallery_figure, png, shared_limits
 from curvafit.geometry.diagram import FAMILIES, family_of, half_thickness
@@ -121,12 +121,12 @@ def write_demo(
     page = folder / PAGE
     can_write(page, lambda path: has_mark(path, _MARK), overwrite=overwrite)
     progress("measuring", 0.0)
-    measures = measure(scan, progress=part(progress, 0.0, 0.1))
-    inference = infer(scan, fast=True, seed=seed, progress=part(progress, 0.1, 0.3))
+    measures = measure(scan, progress=sub_progress(progress, 0.0, 0.1))
+    inference = infer(scan, fast=True, seed=seed, progress=sub_progress(progress, 0.1, 0.3))
     mask = find_level(scan).mask
     volume = Field(mask.view(np.uint8), scan.spacing, scan.unit)
     law = inference.fit if inference.fit.best is not None else Coefficients.willmore()
-    filled = reconstruct(volume, law, every=every, progress=part(progress, 0.3, 0.95))
+    filled = reconstruct(volume, law, every=every, progress=sub_progress(progress, 0.3, 0.95))
     completion = score_completion(mask, filled.mask.values, every, filled.status)
     progress("drawing the page", 0.95)
     text = demo_page(inference, measures, completion, load_atlas(), load_posterior().box, title)

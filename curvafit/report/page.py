@@ -16,10 +16,18 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
-from curvafit.core.files import move_together, staged, write_content
+from curvafit.core.files import move_together, temporary_folder, write_content
 from curvafit.core.records import Format, can_write, has_mark
-from curvafit.core.runtime import undisturbed
-from curvafit.core.units import GLOSSARY, density, length, number, per_unit, percent, unit_name
+from curvafit.core.runtime import hold_signals
+from curvafit.core.units import (
+    GLOSSARY,
+    format_density,
+    format_length,
+    format_number,
+    format_percent,
+    per_unit,
+    unit_name,
+)
 from curvafit.drawing.plot import (
     bands_figure,
     corner_figure,
@@ -121,13 +129,13 @@ def write_inference(inference: Inference, directory: str | Path, *, overwrite: b
         As `check_report`.
     """
     target = check_report(directory, overwrite=overwrite)
-    with staged(target / FILES[0] if target.is_dir() else target) as work:
+    with temporary_folder(target / FILES[0] if target.is_dir() else target) as work:
         (work / "fit.json").write_text(inference.fit.to_json(), encoding="utf-8")
         write_report(inference, work / "report.html")
         if inference.best is not None:
             edge = inference.fit.working_voxel
             save(Field(inference.best, (edge, edge, edge), inference.fit.length_unit), work / "regenerated.nii.gz")
-        with undisturbed():
+        with hold_signals():
             target.mkdir(exist_ok=True)
             (target / "regenerated.nii.gz").unlink(missing_ok=True)
             move_together(sorted(work.iterdir()), target)
@@ -160,7 +168,7 @@ def report_html(inference: Inference) -> str:
     return page.get_template("report.html").render(
         version=fit.provenance.get("curvafit", ""),
         glossary=GLOSSARY,
-        number=number,
+        number=format_number,
         fit=fit,
         sentence=describe(inference),
         scan=_scan_line(inference),
@@ -169,7 +177,7 @@ def report_html(inference: Inference) -> str:
         shapes=_shapes(inference) if inference.twins else [],
         diagrams=[] if inference.diagram is None else _diagrams(inference),
         bars=_bars(inference) if inference.twins else [],
-        unit=length(fit.length, fit.length_unit, 3),
+        unit=format_length(fit.length, fit.length_unit, 3),
         noise=seed_noise_of(fit.candidates),
         twins=0 if fit.best is None else len(fit.best.twins),
         numbers=_number_rows(inference),
@@ -193,9 +201,9 @@ def describe(inference: Inference) -> str:
     pattern = _SIZES.get(fit.family, "{family}, {thickness} thick, {share} of the volume")
     return pattern.format(
         family=fit.family.capitalize(),
-        radius=length(physical, fit.length_unit),
-        thickness=length(numbers.thickness_mean, fit.length_unit),
-        share=percent(numbers.volume_fraction),
+        radius=format_length(physical, fit.length_unit),
+        thickness=format_length(numbers.thickness_mean, fit.length_unit),
+        share=format_percent(numbers.volume_fraction),
     )
 
 
@@ -222,7 +230,7 @@ def _scan_line(inference: Inference) -> str:
     spacing = (scan.spacing[0],) if same else scan.spacing
     voxel = " × ".join(f"{h:.4g}" for h in spacing) + f" {unit_name(scan.unit, spacing[0])}"
     line = f"{Path(scan.source).name or 'a volume'}: {kind} of {shape} voxels (z, y, x), voxel edge {voxel}."
-    return f"{line} Measured on voxels of {length(fit.working_voxel, fit.length_unit, 3)}."
+    return f"{line} Measured on voxels of {format_length(fit.working_voxel, fit.length_unit, 3)}."
 
 
 def _bars(inference: Inference) -> list[dict[str, Any]]:
@@ -233,7 +241,7 @@ def _bars(inference: Inference) -> list[dict[str, Any]]:
     longest = max((value for _, value, _ in rows if value is not None), default=0.0) or 1.0
     bars = []
     for name, value, kind in rows:
-        text = number(value, 2) if value is not None else "not known" if kind == "noise" else "nothing grew"
+        text = format_number(value, 2) if value is not None else "not known" if kind == "noise" else "nothing grew"
         width = None if value is None else f"{100 * value / longest:.1f}"
         bars.append({"name": name, "kind": kind, "text": text, "width": width})
     return bars
@@ -244,11 +252,11 @@ def _number_rows(inference: Inference) -> list[tuple[str, str, list[str]]]:
     scan, best = inference.fit.morphometry, inference.fit.best
     twins, unit = () if best is None else best.twins, scan.unit
     kinds: tuple[tuple[str, str, str, Callable[[float], str]], ...] = (
-        ("Volume fraction", "BV/TV", "volume_fraction", percent),
-        ("Mean thickness", "Tb.Th", "thickness_mean", lambda x: length(x, unit)),
-        ("Mean spacing", "Tb.Sp", "spacing_mean", lambda x: length(x, unit)),
-        ("Connectivity density", "Conn.D", "connectivity_density", lambda x: density(x, unit, 3)),
-        ("Surface to volume", "BS/BV", "surface_to_volume", lambda x: density(x, unit, 1)),
+        ("Volume fraction", "BV/TV", "volume_fraction", format_percent),
+        ("Mean thickness", "Tb.Th", "thickness_mean", lambda x: format_length(x, unit)),
+        ("Mean spacing", "Tb.Sp", "spacing_mean", lambda x: format_length(x, unit)),
+        ("Connectivity density", "Conn.D", "connectivity_density", lambda x: format_density(x, unit, 3)),
+        ("Surface to volume", "BS/BV", "surface_to_volume", lambda x: format_density(x, unit, 1)),
     )
     rows = []
     for name, short, key, text in kinds:
@@ -257,7 +265,7 @@ def _number_rows(inference: Inference) -> list[tuple[str, str, list[str]]]:
         if values:
             mean = sum(values) / len(values)
             extremes = f" ({text(min(values))} to {text(max(values))})" if len(values) > 1 else ""
-            cells += [text(mean) + extremes, number(mean / own, 2) if own else "–"]
+            cells += [text(mean) + extremes, format_number(mean / own, 2) if own else "–"]
         rows.append((name, short, cells))
     return rows
 
@@ -282,10 +290,10 @@ def _parameters(inference: Inference) -> list[tuple[str, tuple[str, ...], str]]:
     rows = []
     for name, value in {**best.coefficients.as_dict(), "mass": best.mass}.items():
         known, power = intervals.get(name), _TERMS[name][2]
-        median = number(known["median"]) if known else ""
-        scaled = "" if name == "mass" else number(physical.as_dict()[name])
+        median = format_number(known["median"]) if known else ""
+        scaled = "" if name == "mass" else format_number(physical.as_dict()[name])
         ranges = _interval(known, "50"), _interval(known, "90")
-        cells = (number(value), _deviation(best, name), median, *ranges, scaled)
+        cells = (format_number(value), _deviation(best, name), median, *ranges, scaled)
         rows.append((name, cells, per_unit(fit.length_unit, power) if power else ""))
     return rows
 
@@ -296,12 +304,12 @@ def _law(inference: Inference) -> dict[str, Any] | None:
     if best is None:
         return None
     rows = [(*_TERMS[name][:2], cells, unit) for name, cells, unit in _parameters(inference)]
-    width = ("0.02", "", "", "", "", number(fit.epsilon_physical))
+    width = ("0.02", "", "", "", "", format_number(fit.epsilon_physical))
     fixed = [name for name in ("a20", "a02") if abs(best.coefficients.as_dict()[name] - 1) < 1e-9]
     return {
         "rows": [*rows, ("ε", "interface", width, unit_name(fit.length_unit, 2))],
         "gauge": f"here {_TERMS[fixed[0]][0]} = 1" if fixed else "all six may be multiplied by one factor",
-        "voxel": length(fit.working_voxel, fit.length_unit, 3),
+        "voxel": format_length(fit.working_voxel, fit.length_unit, 3),
         "title": TITLES.get(best.name, best.name),
         "own": bool(best.uncertainty),
     }
@@ -310,16 +318,16 @@ def _law(inference: Inference) -> dict[str, Any] | None:
 def _deviation(candidate: Candidate, name: str) -> str:
     """Return a candidate's own deviation of a parameter; nothing where it has none."""
     value = candidate.uncertainty.get(name)
-    return "" if value is None else "fixed" if value == 0 else number(value, 2)
+    return "" if value is None else "fixed" if value == 0 else format_number(value, 2)
 
 
 def _interval(known: Mapping[str, Any] | None, level: str) -> str:
-    return "" if known is None else " to ".join(number(end) for end in known[level])
+    return "" if known is None else " to ".join(format_number(end) for end in known[level])
 
 
 def _match_cells(match: Any) -> list[str]:
     values = (*match.coefficients.as_dict().values(), match.mass)
-    return [number(match.distance, 2), *map(number, values), str(match.seed)]
+    return [format_number(match.distance, 2), *map(format_number, values), str(match.seed)]
 
 
 def _plain(value: object) -> str:
@@ -390,7 +398,7 @@ def _slice(inference: Inference, axis: int, index: int, limits: tuple[float, flo
         axes_names=(_AXES[down], _AXES[across]),
         window=framed,
     )
-    depth = length((row + 0.5) * scan.spacing[axis], scan.unit)
+    depth = format_length((row + 0.5) * scan.spacing[axis], scan.unit)
     title, text = f"Across {_AXES[axis]}", f"Slice {row} of {scan.values.shape[axis]}, at {depth}"
     return _picture(figure, f"Slice across {_AXES[axis]} with the surface's outline", title=title, text=text)
 
@@ -417,7 +425,7 @@ def _shapes(inference: Inference) -> list[Picture]:
 def _shape(inference: Inference, title: str, u: np.ndarray | None, more: str = "", badge: str = "") -> Picture:
     if u is None:
         return Picture(None, "", title, badge=badge)
-    edges = [length(n * inference.fit.working_voxel, inference.fit.length_unit, 3) for n in u.shape]
+    edges = [format_length(n * inference.fit.working_voxel, inference.fit.length_unit, 3) for n in u.shape]
     box = f"edge {edges[0]}" if len(set(edges)) == 1 else " × ".join(edges)
     return _picture(surface_figure(u), f"Surface: {title}", title=title, text=box + more, badge=badge)
 
@@ -470,7 +478,7 @@ def bands(inference: Inference) -> Picture | None:
     misfit = inference.fit.misfit
     if inference.simulated is None or misfit is None:
         return None
-    titles = {name: f"{name}, p = {number(misfit.blocks.get(name), 2)}" for name in inference.simulated}
+    titles = {name: f"{name}, p = {format_number(misfit.blocks.get(name), 2)}" for name in inference.simulated}
     return _picture(
         bands_figure({titles[name]: block for name, block in inference.simulated.items()}),
         "The scan's descriptors on the bands of simulated shapes",

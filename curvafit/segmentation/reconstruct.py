@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from curvafit.core.checks import SEEDS, check_float, check_int
-from curvafit.core.runtime import Progress, part, silent
+from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.core.workers import Workers
 from curvafit.generation import data
 from curvafit.priors.coefficients import Coefficients
@@ -355,7 +355,7 @@ def reconstruct_labels(
     for count, number in enumerate(numbers):
         each = {
             "store": None if store is None else Path(store) / str(number),
-            "progress": part(progress, count / len(numbers), (count + 1) / len(numbers)),
+            "progress": sub_progress(progress, count / len(numbers), (count + 1) / len(numbers)),
         }
         phase, one = _completed(volume, number, laws[number], places, axis, other, {**options, **each})
         owner = np.where(phase > deepest, number, owner)

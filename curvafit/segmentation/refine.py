@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from curvafit.core.checks import SEEDS, check_float, check_int, quoted
-from curvafit.core.runtime import Progress, part, silent
+from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.core.workers import Workers
 from curvafit.generation.data import Evidence
 from curvafit.priors.coefficients import Coefficients
@@ -143,7 +143,7 @@ def refine(
             alike = {name: value for name, value in reading.items() if name not in ("like", "crop")}
             chances, truth = chances_of(example[0], **alike), _truth(example[1], label, alike)
             check_spacing(chances, field, "the probabilities")
-            trials, progress = part(progress, 0.0, TRIALS), part(progress, TRIALS, 1.0)
+            trials, progress = sub_progress(progress, 0.0, TRIALS), sub_progress(progress, TRIALS, 1.0)
             example = calibrate(chances, truth, prior, epsilon=epsilon, steps=steps, progress=trials)
         check_spacing(example.example, field, "the probabilities")
         setting, said = example.choice.setting, f"{example}; "

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from curvafit.core.files import move_together, remove, staged
+from curvafit.core.files import move_together, remove, temporary_folder
 from curvafit.core.pictures import Pictured
 from curvafit.core.records import Format, can_write, sibling
-from curvafit.core.runtime import undisturbed
-from curvafit.core.units import sampling
+from curvafit.core.runtime import hold_signals
+from curvafit.core.units import format_sampling
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.tiles import Lowered
 from curvafit.segmentation.uncertainty import entropy
@@ -105,7 +105,7 @@ class Segmentation(Pictured):
     def __repr__(self) -> str:
         mask = self.mask.values
         count = f"{np.count_nonzero(mask)} inside ({100 * mask.mean():.3g} %)"
-        size = sampling(self.mask.shape, self.mask.spacing, self.mask.unit)
+        size = format_sampling(self.mask.shape, self.mask.spacing, self.mask.unit)
         return f"Segmentation({size}, {count}: {self.status})"
 
 
@@ -219,7 +219,7 @@ def write_mask(
             save(Field(values, scan.spacing, scan.unit, scan.affine), place, kind=FORMAT.name)
         return place
 
-    with staged(target) as work:
+    with temporary_folder(target) as work:
         temporary = work / target.name
         mask, labels = segmentation.mask.values, segmentation.labels
         write(mask.view(np.uint8) if labels is None else labels.values, temporary)
@@ -231,7 +231,7 @@ def write_mask(
             parts.append(write(chances.values, _map_path(temporary)))
         content = {**_record(segmentation, scan, record or {}), "files": [part.name for part in parts]}
         FORMAT.write(note, content)
-        with undisturbed():
+        with hold_signals():
             files = move_together(parts, target.parent)
             if former and chances is None:
                 remove(_map_path(target))

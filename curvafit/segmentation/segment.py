@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from curvafit.core.checks import check_float
-from curvafit.core.runtime import Progress, part, silent
+from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.core.workers import Workers
 from curvafit.generation.data import Evidence
 from curvafit.priors.coefficients import Coefficients
@@ -114,9 +114,9 @@ def segment(
         overlap, block = threshold == "otsu" and classes.faint, busiest(values, sample, classes, blocks)
         chosen = weighing(
             values[block], sample.crop(block), classes, (*laws, *({WILLMORE} - set(laws))),
-            epsilon=epsilon, steps=steps, measured=overlap, progress=part(progress, 0.0, TRIALS),
+            epsilon=epsilon, steps=steps, measured=overlap, progress=sub_progress(progress, 0.0, TRIALS),
         )  # fmt: skip
-        law, nats, classes, progress = chosen.law, chosen.nats, chosen.classes, part(progress, TRIALS, 1.0)
+        law, nats, classes, progress = chosen.law, chosen.nats, chosen.classes, sub_progress(progress, TRIALS, 1.0)
     evidence, note = _Grey(boxes, bounds, classes), str(classes)
     if classes.faint and threshold == "otsu" and (chosen is None or chosen.law is None):
         notes = (*notes, FAINT)

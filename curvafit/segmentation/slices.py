@@ -10,7 +10,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.interpolate import CubicSpline, make_interp_spline
 
-from curvafit.core.units import METRES, sampling
+from curvafit.core.units import METRES, format_sampling
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.part import Box
 
@@ -201,7 +201,7 @@ def labels(values: np.ndarray, name: str) -> np.ndarray:
 def check_spacing(example: Field, volume: Field, name: str) -> None:
     """Raise ScanError where an example's voxels differ in size from those of a volume, which the error calls `name`."""
     if example.unit != volume.unit or not np.allclose(example.spacing, volume.spacing, rtol=SAME):
-        one, two = (sampling(each.shape, each.spacing, each.unit) for each in (volume, example))
+        one, two = (format_sampling(each.shape, each.spacing, each.unit) for each in (volume, example))
         raise ScanError(f"expected an example with the spacing of {name} ({one}), got {two}")
 
 

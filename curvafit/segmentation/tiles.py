@@ -18,7 +18,7 @@ from filelock import FileLock, Timeout
 
 from curvafit.core.checks import check_int
 from curvafit.core.files import write_content
-from curvafit.core.runtime import Progress, part, silent
+from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.core.workers import Workers
 from curvafit.generation.checkpoint import identity
 from curvafit.generation.data import Data
@@ -366,7 +366,7 @@ def _in_turn(problem: Problem, tiling: Tiling, tiles: Sequence[Tile], progress: 
     """Lower tiles one after another."""
     total = tiling.count
     for count, tile in enumerate(tiles, total - len(tiles)):
-        yield _piece(problem, tiling, tile, part(progress, count / total, (count + 1) / total))
+        yield _piece(problem, tiling, tile, sub_progress(progress, count / total, (count + 1) / total))
 
 
 def _by(workers: Workers, problem: Problem, tiling: Tiling, tiles: Sequence[Tile]) -> Iterator[Piece]:

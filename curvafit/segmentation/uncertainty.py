@@ -11,7 +11,7 @@ from scipy import ndimage
 from scipy.optimize import minimize
 from scipy.special import entr, expit, logit
 
-from curvafit.core.runtime import Progress, part, silent
+from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.profile import profile_distance
 from curvafit.segmentation.slices import Slices, plane_distances, reach
@@ -91,7 +91,7 @@ def chances(
     spread = _spread(task, level(task.given, setting.way))
     tried, target = (
         _Runs.of(each, level(each, setting.way), setting, laws, spread, count=runs, flow=flow, progress=half)
-        for each, half in ((task.given, part(progress, 0, 0.5)), (slices, part(progress, 0.5, 1)))
+        for each, half in ((task.given, sub_progress(progress, 0, 0.5)), (slices, sub_progress(progress, 0.5, 1)))
     )
     rows = list(task.places)
     weights = fitted(tried.evidence(rows), task.truth.ravel())
@@ -133,7 +133,7 @@ class _Runs:
     ) -> _Runs:
         votes, distance = np.zeros(level.shape, dtype=np.uint16), np.zeros(level.shape, dtype=np.float32)
         for seed in range(count):
-            step = part(progress, seed / count, (seed + 1) / count)
+            step = sub_progress(progress, seed / count, (seed + 1) / count)
             start = level + (spread * slices.reach)[:, None, None].astype(np.float32) * _wave(slices, seed)
             u, ε = flow(slices, replace(setting, law=laws[seed % len(laws)]), start, step)
             votes += u > 0

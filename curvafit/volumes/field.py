@@ -11,7 +11,7 @@ import numpy as np
 from curvafit.core.checks import SEEDS, check_int, quoted
 from curvafit.core.pictures import Pictured
 from curvafit.core.runtime import one_line
-from curvafit.core.units import parse_unit, sampling
+from curvafit.core.units import format_sampling, parse_unit
 from curvafit.volumes.formats.base import ScanError
 from curvafit.volumes.formats.part import Crop, parse_box, resolve_box
 
@@ -71,7 +71,7 @@ class Field(Pictured):
     def __repr__(self) -> str:
         extent = f" from {self.values.min():.4g} to {self.values.max():.4g}" if self.values.size else ""
         source = f", from {self.source}" if self.source else ""
-        size = sampling(self.shape, self.spacing, self.unit)
+        size = format_sampling(self.shape, self.spacing, self.unit)
         return one_line(f"Field({size}, {self.values.dtype}{extent}{source})")
 
     @property

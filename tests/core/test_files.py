@@ -15,8 +15,8 @@ from curvafit.core.files import (
     is_empty,
     move_together,
     remove,
-    staged,
-    sweep,
+    remove_leftovers,
+    temporary_folder,
     write_atomically,
     write_content,
 )
@@ -40,11 +40,11 @@ def test_a_file_is_the_new_one_or_the_old_one(tmp_path: Path) -> None:
 
 
 def test_a_staged_folder_goes_with_what_was_not_moved(tmp_path: Path) -> None:
-    with staged(tmp_path / "deep" / "out") as work:
+    with temporary_folder(tmp_path / "deep" / "out") as work:
         for name in "abc":
             (work / name).write_text(name)
         assert move_together([work / "a", work / "b"], tmp_path) == (tmp_path / "a", tmp_path / "b")
-    with pytest.raises(KeyboardInterrupt), staged(tmp_path / "out") as work:
+    with pytest.raises(KeyboardInterrupt), temporary_folder(tmp_path / "out") as work:
         (work / "half").write_text("")
         raise KeyboardInterrupt
     assert tree(tmp_path) == {"a": b"a", "b": b"b"}
@@ -65,7 +65,7 @@ def test_a_link_is_replaced_and_not_what_it_leads_to(tmp_path: Path) -> None:
 def test_what_a_killed_process_left_is_swept(tmp_path: Path) -> None:
     for name in (".0123abcd.run.pt", ".0123abcd.other.pt", ".0123abc.run.pt", "run.pt", ".run.pt"):
         (tmp_path / name).write_text("")
-    sweep(tmp_path / "run.pt")
+    remove_leftovers(tmp_path / "run.pt")
     assert sorted(tree(tmp_path)) == [".0123abc.run.pt", ".0123abcd.other.pt", ".run.pt", "run.pt"]
 
 

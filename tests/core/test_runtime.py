@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from curvafit.core.files import move_together, staged
-from curvafit.core.runtime import Terminated, exit_code, listen, undisturbed
+from curvafit.core.files import move_together, temporary_folder
+from curvafit.core.runtime import Terminated, exit_code, hold_signals, listen
 
 ROOT = Path(__file__).resolve().parents[2]
 HEARD = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
@@ -70,7 +70,7 @@ def test_it_waits_until_files_are_moved(
         send(number)
 
     monkeypatch.setattr(os, "replace", disturbed)
-    with pytest.raises(KeyboardInterrupt), staged(tmp_path / "out") as work:
+    with pytest.raises(KeyboardInterrupt), temporary_folder(tmp_path / "out") as work:
         for name in "abc":
             (work / name).write_text(name)
         move_together([work / name for name in "abc"], tmp_path)
@@ -79,13 +79,13 @@ def test_it_waits_until_files_are_moved(
 
 def test_nested_blocks_end_with_the_outermost(listening: None) -> None:
     reached = []
-    with pytest.raises(Terminated), undisturbed():
-        with undisturbed():
+    with pytest.raises(Terminated), hold_signals():
+        with hold_signals():
             send(signal.SIGTERM)
             reached.append("inner")
         reached.append("outer")
     assert reached == ["inner", "outer"]
-    with undisturbed():
+    with hold_signals():
         pass
 
 
@@ -107,7 +107,7 @@ def test_other_threads_are_let_alone() -> None:
     inside, done = threading.Event(), threading.Event()
 
     def work() -> None:
-        with undisturbed():
+        with hold_signals():
             inside.set()
             done.wait(5)
 
@@ -115,7 +115,7 @@ def test_other_threads_are_let_alone() -> None:
     thread.start()
     inside.wait(5)
     try:
-        with pytest.raises(KeyboardInterrupt), undisturbed():
+        with pytest.raises(KeyboardInterrupt), hold_signals():
             raise KeyboardInterrupt
     finally:
         done.set()

@@ -15,7 +15,7 @@ import torch
 from found import EPSILON, RADIUS, SCALE, made_fit, made_inference, without_drawing
 from matplotlib.figure import Figure
 
-from curvafit.core.units import GLOSSARY, density, length, number
+from curvafit.core.units import GLOSSARY, format_density, format_length, format_number
 from curvafit.geometry.diagram import diagram
 from curvafit.inference.infer import Inference
 from curvafit.priors import Grid
@@ -130,8 +130,8 @@ def test_physical_coefficients_carry_their_power_of_length(html: str) -> None:
     rows = dict(re.findall(r'<tr><th scope="row">(a.{2})</th>(.*?)</tr>', html))
     assert {"a₂₀", "a₁₁", "a₀₂", "a₁₀", "a₀₁", "a₀₀"} <= set(rows)
     λ = SCALE / 0.01
-    assert number(-38.5 / λ) in rows["a₁₀"] and ">6.0<" in rows["a₁₀"] and "1/mm<" in rows["a₁₀"]
-    assert number(433 / λ**2) in rows["a₀₀"] and ">51<" in rows["a₀₀"] and "1/mm²" in rows["a₀₀"]
+    assert format_number(-38.5 / λ) in rows["a₁₀"] and ">6.0<" in rows["a₁₀"] and "1/mm<" in rows["a₁₀"]
+    assert format_number(433 / λ**2) in rows["a₀₀"] and ">51<" in rows["a₀₀"] and "1/mm²" in rows["a₀₀"]
     assert "fixed" in rows["a₂₀"] and "1/mm" not in rows["a₁₁"]
 
 
@@ -278,7 +278,7 @@ def test_the_first_sentence(family: str, said: str) -> None:
     ],
 )
 def test_numbers_are_rounded_to_significant_digits(value: float | None, digits: int, said: str) -> None:
-    assert number(value, digits) == said
+    assert format_number(value, digits) == said
 
 
 @pytest.mark.parametrize(
@@ -286,10 +286,10 @@ def test_numbers_are_rounded_to_significant_digits(value: float | None, digits: 
     [(0.0412, "mm", "41 µm"), (1500.0, "um", "1.5 mm"), (5.13, "voxel", "5.1 voxels"), (0.2, "nm", "0.20 nm")],
 )
 def test_lengths_are_said_in_a_fitting_unit(value: float, unit: str, said: str) -> None:
-    assert length(value, unit).replace("\u00a0", " ") == said
+    assert format_length(value, unit).replace("\u00a0", " ") == said
 
 
 def test_densities_change_their_unit_only_where_they_must() -> None:
-    assert density(4.9, "mm", 3).replace("\u00a0", " ") == "4.90 /mm³"
-    assert density(4.9e-9, "um", 3).replace("\u00a0", " ") == "4.90 /mm³"
-    assert density(0.02, "voxel", 1).replace("\u00a0", " ") == "0.0200 /voxel"
+    assert format_density(4.9, "mm", 3).replace("\u00a0", " ") == "4.90 /mm³"
+    assert format_density(4.9e-9, "um", 3).replace("\u00a0", " ") == "4.90 /mm³"
+    assert format_density(0.02, "voxel", 1).replace("\u00a0", " ") == "0.0200 /voxel"

@@ -14,7 +14,7 @@ from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
 import numpy as np
 import yaml
 
-from curvafit.core.checks import LONGEST, SHORTEST, check_float, plain_name, quoted
+from curvafit.core.checks import LONGEST, SHORTEST, check_float, quoted, simplify_name
 from curvafit.core.units import METRES
 from curvafit.data_synth.imaging.maths import Triple, seeds_of
 
@@ -346,7 +346,7 @@ MODALITIES = _load_modalities()
 
 def modality(name: str) -> Modality:
     """Return the preset of a name; capitals, spaces and underscores do not count: `two-photon` is `Two_Photon`."""
-    plain = plain_name(str(name))
+    plain = simplify_name(str(name))
     if plain not in MODALITIES:
         raise ValueError(f"a modality is one of {', '.join(MODALITIES)}, got {quoted(name)}")
     return MODALITIES[plain]

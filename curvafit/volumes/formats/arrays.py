@@ -12,7 +12,15 @@ import numpy as np
 
 from curvafit.core.checks import quoted
 from curvafit.core.records import read_array, read_array_header
-from curvafit.volumes.formats.base import Raw, ScanError, check_regular, mapped, pick_key, read_numbers, spacing_of
+from curvafit.volumes.formats.base import (
+    Raw,
+    ScanError,
+    check_regular,
+    map_numbers,
+    pick_key,
+    read_numbers,
+    read_spacing,
+)
 from curvafit.volumes.formats.part import Part, read_part
 
 #: Attributes that may state a spacing or its unit.
@@ -28,7 +36,7 @@ def read_npy(path: Path, *, part: Part | None = None, **_: object) -> Raw:
         if part is None:
             values = read_numbers(stream, order, dtype, path)
             return Raw(values.T if fortran else values)
-        values = mapped(path, stream.tell(), order, dtype)
+        values = map_numbers(path, stream.tell(), order, dtype)
     return read_part(values.T if fortran else values, part, path)
 
 
@@ -60,7 +68,7 @@ def read_hdf5(path: Path, *, key: str | None = None, part: Part | None = None, *
         if dataset.shape is None:
             raise ScanError(f"a volume must be 3D, got no values in {path}")
         attributes = {name: dataset.attrs[name] for name in _ATTRIBUTES if name in dataset.attrs}
-        spacing, unit = spacing_of(attributes, dataset.ndim)
+        spacing, unit = read_spacing(attributes, dataset.ndim)
         gaps = tuple(_gaps(dataset, path))
         return read_part(dataset, part, path)._replace(spacing=spacing, unit=unit, gaps=gaps)
 
@@ -108,4 +116,4 @@ def read_raw(
         raise ScanError(f"shape {shape} of {kind} takes {nbytes} bytes, got {size} in {path}")
     if part is None:
         return Raw(np.fromfile(path, dtype=kind).reshape(shape))
-    return read_part(mapped(path, 0, shape, kind), part, path)
+    return read_part(map_numbers(path, 0, shape, kind), part, path)

@@ -88,7 +88,7 @@ def pick_key(keys: list[str], key: str | None, path: object) -> str:
     return name
 
 
-def spacing_of(attributes: Mapping[str, Any], ndim: int) -> tuple[tuple[Any, ...] | None, Any]:
+def read_spacing(attributes: Mapping[str, Any], ndim: int) -> tuple[tuple[Any, ...] | None, Any]:
     """Return spacing and unit of an array's attributes, unchecked; one number counts for all axes."""
     for name, fixed_unit in (("element_size_um", "um"), ("spacing", None), ("voxel_size", None)):
         if name in attributes:
@@ -114,7 +114,7 @@ def read_numbers(stream: Any, shape: Sequence[int], dtype: np.dtype, place: obje
     return records.read_numbers(stream, shape, dtype)
 
 
-def mapped(path: Path, start: int, shape: Sequence[int], dtype: np.dtype) -> np.ndarray:
+def map_numbers(path: Path, start: int, shape: Sequence[int], dtype: np.dtype) -> np.ndarray:
     """Return the array, last axis fastest, from a byte of a file to its end, mapped rather than read."""
     check_array([0], dtype, path)
     nbytes, size = math.prod(shape) * dtype.itemsize, path.stat().st_size - start

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from curvafit.core.units import parse_unit
-from curvafit.volumes.formats.base import Raw, ScanError, collect_complaints, mapped, read_numbers
+from curvafit.volumes.formats.base import Raw, ScanError, collect_complaints, map_numbers, read_numbers
 from curvafit.volumes.formats.part import Part, read_part
 
 #: Bytes that are compressed together.
@@ -69,7 +69,7 @@ def _values(image: Any, path: Path, part: Part | None) -> Raw:
     long = [axis for axis, n in enumerate(shape[:-3]) if n != 1]
     channels = long[0] if len(long) == 1 else None
     if part is not None and not compression:
-        raw = read_part(mapped(path, proxy.offset, shape, proxy.dtype), part, path, channels)
+        raw = read_part(map_numbers(path, proxy.offset, shape, proxy.dtype), part, path, channels)
     else:
         with gzip.open(path) if compression else path.open("rb") as stream:
             stream.seek(proxy.offset)

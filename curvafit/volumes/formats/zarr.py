@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from curvafit.core.records import MARK
-from curvafit.core.runtime import undisturbed
-from curvafit.volumes.formats.base import Damaged, Raw, ScanError, pick_key, spacing_of
+from curvafit.core.runtime import hold_signals
+from curvafit.volumes.formats.base import Damaged, Raw, ScanError, pick_key, read_spacing
 from curvafit.volumes.formats.part import Part, index_of, read_part
 
 #: Edge of a chunk, and of the largest volume that is not halved any more, in voxels.
@@ -35,7 +35,7 @@ def read_zarr(path: Path, *, key: str | None = None, part: Part | None = None, *
     _check_store(path)
     node: Any = zarr.open(path, mode="r")
     if isinstance(node, zarr.Array):
-        return _raw(node, path, (*spacing_of(node.attrs.asdict(), node.ndim), None), part)
+        return _raw(node, path, (*read_spacing(node.attrs.asdict(), node.ndim), None), part)
     arrays = _arrays(node)
     attributes = node.attrs.asdict()
     scales = _multiscales(attributes)
@@ -43,7 +43,7 @@ def read_zarr(path: Path, *, key: str | None = None, part: Part | None = None, *
         key = next(iter(scales))
     name = pick_key(sorted(arrays), key, path)
     array = arrays[name]
-    place = scales.get(name) or (*spacing_of({**attributes, **array.attrs.asdict()}, array.ndim), None)
+    place = scales.get(name) or (*read_spacing({**attributes, **array.attrs.asdict()}, array.ndim), None)
     return _raw(array, path / array.path, place, part)
 
 
@@ -69,13 +69,13 @@ def write_zarr(field: Any, path: Path) -> None:
             for k, (_, first) in enumerate(levels)
         ],
     }
-    with undisturbed():
+    with hold_signals():
         group = zarr.create_group(path, attributes={"ome": {"version": "0.5", "multiscales": [image]}})
     for k, (values, _) in enumerate(levels):
         _write_level(group, str(k), values)
 
 
-@undisturbed()  # Zarr writes in threads of its own, which would go on beside what cleans up
+@hold_signals()  # Zarr writes in threads of its own, which would go on beside what cleans up
 def _write_level(group: Any, name: str, values: np.ndarray) -> None:
     array = group.create_array(
         name,
@@ -88,7 +88,7 @@ def _write_level(group: Any, name: str, values: np.ndarray) -> None:
     array[...] = values
 
 
-@undisturbed()
+@hold_signals()
 def mark(folder: Path, kind: str) -> None:
     """Mark a group, in its attributes, as written by this program, with its kind."""
     import zarr
