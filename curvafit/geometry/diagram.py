@@ -169,7 +169,10 @@ def diagram(
     margin: int | None = None,
     where: np.ndarray | None = None,
 ) -> Diagram:
-    """Return the curvature diagram of {u = 0}: `surface_curvatures`, which takes the same, without the places."""
+    """Return the curvature diagram of {u = 0}, Σ area[c] δ_(κ1, κ2)[c] over the cells c of its mesh (paper, eq. 25).
+
+    Parameters and errors are those of `surface_curvatures`.
+    """
     curvatures = surface_curvatures(u, grid, epsilon, curvature=curvature, margin=margin, where=where)
     return Diagram(curvatures.points, curvatures.areas, excluded=curvatures.excluded)
 
@@ -177,7 +180,7 @@ def diagram(
 def diagrams(field: Tensor, grid: Grid, epsilon: float) -> tuple[Diagram, Diagram]:
     """Measure a phase field (Z, Y, X) and its mask {u > 0}, re-profiled as a scan's mask is: two geometric diagrams.
 
-    Thinned with the bins that `transport.wasserstein` uses, so that a distance to them is the one to the whole diagram.
+    Both are thinned as `wasserstein` thins them, so that a distance to one is the distance to the whole diagram.
     """
     profile = phase_field(field > 0, grid, epsilon)
     of_field, of_mask = (diagram(u, grid, epsilon).thinned(BIN_WIDTH, TAIL_SHARE) for u in (field, profile))

@@ -2,6 +2,11 @@
 
 `find_level` decides the kind of a scan and splits structure from background. `Quality` is how the scan blurs and how
 noisy it is, measured from its grey levels (`measure_quality`), and scans a grown shape alike (`Quality.rescan`).
+
+Two rooms split grey levels otherwise, on purpose. `segmentation.evidence` needs the noise of each voxel: it thresholds
+levels smoothed as far as their noise asks, and splits half way between the means of the raw ones. `data_synth.imaging`
+follows brightness that varies along a structure: its threshold is that of square roots, then half of what is around.
+Here thin structures must not grow fat: the threshold is that of the raw levels, applied to smoothed ones.
 """
 
 from __future__ import annotations
