@@ -41,66 +41,59 @@ _what = partial(typer.Option, rich_help_panel="What to make")
 _how = partial(typer.Option, rich_help_panel="How")
 _out = partial(typer.Option, rich_help_panel="What to write")
 
-Target = Annotated[
-    Path,
-    _out("-o", "--output", help="Volume (.nii.gz .nii .tif .npy .mrc .zarr) or surface (.stl .ply .vtp) to write."),
-]
-Preset = Annotated[str | None, _what(help="A published shape; see `curvafit presets`.")]
-Six = Annotated[str | None, _what(help="a20,a11,a02,a10,a01,a00 in working units; needs --mass or --volume-fraction.")]
-Prior = Annotated[str | None, _what(help="fit.json of `curvafit infer`, or a preset's name.")]
-Mass = Annotated[float | None, _what(help="Mean of the field, in (-1, 1).")]
 Share = Annotated[float | None, _what(help="Share of the volume inside, in (0, 1), instead of a mass.")]
-Orientation = Annotated[str | None, _what(help="θz,θy,θx,μ: tubes and layers lie along θ, more so with a larger μ.")]
-Maps = Annotated[
-    Path | None,
-    _what(help="Parameters that vary in space: an .npz of volumes a20 … a00, mass, epsilon, or a folder of them."),
-]
-Shape = Annotated[str | None, _what(help=f"Voxels: N or Z,Y,X; {EDGE} or the maps' by default.")]
-Boundary = Annotated[str, _what(help="periodic, or replicate (walls that the shape meets at right angles).")]
 Epsilon = Annotated[float | None, _what(help="Interface width in working units; 0.02 (two voxels) by default.")]
 Seed = Annotated[int, _what(help="Seed of the noise that the shape grows from.")]
-Plan = Annotated[str, _how(help="fast (1500 steps), paper (8000) or cosine (1000).")]
 Steps = Annotated[int | None, _how(help="Number of steps, instead of the schedule's.")]
-Device = Annotated[str, _how(help="cpu, cuda, cuda:1 …")]
-Checkpoint = Annotated[Path | None, _how(help="File to save the run in; the run goes on from it if it exists.")]
-Every = Annotated[float | None, _how(help="Seconds between two checkpoints; 60 by default.")]
-Spacing = Annotated[str | None, _out(help="Edge of a voxel (a cube), in --unit; by default 1, or the prior's.")]
-Unit = Annotated[str | None, _out(help="nm, um, mm or m; needs --spacing.")]
-Tile = Annotated[str | None, _out(help="Repeat a periodic box N or Z,Y,X times.")]
-Cap = Annotated[
-    bool | None,
-    _out("--cap/--no-cap", help="Close a surface on the box's faces (the default), or leave it open there."),
-]
-Picture = Annotated[
-    bool, _out("--picture/--no-picture", help="Draw the shape beside it (.png), once it is written, or do not.")
-]
-Snapshots = Annotated[str | None, _out(help="Also write the field after these numbers of steps: 10,100,1000.")]
 
 
 def generate(
-    out: Target,
-    preset: Preset = None,
-    coefficients: Six = None,
-    prior: Prior = None,
-    mass: Mass = None,
+    out: Annotated[
+        Path,
+        _out("-o", "--output", help="Volume (.nii.gz .nii .tif .npy .mrc .zarr) or surface (.stl .ply .vtp) to write."),
+    ],
+    preset: Annotated[str | None, _what(help="A published shape; see `curvafit presets`.")] = None,
+    coefficients: Annotated[
+        str | None, _what(help="a20,a11,a02,a10,a01,a00 in working units; needs --mass or --volume-fraction.")
+    ] = None,
+    prior: Annotated[str | None, _what(help="fit.json of `curvafit infer`, or a preset's name.")] = None,
+    mass: Annotated[float | None, _what(help="Mean of the field, in (-1, 1).")] = None,
     volume_fraction: Share = None,
-    orientation: Orientation = None,
-    maps: Maps = None,
-    shape: Shape = None,
-    boundary: Boundary = "periodic",
+    orientation: Annotated[
+        str | None, _what(help="θz,θy,θx,μ: tubes and layers lie along θ, more so with a larger μ.")
+    ] = None,
+    maps: Annotated[
+        Path | None,
+        _what(help="Parameters that vary in space: an .npz of volumes a20 … a00, mass, epsilon, or a folder of them."),
+    ] = None,
+    shape: Annotated[str | None, _what(help=f"Voxels: N or Z,Y,X; {EDGE} or the maps' by default.")] = None,
+    boundary: Annotated[
+        str, _what(help="periodic, or replicate (walls that the shape meets at right angles).")
+    ] = "periodic",
     epsilon: Epsilon = None,
     seed: Seed = 0,
-    schedule: Plan = "fast",
+    schedule: Annotated[str, _how(help="fast (1500 steps), paper (8000) or cosine (1000).")] = "fast",
     steps: Steps = None,
-    device: Device = "cpu",
-    checkpoint: Checkpoint = None,
-    checkpoint_every: Every = None,
-    spacing: Spacing = None,
-    unit: Unit = None,
-    tile: Tile = None,
-    cap: Cap = None,
-    picture: Picture = True,
-    snapshots: Snapshots = None,
+    device: Annotated[str, _how(help="cpu, cuda, cuda:1 …")] = "cpu",
+    checkpoint: Annotated[
+        Path | None, _how(help="File to save the run in; the run goes on from it if it exists.")
+    ] = None,
+    checkpoint_every: Annotated[float | None, _how(help="Seconds between two checkpoints; 60 by default.")] = None,
+    spacing: Annotated[
+        str | None, _out(help="Edge of a voxel (a cube), in --unit; by default 1, or the prior's.")
+    ] = None,
+    unit: Annotated[str | None, _out(help="nm, um, mm or m; needs --spacing.")] = None,
+    tile: Annotated[str | None, _out(help="Repeat a periodic box N or Z,Y,X times.")] = None,
+    cap: Annotated[
+        bool | None,
+        _out("--cap/--no-cap", help="Close a surface on the box's faces (the default), or leave it open there."),
+    ] = None,
+    picture: Annotated[
+        bool, _out("--picture/--no-picture", help="Draw the shape beside it (.png), once it is written, or do not.")
+    ] = True,
+    snapshots: Annotated[
+        str | None, _out(help="Also write the field after these numbers of steps: 10,100,1000.")
+    ] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Make a shape from parameters, with a record (.json) and a picture (.png) beside it."""

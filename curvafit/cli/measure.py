@@ -18,14 +18,13 @@ EXAMPLES = examples(
     "curvafit measure mouse1.nii.gz mouse2.nii.gz mouse3.nii.gz -o measures.csv",
     "curvafit measure cells.ome.zarr --channel 1 --dark --threshold 90 -o measures.parquet",
 )
-Scans = Annotated[
-    list[str], typer.Argument(help="NIfTI, TIFF (or folder of slices), NPY, NPZ, HDF5 (file.h5::key), RAW, Zarr …")
-]
 
 
 @reads_volume
 def measure(
-    scans: Scans,
+    scans: Annotated[
+        list[str], typer.Argument(help="NIfTI, TIFF (or folder of slices), NPY, NPZ, HDF5 (file.h5::key), RAW, Zarr …")
+    ],
     out: Annotated[Path | None, typer.Option("-o", "--output", help="Table to write: .csv .json .parquet.")] = None,
     kind: Annotated[str, typer.Option(help="Kind of volume: auto, field, mask or image.")] = "auto",
     periodic: Annotated[bool, typer.Option("--periodic", help="The box repeats (generated fields).")] = False,

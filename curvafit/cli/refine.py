@@ -25,29 +25,29 @@ EXAMPLES = examples(
 
 _what = partial(typer.Option, rich_help_panel="What to do")
 
-Probabilities = Annotated[
-    str, typer.Argument(help="Probability of the inside: NIfTI, TIFF, NPY, NPZ, Zarr …; or a folder of NPZ files.")
-]
-Target = Annotated[Path, typer.Option("-o", "--output", help="Mask to write: .nii.gz .tif …; for a folder, a folder.")]
-Example = Annotated[Path | None, _what(help="True mask of another volume: law and weight are tried out on it.")]
-Others = Annotated[Path | None, _what(help="The same network's probabilities for the example.")]
-Like = Annotated[Path | None, _what(help="Image of the same voxels; by default one beside an NPZ, of its name.")]
-
 
 @reads_volume
 def refine(
-    probabilities: Probabilities,
-    out: Target,
+    probabilities: Annotated[
+        str, typer.Argument(help="Probability of the inside: NIfTI, TIFF, NPY, NPZ, Zarr …; or a folder of NPZ files.")
+    ],
+    out: Annotated[Path, typer.Option("-o", "--output", help="Mask to write: .nii.gz .tif …; for a folder, a folder.")],
     prior: OwnPrior = None,
-    example: Example = None,
-    example_probabilities: Others = None,
+    example: Annotated[
+        Path | None, _what(help="True mask of another volume: law and weight are tried out on it.")
+    ] = None,
+    example_probabilities: Annotated[
+        Path | None, _what(help="The same network's probabilities for the example.")
+    ] = None,
     weight: Weight = None,
     epsilon: Epsilon = None,
     *,
     steps: Steps = 400,
     tile: TileOption = None,
     workers: WorkersOption = None,
-    like: Like = None,
+    like: Annotated[
+        Path | None, _what(help="Image of the same voxels; by default one beside an NPZ, of its name.")
+    ] = None,
     reading: Reading,
     overwrite: OverwriteOption = False,
 ) -> None:

@@ -44,16 +44,9 @@ RECONSTRUCT_EXAMPLES = examples(
 _what = partial(typer.Option, rich_help_panel="What to do")
 
 Target = Annotated[Path, typer.Option("-o", "--output", help="Mask to write: .nii.gz .nii .tif .npy .mrc .zarr.")]
-Prior = Annotated[str, _what(help="fit.json of `curvafit infer`, or a preset's name (see `curvafit presets`).")]
 Weight = Annotated[float | None, _what(help="Cost of a unit of the energy, in nats; by default chosen, with the law.")]
-Threshold = Annotated[str, _what(help="Grey level between the phases, or otsu.")]
-Dark = Annotated[bool, _what("--dark", help="The structure is the dark phase.")]
 OwnPrior = Annotated[str | None, _what("--prior", help="As in segment; by default inferred from the example.")]
-Example = Annotated[Path | None, _what(help="Mask of another such volume, known whole: the prior is tried out on it.")]
 Stiffness = Annotated[float | None, _what(help="Stiffness of springs on the known slices: try nothing out.")]
-Periodic = Annotated[bool, _what("--periodic", help="The volume repeats, as generated ones do.")]
-Runs = Annotated[int, _what(help="Further runs that tell the probability of the inside; 8 are a good number.", min=0)]
-Suggest = Annotated[int, _what(help="Number of slices to suggest for annotation; needs --runs, by default 8.", min=0)]
 Epsilon = Annotated[float | None, _what(help="ε in the scan's unit; by default twice the smallest voxel edge.")]
 Steps = Annotated[int, _what(help="Steps of the flow.", min=1)]
 TileOption = Annotated[
@@ -64,11 +57,6 @@ WorkersOption = Annotated[
     int | None,
     _what("--workers", help="Processes that lower tiles at once; by default this one, a tile at a time.", min=0),
 ]
-Every = Annotated[int | None, _what(help="Distance of known slices: with 8, every eighth slice is known.")]
-First = Annotated[int | None, _what(help="Number of the first known slice, with --every; by default 0.")]
-Labels = Annotated[
-    str | None, _what(help="Several structures that exclude each other: all, or their labels, 1,2,5; writes labels.")
-]
 Axis = Annotated[str, _what(help="Axis across the slices: z, y or x (first, second, last axis of an array).")]
 
 
@@ -76,10 +64,10 @@ Axis = Annotated[str, _what(help="Axis across the slices: z, y or x (first, seco
 def segment(
     scan: Volume,
     out: Target,
-    prior: Prior,
+    prior: Annotated[str, _what(help="fit.json of `curvafit infer`, or a preset's name (see `curvafit presets`).")],
     weight: Weight = None,
-    threshold: Threshold = "otsu",
-    dark: Dark = False,
+    threshold: Annotated[str, _what(help="Grey level between the phases, or otsu.")] = "otsu",
+    dark: Annotated[bool, _what("--dark", help="The structure is the dark phase.")] = False,
     epsilon: Epsilon = None,
     steps: Steps = 400,
     tile: TileOption = None,
@@ -107,17 +95,26 @@ def reconstruct(
     slices: Volume,
     out: Target,
     prior: OwnPrior = None,
-    every: Every = None,
-    first: First = None,
+    every: Annotated[int | None, _what(help="Distance of known slices: with 8, every eighth slice is known.")] = None,
+    first: Annotated[int | None, _what(help="Number of the first known slice, with --every; by default 0.")] = None,
     known: Annotated[str | None, _what("--known", "--slices", help="Or: numbers of the known slices, 0,7,15.")] = None,
     axis: Axis = "z",
     *,
-    labels: Labels = None,
-    example: Example = None,
+    labels: Annotated[
+        str | None,
+        _what(help="Several structures that exclude each other: all, or their labels, 1,2,5; writes labels."),
+    ] = None,
+    example: Annotated[
+        Path | None, _what(help="Mask of another such volume, known whole: the prior is tried out on it.")
+    ] = None,
     stiffness: Stiffness = None,
-    periodic: Periodic = False,
-    runs: Runs = 0,
-    suggest: Suggest = 0,
+    periodic: Annotated[bool, _what("--periodic", help="The volume repeats, as generated ones do.")] = False,
+    runs: Annotated[
+        int, _what(help="Further runs that tell the probability of the inside; 8 are a good number.", min=0)
+    ] = 0,
+    suggest: Annotated[
+        int, _what(help="Number of slices to suggest for annotation; needs --runs, by default 8.", min=0)
+    ] = 0,
     epsilon: Epsilon = None,
     steps: Steps = 400,
     tile: TileOption = None,

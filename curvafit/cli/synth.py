@@ -39,17 +39,7 @@ _what = partial(typer.Option, rich_help_panel="Shapes: one of these")
 _image = partial(typer.Option, rich_help_panel="Images")
 _out = partial(typer.Option, rich_help_panel="Output")
 
-Target = Annotated[Path, _out("-o", "--output", help="Folder of the set; a set that exists is resumed.")]
-Count = Annotated[int, _out(help="Number of cases in the set at the end.")]
-Shape = Annotated[str, _out(help="Voxels of an image: N or Z,Y,X.")]
 Layout = Annotated[str, _out(help="Layout of the files: nnunet (v2, raw), monai (decathlon's list) or zarr.")]
-Parts = Annotated[
-    str | None,
-    _out(
-        "--labels",
-        help="Labels besides masks: distance, skeleton, instances, kappa1, kappa2, radius, betti, centreline.",
-    ),
-]
 Seed = Annotated[int, _out(help="Seed of shapes and images; the same seed gives the same voxels.")]
 Laws = Annotated[
     str | None,
@@ -61,26 +51,10 @@ Laws = Annotated[
         "infer`, several between commas.",
     ),
 ]
-Atlas = Annotated[
-    Path | None,
-    _what(help="Store of `curvafit atlas build`, to crop its shapes; or atlas (.npz), to generate shapes of its laws."),
-]
-Calibres = Annotated[
-    str,
-    _image(help="LOW,HIGH: each case draws a factor in between, and its structure is thicker than with --voxel by it."),
-]
-Filled = Annotated[
-    float | None,
-    _what(
-        "--volume-fraction",
-        help="Share of the volume that generated shapes fill; by default that of the scan of a fit.json.",
-    ),
-]
 Kind = Annotated[
     str | None,
     _image("--modality", help="Kind of image: confocal, two-photon, light-sheet, micro-ct, mra, em-membrane."),
 ]
-Like = Annotated[str | None, _image(help="Scan to take noise, blur, contrast and spacing from, instead of --modality.")]
 Voxel = Annotated[
     float | None,
     _image(
@@ -88,43 +62,66 @@ Voxel = Annotated[
         "fit.json, or of the modality."
     ),
 ]
-Like_mask = Annotated[str | None, _image(help="Mask of the structure in --like, for better estimates.")]
-Visible = Annotated[
-    str | None,
-    _image(
-        help="Masks as annotators draw them: the voxels where this share of the structure's light arrives; "
-        "auto: midway in the logarithm of the levels. By default masks hold the structure itself."
-    ),
-]
-Spacing = Annotated[str | None, _image(help="Voxel edges of --like, Z,Y,X or one number for all; overrides the file.")]
 Unit = Annotated[str | None, _image(help="Unit of --spacing and --voxel: nm, um, mm or m.")]
 Channel = Annotated[int | None, _image(help="Channel of --like to read, counted from 0, where the file has several.")]
 Label = Annotated[int | None, _image(help="Label of the structure: the voxels of --like-mask with this value.")]
-Crop = Annotated[str | None, _image(help="Box of voxels of --like and --like-mask: z0:z1,y0:y1,x0:x1; : is all.")]
-Strict = Annotated[bool, _image("--strict", help="Refuse a scan with missing chunks or slices for --like.")]
 
 
 def synth(
-    out: Target,
-    count: Count = 200,
-    shape: Shape = "96",
+    out: Annotated[Path, _out("-o", "--output", help="Folder of the set; a set that exists is resumed.")],
+    count: Annotated[int, _out(help="Number of cases in the set at the end.")] = 200,
+    shape: Annotated[str, _out(help="Voxels of an image: N or Z,Y,X.")] = "96",
     laws: Laws = None,
-    atlas: Atlas = None,
-    volume_fraction: Filled = None,
+    atlas: Annotated[
+        Path | None,
+        _what(
+            help="Store of `curvafit atlas build`, to crop its shapes; or atlas (.npz), to generate shapes of its laws."
+        ),
+    ] = None,
+    volume_fraction: Annotated[
+        float | None,
+        _what(
+            "--volume-fraction",
+            help="Share of the volume that generated shapes fill; by default that of the scan of a fit.json.",
+        ),
+    ] = None,
     modality: Kind = None,
-    like: Like = None,
-    like_mask: Like_mask = None,
-    visible: Visible = None,
+    like: Annotated[
+        str | None, _image(help="Scan to take noise, blur, contrast and spacing from, instead of --modality.")
+    ] = None,
+    like_mask: Annotated[str | None, _image(help="Mask of the structure in --like, for better estimates.")] = None,
+    visible: Annotated[
+        str | None,
+        _image(
+            help="Masks as annotators draw them: the voxels where this share of the structure's light arrives; "
+            "auto: midway in the logarithm of the levels. By default masks hold the structure itself."
+        ),
+    ] = None,
     voxel: Voxel = None,
-    calibres: Calibres = "1,1",
-    spacing: Spacing = None,
+    calibres: Annotated[
+        str,
+        _image(
+            help="LOW,HIGH: each case draws a factor in between, and its structure is thicker than with --voxel by it."
+        ),
+    ] = "1,1",
+    spacing: Annotated[
+        str | None, _image(help="Voxel edges of --like, Z,Y,X or one number for all; overrides the file.")
+    ] = None,
     unit: Unit = None,
     channel: Channel = None,
     label: Label = None,
-    crop: Crop = None,
-    strict: Strict = False,
+    crop: Annotated[
+        str | None, _image(help="Box of voxels of --like and --like-mask: z0:z1,y0:y1,x0:x1; : is all.")
+    ] = None,
+    strict: Annotated[bool, _image("--strict", help="Refuse a scan with missing chunks or slices for --like.")] = False,
     layout: Layout = "nnunet",
-    labels: Parts = None,
+    labels: Annotated[
+        str | None,
+        _out(
+            "--labels",
+            help="Labels besides masks: distance, skeleton, instances, kappa1, kappa2, radius, betti, centreline.",
+        ),
+    ] = None,
     seed: Seed = 0,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,

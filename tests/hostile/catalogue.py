@@ -11,8 +11,8 @@ from .case import Case, dice, unique
 _CLASSES = (damage, options, documents, designs, bombs, names, belongings, signals, disks, together)
 #: Cases of the quick part, by class.
 SHARES = {
-    "damage": 40, "damage-command": 6, "options": 24, "documents": 20, "designs": 12, "bombs": 10, "names": 18,
-    "belongings": 12, "signals": 4, "disks": 5, "together": 3,
+    "damage": 24, "damage-command": 4, "options": 16, "documents": 14, "designs": 8, "bombs": 8, "names": 12,
+    "belongings": 10, "signals": 4, "disks": 5, "together": 3,
 }  # fmt: skip
 
 
