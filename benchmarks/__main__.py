@@ -12,9 +12,9 @@ holds `gallery/` and `scans/`.
 from __future__ import annotations
 
 import argparse
+import ast
 import sys
 from importlib import import_module
-from inspect import getdoc
 from pathlib import Path
 
 from benchmarks.claims import Ledger
@@ -40,7 +40,8 @@ def main(arguments: list[str]) -> None:
     else:
         print(__doc__)
         for topic in topics():
-            print(f"  {topic:12} {(getdoc(import_module(f'benchmarks.{topic}')) or '').splitlines()[0]}")
+            source = Path(__file__).with_name(f"{topic}.py").read_text("utf-8")
+            print(f"  {topic:12} {(ast.get_docstring(ast.parse(source)) or '').partition(chr(10))[0]}")
         if name not in ("", "-h", "--help"):
             raise SystemExit(f"there is no benchmark {name!r}")
 
