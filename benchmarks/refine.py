@@ -45,9 +45,6 @@ SURE = 0.1
 EVERY, RUNS = 8, 8
 
 
-# ---- masks from probabilities ----------------------------------------------------------------------------------------
-
-
 def features(law: str, seed: int, cases: Cases) -> np.ndarray:
     """Return smoothed levels, gradients and Laplacians of a shape's scan at each width, (voxels, features)."""
     clear = ndimage.gaussian_filter(shape(law, seed, cases).astype(np.float32), BLUR, mode="nearest")
@@ -100,9 +97,6 @@ def way_case(way: str, law: str, seed: int, cases: Cases) -> Values:
     return {**scores(mask, truth), "status": status}
 
 
-# ---- how sure, and what to annotate next -----------------------------------------------------------------------------
-
-
 def calibration_case(way: str, law: str, seed: int, cases: Cases) -> Values:
     truth = shape(law, seed, cases)
     other = {"example": shape(law, seed + 1, cases).astype(np.uint8)} if way == "example" else {}
@@ -114,9 +108,6 @@ def calibration_case(way: str, law: str, seed: int, cases: Cases) -> Values:
     masks = {"mask": found.mask.values > 0, "half": p > 0.5}
     more = {name: dice(mask[between], truth[between]) for name, mask in masks.items()}
     return {**errors, **more, "stated": float(found.uncertainty.calibration_error), "status": found.status}
-
-
-# ---- runs ------------------------------------------------------------------------------------------------------------
 
 
 def options(parser: argparse.ArgumentParser) -> None:

@@ -5,9 +5,6 @@ Needs $CURVAFIT_DATA. Of each scan by `infer`: the structure's share, thickness 
 posterior alone (`--halves`), in working units and deviations of the prior: the distance between the means of their
 posteriors (root mean square over the six parameters), and the distance to the nearest half of another tissue. Means
 move less than posteriors are wide, so a small distance alone says nothing: compare the two.
-
-Three scans of the data set are left out: the osteocytes' file is read by no reader here, the axons are annotated on
-three slices only, and the autophagosome's membranes are labels of one organelle.
 """
 
 from __future__ import annotations

@@ -58,13 +58,13 @@ def plain_stepper(size: int) -> TorchStepper:
     return TorchStepper(white_noise(grid, 0), form, shape.coefficients, WORKING_EPSILON, betas, None, "cpu")
 
 
-def step(flow: FusedFlow) -> None:
-    flow.evaluate()
-    flow.update(1e-3)
-
-
 def measure(size: int, rounds: int) -> dict[str, float]:
     """Return milliseconds (medians, and `least`) of both programs and of each pass; GB/s of a copy; bytes a voxel."""
+
+    def step(flow: FusedFlow) -> None:
+        flow.evaluate()
+        flow.update(1e-3)
+
     step(fused_flow(8))
     tracemalloc.start()
     fused = fused_flow(size)
