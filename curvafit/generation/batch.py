@@ -16,7 +16,7 @@ from curvafit.generation.flow import WORKING_BLUR, Backend, generate
 from curvafit.generation.initial import white_noise
 from curvafit.generation.loop import Orders, run
 from curvafit.generation.memory import EAGER, check_memory, memory
-from curvafit.generation.parametrization import DivergenceForm
+from curvafit.generation.forms import DivergenceForm
 from curvafit.generation.result import Flow
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.schedule import schedule as named_schedule

@@ -15,7 +15,7 @@ from curvafit.generation.cost import Cost
 from curvafit.generation.data import Data
 from curvafit.generation.initial import white_noise
 from curvafit.generation.loop import Orders, run
-from curvafit.generation.parametrization import FORMS, DivergenceForm
+from curvafit.generation.forms import FORMS, DivergenceForm
 from curvafit.generation.result import RECORD_EVERY, Callback, Flow, History, State
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.schedule import schedule as named_schedule

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from curvafit.generation.cost import Cost
-from curvafit.generation.parametrization import DivergenceForm
+from curvafit.generation.forms import DivergenceForm
 from curvafit.generation.stepper import ADAM_EPS, ShapeView, Statistics, Stepper
 from curvafit.priors import kernels
 

@@ -14,7 +14,7 @@ from curvafit.generation.checkpoint import Checkpoint, identity
 from curvafit.generation.cost import Cost, check_shape
 from curvafit.generation.fused import FusedStepper
 from curvafit.generation.loop import Orders
-from curvafit.generation.parametrization import Blur, DivergenceForm, Form
+from curvafit.generation.forms import Blur, DivergenceForm, Form
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.stepper import LbfgsStepper, Stepper, TorchStepper
 from curvafit.priors import kernels, stencils

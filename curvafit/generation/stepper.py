@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from curvafit.generation.data import Data
-from curvafit.generation.parametrization import Form
+from curvafit.generation.forms import Form
 from curvafit.priors import kernels
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.energy import energy

@@ -13,7 +13,7 @@ from found import made_fit
 
 from curvafit.generation.flow import RECORD_EVERY, generate, relax
 from curvafit.generation.initial import white_noise
-from curvafit.generation.parametrization import DivergenceForm
+from curvafit.generation.forms import DivergenceForm
 from curvafit.generation.schedule import SCHEDULES, Phase, Schedule, present_name, schedule
 from curvafit.generation.viability import viability
 from curvafit.priors.coefficients import Coefficients

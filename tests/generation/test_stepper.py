@@ -11,7 +11,7 @@ import torch
 from kernel_cases import BLUR, EPSILON, TUBES
 
 from curvafit.generation.flow import generate
-from curvafit.generation.parametrization import DivergenceForm
+from curvafit.generation.forms import DivergenceForm
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.stepper import TorchStepper
 from curvafit.priors.grid import Grid

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from curvafit.generation.flow import descend, relax
-from curvafit.generation.parametrization import FORMS, DivergenceForm, MassProjectedForm
+from curvafit.generation.forms import FORMS, DivergenceForm, MassProjectedForm
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.stepper import LbfgsStepper
 from curvafit.priors import kernels
