@@ -19,8 +19,7 @@ import numpy as np
 import torch
 
 from benchmarks.harness import Cases, Figure, in_turns, show
-from curvafit.generation.initial import white_noise
-from curvafit.generation.forms import DivergenceForm
+from curvafit.generation.forms import DivergenceForm, white_noise
 from curvafit.generation.schedule import SCHEDULES
 from curvafit.generation.stepper import ADAM_EPS, TorchStepper
 from curvafit.priors.grid import WORKING_EPSILON, Grid

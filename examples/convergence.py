@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from curvafit.drawing.plot import write_picture
 from curvafit.generation.flow import Flow, generate
-from curvafit.generation.viability import viability
+from curvafit.generation.result import viability
 from curvafit.geometry.diagram import Diagram, diagram
 from curvafit.geometry.distances import wasserstein
 from curvafit.geometry.mesh import NoSurface

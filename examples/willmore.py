@@ -29,7 +29,7 @@ from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.energy import cahn_hilliard_area
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import SIGMA, optimal_profile
-from curvafit.priors.refined import refined
+from curvafit.priors.stencils import refine_axis
 
 #: Grids as multiples of the full one, and ε in voxels. The last is the published one: 200 voxels, spacing 0.01, ε 0.04.
 RUNS, EXTRAPOLATED = ((0.75, 4), (1, 16 / 3), (1, 4)), ("sphere", "smaller-torus")
@@ -83,7 +83,7 @@ def warm_start(name: str, edge: int, width: float, steps: int, folder: Path) -> 
         np.save(path, flow_of(name, edge // 2, width / 2, steps, folder).flow.field.numpy())
     field = torch.from_numpy(np.load(path))
     for axis in range(3):
-        field = refined(field, axis, 2)
+        field = refine_axis(field, axis, 2)
     return field
 
 

@@ -11,7 +11,7 @@ from scipy.spatial.distance import cdist
 import curvafit.atlas_map.files as atlas_files
 from curvafit.data_synth.design import boxed
 from curvafit.data_synth.store import Record, Settings, Store, open_store
-from curvafit.generation.viability import Viability
+from curvafit.generation.result import Viability
 from curvafit.geometry.distances import sliced_embedding
 from curvafit.priors.coefficients import Coefficients
 

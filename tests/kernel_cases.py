@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import torch
 
+from curvafit.generation.flow import WORKING_BLUR, descend
+from curvafit.generation.result import Flow
+from curvafit.generation.schedule import Schedule
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.energy import energy
 from curvafit.priors.grid import Grid
@@ -27,3 +30,9 @@ def torch_gradient(u: torch.Tensor, a: Coefficients, grid: Grid, ε=EPSILON, Q=N
     value = energy(free, a, grid, ε, Q)
     (slope,) = torch.autograd.grad(value, free)
     return float(value.detach()), slope.double()
+
+
+def relax(field: torch.Tensor, law: Coefficients, grid: Grid, schedule: Schedule, **options) -> Flow:
+    """The flow of `generate` from a field: u = k ∗ (div A + field) from A = 0, under Adam."""
+    options = {"blur": WORKING_BLUR, "steps": schedule.steps} | options
+    return descend(field, law, grid, flow="h-1", optimiser="adam", schedule=schedule, **options)

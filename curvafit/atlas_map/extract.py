@@ -20,8 +20,8 @@ from curvafit.core.workers import ThisProcess, Workers
 from curvafit.data_synth.atlas import versions
 from curvafit.data_synth.design import boxed
 from curvafit.data_synth.store import Record, Store, open_store
+from curvafit.generation.result import FORMED, well_formed
 from curvafit.generation.schedule import SCHEDULES, present_name
-from curvafit.generation.viability import FORMED, well_formed
 from curvafit.geometry.descriptors import Descriptors, descriptors
 from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram, diagrams
 from curvafit.geometry.mesh import NoSurface

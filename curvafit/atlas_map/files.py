@@ -23,7 +23,7 @@ from curvafit.core.records import can_write, has_mark, read_archive
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.data_synth.atlas import summarise
 from curvafit.data_synth.store import Record, Store, open_store
-from curvafit.generation.viability import well_formed
+from curvafit.generation.result import well_formed
 from curvafit.geometry.diagram import Diagram
 from curvafit.inference.atlas import Atlas
 

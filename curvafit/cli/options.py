@@ -118,8 +118,8 @@ class Crew(NamedTuple):
 
     def check(self, shape: Sequence[int] | None = None) -> None:
         """Raise ValueError where the options contradict each other, or a shape does not fit into memory."""
+        from curvafit.core.runtime import FLOW, check_memory
         from curvafit.core.workers import check_workers
-        from curvafit.generation.memory import FLOW, check_memory
 
         check_workers(self.workers, self.scheduler)
         if shape is not None and self.scheduler is None:

@@ -6,14 +6,16 @@ program listens from its first line (`listen`); the library changes no signal's 
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 # ---- progress and messages -------------------------------------------------------------------------------------------
 
@@ -63,6 +65,39 @@ def _allowed() -> int:
         return int(Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii"))
     except (OSError, ValueError):
         return sys.maxsize
+
+
+#: Bytes for each voxel of a field; and of one that is written: the field and a copy in the file's layout.
+FIELD, FILE = 4, 8
+#: The least bytes for each voxel of a flow: A, Adam's two moments and the start, three float32 numbers each; u, the
+#: gradient, and the field between two passes of the blur. And those in plain torch, where autograd stores what the
+#: energy's gradient needs.
+FLOW, EAGER = 60, 400
+
+
+def check_memory(voxels: Sequence[int], each: int, what: str, device: Any = "cpu") -> None:
+    """Raise ValueError where voxels along axes, of `each` bytes, need more memory than a device or this machine has."""
+    need, capacity = math.prod(map(int, voxels)) * each, device_memory(device)
+    if need > capacity:
+        size = " x ".join(map(str, voxels))
+        limit = f"where there are {_gibibytes(capacity)}" if capacity < sys.maxsize else "more than any machine has"
+        least = f"which need at least {_gibibytes(need)}, {limit}"
+        raise ValueError(f"expected {what} that fits into memory, got {size} voxels, {least}")
+
+
+def device_memory(device: Any = "cpu") -> int:
+    """Return the bytes of memory of a torch device or of this machine; `sys.maxsize` where the number is unknown."""
+    if str(device) != "cpu":
+        import torch
+
+        if torch.device(device).type == "cuda" and torch.cuda.is_available():
+            return torch.cuda.get_device_properties(device).total_memory
+    return memory()
+
+
+def _gibibytes(size: int) -> str:
+    """Return a number of bytes in GiB."""
+    return f"{size / 2**30:.3g} GiB"
 
 
 # ---- signals ---------------------------------------------------------------------------------------------------------

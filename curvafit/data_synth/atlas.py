@@ -18,12 +18,11 @@ import numpy as np
 from llvmlite import binding
 
 from curvafit.core.checks import check_int, check_seed, check_type
-from curvafit.core.runtime import Progress, silent
+from curvafit.core.runtime import FILE, FLOW, Progress, check_memory, silent
 from curvafit.core.workers import ThisProcess, Workers
 from curvafit.data_synth.design import Design, Draw, boxed
 from curvafit.data_synth.store import Record, Settings, Store, open_store
 from curvafit.generation.flow import WORKING_BLUR, generate
-from curvafit.generation.memory import FILE, FLOW, check_memory
 from curvafit.generation.result import Flow
 from curvafit.generation.schedule import Schedule, present_name
 from curvafit.generation.schedule import schedule as named_schedule

@@ -21,10 +21,10 @@ from curvafit.data_synth.design import PARAMETERS, Design
 from curvafit.data_synth.imaging.modality import Modality
 from curvafit.data_synth.store import Store, open_store
 from curvafit.generation.flow import generate
-from curvafit.generation.fraction import first_mass
+from curvafit.generation.loop import first_mass
+from curvafit.generation.result import well_formed
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.schedule import schedule as named_schedule
-from curvafit.generation.viability import well_formed
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.priors.kernels.threads import one_thread

@@ -36,8 +36,8 @@ from curvafit.core.checks import quoted
 from curvafit.core.files import temporary_folder, write_content
 from curvafit.core.records import parse_json
 from curvafit.core.runtime import hold_signals
+from curvafit.generation.result import Viability
 from curvafit.generation.schedule import Schedule
-from curvafit.generation.viability import Viability
 from curvafit.priors.coefficients import NAMES, Coefficients
 from curvafit.priors.grid import Grid
 

@@ -18,11 +18,10 @@ from torch import Tensor
 from curvafit.core.checks import LONGEST, SHORTEST, as_tuple, check_float, check_int, check_type
 from curvafit.core.files import move_together, remove, temporary_folder
 from curvafit.core.records import Format, can_write, sibling
-from curvafit.core.runtime import hold_signals
+from curvafit.core.runtime import FILE, check_memory, hold_signals
 from curvafit.core.units import parse_unit
 from curvafit.drawing.render import surface_picture
 from curvafit.generation.flow import Flow
-from curvafit.generation.memory import FILE, check_memory
 from curvafit.geometry.mesh import SUFFIXES, NoSurface, Surface, solid_surface, surface, write_surface
 from curvafit.priors.coefficients import NAMES
 from curvafit.priors.curvature import geometric_curvatures, jet

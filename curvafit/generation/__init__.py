@@ -16,13 +16,12 @@ if TYPE_CHECKING:
     from curvafit.generation.data import Hinge as Hinge
     from curvafit.generation.flow import descend as descend
     from curvafit.generation.flow import generate as generate
-    from curvafit.generation.flow import relax as relax
-    from curvafit.generation.initial import white_noise as white_noise
+    from curvafit.generation.forms import white_noise as white_noise
     from curvafit.generation.result import Flow as Flow
     from curvafit.generation.result import History as History
     from curvafit.generation.result import State as State
+    from curvafit.generation.result import Viability as Viability
     from curvafit.generation.schedule import SCHEDULES as SCHEDULES
     from curvafit.generation.schedule import Schedule as Schedule
-    from curvafit.generation.viability import Viability as Viability
 
 attach_lazy_names(__name__)

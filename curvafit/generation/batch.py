@@ -11,22 +11,19 @@ import torch
 from torch import Tensor
 
 from curvafit.core.checks import as_tuple, check_choice, check_int
+from curvafit.core.runtime import EAGER, check_memory, device_memory
 from curvafit.generation.cost import Cost
-from curvafit.generation.flow import WORKING_BLUR, Backend, generate
-from curvafit.generation.initial import white_noise
-from curvafit.generation.loop import Orders, run
-from curvafit.generation.memory import EAGER, check_memory, memory
-from curvafit.generation.forms import DivergenceForm
+from curvafit.generation.flow import BACKENDS, WORKING_BLUR, Backend, base_of, check_device, generate
+from curvafit.generation.forms import DivergenceForm, white_noise
+from curvafit.generation.loop import FlowOptions, run
 from curvafit.generation.result import Flow
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.schedule import schedule as named_schedule
-from curvafit.generation.setup import BACKENDS, base_of, check_device
 from curvafit.generation.stepper import TorchStepper
 from curvafit.priors import kernels
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.law import LawLike, read_laws
-from curvafit.priors.shapes import Float
 
 #: The most shapes that a device makes together by default.
 MOST_TOGETHER = 64
@@ -41,8 +38,6 @@ def generate_batch(
     schedule: str | Schedule = "fast",
     epsilon: float | Tensor = WORKING_EPSILON,
     blur: float = WORKING_BLUR,
-    orientation: Float[Tensor, "3 3"] | None = None,
-    snapshots: Sequence[int] = (),
     reject_early: bool = False,
     together: int | None = None,
     backend: Backend = "auto",
@@ -69,8 +64,8 @@ def generate_batch(
     jobs, plan = _jobs(laws, masses, seeds), named_schedule(schedule)
     grid = grid if isinstance(grid, Grid) else Grid(grid)  # type: ignore[arg-type]
     options = {
-        "schedule": plan, "epsilon": epsilon, "blur": blur, "orientation": orientation,
-        "snapshots": snapshots, "reject_early": reject_early, "backend": backend, "device": device,
+        "schedule": plan, "epsilon": epsilon, "blur": blur, "reject_early": reject_early, "backend": backend,
+        "device": device,
     }  # fmt: skip
     check_choice(backend, BACKENDS, f"a backend among {', '.join(BACKENDS)}")
     check_device(device)
@@ -88,7 +83,7 @@ def _fitting(grid: Grid, device: torch.device | str) -> int:
     """Return how many shapes fit into half of a device's memory; one on a processor, where threads share a shape."""
     if torch.device(device).type == "cpu":
         return 1
-    return max(1, min(MOST_TOGETHER, memory(device) // (2 * EAGER * math.prod(grid.shape))))
+    return max(1, min(MOST_TOGETHER, device_memory(device) // (2 * EAGER * math.prod(grid.shape))))
 
 
 class _Job(NamedTuple):
@@ -119,7 +114,7 @@ def _joint_flows(jobs: list[_Job], grid: Grid, options: dict[str, Any]) -> list[
     """Make shapes together, in the same steps."""
     plan, device, width = options["schedule"], options["device"], options["blur"]
     check_memory((len(jobs), *grid.shape), EAGER, "a batch", device)
-    costs = [Cost(job.coefficients, grid, options["epsilon"], options["orientation"], width) for job in jobs]
+    costs = [Cost(job.coefficients, grid, options["epsilon"], None, width) for job in jobs]
     bases = [DivergenceForm.of(grid, width, base_of(job.mass, None, grid)).base for job in jobs]
     coefficients = Coefficients(*(_stack(values) for values in zip(*(job.coefficients for job in jobs), strict=True)))
     stepper = TorchStepper(
@@ -130,12 +125,11 @@ def _joint_flows(jobs: list[_Job], grid: Grid, options: dict[str, Any]) -> list[
         plan.betas,
         None,
         device,
-        orientation=costs[0].orientation,
         compiled=options["backend"] == "compiled",
         count=len(jobs),
     )
-    shared = {name: options[name] for name in ("snapshots", "reject_early")}
-    return run(stepper, [Orders(cost, plan, **shared) for cost in costs], [job.seed for job in jobs])
+    each = [FlowOptions(cost, plan, reject_early=options["reject_early"]) for cost in costs]
+    return run(stepper, each, [job.seed for job in jobs])
 
 
 def _stack(values: Sequence[float | Tensor]) -> Tensor:

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from curvafit.core.checks import check_float, quoted
-from curvafit.priors.grid import Grid
-from curvafit.priors.shapes import Float
+from curvafit.priors.grid import Float, Grid
 
 
 class Data(Protocol):

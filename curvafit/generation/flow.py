@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -10,27 +11,26 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from curvafit.core.checks import check_choice, check_seed, quoted
-from curvafit.generation.cost import Cost
+from curvafit.core.checks import check_choice, check_float, check_open_interval, check_seed, check_type, quoted
+from curvafit.generation.checkpoint import Checkpoint, identity
+from curvafit.generation.cost import Cost, check_shape
 from curvafit.generation.data import Data
-from curvafit.generation.initial import white_noise
-from curvafit.generation.loop import Orders, run
-from curvafit.generation.forms import FORMS, DivergenceForm
-from curvafit.generation.result import RECORD_EVERY, Callback, Flow, History, State
+from curvafit.generation.forms import FORMS, Blur, DivergenceForm, Form, white_noise
+from curvafit.generation.loop import FlowOptions, first_mass, run
+from curvafit.generation.result import Callback, Flow
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.schedule import schedule as named_schedule
-from curvafit.generation.setup import Execution, base_of
-from curvafit.priors.grid import WORKING_EPSILON, Grid
+from curvafit.generation.stepper import FusedStepper, LbfgsStepper, Stepper, TorchStepper
+from curvafit.priors import kernels, stencils
+from curvafit.priors.grid import WORKING_EPSILON, Bool, Float, Grid
 from curvafit.priors.law import Law, LawLike
-from curvafit.priors.shapes import Bool, Float
-
-__all__ = ["RECORD_EVERY", "WORKING_BLUR", "Flow", "History", "State", "descend", "generate", "relax"]
 
 #: Standard deviation of the published blur, in working units (two voxels).
 WORKING_BLUR = 0.02
 #: Seconds between two checkpoints by default.
 CHECKPOINT_EVERY = 60.0
-
+#: The ways to run a flow: see `generate`.
+BACKENDS = ("auto", "torch", "fused", "compiled")
 Backend = Literal["auto", "torch", "fused", "compiled"]
 
 
@@ -71,7 +71,8 @@ def generate(
     volume_fraction
         Share of voxels with u > 0, instead of a mass. Corrections of the mass approach the share while the flow runs,
         and a small constant makes it exact at the end; where that fails, `status` says so. `Flow.mass` is the mass. A
-        mass beside it is the one to begin with; a law may make few large bodies from one and many small from another.
+        mass given as well is the one to begin with; a law may make few large bodies from one and many small from
+        another.
     schedule
         `"fast"`, `"paper"`, `"deep"`, `"cosine"` (see `SCHEDULES`), or a `Schedule`.
     seed
@@ -112,50 +113,16 @@ def generate(
     known = Law.of(law)
     mass = known.mass if mass is None and volume_fraction is None else mass
     grid, seed = grid if isinstance(grid, Grid) else Grid(grid), check_seed(seed)  # type: ignore[arg-type]
-    execution = Execution(backend, device, checkpoint, checkpoint_every, keep_checkpoint)
+    execution = _Execution(backend, device, checkpoint, checkpoint_every, keep_checkpoint)
     plan = named_schedule(schedule)
     cost = Cost(known.coefficients, grid, epsilon, orientation, blur)
-    orders = Orders(cost, plan, callbacks, snapshots, reject_early, volume_fraction)
-    orders.check_memory(device)
+    options = FlowOptions(cost, plan, callbacks, snapshots, reject_early, volume_fraction)
+    options.check_memory(device)
     base = base_of(mass, volume_fraction, grid)
     form = DivergenceForm.of(grid, cost.blur, base, execution.blur)
     stepper = execution.stepper(white_noise(grid, seed), form, cost, plan, "adam", None)
-    checkpoint_file = execution.checkpoint_file(stepper, cost, orders, seed=seed, mass=base)
-    return run(stepper, [orders], [seed], checkpoint_file)[0]
-
-
-def relax(
-    field: Float[Tensor, "z y x"],
-    law: LawLike,
-    grid: Grid,
-    *,
-    schedule: str | Schedule,
-    epsilon: float | Tensor = WORKING_EPSILON,
-    blur: float = WORKING_BLUR,
-    orientation: Float[Tensor, "3 3"] | None = None,
-    frozen: Bool[Tensor, "z y x"] | None = None,
-    snapshots: Sequence[int] = (),
-    callbacks: Sequence[Callback] = (),
-    checkpoint: str | Path | None = None,
-    checkpoint_every: float = CHECKPOINT_EVERY,
-    backend: Backend = "auto",
-    device: torch.device | str = "cpu",
-) -> Flow:
-    """Lower F_ε from a field v₀ at constant mass: the flow of `generate` with u = k ∗ (div A + v₀), from A = 0.
-
-    Voxels where `frozen` is True keep their A; the other arguments are those of `generate`. u starts at k ∗ v₀, not at
-    v₀: sharpen v₀ first where the interface's width matters.
-
-    Raises
-    ------
-    ValueError
-        If the field or the mask does not have the grid's shape, or the field is not finite; otherwise as `generate`
-        does.
-    """
-    cost = Cost(Law.of(law).coefficients, grid, epsilon, orientation, blur)
-    execution = Execution(backend, device, checkpoint, checkpoint_every)
-    orders = Orders(cost, named_schedule(schedule), callbacks, snapshots)
-    return _from_field(field, cost, execution, "h-1", "adam", frozen, orders)
+    checkpoint_file = execution.checkpoint_file(stepper, cost, options, seed=seed, mass=base)
+    return run(stepper, [options], [seed], checkpoint_file)[0]
 
 
 def descend(
@@ -171,7 +138,7 @@ def descend(
     blur: float | None = None,
     orientation: Float[Tensor, "3 3"] | None = None,
     data: Data | None = None,
-    snapshots: Sequence[int] = (),
+    frozen: Bool[Tensor, "z y x"] | None = None,
     callbacks: Sequence[Callback] = (),
     checkpoint: str | Path | None = None,
     checkpoint_every: float = CHECKPOINT_EVERY,
@@ -180,7 +147,8 @@ def descend(
 ) -> Flow:
     """Lower F_ε, or F_ε + D, from a field v₀ to a minimum near it (paper, Algorithm 2: the L² flow under L-BFGS).
 
-    u starts at k ∗ v₀. The other arguments are those of `generate`.
+    u starts at k ∗ v₀: sharpen v₀ first where the interface's width matters. The other arguments are those of
+    `generate`.
 
     Parameters
     ----------
@@ -188,8 +156,8 @@ def descend(
         v₀, `(Z, Y, X)`.
     flow
         `"l2"`: u = k ∗ v with v free. Algorithm 2 blurs u at each iteration; here the blur is part of this map, so that
-        the energy is one function of v. `"mass"`: u = k ∗ (v - mean v) + m₀, the L² flow at constant mass. `"h-1"`: the
-        flow of `relax`.
+        the energy is one function of v. `"mass"`: u = k ∗ (v - mean v) + m₀, the L² flow at constant mass. `"h-1"`:
+        u = k ∗ (div A + v₀) from A = 0, the flow of `generate`, also at constant mass.
     optimiser
         `"lbfgs"` (a history of 10, and a strong Wolfe line search from length 1) or `"adam"`.
     steps
@@ -201,11 +169,14 @@ def descend(
         Standard deviation of k; None takes a voxel's shortest edge, as published.
     data
         A term D(u) that is added to F_ε, such as `generation.data.Evidence`; the history's energies include it.
+    frozen
+        Voxels whose v, or A, stays.
 
     Raises
     ------
     ValueError
-        If the flow or the optimiser has another name; otherwise as `relax` does.
+        If the flow or the optimiser has another name, the field or the frozen mask does not have the grid's shape, or
+        the field is not finite; otherwise as `generate` does.
     """
     check_choice(flow, FORMS, f"a flow among {', '.join(FORMS)}")
     plan = named_schedule(schedule, steps)
@@ -213,27 +184,118 @@ def descend(
         plan = Schedule("lbfgs", steps, 1.0, 1.0, "constant")
     width = min(grid.spacing) if blur is None and isinstance(grid, Grid) else blur
     cost = Cost(Law.of(law).coefficients, grid, epsilon, orientation, width, data)  # type: ignore[arg-type]
-    execution = Execution(backend, device, checkpoint, checkpoint_every)
-    orders = Orders(cost, plan, callbacks, snapshots)
-    return _from_field(field, cost, execution, flow, optimiser, None, orders)
-
-
-def _from_field(
-    field: Tensor, cost: Cost, execution: Execution, flow: str, optimiser: str, frozen: Tensor | None, orders: Orders
-) -> Flow:
-    """Check a field and a frozen mask, and run a flow from the field."""
-    grid, plan = cost.grid, orders.plan
+    execution = _Execution(backend, device, checkpoint, checkpoint_every)
+    options = FlowOptions(cost, plan, callbacks)
     for name, values in (("field", field), ("frozen mask", frozen)):
         if name == "field" or values is not None:
             if not isinstance(values, (Tensor, np.ndarray)):
                 raise ValueError(f"expected a {name} of shape {grid.shape}, got {quoted(values)}")
             if tuple(values.shape) != grid.shape:
                 raise ValueError(f"expected a {name} of shape {grid.shape}, got {tuple(values.shape)}")
-    orders.check_memory(execution.device)
+    options.check_memory(execution.device)
     field = torch.as_tensor(field).detach().to("cpu", torch.float32).contiguous()
     if not bool(torch.isfinite(field).all()):
         raise ValueError("expected a finite field, got NaN or infinity")
     form, start = FORMS[flow].at(field, grid, cost.blur, execution.blur)
     stepper = execution.stepper(start, form, cost, plan, optimiser, frozen)
-    checkpoint_file = execution.checkpoint_file(stepper, cost, orders, flow=flow, field=field, frozen=frozen)
-    return run(stepper, [orders], [None], checkpoint_file)[0]
+    checkpoint_file = execution.checkpoint_file(stepper, cost, options, flow=flow, field=field, frozen=frozen)
+    return run(stepper, [options], [None], checkpoint_file)[0]
+
+
+@dataclass(frozen=True)
+class _Execution:
+    """Backend, device and checkpoint of a flow; ValueError where one of them cannot be."""
+
+    backend: str
+    device: torch.device | str
+    checkpoint: str | Path | None
+    every: float
+    keep: bool = False
+
+    def __post_init__(self) -> None:
+        check_choice(self.backend, BACKENDS, f"a backend among {', '.join(BACKENDS)}")
+        check_device(self.device)
+        if self.checkpoint is not None:
+            check_type(self.checkpoint, (str, Path), "a path for the checkpoint")
+        check_float(self.every, "a finite number of seconds between checkpoints, at least 0", 0)
+
+    @property
+    def plain(self) -> bool:
+        """Whether the step is plain torch wherever it runs."""
+        return self.backend in ("torch", "compiled")
+
+    @property
+    def blur(self) -> Blur:
+        """The function that blurs in forms."""
+        return stencils.gaussian_blur if self.plain else kernels.gaussian_blur
+
+    def stepper(
+        self, start: Tensor, form: Form, cost: Cost, plan: Schedule, optimiser: str, frozen: Tensor | None
+    ) -> Stepper:
+        """Return the stepper of one shape: fused where there is a kernel, unless the backend is plain torch.
+
+        Raises
+        ------
+        ValueError
+            If the optimiser is unknown, or the backend is `"fused"` and there is no fused kernel.
+        """
+        check_choice(optimiser, ("adam", "lbfgs"), "an optimiser 'adam' or 'lbfgs'")
+        able = kernels.fused(self.device)
+        if self.backend == "fused" and not able:
+            raise ValueError(f"expected a device with fused kernels (a processor, with numba), got {self.device}")
+        whole = isinstance(form, DivergenceForm) and optimiser == "adam" and cost.data is None
+        if whole and able and not self.plain:
+            return FusedStepper(start, form, cost, plan.betas, frozen)  # type: ignore[arg-type]
+        kind = LbfgsStepper if optimiser == "lbfgs" else TorchStepper
+        return kind(
+            start,
+            form,
+            cost.coefficients,
+            cost.epsilon,
+            plan.betas,
+            frozen,
+            self.device,
+            orientation=cost.orientation,
+            fused=not self.plain,
+            compiled=self.backend == "compiled",
+            data=cost.data,
+        )
+
+    def checkpoint_file(self, stepper: Stepper, cost: Cost, options: FlowOptions, **start: object) -> Checkpoint | None:
+        """Return the checkpoint of a run, or None where the run has none."""
+        if self.checkpoint is None:
+            return None
+        job = {"schedule": options.plan, "volume_fraction": options.volume_fraction, "snapshots": [*options.snapshots]}
+        place = {"stepper": type(stepper).__name__, "backend": self.backend, "device": self.device}
+        return Checkpoint(self.checkpoint, self.every, identity(**vars(cost), **job, **place, **start), self.keep)
+
+
+def check_device(device: torch.device | str) -> None:
+    """Raise ValueError where torch cannot compute on a device."""
+    try:
+        usable = device is not None and torch.zeros(1, device=device).add(1).item() == 1
+    except (RuntimeError, TypeError, ValueError, AssertionError):
+        usable = False
+    if not usable:
+        raise ValueError(f"expected a device that torch computes on, such as 'cpu' or 'cuda', got {quoted(device)}")
+
+
+def base_of(mass: float | Tensor | None, share: float | None, grid: Grid) -> float | Tensor:
+    """Return the base of div A: the mass, a field of masses `(Z, Y, X)`, or the first one for a share of volume.
+
+    Raises
+    ------
+    ValueError
+        If mass and share are both None, or one is out of range or has another shape, or a share is given with a mass
+        that is not one number.
+    """
+    if share is not None:
+        return first_mass(share, None if mass is None else check_open_interval(mass, "a mass in (-1, 1)", -1, 1))
+    if mass is None:
+        raise ValueError("expected a mass or a volume fraction, got neither")
+    if not isinstance(mass, Tensor) or mass.dim() == 0:
+        return check_open_interval(mass, "a mass in (-1, 1)", -1, 1)
+    check_shape("mass", mass, grid)
+    if not bool((mass.abs() < 1).all()):
+        raise ValueError(f"expected a mass in (-1, 1), got {float(mass.min())} to {float(mass.max())}")
+    return mass.detach().to("cpu", torch.float32).expand(grid.shape).contiguous()

@@ -1,4 +1,4 @@
-"""Affine maps from the parameters that a flow moves to fields, each beside its adjoint."""
+"""Affine maps from the parameters that a flow moves to fields, each with its adjoint; seeded starts."""
 
 from __future__ import annotations
 
@@ -10,10 +10,13 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from curvafit.priors.grid import Grid
-from curvafit.priors.shapes import Float
+from curvafit.core.checks import check_seed, check_type
+from curvafit.core.runtime import FIELD, check_memory
+from curvafit.priors.grid import Float, Grid
 from curvafit.priors.stencils import divergence, gaussian_blur, gradient
 
+#: Width of the published start's interval, 40 Δx at Δx = 0.01.
+AMPLITUDE = 0.4
 #: A function of field, grid and standard deviation that returns k ∗ field.
 Blur = Callable[[Tensor, Grid, float], Tensor]
 
@@ -156,3 +159,21 @@ FORMS: dict[str, type[DivergenceForm] | type[DirectForm] | type[MassProjectedFor
     "l2": DirectForm,
     "mass": MassProjectedForm,
 }
+
+
+def white_noise(grid: Grid, seed: int) -> Float[torch.Tensor, "3 z y x"]:
+    """Return A₀, independent and uniform on [0, `AMPLITUDE`) in every voxel and component; float32, on the processor.
+
+    The same seed and shape make the same numbers, whatever was drawn before. In a box with walls the mean is
+    subtracted: a constant A has no divergence in a periodic box, but has a flux through walls.
+
+    Raises
+    ------
+    ValueError
+        If the seed is not a whole number from 0, or the box does not fit into memory.
+    """
+    check_type(grid, Grid, "a Grid")
+    generator = torch.Generator().manual_seed(check_seed(seed))
+    check_memory((*grid.shape, 3), FIELD, "a box")
+    noise = AMPLITUDE * torch.rand((3, *grid.shape), generator=generator, dtype=torch.float32)
+    return noise if grid.periodic else noise - AMPLITUDE / 2

@@ -13,22 +13,32 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from curvafit.core.checks import as_tuple, quoted
-from curvafit.generation import fraction
+from curvafit.core.checks import as_tuple, check_open_interval, quoted
+from curvafit.core.runtime import FIELD, FLOW, check_memory
 from curvafit.generation.checkpoint import Checkpoint
 from curvafit.generation.cost import Cost
-from curvafit.generation.memory import FIELD, FLOW, check_memory
-from curvafit.generation.result import RECORD_EVERY, Callback, Flow, History, State
+from curvafit.generation.result import RECORD_EVERY, Callback, Flow, History, State, Viability, viability
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.stepper import ShapeView, Statistics, Stepper
-from curvafit.generation.viability import Viability, viability
 
 #: A flow is called converged where its energy changes by less than this share over the last tenth of the steps.
 SETTLED = 0.01
+#: Share of the steps after which corrections begin: before, the sign of u says little about a shape's volume.
+FRACTION_BEGIN = 0.2
+#: Share of the shortfall that one correction adds, in a flow of at most `FRACTION_GAIN_STEPS` steps: in a longer
+#: flow the shape responds more slowly, and there are more corrections.
+FRACTION_GAIN, FRACTION_GAIN_STEPS = 0.1, 1000
+#: The greatest distance of the mass from that of a sharp shape: thin shapes differ by some 0.15; beyond
+#: `FRACTION_REACH`, a phase is lost.
+FRACTION_REACH = 0.2
+#: The greatest modulus of a mass.
+FRACTION_BOUND = 0.95
+#: The largest constant that is added at the end to make the share exact; beyond, the share was not reached.
+FRACTION_LAST = 0.1
 
 
 @dataclass(frozen=True)
-class Orders:
+class FlowOptions:
     """The task of a flow: the functional, the steps, and the options of `generate`.
 
     Parameters
@@ -73,7 +83,7 @@ class Orders:
 
 
 def run(
-    stepper: Stepper, orders: Sequence[Orders], seeds: Sequence[int | None], checkpoint: Checkpoint | None = None
+    stepper: Stepper, options: Sequence[FlowOptions], seeds: Sequence[int | None], checkpoint: Checkpoint | None = None
 ) -> list[Flow]:
     """Step shapes that share a stepper and a plan until the plan ends or no shape is left.
 
@@ -81,15 +91,17 @@ def run(
     All shapes stop where the optimiser stalls. At the end the checkpoint is closed, but saved where a callback stopped
     the flow.
     """
-    lanes = [_Lane(*lane) for lane in zip(stepper.shapes, orders, seeds, strict=True)]
+    runs = [_ShapeRun(*parts) for parts in zip(stepper.shapes, options, seeds, strict=True)]
     with nullcontext() if checkpoint is None else checkpoint.held():
-        _advance(stepper, lanes, orders, checkpoint)
-    return [lane.end() for lane in lanes]
+        _advance(stepper, runs, options, checkpoint)
+    return [shape.end() for shape in runs]
 
 
-def _advance(stepper: Stepper, lanes: list[_Lane], orders: Sequence[Orders], checkpoint: Checkpoint | None) -> None:
-    """Step until the plan ends or every lane has stopped."""
-    plan, steps = orders[0].plan, _resume(stepper, lanes, checkpoint)
+def _advance(
+    stepper: Stepper, runs: list[_ShapeRun], options: Sequence[FlowOptions], checkpoint: Checkpoint | None
+) -> None:
+    """Step until the plan ends or every shape has stopped."""
+    plan, steps = options[0].plan, _resume(stepper, runs, checkpoint)
     betas = plan.betas
     while True:
         if steps < plan.steps and plan.betas_at(steps) != betas:
@@ -97,45 +109,45 @@ def _advance(stepper: Stepper, lanes: list[_Lane], orders: Sequence[Orders], che
             stepper.set_betas(betas)
         last = steps == plan.steps or stepper.stalled
         stepper.step(None if last else plan.rate(steps))
-        shifts = [lane.settle() for lane in lanes] if last else []
+        shifts = [shape.settle() for shape in runs] if last else []
         if any(shifts):
             stepper.step(None)
-        for lane in lanes:
-            lane.look(steps, last, stepper.stalled)
-        if last or all(lane.stop for lane in lanes):
+        for shape in runs:
+            shape.look(steps, last, stepper.stalled)
+        if last or all(shape.stop for shape in runs):
             break
-        mark = min(order.next_mark(steps) for order in orders)
+        mark = min(option.next_mark(steps) for option in options)
         steps += 1 + stepper.run([plan.rate(step) for step in range(steps + 1, mark)])
         if checkpoint is not None and checkpoint.due():
-            checkpoint.save(_content(stepper, lanes, steps))
+            checkpoint.save(_content(stepper, runs, steps))
     if checkpoint is not None:
-        if any(lane.asked for lane in lanes) and not last:
-            checkpoint.save(_content(stepper, lanes, steps + 1))
+        if any(shape.asked for shape in runs) and not last:
+            checkpoint.save(_content(stepper, runs, steps + 1))
         else:
             checkpoint.close()
 
 
-def _resume(stepper: Stepper, lanes: list[_Lane], checkpoint: Checkpoint | None) -> int:
-    """Restore the checkpoint's state, where there is one, and return its number of steps, else 0."""
+def _resume(stepper: Stepper, runs: list[_ShapeRun], checkpoint: Checkpoint | None) -> int:
+    """Restore the checkpoint's state, where there is shape, and return its number of steps, else 0."""
     content = checkpoint.load() if checkpoint else None
     if content is None:
         return 0
     stepper.restore(content["stepper"])
-    for lane, (rows, snapshots) in zip(lanes, content["lanes"], strict=True):
-        lane.rows, lane.snapshots = rows, snapshots
+    for shape, (rows, snapshots) in zip(runs, content["lanes"], strict=True):
+        shape.rows, shape.snapshots = rows, snapshots
     return content["made"]
 
 
-def _content(stepper: Stepper, lanes: list[_Lane], steps: int) -> dict[str, Any]:
+def _content(stepper: Stepper, runs: list[_ShapeRun], steps: int) -> dict[str, Any]:
     """Return the content of a checkpoint."""
-    return {"made": steps, "lanes": [(lane.rows, lane.snapshots) for lane in lanes], "stepper": stepper.state()}
+    return {"made": steps, "lanes": [(shape.rows, shape.snapshots) for shape in runs], "stepper": stepper.state()}
 
 
-class _Lane:
+class _ShapeRun:
     """The run of one shape: its records, its snapshots, and the reason why it stopped."""
 
-    def __init__(self, shape: ShapeView, orders: Orders, seed: int | None) -> None:
-        self._shape, self._orders, self._seed = shape, orders, seed
+    def __init__(self, shape: ShapeView, options: FlowOptions, seed: int | None) -> None:
+        self._shape, self._options, self._seed = shape, options, seed
         self.rows: list[list[float]] = []
         self.snapshots: dict[int, Tensor] = {}
         #: The reason for a stop before the plan's end, and whether a callback is the reason.
@@ -145,12 +157,12 @@ class _Lane:
 
     def settle(self) -> bool:
         """Make the share of volume exact at the end where a small constant does, and return whether one was added."""
-        share = self._orders.volume_fraction
+        share = self._options.volume_fraction
         if share is None or self.stop:
             return False
         u = self._shape.field()
-        shift, end = fraction.last_shift(u, share), self._viability(u)
-        if end.viable and abs(shift) <= fraction.LAST:
+        shift, end = last_shift(u, share), self._viability(u)
+        if end.viable and abs(shift) <= FRACTION_LAST:
             self._shape.shift(shift)
             return True
         self._shortfall = f"; volume fraction {float((u > 0).double().mean()):.4f} instead of {share:.4f}"
@@ -160,12 +172,12 @@ class _Lane:
         """Take the snapshot, the record and the check that are due after `steps` steps, and the end's field."""
         if self.stop:
             return
-        orders, shape, total = self._orders, self._shape, self._orders.plan.steps
-        if steps in orders.snapshots:
+        options, shape, total = self._options, self._shape, self._options.plan.steps
+        if steps in options.snapshots:
             self.snapshots[steps] = shape.field()
         if last or steps % RECORD_EVERY == 0:
             self._record(steps, last)
-        if not self.stop and orders.reject_early and steps in orders.plan.checks:
+        if not self.stop and options.reject_early and steps in options.plan.checks:
             check = self._viability(shape.field())
             self.stop = "" if check.viable else f"stopped after {steps} of {total} steps: {check.reason}"
         if last or self.stop:
@@ -174,37 +186,37 @@ class _Lane:
     def end(self) -> Flow:
         """Return the flow at its end."""
         assert self._field is not None
-        orders, cost, end = self._orders, self._orders.cost, self._viability(self._field)
+        options, cost, end = self._options, self._options.cost, self._viability(self._field)
         if self._failure:
             end = dataclasses.replace(end, viable=False, reason=self._failure)
         history = History(*np.array(self.rows, dtype=np.float64).T)
         status = self._status(end, history)
         return Flow(
-            self._field, history, status, cost.grid, end, orders.plan, self._seed, self._mass, self.snapshots,
+            self._field, history, status, cost.grid, end, options.plan, self._seed, self._mass, self.snapshots,
             cost.coefficients, cost.epsilon,
         )  # fmt: skip
 
     def _record(self, steps: int, last: bool) -> None:
         """Add a row to the history, stop where a figure is not finite, call the callbacks, and correct the mass."""
-        orders, shape, total = self._orders, self._shape, self._orders.plan.steps
+        options, shape, total = self._options, self._shape, self._options.plan.steps
         statistics, mass = shape.statistics(), shape.mass()
         self.rows.append([steps, *statistics, mass])
         if subject := _not_finite(statistics, mass):
             self._failure = f"{subject} is not finite"
             self.stop = f"stopped after {steps} of {total} steps: {self._failure}"
             return
-        if orders.callbacks:
+        if options.callbacks:
             state = State(shape.field(), *statistics, mass)
-            answers = [bool(callback(steps, total, state)) for callback in orders.callbacks]
+            answers = [bool(callback(steps, total, state)) for callback in options.callbacks]
             if any(answers):
                 self.stop, self.asked = f"stopped by a callback after {steps} of {total} steps", True
-        share = orders.volume_fraction
-        if share is not None and not last and steps >= fraction.BEGIN * total:
-            shape.shift(fraction.correction(shape.field(), share, mass, total))
+        share = options.volume_fraction
+        if share is not None and not last and steps >= FRACTION_BEGIN * total:
+            shape.shift(correct_mass(shape.field(), share, mass, total))
 
     def _viability(self, u: Tensor) -> Viability:
         """Return the viability of a field."""
-        return viability(u, self._orders.cost.grid, self._orders.cost.epsilon)
+        return viability(u, self._options.cost.grid, self._options.cost.epsilon)
 
     def _status(self, end: Viability, history: History) -> str:
         """Return the sentence that says how the flow ended."""
@@ -226,3 +238,37 @@ def _not_finite(statistics: Statistics, mass: float) -> str:
     """Return the name of the first of a flow's figures that is infinite or NaN; empty where all are finite."""
     figures = {"the energy": [statistics.energy], "the gradient": statistics[1:], "the field": [mass]}
     return next((name for name, values in figures.items() if not all(map(math.isfinite, values))), "")
+
+
+# ---- a share of volume in place of a mass --------------------------------------------------------------------------
+
+
+def first_mass(share: float, mass: float | None = None) -> float:
+    """Return the mass that a flow towards this share begins with: a given one, as far as a shape of this share may have
+    it; else that of a sharp shape, with values ±1.
+
+    Raises
+    ------
+    ValueError
+        If the share is not in (0, 1).
+    """
+    share = check_open_interval(share, "a volume fraction in (0, 1)", 0, 1)
+    sharp = min(max(2 * share - 1, -FRACTION_BOUND), FRACTION_BOUND)
+    begin = sharp if mass is None else min(max(mass, sharp - FRACTION_REACH), sharp + FRACTION_REACH)
+    return min(max(begin, -FRACTION_BOUND), FRACTION_BOUND)
+
+
+def correct_mass(u: Tensor, share: float, mass: float, steps: int) -> float:
+    """Return what to add to the mass during a flow of `steps` steps; a sharp shape's share grows by half of that."""
+    shortfall = share - float(np.count_nonzero(u.numpy() > 0)) / u.numel()
+    gain, sharp = min(FRACTION_GAIN, FRACTION_GAIN * FRACTION_GAIN_STEPS / steps), first_mass(share)
+    target = min(max(mass + gain * 2 * shortfall, sharp - FRACTION_REACH), sharp + FRACTION_REACH)
+    return min(max(target, -FRACTION_BOUND), FRACTION_BOUND) - mass
+
+
+def last_shift(u: Tensor, share: float) -> float:
+    """Return the constant whose sum with u has round(share × voxels) values above 0."""
+    values, inside = u.numpy().ravel(), round(share * u.numel())
+    place = min(max(u.numel() - inside, 1), u.numel() - 1)
+    below, above = np.partition(values, (place - 1, place))[place - 1 : place + 1]
+    return -(float(below) + float(above)) / 2

@@ -10,12 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from curvafit.generation.flow import relax
+from curvafit.generation.flow import WORKING_BLUR, descend
 from curvafit.generation.schedule import Schedule
 from curvafit.inference.stationarity import energy_gradients
 from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.grid import Grid
-from curvafit.priors.shapes import Float
+from curvafit.priors.grid import Float, Grid
 from curvafit.priors.stencils import gaussian_blur, gradient
 from curvafit.scan.grids import boxes_by_surface, surface_voxels
 
@@ -72,7 +71,18 @@ class ShortFlow:
         """Return the displacement in voxels, low-passed, weighted by interface so that its square sums to the mean
         square."""
         scaled = law.scaled(self._budget / self._force(law))
-        flow = relax(self.start, scaled, self.grid, schedule=SHORT_FLOW, epsilon=self.epsilon, frozen=self.frozen)
+        flow = descend(
+            self.start,
+            scaled,
+            self.grid,
+            flow="h-1",
+            optimiser="adam",
+            steps=SHORT_FLOW.steps,
+            schedule=SHORT_FLOW,
+            epsilon=self.epsilon,
+            blur=WORKING_BLUR,
+            frozen=self.frozen,
+        )
         moved = (flow.field - self._before).double()
         if not bool(torch.isfinite(moved).all()):
             return np.full(len(self._norm), _LOST / np.sqrt(len(self._norm)))

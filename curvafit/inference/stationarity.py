@@ -25,8 +25,7 @@ from curvafit.core.runtime import Progress, silent
 from curvafit.priors.coefficients import NAMES, Coefficients
 from curvafit.priors.curvature import jet
 from curvafit.priors.energy import energy_terms
-from curvafit.priors.grid import Grid
-from curvafit.priors.shapes import Float
+from curvafit.priors.grid import Float, Grid
 from curvafit.priors.stencils import gaussian_blur, pad
 from curvafit.scan.structure import is_rounded
 

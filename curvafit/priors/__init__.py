@@ -4,14 +4,12 @@ if __name__ != "curvafit.priors":
     raise ImportError("import curvafit.priors, not priors: the folder at the project's root is a link into the package")
 
 from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.combined import CombinedLoss
 from curvafit.priors.curvature import diffuse_curvatures, geometric_curvatures, jet
 from curvafit.priors.energy import cahn_hilliard_area, discrepancy_ratio, energy, energy_terms, orientation
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.priors.law import PRESETS, Law, LawLike, preset, read_laws
-from curvafit.priors.loss import curvature_prior
+from curvafit.priors.loss import CombinedLoss, CurvaturePrior, curvature_prior
 from curvafit.priors.profile import SIGMA, optimal_profile, phase_field, profile_distance, signed_distance
-from curvafit.priors.segmentation import CurvaturePrior
 
 __all__ = [
     "PRESETS",

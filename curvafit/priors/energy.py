@@ -14,9 +14,8 @@ from torch import Tensor
 from curvafit.core.checks import as_tuple, check_float, quoted
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.curvature import Jet, diffuse_curvatures, jet, second_form
-from curvafit.priors.grid import Grid
+from curvafit.priors.grid import Float, Grid
 from curvafit.priors.profile import double_well
-from curvafit.priors.shapes import Float
 from curvafit.priors.stencils import gradient
 
 

@@ -1,12 +1,27 @@
-"""The sampling grid that travels with every field."""
+"""The sampling grid that travels with every field, and array shapes in signatures."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from curvafit.core.checks import LONGEST, SHORTEST, check_choice, check_float, check_int
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+else:
+    try:
+        from jaxtyping import Bool, Float
+    except ImportError:  # a bare training environment: array shapes in signatures are then inert names
+
+        class Float:
+            def __class_getitem__(cls, item: Any) -> Any:
+                return item[0]
+
+        Bool = Float
+
+__all__ = ["WORKING_EPSILON", "WORKING_SPACING", "Bool", "Boundary", "Float", "Grid"]
 
 Boundary = Literal["periodic", "replicate"]
 

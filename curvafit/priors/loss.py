@@ -1,21 +1,22 @@
-"""The training loss as a function: F_ε of predicted probabilities in a window of a larger volume."""
+"""F_ε as a training loss: of a predicted segmentation (`CurvaturePrior`), with another loss, and as a function."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Literal
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Literal, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from curvafit.core.checks import check_float, check_int, quoted
+from curvafit.core.units import METRES
 from curvafit.priors.coefficients import NAMES, POWERS, Coefficients, check_strength
-from curvafit.priors.grid import WORKING_EPSILON, Grid
+from curvafit.priors.grid import WORKING_EPSILON, Float, Grid
 from curvafit.priors.kernels.differentiable import areas, energies
-from curvafit.priors.law import Law, LawLike
-from curvafit.priors.refined import refined
-from curvafit.priors.shapes import Float
-from curvafit.priors.stencils import gaussian_blur
+from curvafit.priors.law import Law, LawLike, read_laws
+from curvafit.priors.stencils import gaussian_blur, refine_axis
 
 #: Voxels that ε spans: an axis with fewer, by more than a tenth, is interpolated.
 RESOLVED = 2
@@ -23,6 +24,305 @@ RESOLVED = 2
 MOST = 16
 #: The most voxels of the smallest edge that ε spans: no window has more.
 COARSEST = 10_000
+#: The most that a weight or a mask's value may be: float32 holds its products.
+HEAVIEST = 1e9
+_MOST_BORDER = 2**31
+_REDUCTIONS, _NORMALIZATIONS = ("mean", "sum", "none"), ("voxel", "area")
+_Values = TypeVar("_Values", bound=Tensor | None)
+
+
+class CurvaturePrior(nn.Module):
+    """The energy F_ε of a segmentation, as a loss with the keywords of MONAI's.
+
+    `forward(input, target=None, mask=None)` takes an `input` `(B, N, D, H, W)` of N classes and returns a scalar, or
+    `(B, N, 1, 1, 1)` with `reduction="none"`. It computes in float32 under autocast too; float64 input stays float64.
+    The target states only which voxels to ignore. The mask holds weights of voxels from 0, in the input's shape or with
+    1 for B or N. The loss is deterministic, and a constant or saturated input has a finite value and gradient. First
+    derivatives work in reverse and forward mode and through `torch.func`, also over batches of batches. Second
+    derivatives need float64; in float32 they raise a RuntimeError.
+
+    Parameters
+    ----------
+    law
+        `Coefficients` with lengths in spacing's unit; a `Law`, or a preset's name, in working units, where the smallest
+        voxel edge is 0.01; the path of a `fit.json`, or a fit. Or a sequence of laws, one for each class.
+    sigmoid, softmax
+        Whether the input is logits, to which this function is applied first. Without either the input is
+        probabilities; a warning says where it has other values.
+    include_background
+        Whether channel 0 counts.
+    to_onehot_y
+        Whether the target is class numbers `(B, 1, D, H, W)`.
+    reduction
+        `"mean"` over batch and classes; `"sum"` of the energies F_ε, which are not normalised then, so that windows
+        that overlap by 2·border voxels add up to the interior of the whole (border 2 where an axis is interpolated);
+        `"none"`.
+    ignore_index
+        Voxels where the target has this value do not count.
+    spacing
+        Voxel edges (z, y, x), or one edge for all axes.
+    unit
+        Spacing's unit (nm, um, mm or m) where the `fit.json` has another one; the fit is then converted. A warning says
+        where ε differs from the fit's by more than a factor of four.
+    epsilon
+        ε in spacing's unit; twice the smallest edge by default. Structures thinner than twice the smallest edge do not
+        survive. An axis on which ε spans fewer than two voxels, by more than a tenth, is interpolated, and a warning
+        says so. A refinement of more than 16-fold is refused, and so is an ε longer than the window.
+    weight
+        A factor, or one for each class; classes of weight 0 are not computed.
+    normalize
+        `"voxel"`: the mean density in units of ε, which compares patches of all sizes. `"area"`: the energy per area of
+        interface.
+    border
+        Number of voxels at each face of the input that do not count, since their neighbours are unknown.
+    blur
+        Standard deviation, in spacing's unit, of a Gaussian blur of the probabilities; none by default.
+    shape
+        Voxels (D, H, W) of a whole patch. An input of another shape is then the same patch on a coarser grid, as in
+        deep supervision, with a larger spacing. The loss is zero on a level that has no interior or would need a
+        refinement of more than 16-fold.
+
+    Raises
+    ------
+    ValueError
+        If an argument is out of range; in `forward`, if a shape does not match, or ε or the blur is longer than the
+        window.
+    """
+
+    def __init__(
+        self,
+        law: LawLike | Sequence[LawLike],
+        *,
+        sigmoid: bool = False,
+        softmax: bool = False,
+        include_background: bool = True,
+        to_onehot_y: bool = False,
+        reduction: str = "mean",
+        ignore_index: int | None = None,
+        spacing: float | Sequence[float] = 1.0,
+        unit: str | None = None,
+        epsilon: float | None = None,
+        weight: float | Sequence[float] = 1.0,
+        normalize: Literal["voxel", "area"] = "voxel",
+        border: int = 1,
+        blur: float = 0.0,
+        shape: Sequence[int] | None = None,
+    ) -> None:
+        super().__init__()
+        if sigmoid and softmax:
+            raise ValueError("expected sigmoid or softmax, got both")
+        if reduction not in _REDUCTIONS or normalize not in _NORMALIZATIONS:
+            expected = f"a reduction among {_REDUCTIONS} and normalize among {_NORMALIZATIONS}"
+            raise ValueError(f"expected {expected}, got {reduction!r} and {normalize!r}")
+        self.sigmoid, self.softmax, self.reduction = sigmoid, softmax, reduction
+        self.normalize: Literal["voxel", "area"] = normalize
+        self.include_background, self.to_onehot_y, self.ignore_index = include_background, to_onehot_y, ignore_index
+        self.spacing = _edges(spacing)
+        width = RESOLVED * min(self.spacing) if epsilon is None else epsilon
+        self.epsilon = check_float(width, "epsilon > 0 in spacing's unit", math.ulp(0), COARSEST * min(self.spacing))
+        self.blur = check_float(blur, "blur >= 0 in spacing's unit", 0, COARSEST * min(self.spacing))
+        self.border = check_int(border, "a border of whole voxels from 0", 0, _MOST_BORDER)
+        self._warned: set[str] = set()
+        self.shape = None if shape is None else Grid(shape, self.spacing).shape  # type: ignore[arg-type]
+        self.weight = _weights(weight)
+        edge = min(self.spacing)
+        self.coefficients = tuple(_numbers(each, edge, unit, self.epsilon) for each in read_laws(law))
+        for numbers in self.coefficients:
+            check_numbers(numbers, self.epsilon)
+        _warn_of_interpolation(self.spacing, self.epsilon)
+
+    def extra_repr(self) -> str:
+        """Return the settings that `repr` shows."""
+        return f"spacing={self.spacing}, epsilon={self.epsilon:g}, weight={self.weight}, border={self.border}"
+
+    def forward(self, input: Tensor, target: Tensor | None = None, mask: Tensor | None = None) -> Tensor:
+        """Return the loss of a batch; see the class."""
+        input, target, mask = _plain(input), _plain(target), _plain(mask)
+        with torch.autocast(input.device.type, enabled=False):
+            probability, voxels = self._probability(input), self._voxel_weights(input, target, mask)
+            classes = probability.shape[1]
+            laws, weights = _each(self.coefficients, classes, "one law"), _each(self.weight, classes, "one weight")
+            spacing = self._spacing(input)
+            skipped, columns = self._skips(input), []
+            for channel, (law, weight) in enumerate(zip(laws, weights, strict=True)):
+                field = probability[:, channel]
+                if weight == 0 or skipped:
+                    columns.append(field.sum((-3, -2, -1)) * 0)
+                    continue
+                value = curvature_prior(
+                    field,
+                    law,
+                    spacing,
+                    self.epsilon,
+                    mask=None if voxels is None else voxels[:, min(channel, voxels.shape[1] - 1)],
+                    normalize=None if self.reduction == "sum" else self.normalize,
+                    border=self.border,
+                    blur=self.blur,
+                )
+                columns.append(weight * value)
+            values = torch.stack(columns, 1)
+            if self.reduction == "none":
+                return values[..., None, None, None]
+            return values.sum() if self.reduction == "sum" else values.mean()
+
+    def suggest_weight(
+        self, loss_fn: Callable[[Tensor, Tensor], Tensor], batch: tuple[Tensor, Tensor], share: float = 1.0
+    ) -> float:
+        """Return the factor that gives this loss `share` times the gradient of another loss, as norms over the input.
+
+        Parameters
+        ----------
+        loss_fn
+            The other loss, a function of output and target; its values are summed.
+        batch
+            A network's output and its target, as in training.
+        share
+            At the default ε, tubes two voxels thick survive a share of 0.1 with `trabec` and `tubes`, but not with
+            `pearls`; a share of 1 removes them.
+
+        Raises
+        ------
+        ValueError
+            If either gradient is zero or not finite, as on a batch whose prediction has no surface.
+        """
+        output, target = batch
+        leaf = output.detach().float().requires_grad_()
+        sizes = []
+        for loss in (loss_fn, self):
+            with torch.enable_grad():
+                (slope,) = torch.autograd.grad(loss(leaf, target).sum(), leaf)
+            sizes.append(float(slope.double().norm()))
+        if not all(0 < size < math.inf for size in sizes):
+            raise ValueError(f"expected a batch on which both losses have a gradient, got norms {sizes[0]}, {sizes[1]}")
+        return share * sizes[0] / sizes[1]
+
+    def _probability(self, input: Tensor) -> Tensor:
+        """Return probabilities (B, classes that count, D, H, W) in float32 or float64."""
+        if input.dim() != 5 or not input.is_floating_point() or 0 in input.shape:
+            raise ValueError(f"expected an input of floats (B, N, D, H, W), got {input.dtype} {tuple(input.shape)}")
+        values = input if input.dtype == torch.float64 else input.float()
+        if self.sigmoid:
+            values = values.sigmoid()
+        elif not self.softmax or input.shape[1] == 1:
+            self._check_range(values)
+        if input.shape[1] == 1:
+            options = {"softmax=True": self.softmax, "include_background=False": not self.include_background}
+            for name in (name for name, active in options.items() if active):
+                warnings.warn(f"single channel prediction, `{name}` ignored.", stacklevel=3)
+            return values
+        if self.softmax:
+            values = values.softmax(1)
+        return values if self.include_background else values[:, 1:]
+
+    def _voxel_weights(self, input: Tensor, target: Tensor | None, mask: Tensor | None) -> Tensor | None:
+        """Return the mask (B or 1, classes that count or 1, D, H, W) with zeros on ignored voxels, or None."""
+        batch, classes = input.shape[:2]
+        space = tuple(input.shape[2:])
+        if mask is not None:
+            fits = mask.dim() == 5 and mask.shape[0] in (1, batch) and mask.shape[1] in (1, classes)
+            if not fits or tuple(mask.shape[2:]) != space:
+                expected = f"({batch} or 1, {classes} or 1, {', '.join(map(str, space))})"
+                raise ValueError(f"expected a mask of shape {expected}, got {tuple(mask.shape)}")
+            if _number_of(((mask >= 0) & (mask <= HEAVIEST)).all()) == 0:
+                raise ValueError(f"expected a mask of finite numbers from 0, at most {HEAVIEST:g}, got others")
+            if mask.shape[1] > 1 and not self.include_background:
+                mask = mask[:, 1:]
+        if target is not None and (target.dim() != 5 or target.shape[0] != batch or tuple(target.shape[2:]) != space):
+            raise ValueError(f"expected a target of shape {(batch, 1, *space)}, got {tuple(target.shape)}")
+        if target is not None and self.to_onehot_y and target.shape[1] != 1:
+            raise ValueError(f"expected a target of class numbers (B, 1, D, H, W), got {tuple(target.shape)}")
+        if self.ignore_index is None:
+            return mask
+        if target is None or target.shape[1] != 1:
+            got = "none" if target is None else f"shape {tuple(target.shape)}"
+            raise ValueError(
+                f"expected a target (B, 1, D, H, W) with label {self.ignore_index} on ignored voxels, got {got}"
+            )
+        valid = target != self.ignore_index
+        return valid if mask is None else mask * valid
+
+    def _spacing(self, input: Tensor) -> tuple[float, float, float]:
+        """Return the voxel edges of an input, which are larger than the patch's where the input has fewer voxels."""
+        if self.shape is None:
+            return self.spacing
+        pairs = zip(self.spacing, self.shape, input.shape[2:], strict=True)
+        return tuple(h * whole / n for h, whole, n in pairs)  # type: ignore[return-value]
+
+    def _skips(self, input: Tensor) -> bool:
+        """Return whether an input is a level of deep supervision that has no interior or is too coarse for ε."""
+        space = tuple(input.shape[2:])
+        if self.shape is None or space == self.shape:
+            return False
+        times = RESOLVED * max(self._spacing(input)) / self.epsilon
+        if times <= MOST + 1e-3 and min(space) >= max(4, 2 * self.border + 1):
+            return False
+        self._warn(str(space), f"a level of {space} voxels is too coarse for ε = {self.epsilon:g}, so its loss is 0")
+        return True
+
+    def _check_range(self, probability: Tensor) -> None:
+        """Warn once where probabilities are outside [0, 1]."""
+        if torch.compiler.is_compiling() or "range" in self._warned:
+            return
+        low, high = (_number_of(value) for value in probability.detach().aminmax())
+        if low is not None and high is not None and not (low >= -1e-3 and high <= 1 + 1e-3):
+            self._warn("range", f"expected probabilities, got {low:g} to {high:g}: is sigmoid or softmax missing?")
+
+    def _warn(self, subject: str, message: str) -> None:
+        """Warn once about each subject."""
+        if not torch.compiler.is_compiling() and subject not in self._warned:
+            self._warned.add(subject)
+            warnings.warn(message, stacklevel=3)
+
+
+class CombinedLoss(nn.Module):
+    """base(input, target) + weight × prior(input, target), where the prior's weight grows over the first calls.
+
+    Parameters
+    ----------
+    base
+        Any loss of an input and a target, a module or a function.
+    prior
+        A `CurvaturePrior` that takes the same input.
+    weight
+        See `CurvaturePrior.suggest_weight`.
+    warmup
+        Number of calls over which the weight grows linearly to its full value. Calls in evaluation mode or without a
+        gradient do not count. The count is a buffer, so that a resumed training goes on from it.
+
+    Attributes
+    ----------
+    parts
+        The terms of the last call, to log: `base`, `prior` before weighting, and the prior's `weight`, as tensors
+        without a gradient on the device of the loss. Empty before the first call.
+
+    Raises
+    ------
+    ValueError
+        If the weight is not a finite number from 0, or the warm-up is not a whole number from 0.
+    """
+
+    calls: Tensor
+
+    def __init__(
+        self, base: Callable[[Tensor, Tensor], Tensor], prior: nn.Module, weight: float = 1.0, warmup: int = 0
+    ) -> None:
+        super().__init__()
+        self.weight = check_float(weight, "a finite weight from 0", 0)
+        self.warmup = check_int(warmup, "a warm-up of a whole number of calls from 0", 0, 2**53)
+        self.base, self.prior = base, prior
+        self.parts: dict[str, Tensor] = {}
+        self.register_buffer("calls", torch.zeros((), dtype=torch.int64))
+
+    def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+        """Return the weighted sum; `mask` is passed to the prior."""
+        if self.training and torch.is_grad_enabled():
+            self.calls += 1
+        weight = self.weight
+        if self.warmup:
+            weight = weight * (self.calls / self.warmup).clamp(max=1)
+        base, prior = self.base(input, target), self.prior(input, target, mask)
+        self.parts = {"base": base.detach(), "prior": prior.detach(), "weight": torch.as_tensor(weight)}
+        return base + weight * prior
 
 
 def curvature_prior(
@@ -76,7 +376,8 @@ def curvature_prior(
     unit = epsilon / WORKING_EPSILON
     u, weights = 2 * probability - 1, _window(probability, mask, border)
     for axis, n in enumerate(times):
-        u, weights = refined(u, axis, n), weights.repeat_interleave(n, axis - 3) if n > 1 else weights
+        if n > 1:
+            u, weights = refine_axis(u, axis, n), weights.repeat_interleave(n, axis - 3)
     grid = Grid(tuple(u.shape[1:]), tuple(h / n / unit for h, n in zip(spacing, times, strict=True)), "replicate")  # type: ignore[arg-type]
     if blur:
         u = gaussian_blur(u, grid, blur / unit)
@@ -138,9 +439,73 @@ def check_lengths(epsilon: float, blur: float, longest: float) -> None:
             raise ValueError(f"expected {name} of at most the window's longest side, {longest:g}, got {length:g}")
 
 
+def _edges(spacing: float | Sequence[float]) -> tuple[float, float, float]:
+    """Return three voxel edges."""
+    return Grid((4, 4, 4), spacing).spacing  # type: ignore[arg-type]
+
+
+def _weights(weight: float | Sequence[float]) -> tuple[float, ...]:
+    """Return one weight, or the weights of all classes."""
+    try:
+        values = tuple(torch.as_tensor(weight, dtype=torch.float64).flatten().tolist())
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        values = ()
+    if not values or not all(0 <= value <= HEAVIEST for value in values):
+        raise ValueError(f"expected a weight from 0 to {HEAVIEST:g}, or one for each class, got {quoted(weight)}")
+    return values
+
+
+def _numbers(law: Law, edge: float, unit: str | None, epsilon: float) -> Coefficients:
+    """Return coefficients with lengths in spacing's unit; warn where ε is far from the fit's."""
+    numbers = law.in_unit(unit, edge)
+    if law.length_unit is None:
+        if unit is not None and unit not in METRES:
+            raise ValueError(f"expected a unit among {', '.join(METRES)}, got {quoted(unit)}")
+        return numbers
+    width, fit_unit = law.epsilon_physical, law.length_unit
+    unit = unit or fit_unit
+    width *= 1 if unit == fit_unit else METRES[fit_unit] / METRES[unit]
+    if not 1 / 4 <= epsilon / width <= 4:
+        widths = f"ε is {epsilon:g} {unit} here and was {width:g} {unit} in the fit"
+        warnings.warn(f"{widths}: state spacing and its unit if the two should be alike", stacklevel=4)
+    return numbers
+
+
+def _each(values: tuple, classes: int, name: str) -> tuple:
+    """Return one value for each class."""
+    if len(values) not in (1, classes):
+        raise ValueError(f"expected {name}, or one for each class that counts ({classes} in all), got {len(values)}")
+    return values * classes if len(values) == 1 else values
+
+
+def _warn_of_interpolation(spacing: tuple[float, float, float], epsilon: float) -> None:
+    """Warn about the axes that are interpolated."""
+    times = upsampling(spacing, epsilon)
+    if max(times) > 1:
+        axes = ", ".join(f"{axis} {n}-fold" for axis, n in zip("zyx", times, strict=True) if n > 1)
+        warnings.warn(f"ε = {epsilon:g} spans fewer than 2 voxels: interpolating {axes}", stacklevel=3)
+
+
 def _window(probability: Tensor, mask: Tensor | None, border: int) -> Tensor:
     """Return the mask `(1 or batch, z, y, x)` with zeros at the border."""
     inside = probability.new_zeros(probability.shape[1:])
     z, y, x = (slice(border, n - border) for n in inside.shape)
     inside[z, y, x] = 1
     return inside[None] if mask is None else inside * mask.to(inside)
+
+
+def _plain(values: _Values) -> _Values:
+    """Return a tensor without its subclass (MONAI's `MetaTensor`)."""
+    return values if values is None or type(values) is Tensor else values.as_subclass(Tensor)  # type: ignore[return-value]
+
+
+def _number_of(value: Tensor) -> float | None:
+    """Return a tensor's single number, or None where it has none yet: in compiled code and under `torch.func.vmap`."""
+    if torch.compiler.is_compiling():
+        return None
+    try:
+        return float(value)
+    except RuntimeError as error:
+        if "vmap" not in str(error):
+            raise
+        return None

@@ -7,8 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from curvafit.priors.grid import Grid
-from curvafit.priors.shapes import Bool, Float
+from curvafit.priors.grid import Bool, Float, Grid
 from curvafit.priors.stencils import gaussian_blur
 
 #: σ = ∫ √(2W) over [-1, 1] = 4 / (3√2): what a unit of area costs in the limit ε → 0.

@@ -10,12 +10,12 @@ difference of another continuation: periodic, or mirrored with a sign along the 
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import torch
 from torch import Tensor
 
-from curvafit.priors.grid import Grid
-from curvafit.priors.shapes import Float
+from curvafit.priors.grid import Float, Grid
 
 #: The most voxels that a blur's standard deviation spans: eighty thousand weights.
 WIDEST = 10_000
@@ -125,6 +125,19 @@ def gaussian_taps(deviation: float) -> tuple[float, ...]:
     return tuple(w / math.fsum(taps) for w in taps)
 
 
+def refine_axis(u: Tensor, axis: int, times: int) -> Tensor:
+    """Return `u (..., Z, Y, X)` with every voxel along `axis` (0 to 2) split into `times`; differentiable.
+
+    The interpolation is Keys' cubic convolution (a = -1/2), third-order accurate and exact for parabolas. Beyond its
+    ends the field continues with the last value.
+    """
+    if times == 1:
+        return u
+    dim = axis - 3
+    weights = _cubic_weights(u.shape[dim], times).to(u)
+    return torch.movedim(torch.movedim(u, dim, -1) @ weights, -1, dim).contiguous()
+
+
 def _pad_axis(v: Tensor, grid: Grid, axis: int, width: int) -> Tensor:
     """Continue a field by `width` voxels, any number, at both ends of an axis."""
     dim, n = axis - 3, grid.shape[axis]
@@ -167,3 +180,25 @@ def _checked(u: Tensor, grid: Grid) -> Tensor:
     if tuple(u.shape[-3:]) != grid.shape:
         raise ValueError(f"expected a field whose last axes are {grid.shape}, got {tuple(u.shape)}")
     return u
+
+
+@lru_cache(maxsize=32)
+@torch.inference_mode(False)  # cached weights must serve a later backward pass
+def _cubic_weights(n: int, times: int) -> Tensor:
+    """Return interpolation weights `(n, n · times)`, a column for each new sample."""
+    place = (torch.arange(n * times, dtype=torch.float64) + 0.5) / times - 0.5
+    first = place.floor()
+    t = place - first
+    four = torch.stack(
+        (
+            ((2 - t) * t - 1) * t / 2,
+            ((3 * t - 5) * t * t + 2) / 2,
+            ((4 - 3 * t) * t + 1) * t / 2,
+            (t - 1) * t * t / 2,
+        )
+    )
+    weights = torch.zeros(n, n * times, dtype=torch.float64)
+    for k in range(4):
+        row = (first.long() + k - 1).clamp(0, n - 1)
+        weights[row, torch.arange(n * times)] += four[k]
+    return weights

@@ -21,7 +21,7 @@ from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.law import Law, LawLike
 from curvafit.priors.loss import RESOLVED, upsampling
 from curvafit.priors.profile import phase_field
-from curvafit.priors.refined import refined
+from curvafit.priors.stencils import refine_axis
 from curvafit.segmentation.evidence import VoxelEvidence
 from curvafit.volumes.field import Field, ScanError
 
@@ -270,7 +270,7 @@ class WorkingGrid:
         """Return a smooth volume interpolated to the flow's grid, and continued into the halo by its last values."""
         u = torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
         for axis, n in enumerate(self.times):
-            u = refined(u, axis, n)
+            u = refine_axis(u, axis, n)
         return pad(u[None, None], self._sides, mode="replicate")[0, 0]
 
     def spread(self, values: np.ndarray, centre: int | None = None) -> Tensor:

@@ -12,7 +12,7 @@ from flat_recipe import SHAPE, flat_recipe
 from curvafit.data_synth.case import Recipe
 from curvafit.data_synth.imaging.modality import Imaging, Modality
 from curvafit.data_synth.sources import Generated, PhaseField, source_of
-from curvafit.generation import fraction as steering
+from curvafit.generation import loop as steering
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +59,7 @@ def test_shapes_fill_the_share_that_is_asked_for(monkeypatch):
     assert source_of(source.as_dict()) == source
     with pytest.raises(ValueError, match="fraction"):
         Generated((point,), ("tubes",), fraction=1.5)
-    monkeypatch.setattr(steering, "LAST", -1.0)
+    monkeypatch.setattr(steering, "FRACTION_LAST", -1.0)
     missed = source.shape((20, 20, 20), 0, np.random.default_rng(0))
     assert f"volume fraction {(missed.values > 0).mean():.4f} instead of 0.1500" in missed.origin["status"]
 

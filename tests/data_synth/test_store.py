@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from curvafit.data_synth.store import Record, Settings, Store, open_store
-from curvafit.generation.viability import Viability
+from curvafit.generation.result import Viability
 from curvafit.priors.coefficients import Coefficients
 
 SHAPE = (6, 5, 4)

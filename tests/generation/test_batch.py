@@ -22,14 +22,13 @@ def assert_same(one, other) -> None:
     for name in ("step", "energy", "gradient_max", "gradient_mean", "mass"):
         np.testing.assert_allclose(getattr(one.history, name), getattr(other.history, name), rtol=1e-12)
     assert (one.seed, one.status, one.schedule, one.grid) == (other.seed, other.status, other.schedule, other.grid)
-    assert one.snapshots.keys() == other.snapshots.keys()
 
 
 def test_one_after_another():
     pairs = [(TUBES.coefficients, TUBES.mass), (SPONGE.coefficients, SPONGE.mass)]
-    flows = generate_batch(*zip(*pairs, strict=True), GRID, seeds=(3, 4), schedule=PLAN, snapshots=(7,))
+    flows = generate_batch(*zip(*pairs, strict=True), GRID, seeds=(3, 4), schedule=PLAN)
     for flow, (a, mass), seed in zip(flows, pairs, (3, 4), strict=True):
-        assert_same(flow, generate(a, mass, GRID, seed=seed, schedule=PLAN, snapshots=(7,)))
+        assert_same(flow, generate(a, mass, GRID, seed=seed, schedule=PLAN))
 
 
 def test_one_for_all():
@@ -66,7 +65,7 @@ def test_shapes_that_share_steps_are_the_same(varying):
     if varying:
         laws[0] = Coefficients(torch.linspace(1, 2, 12).reshape(12, 1, 1), *list(TUBES.coefficients)[1:])
     masses = [-0.5, -0.75, -0.25]
-    options = {"schedule": PLAN, "reject_early": True, "snapshots": (7,), "backend": "torch"}
+    options = {"schedule": PLAN, "reject_early": True, "backend": "torch"}
     flows = list(generate_batch(laws, masses, GRID, seeds=range(3), together=2, **options))
     assert len({flow.status for flow in flows}) > 1
     for flow, a, mass in zip(flows, laws, masses, strict=True):

@@ -14,9 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from kernel_cases import relax
 
 from curvafit.generation.checkpoint import Checkpoint, identity
-from curvafit.generation.flow import descend, generate, relax
+from curvafit.generation.flow import descend, generate
 from curvafit.generation.schedule import SCHEDULES, Schedule
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid

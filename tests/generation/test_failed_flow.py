@@ -10,15 +10,16 @@ import pytest
 import torch
 from calling import LAW, call
 from exact import Sphere, centres
+from kernel_cases import relax
 from torch import Tensor
 
 from curvafit.data_synth import atlas
 from curvafit.data_synth.store import open_store
-from curvafit.generation import SCHEDULES, Schedule, descend, generate_batch, relax
+from curvafit.generation import SCHEDULES, Schedule, descend, generate_batch
 from curvafit.generation.cost import Cost
-from curvafit.generation.loop import Orders, run
+from curvafit.generation.loop import FlowOptions, run
+from curvafit.generation.result import viability
 from curvafit.generation.stepper import Statistics, Stepper
-from curvafit.generation.viability import viability
 from curvafit.priors.grid import Grid
 from curvafit.priors.law import preset
 from curvafit.priors.profile import optimal_profile
@@ -67,7 +68,7 @@ def test_figures_that_are_not_finite_end_a_flow(part: str, step: int, bad: float
     good = Statistics(1.0, 1.0, 1.0)
     figures = {"energy": good._replace(energy=bad), "gradient": good._replace(gradient_max=bad)}
     stepper = Seen({step: figures.get(part, good)}, bad if part == "field" else 0.0)
-    flow = run(stepper, [Orders(COST, Schedule("x", 20, 1e-3, 1e-3, "constant"))], [0])[0]
+    flow = run(stepper, [FlowOptions(COST, Schedule("x", 20, 1e-3, 1e-3, "constant"))], [0])[0]
     at = 0 if part == "field" else step
     assert not flow.finite and not flow.viability.viable
     assert flow.viability.reason == f"the {part} is not finite"
@@ -75,7 +76,7 @@ def test_figures_that_are_not_finite_end_a_flow(part: str, step: int, bad: float
 
 
 def test_a_flow_that_goes_well_is_finite() -> None:
-    flow = run(Seen({}), [Orders(COST, Schedule("x", 20, 1e-3, 1e-3, "constant"))], [0])[0]
+    flow = run(Seen({}), [FlowOptions(COST, Schedule("x", 20, 1e-3, 1e-3, "constant"))], [0])[0]
     assert flow.finite and flow.viability.viable
 
 

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import torch
 from found import made_fit
+from kernel_cases import relax
 
-from curvafit.generation.flow import RECORD_EVERY, generate, relax
-from curvafit.generation.initial import white_noise
-from curvafit.generation.forms import DivergenceForm
+from curvafit.generation.flow import descend, generate
+from curvafit.generation.forms import DivergenceForm, white_noise
+from curvafit.generation.result import RECORD_EVERY, viability
 from curvafit.generation.schedule import SCHEDULES, Phase, Schedule, present_name, schedule
-from curvafit.generation.viability import viability
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.energy import energy
 from curvafit.priors.grid import Grid
@@ -308,11 +308,11 @@ def test_wrong_input_is_refused():
     with pytest.raises(ValueError, match="expected a device that torch computes on, .*, got .meta."):
         generate(TUBES, MASS, grid, backend="fused", device="meta")
     with pytest.raises(ValueError, match="expected a field of shape"):
-        relax(torch.zeros(12, 12, 11), TUBES, grid, schedule="fast")
+        descend(torch.zeros(12, 12, 11), TUBES, grid)
     with pytest.raises(ValueError, match="expected a frozen mask of shape"):
-        relax(torch.zeros(grid.shape), TUBES, grid, schedule="fast", frozen=torch.zeros(3, 3, 3, dtype=torch.bool))
+        descend(torch.zeros(grid.shape), TUBES, grid, frozen=torch.zeros(3, 3, 3, dtype=torch.bool))
     with pytest.raises(ValueError, match="expected a finite field"):
-        relax(torch.full(grid.shape, math.inf), TUBES, grid, schedule="fast")
+        descend(torch.full(grid.shape, math.inf), TUBES, grid)
 
 
 def test_fast_makes_a_shape():

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from curvafit.generation import fraction
-from curvafit.generation.flow import generate
-from curvafit.generation.fraction import first_mass
+from curvafit.generation import loop
+from curvafit.generation.flow import base_of, generate
+from curvafit.generation.loop import first_mass
 from curvafit.generation.schedule import Schedule, schedule
-from curvafit.generation.setup import base_of
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
 from curvafit.priors.law import preset
@@ -82,17 +81,17 @@ def test_a_flow_begins_with_the_mass_that_is_given(mass, first):
 def test_the_last_constant_is_exact(wanted):
     """Counted, with the rounding to whole voxels; at least one voxel on either side."""
     u = torch.rand((20, 21, 22), generator=torch.Generator().manual_seed(0)) - 0.7
-    moved = u.double() + fraction.last_shift(u, wanted)
+    moved = u.double() + loop.last_shift(u, wanted)
     inside = int((moved > 0).sum())
     assert inside == min(max(round(wanted * u.numel()), 1), u.numel() - 1)
 
 
 def test_corrections_are_bounded_and_point_the_right_way():
     u = torch.linspace(-1, 1, 1000).reshape(10, 10, 10)
-    assert fraction.correction(u, 0.5, 0.0, 1000) == pytest.approx(0, abs=1e-9)
-    up, down = fraction.correction(u, 0.55, 0.0, 1000), fraction.correction(u, 0.45, 0.0, 1000)
-    assert up == pytest.approx(fraction.GAIN * 2 * 0.05) == -down
-    assert fraction.correction(u, 0.55, 0.0, 8000) == pytest.approx(up / 8)
-    ends = [mass + fraction.correction(u, 0.7, mass, 1000) for mass in (0.0, 0.6, 0.4)]
+    assert loop.correct_mass(u, 0.5, 0.0, 1000) == pytest.approx(0, abs=1e-9)
+    up, down = loop.correct_mass(u, 0.55, 0.0, 1000), loop.correct_mass(u, 0.45, 0.0, 1000)
+    assert up == pytest.approx(loop.FRACTION_GAIN * 2 * 0.05) == -down
+    assert loop.correct_mass(u, 0.55, 0.0, 8000) == pytest.approx(up / 8)
+    ends = [mass + loop.correct_mass(u, 0.7, mass, 1000) for mass in (0.0, 0.6, 0.4)]
     assert ends == pytest.approx([0.2, 0.6, 0.44])
-    assert fraction.correction(u, 0.99, fraction.BOUND, 1000) == 0
+    assert loop.correct_mass(u, 0.99, loop.FRACTION_BOUND, 1000) == 0

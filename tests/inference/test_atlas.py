@@ -16,8 +16,8 @@ from curvafit.atlas_map.extract import extract
 from curvafit.data_synth import atlas as building
 from curvafit.data_synth.design import INTERVALS, Design, boxed
 from curvafit.data_synth.store import open_store
+from curvafit.generation.result import Viability
 from curvafit.generation.schedule import LEARNED, present_name, schedule
-from curvafit.generation.viability import Viability
 from curvafit.inference.atlas import VERSION, Atlas, load_atlas, save_atlas
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile

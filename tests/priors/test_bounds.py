@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from curvafit.core.checks import SHOWN, check_float, check_int, quoted
+from curvafit.core.runtime import check_memory, device_memory
 from curvafit.core.workers import check_workers
 from curvafit.data_synth.case import Recipe
 from curvafit.data_synth.design import Design, around, boxed
@@ -17,7 +18,6 @@ from curvafit.data_synth.imaging.modality import MODALITIES
 from curvafit.data_synth.sources import Generated
 from curvafit.drawing.shapes import Output
 from curvafit.generation import Schedule, descend, generate, generate_batch, white_noise
-from curvafit.generation.memory import check_memory, memory
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.energy import orientation
 from curvafit.priors.grid import Grid
@@ -188,7 +188,7 @@ def test_outputs_have_bounds() -> None:
 
 
 def test_memory_is_told_before_it_is_taken() -> None:
-    room = memory()
+    room = device_memory()
     assert room > 2**28
     check_memory((1, 1, room), 1, "a line")
     with pytest.raises(

@@ -10,8 +10,7 @@ from loss_cases import LAW, TUBES, fit_file, noise, probabilities, slope_of
 from torch import Tensor
 
 from curvafit.priors import Coefficients, CurvaturePrior, Grid, curvature_prior, energy, optimal_profile
-from curvafit.priors.refined import refined
-from curvafit.priors.stencils import gaussian_blur
+from curvafit.priors.stencils import gaussian_blur, refine_axis
 
 
 def ball(shape: tuple[int, int, int], spacing: tuple[float, float, float], radius: float, epsilon: float) -> Tensor:
@@ -151,7 +150,7 @@ def test_cubic_convolution_keeps_parabolas():
     fine = (torch.arange(36, dtype=torch.float64) + 0.5) / 3 - 0.5
     inside = slice(6, -6)
     for law in (lambda t: 0 * t + 2, lambda t: 3 * t - 1, lambda t: t**2 - 4 * t):
-        found = refined(law(z)[None, :, None, None].expand(2, 12, 4, 5), 0, 3)
+        found = refine_axis(law(z)[None, :, None, None].expand(2, 12, 4, 5), 0, 3)
         assert found.shape == (2, 36, 4, 5)
         torch.testing.assert_close(found[1, inside, 2, 3], law(fine)[inside])
 

@@ -7,8 +7,7 @@ import torch
 from loss_cases import LAW, noise, probabilities, slope_of
 
 from curvafit.priors import CurvaturePrior, Grid, curvature_prior
-from curvafit.priors.refined import refined
-from curvafit.priors.stencils import gaussian_blur
+from curvafit.priors.stencils import gaussian_blur, refine_axis
 
 pytestmark = pytest.mark.filterwarnings("ignore:ε = .* interpolating")
 
@@ -60,7 +59,7 @@ def test_blur_is_in_the_unit_of_the_spacing(normalize):
 def test_an_interpolated_axis_is_a_finer_grid(dtype, normalize):
     p, spacing = probabilities(2, 8, 10, 10).to(dtype), (3.0, 1.0, 1.0)
     mask = torch.rand(2, 8, 10, 10, generator=torch.Generator().manual_seed(0)).to(dtype)
-    fine, parts = (refined(2 * p - 1, 0, 3) + 1) / 2, mask.repeat_interleave(3, 1)
+    fine, parts = (refine_axis(2 * p - 1, 0, 3) + 1) / 2, mask.repeat_interleave(3, 1)
     found = curvature_prior(p, LAW, spacing, 2.0, mask=mask, normalize=normalize, border=0)
     expected = curvature_prior(fine, LAW, (1.0, 1.0, 1.0), 2.0, mask=parts, normalize=normalize, border=0)
     torch.testing.assert_close(found, expected, rtol=1e-4 if dtype == torch.float32 else 1e-9, atol=0)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from curvafit.generation.flow import generate
-from curvafit.generation.initial import white_noise
+from curvafit.generation.forms import white_noise
 from curvafit.generation.schedule import Schedule
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.energy import energy, orientation

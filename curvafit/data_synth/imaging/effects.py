@@ -29,9 +29,8 @@ from curvafit.data_synth.imaging.maths import (
     stream,
     uniform,
 )
-from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
+from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Float
 from curvafit.priors.profile import profile_distance
-from curvafit.priors.shapes import Float
 
 #: ε of a generated shape, in its voxels.
 EPSILON = WORKING_EPSILON / WORKING_SPACING

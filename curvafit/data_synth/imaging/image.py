@@ -11,7 +11,7 @@ from curvafit.data_synth.imaging import effects
 from curvafit.data_synth.imaging.effects import EPSILON
 from curvafit.data_synth.imaging.maths import Triple, count_samples, seeds_of
 from curvafit.data_synth.imaging.modality import Imaging
-from curvafit.priors.shapes import Bool, Float
+from curvafit.priors.grid import Bool, Float
 
 
 def image(

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from curvafit.priors.shapes import Float
+from curvafit.priors.grid import Float
 
 Triple = tuple[float, float, float]
 

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from curvafit.priors import kernels
 from curvafit.priors.energy import energy
-from curvafit.priors.grid import Grid
-from curvafit.priors.shapes import Float
+from curvafit.priors.grid import Float, Grid
 from curvafit.priors.stencils import gradient
 
 
