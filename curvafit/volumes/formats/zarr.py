@@ -162,7 +162,10 @@ def _check_store(folder: Path) -> None:
 
 
 def _missing_chunks(array: Any, folder: Path) -> tuple[str, ...]:
-    """Return a sentence on the chunks of an array that are not stored, within shards too, or none."""
+    """Return a sentence on the chunks of an array that are not stored, within shards too, or none.
+
+    Zarr's own `nchunks_initialized` looks every chunk up in a list of all files, and not into shards.
+    """
     outer = array.shards or array.chunks
     counts, chunks = _counts(array.shape, outer), math.prod(_counts(array.shape, array.chunks))
     if chunks > _MOST:
