@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy import stats
@@ -42,8 +42,6 @@ EDGES = (32, 64)
 METHOD = "amortised: conditional flows given the descriptors"
 #: Draws by which a row is summarised in `check`, and those of them from which the best parameters are looked for.
 SUMMARY_DRAWS, STARTS = 64, 8
-#: Levels of a block's band.
-LEVELS = (0.05, 0.5, 0.95)
 #: Least simulations to compare with.
 FEWEST = 6
 #: Simulations that the prior of a block's regression on the summaries counts as, and least deviation of a column, of
@@ -193,12 +191,9 @@ class _Reading:
 
 def _checked(reading: _Reading, grown: Simulations, others: Mapping[str, np.ndarray]) -> Estimate:
     """Return what is known once draws were grown, and other parameters were chosen by what grew."""
-    posterior, row, count = reading.posterior, reading.row, len(grown.parameters)
+    row = reading.row
     draws = reading.draws(reading.parameters, METHOD)
-    checked = check(posterior, row, reading.view, grown.descriptors)
-    misfit = Misfit(
-        checked.p, {name: each.p for name, each in checked.blocks.items()}, f"{count} shapes grown from draws"
-    )
+    misfit = check(reading.posterior, row, reading.view, grown.descriptors)
     refined, simulation = (Candidate(name, *law_of(reading.turn(each)), {}) for name, each in others.items())
     names = np.array(column_names())
     blocks = {name: (row[names == name], grown.descriptors[:, names == name]) for name in BLOCKS}
@@ -234,23 +229,6 @@ def _simulator(prepared: Prepared, view: str, schedule: Schedule | str) -> Simul
     return simulate
 
 
-class BlockCheck(NamedTuple):
-    """Of a block of descriptors: tail probability of the query among simulations, and their quantiles at `LEVELS`,
-    `(3, c)`."""
-
-    p: float
-    band: np.ndarray
-
-
-class Check(NamedTuple):
-    """Tail probability of a query's descriptors among simulations, for all together and for each block, and how many
-    simulations there were."""
-
-    p: float
-    blocks: dict[str, BlockCheck]
-    count: int
-
-
 def tail_probability(posterior: Posterior, view: str, misfit: float) -> float:
     """Return the part of shapes that fit worse than a query, each by its best parameters from `STARTS` draws.
 
@@ -263,7 +241,7 @@ def tail_probability(posterior: Posterior, view: str, misfit: float) -> float:
     return float((1 + (usual >= misfit).sum()) / (1 + len(usual)))
 
 
-def check(posterior: Posterior, descriptors: np.ndarray, view: str, simulated: np.ndarray) -> Check:
+def check(posterior: Posterior, descriptors: np.ndarray, view: str, simulated: np.ndarray) -> Misfit:
     """Compare a row of descriptors `(351,)` with those of simulations of the posterior's draws `(n, 351)`.
 
     Probabilities of blocks are of what the posterior's mean given a row, by linear regression, does not tell of the
@@ -279,12 +257,9 @@ def check(posterior: Posterior, descriptors: np.ndarray, view: str, simulated: n
     rows = np.concatenate([np.atleast_2d(descriptors), simulated])
     draws = posterior.sample(rows, view, SUMMARY_DRAWS)
     left = np.log(misfits(posterior.emulator, rows, view, draws[:, :STARTS]) + FLOOR)
-    summaries, names = posterior.standard(draws).mean(1), np.array(column_names())
-    blocks = {}
-    for name in BLOCKS:
-        band = np.quantile(simulated[:, names == name], LEVELS, axis=0)
-        blocks[name] = BlockCheck(_tail(_distances(columns_of(rows, [name]), summaries)), band)
-    return Check(_tail(left), blocks, len(simulated))
+    summaries = posterior.standard(draws).mean(1)
+    blocks = {name: _tail(_distances(columns_of(rows, [name]), summaries)) for name in BLOCKS}
+    return Misfit(_tail(left), blocks, f"{len(simulated)} shapes grown from draws")
 
 
 def _tail(values: np.ndarray) -> float:

@@ -114,7 +114,7 @@ def stationarity(
     gradients = energy_gradients(values, grid, epsilon)
     octants = _equations(gradients, grid, epsilon, width)
     progress("propagating the field's error", 0.2)
-    problem, size, trials = _with_error(values, gradients, _triangle(octants), grid, epsilon, width, seed)
+    problem, size = _with_error(values, gradients, _triangle(octants), grid, epsilon, width, seed)
     progress("solving", 0.8)
     tls, singular = _total_least_squares(problem)
     matches = [np.array([float(value) for value in start]) / unit_factors(epsilon) for start in starts]
@@ -135,7 +135,6 @@ def stationarity(
         residual=residual,
         starts=tuple((fix_gauge(origins[k] * unit_factors(epsilon))[0], float(size * residuals[k])) for k in order),
         status=_status(coefficients, deviations, fixed, residual, is_rounded(values.numpy())),
-        evaluations=1 + trials,
     )
 
 
@@ -194,8 +193,8 @@ def _triangle(stack: np.ndarray) -> np.ndarray:
 
 def _with_error(
     u: Tensor, clean: Tensor, columns: np.ndarray, grid: Grid, epsilon: float, width: float, seed: int
-) -> tuple[_Problem, float, int]:
-    """Return the problem whitened by a field error, the error's root mean square and the number of trials.
+) -> tuple[_Problem, float]:
+    """Return the problem whitened by a field error, and that error's root mean square.
 
     A finite error, not its linearisation: the columns are singular where ∇u = 0 and at umbilics. Its size is searched
     until the misfit is what it causes (smallest singular value 1).
@@ -213,7 +212,7 @@ def _with_error(
         if trial == _ERROR_STEPS or abs(math.log(target / size)) < 0.1:
             break
         size = target
-    return problem, size, trial
+    return problem, size
 
 
 def _total_least_squares(problem: _Problem) -> tuple[np.ndarray, np.ndarray]:
@@ -304,8 +303,6 @@ class Refinement:
         Each start's coefficients with the residual it ended at, best first.
     status
         A sentence on how well the answer is supported.
-    evaluations
-        Times that the costly part was evaluated.
     """
 
     method: str
@@ -316,7 +313,6 @@ class Refinement:
     residual: float
     starts: tuple[tuple[Coefficients, float], ...]
     status: str
-    evaluations: int
 
 
 def unit_factors(epsilon: float) -> np.ndarray:

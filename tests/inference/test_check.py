@@ -10,7 +10,7 @@ from emulated import BOX, HIGH, LOW, NOISE, linear, row, told
 
 from curvafit.geometry.descriptors import BLOCKS, Descriptors
 from curvafit.inference.emulator import misfits
-from curvafit.inference.estimate import LEVELS, STARTS, check, tail_probability
+from curvafit.inference.estimate import STARTS, check, tail_probability
 from curvafit.inference.posterior import Posterior
 from curvafit.inference.simulate import simulate_draws
 from curvafit.inference.table import PARAMETERS, column_names
@@ -53,11 +53,11 @@ def grown(rng: np.random.Generator, count: int) -> np.ndarray:
 @pytest.mark.slow
 def test_a_row_of_the_same_law_passes_and_another_does_not() -> None:
     rng = np.random.default_rng(1)
-    p = [check(POSTERIOR, (rows := grown(rng, 25))[0], "mask", rows[1:]).p for _ in range(12)]
+    p = [check(POSTERIOR, (rows := grown(rng, 25))[0], "mask", rows[1:]).probability for _ in range(12)]
     assert 0.25 < np.mean(p) < 0.75  # of uniform ones .5 ± .08
     rows = grown(rng, 25)
     rows[0, 2] += 5  # beyond the box
-    assert check(POSTERIOR, rows[0], "mask", rows[1:]).p < 1e-3
+    assert check(POSTERIOR, rows[0], "mask", rows[1:]).probability < 1e-3
 
 
 @pytest.mark.slow
@@ -66,12 +66,8 @@ def test_a_block_that_differs_is_named() -> None:
     rows[0, NAMES == "gaps"] *= 2
     blocks = check(POSTERIOR, rows[0], "mask", rows[1:]).blocks
     assert list(blocks) == list(BLOCKS)
-    assert blocks["gaps"].p < 1e-3
-    assert min(blocks[name].p for name in ("chords", "depths", "clearances", "correlation")) > 1e-3
-    for name, block in blocks.items():
-        assert block.band.shape == (3, BLOCKS[name])
-        assert (np.diff(block.band, axis=0) >= 0).all()
-        assert block.band == pytest.approx(np.quantile(rows[1:, name == NAMES], LEVELS, axis=0))
+    assert blocks["gaps"] < 1e-3
+    assert min(blocks[name] for name in ("chords", "depths", "clearances", "correlation")) > 1e-3
 
 
 def test_without_simulations_the_reference_tells() -> None:
