@@ -24,7 +24,7 @@ from skimage.segmentation import random_walker
 from benchmarks.completion import LAWS, fitted, shape
 from benchmarks.harness import Cases, Figure, Values, best, bootstrap, scores, show
 from curvafit.priors.coefficients import Coefficients
-from curvafit.segmentation.evidence import classes_of, grey_levels, of_classes
+from curvafit.segmentation.evidence import estimate_classes, grey_evidence, grey_levels
 from curvafit.segmentation.segment import segment
 from curvafit.volumes.field import Field
 
@@ -63,7 +63,7 @@ def case(way: str, law: str, seed: int, noise: float, cases: Cases) -> Values:
     if way == "start":
         scan = Field(values, (1.0, 1.0, 1.0))
         levels = grey_levels(scan)
-        mask = of_classes(levels, scan, classes_of(levels, scan)).level > 0
+        mask = grey_evidence(levels, scan, estimate_classes(levels, scan)).level > 0
     elif way == "smoothing":
         mask = best((split(ndimage.gaussian_filter(values, width)) for width in WIDTHS), truth)
     elif way == "TV":

@@ -28,7 +28,7 @@ from benchmarks.harness import Cases, Figure, Values, best, dice, scores, show
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.refine import refine
-from curvafit.segmentation.uncertainty import calibration_error, near
+from curvafit.segmentation.uncertainty import calibration_error, near_surface
 
 LAWS = {
     "probabilities": ("tubes", "trabec", "sponge", "metatubes"),
@@ -102,7 +102,7 @@ def calibration_case(way: str, law: str, seed: int, cases: Cases) -> Values:
     other = {"example": shape(law, seed + 1, cases).astype(np.uint8)} if way == "example" else {}
     found = reconstruct(truth.astype(np.uint8), fitted(law, seed + 1, cases), every=EVERY, runs=RUNS, **other)
     p, between = found.probability.values, [n for n in range((EDGE - 1) // EVERY * EVERY) if n % EVERY]
-    bands = {"error": near(p > 0.5), "true": near(truth)}
+    bands = {"error": near_surface(p > 0.5), "true": near_surface(truth)}
     errors = {name: float(calibration_error(p[between][band[between]], truth[between][band[between]]))
               for name, band in bands.items()}  # fmt: skip
     masks = {"mask": found.mask.values > 0, "half": p > 0.5}

@@ -57,7 +57,7 @@ def refine(
     NPZ files --channel takes the class; a folder of them becomes a folder of masks. --label is the example's.
     """
     with plainly():
-        from curvafit.segmentation.refine import calibrate, chances_of, check_judge, image_beside
+        from curvafit.segmentation.refine import calibrate, check_judge, find_image, load_probabilities
         from curvafit.segmentation.refine import refine as refine_map
         from curvafit.segmentation.slices import check_spacing
 
@@ -81,7 +81,7 @@ def refine(
             from curvafit.segmentation.reconstruct import infer_law
             from curvafit.volumes.read import load
 
-            chances, mask = chances_of(example_probabilities, **others), load(example, **place)  # type: ignore[arg-type]
+            chances, mask = load_probabilities(example_probabilities, **others), load(example, **place)  # type: ignore[arg-type]
             check_spacing(chances, volume.frame, "the probabilities")
             say_notes((*chances.notes, *mask.notes))
             learned["prior"] = prior if prior is not None else infer_law(mask, progress)
@@ -99,12 +99,12 @@ def refine(
         named = {"example": example, "example_probabilities": example_probabilities, "like": like}
         record: dict[str, Any] = {"job": "refine", "weight": weight, "tile": tile, **options}
         record |= {name: None if path is None else str(path) for name, path in named.items()}
-        images = {source: like or (image_beside(source) if _unplaced(reading) else None) for source, _ in files}
+        images = {source: like or (find_image(source) if _unplaced(reading) else None) for source, _ in files}
         if len(files) > 1:
             _check(files, [*images.values(), *named.values()], maps, overwrite)
         for source, target in files:
             job = Job(source, target, prior, {**maps, "like": like}, record, overwrite, workers, images[source])
-            run_job(job, compute, chances_of)
+            run_job(job, compute, load_probabilities)
 
 
 def _unplaced(reading: dict[str, Any]) -> bool:
@@ -120,11 +120,11 @@ def _files(source: str, out: Path) -> list[tuple[str, Path]]:
 
 def _check(files: list[tuple[str, Path]], more: list[Path | None], reading: dict[str, Any], overwrite: bool) -> None:
     """Read all maps and check all targets before the first is worked on."""
-    from curvafit.segmentation.evidence import of_probability
-    from curvafit.segmentation.refine import chances_of
+    from curvafit.segmentation.evidence import probability_evidence
+    from curvafit.segmentation.refine import load_probabilities
     from curvafit.segmentation.result import check_mask_target
 
     inputs = [*(source for source, _ in files), *(path for path in more if path is not None)]
     for source, target in files:
         check_mask_target(target, inputs=inputs, overwrite=overwrite)
-        of_probability(chances_of(source, **reading))
+        probability_evidence(load_probabilities(source, **reading))

@@ -25,32 +25,19 @@ from curvafit.priors.stencils import refine_axis
 from curvafit.segmentation.evidence import VoxelEvidence
 from curvafit.volumes.field import Field, ScanError
 
-__all__ = [
-    "BENDING",
-    "HALO",
-    "STEPS",
-    "Law",
-    "WorkingGrid",
-    "bending",
-    "completed",
-    "drawn_laws",
-    "law_of",
-    "laws_of",
-    "likelihood",
-    "started",
-    "stiff",
-    "weighed",
-]
-
 #: Default steps of Adam.
 STEPS = 400
 #: Voxels of the grid around a volume that does not repeat: far enough for the border's right angles not to reach it.
 HALO = 6
 #: a20 + a02 of the law in a flow, on which the steps of Adam depend; the Willmore energy has it.
 BENDING = 2.0
+#: Whether there is a halo before and beyond the voxels, along each axis.
+Ends = tuple[tuple[bool, bool], tuple[bool, bool], tuple[bool, bool]]
+#: Candidates of a fit that are laws of their own: the nearest match's destroys.
+TRUSTED = ("refined", "posterior", "simulation", "optimum")
 
 
-def completed(
+def lower_energy(
     level: np.ndarray, law: Coefficients, data: Data, place: WorkingGrid, steps: int, progress: Progress = silent
 ) -> Flow:
     """Lower D(u) + F_ε(u) from the set where a level is positive, with u = k ∗ v: Adam under a cooling schedule.
@@ -74,8 +61,8 @@ def completed(
         progress("lowering the energy", step / total)
 
     flow = descend(
-        started(level, place),
-        stiff(law).in_unit(place.unit),
+        initial_field(level, place),
+        normalise_bending(law).in_unit(place.unit),
         place.grid,
         data=data,
         optimiser="adam",
@@ -89,7 +76,7 @@ def completed(
     return flow
 
 
-def weighed(
+def lower_with_evidence(
     evidence: VoxelEvidence,
     law: Coefficients,
     nats: float,
@@ -97,8 +84,8 @@ def weighed(
     steps: int,
     progress: Progress = silent,
 ) -> Flow:
-    """Lower -log p(scan | mask) + F_ε, of which a unit of the Willmore energy costs so many nats, as `completed`."""
-    return completed(evidence.level, law, likelihood(evidence, nats, place), place, steps, progress)
+    """Lower -log p(scan | mask) + F_ε, of which a unit of the Willmore energy costs so many nats, as `lower_energy`."""
+    return lower_energy(evidence.level, law, likelihood(evidence, nats, place), place, steps, progress)
 
 
 def likelihood(evidence: VoxelEvidence, nats: float, place: WorkingGrid) -> Evidence:
@@ -106,12 +93,12 @@ def likelihood(evidence: VoxelEvidence, nats: float, place: WorkingGrid) -> Evid
     return Evidence(place.spread(evidence.ratio) / (nats * place.grid.voxel_volume))
 
 
-def started(level: np.ndarray, place: WorkingGrid) -> Tensor:
+def initial_field(level: np.ndarray, place: WorkingGrid) -> Tensor:
     """Return the phase field, on the place's grid, of the set where a smooth volume (Z, Y, X) is positive.
 
     Where it is positive everywhere or nowhere, as in a tile far from the surface, the field is 1 or -1.
     """
-    inside = place.finer(level) > 0
+    inside = place.to_grid(level) > 0
     if inside.all() or not inside.any():
         return 2 * inside.float() - 1
     return phase_field(inside, place.grid, WORKING_EPSILON)
@@ -131,16 +118,12 @@ def bending(law: Coefficients) -> float:
     return sum_of_squares
 
 
-def stiff(law: Coefficients) -> Coefficients:
+def normalise_bending(law: Coefficients) -> Coefficients:
     """Return a law scaled to a20 + a02 = `BENDING`; raise ScanError as `bending`."""
     return law.scaled(BENDING / bending(law))
 
 
-#: Whether there is a halo before and beyond the voxels, along each axis.
-Ends = tuple[tuple[bool, bool], tuple[bool, bool], tuple[bool, bool]]
-
-#: Candidates of a fit that are laws of their own: the nearest match's destroys.
-TRUSTED = ("refined", "posterior", "simulation", "optimum")
+# ---- laws ------------------------------------------------------------------------------------------------------------
 
 
 def law_of(prior: LawLike, scan: Field) -> tuple[Coefficients, tuple[str, ...]]:
@@ -154,17 +137,17 @@ def law_of(prior: LawLike, scan: Field) -> tuple[Coefficients, tuple[str, ...]]:
         If there is no such file.
     """
     check_type(scan, Field, "a scan as Field")
-    texture = Law.of(prior)
-    if not texture.fitted:
-        note = f"The {texture.origin}, at a working voxel of one scan voxel."
-        return texture.in_unit(scan.unit, min(scan.spacing)), (note,) if texture.working else ()
+    law = Law.of(prior)
     try:
-        law = texture.in_unit(scan.unit, min(scan.spacing))
+        coefficients = law.in_unit(scan.unit, min(scan.spacing))
     except ValueError as reason:
-        mend = ": give --spacing and --unit" if texture.length_unit in METRES else ""
+        mend = ": give --spacing and --unit" if law.fitted and law.length_unit in METRES else ""
         raise ScanError(f"{reason}{mend}") from None
-    note = f"The prior's lengths, in {texture.length_unit}, are converted to {scan.unit}."
-    return law, () if texture.length_unit == scan.unit else (note,)
+    if not law.fitted:
+        note = f"The {law.origin}, at a working voxel of one scan voxel."
+        return coefficients, (note,) if law.working else ()
+    note = f"The prior's lengths, in {law.length_unit}, are converted to {scan.unit}."
+    return coefficients, () if law.length_unit == scan.unit else (note,)
 
 
 def laws_of(prior: LawLike, scan: Field) -> tuple[tuple[Coefficients, ...], tuple[str, ...]]:
@@ -172,39 +155,31 @@ def laws_of(prior: LawLike, scan: Field) -> tuple[tuple[Coefficients, ...], tupl
 
     The first is that of `law_of`. A fit has others, which were read from the same descriptors (`TRUSTED`).
     """
-    law, notes = law_of(prior, scan)
-    fitted = Law.of(prior)
-    if not fitted.fitted:
-        return (law,), notes
-    others = (each for each in _candidates(prior) if each != fitted.coefficients)
-    return (law, *_in_scan(others, fitted, scan)), notes
+    first, notes = law_of(prior, scan)
+    law = Law.of(prior)
+    if not law.fitted:
+        return (first,), notes
+    _, candidates = load_draws_and_candidates(prior)
+    others = [each.coefficients for each in candidates if each.name in TRUSTED]
+    return (first, *_in_scan((other for other in others if other != law.coefficients), law, scan)), notes
 
 
 def drawn_laws(prior: LawLike, scan: Field, count: int) -> tuple[Coefficients, ...]:
     """Return so many laws drawn from the posterior of a fit, with lengths in the scan's unit; none of other priors."""
-    fitted = Law.of(prior)
-    rows = _draws(prior) if fitted.fitted else np.empty((0, 5))
-    if not len(rows):
+    law = Law.of(prior)
+    draws, _ = load_draws_and_candidates(prior) if law.fitted else (None, ())
+    if draws is None or not len(draws.values):
         return ()
-    some = rows[np.linspace(0, len(rows) - 1, count).astype(int)]
-    return _in_scan((Coefficients(1.0, *map(float, row)) for row in some), fitted, scan)
+    rows = draws.values[np.linspace(0, len(draws.values) - 1, count).astype(int), :5]
+    return _in_scan((Coefficients(1.0, *map(float, row)) for row in rows), law, scan)
 
 
-def _in_scan(laws: Iterable[Coefficients], fitted: Law, scan: Field) -> tuple[Coefficients, ...]:
+def _in_scan(laws: Iterable[Coefficients], fit: Law, scan: Field) -> tuple[Coefficients, ...]:
     """Return laws in a fit's working units with lengths in the scan's unit."""
-    return tuple(law_of(replace(fitted, coefficients=each), scan)[0] for each in laws)
+    return tuple(law_of(replace(fit, coefficients=each), scan)[0] for each in laws)
 
 
-def _draws(prior: LawLike) -> np.ndarray:
-    """Return a fit's draws of the coefficients but a20 = 1, (N, 5), from the fit or its file; N = 0 without draws."""
-    draws, _ = load_draws_and_candidates(prior)
-    return np.empty((0, 5)) if draws is None else draws.values[:, :5]
-
-
-def _candidates(prior: LawLike) -> list[Coefficients]:
-    """Return the trusted candidates of a fit or its file, in working units; none of a law without candidates."""
-    _, candidates = load_draws_and_candidates(prior)
-    return [each.coefficients for each in candidates if each.name in TRUSTED]
+# ---- grids -----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -252,7 +227,7 @@ class WorkingGrid:
         grid = Grid(shape, spacing, "periodic" if periodic else "replicate")  # type: ignore[arg-type]
         return cls(grid, times, unit, ε, halo)  # type: ignore[arg-type]
 
-    def part(self, shape: Sequence[int], ends: Ends) -> WorkingGrid:
+    def of_box(self, shape: Sequence[int], ends: Ends) -> WorkingGrid:
         """Return the grid of a box of scan voxels, with the halo on these sides; a box does not repeat."""
         pairs = zip(shape, self.times, ends, strict=True)
         edges = tuple(n * times + self.halo * sum(sides) for n, times, sides in pairs)
@@ -266,7 +241,7 @@ class WorkingGrid:
         axes = ", ".join(f"{axis} {n}-fold" for axis, n in zip("zyx", self.times, strict=True) if n > 1)
         return (f"ε spans fewer than 2 voxels on some axes: the flow ran on a grid refined {axes}.",)
 
-    def finer(self, values: np.ndarray) -> Tensor:
+    def to_grid(self, values: np.ndarray) -> Tensor:
         """Return a smooth volume interpolated to the flow's grid, and continued into the halo by its last values."""
         u = torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
         for axis, n in enumerate(self.times):
@@ -286,7 +261,7 @@ class WorkingGrid:
             u = u.flatten(axis, axis + 1)
         return pad(u, self._sides)
 
-    def back(self, u: Tensor) -> np.ndarray:
+    def to_scan(self, u: Tensor) -> np.ndarray:
         """Return the mean of each scan voxel's parts, without the halo."""
         for axis, (before, beyond) in enumerate(self.ends):
             u = u.narrow(axis, self.halo * before, u.shape[axis] - self.halo * (before + beyond))

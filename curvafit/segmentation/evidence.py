@@ -11,16 +11,6 @@ from skimage.filters import threshold_otsu
 
 from curvafit.volumes.field import Field, ScanError
 
-__all__ = [
-    "Classes",
-    "VoxelEvidence",
-    "bounds_of",
-    "classes_of",
-    "grey_levels",
-    "of_classes",
-    "of_probability",
-]
-
 #: Percentiles to which grey levels are clipped for Otsu's threshold.
 TAILS = (0.1, 99.9)
 #: Most noise of a smoothed scan, as a share of the contrast; least and greatest deviation of the smoothing, in voxels.
@@ -85,10 +75,10 @@ def grey_levels(scan: Field, threshold: float | str = "otsu") -> np.ndarray:
     values = scan.values.astype(np.float32)
     if not np.isfinite(values).all():
         raise ScanError(f"expected finite values, got {np.count_nonzero(~np.isfinite(values))} that are not")
-    return values.clip(*bounds_of(values, threshold))
+    return values.clip(*grey_bounds(values, threshold))
 
 
-def bounds_of(values: np.ndarray, threshold: float | str = "otsu") -> tuple[float, float]:
+def grey_bounds(values: np.ndarray, threshold: float | str = "otsu") -> tuple[float, float]:
     """Return the levels between which Otsu's threshold takes grey levels as they are; infinite ones for a number.
 
     Raises
@@ -104,7 +94,7 @@ def bounds_of(values: np.ndarray, threshold: float | str = "otsu") -> tuple[floa
     return -math.inf, math.inf
 
 
-def classes_of(values: np.ndarray, scan: Field, threshold: float | str = "otsu", dark: bool = False) -> Classes:
+def estimate_classes(values: np.ndarray, scan: Field, threshold: float | str = "otsu", dark: bool = False) -> Classes:
     """Return the classes of grey levels on either side of Otsu's threshold of the smoothed scan: means and pooled
     deviation of the raw levels, and the split half way between the means.
 
@@ -130,7 +120,7 @@ def classes_of(values: np.ndarray, scan: Field, threshold: float | str = "otsu",
     return Classes(outside, inside, max(noise, LEAST_NOISE * (means[1] - means[0])), middle)
 
 
-def of_classes(values: np.ndarray, scan: Field, classes: Classes, known: np.ndarray | None = None) -> VoxelEvidence:
+def grey_evidence(values: np.ndarray, scan: Field, classes: Classes, known: np.ndarray | None = None) -> VoxelEvidence:
     """Return the evidence of grey levels (Z, Y, X) with known classes: r = (g - t) (c₁ - c₀) / σ².
 
     Parameters
@@ -149,7 +139,7 @@ def of_classes(values: np.ndarray, scan: Field, classes: Classes, known: np.ndar
     return VoxelEvidence(ratio, sign * level, str(classes))
 
 
-def of_probability(probability: Field) -> VoxelEvidence:
+def probability_evidence(probability: Field) -> VoxelEvidence:
     """Return the evidence of a probability map (Z, Y, X) in [0, 1]: r = log p / (1 - p), and p - 1/2 as first guess.
 
     Raises

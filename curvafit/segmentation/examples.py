@@ -1,4 +1,8 @@
-"""Another volume, known whole: it judges ways to fill a volume between slices, and tells how likely voxels are."""
+"""Another volume, known whole, or a shape grown in its place: it judges ways to fill a volume between slices.
+
+An example also tells the odds of the inside: how likely a voxel between two known slices is inside by its distances
+from their outlines.
+"""
 
 from __future__ import annotations
 
@@ -13,18 +17,24 @@ from curvafit.core.runtime import Progress, silent
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import LEARNED
 from curvafit.priors.coefficients import Coefficients
-from curvafit.segmentation.engine import WorkingGrid, stiff
-from curvafit.segmentation.slices import Slices, labels
-from curvafit.segmentation.trials import ODDS, Task, densest
+from curvafit.segmentation.engine import WorkingGrid, normalise_bending
+from curvafit.segmentation.slices import Slices, box_with_most_surface, require_labels
+from curvafit.segmentation.trials import ODDS, Task
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.part import Box
-
-__all__ = ["Example", "Odds", "grown", "slices_of", "within"]
 
 #: Longest edge, in voxels, of the box of an example that is read, and of the one on which laws are lowered.
 LARGEST, PART = 256, 96
 #: The fewest known slices of a box.
 FEWEST = 5
+#: Signed distances from an outline at which a bin begins, in voxels: structures are some voxels thick.
+EDGES = np.array([-22, -17, -13, -10, -8, -6, -5, -4, -3, -2, -1, 0, 1, 2, 3, 4, 5, 6, 8, 10, 13, 17, 22])
+#: Deviation by which counts are shared among bins, and voxels that each bin has besides, of the example's share inside.
+SHARED, BESIDES = 0.7, 1.0
+#: Largest edge of a grown shape's slices, in working voxels.
+EDGE = 64
+#: Seed of a grown shape.
+SEED = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +77,7 @@ class Example:
         given = range(0, length, gap)
         inside = np.moveaxis(volume.values, axis, 0)
         between = [n for n in range(given[-1]) if n % gap]
-        every = Task(slices_of(volume, given, axis), labels(inside[between], "an example") > 0, between)
+        every = Task(Slices.of(volume, given, axis), require_labels(inside[between], "an example") > 0, between)
         whole, _ = _cut(every, LARGEST)
         part, box = _cut(whole, PART)
         read = " x ".join(map(str, whole.given.shape))
@@ -89,28 +99,11 @@ class Example:
         return self.odds.level(self.whole.given, crossed=True)
 
 
-def slices_of(volume: Field, places: Sequence[int], axis: int, periodic: bool = False) -> Slices:
-    """Return the known slices of a volume across an axis, which comes first.
-
-    Raises
-    ------
-    ScanError
-        If they are grey levels, or all empty, or all full.
-    """
-    inside = labels(np.moveaxis(volume.values, axis, 0)[list(places)], "known slices") > 0
-    if inside.all() or not inside.any():
-        raise ScanError(
-            f"expected known slices with voxels inside and outside, got {'full' if inside.all() else 'empty'} ones"
-        )
-    edges = [volume.spacing[k] for k in (axis, *(k for k in range(3) if k != axis))]
-    return Slices(inside, tuple(places), volume.shape[axis], (edges[0], edges[1], edges[2]), volume.unit, periodic)
-
-
-def within(slices: Slices, edge: int = PART) -> tuple[Slices, Box]:
+def crop_to_surface(slices: Slices, edge: int = PART) -> tuple[Slices, Box]:
     """Return the known slices in a box that holds most of their surface, at most so many voxels a side but for
     `FEWEST` slices, and its place in the volume."""
     count = max(FEWEST, edge // slices.gap + 1)
-    rows, ys, xs = densest(slices.inside, (count, edge, edge))
+    rows, ys, xs = box_with_most_surface(slices.inside, (count, edge, edge))
     first, *_, last = slices.places[rows]
     places = tuple(place - first for place in slices.places[rows])
     part = replace(slices, inside=slices.inside[rows, ys, xs], places=places, length=places[-1] + 1, periodic=False)
@@ -118,17 +111,11 @@ def within(slices: Slices, edge: int = PART) -> tuple[Slices, Box]:
 
 
 def _cut(task: Task[Slices], edge: int) -> tuple[Task[Slices], Box]:
-    """Return a task within the box of `within`, and the box."""
-    given, box = within(task.given, edge)
+    """Return a task within the box of `crop_to_surface`, and the box."""
+    given, box = crop_to_surface(task.given, edge)
     kept = [k for k, place in enumerate(task.places) if box[0].start < place < box[0].stop]
     places = [task.places[k] - box[0].start for k in kept]
     return Task(given, task.truth[kept][:, box[1], box[2]], places), box
-
-
-#: Signed distances from an outline at which a bin begins, in voxels: structures are some voxels thick.
-EDGES = np.array([-22, -17, -13, -10, -8, -6, -5, -4, -3, -2, -1, 0, 1, 2, 3, 4, 5, 6, 8, 10, 13, 17, 22])
-#: Deviation by which counts are shared among bins, and voxels that each bin has besides, of the example's share inside.
-SHARED, BESIDES = 0.7, 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,13 +195,7 @@ def _log_odds(counts: np.ndarray) -> np.ndarray:
     return odds - (odds.ravel()[order][best] + least) / 2
 
 
-#: Largest edge of a grown shape's slices, in working voxels.
-EDGE = 64
-#: Seed of a grown shape.
-SEED = 0
-
-
-def grown(slices: Slices, law: Coefficients, epsilon: float | None, progress: Progress = silent) -> Task[Slices]:
+def grow_task(slices: Slices, law: Coefficients, epsilon: float | None, progress: Progress = silent) -> Task[Slices]:
     """Return the task to fill a shape of a law between the same slices; its slices are cut to `EDGE`.
 
     The shape has the volume fraction of the known slices.
@@ -230,14 +211,14 @@ def grown(slices: Slices, law: Coefficients, epsilon: float | None, progress: Pr
     place = WorkingGrid.of(frame, epsilon, periodic=True)
     share = float(slices.inside.mean())
     flow = generate(
-        stiff(law).in_unit(place.unit),
+        normalise_bending(law).in_unit(place.unit),
         grid=place.grid,
         schedule=LEARNED,
         volume_fraction=share,
         seed=SEED,
         callbacks=[lambda step, total, state: progress("growing a shape of the law", step / total)],
     )
-    mask = place.back(flow.field) > 0
+    mask = place.to_scan(flow.field) > 0
     known, rest = list(slices.places), np.setdiff1d(np.arange(slices.length), slices.places)
     inside = mask[known]
     if not flow.finite or inside.all() or not inside.any():

@@ -17,25 +17,23 @@ from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.core.workers import Workers
 from curvafit.generation.data import Evidence
 from curvafit.priors.coefficients import Coefficients
-from curvafit.segmentation.engine import BENDING, HALO, STEPS, LawLike, WorkingGrid, bending, laws_of, likelihood
-from curvafit.segmentation.evidence import VoxelEvidence, of_probability
-from curvafit.segmentation.result import Segmentation, ending, filled, result_of
+from curvafit.priors.law import LawLike
+from curvafit.segmentation.engine import BENDING, STEPS, WorkingGrid, bending, laws_of, likelihood
+from curvafit.segmentation.evidence import VoxelEvidence, probability_evidence
+from curvafit.segmentation.result import Segmentation, flow_summary
 from curvafit.segmentation.segment import TRIALS, WEIGHTS, WILLMORE
-from curvafit.segmentation.slices import check_place, check_spacing, labels
-from curvafit.segmentation.tiles import Tiling, lowered
-from curvafit.segmentation.trials import Choice, Setting, Task, choice, densest
+from curvafit.segmentation.slices import box_with_most_surface, check_place, check_spacing, require_labels
+from curvafit.segmentation.tiles import Tiling, lower_volume
+from curvafit.segmentation.trials import Task, Trial, choose_by_masks
 from curvafit.volumes.boxes import digest_of
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.part import Box, Crop
 from curvafit.volumes.read import Source, field_of, place_of
 
-__all__ = ["Calibration", "Refine", "calibrate", "chances_of", "check_judge", "image_beside", "refine", "trial_steps"]
-
 #: The plain way from probabilities to a mask.
 PLAIN = "p > 1/2"
 #: Weights that are tried, in nats of a unit of the Willmore energy, and the first of them.
-NATS = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
-FIRST = 10.0
+NATS, FIRST = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0), 10.0
 #: Longest edge in voxels of the part of an example on which laws and weights are tried.
 EDGE = 96
 #: Images that may lie beside an NPZ file of the same name and say where its voxels are.
@@ -48,7 +46,7 @@ class Calibration:
 
     Attributes
     ----------
-    choice
+    trial
         The law and its strength in nats of a unit of the Willmore energy, or p > 1/2; and the Dice of both.
     fitted
         Whether the law is one of the prior's, rather than the Willmore energy.
@@ -56,25 +54,25 @@ class Calibration:
         The example's probabilities, whose voxels are as large as those of the maps that are refined.
     """
 
-    choice: Choice
+    trial: Trial
     fitted: bool
     example: Field
 
     def __str__(self) -> str:
-        best = self.choice
-        if best.setting.law is None:
-            return f"no prior helps here: Dice {best.plain:.3f} on the example, {best.dice:.3f} with the best prior"
+        best = self.trial
+        if best.law is None:
+            return f"no prior helps here: Dice {best.plain:.3f} on the example, {best.score:.3f} with the best prior"
         name = "the prior helps" if self.fitted else "the Willmore energy helps, more than the prior"
-        gain = f"{best.dice:.3f} on the example, {best.plain:.3f} without, ± {best.noise:.3f}"
-        return f"{name}, at {best.setting.strength:g} nats: Dice {gain}"
+        gain = f"{best.score:.3f} on the example, {best.plain:.3f} without, ± {best.noise:.3f}"
+        return f"{name}, at {best.strength:g} nats: Dice {gain}"
 
     def as_dict(self) -> dict[str, Any]:
         """Return what was chosen and what it gained, for a record."""
-        best, law = self.choice, "prior" if self.fitted else "Willmore"
+        best = self.trial
         return {
-            "law": None if best.setting.law is None else law,
-            "nats": None if best.setting.law is None else best.setting.strength,
-            "dice": best.dice,
+            "law": None if best.law is None else "prior" if self.fitted else "Willmore",
+            "nats": None if best.law is None else best.strength,
+            "dice": best.score,
             "dice_without": best.plain,
             "noise": best.noise,
         }
@@ -131,28 +129,29 @@ def refine(
         If there is no such file.
     """
     check_judge(example, weight)
-    field = chances_of(probabilities, **reading)
-    evidence, tiling = of_probability(field), Tiling.of(field, epsilon, tile)
+    field = load_probabilities(probabilities, **reading)
+    evidence, tiling = probability_evidence(field), Tiling.of(field, epsilon, tile)
     laws, notes = laws_of(prior, field)
     said = ""
     if example is None:
         strength = check_float(weight, "a positive weight", *WEIGHTS) * bending(laws[0]) / BENDING
-        setting = Setting(PLAIN, laws[0], strength, steps)
+        trial = Trial(PLAIN, laws[0], strength, steps)
     else:
         if not isinstance(example, Calibration):
             alike = {name: value for name, value in reading.items() if name not in ("like", "crop")}
-            chances, truth = chances_of(example[0], **alike), _truth(example[1], label, alike)
-            check_spacing(chances, field, "the probabilities")
+            other, truth = load_probabilities(example[0], **alike), _load_truth(example[1], label, alike)
+            check_spacing(other, field, "the probabilities")
             trials, progress = sub_progress(progress, 0.0, TRIALS), sub_progress(progress, TRIALS, 1.0)
-            example = calibrate(chances, truth, prior, epsilon=epsilon, steps=steps, progress=trials)
+            example = calibrate(other, truth, prior, epsilon=epsilon, steps=steps, progress=trials)
         check_spacing(example.example, field, "the probabilities")
-        setting, said = example.choice.setting, f"{example}; "
-    mask, u, end = _filled(evidence, setting, tiling, progress, store=store, workers=workers)
-    λ = None if setting.law is None else setting.strength * BENDING / bending(setting.law)
+        trial, said = example.trial, f"{example}; "
+    found = lower_volume(RefineProblem(evidence, trial), tiling, store=store, workers=workers, progress=progress)
     notes = (*notes, f"{evidence.note[0].upper()}{evidence.note[1:]}.", *tiling.place.notes)
-    return result_of(
-        field, mask, u, weight=λ, law=setting.law, epsilon=tiling.place.epsilon, status=f"{said}{end}", notes=notes
-    )
+    return Segmentation.of(
+        field, found.mask, found.phase, notes,
+        weight=None if trial.law is None else trial.strength * BENDING / bending(trial.law),
+        coefficients=trial.law, epsilon=tiling.place.epsilon, status=f"{said}{flow_summary(found)}",
+    )  # fmt: skip
 
 
 def calibrate(
@@ -168,152 +167,36 @@ def calibrate(
 ) -> Calibration:
     """Return the law and weight that bring a network's probabilities nearest to a true mask, for `refine`.
 
-    A part of 96³ voxels that holds most of the surface is judged by Dice. See `refine` for the parameters.
-
-    Raises
-    ------
-    ValueError
-        As `refine`.
-    FileNotFoundError
-        If there is no such file.
+    A part of 96³ voxels that holds most of the surface is judged by Dice. See `refine` for the parameters and errors.
     """
-    field, truth = chances_of(probabilities, **reading), _truth(mask, label, reading)
+    field, truth = load_probabilities(probabilities, **reading), _load_truth(mask, label, reading)
     check_place(truth, field)
-    inside = labels(truth.values, "an example") > 0
+    inside = require_labels(truth.values, "an example") > 0
     if inside.all() or not inside.any():
-        got = "a full" if inside.all() else "an empty"
-        raise ScanError(f"expected an example with voxels inside and outside, got {got} mask")
+        state = "a full" if inside.all() else "an empty"
+        raise ScanError(f"expected an example with voxels inside and outside, got {state} mask")
     laws, _ = laws_of(prior, field)
-    every = (*laws, *({WILLMORE} - set(laws)))
+    tried = (*laws, *({WILLMORE} - set(laws)))
     for law in laws:
         bending(law)
-    of_probability(field)
-    where = densest(inside, (EDGE, EDGE, EDGE))
+    probability_evidence(field)
+    where = box_with_most_surface(inside, (EDGE, EDGE, EDGE))
     box = replace(field, values=field.values[where])
     tiling = Tiling.of(box, epsilon)
-    count = 0
+    count, expected = 0, 2 * len(tried) + 3
 
-    def fill(evidence: VoxelEvidence, setting: Setting) -> np.ndarray:
+    def fill(evidence: VoxelEvidence, trial: Trial) -> np.ndarray:
         nonlocal count
         count += 1
-        progress("trying the prior out", min(count / _expected(len(every)), 1.0))
+        progress("trying the prior out", min(count / expected, 1.0))
         try:
-            return _filled(evidence, setting, tiling, silent)[0]
+            return lower_volume(RefineProblem(evidence, trial), tiling).mask
         except ScanError:  # the energy does not stay finite
             return np.zeros(box.shape, dtype=bool)
 
-    task = Task(of_probability(box), inside[where], range(box.shape[0]))
-    best = choice(task, lambda way: [Setting(way, law, FIRST, steps) for law in every], fill, (PLAIN,), NATS)
-    return Calibration(best, best.setting.law in laws, field)
-
-
-def _truth(mask: Source, label: int | None, reading: dict[str, Any]) -> Field:
-    """Return an example's mask, read with the spacing and unit of its probabilities."""
-    placed = {} if isinstance(mask, Field) else {name: reading.get(name) for name in ("spacing", "unit")}
-    return field_of(mask, label=label, **placed)
-
-
-def check_judge(example: object, weight: float | None) -> None:
-    """Raise ScanError unless there is either an example or a weight."""
-    if (example is None) == (weight is None):
-        got = "neither" if weight is None else "both"
-        raise ScanError(f"expected either an example, on which law and weight are judged, or a weight, got {got}")
-
-
-def chances_of(
-    source: Source,
-    *,
-    like: str | os.PathLike[str] | None = None,
-    spacing: Sequence[float] | float | None = None,
-    unit: str | None = None,
-    crop: Crop | None = None,
-    **reading: Any,
-) -> Field:
-    """Return a network's probabilities at their place: that of an image of the same voxels, where there is one.
-
-    See `refine` for the parameters.
-
-    Raises
-    ------
-    ScanError
-        If the image has another shape, or both an image and a spacing or unit are given.
-    FileNotFoundError
-        If there is no such file.
-    """
-    stated = spacing is not None or unit is not None
-    if like is not None and stated:
-        raise ScanError("expected either an image that says where the voxels are, or a spacing and unit, got both")
-    image = image_beside(source) if like is None and not stated else like
-    if image is None:
-        return field_of(source, spacing=spacing, unit=unit, crop=crop, **reading)
-    place = place_of(image)
-    field = field_of(source, spacing=place.spacing, unit=place.unit, **reading)
-    if field.shape != place.shape:
-        raise ScanError(f"expected probabilities with the shape {place.shape} of {image}, got {field.shape}")
-    field = replace(field, affine=place.affine, notes=(*field.notes, f"The voxels are those of {image}."))
-    return field if crop is None else field.crop(crop)
-
-
-def image_beside(source: Source) -> Path | None:
-    """Return the image beside an NPZ file that has its name, None where there is none or the source is another."""
-    if not isinstance(source, str | os.PathLike) or not os.fspath(source).lower().endswith(".npz"):
-        return None
-    stem = os.fspath(source)[: -len(".npz")]
-    return next((Path(stem + suffix) for suffix in IMAGES if Path(stem + suffix).is_file()), None)
-
-
-def trial_steps(laws: int, steps: int, voxels: int) -> float:
-    """Return about how many steps of a flow on so many voxels it takes to try laws out on an example."""
-    return _expected(laws) * steps * min(1.0, (EDGE + 2 * HALO) ** 3 / voxels)
-
-
-def _expected(laws: int) -> int:
-    """Return about how many laws and weights are tried."""
-    return 2 * laws + 3
-
-
-@dataclass(frozen=True, eq=False)
-class _Chances:
-    """The evidence of probabilities, and a setting; where they have no surface, they stay as they are."""
-
-    evidence: VoxelEvidence
-    setting: Setting
-
-    @property
-    def law(self) -> Coefficients | None:
-        inside = self.evidence.level > 0
-        return None if inside.all() or not inside.any() else self.setting.law
-
-    @property
-    def steps(self) -> int:
-        return self.setting.steps
-
-    @property
-    def parts(self) -> dict[str, object]:
-        return {"probabilities": digest_of(self.evidence.ratio), "nats": self.setting.strength}
-
-    def given(self, box: Box, place: WorkingGrid) -> tuple[np.ndarray, Evidence]:
-        """Return the first guess and the evidence on a box."""
-        part = replace(self.evidence, ratio=self.evidence.ratio[box], level=self.evidence.level[box])
-        nats = FIRST if self.law is None else self.setting.strength  # a start alone has no weight
-        return part.level, likelihood(part, nats, place)
-
-    def plain(self, level: np.ndarray, place: WorkingGrid) -> np.ndarray:
-        """Return 2 p - 1."""
-        return 2 * level
-
-    def mask(self, phase: np.ndarray, box: Box) -> np.ndarray:
-        """Return the voxels where the phase field is positive."""
-        return phase > 0
-
-
-def _filled(
-    evidence: VoxelEvidence, setting: Setting, tiling: Tiling, progress: Progress, **tools: Any
-) -> tuple[np.ndarray, np.ndarray, str]:
-    """Return the mask and the phase field of a setting, and how its flow ended."""
-    problem = _Chances(evidence, setting)
-    found = lowered(problem, tiling, progress=progress, **tools)
-    return found.mask, found.phase, filled(found.mask) if problem.law is None else ending(found)
+    task = Task(probability_evidence(box), inside[where], range(box.shape[0]))
+    best = choose_by_masks(task, lambda way: [Trial(way, law, FIRST, steps) for law in tried], fill, (PLAIN,), NATS)
+    return Calibration(best, best.law in laws, field)
 
 
 class Refine:
@@ -321,18 +204,14 @@ class Refine:
 
     Parameters
     ----------
-    prior
+    prior, weight, epsilon, steps
         As in `refine`.
-    weight
-        As in `refine`, in place of an example.
     example
         Probabilities and true mask (Z, Y, X) of another volume, which are tried out now; or a `Calibration`.
     channel
         The class, counted from 0.
     spacing, unit
         Voxel edges along the tensor's three axes, or one for all, and their unit.
-    epsilon, steps
-        As in `refine`.
 
     Raises
     ------
@@ -378,3 +257,90 @@ class Refine:
         mask = torch.zeros_like(probabilities[:1])
         mask[0] = torch.from_numpy(found.mask.values)
         return mask
+
+
+@dataclass(frozen=True, eq=False)
+class RefineProblem:
+    """The evidence of probabilities, and a trial; where they have no surface, they stay. See `tiles.Problem`."""
+
+    evidence: VoxelEvidence
+    trial: Trial
+
+    @property
+    def law(self) -> Coefficients | None:
+        inside = self.evidence.level > 0
+        return None if inside.all() or not inside.any() else self.trial.law
+
+    @property
+    def steps(self) -> int:
+        return self.trial.steps
+
+    @property
+    def parts(self) -> dict[str, object]:
+        return {"probabilities": digest_of(self.evidence.ratio), "nats": self.trial.strength}
+
+    def terms(self, box: Box, place: WorkingGrid) -> tuple[np.ndarray, Evidence]:
+        evidence = replace(self.evidence, ratio=self.evidence.ratio[box], level=self.evidence.level[box])
+        nats = FIRST if self.law is None else self.trial.strength  # a start alone has no weight
+        return evidence.level, likelihood(evidence, nats, place)
+
+    def plain(self, level: np.ndarray, place: WorkingGrid) -> np.ndarray:
+        return 2 * level  # the level is p - 1/2
+
+    def mask(self, phase: np.ndarray, box: Box) -> np.ndarray:
+        return phase > 0
+
+
+def check_judge(example: object, weight: float | None) -> None:
+    """Raise ScanError unless there is either an example or a weight."""
+    if (example is None) == (weight is None):
+        got = "neither" if weight is None else "both"
+        raise ScanError(f"expected either an example, on which law and weight are judged, or a weight, got {got}")
+
+
+def load_probabilities(
+    source: Source,
+    *,
+    like: str | os.PathLike[str] | None = None,
+    spacing: Sequence[float] | float | None = None,
+    unit: str | None = None,
+    crop: Crop | None = None,
+    **reading: Any,
+) -> Field:
+    """Return a network's probabilities at their place: that of an image of the same voxels, where there is one.
+
+    See `refine` for the parameters.
+
+    Raises
+    ------
+    ScanError
+        If the image has another shape, or both an image and a spacing or unit are given.
+    FileNotFoundError
+        If there is no such file.
+    """
+    stated = spacing is not None or unit is not None
+    if like is not None and stated:
+        raise ScanError("expected either an image that says where the voxels are, or a spacing and unit, got both")
+    image = find_image(source) if like is None and not stated else like
+    if image is None:
+        return field_of(source, spacing=spacing, unit=unit, crop=crop, **reading)
+    place = place_of(image)
+    field = field_of(source, spacing=place.spacing, unit=place.unit, **reading)
+    if field.shape != place.shape:
+        raise ScanError(f"expected probabilities with the shape {place.shape} of {image}, got {field.shape}")
+    field = replace(field, affine=place.affine, notes=(*field.notes, f"The voxels are those of {image}."))
+    return field if crop is None else field.crop(crop)
+
+
+def find_image(source: Source) -> Path | None:
+    """Return the image beside an NPZ file that has its name, None where there is none or the source is another."""
+    if not isinstance(source, str | os.PathLike) or not os.fspath(source).lower().endswith(".npz"):
+        return None
+    stem = os.fspath(source)[: -len(".npz")]
+    return next((Path(stem + suffix) for suffix in IMAGES if Path(stem + suffix).is_file()), None)
+
+
+def _load_truth(mask: Source, label: int | None, reading: dict[str, Any]) -> Field:
+    """Return an example's mask, read with the spacing and unit of its probabilities."""
+    placed = {} if isinstance(mask, Field) else {name: reading.get(name) for name in ("spacing", "unit")}
+    return field_of(mask, label=label, **placed)

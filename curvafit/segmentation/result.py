@@ -1,4 +1,4 @@
-"""The result of a segmentation, and how its flow ended in words."""
+"""The result of a segmentation, how its flow ended in words, and its files: mask, picture, record, probability."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from curvafit.core.records import Format, can_write, sibling
 from curvafit.core.runtime import hold_signals
 from curvafit.core.units import format_sampling
 from curvafit.priors.coefficients import Coefficients
-from curvafit.segmentation.tiles import Lowered
+from curvafit.segmentation.tiles import LoweredVolume
 from curvafit.segmentation.uncertainty import entropy
 from curvafit.volumes.field import Field
 from curvafit.volumes.formats.nifti import write_nifti_like
@@ -26,20 +26,11 @@ from curvafit.volumes.write import pick_writer, save
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = [
-    "FORMAT",
-    "Segmentation",
-    "Uncertainty",
-    "check_mask_target",
-    "ending",
-    "filled",
-    "result_of",
-    "segmentation_figure",
-    "write_mask",
-]
-
 #: A flow has settled where its last ten steps lower the energy by less than this share.
 SETTLED = 0.001
+#: `format` of the record beside a mask.
+FORMAT = Format("curvafit-mask-1", title="the record of a mask")
+_NIFTI = (".nii", ".nii.gz")
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +88,12 @@ class Segmentation(Pictured):
     uncertainty: Uncertainty | None = None
     labels: Field | None = None
 
+    @classmethod
+    def of(cls, scan: Field, mask: np.ndarray, phase: np.ndarray, notes: tuple[str, ...], **more: Any) -> Segmentation:
+        """Return the segmentation of a scan from its arrays (Z, Y, X) and the other attributes."""
+        fields = [replace(scan, values=values, notes=()) for values in (mask, phase)]
+        return cls(fields[0], fields[1], notes=(*scan.notes, *notes), **more)
+
     @property
     def probability(self) -> Field | None:
         """The probability of the inside, of a reconstruction with several runs."""
@@ -109,43 +106,20 @@ class Segmentation(Pictured):
         return f"Segmentation({size}, {count}: {self.status})"
 
 
-def ending(found: Lowered) -> str:
-    """Return whether a flow settled, and which share of the volume is inside, as a sentence."""
-    share, energy = float(found.mask.mean()), found.energies
+def flow_summary(lowered: LoweredVolume) -> str:
+    """Return whether a flow settled, if there was one, and which share of the volume is inside, as a sentence."""
+    share, energy, steps = float(lowered.mask.mean()), lowered.energies, lowered.steps
+    inside = f"{100 * share:.2f} % of the volume is inside"
+    if not steps:
+        return inside
     fall = (energy[0] - energy[-1]) / max(abs(energy[-1]), 1e-30) if len(energy) > 1 else 1.0
-    count, word = found.steps, "settled" if abs(fall) < SETTLED else "still moving"
-    length = f"{count} step" if count == 1 else f"{count} steps"
+    length = f"{steps} step" if steps == 1 else f"{steps} steps"
     if share in (0.0, 1.0):
         return f"no surface is left after {length}: the prior is too strong for the data, lower its weight"
-    return f"{word} after {length}: {filled(found.mask)}"
+    return f"{'settled' if abs(fall) < SETTLED else 'still moving'} after {length}: {inside}"
 
 
-def filled(mask: np.ndarray) -> str:
-    """Return which share of the volume is inside, as a sentence."""
-    return f"{100 * float(mask.mean()):.2f} % of the volume is inside"
-
-
-def result_of(
-    scan: Field,
-    mask: np.ndarray,
-    u: np.ndarray,
-    *,
-    weight: float | None,
-    law: Coefficients | None,
-    epsilon: float,
-    status: str,
-    notes: tuple[str, ...],
-    uncertainty: Uncertainty | None = None,
-) -> Segmentation:
-    """Return the segmentation of a scan from its arrays (Z, Y, X)."""
-    fields = [replace(scan, values=values, source=scan.source, notes=()) for values in (mask, u)]
-    return Segmentation(fields[0], fields[1], weight, law, epsilon, status, (*scan.notes, *notes), uncertainty)
-
-
-#: `format` of the record beside a mask.
-FORMAT = Format("curvafit-mask-1", title="the record of a mask")
-
-_NIFTI = (".nii", ".nii.gz")
+# ---- files -----------------------------------------------------------------------------------------------------------
 
 
 def check_mask_target(
@@ -160,12 +134,6 @@ def check_mask_target(
 
     `inputs` are the files, or folders, that are read: none may be overwritten. `overwrite` says whether files of other
     origin may be replaced, `probability` whether a map goes beside the mask.
-
-    Raises
-    ------
-    ValueError
-        If the suffix is not a volume's, its format needs a unit, the folder cannot be written to, or one of the files
-        would replace an input or another file.
     """
     target = Path(path)
     pick_writer(target, unit or "mm")
@@ -207,9 +175,9 @@ def write_mask(
     """
     from curvafit.drawing.plot import DPI
 
-    chances = segmentation.probability
+    probability = segmentation.probability
     inputs = () if like is None else (like,)
-    target = check_mask_target(path, scan.unit, inputs, overwrite, probability=chances is not None)
+    target = check_mask_target(path, scan.unit, inputs, overwrite, probability=probability is not None)
     former = _map_path(target).name in FORMAT.companions(target)
 
     def write(values: np.ndarray, place: Path) -> Path:
@@ -227,25 +195,19 @@ def write_mask(
         rows = [(scan.values, None), (scan.values, mask) if labels is None else (labels.values, None)]
         _figure(rows, segmentation).savefig(picture, dpi=DPI)
         parts = [temporary, picture, note]
-        if chances is not None:
-            parts.append(write(chances.values, _map_path(temporary)))
+        if probability is not None:
+            parts.append(write(probability.values, _map_path(temporary)))
         content = {**_record(segmentation, scan, record or {}), "files": [part.name for part in parts]}
         FORMAT.write(note, content)
         with hold_signals():
             files = move_together(parts, target.parent)
-            if former and chances is None:
+            if former and probability is None:
                 remove(_map_path(target))
         return files
 
 
 def segmentation_figure(segmentation: Segmentation) -> Figure:
-    """Return a figure of the phase field's middle slices with the mask's outline, or of the most uncertain slices.
-
-    Raises
-    ------
-    ValueError
-        If the phase field is not finite.
-    """
+    """Return a figure of the phase field's middle slices with the mask's outline, or of the most uncertain slices."""
     return _figure([(segmentation.phase.values, segmentation.mask.values)], segmentation)
 
 
@@ -253,10 +215,10 @@ def _figure(rows: list[tuple[np.ndarray, np.ndarray | None]], segmentation: Segm
     """Return a figure of the middle slices; of a probability its entropy too, and the most uncertain slices."""
     from curvafit.drawing.plot import section_figure
 
-    chances, mask = segmentation.probability, segmentation.mask
-    if chances is None:
+    probability, mask = segmentation.probability, segmentation.mask
+    if probability is None:
         return section_figure(rows, mask.spacing)
-    unsure = entropy(chances.values)
+    unsure = entropy(probability.values)
     places = [int(unsure.sum(tuple({0, 1, 2} - {axis})).argmax()) for axis in range(3)]
     return section_figure([*rows, (unsure, mask.values)], mask.spacing, places)
 
@@ -266,14 +228,11 @@ def _map_path(target: Path) -> Path:
     return sibling(target, f"_probability{target.name.removeprefix(sibling(target, '').name)}")
 
 
-def _doubts(uncertain: Uncertainty | None) -> dict[str, Any]:
-    if uncertain is None:
-        return {}
-    names = ("seeds", "calibration_error", "suggestions")
-    return {name: getattr(uncertain, name) for name in names} | {"runs": len(uncertain.seeds)}
-
-
 def _record(segmentation: Segmentation, scan: Field, more: dict[str, Any]) -> dict[str, Any]:
+    uncertain, doubts = segmentation.uncertainty, {}
+    if uncertain is not None:
+        doubts = {name: getattr(uncertain, name) for name in ("seeds", "calibration_error", "suggestions")}
+        doubts["runs"] = len(uncertain.seeds)
     return {
         "status": segmentation.status,
         **more,
@@ -285,7 +244,7 @@ def _record(segmentation: Segmentation, scan: Field, more: dict[str, Any]) -> di
         "epsilon": segmentation.epsilon,
         "weight": segmentation.weight,
         "volume_fraction": float(segmentation.mask.values.mean()),
-        **_doubts(segmentation.uncertainty),
+        **doubts,
         "notes": list(segmentation.notes),
         "curvafit": version("curvafit"),
         "torch": version("torch"),

@@ -14,17 +14,31 @@ from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.core.workers import Workers
 from curvafit.generation.data import Evidence
 from curvafit.priors.coefficients import Coefficients
-from curvafit.segmentation.engine import BENDING, STEPS, LawLike, WorkingGrid, bending, laws_of, likelihood, started
-from curvafit.segmentation.evidence import Classes, VoxelEvidence, bounds_of, classes_of, grey_levels, of_classes
-from curvafit.segmentation.result import Segmentation, ending, filled, result_of
-from curvafit.segmentation.tiles import Tiling, lowered
-from curvafit.segmentation.trials import Weighing, busiest, weighing
+from curvafit.priors.law import LawLike
+from curvafit.segmentation.engine import (
+    BENDING,
+    STEPS,
+    WorkingGrid,
+    bending,
+    initial_field,
+    laws_of,
+    likelihood,
+)
+from curvafit.segmentation.evidence import (
+    Classes,
+    VoxelEvidence,
+    estimate_classes,
+    grey_bounds,
+    grey_evidence,
+    grey_levels,
+)
+from curvafit.segmentation.result import Segmentation, flow_summary
+from curvafit.segmentation.tiles import Tiling, lower_volume
+from curvafit.segmentation.trials import Trial, choose_by_voxels, fullest_block
 from curvafit.volumes.boxes import Boxes, boxes_of, subsample, value_range
 from curvafit.volumes.field import ScanError
 from curvafit.volumes.formats.part import Box, Crop
 from curvafit.volumes.read import Source
-
-__all__ = ["segment"]
 
 #: A law that is tried beside the prior's.
 WILLMORE = Coefficients.willmore()
@@ -56,7 +70,7 @@ def segment(
 
     Which law is lowered, and with which weight, is decided by grey levels that are left out: those that a fit trusts
     and the Willmore energy are tried, and where none tells them better than the start does, the start is the answer.
-    A network's probabilities are for `refine`: none of them can be left out, since they tell each other.
+    A network's probabilities are for `refine`: none of them can be left out, since neighbouring ones are correlated.
 
     Parameters
     ----------
@@ -105,30 +119,33 @@ def segment(
         check_float(threshold, "a threshold that is a number or 'otsu'")
     value_range(boxes)
     sample, blocks = subsample(boxes)
-    values, bounds = grey_levels(sample, threshold), bounds_of(sample.values.astype(np.float32), threshold)
-    classes = classes_of(values, sample, threshold, dark)
+    values, bounds = grey_levels(sample, threshold), grey_bounds(sample.values.astype(np.float32), threshold)
+    classes = estimate_classes(values, sample, threshold, dark)
     _check_phases(_Grey(boxes, bounds, classes), tiling)
     law, nats = laws[0], bending(laws[0]) / BENDING * (weight or 0.0)
-    chosen: Weighing | None = None
+    chosen: Trial | None = None
     if weight is None:
-        overlap, block = threshold == "otsu" and classes.faint, busiest(values, sample, classes, blocks)
-        chosen = weighing(
+        block = fullest_block(values, sample, classes, blocks)
+        overlap = threshold == "otsu" and classes.faint
+        trials, progress = sub_progress(progress, 0.0, TRIALS), sub_progress(progress, TRIALS, 1.0)
+        chosen, classes = choose_by_voxels(
             values[block], sample.crop(block), classes, (*laws, *({WILLMORE} - set(laws))),
-            epsilon=epsilon, steps=steps, measured=overlap, progress=sub_progress(progress, 0.0, TRIALS),
+            epsilon=epsilon, steps=steps, remeasure=overlap, progress=trials,
         )  # fmt: skip
-        law, nats, classes, progress = chosen.law, chosen.nats, chosen.classes, sub_progress(progress, TRIALS, 1.0)
-    evidence, note = _Grey(boxes, bounds, classes), str(classes)
+        law, nats = chosen.law, chosen.strength
     if classes.faint and threshold == "otsu" and (chosen is None or chosen.law is None):
         notes = (*notes, FAINT)
-    notes = (*notes, f"{note[0].upper()}{note[1:]}.", *tiling.place.notes)
-    found = lowered(_Scan(evidence, law, nats, steps), tiling, store=store, workers=workers, progress=progress)
-    λ = weight if weight is not None or law is None else nats * BENDING / bending(law)
-    status = filled(found.mask) if law is None else ending(found)
-    if chosen is not None:
-        status = f"{_gain(chosen, laws)}; {status}"
-    return result_of(
-        frame, found.mask, found.phase, weight=λ, law=law, epsilon=tiling.place.epsilon, status=status, notes=notes
-    )
+    said = str(classes)
+    notes = (*notes, f"{said[0].upper()}{said[1:]}.", *tiling.place.notes)
+    problem = ScanProblem(_Grey(boxes, bounds, classes), law, nats, steps)
+    found = lower_volume(problem, tiling, store=store, workers=workers, progress=progress)
+    status = flow_summary(found)
+    return Segmentation.of(
+        frame, found.mask, found.phase, notes,
+        weight=weight if weight is not None or law is None else nats * BENDING / bending(law),
+        coefficients=law, epsilon=tiling.place.epsilon,
+        status=status if chosen is None else f"{_gain(chosen, laws)}; {status}",
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,12 +158,12 @@ class _Grey:
 
     def __call__(self, box: Box) -> VoxelEvidence:
         values = self.boxes.part(box).astype(np.float32).clip(*self.bounds)
-        return of_classes(values, self.boxes.frame, self.classes)
+        return grey_evidence(values, self.boxes.frame, self.classes)
 
 
 @dataclass(frozen=True, eq=False)
-class _Scan:
-    """A scan's evidence, and a law with its weight."""
+class ScanProblem:
+    """A scan's evidence, and a law with its weight; see `tiles.Problem`."""
 
     evidence: _Grey
     law: Coefficients | None
@@ -158,17 +175,14 @@ class _Scan:
         evidence = self.evidence
         return {"scan": evidence.boxes.digest, "evidence": str(evidence.classes), "nats": self.nats}
 
-    def given(self, box: Box, place: WorkingGrid) -> tuple[np.ndarray, Evidence]:
-        """Return the first guess and the evidence on a box."""
+    def terms(self, box: Box, place: WorkingGrid) -> tuple[np.ndarray, Evidence]:
         evidence = self.evidence(box)
         return evidence.level, likelihood(evidence, self.nats, place)
 
     def plain(self, level: np.ndarray, place: WorkingGrid) -> np.ndarray:
-        """Return the phase field of the first guess."""
-        return place.back(started(level, place))
+        return place.to_scan(initial_field(level, place))
 
     def mask(self, phase: np.ndarray, box: Box) -> np.ndarray:
-        """Return the voxels where the phase field is positive."""
         return phase > 0
 
 
@@ -185,10 +199,10 @@ def _check_phases(evidence: _Grey, tiling: Tiling) -> None:
     )
 
 
-def _gain(chosen: Weighing, laws: Sequence[Coefficients]) -> str:
+def _gain(chosen: Trial, laws: Sequence[Coefficients]) -> str:
     """Return what was chosen and what it gains, as the beginning of a sentence."""
-    share = f"{100 * chosen.gain:+.2g} ± {100 * chosen.noise:.2g} % of the voxels left out are on their side"
+    share = f"{100 * chosen.score:+.2g} ± {100 * chosen.noise:.2g} % of the voxels left out are on their side"
     if chosen.law is None:
         return f"no prior helps here: with the best {share}"
     law = "the prior helps" if chosen.law in laws else "the Willmore energy helps, more than the prior"
-    return f"{law}, at {chosen.nats:g} nats: {share}"
+    return f"{law}, at {chosen.strength:g} nats: {share}"

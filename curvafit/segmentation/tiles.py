@@ -1,4 +1,8 @@
-"""The tiles of a volume: boxes of voxels, with the overlap at which a cut is not felt any more."""
+"""Lowering the energy of a volume of any size: tile by tile, with what is finished kept in a folder.
+
+Tiles overlap by so much that a cut is not felt any more; the result does not depend on them beyond a few voxels of the
+surface.
+"""
 
 from __future__ import annotations
 
@@ -25,24 +29,9 @@ from curvafit.generation.data import Data
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import MOST
 from curvafit.priors.kernels.threads import one_thread
-from curvafit.segmentation.engine import HALO, Ends, WorkingGrid, completed
+from curvafit.segmentation.engine import HALO, Ends, WorkingGrid, lower_energy
 from curvafit.volumes.field import Field
 from curvafit.volumes.formats.part import Box
-
-__all__ = [
-    "EDGE",
-    "OVERLAP",
-    "WHOLE",
-    "FolderStore",
-    "Lowered",
-    "MemoryStore",
-    "Piece",
-    "Problem",
-    "Tile",
-    "Tiling",
-    "folder_store",
-    "lowered",
-]
 
 #: Working voxels beyond a tile that are lowered with it: at that distance the cut is not felt any more.
 OVERLAP = 24
@@ -50,6 +39,8 @@ OVERLAP = 24
 WHOLE, EDGE = 256**3, 192
 #: Shortest edge of a tile, in working voxels.
 SHORTEST = 8
+#: Files of a folder: what it belongs to, the volume's arrays, and the lock of the run that uses it.
+_RUN, _MASK, _PHASE, _LOCK = "run.json", "mask.npy", "phase.npy", "lock"
 
 
 @dataclass(frozen=True)
@@ -134,7 +125,7 @@ class Tiling:
 
     def place_of(self, tile: Tile) -> WorkingGrid:
         """Return the grid of a tile's box."""
-        return self.place if self.count == 1 else self.place.part(tile.shape, tile.ends)
+        return self.place if self.count == 1 else self.place.of_box(tile.shape, tile.ends)
 
     @property
     def voxels(self) -> list[int]:
@@ -157,8 +148,7 @@ class Tiling:
         return tiles
 
 
-#: Files of a folder: what it belongs to, the volume's arrays, and the lock of the run that uses it.
-_RUN, _MASK, _PHASE, _LOCK = "run.json", "mask.npy", "phase.npy", "lock"
+# ---- finished tiles --------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,16 +169,13 @@ class MemoryStore:
         self._energies: dict[int, tuple[float, ...]] = {}
 
     def has(self, number: int) -> bool:
-        """Return whether a tile is there."""
         return number in self._energies
 
     def write(self, core: Box, piece: Piece) -> None:
-        """Add a tile."""
         self._mask[core], self._phase[core] = piece.mask, piece.phase
         self._energies[piece.number] = piece.energies
 
     def energies(self, number: int) -> tuple[float, ...]:
-        """Return the last two energies of a tile's flow."""
         return self._energies[number]
 
     def volume(self) -> tuple[np.ndarray, np.ndarray]:
@@ -197,7 +184,7 @@ class MemoryStore:
 
 
 class FolderStore:
-    """Tiles of a volume in a folder; open with `folder_store`.
+    """Tiles of a volume in a folder that outlives a killed run; open with `open_store`.
 
     The arrays are files of the volume's size, which are mapped. A tile has a note, `000012.json`, which is written once
     the tile's voxels are on the disk: a killed run loses the tile it was at and nothing else.
@@ -207,11 +194,9 @@ class FolderStore:
         self._folder = folder
 
     def has(self, number: int) -> bool:
-        """Return whether a tile is there."""
         return self._note(number).exists()
 
     def write(self, core: Box, piece: Piece) -> None:
-        """Add a tile."""
         for name, values in ((_MASK, piece.mask), (_PHASE, piece.phase)):
             array = np.load(self._folder / name, mmap_mode="r+")
             array[core] = values
@@ -219,7 +204,6 @@ class FolderStore:
         write_content(self._note(piece.number), json.dumps(piece.energies))
 
     def energies(self, number: int) -> tuple[float, ...]:
-        """Return the last two energies of a tile's flow."""
         return tuple(json.loads(self._note(number).read_bytes()))
 
     def volume(self) -> tuple[np.ndarray, np.ndarray]:
@@ -232,7 +216,7 @@ class FolderStore:
 
 
 @contextmanager
-def folder_store(
+def open_store(
     folder: str | PathLike[str], shape: tuple[int, int, int], run: Mapping[str, Any]
 ) -> Iterator[FolderStore]:
     """Open the tiles of a run, or make a folder for them.
@@ -250,8 +234,8 @@ def folder_store(
         If the folder has other things or the tiles of another run, or another run uses it.
     """
     place = Path(folder)
-    there = {path.name for path in place.iterdir()} if place.is_dir() else set()
-    if (_RUN not in there and there - {_MASK, _PHASE, _LOCK}) or (place.exists() and not place.is_dir()):
+    names = {path.name for path in place.iterdir()} if place.is_dir() else set()
+    if (_RUN not in names and names - {_MASK, _PHASE, _LOCK}) or (place.exists() and not place.is_dir()):
         raise ValueError(f"expected a new folder for tiles, got {place}, which holds something else")
     place.mkdir(parents=True, exist_ok=True)
     lock = FileLock(place / _LOCK)
@@ -280,7 +264,7 @@ def _prepare(place: Path, shape: tuple[int, int, int], run: dict[str, str]) -> N
     write_content(place / _RUN, json.dumps(run, indent=2))
 
 
-_LOWERING = "lowering the energy"
+# ---- lowering --------------------------------------------------------------------------------------------------------
 
 
 class Problem(Protocol):
@@ -301,7 +285,7 @@ class Problem(Protocol):
         """What tells the problem from others, by name."""
         ...
 
-    def given(self, box: Box, place: WorkingGrid) -> tuple[np.ndarray, Data]:
+    def terms(self, box: Box, place: WorkingGrid) -> tuple[np.ndarray, Data]:
         """Return the start and the data term on a box."""
         ...
 
@@ -315,8 +299,9 @@ class Problem(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Lowered:
-    """A volume's mask (Z, Y, X), bool, and phase field, float32, the last two energies of its flow, and its steps."""
+class LoweredVolume:
+    """A volume's mask (Z, Y, X), bool, and phase field, float32, the last two energies of its flow, and its steps: none
+    where nothing was lowered."""
 
     mask: np.ndarray
     phase: np.ndarray
@@ -324,14 +309,14 @@ class Lowered:
     steps: int
 
 
-def lowered(
+def lower_volume(
     problem: Problem,
     tiling: Tiling,
     *,
     store: str | PathLike[str] | None = None,
     workers: Workers | None = None,
     progress: Progress = silent,
-) -> Lowered:
+) -> LoweredVolume:
     """Lower a problem on each tile of a volume, and return the whole.
 
     Parameters
@@ -344,29 +329,30 @@ def lowered(
     Raises
     ------
     ScanError
-        As `engine.completed`.
+        As `engine.lower_energy`.
     ValueError
-        If the store has the tiles of another problem, or another run uses it.
+        As `open_store`.
     """
     run = {**problem.parts, "law": problem.law, "steps": problem.steps, "tiles": tiling.counts, "place": tiling.place}
-    pieces = nullcontext(MemoryStore(tiling.shape)) if store is None else folder_store(store, tiling.shape, run)
-    with pieces as stored:
+    opened = nullcontext(MemoryStore(tiling.shape)) if store is None else open_store(store, tiling.shape, run)
+    with opened as finished:
         tiles = tiling.tiles
-        rest = [tile for tile in tiles if not stored.has(tile.number)]
-        made = _in_turn(problem, tiling, rest, progress) if workers is None else _by(workers, problem, tiling, rest)
-        for count, piece in enumerate(made, tiling.count - len(rest) + 1):
-            stored.write(tiles[piece.number].core, piece)
-            progress(_LOWERING, count / tiling.count)
-        energies = [stored.energies(tile.number) for tile in tiles]
-        mask, phase = stored.volume()
-    return Lowered(mask, phase, tuple(map(sum, zip(*energies, strict=True))), problem.steps)
+        rest = [tile for tile in tiles if not finished.has(tile.number)]
+        pieces = _in_turn(problem, tiling, rest, progress) if workers is None else _by(workers, problem, tiling, rest)
+        for count, piece in enumerate(pieces, tiling.count - len(rest) + 1):
+            finished.write(tiles[piece.number].core, piece)
+            progress("lowering the energy", count / tiling.count)
+        energies = [finished.energies(tile.number) for tile in tiles]
+        mask, phase = finished.volume()
+    steps = 0 if problem.law is None else problem.steps
+    return LoweredVolume(mask, phase, tuple(map(sum, zip(*energies, strict=True))), steps)
 
 
 def _in_turn(problem: Problem, tiling: Tiling, tiles: Sequence[Tile], progress: Progress) -> Iterator[Piece]:
     """Lower tiles one after another."""
     total = tiling.count
     for count, tile in enumerate(tiles, total - len(tiles)):
-        yield _piece(problem, tiling, tile, sub_progress(progress, count / total, (count + 1) / total))
+        yield _lower_tile(problem, tiling, tile, sub_progress(progress, count / total, (count + 1) / total))
 
 
 def _by(workers: Workers, problem: Problem, tiling: Tiling, tiles: Sequence[Tile]) -> Iterator[Piece]:
@@ -374,28 +360,27 @@ def _by(workers: Workers, problem: Problem, tiling: Tiling, tiles: Sequence[Tile
     waiting, asked = list(tiles), 0
     while waiting or asked:
         while waiting and asked < workers.places:
-            workers.submit(partial(_pieces, problem, tiling), Path(), [waiting.pop(0).number])
+            workers.submit(partial(_lower_tiles, problem, tiling), Path(), [waiting.pop(0).number])
             asked += 1
         pieces = workers.collect()
         asked -= len(pieces)
         yield from pieces
 
 
-def _pieces(problem: Problem, tiling: Tiling, _: Path, numbers: Sequence[int]) -> list[Piece]:
+def _lower_tiles(problem: Problem, tiling: Tiling, _: Path, numbers: Sequence[int]) -> list[Piece]:
     """Lower tiles by their numbers, as workers do, each on one thread: the workers share the cores."""
     tiles = tiling.tiles
     with one_thread():
-        return [_piece(problem, tiling, tiles[number], silent) for number in numbers]
+        return [_lower_tile(problem, tiling, tiles[number], silent) for number in numbers]
 
 
-def _piece(problem: Problem, tiling: Tiling, tile: Tile, progress: Progress) -> Piece:
-    """Lower a tile."""
+def _lower_tile(problem: Problem, tiling: Tiling, tile: Tile, progress: Progress) -> Piece:
     place, energies = tiling.place_of(tile), ()
-    level, term = problem.given(tile.box, place)
+    level, term = problem.terms(tile.box, place)
     if problem.law is None:
         phase = problem.plain(level, place)
     else:
-        flow = completed(level, problem.law, term, place, problem.steps, progress)
-        phase, energies = place.back(flow.field), tuple(map(float, flow.history.energy[-2:]))
+        flow = lower_energy(level, problem.law, term, place, problem.steps, progress)
+        phase, energies = place.to_scan(flow.field), tuple(map(float, flow.history.energy[-2:]))
     phase = np.ascontiguousarray(phase[tile.inner])
     return Piece(tile.number, problem.mask(phase, tile.core), phase, energies)

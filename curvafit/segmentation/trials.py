@@ -1,355 +1,65 @@
-"""A law and its weight chosen by voxels left out: by how well the others tell their grey levels."""
+"""The choice of a law and its strength by data: by masks that are known, or by voxels that are left out.
+
+Both ways try each law at one strength, then the best one at stronger and weaker ones as long as it gets better. A law
+is chosen only where it beats the plain way by more than the noise.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import count
 from typing import Generic, TypeVar
 
 import numpy as np
-from scipy import ndimage
 
 from curvafit.core.runtime import Progress, silent
 from curvafit.priors.coefficients import Coefficients
-from curvafit.segmentation.engine import HALO, WorkingGrid, weighed
-from curvafit.segmentation.evidence import LEAST_NOISE, Classes, VoxelEvidence, of_classes
-from curvafit.segmentation.slices import WAYS, Slices
+from curvafit.segmentation.engine import HALO, WorkingGrid, lower_with_evidence
+from curvafit.segmentation.evidence import LEAST_NOISE, Classes, VoxelEvidence, grey_evidence
+from curvafit.segmentation.slices import WAYS, Slices, box_with_most_surface, count_faces
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.part import Box
 
-__all__ = [
-    "BEYOND",
-    "ODDS",
-    "Choice",
-    "Setting",
-    "Task",
-    "Weighing",
-    "busiest",
-    "choice",
-    "climbed",
-    "densest",
-    "left_out",
-    "plainest",
-    "trial_steps",
-    "weighing",
-]
-
-#: Longest edge in voxels of the part on which laws and weights are tried.
+#: What is given of a volume.
+Given = TypeVar("Given")
+#: The way of `examples.Odds`, beside those of `slices.WAYS`.
+ODDS = "odds"
+#: Standard errors by which a trial must be better than a simpler one.
+BEYOND = 1.0
+#: Edges of the cubes that are taken to be independent, in voxels: of masks' counts, and of grey levels' gains.
+CUBE, TILE = 16, 8
+#: Longest edge in voxels of the part of a scan on which laws and weights are tried.
 EDGE = 64
 #: Part of its voxels that is left out, in blocks, and times that others are; longest edge of a block, and correlation
 #: of noise that it outlasts.
 LEFT_OUT, TIMES, LONGEST_BLOCK, CORRELATED = 0.25, 2, 6, 0.15
 #: Weights that are tried, in nats of a unit of the Willmore energy, and the first of them.
-WEIGHTS = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
-FIRST = WEIGHTS.index(1.0)
+WEIGHTS, FIRST = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0), 1.0
 #: Times that the classes are measured again, as long as that makes so many nats more likely what was left out.
 ROUNDS, ENOUGH = 4, 3.0
 #: Fewest voxels of a class that are measured.
 FEWEST = 100
-#: Edge of the cubes whose gains are taken to be independent, in voxels.
-TILE = 8
 
 
 @dataclass(frozen=True)
-class Weighing:
-    """What voxels left out say of a prior.
-
-    Attributes
-    ----------
-    law
-        Coefficients with lengths in the scan's unit; None where none helps.
-    nats
-        Its weight, in nats of a unit of the Willmore energy.
-    gain, noise
-        By which part more of the voxels left out the best law finds on their side of the surface than the start does,
-        and its standard error.
-    classes
-        The grey levels of the two phases, as measured again; as they were given where no law helps.
-    """
-
-    law: Coefficients | None
-    nats: float
-    gain: float
-    noise: float
-    classes: Classes
-
-
-def weighing(
-    values: np.ndarray,
-    scan: Field,
-    classes: Classes,
-    laws: Sequence[Coefficients],
-    *,
-    epsilon: float | None = None,
-    steps: int,
-    measured: bool = True,
-    progress: Progress = silent,
-) -> Weighing:
-    """Return the law, and its weight, that leave the fewest voxels on the wrong side.
-
-    A quarter of the voxels of a part of the scan is left out, in blocks, and then another; from the evidence of the
-    others the surface is found by each law. The log-likelihood ratios of the voxels left out, summed over what is
-    inside, are in the mean (c₁ - c₀)² / 2σ² times the voxels that are rightly inside less those that are not, whatever
-    the law. Where the classes themselves are to be measured, the sides are worth what their own means explain of the
-    levels left out, whatever the classes they came from. The best law at the first weight is tried at others; then with
-    the classes of the voxels on its sides, as long as that explains more; and at last the other laws with these.
-
-    Parameters
-    ----------
-    values
-        Grey levels (Z, Y, X), as `grey_levels` returns them.
-    classes
-        A first guess of the classes, which overlapping phases bring together.
-    laws
-        Coefficients with lengths in the scan's unit.
-    steps
-        Steps of each flow.
-    measured
-        Whether the classes are measured again, of the voxels left out on either side; else they stay.
-
-    Raises
-    ------
-    ScanError
-        If the start has one phase only.
-    """
-    inside = of_classes(values, scan, classes).level > 0
-    where = densest(inside, (EDGE, EDGE, EDGE))
-    part = replace(scan.crop(where), values=values[where])
-    outs = hold_out_masks(part.shape, block_edge(part.values, inside[where]))
-    place = WorkingGrid.of(part, epsilon, halo=HALO)
-    judge = Judge(part.values, outs, classes, measured)
-
-    def found(known: VoxelEvidence, law: Coefficients, nats: float) -> np.ndarray:
-        return place.back(weighed(known, law, nats, place, steps).field) > 0
-
-    trials = _Trials(part, judge, found, _expected(len(laws), measured), progress)
-    chosen = trials.best(laws, FIRST, classes)
-    for _ in range(ROUNDS if measured else 0):
-        apart = measure_classes(part.values, chosen.phases, chosen.classes)
-        other = trials.best([chosen.law], chosen.number, apart)
-        if other.worth < chosen.worth + ENOUGH:
-            break
-        chosen = other
-    if chosen.classes != classes:
-        chosen = trials.best(laws, chosen.number, chosen.classes)
-    gain, noise = judge.gain(chosen.phases, predict_sides(part, outs, classes, lambda known: known.level > 0))
-    if np.isfinite(chosen.worth) and gain > BEYOND * noise:
-        return Weighing(chosen.law, WEIGHTS[chosen.number], gain, noise, chosen.classes)
-    return Weighing(None, WEIGHTS[chosen.number], gain, noise, classes)
-
-
-def busiest(values: np.ndarray, scan: Field, classes: Classes, blocks: Sequence[Box]) -> Box:
-    """Return the block, of several of a sample's, that holds most of the surface of its first guess."""
-    inside = of_classes(values, scan, classes).level > 0
-    return max(blocks, key=lambda block: int(_surface(inside[block]).sum()))
-
-
-def trial_steps(laws: int, steps: int, voxels: int) -> float:
-    """Return about how many steps of a flow on so many voxels it takes to try laws out."""
-    return TIMES * _expected(laws, True) * steps * min(1.0, (EDGE + 2 * HALO) ** 3 / voxels)
-
-
-def _expected(laws: int, measured: bool) -> int:
-    """Return about how many laws and weights are tried."""
-    return (laws + 2) * (1 + measured)
-
-
-@dataclass(frozen=True, eq=False)
-class _Trial:
-    """A law, the number of its weight, the classes by which it was tried; the voxels left out on either side of its
-    surface, bool (2, Z, Y, X), and what that is worth, in nats."""
-
-    law: Coefficients
-    number: int
-    classes: Classes
-    phases: np.ndarray
-    worth: float
-
-
-@dataclass(frozen=True, eq=False)
-class Judge:
-    """What the levels (Z, Y, X) of voxels left out say of two sides, bool (2, Z, Y, X).
-
-    With classes that are known their log-likelihood ratios are summed over the inside; with classes that are to be
-    measured the sides are worth what their own means explain, whatever the classes by which they came about.
-    """
-
-    levels: np.ndarray
-    outs: Sequence[np.ndarray]
-    classes: Classes
-    measured: bool
-
-    def worth(self, phases: np.ndarray) -> float:
-        """Return the log-likelihood of the sides, in nats, but for a constant."""
-        classes = self.classes
-        if self.measured:
-            return float(np.sign(classes.contrast)) * _explained(self.levels, phases) / (2 * classes.noise**2)
-        inside = self.levels[phases[1]].astype(np.float64)
-        return float((inside - classes.middle).sum() * classes.contrast / classes.noise**2)
-
-    def gain(self, phases: np.ndarray, start: np.ndarray) -> tuple[float, float]:
-        """Return by which part more of the voxels are on their side than in other sides, and its standard error."""
-        classes = measure_classes(self.levels, phases, self.classes) if self.measured else self.classes
-        change = (phases[1].astype(np.int8) - start[1]) * (self.levels - classes.middle).astype(np.float64)
-        for axis, n in enumerate(change.shape):
-            change = np.add.reduceat(change, np.arange(0, n, TILE), axis=axis)
-        right = 2 / classes.contrast / sum(int(out.sum()) for out in self.outs)
-        nats = self.worth(phases) - self.worth(start)
-        error = abs(right) * float(np.sqrt(np.square(change).sum()))
-        return nats * self.classes.noise**2 / classes.contrast * right, error
-
-
-class _Trials:
-    """Trials on a part of a scan by what finds a mask (Z, Y, X) from evidence, by a law and its weight: each is made
-    once."""
-
-    def __init__(
-        self,
-        part: Field,
-        judge: Judge,
-        found: Callable[[VoxelEvidence, Coefficients, float], np.ndarray],
-        expected: int,
-        progress: Progress,
-    ) -> None:
-        self._part, self._judge, self._found = part, judge, found
-        self._expected, self._progress = expected, progress
-        self._made: dict[tuple[Coefficients, int, Classes], _Trial] = {}
-
-    def best(self, laws: Sequence[Coefficients], number: int, classes: Classes) -> _Trial:
-        """Return the best law at the weight of a number, or at the weights on either side of it while they are better
-        still."""
-
-        def neighbour(trial: _Trial, step: int) -> _Trial | None:
-            further = trial.number + step
-            return self._trial(trial.law, further, classes) if 0 <= further < len(WEIGHTS) else None
-
-        first = max((self._trial(law, number, classes) for law in laws), key=_worth)
-        return climbed(first, neighbour, _worth)
-
-    def _trial(self, law: Coefficients, number: int, classes: Classes) -> _Trial:
-        if (law, number, classes) not in self._made:
-            self._progress("trying the prior out", min((len(self._made) + 1) / self._expected, 1.0))
-            self._made[law, number, classes] = self._tried(law, number, classes)
-        return self._made[law, number, classes]
-
-    def _tried(self, law: Coefficients, number: int, classes: Classes) -> _Trial:
-        """Return a trial, one that is worth nothing where the flow fails."""
-        try:
-            phases = predict_sides(
-                self._part, self._judge.outs, classes, lambda known: self._found(known, law, WEIGHTS[number])
-            )
-        except ScanError:
-            return _Trial(law, number, classes, np.zeros((2, *self._part.shape), dtype=bool), -np.inf)
-        return _Trial(law, number, classes, phases, self._judge.worth(phases))
-
-
-def _worth(trial: _Trial) -> float:
-    return trial.worth
-
-
-def predict_sides(
-    part: Field, outs: Sequence[np.ndarray], classes: Classes, found: Callable[[VoxelEvidence], np.ndarray]
-) -> np.ndarray:
-    """Return the voxels left out, bool (2, Z, Y, X), that are outside and inside of what is found of the others."""
-    phases = np.zeros((2, *part.shape), dtype=bool)
-    for out in outs:
-        mask = found(of_classes(part.values, part, classes, ~out))
-        phases |= np.stack([out & ~mask, out & mask])
-    return phases
-
-
-def _explained(levels: np.ndarray, phases: np.ndarray) -> float:
-    """Return the sum of squares of the levels in two phases `(2, Z, Y, X)` that the phases' means explain, negative
-    where the second is the darker one."""
-    outside, inside = (levels[phase].astype(np.float64) for phase in phases)
-    if not len(outside) or not len(inside):
-        return 0.0
-    weight = len(outside) * len(inside) / (len(outside) + len(inside))
-    contrast = float(inside.mean() - outside.mean())
-    return weight * contrast * abs(contrast)
-
-
-def measure_classes(levels: np.ndarray, phases: np.ndarray, classes: Classes) -> Classes:
-    """Return the classes of the voxels of two phases `(2, Z, Y, X)`; the old ones where these are few, or the other way
-    round."""
-    outside, inside = (levels[phase].astype(np.float64) for phase in phases)
-    if min(len(outside), len(inside)) < FEWEST or (inside.mean() - outside.mean()) * classes.contrast <= 0:
-        return classes
-    low, high = float(outside.mean()), float(inside.mean())
-    squares = len(outside) * outside.var() + len(inside) * inside.var()
-    noise = max(float(np.sqrt(squares / (len(outside) + len(inside)))), LEAST_NOISE * abs(high - low))
-    return Classes(low, high, noise, (low + high) / 2)
-
-
-def densest(inside: np.ndarray, edges: tuple[int, int, int]) -> Box:
-    """Return the box, of at most these edges, that holds most of a mask's surface."""
-    box = [min(n, edge) for n, edge in zip(inside.shape, edges, strict=True)]
-    held = _surface(inside).astype(np.float32)
-    for axis, edge in enumerate(box):
-        held = ndimage.uniform_filter1d(held, edge, axis, mode="constant")
-    inner = tuple(slice(b // 2, n - (b - 1) // 2) for n, b in zip(inside.shape, box, strict=True))
-    z, y, x = (int(k) for k in np.unravel_index(int(held[inner].argmax()), held[inner].shape))
-    return slice(z, z + box[0]), slice(y, y + box[1]), slice(x, x + box[2])
-
-
-def _surface(inside: np.ndarray) -> np.ndarray:
-    """Return how many of a voxel's next neighbours along the axes are on the other side."""
-    sides = inside.astype(np.int8)
-    z, y, x = (np.abs(np.diff(sides, axis=axis, append=0)) for axis in range(3))
-    return z + y + x
-
-
-def block_edge(values: np.ndarray, inside: np.ndarray) -> int:
-    """Return the edge of a block within which the noise of grey levels may be alike."""
-    residual = values - np.where(inside, values[inside].mean(), values[~inside].mean())
-    square = float(np.square(residual).mean())
-    for reach in range(1, LONGEST_BLOCK // 2):
-        products = [float((residual[reach:] * residual[:-reach]).mean()) for residual in _turned(residual)]
-        if max(products) < CORRELATED * square:
-            return 2 * reach
-    return LONGEST_BLOCK
-
-
-def _turned(values: np.ndarray) -> list[np.ndarray]:
-    """Return a volume with each of its axes first."""
-    return [np.moveaxis(values, axis, 0) for axis in range(3)]
-
-
-def hold_out_masks(shape: Sequence[int], edge: int) -> list[np.ndarray]:
-    """Return the voxels that are left out, in blocks chosen at random, and those that are left out then: bool of a
-    shape."""
-    coarse = np.random.default_rng(0).random([-(-n // edge) for n in shape])
-    for axis, n in enumerate(shape):
-        coarse = np.repeat(coarse, edge, axis=axis).take(range(n), axis=axis)
-    return [(LEFT_OUT * k <= coarse) & (coarse < LEFT_OUT * (k + 1)) for k in range(TIMES)]
-
-
-#: What is given of a volume, and what is tried of it.
-Given = TypeVar("Given")
-Trial = TypeVar("Trial")
-#: The way of `odds.Odds`, beside those of `slices.WAYS`.
-ODDS = "odds"
-#: Edge of the cubes whose counts are taken to be independent, in voxels.
-CUBE = 16
-#: Standard errors by which a setting must be better than a simpler one.
-BEYOND = 1.0
-
-
-@dataclass(frozen=True)
-class Setting:
-    """A way to fill a volume: a plain one, and a law that is lowered from there, or none.
+class Trial:
+    """A way to fill a volume: a plain one, or a law that is lowered from there; and how it did, once it is chosen.
 
     Attributes
     ----------
     way
         One of `slices.WAYS`, `ODDS` or another plain way.
     law
-        Coefficients with lengths in the scan's unit.
+        Coefficients with lengths in the scan's unit; None where the plain way stays as it is.
     strength, steps
         Stiffness of the springs on known voxels, or nats of a unit of the Willmore energy; and steps of the flow.
     pull
-        Stiffness of the springs on the others for each nat of an example's odds.
+        Stiffness of the springs on the other voxels for each nat of an example's odds.
+    score, plain, noise
+        Of a choice: what the best law scores, what the plain way does, and the standard error of the difference. Dice
+        on masks that are known; of voxels left out, by which part more are on their side (0 of the plain way).
     """
 
     way: str
@@ -357,16 +67,42 @@ class Setting:
     strength: float = 0.0
     steps: int = 0
     pull: float = 0.0
+    score: float = 0.0
+    plain: float = 0.0
+    noise: float = 0.0
+
+
+def search(trials: Sequence[Trial], strengths: Sequence[float], worth: Callable[[Trial], float]) -> Trial:
+    """Return the best of some trials, or of that one at stronger and weaker strengths as long as each is better still.
+
+    Parameters
+    ----------
+    strengths
+        Strengths to try, ascending; a trial whose own is not among them stays as it is.
+    """
+    first = max(trials, key=worth)
+    best = first
+    for step in (1, -1):
+        last = first
+        while last.strength in strengths:
+            number = [*strengths].index(last.strength) + step
+            further = replace(last, strength=strengths[number]) if 0 <= number < len(strengths) else last
+            if further == last or worth(further) <= worth(last):
+                break
+            last = further
+        best = max(best, last, key=worth)
+    return best
+
+
+# ---- by masks that are known -----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class Task(Generic[Given]):
-    """What is given of a volume, and masks to compare the volume with.
+    """What is given of a volume, slices or evidence, and masks to compare the filled volume with.
 
     Attributes
     ----------
-    given
-        Slices, or evidence.
     truth
         Known masks, bool (N, Y, X), which are not given.
     places
@@ -378,119 +114,70 @@ class Task(Generic[Given]):
     places: Sequence[int]
 
 
-@dataclass(frozen=True)
-class Choice:
-    """The chosen setting and how it did.
-
-    Attributes
-    ----------
-    setting
-        The setting.
-    dice, plain
-        Dice of the best prior and of the best plain way on the task's masks.
-    noise
-        Standard error of the difference.
-    """
-
-    setting: Setting
-    dice: float
-    plain: float
-    noise: float
-
-
-def left_out(slices: Slices) -> Task[Slices] | None:
+def leave_out_slices(slices: Slices) -> Task[Slices] | None:
     """Return the task to predict every second known slice from the others; None where there are too few.
 
     The first and the last slice are not left out, unless the volume repeats.
     """
-    count = len(slices.places)
-    out = range(1, count - (0 if slices.periodic and count % 2 == 0 else 1), 2)
-    rest = [k for k in range(count) if k not in out]
-    given = slices.among(rest)
+    number = len(slices.places)
+    out = range(1, number - (0 if slices.periodic and number % 2 == 0 else 1), 2)
+    rest = [k for k in range(number) if k not in out]
+    given = slices.select(rest)
     if not out or len(rest) < 2 or given.inside.all() or not given.inside.any():
         return None
     return Task(given, slices.inside[list(out)], [slices.places[k] for k in out])
 
 
-def choice(
+def choose_by_masks(
     task: Task[Given],
-    lowered: Callable[[str], Sequence[Setting]],
-    filled: Callable[[Given, Setting], np.ndarray],
+    candidates: Callable[[str], Sequence[Trial]],
+    fill: Callable[[Given, Trial], np.ndarray],
     ways: Sequence[str] = WAYS,
     strengths: Sequence[float] = (),
-) -> Choice:
-    """Return the setting with the best Dice on a task: a prior where it is better than plain beyond the noise.
+) -> Trial:
+    """Return the trial with the best Dice on a task: a law where it is better than the plain way beyond the noise.
 
     Parameters
     ----------
-    lowered
-        Returns the settings with a law that are lowered from a way: the best of the plain ones. The best is tried at
-        the strengths on either side as long as they are better, and the others at the strength that is best then.
-    filled
-        Fills the volume of what is given by a setting: a mask (Z, Y, X).
+    candidates
+        Returns the trials of laws that are lowered from a way, the best plain one. The best of them is tried at other
+        strengths, and then the others at the strength that is best.
+    fill
+        Fills the volume of what is given by a trial: a mask (Z, Y, X).
     ways
         Plain ways to compare with. Slices left out double the gap, at which the nearest slice may win by much that
         loses by more at the gap itself: there only what is lowered and its start are to be compared.
     strengths
-        Strengths to try, ascending, the settings' own among them; by default none but their own.
+        Strengths to try, ascending, the candidates' own among them; by default none but their own.
     """
 
     @cache
-    def counts(setting: Setting) -> np.ndarray:
-        return _tallies(filled(task.given, setting)[list(task.places)], task.truth, task.places)
+    def counts(trial: Trial) -> np.ndarray:
+        return _tallies(fill(task.given, trial)[list(task.places)], task.truth, task.places)
 
-    def worth(setting: Setting) -> float:
-        return float(_dice(counts(setting).sum(0)))
+    def worth(trial: Trial) -> float:
+        return float(_dice(counts(trial).sum(0)))
 
-    def stronger(setting: Setting, step: int) -> Setting | None:
-        number = [*strengths, setting.strength].index(setting.strength) + step
-        return replace(setting, strength=strengths[number]) if 0 <= number < len(strengths) else None
-
-    start = Setting(plainest(task, filled, ways))
-    settings = lowered(start.way)
-    best = climbed(max(settings, key=worth), stronger, worth)
-    best = max((best, *(replace(each, strength=best.strength) for each in settings)), key=worth)
-    gain = _difference(counts(best), counts(start))
-    return Choice(start if gain.within else best, worth(best), worth(start), gain.noise)
+    start = Trial(best_plain_way(task, fill, ways))
+    trials = candidates(start.way)
+    best = search(trials, strengths, worth)
+    best = max((best, *(replace(trial, strength=best.strength) for trial in trials)), key=worth)
+    gain, noise = _gain(counts(best), counts(start))
+    chosen = best if gain > BEYOND * noise else start
+    return replace(chosen, score=worth(best), plain=worth(start), noise=noise)
 
 
-def plainest(task: Task[Given], filled: Callable[[Given, Setting], np.ndarray], ways: Sequence[str] = WAYS) -> str:
+def best_plain_way(task: Task[Given], fill: Callable[[Given, Trial], np.ndarray], ways: Sequence[str] = WAYS) -> str:
     """Return the plain way with the best Dice on a task: a later one where it is better beyond the noise."""
     if len(ways) == 1:
         return ways[0]
     places = list(task.places)
-    counts = {way: _tallies(filled(task.given, Setting(way))[places], task.truth, places) for way in ways}
+    counts = {way: _tallies(fill(task.given, Trial(way))[places], task.truth, places) for way in ways}
     best = ways[0]
     for way in ways[1:]:
-        best = best if _difference(counts[way], counts[best]).within else way
+        gain, noise = _gain(counts[way], counts[best])
+        best = way if gain > BEYOND * noise else best
     return best
-
-
-def climbed(first: Trial, neighbour: Callable[[Trial, int], Trial | None], worth: Callable[[Trial], float]) -> Trial:
-    """Return the best of a trial and its neighbours on either side, each as long as the last is better than before.
-
-    `neighbour` returns the next trial towards 1 or -1, None beyond the end.
-    """
-    best = first
-    for step in (1, -1):
-        last = first
-        while (further := neighbour(last, step)) is not None and worth(further) > worth(last):
-            last = further
-        best = max(best, last, key=worth)
-    return best
-
-
-@dataclass(frozen=True)
-class _Difference:
-    """The difference of two Dice coefficients and its standard error."""
-
-    gain: float
-    noise: float
-
-    @property
-    def within(self) -> bool:
-        """Return whether the gain is within the noise."""
-        return not self.gain > BEYOND * self.noise
 
 
 def _tallies(masks: np.ndarray, truth: np.ndarray, places: Sequence[int]) -> np.ndarray:
@@ -508,8 +195,193 @@ def _dice(counts: np.ndarray) -> np.ndarray:
     return np.where(sizes == 0, 1.0, 2 * both / np.maximum(sizes, 1))
 
 
-def _difference(after: np.ndarray, before: np.ndarray) -> _Difference:
-    """Return the difference of two Dice coefficients of counts (T, 2), with the jackknife's error over the cubes."""
+def _gain(after: np.ndarray, before: np.ndarray) -> tuple[float, float]:
+    """Return the difference of two Dice coefficients of counts (T, 2), and the jackknife's error of it over the cubes.
+
+    Errors of a network, or of an interpolation, lie side by side: cubes are independent, voxels are not.
+    """
     whole = _dice(after.sum(0)) - _dice(before.sum(0))
-    each = _dice(after.sum(0) - after) - _dice(before.sum(0) - before)
-    return _Difference(float(whole), float(np.sqrt((len(each) - 1) * each.var())))
+    without = _dice(after.sum(0) - after) - _dice(before.sum(0) - before)
+    return float(whole), float(np.sqrt((len(without) - 1) * without.var()))
+
+
+# ---- by voxels that are left out -------------------------------------------------------------------------------------
+
+
+def choose_by_voxels(
+    values: np.ndarray,
+    scan: Field,
+    classes: Classes,
+    laws: Sequence[Coefficients],
+    *,
+    epsilon: float | None = None,
+    steps: int,
+    remeasure: bool = True,
+    progress: Progress = silent,
+) -> tuple[Trial, Classes]:
+    """Return the law, and its weight, that leave the fewest voxels on the wrong side; and the phases' levels.
+
+    A quarter of the voxels of a part of the scan is left out, in blocks, and then another; from the evidence of the
+    others the surface is found by each law. The best law at the first weight is tried at others; then with the classes
+    of the voxels on its sides, as long as that explains more; and at last the other laws with these. See `Judge` for
+    what a surface is worth.
+
+    Parameters
+    ----------
+    values
+        Grey levels (Z, Y, X), as `grey_levels` returns them.
+    classes
+        A first guess of the classes, which overlapping phases bring together. Where no law helps they are returned.
+    laws
+        Coefficients with lengths in the scan's unit.
+    remeasure
+        Whether the classes are measured again, of the voxels left out on either side; else they stay.
+
+    Raises
+    ------
+    ScanError
+        If the start has one phase only.
+    """
+    inside = grey_evidence(values, scan, classes).level > 0
+    where = box_with_most_surface(inside, (EDGE, EDGE, EDGE))
+    part = replace(scan.crop(where), values=values[where])
+    outs = hold_out_masks(part.shape, block_edge(part.values, inside[where]))
+    place = WorkingGrid.of(part, epsilon, halo=HALO)
+    judge = Judge(part.values, outs, classes, remeasure)
+    numbers, expected = count(1), (len(laws) + 2) * (1 + remeasure)
+
+    @cache
+    def sides(trial: Trial, classes: Classes) -> np.ndarray | None:
+        """Return the voxels left out on either side; None where the flow fails."""
+        progress("trying the prior out", min(next(numbers) / expected, 1.0))
+
+        def find(known: VoxelEvidence) -> np.ndarray:
+            flow = lower_with_evidence(known, trial.law, trial.strength, place, steps)  # type: ignore[arg-type]
+            return place.to_scan(flow.field) > 0
+
+        try:
+            return predict_sides(part, outs, classes, find)
+        except ScanError:
+            return None
+
+    def worth(trial: Trial, classes: Classes) -> float:
+        phases = sides(trial, classes)
+        return -np.inf if phases is None else judge.worth(phases)
+
+    def best(laws: Sequence[Coefficients | None], strength: float, classes: Classes) -> Trial:
+        trials = [Trial("start", law, strength, steps) for law in laws]
+        return search(trials, WEIGHTS, lambda trial: worth(trial, classes))
+
+    chosen, used = best(laws, FIRST, classes), classes
+    for _ in range(ROUNDS if remeasure else 0):
+        phases = sides(chosen, used)
+        apart = used if phases is None else measure_classes(part.values, phases, used)
+        other = best([chosen.law], chosen.strength, apart)
+        if worth(other, apart) < worth(chosen, used) + ENOUGH:
+            break
+        chosen, used = other, apart
+    if used != classes:
+        chosen = best(laws, chosen.strength, used)
+    phases, start = sides(chosen, used), predict_sides(part, outs, classes, lambda known: known.level > 0)
+    gain, noise = judge.gain(np.zeros_like(start) if phases is None else phases, start)
+    if phases is not None and gain > BEYOND * noise:
+        return replace(chosen, score=gain, noise=noise), used
+    return replace(chosen, law=None, score=gain, noise=noise), classes
+
+
+def fullest_block(values: np.ndarray, scan: Field, classes: Classes, blocks: Sequence[Box]) -> Box:
+    """Return the block, of several of a sample's, that holds most of the surface of its first guess."""
+    inside = grey_evidence(values, scan, classes).level > 0
+    return max(blocks, key=lambda block: int(count_faces(inside[block]).sum()))
+
+
+@dataclass(frozen=True, eq=False)
+class Judge:
+    """What the levels (Z, Y, X) of voxels left out say of two sides, bool (2, Z, Y, X): outside and inside.
+
+    With classes that are known the log-likelihood ratios, summed over the inside, are the sides' worth: in the mean
+    (c₁ - c₀)² / 2σ² times the voxels that are rightly inside less those that are not, whatever the law. With classes
+    that are to be measured the sides are worth what their own means explain of the levels, whatever the classes by
+    which they came about: a mask that grows fat brings its classes together, and would else vote for itself.
+    """
+
+    levels: np.ndarray
+    outs: Sequence[np.ndarray]
+    classes: Classes
+    remeasure: bool
+
+    def worth(self, phases: np.ndarray) -> float:
+        """Return the log-likelihood of the sides, in nats, but for a constant."""
+        classes = self.classes
+        if self.remeasure:
+            return float(np.sign(classes.contrast)) * _explained(self.levels, phases) / (2 * classes.noise**2)
+        inside = self.levels[phases[1]].astype(np.float64)
+        return float((inside - classes.middle).sum() * classes.contrast / classes.noise**2)
+
+    def gain(self, phases: np.ndarray, start: np.ndarray) -> tuple[float, float]:
+        """Return by which part more of the voxels are on their side than in other sides, and its standard error."""
+        classes = measure_classes(self.levels, phases, self.classes) if self.remeasure else self.classes
+        change = (phases[1].astype(np.int8) - start[1]) * (self.levels - classes.middle).astype(np.float64)
+        for axis, n in enumerate(change.shape):
+            change = np.add.reduceat(change, np.arange(0, n, TILE), axis=axis)
+        # A voxel that changes to its side gains (c₁ - c₀) / 2 of this sum in the mean.
+        share = 2 / classes.contrast / sum(int(out.sum()) for out in self.outs)
+        nats = self.worth(phases) - self.worth(start)
+        error = abs(share) * float(np.sqrt(np.square(change).sum()))
+        return nats * self.classes.noise**2 / classes.contrast * share, error
+
+
+def predict_sides(
+    part: Field, outs: Sequence[np.ndarray], classes: Classes, find: Callable[[VoxelEvidence], np.ndarray]
+) -> np.ndarray:
+    """Return the voxels left out, bool (2, Z, Y, X), that are outside and inside of the mask found of the others."""
+    phases = np.zeros((2, *part.shape), dtype=bool)
+    for out in outs:
+        mask = find(grey_evidence(part.values, part, classes, ~out))
+        phases |= np.stack([out & ~mask, out & mask])
+    return phases
+
+
+def measure_classes(levels: np.ndarray, phases: np.ndarray, classes: Classes) -> Classes:
+    """Return the classes of the voxels of two phases (2, Z, Y, X); the old ones where these are few, or the other way
+    round."""
+    outside, inside = (levels[phase].astype(np.float64) for phase in phases)
+    if min(len(outside), len(inside)) < FEWEST or (inside.mean() - outside.mean()) * classes.contrast <= 0:
+        return classes
+    low, high = float(outside.mean()), float(inside.mean())
+    squares = len(outside) * outside.var() + len(inside) * inside.var()
+    noise = max(float(np.sqrt(squares / (len(outside) + len(inside)))), LEAST_NOISE * abs(high - low))
+    return Classes(low, high, noise, (low + high) / 2)
+
+
+def _explained(levels: np.ndarray, phases: np.ndarray) -> float:
+    """Return the sum of squares of the levels in two phases (2, Z, Y, X) that the phases' means explain, negative where
+    the second is the darker one."""
+    outside, inside = (levels[phase].astype(np.float64) for phase in phases)
+    if not len(outside) or not len(inside):
+        return 0.0
+    weight = len(outside) * len(inside) / (len(outside) + len(inside))
+    contrast = float(inside.mean() - outside.mean())
+    return weight * contrast * abs(contrast)
+
+
+def block_edge(values: np.ndarray, inside: np.ndarray) -> int:
+    """Return the edge of a block within which the noise of grey levels may be alike.
+
+    A voxel left out is told by its neighbours' noise where that is correlated: blocks outlast the correlation.
+    """
+    residual = values - np.where(inside, values[inside].mean(), values[~inside].mean())
+    square = float(np.square(residual).mean())
+    for reach in range(1, LONGEST_BLOCK // 2):
+        turned = (np.moveaxis(residual, axis, 0) for axis in range(3))
+        if max(float((rows[reach:] * rows[:-reach]).mean()) for rows in turned) < CORRELATED * square:
+            return 2 * reach
+    return LONGEST_BLOCK
+
+
+def hold_out_masks(shape: Sequence[int], edge: int) -> list[np.ndarray]:
+    """Return `TIMES` disjoint masks, bool of a shape, each of `LEFT_OUT` of the voxels, in random blocks."""
+    coarse = np.random.default_rng(0).random([-(-n // edge) for n in shape])
+    for axis, n in enumerate(shape):
+        coarse = np.repeat(coarse, edge, axis=axis).take(range(n), axis=axis)
+    return [(LEFT_OUT * k <= coarse) & (coarse < LEFT_OUT * (k + 1)) for k in range(TIMES)]

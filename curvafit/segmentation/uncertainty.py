@@ -14,38 +14,29 @@ from scipy.special import entr, expit, logit
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.profile import profile_distance
+from curvafit.scan.grids import centre_distance
 from curvafit.segmentation.slices import Slices, plane_distances, reach
-from curvafit.segmentation.trials import Setting, Task
-
-__all__ = [
-    "NEAR",
-    "RUNS",
-    "Chances",
-    "Flow",
-    "calibration_error",
-    "chances",
-    "entropy",
-    "evidence",
-    "fitted",
-    "near",
-    "probability",
-    "remaining",
-    "suggestions",
-]
+from curvafit.segmentation.trials import Task, Trial
 
 #: Default number of runs.
 RUNS = 8
 #: Distance from a surface, in voxels, within which probabilities are judged.
 NEAR = 3
+#: Greatest weight: where all is right it would grow without end.
+STRONGEST = 20.0
+#: Most voxels that the weights are fitted to.
+MOST = 1_000_000
+#: Bins of the calibration error.
+BINS = 15
 
 #: Interpolates between slices in a way: a level (Z, Y, X), positive inside.
 Level = Callable[[Slices, str], np.ndarray]
 #: Fills a volume between slices by a setting, from a level of its own: a phase field (Z, Y, X), and ε.
-Flow = Callable[[Slices, Setting, np.ndarray, Progress], tuple[np.ndarray, float]]
+Flow = Callable[[Slices, Trial, np.ndarray, Progress], tuple[np.ndarray, float]]
 
 
 @dataclass(frozen=True, eq=False)
-class Chances:
+class ProbabilityMap:
     """Probabilities of the inside.
 
     Attributes
@@ -55,7 +46,7 @@ class Chances:
     error
         The calibration error on the slices that the probabilities were fitted to, near the surface.
     weights
-        Those of `probability.fitted`.
+        Those of `fit_weights`.
     """
 
     values: np.ndarray
@@ -63,17 +54,17 @@ class Chances:
     weights: tuple[float, ...]
 
 
-def chances(
+def estimate_probability(
     task: Task[Slices],
     slices: Slices,
-    setting: Setting,
+    setting: Trial,
     laws: Sequence[Coefficients | None],
     runs: int,
     *,
     level: Level,
     flow: Flow,
     progress: Progress = silent,
-) -> Chances:
+) -> ProbabilityMap:
     """Return the probability of the inside in each voxel between slices.
 
     A few runs are too sure of what they agree on. So the same runs are made on a task, where it is known what is inside
@@ -90,27 +81,24 @@ def chances(
     """
     spread = _spread(task, level(task.given, setting.way))
     tried, target = (
-        _Runs.of(each, level(each, setting.way), setting, laws, spread, count=runs, flow=flow, progress=half)
+        _Ensemble.of(each, level(each, setting.way), setting, laws, spread, count=runs, flow=flow, progress=half)
         for each, half in ((task.given, sub_progress(progress, 0, 0.5)), (slices, sub_progress(progress, 0.5, 1)))
     )
     rows = list(task.places)
-    weights = fitted(tried.evidence(rows), task.truth.ravel())
+    weights = fit_weights(tried.evidence(rows), task.truth.ravel())
     told = tried.probabilities(weights)
-    close = near(told > 0.5)[rows]
+    close = near_surface(told > 0.5)[rows]
     error = calibration_error(told[rows][close], task.truth[close])
-    return Chances(target.probabilities(weights), error, tuple(map(float, weights)))
+    return ProbabilityMap(target.probabilities(weights), error, tuple(map(float, weights)))
 
 
-def near(mask: np.ndarray) -> np.ndarray:
+def near_surface(mask: np.ndarray) -> np.ndarray:
     """Return the voxels whose centres are within `NEAR` voxels of a mask's surface; none where there is no surface."""
-    if mask.all() or not mask.any():
-        return np.zeros(mask.shape, dtype=bool)
-    inner, outer = (np.asarray(ndimage.distance_transform_edt(side)) for side in (mask, ~mask))
-    return np.where(mask, inner, outer) < NEAR + 0.5
+    return np.abs(centre_distance(mask, (1, 1, 1), dtype=np.float64)) < NEAR
 
 
 @dataclass(frozen=True, eq=False)
-class _Runs:
+class _Ensemble:
     """What runs say: how many have a voxel inside, and the mean signed distance to their surfaces."""
 
     slices: Slices
@@ -123,14 +111,14 @@ class _Runs:
         cls,
         slices: Slices,
         level: np.ndarray,
-        setting: Setting,
+        setting: Trial,
         laws: Sequence[Coefficients | None],
         spread: float,
         *,
         count: int,
         flow: Flow,
         progress: Progress,
-    ) -> _Runs:
+    ) -> _Ensemble:
         votes, distance = np.zeros(level.shape, dtype=np.uint16), np.zeros(level.shape, dtype=np.float32)
         for seed in range(count):
             step = sub_progress(progress, seed / count, (seed + 1) / count)
@@ -143,7 +131,7 @@ class _Runs:
     def evidence(self, rows: Sequence[int]) -> np.ndarray:
         """Return the evidence (N, 2) in the voxels of slices that are not known."""
         depth = self.distance[rows] / self.slices.reach[rows, None, None]
-        return evidence(self.votes[rows].ravel(), self.count, depth.ravel())
+        return vote_evidence(self.votes[rows].ravel(), self.count, depth.ravel())
 
     def probabilities(self, weights: np.ndarray) -> np.ndarray:
         values = np.empty(self.votes.shape, dtype=np.float32)
@@ -171,15 +159,7 @@ def _wave(slices: Slices, seed: int) -> np.ndarray:
     return wave / wave.std()
 
 
-#: Greatest weight: where all is right it would grow without end.
-STRONGEST = 20.0
-#: Most voxels that the weights are fitted to.
-MOST = 1_000_000
-#: Bins of the calibration error.
-BINS = 15
-
-
-def evidence(votes: np.ndarray, runs: int, depth: np.ndarray) -> np.ndarray:
+def vote_evidence(votes: np.ndarray, runs: int, depth: np.ndarray) -> np.ndarray:
     """Return two kinds of evidence for the inside, float64 (N, 2): log odds, and the depth below the surface.
 
     Parameters
@@ -193,7 +173,7 @@ def evidence(votes: np.ndarray, runs: int, depth: np.ndarray) -> np.ndarray:
     return np.stack([odds, depth.astype(np.float64)], axis=-1)
 
 
-def fitted(evidence: np.ndarray, inside: np.ndarray) -> np.ndarray:
+def fit_weights(evidence: np.ndarray, inside: np.ndarray) -> np.ndarray:
     """Return the weights under which evidence (N, 2) makes what is inside (N,) most likely: one for each kind, from 0,
     and a constant, by which runs are too thick or too thin.
     """
@@ -234,7 +214,7 @@ def _with_constant(evidence: np.ndarray) -> np.ndarray:
     return np.concatenate([evidence, np.ones_like(evidence[:, :1])], axis=1)
 
 
-def suggestions(entropies: np.ndarray, places: Sequence[int], count: int, periodic: bool = False) -> tuple[int, ...]:
+def suggest_slices(entropies: np.ndarray, places: Sequence[int], count: int, periodic: bool = False) -> tuple[int, ...]:
     """Return the slices to annotate next, the most telling first, each chosen as if those before it were known.
 
     There are fewer where no other slice would tell anything.
@@ -252,7 +232,7 @@ def suggestions(entropies: np.ndarray, places: Sequence[int], count: int, period
     chosen: list[int] = []
     for _ in range(count):
         unknown = [n for n in range(len(left)) if n not in known]
-        after = [remaining(left, known, n, periodic) for n in unknown]
+        after = [remaining_entropy(left, known, n, periodic) for n in unknown]
         sums = [each.sum() for each in after]
         if not sums or min(sums) >= left.sum():
             break
@@ -263,7 +243,9 @@ def suggestions(entropies: np.ndarray, places: Sequence[int], count: int, period
     return tuple(chosen)
 
 
-def remaining(entropies: np.ndarray, places: Sequence[int] | set[int], new: int, periodic: bool = False) -> np.ndarray:
+def remaining_entropy(
+    entropies: np.ndarray, places: Sequence[int] | set[int], new: int, periodic: bool = False
+) -> np.ndarray:
     """Return the entropies (Z,) of the slices once a new one is known.
 
     The uncertain layer of a slice is as thick as its `reach`: in that proportion the entropy falls. A new slice tells

@@ -17,7 +17,7 @@ from curvafit.generation.flow import descend
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
-from curvafit.segmentation.evidence import of_probability
+from curvafit.segmentation.evidence import probability_evidence
 from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.refine import refine
 from curvafit.volumes.field import Field
@@ -143,5 +143,5 @@ def test_evidence_counts_its_nats_once_whatever_the_volume_of_a_part(epsilon: fl
     law = Coefficients(1.5, 0.5, 2.5)
     found = refine(likely, law, weight=0.3, epsilon=epsilon, steps=1)
     assert found.epsilon == epsilon
-    nats = float(of_probability(likely).ratio.sum(dtype=np.float64))
+    nats = float(probability_evidence(likely).ratio.sum(dtype=np.float64))
     assert 0.3 * 2 * gained[0] == pytest.approx(nats, rel=1e-4)  # λ times the stiffness, 0.3 (1.5 + 2.5) / 2

@@ -17,12 +17,12 @@ from found import made_fit
 from curvafit.inference.candidates import Candidate
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.law import preset
-from curvafit.segmentation.engine import TRUSTED, WorkingGrid, law_of, laws_of, stiff
+from curvafit.segmentation.engine import TRUSTED, WorkingGrid, law_of, laws_of, normalise_bending
 from curvafit.segmentation.examples import Example, Odds
 from curvafit.segmentation.reconstruct import MARGIN, STIFFNESS, SlicesProblem, reconstruct, reconstruct_labels
 from curvafit.segmentation.slices import WAYS, Slices
-from curvafit.segmentation.tiles import Tiling, lowered
-from curvafit.segmentation.trials import ODDS, Setting, left_out
+from curvafit.segmentation.tiles import Tiling, lower_volume
+from curvafit.segmentation.trials import ODDS, Trial, leave_out_slices
 from curvafit.volumes.field import Field, ScanError
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
@@ -166,7 +166,7 @@ def test_odds_hold_the_surface_while_the_energy_is_lowered() -> None:
     slices = known(truth, 8)
     level, tiling = odds_of(pancakes(2)).level(slices), Tiling.of(slices.frame, None)
     held, free = (
-        lowered(SlicesProblem(slices, Setting(ODDS, WILLMORE, 1e7, 60, pull), level), tiling).mask
+        lower_volume(SlicesProblem(slices, Trial(ODDS, WILLMORE, 1e7, 60, pull), level), tiling).mask
         for pull in (1e7, 0.0)
     )
     assert (held != truth).sum() < (free != truth).sum()
@@ -181,17 +181,17 @@ def test_a_halo_is_cut_off_again() -> None:
         scan = Field(values, spacing)
         bare, place = (WorkingGrid.of(scan, None, halo=halo) for halo in (0, 5))
         assert place.grid.shape == tuple(n + 10 for n in bare.grid.shape) and place.grid.spacing == bare.grid.spacing
-        np.testing.assert_array_equal(place.back(place.finer(values)), bare.back(bare.finer(values)))
-        assert torch.equal(place.finer(values)[0], place.finer(values)[5])  # the last values go on
+        np.testing.assert_array_equal(place.to_scan(place.to_grid(values)), bare.to_scan(bare.to_grid(values)))
+        assert torch.equal(place.to_grid(values)[0], place.to_grid(values)[5])  # the last values go on
         shared = place.spread(values, centre=0)
-        np.testing.assert_array_equal(place.back(shared), bare.back(bare.spread(values, centre=0)))
+        np.testing.assert_array_equal(place.to_scan(shared), bare.to_scan(bare.spread(values, centre=0)))
         assert float(shared.sum()) == pytest.approx(float(bare.spread(values, centre=0).sum()), rel=1e-5)
     whole = WorkingGrid.of(Field(values), None, halo=5, periodic=True)
     assert whole.grid.periodic and whole.grid.shape == values.shape
 
 
 def test_a_law_s_scale_does_not_matter_to_the_engine() -> None:
-    one, other = stiff(WILLMORE), stiff(WILLMORE.scaled(7.5))
+    one, other = normalise_bending(WILLMORE), normalise_bending(WILLMORE.scaled(7.5))
     assert other.as_dict() == pytest.approx(one.as_dict()) and one.a20 + one.a02 == pytest.approx(2)
 
 
@@ -205,17 +205,17 @@ def test_a_law_s_scale_does_not_matter_to_the_engine() -> None:
 def test_every_second_slice_is_left_out(count: int, periodic: bool, out: list[int]) -> None:
     mask = ball()
     places = tuple(range(8, 8 + 4 * count, 4))
-    task = left_out(Slices(mask[list(places)], places, len(mask), EDGES, periodic=periodic))
+    task = leave_out_slices(Slices(mask[list(places)], places, len(mask), EDGES, periodic=periodic))
     assert task is not None and list(task.places) == [places[k] for k in out]
     assert task.given.places == tuple(place for k, place in enumerate(places) if k not in out)
     assert np.array_equal(task.truth, mask[task.places])
 
 
 def test_there_may_be_too_few_slices_to_leave_any_out() -> None:
-    assert left_out(known(ball(), 20)) is None
+    assert leave_out_slices(known(ball(), 20)) is None
     middle = np.zeros((3, 4, 4), dtype=bool)
     middle[1, 1:3, 1:3] = True  # the others are empty
-    assert left_out(Slices(middle, (0, 4, 8), 9, EDGES)) is None
+    assert leave_out_slices(Slices(middle, (0, 4, 8), 9, EDGES)) is None
 
 
 def test_no_prior_helps_where_the_interpolation_is_exact() -> None:

@@ -16,8 +16,8 @@ from scipy import ndimage
 
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation import Refine, calibrate, refine
-from curvafit.segmentation.evidence import of_probability
-from curvafit.segmentation.refine import chances_of
+from curvafit.segmentation.evidence import probability_evidence
+from curvafit.segmentation.refine import load_probabilities
 from curvafit.volumes.field import Field
 from curvafit.volumes.read import load
 from curvafit.volumes.write import save
@@ -50,12 +50,12 @@ def dice(a: np.ndarray, b: np.ndarray) -> float:
 def test_a_probability_is_its_own_evidence() -> None:
     p = np.random.default_rng(0).random((6, 7, 8)).astype(np.float32)
     p[0, 0, :2] = 0, 1
-    found = of_probability(Field(p))
+    found = probability_evidence(Field(p))
     np.testing.assert_allclose(1 / (1 + np.exp(-found.ratio.astype(float))), p.clip(1e-4, 1 - 1e-4), atol=1e-6)
     assert np.array_equal(found.level > 0, p > 0.5)
     for bad in (2 * p, p - 1e-3):
         with pytest.raises(ValueError, match="probabilities"):
-            of_probability(Field(bad))
+            probability_evidence(Field(bad))
 
 
 #: Turned about z, with the shift and the mirrored axis of a real scanner.
@@ -76,18 +76,18 @@ def predicted(folder: Path, name: str, p: np.ndarray) -> Path:
 def test_nnu_net_s_probabilities_lie_where_its_segmentation_does(tmp_path: Path) -> None:
     p = np.random.default_rng(0).random((5, 6, 7)).astype(np.float32)
     path = predicted(tmp_path, "case.7", p)
-    found, image = chances_of(path, channel=1), load(tmp_path / "case.7.nii.gz")
+    found, image = load_probabilities(path, channel=1), load(tmp_path / "case.7.nii.gz")
     np.testing.assert_allclose(found.values, p, atol=1e-3)
     assert (found.spacing, found.unit) == (image.spacing, "mm") and found.spacing == pytest.approx(
         (1.2, 0.4, 0.5), 2e-3
     )
     assert np.array_equal(found.affine, image.affine)  # type: ignore[arg-type]
-    np.testing.assert_allclose(chances_of(path, channel=0).values, 1 - p, atol=1e-3)
-    part = chances_of(path, channel=1, crop="1:,:4,2:")
+    np.testing.assert_allclose(load_probabilities(path, channel=0).values, 1 - p, atol=1e-3)
+    part = load_probabilities(path, channel=1, crop="1:,:4,2:")
     np.testing.assert_array_equal(part.affine @ [0, 0, 0, 1], image.affine @ [2, 0, 1, 1])  # type: ignore[operator]
-    told = chances_of(path, channel=1, spacing=2.0, unit="um")
+    told = load_probabilities(path, channel=1, spacing=2.0, unit="um")
     assert (told.spacing, told.unit, told.affine) == ((2.0, 2.0, 2.0), "um", None)
-    alike = chances_of(p, like=tmp_path / "case.7.nii.gz")
+    alike = load_probabilities(p, like=tmp_path / "case.7.nii.gz")
     assert alike.spacing == image.spacing and np.array_equal(alike.affine, image.affine)  # type: ignore[arg-type]
 
 
@@ -111,7 +111,7 @@ def test_a_place_that_does_not_fit_is_refused(options, word, tmp_path, monkeypat
     predicted(tmp_path, "case", np.random.default_rng(0).random((5, 6, 7)))
     np.save("other.npy", np.zeros((3, 3, 3)))
     with pytest.raises(ValueError, match=word):
-        chances_of("case.npz", **({"channel": 1} | options if options else {}))
+        load_probabilities("case.npz", **({"channel": 1} | options if options else {}))
 
 
 # ---- what comes out --------------------------------------------------------------------------------------------------
@@ -141,8 +141,8 @@ def test_an_example_chooses_a_weight_that_helps_elsewhere() -> None:
     learned = calibrate(network(one, 0), one, WILLMORE, steps=150)
     found = refine(p, WILLMORE, example=learned, steps=150)
     assert dice(found.mask.values, other) > dice(p > 0.5, other) + 0.05
-    assert found.coefficients == WILLMORE and found.weight == learned.choice.setting.strength
-    assert f"the prior helps, at {found.weight:g} nats: Dice {learned.choice.dice:.3f} on the example" in found.status
+    assert found.coefficients == WILLMORE and found.weight == learned.trial.strength
+    assert f"the prior helps, at {found.weight:g} nats: Dice {learned.trial.score:.3f} on the example" in found.status
     again = refine(p, WILLMORE, example=(network(one, 0), one), steps=150)
     assert np.array_equal(again.mask.values, found.mask.values) and again.status == found.status
 

@@ -16,7 +16,7 @@ from skimage.filters import threshold_otsu
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.law import preset
 from curvafit.segmentation.engine import WorkingGrid, law_of
-from curvafit.segmentation.evidence import VoxelEvidence, classes_of, grey_levels, of_classes
+from curvafit.segmentation.evidence import VoxelEvidence, estimate_classes, grey_evidence, grey_levels
 from curvafit.segmentation.segment import segment
 from curvafit.volumes.field import Field
 
@@ -46,7 +46,7 @@ def dice(a: np.ndarray, b: np.ndarray) -> float:
 
 def of_intensities(scan: Field, threshold: float | str = "otsu", dark: bool = False) -> VoxelEvidence:
     values = grey_levels(scan, threshold)
-    return of_classes(values, scan, classes_of(values, scan, threshold, dark))
+    return grey_evidence(values, scan, estimate_classes(values, scan, threshold, dark))
 
 
 def test_intensities_find_the_classes_and_the_noise() -> None:
@@ -63,9 +63,10 @@ def test_intensities_find_the_classes_and_the_noise() -> None:
 def test_voxels_that_are_left_out_say_nothing() -> None:
     scan = noisy(tubes(), 25)
     known = np.random.default_rng(0).random(scan.shape) < 0.75
-    classes = classes_of(scan.values, scan)
+    classes = estimate_classes(scan.values, scan)
     one, other = (
-        of_classes(np.where(known, scan.values, level).astype(np.float32), scan, classes, known) for level in (0, 1e4)
+        grey_evidence(np.where(known, scan.values, level).astype(np.float32), scan, classes, known)
+        for level in (0, 1e4)
     )
     assert not one.ratio[~known].any()
     np.testing.assert_array_equal(one.ratio, other.ratio)
@@ -116,7 +117,7 @@ def test_axes_are_refined_and_brought_back() -> None:
     values = np.random.default_rng(0).random((6, 7, 8)).astype(np.float32)
     shared = place.spread(values)
     assert float(shared.sum()) == pytest.approx(float(values.sum()), rel=1e-5)
-    np.testing.assert_allclose(place.back(3 * shared), values, rtol=1e-6)
+    np.testing.assert_allclose(place.to_scan(3 * shared), values, rtol=1e-6)
     held = place.spread(values, centre=0)
     np.testing.assert_array_equal(held[1::3].numpy(), values)
     assert not held[0::3].any() and not held[2::3].any()

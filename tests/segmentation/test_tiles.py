@@ -66,14 +66,14 @@ def test_tiles_hold_each_voxel_once(shape, spacing, edge: int, periodic: bool) -
 def test_a_tile_s_grid_has_the_halo_where_the_volume_ends() -> None:
     tiling = Tiling.of(frame((75, 40, 9), (1.0, 1.0, 2.0)), None, 40)
     values = np.random.default_rng(0).random((75, 40, 9)).astype(np.float32)
-    whole = tiling.place.finer(values)
+    whole = tiling.place.to_grid(values)
     for tile in tiling.tiles:
         place = tiling.place_of(tile)
-        part = place.finer(values[tile.box])
+        part = place.to_grid(values[tile.box])
         assert tuple(part.shape) == place.grid.shape
-        np.testing.assert_allclose(place.back(part), tiling.place.back(whole)[tile.box], atol=1e-6)
+        np.testing.assert_allclose(place.to_scan(part), tiling.place.to_scan(whole)[tile.box], atol=1e-6)
         np.testing.assert_array_equal(
-            place.back(place.spread(values[tile.box])), tiling.place.back(tiling.place.spread(values))[tile.box]
+            place.to_scan(place.spread(values[tile.box])), tiling.place.to_scan(tiling.place.spread(values))[tile.box]
         )
 
 

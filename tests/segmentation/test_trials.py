@@ -10,28 +10,24 @@ from scipy import ndimage
 
 import curvafit.segmentation.trials as room
 from curvafit.priors.coefficients import Coefficients
-from curvafit.segmentation.evidence import Classes, classes_of, grey_levels
+from curvafit.segmentation.evidence import Classes, estimate_classes, grey_levels
 from curvafit.segmentation.refine import FIRST, NATS, PLAIN
 from curvafit.segmentation.segment import segment
-from curvafit.segmentation.slices import Slices
+from curvafit.segmentation.slices import Slices, box_with_most_surface
 from curvafit.segmentation.trials import (
     EDGE,
     TIMES,
     WEIGHTS,
-    Choice,
     Judge,
-    Setting,
     Task,
-    Weighing,
+    Trial,
     block_edge,
-    choice,
-    climbed,
-    densest,
+    choose_by_masks,
+    choose_by_voxels,
     hold_out_masks,
     measure_classes,
     predict_sides,
-    trial_steps,
-    weighing,
+    search,
 )
 from curvafit.volumes.field import Field, ScanError
 
@@ -54,58 +50,58 @@ def every_twelfth(mask: np.ndarray) -> Slices:
     return Slices(mask[list(places)], places, len(mask), (1.0, 1.0, 1.0))
 
 
-def decided(better: np.ndarray) -> Choice:
+def decided(better: np.ndarray) -> Trial:
     """The choice between interpolations of a ball and a prior that fills with `better`."""
     mask, slices = ball(), every_twelfth(ball())
     between = [n for n in range(36) if n % 12]
 
-    def filled(given: Slices, setting: Setting) -> np.ndarray:
+    def filled(given: Slices, setting: Trial) -> np.ndarray:
         return given.level(setting.way) > 0 if setting.law is None else better
 
-    return choice(Task(slices, mask[between], between), lambda way: [Setting(way, WILLMORE, 1.0, 1)], filled)
+    return choose_by_masks(Task(slices, mask[between], between), lambda way: [Trial(way, WILLMORE, 1.0, 1)], filled)
 
 
 def test_a_prior_is_taken_where_it_is_better_only() -> None:
     best = decided(ball())
-    assert best.setting.law is WILLMORE and best.dice == 1 > best.plain
+    assert best.law is WILLMORE and best.score == 1 > best.plain
     plain = decided(np.zeros((48, 48, 48), dtype=bool))
-    assert plain.setting.law is None and plain.dice == 0 and plain.plain == best.plain
-    same = decided(every_twelfth(ball()).level(plain.setting.way) > 0)
-    assert same.setting == plain.setting and same.noise == 0
+    assert plain.law is None and plain.score == 0 and plain.plain == best.plain
+    same = decided(every_twelfth(ball()).level(plain.way) > 0)
+    assert same.law is None and same.way == plain.way and same.noise == 0
 
 
 def test_a_gain_within_the_noise_is_none() -> None:
     """A single voxel is one tile's gain: as large as its standard error, (T - 1) / T of it being the jackknife's."""
-    way = decided(ball()).setting.way
+    way = decided(ball()).way
     start = every_twelfth(ball()).level(way) > 0
     wrong = np.argwhere(start != ball())
     wrong = wrong[(wrong[:, 0] < 36) & (wrong[:, 0] % 12 > 0)]
     better = start.copy()
     better[tuple(wrong[0])] ^= True
     best = decided(better)
-    assert best.setting.law is None and best.dice > best.plain
+    assert best.law is None and best.score > best.plain
 
 
 def test_a_climb_ends_at_the_best_on_either_side() -> None:
-    def neighbour(number: int, step: int) -> int | None:
-        return number + step if 0 <= number + step < len(heights) else None
-
     for heights, first, best in (([5, 1, 2, 3, 4], 2, 4), ([5, 4, 3, 1, 9], 2, 0), ([1, 2, 1], 1, 1), ([7], 0, 0)):
-        assert climbed(first, neighbour, heights.__getitem__) == best
+        found = search(
+            [Trial(PLAIN, None, first)], range(len(heights)), lambda trial, h=heights: h[int(trial.strength)]
+        )
+        assert found.strength == best
 
 
 def test_strengths_are_tried_as_long_as_they_are_better() -> None:
     truth, tried = ball(26), []
 
-    def fill(given: None, setting: Setting) -> np.ndarray:
+    def fill(given: None, setting: Trial) -> np.ndarray:
         tried.append(setting)
         wrong = 1 if setting.law is None else 1 - 0.1 * [*NATS].index(setting.strength)
         return truth & (np.random.default_rng(0).random(truth.shape) > 0.3 * wrong)
 
     other = WILLMORE.scaled(2)
-    settings = [Setting(PLAIN, law, FIRST, 1) for law in (WILLMORE, other)]
-    best = choice(Task(None, truth, range(len(truth))), lambda _: settings, fill, (PLAIN,), NATS)
-    assert best.setting == Setting(PLAIN, WILLMORE, NATS[-1], 1) and len(tried) == len(set(tried))
+    settings = [Trial(PLAIN, law, FIRST, 1) for law in (WILLMORE, other)]
+    best = choose_by_masks(Task(None, truth, range(len(truth))), lambda _: settings, fill, (PLAIN,), NATS)
+    assert (best.way, best.law, best.strength) == (PLAIN, WILLMORE, NATS[-1]) and len(tried) == len(set(tried))
     assert {setting.strength for setting in tried if setting.law is WILLMORE} == {3.0, *NATS[NATS.index(FIRST) :]}
     assert [setting.strength for setting in tried if setting.law is other] == [FIRST, NATS[-1]]
 
@@ -115,10 +111,10 @@ def test_errors_side_by_side_are_one() -> None:
     truth = np.ones((16, 16, 32), dtype=bool)
     half = np.arange(32) < 16
 
-    def fill(given: None, setting: Setting) -> np.ndarray:
+    def fill(given: None, setting: Trial) -> np.ndarray:
         return truth if setting.law is None else truth & half
 
-    best = choice(Task(None, truth, range(16)), lambda way: [Setting(way, WILLMORE, 1.0, 1)], fill, (PLAIN,))
+    best = choose_by_masks(Task(None, truth, range(16)), lambda way: [Trial(way, WILLMORE, 1.0, 1)], fill, (PLAIN,))
     assert best.noise == pytest.approx(math.sqrt(1 / 4))  # without the one cube 0, without the other -1
 
 
@@ -139,9 +135,9 @@ def noisy(mask: np.ndarray, noise: float, width: float = 0.0) -> Field:
     return Field((30 + 100 * mask + noise * values).astype(np.float32), (1.0, 1.0, 1.0))
 
 
-def weighed(scan: Field, laws, **options) -> Weighing:
+def weighed(scan: Field, laws, **options) -> tuple[Trial, Classes]:
     values = grey_levels(scan)
-    return weighing(values, scan, classes_of(values, scan), laws, **{"steps": 100, **options})
+    return choose_by_voxels(values, scan, estimate_classes(values, scan), laws, **{"steps": 100, **options})
 
 
 def test_what_is_left_out_comes_in_blocks_and_once() -> None:
@@ -163,7 +159,7 @@ def test_blocks_outlast_the_noise(width: float, edge: int) -> None:
 def test_the_part_that_is_tried_is_where_the_surface_is() -> None:
     inside = np.zeros((30, 150, 90), dtype=bool)
     inside[:, 100:140, 5:25] = np.random.default_rng(0).random((30, 40, 20)) < 0.5
-    z, y, x = densest(inside, (EDGE,) * 3)
+    z, y, x = box_with_most_surface(inside, (EDGE,) * 3)
     assert (z.start, z.stop) == (0, 30) and y.stop - y.start == x.stop - x.start == EDGE
     assert y.start <= 100 and y.stop >= 140 and x.start <= 5 and x.stop <= 90
 
@@ -174,17 +170,17 @@ def test_the_law_that_tells_more_is_chosen_and_classes_that_overlap_are_measured
     their means are nearer to each other."""
     wrong = Coefficients(1.0, 0.0, 1.0, 3.0, 3.0, 9.0)
     scan, said = noisy(tubes(28), 150), list[float]()
-    first = classes_of(grey_levels(scan), scan)
-    best = weighed(scan, [wrong, WILLMORE], progress=lambda _, share: said.append(share))
-    assert best.law == WILLMORE and best.gain > best.noise > 0 and best.nats in WEIGHTS
-    assert abs(first.middle - 80) > 1.3 * abs(best.classes.middle - 80)
-    assert 80 > first.contrast < best.classes.contrast < 110 and best.classes.noise == pytest.approx(150, rel=0.03)
+    first = estimate_classes(grey_levels(scan), scan)
+    best, classes = weighed(scan, [wrong, WILLMORE], progress=lambda _, share: said.append(share))
+    assert best.law == WILLMORE and best.score > best.noise > 0 and best.strength in WEIGHTS
+    assert abs(first.middle - 80) > 1.3 * abs(classes.middle - 80)
+    assert 80 > first.contrast < classes.contrast < 110 and classes.noise == pytest.approx(150, rel=0.03)
     assert said == sorted(said) and said[0] > 0 and said[-1] <= 1
 
 
 def test_classes_that_are_known_stay() -> None:
     scan = noisy(tubes(28), 150)
-    assert weighed(scan, [WILLMORE], measured=False, steps=5).classes == classes_of(grey_levels(scan), scan)
+    assert weighed(scan, [WILLMORE], remeasure=False, steps=5)[1] == estimate_classes(grey_levels(scan), scan)
 
 
 @pytest.mark.parametrize("measured", [False, True])
@@ -208,8 +204,8 @@ def test_where_a_prior_tells_nothing_the_start_is_the_answer() -> None:
     truth = tubes(28)
     scan = noisy(truth, 5)
     wrong = Coefficients(1.0, 0.0, 1.0, 30.0, 30.0, 900.0)
-    best = weighed(scan, [wrong], steps=30)
-    assert best.law is None and best.classes == classes_of(grey_levels(scan), scan)
+    best, classes = weighed(scan, [wrong], steps=30)
+    assert best.law is None and classes == estimate_classes(grey_levels(scan), scan)
     found = segment(scan, wrong, steps=30)
     assert (found.mask.values != truth).mean() < 0.01
 
@@ -234,18 +230,14 @@ def test_sides_are_judged_without_the_classes_that_made_them() -> None:
 
 
 def test_a_flow_that_fails_is_no_choice(monkeypatch: pytest.MonkeyPatch) -> None:
-    real = room.weighed
+    real = room.lower_with_evidence
 
     def failing(known, law, *rest):
         if law != WILLMORE:
             raise ScanError("expected an energy that stays finite")
         return real(known, law, *rest)
 
-    monkeypatch.setattr(room, "weighed", failing)
+    monkeypatch.setattr(room, "lower_with_evidence", failing)
     scan = noisy(tubes(28), 150)
-    assert weighed(scan, [TUBE, WILLMORE], steps=60, measured=False).law == WILLMORE
-    assert weighed(scan, [TUBE], steps=60, measured=False).law is None
-
-
-def test_trying_takes_as_many_steps_as_is_forecast() -> None:
-    assert trial_steps(2, 20, 10**6) < trial_steps(2, 20, 10**5) == pytest.approx(TIMES * 8 * 20)
+    assert weighed(scan, [TUBE, WILLMORE], steps=60, remeasure=False)[0].law == WILLMORE
+    assert weighed(scan, [TUBE], steps=60, remeasure=False)[0].law is None

@@ -12,22 +12,22 @@ from found import made_fit
 from curvafit.inference.fit import Draws
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.engine import drawn_laws
-from curvafit.segmentation.examples import grown
+from curvafit.segmentation.examples import grow_task
 from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.slices import Slices, reach
-from curvafit.segmentation.trials import Setting, Task
+from curvafit.segmentation.trials import Task, Trial
 from curvafit.segmentation.uncertainty import (
     BINS,
     RUNS,
     calibration_error,
-    chances,
     entropy,
-    evidence,
-    fitted,
-    near,
+    estimate_probability,
+    fit_weights,
+    near_surface,
     probability,
-    remaining,
-    suggestions,
+    remaining_entropy,
+    suggest_slices,
+    vote_evidence,
 )
 from curvafit.volumes.field import Field
 
@@ -76,7 +76,7 @@ def test_labels_drawn_by_their_probability_are_calibrated() -> None:
     p = rng.random(100_000)
     inside, noise = rng.random(len(p)) < p, np.sqrt(BINS / len(p)) / 2
     assert calibration_error(p, inside) < 5 * noise
-    overconfident = probability(evidence(np.zeros(len(p)), 1, np.log(p / (1 - p))), np.array([0.0, 2.0, 0.0]))
+    overconfident = probability(vote_evidence(np.zeros(len(p)), 1, np.log(p / (1 - p))), np.array([0.0, 2.0, 0.0]))
     gap = float(np.abs(overconfident - p).mean())
     assert abs(calibration_error(overconfident, inside) - gap) < 5 * noise + 1 / BINS  # within a bin p varies by 1 / 15
 
@@ -85,27 +85,27 @@ def test_the_weights_are_those_by_which_labels_were_drawn() -> None:
     """The error of the likeliest weights has the inverse Fisher information for its covariance."""
     rng = np.random.default_rng(1)
     votes, depth, weights = rng.integers(0, 9, 40_000), rng.normal(size=40_000), np.array([0.5, 2.0, -0.7])
-    signs = evidence(votes, 8, depth)
+    signs = vote_evidence(votes, 8, depth)
     p = probability(signs, weights)
     inside = rng.random(len(p)) < p
     columns = np.column_stack([signs, np.ones(len(p))])
     noise = np.sqrt(np.diag(np.linalg.inv(columns.T @ (columns * (p * (1 - p))[:, None]))))
-    found = fitted(signs, inside)
+    found = fit_weights(signs, inside)
     assert (np.abs(found - weights) < 5 * noise).all()
-    other = fitted(-signs, ~inside)  # what is inside is named outside
+    other = fit_weights(-signs, ~inside)  # what is inside is named outside
     assert other == pytest.approx(found * [1, 1, -1], rel=1e-4)
 
 
 def test_evidence_has_no_side() -> None:
     votes, depth = np.arange(9), np.linspace(-2, 2, 9)
-    np.testing.assert_allclose(evidence(8 - votes, 8, -depth), -evidence(votes, 8, depth), atol=1e-12)
+    np.testing.assert_allclose(vote_evidence(8 - votes, 8, -depth), -vote_evidence(votes, 8, depth), atol=1e-12)
 
 
 def test_what_is_always_right_gets_weights_that_end() -> None:
     votes = np.repeat([0, 8], 50)
-    weights = fitted(evidence(votes, 8, votes - 4.0), votes > 4)
+    weights = fit_weights(vote_evidence(votes, 8, votes - 4.0), votes > 4)
     assert np.isfinite(weights).all()
-    assert calibration_error(probability(evidence(votes, 8, votes - 4.0), weights), votes > 4) < 1e-3
+    assert calibration_error(probability(vote_evidence(votes, 8, votes - 4.0), weights), votes > 4) < 1e-3
 
 
 def test_the_entropy_of_certainty_is_none() -> None:
@@ -116,19 +116,22 @@ def test_the_entropy_of_certainty_is_none() -> None:
 def test_near_is_within_three_voxels() -> None:
     mask = np.zeros((20, 4, 4), dtype=bool)
     mask[10:] = True
-    assert near(mask)[:, 0, 0].nonzero()[0].tolist() == [7, 8, 9, 10, 11, 12]
-    assert not near(np.zeros((4, 4, 4), dtype=bool)).any() and not near(np.ones((4, 4, 4), dtype=bool)).any()
+    assert near_surface(mask)[:, 0, 0].nonzero()[0].tolist() == [7, 8, 9, 10, 11, 12]
+    assert (
+        not near_surface(np.zeros((4, 4, 4), dtype=bool)).any()
+        and not near_surface(np.ones((4, 4, 4), dtype=bool)).any()
+    )
 
 
 # ---- runs ------------------------------------------------------------------------------------------------------------
 
 
-def still(slices: Slices, setting: Setting, start: np.ndarray, progress) -> tuple[np.ndarray, float]:
+def still(slices: Slices, setting: Trial, start: np.ndarray, progress) -> tuple[np.ndarray, float]:
     """A flow that forgets where it starts: the interpolation itself."""
     return np.tanh(slices.level(setting.way) / np.sqrt(8)), 2.0
 
 
-def moved(slices: Slices, setting: Setting, start: np.ndarray, progress) -> tuple[np.ndarray, float]:
+def moved(slices: Slices, setting: Trial, start: np.ndarray, progress) -> tuple[np.ndarray, float]:
     """A flow that stays where it starts."""
     return np.tanh(start / np.sqrt(8)), 2.0
 
@@ -141,9 +144,11 @@ def task(mask: np.ndarray, places: list[int], *, periodic: bool = False) -> Task
 def test_a_mirrored_volume_has_mirrored_probabilities() -> None:
     mask, places = ball() | np.roll(ball(radius=5), 9, 0), [0, 6, 12, 15, 24, 31]
     mirrored = sorted(31 - n for n in places)
-    one = chances(task(mask, places), known(mask, places), Setting("spline"), [None], 2, level=Slices.level, flow=still)
+    one = estimate_probability(
+        task(mask, places), known(mask, places), Trial("spline"), [None], 2, level=Slices.level, flow=still
+    )
     turned = task(mask[::-1], mirrored), known(mask[::-1], mirrored)
-    other = chances(*turned, Setting("spline"), [None], 2, level=Slices.level, flow=still)
+    other = estimate_probability(*turned, Trial("spline"), [None], 2, level=Slices.level, flow=still)
     np.testing.assert_allclose(other.values[::-1], one.values, atol=1e-3)
     assert other.error == pytest.approx(one.error, abs=1e-3)
 
@@ -151,7 +156,7 @@ def test_a_mirrored_volume_has_mirrored_probabilities() -> None:
 def test_runs_disagree_between_known_slices_alone() -> None:
     mask, places = ball(), [0, 8, 16, 24, 31]
     same = task(mask, places), known(mask, places)
-    odds = chances(*same, Setting("spline"), [None], RUNS, level=Slices.level, flow=moved)
+    odds = estimate_probability(*same, Trial("spline"), [None], RUNS, level=Slices.level, flow=moved)
     assert np.array_equal(odds.values[places], mask[places])
     assert odds.values.min() >= 0 and odds.values.max() <= 1
     unsure = entropy(odds.values).sum((1, 2))
@@ -160,7 +165,7 @@ def test_runs_disagree_between_known_slices_alone() -> None:
 
 def test_a_grown_task_has_the_volume_s_slices() -> None:
     slices = known(ball(), [0, 5, 10, 31])
-    same = grown(slices, WILLMORE, None)
+    same = grow_task(slices, WILLMORE, None)
     assert same.given.places == slices.places and same.given.length == 32
     assert [*same.places] == [n for n in range(32) if n not in slices.places]
     assert same.truth.shape == (28, 32, 32) and same.given.inside.any() and not same.given.inside.all()
@@ -171,7 +176,7 @@ def test_a_law_of_which_no_shape_grows_is_refused() -> None:
     mask = np.zeros((16, 32, 32), dtype=bool)
     mask[:, :1, :2] = True
     with pytest.raises(ValueError, match="grows"):
-        grown(known(mask, [0, 8, 15]), WILLMORE, None)
+        grow_task(known(mask, [0, 8, 15]), WILLMORE, None)
 
 
 # ---- reconstruct -----------------------------------------------------------------------------------------------------
@@ -232,25 +237,25 @@ PLACES = [0, 7, 20, 22, 39]
 
 
 def test_suggestions_are_unknown_slices_in_any_order_of_the_known() -> None:
-    found = suggestions(ENTROPIES, PLACES, 6)
+    found = suggest_slices(ENTROPIES, PLACES, 6)
     assert len(set(found)) == 6 and not set(found) & set(PLACES)
-    assert suggestions(ENTROPIES, PLACES[::-1], 6) == found
-    assert suggestions(ENTROPIES, PLACES, 3) == found[:3]
+    assert suggest_slices(ENTROPIES, PLACES[::-1], 6) == found
+    assert suggest_slices(ENTROPIES, PLACES, 3) == found[:3]
 
 
 def test_a_mirrored_volume_has_mirrored_suggestions() -> None:
-    mirrored = suggestions(ENTROPIES[::-1], [39 - n for n in PLACES], 6)
-    assert tuple(39 - n for n in mirrored) == suggestions(ENTROPIES, PLACES, 6)
+    mirrored = suggest_slices(ENTROPIES[::-1], [39 - n for n in PLACES], 6)
+    assert tuple(39 - n for n in mirrored) == suggest_slices(ENTROPIES, PLACES, 6)
 
 
 @pytest.mark.parametrize("periodic", [False, True])
 def test_each_suggestion_lowers_the_entropy(periodic: bool) -> None:
     left, places = ENTROPIES.copy(), list(PLACES)
     left[places] = 0
-    for new in suggestions(left, PLACES, 5, periodic):
-        after = remaining(left, places, new, periodic)
+    for new in suggest_slices(left, PLACES, 5, periodic):
+        after = remaining_entropy(left, places, new, periodic)
         assert (after <= left).all() and after[new] == 0 and after.sum() < left.sum()
-        others = [remaining(left, places, n, periodic).sum() for n in range(40) if n not in places]
+        others = [remaining_entropy(left, places, n, periodic).sum() for n in range(40) if n not in places]
         assert after.sum() == min(others)
         left, places = after, [*places, new]
 
@@ -258,11 +263,11 @@ def test_each_suggestion_lowers_the_entropy(periodic: bool) -> None:
 def test_an_even_gap_is_halved_and_the_most_uncertain_comes_first() -> None:
     flat = np.ones(33)
     flat[[0, 16, 32]] = 0
-    assert sorted(suggestions(flat, [0, 16, 32], 2)) == [8, 24]
+    assert sorted(suggest_slices(flat, [0, 16, 32], 2)) == [8, 24]
     flat[17:32] *= 2
-    assert suggestions(flat, [0, 16, 32], 1) == (24,)
+    assert suggest_slices(flat, [0, 16, 32], 1) == (24,)
 
 
 def test_where_nothing_is_open_nothing_is_suggested() -> None:
-    assert suggestions(np.zeros(10), [0, 9], 3) == ()
-    assert suggestions(np.ones(4), [0, 1, 2], 3) == (3,)
+    assert suggest_slices(np.zeros(10), [0, 9], 3) == ()
+    assert suggest_slices(np.ones(4), [0, 1, 2], 3) == (3,)
