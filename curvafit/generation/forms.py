@@ -44,7 +44,9 @@ class Form(Protocol):
 
 @dataclass(frozen=True)
 class DivergenceForm:
-    """u = k ∗ (div A + base), whose mass is the base's for every A (paper, Algorithm 1; H⁻¹ flow).
+    """u = k ∗ (div A + base), whose mass is the base's for every A (paper, eq. 24 and Algorithm 1).
+
+    The descent of A is the H⁻¹ flow ∂u/∂t = Δ ∂F_ε/∂u (eq. 2): ∂F_ε/∂A = -∇ ∂F_ε/∂u moves u by the divergence of that.
 
     Parameters
     ----------

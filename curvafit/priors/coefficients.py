@@ -23,7 +23,7 @@ STRONGEST = 1e6
 
 @dataclass(frozen=True)
 class Coefficients:
-    """p(κ1, κ2) = a20 κ1² + a11 κ1κ2 + a02 κ2² + a10 κ1 + a01 κ2 + a00 with κ1 ≥ κ2 (eq. `F`).
+    """p(κ1, κ2) = a20 κ1² + a11 κ1κ2 + a02 κ2² + a10 κ1 + a01 κ2 + a00 with κ1 ≥ κ2 (paper, eq. 6).
 
     The values are numbers, or tensors that broadcast with the voxels (coefficients that vary in space or over a batch).
     Lengths are in the unit of the grid's spacing; the published values are in working units (spacing 0.01).
@@ -100,7 +100,7 @@ class Coefficients:
 
     @classmethod
     def from_b(cls, h2, H0, k1, alpha, kappa1, beta, kappa2) -> Coefficients:
-        """Expand h2 (H - H0)² + k1 K + α (κ1 - κ1⁰)² + β (κ2 - κ2⁰)² (eq. `redundant`)."""
+        """Expand h2 (H - H0)² + k1 K + α (κ1 - κ1⁰)² + β (κ2 - κ2⁰)² (paper, eq. 26)."""
         return cls(
             h2 + alpha,
             2 * h2 + k1,
@@ -112,12 +112,12 @@ class Coefficients:
 
     @classmethod
     def helfrich(cls, bending: float, gaussian: float = 0.0, spontaneous: float = 0.0) -> Coefficients:
-        """Return Helfrich's χ_b/2 (H - H0)² + χ_G K with H = κ1 + κ2 (eq. `Helfrich`)."""
+        """Return Helfrich's χ_b/2 (H - H0)² + χ_G K with H = κ1 + κ2 (paper, eq. 3)."""
         return cls.from_b(bending / 2, spontaneous, gaussian, 0, 0, 0, 0)
 
     @classmethod
     def willmore(cls) -> Coefficients:
-        """Return Willmore's H² (eq. `Willmore`)."""
+        """Return Willmore's H² (paper, eq. 5)."""
         return cls(1, 2, 1)
 
     @classmethod

@@ -55,7 +55,7 @@ def jet(u: Tensor, grid: Grid) -> Jet:
 
 
 def second_form(field: Jet, epsilon: float | Tensor, xi: float = XI) -> SecondForm:
-    """Return the invariants of M_ε = -ε Hess u + W'(u)/ε n⊗n (eq. `Meps`), where n⊗n = ∇u⊗∇u / (|∇u|² + ξ²).
+    """Return the invariants of M_ε = -ε Hess u + W'(u)/ε n⊗n (paper, eq. 7), where n⊗n = ∇u⊗∇u / (|∇u|² + ξ²).
 
     ε is a number or a tensor that broadcasts with the field.
 
@@ -95,7 +95,7 @@ def positive_root(square: Tensor, squares: Tensor) -> Tensor:
 
 
 def diffuse_curvatures(field: Jet, epsilon: float | Tensor) -> Curvatures:
-    """Return κ1, κ2 = (Tr M ± √(2|M|² - (Tr M)²)⁺) / 2ε|∇u|, H and K (eqs. `Heps`, `Keps`, `kepsa`, `kepsb`)."""
+    """Return κ1, κ2 = (Tr M ± √(2|M|² - (Tr M)²)⁺) / 2ε|∇u|, H and K (paper, eqs. 15 to 18)."""
     trace, norm2, root, slope = second_form(field, epsilon)
     width = 2 * epsilon * slope
     gauss = (trace**2 - norm2) / (2 * (epsilon * slope) ** 2)

@@ -27,7 +27,7 @@ def energy(
     orientation: Float[Tensor, "3 3"] | None = None,
     mask: Tensor | None = None,
 ) -> Float[Tensor, "*batch"]:
-    """Return F_ε(u) (eq. `Feps`), differentiable in the field and in the coefficients.
+    """Return F_ε(u) (paper, eq. 20), differentiable in the field and in the coefficients.
 
     Parameters
     ----------
@@ -104,7 +104,11 @@ def orientation_form(slope: Float[Tensor, "*batch 3 z y x"], orientation: Float[
 
 
 def energy_terms(field: Jet, epsilon: float | Tensor) -> Float[Tensor, "*batch 6 z y x"]:
-    """Return the densities of the six terms of F_ε, those that a20, a11, a02, a10, a01 and a00 multiply."""
+    """Return the densities of the six terms of F_ε, those that a20, a11, a02, a10, a01 and a00 multiply.
+
+    They are eq. 20 of the paper, sorted by coefficient: with R = √(2|M|² - (Tr M)²)⁺, that of κ1² is (|M|² + R Tr M)/2ε
+    and that of κ2² (|M|² - R Tr M)/2ε, since κ1, κ2 = (Tr M ± R)/2ε|∇u| (eqs. 17 and 18).
+    """
     ε = epsilon
     trace, norm2, root, slope = second_form(field, ε)
     slope2 = field.gradient.square().sum(-4)
@@ -121,7 +125,7 @@ def energy_terms(field: Jet, epsilon: float | Tensor) -> Float[Tensor, "*batch 6
 
 
 def unsimplified_energy(u: Tensor, coefficients: Coefficients, grid: Grid, epsilon: float) -> Tensor:
-    """Return 𝓔̃_ε: F_ε with the positive part of 2|M|² - (Tr M)² in its quadratic terms too (eq. `tildeEeps`)."""
+    """Return 𝓔̃_ε: F_ε with the positive part of 2|M|² - (Tr M)² in its quadratic terms too (paper, before eq. 20)."""
     density = unsimplified_density(jet(u, grid), coefficients, epsilon)
     return density.sum((-3, -2, -1)) * grid.voxel_volume
 
@@ -138,7 +142,7 @@ def unsimplified_density(field: Jet, coefficients: Coefficients, epsilon: float)
 
 
 def curvature_integral(u: Tensor, coefficients: Coefficients, grid: Grid, epsilon: float) -> Tensor:
-    """Return 𝓔_ε(u) = ∫ p(κ1_ε, κ2_ε) ε|∇u|² dx (eq. `Eeps`), which 𝓔̃_ε and F_ε expand."""
+    """Return 𝓔_ε(u) = ∫ p(κ1_ε, κ2_ε) ε|∇u|² dx (paper, section 3, before eq. 20), which 𝓔̃_ε and F_ε expand."""
     density = curvature_density(jet(u, grid), coefficients, epsilon)
     return density.sum((-3, -2, -1)) * grid.voxel_volume
 
@@ -151,7 +155,7 @@ def curvature_density(field: Jet, coefficients: Coefficients, epsilon: float) ->
 
 
 def cahn_hilliard_area(u: Tensor, grid: Grid, epsilon: float | Tensor) -> Tensor:
-    """Return 𝓐_ε(u) = ∫ ε/2 |∇u|² + W(u)/ε, about σ × area (eq. `CH_eps`)."""
+    """Return 𝓐_ε(u) = ∫ ε/2 |∇u|² + W(u)/ε, about σ × area (paper, eq. 8)."""
     gradient_part, well_part = cahn_hilliard_parts(u, grid, epsilon)
     return (gradient_part + well_part).sum((-3, -2, -1)) * grid.voxel_volume
 

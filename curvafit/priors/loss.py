@@ -336,7 +336,7 @@ def curvature_prior(
     border: int = 1,
     blur: float = 0.0,
 ) -> Float[Tensor, " batch"]:
-    """Return F_ε(2p - 1) of probabilities in a window of a larger volume (eq. `Feps`), by fused kernels in float32.
+    """Return F_ε(2p - 1) of probabilities in a window of a larger volume (paper, eq. 20), by fused kernels in float32.
 
     Parameters
     ----------

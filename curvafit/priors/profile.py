@@ -30,7 +30,7 @@ def double_well_derivative(u: Tensor) -> Tensor:
 
 
 def optimal_profile(distance: Tensor, epsilon: float) -> Tensor:
-    """Return tanh(d / √2 ε) of a signed distance d, positive inside (eq. `tanh_profile`)."""
+    """Return tanh(d / √2 ε) of a signed distance d, positive inside (paper, eq. 19)."""
     return torch.tanh(distance / (math.sqrt(2) * epsilon))
 
 

@@ -19,6 +19,33 @@ Notation follows the plain-torch definition: s = |∇u|², d = s + ξ², G = √
 q = ∇uᵀ Hess u ∇u / d, T = Tr M, P = |M|², X = 2P - T², S = √(X⁺), all in the units of `_density_constants`. The root
 and what is taken as its derivative at umbilics, X = 0, are `curvature.positive_root`.
 
+The density and its adjoint (`_partials`), by hand since autograd would store some thirty fields. Write g = ∇u and
+D = Hess u, so that M = w g⊗g/d - D in these units (paper, eq. 7), and
+
+    T = w r - tr D,    P = |M|² = N - 2 w q + (w r)²,    X = 2P - T².
+
+With |M|² = (X + T²)/2 in eq. 20 the density is a polynomial in T, S, G and one term in X, with weights `of_…`:
+
+    e = of_X X + of_T2 T² + of_TS T S + G (of_GT T + of_GS S) + of_s s.
+
+Derivatives from the outside in, e_y being that by y. S depends on X alone, with S' = 1/2S (0 where X is not resolved),
+and X on P and T, so
+
+    e_S = of_TS T + of_GS G,            e_P = 2 of_X + e_S/S,           e_G = of_GT T + of_GS S,
+    e_T = (2 of_T2 - e_P) T + of_TS S + of_GT G.
+
+T and P depend on u's three derivatives u, g, D through w, r, q, N and tr D. By the product w r it is
+e_wr = e_T + 2 e_P w r. From ∂q/∂g = 2 (D g - q g)/d, ∂r/∂g = 2 ξ² g/d², ∂G/∂g = g/G and ∂s/∂g = 2 g,
+
+    ∂e/∂u = W''(u) (r e_wr - 2 q e_P),
+    ∂e/∂g = (2 of_s + e_G/G + 4 w e_P q/d + 2 ξ² w e_wr/d²) g - (4 w e_P/d) D g,
+    ∂e/∂D = 2 e_P D - e_T I - (2 w e_P/d) g⊗g.
+
+The gradient with respect to the voxels is the transpose of the stencils applied to these: a central difference sends
+±∂e/∂g to two neighbours, a second difference ∂e/∂D to two and -2 of it to the centre, a mixed one ±∂e/∂D to the four
+on the diagonals. The sums go to each receiver (`PARTIALS`), and `_gather` adds them plane by plane, as soon as
+the three planes that a voxel hears from are there: no field but u and the gradient is ever held.
+
 The order of every sum does not depend on the number of threads.
 """
 
@@ -335,7 +362,8 @@ def _partials(u, m, c, p, stride, n, ring, size, at, inside, from_, k, ratios, o
         )
         zy, zx = _scaled(quarter * zy, ratios, 6), _scaled(quarter * zx, ratios, 7)
         yx = _scaled(quarter * yx, ratios, 8)
-        # The density.
+        # The density: each invariant once; what two of them share is computed in the order in which it is needed, for
+        # registers are what runs out.
         gzz, gyy, gxx = gz * gz, gy * gy, gx * gx
         s = gzz + gyy + gxx
         d = s + ξ2
@@ -367,8 +395,8 @@ def _partials(u, m, c, p, stride, n, ring, size, at, inside, from_, k, ratios, o
             tz, ty, tx = _tilt(gz, gy, gx, orient, local, places, c + i, i)
             e = e + (gz * tz + gy * ty + gx * tx)
         energy = energy + e * _wide(inside, from_ + i)
-        # Its derivatives, from the outside in: by P twice that by X, which is zero in e's root where X is not resolved
-        # (`curvature.positive_root`).
+        # Its derivatives, from the outside in, as at the file's head. The root's is zero where X is not resolved
+        # (`curvature.positive_root`); `e_q` and `e_s` are the factors of D g and g in ∂e/∂g.
         slope = _where_above(X, low, i_S, zero)
         e_P = twice_X + e_S * _where_above(X, squares * k[18], slope, zero)
         e_T = T * (twice_T2 - e_P) + (of_TS * S + of_GT * G)
@@ -385,6 +413,8 @@ def _partials(u, m, c, p, stride, n, ring, size, at, inside, from_, k, ratios, o
         dz, dy, dx = _scaled(dz, ratios, 0), _scaled(dy, ratios, 1), _scaled(dx, ratios, 2)
         dzz, dyy = _scaled(P2 * zz - e_T - Q * gzz, ratios, 3), _scaled(P2 * yy - e_T - Q * gyy, ratios, 4)
         dxx = _scaled(P2 * xx - e_T - Q * gxx, ratios, 5)
+        # What each neighbour receives: the stencils' coefficients times the derivatives. Off the diagonal, N and q
+        # count a component twice and the stencil divides by four, so a half of ∂e/∂D is left.
         o = at + i
         _store(ring, o + _C * size, e_w * (well * (three * u2) - well) - two * (dzz + dyy + dxx))
         _store(ring, o + _ZM * size, dzz - dz)

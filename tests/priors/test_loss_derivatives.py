@@ -1,10 +1,10 @@
-"""The curvature prior's derivatives in every mode: those of the definition in float64, or refused in one sentence."""
+"""The training loss's derivatives in every mode: those of the definition in float64, or refused."""
 
 from __future__ import annotations
 
 import pytest
 import torch
-from loss_cases import LAW, noise, probabilities
+from loss_cases import LAW, noise, probabilities, slope_of
 from torch import Tensor
 from torch.func import grad, hessian, jacfwd, jacrev, jvp, vjp, vmap
 
@@ -189,3 +189,22 @@ def test_the_loss_keeps_few_numbers_for_each_voxel() -> None:
     fields = sum(count > 0 for count in held.values())
     assert 2 <= fields <= 6
     loss.backward()
+
+
+def hessian_product(dtype: torch.dtype, vector: torch.Tensor, normalize: str) -> torch.Tensor:
+    prior = CurvaturePrior("tubes", sigmoid=True, normalize=normalize)  # type: ignore[arg-type]
+    logits = noise(1, 1, 6, 6, 6).to(dtype).requires_grad_()
+    (slope,) = torch.autograd.grad(prior(logits), logits, create_graph=True)
+    assert torch.equal(slope, slope_of(prior, logits))
+    return torch.autograd.grad((slope * vector).sum(), logits)[0]
+
+
+@pytest.mark.parametrize("normalize", ["voxel", "area"])
+def test_second_derivatives_are_right_or_refused(normalize):
+    vector = noise(1, 1, 6, 6, 6, seed=1)
+    with pytest.raises(RuntimeError, match="expected first derivatives of F_ε in float32, got a second one"):
+        hessian_product(torch.float32, vector.float(), normalize)
+    prior, logits, step = CurvaturePrior("tubes", sigmoid=True, normalize=normalize), noise(1, 1, 6, 6, 6), 1e-5
+    ends = [slope_of(prior, logits + sign * step * vector) for sign in (1, -1)]
+    found = hessian_product(torch.float64, vector, normalize)
+    torch.testing.assert_close(found, (ends[0] - ends[1]) / (2 * step), rtol=1e-4, atol=1e-4 * float(found.abs().max()))

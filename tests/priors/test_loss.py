@@ -1,4 +1,4 @@
-"""The curvature prior: what it computes, whatever the window, the sampling, the labels and the precision."""
+"""The training loss is the energy: of windows, classes, units, masks and both types of float."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def ball(shape: tuple[int, int, int], spacing: tuple[float, float, float], radiu
     return optimal_profile(radius - (z**2 + y**2 + x**2).sqrt(), epsilon)[None, None]
 
 
-# ---- the value -------------------------------------------------------------------------------------------------------
+# ---- the value ------------------------------------------------------------------------------------------------------
 
 
 def test_the_sum_is_the_energy_of_the_interior():
@@ -72,7 +72,7 @@ def test_area_is_that_of_the_interface():
     assert float(willmore((u + 1) / 2)) == pytest.approx(4 * (epsilon / radius) ** 2, rel=0.02)
 
 
-# ---- windows ---------------------------------------------------------------------------------------------------------
+# ---- windows --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("spacing", "border"), [((1.0, 1.0, 1.0), 1), ((2.0, 1.0, 1.0), 2)])
@@ -118,7 +118,7 @@ def test_the_level_of_a_deep_supervision_has_its_own_spacing():
     torch.testing.assert_close(level(fine), CurvaturePrior("tubes", spacing=0.5, epsilon=2.0)(fine))
 
 
-# ---- anisotropy ------------------------------------------------------------------------------------------------------
+# ---- anisotropy -----------------------------------------------------------------------------------------------------
 
 
 def ball_energy(times: int, epsilon: float) -> float:
@@ -155,7 +155,7 @@ def test_cubic_convolution_keeps_parabolas():
         torch.testing.assert_close(found[1, inside, 2, 3], law(fine)[inside])
 
 
-# ---- gradients and precision -----------------------------------------------------------------------------------------
+# ---- gradients and precision ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("normalize", ["voxel", "area"])
@@ -210,3 +210,63 @@ def test_it_is_deterministic():
     prior, logits = CurvaturePrior("tubes", sigmoid=True), noise(2, 1, 20, 20, 20, dtype=torch.float32)
     assert torch.equal(prior(logits), prior(logits))
     assert torch.equal(slope_of(prior, logits), slope_of(prior, logits))
+
+
+# ---- float32 is float64 ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"normalize": "area"},
+        {"normalize": "area", "spacing": (0.75, 0.25, 0.25)},
+        {"spacing": (0.75, 0.25, 0.25)},
+        {"spacing": 0.25, "blur": 0.3},
+        {"normalize": "area", "spacing": (0.75, 0.25, 0.25), "blur": 0.3, "reduction": "sum"},
+    ],
+)
+@pytest.mark.filterwarnings("ignore:ε = .* interpolating")
+def test_float32_is_float64(options):
+    """Values and gradients of the fused kernels and of the definition, per class, under a mask of each class."""
+    prior = CurvaturePrior((LAW, "tubes"), **options)
+    p = torch.cat([probabilities(2, 1, 9, 12, 11, seed=k) for k in range(2)], 1)
+    mask = noise(2, 2, 9, 12, 11, seed=3).abs()
+    exact, found = (slope_of(lambda x: prior(x, mask=mask), p.to(kind)) for kind in (torch.float64, torch.float32))
+    torch.testing.assert_close(prior(p.float(), mask=mask).double(), prior(p, mask=mask), rtol=2e-5, atol=0)
+    assert found.dtype == torch.float32
+    error = (found.double() - exact).abs() / exact.abs().max()
+    assert error.quantile(0.9) < 2e-6 and error.max() < 1e-2
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("include", [True, False])
+@pytest.mark.filterwarnings("ignore:ε = .* interpolating")
+def test_every_class_has_its_own_mask(dtype, include):
+    p = torch.cat([probabilities(2, 1, 8, 9, 10, seed=k) for k in range(3)], 1).to(dtype)
+    mask = torch.rand(2, 3, 8, 9, 10, generator=torch.Generator().manual_seed(0))
+    found = CurvaturePrior("tubes", include_background=include, reduction="none")(p, mask=mask)
+    for k, column in zip(range(3 - found.shape[1], 3), found.unbind(1), strict=True):
+        alone = CurvaturePrior("tubes", reduction="none")(p[:, k : k + 1], mask=mask[:, k : k + 1])
+        torch.testing.assert_close(column, alone[:, 0])
+
+
+@pytest.mark.parametrize("normalize", ["voxel", "area"])
+@pytest.mark.filterwarnings("ignore:ε = .* interpolating")
+def test_blur_is_in_the_unit_of_the_spacing(normalize):
+    p, spacing = probabilities(1, 1, 10, 11, 12), (0.3, 0.25, 0.25)
+    blurred = gaussian_blur(p, Grid((10, 11, 12), spacing, "replicate"), 0.4)
+    found = CurvaturePrior("tubes", spacing=spacing, epsilon=0.6, blur=0.4, normalize=normalize)(p)
+    expected = CurvaturePrior("tubes", spacing=spacing, epsilon=0.6, normalize=normalize)(blurred)
+    torch.testing.assert_close(found, expected)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("normalize", ["voxel", "area", None])
+@pytest.mark.filterwarnings("ignore:ε = .* interpolating")
+def test_an_interpolated_axis_is_a_finer_grid(dtype, normalize):
+    p, spacing = probabilities(2, 8, 10, 10).to(dtype), (3.0, 1.0, 1.0)
+    mask = torch.rand(2, 8, 10, 10, generator=torch.Generator().manual_seed(0)).to(dtype)
+    fine, parts = (refine_axis(2 * p - 1, 0, 3) + 1) / 2, mask.repeat_interleave(3, 1)
+    found = curvature_prior(p, LAW, spacing, 2.0, mask=mask, normalize=normalize, border=0)
+    expected = curvature_prior(fine, LAW, (1.0, 1.0, 1.0), 2.0, mask=parts, normalize=normalize, border=0)
+    torch.testing.assert_close(found, expected, rtol=1e-4 if dtype == torch.float32 else 1e-9, atol=0)
