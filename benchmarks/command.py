@@ -33,6 +33,15 @@ reconstruct(mask[:16, :16, :16], {law!r}, every=8, stiffness=1e7)
 begun = time.perf_counter()
 end(begun, reconstruct(mask, {law!r}, every=8, stiffness=1e7).mask.values)
 """
+INFER = """
+import subprocess, sys
+from curvafit import infer
+samples = [sys.executable, "-m", "curvafit", "samples", "get", "synthetic", "-o", "scan.nii.gz"]
+subprocess.run(samples, check=True, stdout=subprocess.DEVNULL)
+begun = time.perf_counter()
+fit = infer("scan.nii.gz", seed=0, fast={fast}).fit
+end(begun, np.array([*fit.coefficients, fit.mass] if fit.coefficients else []))
+"""
 #: What is timed within a process, after a first call that compiles.
 JOBS = {
     "step": """
@@ -55,17 +64,15 @@ end(begun, gradient.numpy())
 """,
     "completion of tubes": COMPLETION.format(law="tubes"),
     "completion of trabec": COMPLETION.format(law="trabec"),
-    "infer": """
-import subprocess, sys
-from curvafit import infer
-samples = [sys.executable, "-m", "curvafit", "samples", "get", "synthetic", "-o", "scan.nii.gz"]
-subprocess.run(samples, check=True, stdout=subprocess.DEVNULL)
-begun = time.perf_counter()
-fit = infer("scan.nii.gz", seed=0).fit
-end(begun, np.array([*fit.coefficients, fit.mass] if fit.coefficients else []))
-""",
+    "infer": INFER.format(fast=False),
+    "infer fast": INFER.format(fast=True),
 }
-KEYS = {"completion of tubes": "tubes", "completion of trabec": "trabec", "generate fixed": "command"}
+KEYS = {
+    "completion of tubes": "tubes",
+    "completion of trabec": "trabec",
+    "generate fixed": "command",
+    "infer fast": "infer_fast",
+}
 
 
 def job(name: str, checkout: Path) -> tuple[float, str]:
