@@ -7,8 +7,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from curvafit.cli.console import command_line, error_console, kept, plainly, say, stages
-from curvafit.cli.options import Crew, DashboardOption, OverwriteOption, SchedulerOption, WorkersOption, whole_triple
+from curvafit.cli.console import command_line, error_console, plain_errors, resumable, say, show_stages
+from curvafit.cli.options import (
+    Crew,
+    DashboardOption,
+    OverwriteOption,
+    SchedulerOption,
+    WorkersOption,
+    parse_whole_triple,
+)
 
 if TYPE_CHECKING:
     from curvafit.core.records import Format
@@ -46,9 +53,9 @@ def build_atlas(
     dashboard: DashboardOption = None,
 ) -> None:
     """Generate shapes into a store until enough are viable. The same command resumes a build that was stopped."""
-    with plainly():
-        box = whole_triple(shape, "--shape")
-        law = _design(design, around, spread)
+    with plain_errors():
+        box = parse_whole_triple(shape, "--shape")
+        law = _choose_design(design, around, spread)
         from curvafit.core.files import check_folder
         from curvafit.data_synth.atlas import build, check_count, settings_of
         from curvafit.data_synth.store import open_store
@@ -76,7 +83,7 @@ def extend_atlas(
     dashboard: DashboardOption = None,
 ) -> None:
     """Add shapes to a store, with the design and the settings of the store."""
-    with plainly():
+    with plain_errors():
         from curvafit.data_synth.atlas import check_count, extend
         from curvafit.data_synth.store import open_store
 
@@ -96,7 +103,7 @@ def extend_atlas(
 @atlas_app.command("info", epilog="[bold]Example[/bold]\n\ncurvafit atlas info store.zarr")
 def atlas_info(store: _Store) -> None:
     """Show the content of a store, and how it was made."""
-    with plainly():
+    with plain_errors():
         from curvafit.data_synth.atlas import summarise
         from curvafit.data_synth.store import open_store
 
@@ -107,10 +114,10 @@ def atlas_info(store: _Store) -> None:
 @atlas_app.command("verify", epilog="[bold]Example[/bold]\n\ncurvafit atlas verify store.zarr")
 def verify_atlas(store: _Store) -> None:
     """Check every draw of a store; exit with code 1 where one is missing, torn or changed."""
-    with plainly():
+    with plain_errors():
         from curvafit.data_synth.atlas import verify
 
-        with stages() as progress:
+        with show_stages() as progress:
             verdict = verify(store, progress)
         for note in verdict.notes:
             say(f"note: {note}")
@@ -132,12 +139,12 @@ def extract_atlas(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Measure the shapes of stores, and write the atlas that `infer --atlas` reads."""
-    with plainly():
+    with plain_errors():
         from curvafit.atlas_map.extract import extract
         from curvafit.inference.atlas import ATLAS_FILE, save_atlas
 
         _check_archive(out, ATLAS_FILE, stores, overwrite)
-        with stages() as progress:
+        with show_stages() as progress:
             atlas = extract(stores, [command_line()], progress=progress)
         out.parent.mkdir(parents=True, exist_ok=True)
         save_atlas(atlas, out)
@@ -160,7 +167,7 @@ def describe_atlas(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Measure each shape of stores as field, mask, crop and scan: the table that `atlas train` reads."""
-    with plainly():
+    with plain_errors():
         from curvafit.atlas_map.extract import describe
         from curvafit.inference.table import TABLE_FILE, VIEWS
 
@@ -186,7 +193,7 @@ def train_atlas(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Train the posterior of the parameters, given descriptors, on a table of them."""
-    with plainly():
+    with plain_errors():
         from curvafit.inference.posterior import POSTERIOR_FILE, save_posterior
         from curvafit.inference.table import load_table
         from curvafit.inference.training import train_posterior
@@ -195,7 +202,7 @@ def train_atlas(
         content = load_table(table)
         if views is not None:
             content = content.of(views.split(","))
-        with stages() as progress:
+        with show_stages() as progress:
             posterior = train_posterior(content, members=members, seed=seed, progress=progress)
         out.parent.mkdir(parents=True, exist_ok=True)
         save_posterior(posterior, out)
@@ -214,8 +221,8 @@ def map_atlas(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Draw a map of the shapes of stores: a picture, and a page to explore the shapes and to place scans."""
-    with plainly():
-        with kept(), stages() as progress:
+    with plain_errors():
+        with resumable(), show_stages() as progress:
             from curvafit.atlas_map.files import check_map, write_map
 
             check_map(out, stores, overwrite)
@@ -234,7 +241,7 @@ def _check_archive(out: Path, kind: Format, inputs: list[Path], overwrite: bool)
     can_write(out, kind, inputs=inputs, overwrite=overwrite)
 
 
-def _design(name: str, around: str | None, spread: float | None) -> Design:
+def _choose_design(name: str, around: str | None, spread: float | None) -> Design:
     """Return the design that the options name."""
     from curvafit.data_synth import design
 

@@ -66,7 +66,7 @@ def _leave(error: Any) -> NoReturn:
 
 
 @contextmanager
-def plainly() -> Iterator[None]:
+def plain_errors() -> Iterator[None]:
     """Turn an expected exception into its sentence and exit code 2, and a signal into the exit code of `exit_code`.
 
     Warnings become notes, printed at the end of a command that succeeds; one that fails prints its error alone.
@@ -74,44 +74,44 @@ def plainly() -> Iterator[None]:
     notes: dict[str, None] = {}
     try:
         with warnings.catch_warnings():
-            warnings.showwarning = partial(_note, notes)
+            warnings.showwarning = partial(_keep_note, notes)
             yield
         _say_notes(notes)
     except typer.Exit:
         _say_notes(notes)
         raise
     except KeyboardInterrupt as signal:
-        say(f"{_ending(signal)}: nothing is left half-written", to=error_console())
+        say(f"{_name_signal(signal)}: nothing is left half-written", to=error_console())
         raise typer.Exit(exit_code(signal)) from None
     except (ValueError, OSError, ImportError, MemoryError, RuntimeError) as error:
-        if os.environ.get(DEBUG) or not _expected(error):
+        if os.environ.get(DEBUG) or not _is_expected(error):
             raise
-        say(_sentence(error), to=error_console())
+        say(_explain(error), to=error_console())
         raise typer.Exit(2) from None
 
 
 @contextmanager
-def kept(again: Callable[[], str] = lambda: "the same command") -> Iterator[None]:
+def resumable(again: Callable[[], str] = lambda: "the same command") -> Iterator[None]:
     """On a signal, print that nothing is lost and which command resumes the work."""
     try:
         yield
     except KeyboardInterrupt as signal:
-        say(f"{_ending(signal)}: finished parts are saved. Run {again()} to resume", to=error_console())
+        say(f"{_name_signal(signal)}: finished parts are saved. Run {again()} to resume", to=error_console())
         raise typer.Exit(exit_code(signal)) from None
 
 
-def _ending(signal: KeyboardInterrupt) -> str:
+def _name_signal(signal: KeyboardInterrupt) -> str:
     return "terminated" if isinstance(signal, Terminated) else "interrupted"
 
 
-def _expected(error: Exception) -> bool:
+def _is_expected(error: Exception) -> bool:
     """Return whether an exception tells of the input or the machine rather than of a fault of the program."""
     if isinstance(error, ImportError):
         return not (error.name or "").startswith("curvafit")
     return not isinstance(error, RuntimeError) or "memory" in str(error).lower()
 
 
-def _sentence(error: Exception) -> str:
+def _explain(error: Exception) -> str:
     if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "memory" in str(error).lower()):
         return "error: the volume does not fit into memory"
     if isinstance(error, OSError) and error.strerror:
@@ -119,7 +119,9 @@ def _sentence(error: Exception) -> str:
     return sentence(str(error) or type(error).__name__)
 
 
-def _note(notes: dict[str, None], message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
+def _keep_note(
+    notes: dict[str, None], message: Warning | str, category: type[Warning], *_: object, **__: object
+) -> None:
     if issubclass(category, UserWarning):
         notes[sentence(str(message), "note")] = None
 
@@ -167,7 +169,7 @@ def say_notes(notes: Iterable[str]) -> None:
         say(f"note: {note}", to=error_console())
 
 
-def output(heads: Sequence[str], rows: Iterable[Sequence[str]], right: Iterable[int] = ()) -> None:
+def print_table(heads: Sequence[str], rows: Iterable[Sequence[str]], right: Iterable[int] = ()) -> None:
     """Print a table without a frame; the columns in `right` are aligned to the right."""
     table = Table(box=None, pad_edge=False, header_style="bold")
     rights = set(right)
@@ -180,7 +182,7 @@ def output(heads: Sequence[str], rows: Iterable[Sequence[str]], right: Iterable[
 
 
 @contextmanager
-def stages() -> Iterator[Callable[[str, float], None]]:
+def show_stages() -> Iterator[Callable[[str, float], None]]:
     """Show a progress bar for a job that names its stages; call it with a sentence and the share done.
 
     Without a terminal each new sentence is a line, and one that differs only in its numbers is a line every 5 %. A line

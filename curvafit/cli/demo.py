@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from curvafit.cli.console import error_console, plainly, say, stages
+from curvafit.cli.console import error_console, plain_errors, say, show_stages
 from curvafit.cli.options import OverwriteOption, examples
 
 EXAMPLES = examples("curvafit demo", "curvafit demo shell -o shell_out")
@@ -25,8 +25,8 @@ def demo(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Measure a real scan, fill it from every 8th slice, and read its texture: one page, in minutes."""
-    with plainly():
-        with stages() as progress:
+    with plain_errors():
+        with show_stages() as progress:
             from curvafit.cli.samples import SYNTHETIC, fetch_or_make
             from curvafit.data_synth.samples import SampleUnavailable
             from curvafit.report.demo import write_demo

@@ -9,8 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli.console import command_line, error_console, flow_progress, output, plainly, say
-from curvafit.cli.options import OverwriteOption, device_of, examples, numbers, triple, whole_numbers, whole_triple
+from curvafit.cli.console import command_line, error_console, flow_progress, plain_errors, print_table, say
+from curvafit.cli.options import (
+    OverwriteOption,
+    examples,
+    parse_device,
+    parse_numbers,
+    parse_triple,
+    parse_whole_numbers,
+    parse_whole_triple,
+)
 from curvafit.core.runtime import exit_code
 
 if TYPE_CHECKING:
@@ -97,42 +105,43 @@ def generate(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Make a shape from parameters, with a record (.json) and a picture (.png) beside it."""
-    with plainly():
-        box = None if shape is None else whole_triple(shape, "--shape")
+    with plain_errors():
+        box = None if shape is None else parse_whole_triple(shape, "--shape")
         from curvafit.priors.grid import Grid
         from curvafit.volumes.parameter_maps import map_shape, read_maps
 
         volumes = {} if maps is None else read_maps(maps, box)
-        texture = _texture(preset, coefficients, prior, volumes)
-        options = _parameters(texture, volumes, mass, volume_fraction, epsilon)
+        law = _read_law(preset, coefficients, prior, volumes)
+        options = _choose_parameters(law, volumes, mass, volume_fraction, epsilon)
         grid = Grid(box or map_shape(volumes) or EDGE, boundary=boundary)  # type: ignore[arg-type]
-        how = _output(texture, grid, spacing, unit, tile, cap)
-        saving = _checkpoint(checkpoint, checkpoint_every)
+        how = _plan_output(law, grid, spacing, unit, tile, cap)
+        saving = _place_checkpoint(checkpoint, checkpoint_every)
         options |= {"grid": grid, "seed": seed, **saving}
         from curvafit.drawing.shapes import check_target
         from curvafit.generation.schedule import schedule as named
 
         options["schedule"] = plan = named(schedule, steps)
-        options["snapshots"] = () if snapshots is None else (*map(plan.among, whole_numbers(snapshots, "--snapshots")),)
-        options["orientation"] = Q = None if orientation is None else _orientation(orientation)
-        law_file = None if not texture.fitted else prior or preset
+        after = () if snapshots is None else parse_whole_numbers(snapshots, "--snapshots")
+        options["snapshots"] = tuple(map(plan.among, after))
+        options["orientation"] = Q = None if orientation is None else _parse_orientation(orientation)
+        law_file = None if not law.fitted else prior or preset
         inputs = [str(path) for path in (law_file, maps) if path is not None]
-        _check(out, saving["checkpoint"], cap)
+        _check_places(out, saving["checkpoint"], cap)
         writing = {"picture": picture, "overwrite": overwrite}
         check_target(out, how, steps=options["snapshots"], inputs=inputs, **writing)
-        flow = _flow({**options, "device": device_of(device)})
+        flow = _grow({**options, "device": parse_device(device)})
         more = {"orientation": Q if Q is None else Q.tolist(), "maps": maps if maps is None else str(maps)}
-        more |= {"origin": texture.origin, "wanted_volume_fraction": volume_fraction, "command": command_line()}
+        more |= {"origin": law.origin, "wanted_volume_fraction": volume_fraction, "command": command_line()}
         from curvafit.drawing.shapes import shape_record
 
         record = shape_record(flow, mass=options["mass"], output=how, snapshots=list(flow.snapshots), **more)
         _write(flow, out, record, output=how, **writing)
-        _discard(saving["checkpoint"])
+        _remove(saving["checkpoint"])
 
 
 def presets() -> None:
     """List the published shapes: coefficients in working units, mass, source."""
-    with plainly():
+    with plain_errors():
         from curvafit.priors.coefficients import NAMES
         from curvafit.priors.law import PRESETS
 
@@ -140,11 +149,11 @@ def presets() -> None:
             (name, *(f"{value:g}" for value in entry.coefficients.as_dict().values()), f"{entry.mass:g}", entry.source)
             for name, entry in PRESETS.items()
         ]
-        output(("name", *NAMES, "mass", "source"), rows, right=range(1, 8))
+        print_table(("name", *NAMES, "mass", "source"), rows, right=range(1, 8))
 
 
-def _texture(preset: str | None, six: str | None, prior: str | None, maps: Maps3D) -> Law:
-    """Return the texture of the one law among the options, or of six maps of coefficients."""
+def _read_law(preset: str | None, six: str | None, prior: str | None, maps: Maps3D) -> Law:
+    """Return the one law among the options, or that of six maps of coefficients."""
     from curvafit.priors.coefficients import NAMES, Coefficients
     from curvafit.priors.law import Law
 
@@ -153,11 +162,11 @@ def _texture(preset: str | None, six: str | None, prior: str | None, maps: Maps3
         raise ValueError(f"give one of --preset, --coefficients and --prior, got {len(laws)} of them")
     if not laws:
         return Law(Coefficients(1, 0, 1), None, "maps")
-    return Law.of(laws[0] if six is None else Coefficients(*numbers(six, "--coefficients", 6)))
+    return Law.of(laws[0] if six is None else Coefficients(*parse_numbers(six, "--coefficients", 6)))
 
 
-def _parameters(
-    texture: Law,
+def _choose_parameters(
+    law: Law,
     maps: Maps3D,
     mass: float | None,
     share: float | None,
@@ -174,15 +183,15 @@ def _parameters(
     if mean is not None and share is not None:
         raise ValueError("give either a mass or --volume-fraction, got both")
     if mean is None and share is None:
-        mean = texture.mass
+        mean = law.mass
     if mean is None and share is None:
         raise ValueError("coefficients need --mass or --volume-fraction")
-    law = replace(texture.coefficients, **{name: maps[name] for name in NAMES if name in maps})
+    coefficients = replace(law.coefficients, **{name: maps[name] for name in NAMES if name in maps})
     width = maps.get("epsilon", WORKING_EPSILON if epsilon is None else epsilon)
-    return {"law": law, "mass": mean, "volume_fraction": share, "epsilon": width}
+    return {"law": coefficients, "mass": mean, "volume_fraction": share, "epsilon": width}
 
 
-def _checkpoint(file: Path | None, every: float | None) -> dict[str, Any]:
+def _place_checkpoint(file: Path | None, every: float | None) -> dict[str, Any]:
     """Return the options of the checkpoint as `generate` takes them."""
     if file is None and every is not None:
         raise ValueError(f"--checkpoint-every {every:g} needs --checkpoint")
@@ -192,35 +201,35 @@ def _checkpoint(file: Path | None, every: float | None) -> dict[str, Any]:
     return {"checkpoint": place} if every is None else {"checkpoint": place, "checkpoint_every": every}
 
 
-def _output(
-    texture: Law, grid: Grid, spacing: str | None, unit: str | None, tile: str | None, cap: bool | None
+def _plan_output(
+    law: Law, grid: Grid, spacing: str | None, unit: str | None, tile: str | None, cap: bool | None
 ) -> Output:
-    """Return how to write the shape, with the voxel of the options, else the fit's."""
+    """Return how to write the shape: voxels as large as the options say, else as the fit's."""
     if unit is not None and spacing is None:
         raise ValueError("--unit needs --spacing")
-    edge, fit_unit = texture.working_voxel or 1.0, texture.length_unit or "voxel"
-    edges = (edge,) * 3 if spacing is None else triple(spacing, "--spacing")
+    edge, fit_unit = law.working_voxel or 1.0, law.length_unit or "voxel"
+    edges = (edge,) * 3 if spacing is None else parse_triple(spacing, "--spacing")
     if len(set(edges)) > 1:
         raise ValueError(f"--spacing must be one number, as voxels are cubes, got {spacing!r}")
     if tile is not None and not grid.periodic:
         raise ValueError(f"--tile needs a periodic boundary, got {grid.boundary!r}")
     from curvafit.drawing.shapes import Output
 
-    repeats = (1, 1, 1) if tile is None else whole_triple(tile, "--tile")
+    repeats = (1, 1, 1) if tile is None else parse_whole_triple(tile, "--tile")
     how = Output(edges[0], unit or fit_unit, repeats, cap is not False)
     how.shape(grid)
     return how
 
 
-def _orientation(text: str) -> Tensor:
+def _parse_orientation(text: str) -> Tensor:
     """Return the orientation of an option."""
     from curvafit.priors.energy import orientation
 
-    *direction, strength = numbers(text, "--orientation", 4)
+    *direction, strength = parse_numbers(text, "--orientation", 4)
     return orientation(direction, strength)
 
 
-def _check(out: Path, checkpoint: Path | None, cap: bool | None) -> None:
+def _check_places(out: Path, checkpoint: Path | None, cap: bool | None) -> None:
     """Refuse a checkpoint at the place of an output, and options of a surface where a volume is written."""
     from curvafit.core.files import check_folder
     from curvafit.core.records import sibling
@@ -236,7 +245,7 @@ def _check(out: Path, checkpoint: Path | None, cap: bool | None) -> None:
             raise ValueError(f"the checkpoint {checkpoint} would be written over by an output: choose another name")
 
 
-def _flow(options: dict[str, Any]) -> Flow:
+def _grow(options: dict[str, Any]) -> Flow:
     """Run the flow with progress; exit with code 1 where it failed or has no surface."""
     from curvafit.generation.flow import generate as make
 
@@ -249,13 +258,13 @@ def _flow(options: dict[str, Any]) -> Flow:
             say(f"interrupted: run the same command to resume from {options['checkpoint']}", to=error_console())
             raise typer.Exit(exit_code(signal)) from None
     if not (flow.finite and flow.viability.lowest < 0 < flow.viability.highest):
-        _discard(options["checkpoint"])
+        _remove(options["checkpoint"])
         say(f"{flow.status}; nothing was written", to=error_console())
         raise typer.Exit(1)
     return flow
 
 
-def _discard(checkpoint: Path | None) -> None:
+def _remove(checkpoint: Path | None) -> None:
     """Remove the checkpoint, which the flow leaves until the results are written."""
     if checkpoint is not None:
         checkpoint.unlink(missing_ok=True)

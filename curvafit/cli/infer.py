@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli.console import command_line, output, plainly, say, say_notes, stages
-from curvafit.cli.options import OverwriteOption, Reading, Volume, examples, reads_volume, threshold_of
+from curvafit.cli.console import command_line, plain_errors, print_table, say, say_notes, show_stages
+from curvafit.cli.options import OverwriteOption, Reading, Volume, examples, parse_threshold, reads_volume
 
 if TYPE_CHECKING:
     from curvafit.inference.infer import Inference
@@ -41,22 +41,22 @@ def infer(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Infer the parameters of a scanned volume, and write a report."""
-    with plainly():
-        level = threshold_of(threshold)
+    with plain_errors():
+        level = parse_threshold(threshold)
         what = {"kind": kind, "periodic": periodic, "threshold": level, "dark": dark, "roi": roi}
-        inference, report = _inferred(
+        inference, report = _infer_and_write(
             scan,
             out,
             {**what, "atlas": atlas, "posterior": posterior, "fast": fast, "seed": seed, **reading},
             overwrite,
         )
-        _show(inference)
+        _print_result(inference)
         say(str(report))
 
 
-def _inferred(scan: str, out: Path, options: dict[str, Any], overwrite: bool) -> tuple[Inference, Path]:
+def _infer_and_write(scan: str, out: Path, options: dict[str, Any], overwrite: bool) -> tuple[Inference, Path]:
     """Return the inference and the path of its report, and show the progress."""
-    with stages() as progress:
+    with show_stages() as progress:
         from curvafit.inference.infer import infer as infer_scan
         from curvafit.report.page import check_report, with_command, write_inference
 
@@ -68,7 +68,7 @@ def _inferred(scan: str, out: Path, options: dict[str, Any], overwrite: bool) ->
         return inference, write_inference(with_command(inference, command_line()), out, overwrite=overwrite)
 
 
-def _show(inference: Inference) -> None:
+def _print_result(inference: Inference) -> None:
     """Print the description, the verdict and a small table."""
     from curvafit.core.units import format_length, format_number
     from curvafit.inference.candidates import TITLES
@@ -79,7 +79,7 @@ def _show(inference: Inference) -> None:
     say(fit.status)
     if rows := parameter_table(inference):
         heads = ("", "working units", "±", "90 % of the posterior", f"with lengths in {fit.length_unit}")
-        output(heads, rows, right=range(1, 5))
+        print_table(heads, rows, right=range(1, 5))
     for each in fit.weak_directions:
         say(each)
     if inference.twins:

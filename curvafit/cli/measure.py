@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli.console import output, plainly, say, say_notes, stages
-from curvafit.cli.options import OverwriteOption, Reading, examples, reads_volume, threshold_of
+from curvafit.cli.console import plain_errors, print_table, say, say_notes, show_stages
+from curvafit.cli.options import OverwriteOption, Reading, examples, parse_threshold, reads_volume
 
 if TYPE_CHECKING:
     from curvafit.scan.measure import Measures, Quantity
@@ -35,10 +35,10 @@ def measure(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Measure scans in seconds: morphometry, fabric and curvature in physical units, with 95 % intervals."""
-    with plainly():
-        options: dict[str, Any] = {"kind": kind, "periodic": periodic, "threshold": threshold_of(threshold)}
+    with plain_errors():
+        options: dict[str, Any] = {"kind": kind, "periodic": periodic, "threshold": parse_threshold(threshold)}
         options |= {"dark": dark, **reading}
-        with stages() as progress:
+        with show_stages() as progress:
             from curvafit.scan.measure import measure as measure_scan
             from curvafit.studies.tables import check_table, write_table
 
@@ -52,23 +52,23 @@ def measure(
 
                 found.append(measure_scan(scan, progress=watch, **options))
         for each in found:
-            _show(each, len(scans) > 1)
+            _print_measures(each, len(scans) > 1)
         if out is not None:
             say(str(write_table(found, out, overwrite=overwrite)))
 
 
-def _show(measures: Measures, several: bool) -> None:
+def _print_measures(measures: Measures, several: bool) -> None:
     """Print the numbers of a scan."""
     if several:
         say(measures.source, style="bold")
     say_notes(measures.notes)
-    rows = [(each.name, each.symbol, *_cells(each, measures.unit)) for each in measures.quantities]
-    output(("", "", "value", "95 %", "unit"), rows, right=(2, 3))
+    rows = [(each.name, each.symbol, *_format(each, measures.unit)) for each in measures.quantities]
+    print_table(("", "", "value", "95 %", "unit"), rows, right=(2, 3))
     z, y, x = measures.direction
     say(f"The surface is most nearly parallel to the direction {z:.2f}, {y:.2f}, {x:.2f} (z, y, x).")
 
 
-def _cells(quantity: Quantity, unit: str) -> tuple[str, str, str]:
+def _format(quantity: Quantity, unit: str) -> tuple[str, str, str]:
     """Return a number, its interval and its unit as text."""
     from curvafit.core.units import format_number, per_unit, unit_name
 

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from curvafit.cli.console import plainly, say
+from curvafit.cli.console import plain_errors, say
 
 EXAMPLE = """[bold]Example[/bold]
 
@@ -34,22 +34,22 @@ def nnunet(
 
     Lengths of nnU-Net are in mm: a fit in another physical unit is converted.
     """
-    with plainly():
+    with plain_errors():
         from curvafit.priors.law import PRESETS, Law, preset_name
 
         name = preset_name(prior)
         if name is None:
             if not prior.endswith(".json"):
-                raise ValueError(f"expected --prior to be a fit.json or a preset ({', '.join(PRESETS)}), got {prior!r}")
+                raise ValueError(f"--prior must be a fit.json or a preset ({', '.join(PRESETS)}), got {prior!r}")
             Law.load(prior).in_unit("mm")
         prior = name or str(Path(prior).resolve())
         if share is not None and weight is not None:
-            raise ValueError("expected either --share or --weight, got both")
+            raise ValueError("give either --share or --weight, got both")
         share = 0.1 if share is None and weight is None else share
         settings = {"SHARE": share, "WEIGHT": weight, "WARMUP": warmup, "EPSILON": epsilon}
         for name, value in settings.items():
             if value is not None and not (0 <= value < math.inf and (value or name in ("WEIGHT", "WARMUP"))):
-                raise ValueError(f"expected --{name.lower()} to be a positive number, got {value}")
+                raise ValueError(f"--{name.lower()} must be a positive number, got {value}")
         folder = shlex.quote(str(Path(__file__).resolve().parent.parent / "nnunet"))
         say(f"export nnUNet_extTrainer={folder}${{nnUNet_extTrainer:+:$nnUNet_extTrainer}}")
         say(f"export CURVAFIT_PRIOR={shlex.quote(prior)}")

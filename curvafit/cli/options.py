@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from curvafit.cli.console import kept, plainly, stages
+from curvafit.cli.console import plain_errors, resumable, show_stages
 
 if TYPE_CHECKING:
     from curvafit.core.runtime import Progress
@@ -40,7 +40,7 @@ Volume = Annotated[
 Reading = dict[str, Any]
 
 
-def reading_of(
+def parse_reading(
     spacing: Annotated[str | None, _read(help="Voxel edges Z,Y,X, or one number for all; overrides the file.")] = None,
     unit: Annotated[str | None, _read(help="Unit of lengths: nm, um, mm or m; overrides the file.")] = None,
     channel: Annotated[int | None, _read(help="Channel to read, counted from 0, of several (colours, times).")] = None,
@@ -63,12 +63,12 @@ def reading_of(
 
         parse_box(crop)
     return {
-        "spacing": None if spacing is None else triple(spacing, "--spacing"),
+        "spacing": None if spacing is None else parse_triple(spacing, "--spacing"),
         "unit": unit,
         "channel": channel,
         "label": label,
         "crop": crop,
-        "raw_shape": None if raw_shape is None else whole_triple(raw_shape, "--raw-shape"),
+        "raw_shape": None if raw_shape is None else parse_whole_triple(raw_shape, "--raw-shape"),
         "dtype": dtype,
         "key": key,
         "strict": strict,
@@ -77,13 +77,13 @@ def reading_of(
 
 def reads_volume(command: Callable[..., None]) -> Callable[..., None]:
     """Put the options of reading a volume in the place of a command's parameter `reading`."""
-    options = inspect.signature(reading_of, eval_str=True).parameters
+    options = inspect.signature(parse_reading, eval_str=True).parameters
     own = inspect.signature(command, eval_str=True).parameters
 
     @functools.wraps(command)
     def reader(**arguments: Any) -> None:
-        with plainly():
-            reading = reading_of(**{name: arguments.pop(name) for name in options})
+        with plain_errors():
+            reading = parse_reading(**{name: arguments.pop(name) for name in options})
         command(**arguments, reading=reading)
 
     parameters = [each for name in own for each in (options.values() if name == "reading" else (own[name],))]
@@ -130,7 +130,7 @@ class Crew(NamedTuple):
         """Start the workers and their progress bar; `again` returns the command that resumes after an interrupt."""
         from curvafit.core.workers import cluster
 
-        with kept(again), stages() as progress:
+        with resumable(again), show_stages() as progress:
             progress("starting workers", 0.0)
             with cluster(*self) as workers:
                 yield workers, progress
@@ -139,7 +139,7 @@ class Crew(NamedTuple):
 # ---- parsing ---------------------------------------------------------------------------------------------------------
 
 
-def numbers(text: str, option: str, count: int) -> tuple[float, ...]:
+def parse_numbers(text: str, option: str, count: int) -> tuple[float, ...]:
     """Return a text as `count` finite numbers between commas."""
     try:
         values = tuple(float(part) for part in text.split(","))
@@ -151,31 +151,31 @@ def numbers(text: str, option: str, count: int) -> tuple[float, ...]:
     return values
 
 
-def triple(text: str, option: str) -> tuple[float, float, float]:
+def parse_triple(text: str, option: str) -> tuple[float, float, float]:
     """Return a text as three positive numbers; one counts for all axes."""
-    values = numbers(text, option, 1) * 3 if "," not in text else numbers(text, option, 3)
+    values = parse_numbers(text, option, 1) * 3 if "," not in text else parse_numbers(text, option, 3)
     if min(values) <= 0:
         raise ValueError(f"{option} must be positive, got {text!r}")
     return values  # type: ignore[return-value]
 
 
-def whole_triple(text: str, option: str) -> tuple[int, int, int]:
+def parse_whole_triple(text: str, option: str) -> tuple[int, int, int]:
     """Return a text as three positive whole numbers; one counts for all axes."""
-    values = triple(text, option)
+    values = parse_triple(text, option)
     if any(value != int(value) for value in values):
         raise ValueError(f"{option} must be whole numbers, got {text!r}")
     return tuple(int(value) for value in values)  # type: ignore[return-value]
 
 
-def whole_numbers(text: str, option: str) -> tuple[int, ...]:
+def parse_whole_numbers(text: str, option: str) -> tuple[int, ...]:
     """Return a text as whole numbers from 0."""
-    values = numbers(text, option, text.count(",") + 1)
+    values = parse_numbers(text, option, text.count(",") + 1)
     if min(values) < 0 or any(value != int(value) for value in values):
         raise ValueError(f"{option} must be whole numbers from 0, got {text!r}")
     return tuple(int(value) for value in values)
 
 
-def device_of(text: str) -> str:
+def parse_device(text: str) -> str:
     """Return the name of a device, or raise ValueError where this machine does not have it."""
     import torch
 
@@ -190,6 +190,6 @@ def device_of(text: str) -> str:
     return text
 
 
-def threshold_of(text: str) -> float | str:
+def parse_threshold(text: str) -> float | str:
     """Return a text as a grey level, or `"otsu"`."""
-    return text.lower() if text.lower() == "otsu" else numbers(text, "--threshold", 1)[0]
+    return text.lower() if text.lower() == "otsu" else parse_numbers(text, "--threshold", 1)[0]

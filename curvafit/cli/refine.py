@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli.console import plainly, say_notes
+from curvafit.cli.console import plain_errors, say_notes
 from curvafit.cli.options import OverwriteOption, Reading, examples, reads_volume
 from curvafit.cli.segment import Epsilon, Job, OwnPrior, Steps, TileOption, Weight, WorkersOption, run_job
 
@@ -56,7 +56,7 @@ def refine(
     Law and weight are those that do best on an example; where p > 1/2 does best, that is the mask. Of nnU-Net's
     NPZ files --channel takes the class; a folder of them becomes a folder of masks. --label is the example's.
     """
-    with plainly():
+    with plain_errors():
         from curvafit.segmentation.refine import calibrate, check_judge, find_image, load_probabilities
         from curvafit.segmentation.refine import refine as refine_map
         from curvafit.segmentation.slices import check_spacing
@@ -66,7 +66,7 @@ def refine(
         check_judge(example, weight)
         if prior is None and example is None:
             raise ValueError("give --prior or --example: the law, or a mask from which it is inferred")
-        files = _files(probabilities, out)
+        files = _list_files(probabilities, out)
         if like is not None and len(files) > 1:
             raise ValueError("--like is for one file; images of a folder lie beside its NPZ files")
         maps = {name: value for name, value in reading.items() if name != "label"}
@@ -99,26 +99,28 @@ def refine(
         named = {"example": example, "example_probabilities": example_probabilities, "like": like}
         record: dict[str, Any] = {"job": "refine", "weight": weight, "tile": tile, **options}
         record |= {name: None if path is None else str(path) for name, path in named.items()}
-        images = {source: like or (find_image(source) if _unplaced(reading) else None) for source, _ in files}
+        images = {source: like or (find_image(source) if _is_unplaced(reading) else None) for source, _ in files}
         if len(files) > 1:
-            _check(files, [*images.values(), *named.values()], maps, overwrite)
+            _check_all(files, [*images.values(), *named.values()], maps, overwrite)
         for source, target in files:
             job = Job(source, target, prior, {**maps, "like": like}, record, overwrite, workers, images[source])
             run_job(job, compute, load_probabilities)
 
 
-def _unplaced(reading: dict[str, Any]) -> bool:
+def _is_unplaced(reading: dict[str, Any]) -> bool:
     """Return whether the options leave the place of the voxels to a file."""
     return reading["spacing"] is None and reading["unit"] is None
 
 
-def _files(source: str, out: Path) -> list[tuple[str, Path]]:
+def _list_files(source: str, out: Path) -> list[tuple[str, Path]]:
     """Return the maps to read and the masks to write: those of a folder of NPZ files, or one."""
     maps = sorted(Path(source).glob("*.npz")) if Path(source).is_dir() else []
     return [(str(path), out / f"{path.stem}.nii.gz") for path in maps] or [(source, out)]
 
 
-def _check(files: list[tuple[str, Path]], more: list[Path | None], reading: dict[str, Any], overwrite: bool) -> None:
+def _check_all(
+    files: list[tuple[str, Path]], more: list[Path | None], reading: dict[str, Any], overwrite: bool
+) -> None:
     """Read all maps and check all targets before the first is worked on."""
     from curvafit.segmentation.evidence import probability_evidence
     from curvafit.segmentation.refine import load_probabilities

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from curvafit.cli.console import error_console, output, plainly, say
+from curvafit.cli.console import error_console, plain_errors, print_table, say
 from curvafit.cli.options import OverwriteOption
 
 #: The sample that needs no network, and its line in the list.
@@ -23,11 +23,11 @@ samples_app = typer.Typer(help="Sample volumes, with their licences.", invoke_wi
 def list_samples(context: typer.Context) -> None:
     """List sample volumes, or fetch one with `get`."""
     if context.invoked_subcommand is None:
-        with plainly():
+        with plain_errors():
             from curvafit.data_synth.samples import samples
 
             rows = [(each.name, each.description, each.licence, each.source) for each in samples()]
-            output(("name", "what", "licence", "source"), [*rows, (SYNTHETIC, *_SYNTHETIC_ABOUT)])
+            print_table(("name", "what", "licence", "source"), [*rows, (SYNTHETIC, *_SYNTHETIC_ABOUT)])
 
 
 @samples_app.command("get", epilog="[bold]Example[/bold]\n\ncurvafit infer $(curvafit samples get bone) -o bone")
@@ -40,17 +40,17 @@ def get_sample(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Download a sample once, check it, and print its path."""
-    with plainly():
+    with plain_errors():
         from curvafit.data_synth.samples import samples
 
         about = {each.name: (each.description, each.licence, each.source) for each in samples()}
         about[SYNTHETIC] = _SYNTHETIC_ABOUT
         if name not in about:
-            raise ValueError(f"expected a sample named {', '.join(about)}, got {name!r}")
+            raise ValueError(f"the samples are {', '.join(about)}, got {name!r}")
         what, licence, source = about[name]
         say(f"{name}: {what}; licence {licence}; {source}", to=error_console())
         path = fetch_or_make(name)
-        say(str(path if out is None else _copied(path, out, overwrite)))
+        say(str(path if out is None else _copy_to(path, out, overwrite)))
 
 
 def fetch_or_make(name: str) -> Path:
@@ -63,7 +63,7 @@ def fetch_or_make(name: str) -> Path:
     return path if path.is_file() else synthetic_scan(path)
 
 
-def _copied(path: Path, target: Path, overwrite: bool) -> Path:
+def _copy_to(path: Path, target: Path, overwrite: bool) -> Path:
     """Copy a sample to a target, whose suffix must be the sample's."""
     from curvafit.core.files import write_atomically
     from curvafit.core.records import can_write
@@ -71,14 +71,10 @@ def _copied(path: Path, target: Path, overwrite: bool) -> Path:
     target = target / path.name if target.is_dir() else target
     suffix = path.name[path.name.index(".") :]
     if not target.name.lower().endswith(suffix):
-        raise ValueError(f"expected a name ending in {suffix} for this sample, got {target.name!r}")
+        raise ValueError(f"the name of this sample must end in {suffix}, got {target.name!r}")
 
     def is_same(there: Path) -> bool:
         return there.is_file() and filecmp.cmp(path, there, shallow=False)
 
     can_write(target, is_same, inputs=[path], overwrite=overwrite)
-    return write_atomically(target, lambda temporary: _copy(path, temporary))
-
-
-def _copy(source: Path, target: Path) -> None:
-    shutil.copyfile(source, target)
+    return write_atomically(target, lambda temporary: shutil.copyfile(path, temporary))

@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli.console import command_line, kept, plainly, say, say_notes, stages
+from curvafit.cli.console import command_line, plain_errors, resumable, say, say_notes, show_stages
 from curvafit.cli.options import (
     OverwriteOption,
     Reading,
     Volume,
     examples,
+    parse_threshold,
+    parse_whole_numbers,
     reads_volume,
-    threshold_of,
-    whole_numbers,
 )
 
 if TYPE_CHECKING:
@@ -77,9 +77,9 @@ def segment(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Find the structure of a noisy scan under a curvature prior; write its mask, a picture and a record."""
-    with plainly():
+    with plain_errors():
         options: dict[str, Any] = {"weight": weight, "epsilon": epsilon}
-        options |= {"threshold": threshold_of(threshold), "dark": dark}
+        options |= {"threshold": parse_threshold(threshold), "dark": dark}
 
         def compute(volume: Boxes, progress: Progress, **tools: Any) -> Segmentation:
             from curvafit.segmentation.segment import segment as segment_scan
@@ -123,7 +123,7 @@ def reconstruct(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Fill a mask between known slices, with a curvature prior where it helps; write mask, picture and record."""
-    with plainly():
+    with plain_errors():
         if axis.lower() not in ("z", "y", "x"):
             raise ValueError(f"--axis must be z, y or x, got {axis!r}")
         if (every is None) == (known is None):
@@ -132,8 +132,8 @@ def reconstruct(
             raise ValueError("give --prior or --example: the law, or a mask from which it is inferred")
         if labels is not None and (reading["label"] is not None or runs or suggest):
             raise ValueError("--labels is for several structures; --label, --runs and --suggest are for one")
-        several = None if labels in (None, "all") else list(whole_numbers(labels, "--labels"))
-        numbers = None if known is None else list(whole_numbers(known, "--known"))
+        several = None if labels in (None, "all") else list(parse_whole_numbers(labels, "--labels"))
+        numbers = None if known is None else list(parse_whole_numbers(known, "--known"))
         if known is not None and first is not None:
             raise ValueError(f"--first {first} goes with --every, not with --known")
         place = {"every": every, "first": first or 0, "known": numbers, "axis": "zyx".index(axis.lower())}
@@ -213,13 +213,13 @@ def run_job(job: Job, compute: Callable[..., Segmentation], read: Callable[..., 
     check_mask_target(job.out, inputs=inputs, overwrite=job.overwrite, probability=probability)
     if job.prior is not None:
         Law.of(job.prior)
-    with stages() as progress:
+    with show_stages() as progress:
         progress("reading", 0.0)
         boxes = boxes_of(job.source, **reading) if read is None else boxes_of(read(job.source, **reading))
         check_mask_target(job.out, boxes.frame.unit, overwrite=job.overwrite, probability=probability)
         tiling = Tiling.of(boxes.frame, record["epsilon"], record["tile"], periodic=record.get("periodic", False))
         store = job.out.with_name(f".{job.out.name}.curvafit-tiles") if tiling.count > 1 else None
-        with kept() if store else nullcontext(), _start_workers(job.workers if store else None) as workers:
+        with resumable() if store else nullcontext(), _start_workers(job.workers if store else None) as workers:
             result = compute(boxes, progress, tile=record["tile"], store=store, workers=workers)
         progress("writing", 1.0)
         place = ("spacing", "crop") if image else ("spacing", "crop", "channel")

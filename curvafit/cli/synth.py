@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli.console import error_console, plainly, say, say_notes
+from curvafit.cli.console import error_console, plain_errors, say, say_notes
 from curvafit.cli.options import (
     Crew,
     DashboardOption,
     SchedulerOption,
     WorkersOption,
     examples,
-    numbers,
-    reading_of,
-    whole_triple,
+    parse_numbers,
+    parse_reading,
+    parse_whole_triple,
 )
 
 if TYPE_CHECKING:
@@ -128,8 +128,8 @@ def synth(
     dashboard: DashboardOption = None,
 ) -> None:
     """Make a training set: images of generated shapes with exact labels."""
-    with plainly():
-        box = whole_triple(shape, "--shape")
+    with plain_errors():
+        box = parse_whole_triple(shape, "--shape")
         if count < 1:
             raise ValueError(f"--count must be at least 1, got {count}")
         crew = Crew(workers, scheduler, dashboard)
@@ -137,22 +137,22 @@ def synth(
         if unit is not None and spacing is None and voxel is None:
             raise ValueError("--unit needs --spacing or --voxel")
         names = [] if laws is None else laws.split(",")
-        source = _source(names, atlas, volume_fraction)
+        source = _choose_source(names, atlas, volume_fraction)
         placed = {"spacing": spacing, "unit": None if spacing is None else unit}  # a unit alone is that of --voxel
-        reading = reading_of(**placed, crop=crop, channel=channel, label=label, strict=strict)
-        kind = _modality(modality, like, like_mask, visible, reading)
+        reading = parse_reading(**placed, crop=crop, channel=channel, label=label, strict=strict)
+        kind = _choose_modality(modality, like, like_mask, visible, reading)
         from curvafit.core.units import convert_length
         from curvafit.data_synth.case import Recipe
         from curvafit.data_synth.sets import SetSpec
         from curvafit.data_synth.sources import voxel_of
 
         edge = voxel_of(names, kind) if voxel is None else convert_length(voxel, unit, kind.base.unit)
-        low, high = numbers(calibres, "--calibres", 2)
+        low, high = parse_numbers(calibres, "--calibres", 2)
         recipe = Recipe(source, kind, box, edge, seed, (low, high))
-        _build(out, SetSpec(recipe, layout, tuple(labels.split(",")) if labels else ()), count, crew)
+        _build_and_preview(out, SetSpec(recipe, layout, tuple(labels.split(",")) if labels else ()), count, crew)
 
 
-def _build(out: Path, order: SetSpec, count: int, crew: Crew) -> None:
+def _build_and_preview(out: Path, order: SetSpec, count: int, crew: Crew) -> None:
     from curvafit.core.checks import check_int
     from curvafit.core.files import check_folder
     from curvafit.data_synth.sets import MOST, build_set, cases_of, check_set, write_preview
@@ -171,7 +171,7 @@ def _build(out: Path, order: SetSpec, count: int, crew: Crew) -> None:
     say(str(preview))
 
 
-def _source(laws: list[str], atlas: Path | None, filled: float | None) -> ShapeSource:
+def _choose_source(laws: list[str], atlas: Path | None, filled: float | None) -> ShapeSource:
     """Return the source of shapes that the options name."""
     if bool(laws) == (atlas is not None):
         raise ValueError(f"give either --prior (or --preset) or --atlas, got {'both' if laws else 'neither'}")
@@ -192,7 +192,7 @@ def _source(laws: list[str], atlas: Path | None, filled: float | None) -> ShapeS
     return Generated(points, shapes.ids, fraction=filled)
 
 
-def _modality(
+def _choose_modality(
     name: str | None, like: str | None, mask: str | None, visible: str | None, reading: dict[str, Any]
 ) -> Modality:
     """Return the named kind of image, or one like a scan, with the share of light in masks."""
@@ -204,7 +204,7 @@ def _modality(
             raise ValueError(f"{f'--{extras[0]}' if extras else '--like-mask'} needs --like")
         from curvafit.data_synth.imaging.modality import modality
 
-        return _visible(modality(str(name)), visible)
+        return _with_visible(modality(str(name)), visible)
     from curvafit.data_synth.imaging import like as estimate
     from curvafit.volumes.read import load
 
@@ -212,11 +212,11 @@ def _modality(
         raise ValueError("--label needs --like-mask: it is a value of that mask")
     scan = load(like, **{**reading, "label": None})
     say_notes(scan.notes)
-    inside = None if mask is None else _mask(load(mask, **{**reading, "channel": None}).values)
-    return _visible(estimate.like(scan, inside), visible)
+    inside = None if mask is None else _split_mask(load(mask, **{**reading, "channel": None}).values)
+    return _with_visible(estimate.like(scan, inside), visible)
 
 
-def _mask(values: np.ndarray) -> np.ndarray:
+def _split_mask(values: np.ndarray) -> np.ndarray:
     import numpy as np
 
     kinds = len(np.unique(values))
@@ -225,10 +225,10 @@ def _mask(values: np.ndarray) -> np.ndarray:
     return values > values.min()
 
 
-def _visible(kind: Modality, share_text: str | None) -> Modality:
+def _with_visible(kind: Modality, share_text: str | None) -> Modality:
     if share_text is None:
         return kind
     from curvafit.data_synth.imaging.image import visible_share
 
-    share = visible_share(kind.base) if share_text == "auto" else numbers(share_text, "--visible", 1)[0]
+    share = visible_share(kind.base) if share_text == "auto" else parse_numbers(share_text, "--visible", 1)[0]
     return replace(kind, base=replace(kind.base, visible=share))

@@ -9,7 +9,7 @@ import pytest
 from calling import LAW, call, refused
 from exact_store import exact_store
 
-from curvafit.cli.console import LONGEST, error_console, sentence, stages, writable
+from curvafit.cli.console import LONGEST, error_console, sentence, show_stages, writable
 from curvafit.volumes.field import Field
 from curvafit.volumes.write import save
 
@@ -136,18 +136,18 @@ def test_reconstruct_refuses_what_it_would_ignore(tmp_path: Path) -> None:
 
 
 def test_a_job_that_fails_at_its_start_says_why_alone(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(OSError, match="gone"), stages() as progress:
+    with pytest.raises(OSError, match="gone"), show_stages() as progress:
         progress("reading", 0.0)
         raise OSError("gone")
     assert capsys.readouterr().err == ""
-    with stages() as progress:
+    with show_stages() as progress:
         progress("reading", 0.0)
     assert capsys.readouterr().err == "[  0 %] reading\n"
 
 
 def test_a_stage_that_counts_on_is_a_line_every_five_percent(capsys: pytest.CaptureFixture[str]) -> None:
     """Progress where there is no terminal: lines that a log can hold."""
-    with stages() as progress:
+    with show_stages() as progress:
         for k in range(1000):
             progress(f"{k} of 1000 draws checked", 0.9 * k / 1000)
         progress("making draw 12 again", 0.9)
