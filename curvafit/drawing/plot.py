@@ -86,7 +86,7 @@ def gallery_figure(fields: Mapping[str, np.ndarray], *, columns: int = 4, width:
     `options` are those of `surface_on`.
     """
     if not fields:
-        raise ValueError("expected at least one field to draw, got none")
+        raise ValueError("there is no field to draw")
     columns = min(columns, len(fields))
     rows = math.ceil(len(fields) / columns)
     cell = width / columns / DPI
@@ -166,7 +166,7 @@ def _scale_bar(figure: Figure, axes: Axes, length: float, unit: str, name: str) 
 def round_length(length: float) -> float:
     """Return the largest of 1, 2, 5 × 10ⁿ that is not above `length`."""
     if not length > 0:
-        raise ValueError(f"expected a positive length, got {length}")
+        raise ValueError(f"a length must be positive, got {length}")
     power = 10.0 ** math.floor(math.log10(length))
     return max((step * power for step in (1, 2, 5) if step * power <= length), default=power)
 
@@ -185,7 +185,7 @@ def diagram_figure(
         If the diagram is empty.
     """
     if not diagram.area > 0:
-        raise ValueError("expected a diagram with area to draw, got an empty one")
+        raise ValueError("the diagram is empty: it has no area to draw")
     unit = diagram.unit.removeprefix("1/") if unit is None else unit
     figure = _figure(4.2, 4.2)
     axes = figure.add_axes((0.16, 0.13, 0.82, 0.79 if title else 0.85))

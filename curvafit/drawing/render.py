@@ -130,9 +130,9 @@ def render(
     """
     field = np.asarray(u, dtype=np.float32)
     if field.ndim != 3 or min(field.shape) < 4:
-        raise ValueError(f"expected a volume of 3 axes of at least 4 voxels to draw, got shape {field.shape}")
+        raise ValueError(f"a volume to draw needs 3 axes of at least 4 voxels, got shape {field.shape}")
     if not np.isfinite(field).all():
-        raise ValueError("expected a finite volume to draw, got NaN or infinite values")
+        raise ValueError("a volume to draw needs finite values, got NaN or infinity")
     camera = view(field.shape, spacing, azimuth=azimuth, elevation=elevation)
     if height is not None:
         width = max(2, min(width, round(height * camera.half[0] / camera.half[1])))

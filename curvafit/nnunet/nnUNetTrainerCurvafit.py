@@ -79,10 +79,12 @@ class nnUNetTrainerCurvafit(nnUNetTrainer):
     def _prior(self) -> CurvaturePrior:
         spacing, patch = self.configuration_manager.spacing, self.configuration_manager.patch_size
         if len(patch) != 3:
-            raise ValueError(f"expected a 3D configuration, got {self.configuration_name} of patch size {list(patch)}")
+            raise ValueError(
+                f"the prior needs a 3D configuration, got {self.configuration_name} of patch size {list(patch)}"
+            )
         law, epsilon = os.environ.get("CURVAFIT_PRIOR"), _number("CURVAFIT_EPSILON", 0.0)
         if not law:
-            raise ValueError("expected CURVAFIT_PRIOR to be a preset or a fit.json, got nothing: see `curvafit nnunet`")
+            raise ValueError("CURVAFIT_PRIOR must be a preset or a fit.json, but it is not set: see `curvafit nnunet`")
         regions = self.label_manager.has_regions
         return CurvaturePrior(
             law,
@@ -105,5 +107,5 @@ def _number(name: str, missing: float | None = None) -> float:
     except ValueError:
         value = -1.0
     if not 0 <= value < float("inf"):
-        raise ValueError(f"expected {name} to be a number from 0, got {text!r}: see `curvafit nnunet`")
+        raise ValueError(f"{name} must be a number from 0, got {text!r}: see `curvafit nnunet`")
     return value

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import math
 from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
+from curvafit.core.extras import require
 from curvafit.core.files import write_atomically, write_content
 from curvafit.core.records import Format, can_write, has_mark
 from curvafit.scan.measure import Measures
@@ -22,7 +22,7 @@ SUFFIXES = (".csv", ".json", ".parquet")
 #: Columns of a table; a CSV file begins with them.
 COLUMNS = ("scan", "quantity", "symbol", "value", "low", "high", "unit", "direction", "version")
 #: `format` of a JSON table.
-FORMAT = "curvafit measures 1"
+FORMAT = Format("curvafit measures 1", title="a table of measures")
 
 
 def rows_of(measures: Measures) -> list[dict[str, Any]]:
@@ -35,17 +35,8 @@ def rows_of(measures: Measures) -> list[dict[str, Any]]:
         ends = (each.value, each.value - each.half, each.value + each.half)
         value, low, high = (end if math.isfinite(end) else None for end in ends)
         axis = f"{z:.4f} {y:.4f} {x:.4f}" if each.symbol == "DA" else ""
-        cells = (
-            measures.source,
-            each.name,
-            each.symbol,
-            value,
-            low,
-            high,
-            _unit(measures.unit, each.power),
-            axis,
-            release,
-        )
+        unit = _unit(measures.unit, each.power)
+        cells = (measures.source, each.name, each.symbol, value, low, high, unit, axis, release)
         rows.append(dict(zip(COLUMNS, cells, strict=True)))
     return rows
 
@@ -62,7 +53,7 @@ def check_table(path: str | PathLike[str], inputs: Sequence[str | Path] = (), ov
     """
     target = Path(path)
     if target.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"expected a table to write as {', '.join(SUFFIXES)}, got {target}")
+        raise ValueError(f"the name of a table must end in {', '.join(SUFFIXES)}, got {target}")
     if target.suffix.lower() == ".parquet":
         _pandas()
     return can_write(target, _ours, inputs=inputs, overwrite=overwrite)
@@ -85,7 +76,7 @@ def write_table(measures: Sequence[Measures], path: str | PathLike[str], *, over
         scans = [
             {"scan": each.source, "kind": each.kind, "blocks": each.blocks, "notes": each.notes} for each in measures
         ]
-        return write_content(target, json.dumps({"format": FORMAT, "scans": scans, "rows": rows}, indent=1))
+        return FORMAT.write(target, {"scans": scans, "rows": rows})
     text = io.StringIO(newline="")
     writer = csv.writer(text)
     writer.writerow(COLUMNS)
@@ -97,7 +88,7 @@ def _ours(target: Path) -> bool:
     """Return whether a file is a table of this program."""
     if target.suffix.lower() == ".csv":
         return has_mark(target, ",".join(COLUMNS))
-    return target.suffix.lower() == ".json" and Format(FORMAT).owns(target)
+    return target.suffix.lower() == ".json" and FORMAT.owns(target)
 
 
 def _unit(unit: str, power: int) -> str:
@@ -109,12 +100,5 @@ def _unit(unit: str, power: int) -> str:
 
 
 def _pandas() -> Any:
-    try:
-        import pandas
-        import pyarrow  # noqa: F401
-    except ImportError as error:
-        raise ImportError(
-            'expected pandas and pyarrow for a Parquet table, got neither: pip install "curvafit[tables]"',
-            name="pandas",
-        ) from error
-    return pandas
+    require("pyarrow", "tables", "a Parquet table")
+    return require("pandas", "tables", "a Parquet table")
