@@ -26,7 +26,6 @@ def run(name: str) -> dict[str, Any]:
     return runpy.run_path(str(NOTEBOOKS / f"{name}.py"))
 
 
-@pytest.mark.slow
 def test_infer() -> None:
     """A phase field gives its coefficients back: from another processor's shape as well."""
     ended = run("infer")
