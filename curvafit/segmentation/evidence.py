@@ -65,29 +65,13 @@ class Classes:
 
 
 def grey_levels(scan: Field, threshold: float | str = "otsu") -> np.ndarray:
-    """Return a scan's grey levels, float32, without its tails where Otsu's threshold is to split them.
-
-    Raises
-    ------
-    ScanError
-        If a value is not finite, or the threshold is another word.
-    """
+    """Return a scan's grey levels, float32, without its tails where Otsu's threshold is to split them."""
     values = scan.values.astype(np.float32)
-    if not np.isfinite(values).all():
-        raise ScanError(f"expected finite values, got {np.count_nonzero(~np.isfinite(values))} that are not")
     return values.clip(*grey_bounds(values, threshold))
 
 
 def grey_bounds(values: np.ndarray, threshold: float | str = "otsu") -> tuple[float, float]:
-    """Return the levels between which Otsu's threshold takes grey levels as they are; infinite ones for a number.
-
-    Raises
-    ------
-    ScanError
-        If the threshold is another word.
-    """
-    if isinstance(threshold, str) and threshold != "otsu":
-        raise ScanError(f"expected a threshold that is a number or 'otsu', got {threshold!r}")
+    """Return the levels between which Otsu's threshold takes grey levels as they are; infinite ones for a number."""
     if threshold == "otsu" and not np.all((values == values.min()) | (values == values.max())):
         low, high = np.percentile(values, TAILS)  # a mask's rarer value is no tail
         return float(low), float(high)
@@ -107,11 +91,6 @@ def estimate_classes(values: np.ndarray, scan: Field, threshold: float | str = "
         The split, or `"otsu"`.
     dark
         Whether the inside is the dark phase.
-
-    Raises
-    ------
-    ScanError
-        If a threshold leaves nothing on one side.
     """
     means, noise = _classes(values, _smoothed(values, scan, WIDTHS[0] + 0.3), threshold)
     means, noise = _classes(values, _smoothed(values, scan, _width(noise / (means[1] - means[0]))), threshold)

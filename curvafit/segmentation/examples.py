@@ -61,13 +61,7 @@ class Example:
 
     @classmethod
     def of(cls, volume: Field, places: Sequence[int], axis: int) -> Example:
-        """Know an example in slices that are as far apart as those of the volume at most.
-
-        Raises
-        ------
-        ScanError
-            If it is no mask, the slices are all empty or all full, or none would lie between them.
-        """
+        """Know an example in slices that are as far apart as those of the volume at most."""
         gap, length = int(np.diff(places).max()), volume.shape[axis]
         if not 1 < gap < length:
             raise ScanError(
@@ -199,11 +193,6 @@ def grow_task(slices: Slices, law: Coefficients, epsilon: float | None, progress
     """Return the task to fill a shape of a law between the same slices; its slices are cut to `EDGE`.
 
     The shape has the volume fraction of the known slices.
-
-    Raises
-    ------
-    ScanError
-        If no shape grows, or its slices are all empty or all full.
     """
     times = WorkingGrid.of(slices.frame, epsilon, periodic=True).times
     planes = [min(n, max(4, EDGE // part)) for n, part in zip(slices.inside.shape[1:], times[1:], strict=True)]

@@ -325,13 +325,6 @@ def lower_volume(
         A folder in which finished tiles stay, those of an earlier, killed run too; by default they are in memory.
     workers
         Whoever lowers the tiles, by default this process, one after another.
-
-    Raises
-    ------
-    ScanError
-        As `engine.lower_energy`.
-    ValueError
-        As `open_store`.
     """
     run = {**problem.parts, "law": problem.law, "steps": problem.steps, "tiles": tiling.counts, "place": tiling.place}
     opened = nullcontext(MemoryStore(tiling.shape)) if store is None else open_store(store, tiling.shape, run)

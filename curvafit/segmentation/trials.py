@@ -236,11 +236,6 @@ def choose_by_voxels(
         Coefficients with lengths in the scan's unit.
     remeasure
         Whether the classes are measured again, of the voxels left out on either side; else they stay.
-
-    Raises
-    ------
-    ScanError
-        If the start has one phase only.
     """
     inside = grey_evidence(values, scan, classes).level > 0
     where = box_with_most_surface(inside, (EDGE, EDGE, EDGE))

@@ -135,6 +135,7 @@ def test_where_no_prior_helps_the_mask_is_what_is_likely() -> None:
     assert np.array_equal(found.mask.values, p > 0.5) and found.status.startswith(f"{learned}; ")
 
 
+@pytest.mark.slow
 def test_an_example_chooses_a_weight_that_helps_elsewhere() -> None:
     one, other = tubes(), tubes(at=1.5)
     p = network(other, 1)
