@@ -20,7 +20,7 @@ from curvafit.core.workers import ThisProcess, Workers
 from curvafit.data_synth.atlas import versions
 from curvafit.data_synth.design import boxed
 from curvafit.data_synth.store import Record, Store, open_store
-from curvafit.generation.result import FORMED, well_formed
+from curvafit.generation.result import FORMED, is_well_formed
 from curvafit.generation.schedule import SCHEDULES, present_name
 from curvafit.geometry.descriptors import Descriptors, descriptors
 from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram, diagrams
@@ -46,7 +46,7 @@ def extract(
     measure: Callable[[Store, Record], Measured] | None = None,
     progress: Progress = silent,
 ) -> Atlas:
-    """Measure every well-formed shape of stores (`generation.viability.well_formed`), as field and as mask.
+    """Measure every well-formed shape of stores (`generation.result.is_well_formed`), as field and as mask.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def extract(
         (store, record)
         for store, records in zip(sources, draws, strict=True)
         for record in records
-        if well_formed(record.viability)
+        if is_well_formed(record.viability)
     ]
     if not shapes:
         places, count = " or ".join(str(store.path) for store in sources), sum(map(len, draws))
@@ -314,7 +314,7 @@ def _jobs(store: Store, views: Sequence[str], rows: _Rows) -> list[tuple[Store, 
         shape = _shape(store, index)
         missing = tuple(name for name in views if (shape, name) not in rows.keys)
         with suppress(KeyError):  # a draw that was removed since it was listed
-            if missing and store.viable(index) and well_formed(store.record(index).viability):
+            if missing and store.viable(index) and is_well_formed(store.record(index).viability):
                 jobs.append((store, index, missing))
     return jobs
 

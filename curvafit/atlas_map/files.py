@@ -23,7 +23,7 @@ from curvafit.core.records import can_write, has_mark, read_archive
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.data_synth.atlas import summarise
 from curvafit.data_synth.store import Record, Store, open_store
-from curvafit.generation.result import well_formed
+from curvafit.generation.result import is_well_formed
 from curvafit.geometry.diagram import Diagram
 from curvafit.inference.atlas import Atlas
 
@@ -83,7 +83,7 @@ def write_map(
     check_extra()
     sources = [store if isinstance(store, Store) else open_store(store) for store in stores]
     check_map(directory, [store.path for store in sources], overwrite)
-    check_size(sum(well_formed(store.record(index).viability) for store in sources for index in store.indices()))
+    check_size(sum(is_well_formed(store.record(index).viability) for store in sources for index in store.indices()))
     folder = Path(directory)
     (folder / CACHE).mkdir(parents=True, exist_ok=True)
     write_content(folder / CACHE / TAG, f"{_TAGGED}\n")

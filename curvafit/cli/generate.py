@@ -122,7 +122,7 @@ def generate(
 
         options["schedule"] = plan = named(schedule, steps)
         after = () if snapshots is None else parse_whole_numbers(snapshots, "--snapshots")
-        options["snapshots"] = tuple(map(plan.among, after))
+        options["snapshots"] = tuple(map(plan.check_step, after))
         options["orientation"] = Q = None if orientation is None else _parse_orientation(orientation)
         law_file = None if not law.fitted else prior or preset
         inputs = [str(path) for path in (law_file, maps) if path is not None]
@@ -195,9 +195,9 @@ def _place_checkpoint(file: Path | None, every: float | None) -> dict[str, Any]:
     """Return the options of the checkpoint as `generate` takes them."""
     if file is None and every is not None:
         raise ValueError(f"--checkpoint-every {every:g} needs --checkpoint")
-    from curvafit.generation.checkpoint import place_of
+    from curvafit.generation.checkpoint import resolve_place
 
-    place = None if file is None else place_of(file)
+    place = None if file is None else resolve_place(file)
     return {"checkpoint": place} if every is None else {"checkpoint": place, "checkpoint_every": every}
 
 

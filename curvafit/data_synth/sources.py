@@ -22,7 +22,7 @@ from curvafit.data_synth.imaging.modality import Modality
 from curvafit.data_synth.store import Store, open_store
 from curvafit.generation.flow import generate
 from curvafit.generation.loop import first_mass
-from curvafit.generation.result import well_formed
+from curvafit.generation.result import is_well_formed
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.schedule import schedule as named_schedule
 from curvafit.priors.coefficients import Coefficients
@@ -117,7 +117,7 @@ class Generated:
                     schedule=self.schedule,
                     reject_early=True,
                 )
-            if well_formed(flow.viability):
+            if is_well_formed(flow.viability):
                 point = dict(zip(PARAMETERS, (*six, flow.mass), strict=True))
                 grown = {"seed": seed, "schedule": flow.schedule.as_dict(), "status": flow.status}
                 origin = {"name": self.names[turn], "parameters": point, **grown}
@@ -297,7 +297,7 @@ def _well_formed_draws(paths: tuple[Path, ...]) -> list[tuple[Store, int]]:
     """Return the well-formed draws of some stores, each with its store."""
     draws = []
     for store in map(open_store, paths):
-        formed = [(store, index) for index in store.indices() if well_formed(store.record(index).viability)]
+        formed = [(store, index) for index in store.indices() if is_well_formed(store.record(index).viability)]
         if not formed:
             raise ValueError(f"the store {store.path} has no well-formed shapes")
         draws += formed

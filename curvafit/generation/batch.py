@@ -70,7 +70,7 @@ def generate_batch(
     check_choice(backend, BACKENDS, f"a backend among {', '.join(BACKENDS)}")
     check_device(device)
     size = 1
-    if backend in ("torch", "compiled") or not kernels.fused(device):
+    if backend in ("torch", "compiled") or not kernels.has_kernel(device):
         size = _fitting(grid, device) if together is None else together
     size = check_int(size, "at least one shape at a time", 1, 10**6)
     if size == 1:

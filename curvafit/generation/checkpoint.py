@@ -48,11 +48,11 @@ class Checkpoint:
     def __init__(self, path: str | Path, every: float, run: dict[str, str], keep: bool = False) -> None:
         if not every >= 0:
             raise ValueError(f"expected seconds between checkpoints, at least 0, got {every}")
-        self.path, self._every, self._run, self._keep = place_of(path), every, run, keep
+        self.path, self._every, self._run, self._keep = resolve_place(path), every, run, keep
         self._last_save = time.monotonic()
 
     @contextmanager
-    def held(self) -> Iterator[None]:
+    def lock(self) -> Iterator[None]:
         """Lock the file against other runs.
 
         Raises
@@ -103,7 +103,7 @@ class Checkpoint:
             raise ValueError(f"expected a checkpoint of this run, got one with {'; '.join(parts)}: {self.path}")
         return record["content"]
 
-    def due(self) -> bool:
+    def is_due(self) -> bool:
         """Return whether it is time to save."""
         return time.monotonic() - self._last_save >= self._every
 
@@ -122,7 +122,7 @@ class Checkpoint:
             self.path.unlink(missing_ok=True)
 
 
-def place_of(path: str | Path) -> Path:
+def resolve_place(path: str | Path) -> Path:
     """Return the file to which a checkpoint's path leads.
 
     Raises

@@ -240,7 +240,7 @@ class _Execution:
             If the optimiser is unknown, or the backend is `"fused"` and there is no fused kernel.
         """
         check_choice(optimiser, ("adam", "lbfgs"), "an optimiser 'adam' or 'lbfgs'")
-        able = kernels.fused(self.device)
+        able = kernels.has_kernel(self.device)
         if self.backend == "fused" and not able:
             raise ValueError(f"expected a device with fused kernels (a processor, with numba), got {self.device}")
         whole = isinstance(form, DivergenceForm) and optimiser == "adam" and cost.data is None

@@ -66,7 +66,7 @@ class FlowOptions:
             object.__setattr__(self, name, as_tuple(getattr(self, name), name))
         if faults := [callback for callback in self.callbacks if not callable(callback)]:
             raise ValueError(f"expected callbacks that can be called, got {quoted(faults[0])}")
-        object.__setattr__(self, "snapshots", tuple(map(self.plan.among, self.snapshots)))
+        object.__setattr__(self, "snapshots", tuple(map(self.plan.check_step, self.snapshots)))
 
     def check_memory(self, device: torch.device | str) -> None:
         """Raise ValueError where a flow does not fit into the device's memory, or its snapshots into the machine's."""
@@ -92,7 +92,7 @@ def run(
     the flow.
     """
     runs = [_ShapeRun(*parts) for parts in zip(stepper.shapes, options, seeds, strict=True)]
-    with nullcontext() if checkpoint is None else checkpoint.held():
+    with nullcontext() if checkpoint is None else checkpoint.lock():
         _advance(stepper, runs, options, checkpoint)
     return [shape.end() for shape in runs]
 
@@ -109,20 +109,20 @@ def _advance(
             stepper.set_betas(betas)
         last = steps == plan.steps or stepper.stalled
         stepper.step(None if last else plan.rate(steps))
-        shifts = [shape.settle() for shape in runs] if last else []
+        shifts = [shape.set_fraction() for shape in runs] if last else []
         if any(shifts):
             stepper.step(None)
         for shape in runs:
-            shape.look(steps, last, stepper.stalled)
+            shape.observe(steps, last, stepper.stalled)
         if last or all(shape.stop for shape in runs):
             break
         mark = min(option.next_mark(steps) for option in options)
         steps += 1 + stepper.run([plan.rate(step) for step in range(steps + 1, mark)])
-        if checkpoint is not None and checkpoint.due():
-            checkpoint.save(_content(stepper, runs, steps))
+        if checkpoint is not None and checkpoint.is_due():
+            checkpoint.save(_pack_state(stepper, runs, steps))
     if checkpoint is not None:
-        if any(shape.asked for shape in runs) and not last:
-            checkpoint.save(_content(stepper, runs, steps + 1))
+        if any(shape.stopped_by_callback for shape in runs) and not last:
+            checkpoint.save(_pack_state(stepper, runs, steps + 1))
         else:
             checkpoint.close()
 
@@ -138,7 +138,7 @@ def _resume(stepper: Stepper, runs: list[_ShapeRun], checkpoint: Checkpoint | No
     return content["made"]
 
 
-def _content(stepper: Stepper, runs: list[_ShapeRun], steps: int) -> dict[str, Any]:
+def _pack_state(stepper: Stepper, runs: list[_ShapeRun], steps: int) -> dict[str, Any]:
     """Return the content of a checkpoint."""
     return {"made": steps, "lanes": [(shape.rows, shape.snapshots) for shape in runs], "stepper": stepper.state()}
 
@@ -151,11 +151,11 @@ class _ShapeRun:
         self.rows: list[list[float]] = []
         self.snapshots: dict[int, Tensor] = {}
         #: The reason for a stop before the plan's end, and whether a callback is the reason.
-        self.stop, self.asked = "", False
+        self.stop, self.stopped_by_callback = "", False
         self._shortfall, self._failure, self._stalled = "", "", False
         self._field, self._mass = None, math.nan
 
-    def settle(self) -> bool:
+    def set_fraction(self) -> bool:
         """Make the share of volume exact at the end where a small constant does, and return whether one was added."""
         share = self._options.volume_fraction
         if share is None or self.stop:
@@ -168,7 +168,7 @@ class _ShapeRun:
         self._shortfall = f"; volume fraction {float((u > 0).double().mean()):.4f} instead of {share:.4f}"
         return False
 
-    def look(self, steps: int, last: bool, stalled: bool) -> None:
+    def observe(self, steps: int, last: bool, stalled: bool) -> None:
         """Take the snapshot, the record and the check that are due after `steps` steps, and the end's field."""
         if self.stop:
             return
@@ -201,7 +201,7 @@ class _ShapeRun:
         options, shape, total = self._options, self._shape, self._options.plan.steps
         statistics, mass = shape.statistics(), shape.mass()
         self.rows.append([steps, *statistics, mass])
-        if subject := _not_finite(statistics, mass):
+        if subject := _find_infinite(statistics, mass):
             self._failure = f"{subject} is not finite"
             self.stop = f"stopped after {steps} of {total} steps: {self._failure}"
             return
@@ -209,7 +209,7 @@ class _ShapeRun:
             state = State(shape.field(), *statistics, mass)
             answers = [bool(callback(steps, total, state)) for callback in options.callbacks]
             if any(answers):
-                self.stop, self.asked = f"stopped by a callback after {steps} of {total} steps", True
+                self.stop, self.stopped_by_callback = f"stopped by a callback after {steps} of {total} steps", True
         share = options.volume_fraction
         if share is not None and not last and steps >= FRACTION_BEGIN * total:
             shape.shift(correct_mass(shape.field(), share, mass, total))
@@ -234,7 +234,7 @@ class _ShapeRun:
         return f"{word} after {steps} steps: {change}{self._shortfall}"
 
 
-def _not_finite(statistics: Statistics, mass: float) -> str:
+def _find_infinite(statistics: Statistics, mass: float) -> str:
     """Return the name of the first of a flow's figures that is infinite or NaN; empty where all are finite."""
     figures = {"the energy": [statistics.energy], "the gradient": statistics[1:], "the field": [mass]}
     return next((name for name, values in figures.items() if not all(map(math.isfinite, values))), "")

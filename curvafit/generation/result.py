@@ -23,7 +23,7 @@ RECORD_EVERY = 10
 #: Greatest discrepancy ratio, and least extent of either phase, of a viable shape (paper, Experiment 4).
 DISCREPANCY_LIMIT = 0.75
 PHASE_LIMIT = 0.1
-#: `well_formed` also requires that |u| reaches a value in this interval in both phases. The published tests accept
+#: `is_well_formed` also requires that |u| reaches a value in this interval in both phases. The published tests accept
 #: plateaus near 0, whose level set is not an interface, and fragments of a few voxels with |u| up to 7.
 FORMED = (0.5, 2.0)
 #: Number of planes that are processed together.
@@ -122,7 +122,7 @@ class Flow(Pictured):
         return bool(np.isfinite(np.concatenate([*rows, extent])).all())
 
 
-def well_formed(end: Viability) -> bool:
+def is_well_formed(end: Viability) -> bool:
     """Return whether a shape is viable and |u| reaches a value within `FORMED` in both phases."""
     return end.viable and all(FORMED[0] < extent < FORMED[1] for extent in (end.highest, -end.lowest))
 

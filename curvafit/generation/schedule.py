@@ -99,7 +99,7 @@ class Schedule:
             sum(phase.share for phase in self.opening), "phases with shares below 1 in all", -math.ulp(0), 1
         )
 
-    def among(self, step: int) -> int:
+    def check_step(self, step: int) -> int:
         """Return a snapshot's number of steps.
 
         Raises
@@ -161,7 +161,7 @@ def _check_steps(phase: Phase | Schedule) -> None:
         object.__setattr__(phase, name, check_open_interval(getattr(phase, name), f"{name} in [0, 1)", -math.ulp(0), 1))
 
 
-def _opened(name: str, longest: float) -> Schedule:
+def _make_phased(name: str, longest: float) -> Schedule:
     """Return 1500 steps: the published ones while the topology forms, then longer ones with more momentum and less
     memory, which follow the same descent."""
     late = {"shape": "cosine", "momentum": 0.97, "memory": 0.99}
@@ -174,8 +174,8 @@ def _opened(name: str, longest: float) -> Schedule:
 #: cools: sooner, and often to other ends of less energy. `benchmarks.texture` compares them for each preset.
 SCHEDULES: dict[str, Schedule] = {
     "paper": Schedule("paper", 8000, 1e-3, 1e-3, "constant"),
-    "fast": _opened("fast", 7.5e-3),
-    "deep": _opened("deep", 1.5e-2),
+    "fast": _make_phased("fast", 7.5e-3),
+    "deep": _make_phased("deep", 1.5e-2),
     "cosine": Schedule("cosine", 1000, 2e-2, 1e-4, "cosine", momentum=0.97, memory=0.97),
 }
 #: The schedule of the packaged atlas and of most shapes that the packaged posterior learned from. What `infer` grows

@@ -105,7 +105,7 @@ class FusedStepper(Stepper):
         from curvafit.priors.kernels.cpu import FusedFlow
 
         base = form.base.numpy() if isinstance(form.base, Tensor) else form.base
-        a, epsilon, Q = kernels.on_processor(cost.coefficients, cost.grid, cost.epsilon, cost.orientation)
+        a, epsilon, Q = kernels.to_numpy_cost(cost.coefficients, cost.grid, cost.epsilon, cost.orientation)
         fixed = None if frozen is None else torch.as_tensor(frozen).numpy()
         self._flow = FusedFlow(
             start.numpy(), base, a, cost.grid, epsilon, cost.blur, fixed,
@@ -212,9 +212,9 @@ class TorchStepper(Stepper):
         if compiled:
             self._slope_of, switch = _differentiate, _Compiled()
             self._evaluate, self._adam = switch(self._evaluate_plainly), switch(adam)
-        self._begin()
+        self._start_optimiser()
 
-    def _begin(self) -> None:
+    def _start_optimiser(self) -> None:
         """Set the optimiser's state before its first step."""
         self._moments = torch.zeros_like(self._parameters), torch.zeros_like(self._parameters)
         self._taken = 0
@@ -349,7 +349,7 @@ class LbfgsStepper(TorchStepper):
     in float32, where rounding hides the decrease: the parameters then stay, and the stepper is stalled.
     """
 
-    def _begin(self) -> None:
+    def _start_optimiser(self) -> None:
         self._cached: tuple[Tensor, tuple[Tensor | float, Tensor, Tensor]] | None = None
         self._optimiser = torch.optim.LBFGS(
             [self._parameters],
@@ -361,7 +361,7 @@ class LbfgsStepper(TorchStepper):
             line_search_fn="strong_wolfe",
         )
 
-    def _look(self) -> tuple[Tensor | float, Tensor, Tensor]:
+    def _evaluate_once(self) -> tuple[Tensor | float, Tensor, Tensor]:
         """Return the evaluation at the parameters, which is the cached one where they have not moved."""
         if self._cached is None or not torch.equal(self._cached[0], self._parameters):
             self._cached = self._parameters.clone(), self._evaluate(self._parameters, self._offset)
@@ -369,7 +369,7 @@ class LbfgsStepper(TorchStepper):
 
     def step(self, rate: float | None) -> None:
         self._statistics = None
-        self._value, self._u, self._slope = self._look()
+        self._value, self._u, self._slope = self._evaluate_once()
         if rate is None:
             return
         first = not self._optimiser.state
@@ -388,7 +388,7 @@ class LbfgsStepper(TorchStepper):
 
     def _closure(self) -> float:
         """Return the energy and set the parameters' gradient, as torch's line search asks."""
-        value, _, self._parameters.grad = self._look()
+        value, _, self._parameters.grad = self._evaluate_once()
         return float(value)
 
     def shift(self, k: int, amount: float) -> None:

@@ -117,7 +117,7 @@ class CurvaturePrior(nn.Module):
         self.sigmoid, self.softmax, self.reduction = sigmoid, softmax, reduction
         self.normalize: Literal["voxel", "area"] = normalize
         self.include_background, self.to_onehot_y, self.ignore_index = include_background, to_onehot_y, ignore_index
-        self.spacing = _edges(spacing)
+        self.spacing = _three_edges(spacing)
         width = RESOLVED * min(self.spacing) if epsilon is None else epsilon
         self.epsilon = check_float(width, "epsilon > 0 in spacing's unit", math.ulp(0), COARSEST * min(self.spacing))
         self.blur = check_float(blur, "blur >= 0 in spacing's unit", 0, COARSEST * min(self.spacing))
@@ -126,7 +126,7 @@ class CurvaturePrior(nn.Module):
         self.shape = None if shape is None else Grid(shape, self.spacing).shape  # type: ignore[arg-type]
         self.weight = _weights(weight)
         edge = min(self.spacing)
-        self.coefficients = tuple(_numbers(each, edge, unit, self.epsilon) for each in read_laws(law))
+        self.coefficients = tuple(_law_in_unit(known, edge, unit, self.epsilon) for known in read_laws(law))
         for numbers in self.coefficients:
             check_numbers(numbers, self.epsilon)
         _warn_of_interpolation(self.spacing, self.epsilon)
@@ -141,9 +141,12 @@ class CurvaturePrior(nn.Module):
         with torch.autocast(input.device.type, enabled=False):
             probability, voxels = self._probability(input), self._voxel_weights(input, target, mask)
             classes = probability.shape[1]
-            laws, weights = _each(self.coefficients, classes, "one law"), _each(self.weight, classes, "one weight")
+            laws, weights = (
+                _per_class(self.coefficients, classes, "one law"),
+                _per_class(self.weight, classes, "one weight"),
+            )
             spacing = self._spacing(input)
-            skipped, columns = self._skips(input), []
+            skipped, columns = self._is_skipped(input), []
             for channel, (law, weight) in enumerate(zip(laws, weights, strict=True)):
                 field = probability[:, channel]
                 if weight == 0 or skipped:
@@ -248,7 +251,7 @@ class CurvaturePrior(nn.Module):
         pairs = zip(self.spacing, self.shape, input.shape[2:], strict=True)
         return tuple(h * whole / n for h, whole, n in pairs)  # type: ignore[return-value]
 
-    def _skips(self, input: Tensor) -> bool:
+    def _is_skipped(self, input: Tensor) -> bool:
         """Return whether an input is a level of deep supervision that has no interior or is too coarse for ε."""
         space = tuple(input.shape[2:])
         if self.shape is None or space == self.shape:
@@ -374,7 +377,7 @@ def curvature_prior(
     check_numbers(coefficients, epsilon)
     check_lengths(epsilon, blur, max(n * h for n, h in zip(shape, spacing, strict=True)))
     unit = epsilon / WORKING_EPSILON
-    u, weights = 2 * probability - 1, _window(probability, mask, border)
+    u, weights = 2 * probability - 1, _window_mask(probability, mask, border)
     for axis, n in enumerate(times):
         if n > 1:
             u, weights = refine_axis(u, axis, n), weights.repeat_interleave(n, axis - 3)
@@ -439,7 +442,7 @@ def check_lengths(epsilon: float, blur: float, longest: float) -> None:
             raise ValueError(f"expected {name} of at most the window's longest side, {longest:g}, got {length:g}")
 
 
-def _edges(spacing: float | Sequence[float]) -> tuple[float, float, float]:
+def _three_edges(spacing: float | Sequence[float]) -> tuple[float, float, float]:
     """Return three voxel edges."""
     return Grid((4, 4, 4), spacing).spacing  # type: ignore[arg-type]
 
@@ -455,7 +458,7 @@ def _weights(weight: float | Sequence[float]) -> tuple[float, ...]:
     return values
 
 
-def _numbers(law: Law, edge: float, unit: str | None, epsilon: float) -> Coefficients:
+def _law_in_unit(law: Law, edge: float, unit: str | None, epsilon: float) -> Coefficients:
     """Return coefficients with lengths in spacing's unit; warn where ε is far from the fit's."""
     numbers = law.in_unit(unit, edge)
     if law.length_unit is None:
@@ -471,7 +474,7 @@ def _numbers(law: Law, edge: float, unit: str | None, epsilon: float) -> Coeffic
     return numbers
 
 
-def _each(values: tuple, classes: int, name: str) -> tuple:
+def _per_class(values: tuple, classes: int, name: str) -> tuple:
     """Return one value for each class."""
     if len(values) not in (1, classes):
         raise ValueError(f"expected {name}, or one for each class that counts ({classes} in all), got {len(values)}")
@@ -486,7 +489,7 @@ def _warn_of_interpolation(spacing: tuple[float, float, float], epsilon: float) 
         warnings.warn(f"ε = {epsilon:g} spans fewer than 2 voxels: interpolating {axes}", stacklevel=3)
 
 
-def _window(probability: Tensor, mask: Tensor | None, border: int) -> Tensor:
+def _window_mask(probability: Tensor, mask: Tensor | None, border: int) -> Tensor:
     """Return the mask `(1 or batch, z, y, x)` with zeros at the border."""
     inside = probability.new_zeros(probability.shape[1:])
     z, y, x = (slice(border, n - border) for n in inside.shape)

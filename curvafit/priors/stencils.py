@@ -42,13 +42,13 @@ def pad(u: Float[Tensor, "*batch z y x"], grid: Grid, width: int = 1, odd: tuple
 
 def gradient(u: Float[Tensor, "*batch z y x"], grid: Grid) -> Float[Tensor, "*batch 3 z y x"]:
     """Return central differences [-1, 0, 1] / 2Δx."""
-    v = pad(_checked(u, grid), grid)
+    v = pad(_check_shape(u, grid), grid)
     return torch.stack([_central(v, axis) / (2 * h) for axis, h in enumerate(grid.spacing)], -4)
 
 
 def gradient_adjoint(p: Float[Tensor, "*batch 3 z y x"], grid: Grid) -> Float[Tensor, "*batch z y x"]:
     """Apply the transpose of `gradient`: ⟨∇u, p⟩ = ⟨u, ∇ᵀp⟩ as plain sums over voxels."""
-    _checked(p, grid)
+    _check_shape(p, grid)
     return sum(
         -_central(pad(p.select(-4, axis), grid, odd=(axis,)), axis) / (2 * h) for axis, h in enumerate(grid.spacing)
     )  # type: ignore[return-value]
@@ -61,13 +61,13 @@ def divergence(vector: Float[Tensor, "*batch 3 z y x"], grid: Grid) -> Float[Ten
 
 def hessian(u: Float[Tensor, "*batch z y x"], grid: Grid) -> Float[Tensor, "*batch 6 z y x"]:
     """Return second differences: [1, -2, 1] on the diagonal, the 4-point cross off the diagonal (19 points in all)."""
-    v = pad(_checked(u, grid), grid)
+    v = pad(_check_shape(u, grid), grid)
     return torch.stack([_second(v, i, j) / _area(grid, i, j) for i, j in HESSIAN_AXES], -4)
 
 
 def hessian_adjoint(p: Float[Tensor, "*batch 6 z y x"], grid: Grid) -> Float[Tensor, "*batch z y x"]:
     """Apply the transpose of `hessian`: ⟨Hess u, p⟩ = ⟨u, Hessᵀp⟩ over the six stored components."""
-    _checked(p, grid)
+    _check_shape(p, grid)
     return sum(
         _second(pad(p.select(-4, c), grid, odd=() if i == j else (i, j)), i, j) / _area(grid, i, j)
         for c, (i, j) in enumerate(HESSIAN_AXES)
@@ -84,7 +84,7 @@ def gaussian_blur(u: Float[Tensor, "*batch z y x"], grid: Grid, width: float) ->
     ValueError
         If the field's shape is not the grid's, or as `check_blur` does.
     """
-    _checked(u, grid)
+    _check_shape(u, grid)
     check_blur(grid, width)
     if width == 0:
         return u
@@ -175,7 +175,7 @@ def _area(grid: Grid, i: int, j: int) -> float:
     return grid.spacing[i] * grid.spacing[j]
 
 
-def _checked(u: Tensor, grid: Grid) -> Tensor:
+def _check_shape(u: Tensor, grid: Grid) -> Tensor:
     """Return a field; raise ValueError where its shape is not the grid's."""
     if tuple(u.shape[-3:]) != grid.shape:
         raise ValueError(f"expected a field whose last axes are {grid.shape}, got {tuple(u.shape)}")

@@ -277,7 +277,7 @@ def test_what_a_killed_save_left_goes(tmp_path):
 
 
 def test_seconds_between_checkpoints(tmp_path):
-    assert Checkpoint(tmp_path / "a", 0, {}).due()
-    assert not Checkpoint(tmp_path / "a", 3600, {}).due()
+    assert Checkpoint(tmp_path / "a", 0, {}).is_due()
+    assert not Checkpoint(tmp_path / "a", 3600, {}).is_due()
     with pytest.raises(ValueError, match="expected seconds between checkpoints, at least 0, got -1"):
         Checkpoint(tmp_path / "a", -1, {})

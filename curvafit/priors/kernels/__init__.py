@@ -14,12 +14,12 @@ from curvafit.priors.energy import energy
 from curvafit.priors.grid import Grid
 
 
-def fused(device: torch.device | str) -> bool:
+def has_kernel(device: torch.device | str) -> bool:
     """Return whether there is a fused kernel for float32 fields on a device: on processors, where numba is."""
     return torch.device(device).type == "cpu" and importlib.util.find_spec("numba") is not None
 
 
-def on_processor(
+def to_numpy_cost(
     coefficients: Iterable[float | Tensor], grid: Grid, epsilon: float | Tensor, orientation: Tensor | None
 ) -> tuple[list[float | np.ndarray], float | np.ndarray, np.ndarray | None]:
     """Return a cost as `cpu` takes it: numbers, or arrays `(Z, Y, X)` where they vary in space."""
@@ -48,11 +48,11 @@ def energy_gradient(
     ValueError
         If the field's shape is not the grid's.
     """
-    if u.dtype != torch.float32 or not fused(u.device):
+    if u.dtype != torch.float32 or not has_kernel(u.device):
         return plain_energy_gradient(u, coefficients, grid, epsilon, orientation, mask)
     from curvafit.priors.kernels import cpu
 
-    a, ε, Q = on_processor(coefficients, grid, epsilon, orientation)
+    a, ε, Q = to_numpy_cost(coefficients, grid, epsilon, orientation)
     kept = None if mask is None else mask.detach().numpy()
     value, slope = cpu.energy_gradient(u.detach().numpy(), a, grid, ε, Q, kept)
     return torch.tensor(value, dtype=torch.float64), torch.from_numpy(slope)

@@ -43,7 +43,7 @@ def energies(
     """
     if mask.requires_grad:
         raise ValueError("expected a mask that asks for no gradient, got one that does: detach it")
-    compiling, fused = torch.compiler.is_compiling(), kernels.fused(u.device)
+    compiling, fused = torch.compiler.is_compiling(), kernels.has_kernel(u.device)
     if u.dtype != torch.float32 or not (fused or (torch.is_grad_enabled() and not compiling)):
         return energy(u, coefficients, grid, epsilon, mask=mask)
     given = u, mask.to(u).expand(u.shape), [float(value) for value in coefficients], list(grid.spacing), epsilon
@@ -55,13 +55,13 @@ def areas(
     u: Float[Tensor, "batch z y x"], grid: Grid, epsilon: float, mask: Float[Tensor, "#batch z y x"]
 ) -> Float[Tensor, " batch"]:
     """Return ∫ ε|∇u|² of every field, the term of F_ε that a00 multiplies, about σ × area, as `energies` does."""
-    if u.dtype == torch.float32 and kernels.fused(u.device):
+    if u.dtype == torch.float32 and kernels.has_kernel(u.device):
         return energies(u, (0.0, 0.0, 0.0, 0.0, 0.0, 1.0), grid, epsilon, mask)
     slope2 = gradient(u, grid).square().sum(-4)
     return epsilon * (slope2 * mask.to(u)).sum((-3, -2, -1)) * grid.voxel_volume
 
 
-def _computed(u, mask, a, spacing, epsilon) -> tuple[Tensor, Tensor]:
+def _compute(u, mask, a, spacing, epsilon) -> tuple[Tensor, Tensor]:
     """Return the energies and their gradient."""
     grid = Grid(tuple(u.shape[1:]), tuple(spacing), "replicate")
     values, slopes = u.new_empty((u.shape[0],)), torch.empty_like(u, memory_format=torch.contiguous_format)
@@ -85,7 +85,7 @@ class _Energies(torch.autograd.Function):
 
     @staticmethod
     def forward(u, mask, a, spacing, epsilon):
-        return _computed(u, mask, a, spacing, epsilon)
+        return _compute(u, mask, a, spacing, epsilon)
 
     @staticmethod
     def setup_context(ctx, inputs, output) -> None:
@@ -135,7 +135,7 @@ _ONLY_FIRST = "expected first derivatives of F_ε in float32, got a second one: 
 
 
 _SCHEMA = "(Tensor u, Tensor mask, float[] a, float[] spacing, float epsilon) -> (Tensor, Tensor)"
-_energies = torch.library.custom_op("curvafit::energies", _computed, mutates_args=(), schema=_SCHEMA)
+_energies = torch.library.custom_op("curvafit::energies", _compute, mutates_args=(), schema=_SCHEMA)
 
 
 @_energies.register_fake
