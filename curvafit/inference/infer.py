@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import datetime
 import platform
-from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -110,7 +109,6 @@ def infer(
     crop: Crop | None = None,
     seed: int = 0,
     effort: Effort = Effort(),  # noqa: B008
-    watch: Callable[[Prepared], None] | None = None,
     progress: Progress = silent,
     **reading: Any,
 ) -> Inference:
@@ -145,8 +143,6 @@ def infer(
         The voxels of one value as a mask; a box of voxels, of the scan and of `roi`: see `curvafit.load`.
     effort
         How many shapes are grown, of how many steps.
-    watch
-        Called with the `Prepared` scan before the long part begins; an exception of it ends the inference.
     progress
         Called with a sentence and the share done.
     reading
@@ -171,8 +167,6 @@ def infer(
     region = None if roi is None else field_of(roi)
     region = region if region is None or crop is None else region.crop(crop)
     prepared = prepare(volume, kind=kind, periodic=periodic, threshold=threshold, dark=dark, roi=region)
-    if watch is not None:
-        watch(prepared)
     progress("measuring curvature", 0.05)
     measured = None if prepared.noise else scan_diagram(prepared)
     numbers = morphometry(prepared.mask, prepared.working_voxel, prepared.unit, periodic=prepared.grid.periodic)
