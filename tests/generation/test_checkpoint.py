@@ -186,7 +186,7 @@ def test_a_checkpoint_is_its_backends(tmp_path):
     path, start = tmp_path / "run", generate(TUBES, MASS, GRID, schedule=PLAN).field
     told = {"flow": "mass", "optimiser": "adam", "steps": 40, "checkpoint": path}
     descend(start, TUBES, GRID, **told, callbacks=[lambda step, *rest: step == 20], backend="torch")
-    with pytest.raises(ValueError, match="backend torch instead of auto"):
+    with pytest.raises(ValueError, match="backend"):
         descend(start, TUBES, GRID, **told)
 
 
@@ -244,7 +244,7 @@ def test_links_are_followed_and_stay(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
     for name in ("pipe", "loop", "there"):
-        with pytest.raises(ValueError, match="expected a file for the checkpoint, got .* which is not a regular file"):
+        with pytest.raises(ValueError, match="regular file"):
             Checkpoint(tmp_path / name, 0, {})
 
 
@@ -253,9 +253,7 @@ def test_two_runs_do_not_share_a_file(tmp_path):
     path = tmp_path / "run"
 
     def other(step, total, state):
-        with pytest.raises(
-            ValueError, match="expected a checkpoint that no other run uses, got .*run, which is in use"
-        ):
+        with pytest.raises(ValueError, match="in use"):
             generate(TUBES, MASS, GRID, schedule=PLAN, checkpoint=path)
 
     generate(TUBES, MASS, GRID, schedule=PLAN, checkpoint=path, callbacks=[other])
@@ -279,5 +277,5 @@ def test_what_a_killed_save_left_goes(tmp_path):
 def test_seconds_between_checkpoints(tmp_path):
     assert Checkpoint(tmp_path / "a", 0, {}).is_due()
     assert not Checkpoint(tmp_path / "a", 3600, {}).is_due()
-    with pytest.raises(ValueError, match="expected seconds between checkpoints, at least 0, got -1"):
+    with pytest.raises(ValueError, match="seconds"):
         Checkpoint(tmp_path / "a", -1, {})

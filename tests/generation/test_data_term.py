@@ -61,12 +61,12 @@ def test_a_hinge_lets_go_where_it_is_right() -> None:
 @pytest.mark.parametrize("bad", [torch.full((4, 4, 4), math.nan), torch.zeros(4, 4)])
 def test_bad_evidence_is_refused(bad) -> None:
     for kind in (Evidence, Hinge):
-        with pytest.raises(ValueError, match="expected finite evidence"):
+        with pytest.raises(ValueError, match="evidence"):
             kind(bad)
 
 
 def test_evidence_of_another_shape_is_refused() -> None:
-    with pytest.raises(ValueError, match="expected the data's ratio to broadcast"):
+    with pytest.raises(ValueError, match="ratio"):
         descend(torch.zeros(8, 8, 8), WILLMORE, Grid(8), data=Evidence(torch.ones(7, 8, 8)), steps=1)  # type: ignore[arg-type]
 
 
@@ -97,7 +97,7 @@ def test_a_checkpoint_is_its_data_s(tmp_path: Path) -> None:
     options = {"steps": 20, "checkpoint": path, "checkpoint_every": 0.0, "optimiser": "adam"}
     start, stop = 0.5 * drawn(8, 8, 8), [lambda made, total, state: made >= 10]
     descend(start, WILLMORE, Grid(8), data=Evidence(drawn(8, 8, 8)), callbacks=stop, **options)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="expected a checkpoint of this run"):
+    with pytest.raises(ValueError, match="this run"):
         descend(start, WILLMORE, Grid(8), data=Evidence(2 * drawn(8, 8, 8)), **options)
     resumed = descend(start, WILLMORE, Grid(8), data=Evidence(drawn(8, 8, 8)), **options)
     whole = descend(start, WILLMORE, Grid(8), data=Evidence(drawn(8, 8, 8)), **{**options, "checkpoint": None})

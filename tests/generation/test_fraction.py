@@ -58,13 +58,13 @@ def test_what_cannot_be_reached_is_told():
 
 def test_a_mass_or_a_volume_fraction():
     a, grid = preset("tubes").coefficients, Grid((12, 12, 12))
-    with pytest.raises(ValueError, match="expected a mass or a volume fraction, got neither"):
+    with pytest.raises(ValueError, match="neither"):
         generate(a, None, grid)
     for mass in (1.0, float("nan"), torch.full(grid.shape, -0.5)):
-        with pytest.raises(ValueError, match=r"expected a mass in \(-1, 1\)"):
+        with pytest.raises(ValueError, match="mass"):
             generate(a, mass, grid, volume_fraction=0.2)
     for wanted in (0.0, 1.0, -0.1, float("nan")):
-        with pytest.raises(ValueError, match=r"expected a volume fraction in \(0, 1\)"):
+        with pytest.raises(ValueError, match="volume fraction"):
             generate(a, None, grid, volume_fraction=wanted)
 
 

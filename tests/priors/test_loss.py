@@ -60,7 +60,7 @@ def test_a_fit_is_in_its_own_unit_or_converted(tmp_path):
     assert tuple(law) == pytest.approx(tuple(TUBES.in_unit(1 / 200)))
     (law,) = CurvaturePrior(str(path), spacing=2e-3, unit="mm").coefficients
     assert tuple(law) == pytest.approx(tuple(TUBES.in_unit(1e3 / 200)))
-    with pytest.raises(ValueError, match="expected two units among nm, um, mm, m, got voxel and the fit's um"):
+    with pytest.raises(ValueError, match="units"):
         CurvaturePrior(path, unit="voxel")
 
 

@@ -202,7 +202,7 @@ def hessian_product(dtype: torch.dtype, vector: torch.Tensor, normalize: str) ->
 @pytest.mark.parametrize("normalize", ["voxel", "area"])
 def test_second_derivatives_are_right_or_refused(normalize):
     vector = noise(1, 1, 6, 6, 6, seed=1)
-    with pytest.raises(RuntimeError, match="expected first derivatives of F_ε in float32, got a second one"):
+    with pytest.raises(RuntimeError, match="float64"):
         hessian_product(torch.float32, vector.float(), normalize)
     prior, logits, step = CurvaturePrior("tubes", sigmoid=True, normalize=normalize), noise(1, 1, 6, 6, 6), 1e-5
     ends = [slope_of(prior, logits + sign * step * vector) for sign in (1, -1)]

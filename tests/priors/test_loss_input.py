@@ -111,7 +111,7 @@ def test_the_suggested_weight_balances_gradients():
     weight = prior.suggest_weight(base, (logits, target), share=0.3)
     ours, theirs = slope_of(prior, logits).norm(), slope_of(lambda x: base(x, target), logits).norm()
     assert float(weight * ours) == pytest.approx(0.3 * float(theirs), rel=1e-5)
-    with pytest.raises(ValueError, match="expected a batch on which both losses have a gradient"):
+    with pytest.raises(ValueError, match="gradient"):
         prior.suggest_weight(base, (torch.full_like(logits, 1e4), target))
 
 
@@ -145,13 +145,13 @@ def test_wrong_arguments_are_said(options, message):
 
 
 def test_wrong_laws_are_said(tmp_path):
-    with pytest.raises(ValueError, match=r"expected a preset among .* got 'tubs'"):
+    with pytest.raises(ValueError, match="preset"):
         CurvaturePrior("tubs")
-    with pytest.raises(FileNotFoundError, match=r"expected a fit\.json, found no file"):
+    with pytest.raises(FileNotFoundError, match="no file"):
         CurvaturePrior(tmp_path / "fit.json")
-    with pytest.raises(ValueError, match="expected coefficients that are numbers"):
+    with pytest.raises(ValueError, match="numbers"):
         CurvaturePrior(Coefficients(torch.ones(2), 1, 1))
-    with pytest.raises(ValueError, match=r"expected one law, or one for each class that counts \(1 in all\), got 2"):
+    with pytest.raises(ValueError, match="one law"):
         CurvaturePrior(("tubes", "sponge"))(torch.rand(1, 1, 8, 8, 8))
 
 
@@ -166,28 +166,28 @@ def test_wrong_laws_are_said(tmp_path):
 def test_flat_input_is_refused(shape, message):
     with pytest.raises(ValueError, match=message):
         CurvaturePrior("tubes")(torch.rand(shape))
-    with pytest.raises(ValueError, match="expected an input of floats"):
+    with pytest.raises(ValueError, match="input"):
         CurvaturePrior("tubes")(torch.ones((1, 1, 8, 8, 8), dtype=torch.int64))
 
 
 def test_wrong_targets_and_masks_are_said():
     p, prior = torch.rand(2, 2, 8, 8, 8), CurvaturePrior("tubes", ignore_index=2)
     for target in (None, torch.ones(2, 2, 8, 8, 8)):
-        with pytest.raises(ValueError, match="expected a target .* with label 2 on ignored voxels"):
+        with pytest.raises(ValueError, match="label 2"):
             prior(p, target)
-    with pytest.raises(ValueError, match="expected a target of shape"):
+    with pytest.raises(ValueError, match="target"):
         prior(p, torch.ones(2, 1, 8, 8, 4))
     for shape in ((2, 3, 8, 8, 8), (3, 1, 8, 8, 8), (0, 1, 8, 8, 8), (2, 1, 8, 8, 1), (2, 8, 8, 8)):
-        with pytest.raises(ValueError, match=r"expected a mask of shape \(2 or 1, 2 or 1, 8, 8, 8\), got"):
+        with pytest.raises(ValueError, match="mask"):
             prior(p, torch.ones(2, 1, 8, 8, 8), mask=torch.ones(shape))
-    with pytest.raises(ValueError, match="expected a target of class numbers"):
+    with pytest.raises(ValueError, match="class numbers"):
         CurvaturePrior("tubes", to_onehot_y=True)(p, torch.ones(2, 2, 8, 8, 8))
 
 
 @pytest.mark.parametrize("option", [{"softmax": True}, {"include_background": False}])
 def test_what_a_single_channel_ignores_is_said(option):
     p = probabilities(1, 1, 8, 8, 8)
-    with pytest.warns(UserWarning, match="single channel prediction"):
+    with pytest.warns(UserWarning, match="single channel"):
         found = CurvaturePrior("tubes", **option)(p)
     assert torch.equal(found, CurvaturePrior("tubes")(p))
 
@@ -196,7 +196,7 @@ def test_what_a_single_channel_ignores_is_said(option):
 def test_a_mask_that_asks_for_a_gradient_is_refused(dtype):
     probability = torch.rand((1, 1, 8, 8, 8), generator=torch.Generator().manual_seed(0)).to(dtype)
     mask = torch.ones_like(probability, requires_grad=True)
-    with pytest.raises(ValueError, match="expected a mask that asks for no gradient, got one that does: detach it"):
+    with pytest.raises(ValueError, match="detach"):
         CurvaturePrior("tubes")(probability, mask=mask)
 
 
@@ -268,9 +268,9 @@ def test_lengths_beyond_the_window_are_refused(options, said) -> None:
 def test_products_beyond_float32_are_refused() -> None:
     """With what is too large, by name; as the function does."""
     law = Coefficients(1, 1, 1, a00=1e7)
-    with pytest.raises(ValueError, match=r"expected \|a00\| epsilon² of at most 1e\+06, got 4e\+07"):
+    with pytest.raises(ValueError, match="a00"):
         CurvaturePrior(law)
-    with pytest.raises(ValueError, match=r"expected \|a00\| epsilon² of at most 1e\+06, got 4e\+07"):
+    with pytest.raises(ValueError, match="a00"):
         curvature_prior(probabilities(1, 8, 9, 10), law, (1.0, 1.0, 1.0), 2.0)
 
 
@@ -280,7 +280,7 @@ def test_masks_beyond_float32_are_refused(value) -> None:
     p = probabilities(1, 1, 8, 9, 10)
     mask = torch.ones_like(p)
     mask[..., 3] = value
-    with pytest.raises(ValueError, match=r"expected a mask of finite numbers from 0, at most 1e\+09, got others"):
+    with pytest.raises(ValueError, match="mask"):
         CurvaturePrior("tubes")(p.float(), mask=mask)
 
 
@@ -291,7 +291,7 @@ def test_a_lost_value_is_warned_of_and_shows_in_the_loss(value, dtype) -> None:
     """Not among the probabilities that are promised: said once, and the loss is not a number."""
     prior, p = CurvaturePrior("tubes"), probabilities(1, 1, 8, 9, 10).to(dtype)
     p[0, 0, 4, 4, 4] = value
-    with pytest.warns(UserWarning, match="expected probabilities, got"):
+    with pytest.warns(UserWarning, match="probabilities"):
         assert not bool(torch.isfinite(prior(p)))
     assert not bool(torch.isfinite(prior(p)))
 
@@ -322,7 +322,7 @@ def test_other_axes_have_two_voxels_to_epsilon():
 
 @pytest.mark.parametrize(("spacing", "epsilon"), [(1.0, 0.02), ((16.1, 1.0, 1.0), 2.0)])
 def test_no_axis_is_interpolated_more_than_16_fold(spacing, epsilon):
-    with pytest.raises(ValueError, match=r"expected an ε of at least .* refined (100|17)-fold"):
+    with pytest.raises(ValueError, match="fold"):
         CurvaturePrior("tubes", spacing=spacing, epsilon=epsilon)
 
 
@@ -338,7 +338,7 @@ def test_an_epsilon_far_from_the_fit_s_is_said(tmp_path, factor):
 
 @pytest.mark.parametrize("law", ["tubes", LAW])
 def test_an_unknown_unit_is_said(law):
-    with pytest.raises(ValueError, match="expected a unit among nm, um, mm, m, got 'furlong'"):
+    with pytest.raises(ValueError, match="unit"):
         CurvaturePrior(law, unit="furlong")
     assert CurvaturePrior(law, unit="mm").coefficients == CurvaturePrior(law).coefficients
 
@@ -349,7 +349,7 @@ def test_an_unknown_unit_is_said(law):
 def test_logits_taken_for_probabilities_are_said_once():
     logits, prior = noise(1, 1, 8, 8, 8), CurvaturePrior("tubes")
     prior(probabilities(1, 1, 8, 8, 8) * 1.001)
-    with pytest.warns(UserWarning, match="expected probabilities, got -.* sigmoid or softmax missing"):
+    with pytest.warns(UserWarning, match="sigmoid"):
         prior(logits)
     prior(logits)  # a warning is an error here
     CurvaturePrior("tubes", sigmoid=True)(logits)
@@ -360,7 +360,7 @@ def test_logits_are_no_break_in_a_compiled_graph():
     prior = CurvaturePrior("tubes", shape=(16, 16, 16))
     compiled = torch.compile(prior, backend="aot_eager", fullgraph=True)
     value, mask = noise(1, 1, 8, 8, 8, dtype=torch.float32), torch.ones(1, 1, 8, 8, 8)
-    with pytest.warns(UserWarning, match="expected probabilities"):
+    with pytest.warns(UserWarning, match="probabilities"):
         expected = prior(value)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Dynamo detected a call to a `functools.lru_cache`", UserWarning)
@@ -376,7 +376,7 @@ def test_weights_are_numbers_of_any_kind(weight):
 def test_a_mask_is_finite_and_from_0(value):
     mask = torch.ones(1, 1, 8, 8, 8)
     mask[0, 0, 4, 4, 4] = value
-    with pytest.raises(ValueError, match="expected a mask of finite numbers from 0"):
+    with pytest.raises(ValueError, match="mask"):
         CurvaturePrior("tubes")(torch.rand(1, 1, 8, 8, 8), mask=mask)
 
 
@@ -401,7 +401,7 @@ def test_a_look_without_gradients_leaves_later_ones_alone():
 def test_a_level_too_coarse_is_zero(shape, options):
     whole = {"shape": (32, 32, 32)} | options
     prior, value = CurvaturePrior(("tubes", LAW), reduction="none", **whole), torch.rand(2, 2, *shape)
-    with pytest.warns(UserWarning, match="a level of .* voxels is too coarse for ε = 2, so its loss is 0"):
+    with pytest.warns(UserWarning, match="coarse"):
         found = prior(value.requires_grad_())
     assert found.shape == (2, 2, 1, 1, 1) and not bool(found.any())
     found.sum().backward()
