@@ -12,8 +12,8 @@ TORCH_INDEX ?=
 
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
-# Modules stay whole on one worker, so that what they share is made once.
-PYTEST := OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(BIN)/python -m pytest -q -n 2 --dist loadscope
+# Modules stay whole on one worker, so that what they share is made once. Workers with several threads wait for each other.
+PYTEST := OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} NUMBA_NUM_THREADS=$${NUMBA_NUM_THREADS:-1} $(BIN)/python -m pytest -q -n 2 --dist loadscope
 
 .PHONY: demo test test-all test-hostile lint docs clean
 
