@@ -21,11 +21,10 @@ LOOPBACK = "127.0.0.1"
 MOST = 1024
 #: Seconds that a scheduler has to answer.
 PATIENCE = 10
-#: A worker's environment: one thread for numba, as dask sets it for other libraries. Dask has the C library give memory
-#: back at once: arrays of a megabyte are then mapped anew each time, and measuring shapes takes four times as long.
+#: A worker's environment, which this process gets too. Dask has the C library give memory back at once: arrays of a
+#: megabyte are then mapped anew each time, and measuring shapes takes nearly four times as long.
 _ENVIRONMENT = {
     "DASK_LOGGING__DISTRIBUTED": "critical",
-    "NUMBA_NUM_THREADS": 1,
     "MALLOC_TRIM_THRESHOLD_": 1 << 28,
     "MALLOC_MMAP_THRESHOLD_": 1 << 25,
 }
