@@ -80,7 +80,6 @@ def test_segment_keeps_the_header_to_the_bit(oblique: Path, tmp_path: Path) -> N
     assert again.exit_code == 0 and json.loads(target.with_name("mask.json").read_text())["steps"] == 1
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("unit", "written"), [("um", "um"), ("voxel", "voxel"), ("cm", "mm")])
 def test_another_unit_renames_and_keeps_the_rest_of_the_header(unit, written, oblique, tmp_path) -> None:
     target, again = tmp_path / "mask.nii.gz", tmp_path / "again.nii"
@@ -99,7 +98,6 @@ def test_another_unit_renames_and_keeps_the_rest_of_the_header(unit, written, ob
     assert load(again).unit == "um" and load(again).spacing == pytest.approx(made.spacing, rel=1e-6)
 
 
-@pytest.mark.slow
 def test_an_axis_of_one_and_another_spacing(tmp_path: Path) -> None:
     path, target = tmp_path / "scan.nii", tmp_path / "mask.nii"
     image = nibabel.Nifti2Image(grey().T[..., None], np.diag([0.2, 0.2, 0.4, 1]))
@@ -211,7 +209,6 @@ def test_wrong_input_is_a_sentence(arguments, word, oblique, tmp_path, monkeypat
     assert not (tmp_path / "m.nii.gz").exists() and not list(tmp_path.glob(".m*"))
 
 
-@pytest.mark.slow
 def test_a_part_of_a_file_is_segmented_where_it_was(oblique: Path, tmp_path: Path) -> None:
     whole = nibabel.load(oblique)
     times = np.stack([np.asanyarray(whole.dataobj)[::-1], np.asanyarray(whole.dataobj)], axis=-1)
