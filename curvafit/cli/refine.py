@@ -75,8 +75,8 @@ def refine(
         options = {"epsilon": epsilon, "steps": steps}
         learned: dict[str, Any] = {}
 
-        def learn(volume: Boxes, progress: Progress) -> None:
-            """Try the prior out on the example, once."""
+        def calibrate_on_example(volume: Boxes, progress: Progress) -> None:
+            """Infer the prior from the example where none is given, calibrate it there, and keep both."""
             from curvafit.core.runtime import sub_progress
             from curvafit.segmentation.reconstruct import infer_law
             from curvafit.volumes.read import load
@@ -92,7 +92,7 @@ def refine(
             from curvafit.volumes.boxes import read_whole
 
             if example is not None and not learned:
-                learn(volume, progress)
+                calibrate_on_example(volume, progress)
             told = learned or {"prior": prior, "weight": weight}
             return refine_map(read_whole(volume), progress=progress, **told, **tools, **options)
 

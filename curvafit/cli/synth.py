@@ -144,9 +144,9 @@ def synth(
         from curvafit.core.units import convert_length
         from curvafit.data_synth.case import Recipe
         from curvafit.data_synth.sets import SetSpec
-        from curvafit.data_synth.sources import voxel_of
+        from curvafit.data_synth.sources import choose_voxel
 
-        edge = voxel_of(names, kind) if voxel is None else convert_length(voxel, unit, kind.base.unit)
+        edge = choose_voxel(names, kind) if voxel is None else convert_length(voxel, unit, kind.base.unit)
         low, high = parse_numbers(calibres, "--calibres", 2)
         recipe = Recipe(source, kind, box, edge, seed, (low, high))
         _build_and_preview(out, SetSpec(recipe, layout, tuple(labels.split(",")) if labels else ()), count, crew)

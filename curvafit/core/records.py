@@ -17,7 +17,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any, NamedTuple, TypeVar
+from typing import IO, Any, NamedTuple, NoReturn, TypeVar
 
 import numpy as np
 
@@ -397,7 +397,7 @@ def parse_json(content: str | bytes, expected: str, place: object) -> Any:
             text.removeprefix("\ufeff"),
             parse_int=_whole,
             parse_float=_finite,
-            parse_constant=_constant,
+            parse_constant=_refuse_constant,
             object_pairs_hook=_single,
         )
     except UnicodeDecodeError:
@@ -433,8 +433,8 @@ def _finite(text: str) -> float:
     return value
 
 
-def _constant(name: str) -> float:
-    """Raise ValueError for NaN and the infinities."""
+def _refuse_constant(name: str) -> NoReturn:
+    """Refuse NaN and the infinities, which Python's JSON parser hands to this function."""
     raise ValueError(f"{name}, which is not a finite number")
 
 

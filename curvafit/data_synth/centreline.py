@@ -101,9 +101,11 @@ def _thin(left, fixed, order, periodic):  # pragma: no cover
 
 @njit(cache=True)
 def _is_simple(around):  # pragma: no cover
-    """Return whether the middle of 27 voxels can go, given those of the mask around it as bits: they are one
-    26-connected piece, and what is outside and next to it is one 6-connected piece within its 18-neighbourhood
-    (Bertrand and Malandain 1994)."""
+    """Return whether deleting the middle of 3×3×3 voxels keeps the topology; `around` has the mask around it as bits.
+
+    It does where the mask around is one 26-connected piece, and what is outside and touches the middle is one
+    6-connected piece within the 18-neighbourhood (a simple point, Bertrand and Malandain 1994).
+    """
     outside = ~around & EIGHTEEN
     return outside & FACES != 0 and _is_one(around, around, CORNERS) and _is_one(outside, outside & FACES, SIDES)
 

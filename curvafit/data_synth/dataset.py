@@ -18,7 +18,7 @@ from curvafit.data_synth.case import check_calibres, check_crop, check_shape, dr
 from curvafit.data_synth.imaging.image import field_shape
 from curvafit.data_synth.imaging.maths import correlated_field
 from curvafit.data_synth.imaging.modality import Modality, modality
-from curvafit.data_synth.sources import Generated, Pool, Stored, voxel_of
+from curvafit.data_synth.sources import Generated, Pool, Stored, choose_voxel
 from curvafit.priors.law import LAW_TYPES, LawLike
 
 #: Length over which one texture gives way to another, as a share of the crop's longest edge.
@@ -109,7 +109,7 @@ class TextureDataset(IterableDataset):
         self._check(sources)
         stores = all(map(_is_store, sources))
         edge = None if voxel is None else check_float(voxel, "a shape's voxel of positive length", SHORTEST, LONGEST)
-        self.voxels = [edge or voxel_of([] if stores else sources, kind) for kind in self.modalities]
+        self.voxels = [edge or choose_voxel([] if stores else sources, kind) for kind in self.modalities]
         if stores:
             if volume_fraction is not None:
                 raise ValueError("volume_fraction applies to laws only; the source is a store of shapes")

@@ -257,10 +257,11 @@ def source_of(content: dict[str, Any]) -> ShapeSource:
     return Generated(points, tuple(content["names"]), plan, content["fraction"])
 
 
-def voxel_of(laws: Iterable[LawLike], kind: Modality) -> float:
-    """Return the edge of a shape's voxel in a modality's unit: that of a law that is a fit, else the modality's own.
+def choose_voxel(laws: Iterable[LawLike], kind: Modality) -> float:
+    """Return the voxel edge, in the modality's unit, that the fitted laws agree on, or else the modality's default.
 
-    A fit in voxels tells no edge of images in a unit of length. Raises ValueError where fits differ in their edges.
+    A fit whose lengths are in voxels has no edge in a unit of length and is passed over. Raises ValueError where fits
+    differ.
     """
     unit = kind.base.unit
     fits = [(law.working_voxel, law.length_unit) for law in read_laws(laws) if law.working_voxel and law.length_unit]

@@ -195,9 +195,14 @@ def _rays(shape: tuple[int, ...], direction: np.ndarray, steps: np.ndarray) -> _
     return _Rays(slopes, (rows, columns))
 
 
-def _planes(values: np.ndarray, rays: _Rays, times: int = 1) -> Iterator[tuple[float, tuple[slice, slice], np.ndarray]]:
-    """Yield the place of each plane of a stack, and of those between them where `times` is more than 1, the window of
-    rays that cross the plane, and its values there, linearly between voxels."""
+def _resample_planes(
+    values: np.ndarray, rays: _Rays, times: int = 1
+) -> Iterator[tuple[float, tuple[slice, slice], np.ndarray]]:
+    """Yield for each plane of a stack its place, the window of rays that cross it, and its values at those rays.
+
+    With `times` above 1, planes between those of the stack are interpolated. Bilinear interpolation is separable: one
+    sparse matrix for the rows, one for the columns.
+    """
     for n in range((len(values) - 1) * times + 1):
         k, part = divmod(n, times)
         plane = values[k] + np.float32(part / times) * (values[k + 1] - values[k]) if part else values[k]
@@ -292,7 +297,7 @@ def _first(field: np.ndarray, rays: _Rays, enter: np.ndarray, leave: np.ndarray,
     sides = np.flatnonzero(waiting & (enter > 0))
     look(sides, enter[sides])
     free, before = waiting.reshape(rays.shape), last.reshape(rays.shape)
-    for place, window, values in _planes(field, rays, times):
+    for place, window, values in _resample_planes(field, rays, times):
         hits = np.flatnonzero((values > 0) & free[window])
         i, j = np.divmod(hits, values.shape[1])
         meet((i + window[0].start) * rays.shape[1] + j + window[1].start, place, values.ravel()[hits])
@@ -366,7 +371,7 @@ def _shadow(field: np.ndarray, light: np.ndarray, points: np.ndarray) -> np.ndar
     order, planes = _stack(field, -light)
     rays = _rays(planes.shape, order.turned(-light), np.ones(2))
     highest = np.full((len(planes) + 2, *rays.shape), -1, np.float32)
-    for place, window, values in _planes(planes, rays):
+    for place, window, values in _resample_planes(planes, rays):
         highest[int(place) + 2][window] = values
     np.maximum.accumulate(highest, axis=0, out=highest)
     k, *others = points[order.axes]

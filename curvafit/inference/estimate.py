@@ -212,7 +212,8 @@ def _simulator(prepared: Prepared, view: str, schedule: Schedule | str) -> Simul
     Blur, noise and window are the scan's own.
     """
     grid = simulation_grid(prepared)
-    window = VIEWS["mask" if prepared.part(prepared.windows[0]).periodic else "crop"]
+    # A window of something larger loses what its faces cut; a box that repeats loses nothing.
+    apply_view = VIEWS["mask" if prepared.part(prepared.windows[0]).periodic else "crop"]
 
     def simulate(parameters: np.ndarray, seed: int) -> Descriptors | None:
         flow = generate(*law_of(parameters), grid, schedule=schedule, seed=seed, reject_early=True)
@@ -222,7 +223,7 @@ def _simulator(prepared: Prepared, view: str, schedule: Schedule | str) -> Simul
         try:
             if view == "field":
                 return descriptors(field, grid)
-            return descriptors(*window(prepared.rescan(field > 0, seed), grid, np.random.default_rng(seed)))
+            return descriptors(*apply_view(prepared.rescan(field > 0, seed), grid, np.random.default_rng(seed)))
         except (ScanError, NoSurface):
             return None
 

@@ -281,7 +281,9 @@ def _emulator(
     compression: Compression, views: tuple[str, ...], arrays: dict[str, np.ndarray], inflation: float
 ) -> Emulator:
     components = len(compression.basis)
-    layers = {name: _layers(arrays, f"emulator.{name}", len(PARAMETERS) + len(views)) for name in ("mean", "spread")}
+    layers = {
+        name: _read_layers(arrays, f"emulator.{name}", len(PARAMETERS) + len(views)) for name in ("mean", "spread")
+    }
     for name, each in layers.items():
         if each[-1].weight.shape[1] != components:
             raise ValueError(f"networks of the emulator's {name} with {each[-1].weight.shape[1]} outputs")
@@ -291,8 +293,8 @@ def _emulator(
     return Emulator(compression, views, arrays["box"], layers["mean"], layers["spread"], basis, inflation)
 
 
-def _layers(arrays: dict[str, np.ndarray], name: str, inputs: int) -> tuple[Layer, ...]:
-    """Return the layers of some networks, each of which reads what the one before it gives."""
+def _read_layers(arrays: dict[str, np.ndarray], name: str, inputs: int) -> tuple[Layer, ...]:
+    """Return the layers (member, out, in) of an ensemble; raise ValueError where their shapes do not chain."""
     count = sum(key.startswith(f"{name}.") for key in arrays) // 2
     layers = [Layer(arrays[f"{name}.{k}.weight"], arrays[f"{name}.{k}.bias"]) for k in range(count)]
     for weight, bias in layers:

@@ -87,7 +87,7 @@ class Grid:
 
 
 def _triple(value: Any) -> tuple:
-    """Return three values, or a single value three times; three times None where there is another number of values."""
+    """Return three values, or a single one three times; three None, which the next check refuses, for others."""
     single = isinstance(value, str) or not hasattr(value, "__iter__") or getattr(value, "shape", None) == ()
     try:
         parts = (value,) * 3 if single else tuple(value)

@@ -261,7 +261,7 @@ def _on_working_grid(scan: _Scan) -> Prepared:
         (WORKING_SPACING, WORKING_SPACING, WORKING_SPACING),
         "periodic" if scan.periodic and not cut else "replicate",
     )
-    mask, dropped = _structure(scan.level.kind, values, region, thickness / edge, grid.periodic)
+    mask, dropped = _clean_mask(scan.level.kind, values, region, thickness / edge, grid.periodic)
     windows = boxes_by_surface(surface_voxels(mask), LARGEST_WINDOW)
     filled = float((mask if region is None else mask[region]).mean())
     inverted = (MOSTLY.format(filled),) if filled > HALF else ()
@@ -359,10 +359,10 @@ def _moved(
     return moved, resample(region.astype(np.uint8), scale, start, shape, periodic=scan.periodic, nearest=True) > 0
 
 
-def _structure(
+def _clean_mask(
     kind: Kind, values: np.ndarray, region: np.ndarray | None, thickness: float, periodic: bool
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return the mask on the working grid, without what is too small to be structure."""
+    """Return the mask on the working grid, without specks and pinholes unless of a phase field, and notes."""
     mask = values > 0 if region is None else (values > 0) & region
     if kind == "field":
         return mask, ()

@@ -127,15 +127,18 @@ class Odds:
 
     @classmethod
     def of(cls, slices: Slices, truth: np.ndarray, places: Sequence[int]) -> Odds:
-        """Count the voxels of an example between its known slices.
+        """Count, for every bin of distances, the example's voxels between known slices, and those of them inside.
 
         Parameters
         ----------
+        slices
+            The example's known slices.
         truth
-            Other masks, bool (N, Y, X).
+            The true masks of slices between them, bool (N, Y, X).
         places
-            Their numbers in the volume.
+            The indices of these slices in the example.
         """
+        # Each voxel has the number of its bin in `counts`; counting numbers counts all bins in one pass.
         shape = (2, slices.gap // 2 + 1, len(EDGES) + 1, len(EDGES) + 1)
         bins = (np.broadcast_to(_half(truth.shape), truth.shape), *(each[list(places)] for each in _bins(slices)))
         numbers, size = np.ravel_multi_index(bins, shape), int(np.prod(shape))

@@ -131,9 +131,9 @@ class Slices:
         return int(max(*steps, self.places[0] + self.length - self.places[-1]) if self.periodic else steps.max())
 
     @property
-    def reach(self) -> np.ndarray:
-        """How far each slice is from the known ones, (length,), in the unit of the spacing; see `reach`."""
-        return self.spacing[0] * reach(self.places, self.length, self.periodic)
+    def harmonic_distance(self) -> np.ndarray:
+        """How far each slice is from the known ones, (length,), in the unit of the spacing; see `harmonic_distance`."""
+        return self.spacing[0] * harmonic_distance(self.places, self.length, self.periodic)
 
     @property
     def neighbours(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -178,12 +178,11 @@ def known_places(length: int, every: int | None, first: int, known: Sequence[int
     return places
 
 
-def reach(places: Sequence[int], length: int, periodic: bool = False) -> np.ndarray:
-    """Return how far slices are from the known ones, float64 (length,), in slices: the error of an interpolation grows
-    in proportion.
+def harmonic_distance(places: Sequence[int], length: int, periodic: bool = False) -> np.ndarray:
+    """Return d e / (d + e) of every slice, float64 (length,), d and e the distances to the known slices on either side.
 
-    With the distances d and e to the known slices before and after it is d e / (d + e): 0 at a known slice, a quarter
-    of the gap in its middle. Where there is none on one side, it is the distance to the other.
+    The error of an interpolation grows in proportion to it: it is 0 at a known slice, a quarter of the gap in its
+    middle. Where there is none on one side, it is the distance to the other.
     """
     known, every = np.array(places), np.arange(length)
     if periodic:

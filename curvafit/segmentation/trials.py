@@ -361,9 +361,10 @@ def _explained(levels: np.ndarray, phases: np.ndarray) -> float:
 
 
 def block_edge(values: np.ndarray, inside: np.ndarray) -> int:
-    """Return the edge of a block within which the noise of grey levels may be alike.
+    """Return the edge, in voxels, of the blocks that are left out together when a prior is tried.
 
-    A voxel left out is told by its neighbours' noise where that is correlated: blocks outlast the correlation.
+    It is twice the first lag at which the noise's correlation is below `CORRELATED` along every axis: within less, a
+    voxel that is left out would be known from the noise of its neighbours.
     """
     residual = values - np.where(inside, values[inside].mean(), values[~inside].mean())
     square = float(np.square(residual).mean())

@@ -15,7 +15,7 @@ from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.profile import profile_distance
 from curvafit.scan.grids import centre_distance
-from curvafit.segmentation.slices import Slices, plane_distances, reach
+from curvafit.segmentation.slices import Slices, harmonic_distance, plane_distances
 from curvafit.segmentation.trials import Task, Trial
 
 #: Default number of runs.
@@ -69,7 +69,7 @@ def estimate_probability(
 
     A few runs are too sure of what they agree on. So the same runs are made on a task, where it is known what is inside
     how often, and three weights are fitted: of their votes, of the depth below their mean surface in units of a slice's
-    `reach`, and a constant.
+    `harmonic_distance`, and a constant.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ class _Ensemble:
         votes, distance = np.zeros(level.shape, dtype=np.uint16), np.zeros(level.shape, dtype=np.float32)
         for seed in range(count):
             step = sub_progress(progress, seed / count, (seed + 1) / count)
-            start = level + (spread * slices.reach)[:, None, None].astype(np.float32) * _wave(slices, seed)
+            start = level + (spread * slices.harmonic_distance)[:, None, None].astype(np.float32) * _wave(slices, seed)
             u, ε = flow(slices, replace(setting, law=laws[seed % len(laws)]), start, step)
             votes += u > 0
             distance += profile_distance(torch.from_numpy(u), ε).numpy() / count
@@ -130,12 +130,12 @@ class _Ensemble:
 
     def evidence(self, rows: Sequence[int]) -> np.ndarray:
         """Return the evidence (N, 2) in the voxels of slices that are not known."""
-        depth = self.distance[rows] / self.slices.reach[rows, None, None]
+        depth = self.distance[rows] / self.slices.harmonic_distance[rows, None, None]
         return vote_evidence(self.votes[rows].ravel(), self.count, depth.ravel())
 
     def probabilities(self, weights: np.ndarray) -> np.ndarray:
         values = np.empty(self.votes.shape, dtype=np.float32)
-        for row, far in enumerate(self.slices.reach):
+        for row, far in enumerate(self.slices.harmonic_distance):
             if far > 0:
                 values[row] = probability(self.evidence([row]), weights).reshape(values.shape[1:])
         values[list(self.slices.places)] = self.slices.inside
@@ -146,7 +146,7 @@ def _spread(task: Task[Slices], level: np.ndarray) -> float:
     """Return how far an interpolation's distances are from a task's true ones, over the slices' reach: the median."""
     slices, rows = task.given, list(task.places)
     truth = plane_distances(task.truth, slices.spacing[1:], slices.gap * slices.spacing[0])
-    ratio = np.abs(level[rows] - truth) / slices.reach[rows, None, None]
+    ratio = np.abs(level[rows] - truth) / slices.harmonic_distance[rows, None, None]
     return float(np.median(ratio[np.abs(truth) < NEAR * min(slices.spacing[1:])]))
 
 
@@ -248,8 +248,8 @@ def remaining_entropy(
 ) -> np.ndarray:
     """Return the entropies (Z,) of the slices once a new one is known.
 
-    The uncertain layer of a slice is as thick as its `reach`: in that proportion the entropy falls. A new slice tells
-    nothing about slices beyond other known ones.
+    The uncertain layer of a slice is as thick as its `harmonic_distance`: in that proportion the entropy falls. A new
+    slice tells nothing about slices beyond other known ones.
     """
-    before, after = (reach(sorted(known), len(entropies), periodic) for known in (places, {*places, new}))
+    before, after = (harmonic_distance(sorted(known), len(entropies), periodic) for known in (places, {*places, new}))
     return entropies * np.divide(after, before, out=np.zeros_like(before), where=before > 0)

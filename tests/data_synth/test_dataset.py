@@ -19,7 +19,7 @@ from torch.utils.data import DataLoader
 from curvafit.data_synth import dataset as training
 from curvafit.data_synth.dataset import Sample, TextureDataset, as_dict, as_monai, as_subject
 from curvafit.data_synth.imaging.modality import Contrast, Imaging, Modality, Noise, Optics
-from curvafit.data_synth.sources import apply_symmetry, crop_periodic, crop_rotated, voxel_of
+from curvafit.data_synth.sources import apply_symmetry, choose_voxel, crop_periodic, crop_rotated
 from curvafit.data_synth.store import open_store
 from curvafit.priors import preset
 
@@ -199,7 +199,11 @@ def test_a_fit_in_voxels_tells_no_edge_of_images_in_a_unit():
     in_voxels = dataclasses.replace(in_um, length_unit="voxel")
     kind, of_voxels = Modality("um", "", 0.5, Imaging()), Modality("voxel", "", 0.5, Imaging(unit="voxel"))
     assert (kind.base.unit, of_voxels.base.unit) == ("um", "voxel")
-    assert (voxel_of([in_um], kind), voxel_of([in_voxels], kind), voxel_of([in_voxels], of_voxels)) == (0.25, 0.5, 0.25)
+    assert (choose_voxel([in_um], kind), choose_voxel([in_voxels], kind), choose_voxel([in_voxels], of_voxels)) == (
+        0.25,
+        0.5,
+        0.25,
+    )
 
 
 def test_torchio_s_form(store):

@@ -14,7 +14,7 @@ from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.engine import drawn_laws
 from curvafit.segmentation.examples import grow_task
 from curvafit.segmentation.reconstruct import reconstruct
-from curvafit.segmentation.slices import Slices, reach
+from curvafit.segmentation.slices import Slices, harmonic_distance
 from curvafit.segmentation.trials import Task, Trial
 from curvafit.segmentation.uncertainty import (
     BINS,
@@ -45,17 +45,17 @@ def known(mask: np.ndarray, places: list[int], *, periodic: bool = False) -> Sli
     return Slices(mask[places], tuple(places), len(mask), EDGES, periodic=periodic)
 
 
-# ---- reach -----------------------------------------------------------------------------------------------------------
+# ---- harmonic distance -----------------------------------------------------------------------------------------------
 
 
 def test_the_reach_is_that_of_both_sides() -> None:
-    np.testing.assert_allclose(reach([1, 5], 8), [1, 0, 3 / 4, 1, 3 / 4, 0, 1, 2])
-    np.testing.assert_allclose(reach([1, 5], 8, periodic=True), [3 / 4, 0, 3 / 4, 1, 3 / 4, 0, 3 / 4, 1])
-    np.testing.assert_allclose(reach([2], 4, periodic=True), [1, 3 / 4, 0, 3 / 4])
+    np.testing.assert_allclose(harmonic_distance([1, 5], 8), [1, 0, 3 / 4, 1, 3 / 4, 0, 1, 2])
+    np.testing.assert_allclose(harmonic_distance([1, 5], 8, periodic=True), [3 / 4, 0, 3 / 4, 1, 3 / 4, 0, 3 / 4, 1])
+    np.testing.assert_allclose(harmonic_distance([2], 4, periodic=True), [1, 3 / 4, 0, 3 / 4])
 
 
 def test_a_new_slice_lowers_the_reach_of_its_gap_alone() -> None:
-    before, after = reach([0, 8, 16], 20), reach([0, 3, 8, 16], 20)
+    before, after = harmonic_distance([0, 8, 16], 20), harmonic_distance([0, 3, 8, 16], 20)
     assert (after[1:8] < before[1:8]).all() and np.array_equal(after[8:], before[8:])
 
 

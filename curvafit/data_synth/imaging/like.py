@@ -204,7 +204,7 @@ def _measure_texture(relative: np.ndarray, inside: np.ndarray, steps: np.ndarray
     logs = np.log(np.where(bright_part, relative, 1.0))
     weight = bright_part.astype(np.float32)
     rest = (logs - logs[bright_part].mean()) * weight
-    first, second = (covariance(rest, weight, axis) for axis in (1, 2))
+    first, second = (autocovariance(rest, weight, axis) for axis in (1, 2))
     covariances = np.concatenate([first, second])
     lags = np.concatenate([np.arange(len(first)) * steps[1], np.arange(len(second)) * steps[2]]) / steps.min()
     share = covariances / max(covariances[0], 1e-12)
@@ -265,7 +265,7 @@ def measure_background(values: np.ndarray, inside: np.ndarray, steps: np.ndarray
     level = float(values[where].mean())
     weight = where.astype(np.float32)
     rest = (values - level) * weight
-    covariances = [covariance(rest, weight, axis) for axis in range(3)]
+    covariances = [autocovariance(rest, weight, axis) for axis in range(3)]
     lags = min(map(len, covariances[1:]))
     plane = (covariances[1][:lags] + covariances[2][:lags]) / 2
     noise, lateral, texture, length = _split_covariance(plane)
@@ -304,8 +304,11 @@ def measure_noise(
     return NoiseEstimate(gain, math.sqrt(max(constant, 0.0)), offset, ground.width, *rest)
 
 
-def covariance(rest: np.ndarray, weight: np.ndarray, axis: int) -> np.ndarray:
-    """Return the covariance at lags from 0, of pairs of which both are background."""
+def autocovariance(rest: np.ndarray, weight: np.ndarray, axis: int) -> np.ndarray:
+    """Return the autocovariance along an axis, at lags from 0, of a residual that is 0 off the background.
+
+    `weight` is 1 in the background and 0 elsewhere: pairs count of which both are background.
+    """
     a, w = np.moveaxis(rest, axis, 0), np.moveaxis(weight, axis, 0)
     lags = min(LAGS, len(a) // 3)
     sums = [(float((a[: len(a) - k] * a[k:]).sum()), float((w[: len(w) - k] * w[k:]).sum())) for k in range(lags + 1)]

@@ -119,7 +119,7 @@ def stream(seed: int, purpose: str, device: torch.device | str = "cpu") -> torch
 
 def white_noise(like: Float[Tensor, "b 1 z y x"], seeds: Sequence[int], purpose: str) -> Float[Tensor, "b 1 z y x"]:
     """Return independent standard normal numbers."""
-    return _drawn(tuple(like.shape[2:]), like, seeds, purpose)
+    return _standard_normal(tuple(like.shape[2:]), like, seeds, purpose)
 
 
 def correlated_field(
@@ -139,7 +139,7 @@ def correlated_field(
     shape = like.shape[2:]
     maps = [_interpolation(n, length, like) for n, length in zip(shape, lengths, strict=True)]
     nodes = tuple(n if weights is None else weights.shape[-1] for n, weights in zip(shape, maps, strict=True))
-    return along(_drawn(nodes, like, seeds, purpose), *maps)
+    return along(_standard_normal(nodes, like, seeds, purpose), *maps)
 
 
 def grainy_noise(
@@ -167,7 +167,8 @@ def seeds_of(seeds: Sequence[int], count: int) -> list[int]:
     return [int(seed) for seed in seeds]
 
 
-def _drawn(shape: tuple[int, ...], like: Tensor, seeds: Sequence[int], purpose: str) -> Tensor:
+def _standard_normal(shape: tuple[int, ...], like: Tensor, seeds: Sequence[int], purpose: str) -> Tensor:
+    """Return standard normal noise (batch, 1, *shape), a stream of its own for each seed and purpose."""
     drawn = [
         torch.randn((1, *shape), generator=stream(seed, purpose, like.device), device=like.device, dtype=like.dtype)
         for seed in seeds_of(seeds, len(like))

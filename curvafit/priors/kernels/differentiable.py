@@ -76,8 +76,9 @@ def _keep(ctx, inputs, output) -> None:
 
 
 def _backward(ctx, *by_outputs):
+    """Multiply the gradient that came with the energies by that of the loss; the second output has none of its own."""
     (by_energies, _), (slopes, u) = by_outputs, ctx.saved_tensors
-    return _Known.apply(slopes, u) * by_energies[:, None, None, None], None, None, None, None
+    return _PrecomputedGradient.apply(slopes, u) * by_energies[:, None, None, None], None, None, None, None
 
 
 class _Energies(torch.autograd.Function):
@@ -97,7 +98,7 @@ class _Energies(torch.autograd.Function):
     @staticmethod
     def jvp(ctx, by_u, *_):
         slopes, u = ctx.saved_tensors
-        return (_Known.apply(slopes, u) * by_u).sum((-3, -2, -1)), None
+        return (_PrecomputedGradient.apply(slopes, u) * by_u).sum((-3, -2, -1)), None
 
     @staticmethod
     def vmap(info, in_dims, u, mask, *numbers):
@@ -110,7 +111,7 @@ class _Energies(torch.autograd.Function):
         return (energies.unflatten(0, batches), slopes.unflatten(0, batches)), (0, 0)
 
 
-class _Known(torch.autograd.Function):
+class _PrecomputedGradient(torch.autograd.Function):
     """The gradient by u, which says that it depends on u but not how."""
 
     generate_vmap_rule = True
