@@ -38,3 +38,11 @@ def labyrinth():
 
     grid = Grid((32, 32, 32))
     return profile(Gyroid(0.32), centres(grid), 0.02).float(), grid
+
+
+@pytest.fixture(autouse=True)
+def _fused_where_asked(request: pytest.FixtureRequest) -> None:
+    """A test of the fused backend is skipped where numba is not installed."""
+    names = getattr(request.node, "callspec", None)
+    if names is not None and names.params.get("backend") == "fused":
+        pytest.importorskip("numba")

@@ -1,4 +1,4 @@
-"""What the tests of the kernels share: grids, a law, a smooth field and its gradient in plain torch."""
+"""What tests of the kernels share: grids, a law, a short schedule, a smooth field and its gradient in plain torch."""
 
 from __future__ import annotations
 
@@ -16,6 +16,10 @@ BOUNDARIES = ("periodic", "replicate")
 SPACINGS = ((0.01, 0.01, 0.01), (0.013, 0.01, 0.008))
 TUBES = Coefficients(1, 2, 6, -40, -40, 400)
 BETAS, ADAM_EPS, BLUR, EPSILON = (0.9, 0.999), 1e-2, 0.02, 0.02
+
+
+def short(steps: int, rate: float = 1e-2) -> Schedule:
+    return Schedule("test", steps, rate, rate / 10, "cosine")
 
 
 def smooth_field(grid: Grid, seed: int = 0, rms: float = 0.8) -> torch.Tensor:

@@ -99,7 +99,7 @@ def map_atlas(atlas: Atlas, distances: np.ndarray, positions: np.ndarray | None 
         raise ValueError(f"distances must be finite, symmetric and of shape ({n}, {n}), got {distances.shape}")
     positions = embed(distances) if positions is None else positions
     clusters = find_clusters(positions)
-    families, shares = _families(atlas)
+    families, shares = families_of(atlas)
     pooled = [shares[clusters == cluster].mean(0) for cluster in range(max(clusters) + 1)]
     names = tuple(leading_family(dict(zip(FAMILIES, pool, strict=True))) for pool in pooled)
     return AtlasMap(atlas, distances, positions, clusters, names, families, _settings(n))
@@ -191,7 +191,7 @@ def check_extra() -> None:
             raise ImportError(f'a map needs {module}: pip install "curvafit[atlas]"')
 
 
-def _families(atlas: Atlas) -> tuple[tuple[str, ...], np.ndarray]:
+def families_of(atlas: Atlas) -> tuple[tuple[str, ...], np.ndarray]:
     """Return the family of each shape, and its shares of area in the order of `FAMILIES`, `(N, 6)`."""
     sampling = atlas.provenance["settings"]
     box = float(np.prod(sampling["shape"]) * np.prod(sampling["spacing"]))

@@ -11,7 +11,7 @@ from curvafit.cli.console import plain_errors, print_table, say, say_notes, show
 from curvafit.cli.options import OverwriteOption, Reading, examples, parse_threshold, reads_volume
 
 if TYPE_CHECKING:
-    from curvafit.scan.measure import Measures, Quantity
+    from curvafit.scan.measure import Measures
 
 EXAMPLES = examples(
     "curvafit measure bone.tif --spacing 0.0195 --unit mm",
@@ -62,16 +62,7 @@ def _print_measures(measures: Measures, several: bool) -> None:
     if several:
         say(measures.source, style="bold")
     say_notes(measures.notes)
-    rows = [(each.name, each.symbol, *_format(each, measures.unit)) for each in measures.quantities]
+    rows = [(each.name, each.symbol, *each.format(measures.unit)) for each in measures.quantities]
     print_table(("", "", "value", "95 %", "unit"), rows, right=(2, 3))
     z, y, x = measures.direction
     say(f"The surface is most nearly parallel to the direction {z:.2f}, {y:.2f}, {x:.2f} (z, y, x).")
-
-
-def _format(quantity: Quantity, unit: str) -> tuple[str, str, str]:
-    """Return a number, its interval and its unit as text."""
-    from curvafit.core.units import format_number, per_unit, unit_name
-
-    power = quantity.power
-    name = "" if power == 0 else unit_name(unit) if power > 0 else per_unit(unit, -power)
-    return format_number(quantity.value, 4), f"± {format_number(quantity.half, 2)}", name

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Mapping
-from html import escape
 from importlib.metadata import version
-from importlib.resources import files
 from pathlib import Path
-from string import Template
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -16,18 +12,26 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
+from curvafit.atlas_map.layout import families_of
+from curvafit.atlas_map.picture import FAMILY_COLOURS
 from curvafit.core.files import write_content
 from curvafit.core.records import can_write, has_mark
 from curvafit.core.runtime import Progress, silent, sub_progress
-from curvafit.core.units import unit_name
-from curvafit.drawing.plot import INK, diagram_on, gallery_figure, png, shared_limits
-from curvafit.geometry.diagram import FAMILIES, family_of, half_thickness
+from curvafit.drawing.plot import CONTOUR, INK, diagram_on, gallery_figure, shared_limits
 from curvafit.geometry.distances import sliced_embedding
 from curvafit.inference.atlas import load_atlas
 from curvafit.inference.infer import infer
 from curvafit.inference.posterior import load_posterior
 from curvafit.priors.coefficients import Coefficients
-from curvafit.report.page import SYMBOLS, check_report, write_inference
+from curvafit.report.page import (
+    MARK,
+    SYMBOLS,
+    check_report,
+    describe_scan,
+    picture_of,
+    render_template,
+    write_inference,
+)
 from curvafit.scan.measure import measure
 from curvafit.scan.structure import find_level
 from curvafit.segmentation.reconstruct import reconstruct
@@ -40,23 +44,12 @@ if TYPE_CHECKING:
     from curvafit.inference.infer import Inference
     from curvafit.scan.measure import Measures
 
-#: The page's name in its folder, and the mark by which it is known as ours.
-PAGE, _MARK = "demo.html", '<meta name="generator" content="curvafit'
-#: Colours of `FAMILIES` that stay apart for the colour-blind (Okabe & Ito 2008).
-COLOURS = dict(zip(FAMILIES, ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00"), strict=True))
+#: The page's name in its folder.
+PAGE = "demo.html"
 #: A parameter is read where its 90 % interval is at most this share of the prior's, and partly read up to the second.
 _READ, _PARTLY = 0.35, 0.7
-#: What each measure is called on the page.
-_NUMBERS = {
-    "BV/TV": "volume fraction",
-    "Tb.Th": "mean thickness",
-    "Tb.Sp": "mean spacing",
-    "Conn.D": "connectivity density",
-    "BS/BV": "surface to volume",
-    "DA": "degree of anisotropy",
-    "H": "mean curvature",
-    "K": "Gaussian curvature",
-}
+#: The symbols of the measures on the page.
+_MEASURES = ("BV/TV", "Tb.Th", "Tb.Sp", "Conn.D", "BS/BV", "DA", "H", "K")
 
 
 class Demo(NamedTuple):
@@ -119,17 +112,19 @@ def write_demo(
     """
     folder = check_report(directory, [scan.source] if scan.source else (), overwrite)
     page = folder / PAGE
-    can_write(page, lambda path: has_mark(path, _MARK), overwrite=overwrite)
+    can_write(page, lambda path: has_mark(path, MARK), overwrite=overwrite)
     progress("measuring", 0.0)
     measures = measure(scan, progress=sub_progress(progress, 0.0, 0.1))
-    inference = infer(scan, fast=True, seed=seed, progress=sub_progress(progress, 0.1, 0.3))
+    atlas, posterior = load_atlas(), load_posterior()
+    reading = sub_progress(progress, 0.1, 0.3)
+    inference = infer(scan, fast=True, seed=seed, atlas=atlas, posterior=posterior, progress=reading)
     mask = find_level(scan).mask
     volume = Field(mask.view(np.uint8), scan.spacing, scan.unit)
     law = inference.fit if inference.fit.best is not None else Coefficients.willmore()
     filled = reconstruct(volume, law, every=every, progress=sub_progress(progress, 0.3, 0.95))
     completion = score_completion(mask, filled.mask.values, every, filled.status)
     progress("drawing the page", 0.95)
-    text = demo_page(inference, measures, completion, load_atlas(), load_posterior().box, title)
+    text = demo_page(inference, measures, completion, atlas, posterior.box, title)
     write_inference(inference, folder, overwrite=overwrite)
     return Demo(write_content(page, text), completion, measures, inference.fit)
 
@@ -173,37 +168,26 @@ def demo_page(
     title
         The page's heading, plain text.
     """
-    template = Template(files("curvafit.report").joinpath("templates", "demo.html").read_text(encoding="utf-8"))
-    fit, scan = inference.fit, inference.scan
-    shape = " × ".join(map(str, scan.shape))
-    return template.substitute(
-        version=escape(version("curvafit")),
-        title=escape(title),
-        scan=escape(f"{Path(scan.source).name or 'a volume'}: {shape} voxels (z, y, x) of {_voxel(scan)}."),
-        shapes=_image(_completion_figure(completion), "Known slices, the filled volume, and the scan"),
-        slices=_image(_slice_figure(scan, completion), "A left-out slice, the filled one, their difference"),
+    fit = inference.fit
+    return render_template(
+        "demo.html",
+        version=version("curvafit"),
+        title=title,
+        scan=describe_scan(inference),
+        shapes=picture_of(_completion_figure(completion), "Known slices, the filled volume, and the scan"),
+        slices=picture_of(_slice_figure(inference.scan, completion), "A left-out slice, as it is and as filled"),
         every=completion.every,
         score=f"{completion.dice['curvafit']:.3f}",
-        rivals=escape(", ".join(f"{way} {completion.dice[way]:.3f}" for way in WAYS)),
-        filled=escape(completion.status),
+        rivals=", ".join(f"{way} {completion.dice[way]:.3f}" for way in WAYS),
+        filled=completion.status,
         measures=_measure_rows(measures),
-        blocks=escape(_say_intervals(measures)),
-        map=_image(_map_figure(inference, atlas), "The scan's curvature diagram, and its place on the atlas's map"),
-        reading=escape(fit.status),
+        blocks=_say_intervals(measures),
+        map=picture_of(_map_figure(inference, atlas), "The scan's curvature diagram, and its place on the atlas's map"),
+        reading=fit.status,
         parameters=_parameter_rows(fit.draws, box),
-        weak="".join(f"<li>{escape(each)}</li>" for each in fit.weak_directions),
-        notes="".join(f"<li>{escape(note)}</li>" for note in dict.fromkeys((*scan.notes, *fit.notes))),
+        weak=fit.weak_directions,
+        notes=dict.fromkeys((*inference.scan.notes, *fit.notes)),
     )
-
-
-def _voxel(scan: Field) -> str:
-    if len(set(scan.spacing)) == 1:
-        return f"{scan.spacing[0]:.4g} {unit_name(scan.unit, scan.spacing[0])}"
-    return " × ".join(f"{h:.4g}" for h in scan.spacing) + f" {unit_name(scan.unit, 2)}"
-
-
-def _image(figure: Figure, alt: str) -> str:
-    return f'<img alt="{escape(alt)}" src="data:image/png;base64,{base64.b64encode(png(figure)).decode("ascii")}">'
 
 
 def _completion_figure(completion: Completion) -> Figure:
@@ -230,7 +214,7 @@ def _slice_figure(scan: Field, completion: Completion) -> Figure:
     for each, mask, name in ((axes[0], truth, "the slice that was left out"), (axes[1], filled, "the filled slice")):
         each.imshow(plane, cmap="gray", vmin=low, vmax=max(high, low + 1e-6), aspect=aspect)
         if mask.any() and not mask.all():
-            each.contour(mask, [0.5], colors="#E69F00", linewidths=1.1)
+            each.contour(mask, [0.5], colors=CONTOUR, linewidths=1.1)
         each.set_title(name, fontsize=11)
     difference = np.ones((*truth.shape, 3), np.float32)
     difference[truth & filled] = (0.72, 0.74, 0.78)
@@ -254,7 +238,7 @@ def _map_figure(inference: Inference, atlas: Atlas) -> Figure:
     places = (embeddings - mean) @ axes_of[:2].T
     own = (np.asarray(sliced_embedding(inference.diagram)) - mean) @ axes_of[:2].T
     share = float((spread[:2] ** 2).sum() / (spread**2).sum())
-    names = _families(atlas)
+    names, _ = families_of(atlas)
     figure = Figure(figsize=(10.2, 4.6), facecolor="white")
     FigureCanvasAgg(figure)
     λ, unit = inference.fit.length, inference.fit.length_unit
@@ -262,7 +246,7 @@ def _map_figure(inference: Inference, atlas: Atlas) -> Figure:
     diagram_on(left, inference.diagram, limits=shared_limits([inference.diagram], length=λ), unit=unit, length=λ)
     left.set_title("how much surface has which curvatures", fontsize=11)
     right = figure.add_axes((0.5, 0.13, 0.48, 0.78))
-    for name, colour in COLOURS.items():
+    for name, colour in FAMILY_COLOURS.items():
         of = [k for k, each in enumerate(names) if each == name]
         if of:
             right.scatter(*places[of].T, s=9, c=colour, linewidths=0, alpha=0.75, label=name)
@@ -282,27 +266,14 @@ def _map_figure(inference: Inference, atlas: Atlas) -> Figure:
     return figure
 
 
-def _families(atlas: Atlas) -> list[str]:
-    """Return the family of each shape of an atlas."""
-    box = float(np.prod(atlas.provenance["settings"]["shape"]) * np.prod(atlas.provenance["settings"]["spacing"]))
-    pairs = zip(atlas.field_diagrams, atlas.volume_fractions, strict=True)
-    return [family_of(diagram, half_thickness(diagram, float(share) * box)) for diagram, share in pairs]
-
-
-def _measure_rows(measures: Measures) -> str:
+def _measure_rows(measures: Measures) -> list[tuple[str, str, str, str]]:
+    """Return name, symbol, value with its unit, and interval; no interval where the scan is too small for one."""
     rows = []
-    for symbol, name in _NUMBERS.items():
-        quantity = measures[symbol]
-        unit = "" if not quantity.power else f" {unit_name(measures.unit, 2)}{_POWERS[quantity.power]}"
-        interval = "" if not np.isfinite(quantity.half) else f"± {quantity.half:.2g}"
-        rows.append(
-            f'<tr><th scope="row">{escape(name)}</th><td class="small">{escape(symbol)}</td>'
-            f'<td class="n">{quantity.value:.3g}{escape(unit)}</td><td class="n">{interval}</td></tr>'
-        )
-    return "\n".join(rows)
-
-
-_POWERS = {1: "", -1: "⁻¹", -2: "⁻²", -3: "⁻³"}
+    for symbol in _MEASURES:
+        value, interval, unit = measures[symbol].format(measures.unit)
+        known = np.isfinite(measures[symbol].half)
+        rows.append((measures[symbol].name, symbol, f"{value} {unit}".rstrip(), interval if known else ""))
+    return rows
 
 
 def _say_intervals(measures: Measures) -> str:
@@ -313,17 +284,14 @@ def _say_intervals(measures: Measures) -> str:
     return f"No intervals: they need eight blocks of one thickness and one spacing each, and the scan holds {count}."
 
 
-def _parameter_rows(draws: Draws | None, box: np.ndarray) -> str:
-    """Return a row for each parameter: its 90 % interval, how wide it is of the prior's, and whether it is read."""
+def _parameter_rows(draws: Draws | None, box: np.ndarray) -> list[tuple[str, str, str, str]]:
+    """Return each parameter's 90 % interval, how wide it is of the prior's, and whether the parameter is read."""
     if draws is None:
-        return ""
+        return []
     rows = []
     low, high = np.percentile(draws.parameters, (5, 95), axis=0)
     shares = (high - low) / (0.9 * (box[:, 1] - box[:, 0]))
     for name, a, b, share in zip(SYMBOLS, low, high, shares, strict=True):
         word = "read" if share <= _READ else "partly read" if share <= _PARTLY else "not read"
-        rows.append(
-            f'<tr><th scope="row">{escape(name)}</th><td class="n">{a:.3g} to {b:.3g}</td>'
-            f'<td class="n">{share:.0%}</td><td>{word}</td></tr>'
-        )
-    return "\n".join(rows)
+        rows.append((name, f"{a:.3g} to {b:.3g}", f"{share:.0%}", word))
+    return rows

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from curvafit.inference.infer import Inference
 
 #: The mark by which a page is known as this program's.
-_MARK = '<meta name="generator" content="curvafit'
+MARK = '<meta name="generator" content="curvafit'
 #: What an inference writes into its folder.
 FILES = ("fit.json", "report.html", "regenerated.nii.gz")
 #: Each parameter as it is written, what it multiplies, and the power of 1/length that it carries in physical units.
@@ -87,7 +87,7 @@ _SIZES = {
 
 
 class Picture(NamedTuple):
-    """A picture in the page: its PNG in base64, None where no shape grew, and the words below it."""
+    """A picture in the page: its PNG in base64, None where no shape was grown, and the words below it."""
 
     data: str | None
     alt: str
@@ -111,7 +111,7 @@ def check_report(directory: str | Path, inputs: Iterable[str | Path] = (), overw
         If it is no folder that can be written to, or an input or another file stands where one of the three goes.
     """
     folder = Path(directory)
-    ours = Format(FORMAT).owns(folder / "fit.json") and has_mark(folder / "report.html", _MARK)
+    ours = Format(FORMAT).owns(folder / "fit.json") and has_mark(folder / "report.html", MARK)
     first, *more = (folder / name for name in FILES)
     can_write(first, lambda _: ours, more=more, inputs=inputs, overwrite=overwrite)
     return folder
@@ -154,9 +154,9 @@ def write_report(inference: Inference, path: str | Path) -> Path:
     return write_content(Path(path), page)
 
 
-def report_html(inference: Inference) -> str:
-    """Return the page itself."""
-    page = Environment(
+def render_template(name: str, **values: Any) -> str:
+    """Return a page of `templates`, filled with values; all text is escaped."""
+    environment = Environment(
         loader=PackageLoader("curvafit.report"),
         autoescape=True,
         undefined=StrictUndefined,
@@ -164,14 +164,20 @@ def report_html(inference: Inference) -> str:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
+    return environment.get_template(name).render(**values)
+
+
+def report_html(inference: Inference) -> str:
+    """Return the page itself."""
     fit = inference.fit
-    return page.get_template("report.html").render(
+    return render_template(
+        "report.html",
         version=fit.provenance.get("curvafit", ""),
         glossary=GLOSSARY,
         number=format_number,
         fit=fit,
         sentence=describe(inference),
-        scan=_scan_line(inference),
+        scan=describe_scan(inference),
         slices=_slices(inference),
         framed=_is_framed(inference),
         shapes=_shapes(inference) if inference.twins else [],
@@ -221,7 +227,7 @@ def family_radius(diagram: Diagram, family: str) -> float | None:
     return float(1 / kappa[own][order][middle])
 
 
-def _scan_line(inference: Inference) -> str:
+def describe_scan(inference: Inference) -> str:
     """Return what was read: name, kind, voxels and their size."""
     scan, fit = inference.scan, inference.fit
     shape = " × ".join(str(n) for n in scan.values.shape)
@@ -362,7 +368,7 @@ def inference_figure(inference: Inference, **options: Any) -> Figure:
     return gallery_figure(shapes, **{"columns": 2, "width": 900, **options})
 
 
-def _picture(figure: Figure, alt: str, **words: str) -> Picture:
+def picture_of(figure: Figure, alt: str, **words: str) -> Picture:
     return Picture(base64.b64encode(png(figure)).decode("ascii"), alt, **words)
 
 
@@ -400,7 +406,7 @@ def _slice(inference: Inference, axis: int, index: int, limits: tuple[float, flo
     )
     depth = format_length((row + 0.5) * scan.spacing[axis], scan.unit)
     title, text = f"Across {_AXES[axis]}", f"Slice {row} of {scan.values.shape[axis]}, at {depth}"
-    return _picture(figure, f"Slice across {_AXES[axis]} with the surface's outline", title=title, text=text)
+    return picture_of(figure, f"Slice across {_AXES[axis]} with the surface's outline", title=title, text=text)
 
 
 def _is_framed(inference: Inference) -> bool:
@@ -427,7 +433,7 @@ def _shape(inference: Inference, title: str, u: np.ndarray | None, more: str = "
         return Picture(None, "", title, badge=badge)
     edges = [format_length(n * inference.fit.working_voxel, inference.fit.length_unit, 3) for n in u.shape]
     box = f"edge {edges[0]}" if len(set(edges)) == 1 else " × ".join(edges)
-    return _picture(surface_figure(u), f"Surface: {title}", title=title, text=box + more, badge=badge)
+    return picture_of(surface_figure(u), f"Surface: {title}", title=title, text=box + more, badge=badge)
 
 
 def scan_box(inference: Inference) -> np.ndarray:
@@ -452,7 +458,7 @@ def _diagrams(inference: Inference) -> list[Picture]:
     return [
         Picture(None, "", title)
         if diagram is None
-        else _picture(
+        else picture_of(
             diagram_figure(diagram, limits=limits, unit=unit, length=λ), f"Curvature diagram: {title}", title=title
         )
         for title, diagram in diagrams
@@ -470,7 +476,7 @@ def _corner(inference: Inference) -> Picture | None:
     low, high = np.concatenate(rows).min(0), np.concatenate(rows).max(0)
     rim = 0.06 * np.maximum(high - low, 1e-6)
     limits = list(zip((low - rim).tolist(), (high + rim).tolist(), strict=True))
-    return _picture(corner_figure(draws.parameters, SYMBOLS, limits, marks), "Draws of the parameters, two by two")
+    return picture_of(corner_figure(draws.parameters, SYMBOLS, limits, marks), "Draws of the parameters, two by two")
 
 
 def bands(inference: Inference) -> Picture | None:
@@ -479,7 +485,7 @@ def bands(inference: Inference) -> Picture | None:
     if inference.simulated is None or misfit is None:
         return None
     titles = {name: f"{name}, p = {format_number(misfit.blocks.get(name), 2)}" for name in inference.simulated}
-    return _picture(
+    return picture_of(
         bands_figure({titles[name]: block for name, block in inference.simulated.items()}),
         "The scan's descriptors on the bands of simulated shapes",
         text="Orange: the scan. Bands: 50 and 90 % of shapes grown from draws of the posterior, seen as the scan is. "

@@ -13,6 +13,7 @@ import numpy as np
 from scipy import ndimage, stats
 
 from curvafit.core.runtime import Progress, silent
+from curvafit.core.units import format_number, per_unit, unit_name
 from curvafit.geometry.descriptors import Descriptors, descriptors
 from curvafit.geometry.diagram import FAMILIES, MARGIN, Diagram, SurfaceCurvatures, families, surface_curvatures
 from curvafit.geometry.mesh import NoSurface, area_vectors
@@ -58,6 +59,11 @@ class Quantity:
     value: float
     half: float
     power: int
+
+    def format(self, unit: str) -> tuple[str, str, str]:
+        """Return the number, its interval and its unit as text, of a scan in `unit`."""
+        name = "" if self.power == 0 else unit_name(unit) if self.power > 0 else per_unit(unit, -self.power)
+        return format_number(self.value, 4), f"± {format_number(self.half, 2)}", name
 
 
 #: Name, symbol and power of each quantity, and how it comes from sums.

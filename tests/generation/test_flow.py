@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from found import made_fit
-from kernel_cases import relax
+from kernel_cases import relax, short
 
 from curvafit.generation.flow import descend, generate
 from curvafit.generation.forms import DivergenceForm, white_noise
@@ -27,17 +27,6 @@ from curvafit.priors.stencils import gaussian_blur
 TUBES, MASS = preset("tubes").coefficients, preset("tubes").mass
 BACKENDS = ("torch", "fused")
 EPSILON = BLUR = 0.02
-
-
-@pytest.fixture(autouse=True)
-def _fused_where_asked(request):
-    names = getattr(request.node, "callspec", None)
-    if names is not None and names.params.get("backend") == "fused":
-        pytest.importorskip("numba")
-
-
-def short(steps: int, rate: float = 1e-2) -> Schedule:
-    return Schedule("test", steps, rate, rate / 10, "cosine")
 
 
 def gyroid(grid: Grid) -> torch.Tensor:

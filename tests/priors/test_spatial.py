@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 import torch
+from kernel_cases import short
 
 from curvafit.generation.flow import generate
 from curvafit.generation.forms import white_noise
-from curvafit.generation.schedule import Schedule
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.energy import energy, orientation
 from curvafit.priors.grid import Grid
@@ -20,17 +20,6 @@ from curvafit.priors.stencils import divergence, gaussian_blur, gradient
 TUBES, MASS = preset("tubes").coefficients, preset("tubes").mass
 BACKENDS = ("torch", "fused")
 EPSILON = BLUR = 0.02
-
-
-@pytest.fixture(autouse=True)
-def _fused_where_asked(request):
-    names = getattr(request.node, "callspec", None)
-    if names is not None and names.params.get("backend") == "fused":
-        pytest.importorskip("numba")
-
-
-def short(steps: int, rate: float = 1e-2) -> Schedule:
-    return Schedule("test", steps, rate, rate / 10, "cosine")
 
 
 @pytest.mark.parametrize("boundary", ["periodic", "replicate"])

@@ -83,7 +83,7 @@ def gaussian_blur(u: Tensor, grid: Grid, width: float) -> Tensor:
         If the field's shape is not the grid's, or as `stencils.check_blur` does.
     """
     stencils.check_blur(grid, width)
-    if u.dtype == torch.float32 and u.dim() == 3 and u.device.type == "cpu" and importlib.util.find_spec("numba"):
+    if u.dtype == torch.float32 and u.dim() == 3 and has_kernel(u.device):
         from curvafit.priors.kernels import cpu
 
         return torch.from_numpy(cpu.gaussian_blur(u.detach().numpy(), grid, width))
