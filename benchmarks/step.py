@@ -72,7 +72,7 @@ def measure(size: int, rounds: int) -> dict[str, float]:
     tracemalloc.stop()
     source = torch.ones(COPIED)
     target = source.clone()
-    passes = (fused.blur_along_z, fused.energy_gradient, fused.blur_gradient_along_z, lambda: fused.blur_adam(1e-3))
+    passes = (fused.blur_along_z, fused.fill_gradient, fused.blur_gradient_along_z, lambda: fused.blur_adam(1e-3))
     actions = {"fused": lambda: step(fused), "copy": lambda: target.copy_(source)}
     actions |= dict(zip(PASSES, passes, strict=True))
     if size <= PLAIN:

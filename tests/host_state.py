@@ -163,6 +163,7 @@ class Calls:
             "__version__": lambda: curvafit.__version__,
             "preset": lambda: curvafit.preset("tubes"),
             "energy": lambda: priors.energy(u, a, grid, 0.02),
+            "energy_gradient": lambda: priors.energy_gradient(u, self.a, grid, 0.02),
             "energy_terms": lambda: priors.energy_terms(priors.jet(u, grid), 0.02),
             "jet": lambda: priors.jet(u, grid),
             "diffuse_curvatures": lambda: priors.diffuse_curvatures(priors.jet(u, grid), 0.02),
@@ -181,7 +182,7 @@ class Calls:
         mse = torch.nn.functional.mse_loss
         return {
             "curvature_prior": lambda: priors.curvature_prior(self.noise[0], self.a, (0.01, 0.01, 0.01), 0.02),
-            "CurvaturePrior": lambda: self._train(priors.CurvaturePrior("tubes", blur=1.0, normalize="area")),
+            "CurvaturePrior": lambda: self._train(priors.CurvaturePrior("tubes")),
             "CombinedLoss": lambda: self._train(priors.CombinedLoss(mse, priors.CurvaturePrior("tubes"), 0.1, 2)),
         }
 

@@ -15,7 +15,7 @@ import yaml
 from scipy.stats import qmc
 
 from curvafit.core.checks import SEEDS, as_tuple, check_choice, check_float, check_int, check_seed, quoted
-from curvafit.priors.coefficients import NAMES, POWERS, Coefficients, check_strength
+from curvafit.priors.coefficients import NAMES, Coefficients, check_strengths
 from curvafit.priors.grid import WORKING_EPSILON
 from curvafit.priors.law import Law
 
@@ -96,8 +96,7 @@ class Design:
         for row in rows:
             if not -1 < row[-1] < 1:
                 raise ValueError(f"masses must be in (-1, 1), got {row[-1]}")
-            for name, value in zip(NAMES, row, strict=False):
-                check_strength(name, value, POWERS[name], WORKING_EPSILON)
+            check_strengths(row[:-1], WORKING_EPSILON)
 
     def draw(self, seed: int, index: int) -> Draw:
         """Draw parameters number `index` of a seed, both whole numbers from 0."""

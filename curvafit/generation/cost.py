@@ -11,7 +11,7 @@ from torch import Tensor
 
 from curvafit.core.checks import check_float, check_type, quoted
 from curvafit.generation.data import Data
-from curvafit.priors.coefficients import NAMES, POWERS, Coefficients, check_strength
+from curvafit.priors.coefficients import NAMES, Coefficients, check_strengths
 from curvafit.priors.grid import Grid
 
 #: The least that ε is, in voxels: two are published; below a tenth no voxel lies on the interface.
@@ -45,7 +45,7 @@ class Cost:
             check_type(getattr(self, name), kind, f"{name} as {kind.__name__}")
         self._check_lengths()
         self._check_tensors()
-        self._check_strengths()
+        check_strengths(self.coefficients, self.epsilon, self.orientation)
 
     def _check_lengths(self) -> None:
         """Convert ε and the blur to numbers; raise ValueError where they or the voxels' edges are out of range."""
@@ -82,15 +82,6 @@ class Cost:
             return
         if not isinstance(Q, Tensor) or tuple(Q.shape) != (3, 3) or not torch.equal(Q, Q.T):
             raise ValueError(f"expected a symmetric orientation of shape (3, 3) (z, y, x), got {quoted(_plain(Q))}")
-
-    def _check_strengths(self) -> None:
-        """Raise ValueError where a coefficient, or the orientation (in the unit of a00), is too large, given ε."""
-        ε = torch.as_tensor(self.epsilon, dtype=torch.float64)
-        strengths = {name: (value, POWERS[name]) for name, value in zip(NAMES, self.coefficients, strict=True)}
-        if self.orientation is not None:
-            strengths["the orientation"] = self.orientation, 2
-        for name, (value, power) in strengths.items():
-            check_strength(name, torch.as_tensor(value, dtype=torch.float64).detach().abs().max(), power, ε.max())
 
 
 def check_shape(name: str, value: Tensor, grid: Grid) -> None:

@@ -15,7 +15,7 @@ from curvafit.generation.data import Data
 from curvafit.generation.forms import DivergenceForm, Form
 from curvafit.priors import kernels
 from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.energy import energy
+from curvafit.priors.energy import energy_gradient, energy_gradient_by_autograd
 
 #: The number that Adam adds to the root, as published instead of the usual 1e-8; shapes depend on it.
 ADAM_EPS = 1e-2
@@ -201,7 +201,7 @@ class TorchStepper(Stepper):
         self._form, self._betas, self._count = form.to(device), betas, count
         self._data = None if data is None else data.to(device)
         self._cost = [*map(on_device, coefficients)], form.grid, on_device(epsilon), on_device(orientation)
-        self._slope_of = kernels.energy_gradient if fused else kernels.plain_energy_gradient
+        self._slope_of = energy_gradient if fused else energy_gradient_by_autograd
         self._free = None if frozen is None else ~torch.as_tensor(frozen, dtype=torch.bool, device=device)
         self._parameters = start.to(device).clone()
         self._value: Tensor | float = 0.0
@@ -210,7 +210,7 @@ class TorchStepper(Stepper):
         self._statistics: list[Statistics] | None = None
         self._evaluate, self._adam = self._evaluate_plainly, adam
         if compiled:
-            self._slope_of, switch = _differentiate, _Compiled()
+            switch = _Compiled()
             self._evaluate, self._adam = switch(self._evaluate_plainly), switch(adam)
         self._start_optimiser()
 
@@ -329,17 +329,6 @@ class _Compiled:
             return function(*arguments)
 
         return call
-
-
-def _differentiate(u: Tensor, *cost: Any) -> tuple[Tensor, Tensor]:
-    """Return the energies of fields and their gradients, as `kernels.plain_energy_gradient`, for a compiler to read."""
-
-    def total(u: Tensor) -> tuple[Tensor, Tensor]:
-        values = energy(u, *cost)
-        return values.sum(), values
-
-    gradients, values = torch.func.grad(total, has_aux=True)(u)
-    return values, gradients
 
 
 class LbfgsStepper(TorchStepper):

@@ -5,7 +5,14 @@ if __name__ != "curvafit.priors":
 
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.curvature import diffuse_curvatures, geometric_curvatures, jet
-from curvafit.priors.energy import cahn_hilliard_area, discrepancy_ratio, energy, energy_terms, orientation
+from curvafit.priors.energy import (
+    cahn_hilliard_area,
+    discrepancy_ratio,
+    energy,
+    energy_gradient,
+    energy_terms,
+    orientation,
+)
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.priors.law import PRESETS, Law, LawLike, preset, read_laws
 from curvafit.priors.loss import CombinedLoss, CurvaturePrior, curvature_prior
@@ -27,6 +34,7 @@ __all__ = [
     "diffuse_curvatures",
     "discrepancy_ratio",
     "energy",
+    "energy_gradient",
     "energy_terms",
     "geometric_curvatures",
     "jet",

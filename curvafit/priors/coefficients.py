@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -130,9 +130,20 @@ class Coefficients:
         return {name: float(value) for name, value in dataclasses.asdict(self).items()}
 
 
-def check_strength(name: str, value: float | Tensor, power: int, epsilon: float | Tensor) -> None:
-    """Raise ValueError where a coefficient, with lengths in units of ε, is over `STRONGEST`."""
-    size = float(abs(value) * epsilon**power)
-    if not size <= STRONGEST:
-        of = {0: "", 1: " epsilon", 2: " epsilon²"}[power]
-        raise ValueError(f"expected |{name}|{of} of at most {STRONGEST:g}, got {size:.3g}")
+def check_strengths(
+    coefficients: Iterable[float | Tensor], epsilon: float | Tensor, orientation: Tensor | None = None
+) -> None:
+    """Raise ValueError where a coefficient, or the orientation, is over `STRONGEST` with lengths in units of ε."""
+    parts = [(name, value, POWERS[name]) for name, value in zip(NAMES, coefficients, strict=True)]
+    if orientation is not None:
+        parts.append(("the orientation", orientation, POWERS["a00"]))
+    for name, value, power in parts:
+        size = _largest(value) * _largest(epsilon) ** power
+        if not size <= STRONGEST:
+            of = {0: "", 1: " epsilon", 2: " epsilon²"}[power]
+            raise ValueError(f"expected |{name}|{of} of at most {STRONGEST:g}, got {size:.3g}")
+
+
+def _largest(value: float | Tensor) -> float:
+    """Return the largest modulus of a number or a tensor."""
+    return float(value.detach().abs().max()) if isinstance(value, Tensor) else abs(value)

@@ -1,4 +1,5 @@
-"""F_ε and its relatives in plain torch: the definition that the fused kernels are tested against.
+"""F_ε, its gradient, and its relatives. `energy` is the definition in plain torch, which the fused kernels are tested
+against; `energy_gradient` takes a kernel where there is one.
 
 Every energy is a sum over voxels times the voxel's volume. Fields are `(..., Z, Y, X)`; results drop the space axes.
 """
@@ -7,13 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from curvafit.core.checks import as_tuple, check_float, quoted
-from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.curvature import Jet, diffuse_curvatures, jet, second_form
+from curvafit.priors import kernels
+from curvafit.priors.curvature import Jet, jet, second_form
 from curvafit.priors.grid import Float, Grid
 from curvafit.priors.profile import double_well
 from curvafit.priors.stencils import gradient
@@ -41,21 +43,59 @@ def energy(
         Q of a further term ε ∫ ∇uᵀQ∇u, symmetric, axes z, y, x; see `orientation`.
     mask
         Weights of the energy's density, which broadcast with `u`.
-
-    Raises
-    ------
-    ValueError
-        If the orientation is not symmetric.
     """
-    field, ε = jet(u, grid), _like(epsilon, u)
+    field, ε = jet(u, grid), _match_field(epsilon, u)
     terms = energy_terms(field, ε).unbind(-4)
-    weighted = (_like(a, u) * term for a, term in zip(coefficients, terms, strict=True))
+    weighted = (_match_field(a, u) * term for a, term in zip(coefficients, terms, strict=True))
     per_voxel = sum(weighted, start=torch.zeros_like(u))
     if orientation is not None:
         per_voxel = per_voxel + ε * orientation_form(field.gradient, orientation)
     if mask is not None:
         per_voxel = per_voxel * mask.to(u)
     return per_voxel.sum((-3, -2, -1)) * grid.voxel_volume
+
+
+def energy_gradient(
+    u: Tensor,
+    coefficients: Iterable[float | Tensor],
+    grid: Grid,
+    epsilon: float | Tensor,
+    orientation: Tensor | None = None,
+    mask: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Return F_ε(u) of a field `(Z, Y, X)` (paper, eq. 20) and its gradient ∂F_ε/∂u, a number for every voxel.
+
+    Float32 on a processor takes the fused kernel, where numba is; all else takes `energy` by autograd. The parameters
+    are those of `energy`; the voxel's volume is a factor of the gradient.
+    """
+    if u.dtype != torch.float32 or not kernels.has_kernel(u.device):
+        return energy_gradient_by_autograd(u, coefficients, grid, epsilon, orientation, mask)
+    from curvafit.priors.kernels import cpu
+
+    a, ε, Q = kernels.to_numpy_cost(coefficients, grid, epsilon, orientation)
+    weights = None if mask is None else mask.detach().numpy()
+    value, slope = cpu.fused_energy_gradient(u.detach().numpy(), a, grid, ε, Q, weights)
+    return torch.tensor(value, dtype=torch.float64), torch.from_numpy(slope)
+
+
+def energy_gradient_by_autograd(u: Tensor, *cost: Any) -> tuple[Tensor, Tensor]:
+    """Return F_ε of fields `(..., Z, Y, X)` and its gradients in plain torch, on any device.
+
+    `cost` are the other arguments of `energy`.
+    """
+
+    def total(u: Tensor) -> tuple[Tensor, Tensor]:
+        values = energy(u, *cost)
+        return values.sum(), values
+
+    if torch.compiler.is_compiling():  # the one form that compilers read; uncompiled, it would take more memory
+        gradients, values = torch.func.grad(total, has_aux=True)(u)
+        return values, gradients
+    free = u.detach().requires_grad_()
+    with torch.enable_grad():
+        whole, values = total(free)
+        (gradients,) = torch.autograd.grad(whole, free)
+    return values.detach(), gradients
 
 
 def orientation(direction: Sequence[int | float] | Tensor, strength: int | float) -> Float[Tensor, "3 3"]:
@@ -72,11 +112,6 @@ def orientation(direction: Sequence[int | float] | Tensor, strength: int | float
     -------
     Tensor
         Symmetric `(3, 3)`, float64. A sum of orientations is an orientation too.
-
-    Raises
-    ------
-    ValueError
-        If the direction is not three finite numbers that are not all 0, or the strength is not finite.
     """
     expected = "a direction of 3 finite numbers (z, y, x), not all 0"
     parts = [check_float(part, expected, of=direction) for part in as_tuple(direction, "3 numbers")]
@@ -90,13 +125,7 @@ def orientation(direction: Sequence[int | float] | Tensor, strength: int | float
 
 
 def orientation_form(slope: Float[Tensor, "*batch 3 z y x"], orientation: Float[Tensor, "3 3"]) -> Tensor:
-    """Return ∇uᵀQ∇u in every voxel, which is μ (θ·∇u)² for Q = μ θθᵀ (paper, "Extensions").
-
-    Raises
-    ------
-    ValueError
-        If the orientation is not symmetric.
-    """
+    """Return ∇uᵀQ∇u in every voxel, which is μ (θ·∇u)² for Q = μ θθᵀ (paper, "Extensions")."""
     Q = orientation.to(slope)
     if tuple(Q.shape) != (3, 3) or not torch.equal(Q, Q.T):
         raise ValueError(f"expected a symmetric orientation of shape (3, 3) (z, y, x), got {orientation.tolist()}")
@@ -124,36 +153,6 @@ def energy_terms(field: Jet, epsilon: float | Tensor) -> Float[Tensor, "*batch 6
     return torch.stack(terms, -4)
 
 
-def unsimplified_energy(u: Tensor, coefficients: Coefficients, grid: Grid, epsilon: float) -> Tensor:
-    """Return 𝓔̃_ε: F_ε with the positive part of 2|M|² - (Tr M)² in its quadratic terms too (paper, before eq. 20)."""
-    density = unsimplified_density(jet(u, grid), coefficients, epsilon)
-    return density.sum((-3, -2, -1)) * grid.voxel_volume
-
-
-def unsimplified_density(field: Jet, coefficients: Coefficients, epsilon: float) -> Tensor:
-    """Return the integrand of 𝓔̃_ε."""
-    trace, norm2, root, slope = second_form(field, epsilon)
-    a20, a11, a02, a10, a01, a00 = coefficients
-    slope2 = field.gradient.square().sum(-4)
-    positive = (2 * norm2 - trace**2).clamp_min(0)
-    quadratic = (a20 + a02 - a11) * positive + (a20 + a02 + a11) * trace**2 + 2 * (a20 - a02) * trace * root
-    linear = (a10 + a01) * trace + (a10 - a01) * root
-    return quadratic / (4 * epsilon) + slope * linear / 2 + a00 * epsilon * slope2
-
-
-def curvature_integral(u: Tensor, coefficients: Coefficients, grid: Grid, epsilon: float) -> Tensor:
-    """Return 𝓔_ε(u) = ∫ p(κ1_ε, κ2_ε) ε|∇u|² dx (paper, section 3, before eq. 20), which 𝓔̃_ε and F_ε expand."""
-    density = curvature_density(jet(u, grid), coefficients, epsilon)
-    return density.sum((-3, -2, -1)) * grid.voxel_volume
-
-
-def curvature_density(field: Jet, coefficients: Coefficients, epsilon: float) -> Tensor:
-    """Return the integrand of 𝓔_ε, which is zero where ∇u is zero."""
-    curvatures = diffuse_curvatures(field, epsilon)
-    slope2 = field.gradient.square().sum(-4)
-    return coefficients.polynomial(curvatures.kappa1, curvatures.kappa2) * epsilon * slope2
-
-
 def cahn_hilliard_area(u: Tensor, grid: Grid, epsilon: float | Tensor) -> Tensor:
     """Return 𝓐_ε(u) = ∫ ε/2 |∇u|² + W(u)/ε, about σ × area (paper, eq. 8)."""
     gradient_part, well_part = cahn_hilliard_parts(u, grid, epsilon)
@@ -169,10 +168,10 @@ def discrepancy_ratio(u: Tensor, grid: Grid, epsilon: float | Tensor) -> Tensor:
 
 def cahn_hilliard_parts(u: Tensor, grid: Grid, epsilon: float | Tensor) -> tuple[Tensor, Tensor]:
     """Return ε/2 |∇u|² and W(u)/ε in every voxel."""
-    ε, slope2 = _like(epsilon, u), gradient(u, grid).square().sum(-4)
+    ε, slope2 = _match_field(epsilon, u), gradient(u, grid).square().sum(-4)
     return ε / 2 * slope2, double_well(u) / ε
 
 
-def _like(value: float | Tensor, u: Tensor) -> float | Tensor:
+def _match_field(value: float | Tensor, u: Tensor) -> float | Tensor:
     """Return a number unchanged, or a tensor in the field's type and on the field's device."""
     return value.to(u) if isinstance(value, Tensor) else value

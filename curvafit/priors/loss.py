@@ -5,18 +5,18 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Literal, TypeVar
+from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
 
-from curvafit.core.checks import check_float, check_int, quoted
+from curvafit.core.checks import check_choice, check_float, check_int, quoted
 from curvafit.core.units import METRES
-from curvafit.priors.coefficients import NAMES, POWERS, Coefficients, check_strength
+from curvafit.priors.coefficients import Coefficients, check_strengths
 from curvafit.priors.grid import WORKING_EPSILON, Float, Grid
-from curvafit.priors.kernels.differentiable import areas, energies
+from curvafit.priors.kernels.differentiable import energies
 from curvafit.priors.law import Law, LawLike, read_laws
-from curvafit.priors.stencils import gaussian_blur, refine_axis
+from curvafit.priors.stencils import refine_axis
 
 #: Voxels that ε spans: an axis with fewer, by more than a tenth, is interpolated.
 RESOLVED = 2
@@ -26,8 +26,6 @@ MOST = 16
 COARSEST = 10_000
 #: The most that a weight or a mask's value may be: float32 holds its products.
 HEAVIEST = 1e9
-_MOST_BORDER = 2**31
-_REDUCTIONS, _NORMALIZATIONS = ("mean", "sum", "none"), ("voxel", "area")
 _Values = TypeVar("_Values", bound=Tensor | None)
 
 
@@ -70,13 +68,8 @@ class CurvaturePrior(nn.Module):
         says so. A refinement of more than 16-fold is refused, and so is an ε longer than the window.
     weight
         A factor, or one for each class; classes of weight 0 are not computed.
-    normalize
-        `"voxel"`: the mean density in units of ε, which compares patches of all sizes. `"area"`: the energy per area of
-        interface.
     border
         Number of voxels at each face of the input that do not count, since their neighbours are unknown.
-    blur
-        Standard deviation, in spacing's unit, of a Gaussian blur of the probabilities; none by default.
     shape
         Voxels (D, H, W) of a whole patch. An input of another shape is then the same patch on a coarser grid, as in
         deep supervision, with a larger spacing. The loss is zero on a level that has no interior or would need a
@@ -85,8 +78,7 @@ class CurvaturePrior(nn.Module):
     Raises
     ------
     ValueError
-        If an argument is out of range; in `forward`, if a shape does not match, or ε or the blur is longer than the
-        window.
+        If an argument is out of range; in `forward`, if a shape does not match, or ε is longer than the window.
     """
 
     def __init__(
@@ -103,33 +95,28 @@ class CurvaturePrior(nn.Module):
         unit: str | None = None,
         epsilon: float | None = None,
         weight: float | Sequence[float] = 1.0,
-        normalize: Literal["voxel", "area"] = "voxel",
         border: int = 1,
-        blur: float = 0.0,
         shape: Sequence[int] | None = None,
     ) -> None:
         super().__init__()
         if sigmoid and softmax:
             raise ValueError("expected sigmoid or softmax, got both")
-        if reduction not in _REDUCTIONS or normalize not in _NORMALIZATIONS:
-            expected = f"a reduction among {_REDUCTIONS} and normalize among {_NORMALIZATIONS}"
-            raise ValueError(f"expected {expected}, got {reduction!r} and {normalize!r}")
+        check_choice(reduction, ("mean", "sum", "none"), "a reduction 'mean', 'sum' or 'none'")
         self.sigmoid, self.softmax, self.reduction = sigmoid, softmax, reduction
-        self.normalize: Literal["voxel", "area"] = normalize
         self.include_background, self.to_onehot_y, self.ignore_index = include_background, to_onehot_y, ignore_index
-        self.spacing = _three_edges(spacing)
-        width = RESOLVED * min(self.spacing) if epsilon is None else epsilon
-        self.epsilon = check_float(width, "epsilon > 0 in spacing's unit", math.ulp(0), COARSEST * min(self.spacing))
-        self.blur = check_float(blur, "blur >= 0 in spacing's unit", 0, COARSEST * min(self.spacing))
-        self.border = check_int(border, "a border of whole voxels from 0", 0, _MOST_BORDER)
-        self._warned: set[str] = set()
-        self.shape = None if shape is None else Grid(shape, self.spacing).shape  # type: ignore[arg-type]
-        self.weight = _weights(weight)
+        patch = Grid((4, 4, 4) if shape is None else shape, spacing)  # type: ignore[arg-type]
+        self.spacing, self.shape = patch.spacing, None if shape is None else patch.shape
         edge = min(self.spacing)
-        self.coefficients = tuple(_law_in_unit(known, edge, unit, self.epsilon) for known in read_laws(law))
-        for numbers in self.coefficients:
-            check_numbers(numbers, self.epsilon)
-        _warn_of_interpolation(self.spacing, self.epsilon)
+        width = RESOLVED * edge if epsilon is None else epsilon
+        self.epsilon = check_float(width, "epsilon > 0 in spacing's unit", math.ulp(0), COARSEST * edge)
+        self.border = check_int(border, "a border of whole voxels from 0", 0, 2**31)
+        self._warned: set[str] = set()
+        self.weight = _read_weights(weight)
+        self.coefficients = tuple(_read_coefficients(known, edge, unit, self.epsilon) for known in read_laws(law))
+        times = upsampling(self.spacing, self.epsilon)
+        if max(times) > 1:
+            axes = ", ".join(f"{axis} {n}-fold" for axis, n in zip("zyx", times, strict=True) if n > 1)
+            warnings.warn(f"ε = {self.epsilon:g} spans fewer than 2 voxels: interpolating {axes}", stacklevel=2)
 
     def extra_repr(self) -> str:
         """Return the settings that `repr` shows."""
@@ -140,12 +127,9 @@ class CurvaturePrior(nn.Module):
         input, target, mask = _plain(input), _plain(target), _plain(mask)
         with torch.autocast(input.device.type, enabled=False):
             probability, voxels = self._probability(input), self._voxel_weights(input, target, mask)
-            classes = probability.shape[1]
-            laws, weights = (
-                _per_class(self.coefficients, classes, "one law"),
-                _per_class(self.weight, classes, "one weight"),
-            )
-            spacing = self._spacing(input)
+            classes, spacing = probability.shape[1], self._spacing_of(input)
+            laws = _repeat_per_class(self.coefficients, classes, "one law")
+            weights = _repeat_per_class(self.weight, classes, "one weight")
             skipped, columns = self._is_skipped(input), []
             for channel, (law, weight) in enumerate(zip(laws, weights, strict=True)):
                 field = probability[:, channel]
@@ -158,9 +142,8 @@ class CurvaturePrior(nn.Module):
                     spacing,
                     self.epsilon,
                     mask=None if voxels is None else voxels[:, min(channel, voxels.shape[1] - 1)],
-                    normalize=None if self.reduction == "sum" else self.normalize,
+                    normalize=self.reduction != "sum",
                     border=self.border,
-                    blur=self.blur,
                 )
                 columns.append(weight * value)
             values = torch.stack(columns, 1)
@@ -230,21 +213,19 @@ class CurvaturePrior(nn.Module):
                 raise ValueError(f"expected a mask of finite numbers from 0, at most {HEAVIEST:g}, got others")
             if mask.shape[1] > 1 and not self.include_background:
                 mask = mask[:, 1:]
-        if target is not None and (target.dim() != 5 or target.shape[0] != batch or tuple(target.shape[2:]) != space):
-            raise ValueError(f"expected a target of shape {(batch, 1, *space)}, got {tuple(target.shape)}")
-        if target is not None and self.to_onehot_y and target.shape[1] != 1:
-            raise ValueError(f"expected a target of class numbers (B, 1, D, H, W), got {tuple(target.shape)}")
+        numbers = self.to_onehot_y or self.ignore_index is not None
+        if target is not None:
+            fits = target.dim() == 5 and target.shape[0] == batch and tuple(target.shape[2:]) == space
+            if not fits or (numbers and target.shape[1] != 1):
+                raise ValueError(f"expected a target of shape {(batch, 1, *space)}, got {tuple(target.shape)}")
         if self.ignore_index is None:
             return mask
-        if target is None or target.shape[1] != 1:
-            got = "none" if target is None else f"shape {tuple(target.shape)}"
-            raise ValueError(
-                f"expected a target (B, 1, D, H, W) with label {self.ignore_index} on ignored voxels, got {got}"
-            )
+        if target is None:
+            raise ValueError(f"ignore_index needs a target with label {self.ignore_index} on ignored voxels, got none")
         valid = target != self.ignore_index
         return valid if mask is None else mask * valid
 
-    def _spacing(self, input: Tensor) -> tuple[float, float, float]:
+    def _spacing_of(self, input: Tensor) -> tuple[float, float, float]:
         """Return the voxel edges of an input, which are larger than the patch's where the input has fewer voxels."""
         if self.shape is None:
             return self.spacing
@@ -256,7 +237,7 @@ class CurvaturePrior(nn.Module):
         space = tuple(input.shape[2:])
         if self.shape is None or space == self.shape:
             return False
-        times = RESOLVED * max(self._spacing(input)) / self.epsilon
+        times = RESOLVED * max(self._spacing_of(input)) / self.epsilon
         if times <= MOST + 1e-3 and min(space) >= max(4, 2 * self.border + 1):
             return False
         self._warn(str(space), f"a level of {space} voxels is too coarse for ε = {self.epsilon:g}, so its loss is 0")
@@ -335,9 +316,8 @@ def curvature_prior(
     epsilon: float,
     *,
     mask: Float[Tensor, "#batch z y x"] | None = None,
-    normalize: Literal["voxel", "area"] | None = "voxel",
+    normalize: bool = True,
     border: int = 1,
-    blur: float = 0.0,
 ) -> Float[Tensor, " batch"]:
     """Return F_ε(2p - 1) of probabilities in a window of a larger volume (paper, eq. 20), by fused kernels in float32.
 
@@ -347,50 +327,44 @@ def curvature_prior(
         Values in [0, 1]; float32, or float64, which takes the definition in plain torch.
     law
         Coefficients in spacing's unit, or another law, as in `CurvaturePrior`.
-    epsilon, blur
-        ε, and the standard deviation of a Gaussian blur of the field before the energy, in spacing's unit.
-    spacing
-        Voxel edges (z, y, x). An axis on which ε spans fewer than two voxels, by more than a tenth, is refined by cubic
-        interpolation until it spans two.
+    spacing, epsilon
+        Voxel edges (z, y, x), and ε in their unit. An axis on which ε spans fewer than two voxels, by more than a
+        tenth, is refined by cubic interpolation until it spans two.
     mask
         Weights of the energy's density.
     normalize
-        `"voxel"`: the mean density over the mask, in units of ε (F_ε ε³ / volume). `"area"`: per interface
-        area in units of ε (F_ε ε² / (∫ ε|∇u|² + ε²)), which is the mean of p(κ1, κ2) ε². None: F_ε itself.
+        Whether to return the mean density over the mask, in units of ε (F_ε ε³ / volume), instead of F_ε itself.
     border
         Number of voxels at each side of the window whose density does not count.
 
     Raises
     ------
     ValueError
-        If the window is too small for its border, ε or the blur is longer than the window's longest side, a coefficient
-        is over `STRONGEST` with lengths in units of ε, or as `upsampling` does.
+        If the window is too small for its border or for ε, a coefficient is over `STRONGEST` with lengths in units of
+        ε, or as `upsampling` does.
     """
-    shape = tuple(probability.shape[1:])
-    if min(shape) < max(4, 2 * border + 1):
-        least = max(4, 2 * border + 1)
+    shape, least = tuple(probability.shape[1:]), max(4, 2 * border + 1)
+    if min(shape) < least:
         raise ValueError(
             f"expected a volume of at least {least} voxels along each axis, got {shape}, which has no interior"
         )
     times = upsampling(spacing, epsilon)
+    longest = max(n * h for n, h in zip(shape, spacing, strict=True))
+    if epsilon > longest:
+        raise ValueError(f"expected an ε of at most the window's longest side, {longest:g}, got {epsilon:g}")
     coefficients = Law.of(law).in_unit(None, min(spacing))
-    check_numbers(coefficients, epsilon)
-    check_lengths(epsilon, blur, max(n * h for n, h in zip(shape, spacing, strict=True)))
+    check_strengths(coefficients, epsilon)
     unit = epsilon / WORKING_EPSILON
     u, weights = 2 * probability - 1, _window_mask(probability, mask, border)
     for axis, n in enumerate(times):
         if n > 1:
             u, weights = refine_axis(u, axis, n), weights.repeat_interleave(n, axis - 3)
     grid = Grid(tuple(u.shape[1:]), tuple(h / n / unit for h, n in zip(spacing, times, strict=True)), "replicate")  # type: ignore[arg-type]
-    if blur:
-        u = gaussian_blur(u, grid, blur / unit)
     total = energies(u, coefficients.in_unit(unit), grid, WORKING_EPSILON, weights)
-    if normalize == "voxel":
-        volume = weights.sum((-3, -2, -1)) * (grid.voxel_volume / WORKING_EPSILON**3)
-        return total / volume.clamp_min(torch.finfo(volume.dtype).tiny)
-    if normalize == "area":
-        return total / (areas(u, grid, WORKING_EPSILON, weights) / WORKING_EPSILON**2 + 1)
-    return total
+    if not normalize:
+        return total
+    volume = weights.sum((-3, -2, -1)) * (grid.voxel_volume / WORKING_EPSILON**3)
+    return total / volume.clamp_min(torch.finfo(volume.dtype).tiny)
 
 
 def upsampling(spacing: Sequence[float], epsilon: float) -> tuple[int, int, int]:
@@ -417,37 +391,7 @@ def upsampling(spacing: Sequence[float], epsilon: float) -> tuple[int, int, int]
     return times  # type: ignore[return-value]
 
 
-def check_numbers(coefficients: Coefficients, epsilon: float) -> None:
-    """Refuse coefficients that are too large for float32, given ε.
-
-    Raises
-    ------
-    ValueError
-        If a coefficient is over `STRONGEST` with lengths in units of ε.
-    """
-    for name, value in zip(NAMES, coefficients, strict=True):
-        check_strength(name, value, POWERS[name], epsilon)
-
-
-def check_lengths(epsilon: float, blur: float, longest: float) -> None:
-    """Refuse an ε or a blur that is longer than the window, where the energy of any field is about 0.
-
-    Raises
-    ------
-    ValueError
-        If ε or the blur is longer than the window's longest side.
-    """
-    for name, length in (("an ε", epsilon), ("a blur", blur)):
-        if not 0 <= length <= longest:
-            raise ValueError(f"expected {name} of at most the window's longest side, {longest:g}, got {length:g}")
-
-
-def _three_edges(spacing: float | Sequence[float]) -> tuple[float, float, float]:
-    """Return three voxel edges."""
-    return Grid((4, 4, 4), spacing).spacing  # type: ignore[arg-type]
-
-
-def _weights(weight: float | Sequence[float]) -> tuple[float, ...]:
+def _read_weights(weight: float | Sequence[float]) -> tuple[float, ...]:
     """Return one weight, or the weights of all classes."""
     try:
         values = tuple(torch.as_tensor(weight, dtype=torch.float64).flatten().tolist())
@@ -458,9 +402,10 @@ def _weights(weight: float | Sequence[float]) -> tuple[float, ...]:
     return values
 
 
-def _law_in_unit(law: Law, edge: float, unit: str | None, epsilon: float) -> Coefficients:
-    """Return coefficients with lengths in spacing's unit; warn where ε is far from the fit's."""
+def _read_coefficients(law: Law, edge: float, unit: str | None, epsilon: float) -> Coefficients:
+    """Return a law's coefficients with lengths in spacing's unit; warn where ε is far from the fit's."""
     numbers = law.in_unit(unit, edge)
+    check_strengths(numbers, epsilon)
     if law.length_unit is None:
         if unit is not None and unit not in METRES:
             raise ValueError(f"expected a unit among {', '.join(METRES)}, got {quoted(unit)}")
@@ -474,19 +419,11 @@ def _law_in_unit(law: Law, edge: float, unit: str | None, epsilon: float) -> Coe
     return numbers
 
 
-def _per_class(values: tuple, classes: int, name: str) -> tuple:
+def _repeat_per_class(values: tuple, classes: int, name: str) -> tuple:
     """Return one value for each class."""
     if len(values) not in (1, classes):
         raise ValueError(f"expected {name}, or one for each class that counts ({classes} in all), got {len(values)}")
     return values * classes if len(values) == 1 else values
-
-
-def _warn_of_interpolation(spacing: tuple[float, float, float], epsilon: float) -> None:
-    """Warn about the axes that are interpolated."""
-    times = upsampling(spacing, epsilon)
-    if max(times) > 1:
-        axes = ", ".join(f"{axis} {n}-fold" for axis, n in zip("zyx", times, strict=True) if n > 1)
-        warnings.warn(f"ε = {epsilon:g} spans fewer than 2 voxels: interpolating {axes}", stacklevel=3)
 
 
 def _window_mask(probability: Tensor, mask: Tensor | None, border: int) -> Tensor:

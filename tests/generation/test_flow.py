@@ -17,9 +17,8 @@ from curvafit.generation.forms import DivergenceForm, white_noise
 from curvafit.generation.result import RECORD_EVERY, viability
 from curvafit.generation.schedule import SCHEDULES, Phase, Schedule, present_name, schedule
 from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.energy import energy
+from curvafit.priors.energy import energy, energy_gradient_by_autograd
 from curvafit.priors.grid import Grid
-from curvafit.priors.kernels import plain_energy_gradient
 from curvafit.priors.law import Law, preset
 from curvafit.priors.profile import optimal_profile
 from curvafit.priors.stencils import gaussian_blur
@@ -234,7 +233,7 @@ def test_steps_are_those_of_torch_s_adam_bit_for_bit(boundary):
     form, vector = DivergenceForm(grid, 0.02, MASS), white_noise(grid, 3)
     adam = torch.optim.Adam([vector], eps=1e-2)
     for step in range(PHASES.steps):
-        _, slope = plain_energy_gradient(form.field(vector), TUBES, grid, 0.02)
+        _, slope = energy_gradient_by_autograd(form.field(vector), TUBES, grid, 0.02)
         vector.grad = form.pullback(slope)
         adam.param_groups[0].update(lr=PHASES.rate(step), betas=PHASES.betas_at(step))
         adam.step()

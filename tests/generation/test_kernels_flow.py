@@ -14,7 +14,7 @@ from kernel_cases import ADAM_EPS, BETAS, BLUR, BOUNDARIES, EPSILON, SPACINGS, T
 
 from curvafit.priors import kernels
 from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.energy import energy
+from curvafit.priors.energy import energy, energy_gradient
 from curvafit.priors.grid import Grid
 from curvafit.priors.stencils import divergence, gaussian_blur, gradient
 
@@ -63,7 +63,7 @@ def test_adam_is_torchs():
     for step in range(20):
         rate = 1e-3 * (1 + step % 3)
         flow.evaluate()
-        _, slope = cpu.energy_gradient(flow.field, list(TUBES), grid, EPSILON)
+        _, slope = cpu.fused_energy_gradient(flow.field, list(TUBES), grid, EPSILON)
         vector.grad = -gradient(gaussian_blur(torch.from_numpy(slope).double(), grid, BLUR), grid)
         adam.param_groups[0]["lr"] = rate
         adam.step()
@@ -123,12 +123,12 @@ def test_processors_without_wide_vectors(tmp_path):
         pytest.skip("expected an x86 processor")
     grid, path = Grid((6, 7, 20)), tmp_path / "u.npy"
     np.save(path, smooth_field(grid).numpy())
-    value, slope = cpu.energy_gradient(np.load(path), list(TUBES), grid, EPSILON)
+    value, slope = cpu.fused_energy_gradient(np.load(path), list(TUBES), grid, EPSILON)
     program = """
 import sys, numpy as np
 from curvafit.priors.kernels import cpu, loops
 u = np.load(sys.argv[1])
-value, slope = cpu.energy_gradient(u, [1, 2, 6, -40, -40, 400], cpu.Grid(u.shape), 0.02)
+value, slope = cpu.fused_energy_gradient(u, [1, 2, 6, -40, -40, 400], cpu.Grid(u.shape), 0.02)
 assert loops.WIDE == 8
 np.save(sys.argv[1], np.append(slope, value))
 """
@@ -182,7 +182,7 @@ def test_dispatch_by_device_and_type():
     assert not kernels.has_kernel("meta")
     value, slope = torch_gradient(u, TUBES, grid)
     for field, a, tolerance in ((u, TUBES, 1e-12), (u.float(), TUBES, 1e-3), (u.float(), varying, 1e-3)):
-        found, gradient_found = kernels.energy_gradient(field, a, grid, EPSILON)
+        found, gradient_found = energy_gradient(field, a, grid, EPSILON)
         assert gradient_found.dtype == field.dtype
         assert found == pytest.approx(value, rel=max(tolerance / 100, 1e-12))
         assert float((gradient_found.double() - slope).abs().max()) <= tolerance * float(slope.abs().max())
@@ -191,10 +191,10 @@ def test_dispatch_by_device_and_type():
 def test_wrong_shapes_and_orientations_are_refused():
     grid = Grid((6, 7, 16))
     with pytest.raises(ValueError, match="field"):
-        cpu.energy_gradient(np.zeros((6, 7, 15), np.float32), list(TUBES), grid, EPSILON)
+        cpu.fused_energy_gradient(np.zeros((6, 7, 15), np.float32), list(TUBES), grid, EPSILON)
     with pytest.raises(ValueError, match="array"):
-        cpu.energy_gradient(np.zeros(grid.shape), list(TUBES), grid, np.full((6, 7, 15), EPSILON))
+        cpu.fused_energy_gradient(np.zeros(grid.shape), list(TUBES), grid, np.full((6, 7, 15), EPSILON))
     with pytest.raises(ValueError, match="symmetric"):
-        cpu.energy_gradient(np.zeros(grid.shape), list(TUBES), grid, EPSILON, np.tri(3))
+        cpu.fused_energy_gradient(np.zeros(grid.shape), list(TUBES), grid, EPSILON, np.tri(3))
     with pytest.raises(ValueError, match="field"):
         cpu.gaussian_blur(np.zeros((6, 7, 15), np.float32), grid, BLUR)

@@ -11,17 +11,8 @@ from exact import Torus, centres, diffuse_integrals, exact_jet, profile
 
 from benchmarks import convergence
 from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.curvature import Jet, jet, second_form
-from curvafit.priors.energy import (
-    cahn_hilliard_area,
-    curvature_density,
-    curvature_integral,
-    discrepancy_ratio,
-    energy,
-    energy_terms,
-    unsimplified_density,
-    unsimplified_energy,
-)
+from curvafit.priors.curvature import Jet, diffuse_curvatures, jet, second_form
+from curvafit.priors.energy import cahn_hilliard_area, discrepancy_ratio, energy, energy_terms
 from curvafit.priors.grid import Grid
 from curvafit.priors.law import preset
 from curvafit.priors.profile import SIGMA, double_well_derivative, optimal_profile
@@ -40,6 +31,35 @@ def rough(grid: Grid, seed: int = 0, *batch: int) -> torch.Tensor:
 
 def weighted(terms: torch.Tensor, a: Coefficients) -> torch.Tensor:
     return torch.einsum("k,kzyx->zyx", a.tensor(terms.dtype), terms)
+
+
+# ---- what F_ε comes from (paper, section 3, before eq. 20) -----------------------------------------------------------
+
+
+def curvature_density(field: Jet, a: Coefficients, ε: float) -> torch.Tensor:
+    """The integrand of 𝓔_ε(u) = ∫ p(κ1_ε, κ2_ε) ε|∇u|² dx, which is zero where ∇u is zero."""
+    κ1, κ2, _, _ = diffuse_curvatures(field, ε)
+    return a.polynomial(κ1, κ2) * ε * field.gradient.square().sum(-4)
+
+
+def unsimplified_density(field: Jet, a: Coefficients, ε: float) -> torch.Tensor:
+    """The integrand of 𝓔̃_ε: that of F_ε with the positive part of 2|M|² - (Tr M)² in its quadratic terms too."""
+    trace, norm2, root, slope = second_form(field, ε)
+    positive = (2 * norm2 - trace**2).clamp_min(0)
+    even, odd = a.a20 + a.a02 - a.a11, 2 * (a.a20 - a.a02)
+    quadratic = even * positive + (a.a20 + a.a02 + a.a11) * trace**2 + odd * trace * root
+    linear = (a.a10 + a.a01) * trace + (a.a10 - a.a01) * root
+    return quadratic / (4 * ε) + slope * linear / 2 + a.a00 * ε * field.gradient.square().sum(-4)
+
+
+def curvature_integral(u: torch.Tensor, a: Coefficients, grid: Grid, ε: float) -> torch.Tensor:
+    """𝓔_ε(u)."""
+    return curvature_density(jet(u, grid), a, ε).sum((-3, -2, -1)) * grid.voxel_volume
+
+
+def unsimplified_energy(u: torch.Tensor, a: Coefficients, grid: Grid, ε: float) -> torch.Tensor:
+    """𝓔̃_ε(u)."""
+    return unsimplified_density(jet(u, grid), a, ε).sum((-3, -2, -1)) * grid.voxel_volume
 
 
 # ---- values ----------------------------------------------------------------------------------------------------------

@@ -24,7 +24,7 @@ def assert_is_the_definition(u: torch.Tensor, a: Coefficients, grid: Grid, ε=EP
     value, slope = torch_gradient(u, a, grid, ε, Q)
     value32, slope32 = torch_gradient(u.float(), a, grid, ε, Q)
     cost = [value.numpy() if isinstance(value, torch.Tensor) else value for value in (*a, ε, Q)]
-    found, gradient_found = cpu.energy_gradient(u.numpy(), cost[:6], grid, cost[6], cost[7])
+    found, gradient_found = cpu.fused_energy_gradient(u.numpy(), cost[:6], grid, cost[6], cost[7])
     assert abs(found - value) <= 4 * abs(value32 - value) + 1e-6 * abs(value)
     scale = float(slope.abs().max())
     error, error32 = np.abs(gradient_found - slope.numpy()) / scale, (slope32 - slope).abs().numpy() / scale
@@ -74,7 +74,7 @@ def test_a_mask_weighs_the_density(varies, spacing, boundary):
     (slope,) = torch.autograd.grad(value, free)
     given = [v.numpy() if isinstance(v, torch.Tensor) else v for v in a]
     turned = None if Q is None else Q.numpy()
-    found, gradient_found = cpu.energy_gradient(u.numpy(), given, grid, EPSILON, turned, mask.numpy())
+    found, gradient_found = cpu.fused_energy_gradient(u.numpy(), given, grid, EPSILON, turned, mask.numpy())
     error = np.abs(gradient_found - slope.numpy()) / float(slope.abs().max())
     assert found == pytest.approx(float(value.detach()), rel=1e-5)
     assert np.quantile(error, 0.9) < 1e-5 and error.max() < 1e-2
@@ -83,8 +83,10 @@ def test_a_mask_weighs_the_density(varies, spacing, boundary):
 def test_arrays_of_equal_numbers_are_numbers():
     grid = Grid((6, 7, 20))
     u = smooth_field(grid).numpy()
-    value, slope = cpu.energy_gradient(u, list(TUBES), grid, EPSILON)
-    found, gradient_found = cpu.energy_gradient(u, np.stack([np.full(grid.shape, a) for a in TUBES]), grid, EPSILON)
+    value, slope = cpu.fused_energy_gradient(u, list(TUBES), grid, EPSILON)
+    found, gradient_found = cpu.fused_energy_gradient(
+        u, np.stack([np.full(grid.shape, a) for a in TUBES]), grid, EPSILON
+    )
     assert found == pytest.approx(value, rel=1e-6)
     assert np.quantile(np.abs(gradient_found - slope), 0.9) < 1e-6 * np.abs(slope).max()
 
@@ -97,14 +99,14 @@ def test_gradient_predicts_the_energy(boundary):
     step = 1e-5
     ahead, behind = (energy(u + sign * step * direction, TUBES, grid, EPSILON) for sign in (1, -1))
     change = float(ahead - behind)
-    _, slope = cpu.energy_gradient(u.numpy(), list(TUBES), grid, EPSILON)
+    _, slope = cpu.fused_energy_gradient(u.numpy(), list(TUBES), grid, EPSILON)
     assert float((torch.from_numpy(slope).double() * direction).sum()) == pytest.approx(change / (2 * step), rel=1e-4)
 
 
 def test_gradient_vanishes_on_pure_phases():
     grid = Grid((6, 7, 20))
     for phase in (1.0, -1.0):
-        value, slope = cpu.energy_gradient(np.full(grid.shape, phase, np.float32), list(TUBES), grid, EPSILON)
+        value, slope = cpu.fused_energy_gradient(np.full(grid.shape, phase, np.float32), list(TUBES), grid, EPSILON)
         assert value == 0
         assert np.abs(slope).max() < 1e-9
 
@@ -114,7 +116,7 @@ def test_a_lost_value_shows():
     grid = Grid((6, 6, 20))
     u = smooth_field(grid).numpy().astype(np.float32)
     u[3, 2, 19] = np.nan
-    assert np.isnan(cpu.energy_gradient(u, list(TUBES), grid, EPSILON)[0])
+    assert np.isnan(cpu.fused_energy_gradient(u, list(TUBES), grid, EPSILON)[0])
 
 
 @pytest.mark.parametrize("boundary", BOUNDARIES)

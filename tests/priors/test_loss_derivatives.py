@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.func import grad, hessian, jacfwd, jacrev, jvp, vjp, vmap
 
 from curvafit.priors import CurvaturePrior, Grid, curvature_prior, kernels
-from curvafit.priors.kernels.differentiable import areas, energies
+from curvafit.priors.kernels.differentiable import energies
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:ε = .* interpolating"),
@@ -32,12 +32,10 @@ def way(request, monkeypatch) -> str:
 
 #: Functions of probabilities (2, 8, 9, 10), two numbers each.
 FUNCTIONS = {
-    "voxel": lambda p: curvature_prior(p, LAW, (1.0, 1.0, 1.0), 2.0, mask=MASK),
-    "area": lambda p: curvature_prior(p, LAW, (1.0, 1.0, 1.0), 2.0, normalize="area", blur=0.5),
-    "interpolated": lambda p: curvature_prior(p, LAW, (2.0, 1.0, 1.0), 2.0, normalize=None),
+    "mean": lambda p: curvature_prior(p, LAW, (1.0, 1.0, 1.0), 2.0, mask=MASK),
+    "interpolated": lambda p: curvature_prior(p, LAW, (2.0, 1.0, 1.0), 2.0, normalize=False),
     "module": lambda p: CurvaturePrior(LAW, sigmoid=True, reduction="none")(p[:, None]).flatten(),
     "energies": lambda p: energies(2 * p - 1, LAW, GRID, EPSILON, MASK),
-    "areas": lambda p: areas(2 * p - 1, GRID, EPSILON, MASK),
 }
 functions = pytest.mark.parametrize("function", FUNCTIONS.values(), ids=FUNCTIONS)
 
@@ -108,7 +106,7 @@ def test_masks_may_be_batched_alone() -> None:
 
 def test_forward_modes_jacobian_of_a_few_voxels() -> None:
     def moved(shift: Tensor) -> Tensor:
-        return FUNCTIONS["area"](p.to(shift) + shift[:, None, None] * pattern.to(shift))
+        return FUNCTIONS["interpolated"](p.to(shift) + shift[:, None, None] * pattern.to(shift))
 
     p, pattern = fields()[0], noise(2, 3, 9, 10, seed=4).repeat_interleave(8, 1)[:, :8]
     shift = torch.zeros(2, 1, dtype=torch.float64)
@@ -123,9 +121,7 @@ def test_forward_modes_jacobian_of_a_few_voxels() -> None:
     lambda f: jacrev(jacfwd(f)),
     lambda f: lambda x: vmap(grad(lambda y: grad(f)(y).square().sum()))(x[None]),
 ], ids=["forward over reverse", "forward twice", "reverse twice", "reverse over forward", "batched"])  # fmt: skip
-def test_second_derivatives_are_for_float64(function, twice, way) -> None:
-    if way == "plain" and function is FUNCTIONS["areas"]:
-        pytest.skip("plain torch has all derivatives of the area")
+def test_second_derivatives_are_for_float64(function, twice) -> None:
     p, direction = fields()
 
     def along(t: Tensor) -> Tensor:
@@ -144,9 +140,9 @@ def test_the_gradient_of_a_gradient_is_for_float64() -> None:
 
 
 @pytest.mark.filterwarnings("ignore:Dynamo detected a call to a `functools.lru_cache`")
-@pytest.mark.parametrize("name", ["voxel", "interpolated", "energies", "areas"])
+@pytest.mark.parametrize("name", ["mean", "interpolated", "energies"])
 def test_compiled_gradients_are_the_same(name, way) -> None:
-    """What the compiler takes is an operator of its own. (The tests' shape checks keep it from tracing the blur.)"""
+    """What the compiler takes is an operator of its own."""
     if way == "plain":
         pytest.skip("compilers read plain torch itself, but not the tests' checks of shapes in it")
     torch.compiler.reset()
@@ -191,20 +187,19 @@ def test_the_loss_keeps_few_numbers_for_each_voxel() -> None:
     loss.backward()
 
 
-def hessian_product(dtype: torch.dtype, vector: torch.Tensor, normalize: str) -> torch.Tensor:
-    prior = CurvaturePrior("tubes", sigmoid=True, normalize=normalize)  # type: ignore[arg-type]
+def hessian_product(dtype: torch.dtype, vector: torch.Tensor) -> torch.Tensor:
+    prior = CurvaturePrior("tubes", sigmoid=True)
     logits = noise(1, 1, 6, 6, 6).to(dtype).requires_grad_()
     (slope,) = torch.autograd.grad(prior(logits), logits, create_graph=True)
     assert torch.equal(slope, slope_of(prior, logits))
     return torch.autograd.grad((slope * vector).sum(), logits)[0]
 
 
-@pytest.mark.parametrize("normalize", ["voxel", "area"])
-def test_second_derivatives_are_right_or_refused(normalize):
+def test_second_derivatives_are_right_or_refused():
     vector = noise(1, 1, 6, 6, 6, seed=1)
     with pytest.raises(RuntimeError, match="float64"):
-        hessian_product(torch.float32, vector.float(), normalize)
-    prior, logits, step = CurvaturePrior("tubes", sigmoid=True, normalize=normalize), noise(1, 1, 6, 6, 6), 1e-5
+        hessian_product(torch.float32, vector.float())
+    prior, logits, step = CurvaturePrior("tubes", sigmoid=True), noise(1, 1, 6, 6, 6), 1e-5
     ends = [slope_of(prior, logits + sign * step * vector) for sign in (1, -1)]
-    found = hessian_product(torch.float64, vector, normalize)
+    found = hessian_product(torch.float64, vector)
     torch.testing.assert_close(found, (ends[0] - ends[1]) / (2 * step), rtol=1e-4, atol=1e-4 * float(found.abs().max()))

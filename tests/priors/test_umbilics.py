@@ -9,10 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from curvafit.priors import kernels
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.curvature import ROOT_FLOOR, ROOT_ROUNDING, jet, positive_root, second_form
-from curvafit.priors.energy import energy
+from curvafit.priors.energy import energy, energy_gradient, energy_gradient_by_autograd
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
 
@@ -47,7 +46,7 @@ def invariants(u: Tensor, grid: Grid) -> tuple[Tensor, Tensor]:
 
 
 def slope_of(u: Tensor, grid: Grid, a: Coefficients = LAW) -> Tensor:
-    return kernels.plain_energy_gradient(u, a, grid, EPSILON)[1].double()
+    return energy_gradient_by_autograd(u, a, grid, EPSILON)[1].double()
 
 
 def one_sided(u: Tensor, grid: Grid, place: Tensor, step: float, a: Coefficients) -> tuple[Tensor, Tensor]:
@@ -110,7 +109,7 @@ def test_float32_has_the_gradient_of_float64(field, boundary) -> None:
     u, grid, place = field(boundary)
     near = torch.nn.functional.max_pool3d(place.double()[None], 3, 1, 1)[0].bool()
     exact = slope_of(u, grid)
-    found = [slope_of(u.float(), grid), kernels.energy_gradient(u.float(), LAW, grid, EPSILON)[1].double()]
+    found = [slope_of(u.float(), grid), energy_gradient(u.float(), LAW, grid, EPSILON)[1].double()]
     scale = exact[near].abs().max()
     for slope in found:
         assert float((slope - exact)[near].abs().max()) < 1e-3 * float(scale)
@@ -157,6 +156,6 @@ def test_every_fused_kernel_makes_the_same_choice(kind) -> None:
         mask = torch.full(grid.shape, 0.5)
     else:
         a = Coefficients(*list(LAW)[:5], a00=torch.full(grid.shape, 500.0, dtype=torch.float64))
-    _, exact = kernels.plain_energy_gradient(u, a, grid, EPSILON, None, mask)
-    _, found = kernels.energy_gradient(u.float(), a, grid, EPSILON, None, mask)
+    _, exact = energy_gradient_by_autograd(u, a, grid, EPSILON, None, mask)
+    _, found = energy_gradient(u.float(), a, grid, EPSILON, None, mask)
     assert float((found.double() - exact)[place].abs().max()) < 1e-3 * float(exact[place].abs().max())

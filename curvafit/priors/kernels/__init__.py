@@ -1,4 +1,8 @@
-"""The fused energy and blur, which the device chooses, not the caller; plain torch where there is no kernel."""
+"""Fused kernels for float32 fields on processors: whether there is one, and what it takes.
+
+`cpu` is what callers use, `loops` are its loops. `energy.energy_gradient`, and `gaussian_blur` here, choose between
+a kernel and plain torch by the field's type and device.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,6 @@ import torch
 from torch import Tensor
 
 from curvafit.priors import stencils
-from curvafit.priors.energy import energy
 from curvafit.priors.grid import Grid
 
 
@@ -33,55 +36,8 @@ def to_numpy_cost(
     return [number(value) for value in coefficients], number(epsilon), Q
 
 
-def energy_gradient(
-    u: Tensor,
-    coefficients: Iterable[float | Tensor],
-    grid: Grid,
-    epsilon: float | Tensor,
-    orientation: Tensor | None = None,
-    mask: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:
-    """Return `energy` of a field `(Z, Y, X)` and its gradient with respect to every voxel, in the field's type.
-
-    Raises
-    ------
-    ValueError
-        If the field's shape is not the grid's.
-    """
-    if u.dtype != torch.float32 or not has_kernel(u.device):
-        return plain_energy_gradient(u, coefficients, grid, epsilon, orientation, mask)
-    from curvafit.priors.kernels import cpu
-
-    a, ε, Q = to_numpy_cost(coefficients, grid, epsilon, orientation)
-    kept = None if mask is None else mask.detach().numpy()
-    value, slope = cpu.energy_gradient(u.detach().numpy(), a, grid, ε, Q, kept)
-    return torch.tensor(value, dtype=torch.float64), torch.from_numpy(slope)
-
-
-def plain_energy_gradient(
-    u: Tensor,
-    coefficients: Iterable[float | Tensor],
-    grid: Grid,
-    epsilon: float | Tensor,
-    orientation: Tensor | None = None,
-    mask: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:
-    """Return the energies of fields `(..., Z, Y, X)` and their gradients by autograd, the definition, on any device."""
-    free = u.detach().requires_grad_()
-    with torch.enable_grad():
-        values = energy(free, coefficients, grid, epsilon, orientation, mask)
-        (gradients,) = torch.autograd.grad(values.sum(), free)
-    return values.detach(), gradients
-
-
 def gaussian_blur(u: Tensor, grid: Grid, width: float) -> Tensor:
-    """Return `stencils.gaussian_blur` of a field `(Z, Y, X)` that needs no gradient.
-
-    Raises
-    ------
-    ValueError
-        If the field's shape is not the grid's, or as `stencils.check_blur` does.
-    """
+    """Return `stencils.gaussian_blur` of a field that needs no gradient, by the kernel where there is one."""
     stencils.check_blur(grid, width)
     if u.dtype == torch.float32 and u.dim() == 3 and has_kernel(u.device):
         from curvafit.priors.kernels import cpu

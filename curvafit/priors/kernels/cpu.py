@@ -28,7 +28,9 @@ _BLOCK, _TILE = 432, 43_000
 _LINE = 16
 
 
-def energy_gradient(u: np.ndarray, a, grid: Grid, epsilon, orientation=None, mask=None) -> tuple[float, np.ndarray]:
+def fused_energy_gradient(
+    u: np.ndarray, a, grid: Grid, epsilon, orientation=None, mask=None
+) -> tuple[float, np.ndarray]:
     """Return F_ε(u) and its gradient with respect to every voxel, in which the voxel's volume is a factor.
 
     Parameters
@@ -151,7 +153,7 @@ class FusedFlow:
             self.blur_divergence()
         self._ahead = False
         self.blur_along_z()
-        return self.energy_gradient()
+        return self.fill_gradient()
 
     def update(self, rate: float) -> tuple[float, float]:
         """Make an Adam step of length `rate` along the last gradient; return maximum and mean of |∂F_ε/∂A|."""
@@ -166,7 +168,7 @@ class FusedFlow:
         """Blur along z and add the base, the first part of a step."""
         self._blur.along_z(self._gradient, self._field, self._mass, self._base)
 
-    def energy_gradient(self) -> float:
+    def fill_gradient(self) -> float:
         """Compute F_ε and its gradient with respect to u, the second part of a step."""
         return self._density(self._field, self._gradient)
 
@@ -278,7 +280,7 @@ class _Density:
     def __call__(self, u: np.ndarray, gradient: np.ndarray) -> float:
         """Fill the gradient; return the energy."""
         with limited(self._threads):
-            loops.energy_gradient(
+            loops.fill_gradient(
                 u,
                 gradient,
                 self._energies,

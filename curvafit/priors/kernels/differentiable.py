@@ -8,9 +8,8 @@ import torch
 from torch import Tensor
 
 from curvafit.priors import kernels
-from curvafit.priors.energy import energy
+from curvafit.priors.energy import energy, energy_gradient
 from curvafit.priors.grid import Float, Grid
-from curvafit.priors.stencils import gradient
 
 
 def energies(
@@ -51,22 +50,12 @@ def energies(
     return (_energies(*given) if compiling else _Energies.apply(*given))[0]  # type: ignore[index]
 
 
-def areas(
-    u: Float[Tensor, "batch z y x"], grid: Grid, epsilon: float, mask: Float[Tensor, "#batch z y x"]
-) -> Float[Tensor, " batch"]:
-    """Return ∫ ε|∇u|² of every field, the term of F_ε that a00 multiplies, about σ × area, as `energies` does."""
-    if u.dtype == torch.float32 and kernels.has_kernel(u.device):
-        return energies(u, (0.0, 0.0, 0.0, 0.0, 0.0, 1.0), grid, epsilon, mask)
-    slope2 = gradient(u, grid).square().sum(-4)
-    return epsilon * (slope2 * mask.to(u)).sum((-3, -2, -1)) * grid.voxel_volume
-
-
 def _compute(u, mask, a, spacing, epsilon) -> tuple[Tensor, Tensor]:
     """Return the energies and their gradient."""
     grid = Grid(tuple(u.shape[1:]), tuple(spacing), "replicate")
     values, slopes = u.new_empty((u.shape[0],)), torch.empty_like(u, memory_format=torch.contiguous_format)
     for k in range(len(u)):
-        values[k], slopes[k] = kernels.energy_gradient(u[k].detach(), a, grid, epsilon, mask=mask[k].detach())
+        values[k], slopes[k] = energy_gradient(u[k].detach(), a, grid, epsilon, mask=mask[k].detach())
     return values, slopes
 
 

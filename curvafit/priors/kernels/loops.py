@@ -477,7 +477,7 @@ def _carry(ring, size, stride, count):
 
 
 @njit(**_SERIAL)
-def _energy_gradient_chunk(
+def _fill_gradient_chunk(
     u, out, energies, ring, sums, inside, k, ratios, orient, local, places, index,
     first, last, y0, y1, block, Z, Y, stride,
 ):  # fmt: skip
@@ -516,16 +516,14 @@ def _energy_gradient_chunk(
 
 
 @njit(**_PARALLEL)
-def energy_gradient(
-    u, out, energies, rings, sums, inside, k, ratios, orient, local, places, index, block, tile, Z, Y, X
-):
+def fill_gradient(u, out, energies, rings, sums, inside, k, ratios, orient, local, places, index, block, tile, Z, Y, X):
     """Compute the energies of tiles of rows in planes, and the gradient."""
     chunks = rings.shape[0]
     for chunk in prange(chunks):
         first, last = chunk * Z // chunks, (chunk + 1) * Z // chunks
         if first < last:
             for y0 in range(0, Y, tile):
-                _energy_gradient_chunk(
+                _fill_gradient_chunk(
                     u, out, energies[y0 // tile], rings[chunk], sums[chunk], inside, k, ratios, orient,
                     local, places, index, first, last, y0, min(Y, y0 + tile), block, Z, Y, X + 2 * EDGE,
                 )  # fmt: skip
