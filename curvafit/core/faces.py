@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import ast
+import dis
 import sys
 from importlib import import_module
-from inspect import getsource
 from types import ModuleType
 from typing import Any
 
@@ -13,18 +12,17 @@ from typing import Any
 def attach_lazy_names(package: str) -> None:
     """Offer the names that a package imports under `if TYPE_CHECKING:`; each module is imported at their first use.
 
-    The imports stand once, as `from room.module import name as name`, where type checkers and editors read them; here
-    they are read from the source of the package's `__init__.py`.
-
-    Parameters
-    ----------
-    package
-        `__name__` of the package.
+    The imports stand once, as `from room.module import name as name`, where type checkers and editors read them. Python
+    compiles them without running them: the names and their modules are in the package's bytecode.
     """
     face = sys.modules[package]
-    blocks = (node for node in ast.parse(getsource(face)).body if isinstance(node, ast.If))
-    imports = [node for block in blocks for node in block.body if isinstance(node, ast.ImportFrom)]
-    homes = {alias.name: node.module for node in imports for alias in node.names if alias.asname == alias.name}
+    assert face.__spec__ is not None
+    homes, module = {}, ""
+    for instruction in dis.get_instructions(face.__spec__.loader.get_code(package)):  # type: ignore[union-attr]
+        if instruction.opname == "IMPORT_NAME":
+            module = instruction.argval
+        elif instruction.opname == "IMPORT_FROM" and instruction.argval not in face.__dict__:  # not run
+            homes[instruction.argval] = module
     face.__dict__["_homes"] = homes
     face.__dict__["__all__"] = sorted([*homes, *({"__version__"} & face.__dict__.keys())])
     face.__class__ = _Face
