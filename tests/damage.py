@@ -74,7 +74,6 @@ OTHERS: dict[str, Callable[[Path], object]] = {
     "deflate.tif": lambda path: tiff(path, "deflate"),
     "a.h5": hdf5,
     "packed.h5": lambda path: hdf5(path, compression="gzip", fletcher32=True),
-    "ascii.nrrd": lambda path: packed_nrrd(path, "ascii"),
     "v3.zarr": store,
     "v2.zarr": lambda path: store(path, zarr_format=2, compressors=[numcodecs.Blosc()]),
     "blosc.zarr": lambda path: store(path, compressors=[BloscCodec()]),

@@ -138,7 +138,7 @@ def diagram_distances(
     def save(distances: np.ndarray) -> None:
         """Replace the file."""
         arrays = {"keys": np.array(keys, dtype="S64"), "distances": distances}
-        DISTANCES.write(saved, {}, arrays, compress=False)
+        DISTANCES.write(saved, {}, arrays)
 
     return pairwise(diagrams, **DISTANCE, known=known, save=save, progress=progress)
 

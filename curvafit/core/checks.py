@@ -28,61 +28,37 @@ def quoted(value: Any) -> str:
 
 
 def check_int(value: Any, expected: str, least: int, most: int, *, of: Any = None) -> int:
-    """Return a whole number from `least` to `most` as an int; Python's and NumPy's types are accepted.
+    """Return a whole number from `least` to `most` as an int, or raise ValueError; True, text and 64.0 are refused.
 
-    Parameters
-    ----------
-    expected
-        What the message says was expected: the kind of number and the least one. The message adds `most` where the
-        number is above it.
-    of
-        The argument that the message quotes, where the value is a part of one.
-
-    Raises
-    ------
-    ValueError
-        If the value is not such a number: truth values, text and 64.0 are refused.
+    The message says what was `expected` (the kind of number and the least one), adds `most` where the number is above
+    it, and quotes the value, or the argument `of` that the value is a part of.
     """
     try:
         number = None if isinstance(value, bool) else operator.index(value)
     except TypeError:
         number = None
     if number is None or not least <= number <= most:
-        raise ValueError(f"expected {expected}{_beyond(number, 0, most)}, got {quoted(value if of is None else of)}")
+        words = f"{expected}{_bound_words(number, 0, most)}"
+        raise ValueError(f"expected {words}, got {quoted(value if of is None else of)}")
     return number
 
 
 def check_float(
     value: Any, expected: str, least: float = -math.inf, most: float = math.inf, *, of: Any = None
 ) -> float:
-    """Return a finite number from `least` to `most` as a float; any numeric type is accepted.
-
-    The other parameters are those of `check_int`.
-
-    Raises
-    ------
-    ValueError
-        If the value is not such a number: truth values and text are refused.
-    """
+    """Return a finite number from `least` to `most` as a float, or raise ValueError as `check_int` does."""
     number = math.nan
     if not isinstance(value, (bool, str, bytes)) and not getattr(value, "shape", ()):
         with contextlib.suppress(TypeError, ValueError, OverflowError, RuntimeError):
             number = float(value)
     if not (math.isfinite(number) and least <= number <= most):
-        raise ValueError(
-            f"expected {expected}{_beyond(number, least, most)}, got {quoted(value if of is None else of)}"
-        )
+        words = f"{expected}{_bound_words(number, least, most)}"
+        raise ValueError(f"expected {words}, got {quoted(value if of is None else of)}")
     return number
 
 
 def check_open_interval(value: Any, expected: str, low: float, high: float) -> float:
-    """Return a number above `low` and below `high`, as `check_float` does.
-
-    Raises
-    ------
-    ValueError
-        If the value is not such a number.
-    """
+    """Return a number above `low` and below `high` as a float, or raise ValueError."""
     number = check_float(value, expected)
     if not low < number < high:
         raise ValueError(f"expected {expected}, got {quoted(value)}")
@@ -90,13 +66,7 @@ def check_open_interval(value: Any, expected: str, low: float, high: float) -> f
 
 
 def as_tuple(values: Any, name: str) -> tuple[Any, ...]:
-    """Return the values of a sequence of any type but text.
-
-    Raises
-    ------
-    ValueError
-        If the argument is not a sequence.
-    """
+    """Return the values of a sequence of any type but text, or raise ValueError."""
     try:
         parts = None if isinstance(values, (str, bytes)) else tuple(values)
     except TypeError:
@@ -124,18 +94,12 @@ def simplify_name(name: str) -> str:
 
 
 def check_seed(value: Any) -> int:
-    """Return a seed, a whole number from 0 that a signed 64-bit number holds.
-
-    Raises
-    ------
-    ValueError
-        If the value is not such a number.
-    """
+    """Return a seed, a whole number from 0 that a signed 64-bit number holds, or raise ValueError."""
     return check_int(value, "a seed that is a whole number from 0", 0, SEEDS - 1)
 
 
-def _beyond(number: float | None, least: float, most: float) -> str:
-    """Return the words for the bound that a number exceeds; empty where its kind or its sign is wrong."""
+def _bound_words(number: float | None, least: float, most: float) -> str:
+    """Return the words for the bound that a number breaks; none where its kind or its sign is what is wrong."""
     if number is None or not -math.inf < number < math.inf or (number <= most and not 0 < number < least):
         return ""
     return f", at most {most:g}" if number > most else f", at least {least:g}"

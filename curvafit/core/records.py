@@ -3,7 +3,7 @@
 - `Format` names a kind of file. `Format.write` writes a header, alone as JSON or with arrays as NPZ, whole or not at
   all; `Format.read` reads it and refuses what is damaged, of another kind or of another version.
 - `can_write` refuses a name that is taken: a program replaces only what it wrote, unless the caller says `overwrite`.
-- `parse_json` and `read_archive` read JSON and NPZ files that anyone may have written.
+- `parse_json` and `read_archive` read JSON and NPZ files of any origin.
 """
 
 from __future__ import annotations
@@ -14,16 +14,15 @@ import math
 import re
 import zipfile
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any, NamedTuple, NoReturn, TypeVar
+from typing import IO, Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from curvafit.core.checks import quoted
 from curvafit.core.files import check_folder, is_empty, write_content
-from curvafit.core.runtime import memory
 
 Content = TypeVar("Content")
 
@@ -38,11 +37,7 @@ _WRITTEN = re.compile(r"(\d+/)?zarr\.json|\d+/c(/\d+)*")
 #: What the making of a result from a damaged file may raise.
 _FAULTS = (KeyError, ValueError, IndexError, TypeError, AttributeError, RuntimeError)
 #: The most digits of a whole number in JSON.
-DIGITS = 40
-#: Bytes of one read.
-_PIECE = 1 << 22
-#: NPY's versions of plain numbers.
-_NPY_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+_DIGITS = 40
 
 
 # ---- records ---------------------------------------------------------------------------------------------------------
@@ -88,25 +83,24 @@ class Format:
     remedy: str = "make it again"
     fixed: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def _marks(self) -> dict[str, Any]:
+        """The entries of the header that must be as they are here."""
+        return {**({} if self.version is None else {"version": self.version}), **self.fixed}
+
     def write(
-        self,
-        path: str | Path,
-        header: Mapping[str, Any],
-        arrays: Mapping[str, np.ndarray] | None = None,
-        *,
-        compress: bool = True,
+        self, path: str | Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray] | None = None
     ) -> Path:
         """Write a header alone as JSON, or with arrays as NPZ; the file is whole or not there.
 
         The header gets the entries `format`, `version` and those of `fixed`. A file of that name is replaced: call
         `can_write` before.
         """
-        version = {} if self.version is None else {"version": self.version}
-        content = {"format": self.name, **version, **self.fixed, **header}
+        content = {"format": self.name, **self._marks, **header}
         if arrays is None:
             return write_content(Path(path), json.dumps(content, indent=2, allow_nan=False) + "\n")
-        buffer, save = io.BytesIO(), np.savez_compressed if compress else np.savez
-        save(buffer, allow_pickle=False, header=encode(content), **arrays)
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, allow_pickle=False, header=encode(content), **arrays)
         return write_content(Path(path), buffer.getbuffer())
 
     def read(
@@ -123,7 +117,7 @@ class Format:
         source
             A path, or an open file.
         build
-            Any exception that damaged content may lead to in it becomes a ValueError.
+            Makes the result; what it raises where the content is damaged becomes a ValueError.
         place
             What messages call the source, by default its path.
 
@@ -142,22 +136,17 @@ class Format:
             header, arrays = _read(source)
         except (OSError, *_FAULTS) as error:
             raise ValueError(f"{place} is not {self.title}: it is truncated, damaged or something else") from error
-        self.check(header, place)
+        if header.get("format") != self.name:
+            raise ValueError(f"{place} is not {self.title}: it is something else")
+        if others := [name for name, value in self._marks.items() if header.get(name) != value]:
+            theirs = ", ".join(f"{name} {quoted(header.get(name))}" for name in others)
+            mine = ", ".join(f"{name} {quoted(self._marks[name])}" for name in others)
+            raise ValueError(f"{place} is {self.title} with {theirs} instead of {mine}: {self.remedy}")
         try:
             return build(header, arrays)
         except _FAULTS as error:
             reason = f"it lacks {error}" if isinstance(error, KeyError) else str(error)[:200]
             raise ValueError(f"{place} is not {self.title} that can be read: {reason}") from error
-
-    def check(self, header: Any, place: object) -> None:
-        """Raise ValueError where a header is of another format or version, or has other `fixed` entries."""
-        if not isinstance(header, dict) or header.get("format") != self.name:
-            raise ValueError(f"{place} is not {self.title}: it is something else")
-        wanted = {**({} if self.version is None else {"version": self.version}), **self.fixed}
-        others = [f"{name} {quoted(header.get(name))}" for name, value in wanted.items() if header.get(name) != value]
-        if others:
-            mine = ", ".join(f"{name} {quoted(wanted[name])}" for name in wanted if header.get(name) != wanted[name])
-            raise ValueError(f"{place} is {self.title} with {', '.join(others)} instead of {mine}: {self.remedy}")
 
     def owns(self, path: Path) -> bool:
         """Return whether a file says that it is of this format, or a Zarr store of images that it is of this kind.
@@ -219,7 +208,13 @@ def can_write(
     check_folder(target.parent)
     if target.is_dir() and not target.name.lower().endswith(".zarr"):
         raise ValueError(f"{target} is a folder: give the name of a file")
-    replaceable = _replaceable(ours, target)
+    listed = ours.companions(target) if isinstance(ours, Format) else []
+
+    def replaceable(there: Path) -> bool:
+        if not isinstance(ours, Format):
+            return ours(there)
+        return (there.is_file() and there.name in listed) or (there == target and ours.owns(there))
+
     sources = [source for name in inputs if (source := Path(str(name).partition("::")[0])).exists()]
     for place in (target, *more):
         for source in sources:
@@ -235,15 +230,8 @@ def can_write(
     return target
 
 
-def _replaceable(ours: Format | Callable[[Path], bool], target: Path) -> Callable[[Path], bool]:
-    """Return the function that says whether a path that exists may be replaced."""
-    if not isinstance(ours, Format):
-        return ours
-    listed = ours.companions(target)
-    return lambda path: (path.is_file() and path.name in listed) or (path == target and ours.owns(path))
-
-
 def _check_apart(target: Path, source: Path) -> None:
+    """Raise ValueError where writing `target` would change `source`: where one is the other, or lies in it."""
     read, place = source.resolve(), target.resolve()
     same = target.exists() and target.samefile(source)
     if same or place.is_relative_to(read) or read.is_relative_to(place):
@@ -251,7 +239,7 @@ def _check_apart(target: Path, source: Path) -> None:
 
 
 def has_mark(path: Path, mark: str) -> bool:
-    """Return whether a file has a text among its first bytes, by which a page or a table is known."""
+    """Return whether a file has a text among its first bytes: the mark of a page or a table."""
     try:
         if not path.is_file():
             return False
@@ -270,8 +258,10 @@ def sibling(path: str | Path, ending: str) -> Path:
 
 def is_own_zarr(folder: Path, kind: str) -> bool:
     """Return whether a folder is empty, or a Zarr group of images with the mark of this kind and nothing else in it."""
-    if folder.is_symlink() or is_empty(folder):
-        return not folder.is_symlink()
+    if folder.is_symlink():
+        return False
+    if is_empty(folder):
+        return True
     try:
         attributes = parse_json((folder / "zarr.json").read_bytes(), "a Zarr group", folder)["attributes"]
         if attributes[MARK]["kind"] != kind:
@@ -306,75 +296,26 @@ def _read(source: Path | IO[bytes]) -> Record:
 
 
 def read_archive(source: Path | IO[bytes]) -> dict[str, np.ndarray]:
-    """Return all arrays of an NPZ file by name; each is read to its end, where its checksum is.
-
-    Raises
-    ------
-    OSError, ValueError
-        If the file cannot be read, is damaged, or is not an NPZ file.
-    """
+    """Return all arrays of an NPZ file by name; raise OSError or ValueError where it is damaged or something else."""
     if isinstance(source, Path) and source.exists() and not source.is_file():
         raise ValueError(f"{source} is not an NPZ file")
     try:
         with zipfile.ZipFile(source) as archive:
             members = [name for name in archive.namelist() if name.endswith(".npy")]
-            return {name.removesuffix(".npy"): _member(archive, name) for name in members}
+            return {name.removesuffix(".npy"): read_member(archive, name) for name in members}
     except (OSError, ValueError):
         raise
     except Exception as reason:  # zipfile, zlib and numpy have a dozen ways to say so
         raise ValueError(f"the NPZ file cannot be read ({quoted(str(reason))})") from reason
 
 
-def _member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
+def read_member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
+    """Return the array of a member of an NPZ file; the member must end with it, where its checksum is compared."""
     with archive.open(name) as stream:
-        return read_array(stream, archive.getinfo(name).file_size)
-
-
-def read_array(stream: Any, size: int) -> np.ndarray:
-    """Return the numbers of an NPY stream of `size` bytes.
-
-    Raises
-    ------
-    ValueError
-        If the header is of something other than plain numbers, or the stream does not end with them.
-    """
-    shape, fortran, dtype = read_array_header(stream, size)
-    values = read_numbers(stream, shape[::-1] if fortran else shape, dtype)
-    return values.T if fortran else values
-
-
-def read_array_header(stream: Any, size: int) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Return shape, whether the first axis is the fastest, and type, of an NPY stream of `size` bytes."""
-    version = np.lib.format.read_magic(stream)
-    if version not in _NPY_HEADERS:
-        raise ValueError(f"NPY of version {version} holds no plain numbers")
-    shape, fortran, dtype = _NPY_HEADERS[version](stream)
-    if not dtype.hasobject and math.prod(shape) * dtype.itemsize != size - stream.tell():
-        raise ValueError(f"{math.prod(shape) * dtype.itemsize} bytes of values by its header, not so many in the file")
-    return shape, fortran, dtype
-
-
-def read_numbers(stream: Any, shape: Sequence[int], dtype: np.dtype) -> np.ndarray:
-    """Return the array of a stream, last axis fastest; the stream must end with it.
-
-    A gzip, bzip2 or zip stream compares its checksum only at its end.
-
-    Raises
-    ------
-    ValueError, OSError, EOFError, zlib.error, zipfile.BadZipFile
-        If the values are not numbers, do not fit into memory, or the stream is shorter, longer or damaged.
-    """
-    shape = tuple(map(int, shape))
-    nbytes = math.prod(shape) * dtype.itemsize
-    if dtype.kind in "OV" or min(shape, default=1) < 0 or nbytes > memory():
-        raise ValueError(f"an array {shape} of {str(dtype)[:80]} cannot be read into memory")
-    values = np.empty(math.prod(shape), dtype)
-    buffer, size = values.view(np.uint8).data if nbytes else memoryview(b""), 0
-    while size < nbytes and (count := stream.readinto(buffer[size : size + _PIECE])):
-        size += count
-    if size < nbytes or stream.read(1):
-        raise ValueError(f"{nbytes} bytes of values by its header, {size if size < nbytes else 'more'} in the file")
-    return values.reshape(shape)
+        values = np.lib.format.read_array(stream, allow_pickle=False)
+        if stream.read(1):
+            raise ValueError(f"{name} has more bytes than its header says")
+    return values
 
 
 def parse_json(content: str | bytes, expected: str, place: object) -> Any:
@@ -395,10 +336,10 @@ def parse_json(content: str | bytes, expected: str, place: object) -> Any:
         text = content.decode() if isinstance(content, bytes) else content
         return json.loads(
             text.removeprefix("\ufeff"),
-            parse_int=_whole,
-            parse_float=_finite,
-            parse_constant=_refuse_constant,
-            object_pairs_hook=_single,
+            parse_int=_parse_int,
+            parse_float=_parse_float,
+            parse_constant=_parse_float,
+            object_pairs_hook=_parse_object,
         )
     except UnicodeDecodeError:
         fault = "which is not text in UTF-8"
@@ -411,35 +352,22 @@ def parse_json(content: str | bytes, expected: str, place: object) -> Any:
     raise ValueError(f"expected {expected}, got {place}, {fault}")
 
 
-def first_repeated(names: Sequence[Any]) -> Any:
-    """Return the first name that occurs more than once, None where there is none."""
-    if len(set(names)) == len(names):
-        return None
-    return next(name for name, count in Counter(names).items() if count > 1)
-
-
-def _whole(text: str) -> int:
-    """Return a whole number of at most `DIGITS` digits."""
-    if len(text) > DIGITS:
+def _parse_int(text: str) -> int:
+    if len(text) > _DIGITS:
         raise ValueError(f"a number of {len(text)} digits")
     return int(text)
 
 
-def _finite(text: str) -> float:
-    """Return a finite number."""
+def _parse_float(text: str) -> float:
     value = float(text)
     if not math.isfinite(value):
         raise ValueError(f"{quoted(text)}, which is not a finite number")
     return value
 
 
-def _refuse_constant(name: str) -> NoReturn:
-    """Refuse NaN and the infinities, which Python's JSON parser hands to this function."""
-    raise ValueError(f"{name}, which is not a finite number")
-
-
-def _single(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return a dictionary of pairs whose keys all differ."""
-    if (name := first_repeated([name for name, _ in pairs])) is not None:
+def _parse_object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        name = next(name for name, count in Counter(name for name, _ in pairs).items() if count > 1)
         raise ValueError(f"the key {quoted(name)} twice")
-    return dict(pairs)
+    return content

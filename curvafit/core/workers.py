@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from curvafit.core.checks import check_int
 from curvafit.core.extras import require
@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
 #: Where workers on this machine listen.
 LOOPBACK = "127.0.0.1"
-#: Processes that may be asked for on this machine.
-MOST = 1024
 #: Seconds that a scheduler has to answer.
 PATIENCE = 10
 #: A worker's environment, which this process gets too. Dask has the C library give memory back at once: arrays of a
@@ -35,27 +33,10 @@ _IGNORE_INTERRUPTS = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN
 Make = Callable[[Path, Sequence[int]], list[Any]]
 
 
-class Workers(Protocol):
-    """Whoever makes the parts of a job, such as the draws of an atlas."""
-
-    @property
-    def places(self) -> int:
-        """Return how many requests may wait at once."""
-        ...
-
-    def submit(self, make: Make, path: Path, indices: Sequence[int]) -> None:
-        """Ask for some parts of a folder."""
-        ...
-
-    def collect(self) -> list[Any]:
-        """Wait for one of the requests, and return its results."""
-        ...
-
-
 class ThisProcess:
-    """This process, as the only worker."""
+    """This process, as the only worker of a job: `submit` asks for parts of a folder, `collect` makes them."""
 
-    places: int = 1
+    places = 1
 
     def __init__(self) -> None:
         self._requests: list[tuple[Make, Path, Sequence[int]]] = []
@@ -71,7 +52,8 @@ class ThisProcess:
 class Cluster:
     """The workers of a dask cluster, which must see the folder under the same name.
 
-    Each worker always has a request to go on with. A request whose worker dies goes to another.
+    `submit` asks for parts of the folder; `collect` waits for one of the requests and returns its results. `places` is
+    the number of requests that may wait at once. A request whose worker dies goes to another.
     """
 
     def __init__(self, client: Client) -> None:
@@ -100,33 +82,31 @@ class Cluster:
             raise OSError(f"a part of the work killed several workers: {error}") from error
 
 
+#: Whoever makes the parts of a job, such as the draws of an atlas.
+Workers = ThisProcess | Cluster
+
+
 def check_workers(count: int | None, scheduler: str | None) -> None:
-    """Raise ValueError where the number of workers is none, or there is a scheduler, whose workers are its own."""
+    """Raise ValueError unless there is a number of workers, or a scheduler (which has its own), or neither."""
     if count is not None:
-        check_int(count, "a number of workers from 0", 0, MOST)
+        check_int(count, "a number of workers from 0", 0, 1024)
         if scheduler is not None:
             raise ValueError(f"give either a number of workers or a scheduler, got {count} and {scheduler}")
 
 
-def processes(count: int | None) -> int:
-    """Return how many processes work on this machine: the number of workers, or by default one per core.
-
-    Cores are those that a container or the scheduler leaves to this process. 0 workers are this process.
-
-    Raises
-    ------
-    ImportError
-        If dask is not installed and cores are to be counted.
-    """
-    return max(1, _dask("dask.system").CPU_COUNT if count is None else count)
-
-
 @contextmanager
 def cluster(count: int | None = None, scheduler: str | None = None, dashboard: int | None = None) -> Iterator[Workers]:
-    """Start workers: of the scheduler at an address, or so many on this machine (as many as cores); 0 is this process.
+    """Start `count` workers on this machine, or take those of a dask scheduler; end them with the block.
 
-    Those on this machine talk over the loopback alone; `dashboard` is the port of dask's own page there, none if not
-    given.
+    Parameters
+    ----------
+    count
+        Processes on this machine, which talk over the loopback alone; by default one for each core that a container or
+        the scheduler leaves to this process. 0 is this process.
+    scheduler
+        Address of a scheduler, whose workers are used.
+    dashboard
+        Port of dask's own page on the loopback; by default there is none.
 
     Raises
     ------
@@ -139,39 +119,41 @@ def cluster(count: int | None = None, scheduler: str | None = None, dashboard: i
     if count == 0 and scheduler is None:
         yield ThisProcess()
         return
-    distributed, settings = _dask("distributed"), _dask("dask.config")
-    if scheduler is not None:
-        with _connected(distributed, scheduler) as client:
-            yield Cluster(client)
-        return
-    environment = {f"distributed.nanny.pre-spawn-environ.{name}": value for name, value in _ENVIRONMENT.items()}
-    with settings.set(environment), _local(distributed, processes(count), dashboard) as client:
+    require("distributed", "synth", "work by several processes")
+    with _connect(scheduler) if scheduler is not None else _start(count, dashboard) as client:
         yield Cluster(client)
 
 
-def _dask(name: str) -> Any:
-    return require(name, "synth", "work by several processes")
-
-
 @contextmanager
-def _local(distributed: Any, count: int, dashboard: int | None) -> Iterator[Client]:
-    here = distributed.LocalCluster(
-        n_workers=count,
-        threads_per_worker=1,
-        processes=True,
-        host=LOOPBACK,
-        dashboard_address=f"{LOOPBACK}:{dashboard or 0}",
-        scheduler_kwargs={"dashboard": dashboard is not None},
-        memory_limit=0,
-        silence_logs=logging.ERROR,
-        preload=_IGNORE_INTERRUPTS,
-    )
-    with here, distributed.Client(here) as client:
+def _start(count: int | None, dashboard: int | None) -> Iterator[Client]:
+    """Start workers on this machine."""
+    import dask.config
+    import distributed
+    from dask.system import CPU_COUNT
+
+    environment = {f"distributed.nanny.pre-spawn-environ.{name}": value for name, value in _ENVIRONMENT.items()}
+    with (
+        dask.config.set(environment),
+        distributed.LocalCluster(
+            n_workers=CPU_COUNT if count is None else count,
+            threads_per_worker=1,
+            processes=True,
+            host=LOOPBACK,
+            dashboard_address=f"{LOOPBACK}:{dashboard or 0}",
+            scheduler_kwargs={"dashboard": dashboard is not None},
+            memory_limit=0,
+            silence_logs=logging.ERROR,
+            preload=_IGNORE_INTERRUPTS,
+        ) as here,
+        distributed.Client(here) as client,
+    ):
         yield client
 
 
 @contextmanager
-def _connected(distributed: Any, address: str) -> Iterator[Client]:
+def _connect(address: str) -> Iterator[Client]:
+    """Connect to a scheduler."""
+    import distributed
     from distributed.comm.core import CommClosedError
 
     try:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise, product
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -21,34 +21,14 @@ from curvafit.volumes.formats.part import Box, Crop, Part, parse_box, resolve_bo
 from curvafit.volumes.formats.zarr import read_zarr
 from curvafit.volumes.read import Source, field_of, pick_reader, read_file, split_key, to_field
 
-__all__ = ["Boxes", "boxes_of", "digest_of", "frame_of", "read_whole", "subsample", "value_range"]
-
 #: Readers that read a box alone.
 _BY_BOX = (read_zarr, read_hdf5, read_npy, read_raw, read_nifti)
 #: The first voxel.
 _CORNER = (slice(0, 1), slice(0, 1), slice(0, 1))
-#: Voxels of a slab that is looked at.
+#: Voxels that `value_range` reads at once.
 _SLAB = 2**24
 #: A sample has at most so many runs of neighbouring voxels along each axis, each so long.
 RUNS, LONG = 4, 64
-
-
-class Boxes(Protocol):
-    """A volume of which boxes are read."""
-
-    @property
-    def frame(self) -> Field:
-        """The volume's shape and place, with zeros for values."""
-        ...
-
-    @property
-    def digest(self) -> str:
-        """A text that changes with the content."""
-        ...
-
-    def part(self, box: Box) -> np.ndarray:
-        """Return the values (Z, Y, X) of a box of voxels."""
-        ...
 
 
 def boxes_of(
@@ -62,29 +42,18 @@ def boxes_of(
 ) -> Boxes:
     """Return the boxes of any source of a volume.
 
-    From Zarr, HDF5, NPY, RAW and uncompressed NIfTI, boxes are read where they are asked for. Of other sources the
-    whole lies in memory, in the file's type. The arguments are those of `field_of`; boxes are returned as they are.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ScanError
-        As `field_of`.
+    From Zarr, HDF5, NPY, RAW and uncompressed NIfTI, boxes are read where they are asked for. Other sources are wholly
+    in memory, in the file's type. Arguments and errors are those of `field_of`; boxes are returned as they are.
     """
-    if isinstance(source, _Whole | _Stored):
+    if isinstance(source, Boxes):
         return source
     options: dict[str, Any] = {"spacing": spacing, "unit": unit, "crop": crop, **reading}
     if label is None and isinstance(source, str | os.PathLike):
         path, key = split_key(source, reading.get("key"))
-        if _by_box(path, reading.get("raw_shape")):
-            return _stored(path, key, options)
-    return _Whole(field_of(source, label=label, **options))  # type: ignore[arg-type]
-
-
-def frame_of(field: Field) -> Field:
-    """Return a volume's shape and place, with zeros for values."""
-    return replace(field, values=np.broadcast_to(np.zeros((), field.values.dtype), field.shape))
+        box_wise = path.exists() and not path.name.lower().endswith(".gz")
+        if box_wise and pick_reader(path, reading.get("raw_shape") is not None) in _BY_BOX:
+            return _open_file(path, key, options)
+    return InMemory(field_of(source, label=label, **options))  # type: ignore[arg-type]
 
 
 def read_whole(boxes: Boxes) -> Field:
@@ -96,7 +65,10 @@ def read_whole(boxes: Boxes) -> Field:
 def value_range(boxes: Boxes) -> tuple[float, float]:
     """Return the least and the greatest value."""
     lowest, highest, faults = np.inf, -np.inf, 0
-    for values in _slabs(boxes):
+    depth, rows, columns = boxes.frame.shape
+    thick = max(1, _SLAB // max(1, rows * columns))
+    for z in range(0, depth, thick):
+        values = boxes.part((slice(z, min(z + thick, depth)), slice(0, rows), slice(0, columns)))
         faults += np.count_nonzero(~np.isfinite(values)) if values.dtype.kind == "f" else 0
         lowest, highest = min(lowest, float(values.min())), max(highest, float(values.max()))
     if faults:
@@ -110,35 +82,21 @@ def subsample(boxes: Boxes) -> tuple[Field, list[Box]]:
     The sample is the volume itself where it is short; along an axis of more than `RUNS` x `LONG` voxels it has so many
     runs of so many voxels, from the middles of equal parts.
     """
-    runs = [_runs(n) for n in boxes.frame.shape]
-    sample = np.empty([sum(run.stop - run.start for run in axis) for axis in runs], boxes.frame.values.dtype)
-    blocks = [_end_to_end(axis) for axis in runs]
-    places = [(z, y, x) for z, y, x in product(*blocks)]
+    runs = [_sample_runs(n) for n in boxes.frame.shape]
+    ends = [np.cumsum([0, *(run.stop - run.start for run in axis)]).tolist() for axis in runs]
+    sample = np.empty([axis[-1] for axis in ends], boxes.frame.values.dtype)
+    places = [(z, y, x) for z, y, x in product(*([slice(a, b) for a, b in pairwise(axis)] for axis in ends))]
     for place, (z, y, x) in zip(places, product(*runs), strict=True):
         sample[place] = boxes.part((z, y, x))
     return replace(boxes.frame, values=sample, affine=None), places
 
 
-def _runs(n: int) -> list[slice]:
+def _sample_runs(n: int) -> list[slice]:
     """Return the runs of a sample along an axis of n voxels."""
     if n <= RUNS * LONG:
         return [slice(0, n)]
     starts = [(2 * k + 1) * n // (2 * RUNS) - LONG // 2 for k in range(RUNS)]
     return [slice(start, start + LONG) for start in starts]
-
-
-def _end_to_end(runs: Sequence[slice]) -> list[slice]:
-    """Return where runs lie in a sample."""
-    ends = np.cumsum([0, *(run.stop - run.start for run in runs)]).tolist()
-    return [slice(start, stop) for start, stop in pairwise(ends)]
-
-
-def _slabs(boxes: Boxes) -> Iterator[np.ndarray]:
-    """Yield a volume's slices, some at once."""
-    depth, *plane = boxes.frame.shape
-    thick = max(1, _SLAB // max(1, plane[0] * plane[1]))
-    for z in range(0, depth, thick):
-        yield boxes.part((slice(z, min(z + thick, depth)), slice(0, plane[0]), slice(0, plane[1])))
 
 
 def digest_of(values: np.ndarray) -> str:
@@ -148,26 +106,32 @@ def digest_of(values: np.ndarray) -> str:
 
 
 @dataclass(frozen=True)
-class _Whole:
-    """A volume in memory."""
+class InMemory:
+    """The boxes of a volume in memory."""
 
     field: Field
 
-    @cached_property
+    @property
     def frame(self) -> Field:
-        return frame_of(self.field)
+        """The volume's shape and place, with zeros for values."""
+        return _empty(self.field, self.field.shape)
 
     @cached_property
     def digest(self) -> str:
+        """A text that changes with the content."""
         return digest_of(self.field.values)
 
     def part(self, box: Box) -> np.ndarray:
+        """Return the values (Z, Y, X) of a box of voxels."""
         return self.field.values[box]
 
 
 @dataclass(frozen=True, eq=False)
-class _Stored:
-    """A volume in a file: its options of reading, its channel, and its first voxel in the file's array."""
+class InFile:
+    """The boxes of a volume in a file, as `InMemory` offers them.
+
+    `frame` has zeros for values; `options` are those of reading, and `first` is the volume's first voxel in the file.
+    """
 
     frame: Field
     path: Path
@@ -177,39 +141,41 @@ class _Stored:
 
     @property
     def digest(self) -> str:
-        """The file's name, size and time of change; those of a folder are its files' together."""
+        """The file's name, size and time of change; of a folder, the sum and the latest of its files'."""
         files = [path for path in self.path.rglob("*") if path.is_file()] if self.path.is_dir() else [self.path]
         states = [path.stat() for path in files]
         size, time = sum(state.st_size for state in states), max(state.st_mtime_ns for state in states)
         return f"{self.path.resolve()} {self.channel} {self.first} {self.options}: {size} bytes at {time}"
 
     def part(self, box: Box) -> np.ndarray:
+        """Return the values (Z, Y, X) of a box of voxels."""
         z, y, x = (slice(edge.start + n, edge.stop + n) for edge, n in zip(box, self.first, strict=True))
         values = _read(self.path, self.options, Part(self.channel, (z, y, x)))[0].values
         return np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("="))
 
 
-def _by_box(path: Path, raw_shape: Sequence[int] | None) -> bool:
-    """Return whether a file can be read box by box."""
-    if not path.exists() or path.name.lower().endswith(".gz"):
-        return False
-    return pick_reader(path, raw_shape is not None) in _BY_BOX
+#: A volume of which boxes are read.
+Boxes = InMemory | InFile
 
 
-def _stored(path: Path, key: str | None, options: dict[str, Any]) -> _Stored:
-    """Return the boxes of a file, whose first voxel is read to know its place."""
+def _empty(field: Field, shape: Sequence[int]) -> Field:
+    """Return a volume of this shape at a field's place, with zeros that take no memory."""
+    return replace(field, values=np.broadcast_to(np.zeros((), field.values.dtype), shape))
+
+
+def _open_file(path: Path, key: str | None, options: dict[str, Any]) -> InFile:
+    """Return the boxes of a file; the first voxel is read to know the volume's place."""
     reading = {"key": key, "raw_shape": options.get("raw_shape"), "dtype": options.get("dtype")}
     channel = options.get("channel")
-    corner, shape = _read(path, reading, Part(channel, _CORNER, some=options["crop"] is None))
+    corner, shape = _read(path, reading, Part(channel, _CORNER))
     if options.get("strict") and corner.gaps:
         raise ScanError(f"{path} is not whole: {corner.gaps[0]}")
     box = resolve_box(parse_box(options["crop"]), shape, path)
     first, size = [edge.start for edge in box], [edge.stop - edge.start for edge in box]
     check_array(size, corner.values.dtype, path)  # a mask is written from memory
     field = to_field(corner, f"{path}::{key}" if key else str(path), options["spacing"], options["unit"])
-    frame = replace(field, values=np.broadcast_to(field.values, size))
-    frame = frame_of(frame if options["crop"] is None else frame.moved(first))
-    return _Stored(frame, path, reading, channel, tuple(first))
+    frame = _empty(field, size)
+    return InFile(frame if options["crop"] is None else frame.moved(first), path, reading, channel, tuple(first))
 
 
 def _read(path: Path, reading: dict[str, Any], part: Part) -> tuple[Any, tuple[int, ...]]:

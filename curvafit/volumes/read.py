@@ -107,9 +107,14 @@ def load(
     raw, start = take_part(read, part, location)
     if strict and raw.gaps:
         raise ScanError(f"{location} is not whole: {raw.gaps[0]}")
-    _check_values(raw.values, location)
+    if raw.values.size == 0:
+        raise ScanError(f"a volume must be 3D, got no values (shape {raw.values.shape}) in {location}")
+    lowest, highest = _check_finite(raw.values, location)
+    if lowest == highest:
+        raise ScanError(f"every voxel of {location} is {lowest}: a volume must vary")
     field = to_field(raw, f"{location}::{key}" if key else str(location), spacing, unit)
-    return _part(field if part.crop is None else field.moved(start), label)
+    field = field if part.crop is None else field.moved(start)
+    return field if label is None else field.label(label)
 
 
 def field_of(
@@ -144,24 +149,22 @@ def field_of(
     """
     if isinstance(source, str | os.PathLike):
         return load(source, spacing=spacing, unit=unit, label=label, crop=crop, **reading)
-    return _part(_field_of(source, spacing, unit, reading), label, crop)
-
-
-def _field_of(source: Any, spacing: Sequence[float] | float | None, unit: str | None, reading: dict[str, Any]) -> Field:
-    """Return the `Field` of a volume in memory."""
     if isinstance(source, Field):
         _refuse({"spacing": spacing, "unit": unit}, "a file or an array", "a Field, which has its own")
         _refuse(reading, "the path of a file", "a Field, which is read already")
-        return source
-    if isinstance(source, np.ndarray | torch.Tensor):
+        field = source
+    elif isinstance(source, np.ndarray | torch.Tensor):
         _refuse(reading, "the path of a file", "an array")
-        values = _array(source)
-        return Field(values, positive_triple(1.0 if spacing is None else spacing), "voxel" if unit is None else unit)
-    raise ScanError(f"a volume must be the path of a file, a Field, an array or a tensor, got {quoted(source)}")
+        edges = positive_triple(1.0 if spacing is None else spacing)
+        field = Field(_to_numpy(source), edges, "voxel" if unit is None else unit)
+    else:
+        raise ScanError(f"a volume must be the path of a file, a Field, an array or a tensor, got {quoted(source)}")
+    field = field if crop is None else field.crop(crop)
+    return field if label is None else field.label(label)
 
 
 def place_of(path: str | os.PathLike[str]) -> Field:
-    """Return the content of a volume file for its place: spacing, unit and affine; its values are not checked."""
+    """Return the field of a volume file whose spacing, unit and affine are wanted: its values are not checked."""
     location, key = split_key(path, None)
     raw, _ = take_part(read_file(location, key), Part(), location)
     return to_field(raw, str(location), None, None)
@@ -190,14 +193,24 @@ def read_file(
 ) -> Raw:
     """Return the content of a file or a folder, by the reader that `pick_reader` chooses.
 
-    From some formats only the part is read: see `Raw.whole`.
+    From some formats only the part is read: see `Raw.whole`. What a library raises at a damaged file is a ScanError.
     """
     if not path.exists():
         raise FileNotFoundError(one_line(f"no such file: {path}"))
     reader = pick_reader(check_regular(path), raw_shape is not None)
     if key is not None and reader not in KEYED:
         raise ScanError(f"a key applies to NPZ, HDF5, Zarr and DICOM only, got {quoted(key)} for {path}")
-    return _guarded(reader, path, key=key, raw_shape=raw_shape, dtype=dtype, part=part)
+    try:
+        with collect_complaints():
+            return reader(path, key=key, raw_shape=raw_shape, dtype=dtype, part=part)
+    except (ScanError, ImportError):  # a library that is not installed says so itself
+        raise
+    except MemoryError as reason:
+        raise ScanError(f"{path} does not fit into memory") from reason
+    except Exception as reason:  # every library has its own way to say that a file is damaged
+        kind = "" if isinstance(reason, Damaged | ValueError) else f"{type(reason).__name__}: "
+        text = " ".join(f"{kind}{reason}"[:2000].split())[:200]
+        raise ScanError(f"{path} cannot be read, it is damaged or something else ({text})") from reason
 
 
 def pick_reader(path: Path, shape_given: bool = False) -> Callable[..., Raw]:
@@ -212,12 +225,6 @@ def pick_reader(path: Path, shape_given: bool = False) -> Callable[..., Raw]:
     raise ScanError(f"a volume's name must end in one of {', '.join(READERS)}, got {path.name!r}")
 
 
-def _part(field: Field, label: int | None, crop: Crop | None = None) -> Field:
-    """Return the part of a field that a label and a crop choose."""
-    field = field if crop is None else field.crop(crop)
-    return field if label is None else field.label(label)
-
-
 def _refuse(options: dict[str, Any], expected: str, got: str) -> None:
     """Raise ScanError where an option would have no effect."""
     idle = next((name for name, value in options.items() if value is not None and value is not False), None)
@@ -225,8 +232,8 @@ def _refuse(options: dict[str, Any], expected: str, got: str) -> None:
         raise ScanError(f"{idle} applies to {expected} only, got it with {got}")
 
 
-def _array(source: np.ndarray | torch.Tensor) -> np.ndarray:
-    """Return the numbers of an array or tensor."""
+def _to_numpy(source: np.ndarray | torch.Tensor) -> np.ndarray:
+    """Return an array or tensor as an array of real, finite numbers."""
     if isinstance(source, torch.Tensor):
         tensor = source.detach().cpu()
         source = (tensor.float() if tensor.dtype == torch.bfloat16 else tensor).numpy()
@@ -246,14 +253,6 @@ def split_key(path: str | os.PathLike[str], key: str | None) -> tuple[Path, str 
     return (Path(name), key or inner or None) if separator else (Path(path), key)
 
 
-def _check_values(values: np.ndarray, path: Path) -> None:
-    if values.size == 0:
-        raise ScanError(f"a volume must be 3D, got no values (shape {values.shape}) in {path}")
-    lowest, highest = _check_finite(values, path)
-    if lowest == highest:
-        raise ScanError(f"every voxel of {path} is {lowest}: a volume must vary")
-
-
 def _check_finite(values: np.ndarray, place: object) -> tuple[float, float]:
     """Return the lowest and the highest value, or raise ScanError where one is not finite."""
     lowest, highest = values.min(), values.max()
@@ -267,55 +266,31 @@ def _check_finite(values: np.ndarray, place: object) -> tuple[float, float]:
 def to_field(raw: Raw, source: str, spacing: Sequence[float] | float | None, unit: str | None) -> Field:
     """Return the values in native byte order, with the spacing and unit of the caller or, by default, of the file."""
     notes = [*raw.gaps, *raw.notes, *(() if spacing is not None or unit is not None else raw.guesses)]
-    file_unit, factor = ("voxel", 1.0) if spacing is not None and unit is not None else _unit(raw.unit)
-    native = None if raw.spacing is None else _scaled(raw.spacing, factor)
-    affine = None if raw.affine is None else np.diag([factor, factor, factor, 1.0]) @ raw.affine
-    target_unit, target_factor = (file_unit, 1.0) if unit is None else _unit(unit)
-    edges = positive_triple(1.0 if native is None and spacing is None else native if spacing is None else spacing)
-    if native is None and spacing is None:
-        counted = "counted in voxels" if target_unit == "voxel" else f"those of voxels of 1 {target_unit}"
-        notes.append(f"The file states no spacing: lengths are {counted}.")
-    if affine is not None and native != edges:
-        lengths = np.linalg.norm(affine[:3, :3], axis=0)
-        affine[:3, :3] *= np.array(edges)[::-1] / np.where(lengths > 0, lengths, 1)
-    if unit is not None:
-        edges = (edges[0] * target_factor, edges[1] * target_factor, edges[2] * target_factor)
-        affine = None if affine is None else np.diag([target_factor] * 3 + [1.0]) @ affine
-    values = np.ascontiguousarray(raw.values, dtype=raw.values.dtype.newbyteorder("="))
-    return Field(values, edges, target_unit, affine, source, tuple(notes))
-
-
-def _unit(unit: str | None) -> tuple[str, float]:
-    """Return this package's name of a unit and the factor to it, or raise ScanError where it is unknown."""
     try:
-        return parse_unit(unit)
+        file_unit, factor = ("voxel", 1.0) if spacing is not None and unit is not None else parse_unit(raw.unit)
+        name, renamed = (file_unit, 1.0) if unit is None else parse_unit(unit)
     except ValueError as reason:
-        raise ScanError(str(reason)) from None
-
-
-def _scaled(spacing: tuple[object, ...], factor: float) -> tuple[object, ...]:
-    """Return a file's spacing times a factor; entries that are not numbers stay as they are."""
-    return tuple(h * factor if isinstance(h, (int, float)) else h for h in spacing)
-
-
-def _guarded(reader: Callable[..., Raw], path: Path, **options: object) -> Raw:
-    """Return what a reader returns, and turn a library's own exceptions into one sentence."""
-    try:
-        with collect_complaints():
-            return reader(path, **options)
-    except (ScanError, ImportError):  # a library that is not installed says so itself
-        raise
-    except MemoryError as reason:
-        raise ScanError(f"{path} does not fit into memory") from reason
-    except (Damaged, ValueError) as reason:
-        cause, text = reason, str(reason)
-    except Exception as reason:  # every library has its own way to say that a file is damaged
-        cause, text = reason, f"{type(reason).__name__}: {reason}"
-    text = " ".join(text[:2000].split())[:200]
-    raise ScanError(f"{path} cannot be read, it is damaged or something else ({text})") from cause
+        raise ScanError(f"{reason} for {source}") from None
+    if spacing is not None:
+        edges = np.array(positive_triple(spacing))
+    elif raw.spacing is not None:
+        edges = factor * np.array(positive_triple(raw.spacing))
+    else:
+        edges = np.ones(3)
+        counted = "counted in voxels" if name == "voxel" else f"those of voxels of 1 {name}"
+        notes.append(f"The file states no spacing: lengths are {counted}.")
+    affine = None if raw.affine is None else np.diag([factor] * 3 + [1.0]) @ raw.affine
+    if affine is not None:
+        if spacing is not None or raw.spacing is None:
+            lengths = np.linalg.norm(affine[:3, :3], axis=0)
+            affine[:3, :3] *= edges[::-1] / np.where(lengths > 0, lengths, 1)
+        affine[:3] *= renamed
+    values = np.ascontiguousarray(raw.values, dtype=raw.values.dtype.newbyteorder("="))
+    return Field(values, tuple((renamed * edges).tolist()), name, affine, source, tuple(notes))
 
 
 def _pick_folder(path: Path) -> Callable[..., Raw]:
+    """Return the reader of a folder: of a Zarr store, or of TIFF or DICOM slices."""
     inside = [p for p in path.iterdir() if not p.name.startswith(".")]
     if any(p.name in ("zarr.json", ".zarray", ".zgroup") for p in path.iterdir()) or path.suffix == ".zarr":
         return read_zarr

@@ -11,16 +11,8 @@ from typing import Any
 import numpy as np
 
 from curvafit.core.checks import quoted
-from curvafit.core.records import read_array, read_array_header
-from curvafit.volumes.formats.base import (
-    Raw,
-    ScanError,
-    check_regular,
-    map_numbers,
-    pick_key,
-    read_numbers,
-    read_spacing,
-)
+from curvafit.core.records import read_member
+from curvafit.volumes.formats.base import Damaged, Raw, ScanError, check_regular, map_numbers, pick_key, read_spacing
 from curvafit.volumes.formats.part import Part, read_part
 
 #: Attributes that may state a spacing or its unit.
@@ -30,14 +22,10 @@ _RAW_TYPES = "uint8, int8, uint16, int16, uint32, int32, float32, float64 (or wi
 
 def read_npy(path: Path, *, part: Part | None = None, **_: object) -> Raw:
     """Read the numbers of an NPY file, or of a part of it."""
-    with path.open("rb") as stream:
-        shape, fortran, dtype = read_array_header(stream, path.stat().st_size)
-        order = shape[::-1] if fortran else shape
-        if part is None:
-            values = read_numbers(stream, order, dtype, path)
-            return Raw(values.T if fortran else values)
-        values = map_numbers(path, stream.tell(), order, dtype)
-    return read_part(values.T if fortran else values, part, path)
+    values = np.lib.format.open_memmap(path, mode="r")
+    if values.offset + values.nbytes != path.stat().st_size:
+        raise Damaged(f"{values.nbytes} bytes of values by its header, not so many in the file")
+    return read_part(values, part, path)
 
 
 def write_npy(field: Any, path: Path) -> None:
@@ -50,9 +38,7 @@ def read_npz(path: Path, *, key: str | None = None, **_: object) -> Raw:
     """Read the array of an NPZ file that a key names."""
     with path.open("rb") as file, zipfile.ZipFile(file) as archive:
         names = [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
-        member = f"{pick_key(names, key, path)}.npy"
-        with archive.open(member) as stream:
-            return Raw(read_array(stream, archive.getinfo(member).file_size))
+        return Raw(read_member(archive, f"{pick_key(names, key, path)}.npy"))
 
 
 def read_hdf5(path: Path, *, key: str | None = None, part: Part | None = None, **_: object) -> Raw:
@@ -74,7 +60,7 @@ def read_hdf5(path: Path, *, key: str | None = None, part: Part | None = None, *
 
 
 def _gaps(dataset: Any, path: Path) -> Iterator[str]:
-    """Yield sentences on the parts of a dataset that are not in the file, which HDF5 fills in without a word."""
+    """Yield sentences on the parts of a dataset that are not in the file: HDF5 fills them in and says nothing."""
     fill = f"their voxels have the fill value {dataset.fillvalue}."
     if dataset.is_virtual:
         files = {source.file_name for source in dataset.virtual_sources()} - {"."}
@@ -111,9 +97,6 @@ def read_raw(
         kind = np.dtype(dtype or "uint8")
     except TypeError:
         raise ScanError(f"dtype must be one of {_RAW_TYPES}, got {quoted(dtype)}") from None
-    if size != math.prod(shape) * kind.itemsize:
-        nbytes = math.prod(shape) * kind.itemsize
+    if size != (nbytes := math.prod(shape) * kind.itemsize):
         raise ScanError(f"shape {shape} of {kind} takes {nbytes} bytes, got {size} in {path}")
-    if part is None:
-        return Raw(np.fromfile(path, dtype=kind).reshape(shape))
     return read_part(map_numbers(path, 0, shape, kind), part, path)

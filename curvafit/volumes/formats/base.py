@@ -15,9 +15,11 @@ from typing import IO, Any, NamedTuple
 
 import numpy as np
 
-from curvafit.core import records
 from curvafit.core.checks import quoted
 from curvafit.core.runtime import memory, one_line
+
+#: Bytes of one read.
+_PIECE = 1 << 22
 
 
 class ScanError(ValueError):
@@ -35,9 +37,9 @@ class Raw(NamedTuple):
     """The content of a file: an array with z first, and spacing, unit and affine where the file states them.
 
     `spacing` has one number per axis of `values`, or three for (z, y, x). `guesses` are sentences on a spacing or unit
-    that the file leaves open; they are void where the caller states these. `gaps` are sentences on values that are not
-    in the file and were filled in. `channels` is the axis of channels, where the file names one. `whole` is the shape
-    of the file's array where `values` are only a part of this array, with as many axes.
+    that the file does not state; they do not hold where the caller states them. `gaps` are sentences on values that the
+    file lacks and that were filled in. `channels` is the axis of channels, where the file names one. Where `values` are
+    only a part of the file's array, `whole` is the shape of the array, which has as many axes.
     """
 
     values: np.ndarray
@@ -92,14 +94,14 @@ def read_spacing(attributes: Mapping[str, Any], ndim: int) -> tuple[tuple[Any, .
     """Return spacing and unit of an array's attributes, unchecked; one number counts for all axes."""
     for name, fixed_unit in (("element_size_um", "um"), ("spacing", None), ("voxel_size", None)):
         if name in attributes:
-            sizes = _listed(attributes[name])
-            unit = fixed_unit or (_listed(attributes.get("unit", attributes.get("units"))) or (None,))[0]
+            sizes = _entries(attributes[name])
+            unit = fixed_unit or next(iter(_entries(attributes.get("unit", attributes.get("units")))), None)
             return sizes * ndim if len(sizes) == 1 else sizes, unit
     return None, None
 
 
-def _listed(value: Any) -> tuple[Any, ...]:
-    """Return the entries of an attribute as a tuple, bytes as text."""
+def _entries(value: Any) -> tuple[Any, ...]:
+    """Return the first entries of an attribute as a tuple, bytes as text."""
     array = np.asarray(value, dtype=object) if isinstance(value, list | tuple) else np.asarray(value)
     entries = array.ravel()[:99].tolist()
     return tuple(each.decode(errors="replace") if isinstance(each, bytes) else each for each in entries)
@@ -109,14 +111,20 @@ def _listed(value: Any) -> tuple[Any, ...]:
 
 
 def read_numbers(stream: Any, shape: Sequence[int], dtype: np.dtype, place: object) -> np.ndarray:
-    """Return the array of a stream, as `records.read_numbers` does."""
+    """Return the array of a stream, last axis fastest; the stream must end with it, where its checksum is compared."""
     check_array(shape, dtype, place)
-    return records.read_numbers(stream, shape, dtype)
+    values = np.empty(math.prod(shape), dtype)
+    buffer, size = values.view(np.uint8).data, 0
+    while size < values.nbytes and (count := stream.readinto(buffer[size : size + _PIECE])):
+        size += count
+    if size < values.nbytes or stream.read(1):
+        held = size if size < values.nbytes else "more"
+        raise Damaged(f"{values.nbytes} bytes of values by its header, {held} in the file")
+    return values.reshape(shape)
 
 
 def map_numbers(path: Path, start: int, shape: Sequence[int], dtype: np.dtype) -> np.ndarray:
     """Return the array, last axis fastest, from a byte of a file to its end, mapped rather than read."""
-    check_array([0], dtype, path)
     nbytes, size = math.prod(shape) * dtype.itemsize, path.stat().st_size - start
     if nbytes != size:
         raise Damaged(f"{nbytes} bytes of values by its header, {size} in the file")
@@ -141,8 +149,8 @@ def check_regular(path: Path) -> Path:
     return path
 
 
-def decompressed(stream: IO[bytes], encoding: str) -> Any:
-    """Return a stream of the decompressed rest of one in `"gzip"` or `"bzip2"`, or the stream itself."""
+def decompress(stream: IO[bytes], encoding: str) -> Any:
+    """Return a stream that decompresses another from its present place on, if it is in `"gzip"` or `"bzip2"`."""
     if encoding == "gzip":
         return gzip.GzipFile(fileobj=stream)
     return bz2.BZ2File(stream) if encoding == "bzip2" else stream
@@ -150,5 +158,5 @@ def decompressed(stream: IO[bytes], encoding: str) -> Any:
 
 def skip(stream: Any, count: int) -> None:
     """Read and forget `count` bytes, or all where there are fewer."""
-    while count > 0 and (piece := stream.read(min(count, 1 << 22))):
+    while count > 0 and (piece := stream.read(min(count, _PIECE))):
         count -= len(piece)

@@ -21,7 +21,7 @@ from curvafit.volumes.formats.base import (
     check_array,
     check_regular,
     collect_complaints,
-    decompressed,
+    decompress,
     pick_key,
     read_numbers,
     skip,
@@ -29,7 +29,7 @@ from curvafit.volumes.formats.base import (
 
 #: Suffixes of files that must be DICOM's.
 _DICOM = (".dcm", ".dicom", ".ima")
-#: NRRD's encodings with a count or a checksum.
+#: NRRD's encodings that are read.
 _NRRD_ENCODINGS = {"raw": "raw", "gzip": "gzip", "gz": "gzip", "bzip2": "bzip2", "bz2": "bzip2"}
 #: MetaImage's types -> numpy's.
 _META_TYPES = {
@@ -78,29 +78,22 @@ def _nrrd_values(nrrd: Any, header: dict[str, Any], file: IO[bytes], path: Path)
 
     pynrrd reads only the first part of a compressed stream, and not the checksum at its end.
     """
-    name = header.pop("data file", header.pop("datafile", None))
+    name = header.pop("data file", None) or header.pop("datafile", None)
     if name is not None:
         with check_regular(path.parent / str(name)).open("rb") as data:
             return _nrrd_values(nrrd, header, data, path)
     if header["dimension"] != len(header["sizes"]):
         raise Damaged(f"{len(header['sizes'])} sizes for {header['dimension']} axes")
     shape, encoding = [int(n) for n in header["sizes"]][::-1], str(header.get("encoding")).lower()
-    nothing = {
-        "type": header["type"],
-        "endian": header.get("endian", "little"),
-        "dimension": 1,
-        "sizes": np.zeros(1, int),
-    }
-    dtype = nrrd.read_data({**nothing, "encoding": "raw"}, io.BytesIO()).dtype
+    no_values = {"dimension": 1, "sizes": np.zeros(1, int), "encoding": "raw", "type": header["type"]}
+    dtype = nrrd.read_data({"endian": header.get("endian", "little"), **no_values}, io.BytesIO()).dtype
     check_array(shape, dtype, path)
     if encoding not in _NRRD_ENCODINGS:
-        if math.prod(shape) > os.fstat(file.fileno()).st_size:
-            raise Damaged(f"{math.prod(shape)} numbers by its header, fewer bytes in the file")
-        return nrrd.read_data(header, file, str(path), index_order="C")
+        raise ScanError(f"{path} has the encoding {encoding[:40]!r}: write it as raw, gzip or bzip2")
     for _ in range(int(header.get("line skip", header.get("lineskip", 0)))):
         file.readline()
-    stream, start = decompressed(file, _NRRD_ENCODINGS[encoding]), header.get("byte skip", header.get("byteskip", 0))
-    if int(start) < 0:
+    stream, start = decompress(file, _NRRD_ENCODINGS[encoding]), header.get("byte skip", header.get("byteskip", 0))
+    if int(start) < 0:  # the values are the last bytes
         stream.seek(-math.prod(shape) * dtype.itemsize, 2)
     else:
         skip(stream, int(start))
@@ -139,9 +132,9 @@ def _meta_header(file: IO[bytes]) -> dict[str, str]:
 
 
 def _meta_image(header: dict[str, str], file: IO[bytes], path: Path) -> Raw:
-    """Return a MetaImage placed as ITK places it, with the values from the file's position to its end.
+    """Return a MetaImage where ITK places it, with the values from the file's position to its end.
 
-    The axis of channels is the last one where ITK does not count it, otherwise the first of four.
+    Channels are an axis after those that `NDims` counts, or else the first of four.
     """
     shape = [int(n) for n in header["DimSize"].split()]
     axes, channels = len(shape), int(header.get("ElementNumberOfChannels", 1))
@@ -164,7 +157,7 @@ def _meta_image(header: dict[str, str], file: IO[bytes], path: Path) -> Raw:
 def _meta_values(header: dict[str, str], shape: list[int], file: IO[bytes], path: Path) -> np.ndarray:
     """Return the values from the file's position to its end.
 
-    SimpleITK would read them too, but compares no checksum of a compressed file, and prints what it does not like.
+    SimpleITK could read them, but it compares no checksum of a compressed file, and prints warnings itself.
     """
     kind = header.get("ElementType", "")
     if kind not in _META_TYPES:
@@ -190,7 +183,7 @@ def _meta_values(header: dict[str, str], shape: list[int], file: IO[bytes], path
 
 
 def _meta_numbers(header: dict[str, str], names: Sequence[str], default: np.ndarray) -> np.ndarray:
-    """Return the numbers of the first of these lines in a MetaImage's header, or the default, of as many numbers."""
+    """Return the numbers of the first of these lines that the header has; by default, and as many as, `default`."""
     for name in names:
         if name in header:
             numbers = np.array(header[name].split(), dtype=np.float64)
@@ -201,6 +194,7 @@ def _meta_numbers(header: dict[str, str], names: Sequence[str], default: np.ndar
 
 
 def _meta_truth(text: str) -> bool:
+    """Return a MetaImage's True or False."""
     if text.lower() not in ("true", "false", "t", "f", "1", "0"):
         raise Damaged(f"{text[:20]!r} for True or False")
     return text.lower() in ("true", "t", "1")
@@ -216,7 +210,7 @@ def read_mrc(path: Path, **_: object) -> Raw:
     with path.open("rb") as file:
         mark = file.read(3)
         file.seek(0)
-        stream = decompressed(file, "gzip" if mark[:2] == b"\x1f\x8b" else "bzip2" if mark == b"BZh" else "raw")
+        stream = decompress(file, "gzip" if mark[:2] == b"\x1f\x8b" else "bzip2" if mark == b"BZh" else "raw")
         skip(stream, start)
         values = read_numbers(stream, [int(n) for n in shape], dtype, path)
     spacing = (float(size.z), float(size.y), float(size.x))
@@ -246,7 +240,7 @@ def read_dicom(path: Path, *, key: str | None = None, **_: object) -> Raw:
     pydicom = require("pydicom", "io", "reading DICOM folders")
     files = sorted(p for p in path.iterdir() if p.is_file() and (is_dicom(p) or p.suffix.lower() in _DICOM))
     with collect_complaints("pydicom"):
-        images = [image for file in files if (image := _image(pydicom, file)) is not None]
+        images = [image for file in files if (image := _read_slice(pydicom, file)) is not None]
     series = sorted({str(image.get("SeriesInstanceUID", "")) for image in images})
     uid = pick_key(series, key, path)
     slices = [image for image in images if str(image.get("SeriesInstanceUID", "")) == uid]
@@ -254,7 +248,7 @@ def read_dicom(path: Path, *, key: str | None = None, **_: object) -> Raw:
     normal = np.cross(rows, columns)
     slices.sort(key=lambda image: float(np.dot(normal, np.array(image.ImagePositionPatient, dtype=float))))
     with collect_complaints("pydicom"):
-        values = np.stack([_rescaled(image) for image in slices])
+        values = np.stack([_read_plane(image) for image in slices])
     z, origin = _slice_distance(slices, normal, path)
     y, x = (float(h) for h in slices[0].PixelSpacing)
     affine = np.eye(4)
@@ -263,7 +257,7 @@ def read_dicom(path: Path, *, key: str | None = None, **_: object) -> Raw:
     return Raw(values, (z, y, x), "mm", _LPS_TO_RAS @ affine, channels=3 if values.ndim == 4 else None)
 
 
-def _image(pydicom: Any, file: Path) -> Any:
+def _read_slice(pydicom: Any, file: Path) -> Any:
     """Return a slice with its pixels, None for another kind of file such as a folder's index or a report."""
     if not is_dicom(file):
         raise Damaged(f"{file.name} is not a DICOM file")
@@ -282,13 +276,15 @@ def is_dicom(path: Path) -> bool:
         return stream.read(132)[128:] == b"DICM"
 
 
-def _rescaled(image: Any) -> np.ndarray:
+def _read_plane(image: Any) -> np.ndarray:
+    """Return a slice's pixels, with its slope and intercept applied."""
     slope, intercept = float(image.get("RescaleSlope", 1)), float(image.get("RescaleIntercept", 0))
     values = image.pixel_array
     return values if (slope, intercept) == (1, 0) else (values * slope + intercept).astype(np.float32)
 
 
 def _slice_distance(slices: list[Any], normal: np.ndarray, path: Path) -> tuple[float, np.ndarray]:
+    """Return the distance of ordered slices, which must be even, and the position of the first."""
     positions = np.array([image.ImagePositionPatient for image in slices], dtype=float)
     if len(slices) < 2:
         raise ScanError(f"a DICOM series must have several slices, got {len(slices)} in {path}")

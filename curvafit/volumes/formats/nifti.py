@@ -15,7 +15,7 @@ from curvafit.core.units import parse_unit
 from curvafit.volumes.formats.base import Raw, ScanError, collect_complaints, map_numbers, read_numbers
 from curvafit.volumes.formats.part import Part, read_part
 
-#: Bytes that are compressed together.
+#: Bytes of one member of a compressed file.
 MEMBER = 2**28
 #: Our unit -> (NIfTI's, factor to it).
 _TO_FILE = {
@@ -39,21 +39,23 @@ def read_nifti(path: Path, *, part: Part | None = None, **_: object) -> Raw:
         raise ScanError(f"a volume must be 3D, got {len(image.shape)}D of shape {image.shape[::-1]} in {path}")
     unit = image.header.get_xyzt_units()[0]
     affine = np.array(image.affine, dtype=np.float64)
-    spacing: tuple[float, ...] | None = (1.0,) * (raw.values.ndim - 3) + zooms[::-1]
+    spacing: tuple[float, ...] | None = zooms[::-1]
     guesses = [f"The file's header is mended: {text}." for text in dict.fromkeys(repairs)]
     own = _own_unit(image.header)
     if own:
         unit, factor = own
         affine[:3] *= factor
-        spacing = (1.0,) * (raw.values.ndim - 3) + tuple(h * factor for h in zooms[::-1])
+        spacing = tuple(h * factor for h in zooms[::-1])
     elif unit == "unknown" and all(h == 1 for h in zooms):
         spacing = None
     elif unit == "unknown":
         unit = "mm"
         guesses.append("The file names no unit of length: mm is assumed.")
     lengths = np.linalg.norm(affine[:3, :3], axis=0)[::-1]
-    if spacing is not None and not np.allclose(lengths, spacing[-3:], rtol=0.01):
+    if spacing is not None and not np.allclose(lengths, spacing, rtol=0.01):
         guesses.append("The file's affine and voxel sizes disagree: the voxel sizes are used.")
+    if spacing is not None:
+        spacing = (1.0,) * (raw.values.ndim - 3) + spacing
     return raw._replace(spacing=spacing, unit=unit, affine=affine, guesses=tuple(guesses))
 
 
@@ -121,9 +123,9 @@ def write_nifti_like(values: np.ndarray, like: Path, path: Path, unit: str | Non
 
 
 def _save(image: Any, path: Path) -> None:
-    """Write an image; where the name ends in .gz compressed by libdeflate, three times as fast as zlib.
+    """Write an image; if the name ends in .gz, by libdeflate, which is three times as fast as zlib.
 
-    A large file has several members, as gzip allows, so that little memory is needed beside the image.
+    A large file has several members, as gzip allows, so that compression needs little memory.
     """
     from imagecodecs import gzip_encode
 
@@ -137,7 +139,7 @@ def _save(image: Any, path: Path) -> None:
 
 
 def _own_unit(header: Any) -> tuple[str, float] | None:
-    """Return a unit without a code in NIfTI, which `write_nifti` put into the description, and the factor to it."""
+    """Return a unit that NIfTI has no code for, as `write_nifti` noted it in the description, and the factor to it."""
     match = re.match(r"curvafit unit=(\w+)", bytes(header["descrip"]).decode("latin-1"))
     if match is None:
         return None

@@ -23,12 +23,10 @@ Crop = str | Sequence[slice]
 
 @dataclass(frozen=True)
 class Part:
-    """A channel, counted from 0, and a box; None stands for all. Of some parts the others are asked for later: then all
-    of the array must fit into memory."""
+    """A channel, counted from 0, and a box of a file's array; None stands for all."""
 
     channel: int | None = None
     crop: Box | None = None
-    some: bool = False
 
     @property
     def whole(self) -> bool:
@@ -84,10 +82,10 @@ class Part:
 
 def read_part(array: Any, part: Part | None, place: object, channels: int | None = None) -> Raw:
     """Read an array that is not in memory (a dataset, a mapped file), or a part of it."""
-    index = index_of(array, part, place, channels)
-    if part is None:
-        return Raw(np.asarray(array[index]), channels=channels)
-    return Raw(np.array(array[index]), channels=channels, whole=tuple(array.shape))
+    values = array[index_of(array, part, place, channels)]
+    if isinstance(values, np.memmap):
+        values = np.array(values)
+    return Raw(np.asarray(values), channels=channels, whole=None if part is None else tuple(array.shape))
 
 
 def index_of(array: Any, part: Part | None, place: object, channels: int | None = None) -> Any:
@@ -95,8 +93,6 @@ def index_of(array: Any, part: Part | None, place: object, channels: int | None 
     if part is None:
         check_array(array.shape, array.dtype, place)
         return ...
-    if part.some:
-        check_array(array.shape, array.dtype, place)
     index, _ = part.index(array.shape, channels, place)
     check_array([edge.stop - edge.start for edge in index], array.dtype, place)
     return index
@@ -120,17 +116,20 @@ def parse_box(crop: Crop | None) -> Box | None:
     """Return a crop as three slices."""
     if crop is None:
         return None
-    parts: list[Any] = list(map(_slice, crop.split(","))) if isinstance(crop, str) else [*_sequence(crop)]
-    if len(parts) != 3 or not all(isinstance(part, slice) and _is_plain(part) for part in parts):
+    parts: Any = list(map(_parse_slice, crop.split(","))) if isinstance(crop, str) else crop
+    if (
+        not isinstance(parts, Sequence)
+        or len(parts) != 3
+        or not all(isinstance(part, slice) and _is_plain(part) for part in parts)
+    ):
         raise ScanError(f'crop must be "z0:z1,y0:y1,x0:x1" or three slices, got {quoted(crop)}')
     return parts[0], parts[1], parts[2]
 
 
 def resolve_box(box: Box | None, shape: Sequence[int], place: object) -> Box:
     """Return a box in a volume of a shape (z, y, x), with all its ends counted from the first voxel."""
-    whole_box = (slice(0, shape[0]), slice(0, shape[1]), slice(0, shape[2]))
     if box is None:
-        return whole_box
+        return slice(0, shape[0]), slice(0, shape[1]), slice(0, shape[2])
     edges = []
     for name, edge, n in zip("zyx", box, shape, strict=True):
         start, stop = (0 if edge.start is None else edge.start), (n if edge.stop is None else edge.stop)
@@ -141,14 +140,10 @@ def resolve_box(box: Box | None, shape: Sequence[int], place: object) -> Box:
     return edges[0], edges[1], edges[2]
 
 
-def _slice(text: str) -> slice | None:
+def _parse_slice(text: str) -> slice | None:
     """Return the slice of a text such as `"3:7"`, `":7"` or `":"`, None for another text."""
     match = re.fullmatch(r"\s*(-?\d{1,18})?\s*:\s*(-?\d{1,18})?\s*", text)
     return slice(*(None if edge is None else int(edge) for edge in match.groups())) if match else None
-
-
-def _sequence(crop: Any) -> Sequence[Any]:
-    return crop if isinstance(crop, Sequence) else ()
 
 
 def _is_plain(edge: slice) -> bool:

@@ -24,17 +24,11 @@ _IMAGEJ_LIMIT = 2**32 - 2**25
 #: Most voxels per unit that TIFF's resolution can state.
 _RESOLUTION_LIMIT = 2**31
 #: Words of tifffile's messages where it skips a part of a file.
-_LOST = (
-    "invalid page offset",
-    "invalid offset",
-    "missing",
-    "corrupted",
-    "not match",
-    "failed to",
-    "out of range",
-    "raised",
-)
+_LOST = re.compile("invalid (page )?offset|missing|corrupted|not match|failed to|out of range|raised", re.IGNORECASE)
 _TAG_UNITS = {2: "inch", 3: "cm"}
+_NO_DISTANCE = "The file states no distance of slices: it is taken as the pixel's."
+#: Spacing (z, y, x) and unit, where the file states them, and notes on what is assumed.
+_Spacing = tuple[tuple[float, ...] | None, str | None, tuple[str, ...]]
 #: Resolutions that programs write when they know none (dots per inch; 25.4 is one dot per millimetre).
 _SCREEN = (1, 25.4, 72, 96, 100, 150, 200, 300, 600)
 
@@ -48,11 +42,11 @@ def read_tiff(path: Path, **_: object) -> Raw:
         check_array(series.shape, series.dtype or np.dtype("V1"), path)
         _check_pages(file, series)
         values = np.asarray(series.asarray())
-        spacing, unit, guesses = _spacing(file)
+        spacing, unit, guesses = _read_spacing(file)
         channels, guess = _channel_axis(series)
         count = len(file.series)
     tags = [text for text in messages if text.startswith("<TiffTag")]
-    if losses := [text for text in messages if text not in tags and any(mark in text.lower() for mark in _LOST)]:
+    if losses := [text for text in messages if text not in tags and _LOST.search(text)]:
         raise Damaged(losses[0])
     notes = (f"The file holds {count} images: the first is used.",) if count > 1 else ()
     notes += (f"{len(tags)} of the file's tags cannot be read: what they state is not known.",) if tags else ()
@@ -74,7 +68,7 @@ def read_slices(path: Path, **_: object) -> Raw:
     first, slices = None, []
     for name in names:
         raw = read_tiff(check_regular(name))
-        first, plane = first or raw, _plane(raw)
+        first, plane = first or raw, _squeeze_plane(raw)
         slices.append(plane)
         if plane.ndim != 2 + (raw.channels is not None) or plane.shape != slices[0].shape:
             raise ScanError(
@@ -82,10 +76,12 @@ def read_slices(path: Path, **_: object) -> Raw:
             )
     assert first is not None
     channels = None if first.channels is None else 3
-    return first._replace(values=np.stack(slices), gaps=_skipped([name.stem for name in names]), channels=channels)
+    return first._replace(
+        values=np.stack(slices), gaps=_skipped_numbers([name.stem for name in names]), channels=channels
+    )
 
 
-def _plane(raw: Raw) -> np.ndarray:
+def _squeeze_plane(raw: Raw) -> np.ndarray:
     """Return a slice (Y, X), or (Y, X, channels)."""
     if raw.channels is None:
         return np.squeeze(raw.values)
@@ -93,7 +89,7 @@ def _plane(raw: Raw) -> np.ndarray:
     return values.reshape([*(n for n in values.shape[:-1] if n != 1), values.shape[-1]])
 
 
-def _skipped(names: Sequence[str]) -> tuple[str, ...]:
+def _skipped_numbers(names: Sequence[str]) -> tuple[str, ...]:
     """Return a sentence on the numbers that the names of slices skip, if they differ only in their last number."""
     parts = [re.fullmatch(r"(.*?)(\d{1,15})(\D*)", name) for name in names]
     if len(names) < 3 or None in parts or len({(part[1], part[3]) for part in parts if part}) > 1:
@@ -130,7 +126,7 @@ def write_tiff(field: Any, path: Path) -> None:
     """Write a TIFF with ImageJ's metadata, or with OME's where ImageJ lacks the type or cannot hold the size."""
     import tifffile
 
-    values, (z, y, x) = _stored(field), field.spacing
+    values, (z, y, x) = _to_tiff(field), field.spacing
     fits = values.nbytes < _IMAGEJ_LIMIT and max(1 / x, 1 / y) < _RESOLUTION_LIMIT
     if values.dtype in (np.uint8, np.uint16, np.float32) and fits:
         exact = {"curvafit_spacing": f"{z!r},{y!r},{x!r}", "curvafit_unit": field.unit}
@@ -150,10 +146,10 @@ def write_ome_tiff(field: Any, path: Path) -> None:
     sizes = {f"PhysicalSize{axis}": h for axis, h in zip("ZYX", field.spacing, strict=True)}
     units = {f"PhysicalSize{axis}Unit": {"um": "µm", "voxel": "pixel"}.get(field.unit, field.unit) for axis in "ZYX"}
     metadata = {"axes": "ZYX", **sizes, **units}
-    tifffile.imwrite(path, _stored(field), photometric="minisblack", ome=True, metadata=metadata)
+    tifffile.imwrite(path, _to_tiff(field), photometric="minisblack", ome=True, metadata=metadata)
 
 
-def _stored(field: Any) -> np.ndarray:
+def _to_tiff(field: Any) -> np.ndarray:
     """Return the values as a TIFF holds them: bytes for a mask."""
     return field.values.view(np.uint8) if field.values.dtype == bool else field.values
 
@@ -163,9 +159,10 @@ def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
     return tuple((0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", name.casefold()))
 
 
-def _spacing(file: tifffile.TiffFile) -> tuple[tuple[float, ...] | None, str | None, tuple[str, ...]]:
+def _read_spacing(file: tifffile.TiffFile) -> _Spacing:
+    """Return spacing, unit and notes on what is assumed, from the description or, without one, the tags."""
     if file.is_ome and file.ome_metadata:
-        return (*_from_ome(file.ome_metadata), ())
+        return _from_ome(file.ome_metadata)
     description: dict[str, Any] = dict(file.imagej_metadata or (file.shaped_metadata or ({},))[0])
     if "curvafit_spacing" in description:
         return tuple(float(h) for h in description["curvafit_spacing"].split(",")), description["curvafit_unit"], ()
@@ -177,7 +174,7 @@ def _spacing(file: tifffile.TiffFile) -> tuple[tuple[float, ...] | None, str | N
     return _from_description(description) if "spacing" in description else _from_tags(file)
 
 
-def _from_description(description: dict[str, Any]) -> tuple[tuple[float, ...] | None, str | None, tuple[str, ...]]:
+def _from_description(description: dict[str, Any]) -> _Spacing:
     """Return spacing, unit and a note of tifffile's JSON, where `spacing` is three numbers, or one for all axes."""
     sizes = tuple(float(h) for h in np.atleast_1d(description["spacing"]))
     unit = description.get("unit")
@@ -187,22 +184,21 @@ def _from_description(description: dict[str, Any]) -> tuple[tuple[float, ...] | 
     return sizes[:1] * 3, unit, (note,)
 
 
-def _from_ome(text: str) -> tuple[tuple[float, ...] | None, str | None]:
+def _from_ome(text: str) -> _Spacing:
+    """Return spacing and unit of OME's XML; an axis without a size has that of x."""
     pixels = next((node for node in ElementTree.fromstring(text).iter() if node.tag.endswith("Pixels")), None)
     if pixels is None or "PhysicalSizeX" not in pixels.attrib:
-        return None, None
+        return None, None, ()
     unit = pixels.get("PhysicalSizeXUnit", "um")
     sizes = []
     for axis in "ZYX":
         source = axis if f"PhysicalSize{axis}" in pixels.attrib else "X"
         size = float(pixels.attrib[f"PhysicalSize{source}"])
         sizes.append(convert_length(size, pixels.get(f"PhysicalSize{source}Unit", "um"), unit))
-    return tuple(sizes), unit
+    return tuple(sizes), unit, ()
 
 
-def _from_imagej(
-    file: tifffile.TiffFile, description: dict[str, Any]
-) -> tuple[tuple[float, ...] | None, str | None, tuple[str, ...]]:
+def _from_imagej(file: tifffile.TiffFile, description: dict[str, Any]) -> _Spacing:
     """Return spacing, unit and a note of ImageJ's description.
 
     `spacing` is the distance of slices, and the resolution tags count pixels per `unit`. Without a unit only the
@@ -214,11 +210,10 @@ def _from_imagej(
         sizes = (abs(float(description.get("spacing", 1 / x))) * x, x / y, 1.0)
         return (None if np.allclose(sizes, 1) else sizes), None, ()
     z = abs(float(description.get("spacing", 1 / x)))
-    notes = () if "spacing" in description else ("The file states no distance of slices: it is taken as the pixel's.",)
-    return (z, 1 / y, 1 / x), unit, notes
+    return (z, 1 / y, 1 / x), unit, () if "spacing" in description else (_NO_DISTANCE,)
 
 
-def _from_tags(file: tifffile.TiffFile) -> tuple[tuple[float, ...] | None, str | None, tuple[str, ...]]:
+def _from_tags(file: tifffile.TiffFile) -> _Spacing:
     """Return spacing and unit of the resolution tags, unless they are a default; the distance of slices is a guess."""
     y, x = _pixels_per_unit(file)
     tag = file.pages[0].tags.get("ResolutionUnit")  # type: ignore[union-attr]
@@ -229,11 +224,11 @@ def _from_tags(file: tifffile.TiffFile) -> tuple[tuple[float, ...] | None, str |
     if any(abs(dots - screen) < 0.51 for screen in _SCREEN):
         return None, None, ()
     _, factor = parse_unit(unit)
-    notes = ("The file states no distance of slices: it is taken as the pixel's.",)
-    return (factor / x, factor / y, factor / x), "mm", notes
+    return (factor / x, factor / y, factor / x), "mm", (_NO_DISTANCE,)
 
 
 def _pixels_per_unit(file: tifffile.TiffFile) -> tuple[float, float]:
+    """Return the resolution tags along (y, x), 1 where there are none."""
     values = []
     for name in ("YResolution", "XResolution"):
         tag = file.pages[0].tags.get(name)  # type: ignore[union-attr]

@@ -20,8 +20,6 @@ from curvafit.volumes.formats.part import Part, index_of, read_part
 CHUNK = 64
 #: Chunks of an array at most; more would take hours to look for.
 _MOST = 10_000_000
-#: Entry of a shard's index for a chunk that is not in the shard.
-_ABSENT = np.uint64(2**64 - 1)
 #: Spacing along all axes, unit and axis of channels of an array, each where it is known.
 _Place = tuple[tuple[Any, ...] | None, Any, int | None]
 #: Our unit -> OME-NGFF's, which has none for the voxel.
@@ -35,8 +33,8 @@ def read_zarr(path: Path, *, key: str | None = None, part: Part | None = None, *
     _check_store(path)
     node: Any = zarr.open(path, mode="r")
     if isinstance(node, zarr.Array):
-        return _raw(node, path, (*read_spacing(node.attrs.asdict(), node.ndim), None), part)
-    arrays = _arrays(node)
+        return _read_array(node, path, (*read_spacing(node.attrs.asdict(), node.ndim), None), part)
+    arrays = {name: member for name, member in node.members(max_depth=None) if isinstance(member, zarr.Array)}
     attributes = node.attrs.asdict()
     scales = _multiscales(attributes)
     if key is None and scales:
@@ -44,11 +42,11 @@ def read_zarr(path: Path, *, key: str | None = None, part: Part | None = None, *
     name = pick_key(sorted(arrays), key, path)
     array = arrays[name]
     place = scales.get(name) or (*read_spacing({**attributes, **array.attrs.asdict()}, array.ndim), None)
-    return _raw(array, path / array.path, place, part)
+    return _read_array(array, path / array.path, place, part)
 
 
-def _raw(array: Any, folder: Path, place: _Place, part: Part | None) -> Raw:
-    """Return the values of an array in a folder, with sentences on chunks that are not stored."""
+def _read_array(array: Any, folder: Path, place: _Place, part: Part | None) -> Raw:
+    """Return the values of an array in a folder, with a sentence on chunks that are not stored."""
     spacing, unit, channels = place
     index_of(array, part, folder, channels)  # before chunks are counted: a header may claim any number of them
     gaps = _missing_chunks(array, folder)
@@ -65,27 +63,27 @@ def write_zarr(field: Any, path: Path) -> None:
         "name": "volume",
         "axes": [{"name": name, **kind} for name in "zyx"],
         "datasets": [
-            {"path": str(k), "coordinateTransformations": _transforms(field.spacing, 2**k, first)}
+            {
+                "path": str(k),
+                "coordinateTransformations": [
+                    {"type": "scale", "scale": [2**k * h for h in field.spacing]},
+                    *([{"type": "translation", "translation": [first * h for h in field.spacing]}] if first else []),
+                ],
+            }
             for k, (_, first) in enumerate(levels)
         ],
     }
     with hold_signals():
         group = zarr.create_group(path, attributes={"ome": {"version": "0.5", "multiscales": [image]}})
     for k, (values, _) in enumerate(levels):
-        _write_level(group, str(k), values)
-
-
-@hold_signals()  # Zarr writes in threads of its own, which would go on beside what cleans up
-def _write_level(group: Any, name: str, values: np.ndarray) -> None:
-    array = group.create_array(
-        name,
-        shape=values.shape,
-        chunks=tuple(min(CHUNK, n) for n in values.shape),
-        dtype=values.dtype,
-        dimension_names=("z", "y", "x"),
-        config={"write_empty_chunks": True},  # so that a chunk that is not there is one that was lost
-    )
-    array[...] = values
+        with hold_signals():  # Zarr's own threads would go on to write while the folder is deleted
+            group.create_array(
+                str(k),
+                data=values,
+                chunks=tuple(min(CHUNK, n) for n in values.shape),
+                dimension_names=("z", "y", "x"),
+                config={"write_empty_chunks": True},  # so that a chunk that is not there is one that was lost
+            )
 
 
 @hold_signals()
@@ -115,33 +113,16 @@ def _halvings(values: np.ndarray) -> Iterator[tuple[np.ndarray, float]]:
         yield values, first
 
 
-def _transforms(spacing: tuple[float, float, float], factor: int, first: float) -> list[dict[str, Any]]:
-    """Return the scale and, where the first centre is off the origin, the translation, in the axes' unit."""
-    transforms: list[dict[str, Any]] = [{"type": "scale", "scale": [factor * h for h in spacing]}]
-    if first:
-        transforms.append({"type": "translation", "translation": [first * h for h in spacing]})
-    return transforms
-
-
-def _arrays(group: Any, prefix: str = "") -> dict[str, Any]:
-    arrays = {prefix + name: array for name, array in group.arrays()}
-    for name, inner in group.groups():
-        arrays.update(_arrays(inner, f"{prefix}{name}/"))
-    return arrays
-
-
 def _multiscales(attributes: Mapping[str, Any]) -> dict[str, _Place]:
     """Return the scale of the axes, the unit of the last one and the axis of channels of each level, by its path."""
-    images = attributes.get("ome", attributes).get("multiscales") or []
+    image = next(iter(attributes.get("ome", attributes).get("multiscales") or []), {})
+    axes = [axis if isinstance(axis, dict) else {"name": axis} for axis in image.get("axes", [])]
+    unit = axes[-1].get("unit") if axes else None
+    channels = next((k for k, axis in enumerate(axes) if axis.get("type", axis.get("name")) in ("channel", "c")), None)
     places: dict[str, _Place] = {}
-    for image in images[:1]:
-        axes = [axis if isinstance(axis, dict) else {"name": axis} for axis in image.get("axes", [])]
-        unit = axes[-1].get("unit") if axes else None
-        channel_axes = [k for k, axis in enumerate(axes) if axis.get("type", axis.get("name")) in ("channel", "c")]
-        channels = channel_axes[0] if channel_axes else None
-        for level in image.get("datasets", []):
-            scales = [t["scale"] for t in level.get("coordinateTransformations", []) if t.get("type") == "scale"]
-            places[level["path"]] = (tuple(float(h) for h in scales[0]) if scales else None, unit, channels)
+    for level in image.get("datasets", []):
+        scales = [t["scale"] for t in level.get("coordinateTransformations", []) if t.get("type") == "scale"]
+        places[level["path"]] = (tuple(float(h) for h in scales[0]) if scales else None, unit, channels)
     return places
 
 
@@ -162,9 +143,9 @@ def _check_store(folder: Path) -> None:
 
 
 def _missing_chunks(array: Any, folder: Path) -> tuple[str, ...]:
-    """Return a sentence on the chunks of an array that are not stored, within shards too, or none.
+    """Return a sentence on the chunks of an array that are not stored, if there are any.
 
-    Zarr's own `nchunks_initialized` looks every chunk up in a list of all files, and not into shards.
+    Zarr's own `nchunks_initialized` does not look into shards.
     """
     outer = array.shards or array.chunks
     counts, chunks = _counts(array.shape, outer), math.prod(_counts(array.shape, array.chunks))
@@ -199,9 +180,9 @@ def _counts(shape: Sequence[int], edges: Sequence[int]) -> list[int]:
 
 
 def _missing_within(array: Any, shard: Path, inside: Sequence[int]) -> int:
-    """Count the chunks `inside` the array that a shard's index lacks.
+    """Return how many chunks a shard's index lacks, of those `inside` the array.
 
-    An index of another kind than the usual one (little-endian, then a CRC32C) counts 0.
+    An index of another kind than the usual one (little-endian, then a CRC32C) is not looked at.
     """
     codec: Any = next((each for each in array.metadata.codecs if hasattr(each, "index_codecs")), None)
     if [type(each).__name__ for each in getattr(codec, "index_codecs", ())] != ["BytesCodec", "Crc32cCodec"]:
@@ -214,5 +195,5 @@ def _missing_within(array: Any, shard: Path, inside: Sequence[int]) -> int:
         index = stream.read(size)
     if len(index) < size:
         return 0  # reading it says what is wrong
-    absent = (np.frombuffer(index, "<u8").reshape(*counts, 2) == _ABSENT).all(-1)
+    absent = (np.frombuffer(index, "<u8").reshape(*counts, 2) == 2**64 - 1).all(-1)
     return int(absent[tuple(slice(n) for n in inside)].sum())
