@@ -7,21 +7,9 @@ from types import ModuleType
 
 
 def require(module: str, extra: str, purpose: str) -> ModuleType:
-    """Import an optional module, or say what to install.
+    """Import an optional module, or raise ImportError with the command that installs the `extra` that has it.
 
-    Parameters
-    ----------
-    module
-        Its name, as `import` takes it.
-    extra
-        The extra of curvafit that installs it, such as `infer`.
-    purpose
-        What needs it, for the message: `reading parameters`.
-
-    Raises
-    ------
-    ImportError
-        If the module is not installed; the message ends in the command that installs it.
+    `purpose` is what needs the module, for the message: `"reading NRRD files"`.
     """
     try:
         return import_module(module)

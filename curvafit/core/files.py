@@ -17,7 +17,7 @@ from curvafit.core.runtime import hold_signals
 def write_atomically(target: Path, write: Callable[[Path], object]) -> Path:
     """Call `write` with a temporary name beside `target`, of the same suffix, and move the result to `target`."""
     target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = target.with_name(f".{_some()}.{target.name}")
+    temporary = target.with_name(f".{_random_digits()}.{target.name}")
     try:
         write(temporary)
         return move_into_place(temporary, target)
@@ -27,7 +27,7 @@ def write_atomically(target: Path, write: Callable[[Path], object]) -> Path:
 
 
 def write_content(target: Path, *contents: str | bytes | memoryview) -> Path:
-    """Write texts, in UTF-8, or bytes to a file, whole or not at all; they are on the disk before the name is."""
+    """Write texts (in UTF-8) or bytes to a file, whole or not at all: the name appears once the content is on disk."""
 
     def write(temporary: Path) -> None:
         with temporary.open("wb") as file:
@@ -51,7 +51,7 @@ def remove_leftovers(target: Path) -> None:
 def temporary_folder(target: Path) -> Iterator[Path]:
     """Make a temporary folder beside `target`, and its parents; the folder and its content are deleted at the end."""
     target.parent.mkdir(parents=True, exist_ok=True)
-    work = target.parent / f".{target.name[:200]}.{_some()}"
+    work = target.parent / f".{target.name[:200]}.{_random_digits()}"
     try:
         work.mkdir()
         yield work
@@ -68,7 +68,7 @@ def move_together(parts: Iterable[Path], folder: Path) -> tuple[Path, ...]:
 
 def move_into_place(temporary: Path, target: Path) -> Path:
     """Rename a finished file or folder to `target`, on the same disk, and delete the old one after that."""
-    aside = target.with_name(f".{_some()}.old.{target.name}")
+    aside = target.with_name(f".{_random_digits()}.old.{target.name}")
     with hold_signals():
         if target.is_dir():
             os.replace(target, aside)
@@ -94,20 +94,16 @@ def remove(path: Path) -> None:
 
 
 def check_folder(path: str | Path) -> Path:
-    """Return the path of a folder that can be written to, or made.
-
-    Raises
-    ------
-    ValueError
-        If a part of the path is a file, or the nearest folder that exists cannot be written to.
-    """
+    """Return the path of a folder that can be written to, or made; raise ValueError where it cannot."""
     folder = Path(path)
     nearest = next(place for place in (folder, *folder.absolute().parents) if place.exists())
     if not nearest.is_dir():
         raise ValueError(f"cannot write to the folder {folder}: {nearest} is a file")
-    if not os.access(nearest, os.W_OK | os.X_OK) or not _takes_files(nearest):
-        raise ValueError(f"the folder {nearest} cannot be written to")
-    return folder
+    try:  # permissions do not say that a disk is read-only
+        with tempfile.TemporaryFile(dir=nearest):
+            return folder
+    except OSError as error:
+        raise ValueError(f"the folder {nearest} cannot be written to: {error.strerror or error}") from None
 
 
 def is_empty(folder: Path) -> bool:
@@ -115,15 +111,6 @@ def is_empty(folder: Path) -> bool:
     return folder.is_dir() and not folder.is_symlink() and not any(folder.iterdir())
 
 
-def _some() -> str:
-    """Return eight digits that no other temporary name has."""
+def _random_digits() -> str:
+    """Return eight hexadecimal digits that no other temporary name has."""
     return uuid.uuid4().hex[:8]
-
-
-def _takes_files(folder: Path) -> bool:
-    """Return whether a file can be made in a folder: permissions do not tell of a read-only disk."""
-    try:
-        with tempfile.TemporaryFile(dir=folder):
-            return True
-    except OSError:
-        return False

@@ -112,21 +112,8 @@ class Format:
     ) -> Content:
         """Return the header and the arrays of a file, or what `build(header, arrays)` makes of them.
 
-        Parameters
-        ----------
-        source
-            A path, or an open file.
-        build
-            Makes the result; what it raises where the content is damaged becomes a ValueError.
-        place
-            What messages call the source, by default its path.
-
-        Raises
-        ------
-        FileNotFoundError
-            If there is no such file.
-        ValueError
-            If the file is damaged, of another format or version, or has other `fixed` entries.
+        Messages call the source `place`, by default its path. A file that is damaged (also where `build` fails), of
+        another format or version, or with other `fixed` entries is a ValueError.
         """
         source = Path(source) if isinstance(source, str) else source
         place = place or str(source)
@@ -155,20 +142,14 @@ class Format:
         """
         if path.is_dir():
             return path.name.lower().endswith(".zarr") and is_own_zarr(path, self.name)
-        try:
-            return _read(path).header.get("format") == self.name
-        except (OSError, *_FAULTS):
-            return False
+        return _read_header(path).get("format") == self.name
 
     def companions(self, target: Path) -> list[str]:
-        """Return the names of the files that the record beside `target` lists as written together with `target`.
+        """Return the names of the files written together with `target`, by its record `sibling(target, ".json")`.
 
-        That record is `sibling(target, ".json")`; without one of this format that lists `target` there are none.
+        There are none if the record is not there, is of another format, or does not list `target`.
         """
-        try:
-            header = _read(sibling(target, ".json")).header
-        except (OSError, *_FAULTS):
-            return []
+        header = _read_header(sibling(target, ".json"))
         names = header.get("files") if header.get("format") == self.name else None
         return names if isinstance(names, list) and target.name in names else []
 
@@ -181,7 +162,7 @@ def can_write(
     inputs: Iterable[str | Path] = (),
     overwrite: bool = False,
 ) -> Path:
-    """Return the path if a file can be written there, and `more` beside it, and nothing of value is lost.
+    """Return the path of a file if it can be written, and `more` files with it, without a loss; else raise ValueError.
 
     Call it before long work, and again before writing.
 
@@ -190,19 +171,12 @@ def can_write(
     path
         A file, or a Zarr store, that may exist.
     ours
-        The format of what is written: then `path` may be replaced if it is of this format, and so may files that the
-        record `sibling(path, ".json")` lists as written together with `path`. Or a function that says which paths may.
-    more
-        Further files that will be written.
+        The format of the file: an existing `path` may be replaced if it is of this format, and so may its companions
+        (`Format.companions`). Or a function that says which existing paths may be replaced.
     inputs
         Files or folders that are read, also as `file.h5::key`: they are never written over, nor anything in them.
     overwrite
         Whether files and folders of another origin may be replaced.
-
-    Raises
-    ------
-    ValueError
-        If the place cannot be written to, or one of the files would replace an input or something of another origin.
     """
     target = Path(path)
     check_folder(target.parent)
@@ -277,6 +251,14 @@ def encode(value: Any) -> np.ndarray:
     return np.frombuffer(json.dumps(value).encode(), dtype=np.uint8)
 
 
+def _read_header(path: Path) -> dict[str, Any]:
+    """Return the header of a file; an empty one where the file is of another kind, or not there."""
+    try:
+        return _read(path).header
+    except (OSError, *_FAULTS):
+        return {}
+
+
 def _read(source: Path | IO[bytes]) -> Record:
     """Return the header and the arrays of a file, or raise one of many exceptions where it is of another kind."""
     if isinstance(source, Path):
@@ -321,16 +303,8 @@ def read_member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
 def parse_json(content: str | bytes, expected: str, place: object) -> Any:
     """Return the value of a JSON text, in UTF-8, with or without a byte order mark.
 
-    Parameters
-    ----------
-    expected, place
-        What the text should be, and the name of its file, for messages.
-
-    Raises
-    ------
-    ValueError
-        If the text is not JSON, is nested too deeply, repeats a key, or has a number that is not finite or has more
-        than 40 digits.
+    A text that is not JSON, is nested too deeply, repeats a key, or has a number that is not finite or has more than 40
+    digits is a ValueError, which says what was `expected` and the `place` of the text.
     """
     try:
         text = content.decode() if isinstance(content, bytes) else content

@@ -12,7 +12,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -33,15 +33,9 @@ def sub_progress(progress: Progress, start: float, stop: float) -> Progress:
 
 
 def one_line(text: str) -> str:
-    """Return a text on one line; signs that do not show, such as a line break in a name, are escaped."""
-    return "".join(_visible(sign) for sign in text)
-
-
-def _visible(sign: str) -> str:
-    if sign.isprintable():
-        return sign
-    spaces = {"\u00a0": " ", "\u202f": " "}
-    return spaces.get(sign) or sign.encode("unicode_escape").decode()
+    """Return a text on one line; characters that do not show, such as a line break in a name, are escaped."""
+    plain = text.replace("\u00a0", " ").replace("\u202f", " ")
+    return "".join(sign if sign.isprintable() else sign.encode("unicode_escape").decode() for sign in plain)
 
 
 # ---- memory ----------------------------------------------------------------------------------------------------------
@@ -49,29 +43,18 @@ def _visible(sign: str) -> str:
 
 def memory() -> int:
     """Return the bytes of memory of this machine, or of its container; `sys.maxsize` where neither is known."""
-    return min(_installed(), _allowed())
+    sizes = [sys.maxsize]
+    with suppress(AttributeError, ValueError, OSError):
+        sizes.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    with suppress(ValueError, OSError):
+        sizes.append(int(Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii")))
+    return min(sizes)
 
 
-def _installed() -> int:
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):
-        return sys.maxsize
-
-
-def _allowed() -> int:
-    """Return the bytes that a container may use."""
-    try:
-        return int(Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii"))
-    except (OSError, ValueError):
-        return sys.maxsize
-
-
-#: Bytes for each voxel of a field; and of one that is written: the field and a copy in the file's layout.
+#: Bytes that a voxel of a field takes, and one of a field that is written, with its copy in the file's layout.
 FIELD, FILE = 4, 8
-#: The least bytes for each voxel of a flow: A, Adam's two moments and the start, three float32 numbers each; u, the
-#: gradient, and the field between two passes of the blur. And those in plain torch, where autograd stores what the
-#: energy's gradient needs.
+#: The least bytes that a voxel of a flow takes. Compiled: A, Adam's two moments and the start, three float32 numbers
+#: each; u, the gradient, and the field between two passes of the blur. In plain torch autograd stores more.
 FLOW, EAGER = 60, 400
 
 
@@ -80,9 +63,8 @@ def check_memory(voxels: Sequence[int], each: int, what: str, device: Any = "cpu
     need, capacity = math.prod(map(int, voxels)) * each, device_memory(device)
     if need > capacity:
         size = " x ".join(map(str, voxels))
-        limit = f"where there are {_gibibytes(capacity)}" if capacity < sys.maxsize else "more than any machine has"
-        least = f"which need at least {_gibibytes(need)}, {limit}"
-        raise ValueError(f"expected {what} that fits into memory, got {size} voxels, {least}")
+        limit = f"there are {capacity / 2**30:.3g} GiB" if capacity < sys.maxsize else "no machine has them"
+        raise ValueError(f"{what} of {size} voxels does not fit into memory: it needs {need / 2**30:.3g} GiB, {limit}")
 
 
 def device_memory(device: Any = "cpu") -> int:
@@ -95,16 +77,11 @@ def device_memory(device: Any = "cpu") -> int:
     return memory()
 
 
-def _gibibytes(size: int) -> str:
-    """Return a number of bytes in GiB."""
-    return f"{size / 2**30:.3g} GiB"
-
-
 # ---- signals ---------------------------------------------------------------------------------------------------------
 
 #: Signals that end the program besides Ctrl-C, where the platform has them.
 _ENDS = ("SIGTERM", "SIGHUP")
-#: Seconds after which a signal whose exception was lost comes again: the finaliser has ended by then.
+#: Seconds after which a signal whose exception was lost is sent again: the finaliser has ended by then.
 _PAUSE = 0.02
 
 
@@ -131,13 +108,13 @@ def exit_code(error: KeyboardInterrupt) -> int:
 def listen() -> None:
     """Turn signals into exceptions of the main thread, which wait while files change; ignored signals stay ignored.
 
-    Where such an exception is raised in a finaliser or a callback, from which Python lets nothing rise, it comes again.
+    Python drops an exception that is raised in a finaliser or a callback: there the signal is sent again.
     """
-    sys.unraisablehook = _again
+    sys.unraisablehook = _resend_lost_signal
     for name in ("SIGINT", *_ENDS):
         number = getattr(signal, name, None)
         if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, _arrive)
+            signal.signal(number, _handle)
 
 
 def leave() -> None:
@@ -163,15 +140,15 @@ def hold_signals() -> Iterator[None]:
             raise _exception(number)
 
 
-def _arrive(number: int, frame: FrameType | None) -> None:
+def _handle(number: int, frame: FrameType | None) -> None:
     if _Pending.depth:
         _Pending.waiting = number
     else:
         raise _exception(number)
 
 
-def _again(unraisable: sys.UnraisableHookArgs) -> None:
-    """Send a signal anew whose exception was lost; print other lost exceptions, as Python does."""
+def _resend_lost_signal(unraisable: sys.UnraisableHookArgs) -> None:
+    """Send a signal again if its exception was dropped; print other dropped exceptions, as Python does."""
     error = unraisable.exc_value
     if not isinstance(error, KeyboardInterrupt):
         sys.__unraisablehook__(unraisable)

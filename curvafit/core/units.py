@@ -30,13 +30,7 @@ _GLUE = "\u00a0"
 
 
 def parse_unit(unit: str | None) -> tuple[str, float]:
-    """Return this package's name of a length unit, and the factor to it: `"cm"` gives `("mm", 10.0)`.
-
-    Raises
-    ------
-    ValueError
-        If the unit is unknown.
-    """
+    """Return this package's name of a length unit and the factor to it, or raise ValueError; `"cm"`: `("mm", 10.0)`."""
     name = "" if unit is None else unit.strip().casefold() if isinstance(unit, str) else None
     if name not in _UNITS:
         raise ValueError(f"expected a unit of voxel, nm, um, mm or m, got {quoted(unit)}")
@@ -44,7 +38,7 @@ def parse_unit(unit: str | None) -> tuple[str, float]:
 
 
 def convert_length(length: float, unit: str | None, to: str | None) -> float:
-    """Return a length in `unit` converted to the unit `to`; where one of them is the voxel, it counts as the other."""
+    """Return a length, in `unit`, in the unit `to`; if one of the two is the voxel, the number stays."""
     (name, factor), (target, target_factor) = parse_unit(unit), parse_unit(to)
     if "voxel" in (name, target):
         return length * factor
@@ -65,7 +59,7 @@ def format_number(value: float | None, digits: int = 3) -> str:
 
 
 def format_sampling(shape: Sequence[int], spacing: Sequence[float], unit: str = "") -> str:
-    """Return the number and the size of voxels (z, y, x); one edge stands for three that are equal."""
+    """Return the number and the size of voxels (z, y, x) as text; three equal edges are written once."""
     edges = " x ".join(f"{h:.4g}" for h in spacing[: 1 if len(set(spacing)) == 1 else 3])
     return f"{' x '.join(map(str, shape))} voxels of {edges} {unit}".rstrip()
 
@@ -85,12 +79,12 @@ def format_length(value: float, unit: str, digits: int = 2) -> str:
     return f"{format_number(metres / METRES[best], digits)}{_GLUE}{unit_name(best)}"
 
 
-def format_density(value: float, unit: str, power: int, digits: int = 3) -> str:
-    """Return a number per unit of length to a power, in another unit where it would be tiny or huge."""
+def format_density(value: float, unit: str, power: int) -> str:
+    """Return a number per length to a power as text, in another unit of length if it would be tiny or huge."""
     names = [unit, *(name for name in ("mm", "um", "nm", "m") if unit in METRES and name != unit)]
     scaled = {name: value * (METRES[name] / METRES[unit]) ** power if name != unit else value for name in names}
     best = next((name for name in names if 0.1 <= abs(scaled[name]) < 1e4), unit)
-    return f"{format_number(scaled[best], digits)}{_GLUE}{per_unit(best, power)[1:]}"
+    return f"{format_number(scaled[best])}{_GLUE}{per_unit(best, power)[1:]}"
 
 
 def per_unit(unit: str, power: int) -> str:
