@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from curvafit.inference.posterior import Posterior as Posterior
     from curvafit.inference.posterior import load_posterior as load_posterior
     from curvafit.inference.posterior import save_posterior as save_posterior
-    from curvafit.inference.stationarity import Refinement as Refinement
     from curvafit.inference.stationarity import stationarity as stationarity
     from curvafit.inference.table import Table as Table
     from curvafit.inference.table import load_table as load_table

@@ -37,7 +37,7 @@ def test_the_authors_sponge_gives_its_coefficients_back(data) -> None:
     for name in ("a11", "a02", "a10", "a01"):
         assert getattr(found.coefficients, name) == pytest.approx(getattr(truth.coefficients, name), rel=0.05)
     assert found.mass == pytest.approx(truth.mass, abs=1e-4)
-    assert found.method == "stationarity" and found.coefficients.a20 == 1
+    assert found.name == "stationarity" and found.coefficients.a20 == 1
 
 
 def test_the_right_parameters_leave_a_mask_where_it_is(mask_phase: torch.Tensor) -> None:
