@@ -58,7 +58,7 @@ def by_view(training: Table, queries: Table, answer: Callable[[Table, Table], np
     mean = np.empty((len(queries), len(PARAMETERS)))
     for view in set(queries.views.tolist()):
         mine = queries.views == view
-        mean[mine] = answer(training.of([view]), queries.rows(mine))
+        mean[mine] = answer(training.select_views([view]), queries.rows(mine))
     return mean
 
 
@@ -243,7 +243,7 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     if options.table is None:
         raise SystemExit("name a table with --table (curvafit atlas describe makes one), or --gallery")
     views, folds = options.views.split(","), 2 if options.quick else FOLDS
-    table = load_table(options.table).visible.of(views)
+    table = load_table(options.table).visible.select_views(views)
     figures: dict[str, Figure] = {}
     for name in ["match"] if options.quick else options.methods.split(","):
         answers = cross_answers(table, name, folds, cases)

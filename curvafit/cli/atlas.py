@@ -201,7 +201,7 @@ def train_atlas(
         _check_archive(out, POSTERIOR_FILE, [table], overwrite)
         content = load_table(table)
         if views is not None:
-            content = content.of(views.split(","))
+            content = content.select_views(views.split(","))
         with show_stages() as progress:
             posterior = train_posterior(content, members=members, seed=seed, progress=progress)
         out.parent.mkdir(parents=True, exist_ok=True)

@@ -88,6 +88,8 @@ BLOCKS: dict[str, int] = dict(
 def descriptors(shape: np.ndarray | Tensor, grid: Grid, epsilon: float = WORKING_EPSILON) -> Descriptors:
     """Measure a phase field or a mask.
 
+    Raises ValueError if voxels are not cubic, or there is no surface (`NoSurface`) whose curvature the grid resolves.
+
     Parameters
     ----------
     shape
@@ -96,11 +98,6 @@ def descriptors(shape: np.ndarray | Tensor, grid: Grid, epsilon: float = WORKING
         Cubic voxels. Where it is not periodic, the shape is a window of something larger.
     epsilon
         Interface parameter, in the grid's unit.
-
-    Raises
-    ------
-    ValueError
-        If voxels are not cubic, or there is no surface (`NoSurface`) whose curvature the grid resolves.
     """
     check_type(grid, Grid, "a Grid")
     check_type(shape, (np.ndarray, Tensor), f"a field or a mask of shape {grid.shape}")

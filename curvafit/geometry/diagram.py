@@ -200,7 +200,8 @@ def surface_curvatures(
 
     Curvatures of the voxels around a triangle are interpolated linearly at its barycentre. The geometric ones are those
     of the level sets of √2 ε artanh(u), which are u's own: differences of that near-distance err far less than
-    differences of tanh. The diffuse ones are the paper's, of u itself.
+    differences of tanh. The diffuse ones are the paper's, of u itself. Raises ValueError if there is no surface in the
+    box or in `where`, the field is not finite, or `curvature` has another name.
 
     Parameters
     ----------
@@ -213,11 +214,6 @@ def surface_curvatures(
         outermost centres, right where the mirror image beyond them is real.
     where
         bool `(Z, Y, X)`: only triangles whose nearest voxel is True count.
-
-    Raises
-    ------
-    ValueError
-        If there is no surface in the box or in `where`, the field is not finite, or `curvature` has another name.
     """
     check_choice(curvature, ("geometric", "diffuse"), "curvature 'geometric' or 'diffuse'")
     check_type(grid, Grid, "a Grid")

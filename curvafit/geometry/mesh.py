@@ -50,12 +50,8 @@ def surface(u: np.ndarray | Tensor, grid: Grid, level: float = 0.0) -> Surface:
     """Return the level set of `u` `(Z, Y, X)` by Lewiner's marching cubes.
 
     The cells between the last and the first voxels of a periodic box belong to it, each once; a box with other borders
-    ends at its outermost voxels' centres.
-
-    Raises
-    ------
-    ValueError
-        If `u` is not a finite volume of the grid's shape, or nowhere crosses the level.
+    ends at its outermost voxels' centres. Raises ValueError if `u` is not a finite volume of the grid's shape, or
+    nowhere crosses the level.
     """
     values = _checked(u, grid)
     if grid.periodic:
@@ -68,11 +64,7 @@ def capped_surface(u: np.ndarray | Tensor, grid: Grid, level: float = 0.0) -> Su
 
     It is watertight, and stays so in float32: no vertex comes closer to a voxel's centre than some ten-thousandths of
     an edge, and none stands twice. The caps of opposite faces of a periodic box are the same, so that copies tile.
-
-    Raises
-    ------
-    ValueError
-        As `surface` does.
+    Raises ValueError as `surface` does.
     """
     values = _checked(u, grid).astype(np.float32) - np.float32(level)
     if not values.max() > 0:
@@ -90,12 +82,7 @@ def solid_surface(u: np.ndarray | Tensor, grid: Grid) -> Surface:
     """Return the boundary of {u > 0}, closed as `capped_surface` closes it, around the volume of the voxels in {u > 0}.
 
     Flat triangles cut a curved surface short, by 1 % of the volume of tubes 10 voxels thick. The level is moved by as
-    little as makes up for it, some hundredths of a voxel.
-
-    Raises
-    ------
-    ValueError
-        As `surface` does.
+    little as makes up for it, some hundredths of a voxel. Raises ValueError as `surface` does.
     """
     values = _checked(u, grid)
     target = np.count_nonzero(values > 0) * grid.voxel_volume
@@ -174,17 +161,14 @@ def _welded(mesh: Surface) -> Surface:
 def write_surface(mesh: Surface, path: str | Path, *, unit: str = "voxel", data: Data | None = None) -> Path:
     """Write a binary STL, PLY or VTP file by suffix; whole or not at all.
 
+    Raises ValueError if the suffix is another, or there is not one number a vertex.
+
     Parameters
     ----------
     unit
         Of the lengths: a remark in the file, none of the formats has a field for it.
     data
         Numbers `(V,)` at the vertices by name, for PLY and VTP; STL cannot hold them.
-
-    Raises
-    ------
-    ValueError
-        If the suffix is another, or there is not one number a vertex.
     """
     path = Path(path)
     suffix = path.suffix.lower()

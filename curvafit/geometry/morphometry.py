@@ -52,6 +52,8 @@ def morphometry(
 ) -> Morphometry:
     """Measure volume fraction (BV/TV), thickness (Tb.Th), spacing (Tb.Sp), Euler number, connectivity density, BS/BV.
 
+    Raises ValueError if the mask is not 3D, or empty or full.
+
     Parameters
     ----------
     mask
@@ -68,11 +70,6 @@ def morphometry(
         `euler` is 26-connected, and a window's share rounded; `surface_to_volume` is the area by marching cubes over
         the structure's volume, in 1/unit; `connectivity_density` is (1 - χ) over the box's volume, or over that between
         the centres of a window's outer voxels, in 1/unit³.
-
-    Raises
-    ------
-    ValueError
-        If the mask is not 3D, or empty or full.
     """
     mask = np.asarray(mask, dtype=bool)
     edges = (spacing, spacing, spacing) if isinstance(spacing, (int, float)) else spacing

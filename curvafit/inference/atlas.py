@@ -13,7 +13,7 @@ from curvafit.core.records import Format
 from curvafit.core.schema import Rule
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.distances import one_to_many, sliced_embedding, wasserstein
-from curvafit.inference.table import packaged
+from curvafit.inference.table import open_packaged
 from curvafit.priors.coefficients import Coefficients
 
 VERSION = 1
@@ -61,10 +61,7 @@ class Atlas:
     def diagrams(self, seen_as: str) -> tuple[Diagram, ...]:
         """Return the diagrams of the shapes seen as `"field"` or as `"mask"`.
 
-        Raises
-        ------
-        ValueError
-            If `seen_as` is another word.
+        Raises ValueError if `seen_as` is another word.
         """
         if seen_as not in VIEWS:
             raise ValueError(f"expected shapes seen as 'field' or 'mask', got {seen_as!r}")
@@ -92,30 +89,26 @@ def save_atlas(atlas: Atlas, path: str | Path) -> None:
     """
     arrays = {name: getattr(atlas, name) for name in ("coefficients", "masses", "seeds", "volume_fractions")}
     for view in VIEWS:
-        arrays |= {f"{view}_{name}": value for name, value in _packed(atlas.diagrams(view)).items()}
+        arrays |= {f"{view}_{name}": value for name, value in _pack_diagrams(atlas.diagrams(view)).items()}
     ATLAS_FILE.write(path, {"ids": list(atlas.ids), "provenance": atlas.provenance}, arrays)
 
 
 def load_atlas(path: str | Path | None = None) -> Atlas:
     """Read an atlas file; without a path, the one that comes with the package.
 
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is not an atlas, is truncated, or has another format version.
+    Raises FileNotFoundError if there is no such file, and ValueError if it is not an atlas, is truncated, or has
+    another format version.
     """
     if path is None:
-        return ATLAS_FILE.read(packaged("atlas.npz"), _atlas, place="the packaged atlas")
+        return ATLAS_FILE.read(open_packaged("atlas.npz"), _from_arrays, place="the packaged atlas")
     if Path(path).is_dir():
         raise FileNotFoundError(
             f"expected an atlas file, got the folder {path}: `curvafit atlas extract` makes one of it"
         )
-    return ATLAS_FILE.read(path, _atlas)
+    return ATLAS_FILE.read(path, _from_arrays)
 
 
-def _packed(diagrams: tuple[Diagram, ...]) -> dict[str, np.ndarray]:
+def _pack_diagrams(diagrams: tuple[Diagram, ...]) -> dict[str, np.ndarray]:
     """Return the diagrams as flat arrays: the points of number i are rows offsets[i] to offsets[i + 1]."""
     areas = np.array([d.weights.sum() for d in diagrams])
     return {
@@ -128,7 +121,7 @@ def _packed(diagrams: tuple[Diagram, ...]) -> dict[str, np.ndarray]:
     }
 
 
-def _atlas(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Atlas:
+def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Atlas:
     """Return the atlas of a file's header and arrays."""
     sound = all(x.dtype.kind in "iuf" and np.isfinite(x).all() for x in arrays.values())
     if not (sound and (np.abs(arrays["masses"]) < 1).all() and all(isinstance(one, str) for one in header["ids"])):
@@ -139,13 +132,13 @@ def _atlas(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Atlas:
         masses=arrays["masses"],
         seeds=arrays["seeds"],
         volume_fractions=arrays["volume_fractions"],
-        field_diagrams=_unpacked(arrays, "field"),
-        mask_diagrams=_unpacked(arrays, "mask"),
+        field_diagrams=_unpack_diagrams(arrays, "field"),
+        mask_diagrams=_unpack_diagrams(arrays, "mask"),
         provenance=header["provenance"],
     )
 
 
-def _unpacked(arrays: dict[str, np.ndarray], view: str) -> tuple[Diagram, ...]:
+def _unpack_diagrams(arrays: dict[str, np.ndarray], view: str) -> tuple[Diagram, ...]:
     points, weights = (arrays[f"{view}_{name}"].astype(np.float64) for name in ("points", "weights"))
     bounds = arrays[f"{view}_offsets"].astype(np.int64)
     if list(bounds[[0, -1]]) != [0, len(points)] or (np.diff(bounds) < 0).any():
@@ -159,8 +152,10 @@ def _unpacked(arrays: dict[str, np.ndarray], view: str) -> tuple[Diagram, ...]:
 
 @dataclass(frozen=True)
 class Match:
-    """An atlas shape: its id, the Wasserstein distance of its diagram to the query's (1 / working unit), and the
-    parameters that made it (coefficients in working units, mass m₀, noise seed)."""
+    """A shape of an atlas, and the Wasserstein distance of its diagram to the query's (1 / working unit).
+
+    `coefficients` (working units), `mass` m₀ and the noise `seed` made the shape.
+    """
 
     id: str
     distance: Annotated[float, Rule(least=0)]
@@ -186,6 +181,8 @@ def nearest(
 ) -> tuple[Match, ...]:
     """Return the `count` shapes nearest to a diagram, nearest first.
 
+    Raises ValueError if `count` or `shortlist` is not positive, `seen_as` is another word, or the diagram has no area.
+
     Parameters
     ----------
     diagram
@@ -200,11 +197,6 @@ def nearest(
         How many shapes, nearest in sliced distance, have their Wasserstein distance computed; at least `count` have.
     exact
         Compute the distances of the matches by geomloss in float64 (`wasserstein`), and not in float32.
-
-    Raises
-    ------
-    ValueError
-        If `count` or `shortlist` is not positive, `seen_as` is another word, or the diagram has no area.
     """
     if count < 1 or shortlist < 1:
         raise ValueError(f"expected a count and a shortlist of at least 1, got {count} and {shortlist}")

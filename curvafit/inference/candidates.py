@@ -40,8 +40,7 @@ TITLES = {
 }
 #: Longest edge, in working voxels, of the boxes in which twins grow.
 LONGEST_EDGE = 100
-#: Beyond `CLOSE`, twins within so many seeds' distances whose familiar numbers are the scan's are near, and so are
-#: those that are close but for one familiar number; others are no twins.
+#: Up to so many seeds' distances, twins with the scan's familiar numbers are near; further ones are no twins.
 FURTHEST = 5.0
 #: What a verdict begins with where no law is the scan's, and where it is not known.
 UNBELIEVED, UNDECIDED = "No believable twin", "Undecided"
@@ -63,8 +62,8 @@ Deviations = Annotated[dict[str, float], Rule(keys=tuple((name, NotNegative) for
 class Candidate:
     """A law that may have made a scan, in working units, and what grew from it.
 
-    Its mass is that of its twins once they are grown; where that is the one that fills the scan's volume fraction and
-    not the law's own, the deviation of the law's is none of its.
+    Once twins are grown, the mass is theirs. Where it was set so that they fill the scan's volume fraction, the law's
+    own deviation of the mass is dropped.
 
     Attributes
     ----------
@@ -91,7 +90,7 @@ class Candidate:
     twins: tuple[Morphometry, ...] = ()
     status: str = ""
 
-    def grown(self, scan: Diagram, twins: Sequence[Twin]) -> Candidate:
+    def compare(self, scan: Diagram, twins: Sequence[Twin]) -> Candidate:
         """Return the candidate with what its twins measure against the scan's curvature diagram."""
         diagrams = [each.diagram for each in twins if each.diagram is not None]
         if not diagrams:
@@ -108,18 +107,18 @@ class Candidate:
 def best_candidate(candidates: Sequence[Candidate]) -> Candidate | None:
     """Return the first candidate within seed noise of the one nearest to the scan; None where nothing grew.
 
-    The noise is that of the nearest one's twins; where they are fewer than two, the nearest is the best. Of those
-    within it the first is taken whose own twins lie at most `CLOSE` times as far from the scan as from each other, if
-    there is one: seeds that are more alike than the scan is to any of them are another texture's.
+    The noise is the distance between the nearest candidate's twins. Of the candidates within it, the first is preferred
+    whose twins lie at most `CLOSE` times as far from the scan as from each other: where the seeds of a law are more
+    alike than that, the scan is another texture.
     """
-    grown = {each.name: each.distance for each in candidates if each.distance is not None}
+    grown = [(each.distance, each) for each in candidates if each.distance is not None]
     if not grown:
         return None
-    nearest = min((each for each in candidates if each.name in grown), key=lambda each: grown[each.name])
-    reach = grown[nearest.name] + (nearest.seed_noise or 0.0)
-    within = [each for each in candidates if each.name in grown and grown[each.name] <= reach]
-    close = (each for each in within if each.seed_noise is None or grown[each.name] <= CLOSE * each.seed_noise)
-    return next(close, within[0])
+    least, nearest = min(grown, key=lambda pair: pair[0])
+    reach = least + (nearest.seed_noise or 0.0)
+    within = [(distance, each) for distance, each in grown if distance <= reach]
+    close = (each for distance, each in within if each.seed_noise is None or distance <= CLOSE * each.seed_noise)
+    return next(close, within[0][1])
 
 
 def seed_noise_of(candidates: Sequence[Candidate]) -> float | None:
@@ -131,8 +130,11 @@ def seed_noise_of(candidates: Sequence[Candidate]) -> float | None:
 
 @dataclass(frozen=True, eq=False)
 class Twin:
-    """A shape grown from a law, or why none grew: its field and mass; its curvature diagram and familiar numbers as the
-    scan would show them, of a window where the scan is one: what its faces hide is hidden of the twin as well."""
+    """A shape grown from a law, or the reason why none grew.
+
+    `phase` and `mass` are the shape's own. `diagram` and `morphometry` are measured as the scan's were: with its blur
+    and noise, and in a window where the scan is one.
+    """
 
     phase: np.ndarray | None
     mass: float
@@ -149,22 +151,18 @@ def twin(
     A mask or an image does not state a mass: the shape fills as much of its box as the structure does
     (`Prepared.true_volume_fraction`), or has the law's own mass where nothing grows so.
     """
-    grid, options = twin_grid(prepared), {"schedule": schedule, "seed": seed, "reject_early": True}
+    z, y, x = (min(edge.stop - edge.start, LONGEST_EDGE) for edge in prepared.windows[0])
+    grid = Grid((z, y, x), prepared.grid.spacing, "periodic")
+    options = {"schedule": schedule, "seed": seed, "reject_early": True}
     if prepared.kind != "field":
         share = prepared.true_volume_fraction
         flow = generate(coefficients, mass, grid, volume_fraction=share, **options)
-        if (grown := _measured(flow, prepared, seed)).phase is not None:
+        if (grown := _measure_twin(flow, prepared, seed)).phase is not None:
             return grown
-    return _measured(generate(coefficients, mass, grid, **options), prepared, seed)
+    return _measure_twin(generate(coefficients, mass, grid, **options), prepared, seed)
 
 
-def twin_grid(prepared: Prepared) -> Grid:
-    """Return the periodic box in which a scan's twins grow."""
-    z, y, x = (min(edge.stop - edge.start, LONGEST_EDGE) for edge in prepared.windows[0])
-    return Grid((z, y, x), prepared.grid.spacing, "periodic")
-
-
-def _measured(flow: Flow, prepared: Prepared, seed: int) -> Twin:
+def _measure_twin(flow: Flow, prepared: Prepared, seed: int) -> Twin:
     """Return a flow's shape with its diagram and numbers, as the scan would show it."""
     if not flow.viability.viable:
         return Twin(None, flow.mass, None, None, flow.viability.reason)
@@ -184,54 +182,50 @@ def _measured(flow: Flow, prepared: Prepared, seed: int) -> Twin:
 def verdict(
     candidates: Sequence[Candidate], misfit: Misfit | None, scan: Morphometry, *, fast: bool = False
 ) -> tuple[str | None, str]:
-    """Return the name of the best supported law and the verdict on a scan of these familiar numbers; no name where
-    nothing grew.
+    """Return the name of the best supported law, and the verdict on the scan; no name where nothing grew.
 
-    A law that is not believable is still named: it is the nearest that there is, and the verdict says that it is not
-    the scan's.
+    `scan` has the scan's familiar numbers. A law that is not believable is still named: it is the nearest that there
+    is, and the verdict says that it is not the scan's.
     """
     if fast:
-        return candidates[0].name, _joined(_unusual(misfit), "Nothing was grown to check the law (--fast).")
+        return candidates[0].name, _join(_describe_misfit(misfit), "Nothing was grown to check the law (--fast).")
     best = best_candidate(candidates)
     if best is None or best.distance is None:
-        return None, _joined("No law: nothing grew from any candidate.", candidates[0].status)
+        return None, _join("No law: nothing grew from any candidate.", candidates[0].status)
     noise = seed_noise_of(candidates)
     title = TITLES[best.name]
     distances = f"its twins lie {best.distance:.1f} from the scan's curvature diagram"
     distances += f", {noise:.1f} from each other." if noise else "."
-    ratio, other = 0.0 if not noise else best.distance / noise, differences(scan, best.twins)
+    ratio, other = 0.0 if not noise else best.distance / noise, find_differences(scan, best.twins)
     familiar = f"Twins over scan: {', '.join(other)}." if other else ""
     strange = misfit is not None and misfit.probability < UNBELIEVABLE
     allowed = 1 if ratio <= CLOSE else 0
     if strange or ratio > FURTHEST or len(other) > allowed:
         far = f"Twins should lie some {noise:.1f} from it." if ratio > CLOSE else ""
-        reason = _unusual(misfit) if strange else far
-        return best.name, _joined(f"{UNBELIEVED}: of the nearest law ({title}), {distances}", reason, familiar)
+        reason = _describe_misfit(misfit) if strange else far
+        return best.name, _join(f"{UNBELIEVED}: of the nearest law ({title}), {distances}", reason, familiar)
     word, doubt = "Supported", ""
     if ratio > CLOSE:
         word, doubt = "Near", "They have its thickness, spacing and connectivity, and another law may come nearer."
     elif noise is None:
         word, doubt = UNDECIDED, "No law grew twice, so it is not known how far apart two seeds lie."
     elif noise > TELLING:
-        word, doubt = (
-            "Undecided",
-            "Seeds so far apart tell no texture: this law makes none, or the volume holds too little.",
-        )
+        word = UNDECIDED
+        doubt = "Seeds so far apart tell no texture: this law makes none, or the volume holds too little."
     elif familiar:
         word, doubt = "Near", "That is near enough."
-    return best.name, _joined(f"{word} ({title}): {distances}", doubt, familiar, _unusual(misfit), best.status)
+    return best.name, _join(f"{word} ({title}): {distances}", doubt, familiar, _describe_misfit(misfit), best.status)
 
 
-def _joined(*sentences: str) -> str:
+def _join(*sentences: str) -> str:
     """Return the sentences that are not empty, one after the other."""
     return " ".join(filter(None, sentences))
 
 
-def differences(scan: Morphometry, twins: Sequence[Morphometry]) -> list[str]:
-    """Return the familiar numbers in which all twins differ from the scan the same way, with their ratios, as words.
+def find_differences(scan: Morphometry, twins: Sequence[Morphometry]) -> list[str]:
+    """Return words on the familiar numbers that are greater, or smaller, in all twins than in the scan, by over `NEAR`.
 
-    They differ by more than `NEAR`; connectivities also by more than chance lets two counts of so many bodies and
-    tunnels differ, twice the root of their sum.
+    Connectivities are counts of bodies and tunnels: by chance two counts differ by up to twice the root of their sum.
     """
     words = []
     for word, name in FAMILIAR.items():
@@ -245,7 +239,7 @@ def differences(scan: Morphometry, twins: Sequence[Morphometry]) -> list[str]:
     return words
 
 
-def _unusual(misfit: Misfit | None) -> str:
+def _describe_misfit(misfit: Misfit | None) -> str:
     """Return how usual the scan's descriptors are for the model, as a sentence."""
     if misfit is None:
         return ""
@@ -254,13 +248,15 @@ def _unusual(misfit: Misfit | None) -> str:
         return f"The scan's descriptors are of a kind that the model makes (p = {p})."
     names = ", ".join(misfit.strangest) or "none by itself"
     direction = "The scan has a direction (fabric), and the model has none." if "fabric" in misfit.strangest else ""
-    return _joined(f"The model does not make such descriptors (p = {p}); the strangest: {names}.", direction)
+    return _join(f"The model does not make such descriptors (p = {p}); the strangest: {names}.", direction)
 
 
 @dataclass(frozen=True)
 class Misfit:
-    """Part of shapes of the model that lie as far out as the scan does: in all descriptors together
-    (`probability`), and by block of descriptors (`blocks`). `method` says against what."""
+    """The share of the model's shapes whose descriptors are as unusual as the scan's.
+
+    `probability` is of all descriptors together, `blocks` of each block alone; `method` says what was compared with.
+    """
 
     probability: Annotated[float, Rule(least=0, most=1)]
     blocks: dict[str, float]

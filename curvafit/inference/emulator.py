@@ -36,18 +36,11 @@ class Layer(NamedTuple):
 
 
 class Emulated(NamedTuple):
-    """Compressed descriptors that parameters lead to: mean `(N, k)`, and deviations `(N, k)` along the rows of a basis
-    `(k, k)`, directions in which seeds differ independently."""
+    """Compressed descriptors that parameters lead to: mean `(N, k)`, and deviations `(N, k)` along the rows of the
+    emulator's basis, directions in which seeds differ independently."""
 
     mean: np.ndarray
     deviation: np.ndarray
-    basis: np.ndarray
-
-    @property
-    def covariance(self) -> np.ndarray:
-        """Return the covariances `(N, k, k)` between seeds."""
-        inverse = np.linalg.inv(self.basis)
-        return np.einsum("ij,nj,kj->nik", inverse, self.deviation**2, inverse)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +76,7 @@ class Emulator:
         """Return the mean and deviations of the compressed descriptors of parameters `(N, 6)`."""
         inputs = self.inputs(parameters, view)
         mean, spread = forward(self.mean, inputs).mean(0), forward(self.spread, inputs).mean(0)
-        return Emulated(mean, np.maximum(np.exp(spread), FAINTEST), self.basis)
+        return Emulated(mean, np.maximum(np.exp(spread), FAINTEST))
 
     def inputs(self, parameters: np.ndarray, view: str) -> np.ndarray:
         """Return what the networks read: the parameters in deviations of the prior, and the kind of view."""
@@ -112,58 +105,27 @@ class Emulator:
             import jax.numpy as jnp
 
             places = jnp.asarray(self.inputs(parameters, view))
-            slopes = np.asarray(_slopes()(_in_jax(self.mean), places))[..., : len(PARAMETERS)]
+            slopes = np.asarray(_jacobian()(_as_jax(self.mean), places))[..., : len(PARAMETERS)]
         return (self.basis @ slopes) / self(parameters, view).deviation[..., None]
 
 
-class WeakDirection(NamedTuple):
-    """A direction of the parameters, in deviations of the prior, and the ends `(6,)` of its 90 % interval."""
-
-    direction: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-
-    def __str__(self) -> str:
-        """Return the direction as a sentence."""
-        chosen = [k for k in np.argsort(-np.abs(self.direction)) if abs(self.direction[k]) >= NAMED] or [
-            int(np.abs(self.direction).argmax())
-        ]
-        ends = [
-            ", ".join(f"{PARAMETERS[k]} {format_number(float(end[k]), 2)}" for k in chosen)
-            for end in (self.low, self.high)
-        ]
-        names = [PARAMETERS[k] for k in chosen]
-        together = ", ".join(names[:-1]) + " and " + names[-1] if len(names) > 1 else names[0]
-        steps = ", ".join(f"{self.direction[k]:+.1f}" for k in chosen)
-        by = f" together by ({steps})" if len(names) > 1 else ""
-        return f"{together}{by}: anything from {ends[0]} to {ends[1]} grows this texture."
-
-
-@dataclass(frozen=True, eq=False)
-class Optimum:
+class Optimum(NamedTuple):
     """The parameters whose emulated descriptors fit best, in a box that is the prior.
 
     Attributes
     ----------
     parameters, covariance
         `(6,)` and `(6, 6)`: in working units (`PARAMETERS`); the covariance is that of the quadratic form at the best.
-    singular_values
-        `(6,)`, decreasing: of the derivatives of the whitened descriptors by parameters in deviations of the prior. A
-        direction of value s is known up to 1 / √(1 + s²) of the prior's deviation.
     weak
-        The directions that are known up to more than `WEAK` of the prior's deviation, weakest first.
+        Sentences on the directions that are known up to more than `WEAK` of the prior's deviation, weakest first.
     misfit
         Sum of the squares of the whitened descriptors that are not explained, over the emulator's inflation.
-    starts
-        `(n,)`: twice the negative log posterior where each start ended, above the best's.
     """
 
     parameters: np.ndarray
     covariance: np.ndarray
-    singular_values: np.ndarray
-    weak: tuple[WeakDirection, ...]
+    weak: tuple[str, ...]
     misfit: float
-    starts: np.ndarray
 
 
 def optimum(emulator: Emulator, descriptors: np.ndarray, view: str, starts: np.ndarray) -> Optimum:
@@ -179,10 +141,11 @@ def optimum(emulator: Emulator, descriptors: np.ndarray, view: str, starts: np.n
         `(n, 6)`: parameters to start from, such as draws of a posterior; the covariance between seeds is the mean of
         theirs.
     """
-    ends = _solved(emulator, np.atleast_2d(descriptors), view, np.asarray(starts, dtype=np.float64)[None])
-    best = int(ends.value[0].argmin())
-    parameters, jacobian = ends.parameters[0, best], ends.jacobian[0, best]
-    return _summary(emulator, parameters, jacobian, float(ends.misfit[0, best]), ends.value[0] - ends.value[0, best])
+    row = np.atleast_2d(descriptors)
+    parameters, jacobians, left, values = _minimise(emulator, row, view, np.asarray(starts, dtype=np.float64)[None])
+    best = int(values[0].argmin())
+    covariance, weak = _expand(emulator, parameters[0, best], jacobians[0, best])
+    return Optimum(parameters[0, best], covariance, weak, float(left[0, best]))
 
 
 def misfits(emulator: Emulator, descriptors: np.ndarray, view: str, starts: np.ndarray) -> np.ndarray:
@@ -190,16 +153,16 @@ def misfits(emulator: Emulator, descriptors: np.ndarray, view: str, starts: np.n
 
     Rows of descriptors are `(N, 351)`, the starts of each `(N, n, 6)`.
     """
-    ends = _solved(emulator, descriptors, view, starts)
-    return ends.misfit[np.arange(len(descriptors)), ends.value.argmin(1)]
+    _, _, left, values = _minimise(emulator, descriptors, view, starts)
+    return left[np.arange(len(descriptors)), values.argmin(1)]
 
 
 def forward(layers: tuple[Layer, ...], inputs: Any) -> Any:
     """Return the outputs `(members, N, outputs)` of each network of inputs `(N, inputs)`, NumPy's or JAX's."""
     values = inputs[None]
-    for number_of, layer in enumerate(layers):
+    for k, layer in enumerate(layers):
         values = values @ layer.weight.swapaxes(1, 2) + layer.bias[:, None]
-        if number_of < len(layers) - 1:
+        if k < len(layers) - 1:
             values = values * 0.5 * (1 + _tanh(0.5 * values))
     return values
 
@@ -212,17 +175,14 @@ def _tanh(values: Any) -> Any:
     return jnp.tanh(values)
 
 
-class _Ends(NamedTuple):
-    """Of N rows and n starts: parameters, derivatives of the whitened descriptors by parameters in deviations of the
-    prior, unexplained squares, and twice the negative log posterior."""
+def _minimise(
+    emulator: Emulator, descriptors: np.ndarray, view: str, starts: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return where the solver ends, for N rows of descriptors from n starts `(N, n, 6)` each.
 
-    parameters: np.ndarray
-    jacobian: np.ndarray
-    misfit: np.ndarray
-    value: np.ndarray
-
-
-def _solved(emulator: Emulator, descriptors: np.ndarray, view: str, starts: np.ndarray) -> _Ends:
+    Returns parameters, derivatives of the whitened descriptors by parameters in deviations of the prior, unexplained
+    squares, and twice the negative log posterior.
+    """
     target = emulator.compression(descriptors)
     emulated = emulator(starts.reshape(-1, starts.shape[-1]), view)
     deviation = np.sqrt(np.square(emulated.deviation).reshape(*starts.shape[:2], -1).mean(1))
@@ -233,19 +193,20 @@ def _solved(emulator: Emulator, descriptors: np.ndarray, view: str, starts: np.n
 
         deviation *= np.sqrt(emulator.inflation)
         rest = (emulator.basis, target, deviation, emulator.kind(view), np.log(share / (1 - share)))
-        ends = _minimiser()(_in_jax(emulator.mean), *(jnp.asarray(part, float) for part in rest))
+        ends = _minimiser()(_as_jax(emulator.mean), *(jnp.asarray(part, float) for part in rest))
         free, jacobian, misfit, value = (np.asarray(part) for part in ends)
-    return _Ends(low + (high - low) / (1 + np.exp(-free)), jacobian, misfit, value)
+    return low + (high - low) / (1 + np.exp(-free)), jacobian, misfit, value
 
 
-def _in_jax(layers: tuple[Layer, ...]) -> tuple[Layer, ...]:
+def _as_jax(layers: tuple[Layer, ...]) -> tuple[Layer, ...]:
     import jax.numpy as jnp
 
     return tuple(Layer(jnp.asarray(layer.weight, float), jnp.asarray(layer.bias, float)) for layer in layers)
 
 
 @functools.cache
-def _slopes() -> Callable[..., Any]:
+def _jacobian() -> Callable[..., Any]:
+    """Return the derivative of the networks' mean by what they read, at many places."""
     import jax
 
     def mean(layers, place):
@@ -265,17 +226,17 @@ def _minimiser() -> Callable[..., Any]:
     # the negative log posterior as a sum of squares: |whitened misfit|² from the likelihood, and what the prior,
     # uniform in the box, becomes for logits.
 
-    def scaled(free):
+    def scale(free):
         # From logits to parameters in deviations of the prior: a uniform share has deviation 1 / √12.
         return np.sqrt(12) * (jax.nn.sigmoid(free) - 0.5)
 
-    def unexplained(place, args):
+    def whiten(place, args):
         layers, basis, target, deviation, kind = args
         mean = forward(layers, jnp.concatenate([place, kind])[None])[:, 0].mean(0)
         return basis @ (target - mean) / deviation
 
     def uniform(free):
-        """Return what squares to twice the negative logarithm of a uniform prior's density in logits."""
+        """Return the root of twice the negative logarithm of a uniform prior's density in logits."""
         # With s = sigmoid(x), ds/dx = s (1 - s) = 1 / (4 cosh²(x/2)), so that -2 log density = 4 log cosh(x/2) + const.
         # Its root is sign(x) · 2 √(log cosh(x/2)), and x / √2 near 0, where the root of a rounded 0 has no slope.
         near = jnp.abs(free) < 1e-2
@@ -284,34 +245,46 @@ def _minimiser() -> Callable[..., Any]:
         return jnp.where(near, free / np.sqrt(2), jnp.sign(far) * 2 * jnp.sqrt(cosh))
 
     def residual(free, args):
-        return jnp.concatenate([unexplained(scaled(free), args), uniform(free)])
+        return jnp.concatenate([whiten(scale(free), args), uniform(free)])
 
     def minimise(layers, basis, target, deviation, kind, start):
         args = (layers, basis, target, deviation, kind)
         solver = optimistix.LevenbergMarquardt(rtol=1e-6, atol=1e-6)
         free = optimistix.least_squares(residual, solver, start, args=args, max_steps=STEPS, throw=False).value
-        left = unexplained(scaled(free), args)
-        slope = jax.jacfwd(unexplained)(scaled(free), args)
+        left = whiten(scale(free), args)
+        slope = jax.jacfwd(whiten)(scale(free), args)
         return free, slope, jnp.sum(left**2), jnp.sum(residual(free, args) ** 2)
 
     starts = jax.vmap(minimise, (None, None, None, None, None, 0))
     return jax.jit(jax.vmap(starts, (None, None, 0, 0, None, 0)))
 
 
-def _summary(emulator: Emulator, parameters: np.ndarray, jacobian: np.ndarray, misfit: float, starts: np.ndarray):
-    # Laplace's approximation in deviations of the prior, whose own precision is 1. In direction v of singular value s
-    # the posterior's deviation is 1 / √(1 + s²): a direction that the descriptors do not see keeps the prior's.
+def _expand(emulator: Emulator, parameters: np.ndarray, jacobian: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return the covariance at the best parameters, by Laplace's approximation, and sentences on weak directions."""
+    # In deviations of the prior, whose own precision is 1: in direction v of singular value s the posterior's deviation
+    # is 1 / √(1 + s²), so a direction that the descriptors do not see keeps the prior's.
     firmness = jacobian.T @ jacobian
     covariance = np.linalg.inv(firmness + np.eye(len(PARAMETERS)))
-    squares, columns = np.linalg.eigh(firmness)
-    singular, directions = np.sqrt(np.maximum(squares[::-1], 0)), columns.T[::-1]
-    spread = 1 / np.sqrt(1 + singular**2)
+    squares, directions = np.linalg.eigh(firmness)
     weak = []
-    for value, direction in sorted(zip(spread, directions, strict=True), key=lambda pair: -pair[0]):
-        if value > WEAK:
+    for square, direction in zip(squares, directions.T, strict=True):
+        spread = 1 / np.sqrt(1 + max(square, 0))
+        if spread > WEAK:
             direction = direction * np.sign(direction[np.abs(direction).argmax()])
-            step = NINETY * value * direction * emulator.deviation
-            low, high = (np.clip(parameters + sign * step, *emulator.box.T) for sign in (-1, 1))
-            weak.append(WeakDirection(direction, low, high))
-    scale = np.outer(emulator.deviation, emulator.deviation)
-    return Optimum(parameters, scale * covariance, singular, tuple(weak), misfit, starts)
+            step = NINETY * spread * direction * emulator.deviation
+            ends = [np.clip(parameters + sign * step, *emulator.box.T) for sign in (-1, 1)]
+            weak.append(_describe_direction(direction, ends))
+    return np.outer(emulator.deviation, emulator.deviation) * covariance, tuple(weak)
+
+
+def _describe_direction(direction: np.ndarray, ends: list[np.ndarray]) -> str:
+    """Return a sentence on a direction, in deviations of the prior, that is open between two ends `(6,)`."""
+    chosen = [k for k in np.argsort(-np.abs(direction)) if abs(direction[k]) >= NAMED] or [
+        int(np.abs(direction).argmax())
+    ]
+    low, high = (", ".join(f"{PARAMETERS[k]} {format_number(float(end[k]), 2)}" for k in chosen) for end in ends)
+    names = [PARAMETERS[k] for k in chosen]
+    together = ", ".join(names[:-1]) + " and " + names[-1] if len(names) > 1 else names[0]
+    steps = ", ".join(f"{direction[k]:+.1f}" for k in chosen)
+    by = f" together by ({steps})" if len(names) > 1 else ""
+    return f"{together}{by}: anything from {low} to {high} grows this texture."

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy import stats
 
-from curvafit.core.runtime import Progress, silent, sub_progress
+from curvafit.core.runtime import Progress, sub_progress
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import Schedule
 from curvafit.geometry.descriptors import BLOCKS, Descriptors, descriptors
@@ -17,9 +16,9 @@ from curvafit.geometry.mesh import NoSurface
 from curvafit.inference.atlas import Match
 from curvafit.inference.candidates import Candidate, Misfit
 from curvafit.inference.emulator import Optimum, misfits, optimum
-from curvafit.inference.fit import Draws
+from curvafit.inference.fit import Draws, Fit
 from curvafit.inference.posterior import Posterior
-from curvafit.inference.simulate import Effort, Search, Simulate, Simulations, simulate_draws
+from curvafit.inference.simulate import Effort, Search, Simulate, simulate_draws
 from curvafit.inference.table import (
     PARAMETERS,
     VIEWS,
@@ -51,167 +50,102 @@ RIDGE, FAINTEST = 3.0, 0.05
 FLOOR = 0.1
 
 
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """What is known of a scan's law before anything of its size is grown.
-
-    Attributes
-    ----------
-    draws
-        From the posterior.
-    weak_directions
-        Sentences on the directions in which the scan leaves the parameters open.
-    misfit
-        How far out the scan lies among what the model makes.
-    candidates
-        Laws to grow, the most trusted first.
-    simulated
-        By block of descriptors, the scan's numbers `(k,)` and those of the simulations `(n, k)`; None without any.
-    """
-
-    draws: Draws
-    weak_directions: tuple[str, ...]
-    misfit: Misfit
-    candidates: tuple[Candidate, ...]
-    simulated: dict[str, tuple[np.ndarray, np.ndarray]] | None = None
-
-    @property
-    def parts(self) -> dict[str, Any]:
-        """Return the parts of a fit that it knows."""
-        return {"draws": self.draws, "weak_directions": self.weak_directions, "misfit": self.misfit}
-
-
 def estimate(
-    prepared: Prepared,
-    posterior: Posterior,
-    *,
-    seed: int = 0,
-    fast: bool = False,
-    effort: Effort = Effort(),  # noqa: B008
-    progress: Progress = silent,
-) -> Estimate | None:
-    """Read the law of a scan from its descriptors: draw from the posterior, grow some, compare them with the scan.
+    fit: Fit, prepared: Prepared, posterior: Posterior, *, seed: int, fast: bool, effort: Effort, progress: Progress
+) -> tuple[Fit, dict[str, tuple[np.ndarray, np.ndarray]] | None]:
+    """Read the law of a scan from its descriptors: draw from the posterior, grow some draws, and compare.
 
     Parameters
     ----------
     fast
         Grow nothing: the scan is compared with what training left unexplained.
-    effort
-        How much is grown otherwise.
-    progress
-        Called with a sentence and the share done.
 
     Returns
     -------
-    Estimate | None
-        None where the descriptors cannot be measured.
+    tuple
+        The fit with draws, weak directions, misfit and candidates, the most trusted first; as it is where the
+        descriptors cannot be measured. And by block of descriptors the scan's numbers `(k,)` and those of the
+        simulations `(n, k)`; None without simulations.
     """
     progress("measuring descriptors", 0.0)
-    turned = prepared.volume_fraction > HALF
-    seen = prepared.inverted if turned else prepared
-    if (measured := scan_descriptors(seen)) is None:
-        return None
-    row, view = measured[0].vector(), measured[1]
+    if (found := _describe(prepared)) is None:
+        return fit, None
+    seen, row, view, turn = found
     progress("reading the posterior", 0.1)
     parameters = posterior.sample(row, view, DRAWS, seed)
     best = optimum(posterior.emulator, row, view, parameters[:STARTS])
-    reading = _Reading(posterior, row, view, parameters, best, mirror_parameters if turned else np.asarray)
+    draws = Draws.of(turn(parameters), view, METHOD)
+    other = "Of the other phase: " if turn is mirror_parameters else ""
+    fit = replace(fit, draws=draws, weak_directions=tuple(other + each for each in best.weak))
+    middle = Draws.of(parameters, view, "").middle(np.ptp(parameters, axis=0))
+    likely = Candidate("posterior", *law_of(turn(middle)), draws.deviations)
+    grown = None
     if not fast:
         simulate = _simulator(seen, view, effort.schedule)
-        grown = simulate_draws(
-            parameters, simulate, effort.simulations, seed=seed, progress=sub_progress(progress, 0.15, 0.45)
-        )
-        if len(grown.parameters) >= FEWEST:
-            pool = posterior.sample(row, view, POOL, seed)
-            search = Search(posterior.emulator, view, row)
-            likeliest, every = search.parameters(
-                pool, grown, simulate, rounds=effort.rounds, seed=seed, progress=sub_progress(progress, 0.45, 1.0)
-            )
-            near = every.parameters[search.nearest(every)[0]]
-            return _checked(reading, grown, {"refined": likeliest, "simulation": near})
-    draws = reading.draws(parameters, METHOD)
-    misfit = Misfit(tail_probability(posterior, view, best.misfit), {}, "by the best fit, nothing grown")
-    return Estimate(draws, reading.weak, misfit, (reading.middle(draws), reading.optimum))
+        part = sub_progress(progress, 0.15, 0.45)
+        grown = simulate_draws(parameters, simulate, effort.simulations, seed=seed, progress=part)
+    if grown is None or len(grown.parameters) < FEWEST:
+        misfit = Misfit(tail_probability(posterior, view, best.misfit), {}, "by the best fit, nothing grown")
+        return replace(fit, misfit=misfit, candidates=(likely, _best_fit(posterior, best, view, turn))), None
+    pool = posterior.sample(row, view, POOL, seed)
+    search = Search(posterior.emulator, view, row)
+    part = sub_progress(progress, 0.45, 1.0)
+    likeliest, every = search.parameters(pool, grown, simulate, rounds=effort.rounds, seed=seed, progress=part)
+    near = every.parameters[search.nearest(every)[0]]
+    refined, simulation = (
+        Candidate(name, *law_of(turn(each)), {}) for name, each in (("refined", likeliest), ("simulation", near))
+    )
+    names = np.array(column_names())
+    blocks = {name: (row[names == name], grown.descriptors[:, names == name]) for name in BLOCKS}
+    misfit = check(posterior, row, view, grown.descriptors)
+    return replace(fit, misfit=misfit, candidates=(refined, likely, simulation)), blocks
 
 
-def refine_matches(prepared: Prepared, posterior: Posterior, matches: Sequence[Match]) -> Candidate | None:
+def refine_matches(prepared: Prepared, posterior: Posterior, matches: Sequence[Match]) -> tuple[Candidate, ...]:
     """Refine the parameters of the nearest matches until the emulated descriptors fit the scan's best.
 
     Levenberg and Marquardt's method, by optimistix, starts from each match, with the exact derivatives of the emulator.
-    None where the descriptors of the scan cannot be measured.
+    Returns one law; none where the descriptors of the scan cannot be measured.
+    """
+    if (found := _describe(prepared)) is None:
+        return ()
+    _, row, view, turn = found
+    starts = turn(np.stack([parameters_of(each.coefficients, each.mass) for each in matches]))
+    return (_best_fit(posterior, optimum(posterior.emulator, row, view, starts), view, turn),)
+
+
+#: From parameters of the phase that is described to those of the structure.
+Turn = Callable[[np.ndarray], np.ndarray]
+
+
+def _describe(prepared: Prepared) -> tuple[Prepared, np.ndarray, str, Turn] | None:
+    """Return the phase that is described, its row of descriptors and kind of view, and the way to the structure's law.
+
+    Of a structure that fills most of the volume the background is described, as the shapes of the training were thin.
     """
     turned = prepared.volume_fraction > HALF
-    if (measured := scan_descriptors(prepared.inverted if turned else prepared)) is None:
+    seen = prepared.inverted if turned else prepared
+    measured = scan_descriptors(seen)
+    if measured is None:
         return None
-    row, view = measured[0].vector(), measured[1]
-    turn = mirror_parameters if turned else np.asarray
-    starts = turn(np.stack([parameters_of(each.coefficients, each.mass) for each in matches]))
-    best = optimum(posterior.emulator, row, view, starts)
-    return _Reading(posterior, row, view, starts, best, turn).optimum
+    return seen, measured[0].vector(), measured[1], mirror_parameters if turned else np.asarray
 
 
-@dataclass(frozen=True, eq=False)
-class _Reading:
-    """What the posterior and the emulator read from a row of descriptors: draws and the best fit.
-
-    Of a structure that fills most of the volume its background is read; `turn` gives the parameters of the structure.
-    """
-
-    posterior: Posterior
-    row: np.ndarray
-    view: str
-    parameters: np.ndarray
-    best: Optimum
-    turn: Callable[[np.ndarray], np.ndarray]
-
-    @property
-    def weak(self) -> tuple[str, ...]:
-        """Return the weak directions as sentences."""
-        of = "" if self.turn is np.asarray else "Of the other phase: "
-        return tuple(f"{of}{each}" for each in self.best.weak)
-
-    def draws(self, parameters: np.ndarray, method: str) -> Draws:
-        """Return draws of the structure's parameters."""
-        return Draws.of(self.turn(parameters), self.view, method)
-
-    def middle(self, draws: Draws) -> Candidate:
-        """Return the middle of the draws with their deviations."""
-        middle = Draws.of(self.parameters, self.view, "").middle(np.ptp(self.parameters, axis=0))
-        return Candidate("posterior", *law_of(self.turn(middle)), draws.deviations)
-
-    @property
-    def optimum(self) -> Candidate:
-        """Return the best fit of the descriptors with its own deviations."""
-        rng = np.random.default_rng(0)
-        near = rng.multivariate_normal(self.best.parameters, self.best.covariance, DRAWS, check_valid="ignore")
-        low, high = self.posterior.box.T
-        own = self.draws(np.clip(near, low, high), "").deviations
-        return Candidate("optimum", *law_of(self.turn(self.best.parameters)), own)
-
-
-def _checked(reading: _Reading, grown: Simulations, others: Mapping[str, np.ndarray]) -> Estimate:
-    """Return what is known once draws were grown, and other parameters were chosen by what grew."""
-    row = reading.row
-    draws = reading.draws(reading.parameters, METHOD)
-    misfit = check(reading.posterior, row, reading.view, grown.descriptors)
-    refined, simulation = (Candidate(name, *law_of(reading.turn(each)), {}) for name, each in others.items())
-    names = np.array(column_names())
-    blocks = {name: (row[names == name], grown.descriptors[:, names == name]) for name in BLOCKS}
-    return Estimate(draws, reading.weak, misfit, (refined, reading.middle(draws), simulation), blocks)
-
-
-def simulation_grid(prepared: Prepared) -> Grid:
-    """Return the periodic box in which draws are grown: the scan's main window, within `EDGES`."""
-    z, y, x = (int(np.clip(edge.stop - edge.start, *EDGES)) for edge in prepared.windows[0])
-    return Grid((z, y, x), prepared.grid.spacing, "periodic")
+def _best_fit(posterior: Posterior, best: Optimum, view: str, turn: Turn) -> Candidate:
+    """Return the best fit of the descriptors, with deviations by draws from the normal distribution around it."""
+    rng = np.random.default_rng(0)
+    near = rng.multivariate_normal(best.parameters, best.covariance, DRAWS, check_valid="ignore")
+    deviations = Draws.of(turn(np.clip(near, *posterior.box.T)), view, "").deviations
+    return Candidate("optimum", *law_of(turn(best.parameters)), deviations)
 
 
 def _simulator(prepared: Prepared, view: str, schedule: Schedule | str) -> Simulate:
     """Return a function that grows a shape from parameters and measures its descriptors as the scan's were measured.
 
-    Blur, noise and window are the scan's own.
+    Blur, noise and window are the scan's own. Shapes grow in a periodic box of the main window's size, within `EDGES`.
     """
-    grid = simulation_grid(prepared)
+    z, y, x = (int(np.clip(edge.stop - edge.start, *EDGES)) for edge in prepared.windows[0])
+    grid = Grid((z, y, x), prepared.grid.spacing, "periodic")
     # A window of something larger loses what its faces cut; a box that repeats loses nothing.
     apply_view = VIEWS["mask" if prepared.part(prepared.windows[0]).periodic else "crop"]
 
@@ -231,13 +165,7 @@ def _simulator(prepared: Prepared, view: str, schedule: Schedule | str) -> Simul
 
 
 def tail_probability(posterior: Posterior, view: str, misfit: float) -> float:
-    """Return the part of shapes that fit worse than a query, each by its best parameters from `STARTS` draws.
-
-    Parameters
-    ----------
-    misfit
-        What the query's best parameters leave unexplained (`curvafit.inference.emulator.Optimum`).
-    """
+    """Return the part of shapes whose best parameters leave more unexplained than a query's do (`misfit`)."""
     usual = posterior.misfits[view]
     return float((1 + (usual >= misfit).sum()) / (1 + len(usual)))
 
@@ -245,32 +173,27 @@ def tail_probability(posterior: Posterior, view: str, misfit: float) -> float:
 def check(posterior: Posterior, descriptors: np.ndarray, view: str, simulated: np.ndarray) -> Misfit:
     """Compare a row of descriptors `(351,)` with those of simulations of the posterior's draws `(n, 351)`.
 
-    Probabilities of blocks are of what the posterior's mean given a row, by linear regression, does not tell of the
-    block; they are cautious.
-
-    Raises
-    ------
-    ValueError
-        If there are fewer than `FEWEST` simulations.
+    The probability of a block is that of its residual from a linear regression on the posterior's mean; it is cautious.
+    Raises ValueError if there are fewer than `FEWEST` simulations.
     """
     if len(simulated) < FEWEST:
         raise ValueError(f"expected at least {FEWEST} simulations to compare with, got {len(simulated)}")
     rows = np.concatenate([np.atleast_2d(descriptors), simulated])
     draws = posterior.sample(rows, view, SUMMARY_DRAWS)
     left = np.log(misfits(posterior.emulator, rows, view, draws[:, :STARTS]) + FLOOR)
-    summaries = posterior.standard(draws).mean(1)
-    blocks = {name: _tail(_distances(columns_of(rows, [name]), summaries)) for name in BLOCKS}
+    summaries = posterior.standardise(draws).mean(1)
+    blocks = {name: _tail(_residuals(columns_of(rows, [name]), summaries)) for name in BLOCKS}
     return Misfit(_tail(left), blocks, f"{len(simulated)} shapes grown from draws")
 
 
 def _tail(values: np.ndarray) -> float:
-    """Return the probability of the first value or more, if it is another of the rest, which are taken to be normal."""
+    """Return the probability that a value of the same normal distribution as the rest exceeds the first."""
     first, rest = values[0], values[1:]
     score = (first - rest.mean()) / (rest.std(ddof=1) * np.sqrt(1 + 1 / len(rest)) + 1e-9)
     return float(stats.t.sf(score, len(rest) - 1))
 
 
-def _distances(rows: np.ndarray, summaries: np.ndarray) -> np.ndarray:
+def _residuals(rows: np.ndarray, summaries: np.ndarray) -> np.ndarray:
     """Return the leave-one-out residual of each row, regressed on its summary; the query, row 0, is never in the fit.
 
     It is the logarithm of the mean square over columns, in deviations of the other rows.

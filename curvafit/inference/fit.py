@@ -124,21 +124,21 @@ class Fit(Pictured):
 
     kind: str
     family: str
-    candidates: tuple[Candidate, ...]
-    chosen: str | None
-    draws: Draws | None
-    weak_directions: tuple[str, ...]
-    misfit: Misfit | None
-    drift: float | None
     scale: tuple[float, float, float]
     working_voxel: float
     length_unit: str
-    matches: tuple[Match, ...]
     status: str
     morphometry: Morphometry
     notes: tuple[str, ...]
     provenance: dict[str, Any]
     diagram: Diagram | None = None
+    candidates: tuple[Candidate, ...] = ()
+    chosen: str | None = None
+    draws: Draws | None = None
+    weak_directions: tuple[str, ...] = ()
+    misfit: Misfit | None = None
+    drift: float | None = None
+    matches: tuple[Match, ...] = ()
 
     def __repr__(self) -> str:
         six = "none" if self.best is None else f"({', '.join(f'{x:.4g}' for x in self.best.coefficients)})"
@@ -183,10 +183,7 @@ class Fit(Pictured):
     def to_law(self) -> Law:
         """Return what `Law.load` reads from the fit's file: the fit as a law.
 
-        Raises
-        ------
-        ValueError
-            If the fit has none.
+        Raises ValueError if the fit has none.
         """
         six, mass = self.coefficients, self.mass
         if six is None or mass is None:
@@ -203,10 +200,7 @@ class Fit(Pictured):
     def to_json(self) -> str:
         """Return the text of a `fit.json`: indented, but lists of numbers in one line.
 
-        Raises
-        ------
-        ValueError
-            If the fit is none that `from_json` takes.
+        Raises ValueError if the fit is none that `from_json` takes.
         """
         content = self.as_dict()
         if wrong := violation(content, FIT_SCHEMA):
@@ -218,10 +212,7 @@ class Fit(Pictured):
     def from_json(cls, text: str | bytes) -> Fit:
         """Return the fit of a `fit.json`'s text; its diagram has the digits that the text has.
 
-        Raises
-        ------
-        ValueError
-            If the text is no whole fit of this format (`FIT_SCHEMA`).
+        Raises ValueError if the text is no whole fit of this format (`FIT_SCHEMA`).
         """
         return _fit_of(_parse(text, "the text", FIT_SCHEMA))
 
@@ -233,10 +224,7 @@ class Fit(Pictured):
     def load(cls, path: str | PathLike[str]) -> Fit:
         """Read a `fit.json`.
 
-        Raises
-        ------
-        FileNotFoundError, ValueError
-            If there is no such file, or as `from_json`.
+        Raises FileNotFoundError or ValueError if there is no such file, or as `from_json`.
         """
         return _fit_of(_parse(_content(path), path, FIT_SCHEMA))
 
@@ -322,10 +310,7 @@ _SAME = tuple({field.name for field in fields(Fit)} & {field.name for field in f
 def load_draws_and_candidates(law: LawLike) -> tuple[Draws | None, tuple[Candidate, ...]]:
     """Return the draws and the candidates of a fit, an inference or a `fit.json`; none of a law that has none.
 
-    Raises
-    ------
-    FileNotFoundError, ValueError
-        If there is no such file, or its draws or candidates are damaged.
+    Raises FileNotFoundError or ValueError if there is no such file, or its draws or candidates are damaged.
     """
     if not isinstance(law, (str, PathLike)):
         fit = getattr(law, "fit", law)

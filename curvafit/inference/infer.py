@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime
 import platform
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
@@ -18,7 +18,7 @@ from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.core.units import format_number
 from curvafit.generation.schedule import LEARNED, SCHEDULES
 from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram, family_of
-from curvafit.geometry.morphometry import Morphometry, morphometry
+from curvafit.geometry.morphometry import morphometry
 from curvafit.inference.atlas import Atlas, Match, load_atlas, mirror_match, nearest
 from curvafit.inference.candidates import TITLES, Candidate, Twin, best_candidate, twin, verdict
 from curvafit.inference.drift import drift
@@ -27,7 +27,6 @@ from curvafit.inference.fit import Fit
 from curvafit.inference.posterior import Posterior, load_posterior
 from curvafit.inference.simulate import Effort
 from curvafit.inference.stationarity import stationarity
-from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.law import Law
 from curvafit.scan.measure import scan_diagram
@@ -39,11 +38,6 @@ from curvafit.volumes.read import Source, field_of
 
 #: Number of nearest shapes, and of those from which stationarity starts.
 MATCHES, STARTS = 5, 3
-#: The parts of a fit where they are not known.
-_BARE: dict[str, Any] = {
-    "candidates": (), "chosen": None, "draws": None, "weak_directions": (), "misfit": None, "drift": None,
-    "matches": (),
-}  # fmt: skip
 _ARTICLES = {"field": "a phase field", "mask": "a mask", "image": "an image"}
 
 
@@ -121,6 +115,8 @@ def infer(
     is nearest in Wasserstein distance (geomloss), then gradient refinement from it by Levenberg and Marquardt's method
     (optimistix): of a phase field by its stationarity, of a mask or image by its descriptors.
 
+    Raises ValueError or FileNotFoundError if the volume cannot be read or measured, or an argument is out of range.
+
     Parameters
     ----------
     scan
@@ -147,11 +143,6 @@ def infer(
         Called with a sentence and the share done.
     reading
         Options of reading a file, or the place of an array: spacing, unit and the others of `curvafit.load`.
-
-    Raises
-    ------
-    ValueError, FileNotFoundError
-        If the volume cannot be read or measured, or an argument is out of range.
     """
     check_options(kind, threshold, label)
     check_choice(method, ("posterior", "match"), "method posterior or match")
@@ -169,38 +160,29 @@ def infer(
     prepared = prepare(volume, kind=kind, periodic=periodic, threshold=threshold, dark=dark, roi=region)
     progress("measuring curvature", 0.05)
     measured = None if prepared.noise else scan_diagram(prepared)
-    numbers = morphometry(prepared.mask, prepared.working_voxel, prepared.unit, periodic=prepared.grid.periodic)
-    provenance = _provenance(volume, atlas, posterior, seed)
     reason = NOISE if measured is None else why_no_texture(prepared, measured)
+    fit = _describe(prepared, measured, _provenance(volume, atlas, posterior, seed), reason)
     if measured is None or reason:
-        return Inference(volume, prepared, measured, {}, _fit(prepared, measured, numbers, provenance, reason))
-    estimated = None
+        return Inference(volume, prepared, measured, {}, fit)
+    simulated = None
     if method == "posterior":
-        estimated = estimate(
-            prepared, posterior, seed=seed, fast=fast, effort=effort, progress=sub_progress(progress, 0.1, 0.5)
-        )
+        part = sub_progress(progress, 0.1, 0.5)
+        fit, simulated = estimate(fit, prepared, posterior, seed=seed, fast=fast, effort=effort, progress=part)
     progress("searching the atlas", 0.5)
-    matches = _matches(prepared, measured, atlas, exact=method == "match")
-    refined = refine_matches(prepared, posterior, matches) if method == "match" else None
-    drawn = (() if refined is None else (refined,)) if estimated is None else estimated.candidates
-    laws = _laws(prepared, drawn, matches, seed, sub_progress(progress, 0.5, 0.6))
-    laws, twins = (
-        (laws, {}) if fast else _grown(laws, measured, prepared, seed, effort, sub_progress(progress, 0.6, 1.0))
-    )
-    chosen, status = verdict(laws, None if estimated is None else estimated.misfit, numbers, fast=fast)
+    matches = _match(prepared, measured, atlas, exact=method == "match")
+    read = fit.candidates if method == "posterior" else refine_matches(prepared, posterior, matches)
+    laws, twins = _list_laws(prepared, read, matches, seed, sub_progress(progress, 0.5, 0.6)), {}
+    if not fast:
+        laws, twins = _grow(laws, measured, prepared, seed, effort, sub_progress(progress, 0.6, 1.0))
+    chosen, status = verdict(laws, fit.misfit, fit.morphometry, fast=fast)
     law = next((each.coefficients for each in laws if each.name == chosen), None)
-    moved = None if law is None else drift(*_window(prepared), WORKING_EPSILON, law)
-    known = {} if estimated is None else estimated.parts
-    fit = _fit(
-        prepared, measured, numbers, provenance, status,
-        candidates=laws, chosen=chosen, matches=matches, drift=moved, **known,
-    )  # fmt: skip
+    moved = None if law is None else drift(*_main_window(prepared), WORKING_EPSILON, law)
+    fit = replace(fit, candidates=laws, chosen=chosen, matches=matches, drift=moved, status=status)
     progress("done", 1.0)
-    simulated = None if estimated is None else estimated.simulated
     return Inference(volume, prepared, measured, twins, fit, simulated)
 
 
-def _matches(prepared: Prepared, measured: Diagram, atlas: Atlas, exact: bool) -> tuple[Match, ...]:
+def _match(prepared: Prepared, measured: Diagram, atlas: Atlas, exact: bool) -> tuple[Match, ...]:
     """Return the nearest shapes of the atlas.
 
     An atlas holds shapes that fill less than half: of a structure that fills more, the background is matched, and
@@ -209,37 +191,30 @@ def _matches(prepared: Prepared, measured: Diagram, atlas: Atlas, exact: bool) -
     seen_as = "field" if prepared.kind == "field" else "mask"
     inverted = prepared.volume_fraction > HALF
     query = measured.mirrored if inverted else measured
-    found = nearest(query, atlas, seen_as=seen_as, count=MATCHES, exact=exact)
-    return tuple(map(mirror_match, found)) if inverted else found
+    matches = nearest(query, atlas, seen_as=seen_as, count=MATCHES, exact=exact)
+    return tuple(map(mirror_match, matches)) if inverted else matches
 
 
-def _laws(
-    prepared: Prepared, drawn: tuple[Candidate, ...], matches: tuple[Match, ...], seed: int, progress: Progress
+def _list_laws(
+    prepared: Prepared, read: tuple[Candidate, ...], matches: tuple[Match, ...], seed: int, progress: Progress
 ) -> tuple[Candidate, ...]:
-    """Return the laws to grow, the most trusted first: of a phase field its stationarity, those that were drawn, and
-    the nearest match."""
-    match = Candidate("match", matches[0].coefficients, matches[0].mass, {})
+    """Return the laws to grow, the most trusted first: of a phase field its stationarity, those that were read from the
+    descriptors, and the nearest match."""
+    laws = (*read, Candidate("match", matches[0].coefficients, matches[0].mass, {}))
     if prepared.kind != "field" or is_rounded(prepared.phase):
-        return (*drawn, match)
-    starts = [each.coefficients for each in (*drawn[:1], *matches[:STARTS])]
-    refined = _stationarity(prepared, starts, seed, progress)
-    return (refined, *drawn, match)
+        return laws
+    starts = [each.coefficients for each in (*read[:1], *matches[:STARTS])]
+    field = _main_window(prepared)
+    return (stationarity(*field, WORKING_EPSILON, starts=starts, seed=seed, progress=progress), *laws)
 
 
-def _stationarity(prepared: Prepared, starts: list[Coefficients], seed: int, progress: Progress) -> Candidate:
-    """Return the law of a phase field's stationarity, with its own deviations."""
-    refined = stationarity(*_window(prepared), WORKING_EPSILON, starts=starts, seed=seed, progress=progress)
-    deviations = {name: float(value) for name, value in refined.uncertainty.items()}
-    return Candidate("stationarity", refined.coefficients, float(refined.mass), deviations, status=refined.status)
-
-
-def _window(prepared: Prepared) -> tuple[torch.Tensor, Grid]:
+def _main_window(prepared: Prepared) -> tuple[torch.Tensor, Grid]:
     """Return the phase field of the main window and its grid."""
     where = prepared.windows[0]
     return torch.from_numpy(np.ascontiguousarray(prepared.phase[where])), prepared.part(where)
 
 
-def _grown(
+def _grow(
     laws: tuple[Candidate, ...], measured: Diagram, prepared: Prepared, seed: int, effort: Effort, progress: Progress
 ) -> tuple[tuple[Candidate, ...], dict[str, tuple[Twin, ...]]]:
     """Grow a twin of each law, and `effort.twins` of the best: of the nearest, and of the first that is as near."""
@@ -250,7 +225,7 @@ def _grown(
         start = seed + len(twins.get(law.name, ()))
         progress(f"growing: {TITLES[law.name]}, seed {start}", share)
         twins[law.name] = (*twins.get(law.name, ()), twin(law.coefficients, law.mass, prepared, start, effort.schedule))
-        return law.grown(measured, twins[law.name])
+        return law.compare(measured, twins[law.name])
 
     laws = tuple(grow(law, 0.7 * k / len(laws)) for k, law in enumerate(laws))
     for k in range(effort.regrown):
@@ -260,15 +235,8 @@ def _grown(
     return laws, twins
 
 
-def _fit(
-    prepared: Prepared,
-    measured: Diagram | None,
-    numbers: Morphometry,
-    provenance: dict[str, Any],
-    status: str,
-    **parts: Any,
-) -> Fit:
-    """Return a fit of its parts: no candidates, no law and no posterior where they are not given."""
+def _describe(prepared: Prepared, measured: Diagram | None, provenance: dict[str, Any], status: str) -> Fit:
+    """Return the fit of a scan before its law is sought: what was measured."""
     grid = prepared.grid
     return Fit(
         kind=prepared.kind,
@@ -277,11 +245,10 @@ def _fit(
         working_voxel=prepared.working_voxel,
         length_unit=prepared.unit,
         status=status,
-        morphometry=numbers,
+        morphometry=morphometry(prepared.mask, prepared.working_voxel, prepared.unit, periodic=grid.periodic),
         notes=prepared.notes,
         provenance=provenance,
         diagram=None if measured is None else measured.thinned(BIN_WIDTH, TAIL_SHARE),
-        **_BARE | parts,
     )
 
 

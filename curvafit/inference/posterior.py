@@ -15,7 +15,7 @@ from curvafit.core.extras import require
 from curvafit.core.records import Format
 from curvafit.geometry.descriptors import BLOCKS, Descriptors
 from curvafit.inference.emulator import Emulator, Layer
-from curvafit.inference.table import PARAMETERS, Compression, column_names, packaged
+from curvafit.inference.table import PARAMETERS, Compression, column_names, open_packaged
 
 POSTERIOR_FILE = Format("curvafit posterior", 3, "a posterior", "train it again", {"blocks": BLOCKS})
 #: Largest size of a flow, and most flows of an ensemble.
@@ -30,11 +30,7 @@ RIM = 0.02
 class Architecture:
     """Sizes of a flow of splines: principal components of the descriptors that it sees, widths of its hidden layers,
     transforms, bins of a spline, part of the components that training leaves out at random, and blocks of descriptors.
-
-    Raises
-    ------
-    ValueError
-        If a size is not a whole number from 1 to `WIDEST`, or a block has another name.
+    Raises ValueError if a size is not a whole number from 1 to `WIDEST`, or a block has another name.
     """
 
     components: int = 32
@@ -55,8 +51,8 @@ class Architecture:
 class Member(nn.Module):
     """One flow of an ensemble: a conditional distribution of the six parameters, in coordinates without bounds.
 
-    Of the mass it is that of what a straight line of the context leaves, by view, in the deviations `width` `(views,)`:
-    the volume fraction tells the mass, and dropout would hide it.
+    The mass is modelled as a straight line of the context, one for each view, plus a remainder of deviation `width`
+    `(views,)`: dropout would hide the volume fraction, which tells the mass.
     """
 
     slope: Tensor
@@ -119,48 +115,23 @@ class Posterior:
     def sample(self, descriptors: Descriptors | np.ndarray, view: str, count: int = 1000, seed: int = 0) -> np.ndarray:
         """Draw parameters `(N, count, 6)` given descriptors `(N, 351)`; `(count, 6)` given one.
 
-        Raises
-        ------
-        ValueError
-            If it was not trained on the view, or descriptors are not finite.
+        Raises ValueError if it was not trained on the view, or descriptors are not finite.
         """
-        rows, single = _rows(descriptors)
+        row = descriptors.vector() if isinstance(descriptors, Descriptors) else np.asarray(descriptors)
+        rows, single = np.atleast_2d(row), row.ndim == 1
         context = self.context(rows, np.full(len(rows), view))
         parts = [len(part) for part in np.array_split(np.arange(count), len(self.members))]
         with torch.random.fork_rng(), torch.no_grad():
             torch.manual_seed(seed)
             draws = [member(context).sample(torch.Size((n,))) for member, n in zip(self.members, parts, strict=True)]
-        free = torch.cat(draws).movedim(0, 1).double().numpy()
-        parameters = self.of_standard(free)
+        standard = torch.cat(draws).movedim(0, 1).double().numpy()
+        parameters = self.from_logits(standard * self.spread + self.centre)
         return parameters[0] if single else parameters
-
-    def log_density(self, parameters: np.ndarray, descriptors: Descriptors | np.ndarray, view: str) -> np.ndarray:
-        """Return the logarithm of the density of parameters `(N, 6)` given descriptors `(N, 351)`, in nats.
-
-        It is -inf outside the box, which is wider by 1/50 on each side than what was drawn.
-
-        Raises
-        ------
-        ValueError
-            As `sample`.
-        """
-        rows, _ = _rows(descriptors)
-        context = self.context(rows, np.full(len(rows), view))
-        free = self.standard(np.atleast_2d(parameters))
-        with torch.no_grad():
-            parts = torch.stack([member(context).log_prob(torch.from_numpy(free).float()) for member in self.members])
-        density = torch.logsumexp(parts, 0).double().numpy() - np.log(len(self.members))
-        share = self._share(np.atleast_2d(parameters))
-        within = ((share > 0) & (share < 1)).all(1)
-        return np.where(within, density - np.log(self.spread).sum() + self._log_slope(share), -np.inf)
 
     def context(self, descriptors: np.ndarray, views: np.ndarray) -> Tensor:
         """Return what the flows see: components of the descriptors and the kind of each view.
 
-        Raises
-        ------
-        ValueError
-            If a view is of another kind, or descriptors are not finite.
+        Raises ValueError if a view is of another kind, or descriptors are not finite.
         """
         unknown = sorted(set(views.tolist()) - set(self.views))
         if unknown:
@@ -170,39 +141,26 @@ class Posterior:
         kinds = views[:, None] == np.array(self.views)
         return torch.from_numpy(np.concatenate([self.compression(descriptors), kinds], axis=1)).float()
 
-    def unbounded(self, parameters: np.ndarray) -> np.ndarray:
-        """Return the logits of the parameters' places in the box."""
-        share = np.clip(self._share(parameters), 1e-6, 1 - 1e-6)
+    def to_logits(self, parameters: np.ndarray) -> np.ndarray:
+        """Return the logits of the parameters' places in the box: numbers without bounds."""
+        low, wide = self._edges
+        share = np.clip((parameters - low) / wide, 1e-6, 1 - 1e-6)
         return np.log(share / (1 - share))
 
-    def bounded(self, free: np.ndarray) -> np.ndarray:
+    def from_logits(self, logits: np.ndarray) -> np.ndarray:
         """Return the parameters of logits."""
         low, wide = self._edges
-        return low + wide / (1 + np.exp(-free))
+        return low + wide / (1 + np.exp(-logits))
 
-    def standard(self, parameters: np.ndarray) -> np.ndarray:
-        """Return the parameters without bounds, in deviations of the shapes that it was trained on."""
-        return (self.unbounded(parameters) - self.centre) / self.spread
-
-    def of_standard(self, standard: np.ndarray) -> np.ndarray:
-        """Return the parameters whose `standard` it is."""
-        return self.bounded(standard * self.spread + self.centre)
-
-    def _share(self, parameters: np.ndarray) -> np.ndarray:
-        """Return the parameters' places in the box, widened by its rim: 0 to 1 within."""
-        low, wide = self._edges
-        return (parameters - low) / wide
+    def standardise(self, parameters: np.ndarray) -> np.ndarray:
+        """Return the parameters' logits, in deviations of the shapes that the posterior was trained on."""
+        return (self.to_logits(parameters) - self.centre) / self.spread
 
     @property
     def _edges(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the least parameters of the box, widened by its rim, and its lengths."""
         low, high = self.box.T
         return low - RIM * (high - low), (1 + 2 * RIM) * (high - low)
-
-    def _log_slope(self, share: np.ndarray) -> np.ndarray:
-        """Return the logarithm of the volume of logits to one of parameters, at shares of the box `(N, 6)`."""
-        share = np.clip(share, 1e-6, 1 - 1e-6)
-        return -np.log(share * (1 - share) * self._edges[1]).sum(1)
 
 
 def save_posterior(posterior: Posterior, path: str | Path) -> None:
@@ -229,31 +187,28 @@ def save_posterior(posterior: Posterior, path: str | Path) -> None:
 def load_posterior(path: str | Path | None = None) -> Posterior:
     """Read a posterior; by default the packaged one.
 
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is not a posterior, is damaged, or has another format version or other blocks.
+    Raises FileNotFoundError if there is no such file, and ValueError if it is not a posterior, is damaged, or has
+    another format version or other blocks.
     """
     if path is None:
-        return POSTERIOR_FILE.read(packaged("posterior.npz"), _posterior, place="the packaged posterior")
-    return POSTERIOR_FILE.read(path, _posterior)
+        return POSTERIOR_FILE.read(open_packaged("posterior.npz"), _from_arrays, place="the packaged posterior")
+    return POSTERIOR_FILE.read(path, _from_arrays)
 
 
-def _posterior(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Posterior:
+def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Posterior:
     """Return the posterior of a file's header and arrays."""
     if not all(np.isfinite(each).all() for each in arrays.values() if each.dtype.kind == "f"):
         raise ValueError("numbers that are not finite")
     sizes = header["architecture"]
     architecture = Architecture(**sizes | {name: tuple(sizes[name]) for name in ("hidden", "blocks")})
-    columns = int(np.isin(column_names(), architecture.blocks).sum())
-    expected = {"mean": (columns,), "scale": (columns,), "basis": (architecture.components, columns)}
+    views = tuple(str(view) for view in header["views"])
+    columns, components = int(np.isin(column_names(), architecture.blocks).sum()), architecture.components
+    expected = {"mean": (columns,), "scale": (columns,), "basis": (components, columns)}
     expected |= {"box": (len(PARAMETERS), 2), "centre": (len(PARAMETERS),), "spread": (len(PARAMETERS),)}
+    expected |= {"emulator.basis": (components, components)}
     for name, shape in expected.items():
         if arrays[name].shape != shape:
             raise ValueError(f"{name} of shape {arrays[name].shape}, not {shape}")
-    views = tuple(str(view) for view in header["views"])
     members = []
     for number in range(check_int(header["members"], "a number of flows", 1, MOST)):
         with torch.random.fork_rng():  # its first weights are drawn, and then replaced
@@ -263,6 +218,11 @@ def _posterior(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Posteri
         member.load_state_dict(state)
         members.append(member)
     compression = Compression(architecture.blocks, arrays["mean"], arrays["scale"], arrays["basis"])
+    mean, spread = (_read_layers(arrays, f"emulator.{name}", len(views), components) for name in ("mean", "spread"))
+    inflation = check_float(header["inflation"], "an emulator's inflation", 1e-3, 1e3)
+    misfits = {view: arrays[f"misfits.{view}"] for view in views}
+    if any(each.ndim != 1 or not len(each) for each in misfits.values()):
+        raise ValueError("misfits that are no columns of numbers")
     return Posterior(
         architecture,
         tuple(members),
@@ -271,46 +231,21 @@ def _posterior(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Posteri
         arrays["box"],
         arrays["centre"],
         arrays["spread"],
-        _emulator(compression, views, arrays, header["inflation"]),
-        {view: _column(arrays[f"misfits.{view}"]) for view in views},
+        Emulator(compression, views, arrays["box"], mean, spread, arrays["emulator.basis"], inflation),
+        misfits,
         header["provenance"],
     )
 
 
-def _emulator(
-    compression: Compression, views: tuple[str, ...], arrays: dict[str, np.ndarray], inflation: float
-) -> Emulator:
-    components = len(compression.basis)
-    layers = {
-        name: _read_layers(arrays, f"emulator.{name}", len(PARAMETERS) + len(views)) for name in ("mean", "spread")
-    }
-    for name, each in layers.items():
-        if each[-1].weight.shape[1] != components:
-            raise ValueError(f"networks of the emulator's {name} with {each[-1].weight.shape[1]} outputs")
-    if (basis := arrays["emulator.basis"]).shape != (components, components):
-        raise ValueError(f"emulator.basis of shape {basis.shape}, not {(components, components)}")
-    inflation = check_float(inflation, "an emulator's inflation", 1e-3, 1e3)
-    return Emulator(compression, views, arrays["box"], layers["mean"], layers["spread"], basis, inflation)
-
-
-def _read_layers(arrays: dict[str, np.ndarray], name: str, inputs: int) -> tuple[Layer, ...]:
+def _read_layers(arrays: dict[str, np.ndarray], name: str, views: int, outputs: int) -> tuple[Layer, ...]:
     """Return the layers (member, out, in) of an ensemble; raise ValueError where their shapes do not chain."""
     count = sum(key.startswith(f"{name}.") for key in arrays) // 2
     layers = [Layer(arrays[f"{name}.{k}.weight"], arrays[f"{name}.{k}.bias"]) for k in range(count)]
+    inputs = len(PARAMETERS) + views
     for weight, bias in layers:
         if weight.ndim != 3 or weight.shape[2] != inputs or bias.shape != weight.shape[:2]:
             raise ValueError(f"{name} with layers of shapes {weight.shape} and {bias.shape} for {inputs} inputs")
         inputs = weight.shape[1]
+    if inputs != outputs:
+        raise ValueError(f"{name} with {inputs} outputs, not {outputs}")
     return tuple(layers)
-
-
-def _column(values: np.ndarray) -> np.ndarray:
-    if values.ndim != 1 or not len(values):
-        raise ValueError(f"misfits of shape {values.shape}")
-    return np.sort(values)
-
-
-def _rows(descriptors: Descriptors | np.ndarray) -> tuple[np.ndarray, bool]:
-    """Return descriptors as rows, and whether there was one without a leading axis."""
-    row = descriptors.vector() if isinstance(descriptors, Descriptors) else np.asarray(descriptors)
-    return np.atleast_2d(row), row.ndim == 1

@@ -87,17 +87,14 @@ def simulate_draws(
 ) -> Simulations:
     """Grow a shape from each of some of a posterior's draws `(n, 6)`, each with a seed of its own.
 
+    Raises ValueError if the count is not from 1 to the number of draws.
+
     Parameters
     ----------
     count
         Number of draws that are simulated.
     seed
         The k-th simulation has the seed `seed` + k.
-
-    Raises
-    ------
-    ValueError
-        If the count is not from 1 to the number of draws.
     """
     count = check_int(count, "a number of simulations", 1, len(draws))
     chosen = draws[np.random.default_rng(seed).choice(len(draws), count, replace=False)]

@@ -84,6 +84,8 @@ def stationarity(
     vector. Levenberg and Marquardt's method, by optimistix, in float64. m₀ is the field's mean.
 
     The deviations are a jackknife over octants: they hold what varies over the box, not a bias common to all of it.
+    Raises ValueError if the field is not finite, has another shape than the grid, or is a crop under 24 voxels along an
+    axis.
 
     Parameters
     ----------
@@ -93,11 +95,6 @@ def stationarity(
         Coefficients to start from besides the total least squares solution.
     seed
         Of the noise that is propagated.
-
-    Raises
-    ------
-    ValueError
-        If the field is not finite, has another shape than the grid, or is a crop under 24 voxels along an axis.
     """
     values = torch.as_tensor(u).detach().to("cpu", torch.float64)
     if tuple(values.shape) != grid.shape:
@@ -120,7 +117,7 @@ def stationarity(
     deviations = np.sqrt((n - 1) / n * ((replicas - replicas.mean(0)) ** 2).sum(0))
     status = _status(coefficients, deviations, fixed, float(size * residuals.min()), is_rounded(values.numpy()))
     progress("solved", 1.0)
-    uncertainty = dict(zip(NAMES, map(float, deviations), strict=True))
+    uncertainty = {str(name): float(d) for name, d in zip(NAMES, deviations, strict=True)}
     return Candidate("stationarity", coefficients, float(values.mean()), uncertainty, status=status)
 
 
@@ -267,7 +264,7 @@ def unit_factors(epsilon: float) -> np.ndarray:
 
 
 def fix_gauge(values: np.ndarray) -> tuple[Coefficients, int]:
-    """Return the coefficients over the one that fixes the scale, and its number: a20, or a02 where a20 is far smaller."""
+    """Return the coefficients over a20, or over a02 where a20 is far smaller; and which of the six that is."""
     fixed = 0 if values[0] > 1e-3 * values[2] else 2
     return Coefficients(*(float(value) for value in values / values[fixed])), fixed
 

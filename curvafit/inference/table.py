@@ -38,10 +38,10 @@ WINDOW = 0.75
 SCALES = (0.5, 2.0)
 #: A degraded scan: deviation of the blur in voxels, contrast over the noise's deviation, and voxels a slice is thick.
 BLUR, SNR, SLICE = 1.0, 5.0, 2
-#: Blocks of lengths and parts, whose logarithm is taken; and least value of which it is.
+#: Blocks whose logarithm is taken, and the least value that goes into it.
 LOGARITHMIC = ("fraction", "chords", "gaps", "depths", "clearances")
 LEAST = 1e-3
-#: Densities of ∫H and χ are sinh of what is compressed, in these units; that of area is its exponential.
+#: Of the densities of ∫H and χ, in these units, the inverse sinh is taken.
 BENDS, EULERS = 50.0, 100.0
 #: Furthest that a column may lie from its mean, in its deviations.
 FURTHEST = 6.0
@@ -51,9 +51,11 @@ WEIGHTS = {"curvature": 3.0}
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """N views of shapes: `shapes` and `views` name them (str, `(N,)`); `parameters` is `(N, 6)` (`PARAMETERS`),
-    `descriptors` `(N, 351)` the blocks of `Descriptors` in their order, NaN where a view shows no surface.
-    `provenance` says which stores and program made them."""
+    """Descriptors of N views of shapes, and the parameters of the shapes.
+
+    `shapes` and `views` name them (str, `(N,)`); `parameters` is `(N, 6)` (`PARAMETERS`); `descriptors` `(N, 351)` has
+    the blocks of `Descriptors` in their order, NaN where a view shows no surface.
+    """
 
     shapes: np.ndarray
     views: np.ndarray
@@ -76,14 +78,8 @@ class Table:
         i = np.asarray(chosen)
         return Table(self.shapes[i], self.views[i], self.parameters[i], self.descriptors[i], self.provenance)
 
-    def of(self, views: Sequence[str]) -> Table:
-        """Return the rows of some kinds of views.
-
-        Raises
-        ------
-        ValueError
-            If there is none of a kind.
-        """
+    def select_views(self, views: Sequence[str]) -> Table:
+        """Return the rows of some kinds of views; raise ValueError if there is none of a kind."""
         kinds = set(self.views.tolist())
         if missing := [view for view in views if view not in kinds]:
             raise ValueError(f"expected views among {', '.join(sorted(kinds))}, got {', '.join(missing)}")
@@ -98,10 +94,7 @@ class Table:
 def parameters_of(law: Coefficients, mass: float) -> np.ndarray:
     """Return the six parameters of a law and a mass m₀, in the gauge a20 = 1 (`PARAMETERS`).
 
-    Raises
-    ------
-    ValueError
-        If a20 or a02 is not above 0.
+    Raises ValueError if a20 or a02 is not above 0.
     """
     a20, a11, a02, a10, a01, a00 = law
     if not (a20 > 0 and a02 > 0):
@@ -145,22 +138,18 @@ def save_table(table: Table, path: str | Path) -> None:
 def load_table(path: str | Path) -> Table:
     """Read a table of descriptors.
 
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is not a table, is damaged, or has another format version or other blocks.
+    Raises FileNotFoundError if there is no such file, and ValueError if it is not a table, is damaged, or has another
+    format version or other blocks.
     """
-    return TABLE_FILE.read(path, _table)
+    return TABLE_FILE.read(path, _from_arrays)
 
 
-def packaged(name: str) -> io.BytesIO:
+def open_packaged(name: str) -> io.BytesIO:
     """Return a file of this package, in `inference/data`, as an open file."""
     return io.BytesIO((importlib.resources.files("curvafit.inference") / "data" / name).read_bytes())
 
 
-def _table(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Table:
+def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Table:
     """Return the table of a file's header and arrays."""
     shapes, views = (np.array(each, dtype=str) for each in json.loads(arrays["names"].tobytes()))
     if not np.isfinite(arrays["parameters"]).all():
@@ -177,17 +166,17 @@ class View(NamedTuple):
     grid: Grid
 
 
-def field(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
+def see_field(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
     """Return the phase field itself."""
     return View(u, grid)
 
 
-def mask(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
+def see_mask(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
     """Return {u > 0} on the field's own voxels."""
     return View(u > 0, grid)
 
 
-def crop(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
+def see_crop(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
     """Return {u > 0} in a window of three quarters of each side, anywhere in the repeated box."""
     turned = np.roll(u > 0, [int(rng.integers(n)) for n in u.shape], (0, 1, 2))
     nz, ny, nx = (round(WINDOW * n) for n in u.shape)
@@ -197,12 +186,12 @@ def crop(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
     return View(part, Grid((nz, ny, nx), grid.spacing, "replicate"))
 
 
-def resampled(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
-    """Return a crop that was a mask on other voxels, on which it was 5 to 16 thick, brought back by signed distances.
+def see_resampled(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
+    """Return a crop resampled to other voxels, on which it is 5 to 16 thick, and back, by signed distances.
 
-    Back on the voxels of the field, as a scan's mask is brought to the working grid.
+    A scan's mask is brought to the working grid in the same way.
     """
-    part, window = crop(u, grid, rng)
+    part, window = see_crop(u, grid, rng)
     thickness = _thickness(part)
     scale = float(np.clip(thickness / math.exp(rng.uniform(*np.log(KEPT_THICKNESS))), *SCALES))
     coarse = [round(n / scale) for n in part.shape]
@@ -213,17 +202,17 @@ def resampled(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
     return View(remove_specks(back, smallest_piece(thickness), False)[0], window)
 
 
-def scan(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
+def see_scan(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
     """Return a crop scanned badly, split by Otsu's threshold: blurred, slices two voxels thick, noise at SNR 5.
 
     Prepared as `infer` prepares an image: smoothed by a voxel, split, interpolated to cubic voxels, cleared of specks.
     """
-    part, window = crop(u, grid, rng)
-    inside = split(degraded(part, rng), part.shape)
+    part, window = see_crop(u, grid, rng)
+    inside = split(_degrade(part, rng), part.shape)
     return View(remove_specks(inside, smallest_piece(_thickness(inside)), False)[0], window)
 
 
-def degraded(part: np.ndarray, rng: np.random.Generator) -> Field:
+def _degrade(part: np.ndarray, rng: np.random.Generator) -> Field:
     """Return a mask as a bad scan shows it: blurred, slices two voxels thick, noise at SNR 5."""
     grey = ndimage.gaussian_filter(part.astype(np.float32), BLUR, mode="nearest")
     whole = np.pad(grey, ((0, -len(grey) % SLICE), (0, 0), (0, 0)), mode="edge")
@@ -244,11 +233,11 @@ def _thickness(part: np.ndarray) -> float:
 
 #: Views by name.
 VIEWS: dict[str, Callable[[np.ndarray, Grid, np.random.Generator], View]] = {
-    "field": field,
-    "mask": mask,
-    "crop": crop,
-    "resampled": resampled,
-    "scan": scan,
+    "field": see_field,
+    "mask": see_mask,
+    "crop": see_crop,
+    "resampled": see_resampled,
+    "scan": see_scan,
 }
 
 
@@ -268,10 +257,11 @@ class Compression:
 
 
 def compression_of(descriptors: np.ndarray, components: int, blocks: tuple[str, ...] = tuple(BLOCKS)) -> Compression:
-    """Return the principal components of some descriptors: columns in deviations (the curvature block in one for all
-    its columns, as its distance asks), blocks in `WEIGHTS`.
+    """Return the compression to the principal components of some descriptors.
 
-    A component's deviation is the square root of what it would be in the columns, and the components' mean square is 1.
+    Columns are scaled to deviation 1 (those of the curvature block by one factor, so that distances stay), and blocks
+    weighed by `WEIGHTS`. A component's deviation is the root of its own in those columns: the first do not drown the
+    others. The components' mean square is 1.
     """
     names = np.array(column_names())
     names = names[np.isin(names, blocks)]

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import itertools
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from curvafit.core.checks import check_int, check_seed
-from curvafit.core.runtime import Progress, silent
+from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.inference.emulator import FAINTEST, Emulator, Layer, misfits
 from curvafit.inference.posterior import MASS, MOST, Architecture, Member, Posterior
 from curvafit.inference.table import PARAMETERS, Compression, Table, compression_of
@@ -48,14 +49,8 @@ class Plan(NamedTuple):
     patience: int
 
 
-class Plans(NamedTuple):
-    """How the flows of a posterior learn, and how the networks of its emulator do."""
-
-    flows: Plan = Plan(1e-3, 1e-3, 300, 20)
-    emulator: Plan = Plan(3e-3, 1e-2, 200, 15)
-
-
-PLANS = Plans()
+#: How the flows of a posterior learn, and how the networks of its emulator do.
+PLANS = (Plan(1e-3, 1e-3, 300, 20), Plan(3e-3, 1e-2, 200, 15))
 
 
 def train_posterior(
@@ -64,13 +59,14 @@ def train_posterior(
     *,
     members: int = 4,
     seed: int = 0,
-    plans: Plans | None = None,
+    plans: tuple[Plan, Plan] | None = None,
     progress: Progress = silent,
 ) -> Posterior:
     """Fit an ensemble of flows to the parameters of a table's rows, and an emulator to the descriptors.
 
     Each member starts from other weights, and stops where the likelihood of its own tenth of the shapes, which it does
-    not learn from, is highest: all views of a shape are on one side.
+    not learn from, is highest: all views of a shape are on one side. Raises ValueError if the table has too few shapes,
+    or a parameter that does not vary, or an argument is out of range.
 
     Parameters
     ----------
@@ -81,14 +77,9 @@ def train_posterior(
     members
         Number of flows.
     plans
-        How long and how fast networks learn; by default `PLANS`.
+        How the flows and the emulator's networks learn; by default `PLANS`.
     progress
         Called after each epoch with a sentence and the share of the epochs that are done at most.
-
-    Raises
-    ------
-    ValueError
-        If the table has too few shapes, or a parameter that does not vary, or an argument is out of range.
     """
     members, seed = check_int(members, "a number of flows", 1, MOST), check_seed(seed)
     sizes, table = architecture or Architecture(), table.visible
@@ -100,20 +91,17 @@ def train_posterior(
     if fixed := [name for name, (low, high) in zip(PARAMETERS, box, strict=True) if low == high]:
         raise ValueError(f"expected shapes whose parameters all vary, got {', '.join(fixed)} the same in all")
     compression = compression_of(table.descriptors, sizes.components, sizes.blocks)
-    part = EMULATOR_PART
-
-    def first(text: str, share: float) -> None:
-        progress(text, part * share)
-
-    plans = plans or PLANS
-    emulator, left = train_emulator(table, compression, box, seed=seed, plan=plans.emulator, progress=first)
-    posterior = Posterior(
-        sizes, (), compression, views, box, np.zeros(len(PARAMETERS)), np.ones(len(PARAMETERS)), emulator, left,
-        _provenance(table, len(shapes), members, seed),
-    )  # fmt: skip
-    free = posterior.unbounded(table.parameters)
-    centre, spread = free.mean(0), free.std(0)
-    target = torch.from_numpy((free - centre) / spread).float()
+    flow_plan, emulator_plan = plans or PLANS
+    part = sub_progress(progress, 0.0, EMULATOR_PART)
+    emulator, left = train_emulator(table, compression, box, seed=seed, plan=emulator_plan, progress=part)
+    provenance = {
+        "table": table.provenance, "shapes": len(shapes), "rows": len(table), "members": members, "seed": seed,
+    }  # fmt: skip
+    zero, one = np.zeros(len(PARAMETERS)), np.ones(len(PARAMETERS))
+    posterior = Posterior(sizes, (), compression, views, box, zero, one, emulator, left, provenance)
+    logits = posterior.to_logits(table.parameters)
+    centre, spread = logits.mean(0), logits.std(0)
+    target = torch.from_numpy((logits - centre) / spread).float()
     context = posterior.context(table.descriptors, table.views)
     flows = []
     for k in range(members):
@@ -121,27 +109,29 @@ def train_posterior(
         holdout = rng.permutation(len(shapes))[: max(1, round(VALIDATION * len(shapes)))]
         validation = torch.from_numpy(np.isin(number, holdout))
 
-        def report(text: str, share: float, k: int = k) -> None:
-            """Say how far a member is, as part of them all."""
-            progress(f"member {k + 1} of {members}: {text}", part + (1 - part) * (k + share) / members)
-
+        part = sub_progress(progress, *(EMULATOR_PART + (1 - EMULATOR_PART) * end / members for end in (k, k + 1)))
         with torch.random.fork_rng():
             torch.manual_seed(int(rng.integers(2**31)))
-            flows.append(_fit(Member(sizes, len(views)), context, target, validation, plans.flows, report))
+            flow = Member(sizes, len(views))
+            flows.append(_fit(flow, context, target, validation, flow_plan, f"member {k + 1} of {members}", part))
     return dataclasses.replace(posterior, members=tuple(flows), centre=centre, spread=spread)
 
 
-def _fit(member: Member, context: Tensor, target: Tensor, validation: Tensor, plan: Plan, progress: Progress) -> Member:
+def _fit(
+    member: Member, context: Tensor, target: Tensor, validation: Tensor, plan: Plan, name: str, progress: Progress
+) -> Member:
     """Fit a flow to all rows but those of a mask, and return it as it was where the likelihood of those was highest."""
     _draw_lines(member, context[~validation], target[~validation, MASS])
     rows = int((~validation).sum())
-    epochs = min(plan.epochs, STEPS * batch_of(rows) // rows + 1)
+    epochs = min(plan.epochs, STEPS * batch_size(rows) // rows + 1)
+
+    def nats(member: Member, context: Tensor, target: Tensor) -> Tensor:
+        return -member(context).log_prob(target).mean()
 
     def report(epoch: int, best: float) -> None:
-        """Say which epoch has ended."""
-        progress(f"epoch {epoch}, {best:.3f} nats", epoch / epochs)
+        progress(f"{name}: epoch {epoch}, {best:.3f} nats", epoch / epochs)
 
-    return learn(member, (context, target), validation, _nats, plan._replace(epochs=epochs), report)
+    return learn(member, (context, target), validation, nats, plan._replace(epochs=epochs), report)
 
 
 def _draw_lines(member: Member, context: Tensor, mass: Tensor) -> None:
@@ -153,36 +143,20 @@ def _draw_lines(member: Member, context: Tensor, mass: Tensor) -> None:
         member.slope[view], member.width[view] = slope, (y - x @ slope).std()
 
 
-def _nats(member: Member, context: Tensor, target: Tensor) -> Tensor:
-    """Return the mean negative logarithm of the density of parameters."""
-    return -member(context).log_prob(target).mean()
-
-
-def _provenance(table: Table, shapes: int, members: int, seed: int) -> dict[str, Any]:
-    """Return what a posterior's file says of its training."""
-    return {"table": table.provenance, "shapes": shapes, "rows": len(table), "members": members, "seed": seed}
-
-
-class Trained(NamedTuple):
-    """An emulator, and by view what it leaves unexplained of shapes that its networks did not learn from: sums of
-    squares, of `REFERENCE` rows at most, as `emulator.misfits` has them."""
-
-    emulator: Emulator
-    misfits: dict[str, np.ndarray]
-
-
 def train_emulator(
     table: Table,
     compression: Compression,
     box: np.ndarray,
     *,
     seed: int = 0,
-    plan: Plan = PLANS.emulator,
+    plan: Plan = PLANS[1],
     progress: Progress = silent,
-) -> Trained:
+) -> tuple[Emulator, dict[str, np.ndarray]]:
     """Fit networks to the compressed descriptors of a table's rows, given their parameters.
 
-    Other networks are fitted to the deviations of what the first miss of shapes that they did not learn from.
+    Other networks are fitted to the deviations of what the first miss of shapes that they did not learn from. Returned
+    as well, by view: what the emulator leaves unexplained of such shapes, sums of squares as of `emulator.misfits`, of
+    `REFERENCE` rows at most.
     """
     views = tuple(sorted(set(table.views.tolist())))
     target = compression(table.descriptors)
@@ -196,16 +170,13 @@ def train_emulator(
         inputs[mine] = blank.inputs(table.parameters[mine], view)
     x, y = torch.from_numpy(inputs).float(), torch.from_numpy(target).float()
 
-    def report(first: float) -> Callable[[int], Progress]:
-        return lambda k: lambda text, share: progress(f"emulator, {text}", first + (k + share) / FOLDS / 2)
-
-    means = _ensemble(x, y, part, _squares, plan, seed, report(0.0))
-    missed = y - _held_out(means, x, part)
+    means = _train_ensemble(x, y, part, _mean_square, plan, seed, sub_progress(progress, 0.0, 0.5))
+    missed = y - _predict_held_out(means, x, part)
     values, vectors = np.linalg.eigh(np.cov(missed.double().numpy().T))
     basis = (vectors / np.sqrt(np.maximum(values, 1e-9 * values.max()))).T[::-1].astype(np.float32)
     whitened = missed @ torch.from_numpy(basis).T
-    spreads = _ensemble(x, whitened, part, _normal_nats, plan, seed, report(0.5))
-    deviation = torch.exp(_held_out(spreads, x, part)).clamp(min=FAINTEST)
+    spreads = _train_ensemble(x, whitened, part, _normal_nats, plan, seed, sub_progress(progress, 0.5, 1.0))
+    deviation = torch.exp(_predict_held_out(spreads, x, part)).clamp(min=FAINTEST)
     emulator = Emulator(compression, views, box, _layers(means), _layers(spreads), basis, 1.0)
     left = (whitened / deviation).double().numpy()
     emulator = dataclasses.replace(emulator, inflation=_inflation(emulator, table, left))
@@ -214,7 +185,7 @@ def train_emulator(
     if not least:
         raise ValueError(f"expected many shapes in each of the views {', '.join(views)}, got few in one")
     left = [[_misfits(emulator, k, table.rows(parts[k][:least])) for k in range(FOLDS)] for parts in rows]
-    return Trained(emulator, {view: np.sort(np.concatenate(each)) for view, each in zip(views, left, strict=True)})
+    return emulator, {view: np.sort(np.concatenate(each)) for view, each in zip(views, left, strict=True)}
 
 
 def _misfits(emulator: Emulator, number: int, rows: Table) -> np.ndarray:
@@ -228,8 +199,10 @@ def _misfits(emulator: Emulator, number: int, rows: Table) -> np.ndarray:
 
 
 def _inflation(emulator: Emulator, table: Table, left: np.ndarray) -> float:
-    """Return the mean square of what is left along the directions of the parameters, each as firm as it is with a prior
-    of deviation 1, over what it would be if all that is left were uncorrelated."""
+    """Return how much more than uncorrelated residuals `left` move the best parameters: the ratio of mean squares.
+
+    Parameters move along the derivatives of the mean, and are held by a prior of deviation 1.
+    """
     squared, expected = 0.0, 0.0
     for view in emulator.views:
         mine = table.views == view
@@ -242,7 +215,7 @@ def _inflation(emulator: Emulator, table: Table, left: np.ndarray) -> float:
     return float(squared / expected)
 
 
-def _squares(network: nn.Module, x: Tensor, target: Tensor) -> Tensor:
+def _mean_square(network: nn.Module, x: Tensor, target: Tensor) -> Tensor:
     """Return the mean square of what a network's outputs miss."""
     return (network(x) - target).square().mean()
 
@@ -253,38 +226,31 @@ def _normal_nats(network: nn.Module, x: Tensor, target: Tensor) -> Tensor:
     return (0.5 * (target * torch.exp(-output)).square() + output).mean()
 
 
-def _ensemble(
+def _train_ensemble(
     x: Tensor,
     y: Tensor,
     part: np.ndarray,
     cost: Callable[[nn.Module, Tensor, Tensor], Tensor],
     plan: Plan,
     seed: int,
-    progress: Callable[[int], Progress],
+    progress: Progress,
 ) -> list[nn.Sequential]:
     """Return networks; each learns until its own part of the rows, which it does not learn from, is fit best."""
-    networks = []
+    sizes, networks = (x.shape[1], *HIDDEN), []
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         for k in range(FOLDS):
-            network, own = _network(x.shape[1], y.shape[1]), torch.from_numpy(part == k)
-            networks.append(learn(network, (x, y), own, cost, plan, _epochs(progress(k), plan.epochs)))
+
+            def report(epoch: int, _: float, k: int = k) -> None:
+                progress(f"emulator, epoch {epoch}", (k + epoch / plan.epochs) / FOLDS)
+
+            layers = [each for n, m in itertools.pairwise(sizes) for each in (nn.Linear(n, m), nn.SiLU())]
+            network = nn.Sequential(*layers, nn.Linear(HIDDEN[-1], y.shape[1]))
+            networks.append(learn(network, (x, y), torch.from_numpy(part == k), cost, plan, report))
     return networks
 
 
-def _epochs(progress: Progress, epochs: int) -> Callable[[int, float], None]:
-    """Return what reports epochs as progress."""
-    return lambda epoch, _: progress(f"epoch {epoch}", epoch / epochs)
-
-
-def _network(inputs: int, outputs: int) -> nn.Sequential:
-    """Return a network as it is before it learns."""
-    sizes = (inputs, *HIDDEN)
-    layers = [layer for n, m in zip(sizes, HIDDEN, strict=False) for layer in (nn.Linear(n, m), nn.SiLU())]
-    return nn.Sequential(*layers, nn.Linear(HIDDEN[-1], outputs))
-
-
-def _held_out(networks: list[nn.Sequential], x: Tensor, part: np.ndarray) -> Tensor:
+def _predict_held_out(networks: list[nn.Sequential], x: Tensor, part: np.ndarray) -> Tensor:
     """Return each row's outputs by the network that did not learn from it."""
     with torch.no_grad():
         outputs = torch.stack([network(x) for network in networks])
@@ -303,7 +269,7 @@ def _layers(networks: list[nn.Sequential]) -> tuple[Layer, ...]:
     )
 
 
-def batch_of(rows: int) -> int:
+def batch_size(rows: int) -> int:
     """Return how many rows of a table a step sees."""
     return min(max(rows // PACE, BATCH[0]), BATCH[1])
 
@@ -333,7 +299,7 @@ def learn(
     best, state, waited = np.inf, copy.deepcopy(network.state_dict()), 0
     for epoch in range(plan.epochs):
         network.train()
-        for chosen in torch.randperm(len(x)).split(batch_of(len(x))):
+        for chosen in torch.randperm(len(x)).split(batch_size(len(x))):
             optimiser.zero_grad()
             cost(network, x[chosen], y[chosen]).backward()
             nn.utils.clip_grad_norm_(network.parameters(), STEEPEST)

@@ -147,8 +147,9 @@ def measure(
 
     Volume fraction, thickness, spacing, connectivity, surface and fabric are those of the structure on the scan's own
     voxels, all of them. Curvature is that of the scan on the working grid, as `infer` reads it. Intervals are 95 %, by
-    a jackknife over blocks of a period (thickness and spacing) of the structure (`errors`); a scan with
-    fewer than eight has none.
+    a jackknife over blocks of a period (thickness and spacing) of the structure (`errors`); a scan with fewer than
+    eight has none. Raises ValueError if the scan has no structure, or none that the voxels resolve; or as
+    `curvafit.load`, and FileNotFoundError if there is no such file.
 
     Parameters
     ----------
@@ -158,13 +159,6 @@ def measure(
         As in `infer`.
     reading
         Options of reading a file, or the place of an array: see `curvafit.load`.
-
-    Raises
-    ------
-    ValueError
-        If the scan has no structure, or none that the voxels resolve; or as `curvafit.load`.
-    FileNotFoundError
-        If there is no such file.
     """
     check_options(kind, threshold, reading.get("label"))
     field = field_of(scan, **reading)

@@ -174,8 +174,10 @@ def prepare(
     A mask is a volume of two values, a phase field a float volume with plateaus near ±1, anything else an image: it is
     smoothed (Gaussian, one voxel of the finest axis) and thresholded. The grid is kept where it is a phase field's, or
     isotropic with a median thickness of 5 to 16 voxels; else it is resampled to a thickness of 8: images as smoothed
-    grey levels, masks as signed distances. Thickness is the local thickness (`morphometry.local_thickness`), its
-    median over the structure's surface. Specks and pinholes smaller than a ball of half that diameter are dropped.
+    grey levels, masks as signed distances. Thickness is the local thickness (`morphometry.local_thickness`), its median
+    over the structure's surface. Specks and pinholes smaller than a ball of half that diameter are dropped. Raises
+    ScanError if there is no structure, nothing else, no surface, or nothing at least 3 voxels thick; or if `roi` or
+    `threshold` do not fit the scan.
 
     Parameters
     ----------
@@ -191,12 +193,6 @@ def prepare(
         The structure is the dark phase (of a mask: its lower value; of a field: where it is negative).
     roi
         Nonzero where the scan counts (array, field or file of the scan's shape).
-
-    Raises
-    ------
-    ScanError
-        If there is no structure, nothing else, no surface, or nothing at least 3 voxels thick; or if `roi` or
-        `threshold` do not fit the scan.
     """
     region = region_of_interest(roi, field)
     where, notes = bounding_box(field.shape, region, LARGEST_SCAN)

@@ -78,11 +78,7 @@ def find_level(
     """Find the structure of a scan; the parameters are as in `prepare.prepare`.
 
     `extremes` are the lowest and highest value of the whole that `field` is a part of: they tell a mask's two values.
-
-    Raises
-    ------
-    ScanError
-        If the kind or threshold fits nothing in the scan, or a phase is empty.
+    Raises ScanError if the kind or threshold fits nothing in the scan, or a phase is empty.
     """
     if kind not in ("auto", "field", "mask", "image"):
         raise ScanError(f"expected kind auto, field, mask or image, got {kind!r}")
@@ -120,10 +116,7 @@ def check_options(kind: str, threshold: float | str, label: int | None) -> None:
 def region_of_interest(roi: Field | np.ndarray | str | os.PathLike[str] | None, field: Field) -> np.ndarray | None:
     """Return where the scan counts: a mask of its shape, or None for everywhere.
 
-    Raises
-    ------
-    ScanError
-        If the mask is empty or of another shape.
+    Raises ScanError if the mask is empty or of another shape.
     """
     if roi is None:
         return None
@@ -264,7 +257,8 @@ class Quality:
         """Scan a periodic mask as this scan was made, and return the mask that comes back.
 
         The mask is blurred, sampled on the scan's voxels, made noisy, and prepared as an image is: smoothed, split by
-        Otsu's threshold, brought back to its own grid, cleared of specks.
+        Otsu's threshold, brought back to its own grid, cleared of specks. Raises ScanError if nothing is left to be
+        split.
 
         Parameters
         ----------
@@ -276,11 +270,6 @@ class Quality:
             Volume, in working voxels, of the smallest piece that is kept.
         seed
             Of the noise.
-
-        Raises
-        ------
-        ScanError
-            If nothing is left to be split.
         """
         shape, voxel = _sampling(mask.shape, scale)
         filled = np.clip(centre_distance(mask, (1.0, 1.0, 1.0), 2.0, periodic=True) + 0.5, 0, 1)
@@ -326,7 +315,7 @@ def measure_quality(image: np.ndarray, mask: np.ndarray, spacing: tuple[float, f
     (least squares over `_BLURS` and `_SHIFTS`); thin structures come out too fat where noise shifts the threshold. The
     noise is the deviation of grey levels deep within the phases, less uneven lighting. Where nothing lies deep, the
     noise is taken for white and read from second differences along three axes, which neither structure nor lighting
-    passes (Immerkær 1996).
+    passes (Immerkær 1996). Raises ScanError if the grey levels have no contrast between structure and background.
 
     Parameters
     ----------
@@ -334,11 +323,6 @@ def measure_quality(image: np.ndarray, mask: np.ndarray, spacing: tuple[float, f
         `(Z, Y, X)`: grey levels.
     mask
         Bool, same shape: the structure.
-
-    Raises
-    ------
-    ScanError
-        If the grey levels have no contrast between structure and background.
     """
     box = next(iter(boxes_by_surface(surface_voxels(mask), _MEASURED)), (slice(None),) * 3)
     image, mask = image[box].astype(np.float32), mask[box]

@@ -44,12 +44,8 @@ def rows_of(measures: Measures) -> list[dict[str, Any]]:
 def check_table(path: str | PathLike[str], inputs: Sequence[str | Path] = (), overwrite: bool = False) -> Path:
     """Return the path of a table that may be written.
 
-    Raises
-    ------
-    ValueError
-        If the suffix is another, or the file is an input or of another origin, without `overwrite`.
-    ImportError
-        If a Parquet table is to be written without pandas and pyarrow.
+    Raises ValueError if the suffix is another, or the file is an input or of another origin, without `overwrite`, and
+    ImportError if a Parquet table is to be written without pandas and pyarrow.
     """
     target = Path(path)
     if target.suffix.lower() not in SUFFIXES:
@@ -62,10 +58,7 @@ def check_table(path: str | PathLike[str], inputs: Sequence[str | Path] = (), ov
 def write_table(measures: Sequence[Measures], path: str | PathLike[str], *, overwrite: bool = False) -> Path:
     """Write a table of scans as `.csv`, `.json` or `.parquet`, and return its path.
 
-    Raises
-    ------
-    ValueError, ImportError
-        As `check_table`.
+    Raises ValueError or ImportError as `check_table`.
     """
     target = check_table(path, overwrite=overwrite)
     rows = [row for each in measures for row in rows_of(each)]

@@ -35,7 +35,7 @@ class Linear:
         )
         return BOX.mean(1) + (scaled + noise) * (HIGH - LOW) / np.sqrt(12)
 
-    def standard(self, parameters: np.ndarray) -> np.ndarray:
+    def standardise(self, parameters: np.ndarray) -> np.ndarray:
         return (parameters - BOX.mean(1)) / ((HIGH - LOW) / np.sqrt(12))
 
 

@@ -21,7 +21,7 @@ from curvafit.inference.candidates import (
     Misfit,
     Twin,
     best_candidate,
-    differences,
+    find_differences,
     seed_noise_of,
     verdict,
 )
@@ -73,16 +73,16 @@ def test_seed_noise_is_the_best_one_s_or_another_s() -> None:
 def test_what_grew_is_measured_against_the_scan() -> None:
     """One twin is the scan itself: the mean distance is half the twins' own."""
     scan, other = (Diagram(np.array([point]), np.ones(1)) for point in ((3.0, 1.0), (9.0, -2.0)))
-    both = law("simulation").grown(scan, (twin(scan, -0.5), twin(None, 0.0), twin(other, -0.25)))
+    both = law("simulation").compare(scan, (twin(scan, -0.5), twin(None, 0.0), twin(other, -0.25)))
     assert both.seed_noise is not None and both.distance == pytest.approx(both.seed_noise / 2) and both.distance > 1
     assert (both.mass, both.twins, both.status) == (-0.375, (NUMBERS, NUMBERS), "")
-    three = law("simulation").grown(scan, (twin(scan, -0.5), twin(other, -0.25), twin(other, -0.25)))
+    three = law("simulation").compare(scan, (twin(scan, -0.5), twin(other, -0.25), twin(other, -0.25)))
     assert three.seed_noise == pytest.approx(2 / 3 * both.seed_noise)  # of three pairs, two differ
-    over = law("simulation").grown(scan, (twin(scan, -1.002), twin(scan, -1.001)))
+    over = law("simulation").compare(scan, (twin(scan, -1.002), twin(scan, -1.001)))
     assert -1 < over.mass < -0.999  # a rare structure's field lies below -1 in the mean, and a fit holds no such mass
-    one = law("simulation").grown(scan, (twin(scan, -0.5),))
+    one = law("simulation").compare(scan, (twin(scan, -0.5),))
     assert (one.distance, one.seed_noise, one.twins) == (0.0, None, (NUMBERS,))
-    none = law("simulation", status="Hm.").grown(scan, (twin(None, 0.0),))
+    none = law("simulation", status="Hm.").compare(scan, (twin(None, 0.0),))
     assert none == law("simulation", status="Hm. No shape grew: the field is of one phase.")
 
 
@@ -184,22 +184,28 @@ def test_few_tunnels_may_differ_by_the_root_of_their_count() -> None:
     ):
         scan = dataclasses.replace(NUMBERS, euler=1 - tunnels)
         other = dataclasses.replace(scan, connectivity_density=ratio * scan.connectivity_density)
-        assert differences(scan, (other,)) == words
+        assert find_differences(scan, (other,)) == words
 
 
 def test_familiar_numbers_that_differ_are_named() -> None:
     """Where all twins differ by more than 15 %, the same way; none that the scan does not have."""
     near = dataclasses.replace(NUMBERS, thickness_mean=1.14 * NUMBERS.thickness_mean)
-    assert differences(NUMBERS, (NUMBERS, near)) == differences(NUMBERS, (near,)) == differences(NUMBERS, ()) == []
+    assert (
+        find_differences(NUMBERS, (NUMBERS, near))
+        == find_differences(NUMBERS, (near,))
+        == find_differences(NUMBERS, ())
+        == []
+    )
     far = dataclasses.replace(NUMBERS, thickness_mean=3 * NUMBERS.thickness_mean, connectivity_density=0.0)
     further = dataclasses.replace(far, thickness_mean=5 * NUMBERS.thickness_mean)
-    assert differences(NUMBERS, (far, further)) == ["thickness 4.0", "connectivity 0"]
-    assert differences(NUMBERS, (NUMBERS, far)) == []
+    assert find_differences(NUMBERS, (far, further)) == ["thickness 4.0", "connectivity 0"]
+    assert find_differences(NUMBERS, (NUMBERS, far)) == []
     thin = dataclasses.replace(NUMBERS, thickness_mean=0.5 * NUMBERS.thickness_mean)
     assert (
-        differences(NUMBERS, (thin, dataclasses.replace(far, connectivity_density=NUMBERS.connectivity_density))) == []
+        find_differences(NUMBERS, (thin, dataclasses.replace(far, connectivity_density=NUMBERS.connectivity_density)))
+        == []
     )
     pieces = dataclasses.replace(NUMBERS, connectivity_density=-NUMBERS.connectivity_density)
-    assert differences(NUMBERS, (pieces,)) == ["connectivity of the other sign"]
-    assert differences(dataclasses.replace(NUMBERS, thickness_mean=math.nan), (NUMBERS,)) == []
-    assert differences(dataclasses.replace(NUMBERS, connectivity_density=0.0), (NUMBERS,)) == []
+    assert find_differences(NUMBERS, (pieces,)) == ["connectivity of the other sign"]
+    assert find_differences(dataclasses.replace(NUMBERS, thickness_mean=math.nan), (NUMBERS,)) == []
+    assert find_differences(dataclasses.replace(NUMBERS, connectivity_density=0.0), (NUMBERS,)) == []
