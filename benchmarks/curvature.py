@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from benchmarks.harness import Cases, Figure, Values, show
-from curvafit.geometry.diagram import diagram, surface_curvatures
+from curvafit.geometry.diagram import diagram
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import phase_field
 from tests.exact import Cylinder, Shape, Sphere, Torus, centres, profile
@@ -37,8 +37,8 @@ def exact_errors(voxels: int) -> Values:
         nz, ny, nx = (edge * voxels for edge in size)
         grid = Grid((nz, ny, nx), (1 / voxels,) * 3, "replicate")
         for kind in KINDS:
-            measured = surface_curvatures(profile(shape, centres(grid), 1.0), grid, 1.0, curvature=kind, margin=0)  # type: ignore[arg-type]
-            truth = torch.stack(shape.curvatures(torch.from_numpy(measured.centres) + 0.5 / voxels), -1).numpy()
+            measured = diagram(profile(shape, centres(grid), 1.0), grid, 1.0, curvature=kind, margin=0)  # type: ignore[arg-type]
+            truth = torch.stack(shape.curvatures(torch.from_numpy(measured.places) + 0.5 / voxels), -1).numpy()
             error = np.abs(measured.points - truth) / np.abs(truth).max(1, keepdims=True)
             found[f"{name}, {kind}"] = float(error.mean())
     return found

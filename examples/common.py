@@ -115,7 +115,7 @@ def _measured(flow: Flow, about: dict[str, Any]) -> Shape:
     seen = {kind: diagram(u, flow.grid, WORKING_EPSILON, curvature=kind) for kind in facts["kinds"]}
     if seen:
         facts["density"] = seen["geometric"].area / (1 - seen["geometric"].excluded) / flow.grid.volume
-    return Shape(u, {kind: measure.binned(BIN) for kind, measure in seen.items()}, facts)
+    return Shape(u, {kind: measure.bin(BIN) for kind, measure in seen.items()}, facts)
 
 
 def program() -> str:

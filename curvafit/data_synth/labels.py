@@ -13,7 +13,7 @@ from skimage.segmentation import watershed
 from torch import Tensor
 
 from curvafit.data_synth.centreline import skeleton_of
-from curvafit.geometry.diagram import LEAST_SLOPE, MARGIN, resolved
+from curvafit.geometry.diagram import LEAST_SLOPE, MARGIN, find_resolved
 from curvafit.geometry.mesh import NoSurface
 from curvafit.geometry.morphometry import local_thickness
 from curvafit.geometry.topology import betti_numbers, components
@@ -171,7 +171,7 @@ def _curvatures(u: Tensor, mask: np.ndarray, grid: Grid, epsilon: float) -> tupl
     slope = near.gradient.square().sum(-4).sqrt()
     d = near.value / slope.clamp_min(LEAST_SLOPE)
     κ1, κ2 = (κ / (1 + κ * d) for κ in geometric_curvatures(near)[:2])
-    known = resolved(slope, κ1, κ2, grid) & torch.from_numpy(_shell(mask, grid))
+    known = find_resolved(slope, κ1, κ2, grid) & torch.from_numpy(_shell(mask, grid))
     return torch.where(known, κ1, torch.nan).float().numpy(), torch.where(known, κ2, torch.nan).float().numpy()
 
 

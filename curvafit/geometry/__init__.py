@@ -10,13 +10,11 @@ if TYPE_CHECKING:
     from curvafit.geometry.descriptors import Descriptors as Descriptors
     from curvafit.geometry.descriptors import descriptors as descriptors
     from curvafit.geometry.diagram import Diagram as Diagram
-    from curvafit.geometry.diagram import SurfaceCurvatures as SurfaceCurvatures
     from curvafit.geometry.diagram import diagram as diagram
     from curvafit.geometry.diagram import diagrams as diagrams
     from curvafit.geometry.diagram import family_of as family_of
     from curvafit.geometry.diagram import family_shares as family_shares
     from curvafit.geometry.diagram import half_thickness as half_thickness
-    from curvafit.geometry.diagram import surface_curvatures as surface_curvatures
     from curvafit.geometry.distances import one_to_many as one_to_many
     from curvafit.geometry.distances import pairwise as pairwise
     from curvafit.geometry.distances import sinkhorn_divergence as sinkhorn_divergence

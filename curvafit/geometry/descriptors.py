@@ -7,7 +7,6 @@ window Baddeley & Gill 1997), so that a crop's blocks estimate those of the whol
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from functools import lru_cache
 
@@ -17,7 +16,7 @@ from scipy.fft import next_fast_len
 from torch import Tensor
 
 from curvafit.core.checks import check_type
-from curvafit.geometry.diagram import Diagram, surface_curvatures
+from curvafit.geometry.diagram import diagram
 from curvafit.geometry.distances import sliced_embedding
 from curvafit.geometry.mesh import NoSurface, area_vectors, surface
 from curvafit.geometry.topology import euler_shares
@@ -70,9 +69,9 @@ class Descriptors:
     correlation: np.ndarray
     fabric: np.ndarray
 
-    def vector(self, blocks: Iterable[str] | None = None) -> np.ndarray:
-        """Return the blocks of these names, by default all, one after the other."""
-        return np.concatenate([getattr(self, name) for name in blocks or BLOCKS])
+    def vector(self) -> np.ndarray:
+        """Return all blocks, one after the other, `(351,)`."""
+        return np.concatenate([getattr(self, name) for name in BLOCKS])
 
 
 #: Lengths of the blocks, in their order.
@@ -110,8 +109,7 @@ def descriptors(shape: np.ndarray | Tensor, grid: Grid, epsilon: float = WORKING
     if mask.all() or not mask.any():
         raise NoSurface("expected a shape with an inside and an outside, got one of them only")
     phase = phase_field(inside, grid, epsilon) if values.dtype == torch.bool else values
-    curvatures = surface_curvatures(phase, grid, epsilon)
-    diagram = Diagram(curvatures.points, curvatures.areas)
+    measured = diagram(phase, grid, epsilon)
     mesh = surface(phase, grid)
     normals = area_vectors(mesh)
     area = np.linalg.norm(normals, axis=1)
@@ -119,9 +117,9 @@ def descriptors(shape: np.ndarray | Tensor, grid: Grid, epsilon: float = WORKING
     chords, gaps = (voxel * _chord_quantiles(phase, grid.periodic) for phase in (mask, ~mask))
     depths, clearances = (voxel * each for each in _depth_quantiles(inside, grid))
     return Descriptors(
-        curvature=sliced_embedding(diagram.binned(_CURVATURE_BIN / (100 * voxel))),
+        curvature=sliced_embedding(measured.bin(_CURVATURE_BIN / (100 * voxel))),
         fraction=np.array([mask.mean()]),
-        densities=np.array([density, density * diagram.mean().mean(), _euler_density(mask, grid)]),
+        densities=np.array([density, density * measured.mean().mean(), _euler_density(mask, grid)]),
         chords=chords,
         gaps=gaps,
         depths=depths,

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 import torch
@@ -62,6 +61,9 @@ class Diagram(Pictured):
         transport distance (cost ½|x - y|²) between a diagram and its binned self is at most √½ · spread.
     excluded
         Part of the surface's area, in [0, 1], left out because curvature is not resolved there.
+    places
+        (z, y, x) on the surface of each point, `(N, 3)`, in the grid's unit from the first voxel's centre; None once
+        points were merged or read from a file.
     """
 
     points: np.ndarray
@@ -69,6 +71,7 @@ class Diagram(Pictured):
     unit: str = "1/working unit"
     spread: float = 0.0
     excluded: float = 0.0
+    places: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         points, weights = np.asarray(self.points, dtype=np.float64), np.asarray(self.weights, dtype=np.float64)
@@ -102,26 +105,26 @@ class Diagram(Pictured):
         """Return the same diagram with total weight 1."""
         if not self.area > 0:
             raise ValueError("expected a diagram with area, got an empty one")
-        return dataclasses.replace(self, weights=self.weights / self.area)
+        return replace(self, weights=self.weights / self.area)
 
     def mean(self) -> np.ndarray:
         """Return the area-weighted mean (κ1, κ2)."""
         return self.normalised.weights @ self.points
 
-    def binned(self, width: float) -> Diagram:
+    def bin(self, width: float) -> Diagram:
         """Return bins of edge `width`, each replaced by its barycentre: means and total weight are kept exactly."""
         if not width > 0:
             raise ValueError(f"expected a bin width above 0, got {width}")
-        return self._merged(self._cells(width))
+        return self._merge(self._cells(width))
 
-    def thinned(self, width: float, share: float) -> Diagram:
+    def thin(self, width: float, share: float) -> Diagram:
         """Return bins of edge `width` where the area is, and wider ones, by powers of two, in the tails.
 
         A bin is the widest whose part of the area times (edge / width)² is at most `share`.
         """
         if not share > 0:
             raise ValueError(f"expected a share above 0, got {share}")
-        fine = self.binned(width)
+        fine = self.bin(width)
         parts = fine.normalised.weights
         index = fine._cells(width)
         merged = np.zeros(len(parts), dtype=bool)
@@ -130,7 +133,7 @@ class Diagram(Pictured):
             light = (np.bincount(cells, parts * ~merged) * 4.0**level <= share)[cells] & ~merged
             index[light] = level * len(parts) + cells[light]
             merged |= light
-        return fine._merged(np.unique(index, return_inverse=True)[1])
+        return fine._merge(np.unique(index, return_inverse=True)[1])
 
     def _cells(self, width: float) -> np.ndarray:
         """Return the number of the square of edge `width` that each point is in: 0, 1, … over the occupied ones."""
@@ -138,7 +141,7 @@ class Diagram(Pictured):
         cells -= cells.min(0, initial=0)
         return np.unique(cells @ np.array([cells[:, 1].max(initial=0) + 1, 1]), return_inverse=True)[1]
 
-    def _merged(self, index: np.ndarray) -> Diagram:
+    def _merge(self, index: np.ndarray) -> Diagram:
         """Return the points with the same index (0, 1, …) replaced by their barycentre."""
         weights = np.bincount(index, self.weights)
         heavy = weights > 0
@@ -147,17 +150,7 @@ class Diagram(Pictured):
         square = ((self.points - means[index]) ** 2).sum(1)
         added = float(self.weights @ square) / self.area if self.area > 0 else 0.0
         spread = math.sqrt(self.spread**2 + added)
-        return dataclasses.replace(self, points=means[heavy], weights=weights[heavy], spread=spread)
-
-
-class SurfaceCurvatures(NamedTuple):
-    """Barycentres of triangles `(N, 3)` (z, y, x) with their (κ1, κ2) `(N, 2)` and areas `(N,)`, in the grid's unit;
-    and the part of the area where curvature is not resolved, which is left out."""
-
-    centres: np.ndarray
-    points: np.ndarray
-    areas: np.ndarray
-    excluded: float
+        return replace(self, points=means[heavy], weights=weights[heavy], spread=spread, places=None)
 
 
 def diagram(
@@ -169,34 +162,7 @@ def diagram(
     margin: int | None = None,
     where: np.ndarray | None = None,
 ) -> Diagram:
-    """Return the curvature diagram of {u = 0}, Σ area[c] δ_(κ1, κ2)[c] over the cells c of its mesh (paper, eq. 25).
-
-    Parameters and errors are those of `surface_curvatures`.
-    """
-    curvatures = surface_curvatures(u, grid, epsilon, curvature=curvature, margin=margin, where=where)
-    return Diagram(curvatures.points, curvatures.areas, excluded=curvatures.excluded)
-
-
-def diagrams(field: Tensor, grid: Grid, epsilon: float) -> tuple[Diagram, Diagram]:
-    """Measure a phase field (Z, Y, X) and its mask {u > 0}, re-profiled as a scan's mask is: two geometric diagrams.
-
-    Both are thinned as `wasserstein` thins them, so that a distance to one is the distance to the whole diagram.
-    """
-    profile = phase_field(field > 0, grid, epsilon)
-    of_field, of_mask = (diagram(u, grid, epsilon).thinned(BIN_WIDTH, TAIL_SHARE) for u in (field, profile))
-    return of_field, of_mask
-
-
-def surface_curvatures(
-    u: np.ndarray | Tensor,
-    grid: Grid,
-    epsilon: float,
-    *,
-    curvature: Kind = "geometric",
-    margin: int | None = None,
-    where: np.ndarray | None = None,
-) -> SurfaceCurvatures:
-    """Return κ1, κ2 of {u = 0} on every triangle of its mesh.
+    """Measure the curvature diagram of {u = 0}, Σ area[c] δ_(κ1, κ2)[c] over the cells c of its mesh (paper, eq. 25).
 
     Curvatures of the voxels around a triangle are interpolated linearly at its barycentre. The geometric ones are those
     of the level sets of √2 ε artanh(u), which are u's own: differences of that near-distance err far less than
@@ -232,22 +198,28 @@ def surface_curvatures(
     if not counted.any():
         raise NoSurface("expected a surface in the part that counts, got none")
     weights, centres = weights[counted], centres[counted]
-    points, known = _interpolated((kappa1, kappa2), resolved, centres, grid.periodic)
+    points, known = _interpolate((kappa1, kappa2), resolved, centres, grid.periodic)
     if not known.any():
         raise NoSurface("expected a surface whose curvature the grid resolves, got none")
     excluded = 1 - float(weights[known].sum() / weights.sum())
-    return SurfaceCurvatures(centres[known] * np.array(grid.spacing), points[known], weights[known], excluded)
+    places = centres[known] * np.array(grid.spacing)
+    return Diagram(points[known], weights[known], excluded=excluded, places=places)
 
 
-def resolved(slope: Tensor, kappa1: Tensor, kappa2: Tensor, grid: Grid) -> Tensor:
-    """Return where the grid resolves curvature, as bool: the level set is defined, and no radius is under a voxel.
+def diagrams(field: Tensor, grid: Grid, epsilon: float) -> tuple[Diagram, Diagram]:
+    """Measure a phase field (Z, Y, X) and its mask {u > 0}, re-profiled as a scan's mask is: two geometric diagrams.
 
-    Parameters
-    ----------
-    slope
-        Of the distance that the profile gives (`profile_distance`): 1 for a perfect profile.
-    kappa1, kappa2
-        Principal curvatures, in 1 / the grid's unit.
+    Both are thinned as `wasserstein` thins them, so that a distance to one is the distance to the whole diagram.
+    """
+    profile = phase_field(field > 0, grid, epsilon)
+    of_field, of_mask = (diagram(u, grid, epsilon).thin(BIN_WIDTH, TAIL_SHARE) for u in (field, profile))
+    return of_field, of_mask
+
+
+def find_resolved(slope: Tensor, kappa1: Tensor, kappa2: Tensor, grid: Grid) -> Tensor:
+    """Return where the grid resolves curvatures, as bool: the level set is defined, and no radius is under a voxel.
+
+    `slope` is that of the distance that the profile gives (`profile_distance`), 1 for a perfect profile.
     """
     sharpest = 1 / (LEAST_RADIUS * max(grid.spacing))
     return (slope > LEAST_SLOPE) & (kappa1.abs() < sharpest) & (kappa2.abs() < sharpest)
@@ -273,12 +245,12 @@ def _voxel_curvatures(values: Tensor, grid: Grid, epsilon: float, curvature: str
     else:
         κ1, κ2, _, _ = diffuse_curvatures(jet(values, grid), epsilon)
     slope = distance.gradient.square().sum(-4).sqrt()
-    known = resolved(slope, κ1, κ2, grid)
+    known = find_resolved(slope, κ1, κ2, grid)
     parts = (torch.where(known, κ1, 0.0), torch.where(known, κ2, 0.0), known.to(values.dtype))
     return tuple(part.detach().cpu().numpy() for part in parts)
 
 
-def _interpolated(
+def _interpolate(
     fields: tuple[np.ndarray, ...], resolved: np.ndarray, centres: np.ndarray, periodic: bool
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return values `(N, 2)` at `centres` `(N, 3)` (in voxels) from the resolved voxels around, and where any are."""

@@ -75,7 +75,7 @@ def pairwise(
     progress
         Called after every block of pairs with a sentence and the share done.
     """
-    measures = _measures(diagrams, blur, reach, bin_width)
+    clouds = _pack_diagrams(diagrams, blur, reach, bin_width)
     distances = np.full((len(diagrams),) * 2, np.nan) if known is None else known.copy()
     np.fill_diagonal(distances, 0)
     first, second = np.nonzero(np.triu(np.isnan(distances)))
@@ -85,7 +85,7 @@ def pairwise(
     save = save or (lambda distances: None)
     save(distances)
     saved = time.monotonic()
-    blocks = _distances(measures, first, second, blur=blur, reach=reach)
+    blocks = _iterate_distances(clouds, first, second, blur=blur, reach=reach)
     try:
         for start, block in zip(range(0, len(first), BLOCK), blocks, strict=True):
             i, j = first[start : start + BLOCK], second[start : start + BLOCK]
@@ -108,31 +108,31 @@ def one_to_many(
     bin_width: float = BIN_WIDTH,
 ) -> np.ndarray:
     """Return the distances `(N,)` of one diagram to each of N; `pairwise` says what is taken and raised."""
-    measures = _measures([query, *diagrams], blur, reach, bin_width)
+    clouds = _pack_diagrams([query, *diagrams], blur, reach, bin_width)
     others = np.arange(1, len(diagrams) + 1)
-    blocks = _distances(measures, np.zeros_like(others), others, blur=blur, reach=reach)
+    blocks = _iterate_distances(clouds, np.zeros_like(others), others, blur=blur, reach=reach)
     return np.concatenate([np.empty(0), *blocks])
 
 
-def _measures(diagrams: Sequence[Diagram], blur: float, reach: float | None, bin_width: float) -> Measures:
-    reduced = comparable(diagrams, blur, reach, bin_width)
-    return packed([d.points for d in reduced], [d.weights for d in reduced])
+def _pack_diagrams(diagrams: Sequence[Diagram], blur: float, reach: float | None, bin_width: float) -> Clouds:
+    reduced = _normalise(diagrams, blur, reach, bin_width)
+    return pack([d.points for d in reduced], [d.weights for d in reduced])
 
 
-def _distances(measures: Measures, first: np.ndarray, second: np.ndarray, **options: Any) -> Iterator[np.ndarray]:
+def _iterate_distances(clouds: Clouds, first: np.ndarray, second: np.ndarray, **options: Any) -> Iterator[np.ndarray]:
     """Yield the distances of the pairs, block by block.
 
     Half of what a measure costs with itself, in as many steps as the pair's, is what debiasing takes off. That depends
     on the pair by the number of steps alone, of which there are two or three, and is computed once for each.
     """
-    falls = pair_halvings(measures, first, second, options["blur"])
+    falls = pair_halvings(clouds, first, second, options["blur"])
     keys = np.concatenate([np.stack([ends, falls], axis=1) for ends in (first, second)])
     distinct, places = np.unique(keys, axis=0, return_inverse=True)
-    own = costs(measures, distinct[:, 0], distinct[:, 0], distinct[:, 1], **options)
+    own = costs(clouds, distinct[:, 0], distinct[:, 0], distinct[:, 1], **options)
     bias = own[places.reshape(2, -1)].sum(0) / 2
     for start in range(0, len(first), BLOCK):
         block = slice(start, start + BLOCK)
-        divergence = costs(measures, first[block], second[block], falls[block], **options) - bias[block]
+        divergence = costs(clouds, first[block], second[block], falls[block], **options) - bias[block]
         yield np.sqrt(np.maximum(divergence, 0))
 
 
@@ -140,9 +140,9 @@ def digests(
     diagrams: Sequence[Diagram], *, blur: float = 1.0, reach: float | None = 20.0, bin_width: float = BIN_WIDTH
 ) -> list[str]:
     """Return a text for each diagram that is the same where `pairwise` sees the same points and weights."""
-    measures = _measures(diagrams, blur, reach, bin_width)
-    rows = np.stack([measures.x, measures.y, measures.log2], axis=1)
-    parts = (rows[start:end] for start, end in itertools.pairwise(measures.bounds))
+    clouds = _pack_diagrams(diagrams, blur, reach, bin_width)
+    rows = np.stack([clouds.x, clouds.y, clouds.log2], axis=1)
+    parts = (rows[start:end] for start, end in itertools.pairwise(clouds.bounds))
     return [hashlib.sha256(part.tobytes()).hexdigest() for part in parts]
 
 
@@ -166,11 +166,11 @@ def wasserstein(
     reach
         How far area is moved before it is cheaper to destroy it; None moves all.
     bin_width
-        Edge of the bins, widened in the tails (`Diagram.thinned`); 0 compares the points as they are. On published
+        Edge of the bins, widened in the tails (`Diagram.thin`); 0 compares the points as they are. On published
         fields and their masks (distances of 0.4 to 7), bins of 1, 2 and 3 changed a distance by at most 0.01, 0.03 and
         0.1.
     """
-    first, second = comparable([a, b], blur, reach, bin_width)
+    first, second = _normalise([a, b], blur, reach, bin_width)
     if find_spec("geomloss") is None:
         return float(one_to_many(first, [second], blur=blur, reach=reach, bin_width=0)[0])
     tensors = (torch.from_numpy(part) for d in (first, second) for part in (d.points, d.weights))
@@ -181,7 +181,7 @@ def wasserstein(
 def sinkhorn_divergence(
     points_a: Tensor, weights_a: Tensor, points_b: Tensor, weights_b: Tensor, *, blur: float, reach: float | None
 ) -> Tensor:
-    """Return the debiased unbalanced Sinkhorn divergence of two measures, cost ½|x - y|²: a scalar tensor.
+    """Return the debiased unbalanced Sinkhorn divergence of two clouds, cost ½|x - y|²: a scalar tensor.
 
     Its square root is `wasserstein`; descend the divergence itself, as the root's slope is infinite at 0. It is
     differentiable once in points and weights. The gradient is geomloss's, that of the last step with the potentials
@@ -191,7 +191,7 @@ def sinkhorn_divergence(
     Parameters
     ----------
     points_a, points_b
-        `(N, 2)` and `(M, 2)`, of one floating-point type. Differences of near measures want float64.
+        `(N, 2)` and `(M, 2)`, of one floating-point type. Differences of near clouds want float64.
     weights_a, weights_b
         `(N,)` and `(M,)`, of at least 0, each with a total of 1.
     blur, reach
@@ -207,7 +207,7 @@ def sinkhorn_divergence(
         return loss(weights_a, points_a, weights_b, points_b)
 
 
-def comparable(diagrams: Sequence[Diagram], blur: float, reach: float | None, bin_width: float) -> list[Diagram]:
+def _normalise(diagrams: Sequence[Diagram], blur: float, reach: float | None, bin_width: float) -> list[Diagram]:
     """Return the diagrams as distances take them: of total weight 1, in bins.
 
     Raises ValueError as `wasserstein`.
@@ -218,7 +218,7 @@ def comparable(diagrams: Sequence[Diagram], blur: float, reach: float | None, bi
         if other.unit != diagrams[0].unit:
             raise ValueError(f"expected diagrams in one unit, got {diagrams[0].unit} and {other.unit}")
     whole = (diagram.normalised for diagram in diagrams)
-    return [each.thinned(bin_width, TAIL_SHARE) if bin_width else each for each in whole]
+    return [each.thin(bin_width, TAIL_SHARE) if bin_width else each for each in whole]
 
 
 def sliced_embedding(diagram: Diagram, directions: int = 12, quantiles: int = 24) -> np.ndarray:
@@ -239,7 +239,7 @@ def sliced_embedding(diagram: Diagram, directions: int = 12, quantiles: int = 24
     return np.concatenate(rows) / math.sqrt(directions * quantiles)
 
 
-class Measures(NamedTuple):
+class Clouds(NamedTuple):
     """N weighted point sets, one after another, in float32: number i is rows bounds[i] to bounds[i + 1] of `x`, `y` and
     `log2` (of the weights); `low` and `high` are the corners of its box `(N, 2)`."""
 
@@ -251,7 +251,7 @@ class Measures(NamedTuple):
     high: np.ndarray
 
 
-def packed(points: Sequence[np.ndarray], weights: Sequence[np.ndarray]) -> Measures:
+def pack(points: Sequence[np.ndarray], weights: Sequence[np.ndarray]) -> Clouds:
     """Pack point sets `(n, 2)` with weights `(n,)`, some of each above 0; points without weight are left out."""
     heavy = [w > 0 for w in weights]
     points = [p[k].astype(np.float32) for p, k in zip(points, heavy, strict=True)]
@@ -260,7 +260,7 @@ def packed(points: Sequence[np.ndarray], weights: Sequence[np.ndarray]) -> Measu
     low, high = (np.array([end(p, axis=0) for p in points], np.float64).reshape(-1, 2) for end in (np.min, np.max))
     bounds = np.cumsum([0, *map(len, points)])
     x, y = np.ascontiguousarray(flat.T)
-    return Measures(x, y, log2.astype(np.float32), bounds, low, high)
+    return Clouds(x, y, log2.astype(np.float32), bounds, low, high)
 
 
 def halvings(size: np.ndarray, blur: float) -> np.ndarray:
@@ -269,20 +269,20 @@ def halvings(size: np.ndarray, blur: float) -> np.ndarray:
     Parameters
     ----------
     size
-        Edges of the box that holds both measures of a pair, `(…, 2)`.
+        Edges of the box that holds both clouds of a pair, `(…, 2)`.
     """
     diameter = np.maximum(np.hypot(size[..., 0], size[..., 1]), blur)
     return np.ceil(np.log2(diameter / blur) + 0.5).astype(np.int64)
 
 
-def pair_halvings(measures: Measures, first: np.ndarray, second: np.ndarray, blur: float) -> np.ndarray:
-    """Return `halvings` of the box that holds both measures of each pair, `(K,)`."""
-    high = np.maximum(measures.high[first], measures.high[second])
-    return halvings(high - np.minimum(measures.low[first], measures.low[second]), blur)
+def pair_halvings(clouds: Clouds, first: np.ndarray, second: np.ndarray, blur: float) -> np.ndarray:
+    """Return `halvings` of the box that holds both clouds of each pair, `(K,)`."""
+    high = np.maximum(clouds.high[first], clouds.high[second])
+    return halvings(high - np.minimum(clouds.low[first], clouds.low[second]), blur)
 
 
 def costs(
-    measures: Measures,
+    clouds: Clouds,
     first: np.ndarray,
     second: np.ndarray,
     falls: np.ndarray,
@@ -290,29 +290,29 @@ def costs(
     blur: float,
     reach: float | None,
 ) -> np.ndarray:
-    """Return the entropic, unbalanced cost OT_ε of each pair of measures, ½|x - y|² a unit moved, `(K,)` float64.
+    """Return the entropic, unbalanced cost OT_ε of each pair of clouds, ½|x - y|² a unit moved, `(K,)` float64.
 
     The debiased divergence is the pair's cost less half of each measure's with itself (Séjourné et al. 2019).
 
     Parameters
     ----------
     first, second
-        Numbers of the measures of each pair, `(K,)`.
+        Numbers of the clouds of each pair, `(K,)`.
     falls
         How often √ε halves for each pair, `(K,)`: see `halvings`.
     blur, reach
         √ε at the end, and √ρ of the penalty on what is not moved, in the points' unit; no reach moves everything.
     """
     first, second = (np.asarray(numbers, dtype=np.int64) for numbers in (first, second))
-    ε, shares = schedule(falls, blur)
+    ε, shares = _schedule(falls, blur)
     ρ = math.inf if reach is None else reach**2
     values = np.empty(len(first))
     threads.start()
-    _costs(measures, first, second, ε, shares, ρ, values)
+    _fill_costs(clouds, first, second, ε, shares, ρ, values)
     return values
 
 
-def schedule(falls: np.ndarray, blur: float) -> tuple[np.ndarray, np.ndarray]:
+def _schedule(falls: np.ndarray, blur: float) -> tuple[np.ndarray, np.ndarray]:
     """Return ε of every step of every pair, and the share of its potentials that a step keeps, `(K, T)`: 1 before a
     pair begins, 0 at its first step and its last, ½ between."""
     falls = np.asarray(falls, dtype=np.int64)[:, None]
@@ -325,18 +325,18 @@ def schedule(falls: np.ndarray, blur: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 @njit(**_PARALLEL)
-def _costs(measures, first, second, ε, shares, ρ, values):
+def _fill_costs(clouds, first, second, ε, shares, ρ, values):
     """Write the cost of every pair into `values`."""
     for k in prange(len(first)):
-        a, b = _points(measures, first[k]), _points(measures, second[k])
+        a, b = _slice_cloud(clouds, first[k]), _slice_cloud(clouds, second[k])
         values[k] = _cost(a, b, ε[k], shares[k], ρ)
 
 
 @njit(**_SERIAL)
-def _points(measures, number):
+def _slice_cloud(clouds, number):
     """Return x, y and the weights' log2 of one measure."""
-    rows = slice(measures.bounds[number], measures.bounds[number + 1])
-    return measures.x[rows], measures.y[rows], measures.log2[rows]
+    rows = slice(clouds.bounds[number], clouds.bounds[number + 1])
+    return clouds.x[rows], clouds.y[rows], clouds.log2[rows]
 
 
 @njit(**_SERIAL)
@@ -358,8 +358,8 @@ def _cost(a, b, ε, shares, ρ):
             G[j] = g[j] / unit + log_b[j]
         here, there = (x, y, F), (X, Y, G)
         _plan_sums(here, there, h, to_f, to_g)
-        _transformed(here, there, h, to_f)
-        _transformed(there, here, h, to_g)
+        _take_logarithms(here, there, h, to_f)
+        _take_logarithms(there, here, h, to_g)
         moved = (1 - shares[t]) * unit / (1 + ε[t] / ρ)
         for i in range(n):
             f[i] = shares[t] * f[i] - moved * to_f[i]
@@ -385,7 +385,7 @@ def _plan_sums(here, there, h, rows, columns):
 
 
 @njit(**_SERIAL)
-def _transformed(here, there, h, sums):
+def _take_logarithms(here, there, h, sums):
     """Write log2 ∑ 2^(G - h d²) of every row in place of the sums over the plan's rows."""
     x, y, F = here
     for i in range(len(x)):

@@ -248,7 +248,7 @@ def _describe(prepared: Prepared, measured: Diagram | None, provenance: dict[str
         morphometry=morphometry(prepared.mask, prepared.working_voxel, prepared.unit, periodic=grid.periodic),
         notes=prepared.notes,
         provenance=provenance,
-        diagram=None if measured is None else measured.thinned(BIN_WIDTH, TAIL_SHARE),
+        diagram=None if measured is None else measured.thin(BIN_WIDTH, TAIL_SHARE),
     )
 
 

@@ -6,7 +6,7 @@ import contextlib
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -15,7 +15,7 @@ from scipy import ndimage, stats
 from curvafit.core.runtime import Progress, silent
 from curvafit.core.units import format_number, per_unit, unit_name
 from curvafit.geometry.descriptors import Descriptors, descriptors
-from curvafit.geometry.diagram import FAMILIES, MARGIN, Diagram, SurfaceCurvatures, families, surface_curvatures
+from curvafit.geometry.diagram import FAMILIES, MARGIN, Diagram, diagram, families
 from curvafit.geometry.mesh import NoSurface, area_vectors
 from curvafit.geometry.morphometry import connectivity_of, local_thickness, smooth_surface
 from curvafit.geometry.topology import euler_shares
@@ -242,16 +242,22 @@ def _surfaced(
 
 def _curved(blocks: Blocks, prepared: Prepared) -> tuple[dict[str, np.ndarray], Diagram]:
     """Return the sums of curvatures times area, and the diagram, in the scan's unit."""
-    centres, points, areas, excluded = scan_curvatures(prepared)
+    working = scan_diagram(prepared)
     length = prepared.working_voxel / WORKING_SPACING
-    diagram = Diagram(points / length, areas * length**2, f"1/{prepared.unit}", excluded=excluded)
-    voxels = (centres / WORKING_SPACING + 0.5) * np.array(prepared.scale) - 0.5 + np.array(prepared.origin)
-    κ1, κ2 = diagram.points.T
+    physical = replace(
+        working, points=working.points / length, weights=working.weights * length**2, unit=f"1/{prepared.unit}"
+    )
+    voxels = (
+        (np.asarray(working.places) / WORKING_SPACING + 0.5) * np.array(prepared.scale)
+        - 0.5
+        + np.array(prepared.origin)
+    )
+    κ1, κ2 = physical.points.T
     H = (κ1 + κ2) / 2
-    kinds = np.eye(len(FAMILIES))[families(points, prepared.thickness / 2 * WORKING_SPACING)]
+    kinds = np.eye(len(FAMILIES))[families(working.points, prepared.thickness / 2 * WORKING_SPACING)]
     columns = np.column_stack([np.ones_like(H), H, H**2, κ1 * κ2, κ1, κ2, np.hypot(κ1, κ2) / math.sqrt(2), kinds])
-    sums = blocks.gathered(voxels, columns * diagram.weights[:, None])
-    return dict(zip(("curved", "H", "H²", "K", "κ1", "κ2", "C", *FAMILIES), sums.T, strict=True)), diagram
+    sums = blocks.gathered(voxels, columns * physical.weights[:, None])
+    return dict(zip(("curved", "H", "H²", "K", "κ1", "κ2", "C", *FAMILIES), sums.T, strict=True)), physical
 
 
 def _figures(sums: np.ndarray) -> np.ndarray:
@@ -282,27 +288,23 @@ def _anisotropy(sums: Sums) -> np.ndarray:
 
 
 def scan_diagram(prepared: Prepared) -> Diagram:
-    """Return the geometric curvature diagram of a prepared scan."""
-    curvatures = scan_curvatures(prepared)
-    return Diagram(curvatures.points, curvatures.areas, excluded=curvatures.excluded)
+    """Measure the geometric curvature diagram of a prepared scan; of a large one tile by tile, each cell in one tile.
 
-
-def scan_curvatures(prepared: Prepared) -> SurfaceCurvatures:
-    """Return the geometric curvatures of a prepared scan's surface; of a large one tile by tile, each cell in one tile.
-
-    Centres are in working units from the centre of the grid's first voxel.
+    Places are in working units from the centre of the grid's first voxel.
     """
     grid = prepared.grid
     cuts = [[slice(None)] if grid.periodic else _tiles(n) for n in grid.shape]
-    parts: list[SurfaceCurvatures] = []
+    parts: list[Diagram] = []
     for tile in itertools.product(*cuts):
         with contextlib.suppress(NoSurface):
-            parts.append(_tile_curvatures(prepared, tile))
+            parts.append(_tile_diagram(prepared, tile))
     if not parts:
         raise ValueError("expected a surface inside the scan, got none away from its borders")
-    centres, points, areas = (np.concatenate(each) for each in zip(*(part[:3] for part in parts), strict=True))
-    lost = sum(part.excluded * float(part.areas.sum()) for part in parts) / areas.sum()
-    return SurfaceCurvatures(centres, points, areas, float(lost))
+    points, areas, places = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("points", "weights", "places")
+    )
+    lost = sum(part.excluded * float(part.weights.sum()) for part in parts) / areas.sum()
+    return Diagram(points, areas, excluded=float(lost), places=places)
 
 
 def _tiles(n: int) -> list[slice]:
@@ -312,14 +314,14 @@ def _tiles(n: int) -> list[slice]:
     return [slice(a - MARGIN, b + MARGIN + 1) for a, b in itertools.pairwise(ends)]
 
 
-def _tile_curvatures(prepared: Prepared, tile: tuple[slice, ...]) -> SurfaceCurvatures:
+def _tile_diagram(prepared: Prepared, tile: tuple[slice, ...]) -> Diagram:
     phase = np.ascontiguousarray(prepared.phase[tile])
     z, y, x = phase.shape
     grid = Grid((z, y, x), prepared.grid.spacing, prepared.grid.boundary)
     where = None if prepared.roi is None else ndimage.binary_erosion(prepared.roi, iterations=MARGIN)[tile]
-    found = surface_curvatures(phase, grid, WORKING_EPSILON, where=where)
+    part = diagram(phase, grid, WORKING_EPSILON, where=where)
     corner = np.array([edge.start or 0 for edge in tile]) * np.array(grid.spacing)
-    return found._replace(centres=found.centres + corner)
+    return replace(part, places=part.places + corner)
 
 
 def scan_descriptors(prepared: Prepared) -> tuple[Descriptors, str] | None:

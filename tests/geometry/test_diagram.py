@@ -11,7 +11,7 @@ from exact import Cylinder, Gyroid, Shape, Sphere, Torus, centres, profile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from curvafit.geometry.diagram import Diagram, diagram, surface_curvatures
+from curvafit.geometry.diagram import Diagram, diagram
 from curvafit.geometry.distances import wasserstein
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import phase_field
@@ -35,9 +35,9 @@ def octant(name: str, voxels: int) -> tuple[torch.Tensor, Grid]:
 def errors(name: str, voxels: int, kind: str) -> np.ndarray:
     """|κ - exact κ| at every triangle's barycentre, over max(|κ1|, |κ2|) there: `(N, 2)`."""
     u, grid = octant(name, voxels)
-    found = surface_curvatures(u, grid, 1.0, curvature=kind, margin=0)  # type: ignore[arg-type]
+    found = diagram(u, grid, 1.0, curvature=kind, margin=0)  # type: ignore[arg-type]
     assert found.excluded == 0
-    places = torch.from_numpy(found.centres) + 0.5 / voxels
+    places = torch.from_numpy(found.places) + 0.5 / voxels
     truth = torch.stack(OCTANTS[name][0].curvatures(places), -1).numpy()
     return np.abs(found.points - truth) / np.abs(truth).max(1, keepdims=True)
 
@@ -164,7 +164,7 @@ def test_bad_input_is_one_sentence() -> None:
         Diagram(np.zeros((0, 2)), np.zeros(0)).mean()
     for bad in (0.0, -1.0):
         with pytest.raises(ValueError, match="width"):
-            Diagram(np.zeros((1, 2)), np.ones(1)).binned(bad)
+            Diagram(np.zeros((1, 2)), np.ones(1)).bin(bad)
 
 
 def cloud(seed: int, count: int = 500) -> Diagram:
@@ -177,13 +177,13 @@ def cloud(seed: int, count: int = 500) -> Diagram:
 def test_bins_keep_area_and_mean_and_state_their_spread(seed: int, width: float) -> None:
     """The variance that binning takes away is its spread's square."""
     whole = cloud(seed)
-    for binned in (whole.binned(width), whole.thinned(width, 0.01)):
+    for binned in (whole.bin(width), whole.thin(width, 0.01)):
         assert binned.area == pytest.approx(whole.area, rel=1e-12)
         np.testing.assert_allclose(binned.mean(), whole.mean(), rtol=0, atol=1e-9)
         lost = moment(whole) - moment(binned)
         assert binned.spread**2 == pytest.approx(lost, rel=1e-9, abs=1e-9)
-    assert whole.binned(width).spread <= width * math.sqrt(0.5)
-    twice = whole.binned(width).binned(3 * width)
+    assert whole.bin(width).spread <= width * math.sqrt(0.5)
+    twice = whole.bin(width).bin(3 * width)
     assert twice.spread**2 == pytest.approx(moment(whole) - moment(twice), rel=1e-9, abs=1e-9)
 
 
@@ -193,7 +193,7 @@ def moment(d: Diagram) -> float:
 
 def test_thinning_widens_only_the_tails() -> None:
     whole = cloud(0, 20000)
-    fine, thin = whole.binned(2.0), whole.thinned(2.0, 3e-3)
+    fine, thin = whole.bin(2.0), whole.thin(2.0, 3e-3)
     assert len(thin.weights) < 0.75 * len(fine.weights)
     assert fine.spread < thin.spread < 1.5 * fine.spread
 

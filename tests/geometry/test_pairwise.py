@@ -39,8 +39,8 @@ def cost(a: Diagram, b: Diagram, blur: float, reach: float | None, falls: int) -
         return float(loss(*(torch.from_numpy(v) for d in (a, b) for v in (d.normalised.weights, d.points))))
 
 
-def measures(diagrams: list[Diagram]) -> module.Measures:
-    return module.packed([d.points for d in diagrams], [d.normalised.weights for d in diagrams])
+def measures(diagrams: list[Diagram]) -> module.Clouds:
+    return module.pack([d.points for d in diagrams], [d.normalised.weights for d in diagrams])
 
 
 @pytest.mark.parametrize(("blur", "reach"), [(1.0, 20.0), (0.3, 5.0), (1.0, None)])

@@ -77,7 +77,7 @@ def test_binning_costs_less_than_stated() -> None:
     a, b = blob(3, count=2500), blob(4, (24.0, -6.0), 6.0, count=2500)
     fine, coarse = (wasserstein(a, b, bin_width=width) for width in (0.5, 2.0))
     assert abs(fine - coarse) < 0.05
-    binned = a.binned(4.0)
+    binned = a.bin(4.0)
     assert wasserstein(a, binned, reach=None, bin_width=0) <= math.sqrt(0.5) * binned.spread + 0.01
 
 

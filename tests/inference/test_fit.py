@@ -18,7 +18,7 @@ from curvafit.priors import Law
 
 @pytest.fixture(scope="module")
 def fit() -> Fit:
-    seen = measured(lattice(32, 16, 4.5)).thinned(BIN_WIDTH, TAIL_SHARE)
+    seen = measured(lattice(32, 16, 4.5)).thin(BIN_WIDTH, TAIL_SHARE)
     return dataclasses.replace(made_fit(), diagram=seen)
 
 

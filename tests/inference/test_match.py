@@ -15,7 +15,7 @@ from curvafit.inference.atlas import Atlas, load_atlas, nearest
 def blob(centre: tuple[float, float], count: int = 60) -> Diagram:
     """A cloud of width 5 about a centre, with κ1 ≥ κ2."""
     points = np.random.default_rng(0).normal(centre, 5, (count, 2))
-    return Diagram(np.sort(points, axis=1)[:, ::-1].copy(), np.full(count, 0.1)).binned(2.0)
+    return Diagram(np.sort(points, axis=1)[:, ::-1].copy(), np.full(count, 0.1)).bin(2.0)
 
 
 def atlas_of(fields: tuple[Diagram, ...], masks: tuple[Diagram, ...]) -> Atlas:
