@@ -67,4 +67,4 @@ def quick_map(monkeypatch: pytest.MonkeyPatch) -> None:
         return vectors[:, -2:] * np.sqrt(np.maximum(values[-2:], 0))
 
     monkeypatch.setattr(atlas_files, "diagram_distances", apart)
-    monkeypatch.setattr(atlas_files, "embed", flattened)
+    monkeypatch.setattr("curvafit.atlas_map.layout.embed", flattened)

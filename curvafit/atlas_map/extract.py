@@ -6,7 +6,7 @@ import dataclasses
 import datetime
 import json
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -33,19 +33,16 @@ from curvafit.volumes.field import ScanError
 #: Seconds between two writings of a table that grows.
 PAUSE = 60.0
 
-#: What is measured of a draw: volume fraction of {u > 0}, diagram of the field, diagram of its mask.
+#: A draw of a store.
+Drawn = tuple[Store, Record]
+#: What is measured of a shape: volume fraction of {u > 0}, diagram of the field, diagram of its mask.
 Measured = tuple[float, Diagram, Diagram]
 
 
 # ---- atlases ---------------------------------------------------------------------------------------------------------
 
 
-def extract(
-    stores: Sequence[str | Path | Store],
-    command: Sequence[str] = (),
-    measure: Callable[[Store, Record], Measured] | None = None,
-    progress: Progress = silent,
-) -> Atlas:
+def extract(stores: Sequence[str | Path | Store], command: Sequence[str] = (), progress: Progress = silent) -> Atlas:
     """Measure every well-formed shape of stores (`generation.result.is_well_formed`), as field and as mask.
 
     Parameters
@@ -54,8 +51,6 @@ def extract(
         Open stores, or their folders.
     command
         Command lines for the provenance, after those that make the stores.
-    measure
-        What to call in place of `measured`: one that remembers.
     progress
         Called before each shape with a sentence and the share of the shapes that are measured.
 
@@ -65,38 +60,28 @@ def extract(
         If there is no such store, one is of another version or grid, two have one name, or none holds a well-formed
         shape.
     """
+    draws, shapes = read_draws(stores)
+    measures = []
+    for done, (store, record) in enumerate(shapes):
+        progress(f"measuring {len(shapes)} shapes", done / len(shapes))
+        measures.append(measure_shape(store, record))
+    return to_atlas(draws, shapes, measures, command)
+
+
+def read_draws(stores: Sequence[str | Path | Store]) -> tuple[list[Drawn], list[Drawn]]:
+    """Return the draws of stores of one grid and ε, and those of the draws that are well-formed shapes."""
     sources = [store if isinstance(store, Store) else open_store(store) for store in stores]
-    _check_alike(sources)
-    draws = [[store.record(index) for index in store.indices()] for store in sources]
-    shapes = [
-        (store, record)
-        for store, records in zip(sources, draws, strict=True)
-        for record in records
-        if is_well_formed(record.viability)
-    ]
-    if not shapes:
-        places, count = " or ".join(str(store.path) for store in sources), sum(map(len, draws))
-        raise ValueError(f"no well-formed shape in {places}, of {count} draws")
-    fractions, field_diagrams, mask_diagrams = zip(*_measures(shapes, measure or measured, progress), strict=True)
-    return Atlas(
-        ids=tuple(shape_id(store, record) for store, record in shapes),
-        coefficients=np.array([list(record.coefficients) for _, record in shapes], dtype=np.float64),
-        masses=np.array([record.mass for _, record in shapes]),
-        seeds=np.array([record.seed for _, record in shapes], dtype=np.int64),
-        volume_fractions=np.array(fractions),
-        field_diagrams=field_diagrams,
-        mask_diagrams=mask_diagrams,
-        provenance=_provenance(sources, draws, command),
-    )
-
-
-def _check_alike(stores: Sequence[Store]) -> None:
-    """Raise ValueError where two stores have one name, or grids or ε that differ."""
-    _check_names(stores)
-    grids = {(store.settings.shape, store.settings.spacing, store.settings.epsilon) for store in stores}
+    _check_names(sources)
+    grids = {(store.settings.shape, store.settings.spacing, store.settings.epsilon) for store in sources}
     if len(grids) > 1:
         sizes = ", ".join(" x ".join(map(str, shape)) for shape, _, _ in sorted(grids))
         raise ValueError(f"stores must have one grid and one ε, got {len(grids)}: {sizes} voxels")
+    draws = [(store, store.record(index)) for store in sources for index in store.indices()]
+    shapes = [(store, record) for store, record in draws if is_well_formed(record.viability)]
+    if not shapes:
+        places = " or ".join(str(store.path) for store in sources)
+        raise ValueError(f"no well-formed shape in {places}, of {len(draws)} draws")
+    return draws, shapes
 
 
 def _check_names(stores: Sequence[Store]) -> None:
@@ -106,28 +91,39 @@ def _check_names(stores: Sequence[Store]) -> None:
         raise ValueError(f"stores must have different names, got {', '.join(names)}")
 
 
-def _measures(
-    shapes: Sequence[tuple[Store, Record]], measure: Callable[[Store, Record], Measured], progress: Progress
-) -> Iterator[Measured]:
-    for done, (store, record) in enumerate(shapes):
-        progress(f"measuring {len(shapes)} shapes", done / len(shapes))
-        yield measure(store, record)
-
-
 def shape_id(store: Store, record: Record) -> str:
     """Return the name of a draw in an atlas: the store's name and the index of the draw."""
     return f"{store.name}-{record.index:05d}"
 
 
-def measured(store: Store, record: Record) -> Measured:
+def measure_shape(store: Store, record: Record) -> Measured:
     """Return the volume fraction of {u > 0}, and the diagrams of field and mask, of one viable draw."""
     field = torch.from_numpy(store.field(record.index))
     grid = Grid(store.settings.shape, store.settings.spacing)
     return float((field > 0).double().mean()), *diagrams(field, grid, store.settings.epsilon)
 
 
-def _provenance(stores: Sequence[Store], draws: Sequence[list[Record]], command: Sequence[str]) -> dict[str, Any]:
-    accounts = {store.name: _account(store, records) for store, records in zip(stores, draws, strict=True)}
+def to_atlas(
+    draws: Sequence[Drawn], shapes: Sequence[Drawn], measures: Sequence[Measured], command: Sequence[str] = ()
+) -> Atlas:
+    """Return the atlas of measured shapes, which are some of the draws."""
+    fractions, field_diagrams, mask_diagrams = zip(*measures, strict=True)
+    return Atlas(
+        ids=tuple(shape_id(store, record) for store, record in shapes),
+        coefficients=np.array([list(record.coefficients) for _, record in shapes], dtype=np.float64),
+        masses=np.array([record.mass for _, record in shapes]),
+        seeds=np.array([record.seed for _, record in shapes], dtype=np.int64),
+        volume_fractions=np.array(fractions),
+        field_diagrams=field_diagrams,
+        mask_diagrams=mask_diagrams,
+        provenance=_provenance(draws, command),
+    )
+
+
+def _provenance(draws: Sequence[Drawn], command: Sequence[str]) -> dict[str, Any]:
+    """Return how an atlas was made."""
+    stores = list({store.name: store for store, _ in draws}.values())
+    accounts = {store.name: _account(store, [record for own, record in draws if own is store]) for store in stores}
     builds = (_build_command(store, accounts[store.name]["viable"]) for store in stores)
     return {
         "command": [*builds, *command],
@@ -183,8 +179,8 @@ def describe(
 ) -> Table:
     """Measure the well-formed shapes of stores in each view, and write the table; views that the file has stay.
 
-    A view depends on the shape, its seed and the view's name alone: a resumed table has the same rows, possibly in
-    another order. Shapes that are added or removed meanwhile are left out.
+    A view depends only on the shape, its seed and the view's name: a resumed table has the same rows, possibly in
+    another order. Shapes that a build adds or removes meanwhile are left out.
 
     Parameters
     ----------
@@ -206,8 +202,7 @@ def describe(
     Raises
     ------
     FileNotFoundError, ValueError
-        If a store is none, two have one name, `out` is no table, a view has another name, or there is nothing to
-        measure.
+        If there is no such store, two have one name, `out` is no table, a view is unknown, or no shape is well-formed.
     """
     unknown = [name for name in views if name not in VIEWS]
     if unknown or not views:
@@ -240,14 +235,9 @@ def describe(
 
 
 def measure(path: Path, indices: Sequence[int], views: Sequence[str]) -> list[dict[str, Any]]:
-    """Measure some shapes of a store in some views: their parameters and descriptors by view, None without a surface.
+    """Measure shapes of a store, and return the parameters of each and its descriptors by view, None without a surface.
 
-    A shape that is no longer in the store has no views.
-
-    Raises
-    ------
-    ValueError
-        If a shape is damaged, or its law has a20 or a02 that is not above 0.
+    A shape that is no longer in the store has no views. One that is damaged is a ValueError.
     """
     store = open_store(path)
     grid, epsilon = Grid(store.settings.shape, store.settings.spacing), store.settings.epsilon

@@ -6,47 +6,39 @@ import dataclasses
 import hashlib
 import io
 import json
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from curvafit.atlas_map.extract import Measured, extract, measured, shape_id
-from curvafit.atlas_map.layout import AtlasMap, check_extra, check_size, diagram_distances, embed, map_atlas
-from curvafit.atlas_map.page import Shown, page_html, regrow_command, shown
+from curvafit.atlas_map.extract import measure_shape, read_draws, shape_id, to_atlas
+from curvafit.atlas_map.layout import AtlasMap, check_extra, check_size, diagram_distances, map_atlas
+from curvafit.atlas_map.page import Miniature, page_html, regrow_command, shrink
 from curvafit.atlas_map.picture import map_picture
 from curvafit.core.files import is_empty, write_content
 from curvafit.core.records import can_write, has_mark, read_archive
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.data_synth.atlas import summarise
 from curvafit.data_synth.store import Record, Store, open_store
-from curvafit.generation.result import is_well_formed
 from curvafit.geometry.diagram import Diagram
 from curvafit.inference.atlas import Atlas
 
-#: Folder beside the two files for what took long: measured shapes, distances, places.
+#: Folder beside the two files for what took long: measured shapes and distances.
 CACHE = "cache"
-#: Its mark, by which programs that make backups know it too (bford.info/cachedir), and that of the page.
+#: Mark of the folder, which programs that make backups know too (bford.info/cachedir), and mark of the page.
 TAG = "CACHEDIR.TAG"
 _TAGGED = "Signature: 8a477f597d28d172789f06886806bc55\n# curvafit atlas map"
 _MARK = '<meta name="generator" content="curvafit'
-#: Goes up when what is kept changes.
+#: Goes up when the content of the cache changes.
 _CACHE_VERSION = 1
 
 _Arrays = dict[str, np.ndarray]
 
 
 def check_map(directory: str | Path, stores: Sequence[str | Path], overwrite: bool = False) -> Path:
-    """Return the folder, if the map of stores can be written there; for a check before long work.
-
-    Raises
-    ------
-    ValueError
-        If it is no folder that can be written to, lies in a store, or something else stands where a file goes.
-    """
+    """Return the folder if the map of stores can be written there, else raise ValueError; call it before long work."""
     folder = Path(directory)
     page, cache = folder / "atlas.html", folder / CACHE
 
@@ -69,59 +61,68 @@ def write_map(
 ) -> tuple[Path, Path]:
     """Write `atlas.png` and `atlas.html` of the stores' well-formed shapes into a folder; returns their paths.
 
-    What takes long is kept in the folder's `cache`, shape by shape: a run that was stopped goes on where it was, one
-    on larger stores measures the new shapes only. The cache may be deleted at any time.
+    Measures and distances are kept in the folder's `cache`: a run that was stopped goes on where it was, and one on
+    larger stores measures only the new shapes. The cache may be deleted at any time.
 
     Raises
     ------
     ImportError
         If the extra `[atlas]` is not installed.
     FileNotFoundError, ValueError
-        If there is no such store, there are too few well-formed shapes, or as `extract` and `check_map`; `overwrite`
-        tells whether files that no such call wrote may be replaced.
+        If there are too few well-formed shapes, or as `extract` does; or if a file of another origin would be replaced
+        without `overwrite`.
     """
     check_extra()
     sources = [store if isinstance(store, Store) else open_store(store) for store in stores]
-    check_map(directory, [store.path for store in sources], overwrite)
-    check_size(sum(is_well_formed(store.record(index).viability) for store in sources for index in store.indices()))
-    folder = Path(directory)
-    (folder / CACHE).mkdir(parents=True, exist_ok=True)
-    write_content(folder / CACHE / TAG, f"{_TAGGED}\n")
-    atlas, draws, shapes, commands = _measures(sources, folder / CACHE, progress)
-    mapped = _mapped(atlas, folder / CACHE, progress)
+    folder = check_map(directory, [store.path for store in sources], overwrite)
+    draws, shapes = read_draws(sources)
+    check_size(len(shapes))
+    commands = [
+        regrow_command(record, store.settings, f"shape_{shape_id(store, record)}.nii.gz") for store, record in shapes
+    ]
+    cache = folder / CACHE
+    cache.mkdir(parents=True, exist_ok=True)
+    write_content(cache / TAG, f"{_TAGGED}\n")
+    measures, views = [], []
+    for done, (store, record) in enumerate(shapes):
+        progress(f"measuring {len(shapes)} shapes", 0.6 * done / len(shapes))
+        arrays = _measure_once(store, record, cache)
+        measures.append((float(arrays["fraction"]), *(_diagram(arrays, view) for view in ("field", "mask"))))
+        views.append(Miniature(arrays["thumbnail"].tobytes(), arrays["volume"].tobytes()))
+    atlas = to_atlas(draws, shapes, measures)
+    distances = _compare_once(atlas, cache, sub_progress(progress, 0.6, 0.85))
+    progress("laying out the map", 0.86)
+    mapped = map_atlas(atlas, distances)
     progress("drawing", 0.95)
-    picture = map_picture(mapped, lambda k: draws[k][0].field(draws[k][1]), folder / "atlas.png")
-    text = page_html(mapped, shapes, commands, _account(mapped, sources, command))
+    picture = map_picture(mapped, lambda k: shapes[k][0].field(shapes[k][1].index), folder / "atlas.png")
+    text = page_html(mapped, views, commands, _account(mapped, sources, command))
     page = write_content(folder / "atlas.html", text)
     progress("done", 1.0)
     return picture, page
 
 
-def _measures(
-    stores: Sequence[Store], cache: Path, progress: Progress
-) -> tuple[Atlas, list[tuple[Store, int]], list[Shown], list[str]]:
-    """Return every shape's measures, and with each its draw, its pictures and the command that grows it again."""
-    draws: list[tuple[Store, int]] = []
-    shapes: list[Shown] = []
-    commands: list[str] = []
-
-    def look(store: Store, record: Record) -> Measured:
-        draws.append((store, record.index))
-        commands.append(regrow_command(record, store.settings, f"shape_{shape_id(store, record)}.nii.gz"))
-        cached = _cached(cache / f"shape-{_key(store, record)}.npz", lambda: _measure(store, record))
-        shapes.append(Shown(cached["thumbnail"].tobytes(), cached["volume"].tobytes()))
-        return float(cached["fraction"]), _diagram(cached, "field"), _diagram(cached, "mask")
-
-    atlas = extract(stores, measure=look, progress=sub_progress(progress, 0.0, 0.6))
-    return atlas, draws, shapes, commands
+def _measure_once(store: Store, record: Record, cache: Path) -> _Arrays:
+    """Return what is measured and shown of a shape, from the cache if it is there and sound."""
+    settings, facts = dataclasses.asdict(store.settings), dataclasses.asdict(record)
+    # All that the arrays depend on.
+    content = json.dumps([_CACHE_VERSION, version("curvafit"), settings, facts], sort_keys=True, default=str)
+    path = cache / f"shape-{shape_id(store, record)}-{hashlib.sha256(content.encode()).hexdigest()[:12]}.npz"
+    try:
+        return read_archive(path)
+    except (OSError, ValueError):
+        arrays = _measure(store, record)
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, **arrays)
+    write_content(path, buffer.getvalue())
+    return arrays
 
 
 def _measure(store: Store, record: Record) -> _Arrays:
-    fraction, *diagrams = measured(store, record)
-    views = shown(store.field(record.index))
-    arrays = {"fraction": np.array(fraction)} | {
-        name: np.frombuffer(view, dtype=np.uint8) for name, view in views._asdict().items()
-    }
+    """Return what is measured and shown of a shape, as arrays."""
+    fraction, *diagrams = measure_shape(store, record)
+    views = shrink(store.field(record.index))._asdict()
+    arrays = {"fraction": np.array(fraction)}
+    arrays |= {name: np.frombuffer(view, dtype=np.uint8) for name, view in views.items()}
     for view, diagram in zip(("field", "mask"), diagrams, strict=True):
         figures = np.array([diagram.spread, diagram.excluded])
         arrays |= {f"{view}_points": diagram.points, f"{view}_weights": diagram.weights, f"{view}_figures": figures}
@@ -129,42 +130,19 @@ def _measure(store: Store, record: Record) -> _Arrays:
 
 
 def _diagram(cached: _Arrays, view: str) -> Diagram:
+    """Return the diagram of a shape's field or mask."""
     spread, excluded = map(float, cached[f"{view}_figures"])
     return Diagram(cached[f"{view}_points"], cached[f"{view}_weights"], spread=spread, excluded=excluded)
 
 
-def _mapped(atlas: Atlas, cache: Path, progress: Progress) -> AtlasMap:
-    """Return the map of an atlas, its distances and places from the cache where they are there."""
-    saved, comparing = cache / "distances.npz", sub_progress(progress, 0.6, 0.85)
-    compare = partial(diagram_distances, atlas.field_diagrams, progress=comparing, saved=saved)
+def _compare_once(atlas: Atlas, cache: Path, progress: Progress) -> np.ndarray:
+    """Return the distances between the shapes' diagrams; those in the cache are taken from there."""
+    saved = cache / "distances.npz"
     try:
-        distances = compare()
+        return diagram_distances(atlas.field_diagrams, progress=progress, saved=saved)
     except ValueError:  # a file that is damaged, or of other settings
         saved.unlink(missing_ok=True)
-        distances = compare()
-    progress("laying out the map", 0.86)
-    key = hashlib.sha256(distances.tobytes()).hexdigest()[:12]
-    places = _cached(cache / f"places-{key}-{version('umap-learn')}.npz", lambda: {"positions": embed(distances)})
-    return map_atlas(atlas, distances, places["positions"])
-
-
-def _cached(path: Path, make: Callable[[], _Arrays]) -> _Arrays:
-    """Return the arrays in a file; where there is no sound one, make them and write them there."""
-    try:
-        return read_archive(path)
-    except (OSError, ValueError):
-        arrays = make()
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **arrays)
-    write_content(path, buffer.getvalue())
-    return arrays
-
-
-def _key(store: Store, record: Record) -> str:
-    """Return a name that changes with anything a shape's measures and pictures depend on."""
-    settings, facts = dataclasses.asdict(store.settings), dataclasses.asdict(record)
-    content = json.dumps([_CACHE_VERSION, version("curvafit"), settings, facts], sort_keys=True, default=str)
-    return f"{shape_id(store, record)}-{hashlib.sha256(content.encode()).hexdigest()[:12]}"
+        return diagram_distances(atlas.field_diagrams, progress=progress, saved=saved)
 
 
 def _account(mapped: AtlasMap, stores: Sequence[Store], command: str) -> list[tuple[str, str]]:
@@ -178,14 +156,15 @@ def _account(mapped: AtlasMap, stores: Sequence[Store], command: str) -> list[tu
             for store in stores
             for name, words in summarise(store).items()
         },
-        "distances": _listed(settings["distances"]),
-        "UMAP": _listed(settings["umap"]),
-        "HDBSCAN": _listed(settings["hdbscan"]) + f": {max(mapped.clusters) + 1} clusters",
-        "measured with": _listed(settings["versions"]),
+        "distances": _join_words(settings["distances"]),
+        "UMAP": _join_words(settings["umap"]),
+        "HDBSCAN": _join_words(settings["hdbscan"]) + f": {max(mapped.clusters) + 1} clusters",
+        "measured with": _join_words(settings["versions"]),
         "measured on": mapped.atlas.provenance["date"],
     }
     return [(name, words) for name, words in rows.items() if words]
 
 
-def _listed(values: dict[str, Any]) -> str:
+def _join_words(values: dict[str, Any]) -> str:
+    """Return names and values as one line."""
     return ", ".join(f"{name} {value}" for name, value in values.items())

@@ -47,7 +47,7 @@ class AtlasMap:
     distances
         Between the diagrams of the fields, `(N, N)`, in 1 / working unit.
     positions
-        Places on the map, `(N, 2)`; only who is near whom has a meaning.
+        Places on the map, `(N, 2)`; only nearness has a meaning, not direction.
     clusters
         Cluster of each shape `(N,)`, from 0, or `NOISE`.
     cluster_families
@@ -76,15 +76,13 @@ class AtlasMap:
         return np.argsort(others, axis=1, kind="stable")[:, : min(count, len(self) - 1)]
 
 
-def map_atlas(atlas: Atlas, distances: np.ndarray, positions: np.ndarray | None = None) -> AtlasMap:
+def map_atlas(atlas: Atlas, distances: np.ndarray) -> AtlasMap:
     """Lay an atlas out by its distances, find clusters, and name them (paper, Experiment 4 and Figure 10).
 
     Parameters
     ----------
     distances
         `(N, N)`, symmetric: see `diagram_distances`.
-    positions
-        Where the shapes lie, `(N, 2)`, if that is known already; else `embed` tells.
 
     Raises
     ------
@@ -97,7 +95,7 @@ def map_atlas(atlas: Atlas, distances: np.ndarray, positions: np.ndarray | None 
     check_size(n := len(atlas))
     if distances.shape != (n, n) or not np.isfinite(distances).all() or not np.allclose(distances, distances.T):
         raise ValueError(f"distances must be finite, symmetric and of shape ({n}, {n}), got {distances.shape}")
-    positions = embed(distances) if positions is None else positions
+    positions = embed(distances)
     clusters = find_clusters(positions)
     families, shares = families_of(atlas)
     pooled = [shares[clusters == cluster].mean(0) for cluster in range(max(clusters) + 1)]
@@ -113,37 +111,30 @@ def diagram_distances(
     Parameters
     ----------
     saved
-        File (`.npz`) that is replaced every half minute and at the end. What it holds of pairs among these diagrams is
-        taken from it: a run that was stopped goes on, a longer list costs its new rows, and rows of diagrams that are
-        not listed any more go. Diagrams are known by their content, whatever their order.
-
-    Raises
-    ------
-    ValueError
-        As `pairwise`; or if the file is something else, or was made with other settings.
-    OSError
-        If the file cannot be written; before anything is computed.
+        File (`.npz`) that is replaced every half minute and at the end. Distances between these diagrams that it holds
+        are taken from it: a run that was stopped goes on, and a longer list costs only its new rows. Diagrams are
+        recognised by their content, in any order. A file of another kind or of other settings is a ValueError, one
+        that cannot be written an OSError before anything is computed.
     """
     if saved is None:
         return pairwise(diagrams, **DISTANCE, progress=progress)
     keys = digests(diagrams, **DISTANCE)
     known = np.full((len(keys),) * 2, np.nan)
     if saved.exists():
-        there, distances = DISTANCES.read(saved, _table)
+        there, distances = DISTANCES.read(saved, _read_distances)
         place = {key: number for number, key in enumerate(there)}
         mine = [number for number, key in enumerate(keys) if key in place]
         theirs = [place[keys[number]] for number in mine]
         known[np.ix_(mine, mine)] = distances[np.ix_(theirs, theirs)]
 
     def save(distances: np.ndarray) -> None:
-        """Replace the file."""
         arrays = {"keys": np.array(keys, dtype="S64"), "distances": distances}
         DISTANCES.write(saved, {}, arrays)
 
     return pairwise(diagrams, **DISTANCE, known=known, save=save, progress=progress)
 
 
-def _table(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> tuple[list[str], np.ndarray]:
+def _read_distances(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> tuple[list[str], np.ndarray]:
     """Return the digests and the distances of a file."""
     keys, distances = arrays["keys"].astype(str).tolist(), arrays["distances"]
     if distances.shape != (len(keys),) * 2 or distances.dtype != np.float64:
@@ -156,8 +147,7 @@ def embed(distances: np.ndarray) -> np.ndarray:
     neighbours."""
     options = UMAP | {"n_neighbors": min(UMAP["n_neighbors"], len(distances) - 1)}
     with warnings.catch_warnings():
-        # It tells that a neural kin of it is not installed, that precomputed distances cannot be inverted, and that
-        # far families are not connected.
+        # That its neural variant is not installed, that given distances cannot be inverted, that families lie apart.
         warnings.simplefilter("ignore")
         from umap import UMAP as Umap
 

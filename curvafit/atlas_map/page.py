@@ -58,26 +58,26 @@ CUT, LEVELS = 0.5, 31
 
 
 def page_html(
-    mapped: AtlasMap, shapes: Sequence[Shown], commands: Sequence[str], account: Sequence[tuple[str, str]]
+    mapped: AtlasMap, shapes: Sequence[Miniature], commands: Sequence[str], account: Sequence[tuple[str, str]]
 ) -> str:
     """Return the text of the page.
 
     Parameters
     ----------
     shapes, commands
-        What is shown of each shape, and the line that grows it again, in the atlas's order.
+        The miniature of each shape, and the command that grows it again, in the atlas's order.
     account
-        Rows that say how the map was made.
+        Rows, name and text, on how the map was made.
     """
     blobs = {
-        "thumbnails": _joined(one.thumbnail for one in shapes),
-        "volumes": _joined(one.volume for one in shapes),
+        "thumbnails": _join_base64(one.thumbnail for one in shapes),
+        "volumes": _join_base64(one.volume for one in shapes),
     }
-    data = _small(mapped, commands)
+    data = _page_data(mapped, commands)
     scale, pieces = _diagrams(mapped.atlas.field_diagrams)
-    data["diagram"]["scale"], blobs["diagrams"] = scale, _joined(pieces)
+    data["diagram"]["scale"], blobs["diagrams"] = scale, _join_base64(pieces)
     scale, pieces = _embeddings(mapped)
-    data["embedding"]["scale"], blobs["embeddings"] = scale, _joined(pieces)
+    data["embedding"]["scale"], blobs["embeddings"] = scale, _join_base64(pieces)
     data["offsets"] = {name: offsets for name, (_, offsets) in blobs.items()}
     return Template(_template("atlas.html")).substitute(
         version=escape(str(mapped.settings["versions"]["curvafit"])),
@@ -90,7 +90,7 @@ def page_html(
     )
 
 
-def _small(mapped: AtlasMap, commands: Sequence[str]) -> dict[str, Any]:
+def _page_data(mapped: AtlasMap, commands: Sequence[str]) -> dict[str, Any]:
     """Return the data that the page decodes at its start."""
     near = mapped.neighbours(NEIGHBOURS)
     sampling = mapped.atlas.provenance["settings"]
@@ -120,7 +120,10 @@ def _small(mapped: AtlasMap, commands: Sequence[str]) -> dict[str, Any]:
         },
         "diagram": {"limits": [float(np.quantile(limits[:, 0], 0.05)), float(np.quantile(limits[:, 1], 0.95))]},
         "fit": FIT_SCHEMA,
-        "embedding": {"usual": {view: _usual(mapped.atlas.embeddings(view)) for view in VIEWS}, "nearest": PLACED_BY},
+        "embedding": {
+            "usual": {view: _nearest_quantiles(mapped.atlas.embeddings(view)) for view in VIEWS},
+            "nearest": PLACED_BY,
+        },
         "ramps": {
             "values": [to_hex(colour) for colour in colormaps["viridis"](np.linspace(0, 1, 17))],
             "density": [to_hex(colour) for colour in DENSITY(np.linspace(0, 1, 17))],
@@ -129,6 +132,7 @@ def _small(mapped: AtlasMap, commands: Sequence[str]) -> dict[str, Any]:
 
 
 def _columns(mapped: AtlasMap) -> list[dict[str, Any]]:
+    """Return the parameters that points can be coloured by, with their values."""
     atlas = mapped.atlas
     values = dict(zip(NAMES, atlas.coefficients.T, strict=True))
     values |= {"m0": atlas.masses, "volume": atlas.volume_fractions}
@@ -140,12 +144,12 @@ def _columns(mapped: AtlasMap) -> list[dict[str, Any]]:
 
 
 def _unit_square(positions: np.ndarray) -> np.ndarray:
-    """Return the places moved and scaled (both axes alike) so that they are in the middle of [0, 1]²."""
+    """Return the places centred in [0, 1]², both axes scaled alike."""
     low, high = positions.min(0), positions.max(0)
     return (positions - (low + high) / 2) / max(float((high - low).max()), 1e-9) + 0.5
 
 
-def _usual(embeddings: np.ndarray) -> list[float]:
+def _nearest_quantiles(embeddings: np.ndarray) -> list[float]:
     """Return the median and the 95 % quantile of the distance to the nearest other shape."""
     apart = cdist(embeddings, embeddings)
     np.fill_diagonal(apart, np.inf)
@@ -153,8 +157,7 @@ def _usual(embeddings: np.ndarray) -> list[float]:
 
 
 def _diagrams(diagrams: Sequence[Diagram]) -> tuple[float, list[bytes]]:
-    """Return the step of κ, and of each diagram κ1, κ2 (int16) and shares of area (uint16, of 65535), one after
-    another."""
+    """Return the step of κ, and each diagram's κ1, κ2 (int16, in steps) and shares of area (uint16, of 65535)."""
     step = max(float(np.abs(diagram.points).max()) for diagram in diagrams) / 32767
     return step, [
         np.rint(diagram.points.T / step).astype("<i2").tobytes()
@@ -164,14 +167,14 @@ def _diagrams(diagrams: Sequence[Diagram]) -> tuple[float, list[bytes]]:
 
 
 def _embeddings(mapped: AtlasMap) -> tuple[float, list[bytes]]:
-    """Return the step, and the sliced embeddings of fields and of masks `(N, 288)`, int16."""
+    """Return the step, and the sliced embeddings of fields and of masks `(N, 288)`, int16 in steps."""
     views = [mapped.atlas.embeddings(view) for view in VIEWS]
     step = max(float(np.abs(each).max()) for each in views) / 32767
     return step, [np.rint(each / step).astype("<i2").tobytes() for each in views]
 
 
-def _joined(pieces: Iterable[bytes]) -> tuple[str, list[int]]:
-    """Return the pieces in base64, joined, and the offsets at which each begins and the last ends."""
+def _join_base64(pieces: Iterable[bytes]) -> tuple[str, list[int]]:
+    """Return pieces as one text in base64, and the offsets where each begins and the last ends."""
     texts = [base64.b64encode(piece).decode("ascii") for piece in pieces]
     return "".join(texts), np.cumsum([0, *map(len, texts)]).tolist()
 
@@ -183,18 +186,18 @@ def _template(name: str) -> str:
 # ---- one shape -------------------------------------------------------------------------------------------------------
 
 
-class Shown(NamedTuple):
+class Miniature(NamedTuple):
     """A shape's thumbnail (WebP) and small volume (zlib, one byte a voxel, z slowest, of `small_shape`)."""
 
     thumbnail: bytes
     volume: bytes
 
 
-def shown(u: np.ndarray) -> Shown:
+def shrink(u: np.ndarray) -> Miniature:
     """Return the thumbnail and the small volume of a periodic field `(Z, Y, X)`."""
     buffer = io.BytesIO()
     Image.fromarray(render(u, width=THUMBNAIL)[0]).save(buffer, "webp", quality=80, alpha_quality=80)
-    return Shown(buffer.getvalue(), zlib.compress(small_volume(u).tobytes(), 9))
+    return Miniature(buffer.getvalue(), zlib.compress(small_volume(u).tobytes(), 9))
 
 
 def small_shape(shape: tuple[int, ...]) -> tuple[int, ...]:
@@ -214,13 +217,9 @@ def small_volume(u: np.ndarray) -> np.ndarray:
 
 
 def regrow_command(record: Record, settings: Settings, name: str) -> str:
-    """Return the `curvafit generate` line that makes a draw's field again: with the same versions, processor and number
-    of threads (stores are made on one) bit for bit.
+    """Return the `curvafit generate` line that makes a draw's field again; raise ValueError where there is none.
 
-    Raises
-    ------
-    ValueError
-        If the draw was made with a blur or a schedule that the command line does not offer.
+    With the same versions, processor and number of threads (stores are made on one) it is the same bit for bit.
     """
     options = [f"--coefficients {','.join(map(_plain, record.coefficients))}", f"--mass {_plain(record.mass)}"]
     sizes = settings.shape[:1] if len(set(settings.shape)) == 1 else settings.shape

@@ -63,26 +63,27 @@ def test_a_damaged_file_of_distances_is_made_anew(tmp_path: Path, monkeypatch: p
 def test_shapes_that_a_build_adds_meanwhile_mix_up_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     quick_map(monkeypatch)
     store = exact_store(tmp_path / "s.zarr", 10, first=3)
-    real, shown_of = atlas_files.extract, {}
+    real, shown_of = atlas_files.read_draws, {}
 
-    def extract_later(*arguments, **options):
+    def read_early(*arguments, **options):
+        draws = real(*arguments, **options)
         exact_store(tmp_path / "s.zarr", 2)
-        return real(*arguments, **options)
+        return draws
 
     def picture(mapped, field, path):
         shown_of.update({name: field(k) for k, name in enumerate(mapped.atlas.ids)})
         return path
 
-    monkeypatch.setattr(atlas_files, "extract", extract_later)
+    monkeypatch.setattr(atlas_files, "read_draws", read_early)
     monkeypatch.setattr(atlas_files, "map_picture", picture)
     _, page = write_map([store], tmp_path / "map")
-    assert len(shown_of) == 8
+    assert len(shown_of) == 6
     for name, u in shown_of.items():
         np.testing.assert_array_equal(u, exact_field(int(name.split("-")[1])))
     data = json.loads(re.findall(r'id="data">(.*?)</script>', page.read_text())[0])
     assert [f"shape_{name}.nii.gz" in line for name, line in zip(data["ids"], data["commands"], strict=True)] == [
         True
-    ] * 8
+    ] * 6
 
 
 def test_a_map_of_two_stores_shows_the_shapes_of_both(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

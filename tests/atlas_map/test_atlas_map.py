@@ -20,7 +20,7 @@ import curvafit.atlas_map.layout as atlas_map
 from curvafit.atlas_map.extract import extract
 from curvafit.atlas_map.files import write_map
 from curvafit.atlas_map.layout import NOISE, AtlasMap, embed, find_clusters, map_atlas
-from curvafit.atlas_map.page import CUT, LEVELS, regrow_command, shown, small_volume
+from curvafit.atlas_map.page import CUT, LEVELS, regrow_command, shrink, small_volume
 from curvafit.atlas_map.picture import assign_slots, slot_places, spread_out
 from curvafit.generation.flow import generate
 from curvafit.geometry.distances import wasserstein
@@ -34,7 +34,10 @@ COUNT = 16
 def mapped(tmp_path_factory: pytest.TempPathFactory) -> AtlasMap:
     atlas = extract([exact_store(tmp_path_factory.mktemp("map") / "s.zarr", COUNT)])
     apart = cdist(atlas.embeddings("field"), atlas.embeddings("field"))
-    return map_atlas(atlas, apart, np.random.default_rng(0).normal(size=(len(atlas), 2)))
+    places = np.random.default_rng(0).normal(size=(len(atlas), 2))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(atlas_map, "embed", lambda distances: places)
+        return map_atlas(atlas, apart)
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +78,8 @@ def test_clusters_are_blobs_the_largest_first_and_what_lies_apart_is_noise() -> 
 def test_a_cluster_is_named_by_the_diagrams_of_its_shapes(mapped: AtlasMap, monkeypatch: pytest.MonkeyPatch) -> None:
     kinds = np.array([FAMILIES.index(name) for name in mapped.families])
     monkeypatch.setattr(atlas_map, "find_clusters", lambda positions: np.where(kinds == 3, NOISE, kinds))
-    assert map_atlas(mapped.atlas, mapped.distances, mapped.positions).cluster_families == FAMILIES[:3]
+    monkeypatch.setattr(atlas_map, "embed", lambda distances: mapped.positions)
+    assert map_atlas(mapped.atlas, mapped.distances).cluster_families == FAMILIES[:3]
 
 
 @pytest.mark.slow
@@ -101,7 +105,7 @@ def test_distances_are_the_paper_s(mapped: AtlasMap) -> None:
 def test_wrong_distances_and_too_few_shapes_are_refused(mapped: AtlasMap) -> None:
     for wrong in (mapped.distances[1:], np.triu(mapped.distances), np.full((14, 14), np.nan)):
         with pytest.raises(ValueError, match="distances"):
-            map_atlas(mapped.atlas, wrong, mapped.positions)
+            map_atlas(mapped.atlas, wrong)
     with pytest.raises(ValueError, match="5"):
         atlas_map.check_size(4)
 
@@ -163,7 +167,7 @@ def test_a_small_volume_has_the_surface_where_it_was() -> None:
     assert small.shape == (32, 16, 32) and small.dtype == np.uint8 and small.max() == LEVELS
     values, truth = small / LEVELS * 2 * CUT - CUT, np.clip(u[::2, ::2, ::2], -CUT, CUT)
     np.testing.assert_allclose(values, truth, atol=0.06)  # at a slope of up to 0.8 a small voxel: under a tenth of one
-    kept = shown(u)
+    kept = shrink(u)
     assert kept.thumbnail[:4] == b"RIFF" and kept.thumbnail[8:12] == b"WEBP"
     assert zlib.decompress(kept.volume) == small.tobytes()
 
