@@ -24,7 +24,7 @@ from scipy.ndimage import gaussian_filter
 
 from curvafit.core.files import write_content
 from curvafit.core.units import unit_name
-from curvafit.drawing.render import DPI, QUIET, boxed
+from curvafit.drawing.render import DPI, QUIET, render_in_box
 from curvafit.generation.result import Flow
 from curvafit.geometry.diagram import Diagram
 from curvafit.volumes.field import Field
@@ -49,13 +49,10 @@ Limits = tuple[float, float]
 # ---- surfaces --------------------------------------------------------------------------------------------------------
 
 
-def surface_figure(u: np.ndarray, *, width: int = 720, title: str = "", **options) -> Figure:
-    """Return a figure `width` pixels wide of one surface."""
+def surface_figure(u: np.ndarray, *, width: int = 720, **options) -> Figure:
+    """Return a figure `width` pixels wide of one surface; `options` are those of `surface_on`."""
     figure = _figure(width / DPI, width / DPI)
-    axes = figure.add_axes((0, 0, 1, 0.93 if title else 1))
-    surface_on(axes, u, width=width, **options)
-    if title:
-        axes.set_title(title, fontsize=12)
+    surface_on(figure.add_axes((0, 0, 1, 1)), u, width=width, **options)
     return figure
 
 
@@ -72,7 +69,7 @@ def surface_on(
     """Draw the level set of a field (or the outline of a bool mask) in its box, cut faces capped."""
     options = {"spacing": spacing, "level": level, "azimuth": azimuth, "elevation": elevation}
     axes.set_axis_off()
-    axes.imshow(boxed(u, width=width, **options), interpolation="antialiased")
+    axes.imshow(render_in_box(u, width=width, **options), interpolation="antialiased")
 
 
 def gallery_picture(fields: Mapping[str, np.ndarray], path: str | Path, *, width: int = 1600, **options) -> Path:
@@ -126,7 +123,7 @@ def slice_figure(
     axes_names
         Names of the vertical and the horizontal axis.
     window
-        A rectangle to frame, likewise.
+        A rectangle to frame, in the order of `extent`.
     """
     left, right, bottom, top = extent
     ratio = min(max(abs(top - bottom) / abs(right - left), 0.25), 2.0)
@@ -175,23 +172,15 @@ def round_length(length: float) -> float:
 
 
 def diagram_figure(
-    diagram: Diagram, *, limits: Limits | None = None, unit: str | None = None, length: float = 1.0, title: str = ""
+    diagram: Diagram, *, limits: Limits | None = None, unit: str | None = None, length: float = 1.0
 ) -> Figure:
-    """Return a figure of one diagram, in its own unit or another; see `diagram_on`.
-
-    Raises
-    ------
-    ValueError
-        If the diagram is empty.
-    """
+    """Return a figure of one diagram, which must have area, in its own unit or another; see `diagram_on`."""
     if not diagram.area > 0:
         raise ValueError("the diagram is empty: it has no area to draw")
     unit = diagram.unit.removeprefix("1/") if unit is None else unit
     figure = _figure(4.2, 4.2)
-    axes = figure.add_axes((0.16, 0.13, 0.82, 0.79 if title else 0.85))
+    axes = figure.add_axes((0.16, 0.13, 0.82, 0.85))
     diagram_on(axes, diagram, limits=limits or shared_limits([diagram], length=length), unit=unit, length=length)
-    if title:
-        axes.set_title(title, fontsize=11)
     return figure
 
 
@@ -200,7 +189,8 @@ def diagram_on(
 ) -> None:
     """Draw the share of area over (κ1, κ2): κ1 to the right, κ2 up, colours by the logarithm.
 
-    `length` is the diagram's unit in `unit`: curvatures are divided by it. `limits` (in 1 / `unit`) hold for both axes.
+    The diagram's own unit of length is `length` in `unit`: curvatures are divided by it. `limits`, in 1 / `unit`, are
+    those of both axes.
     """
     low, high = limits
     edges = np.linspace(low, high, BINS + 1)
@@ -226,14 +216,14 @@ def diagram_on(
     _name_families(axes, limits)
 
 
-def shared_limits(diagrams: Sequence[Diagram], *, length: float = 1.0, tail: float = 0.006) -> Limits:
-    """Return the interval of both curvatures of all diagrams, but for the outermost `tail` of area at either end."""
+def shared_limits(diagrams: Sequence[Diagram], *, length: float = 1.0) -> Limits:
+    """Return the interval that holds both curvatures of all diagrams, but for 0.6 % of the area at either end."""
     bounds = [0.0, 0.0]
     for diagram in diagrams:
         for kappa in np.asarray(diagram.points).T / length:
             order = np.argsort(kappa)
             cumulated = np.cumsum(np.asarray(diagram.weights)[order])
-            cuts = np.searchsorted(cumulated, [tail * cumulated[-1], (1 - tail) * cumulated[-1]])
+            cuts = np.searchsorted(cumulated, [0.006 * cumulated[-1], 0.994 * cumulated[-1]])
             low, high = kappa[order][np.minimum(cuts, len(kappa) - 1)]
             bounds = [min(bounds[0], float(low)), max(bounds[1], float(high))]
     width = max(bounds[1] - bounds[0], 1e-9)
@@ -261,13 +251,7 @@ def _name_families(axes: Axes, limits: Limits) -> None:
 
 
 def field_figure(field: Field) -> Figure:
-    """Return a figure of a field's middle slices.
-
-    Raises
-    ------
-    ValueError
-        If the field has no voxels, or a value is not finite.
-    """
+    """Return a figure of a field's middle slices."""
     return section_figure([(field.values, None)], field.spacing)
 
 
@@ -286,11 +270,6 @@ def section_figure(
         Voxel edges (z, y, x).
     places
         Number of the slice across each axis; by default the middle one.
-
-    Raises
-    ------
-    ValueError
-        If there are no voxels, or a value is not finite.
     """
     figure = _figure(7.2, 2.5 * len(rows), layout="constrained")
     axes = figure.subplots(len(rows), 3, squeeze=False)
@@ -316,7 +295,7 @@ def section_figure(
 def _section_on(
     axes, plane: np.ndarray, outline: np.ndarray | None, levels: tuple[float, float], aspect: float
 ) -> None:
-    """Draw a slice."""
+    """Draw a slice, black at the first of the levels and white at the second, with the outline of a mask."""
     low, high = levels
     plane, high = plane.astype(np.float32), max(high, low + 1e-6)
     axes.imshow(plane, cmap="gray", vmin=low, vmax=high, aspect=aspect, interpolation="nearest")
@@ -386,10 +365,9 @@ def _label(axes: Axes, names: Sequence[str], row: int, column: int, *, last: boo
 
 
 def bands_figure(blocks: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
-    """Return a picture of blocks of numbers, each the scan's `(k,)` on the band of simulated ones `(n, k)`.
+    """Return a figure of blocks of numbers: the scan's `(k,)` on the bands that hold 50 and 90 % of simulated `(n, k)`.
 
-    The bands hold 50 and 90 % of the simulated numbers; a block of one number is a dot on a bar. Each block has its own
-    scale.
+    Blocks have scales of their own; one of at most three numbers is dots on bars.
     """
     columns = 3
     rows = -(-len(blocks) // columns)
@@ -416,26 +394,14 @@ def bands_figure(blocks: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
 
 
 def fit_figure(fit: Any, **options: Any) -> Figure:
-    """Return a figure of the curvature diagram of a fit's scan; `options` are those of `diagram_figure`.
-
-    Raises
-    ------
-    ValueError
-        If the fit holds no diagram.
-    """
+    """Return a figure of the curvature diagram of a fit's scan; `options` are those of `diagram_figure`."""
     if fit.diagram is None:
         raise ValueError("this fit holds no curvature diagram to draw")
     return diagram_figure(fit.diagram, **options)
 
 
 def flow_figure(flow: Flow, **options: Any) -> Figure:
-    """Return a figure of a flow's surface; `options` are those of `surface_figure`.
-
-    Raises
-    ------
-    ValueError
-        If the field has no surface or is not finite.
-    """
+    """Return a figure of a flow's surface; `options` are those of `surface_figure`."""
     return surface_figure(flow.field.numpy(), spacing=flow.grid.spacing, **options)
 
 

@@ -30,6 +30,8 @@ DPI = 160
 QUIET = "#8A8F98"
 #: Width of the box's edges in pixels, pixels to one along an axis as they are drawn, and opacity behind and in front.
 _LINE, _FINE, _OPACITY = 4 / 3, 3, (0.4, 0.55)
+#: Rays to a pixel, along either axis.
+_SUPERSAMPLE = 2
 #: Distances, in the shortest voxel edge, over which occupancy is blurred for the light of the sky.
 NEAR, FAR = 2.5, 7.0
 #: Voxels along an edge above which the light is computed on a coarser grid.
@@ -37,23 +39,28 @@ COARSE = 128
 
 
 class View(NamedTuple):
-    """A parallel projection: rows `right`, `up`, `towards` (the eye) in (z, y, x), the box (lengths of its edges in
-    the shortest voxel edge), and half the picture's width and height in that unit."""
+    """A parallel projection of a box.
+
+    The rows of `frame` are the directions right, up and towards the eye, in (z, y, x). `box` has the lengths of the
+    box's edges, and `half` is half the picture's width and height, both in the shortest voxel edge.
+    """
 
     frame: np.ndarray
     box: np.ndarray
     half: tuple[float, float]
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Return where points `(N, 3)` of the box, (z, y, x) in [0, 1], lie on the picture: `(N, 2)`, x and y down."""
+        """Return where points `(N, 3)` of the box, (z, y, x) in [0, 1], are on the picture: `(N, 2)`, x and y down."""
         centred = (np.asarray(points) - 0.5) * self.box
         right, up = centred @ self.frame[0], centred @ self.frame[1]
         return np.stack([0.5 + right / (2 * self.half[0]), 0.5 - up / (2 * self.half[1])], axis=-1)
 
 
 class _Scene(NamedTuple):
-    """A field less its level, as a stack of planes from the eye on; its voxel edges over the shortest; and the rows
-    right, up and towards the eye in its axes."""
+    """What is drawn: a field minus its level, as a stack of planes of which the first is nearest to the eye.
+
+    `edges` are the voxel's, in the shortest one; the rows of `frame` are right, up and towards the eye, in these axes.
+    """
 
     field: np.ndarray
     edges: np.ndarray
@@ -71,19 +78,19 @@ class _Scene(NamedTuple):
 
 
 class _Rays(NamedTuple):
-    """Parallel rays through a stack of planes: the ray at `places[0][i]`, `places[1][j]` of plane 0, in voxels, meets
-    plane k farther along by k times `slopes`. A ray's number counts over j, then over i."""
+    """Parallel rays through a stack of planes: ray (i, j) meets plane k at `places[0][i]`, `places[1][j]`, plus k times
+    `slopes`, in voxels. Rays are numbered over j, then over i."""
 
     slopes: np.ndarray
     places: tuple[np.ndarray, np.ndarray]
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Numbers of rays."""
+        """The numbers of rays along i and j."""
         return len(self.places[0]), len(self.places[1])
 
     def at(self, planes: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-        """Return the points `(3, N)`, in voxels, where rays are at planes, in fractions of a plane."""
+        """Return the points `(3, N)`, in voxels, at which rays of these numbers meet planes (or places between two)."""
         (slope, other), (rows, columns) = self.slopes, self.places
         i, j = np.divmod(numbers, len(columns))
         return np.stack([planes, rows[i] + planes * slope, columns[j] + planes * other])
@@ -114,19 +121,13 @@ def render(
     level: float = 0.0,
     width: int = 720,
     height: int | None = None,
-    supersample: int = 2,
     azimuth: float = 32.0,
     elevation: float = 24.0,
 ) -> tuple[np.ndarray, View]:
-    """Return the level set of `u` `(Z, Y, X)` as a picture, and the projection that it was drawn by.
+    """Return a picture of the level set of `u` `(Z, Y, X)`, and the projection that it shows.
 
-    The picture is RGBA bytes, `width` pixels wide, or as wide as lets it be `height` high at most, transparent where
-    there is nothing.
-
-    Raises
-    ------
-    ValueError
-        If the volume is not three-dimensional, has an axis under 4 voxels, or is not finite.
+    The picture is RGBA bytes, transparent where there is nothing; it is `width` pixels wide, or less where it would be
+    higher than `height`. A volume that has no 3 axes of at least 4 voxels, or is not finite, is a ValueError.
     """
     field = np.asarray(u, dtype=np.float32)
     if field.ndim != 3 or min(field.shape) < 4:
@@ -139,14 +140,14 @@ def render(
     height = max(2, round(width * camera.half[1] / camera.half[0]))
     edges = np.array(spacing) / min(spacing)
     order, field = _stack(field - np.float32(level), -camera.frame[2] / edges)
-    scene = _Scene(field, edges[order.axes], order.turned(camera.frame))
-    size = (width * supersample, height * supersample)
+    scene = _Scene(field, edges[order.axes], order.turn(camera.frame))
+    size = (width * _SUPERSAMPLE, height * _SUPERSAMPLE)
     lengths = np.linalg.norm(scene.frame[:2, 1:], axis=0) * scene.edges[1:]  # of a voxel's edges in the picture
     rays = _rays(field.shape, scene.look, 2 * camera.half[0] / size[0] / lengths)
     sheet = Image.fromarray(_colours(scene, rays))
     placement = _placement(scene, rays, camera.half, size)
     picture = sheet.transform(size, Image.Transform.AFFINE, placement, Image.Resampling.BILINEAR)
-    return np.asarray(picture.reduce(supersample)), camera
+    return np.asarray(picture.reduce(_SUPERSAMPLE)), camera
 
 
 def _placement(scene: _Scene, rays: _Rays, half: tuple[float, float], size: tuple[int, int]) -> list[float]:
@@ -165,19 +166,19 @@ def _placement(scene: _Scene, rays: _Rays, half: tuple[float, float], size: tupl
 
 
 class _Order(NamedTuple):
-    """The axes of a volume as a stack of planes, the first along the rays, and which way they count, from the rays'
-    start."""
+    """The axes of a volume as a stack of planes, that of the planes first, and the sign of each: planes count along the
+    rays."""
 
     axes: list[int]
     signs: np.ndarray
 
-    def turned(self, vectors: np.ndarray) -> np.ndarray:
+    def turn(self, vectors: np.ndarray) -> np.ndarray:
         """Return vectors `(…, 3)` in these axes."""
         return (vectors[..., self.axes] * self.signs).astype(np.float32)
 
 
 def _stack(values: np.ndarray, direction: np.ndarray) -> tuple[_Order, np.ndarray]:
-    """Return a volume as the stack of planes that rays along `direction`, in voxels, cross most steeply."""
+    """Return a volume as a stack of planes along the axis that is nearest to the rays' `direction`, in voxels."""
     axis = int(np.abs(direction).argmax())
     order = _Order([axis, *(other for other in range(3) if other != axis)], np.array([np.sign(direction[axis]), 1, 1]))
     planes = values.transpose(order.axes)
@@ -185,7 +186,7 @@ def _stack(values: np.ndarray, direction: np.ndarray) -> tuple[_Order, np.ndarra
 
 
 def _rays(shape: tuple[int, ...], direction: np.ndarray, steps: np.ndarray) -> _Rays:
-    """Return rays along `direction` (a stack's, in voxels), `steps` apart, that fill a stack of planes."""
+    """Return rays along `direction`, in voxels, that fill a stack of planes at distances of `steps`."""
     slopes = (direction[1:] / direction[0]).astype(np.float32)
     shifts = slopes * (shape[0] - 1)
     first, last = np.minimum(0, -shifts), np.array(shape[1:]) - 1 + np.maximum(0, -shifts)
@@ -198,23 +199,23 @@ def _rays(shape: tuple[int, ...], direction: np.ndarray, steps: np.ndarray) -> _
 def _resample_planes(
     values: np.ndarray, rays: _Rays, times: int = 1
 ) -> Iterator[tuple[float, tuple[slice, slice], np.ndarray]]:
-    """Yield for each plane of a stack its place, the window of rays that cross it, and its values at those rays.
+    """Yield for each plane of a stack its place, the window of rays that meet it, and its values at those rays.
 
-    With `times` above 1, planes between those of the stack are interpolated. Bilinear interpolation is separable: one
-    sparse matrix for the rows, one for the columns.
+    With `times` above 1, there are planes between those of the stack too, interpolated. Bilinear interpolation is
+    separable: a sparse matrix for the rows, and one for the columns.
     """
     for n in range((len(values) - 1) * times + 1):
         k, part = divmod(n, times)
         plane = values[k] + np.float32(part / times) * (values[k + 1] - values[k]) if part else values[k]
         (window, rows), (other, columns) = (
-            _weights(places + slope * (n / times), size)
+            _linear_weights(places + slope * (n / times), size)
             for places, slope, size in zip(rays.places, rays.slopes, plane.shape, strict=True)
         )
         yield n / times, (window, other), rows @ (columns @ plane.T).T
 
 
-def _weights(positions: np.ndarray, n: int) -> tuple[slice, csr_array]:
-    """Return which ascending positions lie on n voxels, and the matrix that takes voxels there linearly."""
+def _linear_weights(positions: np.ndarray, n: int) -> tuple[slice, csr_array]:
+    """Return the range of ascending positions that lie on n voxels, and the matrix that interpolates voxels there."""
     window = slice(*np.searchsorted(positions, (0, np.nextafter(np.float32(n - 1), np.float32(n)))))
     inside = positions[window]
     below = np.minimum(inside.astype(np.int32), n - 2)
@@ -224,7 +225,7 @@ def _weights(positions: np.ndarray, n: int) -> tuple[slice, csr_array]:
 
 
 def _crossings(rays: _Rays, shape: tuple[int, ...]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return at which planes rays enter and leave a box along each of its axes; what broadcasts to all rays."""
+    """Return for each axis of a box the planes at which rays enter and leave it; arrays that broadcast to all rays."""
     start, stop = np.zeros((1, 1), np.float32), np.full((1, 1), shape[0] - 1, np.float32)
     ends: list[tuple[np.ndarray, np.ndarray]] = [(start, stop)]
     for axis, (slope, places) in enumerate(zip(rays.slopes, rays.places, strict=True)):
@@ -246,7 +247,7 @@ def _colours(scene: _Scene, rays: _Rays) -> np.ndarray:
         choose(choose(*pair), last).ravel()
         for choose, (*pair, last) in zip((np.maximum, np.minimum), zip(*crossings, strict=True), strict=True)
     )
-    depth = _first(scene.field, rays, enter, leave, max(1, round(1 / abs(float(scene.look[0])))))
+    depth = _first_crossings(scene.field, rays, enter, leave, max(1, round(1 / abs(float(scene.look[0])))))
     numbers = np.flatnonzero(np.isfinite(depth))
     planes = depth[numbers]
     capped = planes == enter[numbers]
@@ -271,24 +272,24 @@ def _colours(scene: _Scene, rays: _Rays) -> np.ndarray:
 
 
 def _glow(eye: np.ndarray, lit: np.ndarray, sky: np.ndarray | float) -> np.ndarray:
-    """Return the light from a surface: of the sky, more from where it faces the eye, and of the key light."""
+    """Return the light from a surface: the sky's, more where the surface faces the eye, and the key light's."""
     return 1.12 * ((0.50 + 0.14 * eye) * sky + 0.52 * lit * (0.55 + 0.45 * sky))
 
 
-def _first(field: np.ndarray, rays: _Rays, enter: np.ndarray, leave: np.ndarray, times: int) -> np.ndarray:
+def _first_crossings(field: np.ndarray, rays: _Rays, enter: np.ndarray, leave: np.ndarray, times: int) -> np.ndarray:
     """Return the planes, in fractions of a plane, at which rays meet the phase; inf where they miss it."""
     waiting, last = enter <= leave, np.full(enter.shape, -1, np.float32)
     depth = np.full(enter.shape, np.inf, np.float32)
 
     def meet(numbers: np.ndarray, place: np.ndarray | float, now: np.ndarray) -> None:
-        """Note where rays cross the level, linearly since the plane before or since the box's side."""
+        """Note where rays cross the level: linearly between the plane before, or the box's side, and this place."""
         start = np.maximum(enter[numbers], np.ceil(np.float32(place) * times - 1e-3) / times - 1 / times)
         past = last[numbers]
         depth[numbers] = start + (place - start) * past / (past - now)
         waiting[numbers] = False
 
     def look(numbers: np.ndarray, places: np.ndarray) -> None:
-        """Find rays that are inside at places of their own."""
+        """Note the rays that are inside at places of their own: where they enter or leave the box."""
         now = map_coordinates(field, rays.at(places, numbers), np.float32, 1, "nearest")
         inside = now > 0
         meet(numbers[inside], places[inside], now[inside])
@@ -311,7 +312,7 @@ def _first(field: np.ndarray, rays: _Rays, enter: np.ndarray, leave: np.ndarray,
 
 
 def _surface_glow(scene: _Scene, light: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Return the light from the level set at points `(3, N)`, linearly between the voxels around them."""
+    """Return the light from the level set at points `(3, N)`, interpolated between the voxels around them."""
     field, edges = scene.field, scene.edges[:, None]
     at = np.clip(at, 0, np.array(field.shape)[:, None] - 1)
     near = np.zeros(field.shape, np.bool_)
@@ -321,12 +322,12 @@ def _surface_glow(scene: _Scene, light: np.ndarray, at: np.ndarray) -> np.ndarra
         after[1:] |= after[:-1]
     voxels = np.stack(np.nonzero(near))
     smooth = gaussian_filter(field, 0.9 / scene.edges, truncate=3)
-    normal = np.stack([_behind(smooth, voxels, axis) for axis in range(3)]) / (2 * edges)
+    normal = np.stack([_differences(smooth, voxels, axis) for axis in range(3)]) / (2 * edges)
     slope = np.maximum(np.linalg.norm(normal, axis=0), 1e-12)
     normal /= slope
     points = voxels + np.clip(field[tuple(voxels)] / slope, -1, 1) * normal / edges
     times = -(-max(field.shape) // COARSE)
-    grey, inside = (_means(values, times) for values in (field, field > 0))
+    grey, inside = (_block_means(values, times) for values in (field, field > 0))
 
     def coarse(points: np.ndarray) -> np.ndarray:
         return (points - (times - 1) / 2) / times
@@ -348,14 +349,14 @@ def _surface_glow(scene: _Scene, light: np.ndarray, at: np.ndarray) -> np.ndarra
     return map_coordinates(glow, at, np.float32, 1, "nearest")
 
 
-def _behind(values: np.ndarray, voxels: np.ndarray, axis: int) -> np.ndarray:
-    """Return the value before each voxel (3, N) along an axis, less the value behind it."""
+def _differences(values: np.ndarray, voxels: np.ndarray, axis: int) -> np.ndarray:
+    """Return the differences, along an axis, of the values before and behind voxels `(3, N)`."""
     (before, behind), end = voxels[None].repeat(2, axis=0), values.shape[axis] - 1
     before[axis], behind[axis] = np.maximum(before[axis] - 1, 0), np.minimum(behind[axis] + 1, end)
     return values[tuple(before)] - values[tuple(behind)]
 
 
-def _means(values: np.ndarray, times: int) -> np.ndarray:
+def _block_means(values: np.ndarray, times: int) -> np.ndarray:
     """Return the means over blocks of `times`³ voxels; those at the end repeat the last voxel."""
     if times == 1:
         return values.astype(np.float32, copy=False)
@@ -366,10 +367,9 @@ def _means(values: np.ndarray, times: int) -> np.ndarray:
 
 
 def _shadow(field: np.ndarray, light: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the share of the key light that does not reach points `(3, N)`, in voxels: 1 where the phase is on the
-    way, less near it."""
+    """Return the share of the key light that does not reach points `(3, N)`: 1 behind the phase, less near it."""
     order, planes = _stack(field, -light)
-    rays = _rays(planes.shape, order.turned(-light), np.ones(2))
+    rays = _rays(planes.shape, order.turn(-light), np.ones(2))
     highest = np.full((len(planes) + 2, *rays.shape), -1, np.float32)
     for place, window, values in _resample_planes(planes, rays):
         highest[int(place) + 2][window] = values
@@ -388,14 +388,8 @@ def _shadow(field: np.ndarray, light: np.ndarray, points: np.ndarray) -> np.ndar
 
 
 def surface_picture(u: np.ndarray, path: str | Path, *, width: int = 900, **options) -> Path:
-    """Write a square picture, `width` pixels wide, of the surface of `u` `(Z, Y, X)`; `options` are those of `boxed`.
-
-    Raises
-    ------
-    ValueError
-        If the volume cannot be drawn (see `render`).
-    """
-    picture = Image.fromarray(boxed(u, width=width, height=width, **options))
+    """Write a square picture, `width` pixels wide, of the surface of `u` `(Z, Y, X)`; options are `render_in_box`'s."""
+    picture = Image.fromarray(render_in_box(u, width=width, height=width, **options))
     sheet = Image.new("RGB", (width, width), "white")
     sheet.paste(picture, ((width - picture.width) // 2, (width - picture.height) // 2), picture)
     buffer = io.BytesIO()
@@ -403,7 +397,7 @@ def surface_picture(u: np.ndarray, path: str | Path, *, width: int = 900, **opti
     return write_content(Path(path), buffer.getvalue())
 
 
-def boxed(u: np.ndarray, *, level: float = 0.0, **options) -> np.ndarray:
+def render_in_box(u: np.ndarray, *, level: float = 0.0, **options) -> np.ndarray:
     """Return the level set of a field (or the outline of a bool mask) in its box, cut faces capped.
 
     The picture is RGBA bytes, transparent where there is nothing; `options` are those of `render`.
@@ -421,7 +415,7 @@ def boxed(u: np.ndarray, *, level: float = 0.0, **options) -> np.ndarray:
 
 
 def _edges(camera: View, size: tuple[int, int], *, front: bool) -> Image.Image:
-    """Return a picture of the box's edges: the nine in front of the shape, or the three behind it."""
+    """Return a picture of the box's edges: of the nine in front of the shape, or of the three behind it."""
     corners = np.array(list(np.ndindex(2, 2, 2)), dtype=float)
     hidden = (corners == (camera.frame[2] < 0)).all(axis=1).argmax()
     pairs = [(a, b) for a in range(8) for b in range(a + 1, 8) if np.abs(corners[a] - corners[b]).sum() == 1]

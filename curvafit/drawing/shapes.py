@@ -52,7 +52,7 @@ class Output:
     Raises
     ------
     ValueError
-        If the unit has no known name, the voxel is not from 1e-12 to 1e12 or a repeat is under 1.
+        If the unit is unknown, the voxel is not from 1e-12 to 1e12, or a repeat is under 1.
     """
 
     voxel: float = 1.0
@@ -72,12 +72,9 @@ class Output:
         object.__setattr__(self, "tile", tile)
 
     def shape(self, grid: Grid) -> tuple[int, ...]:
-        """Return the voxels (z, y, x) of what is written of a field.
+        """Return the shape of the volume that is written of a field on a grid, repeats included.
 
-        Raises
-        ------
-        ValueError
-            If they do not fit into memory, or the box is not periodic and to be repeated.
+        A volume that does not fit into memory, or repeats of a box that is not periodic, are a ValueError.
         """
         if not grid.periodic and self.tile != (1, 1, 1):
             raise ValueError(f"only a periodic box can be repeated, this one has boundary {grid.boundary!r}")
@@ -97,19 +94,9 @@ def check_target(
 ) -> Path:
     """Return the path if a shape can be written there, with its record, picture and snapshots; call it before the work.
 
-    Parameters
-    ----------
-    steps
-        Steps of the snapshots that go beside it.
-    inputs
-        Files that are read: they are never written over.
-    overwrite
-        Whether files that no such command wrote may be replaced.
-
-    Raises
-    ------
-    ValueError
-        If the suffix is unknown, its format cannot hold the output's unit, or one of the files cannot be written.
+    `steps` are those of the snapshots; `inputs` are files that are read, and so never written over; `overwrite` allows
+    to replace files of another origin. An unknown suffix, a unit that the format cannot hold, and a name that cannot be
+    written are a ValueError.
     """
     target = Path(path)
     known = (*WRITABLE, *SUFFIXES)
@@ -139,19 +126,20 @@ def write_shape(
 ) -> tuple[Path, ...]:
     """Write a flow's field as a volume or a surface, by suffix, with a record and a picture of one box.
 
-    The picture is drawn last. Where that fails, a warning says so, the record does not list it, and a former one goes.
+    The picture is drawn last. If that fails, a warning says so, the record does not list it, and an earlier picture is
+    deleted. All other files are made in a temporary folder, then moved together.
 
     Parameters
     ----------
     record
-        What to write into the JSON beside it; see `shape_record`.
+        Content of the record: see `shape_record`.
     overwrite
-        Whether files that no such call wrote may be replaced.
+        Whether files of another origin may be replaced.
 
     Returns
     -------
-    The paths of shape, record (`.json`), the flow's snapshots, but those that have no surface where one is written, and
-    picture (`.png`). All but the picture are made in a temporary folder, then moved together.
+    The paths of the shape, the record (`.json`), the flow's snapshots (not those without a surface, if surfaces are
+    written), and the picture (`.png`).
 
     Raises
     ------
@@ -177,14 +165,14 @@ def write_shape(
                 remove(image)
     if not picture:
         return files
-    if images := _picture(flow, image):
+    if images := _draw_picture(flow, image):
         return (*files, *images)
     with suppress(OSError):  # a disk too full for this as well: the record there is whole, and lists a picture too many
         FORMAT.write(sibling(target, ".json"), content)
     return files
 
 
-def _picture(flow: Flow, path: Path) -> tuple[Path, ...]:
+def _draw_picture(flow: Flow, path: Path) -> tuple[Path, ...]:
     """Draw a flow's surface; where that fails, warn and return no path."""
     try:
         surface_picture(flow.field.numpy(), path)
@@ -197,14 +185,8 @@ def _picture(flow: Flow, path: Path) -> tuple[Path, ...]:
 def write_field(field: Tensor, grid: Grid, path: str | Path, output: Output | None = None) -> Path:
     """Write a field `(Z, Y, X)` as a volume or a surface, by suffix, without picture and record.
 
-    Another file of that name is replaced, another folder is not.
-
-    A VTP surface bears its level set's principal curvatures `kappa1` and `kappa2` at the vertices, 0 on caps.
-
-    Raises
-    ------
-    ValueError
-        As `write_shape` does.
+    Another file of that name is replaced, another folder is not. A VTP surface has its level set's principal curvatures
+    `kappa1` and `kappa2` at the vertices, 0 on caps.
     """
     target, how = Path(path), output or Output()
     how.shape(grid)
@@ -216,7 +198,7 @@ def write_field(field: Tensor, grid: Grid, path: str | Path, output: Output | No
     data = None
     if target.suffix.lower() == ".vtp":
         data = _vertex_curvatures(mesh, field, Grid(grid.shape, edges, grid.boundary))
-        on_caps = how.cap & _on_faces(mesh, box)
+        on_caps = how.cap & _vertices_on_faces(mesh, box)
         data = {name: np.where(on_caps, 0, κ) for name, κ in data.items()}
     return write_surface(mesh, target, unit=how.unit, data=data)
 
@@ -228,18 +210,18 @@ def shape_record(
     output: Output | None = None,
     **more: Any,
 ) -> dict[str, Any]:
-    """Return what is needed to make the shape again: parameters, sampling, seed, schedule, versions; and how it ended.
+    """Return what is needed to make a shape again (parameters, sampling, seed, schedule, versions), and its status.
 
-    The mass is the flow's own where none is given: that of the field, to float32. A parameter that varies in space is
-    stated by its least and greatest value.
+    By default the mass is the flow's: that of the field, to float32. Of a parameter that varies in space, the least and
+    the greatest value are recorded.
     """
     return {
         "format": FORMAT.name,
-        "coefficients": dict(zip(NAMES, map(_stated, flow.coefficients), strict=True)),
-        "mass": _stated(flow.mass if mass is None else mass),
+        "coefficients": dict(zip(NAMES, map(_number_or_range, flow.coefficients), strict=True)),
+        "mass": _number_or_range(flow.mass if mass is None else mass),
         "shape": list(flow.grid.shape),
         "working_spacing": list(flow.grid.spacing),
-        "epsilon": _stated(flow.epsilon),
+        "epsilon": _number_or_range(flow.epsilon),
         "boundary": flow.grid.boundary,
         "seed": flow.seed,
         "schedule": flow.schedule.as_dict(),
@@ -254,7 +236,7 @@ def shape_record(
     }
 
 
-def _stated(value: float | Tensor) -> float | dict[str, float]:
+def _number_or_range(value: float | Tensor) -> float | dict[str, float]:
     """Return a number, or the range of a map."""
     if not isinstance(value, Tensor) or value.numel() == 1:
         return float(value)
@@ -262,7 +244,7 @@ def _stated(value: float | Tensor) -> float | dict[str, float]:
 
 
 def _vertex_curvatures(mesh: Surface, field: Tensor, grid: Grid) -> dict[str, np.ndarray]:
-    """Return κ1, κ2 `(V,)` of the level sets of a field, linearly between its voxels; a periodic one repeats."""
+    """Return κ1, κ2 `(V,)` of a field's level sets at a mesh's vertices, interpolated linearly."""
     from scipy.ndimage import map_coordinates
 
     ε = WORKING_EPSILON / WORKING_SPACING * grid.spacing[0]
@@ -274,8 +256,8 @@ def _vertex_curvatures(mesh: Surface, field: Tensor, grid: Grid) -> dict[str, np
     return {name: map_coordinates(κ, places, order=1, mode=beyond) for name, κ in known.items()}
 
 
-def _on_faces(mesh: Surface, box: Grid) -> np.ndarray:
-    """Return which vertices are on the box's faces, half a voxel beyond the outermost centres, `(V,)`."""
+def _vertices_on_faces(mesh: Surface, box: Grid) -> np.ndarray:
+    """Return a mask `(V,)` of the vertices on the box's faces, which are half a voxel beyond the outermost centres."""
     middle = (np.array(box.shape) - 1) / 2
     reach = np.abs(mesh.vertices / np.array(box.spacing) - middle)
     return np.any(reach > middle + 0.5 - 1e-6, axis=1)

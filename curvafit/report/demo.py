@@ -46,6 +46,8 @@ if TYPE_CHECKING:
 
 #: The page's name in its folder.
 PAGE = "demo.html"
+#: Of this many slices one is kept.
+EVERY = 8
 #: A parameter is read where its 90 % interval is at most this share of the prior's, and partly read up to the second.
 _READ, _PARTLY = 0.35, 0.7
 #: The symbols of the measures on the page.
@@ -53,7 +55,7 @@ _MEASURES = ("BV/TV", "Tb.Th", "Tb.Sp", "Conn.D", "BS/BV", "DA", "H", "K")
 
 
 class Demo(NamedTuple):
-    """What a first look leaves: the page's path, and what stands on it."""
+    """The path of the page, and the results on it."""
 
     page: Path
     completion: Completion
@@ -62,10 +64,10 @@ class Demo(NamedTuple):
 
 
 class Completion(NamedTuple):
-    """A mask, what was filled from every `every`-th of its slices, and how well.
+    """A mask, the mask filled from every `every`-th of its slices, both bool (Z, Y, X), and how well they agree.
 
-    `dice` has the Dice coefficient on the slices left out of the filled volume (`"curvafit"`) and of the plain
-    interpolations of `segmentation.slices.WAYS`; masks are bool (Z, Y, X).
+    `dice` has the Dice coefficients, on the slices left out, of the filled volume (`"curvafit"`) and of the plain
+    interpolations of `segmentation.slices.WAYS`.
     """
 
     truth: np.ndarray
@@ -87,28 +89,20 @@ def write_demo(
     directory: str | Path,
     *,
     title: str,
-    every: int = 8,
     seed: int = 0,
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> Demo:
-    """Measure, fill, place and read a scan, and write one page on it into a folder, with `fit.json` and `report.html`.
+    """Measure a scan, fill it from every 8th slice, infer its law, and write one page with the results into a folder.
 
-    The structure is measured (`measure`); every `every`-th of its slices is kept and the volume filled from them
-    (`reconstruct`), to be compared with the slices left out; its curvature diagram is placed among the atlas's; its law
-    is read (`infer(fast=True)`).
-
-    Parameters
-    ----------
-    scan
-        The scan.
-    title
-        The page's heading, plain text.
+    The structure is measured (`measure`). The volume is filled from the kept slices (`reconstruct`) and compared with
+    those left out. The law is inferred (`infer(fast=True)`), and the curvature diagram placed among the atlas's.
+    `fit.json` and `report.html` are written beside the page. `title` is the page's heading, plain text.
 
     Raises
     ------
     ValueError
-        If the scan has no structure, or the folder cannot be written to; or as `report.check_report`.
+        If the scan has no structure, or as `report.page.check_report`.
     """
     folder = check_report(directory, [scan.source] if scan.source else (), overwrite)
     page = folder / PAGE
@@ -121,8 +115,8 @@ def write_demo(
     mask = find_level(scan).mask
     volume = Field(mask.view(np.uint8), scan.spacing, scan.unit)
     law = inference.fit if inference.fit.best is not None else Coefficients.willmore()
-    filled = reconstruct(volume, law, every=every, progress=sub_progress(progress, 0.3, 0.95))
-    completion = score_completion(mask, filled.mask.values, every, filled.status)
+    filled = reconstruct(volume, law, every=EVERY, progress=sub_progress(progress, 0.3, 0.95))
+    completion = score_completion(mask, filled.mask.values, EVERY, filled.status)
     progress("drawing the page", 0.95)
     text = demo_page(inference, measures, completion, atlas, posterior.box, title)
     write_inference(inference, folder, overwrite=overwrite)
@@ -153,20 +147,8 @@ def demo_page(
 ) -> str:
     """Return the page: a self-contained HTML text.
 
-    Parameters
-    ----------
-    inference
-        What `infer` says of the scan.
-    measures
-        What `measure` says of it.
-    completion
-        Its mask filled from sparse slices (`score_completion`).
-    atlas
-        The atlas on whose map the scan is placed.
-    box
-        Bounds of the posterior's prior, (6, 2): a11, log a02, a10, a01, a00, m₀.
-    title
-        The page's heading, plain text.
+    The scan is placed on the map of `atlas`; `box` (6, 2) has the bounds of the posterior's prior (a11, log a02, a10,
+    a01, a00, m₀); `title` is the heading, plain text.
     """
     fit = inference.fit
     return render_template(
@@ -229,7 +211,7 @@ def _slice_figure(scan: Field, completion: Completion) -> Figure:
 
 
 def _map_figure(inference: Inference, atlas: Atlas) -> Figure:
-    """Return the scan's diagram, and its place among the atlas's on the two main axes of their sliced quantiles."""
+    """Return a figure of the scan's diagram and its place among the atlas's, on the main axes of sliced quantiles."""
     assert inference.diagram is not None
     embeddings = atlas.embeddings("field" if inference.fit.kind == "field" else "mask")
     mean = embeddings.mean(0)
@@ -285,7 +267,7 @@ def _say_intervals(measures: Measures) -> str:
 
 
 def _parameter_rows(draws: Draws | None, box: np.ndarray) -> list[tuple[str, str, str, str]]:
-    """Return each parameter's 90 % interval, how wide it is of the prior's, and whether the parameter is read."""
+    """Return each parameter's name, 90 % interval, the interval's share of the prior's, and whether it is read."""
     if draws is None:
         return []
     rows = []

@@ -100,15 +100,10 @@ class Picture(NamedTuple):
 
 
 def check_report(directory: str | Path, inputs: Iterable[str | Path] = (), overwrite: bool = False) -> Path:
-    """Return the folder if `write_inference` can write there; ask before the work is done.
+    """Return the folder if `write_inference` can write there, else raise ValueError; call it before the work.
 
-    `inputs` are the files, or folders, that are read: none may be written over. `overwrite` tells whether files of the
-    same names that no inference wrote may be.
-
-    Raises
-    ------
-    ValueError
-        If it is no folder that can be written to, or an input or another file stands where one of the three goes.
+    `inputs` are files or folders that are read, and so never written over; `overwrite` allows to replace files that no
+    inference wrote.
     """
     folder = Path(directory)
     ours = Format(FORMAT).owns(folder / "fit.json") and has_mark(folder / "report.html", MARK)
@@ -118,15 +113,10 @@ def check_report(directory: str | Path, inputs: Iterable[str | Path] = (), overw
 
 
 def write_inference(inference: Inference, directory: str | Path, *, overwrite: bool = False) -> Path:
-    """Write `fit.json`, `report.html` and `regenerated.nii.gz` into a folder and return the report's path.
+    """Write `fit.json`, `report.html` and, if a shape was regenerated, `regenerated.nii.gz` into a folder.
 
-    All three are written into a temporary folder beside it and moved once they are whole. Without a regenerated shape
-    there is no `regenerated.nii.gz`. The files of an earlier inference are replaced.
-
-    Raises
-    ------
-    ValueError
-        As `check_report`.
+    Return the report's path. The files are moved into the folder once all are whole. Those of an earlier inference are
+    replaced; others are a ValueError without `overwrite`.
     """
     target = check_report(directory, overwrite=overwrite)
     with temporary_folder(target / FILES[0] if target.is_dir() else target) as work:
@@ -143,15 +133,14 @@ def write_inference(inference: Inference, directory: str | Path, *, overwrite: b
 
 
 def with_command(inference: Inference, command: str) -> Inference:
-    """Return the inference with the command line that made it in its provenance."""
+    """Return the inference with the command line noted in its provenance."""
     provenance = {**inference.fit.provenance, "command": command}
     return dataclasses.replace(inference, fit=dataclasses.replace(inference.fit, provenance=provenance))
 
 
 def write_report(inference: Inference, path: str | Path) -> Path:
     """Write the report of an inference as one HTML page without outside parts, and return its path."""
-    page = report_html(inference)
-    return write_content(Path(path), page)
+    return write_content(Path(path), report_html(inference))
 
 
 def render_template(name: str, **values: Any) -> str:
@@ -168,7 +157,7 @@ def render_template(name: str, **values: Any) -> str:
 
 
 def report_html(inference: Inference) -> str:
-    """Return the page itself."""
+    """Return the report of an inference as the text of its page."""
     fit = inference.fit
     return render_template(
         "report.html",
@@ -214,7 +203,7 @@ def describe(inference: Inference) -> str:
 
 
 def family_radius(diagram: Diagram, family: str) -> float | None:
-    """Return the median radius over the area that a round family holds, in the diagram's unit; None for the others."""
+    """Return the median radius over the area of a round family, in the diagram's unit; None for another family."""
     if family not in _ROUND:
         return None
     own, kappa = _ROUND[family](*np.asarray(diagram.points).T)
@@ -240,7 +229,7 @@ def describe_scan(inference: Inference) -> str:
 
 
 def _bars(inference: Inference) -> list[dict[str, Any]]:
-    """Return a bar for the distance of each candidate's shape, and one for that of two seeds."""
+    """Return the bars of the distances: one for each candidate's shape, and one for two seeds."""
     fit, noise = inference.fit, seed_noise_of(inference.fit.candidates)
     rows = [(_title(each), each.distance, "best" if each.name == fit.chosen else "") for each in _in_order(inference)]
     rows.append(("Two seeds", noise, "noise"))
@@ -254,7 +243,7 @@ def _bars(inference: Inference) -> list[dict[str, Any]]:
 
 
 def _number_rows(inference: Inference) -> list[tuple[str, str, list[str]]]:
-    """Return rows of the scan's familiar numbers, the twins' mean and extremes, and the ratio of the two."""
+    """Return rows of the scan's familiar numbers, the twins' mean with its extremes, and the mean over the scan's."""
     scan, best = inference.fit.morphometry, inference.fit.best
     twins, unit = () if best is None else best.twins, scan.unit
     kinds: tuple[tuple[str, str, str, Callable[[float], str]], ...] = (
@@ -281,10 +270,10 @@ def parameter_table(inference: Inference) -> list[tuple[str, str, str, str, str]
 
     Without a law there are no rows.
     """
-    rows = []
-    for name, (value, deviation, _, _, interval, physical), unit in _parameters(inference):
-        rows.append((name, value, deviation, interval, f"{physical} {unit}".strip()))
-    return rows
+    return [
+        (name, value, deviation, interval, f"{physical} {unit}".strip())
+        for name, (value, deviation, _, _, interval, physical), unit in _parameters(inference)
+    ]
 
 
 def _parameters(inference: Inference) -> list[tuple[str, tuple[str, ...], str]]:
@@ -322,16 +311,18 @@ def _law(inference: Inference) -> dict[str, Any] | None:
 
 
 def _deviation(candidate: Candidate, name: str) -> str:
-    """Return a candidate's own deviation of a parameter; nothing where it has none."""
+    """Return a candidate's deviation of a parameter as text, empty where it has none."""
     value = candidate.uncertainty.get(name)
     return "" if value is None else "fixed" if value == 0 else format_number(value, 2)
 
 
 def _interval(known: Mapping[str, Any] | None, level: str) -> str:
+    """Return a posterior's interval of one level as text, empty without a posterior."""
     return "" if known is None else " to ".join(format_number(end) for end in known[level])
 
 
 def _match_cells(match: Any) -> list[str]:
+    """Return a match's distance, parameters and seed as text."""
     values = (*match.coefficients.as_dict().values(), match.mass)
     return [format_number(match.distance, 2), *map(format_number, values), str(match.seed)]
 
@@ -369,11 +360,12 @@ def inference_figure(inference: Inference, **options: Any) -> Figure:
 
 
 def picture_of(figure: Figure, alt: str, **words: str) -> Picture:
+    """Return a figure as a picture for the page; `alt` describes it, `words` are further fields of `Picture`."""
     return Picture(base64.b64encode(png(figure)).decode("ascii"), alt, **words)
 
 
 def _slices(inference: Inference) -> list[Picture]:
-    """Return slices across z, y and x through the main window's middle: the scan's grey values, the contour on top."""
+    """Return pictures of slices across z, y and x through the main window's middle, with the surface's contour."""
     values, prepared = inference.scan.values, inference.prepared
     sample = np.asarray(values[:: max(1, values.shape[0] // 64)], dtype=np.float32)
     low, high = (float(v) for v in np.percentile(sample, (0.5, 99.5)))
@@ -383,7 +375,7 @@ def _slices(inference: Inference) -> list[Picture]:
 
 
 def _slice(inference: Inference, axis: int, index: int, limits: tuple[float, float]) -> Picture:
-    """Return one slice: the scan and the structure are placed by their voxels' edges, in the scan's unit."""
+    """Return a picture of one slice: scan and structure are placed by the edges of their voxels, in the scan's unit."""
     scan, prepared = inference.scan, inference.prepared
     down, across = (k for k in range(3) if k != axis)
     place = prepared.origin[axis] + (index + 0.5) * prepared.scale[axis]
@@ -416,7 +408,7 @@ def _is_framed(inference: Inference) -> bool:
 
 
 def _shapes(inference: Inference) -> list[Picture]:
-    """Return pictures of the scan's surface and of what grew from each candidate, in boxes of one size."""
+    """Return pictures of the surfaces of the scan and of each candidate's shape, in boxes of one size."""
     fit = inference.fit
     word = "the nearest" if fit.status.startswith((UNBELIEVED, UNDECIDED)) else "best supported"
     pictures = [_shape(inference, "The scan", scan_box(inference))]
@@ -429,6 +421,7 @@ def _shapes(inference: Inference) -> list[Picture]:
 
 
 def _shape(inference: Inference, title: str, u: np.ndarray | None, more: str = "", badge: str = "") -> Picture:
+    """Return a picture of one surface, without data if there is no shape; `more` follows the size of its box."""
     if u is None:
         return Picture(None, "", title, badge=badge)
     edges = [format_length(n * inference.fit.working_voxel, inference.fit.length_unit, 3) for n in u.shape]
@@ -437,7 +430,7 @@ def _shape(inference: Inference, title: str, u: np.ndarray | None, more: str = "
 
 
 def scan_box(inference: Inference) -> np.ndarray:
-    """Return the main window's phase field, cut to the regenerated boxes' size so that all three have one scale."""
+    """Return the main window's phase field, cut to the size of the regenerated shape so that both have one scale."""
     phase = inference.prepared.phase[inference.prepared.windows[0]]
     other = inference.best
     if other is None:
@@ -447,7 +440,7 @@ def scan_box(inference: Inference) -> np.ndarray:
 
 
 def _diagrams(inference: Inference) -> list[Picture]:
-    """Return curvature diagrams with shared axes, in the scan's unit: the scan's, the chosen law's, the match's."""
+    """Return curvature diagrams of the scan, the chosen law and the match, with shared axes, in the scan's unit."""
     diagrams: list[tuple[str, Diagram | None]] = [("The scan", inference.diagram)]
     for each in _in_order(inference):
         if each.name in (inference.fit.chosen, "match"):
@@ -466,7 +459,7 @@ def _diagrams(inference: Inference) -> list[Picture]:
 
 
 def _corner(inference: Inference) -> Picture | None:
-    """Return the corner plot of the posterior's draws in working units, the chosen law and the match marked."""
+    """Return a corner plot of the posterior's draws, in working units, with marks for the chosen law and the match."""
     draws = inference.fit.draws
     if draws is None or inference.fit.best is None:
         return None
@@ -480,7 +473,7 @@ def _corner(inference: Inference) -> Picture | None:
 
 
 def bands(inference: Inference) -> Picture | None:
-    """Return the scan's descriptors on the bands of simulated ones, block by block; None where none were made."""
+    """Return a figure of the scan's descriptors on the bands of simulated ones; None where none were simulated."""
     misfit = inference.fit.misfit
     if inference.simulated is None or misfit is None:
         return None

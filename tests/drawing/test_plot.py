@@ -191,7 +191,7 @@ def test_pictures_are_written_whole_or_not_at_all(tmp_path: Path) -> None:
 
 
 def test_png_bytes_are_a_picture() -> None:
-    content = png(diagram_figure(Diagram(np.array([[2.0, 1.0]]), np.array([1.0])), title="one point"))
+    content = png(diagram_figure(Diagram(np.array([[2.0, 1.0]]), np.array([1.0]))))
     assert matplotlib.image.imread(io.BytesIO(content)).shape[2] == 4
 
 
