@@ -335,7 +335,7 @@ def _parse_int(text: str) -> int:
 def _parse_float(text: str) -> float:
     value = float(text)
     if not math.isfinite(value):
-        raise ValueError(f"{quoted(text)}, which is not a finite number")
+        raise ValueError(f"{text[:_DIGITS]}, which is not a finite number")
     return value
 
 

@@ -1,8 +1,8 @@
-"""Dataclasses in JSON: the schema that a dataclass states, what breaks it, and the way there and back.
+"""Dataclasses in JSON: the schema of a dataclass, the first fault of a value under it, and conversion in both ways.
 
 A schema is plain data in the words of JSON Schema, so that a page in a browser can check the same: `type`, `enum`,
-`required`, `properties`, `items`, `minItems`, `minimum`, `maximum` and their exclusive forms. A message says that the
-`description` was expected.
+`required`, `properties`, `items`, `minItems`, `minimum`, `maximum` and their exclusive forms. Messages use the
+`description`.
 """
 
 from __future__ import annotations
@@ -11,15 +11,13 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
 
 from curvafit.core.checks import quoted
 
-Kind = TypeVar("Kind")
-
 
 class Rule(NamedTuple):
-    """What a field holds, beyond its type, as `Annotated[float, Rule(least=0)]`.
+    """What a field's value must be, beyond its type: `Annotated[float, Rule(least=0)]`.
 
     Attributes
     ----------
@@ -55,22 +53,24 @@ _PLAIN: dict[Any, dict[str, Any]] = {
 
 
 def schema_of(hint: Any, rule: Rule | None = None) -> dict[str, Any]:
-    """Return the schema of a type: a dataclass, text, number, `Literal`, tuple, dictionary, or None beside one."""
+    """Return the schema of a dataclass, text, number, `Literal`, tuple or dictionary, or of one of these or None."""
     rule = rule or Rule()
     if get_origin(hint) is Annotated:
         return schema_of(*get_args(hint)[:2])
     kinds = _kinds(hint)
-    if len(kinds) > 1:
-        inner = schema_of(next(kind for kind in kinds if kind is not NoneType), rule)
-        return {**inner, "type": [inner["type"], "null"], "description": f"{inner['description']}, or null"}
-    hint = next(iter(kinds))
+    schema = _schema_of_one(next(kind for kind in kinds if kind is not NoneType), rule)
+    if len(kinds) == 1 and not rule.unknown:
+        return schema
+    return {**schema, "type": [schema["type"], "null"], "description": f"{schema['description']}, or null"}
+
+
+def _schema_of_one(hint: Any, rule: Rule) -> dict[str, Any]:
+    """Return the schema of a type that is no union."""
     if hint in _PLAIN:
         return _PLAIN[hint]
     if hint in (int, float):
         bounds = {name: getattr(rule, end) for name, (_, end) in _BOUNDS.items() if getattr(rule, end) is not None}
-        number = {"type": "number", **bounds, "description": _number_words(rule)}
-        null = {"type": ["number", "null"], "description": f"{number['description']}, or null"}
-        return {**number, **null} if rule.unknown else number
+        return {"type": "number", **bounds, "description": _number_words(rule)}
     if get_origin(hint) is Literal:
         *some, last = get_args(hint)
         words = f"{', '.join(some)} or {last}" if some else last
@@ -110,7 +110,7 @@ def violation(value: Any, schema: Mapping[str, Any], name: str = "the content") 
 
 
 def decode(hint: Any, value: Any) -> Any:
-    """Return what JSON states of a type; the JSON follows the type's schema (`violation`)."""
+    """Return a value of a type from JSON that follows the type's schema: see `violation`."""
     if get_origin(hint) is Annotated:
         hint, rule = get_args(hint)[:2]
         if value is None and rule.unknown:
@@ -140,7 +140,7 @@ def encode(value: Any) -> Any:
 
 
 def _kinds(hint: Any) -> tuple[Any, ...]:
-    """Return the types that a union names, but for tensors, which JSON does not hold."""
+    """Return the types of a union, without tensors, which JSON cannot hold."""
     kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     return tuple(kind for kind in kinds if getattr(kind, "__name__", "") != "Tensor")
 
@@ -155,7 +155,7 @@ def _number_words(rule: Rule) -> str:
 
 
 def _fits(value: Any, schema: Mapping[str, Any]) -> bool:
-    """Return whether a value, apart from its items and properties, follows its schema."""
+    """Return whether a value follows its schema; its items and properties are not looked at."""
     kind, kinds = _json_type(value), schema["type"]
     if kind not in ([kinds] if isinstance(kinds, str) else kinds):
         return False

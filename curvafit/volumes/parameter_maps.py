@@ -60,12 +60,13 @@ def read_maps(path: str | Path, shape: tuple[int, int, int] | None = None) -> di
 
 
 def map_shape(maps: Mapping[str, float | Tensor]) -> tuple[int, int, int] | None:
-    """Return the common shape of the maps, None where all are numbers."""
+    """Return the common shape of the maps, None if all are numbers."""
     shapes = [tuple(values.shape) for values in maps.values() if isinstance(values, Tensor)]
     return shapes[0] if shapes else None  # type: ignore[return-value]
 
 
 def _from_npz(path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays of an NPZ file by name."""
     try:
         return read_archive(path)
     except (ValueError, OSError) as reason:
@@ -73,6 +74,7 @@ def _from_npz(path: Path) -> dict[str, np.ndarray]:
 
 
 def _from_folder(path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays of a folder's volume files by name; files of other names are not read, and get empty arrays."""
     suffixes = tuple(READERS)
     files = [p for p in sorted(path.iterdir()) if p.name.lower().endswith(suffixes) and not p.name.startswith(".")]
     arrays: dict[str, np.ndarray] = {}

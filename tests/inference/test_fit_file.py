@@ -35,7 +35,7 @@ def test_one_thing_wrong_is_named(tmp_path: Path, where: str, text: str | None, 
     [
         ("mass", "NaN", "NaN, which is not a finite number"),
         ("coefficients.a00", "-Infinity", "-Infinity, which is not a finite number"),
-        ("epsilon_physical", "1e999", "'1e999', which is not a finite number"),
+        ("epsilon_physical", "1e999", "1e999, which is not a finite number"),
         ("working_voxel", "1" * 400, "a number of 400 digits"),
         ("provenance", "1" * 5000, "a number of 5000 digits"),
         ("provenance", "[" * 100_000 + "]" * 100_000, "nested too deeply"),

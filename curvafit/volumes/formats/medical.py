@@ -44,8 +44,8 @@ _META_TYPES = {
     "MET_FLOAT": "f4",
     "MET_DOUBLE": "f8",
 }
-#: Most bytes of a MetaImage's header.
-_HEADER = 1 << 16
+#: What a MetaImage may write for True, and the most bytes of its header.
+_TRUE, _HEADER = ("true", "t", "1"), 1 << 16
 #: From DICOM's and ITK's patient frame (left, posterior, superior) to NIfTI's (right, anterior, superior).
 _LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
@@ -87,7 +87,6 @@ def _nrrd_values(nrrd: Any, header: dict[str, Any], file: IO[bytes], path: Path)
     shape, encoding = [int(n) for n in header["sizes"]][::-1], str(header.get("encoding")).lower()
     no_values = {"dimension": 1, "sizes": np.zeros(1, int), "encoding": "raw", "type": header["type"]}
     dtype = nrrd.read_data({"endian": header.get("endian", "little"), **no_values}, io.BytesIO()).dtype
-    check_array(shape, dtype, path)
     if encoding not in _NRRD_ENCODINGS:
         raise ScanError(f"{path} has the encoding {encoding[:40]!r}: write it as raw, gzip or bzip2")
     for _ in range(int(header.get("line skip", header.get("lineskip", 0)))):
@@ -101,7 +100,7 @@ def _nrrd_values(nrrd: Any, header: dict[str, Any], file: IO[bytes], path: Path)
 
 
 def _channel_axis(header: dict[str, Any]) -> int | None:
-    """Return the one axis, of the values with z first, that is not an axis of space; None without one."""
+    """Return the axis of the values, z first, that is not one of space; None where there is not just one."""
     axes = int(header["dimension"])
     if "space directions" in header:
         directions = np.asarray(header["space directions"], dtype=np.float64)
@@ -163,14 +162,14 @@ def _meta_values(header: dict[str, str], shape: list[int], file: IO[bytes], path
     if kind not in _META_TYPES:
         raise ScanError(f"{path} has the element type {kind[:40]!r}, none of {', '.join(_META_TYPES)}")
     order = header.get("BinaryDataByteOrderMSB", header.get("ElementByteOrderMSB", "False"))
-    dtype = np.dtype(_META_TYPES[kind]).newbyteorder(">" if _meta_truth(order) else "<")
+    dtype = np.dtype(_META_TYPES[kind]).newbyteorder(">" if order.lower() in _TRUE else "<")
     check_array(shape, dtype, path)
-    if not _meta_truth(header.get("BinaryData", "True")):
+    if header.get("BinaryData", "True").lower() not in _TRUE:
         raise ScanError(f"{path} holds values in text, which are not read: write it with binary values")
     nbytes, head = math.prod(shape) * dtype.itemsize, int(header.get("HeaderSize", 0))
     size = os.fstat(file.fileno()).st_size
     file.seek(max(0, size - nbytes) if head < 0 else file.tell() + head)
-    if not _meta_truth(header.get("CompressedData", "False")):
+    if header.get("CompressedData", "False").lower() not in _TRUE:
         return read_numbers(file, shape, dtype, path)
     rest = size - file.tell()
     if int(header.get("CompressedDataSize", rest)) != rest:
@@ -191,13 +190,6 @@ def _meta_numbers(header: dict[str, str], names: Sequence[str], default: np.ndar
                 raise Damaged(f"{name} of {len(numbers)} numbers, not {len(default)}")
             return numbers
     return default
-
-
-def _meta_truth(text: str) -> bool:
-    """Return a MetaImage's True or False."""
-    if text.lower() not in ("true", "false", "t", "f", "1", "0"):
-        raise Damaged(f"{text[:20]!r} for True or False")
-    return text.lower() in ("true", "t", "1")
 
 
 def read_mrc(path: Path, **_: object) -> Raw:
