@@ -33,6 +33,8 @@ from curvafit.volumes.field import ScanError
 #: Seconds between two writings of a table that grows.
 PAUSE = 60.0
 
+#: A row of a table: shape, view, parameters, descriptors.
+Row = tuple[str, str, np.ndarray, np.ndarray]
 #: A draw of a store.
 Drawn = tuple[Store, Record]
 #: What is measured of a shape: volume fraction of {u > 0}, diagram of the field, diagram of its mask.
@@ -210,9 +212,13 @@ def describe(
     sources = [open_store(path) for path in stores]
     _check_names(sources)
     path, crew = Path(out), workers or ThisProcess()
-    rows = _Rows(load_table(path) if path.exists() and not overwrite else None, sources, command)
-    jobs = [job for store in sources for job in _jobs(store, views, rows)]
-    if not jobs and not rows.shapes:
+    begun = load_table(path) if path.exists() and not overwrite else None
+    provenance, rows = _table_provenance(begun, sources, command), []
+    if begun is not None:
+        rows += zip(begun.shapes.tolist(), begun.views.tolist(), begun.parameters, begun.descriptors, strict=True)
+    present = {(shape, view) for shape, view, _, _ in rows}
+    jobs = [job for store in sources for job in _jobs(store, views, present)]
+    if not jobs and not rows:
         raise ValueError(f"no well-formed shape in {', '.join(store.name for store in sources)}")
     queue, count, pending, last_save = iter(jobs), 0, 0, time.monotonic()
     try:
@@ -222,16 +228,19 @@ def describe(
                 crew.submit(partial(measure, views=missing), store.path, [index])
                 pending += 1
             for shape in crew.collect():
-                rows.add(shape)
+                rows += (
+                    (shape["shape"], view, shape["parameters"], to_row(numbers).astype(np.float32))
+                    for view, numbers in shape["views"].items()
+                )
                 count, pending = count + 1, pending - 1
                 progress(f"measured {count} of {len(jobs)} shapes", count / len(jobs))
             if time.monotonic() - last_save > PAUSE:
-                save_table(rows.table(), path)
+                save_table(_to_table(rows, provenance), path)
                 last_save = time.monotonic()
     finally:
-        if rows.shapes:
-            save_table(rows.table(), path)
-    return rows.table()
+        if rows:
+            save_table(_to_table(rows, provenance), path)
+    return _to_table(rows, provenance)
 
 
 def measure(path: Path, indices: Sequence[int], views: Sequence[str]) -> list[dict[str, Any]]:
@@ -263,46 +272,35 @@ def _view_descriptors(u: np.ndarray, grid: Grid, epsilon: float, name: str, seed
         return None
 
 
-class _Rows:
-    """The rows of a table that grows."""
-
-    def __init__(self, table: Table | None, stores: Sequence[Store], command: Sequence[str]) -> None:
-        self.shapes: list[str] = [] if table is None else table.shapes.tolist()
-        self.views: list[str] = [] if table is None else table.views.tolist()
-        self.parameters = [] if table is None else list(table.parameters)
-        self.descriptors = [] if table is None else list(table.descriptors)
-        before = {} if table is None else table.provenance
-        settings = {store.name: json.loads(json.dumps(dataclasses.asdict(store.settings))) for store in stores}
-        for name, now in settings.items():
-            if before.get("stores", {}).get(name, now) != now:
-                raise ValueError(f"the table was begun with another store {name}: choose another name, or overwrite it")
-        self.provenance = {
-            "stores": before.get("stores", {}) | settings,
-            "command": [*before.get("command", []), *command],
-            "measured_with": versions(),
-        }
-        self.keys = set(zip(self.shapes, self.views, strict=True))
-
-    def add(self, shape: dict[str, Any]) -> None:
-        """Add a row for each view of a shape, as `measure` returns it."""
-        for view, blocks in shape["views"].items():
-            self.shapes.append(shape["shape"])
-            self.views.append(view)
-            self.parameters.append(shape["parameters"])
-            self.descriptors.append(to_row(blocks).astype(np.float32))
-
-    def table(self) -> Table:
-        """Return the rows as a table."""
-        shapes, views = np.array(self.shapes, dtype=str), np.array(self.views, dtype=str)
-        return Table(shapes, views, np.array(self.parameters), np.array(self.descriptors), self.provenance)
+def _table_provenance(table: Table | None, stores: Sequence[Store], command: Sequence[str]) -> dict[str, Any]:
+    """Return the provenance of a table, begun or new, to which shapes of stores are added."""
+    before = {} if table is None else table.provenance
+    settings = {store.name: json.loads(json.dumps(dataclasses.asdict(store.settings))) for store in stores}
+    for name, now in settings.items():
+        if before.get("stores", {}).get(name, now) != now:
+            raise ValueError(f"the table was begun with another store {name}: choose another name, or overwrite it")
+    return {
+        "stores": before.get("stores", {}) | settings,
+        "command": [*before.get("command", []), *command],
+        "measured_with": versions(),
+    }
 
 
-def _jobs(store: Store, views: Sequence[str], rows: _Rows) -> list[tuple[Store, int, tuple[str, ...]]]:
-    """Return the shapes of a store with the views of each that are missing."""
+def _to_table(rows: Sequence[Row], provenance: dict[str, Any]) -> Table:
+    """Return rows as a table."""
+    shapes, views, parameters, numbers = zip(*rows, strict=True) if rows else ((),) * 4
+    names = np.array(shapes, dtype=str), np.array(views, dtype=str)
+    return Table(*names, np.array(parameters), np.array(numbers), provenance)
+
+
+def _jobs(
+    store: Store, views: Sequence[str], present: set[tuple[str, str]]
+) -> list[tuple[Store, int, tuple[str, ...]]]:
+    """Return the shapes of a store that lack views in a table, each with these views."""
     jobs = []
     for index in store.indices():
         shape = _shape(store, index)
-        missing = tuple(name for name in views if (shape, name) not in rows.keys)
+        missing = tuple(name for name in views if (shape, name) not in present)
         with suppress(KeyError):  # a draw that was removed since it was listed
             if missing and store.viable(index) and is_well_formed(store.record(index).viability):
                 jobs.append((store, index, missing))

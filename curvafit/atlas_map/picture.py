@@ -46,7 +46,7 @@ def map_picture(mapped: AtlasMap, field: Callable[[int], np.ndarray], path: str 
     Parameters
     ----------
     field
-        The phase field `(Z, Y, X)` of the shape at a position of the atlas; asked for the twenty that are shown.
+        Function of an index in the atlas that returns the shape's phase field `(Z, Y, X)`; called for those shown.
     """
     figure = map_figure(mapped, field)
     settings = json.dumps({"map": mapped.settings, "atlas": mapped.atlas.provenance})
@@ -72,7 +72,7 @@ def map_figure(mapped: AtlasMap, field: Callable[[int], np.ndarray]) -> Figure:
     _name_families(axes, mapped)
     figure.draw_without_rendering()
     slots = slot_places()
-    sample = spread_out(mapped.positions, len(slots))
+    sample = farthest_points(mapped.positions, len(slots))
     places = axes.transData.transform(mapped.positions[sample]) / (figure.dpi * np.array([_WIDTH, _HEIGHT]))
     for position, slot in zip(sample, slots[assign_slots(places, slots)], strict=True):
         _thumbnail(figure, axes, field(position), slot, mapped.positions[position], colours[position])
@@ -80,9 +80,9 @@ def map_figure(mapped: AtlasMap, field: Callable[[int], np.ndarray]) -> Figure:
     return figure
 
 
-def spread_out(positions: np.ndarray, count: int) -> np.ndarray:
-    """Return the indices of up to `count` points, each the farthest from those before it; the first is nearest to the
-    middle."""
+def farthest_points(positions: np.ndarray, count: int) -> np.ndarray:
+    """Return the indices of `count` points (or all): the one nearest to the middle, then always the farthest one from
+    those already chosen."""
     sample = [int(np.linalg.norm(positions - np.median(positions, axis=0), axis=1).argmin())]
     apart = np.linalg.norm(positions - positions[sample[0]], axis=1)
     while len(sample) < min(count, len(positions)):
@@ -101,7 +101,7 @@ def slot_places() -> np.ndarray:
 
 
 def assign_slots(places: np.ndarray, slots: np.ndarray) -> np.ndarray:
-    """Return a slot for each place, so that the lines are shortest in all: then no two of them cross."""
+    """Return a slot for each place such that the sum of the lines' lengths is least: then no two lines cross."""
     inches = np.array([_WIDTH, _HEIGHT])
     return linear_sum_assignment(cdist(places * inches, slots * inches))[1]
 
@@ -138,6 +138,7 @@ def _name_families(axes: Axes, mapped: AtlasMap) -> None:
 
 
 def _legend(figure: Figure, mapped: AtlasMap) -> None:
+    """Write the families, with their numbers of shapes, and the settings below the map."""
     rows = [(name, colour, mapped.families.count(name)) for name, colour in FAMILY_COLOURS.items()]
     marks = [
         Line2D([], [], marker="o", linestyle="", color=colour, markersize=7, label=f"{name}  {count}")

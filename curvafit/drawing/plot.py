@@ -312,7 +312,7 @@ def corner_figure(
 ) -> Figure:
     """Return a corner plot of draws `(n, d)`: histograms of each parameter on the diagonal, pairs below it.
 
-    `limits` are the axes of the parameters, the prior's box; `marks` are points `(d,)` to mark, by name, at most three.
+    `limits` are the ends of each parameter's axis; `marks` are at most three points `(d,)` to mark, by name.
     """
     d = draws.shape[1]
     figure = _figure(_SQUARE * d + 0.7, _SQUARE * d + 0.6)
@@ -330,7 +330,7 @@ def corner_figure(
                     draws[:, column], draws[:, row], s=3, color=_DRAWN, alpha=0.35, linewidth=0, rasterized=True
                 )
             _mark(axes, marks, column, None if row == column else row)
-            _label(axes, names, row, column, last=row == d - 1)
+            _label(axes, names, row, column)
     handles, labels = figure.axes[1].get_legend_handles_labels() if d > 1 else ([], [])
     if handles:
         figure.legend(handles, labels, loc="upper right", bbox_to_anchor=(0.98, 0.98), frameon=False, fontsize=11)
@@ -347,21 +347,16 @@ def _mark(axes: Axes, marks: Mapping[str, np.ndarray], column: int, row: int | N
             axes.plot(point[column], point[row], symbol, color=colour, markersize=6, markeredgewidth=1.8, label=name)
 
 
-def _label(axes: Axes, names: Sequence[str], row: int, column: int, *, last: bool) -> None:
-    """Write ticks and names at the left and the bottom of the whole alone."""
+def _label(axes: Axes, names: Sequence[str], row: int, column: int) -> None:
+    """Write ticks and names on axes at the left and the bottom of the figure."""
     axes.spines[:].set_color(QUIET)
     axes.tick_params(length=2, labelsize=8)
     axes.xaxis.set_major_locator(MaxNLocator(2, prune="both"))
+    axes.set_xlabel(names[column], fontsize=11)
     if row != column:
         axes.yaxis.set_major_locator(MaxNLocator(2, prune="both"))
-    if last:
-        axes.set_xlabel(names[column], fontsize=11)
-    else:
-        axes.set_xticklabels([])
-    if column == 0 and row > 0:
         axes.set_ylabel(names[row], fontsize=11)
-    elif row != column:
-        axes.set_yticklabels([])
+    axes.label_outer()
 
 
 def bands_figure(blocks: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:

@@ -175,7 +175,7 @@ def _open_file(path: Path, key: str | None, options: dict[str, Any]) -> InFile:
     check_array(size, corner.values.dtype, path)  # a mask is written from memory
     field = to_field(corner, f"{path}::{key}" if key else str(path), options["spacing"], options["unit"])
     frame = _empty(field, size)
-    return InFile(frame if options["crop"] is None else frame.moved(first), path, reading, channel, tuple(first))
+    return InFile(frame if options["crop"] is None else frame.move_origin(first), path, reading, channel, tuple(first))
 
 
 def _read(path: Path, reading: dict[str, Any], part: Part) -> tuple[Any, tuple[int, ...]]:

@@ -79,32 +79,16 @@ class Field(Pictured):
         return self.values.shape  # type: ignore[return-value]
 
     def crop(self, crop: Crop) -> Field:
-        """Return a box of voxels; its affine says where the box lies in the volume.
+        """Return a box of voxels, whose affine says where the box lies in the volume.
 
-        Parameters
-        ----------
-        crop
-            `"z0:z1,y0:y1,x0:x1"`, or three slices, as Python counts: `":,10:,-64:"` is all of z, y from voxel 10 on and
-            the last 64 of x.
-
-        Raises
-        ------
-        ScanError
-            If the crop is not a box, or leaves the volume.
+        `crop` is `"z0:z1,y0:y1,x0:x1"` or three slices, counted as Python does: `":,10:,-64:"` is all of z, y from
+        voxel 10 on and the last 64 of x. A crop that is no box, or leaves the volume, is a ScanError.
         """
         box = resolve_box(parse_box(crop), self.shape, self.source or "the volume")
-        return replace(self, values=self.values[box]).moved([edge.start for edge in box])
+        return replace(self, values=self.values[box]).move_origin([edge.start for edge in box])
 
     def label(self, label: int) -> Field:
-        """Return the mask of the voxels with this value.
-
-        Raises
-        ------
-        ScanError
-            If no voxel has this value, or all have it.
-        ValueError
-            If the label is not a whole number.
-        """
+        """Return the mask of the voxels with this value; none or all of them are a ScanError."""
         label = check_int(label, "a label that is a whole number", -SEEDS, SEEDS)
         mask = self.values == label
         if mask.all() or not mask.any():
@@ -114,8 +98,8 @@ class Field(Pictured):
             raise ScanError(f"label {label} {fault} of the scan, which has {listed}")
         return replace(self, values=mask, notes=(*self.notes, f"The structure is label {label}."))
 
-    def moved(self, start: Sequence[int]) -> Field:
-        """Return the same values, with their first voxel at this field's voxel `start` (z, y, x)."""
+    def move_origin(self, start: Sequence[int]) -> Field:
+        """Return the field with its first voxel placed where its voxel `start` (z, y, x) is."""
         affine = np.diag([*self.spacing[::-1], 1.0]) if self.affine is None else self.affine.copy()
         affine[:3, 3] += affine[:3, :3] @ np.array(start[::-1], dtype=np.float64)
         ends = (f"{first}:{first + n}" for first, n in zip(start, self.shape, strict=True))
@@ -123,13 +107,7 @@ class Field(Pictured):
 
 
 def positive_triple(spacing: object) -> tuple[float, float, float]:
-    """Return a spacing as three numbers; one number counts for all axes.
-
-    Raises
-    ------
-    ScanError
-        If the spacing is not one or three positive numbers.
-    """
+    """Return one or three positive numbers as three, or raise ScanError."""
     try:
         triple = (float(spacing),) * 3 if isinstance(spacing, (int, float)) else tuple(float(h) for h in spacing)  # type: ignore[union-attr]
     except (TypeError, ValueError, OverflowError):

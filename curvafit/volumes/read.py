@@ -113,7 +113,7 @@ def load(
     if lowest == highest:
         raise ScanError(f"every voxel of {location} is {lowest}: a volume must vary")
     field = to_field(raw, f"{location}::{key}" if key else str(location), spacing, unit)
-    field = field if part.crop is None else field.moved(start)
+    field = field if part.crop is None else field.move_origin(start)
     return field if label is None else field.label(label)
 
 

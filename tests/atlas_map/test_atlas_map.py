@@ -21,7 +21,7 @@ from curvafit.atlas_map.extract import extract
 from curvafit.atlas_map.files import write_map
 from curvafit.atlas_map.layout import NOISE, AtlasMap, embed, find_clusters, map_atlas
 from curvafit.atlas_map.page import CUT, LEVELS, regrow_command, shrink, small_volume
-from curvafit.atlas_map.picture import assign_slots, slot_places, spread_out
+from curvafit.atlas_map.picture import assign_slots, farthest_points, slot_places
 from curvafit.generation.flow import generate
 from curvafit.geometry.distances import wasserstein
 from curvafit.priors import Coefficients, Grid
@@ -131,11 +131,11 @@ def cross(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> bool:
     return side(a, b, c) != side(a, b, d) and side(c, d, a) != side(c, d, b)
 
 
-def test_the_shapes_shown_are_spread_out() -> None:
+def test_the_shapes_shown_are_farthest_points() -> None:
     grid = np.array([(x, y) for x in range(11) for y in range(11)], dtype=float)
-    chosen = grid[spread_out(grid, 5)]
+    chosen = grid[farthest_points(grid, 5)]
     assert {tuple(place) for place in chosen} == {(5, 5), (0, 0), (0, 10), (10, 0), (10, 10)}
-    assert len(spread_out(grid[:3], 20)) == 3
+    assert len(farthest_points(grid[:3], 20)) == 3
 
 
 # ---- one shape -------------------------------------------------------------------------------------------------------
