@@ -283,7 +283,7 @@ def section_figure(
             plane = np.take(values, places[axis], axis)
             outline = None if mask is None else np.take(mask, places[axis], axis)
             edges = [spacing[other] for other in range(3) if other != axis]
-            _section_on(row[axis], plane, outline, (low, high), edges[0] / edges[1])
+            section_on(row[axis], plane, outline, (low, high), edges[0] / edges[1])
     for axis, name in enumerate("zyx"):
         rows_name, columns_name = (other for other in "zyx" if other != name)
         axes[0, axis].set_title(f"{name} = {places[axis]}", fontsize=9)
@@ -292,11 +292,9 @@ def section_figure(
     return figure
 
 
-def _section_on(
-    axes, plane: np.ndarray, outline: np.ndarray | None, levels: tuple[float, float], aspect: float
-) -> None:
-    """Draw a slice, black at the first of the levels and white at the second, with the outline of a mask."""
-    low, high = levels
+def section_on(axes: Axes, plane: np.ndarray, outline: np.ndarray | None, limits: Limits, aspect: float) -> None:
+    """Draw a slice, with the outline of a mask; `limits` are the values that are black and white."""
+    low, high = limits
     plane, high = plane.astype(np.float32), max(high, low + 1e-6)
     axes.imshow(plane, cmap="gray", vmin=low, vmax=high, aspect=aspect, interpolation="nearest")
     axes.set(xticks=[], yticks=[])

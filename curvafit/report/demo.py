@@ -17,7 +17,7 @@ from curvafit.atlas_map.picture import FAMILY_COLOURS
 from curvafit.core.files import write_content
 from curvafit.core.records import can_write, has_mark
 from curvafit.core.runtime import Progress, silent, sub_progress
-from curvafit.drawing.plot import CONTOUR, INK, diagram_on, gallery_figure, shared_limits
+from curvafit.drawing.plot import INK, diagram_on, gallery_figure, section_on, shared_limits
 from curvafit.geometry.distances import sliced_embedding
 from curvafit.inference.atlas import load_atlas
 from curvafit.inference.infer import infer
@@ -194,9 +194,7 @@ def _slice_figure(scan: Field, completion: Completion) -> Figure:
     low, high = np.percentile(plane, (0.5, 99.5))
     aspect = scan.spacing[1] / scan.spacing[2]
     for each, mask, name in ((axes[0], truth, "the slice that was left out"), (axes[1], filled, "the filled slice")):
-        each.imshow(plane, cmap="gray", vmin=low, vmax=max(high, low + 1e-6), aspect=aspect)
-        if mask.any() and not mask.all():
-            each.contour(mask, [0.5], colors=CONTOUR, linewidths=1.1)
+        section_on(each, plane, mask, (low, high), aspect)
         each.set_title(name, fontsize=11)
     difference = np.ones((*truth.shape, 3), np.float32)
     difference[truth & filled] = (0.72, 0.74, 0.78)

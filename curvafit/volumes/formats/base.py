@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import bz2
-import gzip
 import logging
 import math
 import threading
@@ -11,7 +9,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -147,16 +145,3 @@ def check_regular(path: Path) -> Path:
     if path.exists() and not path.is_file() and not path.is_dir():
         raise ScanError(f"{path} is neither a file nor a folder")
     return path
-
-
-def decompress(stream: IO[bytes], encoding: str) -> Any:
-    """Return a stream that decompresses another from its present place on, if it is in `"gzip"` or `"bzip2"`."""
-    if encoding == "gzip":
-        return gzip.GzipFile(fileobj=stream)
-    return bz2.BZ2File(stream) if encoding == "bzip2" else stream
-
-
-def skip(stream: Any, count: int) -> None:
-    """Read and forget `count` bytes, or all where there are fewer."""
-    while count > 0 and (piece := stream.read(min(count, _PIECE))):
-        count -= len(piece)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import bz2
+import gzip
 import io
 import math
 import os
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -21,16 +23,20 @@ from curvafit.volumes.formats.base import (
     check_array,
     check_regular,
     collect_complaints,
-    decompress,
+    map_numbers,
     pick_key,
     read_numbers,
-    skip,
 )
+from curvafit.volumes.formats.part import read_part
 
 #: Suffixes of files that must be DICOM's.
 _DICOM = (".dcm", ".dicom", ".ima")
-#: NRRD's encodings that are read.
-_NRRD_ENCODINGS = {"raw": "raw", "gzip": "gzip", "gz": "gzip", "bzip2": "bzip2", "bz2": "bzip2"}
+#: NRRD's encodings that are read -> the function that makes a stream of a file.
+_NRRD_ENCODINGS: dict[str, Callable[[Any], Any]] = {
+    "raw": lambda file: file,
+    **dict.fromkeys(("gzip", "gz"), gzip.open),
+    **dict.fromkeys(("bzip2", "bz2"), bz2.open),
+}
 #: MetaImage's types -> numpy's.
 _META_TYPES = {
     "MET_CHAR": "i1",
@@ -91,11 +97,11 @@ def _nrrd_values(nrrd: Any, header: dict[str, Any], file: IO[bytes], path: Path)
         raise ScanError(f"{path} has the encoding {encoding[:40]!r}: write it as raw, gzip or bzip2")
     for _ in range(int(header.get("line skip", header.get("lineskip", 0)))):
         file.readline()
-    stream, start = decompress(file, _NRRD_ENCODINGS[encoding]), header.get("byte skip", header.get("byteskip", 0))
-    if int(start) < 0:  # the values are the last bytes
-        stream.seek(-math.prod(shape) * dtype.itemsize, 2)
+    stream, start = _NRRD_ENCODINGS[encoding](file), int(header.get("byte skip", header.get("byteskip", 0)))
+    if start < 0:
+        stream.seek(-math.prod(shape) * dtype.itemsize, os.SEEK_END)
     else:
-        skip(stream, int(start))
+        stream.seek(start, os.SEEK_CUR)
     return read_numbers(stream, shape, dtype, path)
 
 
@@ -199,14 +205,10 @@ def read_mrc(path: Path, **_: object) -> Raw:
         header, size = file.header, file.voxel_size
         shape, dtype = mrcfile.utils.data_shape_from_header(header), mrcfile.utils.data_dtype_from_header(header)
         start = header.nbytes + int(header.nsymbt)
-    with path.open("rb") as file:
-        mark = file.read(3)
-        file.seek(0)
-        stream = decompress(file, "gzip" if mark[:2] == b"\x1f\x8b" else "bzip2" if mark == b"BZh" else "raw")
-        skip(stream, start)
-        values = read_numbers(stream, [int(n) for n in shape], dtype, path)
+    values = map_numbers(path, start, [int(n) for n in shape], dtype)
+    raw = read_part(values, None, path, channels=0 if values.ndim == 4 else None)
     spacing = (float(size.z), float(size.y), float(size.x))
-    return Raw(values, spacing if min(spacing) > 0 else None, "angstrom", channels=0 if values.ndim == 4 else None)
+    return raw._replace(spacing=spacing if min(spacing) > 0 else None, unit="angstrom")
 
 
 def check_mrc(unit: str) -> None:

@@ -73,10 +73,9 @@ def write_zarr(field: Any, path: Path) -> None:
             for k, (_, first) in enumerate(levels)
         ],
     }
-    with hold_signals():
+    with hold_signals():  # Zarr's own threads would go on to write while the folder is deleted
         group = zarr.create_group(path, attributes={"ome": {"version": "0.5", "multiscales": [image]}})
-    for k, (values, _) in enumerate(levels):
-        with hold_signals():  # Zarr's own threads would go on to write while the folder is deleted
+        for k, (values, _) in enumerate(levels):
             group.create_array(
                 str(k),
                 data=values,
