@@ -131,7 +131,7 @@ def cross(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> bool:
     return side(a, b, c) != side(a, b, d) and side(c, d, a) != side(c, d, b)
 
 
-def test_the_shapes_shown_are_farthest_points() -> None:
+def test_the_shapes_shown_are_spread_out() -> None:
     grid = np.array([(x, y) for x in range(11) for y in range(11)], dtype=float)
     chosen = grid[farthest_points(grid, 5)]
     assert {tuple(place) for place in chosen} == {(5, 5), (0, 0), (0, 10), (10, 0), (10, 10)}
