@@ -74,10 +74,10 @@ def estimate(
     progress("reading the posterior", 0.1)
     parameters = posterior.sample(row, view, DRAWS, seed)
     best = optimum(posterior.emulator, row, view, parameters[:STARTS])
-    draws = Draws.of(turn(parameters), view, METHOD)
+    draws = Draws.from_parameters(turn(parameters), view, METHOD)
     other = "Of the other phase: " if turn is mirror_parameters else ""
     fit = replace(fit, draws=draws, weak_directions=tuple(other + each for each in best.weak))
-    middle = Draws.of(parameters, view, "").middle(np.ptp(parameters, axis=0))
+    middle = Draws.from_parameters(parameters, view, "").middle(np.ptp(parameters, axis=0))
     likely = Candidate("posterior", *law_of(turn(middle)), draws.deviations)
     grown = None
     if not fast:
@@ -90,7 +90,7 @@ def estimate(
     pool = posterior.sample(row, view, POOL, seed)
     search = Search(posterior.emulator, view, row)
     part = sub_progress(progress, 0.45, 1.0)
-    likeliest, every = search.parameters(pool, grown, simulate, rounds=effort.rounds, seed=seed, progress=part)
+    likeliest, every = search.run(pool, grown, simulate, rounds=effort.rounds, seed=seed, progress=part)
     near = every.parameters[search.nearest(every)[0]]
     refined, simulation = (
         Candidate(name, *law_of(turn(each)), {}) for name, each in (("refined", likeliest), ("simulation", near))
@@ -135,7 +135,7 @@ def _best_fit(posterior: Posterior, best: Optimum, view: str, turn: Turn) -> Can
     """Return the best fit of the descriptors, with deviations by draws from the normal distribution around it."""
     rng = np.random.default_rng(0)
     near = rng.multivariate_normal(best.parameters, best.covariance, DRAWS, check_valid="ignore")
-    deviations = Draws.of(turn(np.clip(near, *posterior.box.T)), view, "").deviations
+    deviations = Draws.from_parameters(turn(np.clip(near, *posterior.box.T)), view, "").deviations
     return Candidate("optimum", *law_of(turn(best.parameters)), deviations)
 
 

@@ -55,15 +55,15 @@ class Draws:
             raise ValueError(f"expected finite draws (n, {len(COLUMNS)}), got shape {self.values.shape}")
 
     @staticmethod
-    def of(parameters: np.ndarray, view: str, method: str) -> Draws:
-        """Return the draws of parameters `(n, 6)` with log a02 for a02 (`table.PARAMETERS`)."""
+    def from_parameters(parameters: np.ndarray, view: str, method: str) -> Draws:
+        """Return draws from parameters `(n, 6)`, which have log a02 for a02 (`table.PARAMETERS`)."""
         values = np.array(parameters, dtype=np.float64)
         values[:, 1] = np.exp(values[:, 1])
         return Draws(values, view, method)
 
     @property
     def parameters(self) -> np.ndarray:
-        """Return the draws as `table.PARAMETERS` has them, with log a02."""
+        """Return the draws as `table.PARAMETERS`, with log a02 for a02."""
         values = self.values.copy()
         values[:, 1] = np.log(values[:, 1])
         return values
@@ -79,7 +79,7 @@ class Draws:
         return rows[np.square((rows - np.median(rows, 0)) / scale).sum(1).argmin()]
 
     def intervals(self, length: float = 1.0) -> dict[str, dict[str, Any]]:
-        """Return each parameter's median and central intervals, in the unit of which a working length is `length`."""
+        """Return each parameter's median and central intervals; a working length of 1 is `length` in their unit."""
         parts = {}
         powers = (*(POWERS[name] for name in NAMES[1:]), 0)
         for name, power, column in zip(COLUMNS, powers, self.values.T, strict=True):
@@ -108,7 +108,7 @@ class Fit(Pictured):
     misfit
         How the scan's descriptors lie among those that the model makes; None where that is not known.
     drift
-        How far, in working voxels (root mean square), a short flow of the chosen law moves the scan's own surface.
+        Root mean square distance, in working voxels, by which a short flow of the chosen law moves the scan's surface.
     scale
         Working voxel in scan voxels, (z, y, x).
     working_voxel, length_unit
@@ -168,23 +168,21 @@ class Fit(Pictured):
 
     @property
     def length(self) -> float:
-        """λ: a working length of 1 in physical units."""
+        """Return λ, a working length of 1 in physical units."""
         return self.working_voxel / WORKING_SPACING
 
     @property
     def coefficients_physical(self) -> Coefficients | None:
-        """The same energy in `length_unit`: quadratic part unchanged, linear / λ, constant / λ²."""
+        """Return the same energy in `length_unit`: quadratic part unchanged, linear / λ, constant / λ²."""
         return None if self.coefficients is None else self.coefficients.in_unit(1 / self.length)
 
     @property
     def epsilon_physical(self) -> float:
+        """Return the interface width ε in `length_unit`."""
         return WORKING_EPSILON * self.length
 
     def to_law(self) -> Law:
-        """Return what `Law.load` reads from the fit's file: the fit as a law.
-
-        Raises ValueError if the fit has none.
-        """
+        """Return the chosen law; raise ValueError if the fit has none."""
         six, mass = self.coefficients, self.mass
         if six is None or mass is None:
             raise ValueError(f"expected a fit with a law, got one without: {self.status}")
@@ -194,14 +192,11 @@ class Fit(Pictured):
         return Law(six, mass, "prior", epsilon=width, schedule="deep", **own)  # type: ignore[arg-type]
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain numbers, strings, lists and dicts, as `fit.json` holds them."""
+        """Return plain numbers, strings, lists and dicts, as `fit.json` holds them."""
         return encode(_file_of(self))
 
     def to_json(self) -> str:
-        """Return the text of a `fit.json`: indented, but lists of numbers in one line.
-
-        Raises ValueError if the fit is none that `from_json` takes.
-        """
+        """Return the text of a `fit.json`, indented; raise ValueError where `from_json` would not take it."""
         content = self.as_dict()
         if wrong := violation(content, FIT_SCHEMA):
             raise ValueError(f"expected {wrong} in a fit")
@@ -210,10 +205,7 @@ class Fit(Pictured):
 
     @classmethod
     def from_json(cls, text: str | bytes) -> Fit:
-        """Return the fit of a `fit.json`'s text; its diagram has the digits that the text has.
-
-        Raises ValueError if the text is no whole fit of this format (`FIT_SCHEMA`).
-        """
+        """Return the fit that a `fit.json`'s text states; raise ValueError if it is not whole (`FIT_SCHEMA`)."""
         return _fit_of(_parse(text, "the text", FIT_SCHEMA))
 
     def save(self, path: str | PathLike[str]) -> Path:
@@ -222,17 +214,13 @@ class Fit(Pictured):
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Fit:
-        """Read a `fit.json`.
-
-        Raises FileNotFoundError or ValueError if there is no such file, or as `from_json`.
-        """
+        """Read a `fit.json`; raise FileNotFoundError if there is none, ValueError as `from_json`."""
         return _fit_of(_parse(_content(path), path, FIT_SCHEMA))
 
 
 # ---- the file --------------------------------------------------------------------------------------------------------
 
 Positive = Annotated[float, Rule(above=0)]
-
 Column = Annotated[tuple[float, ...], Rule(filled=True)]
 
 
@@ -259,7 +247,7 @@ class _Posterior:
 
 @dataclass(frozen=True, kw_only=True)
 class _Columns:
-    """A diagram: curvatures to 2 decimals (bins are 2 wide), shares of area, and what of an atlas compares with it."""
+    """A diagram: curvatures to 2 decimals (bins are 2 wide), shares of area, and its kind in an atlas."""
 
     seen_as: Literal["field", "mask"] = "mask"
     unit: str = "1/working unit"
@@ -308,9 +296,9 @@ _SAME = tuple({field.name for field in fields(Fit)} & {field.name for field in f
 
 
 def load_draws_and_candidates(law: LawLike) -> tuple[Draws | None, tuple[Candidate, ...]]:
-    """Return the draws and the candidates of a fit, an inference or a `fit.json`; none of a law that has none.
+    """Return the draws and the candidates of a fit, an inference or a `fit.json`; None and () of any other law.
 
-    Raises FileNotFoundError or ValueError if there is no such file, or its draws or candidates are damaged.
+    Of a file no other entries are read: it may lack them. Raises FileNotFoundError or ValueError as `Fit.load`.
     """
     if not isinstance(law, (str, PathLike)):
         fit = getattr(law, "fit", law)

@@ -26,7 +26,7 @@ from curvafit.scan.structure import check_options, find_level, is_rounded
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.read import Source, field_of
 
-#: What is summed over blocks, in powers of the scan's unit; normals are the six parts of n⊗n, zz zy zx yy yx xx.
+#: What is summed over blocks, in powers of the scan's unit; n0 to n5 are the parts zz zy zx yy yx xx of n⊗n.
 SUMS = ("volume", "inside", "thickness", "thickness²", "gap", "χ", "area", *(f"n{k}" for k in range(6)))
 SUMS += ("curved", "H", "H²", "K", "κ1", "κ2", "C", *FAMILIES)
 _UPPER = np.triu_indices(3)
@@ -143,7 +143,7 @@ def measure(
     progress: Progress = silent,
     **reading: Any,
 ) -> Measures:
-    """Measure a scan: nothing is inferred, nothing grown.
+    """Measure the structure in a scan, with an interval for each number.
 
     Volume fraction, thickness, spacing, connectivity, surface and fabric are those of the structure on the scan's own
     voxels, all of them. Curvature is that of the scan on the working grid, as `infer` reads it. Intervals are 95 %, by
@@ -164,19 +164,25 @@ def measure(
     field = field_of(scan, **reading)
     options = {"threshold": threshold, "dark": dark, "periodic": periodic}
     progress("finding the structure", 0.0)
-    mask, seen, notes = _structure(field, kind, options)
+    mask, seen, notes = _find_structure(field, kind, options)
     progress("measuring thickness", 0.1)
     maps = [local_thickness(each, field.spacing, periodic=periodic) for each in (mask, ~mask)]
-    blocks = Blocks.of(field.shape, field.spacing, sum(float(each[each > 0].mean(dtype=np.float64)) for each in maps))
+    blocks = Blocks.divide(
+        field.shape, field.spacing, sum(float(each[each > 0].mean(dtype=np.float64)) for each in maps)
+    )
     progress("measuring curvature", 0.6)
     prepared = prepare(field, kind=seen, **options)  # type: ignore[arg-type]
-    curved, diagram = _curved(blocks, prepared)
-    sums = {**_filled(blocks, mask, maps, field.spacing), **_surfaced(blocks, mask, field.spacing, periodic), **curved}
+    curved, diagram = _sum_curvatures(blocks, prepared)
+    sums = {
+        **_sum_voxels(blocks, mask, maps, field.spacing),
+        **_sum_surface(blocks, mask, field.spacing, periodic),
+        **curved,
+    }
     table = np.stack([sums[name] for name in SUMS], axis=1)
-    values, names = _figures(table.sum(0)), [name for name, *_ in QUANTITIES]
+    values, names = _combine(table.sum(0)), [name for name, *_ in QUANTITIES]
     whole = [names.index("Euler number"), names.index("connectivity density")]
     values[whole] = connectivity_of(mask, field.spacing, periodic=periodic)
-    halves = errors(table, blocks, _figures) if blocks.count >= LEAST else np.full(len(values), np.nan)
+    halves = errors(table, blocks, _combine) if blocks.count >= LEAST else np.full(len(values), np.nan)
     if blocks.count < LEAST:
         notes = (*notes, f"No intervals: they need {LEAST} blocks of a period, and the scan has {blocks.count}.")
     rows = zip(QUANTITIES, values, halves, strict=True)
@@ -195,8 +201,8 @@ def measure(
     )
 
 
-def _structure(field: Field, kind: str, options: dict[str, Any]) -> tuple[np.ndarray, str, tuple[str, ...]]:
-    """Return the structure on the scan's voxels, what it was taken for, and notes; of an image, without specks."""
+def _find_structure(field: Field, kind: str, options: dict[str, Any]) -> tuple[np.ndarray, str, tuple[str, ...]]:
+    """Return the structure on the scan's voxels, its kind, and notes; specks of an image are dropped."""
     level = find_level(field, kind=kind, **options)  # type: ignore[arg-type]
     mask, notes = level.mask, (*field.notes, level.note)
     if level.kind == "image":
@@ -213,10 +219,10 @@ def _structure(field: Field, kind: str, options: dict[str, Any]) -> tuple[np.nda
     return mask, level.kind, notes
 
 
-def _filled(
+def _sum_voxels(
     blocks: Blocks, mask: np.ndarray, maps: list[np.ndarray], spacing: tuple[float, float, float]
 ) -> dict[str, np.ndarray]:
-    """Return the sums of what voxels have."""
+    """Return each block's sums over voxels: volume, structure, thickness and gaps."""
     voxel, (thickness, gap) = math.prod(spacing), maps
     return {
         "volume": voxel * blocks.sums(np.ones(mask.shape, dtype=bool)),
@@ -227,7 +233,7 @@ def _filled(
     }
 
 
-def _surfaced(
+def _sum_surface(
     blocks: Blocks, mask: np.ndarray, spacing: tuple[float, float, float], periodic: bool
 ) -> dict[str, np.ndarray]:
     """Return the sums of χ, of area, and of n⊗n dA in the upper triangle's order (z, y, x)."""
@@ -235,12 +241,12 @@ def _surfaced(
     normals = area_vectors(mesh)[:, ::-1]
     area = np.linalg.norm(normals, axis=1)
     parts = normals[:, _UPPER[0]] * normals[:, _UPPER[1]] / np.where(area > 0, area, 1)[:, None]
-    sums = blocks.gathered(mesh.barycentres / np.array(spacing), np.column_stack([area, parts]))
+    sums = blocks.gather(mesh.barycentres / np.array(spacing), np.column_stack([area, parts]))
     names = ("area", *(f"n{k}" for k in range(6)))
     return {"χ": blocks.sums(euler_shares(mask, periodic=periodic)), **dict(zip(names, sums.T, strict=True))}
 
 
-def _curved(blocks: Blocks, prepared: Prepared) -> tuple[dict[str, np.ndarray], Diagram]:
+def _sum_curvatures(blocks: Blocks, prepared: Prepared) -> tuple[dict[str, np.ndarray], Diagram]:
     """Return the sums of curvatures times area, and the diagram, in the scan's unit."""
     working = scan_diagram(prepared)
     length = prepared.working_voxel / WORKING_SPACING
@@ -256,12 +262,12 @@ def _curved(blocks: Blocks, prepared: Prepared) -> tuple[dict[str, np.ndarray], 
     H = (κ1 + κ2) / 2
     kinds = np.eye(len(FAMILIES))[families(working.points, prepared.thickness / 2 * WORKING_SPACING)]
     columns = np.column_stack([np.ones_like(H), H, H**2, κ1 * κ2, κ1, κ2, np.hypot(κ1, κ2) / math.sqrt(2), kinds])
-    sums = blocks.gathered(voxels, columns * physical.weights[:, None])
+    sums = blocks.gather(voxels, columns * physical.weights[:, None])
     return dict(zip(("curved", "H", "H²", "K", "κ1", "κ2", "C", *FAMILIES), sums.T, strict=True)), physical
 
 
-def _figures(sums: np.ndarray) -> np.ndarray:
-    """Return the quantities (…, K) of sums (…, C)."""
+def _combine(sums: np.ndarray) -> np.ndarray:
+    """Return the quantities (…, K) that follow from sums (…, C)."""
     named = dict(zip(SUMS, np.moveaxis(sums, -1, 0), strict=True))
     with np.errstate(divide="ignore", invalid="ignore"):  # draws of blocks without surface
         return np.stack([figure(named) for *_, figure in QUANTITIES], axis=-1)
@@ -293,11 +299,11 @@ def scan_diagram(prepared: Prepared) -> Diagram:
     Places are in working units from the centre of the grid's first voxel.
     """
     grid = prepared.grid
-    cuts = [[slice(None)] if grid.periodic else _tiles(n) for n in grid.shape]
+    cuts = [[slice(None)] if grid.periodic else _cut_axis(n) for n in grid.shape]
     parts: list[Diagram] = []
     for tile in itertools.product(*cuts):
         with contextlib.suppress(NoSurface):
-            parts.append(_tile_diagram(prepared, tile))
+            parts.append(_measure_tile(prepared, tile))
     if not parts:
         raise ValueError("expected a surface inside the scan, got none away from its borders")
     points, areas, places = (
@@ -307,14 +313,14 @@ def scan_diagram(prepared: Prepared) -> Diagram:
     return Diagram(points, areas, excluded=float(lost), places=places)
 
 
-def _tiles(n: int) -> list[slice]:
-    """Return stretches of at most a window's length; their interiors (`MARGIN` voxels in) share end planes alone."""
+def _cut_axis(n: int) -> list[slice]:
+    """Cut an axis of n voxels into overlapping stretches whose interiors, `MARGIN` voxels in, meet in a plane."""
     count = math.ceil((n - 2 * MARGIN) / (LARGEST_WINDOW - 2 * MARGIN))
     ends = np.linspace(MARGIN, n - 1 - MARGIN, count + 1).astype(int)
     return [slice(a - MARGIN, b + MARGIN + 1) for a, b in itertools.pairwise(ends)]
 
 
-def _tile_diagram(prepared: Prepared, tile: tuple[slice, ...]) -> Diagram:
+def _measure_tile(prepared: Prepared, tile: tuple[slice, ...]) -> Diagram:
     phase = np.ascontiguousarray(prepared.phase[tile])
     z, y, x = phase.shape
     grid = Grid((z, y, x), prepared.grid.spacing, prepared.grid.boundary)
@@ -334,14 +340,14 @@ def scan_descriptors(prepared: Prepared) -> tuple[Descriptors, str] | None:
     if where is None:
         return None
     mask, grid = np.ascontiguousarray(prepared.mask[where]), prepared.part(where)
-    view = _view(prepared, grid)
+    view = _kind_of_view(prepared, grid)
     try:
         return descriptors(prepared.phase if view == "field" else mask, grid), view
     except NoSurface:
         return None
 
 
-def _view(prepared: Prepared, grid: Grid) -> str:
+def _kind_of_view(prepared: Prepared, grid: Grid) -> str:
     """Return what a posterior takes a window for: a field of a part is read as its mask is, a clean image as a mask."""
     if prepared.quality is not None and prepared.quality.degraded:
         return "scan"
@@ -368,7 +374,7 @@ class Blocks:
     starts: tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]
 
     @classmethod
-    def of(cls, shape: Sequence[int], spacing: Sequence[float], period: float) -> Blocks:
+    def divide(cls, shape: Sequence[int], spacing: Sequence[float], period: float) -> Blocks:
         """Divide a volume into blocks of `PERIODS` periods of its structure, and at most `MOST` along an axis."""
         counts = [min(max(int(n * h / (PERIODS * period)), 1), MOST) for n, h in zip(shape, spacing, strict=True)]
         starts = [tuple(n * k // count for k in range(count)) for n, count in zip(shape, counts, strict=True)]
@@ -392,7 +398,7 @@ class Blocks:
             values = np.add.reduceat(values, starts, axis=axis, dtype=kind)
         return values.ravel().astype(np.float64)
 
-    def gathered(self, places: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    def gather(self, places: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Return sums over each block, (N, …), of weights (M, …) at places (M, 3) in voxels from the first centre."""
         numbers = np.zeros(len(places), dtype=np.int64)
         for axis, starts in enumerate(self.starts):
@@ -406,17 +412,11 @@ class Blocks:
 def errors(sums: np.ndarray, blocks: Blocks, figures: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     """Return half the width of the `SURE` interval of each figure, (K,), by a jackknife over neighbours that correlate.
 
-    With ψ the change of a figure when a block is left out, the variance is ψᵀ W ψ: W has 1 on its diagonal, and ½ for
-    each axis along which two blocks are neighbours (Bartlett's kernel, as Newey & West 1987 for series). Were blocks
-    independent, ψᵀ W ψ would be σ² tr(P W P) / n², P taking the mean off: that sets its scale, and with tr² / tr(·²)
-    the degrees of freedom of Student's t. A bootstrap over single blocks would take neighbours for independent.
-
-    Parameters
-    ----------
-    sums
-        Sums over each block, (N, C), of what is additive.
-    figures
-        Returns figures (…, K) of sums (…, C).
+    `figures` gives figures (…, K) from sums (…, C); `sums` has those of each block, (N, C). With ψ the change of a
+    figure when a block is left out, the variance is ψᵀ W ψ: W has 1 on its diagonal, and ½ for each axis along which
+    two blocks are neighbours (Bartlett's kernel, as Newey & West 1987 for series). Were blocks independent, ψᵀ W ψ
+    would be σ² tr(P W P) / n², P taking the mean off: that sets its scale, and with tr² / tr(·²) the degrees of freedom
+    of Student's t. A bootstrap over single blocks would take neighbours for independent.
     """
     count = len(sums)
     kernel = np.ones((1, 1))

@@ -46,7 +46,7 @@ THINNEST = 3.0
 LARGEST_WINDOW = 128
 LARGEST_BOX = 200
 LARGEST_SCAN = 512
-#: Part of the volume from which on a structure may be the other phase than the one that was meant, and the note.
+#: A structure that fills more than this part of the volume may be the wrong phase, which a note says.
 HALF = 0.5
 MOSTLY = "The structure fills {:.0%} of the volume: if the other phase was meant, turn the two round (--dark)."
 #: Coarsening stops where a side would have fewer working voxels than this.
@@ -77,21 +77,18 @@ class Prepared:
     threshold
         Grey level that separates the phases, None for fields and masks.
     thickness
-        Median thickness beneath its surface, in working voxels, of the structure, or of the background where that fills
-        less of the volume.
+        Median thickness beneath the surface, in working voxels, of the phase that fills less of the volume.
     windows
-        Boxes of at most 128 voxels a side that together cover the grid's surface; the first is the main one. They
-        overlap, so sums belong on the whole grid; one smaller than the grid is no periodic box.
+        Overlapping boxes of at most 128 voxels a side that cover the surface, the main one first.
     origin
         Scan voxel coordinates (z, y, x) of the corner of the first working voxel.
     roi
-        bool, same shape: the region of interest, None where all counts. Structure ends at its faces, so surface within
-        a voxel of them is none of the scan's.
+        bool, same shape: the region of interest, None where all counts. Surface within a voxel of its faces is a cut.
     notes
         Sentences on what was decided.
     noise
         Whether the structure's voxels have nothing to do with those a few voxels away.
-    imaging
+    quality
         Blur and noise of an image; None of fields and masks.
     """
 
@@ -226,12 +223,12 @@ class _Scan:
 
     @property
     def keeps_grid(self) -> bool:
-        """Return whether thickness has no say in the grid: a phase field has its ε, and noise no thickness."""
+        """Return whether the grid is kept whatever the thickness: a phase field has its ε, and noise no thickness."""
         return self.level.kind == "field" or self.noise
 
     @property
     def thinner(self) -> tuple[np.ndarray, str]:
-        """Return the phase that fills less of what counts, whose thickness sets the grid, and its name."""
+        """Return the phase that fills less, whose thickness sets the grid, and its name."""
         structure = self.counted
         counted = structure.size if self.region is None else np.count_nonzero(self.region)
         if np.count_nonzero(structure) <= HALF * counted:
@@ -246,12 +243,12 @@ class _Scan:
 
 def _on_working_grid(scan: _Scan) -> Prepared:
     """Choose the working voxel, move the scan to it, drop specks, profile the mask, choose windows."""
-    thickness, notes = _thickness(scan)
-    scale, why = _scale(scan, thickness)
-    start, shape, cut = _working_box(scan, scale)
+    thickness, notes = _measure_thickness(scan)
+    scale, why = _choose_scale(scan, thickness)
+    start, shape, cut = _choose_box(scan, scale)
     edges = [s * h for s, h in zip(scale, scan.spacing, strict=True)]
     edge = edges[0] if max(edges) <= (1 + 1e-9) * min(edges) else math.prod(edges) ** (1 / 3)
-    values, region = _moved(scan, scale, start, shape)
+    values, region = _move(scan, scale, start, shape)
     grid = Grid(
         shape,
         (WORKING_SPACING, WORKING_SPACING, WORKING_SPACING),
@@ -264,9 +261,9 @@ def _on_working_grid(scan: _Scan) -> Prepared:
     if not windows:
         raise ScanError("expected a surface between structure and background, got none on the working grid")
     if scan.level.kind != "field":
-        phase = _profiled(mask, grid)
+        phase = _profile(mask, grid)
     else:
-        phase = values if region is None or region.all() else np.minimum(values, _profiled(region, grid))
+        phase = values if region is None or region.all() else np.minimum(values, _profile(region, grid))
     return Prepared(
         kind=scan.level.kind,
         phase=np.ascontiguousarray(phase, dtype=np.float32),
@@ -285,8 +282,8 @@ def _on_working_grid(scan: _Scan) -> Prepared:
     )
 
 
-def _thickness(scan: _Scan) -> tuple[float, tuple[str, ...]]:
-    """Return the median thickness in the scan's unit; refused where next to nothing is thick enough to have a shape."""
+def _measure_thickness(scan: _Scan) -> tuple[float, tuple[str, ...]]:
+    """Return the median thickness in the scan's unit, and a note; refuse what is too thin to have a shape."""
     phase, name = scan.thinner
     median, thick = median_thickness(phase, scan.spacing, scan.periodic)
     voxel = math.prod(scan.spacing) ** (1 / 3)
@@ -301,7 +298,7 @@ def _thickness(scan: _Scan) -> tuple[float, tuple[str, ...]]:
     return median, (note,)
 
 
-def _scale(scan: _Scan, thickness: float) -> tuple[tuple[float, float, float], tuple[str, ...]]:
+def _choose_scale(scan: _Scan, thickness: float) -> tuple[tuple[float, float, float], tuple[str, ...]]:
     """Return the working voxel in scan voxels, per axis; all ones where the scan's grid is kept."""
     spacing, finest = scan.spacing, min(scan.spacing)
     isotropic = max(spacing) <= 1.01 * finest
@@ -320,13 +317,13 @@ def _scale(scan: _Scan, thickness: float) -> tuple[tuple[float, float, float], t
     return (scale[0], scale[1], scale[2]), (f"{note}: a working voxel is {edges} scan voxels (z, y, x).",)
 
 
-def _working_box(
+def _choose_box(
     scan: _Scan, scale: tuple[float, float, float]
 ) -> tuple[tuple[int, int, int], tuple[int, int, int], tuple[str, ...]]:
     """Return the first working voxel, number of voxels, and a note where that is not all of the scan."""
     full = [math.floor(n / s + 1e-6) for n, s in zip(scan.shape, scale, strict=True)]
     if min(full) < 4:
-        raise ScanError(f"expected at least 4 working voxels along each axis, got {_times(full)}")
+        raise ScanError(f"expected at least 4 working voxels along each axis, got {_join_sides(full)}")
     if max(full) <= LARGEST_BOX:
         return (0, 0, 0), (full[0], full[1], full[2]), ()
     sides = [min(n, LARGEST_BOX) for n in full]
@@ -334,11 +331,11 @@ def _working_box(
     boxes = boxes_by_surface(surface_voxels(scan.counted), size)
     corner = boxes[0] if boxes else tuple(slice(0, n) for n in size)
     start = [min(int(c.start / s), n - m) for c, s, n, m in zip(corner, scale, full, sides, strict=True)]
-    note = f"Of {_times(full)} working voxels, {_times(sides)} from {tuple(start)} on are used."
+    note = f"Of {_join_sides(full)} working voxels, {_join_sides(sides)} from {tuple(start)} on are used."
     return (start[0], start[1], start[2]), (sides[0], sides[1], sides[2]), (note,)
 
 
-def _moved(
+def _move(
     scan: _Scan, scale: tuple[float, float, float], start: tuple[int, int, int], shape: tuple[int, int, int]
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Return the level values and region of interest on the working grid."""
@@ -375,11 +372,11 @@ def smallest_piece(thickness: float) -> float:
     return math.pi / 6 * (thickness / 2) ** 3
 
 
-def _profiled(mask: np.ndarray, grid: Grid) -> np.ndarray:
+def _profile(mask: np.ndarray, grid: Grid) -> np.ndarray:
     return phase_field(torch.from_numpy(mask), grid, WORKING_EPSILON).numpy()
 
 
-def _times(shape: Iterable[int]) -> str:
+def _join_sides(shape: Iterable[int]) -> str:
     return " x ".join(str(n) for n in shape)
 
 

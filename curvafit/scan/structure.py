@@ -3,10 +3,10 @@
 `find_level` decides the kind of a scan and splits structure from background. `Quality` is how the scan blurs and how
 noisy it is, measured from its grey levels (`measure_quality`), and scans a grown shape alike (`Quality.rescan`).
 
-Two rooms split grey levels otherwise, on purpose. `segmentation.evidence` needs the noise of each voxel: it thresholds
-levels smoothed as far as their noise asks, and splits half way between the means of the raw ones. `data_synth.imaging`
-follows brightness that varies along a structure: its threshold is that of square roots, then half of what is around.
-Here thin structures must not grow fat: the threshold is that of the raw levels, applied to smoothed ones.
+Two rooms split grey levels otherwise, on purpose. `segmentation.evidence` needs the noise of each voxel: it smooths as
+far as the noise asks, and splits half way between the means of the raw levels. `data_synth.imaging` follows brightness
+that varies along a structure. Here thin structures must not grow fat: smoothed levels are split at the raw ones'
+threshold.
 """
 
 from __future__ import annotations
@@ -87,11 +87,15 @@ def find_level(
     two = bool(np.all((values == lowest) | (values == highest)))
     kind = _guess_kind(values, threshold, two) if kind == "auto" else kind
     if kind == "field":
-        level = _field_level(values, dark)
+        note = f"Taken for a phase field: values {values.min():.3g} to {values.max():.3g}."
+        level = Level("field", (-values if dark else values).astype(np.float32), None, note)
     elif kind == "mask":
-        level = _mask_level(values, dark, lowest, highest, two)
+        positive = "Taken for a mask: the structure is where it is positive."
+        note = f"Taken for a mask of the values {float(lowest):g} and {float(highest):g}." if two else positive
+        mask = values == highest if two else values > 0
+        level = Level("mask", np.where(mask != dark, np.float32(1), np.float32(-1)), None, note)
     else:
-        level = _image_level(field, threshold, dark, region, periodic)
+        level = _split_image(field, threshold, dark, region, periodic)
     counted = level.mask if region is None else level.mask[region]
     if not counted.any():
         raise ScanError("expected a structure in the scan, got none: every voxel is background")
@@ -101,16 +105,16 @@ def find_level(
 
 
 def check_options(kind: str, threshold: float | str, label: int | None) -> None:
-    """Raise ValueError where what tells the structure is no such thing, or counts for nothing beside another option."""
+    """Raise ValueError where a kind, threshold or label is none, or contradicts another."""
     check_choice(kind, ("auto", "field", "mask", "image"), "kind auto, field, mask or image")
     otsu = isinstance(threshold, str) and threshold == "otsu"
     level = "otsu" if otsu else check_float(threshold, "a threshold that is a number or 'otsu'")
     if label is not None:
         check_int(label, "a label that is a whole number", -SEEDS, SEEDS)
         if kind in ("field", "image") or level != "otsu":
-            raise ValueError("expected a label, which tells the structure, without a kind or a threshold, got both")
+            raise ValueError("a label states the structure: leave out kind and threshold, got both")
     if kind in ("field", "mask") and level != "otsu":
-        raise ValueError(f"expected a threshold beside grey levels, got kind {kind}")
+        raise ValueError(f"a threshold splits grey levels: leave it out for kind {kind}")
 
 
 def region_of_interest(roi: Field | np.ndarray | str | os.PathLike[str] | None, field: Field) -> np.ndarray | None:
@@ -163,39 +167,21 @@ def _guess_kind(values: np.ndarray, threshold: Literal["otsu"] | float, two: boo
     return "image"
 
 
-def _field_level(values: np.ndarray, dark: bool) -> Level:
-    note = f"Taken for a phase field: values {values.min():.3g} to {values.max():.3g}."
-    return Level("field", (-values if dark else values).astype(np.float32), None, note)
-
-
-def _mask_level(values: np.ndarray, dark: bool, lowest: float, highest: float, two: bool) -> Level:
-    if two:
-        note = f"Taken for a mask of the values {float(lowest):g} and {float(highest):g}."
-        return _signed(values == highest, dark, note)
-    return _signed(values > 0, dark, "Taken for a mask: the structure is where it is positive.")
-
-
-def _signed(mask: np.ndarray, dark: bool, note: str) -> Level:
-    return Level("mask", np.where(mask != dark, np.float32(1), np.float32(-1)), None, note)
-
-
-def _between_phases(values: np.ndarray) -> float:
+def _find_threshold(values: np.ndarray) -> float:
     """Return the middle of the means of the two phases that Otsu's threshold splits.
 
-    That is Otsu's own threshold, but for phases of sharp levels: any threshold between those splits them alike, and
-    Otsu's is the lowest.
+    Between two sharp levels all thresholds split alike and Otsu's is the lowest; else the two agree.
     """
     high = values > threshold_otsu(values)
     return float(values[high].mean(dtype=np.float64) + values[~high].mean(dtype=np.float64)) / 2
 
 
-def _image_level(
+def _split_image(
     field: Field, threshold: Literal["otsu"] | float, dark: bool, region: np.ndarray | None, periodic: bool
 ) -> Level:
-    """Return the grey levels smoothed by one voxel of the finest axis, minus the threshold; Otsu's is that of the raw
-    levels.
+    """Return grey levels smoothed by one voxel of the finest axis, less the threshold, which is that of the raw levels.
 
-    Smoothing lowers thin structures' grey: their own threshold would then sink and make them fat.
+    Smoothing lowers thin structures' grey: a threshold of the smoothed levels would sink and make them fat.
     """
     finest = min(field.spacing)
     width = [finest / h for h in field.spacing]
@@ -203,7 +189,7 @@ def _image_level(
     smooth = ndimage.gaussian_filter(field.values.astype(np.float32), width, mode=mode, truncate=3.0)
     counted, raw = (smooth, field.values) if region is None else (smooth[region], field.values[region])
     try:
-        level = _between_phases(raw) if threshold == "otsu" else float(threshold)
+        level = _find_threshold(raw) if threshold == "otsu" else float(threshold)
     except ValueError:
         raise ScanError(f"expected a threshold that is a number or 'otsu', got {threshold!r}") from None
     lowest, highest = float(counted.min()), float(counted.max())
@@ -227,9 +213,9 @@ class Quality:
     noise
         Deviation of the noise over the contrast of the two phases.
     grain
-        Deviation of the Gaussian that makes such noise of white noise, in voxels of the finest axis.
-    fat
-        How far the structure that was split off reaches beyond the one that was blurred, in voxels of the finest axis.
+        Deviation of the Gaussian that correlates the noise, in voxels of the finest axis; 0 of white noise.
+    boundary_shift
+        How far the split structure reaches beyond the true one, in voxels of the finest axis.
     spacing
         Voxel edges (z, y, x) of the scan.
     """
@@ -242,11 +228,8 @@ class Quality:
 
     @property
     def smoothed(self) -> float:
-        """Return the noise, over the contrast, that is left once the image is smoothed to be split.
-
-        Smoothing by a voxel of the finest axis leaves 0.15 of white noise on cubic voxels.
-        """
-        return self.noise * _left(self.grain, self.spacing)
+        """Return the noise, over the contrast, that is left after smoothing by a voxel of the finest axis."""
+        return self.noise * _smoothing_factor(self.grain, self.spacing)
 
     @property
     def degraded(self) -> bool:
@@ -254,24 +237,14 @@ class Quality:
         return self.smoothed > NOISY or max(self.spacing) > SLICED * min(self.spacing)
 
     def rescan(self, mask: np.ndarray, scale: Sequence[float], smallest: float, seed: int) -> np.ndarray:
-        """Scan a periodic mask as this scan was made, and return the mask that comes back.
+        """Scan a periodic mask `(Z, Y, X)` as this scan was made, and return the mask that comes back.
 
-        The mask is blurred, sampled on the scan's voxels, made noisy, and prepared as an image is: smoothed, split by
-        Otsu's threshold, brought back to its own grid, cleared of specks. Raises ScanError if nothing is left to be
+        The mask, on working voxels, is blurred, sampled on the scan's voxels (a working voxel is `scale` of them), made
+        noisy with noise of a seed, and prepared as an image is: smoothed, split by Otsu's threshold, brought back to
+        its own grid, cleared of pieces under `smallest` working voxels. Raises ScanError if nothing is left to be
         split.
-
-        Parameters
-        ----------
-        mask
-            Bool `(Z, Y, X)`, on the working grid.
-        scale
-            Working voxel in scan voxels (z, y, x).
-        smallest
-            Volume, in working voxels, of the smallest piece that is kept.
-        seed
-            Of the noise.
         """
-        shape, voxel = _sampling(mask.shape, scale)
+        shape, voxel = _sample_grid(mask.shape, scale)
         filled = np.clip(centre_distance(mask, (1.0, 1.0, 1.0), 2.0, periodic=True) + 0.5, 0, 1)
         grey = resample(filled, voxel, (0, 0, 0), shape, periodic=True)
         grey = ndimage.gaussian_filter(grey, [self.blur * min(voxel) / h for h in voxel], mode="wrap")
@@ -294,7 +267,7 @@ def voxelise(mask: np.ndarray, scale: Sequence[float], smallest: float) -> np.nd
     It is resampled there and back by signed distances, and pieces of under `smallest` working voxels are dropped.
     `scale` is a working voxel in scan voxels (z, y, x).
     """
-    shape, voxel = _sampling(mask.shape, scale)
+    shape, voxel = _sample_grid(mask.shape, scale)
     distance = centre_distance(mask, (1.0, 1.0, 1.0), 4 * max(voxel), periodic=True)
     coarse = resample(distance, voxel, (0, 0, 0), shape, periodic=True) > 0
     distance = centre_distance(coarse, voxel, 4 * max(1.0, *voxel), periodic=True)
@@ -302,7 +275,7 @@ def voxelise(mask: np.ndarray, scale: Sequence[float], smallest: float) -> np.nd
     return remove_specks(inside, smallest, True)[0]
 
 
-def _sampling(shape: Sequence[int], scale: Sequence[float]) -> tuple[list[int], list[float]]:
+def _sample_grid(shape: Sequence[int], scale: Sequence[float]) -> tuple[list[int], list[float]]:
     """Return the scan's voxels in a box of working voxels, and their edges in working voxels."""
     voxels = [max(4, round(n * s)) for n, s in zip(shape, scale, strict=True)]
     return voxels, [n / m for n, m in zip(shape, voxels, strict=True)]
@@ -315,28 +288,22 @@ def measure_quality(image: np.ndarray, mask: np.ndarray, spacing: tuple[float, f
     (least squares over `_BLURS` and `_SHIFTS`); thin structures come out too fat where noise shifts the threshold. The
     noise is the deviation of grey levels deep within the phases, less uneven lighting. Where nothing lies deep, the
     noise is taken for white and read from second differences along three axes, which neither structure nor lighting
-    passes (Immerkær 1996). Raises ScanError if the grey levels have no contrast between structure and background.
-
-    Parameters
-    ----------
-    image
-        `(Z, Y, X)`: grey levels.
-    mask
-        Bool, same shape: the structure.
+    passes (Immerkær 1996). The mask of the structure is bool, of the image's shape `(Z, Y, X)`. Raises ScanError if the
+    grey levels have no contrast between structure and background.
     """
     box = next(iter(boxes_by_surface(surface_voxels(mask), _MEASURED)), (slice(None),) * 3)
     image, mask = image[box].astype(np.float32), mask[box]
     levels = image - image.mean()
     edges = [h / min(spacing) for h in spacing]
-    blur, contrast, shift = _blur_of(levels, mask, edges)
+    blur, contrast, shift = _fit_blur(levels, mask, edges)
     if not contrast > 0:
         raise ScanError("expected grey levels that tell structure from background, got none that do")
-    noise, left = _deep_noise(levels, mask, edges) or (_white_noise(levels), 0.0)
-    grain = min(_GRAINS, key=lambda width: abs(_left(width, spacing) - left))
+    noise, left = _measure_deep_noise(levels, mask, edges) or (_measure_white_noise(levels), 0.0)
+    grain = min(_GRAINS, key=lambda width: abs(_smoothing_factor(width, spacing) - left))
     return Quality(blur, noise / contrast, grain, shift, spacing)
 
 
-def _blur_of(levels: np.ndarray, mask: np.ndarray, edges: Sequence[float]) -> tuple[float, float, float]:
+def _fit_blur(levels: np.ndarray, mask: np.ndarray, edges: Sequence[float]) -> tuple[float, float, float]:
     """Return blur, contrast and boundary shift of levels of mean 0 on voxels with edges in units of the finest."""
     distance = centre_distance(mask, edges, 4.0)
     explained = []
@@ -351,7 +318,7 @@ def _blur_of(levels: np.ndarray, mask: np.ndarray, edges: Sequence[float]) -> tu
     return max(explained)[1:]
 
 
-def _deep_noise(levels: np.ndarray, mask: np.ndarray, edges: Sequence[float]) -> tuple[float, float] | None:
+def _measure_deep_noise(levels: np.ndarray, mask: np.ndarray, edges: Sequence[float]) -> tuple[float, float] | None:
     """Return the deviation of levels deep within the phases and the share of it that smoothing leaves, or None."""
     smoothing, uneven = ([width / h for h in edges] for width in (1.0, _UNEVEN))
     both = (levels, ndimage.gaussian_filter(levels, smoothing))
@@ -369,15 +336,15 @@ def _deep_noise(levels: np.ndarray, mask: np.ndarray, edges: Sequence[float]) ->
     return float(noise), float(smoothed / max(noise, 1e-30))
 
 
-def _white_noise(levels: np.ndarray) -> float:
+def _measure_white_noise(levels: np.ndarray) -> float:
     """Return the deviation of white noise in levels."""
     for axis in range(3):
         levels = np.diff(levels, 2, axis)
     return float(np.median(np.abs(levels))) / _NORMAL_MEDIAN / 6**1.5
 
 
-def _left(grain: float, spacing: Sequence[float]) -> float:
-    """Return the part of the deviation of noise of a grain that smoothing by a voxel of the finest axis leaves."""
+def _smoothing_factor(grain: float, spacing: Sequence[float]) -> float:
+    """Return the factor by which smoothing by a voxel of the finest axis lowers the deviation of noise of a grain."""
     spike, left = np.eye(1, 65, 32)[0], 1.0
     for edge in spacing:
         width = min(spacing) / edge

@@ -110,7 +110,7 @@ def test_the_middle_is_the_draw_nearest_to_the_medians() -> None:
     rows = np.zeros((5, 6))
     rows[:, 0] = (-3, -1, 0.5, 1, 9)  # median .5
     rows[:, 2] = (0, 0, 40, 3, 0)  # median 0
-    draws = Draws.of(rows, "mask", "")
+    draws = Draws.from_parameters(rows, "mask", "")
     assert draws.middle(np.ones(6)) == pytest.approx(rows[1])
     assert draws.middle(np.array([1, 1, 100, 1, 1, 1.0])) == pytest.approx(rows[2])
 

@@ -35,7 +35,7 @@ def searched(simulate: Simulate) -> tuple[np.ndarray, Simulations, np.ndarray]:
     rng = np.random.default_rng(0)
     draws = np.clip(TRUTH + (0.1 + 0.15 * rng.standard_normal((400, 6))) * (HIGH - LOW), LOW, HIGH)
     first = simulate_draws(draws, simulate, 12)
-    return *Search(linear(), "mask", QUERY).parameters(draws, first, simulate), draws
+    return *Search(linear(), "mask", QUERY).run(draws, first, simulate), draws
 
 
 def apart(parameters: np.ndarray) -> float:
@@ -69,7 +69,7 @@ def test_the_answer_grows_or_is_the_nearest_that_did() -> None:
     """Nothing grows after the first simulations: the nearest of those is the answer."""
     first = simulate_draws(np.random.default_rng(0).uniform(LOW, HIGH, (400, 6)), simulator(), 12)
     search = Search(linear(), "mask", QUERY)
-    parameters, every = search.parameters(first.parameters, first, lambda *_: None)
+    parameters, every = search.run(first.parameters, first, lambda *_: None)
     assert every.count == 12 + Effort().rounds * BATCH + LAST and len(every.parameters) == 12
     assert np.array_equal(parameters, first.parameters[search.nearest(first)[0]])
 
@@ -77,7 +77,7 @@ def test_the_answer_grows_or_is_the_nearest_that_did() -> None:
 def test_a_process_passes_through_what_it_is_told() -> None:
     places = np.random.default_rng(1).uniform(-2, 2, (60, 2))
     values = np.stack([np.sin(places[:, 0]), places.sum(1)], 1)
-    process = Process.of(places, values)
+    process = Process.fit(places, values)
     mean, variance = process(places)
     assert np.sqrt(np.square(mean - values).mean()) < np.sqrt(0.05)  # the least noise that is tried
     assert process.length >= 1.0 and process.noise == 0.05
@@ -90,4 +90,4 @@ def test_a_process_passes_through_what_it_is_told() -> None:
 def test_noise_is_told_from_what_varies() -> None:
     rng = np.random.default_rng(2)
     places = rng.uniform(-2, 2, (60, 2))
-    assert Process.of(places, 0.9 * rng.standard_normal((60, 5))).noise >= 0.4
+    assert Process.fit(places, 0.9 * rng.standard_normal((60, 5))).noise >= 0.4

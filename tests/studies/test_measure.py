@@ -129,12 +129,12 @@ def test_layers_say_that_the_direction_is_within_them() -> None:
 
 
 def test_blocks_add_up_to_the_whole() -> None:
-    blocks, rng = Blocks.of((50, 37, 29), (1.0, 1.0, 1.0), 9.0), np.random.default_rng(0)
+    blocks, rng = Blocks.divide((50, 37, 29), (1.0, 1.0, 1.0), 9.0), np.random.default_rng(0)
     values, places, weights = rng.random((50, 37, 29)), rng.uniform(-0.5, 60, (500, 3)), rng.random((500, 2))
     assert blocks.counts == (5, 4, 3)
     assert blocks.sums(values).sum() == pytest.approx(values.sum())
-    assert blocks.gathered(places, weights).sum(0) == pytest.approx(weights.sum(0))
-    assert blocks.gathered(np.array([[10.4, 0, 0]]), np.ones((1, 1))).argmax() == 12  # slice 10 begins the second block
+    assert blocks.gather(places, weights).sum(0) == pytest.approx(weights.sum(0))
+    assert blocks.gather(np.array([[10.4, 0, 0]]), np.ones((1, 1))).argmax() == 12  # slice 10 begins the second block
 
 
 def test_shares_of_the_euler_number_add_up(cut: np.ndarray) -> None:
