@@ -179,7 +179,7 @@ def describe(
     command: Sequence[str] = (),
     overwrite: bool = False,
 ) -> Table:
-    """Measure the well-formed shapes of stores in each view, and write the table; views that the file has stay.
+    """Measure the well-formed shapes of stores in each view, and add them to a table, whose own rows stay.
 
     A view depends only on the shape, its seed and the view's name: a resumed table has the same rows, possibly in
     another order. Shapes that a build adds or removes meanwhile are left out.
@@ -308,5 +308,5 @@ def _jobs(
 
 
 def _shape(store: Store, index: int) -> str:
-    """Return a shape's name in a table: the store's folder and the draw."""
+    """Return a shape's name in a table: the store's name and the index of the draw."""
     return f"{store.name}/{index:06d}"

@@ -195,6 +195,7 @@ def families_of(atlas: Atlas) -> tuple[tuple[str, ...], np.ndarray]:
 
 
 def _settings(count: int) -> dict[str, Any]:
+    """Return the parameters and versions that a map of so many shapes is made with."""
     return {
         "distances": {"of": "fields", **DISTANCE},
         "umap": UMAP | {"n_neighbors": min(UMAP["n_neighbors"], count - 1), "metric": "precomputed"},

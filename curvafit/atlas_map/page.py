@@ -221,7 +221,10 @@ def regrow_command(record: Record, settings: Settings, name: str) -> str:
 
     With the same versions, processor and number of threads (stores are made on one) it is the same bit for bit.
     """
-    options = [f"--coefficients {','.join(map(_plain, record.coefficients))}", f"--mass {_plain(record.mass)}"]
+    options = [
+        f"--coefficients {','.join(map(_all_digits, record.coefficients))}",
+        f"--mass {_all_digits(record.mass)}",
+    ]
     sizes = settings.shape[:1] if len(set(settings.shape)) == 1 else settings.shape
     options += [f"--shape {','.join(map(str, sizes))}", f"--seed {record.seed}"]
     plan = present_name(settings.schedule)
@@ -231,11 +234,11 @@ def regrow_command(record: Record, settings: Settings, name: str) -> str:
     if settings.schedule["steps"] != SCHEDULES[plan].steps:
         options.append(f"--steps {settings.schedule['steps']}")
     if not math.isclose(settings.epsilon, WORKING_EPSILON):
-        options.append(f"--epsilon {_plain(settings.epsilon)}")
+        options.append(f"--epsilon {_all_digits(settings.epsilon)}")
     return f"curvafit generate {' '.join(options)} -o {name}"
 
 
-def _plain(value: object) -> str:
+def _all_digits(value: object) -> str:
     """Return all digits of a number without trailing zeros."""
     number = float(value)  # type: ignore[arg-type]
     return str(int(number)) if number.is_integer() else repr(number)

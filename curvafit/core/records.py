@@ -100,7 +100,7 @@ class Format:
         if arrays is None:
             return write_content(Path(path), json.dumps(content, indent=2, allow_nan=False) + "\n")
         buffer = io.BytesIO()
-        np.savez_compressed(buffer, allow_pickle=False, header=encode(content), **arrays)
+        np.savez_compressed(buffer, allow_pickle=False, header=encode_json(content), **arrays)
         return write_content(Path(path), buffer.getbuffer())
 
     def read(
@@ -246,7 +246,7 @@ def is_own_zarr(folder: Path, kind: str) -> bool:
     return all(_WRITTEN.fullmatch(name) for name in inside)
 
 
-def encode(value: Any) -> np.ndarray:
+def encode_json(value: Any) -> np.ndarray:
     """Return a value as JSON in an array of bytes."""
     return np.frombuffer(json.dumps(value).encode(), dtype=np.uint8)
 

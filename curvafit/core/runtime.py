@@ -94,7 +94,7 @@ class Terminated(KeyboardInterrupt):
 
 
 class _Pending:
-    """The number of file changes under way in the main thread, and the signal that waits for their end."""
+    """How many blocks of the main thread hold signals back, and the signal that waits for their end."""
 
     depth = 0
     waiting: int | None = None
@@ -106,7 +106,7 @@ def exit_code(error: KeyboardInterrupt) -> int:
 
 
 def listen() -> None:
-    """Turn signals into exceptions of the main thread, which wait while files change; ignored signals stay ignored.
+    """Turn signals into exceptions in the main thread, held back while files change; ignored signals stay ignored.
 
     Python drops an exception that is raised in a finaliser or a callback: there the signal is sent again.
     """
@@ -141,6 +141,7 @@ def hold_signals() -> Iterator[None]:
 
 
 def _handle(number: int, frame: FrameType | None) -> None:
+    """Raise the exception of a signal, or note the signal while files change."""
     if _Pending.depth:
         _Pending.waiting = number
     else:

@@ -66,7 +66,7 @@ class Cluster:
 
     @property
     def places(self) -> int:
-        """Return two requests a thread, of as many threads as there are now; at least one, for workers to come."""
+        """Return two requests for each thread there is now; at least one, since workers may still come."""
         return max(1, 2 * sum(self._client.nthreads().values()))  # type: ignore
 
     def submit(self, make: Make, path: Path, indices: Sequence[int]) -> None:
@@ -87,7 +87,7 @@ Workers = ThisProcess | Cluster
 
 
 def check_workers(count: int | None, scheduler: str | None) -> None:
-    """Raise ValueError unless there is a number of workers, or a scheduler (which has its own), or neither."""
+    """Raise ValueError if the number of workers is out of range, or a scheduler, which has its own, is given too."""
     if count is not None:
         check_int(count, "a number of workers from 0", 0, 1024)
         if scheduler is not None:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import ndimage
 
-from curvafit.core.records import Format, encode
+from curvafit.core.records import Format, encode_json
 from curvafit.geometry.descriptors import BLOCKS, Descriptors
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
@@ -128,7 +128,7 @@ def to_row(view: Descriptors | None) -> np.ndarray:
 def save_table(table: Table, path: str | Path) -> None:
     """Write a table as one compressed `.npz`: arrays (descriptors in float32) and a JSON header."""
     arrays = {
-        "names": encode([table.shapes.tolist(), table.views.tolist()]),
+        "names": encode_json([table.shapes.tolist(), table.views.tolist()]),
         "parameters": table.parameters,
         "descriptors": table.descriptors.astype(np.float32),
     }

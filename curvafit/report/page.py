@@ -181,7 +181,7 @@ def report_html(inference: Inference) -> str:
         bands=bands(inference),
         symbols=[symbol for symbol, _, _ in _TERMS.values()],
         matches=[(each.id, _match_cells(each)) for each in fit.matches],
-        provenance=[(str(name).replace("_", " "), _plain(value)) for name, value in fit.provenance.items()],
+        provenance=[(str(name).replace("_", " "), _to_words(value)) for name, value in fit.provenance.items()],
     )
 
 
@@ -231,7 +231,9 @@ def describe_scan(inference: Inference) -> str:
 def _bars(inference: Inference) -> list[dict[str, Any]]:
     """Return the bars of the distances: one for each candidate's shape, and one for two seeds."""
     fit, noise = inference.fit, seed_noise_of(inference.fit.candidates)
-    rows = [(_title(each), each.distance, "best" if each.name == fit.chosen else "") for each in _in_order(inference)]
+    rows = [
+        (_title(each), each.distance, "best" if each.name == fit.chosen else "") for each in _chosen_first(inference)
+    ]
     rows.append(("Two seeds", noise, "noise"))
     longest = max((value for _, value, _ in rows if value is not None), default=0.0) or 1.0
     bars = []
@@ -327,15 +329,15 @@ def _match_cells(match: Any) -> list[str]:
     return [format_number(match.distance, 2), *map(format_number, values), str(match.seed)]
 
 
-def _plain(value: object) -> str:
+def _to_words(value: object) -> str:
     """Return a value of JSON's types as words."""
     if isinstance(value, dict):
-        return ", ".join(f"{name} {_plain(part)}" for name, part in value.items())
-    return ", ".join(map(_plain, value)) if isinstance(value, (list, tuple)) else str(value)
+        return ", ".join(f"{name} {_to_words(part)}" for name, part in value.items())
+    return ", ".join(map(_to_words, value)) if isinstance(value, (list, tuple)) else str(value)
 
 
-def _in_order(inference: Inference) -> list[Candidate]:
-    """Return the candidates as the page shows them: the chosen one first."""
+def _chosen_first(inference: Inference) -> list[Candidate]:
+    """Return the candidates, the chosen one first."""
     return sorted(inference.fit.candidates, key=lambda each: each.name != inference.fit.chosen)
 
 
@@ -412,7 +414,7 @@ def _shapes(inference: Inference) -> list[Picture]:
     fit = inference.fit
     word = "the nearest" if fit.status.startswith((UNBELIEVED, UNDECIDED)) else "best supported"
     pictures = [_shape(inference, "The scan", scan_box(inference))]
-    for each in _in_order(inference):
+    for each in _chosen_first(inference):
         distance = "" if each.distance is None else f"; distance {each.distance:.1f}"
         badge = word if each.name == fit.chosen else ""
         u = inference.shape_of(each.name)
@@ -442,7 +444,7 @@ def scan_box(inference: Inference) -> np.ndarray:
 def _diagrams(inference: Inference) -> list[Picture]:
     """Return curvature diagrams of the scan, the chosen law and the match, with shared axes, in the scan's unit."""
     diagrams: list[tuple[str, Diagram | None]] = [("The scan", inference.diagram)]
-    for each in _in_order(inference):
+    for each in _chosen_first(inference):
         if each.name in (inference.fit.chosen, "match"):
             grown = (twin.diagram for twin in inference.twins.get(each.name, ()) if twin.diagram)
             diagrams.append((f"{_title(each)}, regrown", next(grown, None)))

@@ -77,7 +77,7 @@ def value_range(boxes: Boxes) -> tuple[float, float]:
 
 
 def subsample(boxes: Boxes) -> tuple[Field, list[Box]]:
-    """Return a sample of a volume, without an affine, and the boxes of it within which voxels are neighbours.
+    """Return a sample of a volume, without an affine, and the boxes of the sample in which voxels are neighbours.
 
     The sample is the volume itself where it is short; along an axis of more than `RUNS` x `LONG` voxels it has so many
     runs of so many voxels, from the middles of equal parts.
@@ -100,7 +100,7 @@ def _sample_runs(n: int) -> list[slice]:
 
 
 def digest_of(values: np.ndarray) -> str:
-    """Return a text that tells arrays apart."""
+    """Return a text that differs between arrays: type, shape and a part of the SHA-256."""
     content = np.ascontiguousarray(values)
     return f"{content.dtype} {content.shape} {hashlib.sha256(content.view(np.uint8).data).hexdigest()[:16]}"
 

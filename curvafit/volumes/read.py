@@ -164,7 +164,7 @@ def field_of(
 
 
 def place_of(path: str | os.PathLike[str]) -> Field:
-    """Return the field of a volume file whose spacing, unit and affine are wanted: its values are not checked."""
+    """Return the field of a volume file for its spacing, unit and affine: the values are not checked."""
     location, key = split_key(path, None)
     raw, _ = take_part(read_file(location, key), Part(), location)
     return to_field(raw, str(location), None, None)

@@ -28,7 +28,7 @@ class ScanError(ValueError):
 
 
 class Damaged(Exception):
-    """A fault of a file, for the sentence that names the file."""
+    """A fault of a file; `read_file` makes a sentence of it that names the file."""
 
 
 class Raw(NamedTuple):
@@ -53,7 +53,7 @@ class Raw(NamedTuple):
 
 @contextmanager
 def collect_complaints(logger: str | None = None) -> Iterator[list[str]]:
-    """Collect what a library logs in this thread, away from the host's streams, and silence warnings."""
+    """Collect what a library logs in this thread, so that nothing is printed, and silence warnings."""
     messages: list[str] = []
     thread, source = threading.get_ident(), logging.getLogger(logger or __name__)
     level = source.level
@@ -89,7 +89,7 @@ def pick_key(keys: list[str], key: str | None, path: object) -> str:
 
 
 def read_spacing(attributes: Mapping[str, Any], ndim: int) -> tuple[tuple[Any, ...] | None, Any]:
-    """Return spacing and unit of an array's attributes, unchecked; one number counts for all axes."""
+    """Return spacing and unit from an array's attributes, unchecked; one number counts for all axes."""
     for name, fixed_unit in (("element_size_um", "um"), ("spacing", None), ("voxel_size", None)):
         if name in attributes:
             sizes = _entries(attributes[name])
@@ -109,7 +109,7 @@ def _entries(value: Any) -> tuple[Any, ...]:
 
 
 def read_numbers(stream: Any, shape: Sequence[int], dtype: np.dtype, place: object) -> np.ndarray:
-    """Return the array of a stream, last axis fastest; the stream must end with it, where its checksum is compared."""
+    """Return the array of a stream, last axis fastest. The stream must end with it: its checksum is compared there."""
     check_array(shape, dtype, place)
     values = np.empty(math.prod(shape), dtype)
     buffer, size = values.view(np.uint8).data, 0
@@ -122,7 +122,7 @@ def read_numbers(stream: Any, shape: Sequence[int], dtype: np.dtype, place: obje
 
 
 def map_numbers(path: Path, start: int, shape: Sequence[int], dtype: np.dtype) -> np.ndarray:
-    """Return the array, last axis fastest, from a byte of a file to its end, mapped rather than read."""
+    """Map the array, last axis fastest, that fills a file from the byte `start` to the end."""
     nbytes, size = math.prod(shape) * dtype.itemsize, path.stat().st_size - start
     if nbytes != size:
         raise Damaged(f"{nbytes} bytes of values by its header, {size} in the file")
@@ -130,7 +130,7 @@ def map_numbers(path: Path, start: int, shape: Sequence[int], dtype: np.dtype) -
 
 
 def check_array(shape: Sequence[int], dtype: np.dtype, place: object) -> None:
-    """Raise ScanError where the array of a header cannot be read, before memory is allocated."""
+    """Raise ScanError if an array does not hold numbers or fit into memory; call it before memory is allocated."""
     if dtype.kind in "OV":
         raise ScanError(f"a volume must hold numbers, got values of type {str(dtype)[:80]} in {place}")
     size = math.prod(int(n) for n in shape) * dtype.itemsize

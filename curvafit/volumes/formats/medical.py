@@ -80,7 +80,7 @@ def read_nrrd(path: Path, **_: object) -> Raw:
 
 
 def _nrrd_values(nrrd: Any, header: dict[str, Any], file: IO[bytes], path: Path) -> np.ndarray:
-    """Return the values, z first, of an NRRD file that is read to the end of its header, or of the file it names.
+    """Return the values, z first, from an NRRD file open at the end of its header, or from the file that it names.
 
     pynrrd reads only the first part of a compressed stream, and not the checksum at its end.
     """
@@ -128,7 +128,7 @@ def read_metaimage(path: Path, **_: object) -> Raw:
 
 
 def _meta_header(file: IO[bytes]) -> dict[str, str]:
-    """Return the lines `name = value` up to the one that says where the values are."""
+    """Return the values of the lines `name = value`, by name, up to the line that says where the voxels are."""
     header: dict[str, str] = {}
     while "ElementDataFile" not in header and file.tell() < _HEADER and (line := file.readline(_HEADER)):
         name, _, value = line.decode("latin-1").partition("=")
@@ -188,7 +188,7 @@ def _meta_values(header: dict[str, str], shape: list[int], file: IO[bytes], path
 
 
 def _meta_numbers(header: dict[str, str], names: Sequence[str], default: np.ndarray) -> np.ndarray:
-    """Return the numbers of the first of these lines that the header has; by default, and as many as, `default`."""
+    """Return the numbers of the first of these lines that the header has, or `default`, which has as many numbers."""
     for name in names:
         if name in header:
             numbers = np.array(header[name].split(), dtype=np.float64)
@@ -212,14 +212,14 @@ def read_mrc(path: Path, **_: object) -> Raw:
 
 
 def check_mrc(unit: str) -> None:
-    """Raise ScanError where `write_mrc` cannot write: lengths have no unit, or its library is missing."""
+    """Raise ScanError if lengths have no unit, and ImportError without the library, before `write_mrc`."""
     require("mrcfile", "io", "reading and writing MRC files")
     if unit == "voxel":
         raise ScanError("an MRC file holds voxel sizes in Å: give the unit, nm, um, mm or m")
 
 
 def write_mrc(field: Any, path: Path) -> None:
-    """Write a volume with its voxel sizes in Å; float64 becomes float32, bool int8 and uint8 uint16."""
+    """Write a volume with its voxel sizes in Å; MRC has no float64, bool or uint8: float32, int8 or uint16 is written."""
     check_mrc(field.unit)
     kind = {"bool": "int8", "float64": "float32", "uint8": "uint16"}.get(field.values.dtype.name)
     values = field.values if kind is None else field.values.astype(kind)
@@ -230,7 +230,7 @@ def write_mrc(field: Any, path: Path) -> None:
 
 
 def read_dicom(path: Path, *, key: str | None = None, **_: object) -> Raw:
-    """Read a folder of slices in the order of their positions; `key` is the UID of one series of several."""
+    """Read a folder of slices in the order of their positions; `key` is the UID of a series, if there are several."""
     pydicom = require("pydicom", "io", "reading DICOM folders")
     files = sorted(p for p in path.iterdir() if p.is_file() and (is_dicom(p) or p.suffix.lower() in _DICOM))
     with collect_complaints("pydicom"):
@@ -252,7 +252,7 @@ def read_dicom(path: Path, *, key: str | None = None, **_: object) -> Raw:
 
 
 def _read_slice(pydicom: Any, file: Path) -> Any:
-    """Return a slice with its pixels, None for another kind of file such as a folder's index or a report."""
+    """Return a slice with its pixels, or None for another kind of file, such as a folder's index or a report."""
     if not is_dicom(file):
         raise Damaged(f"{file.name} is not a DICOM file")
     image = pydicom.dcmread(file)

@@ -28,7 +28,7 @@ _TO_FILE = {
 
 
 def read_nifti(path: Path, *, part: Part | None = None, **_: object) -> Raw:
-    """Read values, zooms, unit and affine; zooms other than 1 without a unit are in mm, as for NIfTI's readers."""
+    """Read values, zooms, unit and affine; without a unit, zooms other than 1 are taken for mm, as is usual."""
     import nibabel
 
     with collect_complaints("nibabel.global") as repairs:
@@ -60,9 +60,9 @@ def read_nifti(path: Path, *, part: Part | None = None, **_: object) -> Raw:
 
 
 def _values(image: Any, path: Path, part: Part | None) -> Raw:
-    """Return the scaled values, z first; the file must end with them, and the checksum of a compressed file hold.
+    """Return the scaled values, z first, or the part of them from a file that is not compressed.
 
-    From a file that is not compressed only the part is read.
+    The file must end with its values, where the checksum of a compressed one is compared.
     """
     from nibabel.volumeutils import apply_read_scaling
 
@@ -81,7 +81,7 @@ def _values(image: Any, path: Path, part: Part | None) -> Raw:
 
 
 def write_nifti(field: Any, path: Path) -> None:
-    """Write a field with its unit, and with its affine, or its spacing without one, as qform and sform."""
+    """Write a field with its unit and its affine as qform and sform; without an affine, with its spacing."""
     import nibabel
 
     values = field.values.view(np.uint8) if field.values.dtype == bool else field.values
@@ -103,8 +103,8 @@ def write_nifti(field: Any, path: Path) -> None:
 def write_nifti_like(values: np.ndarray, like: Path, path: Path, unit: str | None = None) -> None:
     """Write values (Z, Y, X) with the header of another NIfTI file of that shape: affines, codes and zooms to the bit.
 
-    Only type, scale, range and intent of the values are new, and the unit, if one is given: it renames the numbers of
-    the header. NIfTI has neither nm nor cm: only these are converted.
+    Only the values' type, scale, range and intent are new, and the unit if one is given: it renames the lengths in the
+    header. NIfTI has neither nm nor cm: lengths in these are converted.
     """
     import nibabel
 
@@ -148,7 +148,7 @@ def _own_unit(header: Any) -> tuple[str, float] | None:
 
 
 def _rename(header: Any, unit: str) -> None:
-    """Rename the unit of the lengths that `read_nifti` reads from a header."""
+    """Give the lengths in a header another unit; the numbers stay where NIfTI has the unit."""
     name, factor = parse_unit(unit)
     code, into = _TO_FILE[name]
     own = _own_unit(header)

@@ -64,7 +64,7 @@ class Part:
     def _channel_axis(
         self, shape: Sequence[int], channels: int | None, long: Sequence[int], place: object
     ) -> int | None:
-        """Return the axis of channels, None where there is none."""
+        """Return the axis of channels, or None; raise ScanError if the channel does not fit it."""
         if self.channel is None:
             if channels in long:
                 count = shape[channels]  # type: ignore[index]
@@ -89,7 +89,7 @@ def read_part(array: Any, part: Part | None, place: object, channels: int | None
 
 
 def index_of(array: Any, part: Part | None, place: object, channels: int | None = None) -> Any:
-    """Return the index of a part of an array, or of all of it, once it is sure to fit into memory."""
+    """Return the index of a part of an array, or of the whole; raise ScanError if it does not fit into memory."""
     if part is None:
         check_array(array.shape, array.dtype, place)
         return ...

@@ -54,7 +54,7 @@ def read_tiff(path: Path, **_: object) -> Raw:
 
 
 def _channel_axis(series: tifffile.TiffPageSeries) -> tuple[int | None, tuple[str, ...]]:
-    """Return the axis of colours or channels; channels that leave only two other axes, and are not colours, are z."""
+    """Return the axis of colours or channels, and a note. In a series of three axes channels are taken for slices."""
     channel_axes = [axis for axis, name in enumerate(series.axes) if name in "SC" and series.shape[axis] != 1]
     axis = channel_axes[-1] if channel_axes else None
     if axis is None or series.axes[axis] == "S" or sum(n != 1 for n in series.shape) != 3:
@@ -90,7 +90,7 @@ def _squeeze_plane(raw: Raw) -> np.ndarray:
 
 
 def _skipped_numbers(names: Sequence[str]) -> tuple[str, ...]:
-    """Return a sentence on the numbers that the names of slices skip, if they differ only in their last number."""
+    """Return a sentence on numbers that are skipped, if the names of slices differ only in their last number."""
     parts = [re.fullmatch(r"(.*?)(\d{1,15})(\D*)", name) for name in names]
     if len(names) < 3 or None in parts or len({(part[1], part[3]) for part in parts if part}) > 1:
         return ()
@@ -175,7 +175,7 @@ def _read_spacing(file: tifffile.TiffFile) -> _Spacing:
 
 
 def _from_description(description: dict[str, Any]) -> _Spacing:
-    """Return spacing, unit and a note of tifffile's JSON, where `spacing` is three numbers, or one for all axes."""
+    """Return spacing, unit and a note from tifffile's JSON, where `spacing` is three numbers or one for all axes."""
     sizes = tuple(float(h) for h in np.atleast_1d(description["spacing"]))
     unit = description.get("unit")
     if len(sizes) == 3:
@@ -199,7 +199,7 @@ def _from_ome(text: str) -> _Spacing:
 
 
 def _from_imagej(file: tifffile.TiffFile, description: dict[str, Any]) -> _Spacing:
-    """Return spacing, unit and a note of ImageJ's description.
+    """Return spacing, unit and a note from ImageJ's description.
 
     `spacing` is the distance of slices, and the resolution tags count pixels per `unit`. Without a unit only the
     proportions have a meaning: lengths are then in pixels along x.
@@ -214,7 +214,7 @@ def _from_imagej(file: tifffile.TiffFile, description: dict[str, Any]) -> _Spaci
 
 
 def _from_tags(file: tifffile.TiffFile) -> _Spacing:
-    """Return spacing and unit of the resolution tags, unless they are a default; the distance of slices is a guess."""
+    """Return spacing, unit and a note from the resolution tags, unless they are a program's default."""
     y, x = _pixels_per_unit(file)
     tag = file.pages[0].tags.get("ResolutionUnit")  # type: ignore[union-attr]
     unit = _TAG_UNITS.get(int(tag.value)) if tag is not None else None

@@ -94,7 +94,7 @@ def mark(folder: Path, kind: str) -> None:
 
 
 def _halvings(values: np.ndarray) -> Iterator[tuple[np.ndarray, float]]:
-    """Yield the volume and its halved copies, each with the centre of its first voxel in voxels of the volume.
+    """Yield the volume and its halved copies, each with the centre of its first voxel, in voxels of the volume.
 
     Floats are means of 2³ voxels (the last voxels count twice where the number is odd). Whole numbers, which may be
     labels, are every second value.
@@ -113,7 +113,7 @@ def _halvings(values: np.ndarray) -> Iterator[tuple[np.ndarray, float]]:
 
 
 def _multiscales(attributes: Mapping[str, Any]) -> dict[str, _Place]:
-    """Return the scale of the axes, the unit of the last one and the axis of channels of each level, by its path."""
+    """Return the place of each level of an OME-Zarr image, by the level's path; the unit is that of the last axis."""
     image = next(iter(attributes.get("ome", attributes).get("multiscales") or []), {})
     axes = [axis if isinstance(axis, dict) else {"name": axis} for axis in image.get("axes", [])]
     unit = axes[-1].get("unit") if axes else None
