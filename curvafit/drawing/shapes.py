@@ -126,8 +126,8 @@ def write_shape(
 ) -> tuple[Path, ...]:
     """Write a flow's field as a volume or a surface, by suffix, with a record and a picture of one box.
 
-    The picture is drawn last. If that fails, a warning says so, the record does not list it, and an earlier picture is
-    deleted. All other files are made in a temporary folder, then moved together.
+    All files are made in a temporary folder, then moved together. If the picture cannot be drawn, a warning says so,
+    and an earlier one is deleted.
 
     Parameters
     ----------
@@ -156,30 +156,18 @@ def write_shape(
         for step, field in flow.snapshots.items():
             with suppress(NoSurface):
                 parts.append(write_field(field, flow.grid, step_path(shape, step), output))
-        content = {**(record or {}), "files": [part.name for part in parts]}
-        drawing = content | {"files": [*content["files"], image.name]}
-        FORMAT.write(note, drawing if picture else content)
+        if picture:
+            try:
+                surface_picture(flow.field.numpy(), work / image.name)
+                parts.append(work / image.name)
+            except (OSError, ValueError, MemoryError) as error:
+                reason = getattr(error, "strerror", None) or error
+                warnings.warn(f"no picture was drawn: {reason}", UserWarning, stacklevel=2)
+        FORMAT.write(note, {**(record or {}), "files": [part.name for part in parts]})
         with hold_signals():
-            files = move_together(parts, target.parent)
             if former:
                 remove(image)
-    if not picture:
-        return files
-    if images := _draw_picture(flow, image):
-        return (*files, *images)
-    with suppress(OSError):  # a disk too full for this as well: the record there is whole, and lists a picture too many
-        FORMAT.write(sibling(target, ".json"), content)
-    return files
-
-
-def _draw_picture(flow: Flow, path: Path) -> tuple[Path, ...]:
-    """Draw a flow's surface; where that fails, warn and return no path."""
-    try:
-        surface_picture(flow.field.numpy(), path)
-    except (OSError, ValueError, MemoryError) as error:
-        warnings.warn(f"no picture was drawn: {getattr(error, 'strerror', None) or error}", UserWarning, stacklevel=3)
-        return ()
-    return (path,)
+            return move_together(parts, target.parent)
 
 
 def write_field(field: Tensor, grid: Grid, path: str | Path, output: Output | None = None) -> Path:

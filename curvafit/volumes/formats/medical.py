@@ -219,7 +219,7 @@ def check_mrc(unit: str) -> None:
 
 
 def write_mrc(field: Any, path: Path) -> None:
-    """Write a volume with its voxel sizes in Å; MRC has no float64, bool or uint8: float32, int8 or uint16 is written."""
+    """Write a volume with its voxel sizes in Å; instead of float64, bool, uint8 write float32, int8, uint16."""
     check_mrc(field.unit)
     kind = {"bool": "int8", "float64": "float32", "uint8": "uint16"}.get(field.values.dtype.name)
     values = field.values if kind is None else field.values.astype(kind)
