@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from curvafit.core.runtime import Progress, silent
-from curvafit.core.workers import ThisProcess, Workers
+from curvafit.core.workers import ThisProcess, Workers, collect_all
 from curvafit.data_synth.atlas import versions
 from curvafit.data_synth.design import boxed
 from curvafit.data_synth.store import Record, Store, open_store
@@ -211,7 +211,7 @@ def describe(
         raise ValueError(f"views must be some of {', '.join(VIEWS)}, got {', '.join(unknown) or 'none'}")
     sources = [open_store(path) for path in stores]
     _check_names(sources)
-    path, crew = Path(out), workers or ThisProcess()
+    path = Path(out)
     begun = load_table(path) if path.exists() and not overwrite else None
     provenance, rows = _table_provenance(begun, sources, command), []
     if begun is not None:
@@ -220,20 +220,15 @@ def describe(
     jobs = [job for store in sources for job in _jobs(store, views, present)]
     if not jobs and not rows:
         raise ValueError(f"no well-formed shape in {', '.join(store.name for store in sources)}")
-    queue, count, pending, last_save = iter(jobs), 0, 0, time.monotonic()
+    requests = [(partial(measure, views=missing), store.path, [index]) for store, index, missing in jobs]
+    last_save = time.monotonic()
     try:
-        while count < len(jobs):
-            while pending < crew.places and (job := next(queue, None)) is not None:
-                store, index, missing = job
-                crew.submit(partial(measure, views=missing), store.path, [index])
-                pending += 1
-            for shape in crew.collect():
-                rows += (
-                    (shape["shape"], view, shape["parameters"], to_row(numbers).astype(np.float32))
-                    for view, numbers in shape["views"].items()
-                )
-                count, pending = count + 1, pending - 1
-                progress(f"measured {count} of {len(jobs)} shapes", count / len(jobs))
+        for count, shape in enumerate(collect_all(workers or ThisProcess(), requests), 1):
+            rows += (
+                (shape["shape"], view, shape["parameters"], to_row(numbers).astype(np.float32))
+                for view, numbers in shape["views"].items()
+            )
+            progress(f"measured {count} of {len(jobs)} shapes", count / len(jobs))
             if time.monotonic() - last_save > PAUSE:
                 save_table(_to_table(rows, provenance), path)
                 last_save = time.monotonic()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from pathlib import Path
@@ -84,6 +84,19 @@ class Cluster:
 
 #: Whoever makes the parts of a job, such as the draws of an atlas.
 Workers = ThisProcess | Cluster
+
+
+def collect_all(workers: Workers, requests: Iterable[tuple[Make, Path, Sequence[int]]]) -> Iterator[Any]:
+    """Make requests, as many at once as the workers have places, and yield the results in the order they come."""
+    queue, waiting = iter(requests), 0
+    while True:
+        while waiting < workers.places and (request := next(queue, None)) is not None:
+            workers.submit(*request)
+            waiting += 1
+        if not waiting:
+            return
+        yield from workers.collect()
+        waiting -= 1
 
 
 def check_workers(count: int | None, scheduler: str | None) -> None:

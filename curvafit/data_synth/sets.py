@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import itertools
 import json
 import time
 from collections.abc import Iterator, Sequence
@@ -20,7 +19,7 @@ from curvafit.core.checks import as_tuple, check_choice, check_int, check_type
 from curvafit.core.files import remove, write_content
 from curvafit.core.records import Format, parse_json
 from curvafit.core.runtime import Progress, hold_signals, silent
-from curvafit.core.workers import ThisProcess, Workers
+from curvafit.core.workers import ThisProcess, Workers, collect_all
 from curvafit.data_synth.atlas import versions
 from curvafit.data_synth.case import Case, Recipe
 from curvafit.data_synth.centreline import centreline, write_graphml
@@ -121,22 +120,17 @@ def build_set(
 
 
 def _fill(folder: Path, spec: SetSpec, count: int, progress: Progress, workers: Workers) -> Path:
-    cases = set(cases_of(folder))
-    todo = iter([index for index in range(count) if index not in cases])
-    pending, listed = 0, -LISTED_EVERY
+    """Make the cases of a set that are not there yet; list them every now and then."""
+    cases, listed = set(cases_of(folder)), -LISTED_EVERY
+    requests = ((make_cases, folder, [index]) for index in range(count) if index not in cases)
     try:
-        while True:
-            while pending < workers.places and (chunk := list(itertools.islice(todo, 1))):
-                workers.submit(make_cases, folder, chunk)
-                pending += 1
-            if not pending:
-                return folder
-            cases |= set(workers.collect())
-            pending -= 1
+        for case in collect_all(workers, requests):
+            cases.add(case)
             progress(f"{min(len(cases), count)} of {count} cases", min(len(cases), count) / count)
             if time.monotonic() > listed + LISTED_EVERY:
                 _list(folder, spec)
                 listed = time.monotonic()
+        return folder
     finally:
         _list(folder, spec)
 

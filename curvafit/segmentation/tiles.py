@@ -23,7 +23,7 @@ from filelock import FileLock, Timeout
 from curvafit.core.checks import check_int
 from curvafit.core.files import write_content
 from curvafit.core.runtime import Progress, silent, sub_progress
-from curvafit.core.workers import Workers
+from curvafit.core.workers import Workers, collect_all
 from curvafit.generation.checkpoint import identity
 from curvafit.generation.data import Data
 from curvafit.priors.coefficients import Coefficients
@@ -331,7 +331,11 @@ def lower_volume(
     with opened as finished:
         tiles = tiling.tiles
         rest = [tile for tile in tiles if not finished.has(tile.number)]
-        pieces = _in_turn(problem, tiling, rest, progress) if workers is None else _by(workers, problem, tiling, rest)
+        if workers is None:
+            pieces = _in_turn(problem, tiling, rest, progress)
+        else:
+            lower = partial(_lower_tiles, problem, tiling)
+            pieces = collect_all(workers, [(lower, Path(), [tile.number]) for tile in rest])
         for count, piece in enumerate(pieces, tiling.count - len(rest) + 1):
             finished.write(tiles[piece.number].core, piece)
             progress("lowering the energy", count / tiling.count)
@@ -346,18 +350,6 @@ def _in_turn(problem: Problem, tiling: Tiling, tiles: Sequence[Tile], progress: 
     total = tiling.count
     for count, tile in enumerate(tiles, total - len(tiles)):
         yield _lower_tile(problem, tiling, tile, sub_progress(progress, count / total, (count + 1) / total))
-
-
-def _by(workers: Workers, problem: Problem, tiling: Tiling, tiles: Sequence[Tile]) -> Iterator[Piece]:
-    """Lower tiles by workers, in any order."""
-    waiting, asked = list(tiles), 0
-    while waiting or asked:
-        while waiting and asked < workers.places:
-            workers.submit(partial(_lower_tiles, problem, tiling), Path(), [waiting.pop(0).number])
-            asked += 1
-        pieces = workers.collect()
-        asked -= len(pieces)
-        yield from pieces
 
 
 def _lower_tiles(problem: Problem, tiling: Tiling, _: Path, numbers: Sequence[int]) -> list[Piece]:
