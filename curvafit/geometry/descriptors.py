@@ -113,7 +113,7 @@ def descriptors(shape: np.ndarray | Tensor, grid: Grid, epsilon: float = WORKING
     mesh = surface(phase, grid)
     normals = area_vectors(mesh)
     area = np.linalg.norm(normals, axis=1)
-    density = area.sum() / _meshed_volume(grid)
+    density = area.sum() / _cell_volume(grid)
     chords, gaps = (voxel * _chord_quantiles(phase, grid.periodic) for phase in (mask, ~mask))
     depths, clearances = (voxel * each for each in _depth_quantiles(inside, grid))
     return Descriptors(
@@ -129,7 +129,7 @@ def descriptors(shape: np.ndarray | Tensor, grid: Grid, epsilon: float = WORKING
     )
 
 
-def _meshed_volume(grid: Grid) -> float:
+def _cell_volume(grid: Grid) -> float:
     """Return the volume of the cells of marching cubes: of a window, those between its outermost voxels' centres."""
     return grid.volume if grid.periodic else grid.voxel_volume * float(np.prod([n - 1 for n in grid.shape]))
 
@@ -143,7 +143,7 @@ def _fabric(normals: np.ndarray, area: np.ndarray) -> np.ndarray:
 
 def _euler_density(mask: np.ndarray, grid: Grid) -> float:
     """Return χ per volume of the union of the closed voxels, of a window by the voxels whose neighbours are seen."""
-    return int(euler_shares(mask, periodic=grid.periodic).sum(dtype=np.int64)) / _meshed_volume(grid)
+    return int(euler_shares(mask, periodic=grid.periodic).sum(dtype=np.int64)) / _cell_volume(grid)
 
 
 def _chord_quantiles(phase: np.ndarray, periodic: bool) -> np.ndarray:
@@ -157,14 +157,14 @@ def _chord_quantiles(phase: np.ndarray, periodic: bool) -> np.ndarray:
     for axis in range(3):
         lines = np.moveaxis(phase, axis, -1).reshape(-1, phase.shape[axis])
         for ordered in (lines,) if periodic else (lines, lines[:, ::-1]):
-            length, complete = _runs(ordered, periodic)
+            length, complete = _find_runs(ordered, periodic)
             events += np.bincount(length[complete], minlength=longest + 1)
             runs += np.bincount(length, minlength=longest + 1)
-    quantiles = np.interp(LEVELS, _shorter(events, runs), np.arange(longest + 1) + 0.5)
+    quantiles = np.interp(LEVELS, _estimate_shares(events, runs), np.arange(longest + 1) + 0.5)
     return np.minimum(quantiles, LONGEST)
 
 
-def _runs(lines: np.ndarray, periodic: bool) -> tuple[np.ndarray, np.ndarray]:
+def _find_runs(lines: np.ndarray, periodic: bool) -> tuple[np.ndarray, np.ndarray]:
     """Return the lengths of the runs that begin within the lines `(N, n)`, and whether their ends are seen."""
     n = lines.shape[1]
     begins = lines & ~np.roll(lines, 1, axis=1)
@@ -194,7 +194,7 @@ def _depth_quantiles(inside: Tensor, grid: Grid) -> tuple[np.ndarray, np.ndarray
         depth, known = np.abs(distance[phase]), reach[phase]
         index = (_FINE * np.minimum(depth, known)).astype(int)
         events, points = (np.bincount(each, minlength=_FINE * len(whole)) for each in (index[depth <= known], index))
-        quantiles.append(np.interp(LEVELS, _shorter(events, points)[_FINE - 1 :: _FINE], whole))
+        quantiles.append(np.interp(LEVELS, _estimate_shares(events, points)[_FINE - 1 :: _FINE], whole))
     return quantiles[0], quantiles[1]
 
 
@@ -205,9 +205,11 @@ def _distance_to_faces(shape: tuple[int, int, int]) -> np.ndarray:
     return np.minimum(near, DEPTH)
 
 
-def _shorter(events: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Return the part of lengths that end in each bin or before it, where some are only known to be longer than what is
-    seen of them, by Kaplan & Meier's estimate: how many end in each bin, and how many do or are lost from sight."""
+def _estimate_shares(events: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Return the share of lengths up to each bin by Kaplan & Meier's estimate.
+
+    `events` counts the lengths that end in each bin, `counts` also those that are lost from sight there.
+    """
     risk = np.cumsum(counts[::-1])[::-1]
     return 1 - np.cumprod(1 - events / np.maximum(risk, 1))
 

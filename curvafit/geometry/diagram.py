@@ -307,7 +307,7 @@ def family_of(diagram: Diagram, radius: float) -> str:
 
 
 def leading_family(shares: dict[str, float]) -> str:
-    """Return the family that shares of area speak for: the largest, or layers where they hold at least half."""
+    """Return the family with the largest share of area, or layers where they hold at least half."""
     if shares["layers"] >= _LAYERS:
         return "layers"
     return max(_ANGLES, key=lambda name: shares[name])
@@ -316,9 +316,9 @@ def leading_family(shares: dict[str, float]) -> str:
 def half_thickness(diagram: Diagram, volume: float) -> float:
     """Return the half-thickness of what a surface bounds, from its volume and its diagram alone, in the diagram's unit.
 
-    The depth h at which the inner parallel surfaces have swept the volume: an element of area dA has
-    (1 - κ1 t)(1 - κ2 t) dA at depth t, nothing beyond its centres of curvature (Steiner's formula). Exact for plates,
-    cylinders and balls; at most `_DEEPEST` times volume / area, where a ball's is 3.
+    It is the depth at which the inner parallel surfaces have swept the volume: an element of area dA has
+    (1 - κ1 t)(1 - κ2 t) dA at depth t, and nothing beyond its centres of curvature (Steiner's formula). Exact for
+    plates, cylinders and balls; at most `_DEEPEST` times volume / area, where a ball's is 3.
     """
     depths = np.linspace(0, _DEEPEST * volume / diagram.area, 601)
     left = np.clip(1 - diagram.points[:, :, None] * depths, 0, None).prod(axis=1)

@@ -70,8 +70,8 @@ def pairwise(
     known
         Distances of before, NaN where there is none: only these are computed.
     save
-        Called with the distances so far, NaN where there is none yet: before the first pair, about every `EVERY`
-        seconds, and at the end, also where an exception is the end.
+        Called with the distances so far, NaN where there is none yet: first, about every `EVERY` seconds, and at the
+        end, even after an exception.
     progress
         Called after every block of pairs with a sentence and the share done.
     """
@@ -122,8 +122,8 @@ def _pack_diagrams(diagrams: Sequence[Diagram], blur: float, reach: float | None
 def _iterate_distances(clouds: Clouds, first: np.ndarray, second: np.ndarray, **options: Any) -> Iterator[np.ndarray]:
     """Yield the distances of the pairs, block by block.
 
-    Half of what a measure costs with itself, in as many steps as the pair's, is what debiasing takes off. That depends
-    on the pair by the number of steps alone, of which there are two or three, and is computed once for each.
+    Debiasing takes off half of each cloud's cost with itself, in as many steps as the pair's. A cloud meets two or
+    three numbers of steps, so these costs are computed once for each.
     """
     falls = pair_halvings(clouds, first, second, options["blur"])
     keys = np.concatenate([np.stack([ends, falls], axis=1) for ends in (first, second)])
@@ -240,8 +240,11 @@ def sliced_embedding(diagram: Diagram, directions: int = 12, quantiles: int = 24
 
 
 class Clouds(NamedTuple):
-    """N weighted point sets, one after another, in float32: number i is rows bounds[i] to bounds[i + 1] of `x`, `y` and
-    `log2` (of the weights); `low` and `high` are the corners of its box `(N, 2)`."""
+    """N weighted point sets, one after another, in float32.
+
+    Cloud i is rows bounds[i] to bounds[i + 1] of `x`, `y` and `log2` (of the weights); `low` and `high` `(N, 2)` are
+    the corners of its box.
+    """
 
     x: np.ndarray
     y: np.ndarray
@@ -264,13 +267,7 @@ def pack(points: Sequence[np.ndarray], weights: Sequence[np.ndarray]) -> Clouds:
 
 
 def halvings(size: np.ndarray, blur: float) -> np.ndarray:
-    """Return n, the times that √ε halves: blur · 2^(n - ½) is the least such diameter that holds boxes of `size`.
-
-    Parameters
-    ----------
-    size
-        Edges of the box that holds both clouds of a pair, `(…, 2)`.
-    """
+    """Return n, how often √ε halves: blur · 2^(n - ½) is the least such diameter that holds a box of edges `(…, 2)`."""
     diameter = np.maximum(np.hypot(size[..., 0], size[..., 1]), blur)
     return np.ceil(np.log2(diameter / blur) + 0.5).astype(np.int64)
 
@@ -292,16 +289,9 @@ def costs(
 ) -> np.ndarray:
     """Return the entropic, unbalanced cost OT_ε of each pair of clouds, ½|x - y|² a unit moved, `(K,)` float64.
 
-    The debiased divergence is the pair's cost less half of each measure's with itself (Séjourné et al. 2019).
-
-    Parameters
-    ----------
-    first, second
-        Numbers of the clouds of each pair, `(K,)`.
-    falls
-        How often √ε halves for each pair, `(K,)`: see `halvings`.
-    blur, reach
-        √ε at the end, and √ρ of the penalty on what is not moved, in the points' unit; no reach moves everything.
+    `first` and `second` number the clouds of each pair `(K,)`, and √ε halves `falls` times `(K,)` (`halvings`) down to
+    `blur`; `reach` is √ρ of the penalty on what is not moved, and None moves everything. The debiased divergence is a
+    pair's cost less half of each cloud's with itself (Séjourné et al. 2019).
     """
     first, second = (np.asarray(numbers, dtype=np.int64) for numbers in (first, second))
     ε, shares = _schedule(falls, blur)
@@ -313,8 +303,10 @@ def costs(
 
 
 def _schedule(falls: np.ndarray, blur: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return ε of every step of every pair, and the share of its potentials that a step keeps, `(K, T)`: 1 before a
-    pair begins, 0 at its first step and its last, ½ between."""
+    """Return ε of every step of every pair, and the share of its potentials that a step keeps, both `(K, T)`.
+
+    The share is 1 before a pair begins, 0 at its first step and its last, ½ between.
+    """
     falls = np.asarray(falls, dtype=np.int64)[:, None]
     steps = falls + 4
     longest = int(steps.max(initial=0))

@@ -53,38 +53,41 @@ def surface(u: np.ndarray | Tensor, grid: Grid, level: float = 0.0) -> Surface:
     ends at its outermost voxels' centres. Raises ValueError if `u` is not a finite volume of the grid's shape, or
     nowhere crosses the level.
     """
-    values = _checked(u, grid)
+    values = _as_volume(u, grid)
     if grid.periodic:
         values = np.pad(values, (0, 1), mode="wrap")
-    return _march(values, grid, level)
+    low, high = float(values.min()), float(values.max())
+    if not low < level < high:
+        raise NoSurface(f"expected a field that crosses {level:g}, got values from {low:g} to {high:g}")
+    vertices, faces, _, _ = marching_cubes(values, level, spacing=grid.spacing, gradient_direction="descent")
+    return Surface(vertices.astype(np.float64), faces.astype(np.int64))
 
 
 def capped_surface(u: np.ndarray | Tensor, grid: Grid, level: float = 0.0) -> Surface:
     """Return the boundary of {u > level}, closed by flat caps on the box's faces, for printing and export.
 
-    It is watertight, and stays so in float32: no vertex comes closer to a voxel's centre than some ten-thousandths of
-    an edge, and none stands twice. The caps of opposite faces of a periodic box are the same, so that copies tile.
-    Raises ValueError as `surface` does.
+    The mesh is watertight, also in float32: vertices keep some ten-thousandths of an edge away from voxels' centres.
+    The caps of opposite faces of a periodic box are the same, so that copies tile. Raises ValueError as `surface` does.
     """
-    values = _checked(u, grid).astype(np.float32) - np.float32(level)
+    values = _as_volume(u, grid).astype(np.float32) - np.float32(level)
     if not values.max() > 0:
         raise NoSurface(f"expected a field that exceeds {level:g}, got none over {float(np.max(u)):g}")
     values *= 1 + TIE * np.random.default_rng(0).random(values.shape, dtype=np.float32)
     for axis in range(3):
-        values = _with_walls(values, axis, grid.periodic)
+        values = _add_walls(values, axis, grid.periodic)
     values += np.copysign(LEAST_PART * np.abs(values).max(), values)
     vertices, faces, _, _ = marching_cubes(values, 0.0, gradient_direction="descent")
-    places = [_unpadded(vertices[:, k], n) * h for k, (n, h) in enumerate(zip(grid.shape, grid.spacing, strict=True))]
-    return _welded(Surface(np.stack(places, axis=1), faces.astype(np.int64)))
+    places = [_unpad(vertices[:, k], n) * h for k, (n, h) in enumerate(zip(grid.shape, grid.spacing, strict=True))]
+    return _weld(Surface(np.stack(places, axis=1), faces.astype(np.int64)))
 
 
 def solid_surface(u: np.ndarray | Tensor, grid: Grid) -> Surface:
-    """Return the boundary of {u > 0}, closed as `capped_surface` closes it, around the volume of the voxels in {u > 0}.
+    """Return the capped boundary of {u > 0} (`capped_surface`) that encloses the volume of the voxels in {u > 0}.
 
-    Flat triangles cut a curved surface short, by 1 % of the volume of tubes 10 voxels thick. The level is moved by as
-    little as makes up for it, some hundredths of a voxel. Raises ValueError as `surface` does.
+    Flat triangles cut a curved surface short, by 1 % of the volume of tubes 10 voxels thick. A small shift of the
+    level, some hundredths of a voxel, makes up for it. Raises ValueError as `surface` does.
     """
-    values = _checked(u, grid)
+    values = _as_volume(u, grid)
     target = np.count_nonzero(values > 0) * grid.voxel_volume
 
     def attempt(level: float) -> tuple[float, Surface]:
@@ -117,7 +120,7 @@ def volume(mesh: Surface) -> float:
     return float((mesh.barycentres[:, ::-1] * area_vectors(mesh)).sum() / 3)
 
 
-def _checked(u: np.ndarray | Tensor, grid: Grid) -> np.ndarray:
+def _as_volume(u: np.ndarray | Tensor, grid: Grid) -> np.ndarray:
     values = u.detach().cpu().numpy() if isinstance(u, Tensor) else np.asarray(u)
     if values.shape != grid.shape:
         raise ValueError(f"expected a field of shape {grid.shape}, got {values.shape}")
@@ -126,16 +129,8 @@ def _checked(u: np.ndarray | Tensor, grid: Grid) -> np.ndarray:
     return values
 
 
-def _march(values: np.ndarray, grid: Grid, level: float) -> Surface:
-    low, high = float(values.min()), float(values.max())
-    if not low < level < high:
-        raise NoSurface(f"expected a field that crosses {level:g}, got values from {low:g} to {high:g}")
-    vertices, faces, _, _ = marching_cubes(values, level, spacing=grid.spacing, gradient_direction="descent")
-    return Surface(vertices.astype(np.float64), faces.astype(np.int64))
-
-
-def _with_walls(values: np.ndarray, axis: int, periodic: bool) -> np.ndarray:
-    """Add two layers on both sides of an axis: the field on the box's face, and the outside right beyond it."""
+def _add_walls(values: np.ndarray, axis: int, periodic: bool) -> np.ndarray:
+    """Add two layers at both ends of an axis: the field on the box's face, and the outside right beyond it."""
     first, last = np.take(values, [0], axis), np.take(values, [-1], axis)
     if periodic:
         first = last = (first + last) / 2
@@ -143,14 +138,14 @@ def _with_walls(values: np.ndarray, axis: int, periodic: bool) -> np.ndarray:
     return np.concatenate([outside, first, values, last, outside], axis)
 
 
-def _unpadded(index: np.ndarray, count: int) -> np.ndarray:
-    """Return positions in a padded axis as voxels of the unpadded one: both layers of a side are on the box's face."""
+def _unpad(index: np.ndarray, count: int) -> np.ndarray:
+    """Return positions in an axis with walls as voxels of the axis without; both layers of a wall lie on the face."""
     inner = np.arange(count, dtype=np.float64)
     knots = np.concatenate([[-0.5, -0.5], inner, [count - 0.5, count - 0.5]])
     return np.interp(index, np.arange(count + 4), knots)
 
 
-def _welded(mesh: Surface) -> Surface:
+def _weld(mesh: Surface) -> Surface:
     """Merge the vertices that lie in one place, and drop the triangles that this closes."""
     vertices, index = np.unique(mesh.vertices, axis=0, return_inverse=True)
     faces = index.reshape(-1)[mesh.faces]
@@ -166,7 +161,7 @@ def write_surface(mesh: Surface, path: str | Path, *, unit: str = "voxel", data:
     Parameters
     ----------
     unit
-        Of the lengths: a remark in the file, none of the formats has a field for it.
+        Unit of the lengths, written as a remark: none of the formats has a field for it.
     data
         Numbers `(V,)` at the vertices by name, for PLY and VTP; STL cannot hold them.
     """

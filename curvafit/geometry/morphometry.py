@@ -21,7 +21,7 @@ from curvafit.core.schema import Rule
 from curvafit.geometry.mesh import Surface, areas
 from curvafit.geometry.topology import euler_number, euler_of_window
 
-__all__ = ["Morphometry", "connectivity_of", "local_thickness", "morphometry", "smooth_surface"]
+__all__ = ["Morphometry", "local_thickness", "measure_connectivity", "morphometry", "smooth_surface"]
 
 #: How far a periodic box is continued before distances are taken, in voxels.
 _WRAPPED = 32
@@ -61,8 +61,8 @@ def morphometry(
     spacing
         Voxel edges (z, y, x) in `unit`, or one for all.
     periodic
-        The box repeats. Else it is a window and nothing is known beyond it: balls may reach out of it, its faces count
-        as no surface, and of the Euler number it has its share (`topology.euler_of_window`).
+        The box repeats. Else it is a window: balls may reach out of it, its faces are no surface, and its Euler number
+        is its share of the whole's (`topology.euler_of_window`).
 
     Returns
     -------
@@ -81,7 +81,7 @@ def morphometry(
     voxel = math.prod(edges)
     thickness = local_thickness(mask, edges, periodic=periodic)[mask]
     gap = local_thickness(~mask, edges, periodic=periodic)[~mask]
-    euler, connectivity = connectivity_of(mask, edges, periodic=periodic)
+    euler, connectivity = measure_connectivity(mask, edges, periodic=periodic)
     return Morphometry(
         volume_fraction=filled / mask.size,
         thickness_mean=float(thickness.mean(dtype=np.float64)),
@@ -94,10 +94,10 @@ def morphometry(
     )
 
 
-def connectivity_of(
+def measure_connectivity(
     mask: np.ndarray, spacing: tuple[float, float, float], *, periodic: bool = False
 ) -> tuple[float, float]:
-    """Return χ, and the connectivity density 1 - χ over the volume that χ is counted in (`morphometry`)."""
+    """Return χ, and the connectivity density: 1 - χ over the volume in which χ is counted (see `morphometry`)."""
     euler = float(euler_number(mask, periodic=True)) if periodic else euler_of_window(mask)
     sampled = math.prod(mask.shape if periodic else (max(n - 1, 1) for n in mask.shape))
     return euler, (1 - euler) / (sampled * math.prod(spacing))
@@ -144,12 +144,12 @@ def local_thickness(
     factor = math.ceil(float(radius.max()) / edge / largest)
     if factor == 1:
         return 2 * _largest_balls(radius, np.asarray(spacing, dtype=np.float32), edge)
-    painted = _largest_balls(_coarsened(radius, factor), np.asarray(spacing, dtype=np.float32) * factor, edge)
+    painted = _largest_balls(_coarsen(radius, factor), np.asarray(spacing, dtype=np.float32) * factor, edge)
     fine = painted.repeat(factor, 0).repeat(factor, 1).repeat(factor, 2)[tuple(slice(n) for n in mask.shape)]
     return np.where(mask, 2 * np.maximum(fine, radius), np.float32(0))
 
 
-def _coarsened(radius: np.ndarray, factor: int) -> np.ndarray:
+def _coarsen(radius: np.ndarray, factor: int) -> np.ndarray:
     """Return the largest radius of each block of factor³ voxels."""
     padded = np.pad(radius, [(0, -n % factor) for n in radius.shape])
     z, y, x = (n // factor for n in padded.shape)

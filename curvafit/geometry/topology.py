@@ -16,9 +16,9 @@ def components(mask: np.ndarray, *, periodic: bool = False, connectivity: int = 
 
     Voxels touch by corners (`connectivity` 26) or by faces (6); in a periodic box also across its faces.
     """
-    labels, count = _within(mask, corners=connectivity == 26)
+    labels, count = _label_pieces(mask, corners=connectivity == 26)
     if periodic and count:
-        pairs = _seams(labels, connectivity == 26)[:, :2] - 1
+        pairs = _find_seams(labels, connectivity == 26)[:, :2] - 1
         merged = connected_components(_graph(pairs, count), directed=False)[1]
         _, first = np.unique(merged, return_index=True)  # numbered in the order of their first voxels
         rank = np.empty(len(first), dtype=np.int32)
@@ -37,9 +37,9 @@ def euler_number(mask: np.ndarray, *, periodic: bool = False) -> int:
 def euler_shares(mask: np.ndarray, *, periodic: bool = False) -> np.ndarray:
     """Return what each voxel adds to χ of the union of the closed voxels (26-connected), int8 (Z, Y, X).
 
-    A voxel has itself and the corner, edges and faces at its low end: -1 for the voxel, 1 for each face, -1 for each
-    edge, 1 for the corner that belongs to the union. In a window the first layers, whose neighbours are not seen, have
-    none. Sums over parts of a window are their shares of χ.
+    A voxel counts itself (-1) and those of its low faces (1 each), low edges (-1 each) and low corner (1) that belong
+    to the union. In a window the first layers count nothing: their neighbours are not seen. Sums over parts are shares
+    of χ.
     """
     total = np.zeros(mask.shape, dtype=np.int8)
     for axes in ((), (0,), (1,), (2,), (0, 1), (0, 2), (1, 2), (0, 1, 2)):
@@ -56,10 +56,9 @@ def euler_shares(mask: np.ndarray, *, periodic: bool = False) -> np.ndarray:
 def euler_of_window(mask: np.ndarray) -> float:
     """Return what a window of a larger structure adds to χ, on average over windows.
 
-    χ of the part inside counts what the faces cut off. So half of χ of each outer layer is taken off, and a quarter of
-    that of each outer row is added, and an eighth of each corner taken off (Odgaard & Gundersen 1993; BoneJ's Δχ):
-    windows of n voxels a side then add (n - 1)³ voxels' share of the whole in the mean, and a structure that no face
-    touches has its own χ.
+    From χ of the part inside, half of χ of each outer layer is subtracted, a quarter of that of each outer row added,
+    and an eighth of each corner subtracted (Odgaard & Gundersen 1993; BoneJ's Δχ). On average a window of n voxels a
+    side then has the share of (n - 1)³ voxels, and a structure that touches no face has its own χ.
     """
     total = 0.0
     for where in product((slice(None), 0, -1), repeat=3):
@@ -88,20 +87,20 @@ def betti_numbers(mask: np.ndarray, *, periodic: bool = False) -> tuple[int, int
         return 1, 3, 3
     pieces = components(inside, periodic=periodic)[1]
     if periodic:
-        cavities = components(~inside, periodic=True, connectivity=6)[1] - 1 + 3 - _directions(~inside)
+        cavities = components(~inside, periodic=True, connectivity=6)[1] - 1 + 3 - _count_directions(~inside)
     else:
         cavities = components(~np.pad(inside, 1), connectivity=6)[1] - 1
     return pieces, pieces + cavities - euler_number(inside, periodic=periodic), cavities
 
 
-def _within(mask: np.ndarray, corners: bool) -> tuple[np.ndarray, int]:
+def _label_pieces(mask: np.ndarray, corners: bool) -> tuple[np.ndarray, int]:
     """Return the pieces within the box, and how many."""
     labels = np.empty(mask.shape, dtype=np.int32)
     ndimage.label(mask, ndimage.generate_binary_structure(3, 3 if corners else 1), output=labels)
     return labels, int(labels.max(initial=0))
 
 
-def _seams(labels: np.ndarray, corners: bool) -> np.ndarray:
+def _find_seams(labels: np.ndarray, corners: bool) -> np.ndarray:
     """Return which labels touch across the faces of a periodic box: unique rows (last layer's, first layer's, axis)."""
     rows = [np.empty((0, 3), dtype=np.int64)]
     for axis in range(3):
@@ -118,11 +117,13 @@ def _graph(pairs: np.ndarray, count: int) -> coo_array:
     return coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
 
 
-def _directions(mask: np.ndarray) -> int:
-    """Return the rank of the loops of a 6-connected phase around the torus: of what is left over when its pieces within
-    the box are laid out along a spanning tree."""
-    labels, count = _within(mask, corners=False)
-    seams = _seams(labels, False)
+def _count_directions(mask: np.ndarray) -> int:
+    """Return in how many independent directions a 6-connected phase goes around the torus.
+
+    Its pieces within the box are laid out along spanning trees; contacts that then do not fit are loops around it.
+    """
+    labels, count = _label_pieces(mask, corners=False)
+    seams = _find_seams(labels, False)
     one, other, steps = seams[:, 0] - 1, seams[:, 1] - 1, np.eye(3, dtype=np.int64)[seams[:, 2]]
     graph = _graph(seams[:, :2] - 1, count).tocsr()
     step = {}

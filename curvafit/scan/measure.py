@@ -17,7 +17,7 @@ from curvafit.core.units import format_number, per_unit, unit_name
 from curvafit.geometry.descriptors import Descriptors, descriptors
 from curvafit.geometry.diagram import FAMILIES, MARGIN, Diagram, diagram, families
 from curvafit.geometry.mesh import NoSurface, area_vectors
-from curvafit.geometry.morphometry import connectivity_of, local_thickness, smooth_surface
+from curvafit.geometry.morphometry import local_thickness, measure_connectivity, smooth_surface
 from curvafit.geometry.topology import euler_shares
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.scan.grids import median_thickness, remove_specks
@@ -112,8 +112,6 @@ class Measures:
 
     source: str
     unit: str
-    shape: tuple[int, int, int]
-    spacing: tuple[float, float, float]
     kind: str
     quantities: tuple[Quantity, ...]
     direction: tuple[float, float, float]
@@ -181,7 +179,7 @@ def measure(
     table = np.stack([sums[name] for name in SUMS], axis=1)
     values, names = _combine(table.sum(0)), [name for name, *_ in QUANTITIES]
     whole = [names.index("Euler number"), names.index("connectivity density")]
-    values[whole] = connectivity_of(mask, field.spacing, periodic=periodic)
+    values[whole] = measure_connectivity(mask, field.spacing, periodic=periodic)
     halves = errors(table, blocks, _combine) if blocks.count >= LEAST else np.full(len(values), np.nan)
     if blocks.count < LEAST:
         notes = (*notes, f"No intervals: they need {LEAST} blocks of a period, and the scan has {blocks.count}.")
@@ -190,8 +188,6 @@ def measure(
     return Measures(
         source=field.source,
         unit=field.unit,
-        shape=field.shape,
-        spacing=field.spacing,
         kind=prepared.kind,
         quantities=tuple(Quantity(name, symbol, float(v), float(h), power) for (name, symbol, power, _), v, h in rows),
         direction=tuple(map(float, axes[:, 0] * np.sign(axes[np.abs(axes[:, 0]).argmax(), 0]))),  # type: ignore[arg-type]
