@@ -152,6 +152,7 @@ def render(
 
 def _placement(scene: _Scene, rays: _Rays, half: tuple[float, float], size: tuple[int, int]) -> list[float]:
     """Return the affine map from a picture's pixels (x and y down) to those of a sheet of rays (j and i)."""
+    # Three pixels determine the map: where their sight lines cross plane 0 is the place of a ray.
     corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]) / size
     right, up = (2 * corners[:, :1] - 1) * half[0], (1 - 2 * corners[:, 1:]) * half[1]
     points = (right * scene.frame[0] + up * scene.frame[1]) / scene.edges + scene.middle
@@ -314,6 +315,7 @@ def _first_crossings(field: np.ndarray, rays: _Rays, enter: np.ndarray, leave: n
 def _surface_glow(scene: _Scene, light: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Return the light from the level set at points `(3, N)`, interpolated between the voxels around them."""
     field, edges = scene.field, scene.edges[:, None]
+    # Light is computed at the voxels around the points, then interpolated.
     at = np.clip(at, 0, np.array(field.shape)[:, None] - 1)
     near = np.zeros(field.shape, np.bool_)
     near[tuple(at.astype(np.int32))] = True
@@ -325,6 +327,7 @@ def _surface_glow(scene: _Scene, light: np.ndarray, at: np.ndarray) -> np.ndarra
     normal = np.stack([_differences(smooth, voxels, axis) for axis in range(3)]) / (2 * edges)
     slope = np.maximum(np.linalg.norm(normal, axis=0), 1e-12)
     normal /= slope
+    # A step of Newton's method takes each voxel onto the level set.
     points = voxels + np.clip(field[tuple(voxels)] / slope, -1, 1) * normal / edges
     times = -(-max(field.shape) // COARSE)
     grey, inside = (_block_means(values, times) for values in (field, field > 0))
@@ -341,6 +344,7 @@ def _surface_glow(scene: _Scene, light: np.ndarray, at: np.ndarray) -> np.ndarra
         )
         for distance in (NEAR, FAR)
     )
+    # The more of the phase there is in front of a point, near and far, the less of the sky it sees.
     sky = (1 - np.clip((close - 0.12) * 1.5, 0, 0.7)) * (1 - np.clip((wide - 0.05) * 1.3, 0, 0.6))
     before = coarse(points + (1.5 * normal + 2.0 * light[:, None]) / edges)
     lit = np.maximum(light @ normal, 0) * (1 - 0.6 * _shadow(grey, light / scene.edges, before))

@@ -152,6 +152,8 @@ def _rename(header: Any, unit: str) -> None:
     name, factor = parse_unit(unit)
     code, into = _TO_FILE[name]
     own = _own_unit(header)
+    # A length in the header times `own` is the number that `read_nifti` returns; then times `factor` it is in our unit,
+    # and times `into` in NIfTI's.
     scale = factor * into * (own[1] if own else 1.0)
     header.set_xyzt_units(code, header.get_xyzt_units()[1])
     if scale != 1:

@@ -58,24 +58,19 @@ def write_zarr(field: Any, path: Path) -> None:
     import zarr
 
     levels = list(_halvings(np.asarray(field.values)))
+    # A mean of 2ᵏ voxels along an axis lies (2ᵏ - 1) / 2 voxels behind the first one's centre; a picked voxel does not.
+    shift = 0.5 if field.values.dtype.kind == "f" else 0.0
     kind = {"type": "space", **({"unit": _UNITS[field.unit]} if field.unit in _UNITS else {})}
-    image = {
-        "name": "volume",
-        "axes": [{"name": name, **kind} for name in "zyx"],
-        "datasets": [
-            {
-                "path": str(k),
-                "coordinateTransformations": [
-                    {"type": "scale", "scale": [2**k * h for h in field.spacing]},
-                    *([{"type": "translation", "translation": [first * h for h in field.spacing]}] if first else []),
-                ],
-            }
-            for k, (_, first) in enumerate(levels)
-        ],
-    }
+    datasets = []
+    for k in range(len(levels)):
+        transforms = [{"type": "scale", "scale": [2**k * h for h in field.spacing]}]
+        if shift and k:
+            transforms += [{"type": "translation", "translation": [shift * (2**k - 1) * h for h in field.spacing]}]
+        datasets.append({"path": str(k), "coordinateTransformations": transforms})
+    image = {"name": "volume", "axes": [{"name": name, **kind} for name in "zyx"], "datasets": datasets}
     with hold_signals():  # Zarr's own threads would go on to write while the folder is deleted
         group = zarr.create_group(path, attributes={"ome": {"version": "0.5", "multiscales": [image]}})
-        for k, (values, _) in enumerate(levels):
+        for k, values in enumerate(levels):
             group.create_array(
                 str(k),
                 data=values,
@@ -93,23 +88,21 @@ def mark(folder: Path, kind: str) -> None:
     zarr.open_group(folder, mode="r+").attrs[MARK] = {"kind": kind}
 
 
-def _halvings(values: np.ndarray) -> Iterator[tuple[np.ndarray, float]]:
-    """Yield the volume and its halved copies, each with the centre of its first voxel, in voxels of the volume.
+def _halvings(values: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield the volume and its halved copies, down to one chunk.
 
     Floats are means of 2³ voxels (the last voxels count twice where the number is odd). Whole numbers, which may be
     labels, are every second value.
     """
-    first = 0.0
-    yield values, first
+    yield values
     while max(values.shape) > CHUNK:
         if values.dtype.kind == "f":
             even = np.pad(values, [(0, n % 2) for n in values.shape], mode="edge")
             nz, ny, nx = (n // 2 for n in even.shape)
             values = even.reshape(nz, 2, ny, 2, nx, 2).mean((1, 3, 5), dtype=np.float32).astype(values.dtype)
-            first = 2 * first + 0.5
         else:
             values = values[::2, ::2, ::2]
-        yield values, first
+        yield values
 
 
 def _multiscales(attributes: Mapping[str, Any]) -> dict[str, _Place]:
