@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from curvafit.core.files import write_atomically
-from curvafit.drawing.plot import gallery_picture
+from curvafit.drawing.plot import gallery_figure, write_picture
 from curvafit.generation.flow import generate
 from curvafit.priors.coefficients import NAMES
 from curvafit.priors.grid import Grid
@@ -35,7 +35,7 @@ def main() -> None:
         numbers = [f"{value:g}" for value in (*shape.coefficients.as_dict().values(), shape.mass)]
         inside = f"{100 * np.mean(fields[name] > 0):.1f} %"
         lines.append(row(name, *numbers, inside, "yes" if flow.viability.viable else "no", shape.source))
-    picture = gallery_picture(fields, options.output / "presets.png", columns=6, width=1800)
+    picture = write_picture(gallery_figure(fields, columns=6, width=1800), options.output / "presets.png")
     page = write_atomically(options.output / "presets.md", lambda path: write_page(path, lines, edge, options.seed))
     print(picture, page, sep="\n")
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from curvafit.drawing.plot import gallery_picture
+from curvafit.drawing.plot import gallery_figure, write_picture
 from curvafit.generation.flow import generate
 from curvafit.priors.grid import Grid
 from curvafit.priors.law import preset
@@ -29,7 +29,7 @@ def main() -> None:
         flow = generate(shape.coefficients, shape.mass, grid, seed=options.seed)
         print(f"{name}: {flow.status}")
         fields[name] = flow.field.numpy()
-    gallery_picture(fields, options.output, columns=4, width=1600)
+    write_picture(gallery_figure(fields), options.output)
     print(options.output)
 
 

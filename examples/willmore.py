@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from rich.progress import Progress
 
-from curvafit.drawing.plot import gallery_picture
+from curvafit.drawing.plot import gallery_figure, write_picture
 from curvafit.generation.flow import Flow, descend
 from curvafit.geometry.mesh import surface
 from curvafit.priors.coefficients import Coefficients
@@ -166,7 +166,7 @@ def main() -> None:
         print("\n".join(found), flush=True)
         begun, _ = start(name, *runs[-1])
         pictures = {f"{name}: start": begun.numpy(), f"{name}: end": rows[-1].flow.field.numpy()}
-        gallery_picture(pictures, options.output / f"{name}.png", columns=2, width=1400)
+        write_picture(gallery_figure(pictures, columns=2, width=1400), options.output / f"{name}.png")
     (options.output / "willmore.txt").write_text("\n".join(lines) + "\n")
     print(options.output)
 

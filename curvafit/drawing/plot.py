@@ -72,11 +72,6 @@ def surface_on(
     axes.imshow(render_in_box(u, width=width, **options), interpolation="antialiased")
 
 
-def gallery_picture(fields: Mapping[str, np.ndarray], path: str | Path, *, width: int = 1600, **options) -> Path:
-    """Write a picture of a table of surfaces; `options` are those of `gallery_figure`."""
-    return write_picture(gallery_figure(fields, width=width, **options), path)
-
-
 def gallery_figure(fields: Mapping[str, np.ndarray], *, columns: int = 4, width: int = 1600, **options) -> Figure:
     """Return a figure `width` pixels wide of a table of surfaces, each above its name.
 

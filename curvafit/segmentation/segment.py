@@ -35,7 +35,7 @@ from curvafit.segmentation.evidence import (
 from curvafit.segmentation.result import Segmentation, flow_summary
 from curvafit.segmentation.tiles import Tiling, lower_volume
 from curvafit.segmentation.trials import Trial, choose_by_voxels, fullest_block
-from curvafit.volumes.boxes import Boxes, boxes_of, subsample, value_range
+from curvafit.volumes.boxes import Boxes, boxes_of, check_finite, subsample
 from curvafit.volumes.field import ScanError
 from curvafit.volumes.formats.part import Box, Crop
 from curvafit.volumes.read import Source
@@ -117,7 +117,7 @@ def segment(
         weight = check_float(weight, "a positive weight", *WEIGHTS)
     if not (isinstance(threshold, str) and threshold == "otsu"):
         check_float(threshold, "a threshold that is a number or 'otsu'")
-    value_range(boxes)
+    check_finite(boxes)
     sample, blocks = subsample(boxes)
     values, bounds = grey_levels(sample, threshold), grey_bounds(sample.values.astype(np.float32), threshold)
     classes = estimate_classes(values, sample, threshold, dark)

@@ -25,7 +25,7 @@ from curvafit.volumes.read import Source, field_of, pick_reader, read_file, spli
 _BY_BOX = (read_zarr, read_hdf5, read_npy, read_raw, read_nifti)
 #: The first voxel.
 _CORNER = (slice(0, 1), slice(0, 1), slice(0, 1))
-#: Voxels that `value_range` reads at once.
+#: Voxels that `check_finite` reads at once.
 _SLAB = 2**24
 #: A sample has at most so many runs of neighbouring voxels along each axis, each so long.
 RUNS, LONG = 4, 64
@@ -62,18 +62,16 @@ def read_whole(boxes: Boxes) -> Field:
     return replace(boxes.frame, values=boxes.part((z, y, x)))
 
 
-def value_range(boxes: Boxes) -> tuple[float, float]:
-    """Return the least and the greatest value."""
-    lowest, highest, faults = np.inf, -np.inf, 0
+def check_finite(boxes: Boxes) -> None:
+    """Read all of a volume, some slices at once, and raise ScanError where values are not finite."""
+    faults = 0
     depth, rows, columns = boxes.frame.shape
     thick = max(1, _SLAB // max(1, rows * columns))
     for z in range(0, depth, thick):
         values = boxes.part((slice(z, min(z + thick, depth)), slice(0, rows), slice(0, columns)))
         faults += np.count_nonzero(~np.isfinite(values)) if values.dtype.kind == "f" else 0
-        lowest, highest = min(lowest, float(values.min())), max(highest, float(values.max()))
     if faults:
         raise ScanError(f"a volume must be finite, got {faults} values that are not")
-    return lowest, highest
 
 
 def subsample(boxes: Boxes) -> tuple[Field, list[Box]]:

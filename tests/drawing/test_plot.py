@@ -16,11 +16,12 @@ from curvafit.drawing.plot import (
     bands_figure,
     corner_figure,
     diagram_figure,
-    gallery_picture,
+    gallery_figure,
     png,
     round_length,
     shared_limits,
     slice_figure,
+    write_picture,
 )
 from curvafit.drawing.render import render, surface_picture, view
 from curvafit.geometry.diagram import Diagram
@@ -183,7 +184,8 @@ def test_bars_have_round_lengths(length: float, rounded: float) -> None:
 def test_pictures_are_written_whole_or_not_at_all(tmp_path: Path) -> None:
     made = surface_picture(ball((12, 12, 12), 4) > 0, tmp_path / "ball.png", width=160)
     assert matplotlib.image.imread(made).shape[:2] == (160, 160)
-    gallery_picture({"one": ball((12, 12, 12), 4), "two": ball((12, 12, 12), 3)}, tmp_path / "two.png", width=320)
+    two = gallery_figure({"one": ball((12, 12, 12), 4), "two": ball((12, 12, 12), 3)}, width=320)
+    write_picture(two, tmp_path / "two.png")
     assert matplotlib.image.imread(tmp_path / "two.png").shape[1] == 320
     with pytest.raises(ValueError, match="finite"):
         surface_picture(np.full((8, 8, 8), np.inf), tmp_path / "no.png")

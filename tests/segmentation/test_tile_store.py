@@ -17,7 +17,7 @@ from filelock import FileLock
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation import Segmentation, reconstruct, segment
 from curvafit.volumes import ScanError, load, save
-from curvafit.volumes.boxes import boxes_of, subsample, value_range
+from curvafit.volumes.boxes import boxes_of, check_finite, subsample
 from curvafit.volumes.field import Field
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
@@ -185,7 +185,7 @@ def test_boxes_of_a_file_are_those_of_the_loaded_volume(tmp_path: Path) -> None:
             assert (frame.affine is None) == (loaded.affine is None)
             if frame.affine is not None and loaded.affine is not None:
                 np.testing.assert_allclose(frame.affine, loaded.affine)
-            assert value_range(boxes) == (loaded.values.min(), loaded.values.max())
+            check_finite(boxes)
             assert boxes_of(boxes) is boxes
 
 
