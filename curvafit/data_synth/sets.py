@@ -273,7 +273,7 @@ def _write_parts(folder: Path, spec: SetSpec, name: str, case: Case, places: lis
             known[part] = list(labels.betti)  # type: ignore[arg-type]
         elif part == "centreline":
             places.append(place.with_name(f"{name}.graphml"))
-            graph = centreline(labels.skeleton, labels.distance, grid)  # type: ignore[arg-type]
+            graph = centreline(labels.skeleton, labels.distance, case.spacing)  # type: ignore[arg-type]
             write_graphml(graph, places[-1], case.unit)
         else:
             places.append(place)
