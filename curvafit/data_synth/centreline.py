@@ -68,7 +68,7 @@ def skeleton_of(distance: np.ndarray, grid: Grid) -> np.ndarray:
 
 @njit(cache=True)
 def _thin(mask, fixed, order, periodic):  # pragma: no cover
-    """Delete simple voxels from the mask, in the given order, until none is left; ends of curves and `fixed` ones stay."""
+    """Delete simple voxels from the mask, in the given order, until none is left; curve ends and `fixed` ones stay."""
     nz, ny, nx = mask.shape
     changed = True
     while changed:
