@@ -70,8 +70,7 @@ class AtlasMap:
         return len(self.atlas)
 
     def neighbours(self, count: int) -> np.ndarray:
-        """Return the other shapes nearest to each one, nearest first: `(N, count)`, or `(N, N - 1)` where that is
-        less."""
+        """Return the indices of each shape's nearest others, nearest first: `(N, count)`, at most `(N, N - 1)`."""
         others = self.distances + np.diag(np.full(len(self), np.inf))
         return np.argsort(others, axis=1, kind="stable")[:, : min(count, len(self) - 1)]
 

@@ -55,7 +55,7 @@ def map_picture(mapped: AtlasMap, field: Callable[[int], np.ndarray], path: str 
 
 
 def map_figure(mapped: AtlasMap, field: Callable[[int], np.ndarray]) -> Figure:
-    """Return the map as a figure."""
+    """Return a figure of the map, with thumbnails of some shapes around it; `field` as in `map_picture`."""
     figure = Figure(figsize=(_WIDTH, _HEIGHT), facecolor="white")
     FigureCanvasAgg(figure)
     margin = _CELL + 0.28
@@ -74,8 +74,8 @@ def map_figure(mapped: AtlasMap, field: Callable[[int], np.ndarray]) -> Figure:
     slots = slot_places()
     sample = farthest_points(mapped.positions, len(slots))
     places = axes.transData.transform(mapped.positions[sample]) / (figure.dpi * np.array([_WIDTH, _HEIGHT]))
-    for position, slot in zip(sample, slots[assign_slots(places, slots)], strict=True):
-        _thumbnail(figure, axes, field(position), slot, mapped.positions[position], colours[position])
+    for k, slot in zip(sample, slots[assign_slots(places, slots)], strict=True):
+        _thumbnail(figure, axes, field(k), slot, mapped.positions[k], colours[k])
     _legend(figure, mapped)
     return figure
 

@@ -23,6 +23,7 @@ import numpy as np
 
 from curvafit.core.checks import quoted
 from curvafit.core.files import check_folder, is_empty, write_content
+from curvafit.core.runtime import memory
 
 Content = TypeVar("Content")
 
@@ -205,7 +206,7 @@ def can_write(
 
 
 def _check_apart(target: Path, source: Path) -> None:
-    """Raise ValueError where writing `target` would change `source`: where one is the other, or lies in it."""
+    """Raise ValueError if writing `target` would change `source`: if they are the same, or one is within the other."""
     read, place = source.resolve(), target.resolve()
     same = target.exists() and target.samefile(source)
     if same or place.is_relative_to(read) or read.is_relative_to(place):
@@ -260,7 +261,7 @@ def _read_header(path: Path) -> dict[str, Any]:
 
 
 def _read(source: Path | IO[bytes]) -> Record:
-    """Return the header and the arrays of a file, or raise one of many exceptions where it is of another kind."""
+    """Return the header and the arrays of a file; if it is of another kind, raise OSError or one of `_FAULTS`."""
     if isinstance(source, Path):
         if not source.is_file():  # a pipe may never end
             raise ValueError(f"{source} is not a file")
@@ -292,7 +293,9 @@ def read_archive(source: Path | IO[bytes]) -> dict[str, np.ndarray]:
 
 
 def read_member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
-    """Return the array of a member of an NPZ file; the member must end with it, where its checksum is compared."""
+    """Return the array of a member of an NPZ file. Bytes after it are refused; at its end the checksum is compared."""
+    if archive.getinfo(name).file_size > memory():
+        raise ValueError(f"{name} does not fit into memory")
     with archive.open(name) as stream:
         values = np.lib.format.read_array(stream, allow_pickle=False)
         if stream.read(1):

@@ -77,10 +77,11 @@ def check_finite(boxes: Boxes) -> None:
 def subsample(boxes: Boxes) -> tuple[Field, list[Box]]:
     """Return a sample of a volume, without an affine, and the boxes of the sample in which voxels are neighbours.
 
-    The sample is the volume itself where it is short; along an axis of more than `RUNS` x `LONG` voxels it has so many
-    runs of so many voxels, from the middles of equal parts.
+    Along an axis of more than `RUNS` x `LONG` voxels, the sample has `RUNS` runs of `LONG` voxels, from the middles of
+    equal parts; along a shorter one it has all voxels.
     """
     runs = [_sample_runs(n) for n in boxes.frame.shape]
+    # The runs lie end to end in the sample.
     ends = [np.cumsum([0, *(run.stop - run.start for run in axis)]).tolist() for axis in runs]
     sample = np.empty([axis[-1] for axis in ends], boxes.frame.values.dtype)
     places = [(z, y, x) for z, y, x in product(*([slice(a, b) for a, b in pairwise(axis)] for axis in ends))]

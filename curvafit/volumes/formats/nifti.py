@@ -68,6 +68,7 @@ def _values(image: Any, path: Path, part: Part | None) -> Raw:
 
     proxy, compression = image.dataobj, path.name.lower().endswith(".gz")
     shape = proxy.shape[::-1]
+    # NIfTI does not name its axes: one beyond space, of more than one entry, is that of channels.
     long = [axis for axis, n in enumerate(shape[:-3]) if n != 1]
     channels = long[0] if len(long) == 1 else None
     if part is not None and not compression:
