@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import os
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from curvafit.volumes.formats.part import Part, index_of, read_part
 
 #: Edge of a chunk, and of the largest volume that is not halved any more, in voxels.
 CHUNK = 64
-#: Chunks of an array at most; more would take hours to look for.
+#: Chunks of an array at most; more would take hours to read.
 _MOST = 10_000_000
 #: Spacing along all axes, unit and axis of channels of an array, each where it is known.
 _Place = tuple[tuple[Any, ...] | None, Any, int | None]
@@ -139,18 +139,21 @@ def _missing_chunks(array: Any, folder: Path) -> tuple[str, ...]:
 
     Zarr's own `nchunks_initialized` does not look into shards.
     """
-    outer = array.shards or array.chunks
-    counts, chunks = _counts(array.shape, outer), math.prod(_counts(array.shape, array.chunks))
+    outer, chunks = array.shards or array.chunks, math.prod(_counts(array.shape, array.chunks))
     if chunks > _MOST:
         raise ScanError(f"a Zarr array may have at most {_MOST:,} chunks, got {chunks:,} in {folder}")
-    missing, blosc = 0, "blosc" in type(array.compressors[-1] if array.compressors else None).__name__.lower()
-    for place in itertools.product(*map(range, counts)):
-        path = folder / array.metadata.encode_chunk_key(place)
+    missing, blosc = chunks, "blosc" in type(array.compressors[-1] if array.compressors else None).__name__.lower()
+    for path in folder.rglob("*"):
+        name = path.relative_to(folder).as_posix()
+        place = tuple(map(int, re.findall(r"\d+", name)))
+        if len(place) != array.ndim or array.metadata.encode_chunk_key(place) != name or not path.is_file():
+            continue
         rest = [min(edge, n - k * edge) for n, edge, k in zip(array.shape, outer, place, strict=True)]
+        if min(rest, default=1) <= 0:  # a chunk beyond the array, which may have been larger once
+            continue
         inside = _counts(rest, array.chunks)
-        if not path.is_file():
-            missing += math.prod(inside)
-        elif array.shards:
+        missing -= math.prod(inside)
+        if array.shards:
             missing += _missing_within(array, path, inside)
         elif blosc:
             _check_blosc(path)
