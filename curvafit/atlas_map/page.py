@@ -32,7 +32,7 @@ from curvafit.drawing.render import render
 from curvafit.generation.flow import WORKING_BLUR
 from curvafit.generation.schedule import SCHEDULES, present_name
 from curvafit.geometry.diagram import FAMILIES, Diagram
-from curvafit.inference.atlas import VIEWS
+from curvafit.inference.atlas import SEEN_AS
 from curvafit.inference.fit import FIT_SCHEMA
 from curvafit.priors.coefficients import NAMES
 from curvafit.priors.grid import WORKING_EPSILON
@@ -121,7 +121,7 @@ def _page_data(mapped: AtlasMap, commands: Sequence[str]) -> dict[str, Any]:
         "diagram": {"limits": [float(np.quantile(limits[:, 0], 0.05)), float(np.quantile(limits[:, 1], 0.95))]},
         "fit": FIT_SCHEMA,
         "embedding": {
-            "usual": {view: _nearest_quantiles(mapped.atlas.embeddings(view)) for view in VIEWS},
+            "usual": {view: _nearest_quantiles(mapped.atlas.embeddings(view)) for view in SEEN_AS},
             "nearest": PLACED_BY,
         },
         "ramps": {
@@ -168,7 +168,7 @@ def _diagrams(diagrams: Sequence[Diagram]) -> tuple[float, list[bytes]]:
 
 def _embeddings(mapped: AtlasMap) -> tuple[float, list[bytes]]:
     """Return the step, and the sliced embeddings of fields and of masks `(N, 288)`, int16 in steps."""
-    views = [mapped.atlas.embeddings(view) for view in VIEWS]
+    views = [mapped.atlas.embeddings(view) for view in SEEN_AS]
     step = max(float(np.abs(each).max()) for each in views) / 32767
     return step, [np.rint(each / step).astype("<i2").tobytes() for each in views]
 

@@ -19,7 +19,7 @@ from curvafit.priors.coefficients import Coefficients
 VERSION = 1
 ATLAS_FILE = Format("curvafit atlas", VERSION, "an atlas file", remedy="extract it again from its store")
 #: How a shape can be seen: as its phase field, or as the mask {u > 0} re-profiled.
-VIEWS = ("field", "mask")
+SEEN_AS = ("field", "mask")
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +63,7 @@ class Atlas:
 
         Raises ValueError if `seen_as` is another word.
         """
-        if seen_as not in VIEWS:
+        if seen_as not in SEEN_AS:
             raise ValueError(f"expected shapes seen as 'field' or 'mask', got {seen_as!r}")
         return self.field_diagrams if seen_as == "field" else self.mask_diagrams
 
@@ -88,7 +88,7 @@ def save_atlas(atlas: Atlas, path: str | Path) -> None:
     Weights, as parts of a diagram's area, are stored in float32.
     """
     arrays = {name: getattr(atlas, name) for name in ("coefficients", "masses", "seeds", "volume_fractions")}
-    for view in VIEWS:
+    for view in SEEN_AS:
         arrays |= {f"{view}_{name}": value for name, value in _pack_diagrams(atlas.diagrams(view)).items()}
     ATLAS_FILE.write(path, {"ids": list(atlas.ids), "provenance": atlas.provenance}, arrays)
 
@@ -187,14 +187,10 @@ def nearest(
     ----------
     diagram
         The query's geometric diagram, in 1 / working unit.
-    atlas
-        Where to search; see `curvafit.inference.atlas.load_atlas`.
     seen_as
         What the query was measured on, `"field"` or `"mask"`: it is compared with diagrams of the same kind.
-    count
-        How many; all of them where the atlas has fewer.
     shortlist
-        How many shapes, nearest in sliced distance, have their Wasserstein distance computed; at least `count` have.
+        Number of shapes, nearest in sliced distance, whose Wasserstein distance is computed; at least `count`.
     exact
         Compute the distances of the matches by geomloss in float64 (`wasserstein`), and not in float32.
     """

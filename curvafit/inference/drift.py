@@ -1,7 +1,7 @@
 """How far a short flow of a law moves a scan's surface: the right law leaves the surface where it is.
 
-The profile of a mask is made up, so stationarity, which reads how the profile deviates from tanh, says nothing of it.
-A short flow mends the profile first and moves the interface then, the less the better the law is.
+Stationarity reads how a profile deviates from tanh, so it says nothing of a mask, whose profile is made up. A short
+flow first mends the profile, and then moves the interface: the better the law, the less.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class ShortFlow:
     """
 
     def __init__(self, phase: Tensor, grid: Grid, epsilon: float, reference: Coefficients) -> None:
-        values, self.grid = _box(phase.detach().to("cpu", torch.float32), grid)
+        values, self.grid = _cut_box(phase.detach().to("cpu", torch.float32), grid)
         self.epsilon, self._voxel = epsilon, grid.spacing[0]
         self.start = deblur(values, self.grid, epsilon)
         self._before = gaussian_blur(self.start, self.grid, epsilon)
@@ -64,12 +64,11 @@ class ShortFlow:
         share = gaussian_blur(slope, self.grid, LOW_PASS * self._voxel)[self._read]
         self._kept = share > _FAINT * share.max()
         self._norm = (share * share[self._kept].sum()).sqrt()[self._kept]
-        self._forces = self._force_of_each_term()
+        self._forces = self._measure_forces()
         self._budget = self._force(reference.scaled(1 / float(reference.a20)))
 
     def residual(self, law: Coefficients) -> np.ndarray:
-        """Return the displacement in voxels, low-passed, weighted by interface so that its square sums to the mean
-        square."""
+        """Return the low-passed displacement in voxels, weighted by interface: its squares sum to the mean square."""
         scaled = law.scaled(self._budget / self._force(law))
         flow = descend(
             self.start,
@@ -89,8 +88,8 @@ class ShortFlow:
         low = gaussian_blur(moved, self.grid, LOW_PASS * self._voxel)[self._read][self._kept]
         return (low / self._norm / self._voxel).numpy()
 
-    def _force_of_each_term(self) -> np.ndarray:
-        """Return the root mean square of the six low-passed ∂F_α/∂u where the residual is read."""
+    def _measure_forces(self) -> np.ndarray:
+        """Return the root mean square of each of the six low-passed ∂F_α/∂u where the residual is read."""
         terms = energy_gradients(self._before.double(), self.grid, self.epsilon)
         low = gaussian_blur(terms, self.grid, LOW_PASS * self._voxel)[(slice(None), *self._read)][:, self._kept]
         return low.square().mean(1).sqrt().numpy()
@@ -107,8 +106,8 @@ def deblur(phase: Tensor, grid: Grid, width: float) -> Tensor:
     return v
 
 
-def _box(phase: Tensor, grid: Grid) -> tuple[Tensor, Grid]:
-    """Return the whole, or the part of at most `LARGEST_BOX` voxels a side that is richest in surface."""
+def _cut_box(phase: Tensor, grid: Grid) -> tuple[Tensor, Grid]:
+    """Return the whole, or the part of at most `LARGEST_BOX` voxels a side with the most surface."""
     if max(grid.shape) <= LARGEST_BOX:
         return phase, grid
     windows = boxes_by_surface(surface_voxels((phase > 0).numpy()), LARGEST_BOX)

@@ -25,7 +25,8 @@ from curvafit.priors.coefficients import NAMES, POWERS, Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
 from curvafit.priors.law import FORMAT, Law, LawLike
 
-_SEEN = {"field": "a phase field", "mask": "a mask", "image": "an image"}
+#: What a scan was taken for, in words.
+KINDS = {"field": "a phase field", "mask": "a mask", "image": "an image"}
 #: What is drawn, in the order of the columns; a20 = 1 is the gauge.
 COLUMNS = ("a11", "a02", "a10", "a01", "a00", "mass")
 #: Levels of the intervals, in percent.
@@ -144,7 +145,7 @@ class Fit(Pictured):
         six = "none" if self.best is None else f"({', '.join(f'{x:.4g}' for x in self.best.coefficients)})"
         mass = "" if self.best is None else f", mass {self.best.mass:.3g}"
         voxel = f"working voxel {self.working_voxel:.4g} {self.length_unit}"
-        return f"Fit({self.family} from {_SEEN[self.kind]}, a = {six}{mass}, {voxel}: {self.status})"
+        return f"Fit({self.family} from {KINDS[self.kind]}, a = {six}{mass}, {voxel}: {self.status})"
 
     @property
     def best(self) -> Candidate | None:

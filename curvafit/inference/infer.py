@@ -23,7 +23,7 @@ from curvafit.inference.atlas import Atlas, Match, load_atlas, mirror_match, nea
 from curvafit.inference.candidates import TITLES, Candidate, Twin, best_candidate, twin, verdict
 from curvafit.inference.drift import drift
 from curvafit.inference.estimate import estimate, refine_matches
-from curvafit.inference.fit import Fit
+from curvafit.inference.fit import KINDS, Fit
 from curvafit.inference.posterior import Posterior, load_posterior
 from curvafit.inference.simulate import Effort
 from curvafit.inference.stationarity import stationarity
@@ -38,7 +38,6 @@ from curvafit.volumes.read import Source, field_of
 
 #: Number of nearest shapes, and of those from which stationarity starts.
 MATCHES, STARTS = 5, 3
-_ARTICLES = {"field": "a phase field", "mask": "a mask", "image": "an image"}
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -71,7 +70,7 @@ class Inference(Pictured):
         fit = self.fit
         voxels = " x ".join(map(str, self.scan.values.shape))
         near = ", ".join(f"{each.name} {format_number(each.distance, 2)}" for each in fit.candidates)
-        return f"Inference({fit.family} from {_ARTICLES[fit.kind]} of {voxels} voxels, distances: {near}. {fit.status})"
+        return f"Inference({fit.family} from {KINDS[fit.kind]} of {voxels} voxels, distances: {near}. {fit.status})"
 
     @property
     def best(self) -> np.ndarray | None:

@@ -94,9 +94,8 @@ def train_posterior(
     flow_plan, emulator_plan = plans or PLANS
     part = sub_progress(progress, 0.0, EMULATOR_PART)
     emulator, left = train_emulator(table, compression, box, seed=seed, plan=emulator_plan, progress=part)
-    provenance = {
-        "table": table.provenance, "shapes": len(shapes), "rows": len(table), "members": members, "seed": seed,
-    }  # fmt: skip
+    counts = {"shapes": len(shapes), "rows": len(table), "members": members}
+    provenance = {"table": table.provenance, **counts, "seed": seed}
     zero, one = np.zeros(len(PARAMETERS)), np.ones(len(PARAMETERS))
     posterior = Posterior(sizes, (), compression, views, box, zero, one, emulator, left, provenance)
     logits = posterior.to_logits(table.parameters)
@@ -108,7 +107,6 @@ def train_posterior(
         rng = np.random.default_rng([seed, k])
         holdout = rng.permutation(len(shapes))[: max(1, round(VALIDATION * len(shapes)))]
         validation = torch.from_numpy(np.isin(number, holdout))
-
         part = sub_progress(progress, *(EMULATOR_PART + (1 - EMULATOR_PART) * end / members for end in (k, k + 1)))
         with torch.random.fork_rng():
             torch.manual_seed(int(rng.integers(2**31)))
