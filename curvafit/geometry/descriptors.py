@@ -142,15 +142,15 @@ def _fabric(normals: np.ndarray, area: np.ndarray) -> np.ndarray:
 
 
 def _euler_density(mask: np.ndarray, grid: Grid) -> float:
-    """Return χ per volume of the union of the closed voxels, of a window by the voxels whose neighbours are seen."""
+    """Return χ per volume of the union of the closed voxels; in a window, of the voxels whose neighbours are seen."""
     return int(euler_shares(mask, periodic=grid.periodic).sum(dtype=np.int64)) / _cell_volume(grid)
 
 
 def _chord_quantiles(phase: np.ndarray, periodic: bool) -> np.ndarray:
     """Return quantiles, in voxels, of the lengths of the runs of a phase along the three axes.
 
-    Of a window, each run counts from its ends that are seen: up to the other end, or as longer than what is seen.
-    Quantiles are at most `LONGEST`: a small window does not show longer runs, and all windows are measured alike.
+    In a window a run counts once for each end that is seen: with its length where the other end is seen too, else as
+    longer than the part that is seen. Quantiles are at most `LONGEST`, as a small window shows no longer runs.
     """
     longest = max(phase.shape)
     events, runs = np.zeros((2, longest + 1))
@@ -182,8 +182,8 @@ def _find_runs(lines: np.ndarray, periodic: bool) -> tuple[np.ndarray, np.ndarra
 def _depth_quantiles(inside: Tensor, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
     """Return quantiles, in voxels, of the distances of the voxels inside, and outside, to the surface.
 
-    A distance beyond `DEPTH`, or beyond the window's nearest face, counts as longer than that. Quantiles are read from
-    the counts at whole voxels, between which the distances of voxels come in steps.
+    A distance beyond `DEPTH`, or beyond the window's nearest face, counts as longer than that. Quantiles are read at
+    whole voxels, since distances between voxels come in steps.
     """
     voxels = Grid(grid.shape, (1.0, 1.0, 1.0), grid.boundary)
     distance = signed_distance(inside, voxels, limit=DEPTH + 1).numpy(force=True)

@@ -107,7 +107,7 @@ def one_to_many(
     reach: float | None = 20.0,
     bin_width: float = BIN_WIDTH,
 ) -> np.ndarray:
-    """Return the distances `(N,)` of one diagram to each of N; `pairwise` says what is taken and raised."""
+    """Return the distances `(N,)` of one diagram to each of N; options and errors are those of `pairwise`."""
     clouds = _pack_diagrams([query, *diagrams], blur, reach, bin_width)
     others = np.arange(1, len(diagrams) + 1)
     blocks = _iterate_distances(clouds, np.zeros_like(others), others, blur=blur, reach=reach)
@@ -139,7 +139,7 @@ def _iterate_distances(clouds: Clouds, first: np.ndarray, second: np.ndarray, **
 def digests(
     diagrams: Sequence[Diagram], *, blur: float = 1.0, reach: float | None = 20.0, bin_width: float = BIN_WIDTH
 ) -> list[str]:
-    """Return a text for each diagram that is the same where `pairwise` sees the same points and weights."""
+    """Return a hash of each diagram as `pairwise` sees it: equal where binned points and weights are equal."""
     clouds = _pack_diagrams(diagrams, blur, reach, bin_width)
     rows = np.stack([clouds.x, clouds.y, clouds.log2], axis=1)
     parts = (rows[start:end] for start, end in itertools.pairwise(clouds.bounds))
@@ -208,7 +208,7 @@ def sinkhorn_divergence(
 
 
 def _normalise(diagrams: Sequence[Diagram], blur: float, reach: float | None, bin_width: float) -> list[Diagram]:
-    """Return the diagrams as distances take them: of total weight 1, in bins.
+    """Return the diagrams binned and with total weight 1, as distances compare them.
 
     Raises ValueError as `wasserstein`.
     """
@@ -326,7 +326,7 @@ def _fill_costs(clouds, first, second, ε, shares, ρ, values):
 
 @njit(**_SERIAL)
 def _slice_cloud(clouds, number):
-    """Return x, y and the weights' log2 of one measure."""
+    """Return x, y and the weights' log2 of one cloud."""
     rows = slice(clouds.bounds[number], clouds.bounds[number + 1])
     return clouds.x[rows], clouds.y[rows], clouds.log2[rows]
 

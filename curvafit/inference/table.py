@@ -116,7 +116,7 @@ def mirror_parameters(parameters: np.ndarray) -> np.ndarray:
 
 
 def column_names() -> list[str]:
-    """Return the block of each column of descriptors."""
+    """Return the name of the block that each column of descriptors belongs to."""
     return [name for name, length in BLOCKS.items() for _ in range(length)]
 
 
@@ -192,7 +192,7 @@ def see_resampled(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
     A scan's mask is brought to the working grid in the same way.
     """
     part, window = see_crop(u, grid, rng)
-    thickness = _thickness(part)
+    thickness = _measure_thickness(part)
     scale = float(np.clip(thickness / math.exp(rng.uniform(*np.log(KEPT_THICKNESS))), *SCALES))
     coarse = [round(n / scale) for n in part.shape]
     zoom = [n / m for n, m in zip(part.shape, coarse, strict=True)]
@@ -209,7 +209,7 @@ def see_scan(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
     """
     part, window = see_crop(u, grid, rng)
     inside = split(_degrade(part, rng), part.shape)
-    return View(remove_specks(inside, smallest_piece(_thickness(inside)), False)[0], window)
+    return View(remove_specks(inside, smallest_piece(_measure_thickness(inside)), False)[0], window)
 
 
 def _degrade(part: np.ndarray, rng: np.random.Generator) -> Field:
@@ -221,8 +221,8 @@ def _degrade(part: np.ndarray, rng: np.random.Generator) -> Field:
     return Field(grey, (float(SLICE), 1.0, 1.0), "voxel")
 
 
-def _thickness(part: np.ndarray) -> float:
-    """Return the median thickness in voxels, or raise ScanError where `infer` refuses a structure as too thin."""
+def _measure_thickness(part: np.ndarray) -> float:
+    """Return the median thickness in voxels, or raise ScanError where a structure is too thin for `infer`."""
     if not part.any():
         raise ScanError("expected a structure in the window, got none")
     thickness, thick = median_thickness(part, (1.0, 1.0, 1.0), False)

@@ -133,7 +133,7 @@ def _fit(
 
 
 def _draw_lines(member: Member, context: Tensor, mass: Tensor) -> None:
-    """Give a flow the straight lines, one for each view, that the mass is nearest to, and its deviations from them."""
+    """Give a flow the straight lines, one for each view, that fit the mass by the context, and their deviations."""
     for view in range(len(member.width)):
         mine = context[:, view - len(member.width)] == 1
         x, y = context[mine].double(), mass[mine].double()
@@ -187,7 +187,7 @@ def train_emulator(
 
 
 def _misfits(emulator: Emulator, number: int, rows: Table) -> np.ndarray:
-    """Return what one network, which did not learn from them, leaves unexplained of rows of one view."""
+    """Return what network `number`, which did not learn from these rows of one view, leaves unexplained of them."""
     mean, spread = (
         tuple(Layer(*(each[number : number + 1] for each in layer)) for layer in layers)
         for layers in (emulator.mean, emulator.spread)
@@ -233,7 +233,7 @@ def _train_ensemble(
     seed: int,
     progress: Progress,
 ) -> list[nn.Sequential]:
-    """Return networks; each learns until its own part of the rows, which it does not learn from, is fit best."""
+    """Return `FOLDS` networks; each learns from all parts of the rows but one, and stops where that one is fit best."""
     sizes, networks = (x.shape[1], *HIDDEN), []
     with torch.random.fork_rng():
         torch.manual_seed(seed)

@@ -35,13 +35,8 @@ def bounding_box(
 def median_thickness(mask: np.ndarray, spacing: tuple[float, float, float], periodic: bool) -> tuple[float, float]:
     """Return the median and 95th percentile, over the structure's surface, of the local thickness beneath it.
 
-    By surface and not by volume, since that is what a curvature diagram weighs by: a solid rind beside thin struts
-    would else set the scale. Measured in the box of at most 160 voxels a side that `boxes_by_surface` puts first.
-
-    Returns
-    -------
-    tuple[float, float]
-        In spacing's unit.
+    It is weighed by surface, not by volume, as a curvature diagram is: else a solid rind around thin struts would set
+    the scale. Both are in spacing's unit, from the box of at most 160 voxels a side that `boxes_by_surface` puts first.
     """
     surface = surface_voxels(mask)
     boxes = boxes_by_surface(surface, _MEASURED)
@@ -57,7 +52,7 @@ def surface_voxels(mask: np.ndarray) -> np.ndarray:
 
 
 def boxes_by_surface(content: np.ndarray, size: int | Sequence[int]) -> list[Window]:
-    """Return boxes of at most `size` voxels a side that cover the volume and hold content, the one to look at first.
+    """Return the boxes, of at most `size` voxels a side, that cover the volume and hold content, in order of use.
 
     The first is the middle one, unless it holds less than half of what the others hold on average: then the fullest.
     """
@@ -84,8 +79,8 @@ def centre_distance(
     """Return the signed distance of each voxel to the border of a mask of any dimension, positive inside.
 
     It is measured from centre to centre across the border, less half the finest edge, and cut at ±`limit`; a mask
-    without a border has ±`limit` everywhere. To the smooth surface behind a mask it is nearer than the distance to the
-    voxels' faces (`priors.signed_distance`, which is exact for the set of voxels). Periodic boxes need a limit.
+    without a border has ±`limit` everywhere. It estimates the distance to the smooth surface behind the mask better
+    than `priors.signed_distance`, the exact distance to the voxels' faces. Periodic boxes need a limit.
     """
     if not mask.any() or mask.all():
         return np.full(mask.shape, limit if mask.any() else -limit, dtype)
@@ -140,14 +135,9 @@ def resample(
 
 
 def remove_specks(mask: np.ndarray, smallest: float, periodic: bool) -> tuple[np.ndarray, int, int]:
-    """Return the mask less its components (26-connected) and pinholes (6-connected) of under `smallest` voxels.
+    """Return the mask less its specks (26-connected) and pinholes (6-connected) under `smallest` voxels, and counts of both.
 
     Pieces that touch the faces of a periodic box may go on beyond, and stay.
-
-    Returns
-    -------
-    tuple[np.ndarray, int, int]
-        The mask, and how many specks and pinholes were dropped.
     """
     specks, count = _small_pieces(mask, smallest, periodic, _CONNECTED_26)
     cleaned = mask & ~specks

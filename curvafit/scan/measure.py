@@ -344,7 +344,7 @@ def scan_descriptors(prepared: Prepared) -> tuple[Descriptors, str] | None:
 
 
 def _kind_of_view(prepared: Prepared, grid: Grid) -> str:
-    """Return what a posterior takes a window for: a field of a part is read as its mask is, a clean image as a mask."""
+    """Return the kind of view for a posterior: a part of a field is read as its mask, a clean image as a mask."""
     if prepared.quality is not None and prepared.quality.degraded:
         return "scan"
     if grid.periodic:

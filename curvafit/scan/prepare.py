@@ -145,7 +145,7 @@ class Prepared:
         return share if 0 < share < 1 else self.volume_fraction
 
     def part(self, where: Window) -> Grid:
-        """Return the grid of a part: it repeats only where it is all of a grid that does."""
+        """Return the grid of a part: it is periodic only where it is all of a periodic grid."""
         z, y, x = self.mask[where].shape
         whole = (z, y, x) == self.grid.shape
         return Grid((z, y, x), self.grid.spacing, self.grid.boundary if whole else "replicate")
@@ -201,7 +201,7 @@ def prepare(
     level = find_level(part, region=region, periodic=periodic, extremes=extremes, **options)  # type: ignore[arg-type]
     noise = level.kind != "field" and is_noise(level.mask)
     scan = _Scan(level, part.shape, part.spacing, periodic, region, noise, field.notes + notes + (level.note,))
-    prepared = _on_working_grid(scan)
+    prepared = _put_on_grid(scan)
     if level.kind == "image":
         grey = -part.values if dark else part.values
         prepared = replace(prepared, quality=measure_quality(grey, level.mask, part.spacing))
@@ -241,7 +241,7 @@ class _Scan:
         return self.level.mask if self.region is None else self.level.mask & self.region
 
 
-def _on_working_grid(scan: _Scan) -> Prepared:
+def _put_on_grid(scan: _Scan) -> Prepared:
     """Choose the working voxel, move the scan to it, drop specks, profile the mask, choose windows."""
     thickness, notes = _measure_thickness(scan)
     scale, why = _choose_scale(scan, thickness)

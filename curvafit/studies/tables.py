@@ -26,7 +26,7 @@ FORMAT = Format("curvafit measures 1", title="a table of measures")
 
 
 def rows_of(measures: Measures) -> list[dict[str, Any]]:
-    """Return a row for each quantity of a scan, by column; None where there is no number."""
+    """Return a row for each quantity of a scan, as values by column; None where a number is not known."""
     from importlib.metadata import version
 
     release, z, y, x = version("curvafit"), *measures.direction
