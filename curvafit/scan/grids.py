@@ -135,7 +135,7 @@ def resample(
 
 
 def remove_specks(mask: np.ndarray, smallest: float, periodic: bool) -> tuple[np.ndarray, int, int]:
-    """Return the mask less its specks (26-connected) and pinholes (6-connected) under `smallest` voxels, and counts of both.
+    """Drop specks (26-connected) and pinholes (6-connected) under `smallest` voxels; return the mask and both counts.
 
     Pieces that touch the faces of a periodic box may go on beyond, and stay.
     """
