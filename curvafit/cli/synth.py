@@ -205,7 +205,7 @@ def _choose_modality(
         from curvafit.data_synth.imaging.modality import modality
 
         return _with_visible(modality(str(name)), visible)
-    from curvafit.data_synth.imaging import like as estimate
+    from curvafit.data_synth.imaging.like import fit_modality
     from curvafit.volumes.read import load
 
     if reading["label"] is not None and mask is None:
@@ -213,7 +213,7 @@ def _choose_modality(
     scan = load(like, **{**reading, "label": None})
     say_notes(scan.notes)
     inside = None if mask is None else _split_mask(load(mask, **{**reading, "channel": None}).values)
-    return _with_visible(estimate.like(scan, inside), visible)
+    return _with_visible(fit_modality(scan, inside), visible)
 
 
 def _split_mask(values: np.ndarray) -> np.ndarray:

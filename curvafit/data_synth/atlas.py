@@ -20,10 +20,9 @@ from llvmlite import binding
 from curvafit.core.checks import check_int, check_seed, check_type
 from curvafit.core.runtime import FILE, FLOW, Progress, check_memory, silent
 from curvafit.core.workers import ThisProcess, Workers
-from curvafit.data_synth.design import Design, Draw, boxed
+from curvafit.data_synth.design import Design, boxed
 from curvafit.data_synth.store import Record, Settings, Store, open_store
 from curvafit.generation.flow import WORKING_BLUR, generate
-from curvafit.generation.result import Flow
 from curvafit.generation.schedule import Schedule, present_name
 from curvafit.generation.schedule import schedule as named_schedule
 from curvafit.priors.grid import WORKING_EPSILON, Grid
@@ -69,13 +68,8 @@ def build(
     workers
         Whoever makes the draws (`cluster`); this process by default.
 
-    Raises
-    ------
-    ValueError
-        If `count` is not positive or over 10 million, a shape does not fit into memory, the store was made with other
-        settings or by another format version, or hardly any draw of the design is viable.
-    OSError
-        If the store can't be written, or the workers are gone. What was made is kept.
+    Raises ValueError where the store was made with other settings, a shape does not fit into memory, or hardly any draw
+    is viable; OSError where the store can't be written or the workers are gone. Finished draws are kept.
     """
     check_count(count, 1)
     if workers is None:
@@ -85,7 +79,7 @@ def build(
 
 
 def extend(store_path: str | Path, count: int, progress: Progress = silent, *, workers: Workers | None = None) -> Store:
-    """Go on with a store, by its own settings, until it has `count` more viable shapes than were asked of it so far.
+    """Continue a store, by its own settings, until it has `count` more viable shapes than were asked of it so far.
 
     A count of 0 finishes a build that was stopped. Raises FileNotFoundError where there is no store, and as `build`.
     """
@@ -95,7 +89,7 @@ def extend(store_path: str | Path, count: int, progress: Progress = silent, *, w
 
 
 def check_count(count: int, least: int) -> None:
-    """Raise ValueError where a number of shapes is none, under the least or over 10 million."""
+    """Raise ValueError unless `count` is a whole number from `least` to 10 million."""
     check_int(count, f"a count of shapes from {least}", least, MOST)
 
 
@@ -113,7 +107,7 @@ def settings_of(
 
 
 def _fill(store: Store, count: int, workers: Workers, progress: Progress) -> Store:
-    """Ask for draws in order, never for more than may still be wanted: nothing is made beyond the last viable one."""
+    """Ask for draws in order, never for more than may still be needed: none is made after the last viable one."""
     store.want(count)
     viable = {index: store.viable(index) for index in store.indices()}
     pending = 0
@@ -167,7 +161,19 @@ def _make_draw(store: Store, index: int) -> None:
             blur=settings.blur,
             reject_early=True,
         )
-    record = _record(index, draw, flow, time.perf_counter() - began)
+    history = flow.history
+    record = Record(
+        index=index,
+        coefficients=draw.coefficients,
+        mass=draw.mass,
+        seed=draw.seed,
+        steps=int(history.step[-1]) if len(history.step) else 0,
+        viability=flow.viability,
+        energy=float(history.energy[-1]) if len(history.energy) else math.nan,
+        status=flow.status,
+        versions=versions(),
+        seconds=time.perf_counter() - began,
+    )
     store.write(record, flow.field.numpy().astype("float32") if record.viability.viable else None)
 
 
@@ -176,21 +182,6 @@ def versions() -> dict[str, str]:
     names = ("curvafit", "torch", "numpy", "numba")
     machine = {"python": platform.python_version(), "processor": binding.get_host_cpu_name()}
     return machine | {name: _version(name) for name in names}
-
-
-def _record(index: int, draw: Draw, flow: Flow, seconds: float) -> Record:
-    return Record(
-        index=index,
-        coefficients=draw.coefficients,
-        mass=draw.mass,
-        seed=draw.seed,
-        steps=int(flow.history.step[-1]) if len(flow.history.step) else 0,
-        viability=flow.viability,
-        energy=float(flow.history.energy[-1]) if len(flow.history.energy) else math.nan,
-        status=flow.status,
-        versions=versions(),
-        seconds=seconds,
-    )
 
 
 def _version(name: str) -> str:
@@ -205,7 +196,7 @@ def _version(name: str) -> str:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is wrong with a store, a sentence each; what is only remarkable; and a sentence in all."""
+    """The problems of a store and notes on it, one sentence each; `status` is the verdict in one sentence."""
 
     problems: tuple[str, ...]
     notes: tuple[str, ...]

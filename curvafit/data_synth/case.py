@@ -108,7 +108,7 @@ class Recipe:
             "mask_fraction": float(mask.mean()),
         }
         return Case(
-            _counts(grey, imaging), sampled, mask, imaging.spacing, imaging.unit, phase_field.epsilon * voxel, record
+            _to_counts(grey, imaging), sampled, mask, imaging.spacing, imaging.unit, phase_field.epsilon * voxel, record
         )
 
     def as_dict(self) -> dict[str, Any]:
@@ -186,8 +186,8 @@ def check_crop(within: float, shape: Sequence[int], voxel: float, modality: Moda
         )
 
 
-def _counts(grey: np.ndarray, imaging: Imaging) -> np.ndarray:
-    """Return whole counts as uint16, where they fit in; else float32."""
+def _to_counts(grey: np.ndarray, imaging: Imaging) -> np.ndarray:
+    """Return counts as uint16 where the detector makes whole ones that fit; else float32."""
     ceiling = imaging.detector.ceiling
     whole = ceiling is not None and ceiling <= np.iinfo(np.uint16).max
     return grey.astype(np.uint16 if whole else np.float32)

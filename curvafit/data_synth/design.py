@@ -1,4 +1,4 @@
-"""Which parameters an atlas draws, in turn: designs (boxes, lists, surroundings of a point), and their YAML files."""
+"""Designs: sequences of parameters for an atlas (from a box, a list, or around a point), and their YAML files."""
 
 from __future__ import annotations
 
@@ -65,11 +65,7 @@ class Design:
     log
         Names of the parameters whose logarithm the box holds uniformly; their intervals are above 0.
 
-    Raises
-    ------
-    ValueError
-        If the sampling has another name, there is no box or no point, an interval is not one, m₀ leaves (-1, 1), or no
-        flow takes a coefficient that large (`generation.cost`).
+    Raises ValueError where a parameter is out of range, such as m₀ outside (-1, 1).
     """
 
     sampling: Sampling
@@ -151,11 +147,6 @@ def boxed(sampling: Sampling = "random", log: Sequence[str] = (), /, **intervals
     """Return Experiment 4's box with other intervals, or fixed values, for the parameters that are given by name.
 
     The box is uniform in the logarithm of the parameters in `log`.
-
-    Raises
-    ------
-    ValueError
-        If a name is not a parameter's, or a value is neither a number nor two of them.
     """
     unknown = set(intervals) - set(PARAMETERS)
     if unknown:
@@ -168,12 +159,7 @@ def boxed(sampling: Sampling = "random", log: Sequence[str] = (), /, **intervals
 def around(point: Sequence[float], spread: float, sampling: Sampling = "random") -> Design:
     """Return a box around a point of seven numbers, `spread` times as wide as Experiment 4's.
 
-    The point is brought to a20 = 1; a02 and m₀ stay in range.
-
-    Raises
-    ------
-    ValueError
-        If the spread is not positive or over 100, or the point is not seven numbers with a20 > 0.
+    The point is scaled to a20 = 1; a02 and m₀ stay in range.
     """
     spread = check_float(spread, "a positive spread", *SPREADS)
     point = as_tuple(point, "seven numbers as a point")
@@ -220,13 +206,7 @@ def _stream(seed: int, index: int, purpose: str) -> np.random.SeedSequence:
 
 
 def read_design(path: str | PathLike[str]) -> Design:
-    """Read a design from a YAML file; docs/howto/atlas.md has its keys.
-
-    Raises
-    ------
-    FileNotFoundError, ValueError
-        If there is no such file, or it is not YAML, has unknown keys, or is no design (`Design`).
-    """
+    """Read a design from a YAML file; docs/howto/atlas.md has its keys. Raises FileNotFoundError or ValueError."""
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"found no file {path}")
@@ -247,11 +227,6 @@ def point_of(source: Any, folder: Path = Path()) -> tuple[float, ...]:
     """Return the seven numbers of a law: a preset's name, a `fit.json`, or the numbers by name.
 
     The path of a `fit.json` is relative to `folder`.
-
-    Raises
-    ------
-    FileNotFoundError, ValueError
-        If it is none of these, or a number is missing.
     """
     if isinstance(source, str):
         return Law.of(folder / source if source.endswith(".json") else source).point
@@ -261,7 +236,13 @@ def point_of(source: Any, folder: Path = Path()) -> tuple[float, ...]:
 
 
 def _design(content: Any, folder: Path) -> Design:
-    kind = _kind(content)
+    """Return the design that a YAML file states; every key must be known."""
+    kinds = [key for key in KEYS if key in content] if isinstance(content, Mapping) else []
+    if len(kinds) != 1:
+        raise ValueError(f"a design has one of the keys {', '.join(KEYS)}, got {quoted(content)}")
+    (kind,) = kinds
+    if strange := [key for key in content if key not in (kind, *KEYS[kind])]:
+        raise ValueError(f"a design with the key {kind} has no key {quoted(strange[0])}")
     if kind == "list":
         points = as_tuple(content["list"], "points in list")
         return Design("list", points=tuple(point_of(point, folder) for point in points))
@@ -277,22 +258,8 @@ def _design(content: Any, folder: Path) -> Design:
     return boxed(sampling, content.get("log", ()), **intervals)
 
 
-def _kind(content: Any) -> str:
-    """Return which of the three a file is; every key must be known."""
-    if not isinstance(content, Mapping):
-        raise ValueError(f"a design has one of the keys {', '.join(KEYS)}, got {quoted(content)}")
-    kinds = [key for key in KEYS if key in content]
-    if unknown := [key for key in content if key not in {*KEYS, *itertools.chain(*KEYS.values())}]:
-        raise ValueError(f"a design has no key {quoted(unknown[0])}")
-    if len(kinds) != 1:
-        raise ValueError(f"a design has one of the keys {', '.join(KEYS)}, got {' and '.join(kinds) or 'none'}")
-    if strange := sorted(set(content) - {kinds[0], *KEYS[kinds[0]]}):
-        raise ValueError(f"a design with the key {kinds[0]} has no key {strange[0]}")
-    return kinds[0]
-
-
 def _number(value: Any) -> Any:
-    """Return the value or the interval, but for numbers that YAML takes for text, such as 1e3."""
+    """Return a value or an interval, with numbers that YAML reads as text, such as 1e3, as numbers."""
     if isinstance(value, list) and len(value) == 2 and not any(isinstance(end, list) for end in value):
         return [_number(end) for end in value]
     try:

@@ -80,11 +80,7 @@ def labels_of(field: Tensor | np.ndarray, grid: Grid, epsilon: float, which: Col
     A periodic grid's box repeats: distances, curvatures, radii, pieces and lines go on across its faces, and the Betti
     numbers are those on the torus. Of a crop (replicate) nothing is known beyond: a tube that is cut ends there.
 
-    Raises
-    ------
-    ValueError
-        If the field is not a finite volume of the grid's shape or does not cross 0, ε is not positive, or a name is
-        unknown.
+    Raises ValueError where the field is not a finite volume of the grid's shape that crosses 0, or a name is unknown.
     """
     wanted = {which} if isinstance(which, str) else set(which)
     if unknown := sorted(wanted - set(NAMES)):

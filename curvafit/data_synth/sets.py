@@ -106,12 +106,8 @@ def build_set(
     folder
         Of the set; a new or an empty one, or a set of the same specification to go on with.
 
-    Raises
-    ------
-    ValueError
-        If `count` is not positive, or the folder holds something else or a set of another spec.
-    OSError
-        If the folder can't be written, or the workers are gone. The cases that were made are kept.
+    Raises ValueError where the folder holds something else or a set of another spec; OSError where it can't be written
+    or the workers are gone. Finished cases are kept.
     """
     count = check_int(count, "a count of at least 1 case", 1, MOST)
     folder = Path(folder)
@@ -172,7 +168,7 @@ def case_name(index: int) -> str:
 
 
 def check_set(folder: Path, spec: SetSpec) -> None:
-    """Raise ValueError where a folder holds other things than a set of this spec: it may be new, or empty."""
+    """Raise ValueError unless a folder is new, empty, or holds a set of this spec."""
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder} is a file: name a folder for the set")
     if not (folder / HEADER).exists():
@@ -187,7 +183,7 @@ def check_set(folder: Path, spec: SetSpec) -> None:
 
 @contextmanager
 def _begin(folder: Path, spec: SetSpec) -> Iterator[None]:
-    """Begin a set; where the first case can't be made, remove what was begun."""
+    """Write the header of a new set; remove what was written if its first case can't be made."""
     new = [place for place in (folder, *folder.absolute().parents) if not place.exists()]
     check_set(folder, spec)
     anew = not (folder / HEADER).exists()
@@ -239,7 +235,7 @@ def _list(folder: Path, spec: SetSpec) -> None:
 
 
 def _write_case(folder: Path, spec: SetSpec, index: int, case: Case) -> None:
-    """Write labels, image and record of a case, in this spec, all or none; with its record a case is complete."""
+    """Write labels and image of a case, then its record, which completes it; a case that fails leaves no file."""
     layout, name = LAYOUTS[spec.layout], case_name(index)
     record = folder / RECORDS / f"{name}.json"
     if record.exists():
@@ -261,7 +257,7 @@ def _write_case(folder: Path, spec: SetSpec, index: int, case: Case) -> None:
 
 
 def _write_parts(folder: Path, spec: SetSpec, name: str, case: Case, places: list[Path]) -> dict[str, Any]:
-    """Write the labels besides the mask, append their files to `places`, and return those that are no volumes."""
+    """Write the labels besides the mask, appending their files to `places`; return the labels for the record."""
     if not spec.parts:
         return {}
     grid, known = Grid(case.image.shape, case.spacing, "replicate"), {}  # type: ignore[arg-type]
@@ -331,7 +327,7 @@ def write_preview(folder: str | Path) -> Path:
 
 
 def _read_caption(path: Path) -> tuple[str, tuple[float, float]]:
-    """Return what the picture takes from a case's record: its source's name, and its voxels' edges (y, x)."""
+    """Return the name of a case's source and the edges (y, x) of its voxels, from its record."""
     try:
         record = parse_json(path.read_bytes(), "a case's record", path)
         _, height, width = map(float, record["imaging"]["spacing"])

@@ -1,4 +1,4 @@
-"""Where the shapes of a training set come from: laws, by which shapes are grown, or stores, of which they are crops."""
+"""Sources of shapes for training sets: grown from laws, or cropped from stores."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -47,23 +47,6 @@ class PhaseField(NamedTuple):
     values: np.ndarray
     epsilon: float
     origin: dict[str, Any]
-
-
-class ShapeSource(Protocol):
-    """An endless source of shapes, each decided by the random numbers that it is given."""
-
-    @property
-    def within(self) -> float:
-        """Return the most voxels that a shape can have along an edge."""
-        ...
-
-    def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> PhaseField:
-        """Return shape number `index` of so many voxels (z, y, x)."""
-        ...
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the source in JSON's types, for a set's record; `source_of` reads it."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -149,6 +132,7 @@ class Generated:
         return Generated(points, tuple(names), fraction=fraction)
 
     def as_dict(self) -> dict[str, Any]:
+        """Return the source in JSON's types, for a set's record; `source_of` reads it."""
         return {
             "kind": "generated",
             "names": list(self.names),
@@ -196,6 +180,7 @@ class Stored:
         return PhaseField(field, settings.epsilon / settings.spacing[0], origin)
 
     def as_dict(self) -> dict[str, Any]:
+        """Return the source in JSON's types, for a set's record; `source_of` reads it."""
         return {
             "kind": "stored",
             "paths": [str(path) for path in self.paths],
@@ -249,8 +234,12 @@ class Pool:
         return PhaseField(values, whole.epsilon, whole.origin | move)
 
 
+#: Endless shapes for a set: `shape(voxels, index, rng)` depends on its arguments alone; `within` bounds their edges.
+ShapeSource = Generated | Stored
+
+
 def source_of(content: dict[str, Any]) -> ShapeSource:
-    """Return the source that `ShapeSource.as_dict` wrote."""
+    """Return the source that its `as_dict` wrote."""
     if content["kind"] == "stored":
         return Stored(tuple(map(Path, content["paths"])), content["draws"], content["rotate"])
     points, plan = tuple(map(tuple, content["points"])), Schedule(**content["schedule"])

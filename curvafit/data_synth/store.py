@@ -32,7 +32,7 @@ import numpy as np
 import zarr
 from zarr.codecs import BloscCodec, Crc32cCodec
 
-from curvafit.core.checks import quoted
+from curvafit.core.checks import SEEDS, check_float, check_int, quoted
 from curvafit.core.files import temporary_folder, write_content
 from curvafit.core.records import parse_json
 from curvafit.core.runtime import hold_signals
@@ -126,7 +126,7 @@ class Store:
         try:
             return _decode(attributes)
         except (KeyError, TypeError, AttributeError, ValueError) as error:
-            raise self._damaged("record", index, error) from error
+            raise self._damage("record", index, error) from error
 
     def viable(self, index: int) -> bool:
         """Return whether a draw is recorded as a shape; KeyError where the draw is missing."""
@@ -143,7 +143,7 @@ class Store:
                 raise ValueError(f"{array.dtype} of shape {array.shape}")
             return np.asarray(array[...])
         except Exception as error:  # zarr and its codecs have many ways to say that a field is damaged
-            raise self._damaged("field", index, error) from error
+            raise self._damage("field", index, error) from error
 
     def intact(self, index: int) -> bool:
         """Return whether a draw's record and field have the checksum that was written; KeyError where it is missing."""
@@ -155,7 +155,7 @@ class Store:
         return _digest(attributes, field) == attributes["sha256"]
 
     def write(self, record: Record, field: np.ndarray | None) -> bool:
-        """Add a draw, whole or not at all; False where it was there already (nothing is then changed).
+        """Add a draw, whole or not at all; return False, and change nothing, where it was there already.
 
         Parameters
         ----------
@@ -179,7 +179,7 @@ class Store:
             shutil.rmtree(place)  # what is there is torn
             return _publish(partial / place.name, place)
 
-    def _damaged(self, part: str, index: int, error: Exception) -> ValueError:
+    def _damage(self, part: str, index: int, error: Exception) -> ValueError:
         return ValueError(
             f"the {part} of draw {index} in {self.path} is damaged ({quoted(str(error))}): "
             "`curvafit atlas verify` lists such draws"
@@ -214,12 +214,8 @@ class Store:
 def open_store(path: str | Path, settings: Settings | None = None) -> Store:
     """Open a store; with `settings`, create it where there is none.
 
-    Raises
-    ------
-    FileNotFoundError
-        If there is nothing at `path` and no settings were given.
-    ValueError
-        If `path` holds something else, a store of another format version, or a store made with other settings.
+    Raises FileNotFoundError where there is none and no settings were given; ValueError where `path` holds something
+    else, or a store of another version or of other settings.
     """
     path = Path(path)
     if not path.exists() or (settings is not None and path.is_dir() and not any(path.iterdir())):
@@ -252,7 +248,7 @@ def _decode_settings(attributes: dict[str, Any]) -> Settings:
 
 
 def _difference(stored: Settings, wanted: Settings) -> str:
-    """Return the first setting that differs, with both values; the name of a schedule is none of the draws'."""
+    """Return the first setting that differs, with both values. A schedule's name does not matter: draws ignore it."""
     for name, value in vars(stored).items():
         other = getattr(wanted, name)
         if name == "schedule":
@@ -279,7 +275,7 @@ def _create(path: Path, settings: Settings) -> None:
 @hold_signals()  # Zarr writes in threads of its own, which would go on beside what cleans up
 def _write_draw(folder: Path, record: Record, field: np.ndarray | None) -> None:
     attributes = dataclasses.asdict(record) | {"coefficients": record.coefficients.as_dict()}
-    attributes = _without_nan(attributes | {"viability": _without_nan(attributes["viability"])})
+    attributes = _to_json(attributes | {"viability": _to_json(attributes["viability"])})
     zarr.create_group(store=str(folder), attributes=attributes | {"sha256": _digest(attributes, field)})
     if field is None:
         return
@@ -327,33 +323,27 @@ def _digest(attributes: dict[str, Any], field: np.ndarray | None) -> str:
     return checksum.hexdigest()
 
 
-def _without_nan(values: dict[str, Any]) -> dict[str, Any]:
-    """Return values in JSON's types: plain numbers, and null for those that are not finite."""
+def _to_json(values: dict[str, Any]) -> dict[str, Any]:
+    """Return values as JSON holds them: NumPy's numbers as Python's, and None for NaN and infinity."""
     plain = {name: value.item() if isinstance(value, np.generic) else value for name, value in values.items()}
     return {name: None if isinstance(v, float) and not math.isfinite(v) else v for name, v in plain.items()}
 
 
 def _decode(attributes: dict[str, Any]) -> Record:
-    """Return the record in a draw's attributes; further attributes are left out."""
+    """Return the record in a draw's attributes."""
     viability = {field.name: attributes["viability"][field.name] for field in dataclasses.fields(Viability)}
-    numbers = {name: value for name, value in viability.items() if name not in ("viable", "reason")}
+    figures = {name: _number(value) for name, value in viability.items() if name not in ("viable", "reason")}
+    counts = {name: check_int(attributes[name], name, 0, SEEDS - 1) for name in ("index", "seed", "steps")}
     return Record(
-        **{name: _count(attributes[name]) for name in ("index", "seed", "steps")},
+        **counts,
         **{name: _number(attributes[name]) for name in ("mass", "energy", "seconds")},
         coefficients=Coefficients(*(_number(attributes["coefficients"][name]) for name in NAMES)),
-        viability=Viability(**viability | {name: _number(value) for name, value in numbers.items()}),
+        viability=Viability(**viability | figures),
         status=str(attributes["status"]),
         versions=dict(attributes["versions"]),
     )
 
 
 def _number(value: Any) -> Any:
-    if value is not None and (isinstance(value, bool) or not isinstance(value, (int, float))):
-        raise ValueError(f"{quoted(value)} is no number")
-    return math.nan if value is None else value
-
-
-def _count(value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**63:
-        raise ValueError(f"{quoted(value)} is no whole number from 0")
-    return value
+    """Return a number of a record; null is NaN."""
+    return math.nan if value is None else check_float(value, "a number")

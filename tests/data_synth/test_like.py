@@ -12,7 +12,7 @@ from exact import Cylinder, centres
 
 from curvafit.data_synth.imaging.effects import EPSILON
 from curvafit.data_synth.imaging.image import image, regrid
-from curvafit.data_synth.imaging.like import like
+from curvafit.data_synth.imaging.like import fit_modality
 from curvafit.data_synth.imaging.modality import Contrast, Detector, Imaging, Noise, Optics
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
@@ -74,7 +74,7 @@ def test_parameters_are_found_again(shape: torch.Tensor, name: str, masked: bool
     """With the mask, blur and levels to a tenth; without it they carry the error of the mask's edges."""
     how = CASES[name]
     scan, mask = scan_of(shape, how)
-    found = like(scan, mask if masked else None)
+    found = fit_modality(scan, mask if masked else None)
     b, close = found.base, 0.12 if masked else 0.25
     assert (b.unit, b.spacing, found.voxel) == ("um", how.spacing, 1.0)
     assert b.optics.blur == pytest.approx(how.optics.blur, rel=close)
@@ -91,7 +91,7 @@ def test_noise_is_found_again(shape: torch.Tensor) -> None:
     """The line of variance over mean: its slope, and its height at the background."""
     for how in (PHOTONS, SLICES, TEXTURED):
         scan, mask = scan_of(shape, how)
-        b = like(scan, mask).base
+        b = fit_modality(scan, mask).base
         assert (b.detector.gain > 0) == (how.detector.gain > 0)
         assert b.detector.gain == pytest.approx(how.detector.gain, rel=0.1)
         height = b.detector.gain**2 * b.contrast.background + b.noise.gaussian**2
@@ -99,12 +99,12 @@ def test_noise_is_found_again(shape: torch.Tensor) -> None:
 
 
 def test_textures_are_found_again(shape: torch.Tensor) -> None:
-    b = like(*scan_of(shape, TEXTURED)).base
+    b = fit_modality(*scan_of(shape, TEXTURED)).base
     assert b.contrast.background_texture == pytest.approx(0.15, rel=0.3)
     assert b.contrast.background_length == pytest.approx(5, rel=0.35)
     assert b.contrast.foreground_texture == pytest.approx(0.2, rel=0.6)
     assert b.contrast.foreground_length == pytest.approx(8, rel=0.6)
-    plain = like(*scan_of(shape, PHOTONS)).base
+    plain = fit_modality(*scan_of(shape, PHOTONS)).base
     assert plain.contrast.background_texture < 0.08 and plain.contrast.foreground_texture < 0.1
 
 
@@ -112,21 +112,21 @@ def test_dark_structures_by_their_mask(shape: torch.Tensor) -> None:
     how = Imaging(
         contrast=Contrast(background=150, foreground=60), optics=Optics(blur=(1.0, 1.0, 1.0)), noise=Noise(gaussian=5)
     )
-    b = like(*scan_of(shape, how)).base
+    b = fit_modality(*scan_of(shape, how)).base
     assert b.contrast.foreground == pytest.approx(60, rel=0.1) and b.contrast.background == pytest.approx(150, rel=0.05)
 
 
 def test_the_same_scan_in_nanometres(shape: torch.Tensor) -> None:
     scan, mask = scan_of(shape, SLICES)
-    one = like(scan, mask).base
-    other = like(Field(scan.values, (2000.0, 1000.0, 1000.0), "nm"), mask).base
+    one = fit_modality(scan, mask).base
+    other = fit_modality(Field(scan.values, (2000.0, 1000.0, 1000.0), "nm"), mask).base
     assert other.optics.blur == pytest.approx(tuple(1000 * width for width in one.optics.blur))
     assert other.noise.gaussian == pytest.approx(one.noise.gaussian)
 
 
 def test_integers_saturate_where_their_type_ends(shape: torch.Tensor) -> None:
     scan, mask = scan_of(shape, PHOTONS)
-    found = like(Field(scan.values.astype(np.uint16), scan.spacing, "um"), mask)
+    found = fit_modality(Field(scan.values.astype(np.uint16), scan.spacing, "um"), mask)
     assert found.base.detector.ceiling == 65535
     low, high = found.ranges["detector.gain"]
     assert low < found.base.detector.gain < high and found.draw(1) != found.draw(2)
@@ -137,7 +137,7 @@ def test_odd_scans(shape: torch.Tensor) -> None:
     mask = regrid(shape, 1.0, [Imaging()])[0, 0].numpy() > 0
     rng = np.random.default_rng(0)
     signed = np.where(mask, 500, -500) + rng.normal(0, 40, mask.shape)
-    low = like(Field(signed.astype(np.int16), (1.0, 1.0, 1.0), "um"), mask)
+    low = fit_modality(Field(signed.astype(np.int16), (1.0, 1.0, 1.0), "um"), mask)
     assert low.base.detector.ceiling is None
     assert image(shape, 1.0, [low.base], [0]).amin() < -300
     for values in (
@@ -145,9 +145,9 @@ def test_odd_scans(shape: torch.Tensor) -> None:
         rng.poisson(0.02 + 3.0 * mask),
         rng.normal(0, 10, mask.shape) + 100 * mask,
     ):
-        found = like(Field(values.astype(np.float32), (1.0, 1.0, 1.0), "um"), mask)
+        found = fit_modality(Field(values.astype(np.float32), (1.0, 1.0, 1.0), "um"), mask)
         assert 0 <= found.base.illumination.bias <= 0.9 and np.isfinite(found.base.detector.gain)
-    small = like(Field(signed[:40, :14, :40].astype(np.float32), (1.0, 1.0, 1.0), "um"), mask[:40, :14, :40])
+    small = fit_modality(Field(signed[:40, :14, :40].astype(np.float32), (1.0, 1.0, 1.0), "um"), mask[:40, :14, :40])
     assert small.base.contrast.foreground > small.base.contrast.background
 
 
@@ -155,18 +155,18 @@ def test_lost_stain_does_not_decide_the_texture(shape: torch.Tensor) -> None:
     scan, mask = scan_of(shape, TEXTURED)
     lost = np.random.default_rng(0).random(mask.shape) < 0.03
     scan.values[mask & lost] = scan.values[~mask].mean()
-    assert like(scan, mask).base.contrast.foreground_texture < 0.5
+    assert fit_modality(scan, mask).base.contrast.foreground_texture < 0.5
 
 
 def test_bad_scans_are_told() -> None:
     values = np.random.default_rng(0).normal(size=(12, 12, 12)).astype(np.float32)
     field = Field(values, (1.0, 1.0, 1.0), "um")
     for call, word in (
-        (lambda: like(Field(values[:4])), "8 voxels"),
-        (lambda: like(Field(np.zeros((9, 9, 9)))), "finite"),
-        (lambda: like(Field(values * np.nan)), "finite"),
-        (lambda: like(field, np.ones((3, 3, 3), bool)), "shape"),
-        (lambda: like(field, np.ones(values.shape, bool)), "mask"),
+        (lambda: fit_modality(Field(values[:4])), "8 voxels"),
+        (lambda: fit_modality(Field(np.zeros((9, 9, 9)))), "finite"),
+        (lambda: fit_modality(Field(values * np.nan)), "finite"),
+        (lambda: fit_modality(field, np.ones((3, 3, 3), bool)), "shape"),
+        (lambda: fit_modality(field, np.ones(values.shape, bool)), "mask"),
     ):
         with pytest.raises(ValueError, match=word):
             call()
@@ -176,7 +176,7 @@ def test_a_real_bone(data: Path) -> None:
     """Two classes of grey; the noise as a difference of neighbours sees it; edges of one to two voxels."""
     scan = load(data / "scans" / "lhdl_trabecular_200.tif", spacing=19.5, unit="um")
     cut = Field(scan.values[50:130, 50:130, 50:130], scan.spacing, "um")
-    b = like(cut).base
+    b = fit_modality(cut).base
     assert 10 < b.contrast.background * (b.detector.gain or 1) + b.detector.offset < 40
     assert 120 < b.contrast.foreground * (b.detector.gain or 1) + b.detector.offset < 220
     assert 15 < b.optics.blur[1] < 45 and 0.5 < b.noise.width[1] < 1.1

@@ -16,15 +16,15 @@ import torch
 from torch import Tensor
 
 from curvafit.data_synth.imaging.maths import (
-    along,
+    apply_matrices,
     as_spacing,
     as_triple,
     bell,
     check_volume,
     correlated_field,
-    gaussian,
+    gaussian_matrix,
     grainy_noise,
-    sampling,
+    sampling_matrix,
     seeds_of,
     stream,
     uniform,
@@ -85,7 +85,9 @@ def blur(
     """Return the image under a Gaussian point-spread function of standard deviations `widths` along (z, y, x)."""
     check_volume(image, "an image")
     steps, σ = as_spacing(spacing), as_triple(widths, "a blur")
-    return along(image, *(gaussian(n, s / h, image) for n, s, h in zip(image.shape[2:], σ, steps, strict=True)))
+    return apply_matrices(
+        image, *(gaussian_matrix(n, s / h, image) for n, s, h in zip(image.shape[2:], σ, steps, strict=True))
+    )
 
 
 def blur_with_depth(
@@ -111,8 +113,8 @@ def blur_with_depth(
     wider = 1 + growth * depth[:, None]
     z, y, x = (s / h * wider if s else None for s, h in zip(σ, steps, strict=True))
     lateral = ((n, 0.0 if w is None else w[..., None]) for n, w in zip(image.shape[3:], (y, x), strict=True))
-    axial = gaussian(image.shape[2], 0.0 if z is None else z, image)
-    blurred = along(image, axial, *(gaussian(n, width, image) for n, width in lateral))
+    axial = gaussian_matrix(image.shape[2], 0.0 if z is None else z, image)
+    blurred = apply_matrices(image, axial, *(gaussian_matrix(n, width, image) for n, width in lateral))
     return blurred * torch.exp(-attenuation * depth)[:, None, None]
 
 
@@ -129,7 +131,7 @@ def sample(
     check_volume(image, "an image")
     old, new, wide = as_spacing(spacing), as_spacing(onto), as_triple(window, "a window")
     every = zip(image.shape[2:], old, new, wide, strict=True)
-    return along(image, *(sampling(n, h, to, over, image) for n, h, to, over in every))
+    return apply_matrices(image, *(sampling_matrix(n, h, to, over, image) for n, h, to, over in every))
 
 
 # ---- specimen, light and detector ------------------------------------------------------------------------------------

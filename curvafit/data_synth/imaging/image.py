@@ -9,7 +9,7 @@ import torch
 
 from curvafit.data_synth.imaging import effects
 from curvafit.data_synth.imaging.effects import EPSILON
-from curvafit.data_synth.imaging.maths import Triple, count_samples, seeds_of
+from curvafit.data_synth.imaging.maths import Triple, seeds_of
 from curvafit.data_synth.imaging.modality import Imaging
 from curvafit.priors.grid import Bool, Float
 
@@ -71,12 +71,6 @@ def visible_share(imaging: Imaging) -> float:
 def field_shape(shape: Sequence[int], spacing: float, imaging: Imaging) -> tuple[int, int, int]:
     """Return the least voxels (z, y, x) of edge `spacing` that an image of a shape is made from."""
     z, y, x = (math.ceil(n * h / spacing - 1e-6) for n, h in zip(shape, imaging.spacing, strict=True))
-    return z, y, x
-
-
-def image_shape(shape: Sequence[int], spacing: float, imaging: Imaging) -> tuple[int, int, int]:
-    """Return voxels (z, y, x) of the image of a field of `shape`."""
-    z, y, x = (count_samples(n, spacing, h) for n, h in zip(shape, imaging.spacing, strict=True))
     return z, y, x
 
 

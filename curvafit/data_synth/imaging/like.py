@@ -1,4 +1,4 @@
-"""What a real scan tells of how it was made: noise, blur, levels, textures; as a modality to draw images from."""
+"""A modality estimated from a real scan: its noise, blur, levels and textures."""
 
 from __future__ import annotations
 
@@ -51,10 +51,9 @@ RESIDUAL = np.outer((1, -2, 1), (1, -2, 1)).astype(np.float32)[None]
 
 
 class Structure(NamedTuple):
-    """What the surroundings of the mask tell.
+    """The structure of a scan: its blur in lengths (z, y, x) and its mean contrast.
 
-    The blur in lengths (z, y, x); the mean contrast, its relative deviation, and the length, in voxels of the finest
-    edge, by which it is correlated.
+    `texture` is the contrast's relative deviation, `length` its correlation length in voxels of the finest edge.
     """
 
     blur: tuple[float, float, float]
@@ -63,7 +62,7 @@ class Structure(NamedTuple):
     length: float
 
 
-def like(scan: Field, mask: np.ndarray | None = None) -> Modality:
+def fit_modality(scan: Field, mask: np.ndarray | None = None) -> Modality:
     """Return a modality whose images look like a scan: its spacing, levels, textures, blur, noise and uneven light.
 
     Assumed: two classes; a Gaussian blur, one width in the plane and one along z; noise whose variance is a line over
@@ -85,13 +84,13 @@ def like(scan: Field, mask: np.ndarray | None = None) -> Modality:
     """
     values, given = _crop_middle(scan, mask)
     steps = np.array(scan.spacing)
-    inside = bright(values, steps) if given is None else given
+    inside = find_bright(values, steps) if given is None else given
     if not inside.any() or inside.all():
         raise ValueError("the mask must have voxels inside and outside, got an empty or a full one")
     ground = measure_background(values, inside, steps)
     structure = _measure_structure(values, inside, steps, ground.level)
     noise = measure_noise(values, inside, ground, steps, ground.level + structure.contrast)
-    base = _imaging(scan, structure, noise)
+    base = _to_imaging(scan, structure, noise)
     ranges = {name: _spread(base[name], *ends) for name, ends in SPREAD.items() if np.any(base[name])}
     if bias := ranges.get("illumination.bias"):
         ranges["illumination.bias"] = bias[0], min(bias[1], 1.0)
@@ -99,7 +98,7 @@ def like(scan: Field, mask: np.ndarray | None = None) -> Modality:
     return Modality("like", about, float(min(scan.spacing)), base, ranges)
 
 
-def _imaging(scan: Field, structure: Structure, noise: NoiseEstimate) -> Imaging:
+def _to_imaging(scan: Field, structure: Structure, noise: NoiseEstimate) -> Imaging:
     """Return the parameters of an image.
 
     Levels are in photons where the variance grows with the mean; textures are those before the blur.
@@ -150,11 +149,11 @@ def _crop_middle(scan: Field, mask: np.ndarray | None) -> tuple[np.ndarray, np.n
     return values, None if mask is None else np.asarray(mask)[box].astype(bool)
 
 
-def bright(values: np.ndarray, steps: np.ndarray | Sequence[float]) -> np.ndarray:
-    """Return a guess at the structure's voxels in grey values (Z, Y, X) on voxels of edges `steps`.
+def find_bright(values: np.ndarray, steps: np.ndarray | Sequence[float]) -> np.ndarray:
+    """Guess the structure's voxels in grey values (Z, Y, X) on voxels of edges `steps`.
 
-    Those above half of the brightness of Otsu's voxels around them, each weighed by its own: an edge is then where it
-    is whatever a structure's brightness. The threshold is sought on square roots, so that dim structures count.
+    They are brighter than half of what Otsu's bright voxels around them are on average, weighted by brightness: so an
+    edge has one place however bright the structure is. Otsu's threshold is that of square roots, for dim structures.
     """
     steps = np.asarray(steps, dtype=float)
     finest = steps.min() / steps
@@ -359,7 +358,7 @@ def _bins(
 
 
 def _variance(residual: np.ndarray) -> float:
-    """Return the mean and the deviation of what lies within four deviations, by the median's."""
+    """Return the mean square of a residual without its outliers: beyond four deviations, as the median tells them."""
     square = np.square(residual)
     near = square < 16 * np.median(square) / 0.455
     return float(square[near].mean() if near.any() else square.mean())

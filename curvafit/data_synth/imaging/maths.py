@@ -24,7 +24,7 @@ Triple = tuple[float, float, float]
 CUT = 16.0
 
 
-def along(
+def apply_matrices(
     volume: Float[Tensor, "b 1 z y x"], z: Tensor | None = None, y: Tensor | None = None, x: Tensor | None = None
 ) -> Float[Tensor, "b 1 Z Y X"]:
     """Apply a matrix (out, in) to each axis, `None` where it stays; that of y or x may be one a slice, (Z, out, in)."""
@@ -37,7 +37,7 @@ def along(
     return volume
 
 
-def gaussian(count: int, width: float | Tensor, like: Tensor) -> Tensor | None:
+def gaussian_matrix(count: int, width: float | Tensor, like: Tensor) -> Tensor | None:
     """Return the matrix (count, count) of a blur by a Gaussian of deviation `width` voxels, cut at four; `None` for
     width 0.
 
@@ -59,7 +59,7 @@ def bell(far: Tensor) -> Tensor:
     return torch.exp(-0.5 * square).masked_fill_(square == CUT, 0)
 
 
-def sampling(count: int, spacing: float, onto: float, window: float, like: Tensor) -> Tensor | None:
+def sampling_matrix(count: int, spacing: float, onto: float, window: float, like: Tensor) -> Tensor | None:
     """Return the matrix that samples voxels of edge `spacing` at voxels of edge `onto`, each the mean over a `window`.
 
     The corners of both grids' first voxels coincide. A window narrower than a voxel is as wide as one: the means are
@@ -93,7 +93,7 @@ def check_volume(volume: Tensor, name: str = "a volume") -> Tensor:
 
 
 def as_triple(value: float | Sequence[float], name: str) -> Triple:
-    """Return three numbers (z, y, x) from 0, or one for all."""
+    """Return three numbers (z, y, x) from 0; one number counts for all."""
     numbers = (value,) * 3 if isinstance(value, (int, float)) else tuple(value)
     if len(numbers) != 3 or not all(math.isfinite(h) and h >= 0 for h in numbers):
         raise ValueError(f"{name} must be 3 numbers (z, y, x) from 0, got {value!r}")
@@ -101,7 +101,7 @@ def as_triple(value: float | Sequence[float], name: str) -> Triple:
 
 
 def as_spacing(spacing: float | Sequence[float]) -> Triple:
-    """Return a spacing: three lengths above 0, or one for all."""
+    """Return a spacing as three lengths (z, y, x) above 0; one number counts for all."""
     steps = as_triple(spacing, "a spacing")
     if not all(steps):
         raise ValueError(f"the spacing must be 3 positive numbers (z, y, x), got {spacing!r}")
@@ -117,9 +117,13 @@ def stream(seed: int, purpose: str, device: torch.device | str = "cpu") -> torch
     return torch.Generator(device).manual_seed(int(words.generate_state(1)[0]))
 
 
-def white_noise(like: Float[Tensor, "b 1 z y x"], seeds: Sequence[int], purpose: str) -> Float[Tensor, "b 1 z y x"]:
-    """Return independent standard normal numbers."""
-    return _standard_normal(tuple(like.shape[2:]), like, seeds, purpose)
+def white_noise(shape: tuple[int, ...], like: Tensor, seeds: Sequence[int], purpose: str) -> Tensor:
+    """Return independent standard normal numbers (batch, 1, *shape), of the type and on the device of `like`."""
+    drawn = [
+        torch.randn((1, *shape), generator=stream(seed, purpose, like.device), device=like.device, dtype=like.dtype)
+        for seed in seeds_of(seeds, len(like))
+    ]
+    return torch.stack(drawn)
 
 
 def correlated_field(
@@ -137,20 +141,21 @@ def correlated_field(
         Along (z, y, x), in voxels. Under half a voxel there is no correlation left; infinity means constant.
     """
     shape = like.shape[2:]
-    maps = [_interpolation(n, length, like) for n, length in zip(shape, lengths, strict=True)]
+    maps = [_interpolate_nodes(n, length, like) for n, length in zip(shape, lengths, strict=True)]
     nodes = tuple(n if weights is None else weights.shape[-1] for n, weights in zip(shape, maps, strict=True))
-    return along(_standard_normal(nodes, like, seeds, purpose), *maps)
+    return apply_matrices(white_noise(nodes, like, seeds, purpose), *maps)
 
 
 def grainy_noise(
     like: Float[Tensor, "b 1 z y x"], widths: Sequence[float], seeds: Sequence[int], purpose: str
 ) -> Float[Tensor, "b 1 z y x"]:
     """Return standard normal noise, smoothed by a Gaussian of deviations `widths` voxels: correlated by √2 widths."""
+    noise = white_noise(tuple(like.shape[2:]), like, seeds, purpose)
     if not any(widths):
-        return white_noise(like, seeds, purpose)
-    maps = [gaussian(n, width, like) for n, width in zip(like.shape[2:], widths, strict=True)]
+        return noise
+    maps = [gaussian_matrix(n, width, like) for n, width in zip(like.shape[2:], widths, strict=True)]
     units = [None if weights is None else weights / weights.square().sum(-1, keepdim=True).sqrt() for weights in maps]
-    return along(white_noise(like, seeds, purpose), *units)
+    return apply_matrices(noise, *units)
 
 
 def uniform(count: int, seed: int, purpose: str, like: Tensor) -> Tensor:
@@ -167,16 +172,7 @@ def seeds_of(seeds: Sequence[int], count: int) -> list[int]:
     return [int(seed) for seed in seeds]
 
 
-def _standard_normal(shape: tuple[int, ...], like: Tensor, seeds: Sequence[int], purpose: str) -> Tensor:
-    """Return standard normal noise (batch, 1, *shape), a stream of its own for each seed and purpose."""
-    drawn = [
-        torch.randn((1, *shape), generator=stream(seed, purpose, like.device), device=like.device, dtype=like.dtype)
-        for seed in seeds_of(seeds, len(like))
-    ]
-    return torch.stack(drawn)
-
-
-def _interpolation(count: int, length: float, like: Tensor) -> Tensor | None:
+def _interpolate_nodes(count: int, length: float, like: Tensor) -> Tensor | None:
     """Return the weights (count, nodes) that interpolate random nodes.
 
     Nodes are a deviation apart, at least a voxel, and go four deviations beyond the box.

@@ -15,6 +15,7 @@ import numpy as np
 import yaml
 
 from curvafit.core.checks import LONGEST, SHORTEST, check_float, quoted, simplify_name
+from curvafit.core.schema import encode
 from curvafit.core.units import METRES
 from curvafit.data_synth.imaging.maths import Triple, seeds_of
 
@@ -35,7 +36,7 @@ PARTIAL = Range("a share below 1", 0.0, math.nextafter(1.0, 0.0))
 
 
 class Checked:
-    """Parameters that are turned into floats, or refused, when they are given: those whose annotation has a `Range`."""
+    """A dataclass whose parameters with a `Range` in their annotation must lie in it, and become floats."""
 
     def __post_init__(self) -> None:
         for name, (kind, allowed) in _ranges(type(self)).items():
@@ -44,7 +45,7 @@ class Checked:
 
 @cache
 def _ranges(part: type) -> dict[str, tuple[Any, Range]]:
-    """Return the kind and the range of each parameter of a part."""
+    """Return the type and the range of each parameter of a class."""
     hints = {name: get_args(hint) for name, hint in get_type_hints(part, include_extras=True).items()}
     return {name: (hint[0], hint[1]) for name, hint in hints.items() if len(hint) == 2 and isinstance(hint[1], Range)}
 
@@ -197,10 +198,7 @@ class Imaging(Checked):
         What masks hold: voxels that this share of a structure's light reaches, as an annotator sees them, or, at 0, the
         structure itself.
 
-    Raises
-    ------
-    ValueError
-        If a number is out of range or the unit has no known name.
+    Raises ValueError where a number is out of range or the unit is unknown.
     """
 
     unit: str = "um"
@@ -240,7 +238,7 @@ class Imaging(Checked):
 
     def as_dict(self) -> dict[str, Any]:
         """Return all parameters in JSON's types, each part an object of its own."""
-        return _in_lists(asdict(self))
+        return encode(self)
 
     @staticmethod
     def from_dict(content: Mapping[str, Any]) -> Imaging:
@@ -255,12 +253,6 @@ def _leaves(content: Mapping[str, Any], part: str = "") -> Iterator[tuple[str, A
             yield from _leaves(value, f"{part}{name}.")
         else:
             yield f"{part}{name}", value
-
-
-def _in_lists(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _in_lists(part) for name, part in value.items()}
-    return list(value) if isinstance(value, tuple) else value
 
 
 #: The names of all parameters, those of a part as `optics.blur`.
@@ -283,10 +275,7 @@ class Modality:
         By the name of a parameter, as `optics.blur`: low and high, numbers or three of them that move together. Drawn
         evenly in the logarithm where both ends are above zero, else evenly.
 
-    Raises
-    ------
-    ValueError
-        If a range has no known name or its ends no place in an `Imaging`, or the voxel is not positive.
+    Raises ValueError where a range has no known name or an end that an `Imaging` refuses.
     """
 
     name: str
@@ -306,7 +295,7 @@ class Modality:
         object.__setattr__(self, "ranges", ranges)
 
     def draw(self, seed: int) -> Imaging:
-        """Return one image's parameters; the seed and a parameter's name alone decide what is drawn for it."""
+        """Draw one image's parameters; what is drawn for a parameter depends on the seed and its name alone."""
         (seed,) = seeds_of([seed], 1)
         drawn = {}
         for name, (low, high) in self.ranges.items():
@@ -317,9 +306,7 @@ class Modality:
 
     def as_dict(self) -> dict[str, Any]:
         """Return all of the modality in JSON's types."""
-        ends = {name: [np.asarray(end).tolist() for end in pair] for name, pair in self.ranges.items()}
-        head = {"name": self.name, "about": self.about, "voxel": self.voxel}
-        return head | {"base": self.base.as_dict(), "ranges": ends}
+        return encode(self)
 
     @staticmethod
     def from_dict(content: Mapping[str, Any]) -> Modality:
@@ -329,6 +316,7 @@ class Modality:
 
 
 def _interpolate(low: Any, high: Any, share: float) -> Any:
+    """Return the value that lies a share into a range, in the logarithm where both ends are above 0."""
     a, b = np.asarray(low, dtype=float), np.asarray(high, dtype=float)
     positive = bool(np.all(a > 0) and np.all(b > 0))
     value = np.exp(np.log(a) + share * (np.log(b) - np.log(a))) if positive else a + share * (b - a)
@@ -345,7 +333,7 @@ MODALITIES = _load_modalities()
 
 
 def modality(name: str) -> Modality:
-    """Return the preset of a name; capitals, spaces and underscores do not count: `two-photon` is `Two_Photon`."""
+    """Return the preset of a name; capitals, spaces and underscores do not matter: `Two_Photon` is `two-photon`."""
     plain = simplify_name(str(name))
     if plain not in MODALITIES:
         raise ValueError(f"a modality is one of {', '.join(MODALITIES)}, got {quoted(name)}")
