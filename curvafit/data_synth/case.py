@@ -83,11 +83,11 @@ class Recipe:
     def case(self, index: int) -> Case:
         """Return case number `index`, made on one thread; ValueError where no shape is seen on the image's voxels."""
         for_shape, for_imaging, for_image = np.random.SeedSequence(self.seed, spawn_key=(index,)).spawn(3)
-        imaging = self.modality.draw(_number(for_imaging))
+        imaging = self.modality.draw(_draw_number(for_imaging))
         rng = np.random.default_rng(for_shape)
         voxel = draw_voxel(self.voxel, self.calibres, rng)
         voxels = field_shape(self.shape, voxel, imaging)
-        seed = _number(for_image)
+        seed = _draw_number(for_image)
         with one_thread():
             for _ in range(TRIES):
                 phase_field = self.source.shape(voxels, index, rng)
@@ -193,5 +193,6 @@ def _to_counts(grey: np.ndarray, imaging: Imaging) -> np.ndarray:
     return grey.astype(np.uint16 if whole else np.float32)
 
 
-def _number(words: np.random.SeedSequence) -> int:
+def _draw_number(words: np.random.SeedSequence) -> int:
+    """Return a whole number below 2³², the first of a sequence."""
     return int(words.generate_state(1)[0])

@@ -88,7 +88,7 @@ class Design:
         for name, interval in zip(PARAMETERS, self.box, strict=False):
             if interval[0] > interval[1]:
                 raise ValueError(f"the interval of {name} must go from low to high, got {list(interval)}")
-        object.__setattr__(self, "log", _logarithmic(self.log, self.box))
+        object.__setattr__(self, "log", _check_log(self.log, self.box))
         for row in rows:
             if not -1 < row[-1] < 1:
                 raise ValueError(f"masses must be in (-1, 1), got {row[-1]}")
@@ -96,11 +96,11 @@ class Design:
 
     def draw(self, seed: int, index: int) -> Draw:
         """Draw parameters number `index` of a seed, both whole numbers from 0."""
-        start = int(_stream(seed, index, "start").generate_state(1)[0])
+        start = int(_seed_stream(seed, index, "start").generate_state(1)[0])
         if self.sampling == "list":
             values = self.points[index % len(self.points)]
         else:
-            values = list(map(self._value, PARAMETERS, self.box, self._shares(seed, index)))
+            values = list(map(self._place_in, PARAMETERS, self.box, self._draw_shares(seed, index)))
         return Draw(Coefficients(*map(float, values[:-1])), float(values[-1]), start)
 
     def __str__(self) -> str:
@@ -126,18 +126,18 @@ class Design:
             raise ValueError(f"a design has a law and a box or points, got {quoted(content)}")
         return Design(content["law"], box, points, content.get("log", ()))
 
-    def _value(self, name: str, interval: tuple[float, float], share: float) -> float:
-        """Return the value of a parameter that lies a share into an interval."""
+    def _place_in(self, name: str, interval: tuple[float, float], share: float) -> float:
+        """Return the value that lies a share into the interval of a parameter."""
         low, high = interval
         return low * (high / low) ** share if name in self.log else low + (high - low) * share
 
-    def _shares(self, seed: int, index: int) -> list[float]:
+    def _draw_shares(self, seed: int, index: int) -> list[float]:
         """Return how far into each interval the draw lies, 0 to 1. A fixed parameter takes no random number."""
         free = [low < high for low, high in self.box]
         if self.sampling == "random":
-            values = np.random.default_rng(_stream(seed, index, "parameters")).random(sum(free))
+            values = np.random.default_rng(_seed_stream(seed, index, "parameters")).random(sum(free))
         else:
-            engine = qmc.Sobol(sum(free), scramble=True, rng=np.random.default_rng(_stream(seed, 0, "parameters")))
+            engine = qmc.Sobol(sum(free), scramble=True, rng=np.random.default_rng(_seed_stream(seed, 0, "parameters")))
             values = (engine.fast_forward(index) if index else engine).random(1)[0]
         shares = iter(values.tolist())
         return [next(shares) if moves else 0.0 for moves in free]
@@ -151,7 +151,7 @@ def boxed(sampling: Sampling = "random", log: Sequence[str] = (), /, **intervals
     unknown = set(intervals) - set(PARAMETERS)
     if unknown:
         raise ValueError(f"parameters are {', '.join(PARAMETERS)}, got {', '.join(sorted(unknown))}")
-    asked = {name: _interval(name, value) for name, value in intervals.items()}
+    asked = {name: _to_interval(name, value) for name, value in intervals.items()}
     whole: dict[str, tuple[float, float]] = {"a20": (1.0, 1.0), **INTERVALS, **asked}
     return Design(sampling, tuple(whole[name] for name in PARAMETERS), log=log)  # type: ignore[arg-type]
 
@@ -175,7 +175,7 @@ def around(point: Sequence[float], spread: float, sampling: Sampling = "random")
     return boxed(sampling, **box)
 
 
-def _logarithmic(names: Sequence[str], box: Sequence[tuple[float, float]]) -> tuple[str, ...]:
+def _check_log(names: Sequence[str], box: Sequence[tuple[float, float]]) -> tuple[str, ...]:
     """Check the names of the parameters that a box holds in logarithms."""
     names = as_tuple(names, "names of parameters in log")
     positive = [name for name, (low, _) in zip(PARAMETERS, box, strict=False) if low > 0]
@@ -185,7 +185,7 @@ def _logarithmic(names: Sequence[str], box: Sequence[tuple[float, float]]) -> tu
     return tuple(names)
 
 
-def _interval(name: str, value: Any) -> tuple[float, float]:
+def _to_interval(name: str, value: Any) -> tuple[float, float]:
     pair = [value, value] if isinstance(value, Real) else value
     if not isinstance(pair, (list, tuple)) or len(pair) != 2 or not all(_is_number(end) for end in pair):
         raise ValueError(f"{name} must be a number or two of them, got {quoted(value)}")
@@ -197,7 +197,7 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, Real) and not isinstance(value, bool)
 
 
-def _stream(seed: int, index: int, purpose: str) -> np.random.SeedSequence:
+def _seed_stream(seed: int, index: int, purpose: str) -> np.random.SeedSequence:
     index = check_int(index, "an index that is a whole number from 0", 0, SEEDS - 1)
     return np.random.SeedSequence(check_seed(seed), spawn_key=(index, ("parameters", "start").index(purpose)))
 
@@ -218,7 +218,7 @@ def read_design(path: str | PathLike[str]) -> Design:
         # the last five are what the values of wrong tags raise
         raise ValueError(f"{path} is not YAML: {' '.join(str(error).split())[:200]}") from error
     try:
-        return _design(content, path.parent)
+        return _decode_design(content, path.parent)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 
@@ -235,7 +235,7 @@ def point_of(source: Any, folder: Path = Path()) -> tuple[float, ...]:
     return tuple(check_float(_number(source[name]), f"a number for {name}") for name in PARAMETERS)
 
 
-def _design(content: Any, folder: Path) -> Design:
+def _decode_design(content: Any, folder: Path) -> Design:
     """Return the design that a YAML file states; every key must be known."""
     kinds = [key for key in KEYS if key in content] if isinstance(content, Mapping) else []
     if len(kinds) != 1:

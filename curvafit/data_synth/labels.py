@@ -95,9 +95,9 @@ def labels_of(field: Tensor | np.ndarray, grid: Grid, epsilon: float, which: Col
         if "instances" in wanted:
             labels["instances"] = instances_of(distance, grid)
         if "radius" in wanted:
-            labels["radius"] = _radius(distance, grid)
+            labels["radius"] = _measure_radius(distance, grid)
     if wanted & {"kappa1", "kappa2"}:
-        labels["kappa1"], labels["kappa2"] = _curvatures(u, mask, grid, epsilon)
+        labels["kappa1"], labels["kappa2"] = _measure_curvatures(u, mask, grid, epsilon)
     if "betti" in wanted:
         labels["betti"] = betti_numbers(mask, periodic=grid.periodic)
     return Labels(grid, **{name: value for name, value in ({"mask": mask} | labels).items() if name in wanted})  # type: ignore[arg-type]
@@ -116,7 +116,7 @@ def instances_of(distance: np.ndarray, grid: Grid) -> np.ndarray:
     np.maximum.at(tops, basins.ravel(), distance.ravel())
     tops[0] = 0
     owner = np.arange(len(tops))
-    for width, one, other in _necks(basins, distance, grid):
+    for width, one, other in _find_necks(basins, distance, grid):
         a, b = _root(owner, one), _root(owner, other)
         if a != b and width >= NECK * min(tops[a], tops[b]):
             owner[b] = a
@@ -124,7 +124,7 @@ def instances_of(distance: np.ndarray, grid: Grid) -> np.ndarray:
     return _renumber(np.array([_root(owner, k) for k in range(len(owner))])[basins])
 
 
-def _necks(basins: np.ndarray, distance: np.ndarray, grid: Grid) -> list[tuple[float, int, int]]:
+def _find_necks(basins: np.ndarray, distance: np.ndarray, grid: Grid) -> list[tuple[float, int, int]]:
     """Return the greatest distance at which two basins touch (by faces), widest first."""
     pairs, widths = [], []
     for axis in range(3):
@@ -142,6 +142,7 @@ def _necks(basins: np.ndarray, distance: np.ndarray, grid: Grid) -> list[tuple[f
 
 
 def _root(owner: np.ndarray, k: int) -> int:
+    """Return the basin that basin k was joined to, by way of others."""
     while owner[k] != k:
         k = owner[k]
     return int(k)
@@ -156,7 +157,7 @@ def _renumber(labels: np.ndarray) -> np.ndarray:
     return rank[index].reshape(labels.shape)
 
 
-def _curvatures(u: Tensor, mask: np.ndarray, grid: Grid, epsilon: float) -> tuple[np.ndarray, np.ndarray]:
+def _measure_curvatures(u: Tensor, mask: np.ndarray, grid: Grid, epsilon: float) -> tuple[np.ndarray, np.ndarray]:
     """Return κ1, κ2 of {u = 0} in the voxels that touch it, NaN elsewhere.
 
     A voxel's centre lies on a level set at distance d from the surface; along the normal κ becomes κ / (1 + κ d).
@@ -165,11 +166,11 @@ def _curvatures(u: Tensor, mask: np.ndarray, grid: Grid, epsilon: float) -> tupl
     slope = near.gradient.square().sum(-4).sqrt()
     d = near.value / slope.clamp_min(LEAST_SLOPE)
     κ1, κ2 = (κ / (1 + κ * d) for κ in geometric_curvatures(near)[:2])
-    known = find_resolved(slope, κ1, κ2, grid) & torch.from_numpy(_touching(mask, grid))
+    known = find_resolved(slope, κ1, κ2, grid) & torch.from_numpy(_find_touching(mask, grid))
     return torch.where(known, κ1, torch.nan).float().numpy(), torch.where(known, κ2, torch.nan).float().numpy()
 
 
-def _touching(mask: np.ndarray, grid: Grid) -> np.ndarray:
+def _find_touching(mask: np.ndarray, grid: Grid) -> np.ndarray:
     """Return the voxels with one of their six neighbours on the other side, without the margin of a crop."""
     if grid.periodic:
         return find_boundaries(np.pad(mask, 1, mode="wrap"))[1:-1, 1:-1, 1:-1]
@@ -178,7 +179,7 @@ def _touching(mask: np.ndarray, grid: Grid) -> np.ndarray:
     return touching
 
 
-def _radius(distance: np.ndarray, grid: Grid) -> np.ndarray:
+def _measure_radius(distance: np.ndarray, grid: Grid) -> np.ndarray:
     """Return half the local thickness; a periodic box is continued as far as balls that reach into it need."""
     width = 2 * math.ceil(float(distance.max()) / min(grid.spacing)) + 4 if grid.periodic else 0
     margin = [min(n // 2, width) for n in grid.shape]
@@ -220,7 +221,7 @@ def field_distance(field: Tensor, grid: Grid, epsilon: float) -> np.ndarray:
     edges = np.array(grid.spacing, dtype=np.float32)
     touching, feet, distance = _near_surface(near, edges, grid.periodic)
     far = np.isnan(distance)
-    seed = _nearest(touching, edges, grid.periodic)[far]
+    seed = _find_nearest(touching, edges, grid.periodic)[far]
     # The foot of the nearest voxel, as seen from the far one: `along` its normal, and across it.
     foot = feet[tuple((seed % near.shape).T)]
     offset = (seed - np.argwhere(far)) * edges + foot[:, :3]
@@ -231,7 +232,7 @@ def field_distance(field: Tensor, grid: Grid, epsilon: float) -> np.ndarray:
     return distance
 
 
-def _nearest(touching: np.ndarray, edges: np.ndarray, periodic: bool) -> np.ndarray:
+def _find_nearest(touching: np.ndarray, edges: np.ndarray, periodic: bool) -> np.ndarray:
     """Return the nearest marked voxel of each voxel, (Z, Y, X, 3); a periodic box's may lie up to half a box beyond."""
     before = np.array(touching.shape) // 2 if periodic else np.zeros(3, dtype=int)
     padded = np.pad(~touching, np.stack([before, before], 1), mode="wrap")

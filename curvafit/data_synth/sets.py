@@ -124,11 +124,11 @@ def _fill(folder: Path, spec: SetSpec, count: int, progress: Progress, workers: 
             cases.add(case)
             progress(f"{min(len(cases), count)} of {count} cases", min(len(cases), count) / count)
             if time.monotonic() > listed + LISTED_EVERY:
-                _list(folder, spec)
+                _write_list(folder, spec)
                 listed = time.monotonic()
         return folder
     finally:
-        _list(folder, spec)
+        _write_list(folder, spec)
 
 
 def make_cases(folder: str | Path, indices: Sequence[int]) -> list[int]:
@@ -204,7 +204,7 @@ def _begin(folder: Path, spec: SetSpec) -> Iterator[None]:
         raise
 
 
-def _list(folder: Path, spec: SetSpec) -> None:
+def _write_list(folder: Path, spec: SetSpec) -> None:
     """Write the list of the complete cases that the layout's readers want."""
     names, layout = list(map(case_name, cases_of(folder))), LAYOUTS[spec.layout]
     pairs = [{"image": layout.image.format(case=name), "label": layout.label.format(case=name)} for name in names]

@@ -124,7 +124,7 @@ class Generated:
         shares = {law.volume_fraction for law in known}
         if fraction is None and len(shares) == 1:
             (fraction,) = shares
-        points = tuple(_point(law, fraction) for law in known)
+        points = tuple(_point_of(law, fraction) for law in known)
         names = (
             Path(source).name if isinstance(source, (str, PathLike)) else law.origin
             for source, law in zip(stated, known, strict=True)
@@ -260,8 +260,8 @@ def choose_voxel(laws: Iterable[LawLike], kind: Modality) -> float:
     return edges.pop() if edges else kind.voxel
 
 
-def _point(law: Law, fraction: float | None) -> tuple[float, ...]:
-    """Return the seven numbers of a law; a mass that it does not state is that of the volume fraction."""
+def _point_of(law: Law, fraction: float | None) -> tuple[float, ...]:
+    """Return the seven numbers of a law; where it states no mass, the one that fits the volume fraction."""
     if law.mass is None and fraction is not None:
         return replace(law, mass=first_mass(fraction)).point
     return law.point

@@ -204,7 +204,7 @@ def dropout(
         raise ValueError(f"dropout needs a share and a loss in [0, 1] and a length above 0, got {given}")
     inside = check_volume(occupied, "an occupancy") >= 0.5
     field = correlated_field(occupied, [length / h for h in as_spacing(spacing)], seeds, "dropout")
-    level = [_upper(values[within], share) for values, within in zip(field, inside, strict=True)]
+    level = [_level_above(values[within], share) for values, within in zip(field, inside, strict=True)]
     threshold = torch.stack(level)[:, None, None, None, None]
     return 1 - loss * torch.sigmoid((field - threshold) / FADING)
 
@@ -245,8 +245,8 @@ def _rings(like: Tensor, steps: Sequence[float], width: float, seed: int, centre
     return between[None, None]
 
 
-def _upper(values: Tensor, share: float) -> Tensor:
-    """Return the value that `share` of them exceed: with a share of 0 none does, with 1 all do."""
+def _level_above(values: Tensor, share: float) -> Tensor:
+    """Return the level that a share of the values exceeds: none for a share of 0, all for 1."""
     count = values.numel()
     passed = round(share * count)
     if passed == 0 or passed == count:
@@ -266,12 +266,14 @@ def _specks(occupied: Tensor, steps: Sequence[float], density: float, radius: fl
     place = tried[torch.arange(count, device=tried.device), free.long().argmax(1)] * sides
     height = (0.5 + 0.5 * drawn[:, 0]) * free.any(1)
     width = radius * (0.5 + drawn[:, 1:4])
-    z, y, x = (_bells(n, h, place[:, k], width[:, k]) for k, (n, h) in enumerate(zip(shape, steps, strict=True)))
+    z, y, x = (
+        _speck_profiles(n, h, place[:, k], width[:, k]) for k, (n, h) in enumerate(zip(shape, steps, strict=True))
+    )
     planes = (height[:, None, None] * z[:, :, None] * y[:, None, :]).flatten(1)
     return (planes.mT @ x).reshape(occupied.shape).clamp_max_(1)
 
 
-def _bells(count: int, step: float, place: Tensor, width: Tensor) -> Tensor:
+def _speck_profiles(count: int, step: float, place: Tensor, width: Tensor) -> Tensor:
     """Return the profile of each speck along an axis, (specks, voxels)."""
     at = (torch.arange(count, device=place.device, dtype=place.dtype) + 0.5) * step
     return bell((at - place[:, None]) / width[:, None])
@@ -325,7 +327,7 @@ def poisson_quantile(mean: Tensor, z: Tensor) -> Tensor:
     many.add_(w2, alpha=1 / 6).add_(1 / 3).addcmul_(root, root + z).floor_().clamp_min_(0)
     few = mean < FEW
     if bool(few.any()):
-        return torch.where(few, _few(mean.clamp_max(FEW), z), many)
+        return torch.where(few, _sum_quantile(mean.clamp_max(FEW), z), many)
     return many
 
 
@@ -364,8 +366,8 @@ def digitise(image: Float[Tensor, "b 1 z y x"], ceiling: float) -> Float[Tensor,
     return check_volume(image, "an image").round().clamp_(0, ceiling)
 
 
-def _few(mean: Tensor, z: Tensor) -> Tensor:
-    """Return how many of the sums P(X ≤ k) lie under the normal number's share."""
+def _sum_quantile(mean: Tensor, z: Tensor) -> Tensor:
+    """Return the Poisson quantiles of small means: how many of the sums P(X ≤ k), k = 0, 1, …, are below Φ(z)."""
     share = torch.special.ndtr(z)
     term = torch.exp(-mean)
     total = term.clone()

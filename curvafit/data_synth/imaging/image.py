@@ -39,7 +39,7 @@ def image(
     """
     _check_batch(shapes, imaging)
     every = zip(shapes.split(1), imaging, seeds_of(seeds, len(shapes)), strict=True)
-    return torch.cat([_image(one, spacing, how, [seed], epsilon) for one, how, seed in every])
+    return torch.cat([_make_image(one, spacing, how, [seed], epsilon) for one, how, seed in every])
 
 
 def regrid(
@@ -55,7 +55,9 @@ def visible(
 ) -> Bool[torch.Tensor, "b 1 Z Y X"]:
     """Return the images' voxels that a share of the structure's light reaches (`Imaging.visible`), of even stain."""
     _check_batch(shapes, imaging)
-    return torch.cat([_visible(one, spacing, how, epsilon) for one, how in zip(shapes.split(1), imaging, strict=True)])
+    return torch.cat(
+        [_find_visible(one, spacing, how, epsilon) for one, how in zip(shapes.split(1), imaging, strict=True)]
+    )
 
 
 def visible_share(imaging: Imaging) -> float:
@@ -74,9 +76,9 @@ def field_shape(shape: Sequence[int], spacing: float, imaging: Imaging) -> tuple
     return z, y, x
 
 
-def _image(shape: torch.Tensor, spacing: float, how: Imaging, seeds: list[int], epsilon: float) -> torch.Tensor:
+def _make_image(shape: torch.Tensor, spacing: float, how: Imaging, seeds: list[int], epsilon: float) -> torch.Tensor:
     occupied = effects.occupancy(shape, epsilon)
-    light = _blur(_emit(occupied, spacing, how, seeds), spacing, how)
+    light = _blur_light(_emit(occupied, spacing, how, seeds), spacing, how)
     light = _illuminate(effects.sample(light, spacing, how.spacing, _window(how)), how, seeds)
     return _detect(light, how, seeds)
 
@@ -103,7 +105,7 @@ def _detect(light: torch.Tensor, how: Imaging, seeds: list[int]) -> torch.Tensor
     return counts if detector.ceiling is None else effects.digitise(counts, detector.ceiling)
 
 
-def _visible(shape: torch.Tensor, spacing: float, how: Imaging, epsilon: float) -> torch.Tensor:
+def _find_visible(shape: torch.Tensor, spacing: float, how: Imaging, epsilon: float) -> torch.Tensor:
     light = effects.blur_with_depth(effects.occupancy(shape, epsilon), spacing, how.optics.blur, how.optics.growth)
     return effects.sample(light, spacing, how.spacing, _window(how)) > how.visible
 
@@ -134,7 +136,7 @@ def _emit(occupied: torch.Tensor, spacing: float, how: Imaging, seeds: list[int]
     return light.clamp_min(0)
 
 
-def _blur(light: torch.Tensor, spacing: float, how: Imaging) -> torch.Tensor:
+def _blur_light(light: torch.Tensor, spacing: float, how: Imaging) -> torch.Tensor:
     optics = how.optics
     if optics.growth or optics.attenuation:
         return effects.blur_with_depth(light, spacing, optics.blur, optics.growth, optics.attenuation)

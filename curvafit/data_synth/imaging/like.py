@@ -91,7 +91,7 @@ def fit_modality(scan: Field, mask: np.ndarray | None = None) -> Modality:
     structure = _measure_structure(values, inside, steps, ground.level)
     noise = measure_noise(values, inside, ground, steps, ground.level + structure.contrast)
     base = _to_imaging(scan, structure, noise)
-    ranges = {name: _spread(base[name], *ends) for name, ends in SPREAD.items() if np.any(base[name])}
+    ranges = {name: _surround(base[name], *ends) for name, ends in SPREAD.items() if np.any(base[name])}
     if bias := ranges.get("illumination.bias"):
         ranges["illumination.bias"] = bias[0], min(bias[1], 1.0)
     about = f"estimated from {scan.source or 'a scan'}, {'its mask' if given is not None else 'without a mask'}"
@@ -213,7 +213,7 @@ def _measure_texture(relative: np.ndarray, inside: np.ndarray, steps: np.ndarray
     return math.sqrt(math.expm1(float(covariances[0]) * max(width / length, 1.0))), length
 
 
-def _spread(value: Any, low: float, high: float) -> tuple[Any, Any]:
+def _surround(value: Any, low: float, high: float) -> tuple[Any, Any]:
     if isinstance(value, tuple):
         return tuple(low * part for part in value), tuple(high * part for part in value)
     return low * value, high * value
@@ -269,7 +269,7 @@ def measure_background(values: np.ndarray, inside: np.ndarray, steps: np.ndarray
     plane = (covariances[1][:lags] + covariances[2][:lags]) / 2
     noise, lateral, texture, length = _split_covariance(plane)
     _, axial, _, _ = _split_covariance(covariances[0])
-    bias = _bias(rest, weight, level, values.shape)
+    bias = _measure_bias(rest, weight, level, values.shape)
     return Background(
         where, level, noise, (axial, lateral, lateral), math.sqrt(texture), length * float(steps[2]), bias
     )
@@ -286,7 +286,7 @@ def measure_noise(
     structure that passes for noise makes no steeper line. Where it does not rise, noise is the background's everywhere.
     """
     rest = ground.level, ground.texture, ground.length, ground.bias
-    lines = _bins(values, inside, ground, steps)
+    lines = _measure_bins(values, inside, ground, steps)
     gain = 0.0
     if len(lines) > 2:
         mean, variance, count = np.array(lines).T
@@ -331,7 +331,7 @@ def _split_covariance(covariances: np.ndarray) -> tuple[float, float, float, flo
     return total, width, spread, length
 
 
-def _bias(rest: np.ndarray, weight: np.ndarray, level: float, shape: tuple[int, ...]) -> float:
+def _measure_bias(rest: np.ndarray, weight: np.ndarray, level: float, shape: tuple[int, ...]) -> float:
     """Return half the range of the background's slow variation, relative to its level."""
     widths = [n / 8 for n in shape]
     slow = ndimage.gaussian_filter(rest, widths) / np.maximum(ndimage.gaussian_filter(weight, widths), 1e-3)
@@ -339,7 +339,7 @@ def _bias(rest: np.ndarray, weight: np.ndarray, level: float, shape: tuple[int, 
     return float(high - low) / 2 / max(abs(level), 1e-9)
 
 
-def _bins(
+def _measure_bins(
     values: np.ndarray, inside: np.ndarray, ground: Background, steps: np.ndarray
 ) -> list[tuple[float, float, int]]:
     """Return the mean, the variance of the noise and count, by bins of the mean over the structure."""
@@ -347,17 +347,17 @@ def _bins(
     mean = ndimage.gaussian_filter(values, 1.5 * steps.min() / steps)
     top = values.max()
     used = inside & (ndimage.maximum_filter(values, 3) < top) if (values == top).mean() > 1e-5 else inside
-    passed = max(_variance(residual[ground.where]), 1e-12) / max(ground.noise, 1e-12)
+    passed = max(_robust_square(residual[ground.where]), 1e-12) / max(ground.noise, 1e-12)
     found = []
     edges = np.quantile(mean[used], np.linspace(0, 1, BINS + 1)) if used.any() else np.zeros(1)
     for low, high in itertools.pairwise(edges):
         bin_ = used & (mean >= low) & (mean <= high)
         if (count := int(bin_.sum())) >= LEAST:
-            found.append((float(values[bin_].mean()), _variance(residual[bin_]) / passed, count))
+            found.append((float(values[bin_].mean()), _robust_square(residual[bin_]) / passed, count))
     return found
 
 
-def _variance(residual: np.ndarray) -> float:
+def _robust_square(residual: np.ndarray) -> float:
     """Return the mean square of a residual without its outliers: beyond four deviations, as the median tells them."""
     square = np.square(residual)
     near = square < 16 * np.median(square) / 0.455
