@@ -12,7 +12,7 @@ from torch import Tensor
 
 from curvafit.generation.flow import WORKING_BLUR, descend
 from curvafit.generation.schedule import Schedule
-from curvafit.inference.stationarity import energy_gradients
+from curvafit.inference.stationarity import energy_gradients, fix_gauge
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Float, Grid
 from curvafit.priors.stencils import gaussian_blur, gradient
@@ -65,7 +65,7 @@ class ShortFlow:
         self._kept = share > _FAINT * share.max()
         self._norm = (share * share[self._kept].sum()).sqrt()[self._kept]
         self._forces = self._measure_forces()
-        self._budget = self._force(reference.scaled(1 / float(reference.a20)))
+        self._budget = self._force(fix_gauge(np.array([float(value) for value in reference]))[0])
 
     def residual(self, law: Coefficients) -> np.ndarray:
         """Return the low-passed displacement in voxels, weighted by interface: its squares sum to the mean square."""

@@ -86,6 +86,12 @@ def test_a_fit_in_float64_leaves_jax_as_it_is() -> None:
         assert end.parameters == pytest.approx(at, abs=1e-4 * np.ptp(BOX))
 
 
+def test_a_law_without_a20_has_a_budget(mask_phase: torch.Tensor) -> None:
+    """The gauge is a02 then: over a20 the coefficients would be beyond what a flow computes."""
+    law = Coefficients(1e-9, 1.0, 1.0, -20.0, 0.0, 100.0)
+    assert np.isfinite(drift(mask_phase, GRID, WORKING_EPSILON, law) or np.nan)
+
+
 def test_a_crop_without_an_inside_has_no_drift() -> None:
     """All of it would be the halo that is held."""
     grid = Grid((16, 24, 24), boundary="replicate")
