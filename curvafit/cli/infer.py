@@ -17,6 +17,7 @@ EXAMPLES = examples(
     "curvafit infer bone.tif --spacing 0.0195 --unit mm -o bone",
     "curvafit infer vessels.nii.gz --kind mask -o vessels",
     "curvafit infer cells.ome.zarr --channel 1 --crop 0:64,100:300,100:300 --dark --threshold 90 -o cells",
+    "curvafit infer vessels.nii.gz --method match -o vessels",
     "curvafit infer fibres.raw --raw-shape 128,128,128 --dtype u1 -o fibres",
 )
 
@@ -31,6 +32,9 @@ def infer(
     threshold: Annotated[str, typer.Option(help="Grey level between the phases, or otsu.")] = "otsu",
     dark: Annotated[bool, typer.Option("--dark", help="The structure is the dark phase.")] = False,
     posterior: Annotated[Path | None, typer.Option(help="Posterior (.npz) instead of the packaged one.")] = None,
+    method: Annotated[
+        str, typer.Option(help="posterior, or match: the atlas's nearest shape, then gradient refinement.")
+    ] = "posterior",
     fast: Annotated[
         bool, typer.Option("--fast", help="Seconds instead of minutes: nothing is grown, or checked.")
     ] = False,
@@ -44,12 +48,8 @@ def infer(
     with plain_errors():
         level = parse_threshold(threshold)
         what = {"kind": kind, "periodic": periodic, "threshold": level, "dark": dark, "roi": roi}
-        inference, report = _infer_and_write(
-            scan,
-            out,
-            {**what, "atlas": atlas, "posterior": posterior, "fast": fast, "seed": seed, **reading},
-            overwrite,
-        )
+        how = {"atlas": atlas, "posterior": posterior, "method": method, "fast": fast, "seed": seed}
+        inference, report = _infer_and_write(scan, out, {**what, **how, **reading}, overwrite)
         _print_result(inference)
         say(str(report))
 

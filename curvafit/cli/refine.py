@@ -14,6 +14,7 @@ from curvafit.cli.segment import Epsilon, Job, OwnPrior, Steps, TileOption, Weig
 
 if TYPE_CHECKING:
     from curvafit.core.runtime import Progress
+    from curvafit.segmentation.refine import Calibration
     from curvafit.segmentation.result import Segmentation
     from curvafit.volumes.boxes import Boxes
 
@@ -73,28 +74,26 @@ def refine(
         others = {name: value for name, value in maps.items() if name != "crop"}
         place = {name: reading[name] for name in ("spacing", "unit", "label", "strict")}
         options = {"epsilon": epsilon, "steps": steps}
-        learned: dict[str, Any] = {}
+        calibrations: list[Calibration] = []
 
-        def calibrate_on_example(volume: Boxes, progress: Progress) -> None:
-            """Infer the prior from the example where none is given, calibrate it there, and keep both."""
+        def calibrate_on_example(volume: Boxes, progress: Progress) -> Calibration:
             from curvafit.core.runtime import sub_progress
-            from curvafit.segmentation.reconstruct import infer_law
             from curvafit.volumes.read import load
 
             chances, mask = load_probabilities(example_probabilities, **others), load(example, **place)  # type: ignore[arg-type]
             check_spacing(chances, volume.frame, "the probabilities")
             say_notes((*chances.notes, *mask.notes))
-            learned["prior"] = prior if prior is not None else infer_law(mask, progress)
-            tried = calibrate(chances, mask, learned["prior"], progress=sub_progress(progress, 0.0, 0.7), **options)
-            learned["example"], record["calibration"] = tried, tried.as_dict()
+            tried = calibrate(chances, mask, prior, progress=sub_progress(progress, 0.0, 0.7), **options)
+            record["calibration"] = tried.as_dict()
+            return tried
 
         def compute(volume: Boxes, progress: Progress, **tools: Any) -> Segmentation:
             from curvafit.volumes.boxes import read_whole
 
-            if example is not None and not learned:
-                calibrate_on_example(volume, progress)
-            told = learned or {"prior": prior, "weight": weight}
-            return refine_map(read_whole(volume), progress=progress, **told, **tools, **options)
+            if example is not None and not calibrations:
+                calibrations.append(calibrate_on_example(volume, progress))
+            judge: dict[str, Any] = {"example": calibrations[0]} if calibrations else {"weight": weight}
+            return refine_map(read_whole(volume), prior, progress=progress, **judge, **tools, **options)
 
         named = {"example": example, "example_probabilities": example_probabilities, "like": like}
         record: dict[str, Any] = {"job": "refine", "weight": weight, "tile": tile, **options}

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -24,7 +24,6 @@ from curvafit.cli.options import (
 
 if TYPE_CHECKING:
     from curvafit.core.runtime import Progress
-    from curvafit.core.workers import Workers
     from curvafit.segmentation.result import Segmentation
     from curvafit.volumes.boxes import Boxes
     from curvafit.volumes.field import Field
@@ -140,8 +139,8 @@ def reconstruct(
         how: dict[str, Any] = {"stiffness": stiffness, "periodic": periodic, "epsilon": epsilon}
 
         def compute(volume: Boxes, progress: Progress, **tools: Any) -> Segmentation:
-            from curvafit.segmentation.reconstruct import infer_law, infer_laws, reconstruct_labels
             from curvafit.segmentation.reconstruct import reconstruct as fill
+            from curvafit.segmentation.reconstruct import reconstruct_labels
             from curvafit.volumes.boxes import read_whole
             from curvafit.volumes.read import load
 
@@ -149,15 +148,9 @@ def reconstruct(
             whole = None if example is None else load(example, **alike)
             say_notes(() if whole is None else whole.notes)
             common = {"example": whole, "steps": steps, "progress": progress, **tools, **place, **how}
-            law: Any = prior
             if labels is None:
-                if whole is not None and prior is None:
-                    law = infer_law(whole, progress)
-                return fill(read_whole(volume), law, runs=runs, suggest=suggest, **common)
-            if whole is not None and prior is None:
-                law, notes = infer_laws(whole, several, progress)
-                say_notes(notes)
-            return reconstruct_labels(read_whole(volume), law, chosen=several, **common)
+                return fill(read_whole(volume), prior, runs=runs, suggest=suggest, **common)
+            return reconstruct_labels(read_whole(volume), prior, chosen=several, **common)
 
         record: dict[str, Any] = {"job": "reconstruct", "steps": steps, "tile": tile}
         record |= {"labels": labels} if labels else {}
@@ -218,31 +211,18 @@ def run_job(job: Job, compute: Callable[..., Segmentation], read: Callable[..., 
         boxes = boxes_of(job.source, **reading) if read is None else boxes_of(read(job.source, **reading))
         check_mask_target(job.out, boxes.frame.unit, overwrite=job.overwrite, probability=probability)
         tiling = Tiling.of(boxes.frame, record["epsilon"], record["tile"], periodic=record.get("periodic", False))
-        store = job.out.with_name(f".{job.out.name}.curvafit-tiles") if tiling.count > 1 else None
-        with resumable() if store else nullcontext(), _start_workers(job.workers if store else None) as workers:
-            result = compute(boxes, progress, tile=record["tile"], store=store, workers=workers)
+        store = job.out.with_name(f".{job.out.name}.curvafit-tiles")
+        with resumable() if tiling.count > 1 else nullcontext():
+            result = compute(boxes, progress, tile=record["tile"], store=store, workers=job.workers)
         progress("writing", 1.0)
         place = ("spacing", "crop") if image else ("spacing", "crop", "channel")
         like = (image or job.source) if all(reading[name] is None for name in place) else None
         content = {"command": command_line(), "prior": job.prior, **record}
         how = {"like": like, "unit": reading["unit"], "record": content, "overwrite": job.overwrite}
         files = write_mask(result, read_whole(boxes), job.out, **how)
-        if store is not None:
-            remove(store)
+        remove(store)
     for note in result.notes:
         say(note)
     say(f"{result.status[0].upper()}{result.status[1:]}.", style="bold")
     for path in files:
         say(str(path))
-
-
-@contextmanager
-def _start_workers(count: int | None) -> Iterator[Workers | None]:
-    """Start workers for tiles, where they are asked for."""
-    if not count:
-        yield None
-        return
-    from curvafit.core.workers import cluster
-
-    with cluster(count) as workers:
-        yield workers

@@ -69,6 +69,28 @@ def boxes_by_surface(content: np.ndarray, size: int | Sequence[int]) -> list[Win
     return ordered  # type: ignore[return-value]
 
 
+def box_with_most_surface(mask: np.ndarray, edge: int | Sequence[int]) -> Window:
+    """Return the box, of at most `edge` voxels a side, that holds most of a mask's surface, wherever it lies.
+
+    Unlike `boxes_by_surface` it slides by single voxels: for one small part of a volume, not for covering it.
+    """
+    edges = [edge] * 3 if isinstance(edge, int) else edge
+    box = [min(n, side) for n, side in zip(mask.shape, edges, strict=True)]
+    held = count_faces(mask).astype(np.float32)
+    for axis, side in enumerate(box):
+        held = ndimage.uniform_filter1d(held, side, axis, mode="constant")
+    inner = tuple(slice(b // 2, n - (b - 1) // 2) for n, b in zip(mask.shape, box, strict=True))
+    z, y, x = (int(k) for k in np.unravel_index(int(held[inner].argmax()), held[inner].shape))
+    return slice(z, z + box[0]), slice(y, y + box[1]), slice(x, x + box[2])
+
+
+def count_faces(mask: np.ndarray) -> np.ndarray:
+    """Count, for each voxel, its next neighbours along +z, +y and +x that lie on the other side of the border."""
+    sides = mask.astype(np.int8)
+    z, y, x = (np.abs(np.diff(sides, axis=axis, append=0)) for axis in range(3))
+    return z + y + x
+
+
 def centre_distance(
     mask: np.ndarray,
     spacing: Sequence[float],

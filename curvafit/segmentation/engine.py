@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from curvafit.core.checks import LONGEST, SHORTEST, check_float, check_type
+from curvafit.core.checks import LONGEST, SHORTEST, check_float
 from curvafit.core.runtime import Progress, silent
 from curvafit.core.units import METRES
 from curvafit.generation.data import Data, Evidence
@@ -25,6 +26,9 @@ from curvafit.priors.stencils import refine_axis
 from curvafit.segmentation.evidence import VoxelEvidence
 from curvafit.volumes.field import Field, ScanError
 
+if TYPE_CHECKING:
+    from curvafit.inference.infer import Inference
+
 #: Default steps of Adam.
 STEPS = 400
 #: Voxels of the grid around a volume that does not repeat: far enough for the border's right angles not to reach it.
@@ -33,6 +37,8 @@ HALO = 6
 BENDING = 2.0
 #: Whether there is a halo before and beyond the voxels, along each axis.
 Ends = tuple[tuple[bool, bool], tuple[bool, bool], tuple[bool, bool]]
+#: A law that is tried beside the prior's.
+WILLMORE = Coefficients.willmore()
 #: Candidates of a fit that are laws of their own: the nearest match's destroys.
 TRUSTED = ("refined", "posterior", "simulation", "optimum")
 
@@ -49,12 +55,9 @@ def lower_energy(
     law
         Coefficients with lengths in the scan's unit; their scale does not matter.
     data
-        D on the place's grid, in units of F_ε of a law with a20 + a02 = 2.
+        D on the working grid, in units of F_ε of a law with a20 + a02 = 2.
 
-    Raises
-    ------
-    ScanError
-        If a20 + a02 is not positive, or the energy does not stay finite.
+    Raises `ScanError` if a20 + a02 is not positive, or the energy does not stay finite.
     """
 
     def watch(step: int, total: int, state: object) -> None:
@@ -72,31 +75,19 @@ def lower_energy(
         callbacks=[watch],
     )
     if not flow.finite:
-        raise ScanError(f"expected an energy that stays finite, got a flow that {flow.status}: lower the weight")
+        raise ScanError(f"the energy did not stay finite ({flow.status}): lower the weight")
     return flow
 
 
-def lower_with_evidence(
-    evidence: VoxelEvidence,
-    law: Coefficients,
-    nats: float,
-    place: WorkingGrid,
-    steps: int,
-    progress: Progress = silent,
-) -> Flow:
-    """Lower -log p(scan | mask) + F_ε, of which a unit of the Willmore energy costs so many nats, as `lower_energy`."""
-    return lower_energy(evidence.level, law, likelihood(evidence, nats, place), place, steps, progress)
-
-
 def likelihood(evidence: VoxelEvidence, nats: float, place: WorkingGrid) -> Evidence:
-    """Return -log p(scan | mask), in units of F_ε, of which a unit of the Willmore energy costs so many nats."""
+    """Return -log p(scan | mask) in units of F_ε, where a unit of the Willmore energy costs `nats`."""
     return Evidence(place.spread(evidence.ratio) / (nats * place.grid.voxel_volume))
 
 
 def initial_field(level: np.ndarray, place: WorkingGrid) -> Tensor:
-    """Return the phase field, on the place's grid, of the set where a smooth volume (Z, Y, X) is positive.
+    """Return the phase field, on the working grid, of the set where a smooth volume (Z, Y, X) is positive.
 
-    Where it is positive everywhere or nowhere, as in a tile far from the surface, the field is 1 or -1.
+    A volume that is positive everywhere or nowhere, as in a tile far from the surface, gives a field of 1 or -1.
     """
     inside = place.to_grid(level) > 0
     if inside.all() or not inside.any():
@@ -105,21 +96,18 @@ def initial_field(level: np.ndarray, place: WorkingGrid) -> Tensor:
 
 
 def bending(law: Coefficients) -> float:
-    """Return a20 + a02: bumps on a plane cost half of it times their Willmore energy.
+    """Return a20 + a02, or raise ScanError where it is not positive.
 
-    Raises
-    ------
-    ScanError
-        If it is not positive.
+    Bumps on a plane cost (a20 + a02) / 2 times their Willmore energy.
     """
-    sum_of_squares = float(law.a20 + law.a02)
-    if sum_of_squares <= 0:
-        raise ScanError(f"expected coefficients with a20 + a02 > 0, got {sum_of_squares:g}: surfaces would crumple")
-    return sum_of_squares
+    stiffness = float(law.a20 + law.a02)
+    if stiffness <= 0:
+        raise ScanError(f"a20 + a02 must be positive, got {stiffness:g}: surfaces would crumple")
+    return stiffness
 
 
 def normalise_bending(law: Coefficients) -> Coefficients:
-    """Return a law scaled to a20 + a02 = `BENDING`; raise ScanError as `bending`."""
+    """Scale a law to a20 + a02 = `BENDING`; raise ScanError as `bending`."""
     return law.scaled(BENDING / bending(law))
 
 
@@ -129,14 +117,8 @@ def normalise_bending(law: Coefficients) -> Coefficients:
 def law_of(prior: LawLike, scan: Field) -> tuple[Coefficients, tuple[str, ...]]:
     """Return a law's coefficients with lengths in the scan's unit, and sentences on their origin.
 
-    Raises
-    ------
-    ValueError
-        If there is no preset of that name, or the units of a `fit.json` and the scan cannot be compared.
-    FileNotFoundError
-        If there is no such file.
+    Raises `ValueError` if there is no such preset, or the units of a `fit.json` and the scan cannot be compared.
     """
-    check_type(scan, Field, "a scan as Field")
     law = Law.of(prior)
     try:
         coefficients = law.in_unit(scan.unit, min(scan.spacing))
@@ -151,9 +133,9 @@ def law_of(prior: LawLike, scan: Field) -> tuple[Coefficients, tuple[str, ...]]:
 
 
 def laws_of(prior: LawLike, scan: Field) -> tuple[tuple[Coefficients, ...], tuple[str, ...]]:
-    """Return the laws that a prior trusts, with lengths in the scan's unit, and sentences on their origin.
+    """Return the laws to try for a prior, with lengths in the scan's unit, and sentences on their origin.
 
-    The first is that of `law_of`. A fit has others, which were read from the same descriptors (`TRUSTED`).
+    The first is that of `law_of`; of a fit the candidates in `TRUSTED` follow.
     """
     first, notes = law_of(prior, scan)
     law = Law.of(prior)
@@ -161,21 +143,35 @@ def laws_of(prior: LawLike, scan: Field) -> tuple[tuple[Coefficients, ...], tupl
         return (first,), notes
     _, candidates = load_draws_and_candidates(prior)
     others = [each.coefficients for each in candidates if each.name in TRUSTED]
-    return (first, *_in_scan((other for other in others if other != law.coefficients), law, scan)), notes
+    return (first, *_convert_laws([other for other in others if other != law.coefficients], law, scan)), notes
 
 
-def drawn_laws(prior: LawLike, scan: Field, count: int) -> tuple[Coefficients, ...]:
-    """Return so many laws drawn from the posterior of a fit, with lengths in the scan's unit; none of other priors."""
+def add_willmore(laws: tuple[Coefficients, ...]) -> tuple[Coefficients, ...]:
+    """Append the Willmore energy to the laws to try, unless it is one of them."""
+    return laws if WILLMORE in laws else (*laws, WILLMORE)
+
+
+def infer_law(example: Field | None, progress: Progress = silent) -> Inference:
+    """Infer the law of an example's mask in seconds, without growing anything; raise ScanError where there is none."""
+    from curvafit.inference.infer import infer  # takes long to import
+
+    if example is None:
+        raise ScanError("give a prior, or an example to infer one from, got neither")
+    return infer(example, kind="mask", fast=True, progress=progress)
+
+
+def draw_laws(prior: LawLike, scan: Field, count: int) -> tuple[Coefficients, ...]:
+    """Return `count` laws from a fit's posterior draws, lengths in the scan's unit; none of a prior without draws."""
     law = Law.of(prior)
     draws, _ = load_draws_and_candidates(prior) if law.fitted else (None, ())
     if draws is None or not len(draws.values):
         return ()
     rows = draws.values[np.linspace(0, len(draws.values) - 1, count).astype(int), :5]
-    return _in_scan((Coefficients(1.0, *map(float, row)) for row in rows), law, scan)
+    return _convert_laws([Coefficients(1.0, *map(float, row)) for row in rows], law, scan)
 
 
-def _in_scan(laws: Iterable[Coefficients], fit: Law, scan: Field) -> tuple[Coefficients, ...]:
-    """Return laws in a fit's working units with lengths in the scan's unit."""
+def _convert_laws(laws: Sequence[Coefficients], fit: Law, scan: Field) -> tuple[Coefficients, ...]:
+    """Convert laws from a fit's working units to the scan's unit."""
     return tuple(law_of(replace(fit, coefficients=each), scan)[0] for each in laws)
 
 
@@ -195,7 +191,7 @@ class WorkingGrid:
     unit, epsilon
         A working length of 1, and ε, in the scan's unit.
     halo, ends
-        Voxels of the grid around the scan, on the sides that have a halo.
+        Width of the halo in voxels of the grid, and the sides that have one.
     """
 
     grid: Grid
@@ -209,17 +205,12 @@ class WorkingGrid:
     def of(cls, scan: Field, epsilon: float | None, *, halo: int = 0, periodic: bool = False) -> WorkingGrid:
         """Return the working grid of a scan; ε is twice the smallest voxel edge by default.
 
-        A scan that repeats has no halo.
-
-        Raises
-        ------
-        ScanError
-            If ε is not positive or the scan is too small.
+        A periodic scan has no halo. Raises `ValueError` if ε is not positive or the scan is too small.
         """
         form = f"a positive epsilon in {scan.unit}"
         ε = RESOLVED * min(scan.spacing) if epsilon is None else check_float(epsilon, form, SHORTEST, LONGEST)
         if min(scan.shape) < 4:
-            raise ScanError(f"expected at least 4 voxels along each axis, got {scan.shape}")
+            raise ScanError(f"the volume must have at least 4 voxels along each axis, got {scan.shape}")
         times, unit = upsampling(scan.spacing, ε), ε / WORKING_EPSILON
         halo = 0 if periodic else halo
         shape = tuple(n * t + 2 * halo for n, t in zip(scan.shape, times, strict=True))
@@ -228,30 +219,29 @@ class WorkingGrid:
         return cls(grid, times, unit, ε, halo)  # type: ignore[arg-type]
 
     def of_box(self, shape: Sequence[int], ends: Ends) -> WorkingGrid:
-        """Return the grid of a box of scan voxels, with the halo on these sides; a box does not repeat."""
+        """Return the grid of a box of scan voxels, with a halo on the sides named in `ends`; a box is not periodic."""
         pairs = zip(shape, self.times, ends, strict=True)
         edges = tuple(n * times + self.halo * sum(sides) for n, times, sides in pairs)
         return replace(self, grid=Grid(edges, self.grid.spacing, "replicate"), ends=ends)  # type: ignore[arg-type]
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Return a sentence on the axes that are refined, or none."""
+        """A sentence on the refined axes, where there are any."""
         if max(self.times) == 1:
             return ()
         axes = ", ".join(f"{axis} {n}-fold" for axis, n in zip("zyx", self.times, strict=True) if n > 1)
         return (f"ε spans fewer than 2 voxels on some axes: the flow ran on a grid refined {axes}.",)
 
     def to_grid(self, values: np.ndarray) -> Tensor:
-        """Return a smooth volume interpolated to the flow's grid, and continued into the halo by its last values."""
+        """Interpolate a smooth volume to the grid, and repeat its outermost values in the halo."""
         u = torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
         for axis, n in enumerate(self.times):
             u = refine_axis(u, axis, n)
         return pad(u[None, None], self._sides, mode="replicate")[0, 0]
 
     def spread(self, values: np.ndarray, centre: int | None = None) -> Tensor:
-        """Return the evidence of voxels shared among their parts, none in the halo; along axis `centre` only the middle
-        parts get it.
-        """
+        """Share the evidence of each voxel among its parts; the halo has none, and along axis `centre` only the middle
+        parts get some."""
         u = torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
         for axis, n in enumerate(self.times):
             share = torch.full((n,), 1 / n)
@@ -262,7 +252,7 @@ class WorkingGrid:
         return pad(u, self._sides)
 
     def to_scan(self, u: Tensor) -> np.ndarray:
-        """Return the mean of each scan voxel's parts, without the halo."""
+        """Average each scan voxel's parts, and drop the halo."""
         for axis, (before, beyond) in enumerate(self.ends):
             u = u.narrow(axis, self.halo * before, u.shape[axis] - self.halo * (before + beyond))
         for axis, n in enumerate(self.times):

@@ -1,4 +1,8 @@
-"""Evidence of the inside in a scan or a probability map, and a first guess of the surface."""
+"""What each voxel of a scan or a probability map says of being inside, and a first guess of the surface.
+
+The noise of single voxels decides how far grey levels are smoothed before they are split. `scan.structure` splits them
+otherwise, on purpose: see there.
+"""
 
 from __future__ import annotations
 
@@ -23,26 +27,16 @@ FAINT = 1.0
 
 @dataclass(frozen=True, eq=False)
 class VoxelEvidence:
-    """Evidence of each voxel, and a first guess.
-
-    Attributes
-    ----------
-    ratio
-        float32 (Z, Y, X): log-likelihood ratio of inside to outside, in nats.
-    level
-        float32 (Z, Y, X): smooth, positive inside the first guess.
-    note
-        A sentence on the classes.
-    """
+    """The log-likelihood `ratio` of inside to outside, in nats, and a smooth `level`, positive inside the first guess:
+    both float32 (Z, Y, X)."""
 
     ratio: np.ndarray
     level: np.ndarray
-    note: str
 
 
 @dataclass(frozen=True)
 class Classes:
-    """Two phases of a scan: mean grey levels outside and inside, one Gaussian noise, and the level that splits them."""
+    """The mean grey levels outside and inside, the deviation of the noise, and the level that splits the phases."""
 
     outside: float
     inside: float
@@ -51,12 +45,12 @@ class Classes:
 
     @property
     def contrast(self) -> float:
-        """Return the difference of the means, negative where the structure is dark."""
+        """The difference of the means, negative where the structure is dark."""
         return self.inside - self.outside
 
     @property
     def faint(self) -> bool:
-        """Return whether the means differ by so little that they may be noise."""
+        """Whether the means differ by so little that the classes may be noise."""
         return abs(self.contrast) < FAINT * self.noise
 
     def __str__(self) -> str:
@@ -65,13 +59,14 @@ class Classes:
 
 
 def grey_levels(scan: Field, threshold: float | str = "otsu") -> np.ndarray:
-    """Return a scan's grey levels, float32, without its tails where Otsu's threshold is to split them."""
+    """Return a scan's grey levels as float32, clipped to `grey_bounds`."""
     values = scan.values.astype(np.float32)
     return values.clip(*grey_bounds(values, threshold))
 
 
 def grey_bounds(values: np.ndarray, threshold: float | str = "otsu") -> tuple[float, float]:
-    """Return the levels between which Otsu's threshold takes grey levels as they are; infinite ones for a number."""
+    """Return the levels to which grey levels are clipped before Otsu's threshold splits them; infinite for a given
+    threshold."""
     if threshold == "otsu" and not np.all((values == values.min()) | (values == values.max())):
         low, high = np.percentile(values, TAILS)  # a mask's rarer value is no tail
         return float(low), float(high)
@@ -79,21 +74,15 @@ def grey_bounds(values: np.ndarray, threshold: float | str = "otsu") -> tuple[fl
 
 
 def estimate_classes(values: np.ndarray, scan: Field, threshold: float | str = "otsu", dark: bool = False) -> Classes:
-    """Return the classes of grey levels on either side of Otsu's threshold of the smoothed scan: means and pooled
-    deviation of the raw levels, and the split half way between the means.
+    """Split the smoothed scan at a threshold, and measure the raw levels on either side: means and pooled deviation.
 
-    The scan is then smoothed again, by a width that depends on the noise. A structure of less than 0.1 % of the volume
-    needs a threshold: Otsu's takes such a structure for a tail of the noise.
-
-    Parameters
-    ----------
-    threshold
-        The split, or `"otsu"`.
-    dark
-        Whether the inside is the dark phase.
+    This is done twice: the noise found first sets the width of the smoothing then. With `"otsu"` the classes are split
+    half way between their means. A structure of less than 0.1 % of the volume needs a given threshold, since Otsu's
+    takes it for a tail of the noise.
     """
-    means, noise = _classes(values, _smoothed(values, scan, WIDTHS[0] + 0.3), threshold)
-    means, noise = _classes(values, _smoothed(values, scan, _width(noise / (means[1] - means[0]))), threshold)
+    means, noise = _split(values, _smooth(values, scan, WIDTHS[0] + 0.3), threshold)
+    width = _smoothing_width(noise / (means[1] - means[0]))
+    means, noise = _split(values, _smooth(values, scan, width), threshold)
     middle = sum(means) / 2 if threshold == "otsu" else float(threshold)
     outside, inside = means[::-1] if dark else means
     return Classes(outside, inside, max(noise, LEAST_NOISE * (means[1] - means[0])), middle)
@@ -102,58 +91,57 @@ def estimate_classes(values: np.ndarray, scan: Field, threshold: float | str = "
 def grey_evidence(values: np.ndarray, scan: Field, classes: Classes, known: np.ndarray | None = None) -> VoxelEvidence:
     """Return the evidence of grey levels (Z, Y, X) with known classes: r = (g - t) (c₁ - c₀) / σ².
 
-    Parameters
-    ----------
-    known
-        Voxels whose grey levels count, bool (Z, Y, X), all by default: others have no evidence.
+    Only the voxels in `known`, bool (Z, Y, X), have evidence; by default all.
     """
     steep, sign = np.float32(classes.contrast / classes.noise**2), -1 if classes.contrast < 0 else 1
-    ratio, width = (values - np.float32(classes.middle)) * steep, _width(classes.noise / abs(classes.contrast))
+    ratio, width = (
+        (values - np.float32(classes.middle)) * steep,
+        _smoothing_width(classes.noise / abs(classes.contrast)),
+    )
     if known is None:
-        level = _smoothed(values, scan, width) - np.float32(classes.middle)
+        level = _smooth(values, scan, width) - np.float32(classes.middle)
     else:
         ratio = np.where(known, ratio, np.float32(0))
-        weight = np.maximum(_smoothed(known.astype(np.float32), scan, width), np.float32(1e-6))
-        level = _smoothed(np.where(known, values - np.float32(classes.middle), np.float32(0)), scan, width) / weight
-    return VoxelEvidence(ratio, sign * level, str(classes))
+        weight = np.maximum(_smooth(known.astype(np.float32), scan, width), np.float32(1e-6))
+        level = _smooth(np.where(known, values - np.float32(classes.middle), np.float32(0)), scan, width) / weight
+    return VoxelEvidence(ratio, sign * level)
 
 
 def probability_evidence(probability: Field) -> VoxelEvidence:
-    """Return the evidence of a probability map (Z, Y, X) in [0, 1]: r = log p / (1 - p), and p - 1/2 as first guess.
+    """Return the evidence of probabilities (Z, Y, X): r = log p / (1 - p), and p - 1/2 as level.
 
-    Raises
-    ------
-    ScanError
-        If a value lies outside [0, 1].
+    Raises `ScanError` if a value lies outside [0, 1].
     """
     values = probability.values.astype(np.float32)
     lowest, highest = float(values.min()), float(values.max())
     if not 0 <= lowest <= highest <= 1:
         source = f" in {probability.source}" if probability.source else ""
-        raise ScanError(f"expected probabilities in [0, 1], got {lowest:g} to {highest:g}{source}")
+        raise ScanError(f"probabilities must lie in [0, 1], got {lowest:g} to {highest:g}{source}")
     p = values.clip(CERTAIN, 1 - CERTAIN)
-    note = f"probabilities from {lowest:.3g} to {highest:.3g}"
-    return VoxelEvidence(np.log(p / (1 - p)), values - np.float32(0.5), note)
+    return VoxelEvidence(np.log(p / (1 - p)), values - np.float32(0.5))
 
 
-def _smoothed(values: np.ndarray, scan: Field, width: float) -> np.ndarray:
-    """Return the values after a Gaussian of a width in voxels of the finest axis, truncated at three deviations."""
+def _smooth(values: np.ndarray, scan: Field, width: float) -> np.ndarray:
+    """Smooth by a Gaussian whose deviation is `width` voxels of the finest axis."""
     finest = min(scan.spacing)
     return ndimage.gaussian_filter(values, [width * finest / h for h in scan.spacing], mode="nearest", truncate=3.0)
 
 
-def _width(noise: float) -> float:
-    """Return the deviation w, in voxels, of the Gaussian that lowers white noise to `QUIET`: by (4π)^¾ w^1.5."""
+def _smoothing_width(noise: float) -> float:
+    """Return the deviation w of the Gaussian, in voxels, that lowers white noise to `QUIET`: it divides it by
+    (4π)^¾ w^1.5."""
     return float(np.clip((noise / QUIET / (4 * math.pi) ** 0.75) ** (2 / 3), *WIDTHS))
 
 
-def _classes(values: np.ndarray, smooth: np.ndarray, threshold: float | str) -> tuple[tuple[float, float], float]:
+def _split(values: np.ndarray, smooth: np.ndarray, threshold: float | str) -> tuple[tuple[float, float], float]:
+    """Return the means of the levels below and above a threshold of the smoothed ones, and their pooled deviation."""
     level = float(threshold_otsu(smooth)) if threshold == "otsu" else float(threshold)
     bright = smooth > level
     share = float(bright.mean())
     if share in (0.0, 1.0):
+        lowest, highest = smooth.min(), smooth.max()
         raise ScanError(
-            f"expected a threshold within the smoothed scan's {smooth.min():.4g} to {smooth.max():.4g}, got {level:.4g}"
+            f"the threshold must lie within the smoothed scan's {lowest:.4g} to {highest:.4g}, got {level:.4g}"
         )
     inside, outside = values[bright], values[~bright]
     pooled = share * inside.var(dtype=np.float64) + (1 - share) * outside.var(dtype=np.float64)

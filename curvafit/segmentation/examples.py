@@ -17,8 +17,9 @@ from curvafit.core.runtime import Progress, silent
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import LEARNED
 from curvafit.priors.coefficients import Coefficients
+from curvafit.scan.grids import box_with_most_surface
 from curvafit.segmentation.engine import WorkingGrid, normalise_bending
-from curvafit.segmentation.slices import Slices, box_with_most_surface, require_labels
+from curvafit.segmentation.slices import Slices, require_labels
 from curvafit.segmentation.trials import ODDS, Task
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.part import Box

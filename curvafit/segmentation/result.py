@@ -1,4 +1,4 @@
-"""The result of a segmentation, how its flow ended in words, and its files: mask, picture, record, probability."""
+"""The result of a segmentation, and its files: mask, picture, record, probability."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _NIFTI = (".nii", ".nii.gz")
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """What several runs say of a volume between known slices.
+    """How sure a volume between known slices is, by several runs.
 
     Attributes
     ----------
@@ -44,10 +44,10 @@ class Uncertainty:
     seeds
         The seed of each run.
     calibration_error
-        By how much shares inside differ from probabilities, on average, within 3 voxels of the surface, on the slices
-        that the probabilities were calibrated on.
+        How far shares inside differ from probabilities, on average, within 3 voxels of the surface, on the slices that
+        the probabilities were calibrated on.
     suggestions
-        Numbers of the slices to annotate next, the most telling first.
+        Numbers of the slices to annotate next, the most informative first.
     """
 
     probability: Field
@@ -73,9 +73,9 @@ class Segmentation(Pictured):
     notes
         Sentences on the evidence and on assumptions.
     uncertainty
-        The probability of the inside, and what to annotate next, of a reconstruction with several runs.
+        Of a reconstruction with several runs: the probability of the inside, and what to annotate next.
     labels
-        Of several structures, which one is at each voxel, 0 where there is none: whole numbers.
+        Of several structures: the label at each voxel, a whole number, 0 where there is none.
     """
 
     mask: Field
@@ -89,10 +89,18 @@ class Segmentation(Pictured):
     labels: Field | None = None
 
     @classmethod
-    def of(cls, scan: Field, mask: np.ndarray, phase: np.ndarray, notes: tuple[str, ...], **more: Any) -> Segmentation:
-        """Return the segmentation of a scan from its arrays (Z, Y, X) and the other attributes."""
-        fields = [replace(scan, values=values, notes=()) for values in (mask, phase)]
-        return cls(fields[0], fields[1], notes=(*scan.notes, *notes), **more)
+    def of(
+        cls,
+        scan: Field,
+        lowered: LoweredVolume,
+        law: Coefficients | None,
+        epsilon: float,
+        notes: tuple[str, ...],
+        **more: Any,
+    ) -> Segmentation:
+        """Return the segmentation of a scan whose energy was lowered; `more` are attributes by name."""
+        mask, phase = (replace(scan, values=values, notes=()) for values in (lowered.mask, lowered.phase))
+        return cls(mask, phase, coefficients=law, epsilon=epsilon, notes=(*scan.notes, *notes), **more)
 
     @property
     def probability(self) -> Field | None:
@@ -107,7 +115,7 @@ class Segmentation(Pictured):
 
 
 def flow_summary(lowered: LoweredVolume) -> str:
-    """Return whether a flow settled, if there was one, and which share of the volume is inside, as a sentence."""
+    """Say whether a flow settled, if there was one, and which share of the volume is inside."""
     share, energy, steps = float(lowered.mask.mean()), lowered.energies, lowered.steps
     inside = f"{100 * share:.2f} % of the volume is inside"
     if not steps:
@@ -132,8 +140,8 @@ def check_mask_target(
 ) -> Path:
     """Return the path, or raise ValueError where a mask in `unit` cannot be written there; called before the work.
 
-    `inputs` are the files, or folders, that are read: none may be overwritten. `overwrite` says whether files of other
-    origin may be replaced, `probability` whether a map goes beside the mask.
+    None of the `inputs`, files or folders, may be overwritten. `overwrite` says whether files of other origin may be
+    replaced, `probability` whether a probability map goes beside the mask.
     """
     target = Path(path)
     pick_writer(target, unit or "mm")
@@ -153,25 +161,20 @@ def write_mask(
 ) -> tuple[Path, ...]:
     """Write the mask (0 and 1, uint8) or labels, a picture, a record, and the probability where there is one.
 
-    The picture shows the middle slices, or the most uncertain ones with their uncertainty.
+    The files `mask.nii.gz`, `mask.png`, `mask.json` and `mask_probability.nii.gz` appear together once all are whole;
+    their paths are returned. A former probability is removed.
 
     Parameters
     ----------
     scan
         The scan, for the picture's grey levels.
-    like
-        The scan's file. If this file and the target are NIfTI, the mask gets the same header but for type and range.
-    unit
-        The unit of the lengths in `like`, by default the one of its header.
+    like, unit
+        The scan's file, and the unit of its lengths, by default its header's. If this file and the target are NIfTI,
+        the mask gets the same header but for type and range.
     record
         Entries to add to the record.
     overwrite
         Whether files of other origin may be replaced.
-
-    Returns
-    -------
-    The paths of mask, picture (`.png`), record (`.json`) and probability (`mask_probability.nii.gz` beside
-    `mask.nii.gz`), which appear together once all are whole. A former probability goes.
     """
     from curvafit.drawing.plot import DPI
 
@@ -207,12 +210,12 @@ def write_mask(
 
 
 def segmentation_figure(segmentation: Segmentation) -> Figure:
-    """Return a figure of the phase field's middle slices with the mask's outline, or of the most uncertain slices."""
+    """Draw the mask's outline on the phase field, in the middle slices or the most uncertain ones."""
     return _figure([(segmentation.phase.values, segmentation.mask.values)], segmentation)
 
 
 def _figure(rows: list[tuple[np.ndarray, np.ndarray | None]], segmentation: Segmentation) -> Figure:
-    """Return a figure of the middle slices; of a probability its entropy too, and the most uncertain slices."""
+    """Draw rows of middle slices; where there is a probability, of the most uncertain slices, with its entropy."""
     from curvafit.drawing.plot import section_figure
 
     probability, mask = segmentation.probability, segmentation.mask
@@ -224,7 +227,7 @@ def _figure(rows: list[tuple[np.ndarray, np.ndarray | None]], segmentation: Segm
 
 
 def _map_path(target: Path) -> Path:
-    """Return where the probability goes: `mask_probability.nii.gz` beside `mask.nii.gz`."""
+    """Return `mask_probability.nii.gz` for `mask.nii.gz`."""
     return sibling(target, f"_probability{target.name.removeprefix(sibling(target, '').name)}")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from os import PathLike
 from typing import Any
@@ -13,12 +12,14 @@ from curvafit.core.checks import check_float
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.core.workers import Workers
 from curvafit.generation.data import Evidence
-from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.law import LawLike
+from curvafit.scan.grids import count_faces
+from curvafit.scan.structure import check_options
 from curvafit.segmentation.engine import (
     BENDING,
     STEPS,
     WorkingGrid,
+    add_willmore,
     bending,
     initial_field,
     laws_of,
@@ -33,16 +34,14 @@ from curvafit.segmentation.evidence import (
     grey_levels,
 )
 from curvafit.segmentation.result import Segmentation, flow_summary
-from curvafit.segmentation.tiles import Tiling, lower_volume
-from curvafit.segmentation.trials import Trial, choose_by_voxels, fullest_block
+from curvafit.segmentation.tiles import Problem, Tiling, lower_volume
+from curvafit.segmentation.trials import Trial, choose_by_voxels
 from curvafit.volumes.boxes import Boxes, boxes_of, check_finite, subsample
 from curvafit.volumes.field import ScanError
 from curvafit.volumes.formats.part import Box, Crop
 from curvafit.volumes.read import Source
 
-#: A law that is tried beside the prior's.
-WILLMORE = Coefficients.willmore()
-#: What is said of classes that may be noise.
+#: A note on classes that may be noise.
 FAINT = "The classes differ by less than the noise, as where the structure is rare: better give a threshold."
 #: Share of the time that trying laws out takes.
 TRIALS = 0.7
@@ -61,16 +60,16 @@ def segment(
     steps: int = STEPS,
     tile: int | None = None,
     store: str | PathLike[str] | None = None,
-    workers: Workers | None = None,
+    workers: Workers | int | None = None,
     crop: Crop | None = None,
     progress: Progress = silent,
     **reading: Any,
 ) -> Segmentation:
     """Find the structure of a scan: lower -log p(scan | mask) + λ F_ε from a smoothed, thresholded start.
 
-    Which law is lowered, and with which weight, is decided by grey levels that are left out: those that a fit trusts
-    and the Willmore energy are tried, and where none tells them better than the start does, the start is the answer.
-    A network's probabilities are for `refine`: none of them can be left out, since neighbouring ones are correlated.
+    Grey levels left out decide on the law and its weight: the laws that a fit trusts and the Willmore energy are tried,
+    and where none predicts these levels better than the start does, the start is the result. A network's probabilities
+    are for `refine`: neighbouring ones are correlated, so that none can be left out.
 
     Parameters
     ----------
@@ -89,12 +88,13 @@ def segment(
     steps
         Steps of Adam.
     tile
-        The energy is lowered on tiles of at most so many working voxels a side, with overlap: memory is bounded, and
-        the result does not depend on the tiles beyond a few voxels of the surface. By default the scan is one tile up
-        to 256³ working voxels; larger ones have tiles of 192³.
+        The energy is lowered on overlapping tiles of at most this many working voxels a side, which bounds the memory;
+        the result depends on the tiles by a few voxels of the surface at most. By default the scan is one tile up to
+        256³ working voxels; larger ones have tiles of 192³.
     store, workers
-        A folder in which finished tiles stay: the same call goes on with them after a kill, and the result's arrays are
-        mapped files there. Whoever lowers the tiles, such as `curvafit.core.workers.cluster`.
+        Where there are several tiles: a folder for finished ones, with which the same call goes on after a kill, and
+        whose mapped files the result's arrays are; and the number of processes that lower tiles, or workers such as
+        `curvafit.core.workers.cluster`.
     crop
         A box of voxels: see `curvafit.load`.
     progress
@@ -104,10 +104,9 @@ def segment(
 
     Raises
     ------
-    ValueError
-        If an argument is out of range or does not fit the scan, or the prior's unit cannot be converted.
-    FileNotFoundError
-        If there is no such `fit.json`.
+    ValueError, FileNotFoundError
+        If an argument is out of range or does not fit the scan, or the prior's unit cannot be converted; if there is no
+        such `fit.json`.
     """
     boxes = boxes_of(scan, crop=crop, **reading)
     frame = boxes.frame
@@ -115,42 +114,39 @@ def segment(
     tiling = Tiling.of(frame, epsilon, tile)
     if weight is not None:
         weight = check_float(weight, "a positive weight", *WEIGHTS)
-    if not (isinstance(threshold, str) and threshold == "otsu"):
-        check_float(threshold, "a threshold that is a number or 'otsu'")
+    check_options("image", threshold, None)
     check_finite(boxes)
     sample, blocks = subsample(boxes)
-    values, bounds = grey_levels(sample, threshold), grey_bounds(sample.values.astype(np.float32), threshold)
-    classes = estimate_classes(values, sample, threshold, dark)
-    _check_phases(_Grey(boxes, bounds, classes), tiling)
-    law, nats = laws[0], bending(laws[0]) / BENDING * (weight or 0.0)
-    chosen: Trial | None = None
-    if weight is None:
-        block = fullest_block(values, sample, classes, blocks)
-        overlap = threshold == "otsu" and classes.faint
+    levels, bounds = grey_levels(sample, threshold), grey_bounds(sample.values.astype(np.float32), threshold)
+    classes = estimate_classes(levels, sample, threshold, dark)
+    _check_phases(_GreyEvidence(boxes, bounds, classes), tiling)
+    gain, stiffness = "", bending(laws[0])
+    if weight is not None:
+        trial = Trial("start", laws[0], stiffness / BENDING * weight, steps)
+    else:
+        inside = grey_evidence(levels, sample, classes).level > 0
+        block = max(blocks, key=lambda block: int(count_faces(inside[block]).sum()))
         trials, progress = sub_progress(progress, 0.0, TRIALS), sub_progress(progress, TRIALS, 1.0)
-        chosen, classes = choose_by_voxels(
-            values[block], sample.crop(block), classes, (*laws, *({WILLMORE} - set(laws))),
-            epsilon=epsilon, steps=steps, remeasure=overlap, progress=trials,
+        trial, classes = choose_by_voxels(
+            levels[block], sample.crop(block), classes, add_willmore(laws),
+            epsilon=epsilon, steps=steps, remeasure=threshold == "otsu" and classes.faint, progress=trials,
         )  # fmt: skip
-        law, nats = chosen.law, chosen.strength
-    if classes.faint and threshold == "otsu" and (chosen is None or chosen.law is None):
+        gain = f"{_describe_gain(trial, trial.law in laws)}; "
+    if classes.faint and threshold == "otsu" and (weight is not None or trial.law is None):
         notes = (*notes, FAINT)
-    said = str(classes)
-    notes = (*notes, f"{said[0].upper()}{said[1:]}.", *tiling.place.notes)
-    problem = ScanProblem(_Grey(boxes, bounds, classes), law, nats, steps)
+    problem = ScanProblem(trial, _GreyEvidence(boxes, bounds, classes))
     found = lower_volume(problem, tiling, store=store, workers=workers, progress=progress)
-    status = flow_summary(found)
+    if weight is None and trial.law is not None:
+        weight = trial.strength * BENDING / bending(trial.law)
+    notes = (*notes, f"{str(classes).capitalize()}.", *tiling.place.notes)
     return Segmentation.of(
-        frame, found.mask, found.phase, notes,
-        weight=weight if weight is not None or law is None else nats * BENDING / bending(law),
-        coefficients=law, epsilon=tiling.place.epsilon,
-        status=status if chosen is None else f"{_gain(chosen, laws)}; {status}",
-    )  # fmt: skip
+        frame, found, trial.law, tiling.place.epsilon, notes, weight=weight, status=f"{gain}{flow_summary(found)}"
+    )
 
 
 @dataclass(frozen=True, eq=False)
-class _Grey:
-    """The evidence of grey levels, cut at bounds, with known classes."""
+class _GreyEvidence:
+    """The evidence of a box of grey levels, clipped to bounds, with known classes."""
 
     boxes: Boxes
     bounds: tuple[float, float]
@@ -162,47 +158,39 @@ class _Grey:
 
 
 @dataclass(frozen=True, eq=False)
-class ScanProblem:
-    """A scan's evidence, and a law with its weight; see `tiles.Problem`."""
+class ScanProblem(Problem):
+    """A scan's evidence, and a law whose strength is in nats of a unit of the Willmore energy."""
 
-    evidence: _Grey
-    law: Coefficients | None
-    nats: float
-    steps: int
+    evidence: _GreyEvidence
 
     @property
     def parts(self) -> dict[str, object]:
         evidence = self.evidence
-        return {"scan": evidence.boxes.digest, "evidence": str(evidence.classes), "nats": self.nats}
+        return {"scan": evidence.boxes.digest, "evidence": str(evidence.classes), "nats": self.trial.strength}
 
     def terms(self, box: Box, place: WorkingGrid) -> tuple[np.ndarray, Evidence]:
         evidence = self.evidence(box)
-        return evidence.level, likelihood(evidence, self.nats, place)
+        return evidence.level, likelihood(evidence, self.trial.strength, place)
 
     def plain(self, level: np.ndarray, place: WorkingGrid) -> np.ndarray:
         return place.to_scan(initial_field(level, place))
 
-    def mask(self, phase: np.ndarray, box: Box) -> np.ndarray:
-        return phase > 0
 
-
-def _check_phases(evidence: _Grey, tiling: Tiling) -> None:
-    """Raise ScanError where the first guess has one phase only; tiles are looked at until there are both."""
+def _check_phases(evidence: _GreyEvidence, tiling: Tiling) -> None:
+    """Raise ScanError where the first guess has one phase only; stop at the first tiles that have both."""
     seen: set[bool] = set()
     for tile in tiling.tiles:
         inside = evidence(tile.core).level > 0
         seen |= {bool(inside.any()), bool(inside.all())}
         if len(seen) == 2:
             return
-    raise ScanError(
-        f"expected a structure and background in the scan, got {'no background' if True in seen else 'none'}"
-    )
+    raise ScanError(f"the scan shows no {'background' if True in seen else 'structure'}: every voxel is on one side")
 
 
-def _gain(chosen: Trial, laws: Sequence[Coefficients]) -> str:
-    """Return what was chosen and what it gains, as the beginning of a sentence."""
-    share = f"{100 * chosen.score:+.2g} ± {100 * chosen.noise:.2g} % of the voxels left out are on their side"
-    if chosen.law is None:
+def _describe_gain(trial: Trial, fitted: bool) -> str:
+    """Say which law was chosen, and what it gains, as the beginning of a sentence."""
+    share = f"{100 * trial.score:+.2g} ± {100 * trial.noise:.2g} % of the voxels left out are on their side"
+    if trial.law is None:
         return f"no prior helps here: with the best {share}"
-    law = "the prior helps" if chosen.law in laws else "the Willmore energy helps, more than the prior"
-    return f"{law}, at {chosen.strength:g} nats: {share}"
+    law = "the prior helps" if fitted else "the Willmore energy helps, more than the prior"
+    return f"{law}, at {trial.strength:g} nats: {share}"

@@ -1,13 +1,14 @@
-"""Lowering the energy of a volume of any size: tile by tile, with what is finished kept in a folder.
+"""Lowering the energy of a volume of any size: tile by tile, with finished tiles kept in a folder.
 
-Tiles overlap by so much that a cut is not felt any more; the result does not depend on them beyond a few voxels of the
-surface.
+Tiles overlap so far that a cut is not felt in their cores: tiling moves the result by a few voxels of the surface at
+most.
 """
 
 from __future__ import annotations
 
 import json
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from functools import partial
 from itertools import pairwise, product
 from os import PathLike
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from filelock import FileLock, Timeout
@@ -23,13 +24,13 @@ from filelock import FileLock, Timeout
 from curvafit.core.checks import check_int
 from curvafit.core.files import write_content
 from curvafit.core.runtime import Progress, silent, sub_progress
-from curvafit.core.workers import Workers, collect_all
+from curvafit.core.workers import Workers, cluster, collect_all
 from curvafit.generation.checkpoint import identity
 from curvafit.generation.data import Data
-from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import MOST
 from curvafit.priors.kernels.threads import one_thread
 from curvafit.segmentation.engine import HALO, Ends, WorkingGrid, lower_energy
+from curvafit.segmentation.trials import Trial
 from curvafit.volumes.field import Field
 from curvafit.volumes.formats.part import Box
 
@@ -52,9 +53,9 @@ class Tile:
     number
         Its number, from 0.
     core
-        The voxels that it gives.
+        The voxels whose result the tile gives.
     box
-        The voxels that it is lowered on: with the overlap. In a volume that repeats they may lie around it.
+        The core with its overlap: where the energy is lowered. In a periodic volume it may go beyond the ends.
     ends
         Whether the box ends where the volume does, on either side of each axis.
     """
@@ -78,16 +79,9 @@ class Tile:
 
 @dataclass(frozen=True)
 class Tiling:
-    """A volume in tiles.
+    """A volume of `shape` voxels in tiles: `counts` along each axis, whose sizes differ by a voxel at most.
 
-    Attributes
-    ----------
-    shape
-        Voxels of the volume.
-    place
-        The grid of the whole volume.
-    counts
-        Number of tiles along each axis, whose sizes differ by a voxel at most.
+    `place` is the working grid of the whole volume.
     """
 
     shape: tuple[int, int, int]
@@ -96,14 +90,10 @@ class Tiling:
 
     @classmethod
     def of(cls, frame: Field, epsilon: float | None, edge: int | None = None, *, periodic: bool = False) -> Tiling:
-        """Return the tiles of a volume, of at most `edge` working voxels a side without the overlap.
+        """Cut a volume into tiles of at most `edge` working voxels a side without the overlap.
 
-        By default the volume is one tile where it has at most `WHOLE` working voxels, else tiles of `EDGE`.
-
-        Raises
-        ------
-        ValueError
-            If the edge is not a whole number from `SHORTEST`, or as `WorkingGrid.of`.
+        By default the volume is one tile up to `WHOLE` working voxels, else tiles of `EDGE`. Raises `ValueError` as
+        `WorkingGrid.of`, or if the edge is not a whole number from `SHORTEST`.
         """
         place = WorkingGrid.of(frame, epsilon, halo=HALO, periodic=periodic)
         if edge is None:
@@ -120,27 +110,21 @@ class Tiling:
     @property
     def tiles(self) -> list[Tile]:
         """The tiles, z slowest."""
-        axes = (self._axis(axis) for axis in range(3))
+        axes = (self._cut_axis(axis) for axis in range(3))
         return [Tile(k, *zip(*edges, strict=True)) for k, edges in enumerate(product(*axes))]  # type: ignore[arg-type]
 
     def place_of(self, tile: Tile) -> WorkingGrid:
-        """Return the grid of a tile's box."""
+        """Return the working grid of a tile's box."""
         return self.place if self.count == 1 else self.place.of_box(tile.shape, tile.ends)
 
-    @property
-    def voxels(self) -> list[int]:
-        """The working voxels of each tile's box."""
-        return [math.prod(self.place_of(tile).grid.shape) for tile in self.tiles]
-
-    def _axis(self, axis: int) -> list[tuple[slice, slice, tuple[bool, bool]]]:
+    def _cut_axis(self, axis: int) -> list[tuple[slice, slice, tuple[bool, bool]]]:
         """Return core, box and ends of the tiles along an axis."""
         n, times, count = self.shape[axis], self.place.times[axis], self.counts[axis]
         periodic, overlap = self.place.grid.periodic, -(-OVERLAP // times)
         if self.count == 1:
             return [(slice(0, n), slice(0, n), (True, True))]
-        edges = [k * n // count for k in range(count + 1)]
         tiles = []
-        for start, stop in pairwise(edges):
+        for start, stop in pairwise(k * n // count for k in range(count + 1)):
             first, last = start - overlap, stop + overlap
             ends = (first <= 0 and not periodic, last >= n and not periodic)
             box = slice(0 if ends[0] else first, n if ends[1] else last)
@@ -153,7 +137,7 @@ class Tiling:
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """What a tile gives: its number, mask and phase field on the core, and the last two energies of its flow."""
+    """The result of a tile: its number, mask and phase field on the core, and the last two energies of its flow."""
 
     number: int
     mask: np.ndarray
@@ -161,103 +145,64 @@ class Piece:
     energies: tuple[float, ...]
 
 
-class MemoryStore:
-    """Tiles of a volume of a shape, in memory."""
+class TileStore:
+    """The finished tiles of a volume: in memory, or in a folder that outlives a killed run (see `open_store`).
 
-    def __init__(self, shape: tuple[int, int, int]) -> None:
-        self._mask, self._phase = np.empty(shape, dtype=bool), np.empty(shape, dtype=np.float32)
-        self._energies: dict[int, tuple[float, ...]] = {}
-
-    def has(self, number: int) -> bool:
-        return number in self._energies
-
-    def write(self, core: Box, piece: Piece) -> None:
-        self._mask[core], self._phase[core] = piece.mask, piece.phase
-        self._energies[piece.number] = piece.energies
-
-    def energies(self, number: int) -> tuple[float, ...]:
-        return self._energies[number]
-
-    def volume(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the mask and the phase field."""
-        return self._mask, self._phase
-
-
-class FolderStore:
-    """Tiles of a volume in a folder that outlives a killed run; open with `open_store`.
-
-    The arrays are files of the volume's size, which are mapped. A tile has a note, `000012.json`, which is written once
-    the tile's voxels are on the disk: a killed run loses the tile it was at and nothing else.
+    In a folder the volume's arrays are mapped files. Each tile has a note there, `000012.json`, which is written once
+    the tile's voxels are on the disk: a killed run loses the tiles it was at and nothing else.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-
-    def has(self, number: int) -> bool:
-        return self._note(number).exists()
+    def __init__(self, shape: tuple[int, int, int], folder: Path | None = None) -> None:
+        self._folder, self.energies = folder, dict[int, tuple[float, ...]]()
+        if folder is None:
+            self.mask, self.phase = np.empty(shape, dtype=bool), np.empty(shape, dtype=np.float32)
+        else:
+            self.mask, self.phase = (np.load(folder / name, mmap_mode="r+") for name in (_MASK, _PHASE))
+            notes = folder.glob("[0-9]*.json")
+            self.energies = {int(note.stem): tuple(json.loads(note.read_bytes())) for note in notes}
 
     def write(self, core: Box, piece: Piece) -> None:
-        for name, values in ((_MASK, piece.mask), (_PHASE, piece.phase)):
-            array = np.load(self._folder / name, mmap_mode="r+")
-            array[core] = values
-            array.flush()
-        write_content(self._note(piece.number), json.dumps(piece.energies))
-
-    def energies(self, number: int) -> tuple[float, ...]:
-        return tuple(json.loads(self._note(number).read_bytes()))
-
-    def volume(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the mask and the phase field, mapped: they are read where they are used."""
-        mask, phase = (np.load(self._folder / name, mmap_mode="r") for name in (_MASK, _PHASE))
-        return mask, phase
-
-    def _note(self, number: int) -> Path:
-        return self._folder / f"{number:06d}.json"
+        """Keep the result of a tile."""
+        self.mask[core], self.phase[core] = piece.mask, piece.phase
+        if self._folder is not None:
+            self.mask.flush()  # type: ignore[attr-defined]
+            self.phase.flush()  # type: ignore[attr-defined]
+            write_content(self._folder / f"{piece.number:06d}.json", json.dumps(piece.energies))
+        self.energies[piece.number] = piece.energies
 
 
 @contextmanager
-def open_store(
-    folder: str | PathLike[str], shape: tuple[int, int, int], run: Mapping[str, Any]
-) -> Iterator[FolderStore]:
-    """Open the tiles of a run, or make a folder for them.
+def open_store(folder: str | PathLike[str], shape: tuple[int, int, int], run: Mapping[str, Any]) -> Iterator[TileStore]:
+    """Open the folder of a run's tiles, or make it, and lock it.
 
-    Parameters
-    ----------
-    shape
-        Voxels of the volume.
-    run
-        What two runs that share tiles have in common; see `generation.checkpoint.identity`.
-
-    Raises
-    ------
-    ValueError
-        If the folder has other things or the tiles of another run, or another run uses it.
+    `shape` is the volume's; `run` holds what runs must have in common to share tiles, see `generation.checkpoint`.
+    Raises `ValueError` if the folder holds other things or the tiles of another run, or is in use.
     """
     place = Path(folder)
     names = {path.name for path in place.iterdir()} if place.is_dir() else set()
     if (_RUN not in names and names - {_MASK, _PHASE, _LOCK}) or (place.exists() and not place.is_dir()):
-        raise ValueError(f"expected a new folder for tiles, got {place}, which holds something else")
+        raise ValueError(f"tiles need a new folder, but {place} holds something else")
     place.mkdir(parents=True, exist_ok=True)
     lock = FileLock(place / _LOCK)
     try:
         lock.acquire(timeout=0)
     except Timeout:
-        raise ValueError(f"expected tiles that no other run uses, got {place}, which is in use") from None
+        raise ValueError(f"the tiles in {place} are in use by another run") from None
     try:
-        _prepare(place, shape, identity(**run))
-        yield FolderStore(place)
+        _prepare_folder(place, shape, identity(**run))
+        yield TileStore(shape, place)
     finally:
         lock.release()
 
 
-def _prepare(place: Path, shape: tuple[int, int, int], run: dict[str, str]) -> None:
+def _prepare_folder(place: Path, shape: tuple[int, int, int], run: dict[str, str]) -> None:
     """Make the arrays of a new folder; raise ValueError where an old one is another run's."""
     if (place / _RUN).exists():
         other = json.loads((place / _RUN).read_bytes())
         names = [name for name in {**other, **run} if other.get(name) != run.get(name)]
         if names:
             parts = "; ".join(f"{name} {other.get(name)} instead of {run.get(name)}" for name in names)
-            raise ValueError(f"expected tiles of this run, got some with {parts}: delete {place} to start again")
+            raise ValueError(f"the tiles in {place} are another run's, with {parts}: delete them to start again")
         return
     for name, kind in ((_MASK, np.bool_), (_PHASE, np.float32)):
         np.lib.format.open_memmap(place / name, mode="w+", dtype=kind, shape=shape).flush()
@@ -267,35 +212,31 @@ def _prepare(place: Path, shape: tuple[int, int, int], run: dict[str, str]) -> N
 # ---- lowering --------------------------------------------------------------------------------------------------------
 
 
-class Problem(Protocol):
-    """What is lowered, and from where: the same voxels whatever the box."""
+@dataclass(frozen=True, eq=False)
+class Problem(ABC):
+    """An energy to lower, and the start; any box of the volume sees the same data.
+
+    The trial's law has lengths in the scan's unit; without a law the start is the result.
+    """
+
+    trial: Trial
 
     @property
-    def law(self) -> Coefficients | None:
-        """Coefficients with lengths in the scan's unit; None for the start itself."""
-        ...
-
-    @property
-    def steps(self) -> int:
-        """Steps of the flow."""
-        ...
-
-    @property
+    @abstractmethod
     def parts(self) -> dict[str, object]:
-        """What tells the problem from others, by name."""
-        ...
+        """What tells the problem from others with the same law and steps, by name."""
 
+    @abstractmethod
     def terms(self, box: Box, place: WorkingGrid) -> tuple[np.ndarray, Data]:
-        """Return the start and the data term on a box."""
-        ...
+        """Return the level of the start (Z, Y, X), positive inside, and the data term, on a box."""
 
+    @abstractmethod
     def plain(self, level: np.ndarray, place: WorkingGrid) -> np.ndarray:
         """Return the phase field of a start, on the scan's voxels."""
-        ...
 
     def mask(self, phase: np.ndarray, box: Box) -> np.ndarray:
         """Return the mask, bool (Z, Y, X), of a phase field on a box."""
-        ...
+        return phase > 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -314,58 +255,66 @@ def lower_volume(
     tiling: Tiling,
     *,
     store: str | PathLike[str] | None = None,
-    workers: Workers | None = None,
+    workers: Workers | int | None = None,
     progress: Progress = silent,
 ) -> LoweredVolume:
     """Lower a problem on each tile of a volume, and return the whole.
 
-    Parameters
-    ----------
-    store
-        A folder in which finished tiles stay, those of an earlier, killed run too; by default they are in memory.
-    workers
-        Whoever lowers the tiles, by default this process, one after another.
+    A volume of several tiles may have a folder, `store`, where finished tiles stay, those of an earlier, killed run
+    too, and workers, or a number of processes; by default this process lowers the tiles, one after another.
     """
-    run = {**problem.parts, "law": problem.law, "steps": problem.steps, "tiles": tiling.counts, "place": tiling.place}
-    opened = nullcontext(MemoryStore(tiling.shape)) if store is None else open_store(store, tiling.shape, run)
-    with opened as finished:
+    trial = problem.trial
+    run = {**problem.parts, "law": trial.law, "steps": trial.steps, "tiles": tiling.counts, "place": tiling.place}
+    folder = store if tiling.count > 1 else None
+    opened = nullcontext(TileStore(tiling.shape)) if folder is None else open_store(folder, tiling.shape, run)
+    with _start(workers if tiling.count > 1 else None) as crew, opened as finished:
         tiles = tiling.tiles
-        rest = [tile for tile in tiles if not finished.has(tile.number)]
-        if workers is None:
-            pieces = _in_turn(problem, tiling, rest, progress)
+        rest = [tile for tile in tiles if tile.number not in finished.energies]
+        if crew is None:
+            pieces = _lower_in_turn(problem, tiling, rest, progress)
         else:
             lower = partial(_lower_tiles, problem, tiling)
-            pieces = collect_all(workers, [(lower, Path(), [tile.number]) for tile in rest])
+            pieces = collect_all(crew, [(lower, Path(), [tile.number]) for tile in rest])
         for count, piece in enumerate(pieces, tiling.count - len(rest) + 1):
             finished.write(tiles[piece.number].core, piece)
             progress("lowering the energy", count / tiling.count)
-        energies = [finished.energies(tile.number) for tile in tiles]
-        mask, phase = finished.volume()
-    steps = 0 if problem.law is None else problem.steps
-    return LoweredVolume(mask, phase, tuple(map(sum, zip(*energies, strict=True))), steps)
+    if folder is not None:  # what is done with the result must not change the tiles
+        finished.mask.flags.writeable = finished.phase.flags.writeable = False
+    energies = [finished.energies[tile.number] for tile in tiles]
+    steps = 0 if trial.law is None else trial.steps
+    return LoweredVolume(finished.mask, finished.phase, tuple(map(sum, zip(*energies, strict=True))), steps)
 
 
-def _in_turn(problem: Problem, tiling: Tiling, tiles: Sequence[Tile], progress: Progress) -> Iterator[Piece]:
-    """Lower tiles one after another."""
+@contextmanager
+def _start(workers: Workers | int | None) -> Iterator[Workers | None]:
+    """Start a number of processes, if there is one."""
+    if isinstance(workers, int) and workers:
+        with cluster(workers) as crew:
+            yield crew
+    else:
+        yield workers or None  # type: ignore[misc]
+
+
+def _lower_in_turn(problem: Problem, tiling: Tiling, tiles: Sequence[Tile], progress: Progress) -> Iterator[Piece]:
     total = tiling.count
     for count, tile in enumerate(tiles, total - len(tiles)):
         yield _lower_tile(problem, tiling, tile, sub_progress(progress, count / total, (count + 1) / total))
 
 
 def _lower_tiles(problem: Problem, tiling: Tiling, _: Path, numbers: Sequence[int]) -> list[Piece]:
-    """Lower tiles by their numbers, as workers do, each on one thread: the workers share the cores."""
+    """Lower tiles by their numbers, as a worker does, on one thread: the workers share the cores."""
     tiles = tiling.tiles
     with one_thread():
         return [_lower_tile(problem, tiling, tiles[number], silent) for number in numbers]
 
 
 def _lower_tile(problem: Problem, tiling: Tiling, tile: Tile, progress: Progress) -> Piece:
-    place, energies = tiling.place_of(tile), ()
+    place, trial, energies = tiling.place_of(tile), problem.trial, ()
     level, term = problem.terms(tile.box, place)
-    if problem.law is None:
+    if trial.law is None:
         phase = problem.plain(level, place)
     else:
-        flow = lower_energy(level, problem.law, term, place, problem.steps, progress)
+        flow = lower_energy(level, trial.law, term, place, trial.steps, progress)
         phase, energies = place.to_scan(flow.field), tuple(map(float, flow.history.energy[-2:]))
     phase = np.ascontiguousarray(phase[tile.inner])
     return Piece(tile.number, problem.mask(phase, tile.core), phase, energies)

@@ -1,7 +1,7 @@
-"""The choice of a law and its strength by data: by masks that are known, or by voxels that are left out.
+"""The choice of a law and its strength by data: known masks, or voxels left out.
 
-Both ways try each law at one strength, then the best one at stronger and weaker ones as long as it gets better. A law
-is chosen only where it beats the plain way by more than the noise.
+Each law is tried at one strength, then the best law at stronger and weaker ones as long as it gets better. A law is
+chosen only where it beats the plain way by more than the noise.
 """
 
 from __future__ import annotations
@@ -16,36 +16,36 @@ import numpy as np
 
 from curvafit.core.runtime import Progress, silent
 from curvafit.priors.coefficients import Coefficients
-from curvafit.segmentation.engine import HALO, WorkingGrid, lower_with_evidence
+from curvafit.scan.grids import box_with_most_surface
+from curvafit.segmentation.engine import HALO, WorkingGrid, likelihood, lower_energy
 from curvafit.segmentation.evidence import LEAST_NOISE, Classes, VoxelEvidence, grey_evidence
-from curvafit.segmentation.slices import WAYS, Slices, box_with_most_surface, count_faces
+from curvafit.segmentation.slices import WAYS, Slices
 from curvafit.volumes.field import Field, ScanError
-from curvafit.volumes.formats.part import Box
 
-#: What is given of a volume.
+#: The known part of a volume.
 Given = TypeVar("Given")
 #: The way of `examples.Odds`, beside those of `slices.WAYS`.
 ODDS = "odds"
 #: Standard errors by which a trial must be better than a simpler one.
 BEYOND = 1.0
-#: Edges of the cubes that are taken to be independent, in voxels: of masks' counts, and of grey levels' gains.
+#: Edges in voxels of cubes whose errors are taken to be independent: for the Dice of masks, and for grey levels.
 CUBE, TILE = 16, 8
 #: Longest edge in voxels of the part of a scan on which laws and weights are tried.
 EDGE = 64
-#: Part of its voxels that is left out, in blocks, and times that others are; longest edge of a block, and correlation
-#: of noise that it outlasts.
+#: Share of its voxels that is left out at a time, in blocks, and how many times; longest edge of a block, in voxels,
+#: and the correlation of the noise below which voxels count as independent.
 LEFT_OUT, TIMES, LONGEST_BLOCK, CORRELATED = 0.25, 2, 6, 0.15
 #: Weights that are tried, in nats of a unit of the Willmore energy, and the first of them.
 WEIGHTS, FIRST = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0), 1.0
-#: Times that the classes are measured again, as long as that makes so many nats more likely what was left out.
+#: Most times that the classes are measured again, and the gain in nats below which that ends.
 ROUNDS, ENOUGH = 4, 3.0
-#: Fewest voxels of a class that are measured.
+#: Fewest voxels of a class that is measured again.
 FEWEST = 100
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A way to fill a volume: a plain one, or a law that is lowered from there; and how it did, once it is chosen.
+    """A way to find or fill a structure: a plain one, or a law lowered from there; and its score, once it is chosen.
 
     Attributes
     ----------
@@ -58,8 +58,8 @@ class Trial:
     pull
         Stiffness of the springs on the other voxels for each nat of an example's odds.
     score, plain, noise
-        Of a choice: what the best law scores, what the plain way does, and the standard error of the difference. Dice
-        on masks that are known; of voxels left out, by which part more are on their side (0 of the plain way).
+        Of the chosen trial: the score of the best law, that of the plain way, and the standard error of the difference.
+        Scores are Dice on known masks, or the share of voxels left out that the law brings to their side (plain: 0).
     """
 
     way: str
@@ -73,12 +73,9 @@ class Trial:
 
 
 def search(trials: Sequence[Trial], strengths: Sequence[float], worth: Callable[[Trial], float]) -> Trial:
-    """Return the best of some trials, or of that one at stronger and weaker strengths as long as each is better still.
+    """Return the best of some trials, then climb from it to stronger and weaker strengths as long as they are better.
 
-    Parameters
-    ----------
-    strengths
-        Strengths to try, ascending; a trial whose own is not among them stays as it is.
+    `strengths` ascend; a trial whose own strength is not among them stays as it is.
     """
     first = max(trials, key=worth)
     best = first
@@ -99,14 +96,9 @@ def search(trials: Sequence[Trial], strengths: Sequence[float], worth: Callable[
 
 @dataclass(frozen=True, eq=False)
 class Task(Generic[Given]):
-    """What is given of a volume, slices or evidence, and masks to compare the filled volume with.
+    """The given part of a volume, slices or evidence, and the slices that a filled volume is compared with.
 
-    Attributes
-    ----------
-    truth
-        Known masks, bool (N, Y, X), which are not given.
-    places
-        Their numbers in the volume, ascending.
+    `truth` holds the true masks of these slices, bool (N, Y, X), and `places` their numbers in the volume, ascending.
     """
 
     given: Given
@@ -117,7 +109,7 @@ class Task(Generic[Given]):
 def leave_out_slices(slices: Slices) -> Task[Slices] | None:
     """Return the task to predict every second known slice from the others; None where there are too few.
 
-    The first and the last slice are not left out, unless the volume repeats.
+    The first and the last slice are not left out, unless the volume is periodic.
     """
     number = len(slices.places)
     out = range(1, number - (0 if slices.periodic and number % 2 == 0 else 1), 2)
@@ -135,20 +127,20 @@ def choose_by_masks(
     ways: Sequence[str] = WAYS,
     strengths: Sequence[float] = (),
 ) -> Trial:
-    """Return the trial with the best Dice on a task: a law where it is better than the plain way beyond the noise.
+    """Return the trial with the best Dice on a task: a law where it beats the best plain way by more than the noise.
 
     Parameters
     ----------
     candidates
-        Returns the trials of laws that are lowered from a way, the best plain one. The best of them is tried at other
-        strengths, and then the others at the strength that is best.
+        Returns the trials of laws that start from a plain way. The best of them is tried at other strengths, and then
+        the others at the best strength.
     fill
-        Fills the volume of what is given by a trial: a mask (Z, Y, X).
+        Fills the task's volume by a trial: a mask (Z, Y, X).
     ways
-        Plain ways to compare with. Slices left out double the gap, at which the nearest slice may win by much that
-        loses by more at the gap itself: there only what is lowered and its start are to be compared.
+        Plain ways to compare with. With slices left out give one alone: at their double gap the nearest slice may win
+        by much and yet lose at the true gap.
     strengths
-        Strengths to try, ascending, the candidates' own among them; by default none but their own.
+        Strengths to try, ascending, the candidates' own among them; by default only their own.
     """
 
     @cache
@@ -168,7 +160,7 @@ def choose_by_masks(
 
 
 def best_plain_way(task: Task[Given], fill: Callable[[Given, Trial], np.ndarray], ways: Sequence[str] = WAYS) -> str:
-    """Return the plain way with the best Dice on a task: a later one where it is better beyond the noise."""
+    """Return the plain way with the best Dice on a task; a later one must win by more than the noise."""
     if len(ways) == 1:
         return ways[0]
     places = list(task.places)
@@ -181,7 +173,7 @@ def best_plain_way(task: Task[Given], fill: Callable[[Given, Trial], np.ndarray]
 
 
 def _tallies(masks: np.ndarray, truth: np.ndarray, places: Sequence[int]) -> np.ndarray:
-    """Return the voxels in both of two stacks of slices, and the sum of the voxels in each, for each cube: (T, 2)."""
+    """Count, in each of T cubes, the voxels inside both stacks of slices, and those inside either added up: (T, 2)."""
     pair = np.stack([masks & truth, masks.astype(np.uint8) + truth.astype(np.uint8)], axis=-1).astype(np.int64)
     for axis, where in enumerate((places, *map(range, truth.shape[1:]))):
         starts = np.unique(np.asarray(where) // CUBE, return_index=True)[1]
@@ -196,9 +188,9 @@ def _dice(counts: np.ndarray) -> np.ndarray:
 
 
 def _gain(after: np.ndarray, before: np.ndarray) -> tuple[float, float]:
-    """Return the difference of two Dice coefficients of counts (T, 2), and the jackknife's error of it over the cubes.
+    """Return the difference of the Dice coefficients of two counts (T, 2), and its error by a jackknife over the cubes.
 
-    Errors of a network, or of an interpolation, lie side by side: cubes are independent, voxels are not.
+    The errors of neighbouring voxels are correlated, those of cubes hardly.
     """
     whole = _dice(after.sum(0)) - _dice(before.sum(0))
     without = _dice(after.sum(0) - after) - _dice(before.sum(0) - before)
@@ -219,26 +211,26 @@ def choose_by_voxels(
     remeasure: bool = True,
     progress: Progress = silent,
 ) -> tuple[Trial, Classes]:
-    """Return the law, and its weight, that leave the fewest voxels on the wrong side; and the phases' levels.
+    """Return the law and weight that predict voxels left out best, and the classes of grey levels to use with them.
 
-    A quarter of the voxels of a part of the scan is left out, in blocks, and then another; from the evidence of the
-    others the surface is found by each law. The best law at the first weight is tried at others; then with the classes
-    of the voxels on its sides, as long as that explains more; and at last the other laws with these. See `Judge` for
-    what a surface is worth.
+    A quarter of the voxels of a part of the scan is left out, in blocks, and then another quarter; each law finds the
+    surface from the evidence of the others. `Judge` says what a surface is worth. The best law at the first weight is
+    tried at other weights; then with the classes measured again on either side of its surface, as long as that explains
+    more; and at last the other laws are tried with these classes.
 
     Parameters
     ----------
     values
         Grey levels (Z, Y, X), as `grey_levels` returns them.
     classes
-        A first guess of the classes, which overlapping phases bring together. Where no law helps they are returned.
+        A first guess, whose means are too near to each other where the phases overlap. Returned where no law helps.
     laws
         Coefficients with lengths in the scan's unit.
     remeasure
-        Whether the classes are measured again, of the voxels left out on either side; else they stay.
+        Whether the classes are measured again.
     """
     inside = grey_evidence(values, scan, classes).level > 0
-    where = box_with_most_surface(inside, (EDGE, EDGE, EDGE))
+    where = box_with_most_surface(inside, EDGE)
     part = replace(scan.crop(where), values=values[where])
     outs = hold_out_masks(part.shape, block_edge(part.values, inside[where]))
     place = WorkingGrid.of(part, epsilon, halo=HALO)
@@ -247,11 +239,12 @@ def choose_by_voxels(
 
     @cache
     def sides(trial: Trial, classes: Classes) -> np.ndarray | None:
-        """Return the voxels left out on either side; None where the flow fails."""
+        """Return `predict_sides` under a trial's law; None where the flow fails."""
         progress("trying the prior out", min(next(numbers) / expected, 1.0))
 
         def find(known: VoxelEvidence) -> np.ndarray:
-            flow = lower_with_evidence(known, trial.law, trial.strength, place, steps)  # type: ignore[arg-type]
+            term = likelihood(known, trial.strength, place)
+            flow = lower_energy(known.level, trial.law, term, place, steps)  # type: ignore[arg-type]
             return place.to_scan(flow.field) > 0
 
         try:
@@ -267,6 +260,7 @@ def choose_by_voxels(
         trials = [Trial("start", law, strength, steps) for law in laws]
         return search(trials, WEIGHTS, lambda trial: worth(trial, classes))
 
+    # Measuring the classes anew moves the surface, and the surface moves the classes: a few rounds settle both.
     chosen, used = best(laws, FIRST, classes), classes
     for _ in range(ROUNDS if remeasure else 0):
         phases = sides(chosen, used)
@@ -284,20 +278,14 @@ def choose_by_voxels(
     return replace(chosen, law=None, score=gain, noise=noise), classes
 
 
-def fullest_block(values: np.ndarray, scan: Field, classes: Classes, blocks: Sequence[Box]) -> Box:
-    """Return the block, of several of a sample's, that holds most of the surface of its first guess."""
-    inside = grey_evidence(values, scan, classes).level > 0
-    return max(blocks, key=lambda block: int(count_faces(inside[block]).sum()))
-
-
 @dataclass(frozen=True, eq=False)
 class Judge:
-    """What the levels (Z, Y, X) of voxels left out say of two sides, bool (2, Z, Y, X): outside and inside.
+    """Rates two sides, bool (2, Z, Y, X): outside and inside, by the levels (Z, Y, X) of the voxels left out.
 
-    With classes that are known the log-likelihood ratios, summed over the inside, are the sides' worth: in the mean
-    (c₁ - c₀)² / 2σ² times the voxels that are rightly inside less those that are not, whatever the law. With classes
-    that are to be measured the sides are worth what their own means explain of the levels, whatever the classes by
-    which they came about: a mask that grows fat brings its classes together, and would else vote for itself.
+    With known classes (`remeasure` false) the worth is the log-likelihood ratio summed over the inside: on average
+    (c₁ - c₀)² / 2σ² times the voxels rightly inside less those wrongly inside, whatever the law. Otherwise the worth
+    is the variance that the sides' own means explain, whatever classes led to the sides: a mask that grows fat brings
+    its classes together, and would win by the classes it made.
     """
 
     levels: np.ndarray
@@ -306,7 +294,7 @@ class Judge:
     remeasure: bool
 
     def worth(self, phases: np.ndarray) -> float:
-        """Return the log-likelihood of the sides, in nats, but for a constant."""
+        """Return the log-likelihood of the sides in nats, up to a constant."""
         classes = self.classes
         if self.remeasure:
             return float(np.sign(classes.contrast)) * _explained(self.levels, phases) / (2 * classes.noise**2)
@@ -314,12 +302,12 @@ class Judge:
         return float((inside - classes.middle).sum() * classes.contrast / classes.noise**2)
 
     def gain(self, phases: np.ndarray, start: np.ndarray) -> tuple[float, float]:
-        """Return by which part more of the voxels are on their side than in other sides, and its standard error."""
+        """Return the share of voxels that these sides place better than a start's, and its standard error."""
         classes = measure_classes(self.levels, phases, self.classes) if self.remeasure else self.classes
         change = (phases[1].astype(np.int8) - start[1]) * (self.levels - classes.middle).astype(np.float64)
         for axis, n in enumerate(change.shape):
             change = np.add.reduceat(change, np.arange(0, n, TILE), axis=axis)
-        # A voxel that changes to its side gains (c₁ - c₀) / 2 of this sum in the mean.
+        # A voxel that moves to its right side adds (c₁ - c₀) / 2 to this sum on average.
         share = 2 / classes.contrast / sum(int(out.sum()) for out in self.outs)
         nats = self.worth(phases) - self.worth(start)
         error = abs(share) * float(np.sqrt(np.square(change).sum()))
@@ -329,7 +317,7 @@ class Judge:
 def predict_sides(
     part: Field, outs: Sequence[np.ndarray], classes: Classes, find: Callable[[VoxelEvidence], np.ndarray]
 ) -> np.ndarray:
-    """Return the voxels left out, bool (2, Z, Y, X), that are outside and inside of the mask found of the others."""
+    """Return the voxels left out that fall outside and inside the masks found from the others, bool (2, Z, Y, X)."""
     phases = np.zeros((2, *part.shape), dtype=bool)
     for out in outs:
         mask = find(grey_evidence(part.values, part, classes, ~out))
@@ -338,8 +326,7 @@ def predict_sides(
 
 
 def measure_classes(levels: np.ndarray, phases: np.ndarray, classes: Classes) -> Classes:
-    """Return the classes of the voxels of two phases (2, Z, Y, X); the old ones where these are few, or the other way
-    round."""
+    """Measure the classes of two phases (2, Z, Y, X) anew; keep the old ones where voxels are few or phases swapped."""
     outside, inside = (levels[phase].astype(np.float64) for phase in phases)
     if min(len(outside), len(inside)) < FEWEST or (inside.mean() - outside.mean()) * classes.contrast <= 0:
         return classes
@@ -350,8 +337,7 @@ def measure_classes(levels: np.ndarray, phases: np.ndarray, classes: Classes) ->
 
 
 def _explained(levels: np.ndarray, phases: np.ndarray) -> float:
-    """Return the sum of squares of the levels in two phases (2, Z, Y, X) that the phases' means explain, negative where
-    the second is the darker one."""
+    """Return the sum of squares between the means of two phases (2, Z, Y, X), negative where the second is darker."""
     outside, inside = (levels[phase].astype(np.float64) for phase in phases)
     if not len(outside) or not len(inside):
         return 0.0
@@ -363,8 +349,8 @@ def _explained(levels: np.ndarray, phases: np.ndarray) -> float:
 def block_edge(values: np.ndarray, inside: np.ndarray) -> int:
     """Return the edge, in voxels, of the blocks that are left out together when a prior is tried.
 
-    It is twice the first lag at which the noise's correlation is below `CORRELATED` along every axis: within less, a
-    voxel that is left out would be known from the noise of its neighbours.
+    It is twice the first lag at which the noise's correlation is below `CORRELATED` along every axis: in a smaller
+    block the noise of the neighbours would tell a voxel's own.
     """
     residual = values - np.where(inside, values[inside].mean(), values[~inside].mean())
     square = float(np.square(residual).mean())
@@ -376,7 +362,7 @@ def block_edge(values: np.ndarray, inside: np.ndarray) -> int:
 
 
 def hold_out_masks(shape: Sequence[int], edge: int) -> list[np.ndarray]:
-    """Return `TIMES` disjoint masks, bool of a shape, each of `LEFT_OUT` of the voxels, in random blocks."""
+    """Return `TIMES` disjoint masks, each of a share `LEFT_OUT` of the voxels, in random blocks."""
     coarse = np.random.default_rng(0).random([-(-n // edge) for n in shape])
     for axis, n in enumerate(shape):
         coarse = np.repeat(coarse, edge, axis=axis).take(range(n), axis=axis)

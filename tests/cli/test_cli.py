@@ -76,12 +76,12 @@ def test_infer_writes_three_files_and_says_what_it_found(tmp_path: Path, finding
 
 def test_infer_hands_every_option_on(tmp_path: Path, finding: dict[str, Any]) -> None:
     options = "--kind mask --periodic --threshold -12.5 --label 3 --raw-shape 4,5,6 --dtype u1 --key k --seed 9"
-    options += " --channel 2 --crop 1:3,:,-4:"
+    options += " --channel 2 --crop 1:3,:,-4: --method match"
     result = call("infer", "a.raw", "-o", tmp_path, *options.split(), "--spacing", "0.5", "--roi", "r.npy")
     assert result.exit_code == 0, (result.output, result.exception)
     wanted = {"kind": "mask", "periodic": True, "threshold": -12.5, "label": 3, "raw_shape": (4, 5, 6), "dtype": "u1"}
     wanted |= {"key": "k", "seed": 9, "spacing": (0.5, 0.5, 0.5), "roi": Path("r.npy"), "atlas": None}
-    wanted |= {"channel": 2, "crop": "1:3,:,-4:"}
+    wanted |= {"channel": 2, "crop": "1:3,:,-4:", "method": "match"}
     assert {name: finding[name] for name in wanted} == wanted
 
 
@@ -95,6 +95,7 @@ def test_infer_hands_every_option_on(tmp_path: Path, finding: dict[str, Any]) ->
         ("--raw-shape 4,5", "--raw-shape"),
         ("--unit furlong", "unit"),
         ("--kind drawing", "kind"),
+        ("--method nearest", "method"),
         ("--seed -1", "seed"),
         ("--kind mask --threshold 4", "threshold"),
         ("--label 1 --threshold 4", "label"),

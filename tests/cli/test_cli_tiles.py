@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from calling import call, refused
 
-from curvafit.segmentation.tiles import FolderStore
+from curvafit.segmentation.tiles import TileStore
 from curvafit.volumes import load, save
 from curvafit.volumes.field import Field
 
@@ -32,14 +32,14 @@ def command(scan: Path, target: Path, *more: object) -> tuple:
 
 def killed(monkeypatch: pytest.MonkeyPatch, tile: int) -> None:
     """A run that is interrupted at a tile."""
-    write = FolderStore.write
+    write = TileStore.write
 
-    def stop(store: FolderStore, core, piece) -> None:
+    def stop(store: TileStore, core, piece) -> None:
         if piece.number == tile:
             raise KeyboardInterrupt
         write(store, core, piece)
 
-    monkeypatch.setattr(FolderStore, "write", stop)
+    monkeypatch.setattr(TileStore, "write", stop)
 
 
 @pytest.mark.parametrize(

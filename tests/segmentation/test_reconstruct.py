@@ -166,7 +166,7 @@ def test_odds_hold_the_surface_while_the_energy_is_lowered() -> None:
     slices = known(truth, 8)
     level, tiling = odds_of(pancakes(2)).level(slices), Tiling.of(slices.frame, None)
     held, free = (
-        lower_volume(SlicesProblem(slices, Trial(ODDS, WILLMORE, 1e7, 60, pull), level), tiling).mask
+        lower_volume(SlicesProblem(Trial(ODDS, WILLMORE, 1e7, 60, pull), slices, level), tiling).mask
         for pull in (1e7, 0.0)
     )
     assert (held != truth).sum() < (free != truth).sum()
@@ -275,8 +275,8 @@ def test_an_example_is_degraded_as_the_volume_is() -> None:
         ({"known": [3]}, "two or more"),
         ({"known": [3, 99]}, "31"),
         ({"known": [0.0, 12.5]}, "12.5"),
-        ({"every": math.nan}, "whole numbers"),
-        ({"every": 8, "first": 0.5}, "whole numbers"),
+        ({"every": math.nan}, "whole number"),
+        ({"every": 8, "first": 0.5}, "whole number"),
         ({"every": 8, "axis": 3}, "axis"),
         ({"every": 8, "epsilon": -1.0}, "epsilon"),
         ({"known": [8, 24]}, "three or more"),

@@ -10,10 +10,11 @@ from scipy import ndimage
 
 import curvafit.segmentation.trials as room
 from curvafit.priors.coefficients import Coefficients
+from curvafit.scan.grids import box_with_most_surface
 from curvafit.segmentation.evidence import Classes, estimate_classes, grey_levels
 from curvafit.segmentation.refine import FIRST, NATS, PLAIN
 from curvafit.segmentation.segment import segment
-from curvafit.segmentation.slices import Slices, box_with_most_surface
+from curvafit.segmentation.slices import Slices
 from curvafit.segmentation.trials import (
     EDGE,
     TIMES,
@@ -230,14 +231,14 @@ def test_sides_are_judged_without_the_classes_that_made_them() -> None:
 
 
 def test_a_flow_that_fails_is_no_choice(monkeypatch: pytest.MonkeyPatch) -> None:
-    real = room.lower_with_evidence
+    real = room.lower_energy
 
-    def failing(known, law, *rest):
+    def failing(level, law, *rest):
         if law != WILLMORE:
             raise ScanError("expected an energy that stays finite")
-        return real(known, law, *rest)
+        return real(level, law, *rest)
 
-    monkeypatch.setattr(room, "lower_with_evidence", failing)
+    monkeypatch.setattr(room, "lower_energy", failing)
     scan = noisy(tubes(28), 150)
     assert weighed(scan, [TUBE, WILLMORE], steps=60, remeasure=False)[0].law == WILLMORE
     assert weighed(scan, [TUBE], steps=60, remeasure=False)[0].law is None

@@ -11,7 +11,7 @@ from found import made_fit
 
 from curvafit.inference.fit import Draws
 from curvafit.priors.coefficients import Coefficients
-from curvafit.segmentation.engine import drawn_laws
+from curvafit.segmentation.engine import draw_laws
 from curvafit.segmentation.examples import grow_task
 from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.slices import Slices, harmonic_distance
@@ -218,16 +218,16 @@ def test_draws_are_laws_in_the_scan_s_unit(tmp_path: Path) -> None:
     fit, scan = made_fit(), Field(ball(), (0.0195,) * 3, "mm")
     rows = np.column_stack([np.arange(1.0, 6), np.ones(5), *np.zeros((4, 5))])
     fit = replace(fit, draws=Draws(rows, "mask", "by hand"))
-    laws = drawn_laws(fit, scan, 3)
+    laws = draw_laws(fit, scan, 3)
     assert [law.a11 for law in laws] == [1, 3, 5] and all(law.a20 == 1 for law in laws)
     linear = replace(fit, draws=Draws(rows + np.eye(6)[2], "mask", "by hand"))
-    assert drawn_laws(linear, scan, 1)[0].a10 == pytest.approx(1 / fit.length)
+    assert draw_laws(linear, scan, 1)[0].a10 == pytest.approx(1 / fit.length)
     path = tmp_path / "fit.json"
     path.write_text(fit.to_json())
-    assert [law.as_dict() for law in drawn_laws(path, scan, 3)] == [law.as_dict() for law in laws]
+    assert [law.as_dict() for law in draw_laws(path, scan, 3)] == [law.as_dict() for law in laws]
     none = replace(fit, draws=None)
     for prior in ("tubes", WILLMORE, none):
-        assert drawn_laws(prior, scan, 3) == ()
+        assert draw_laws(prior, scan, 3) == ()
 
 
 # ---- suggestions -----------------------------------------------------------------------------------------------------
