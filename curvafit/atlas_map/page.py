@@ -239,6 +239,6 @@ def regrow_command(record: Record, settings: Settings, name: str) -> str:
 
 
 def _all_digits(value: object) -> str:
-    """Return all digits of a number without trailing zeros."""
+    """Return a number with all its digits, a whole one without a decimal point."""
     number = float(value)  # type: ignore[arg-type]
     return str(int(number)) if number.is_integer() else repr(number)

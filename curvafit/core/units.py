@@ -38,7 +38,10 @@ def parse_unit(unit: str | None) -> tuple[str, float]:
 
 
 def convert_length(length: float, unit: str | None, to: str | None) -> float:
-    """Return a length, in `unit`, in the unit `to`; if one of the two is the voxel, the number stays."""
+    """Convert a length from `unit` to the unit `to`.
+
+    A voxel has no length: if one of the two is the voxel, only a factor such as that of cm to mm is applied.
+    """
     (name, factor), (target, target_factor) = parse_unit(unit), parse_unit(to)
     if "voxel" in (name, target):
         return length * factor

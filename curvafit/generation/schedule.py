@@ -45,7 +45,7 @@ class Phase:
         object.__setattr__(
             self, "share", check_open_interval(self.share, "a phase's share of the steps in (0, 1)", 0, 1)
         )
-        _check_steps(self)
+        _normalise_steps(self)
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Schedule:
         check_type(self.name, str, "a schedule's name as text")
         steps = check_int(self.steps, "a whole number of steps, at least 1", 1, MOST_STEPS)
         object.__setattr__(self, "steps", steps)
-        _check_steps(self)
+        _normalise_steps(self)
         parts = as_tuple(self.opening, "phases")
         phases = tuple(Phase(**part) if isinstance(part, dict) else part for part in parts)
         for phase in phases:
@@ -151,13 +151,14 @@ class Schedule:
         return tuple(mark for mark in marks if 0 < mark < self.steps)
 
 
-def _check_steps(phase: Phase | Schedule) -> None:
-    """Convert the numbers of a phase's steps; raise ValueError where one is out of range."""
+def _normalise_steps(phase: Phase | Schedule) -> None:
+    """Make a phase's lengths of steps and its momenta floats, in place; raise ValueError where one is out of range."""
     for name in ("start", "stop"):
         length = check_float(getattr(phase, name), "positive step lengths", 1e-30, LONGEST_STEP)
         object.__setattr__(phase, name, length)
     check_choice(phase.shape, ("constant", "cosine"), "a schedule's shape 'constant' or 'cosine'")
     for name in ("momentum", "memory"):
+        # The interval is open below, so 0 is allowed from the greatest float under it.
         object.__setattr__(phase, name, check_open_interval(getattr(phase, name), f"{name} in [0, 1)", -math.ulp(0), 1))
 
 

@@ -120,19 +120,19 @@ def _pack_diagrams(diagrams: Sequence[Diagram], blur: float, reach: float | None
 
 
 def _iterate_distances(clouds: Clouds, first: np.ndarray, second: np.ndarray, **options: Any) -> Iterator[np.ndarray]:
-    """Yield the distances of the pairs, block by block.
+    """Yield the debiased Sinkhorn distances √(cost(a, b) - cost(a, a) / 2 - cost(b, b) / 2) of the pairs, by blocks.
 
-    Debiasing takes off half of each cloud's cost with itself, in as many steps as the pair's. A cloud meets two or
-    three numbers of steps, so these costs are computed once for each.
+    A cloud's cost with itself depends on how often the pair's blur is halved: it is computed once for each cloud and
+    number of halvings, of which a cloud meets two or three.
     """
-    falls = pair_halvings(clouds, first, second, options["blur"])
-    keys = np.concatenate([np.stack([ends, falls], axis=1) for ends in (first, second)])
+    halved = pair_halvings(clouds, first, second, options["blur"])
+    keys = np.concatenate([np.stack([ends, halved], axis=1) for ends in (first, second)])
     distinct, places = np.unique(keys, axis=0, return_inverse=True)
-    own = costs(clouds, distinct[:, 0], distinct[:, 0], distinct[:, 1], **options)
-    bias = own[places.reshape(2, -1)].sum(0) / 2
+    self_costs = costs(clouds, distinct[:, 0], distinct[:, 0], distinct[:, 1], **options)
+    bias = self_costs[places.reshape(2, -1)].sum(0) / 2
     for start in range(0, len(first), BLOCK):
         block = slice(start, start + BLOCK)
-        divergence = costs(clouds, first[block], second[block], falls[block], **options) - bias[block]
+        divergence = costs(clouds, first[block], second[block], halved[block], **options) - bias[block]
         yield np.sqrt(np.maximum(divergence, 0))
 
 

@@ -185,15 +185,17 @@ class Search:
     def deviance(self, candidates: np.ndarray, simulated: Simulations) -> np.ndarray:
         """Return twice the negative log likelihood of each candidate `(m,)`, up to a constant.
 
-        A Gaussian process of what the emulator misses of the simulations is added to the emulator's mean.
+        A Gaussian process, fitted to the emulator's residuals at the simulations, is added to the emulator's mean.
+        Descriptors are compared in uncorrelated directions, in units of the emulator's mean deviation along each; that
+        unit is the same for all candidates, so its logarithm is left out.
         """
         emulated = self.emulator(simulated.parameters, self.view)
         basis, deviation = self.emulator.basis, emulated.deviation.mean(0)
-        missed = (self._decorrelate(simulated.descriptors) - emulated.mean @ basis.T) / deviation
-        mean, variance = Process.fit(self._standardise(simulated.parameters), missed)(self._standardise(candidates))
+        residuals = (self._decorrelate(simulated.descriptors) - emulated.mean @ basis.T) / deviation
+        mean, variance = Process.fit(self._standardise(simulated.parameters), residuals)(self._standardise(candidates))
         expected = self.emulator(candidates, self.view).mean @ basis.T / deviation + mean
-        left = self._decorrelate(self.query[None]) / deviation - expected
-        return np.square(left).sum(1) / variance + left.shape[1] * np.log(variance)
+        scan_residual = self._decorrelate(self.query[None]) / deviation - expected
+        return np.square(scan_residual).sum(1) / variance + scan_residual.shape[1] * np.log(variance)
 
     def _decorrelate(self, descriptors: np.ndarray) -> np.ndarray:
         """Return rows of descriptors in the emulator's uncorrelated directions `(N, k)`."""

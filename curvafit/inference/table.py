@@ -260,8 +260,8 @@ def compression_of(descriptors: np.ndarray, components: int, blocks: tuple[str, 
     """Return the compression to the principal components of some descriptors.
 
     Columns are scaled to deviation 1 (those of the curvature block by one factor, so that distances stay), and blocks
-    weighed by `WEIGHTS`. A component's deviation is the root of its own in those columns: the first do not drown the
-    others. The components' mean square is 1.
+    weighed by `WEIGHTS`. Components are half whitened: one of deviation σ is divided by √σ, so that the first do not
+    drown the others. The components' mean square is 1.
     """
     names = np.array(column_names())
     names = names[np.isin(names, blocks)]
@@ -269,14 +269,15 @@ def compression_of(descriptors: np.ndarray, components: int, blocks: tuple[str, 
     mean, scale = columns.mean(0), columns.std(0) + 1e-9
     weight = np.ones(len(names))
     for block in set(names.tolist()):
-        mine = names == block
-        weight[mine] = WEIGHTS.get(block, 1.0) / np.sqrt(mine.sum())
+        in_block = names == block
+        weight[in_block] = WEIGHTS.get(block, 1.0) / np.sqrt(in_block.sum())
         if block == "curvature":
-            scale[mine] = np.sqrt((scale[mine] ** 2).mean())
-    plain = Compression(blocks, mean, scale, np.diag(weight))
-    weighed = plain(descriptors)
+            scale[in_block] = np.sqrt((scale[in_block] ** 2).mean())
+    uncompressed = Compression(blocks, mean, scale, np.diag(weight))
+    weighed = uncompressed(descriptors)
     values, vectors = np.linalg.eigh(weighed.T @ weighed / len(weighed))
     order = np.argsort(-values)[:components]
+    # An eigenvalue is σ², so its fourth root is √σ.
     basis = (vectors[:, order] / (values[order] + 1e-12) ** (1 / 4)).T * weight
     basis /= np.sqrt(np.mean(np.sqrt(values[order])))
     return Compression(blocks, mean, scale, basis)

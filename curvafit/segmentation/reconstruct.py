@@ -186,7 +186,11 @@ class SlicesProblem(Problem):
         return {"slices": digest_of(slices.inside), **numbers, "start": start, **springs}
 
     def terms(self, box: Box, place: WorkingGrid) -> tuple[np.ndarray, data.Data]:
-        """Return the interpolation, and springs on the known voxels and on those held by odds."""
+        """Return the interpolation on a box, positive inside, and the hinge term that holds voxels there.
+
+        Known voxels are held with the trial's strength. Where the start is an example's odds, voxels between known
+        slices are held too: by the trial's pull for each pixel of the level, which is then the log-odds of the inside.
+        """
         slices, trial, (rows, inside) = self.slices, self.trial, self.slices.known(box)
         numbers = slices.numbers(box)
         level = slices.level(trial.way, box) if self.level is None else self.level[np.ix_(*numbers)]
@@ -238,10 +242,10 @@ def _turn_back(axis: int, values: np.ndarray) -> np.ndarray:
 def _uncertainty(
     likely: ProbabilityMap, slices: Slices, volume: Field, axis: int, runs: int, count: int
 ) -> Uncertainty:
-    """Return the uncertainty of a volume with `count` suggestions."""
-    following = suggest_slices(entropy(likely.values).sum((1, 2)), slices.places, count, slices.periodic)
+    """Return the probability map of a volume from its runs, and the `count` slices most worth annotating next."""
+    suggestions = suggest_slices(entropy(likely.values).sum((1, 2)), slices.places, count, slices.periodic)
     probability = replace(volume, values=_turn_back(axis, likely.values), notes=())
-    return Uncertainty(probability, tuple(range(runs)), likely.error, following)
+    return Uncertainty(probability, seeds=tuple(range(runs)), calibration_error=likely.error, suggestions=suggestions)
 
 
 def _describe_errors(uncertain: Uncertainty, where: str) -> str:

@@ -83,11 +83,11 @@ class Slices:
         return [np.arange(edge.start, n if edge.stop is None else edge.stop) % n for edge, n in edges]
 
     def known(self, box: Box) -> tuple[list[int], np.ndarray]:
-        """Return which slices of a box are known, and their masks within the box, bool (N, Y, X)."""
+        """Return the positions, within a box, of its known slices, and their masks there, bool (N, Y, X)."""
         numbers, ys, xs = self.numbers(box)
-        row = {place: k for k, place in enumerate(self.places)}
-        rows = [k for k, place in enumerate(numbers) if place in row]
-        return rows, self.inside[[row[int(numbers[k])] for k in rows]][:, ys][:, :, xs]
+        index_of_place = {place: k for k, place in enumerate(self.places)}
+        positions = [k for k, place in enumerate(numbers) if place in index_of_place]
+        return positions, self.inside[[index_of_place[int(numbers[k])] for k in positions]][:, ys][:, :, xs]
 
     def level(self, way: str, box: Box | None = None) -> np.ndarray:
         """Return an interpolation by one of `WAYS`, float32 (length, Y, X), positive inside, or a box of it.
