@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from numbers import Real
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,7 +13,7 @@ from torch import Tensor
 from curvafit.core.checks import as_tuple, check_choice, check_int
 from curvafit.core.runtime import EAGER, check_memory, device_memory
 from curvafit.generation.cost import Cost
-from curvafit.generation.flow import BACKENDS, WORKING_BLUR, Backend, base_of, check_device, generate
+from curvafit.generation.flow import BACKENDS, WORKING_BLUR, Backend, check_device, choose_base, generate
 from curvafit.generation.forms import DivergenceForm, white_noise
 from curvafit.generation.loop import FlowOptions, run
 from curvafit.generation.result import Flow
@@ -51,17 +51,13 @@ def generate_batch(
         A law, a mass and a seed for all shapes, or sequences of one length with one for each shape. None takes the
         laws' masses. A mass that is a tensor varies in space, for all shapes.
     together
-        How many shapes advance in the same steps, where there is no fused step; None takes as many as fit into half of
-        the device's memory, at most 64, and one on a processor.
+        Number of shapes that advance in the same steps, where there is no fused step; None takes as many as fit into
+        half of the device's memory, at most 64, and one on a processor.
 
-    The other arguments are those of `generate`, for all shapes.
-
-    Raises
-    ------
-    ValueError
-        At once if the sequences differ in length; otherwise as `generate` does, when the shape is made.
+    The other arguments are those of `generate`, for all shapes. Raises ValueError at once if the sequences differ in
+    length, otherwise as `generate` does, when the shape is made.
     """
-    jobs, plan = _jobs(laws, masses, seeds), named_schedule(schedule)
+    jobs, plan = _list_jobs(laws, masses, seeds), named_schedule(schedule)
     grid = grid if isinstance(grid, Grid) else Grid(grid)  # type: ignore[arg-type]
     options = {
         "schedule": plan, "epsilon": epsilon, "blur": blur, "reject_early": reject_early, "backend": backend,
@@ -71,31 +67,23 @@ def generate_batch(
     check_device(device)
     size = 1
     if backend in ("torch", "compiled") or not kernels.has_kernel(device):
-        size = _fitting(grid, device) if together is None else together
+        size = _count_fitting(grid, device) if together is None else together
     size = check_int(size, "at least one shape at a time", 1, 10**6)
     if size == 1:
-        return (generate(job.coefficients, job.mass, grid, seed=job.seed, **options) for job in jobs)
+        return (generate(law, mass, grid, seed=seed, **options) for law, mass, seed in jobs)
     groups = [jobs[first : first + size] for first in range(0, len(jobs), size)]
-    return (flow for group in groups for flow in _joint_flows(group, grid, options))
+    return (flow for group in groups for flow in _generate_together(group, grid, options))
 
 
-def _fitting(grid: Grid, device: torch.device | str) -> int:
+def _count_fitting(grid: Grid, device: torch.device | str) -> int:
     """Return how many shapes fit into half of a device's memory; one on a processor, where threads share a shape."""
     if torch.device(device).type == "cpu":
         return 1
     return max(1, min(MOST_TOGETHER, device_memory(device) // (2 * EAGER * math.prod(grid.shape))))
 
 
-class _Job(NamedTuple):
-    """Parameters of one shape."""
-
-    coefficients: Coefficients
-    mass: float | Tensor | None
-    seed: int
-
-
-def _jobs(laws, masses, seeds) -> list[_Job]:
-    """Return one job for each shape."""
+def _list_jobs(laws, masses, seeds) -> list[tuple[Coefficients, float | Tensor | None, int]]:
+    """Return coefficients, mass and seed of each shape."""
     columns = [
         read_laws(laws),
         [masses] if masses is None or isinstance(masses, (Real, Tensor)) else as_tuple(masses, "masses"),
@@ -104,23 +92,23 @@ def _jobs(laws, masses, seeds) -> list[_Job]:
     lengths = {len(column) for column in columns} - {1}
     if len(lengths) > 1 or 0 in lengths:
         counts = ", ".join(str(len(column)) for column in columns)
-        raise ValueError(f"expected laws, masses and seeds of one length, or one for all, got {counts}")
+        raise ValueError(f"laws, masses and seeds must be of one length, or one for all, got {counts}")
     count = max(lengths, default=1)
     rows = zip(*([*column] * (count // len(column)) for column in columns), strict=True)
-    return [_Job(law.coefficients, law.mass if mass is None else mass, seed) for law, mass, seed in rows]
+    return [(law.coefficients, law.mass if mass is None else mass, seed) for law, mass, seed in rows]
 
 
-def _joint_flows(jobs: list[_Job], grid: Grid, options: dict[str, Any]) -> list[Flow]:
-    """Make shapes together, in the same steps."""
-    plan, device, width = options["schedule"], options["device"], options["blur"]
+def _generate_together(jobs: list[tuple], grid: Grid, options: dict[str, Any]) -> list[Flow]:
+    """Make shapes in the same steps."""
+    plan, device, blur = options["schedule"], options["device"], options["blur"]
     check_memory((len(jobs), *grid.shape), EAGER, "a batch", device)
-    costs = [Cost(job.coefficients, grid, options["epsilon"], None, width) for job in jobs]
-    bases = [DivergenceForm.of(grid, width, base_of(job.mass, None, grid)).base for job in jobs]
-    coefficients = Coefficients(*(_stack(values) for values in zip(*(job.coefficients for job in jobs), strict=True)))
+    laws, masses, seeds = zip(*jobs, strict=True)
+    costs = [Cost(law, grid, options["epsilon"], None, blur) for law in laws]
+    bases = [DivergenceForm.of(grid, blur, choose_base(mass, None, grid)).base for mass in masses]
     stepper = TorchStepper(
-        torch.stack([white_noise(grid, job.seed) for job in jobs]),
+        torch.stack([white_noise(grid, seed) for seed in seeds]),
         DivergenceForm(grid, costs[0].blur, _stack(bases)),
-        coefficients,
+        Coefficients(*map(_stack, zip(*laws, strict=True))),
         costs[0].epsilon,
         plan.betas,
         None,
@@ -128,8 +116,7 @@ def _joint_flows(jobs: list[_Job], grid: Grid, options: dict[str, Any]) -> list[
         compiled=options["backend"] == "compiled",
         count=len(jobs),
     )
-    each = [FlowOptions(cost, plan, reject_early=options["reject_early"]) for cost in costs]
-    return run(stepper, each, [job.seed for job in jobs])
+    return run(stepper, [FlowOptions(cost, plan, reject_early=options["reject_early"]) for cost in costs], seeds)
 
 
 def _stack(values: Sequence[float | Tensor]) -> Tensor:

@@ -30,36 +30,22 @@ class Checkpoint:
     Parameters
     ----------
     path
-        Path of the file; a link is followed and stays. The folder is created. While a run uses the file, a lock
-        `.NAME.curvafit-lock` lies beside it.
+        Path of the file; a link is followed and stays. The folder is created.
     every
         The least number of seconds between two saves; 0 saves after every step.
     run
         The run's parameters by name; see `identity`.
     keep
         Whether the file stays at the end of the run.
-
-    Raises
-    ------
-    ValueError
-        If the seconds are negative, or the path is not that of a regular file.
     """
 
     def __init__(self, path: str | Path, every: float, run: dict[str, str], keep: bool = False) -> None:
-        if not every >= 0:
-            raise ValueError(f"expected seconds between checkpoints, at least 0, got {every}")
         self.path, self._every, self._run, self._keep = resolve_place(path), every, run, keep
         self._last_save = time.monotonic()
 
     @contextmanager
     def lock(self) -> Iterator[None]:
-        """Lock the file against other runs.
-
-        Raises
-        ------
-        ValueError
-            If another run uses the file.
-        """
+        """Lock the file against other runs by a file `.NAME.curvafit-lock`; raise ValueError if one uses it."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
         place = self.path.with_name(f".{self.path.name}.curvafit-lock")
         lock = FileLock(place)
@@ -67,40 +53,34 @@ class Checkpoint:
             lock.acquire(timeout=0)
         except Timeout:
             raise ValueError(
-                f"expected a checkpoint that no other run uses, got {self.path}, which is in use: wait for that run to "
-                "end, or name another file"
+                f"the checkpoint {self.path} is in use by another run: wait for it to end, or name another file"
             ) from None
         try:
             remove_leftovers(self.path)
             yield
         finally:
             with hold_signals():
+                # Before the release: a process that waits for the lock then sees that its file is gone.
                 with suppress(PermissionError):  # Windows deletes no file that is open
-                    place.unlink(
-                        missing_ok=True
-                    )  # before the release: a process that waits for the lock then sees that it is gone
+                    place.unlink(missing_ok=True)
                 lock.release()
 
     def load(self) -> dict[str, Any] | None:
-        """Return the content that was saved last, or None where there is no file.
-
-        Raises
-        ------
-        ValueError
-            If the file is damaged or not a checkpoint, or belongs to another run.
-        """
+        """Return the last content saved, or None where there is no file; raise ValueError if it is not this run's."""
         if not self.path.exists():
             return None
         head, _, payload = self.path.read_bytes().partition(b"\n")
         if head != _HEAD + hashlib.sha256(payload).hexdigest().encode():
             fault = "a damaged one" if head.startswith(_HEAD) else "another kind of file"
-            raise ValueError(f"expected a checkpoint of a flow, got {fault}: delete {self.path} to start again")
+            raise ValueError(f"{self.path} is no checkpoint of a flow, but {fault}: delete it to start again")
         record = torch.load(io.BytesIO(payload), weights_only=True)
         other = record["run"]
         names = [name for name in {**other, **self._run} if other.get(name) != self._run.get(name)]
         if names:
             parts = (f"{name} {other.get(name)} instead of {self._run.get(name)}" for name in names)
-            raise ValueError(f"expected a checkpoint of this run, got one with {'; '.join(parts)}: {self.path}")
+            raise ValueError(
+                f"{self.path} is the checkpoint of another run, with {'; '.join(parts)}: delete or rename it"
+            )
         return record["content"]
 
     def is_due(self) -> bool:
@@ -123,25 +103,19 @@ class Checkpoint:
 
 
 def resolve_place(path: str | Path) -> Path:
-    """Return the file to which a checkpoint's path leads.
-
-    Raises
-    ------
-    ValueError
-        If the path leads to a folder, a device or a pipe, or is a loop of links.
-    """
+    """Return the file to which a checkpoint's path leads; raise ValueError for a folder, a pipe or a loop of links."""
     try:
         place = Path(path).resolve()
         regular = place.is_file() or not place.exists()
     except (OSError, RuntimeError):
         regular = False
     if not regular or (Path(path).is_symlink() and place.is_symlink()):
-        raise ValueError(f"expected a file for the checkpoint, got {path}, which is not a regular file")
+        raise ValueError(f"the checkpoint {path} is not a regular file: name another file")
     return place
 
 
 def identity(**parts: object) -> dict[str, str]:
-    """Return the texts by name that two runs must share: their parts (tensors as digests) and the versions."""
+    """Return the texts, by name, that tell runs apart: those of its parts, with digests of tensors, and versions."""
     texts = {name: _text(value) for name, value in parts.items()}
     return {**texts, "curvafit": version("curvafit"), "torch": version("torch")}
 

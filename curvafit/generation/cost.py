@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -25,12 +24,8 @@ VOXELS = (1e-8, 1e5)
 class Cost:
     """The functional that a flow lowers, and the blur of the field; see `generate` for the parameters.
 
-    Raises
-    ------
-    ValueError
-        If ε is below a tenth of a voxel or longer than the box, the blur is negative or longer than the box, a
-        coefficient or the orientation is over `STRONGEST` with lengths in units of ε, a voxel's edge is outside
-        `VOXELS`, or a tensor does not broadcast with the voxels.
+    Raises ValueError if a length is outside the bounds in which float32 can follow the flow, a coefficient or the
+    orientation is over `STRONGEST` with lengths in units of ε, or a tensor does not broadcast with the voxels.
     """
 
     coefficients: Coefficients
@@ -51,7 +46,7 @@ class Cost:
         """Convert ε and the blur to numbers; raise ValueError where they or the voxels' edges are out of range."""
         edges, box = self.grid.spacing, self.grid.longest
         if not VOXELS[0] <= min(edges) <= max(edges) <= VOXELS[1]:
-            raise ValueError(f"expected voxel edges from {VOXELS[0]:g} to {VOXELS[1]:g} for a flow, got {edges}")
+            raise ValueError(f"a flow needs voxel edges from {VOXELS[0]:g} to {VOXELS[1]:g}, got {edges}")
         expected = "epsilon > 0 and blur >= 0 in the spacing's unit"
         if not isinstance(self.epsilon, Tensor):
             object.__setattr__(self, "epsilon", check_float(self.epsilon, expected, math.ulp(0)))
@@ -63,9 +58,9 @@ class Cost:
         if not FINEST * min(edges) <= low <= high <= box:
             got = f"{low:g}" if low == high else f"{low:g} to {high:g}"
             least = f"{FINEST:g} of a voxel ({FINEST * min(edges):.3g})"
-            raise ValueError(f"expected an epsilon from {least} to the box's side ({box:.3g}), got {got}")
+            raise ValueError(f"epsilon must be from {least} to the box's side ({box:.3g}), got {got}")
         if self.blur > box:
-            raise ValueError(f"expected a blur within the box ({box:.3g}), got {self.blur:g}")
+            raise ValueError(f"the blur must be at most the box's side ({box:.3g}), got {self.blur:g}")
 
     def _check_tensors(self) -> None:
         """Raise ValueError where a tensor does not broadcast with the voxels, or data or orientation do not fit."""
@@ -73,15 +68,14 @@ class Cost:
             if isinstance(value, Tensor):
                 check_shape(name, value, self.grid)
         if self.data is not None and not callable(getattr(self.data, "slope", None)):
-            raise ValueError(f"expected data with a slope, as generation.data.Evidence, got {quoted(self.data)}")
+            raise ValueError(f"data must have a method slope, as generation.Evidence has, got {quoted(self.data)}")
         for name, value in getattr(self.data, "__dict__", {}).items():
             if isinstance(value, Tensor):
                 check_shape(f"the data's {name}", value, self.grid)
         Q = self.orientation
-        if Q is None:
-            return
-        if not isinstance(Q, Tensor) or tuple(Q.shape) != (3, 3) or not torch.equal(Q, Q.T):
-            raise ValueError(f"expected a symmetric orientation of shape (3, 3) (z, y, x), got {quoted(_plain(Q))}")
+        if Q is not None and (not isinstance(Q, Tensor) or tuple(Q.shape) != (3, 3) or not torch.equal(Q, Q.T)):
+            values = Q.tolist() if isinstance(Q, Tensor) else Q
+            raise ValueError(f"the orientation must be symmetric, of shape (3, 3) (z, y, x), got {quoted(values)}")
 
 
 def check_shape(name: str, value: Tensor, grid: Grid) -> None:
@@ -91,9 +85,4 @@ def check_shape(name: str, value: Tensor, grid: Grid) -> None:
     except RuntimeError:
         fits = False
     if not fits:
-        raise ValueError(f"expected {name} to broadcast with the voxels {grid.shape}, got shape {tuple(value.shape)}")
-
-
-def _plain(value: Any) -> Any:
-    """Return a tensor's values as lists, other values unchanged."""
-    return value.tolist() if isinstance(value, Tensor) else value
+        raise ValueError(f"{name} must broadcast with the voxels {grid.shape}, got the shape {tuple(value.shape)}")

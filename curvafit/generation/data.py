@@ -8,7 +8,7 @@ from typing import Protocol, Self
 import torch
 from torch import Tensor
 
-from curvafit.core.checks import check_float, quoted
+from curvafit.core.checks import check_float, check_type
 from curvafit.priors.grid import Float, Grid
 
 
@@ -31,11 +31,9 @@ class _OfVoxels:
     ratio: Float[Tensor, "z y x"]
 
     def __post_init__(self) -> None:
-        if not isinstance(self.ratio, Tensor):
-            raise ValueError(f"expected finite evidence (Z, Y, X), got {quoted(self.ratio)}")
+        check_type(self.ratio, Tensor, "evidence as a tensor (Z, Y, X)")
         if self.ratio.dim() != 3 or not self.ratio.numel() or not bool(torch.isfinite(self.ratio).all()):
-            got = f"values of shape {tuple(self.ratio.shape)}, or values that are not finite"
-            raise ValueError(f"expected finite evidence (Z, Y, X), got {got}")
+            raise ValueError(f"evidence must be finite, of shape (Z, Y, X), got the shape {tuple(self.ratio.shape)}")
 
     def to(self, device: torch.device | str, /) -> Self:
         """Return the same term on a device."""
@@ -53,12 +51,7 @@ class Evidence(_OfVoxels):
     Parameters
     ----------
     ratio
-        r, `(Z, Y, X)`, finite; 0 where nothing is known.
-
-    Raises
-    ------
-    ValueError
-        If the ratio is not a finite 3D tensor.
+        r, `(Z, Y, X)`, finite (or ValueError is raised); 0 where nothing is known.
     """
 
     def slope(self, u: Float[Tensor, "z y x"], grid: Grid, /) -> tuple[float, Float[Tensor, "z y x"]]:
@@ -73,21 +66,16 @@ class Evidence(_OfVoxels):
 class Hinge(_OfVoxels):
     """D(u) = V Σ |r| (m - sign(r) u)₊² / 4, which holds u at ±m or beyond on the side of r's sign.
 
-    The term is for voxels whose side is known: no force where u is on that side, a spring where it is not. At a margin
-    of 1 an error of 2 costs |r| times the voxel's volume, but a profile that crosses the known voxels is squeezed: with
-    the margin of a voxel next to the surface (`priors.profile.optimal_profile`) it is free.
+    The term is for voxels whose side is known: there is no force where u is at least m on that side, and a spring where
+    it is not. At m = 1 the wrong phase, off by 2, costs |r| V, but a profile that crosses known voxels is squeezed; it
+    is free where m is the profile's value in a voxel next to the surface (`priors.profile.optimal_profile`).
 
     Parameters
     ----------
     ratio
-        r, `(Z, Y, X)`, finite; 0 where nothing is known.
+        r, `(Z, Y, X)`, finite (or ValueError is raised); 0 where nothing is known.
     margin
         m, from 0 to 1.
-
-    Raises
-    ------
-    ValueError
-        If the ratio is not a finite 3D tensor, or the margin is out of range.
     """
 
     margin: float = 1.0

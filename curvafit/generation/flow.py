@@ -101,14 +101,10 @@ def generate(
     Returns
     -------
     Flow
-        Its `viability.viable` is False, and its `status` holds the reason, where the field is not a shape or the energy
-        diverged.
+        Where the field is not a shape, or the energy diverged, `viability.viable` is False and `status` says why.
 
-    Raises
-    ------
-    ValueError
-        If the mass is outside (-1, 1), ε is not positive or the blur negative, a tensor does not broadcast with the
-        voxels, a name is unknown, a file is not this run's checkpoint, or there is no fused step for the device.
+    Raises ValueError if an argument is out of range or does not fit the voxels, a file is not this run's checkpoint, or
+    the device has no fused step.
     """
     known = Law.of(law)
     mass = known.mass if mass is None and volume_fraction is None else mass
@@ -118,7 +114,7 @@ def generate(
     cost = Cost(known.coefficients, grid, epsilon, orientation, blur)
     options = FlowOptions(cost, plan, callbacks, snapshots, reject_early, volume_fraction)
     options.check_memory(device)
-    base = base_of(mass, volume_fraction, grid)
+    base = choose_base(mass, volume_fraction, grid)
     form = DivergenceForm.of(grid, cost.blur, base, execution.blur)
     stepper = execution.stepper(white_noise(grid, seed), form, cost, plan, "adam", None)
     checkpoint_file = execution.checkpoint_file(stepper, cost, options, seed=seed, mass=base)
@@ -130,7 +126,7 @@ def descend(
     law: LawLike,
     grid: Grid,
     *,
-    flow: Literal["l2", "mass", "h-1"] = "l2",
+    flow: Literal["l2", "h-1"] = "l2",
     optimiser: Literal["lbfgs", "adam"] = "lbfgs",
     steps: int = 200,
     schedule: str | Schedule = "cosine",
@@ -156,8 +152,8 @@ def descend(
         v₀, `(Z, Y, X)`.
     flow
         `"l2"`: u = k ∗ v with v free. Algorithm 2 blurs u at each iteration; here the blur is part of this map, so that
-        the energy is one function of v. `"mass"`: u = k ∗ (v - mean v) + m₀, the L² flow at constant mass. `"h-1"`:
-        u = k ∗ (div A + v₀) from A = 0, the flow of `generate`, also at constant mass.
+        the energy is one function of v. `"h-1"`: u = k ∗ (div A + v₀) from A = 0, the flow of `generate`, at constant
+        mass.
     optimiser
         `"lbfgs"` (a history of 10, and a strong Wolfe line search from length 1) or `"adam"`.
     steps
@@ -172,39 +168,39 @@ def descend(
     frozen
         Voxels whose v, or A, stays.
 
-    Raises
-    ------
-    ValueError
-        If the flow or the optimiser has another name, the field or the frozen mask does not have the grid's shape, or
-        the field is not finite; otherwise as `generate` does.
+    Raises ValueError as `generate` does, and if the field or the mask is not of the grid's shape or not finite.
     """
     check_choice(flow, FORMS, f"a flow among {', '.join(FORMS)}")
+    check_choice(optimiser, ("adam", "lbfgs"), "an optimiser 'adam' or 'lbfgs'")
     plan = named_schedule(schedule, steps)
-    if isinstance(optimiser, str) and optimiser == "lbfgs":
+    if optimiser == "lbfgs":
         plan = Schedule("lbfgs", steps, 1.0, 1.0, "constant")
     width = min(grid.spacing) if blur is None and isinstance(grid, Grid) else blur
     cost = Cost(Law.of(law).coefficients, grid, epsilon, orientation, width, data)  # type: ignore[arg-type]
     execution = _Execution(backend, device, checkpoint, checkpoint_every)
     options = FlowOptions(cost, plan, callbacks)
-    for name, values in (("field", field), ("frozen mask", frozen)):
-        if name == "field" or values is not None:
-            if not isinstance(values, (Tensor, np.ndarray)):
-                raise ValueError(f"expected a {name} of shape {grid.shape}, got {quoted(values)}")
-            if tuple(values.shape) != grid.shape:
-                raise ValueError(f"expected a {name} of shape {grid.shape}, got {tuple(values.shape)}")
+    _check_voxels("field", field, grid)
+    if frozen is not None:
+        _check_voxels("frozen mask", frozen, grid)
     options.check_memory(execution.device)
     field = torch.as_tensor(field).detach().to("cpu", torch.float32).contiguous()
     if not bool(torch.isfinite(field).all()):
-        raise ValueError("expected a finite field, got NaN or infinity")
+        raise ValueError("the field must be finite, got NaN or infinity")
     form, start = FORMS[flow].at(field, grid, cost.blur, execution.blur)
     stepper = execution.stepper(start, form, cost, plan, optimiser, frozen)
     checkpoint_file = execution.checkpoint_file(stepper, cost, options, flow=flow, field=field, frozen=frozen)
     return run(stepper, [options], [None], checkpoint_file)[0]
 
 
+def _check_voxels(name: str, values: Tensor, grid: Grid) -> None:
+    check_type(values, (Tensor, np.ndarray), f"a {name} of shape {grid.shape}")
+    if tuple(values.shape) != grid.shape:
+        raise ValueError(f"the {name} must have the grid's shape {grid.shape}, got {tuple(values.shape)}")
+
+
 @dataclass(frozen=True)
 class _Execution:
-    """Backend, device and checkpoint of a flow; ValueError where one of them cannot be."""
+    """How a flow is computed and saved: the arguments of `generate`, which are checked here."""
 
     backend: str
     device: torch.device | str
@@ -215,8 +211,7 @@ class _Execution:
     def __post_init__(self) -> None:
         check_choice(self.backend, BACKENDS, f"a backend among {', '.join(BACKENDS)}")
         check_device(self.device)
-        if self.checkpoint is not None:
-            check_type(self.checkpoint, (str, Path), "a path for the checkpoint")
+        check_type(self.checkpoint, (str, Path, type(None)), "a path for the checkpoint")
         check_float(self.every, "a finite number of seconds between checkpoints, at least 0", 0)
 
     @property
@@ -232,37 +227,20 @@ class _Execution:
     def stepper(
         self, start: Tensor, form: Form, cost: Cost, plan: Schedule, optimiser: str, frozen: Tensor | None
     ) -> Stepper:
-        """Return the stepper of one shape: fused where there is a kernel, unless the backend is plain torch.
-
-        Raises
-        ------
-        ValueError
-            If the optimiser is unknown, or the backend is `"fused"` and there is no fused kernel.
-        """
-        check_choice(optimiser, ("adam", "lbfgs"), "an optimiser 'adam' or 'lbfgs'")
-        able = kernels.has_kernel(self.device)
-        if self.backend == "fused" and not able:
-            raise ValueError(f"expected a device with fused kernels (a processor, with numba), got {self.device}")
-        whole = isinstance(form, DivergenceForm) and optimiser == "adam" and cost.data is None
-        if whole and able and not self.plain:
+        """Return the stepper of one shape: fused where there is a kernel, unless the backend is plain torch."""
+        has_kernel = kernels.has_kernel(self.device)
+        if self.backend == "fused" and not has_kernel:
+            raise ValueError(f"the device {self.device} has no fused step: take backend='torch', or the device 'cpu'")
+        fusible = isinstance(form, DivergenceForm) and optimiser == "adam" and cost.data is None
+        if fusible and has_kernel and not self.plain:
             return FusedStepper(start, form, cost, plan.betas, frozen)  # type: ignore[arg-type]
-        kind = LbfgsStepper if optimiser == "lbfgs" else TorchStepper
-        return kind(
-            start,
-            form,
-            cost.coefficients,
-            cost.epsilon,
-            plan.betas,
-            frozen,
-            self.device,
-            orientation=cost.orientation,
-            fused=not self.plain,
-            compiled=self.backend == "compiled",
-            data=cost.data,
-        )
+        return (LbfgsStepper if optimiser == "lbfgs" else TorchStepper)(
+            start, form, cost.coefficients, cost.epsilon, plan.betas, frozen, self.device,
+            orientation=cost.orientation, fused=not self.plain, compiled=self.backend == "compiled", data=cost.data,
+        )  # fmt: skip
 
     def checkpoint_file(self, stepper: Stepper, cost: Cost, options: FlowOptions, **start: object) -> Checkpoint | None:
-        """Return the checkpoint of a run, or None where the run has none."""
+        """Return the checkpoint of a run from a start, or None where the run has none."""
         if self.checkpoint is None:
             return None
         job = {"schedule": options.plan, "volume_fraction": options.volume_fraction, "snapshots": [*options.snapshots]}
@@ -277,25 +255,20 @@ def check_device(device: torch.device | str) -> None:
     except (RuntimeError, TypeError, ValueError, AssertionError):
         usable = False
     if not usable:
-        raise ValueError(f"expected a device that torch computes on, such as 'cpu' or 'cuda', got {quoted(device)}")
+        raise ValueError(
+            f"torch cannot compute on the device {quoted(device)}: take 'cpu', or 'cuda' where there is one"
+        )
 
 
-def base_of(mass: float | Tensor | None, share: float | None, grid: Grid) -> float | Tensor:
-    """Return the base of div A: the mass, a field of masses `(Z, Y, X)`, or the first one for a share of volume.
-
-    Raises
-    ------
-    ValueError
-        If mass and share are both None, or one is out of range or has another shape, or a share is given with a mass
-        that is not one number.
-    """
+def choose_base(mass: float | Tensor | None, share: float | None, grid: Grid) -> float | Tensor:
+    """Return the base of div A: the mass, a field of masses `(Z, Y, X)`, or the first mass for a share of volume."""
     if share is not None:
         return first_mass(share, None if mass is None else check_open_interval(mass, "a mass in (-1, 1)", -1, 1))
     if mass is None:
-        raise ValueError("expected a mass or a volume fraction, got neither")
+        raise ValueError("give a mass or a volume fraction, got neither")
     if not isinstance(mass, Tensor) or mass.dim() == 0:
         return check_open_interval(mass, "a mass in (-1, 1)", -1, 1)
     check_shape("mass", mass, grid)
     if not bool((mass.abs() < 1).all()):
-        raise ValueError(f"expected a mass in (-1, 1), got {float(mass.min())} to {float(mass.max())}")
+        raise ValueError(f"the mass must be in (-1, 1), got {float(mass.min())} to {float(mass.max())}")
     return mass.detach().to("cpu", torch.float32).expand(grid.shape).contiguous()

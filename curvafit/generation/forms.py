@@ -87,19 +87,10 @@ class DivergenceForm:
         """Return the same form on a device."""
         return dataclasses.replace(self, base=self.base.to(device)) if isinstance(self.base, Tensor) else self
 
-    @property
-    def mass(self) -> float:
-        """The constant mean of u."""
-        return float(self.base.double().mean()) if isinstance(self.base, torch.Tensor) else self.base
-
 
 @dataclass(frozen=True)
 class DirectForm:
-    """u = k ∗ v, whose mass may change (paper, Algorithm 2; L² flow).
-
-    Algorithm 2 blurs u anew at each iteration, then steps along the gradient there; here the blur is part of the map,
-    so that F_ε(k ∗ v) is one function, as a line search needs.
-    """
+    """u = k ∗ v, whose mass may change (paper, Algorithm 2; L² flow); see `descend` on its blur."""
 
     grid: Grid
     width: float
@@ -123,56 +114,16 @@ class DirectForm:
         return self
 
 
-@dataclass(frozen=True)
-class MassProjectedForm:
-    """u = k ∗ (v - mean v) + mass: the L² flow on fields of that mass."""
-
-    grid: Grid
-    width: float
-    mass: float
-    blur: Blur = gaussian_blur
-
-    @classmethod
-    def at(cls, field: Tensor, grid: Grid, width: float, blur: Blur) -> tuple[MassProjectedForm, Tensor]:
-        """Return the form with the mass of a field, and the start v = field."""
-        return cls(grid, width, float(field.mean(dtype=torch.float64)), blur), field
-
-    def field(self, values: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]:
-        """Return u for v."""
-        return self.blur(_centred(values), self.grid, self.width) + self.mass
-
-    def pullback(self, slope: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]:
-        """Return k ∗ slope minus the mean."""
-        return _centred(self.blur(slope, self.grid, self.width))
-
-    def to(self, device: torch.device | str) -> MassProjectedForm:
-        """Return the form itself, which holds no tensor."""
-        return self
-
-
-def _centred(values: Tensor) -> Tensor:
-    """Subtract the mean."""
-    return values - values.mean(dtype=torch.float64).to(values.dtype)
-
-
 #: The flows by name, as forms that can start at a field.
-FORMS: dict[str, type[DivergenceForm] | type[DirectForm] | type[MassProjectedForm]] = {
-    "h-1": DivergenceForm,
-    "l2": DirectForm,
-    "mass": MassProjectedForm,
-}
+FORMS: dict[str, type[DivergenceForm] | type[DirectForm]] = {"h-1": DivergenceForm, "l2": DirectForm}
 
 
 def white_noise(grid: Grid, seed: int) -> Float[torch.Tensor, "3 z y x"]:
     """Return A₀, independent and uniform on [0, `AMPLITUDE`) in every voxel and component; float32, on the processor.
 
-    The same seed and shape make the same numbers, whatever was drawn before. In a box with walls the mean is
-    subtracted: a constant A has no divergence in a periodic box, but has a flux through walls.
-
-    Raises
-    ------
-    ValueError
-        If the seed is not a whole number from 0, or the box does not fit into memory.
+    The same seed and shape give the same numbers. In a box with walls the mean is subtracted: a constant A has no
+    divergence in a periodic box, but has a flux through walls. Raises ValueError if the seed is not a whole number from
+    0, or the box does not fit into memory.
     """
     check_type(grid, Grid, "a Grid")
     generator = torch.Generator().manual_seed(check_seed(seed))

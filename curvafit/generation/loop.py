@@ -19,7 +19,7 @@ from curvafit.generation.checkpoint import Checkpoint
 from curvafit.generation.cost import Cost
 from curvafit.generation.result import RECORD_EVERY, Callback, Flow, History, State, Viability, viability
 from curvafit.generation.schedule import Schedule
-from curvafit.generation.stepper import ShapeView, Statistics, Stepper
+from curvafit.generation.stepper import Statistics, Stepper
 
 #: A flow is called converged where its energy changes by less than this share over the last tenth of the steps.
 SETTLED = 0.01
@@ -39,20 +39,7 @@ FRACTION_LAST = 0.1
 
 @dataclass(frozen=True)
 class FlowOptions:
-    """The task of a flow: the functional, the steps, and the options of `generate`.
-
-    Parameters
-    ----------
-    cost, plan
-        The functional and the steps.
-    callbacks, reject_early, snapshots, volume_fraction
-        As in `generate`.
-
-    Raises
-    ------
-    ValueError
-        If a snapshot is not among the plan's steps, or a callback cannot be called.
-    """
+    """The task of a flow: the functional, the steps, and options as `generate` describes them."""
 
     cost: Cost
     plan: Schedule
@@ -85,22 +72,22 @@ class FlowOptions:
 def run(
     stepper: Stepper, options: Sequence[FlowOptions], seeds: Sequence[int | None], checkpoint: Checkpoint | None = None
 ) -> list[Flow]:
-    """Step shapes that share a stepper and a plan until the plan ends or no shape is left.
+    """Step the shapes of a stepper, which share a plan, until the plan ends or every shape has stopped.
 
     A shape stops earlier where its energy, gradient or field is not finite, or where a callback or a check stops it.
-    All shapes stop where the optimiser stalls. At the end the checkpoint is closed, but saved where a callback stopped
+    All shapes stop where the optimiser stalls. At the end the checkpoint is closed, or saved where a callback stopped
     the flow.
     """
-    runs = [_ShapeRun(*parts) for parts in zip(stepper.shapes, options, seeds, strict=True)]
+    runs = [_ShapeRun(stepper, k, *parts) for k, parts in enumerate(zip(options, seeds, strict=True))]
     with nullcontext() if checkpoint is None else checkpoint.lock():
         _advance(stepper, runs, options, checkpoint)
-    return [shape.end() for shape in runs]
+    return [shape.flow() for shape in runs]
 
 
 def _advance(
     stepper: Stepper, runs: list[_ShapeRun], options: Sequence[FlowOptions], checkpoint: Checkpoint | None
 ) -> None:
-    """Step until the plan ends or every shape has stopped."""
+    """Step until the plan ends or every shape has stopped, and save checkpoints."""
     plan, steps = options[0].plan, _resume(stepper, runs, checkpoint)
     betas = plan.betas
     while True:
@@ -128,7 +115,7 @@ def _advance(
 
 
 def _resume(stepper: Stepper, runs: list[_ShapeRun], checkpoint: Checkpoint | None) -> int:
-    """Restore the checkpoint's state, where there is shape, and return its number of steps, else 0."""
+    """Restore the checkpoint's state, if there is one, and return its number of steps, else 0."""
     content = checkpoint.load() if checkpoint else None
     if content is None:
         return 0
@@ -146,46 +133,45 @@ def _pack_state(stepper: Stepper, runs: list[_ShapeRun], steps: int) -> dict[str
 class _ShapeRun:
     """The run of one shape: its records, its snapshots, and the reason why it stopped."""
 
-    def __init__(self, shape: ShapeView, options: FlowOptions, seed: int | None) -> None:
-        self._shape, self._options, self._seed = shape, options, seed
+    def __init__(self, stepper: Stepper, k: int, options: FlowOptions, seed: int | None) -> None:
+        self._stepper, self._k, self._options, self._seed = stepper, k, options, seed
         self.rows: list[list[float]] = []
         self.snapshots: dict[int, Tensor] = {}
         #: The reason for a stop before the plan's end, and whether a callback is the reason.
         self.stop, self.stopped_by_callback = "", False
         self._shortfall, self._failure, self._stalled = "", "", False
-        self._field, self._mass = None, math.nan
+        self._field, self._mass = torch.empty(0), math.nan
 
     def set_fraction(self) -> bool:
-        """Make the share of volume exact at the end where a small constant does, and return whether one was added."""
+        """Add the constant that makes the share of volume exact, if it is small; return whether it was added."""
         share = self._options.volume_fraction
         if share is None or self.stop:
             return False
-        u = self._shape.field()
+        u = self._stepper.field(self._k)
         shift, end = last_shift(u, share), self._viability(u)
         if end.viable and abs(shift) <= FRACTION_LAST:
-            self._shape.shift(shift)
+            self._stepper.shift(shift, self._k)
             return True
         self._shortfall = f"; volume fraction {float((u > 0).double().mean()):.4f} instead of {share:.4f}"
         return False
 
     def observe(self, steps: int, last: bool, stalled: bool) -> None:
-        """Take the snapshot, the record and the check that are due after `steps` steps, and the end's field."""
+        """Take the snapshot, record and check that are due after `steps` steps, and the field if the shape stops."""
         if self.stop:
             return
-        options, shape, total = self._options, self._shape, self._options.plan.steps
+        options, stepper, k, total = self._options, self._stepper, self._k, self._options.plan.steps
         if steps in options.snapshots:
-            self.snapshots[steps] = shape.field()
+            self.snapshots[steps] = stepper.field(k)
         if last or steps % RECORD_EVERY == 0:
             self._record(steps, last)
         if not self.stop and options.reject_early and steps in options.plan.checks:
-            check = self._viability(shape.field())
+            check = self._viability(stepper.field(k))
             self.stop = "" if check.viable else f"stopped after {steps} of {total} steps: {check.reason}"
         if last or self.stop:
-            self._field, self._mass, self._stalled = shape.field(), shape.mass(), stalled
+            self._field, self._mass, self._stalled = stepper.field(k), stepper.mass(k), stalled
 
-    def end(self) -> Flow:
-        """Return the flow at its end."""
-        assert self._field is not None
+    def flow(self) -> Flow:
+        """Return the result of a run that has stopped."""
         options, cost, end = self._options, self._options.cost, self._viability(self._field)
         if self._failure:
             end = dataclasses.replace(end, viable=False, reason=self._failure)
@@ -198,21 +184,21 @@ class _ShapeRun:
 
     def _record(self, steps: int, last: bool) -> None:
         """Add a row to the history, stop where a figure is not finite, call the callbacks, and correct the mass."""
-        options, shape, total = self._options, self._shape, self._options.plan.steps
-        statistics, mass = shape.statistics(), shape.mass()
+        options, stepper, k, total = self._options, self._stepper, self._k, self._options.plan.steps
+        statistics, mass = stepper.statistics(k), stepper.mass(k)
         self.rows.append([steps, *statistics, mass])
         if subject := _find_infinite(statistics, mass):
             self._failure = f"{subject} is not finite"
             self.stop = f"stopped after {steps} of {total} steps: {self._failure}"
             return
         if options.callbacks:
-            state = State(shape.field(), *statistics, mass)
+            state = State(stepper.field(k), *statistics, mass)
             answers = [bool(callback(steps, total, state)) for callback in options.callbacks]
             if any(answers):
                 self.stop, self.stopped_by_callback = f"stopped by a callback after {steps} of {total} steps", True
         share = options.volume_fraction
         if share is not None and not last and steps >= FRACTION_BEGIN * total:
-            shape.shift(correct_mass(shape.field(), share, mass, total))
+            stepper.shift(correct_mass(stepper.field(k), share, mass, total), k)
 
     def _viability(self, u: Tensor) -> Viability:
         """Return the viability of a field."""
@@ -244,13 +230,9 @@ def _find_infinite(statistics: Statistics, mass: float) -> str:
 
 
 def first_mass(share: float, mass: float | None = None) -> float:
-    """Return the mass that a flow towards this share begins with: a given one, as far as a shape of this share may have
-    it; else that of a sharp shape, with values ±1.
+    """Return the first mass of a flow towards a share of volume: that of a sharp shape, with values ±1.
 
-    Raises
-    ------
-    ValueError
-        If the share is not in (0, 1).
+    A given mass replaces it, moved to within `FRACTION_REACH` of it. Raises ValueError if the share is not in (0, 1).
     """
     share = check_open_interval(share, "a volume fraction in (0, 1)", 0, 1)
     sharp = min(max(2 * share - 1, -FRACTION_BOUND), FRACTION_BOUND)
@@ -259,7 +241,7 @@ def first_mass(share: float, mass: float | None = None) -> float:
 
 
 def correct_mass(u: Tensor, share: float, mass: float, steps: int) -> float:
-    """Return what to add to the mass during a flow of `steps` steps; a sharp shape's share grows by half of that."""
+    """Return the number to add to the mass in a flow of `steps` steps; a sharp shape's share grows by half of it."""
     shortfall = share - float(np.count_nonzero(u.numpy() > 0)) / u.numel()
     gain, sharp = min(FRACTION_GAIN, FRACTION_GAIN * FRACTION_GAIN_STEPS / steps), first_mass(share)
     target = min(max(mass + gain * 2 * shortfall, sharp - FRACTION_REACH), sharp + FRACTION_REACH)
@@ -267,7 +249,7 @@ def correct_mass(u: Tensor, share: float, mass: float, steps: int) -> float:
 
 
 def last_shift(u: Tensor, share: float) -> float:
-    """Return the constant whose sum with u has round(share × voxels) values above 0."""
+    """Return the constant c such that u + c is positive in round(share × voxels) voxels, at least 1 and not all."""
     values, inside = u.numpy().ravel(), round(share * u.numel())
     place = min(max(u.numel() - inside, 1), u.numel() - 1)
     below, above = np.partition(values, (place - 1, place))[place - 1 : place + 1]

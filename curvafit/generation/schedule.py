@@ -13,8 +13,6 @@ from curvafit.core.checks import as_tuple, check_choice, check_float, check_int,
 
 #: The most steps that a flow may have, and the longest one.
 MOST_STEPS, LONGEST_STEP = 10**7, 1e6
-#: Steps after which the paper checked its runs (Experiment 4).
-_PAPER_CHECKS = (500, 1000, 5000)
 
 
 @dataclass(frozen=True)
@@ -27,11 +25,6 @@ class Phase:
         Share of the schedule's steps, in (0, 1).
     start, stop, shape, momentum, memory
         As in `Schedule`.
-
-    Raises
-    ------
-    ValueError
-        If a number is out of range, or the shape has another name.
     """
 
     share: float
@@ -42,9 +35,8 @@ class Phase:
     memory: float = 0.999
 
     def __post_init__(self) -> None:
-        object.__setattr__(
-            self, "share", check_open_interval(self.share, "a phase's share of the steps in (0, 1)", 0, 1)
-        )
+        share = check_open_interval(self.share, "a phase's share of the steps in (0, 1)", 0, 1)
+        object.__setattr__(self, "share", share)
         _normalise_steps(self)
 
 
@@ -70,10 +62,7 @@ class Schedule:
         corrections are those of the rates in force: where memory shortens after fewer than some 300 steps, the next
         steps are longer than these say.
 
-    Raises
-    ------
-    ValueError
-        If a number is out of range, the shape has another name, or the phases' shares leave no rest.
+    Raises ValueError if a number is out of range, the shape has another name, or the phases' shares leave no rest.
     """
 
     name: str
@@ -94,19 +83,11 @@ class Schedule:
         phases = tuple(Phase(**part) if isinstance(part, dict) else part for part in parts)
         for phase in phases:
             check_type(phase, Phase, "an opening of phases as Phase")
+        check_open_interval(sum(phase.share for phase in phases), "phases with shares below 1 in all", -1, 1)
         object.__setattr__(self, "opening", phases)
-        check_open_interval(
-            sum(phase.share for phase in self.opening), "phases with shares below 1 in all", -math.ulp(0), 1
-        )
 
     def check_step(self, step: int) -> int:
-        """Return a snapshot's number of steps.
-
-        Raises
-        ------
-        ValueError
-            If it is not a whole number from 0 to the schedule's number of steps.
-        """
+        """Return the number of steps after which a snapshot is due, or raise ValueError where it is out of range."""
         return check_int(step, f"snapshots at 0 to {self.steps} steps", 0, self.steps)
 
     def rate(self, step: int) -> float:
@@ -133,7 +114,7 @@ class Schedule:
         return tuple(round(self.steps * share) for share in accumulate(phase.share for phase in self.opening))
 
     def _phase(self, step: int) -> tuple[Phase | Schedule, int, int]:
-        """Return what describes a step: the phase, its first step, and its number of steps."""
+        """Return the phase of a step, the first step of that phase, and its number of steps."""
         place = bisect_right(self.bounds, step)
         first, end = (0, *self.bounds)[place], (*self.bounds, self.steps)[place]
         return (*self.opening, self)[place], first, end - first
@@ -147,7 +128,8 @@ class Schedule:
     @property
     def checks(self) -> tuple[int, ...]:
         """Numbers of steps before the end after which viability is checked."""
-        marks = _PAPER_CHECKS if self.shape == "constant" else (self.steps // 2,)
+        # The paper checked its runs, whose steps are all as long, after these steps (Experiment 4).
+        marks = (500, 1000, 5000) if self.shape == "constant" else (self.steps // 2,)
         return tuple(mark for mark in marks if 0 < mark < self.steps)
 
 
@@ -185,13 +167,7 @@ LEARNED = "deep"
 
 
 def schedule(name: str | Schedule, steps: int | None = None) -> Schedule:
-    """Return the schedule of a name, or a `Schedule` itself, with `steps` steps where that is not None.
-
-    Raises
-    ------
-    ValueError
-        If there is no schedule of that name.
-    """
+    """Return the schedule of a name (else ValueError), or a `Schedule` itself, with `steps` steps if that is given."""
     if not isinstance(name, Schedule):
         check_choice(name, SCHEDULES, f"a schedule among {', '.join(SCHEDULES)}")
         name = SCHEDULES[name]
@@ -199,8 +175,9 @@ def schedule(name: str | Schedule, steps: int | None = None) -> Schedule:
 
 
 def present_name(fields: dict[str, Any]) -> str:
-    """Return the name in `SCHEDULES` of a schedule's fields (`Schedule.as_dict`), whatever its name and number of steps
-    were when they were recorded; its own name where none is alike.
+    """Return today's name, in `SCHEDULES`, of a schedule recorded by `Schedule.as_dict`; its own name if it has none.
+
+    The name and the number of steps of a record do not count: schedules were renamed, and users choose the steps.
     """
     plan = Schedule(**fields)
     alike = (dataclasses.replace(known, name=plan.name, steps=plan.steps) == plan for known in SCHEDULES.values())

@@ -35,36 +35,11 @@ class Statistics(NamedTuple):
     gradient_mean: float
 
 
-class ShapeView(Protocol):
-    """A shape of a stepper, as the loop reads it."""
-
-    def statistics(self) -> Statistics:
-        """Return the statistics before the last `step` moved the shape."""
-        ...
-
-    def field(self) -> Tensor:
-        """Return the last u, float32 `(Z, Y, X)` on the processor, in a tensor that no step overwrites."""
-        ...
-
-    def mass(self) -> float:
-        """Return the mean of the last u, computed in float64."""
-        ...
-
-    def shift(self, amount: float) -> None:
-        """Add a constant to u from the next step on."""
-        ...
-
-
 class Stepper(Protocol):
-    """The state of the flows of one or more shapes, stepped in place."""
+    """The state of the flows of one or more shapes, stepped in place; `k` is the number of a shape, from 0."""
 
     #: Whether the optimiser found no lower point and therefore stopped.
     stalled: bool = False
-
-    @property
-    def shapes(self) -> Sequence[ShapeView]:
-        """The shapes, in order."""
-        ...
 
     def step(self, rate: float | None) -> None:
         """Compute u and the gradient, then step by `rate`; None leaves the parameters, and no rate may follow it."""
@@ -82,6 +57,22 @@ class Stepper(Protocol):
         """Set Adam's decay rates (momentum, memory) from the next step on."""
         ...
 
+    def statistics(self, k: int = 0) -> Statistics:
+        """Return the statistics before the last `step` moved the shape."""
+        ...
+
+    def field(self, k: int = 0) -> Tensor:
+        """Return the last u, float32 `(Z, Y, X)` on the processor, in a tensor that no step overwrites."""
+        ...
+
+    def mass(self, k: int = 0) -> float:
+        """Return the mean of the last u, computed in float64."""
+        ...
+
+    def shift(self, amount: float, k: int = 0) -> None:
+        """Add a constant to u from the next step on."""
+        ...
+
     def state(self) -> dict[str, Any]:
         """Return tensors and numbers, in lists and dictionaries, that determine all later steps."""
         ...
@@ -92,15 +83,10 @@ class Stepper(Protocol):
 
 
 class FusedStepper(Stepper):
-    """The step on processors; a step of None advances Adam's moments all the same."""
+    """One shape on a processor, by fused kernels; a step of None advances Adam's moments all the same."""
 
     def __init__(
-        self,
-        start: Tensor,
-        form: DivergenceForm,
-        cost: Cost,
-        betas: tuple[float, float],
-        frozen: Tensor | None,
+        self, start: Tensor, form: DivergenceForm, cost: Cost, betas: tuple[float, float], frozen: Tensor | None
     ) -> None:
         from curvafit.priors.kernels.cpu import FusedFlow
 
@@ -113,26 +99,22 @@ class FusedStepper(Stepper):
         )  # fmt: skip
         self._statistics = Statistics(0.0, 0.0, 0.0)
 
-    @property
-    def shapes(self) -> Sequence[ShapeView]:
-        return (self,)
-
     def step(self, rate: float | None) -> None:
         self._statistics = Statistics(self._flow.evaluate(), *self._flow.update(rate or 0.0))
 
     def set_betas(self, betas: tuple[float, float]) -> None:
         self._flow.betas = betas
 
-    def statistics(self) -> Statistics:
+    def statistics(self, k: int = 0) -> Statistics:
         return self._statistics
 
-    def field(self) -> Tensor:
+    def field(self, k: int = 0) -> Tensor:
         return torch.from_numpy(self._flow.field.copy())
 
-    def mass(self) -> float:
+    def mass(self, k: int = 0) -> float:
         return float(self._flow.field.mean(dtype="float64"))
 
-    def shift(self, amount: float) -> None:
+    def shift(self, amount: float, k: int = 0) -> None:
         self._flow.shift(amount)
 
     def state(self) -> dict[str, Any]:
@@ -219,10 +201,6 @@ class TorchStepper(Stepper):
         self._moments = torch.zeros_like(self._parameters), torch.zeros_like(self._parameters)
         self._taken = 0
 
-    @property
-    def shapes(self) -> Sequence[ShapeView]:
-        return [_Shape(self, k) for k in range(self._count or 1)]
-
     def _evaluate_plainly(self, parameters: Tensor, offset: Tensor) -> tuple[Tensor | float, Tensor, Tensor]:
         """Return the energies, u, and the gradient with respect to the parameters."""
         u = self._form.field(parameters) + offset
@@ -254,27 +232,23 @@ class TorchStepper(Stepper):
     def set_betas(self, betas: tuple[float, float]) -> None:
         self._betas = betas
 
-    def statistics(self) -> list[Statistics]:
-        """Return the statistics of every shape before the last `step` moved it."""
-        if self._statistics is None:
+    def statistics(self, k: int = 0) -> Statistics:
+        if self._statistics is None:  # of all shapes at once, as each reading waits for the device
             size = self._slope.abs().reshape(self._count or 1, -1)
             free = self._slope[0] if self._count else self._slope
             count = free.numel() if self._free is None else int(self._free.expand_as(free).sum())
             means = size.sum(1, dtype=torch.float64) / max(1, count)
             columns = torch.as_tensor(self._value).reshape(-1).tolist(), size.amax(1).tolist(), means.tolist()
             self._statistics = [Statistics(*row) for row in zip(*columns, strict=True)]
-        return self._statistics
+        return self._statistics[k]
 
-    def field(self, k: int) -> Tensor:
-        """Return the last u of shape `k`, float32 `(Z, Y, X)` on the processor."""
+    def field(self, k: int = 0) -> Tensor:
         return self._u[k].to("cpu", torch.float32, copy=True) if self._count else self._u.to("cpu", torch.float32)
 
-    def mass(self, k: int) -> float:
-        """Return the mean of the last u of shape `k`."""
+    def mass(self, k: int = 0) -> float:
         return float((self._u[k] if self._count else self._u).mean(dtype=torch.float64))
 
-    def shift(self, k: int, amount: float) -> None:
-        """Add a constant to u of shape `k` from the next step on."""
+    def shift(self, amount: float, k: int = 0) -> None:
         self._offset = self._offset.clone()
         self._offset.view(-1)[k] += amount
 
@@ -288,25 +262,6 @@ class TorchStepper(Stepper):
         for moment, saved in zip(self._moments, state["moments"], strict=True):
             moment.copy_(saved)
         self._taken = state["taken"]
-
-
-class _Shape:
-    """One shape of a `TorchStepper`."""
-
-    def __init__(self, stepper: TorchStepper, k: int) -> None:
-        self._stepper, self._k = stepper, k
-
-    def statistics(self) -> Statistics:
-        return self._stepper.statistics()[self._k]
-
-    def field(self) -> Tensor:
-        return self._stepper.field(self._k)
-
-    def mass(self) -> float:
-        return self._stepper.mass(self._k)
-
-    def shift(self, amount: float) -> None:
-        self._stepper.shift(self._k, amount)
 
 
 class _Compiled:
@@ -380,8 +335,8 @@ class LbfgsStepper(TorchStepper):
         value, _, self._parameters.grad = self._evaluate_once()
         return float(value)
 
-    def shift(self, k: int, amount: float) -> None:
-        super().shift(k, amount)
+    def shift(self, amount: float, k: int = 0) -> None:
+        super().shift(amount, k)
         self._cached = None
 
     def state(self) -> dict[str, Any]:

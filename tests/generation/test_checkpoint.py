@@ -106,7 +106,7 @@ def test_a_killed_program_goes_on(backend, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("optimiser", ["adam", "lbfgs"])
-@pytest.mark.parametrize("flow", ["l2", "mass", "h-1"])
+@pytest.mark.parametrize("flow", ["l2", "h-1"])
 def test_flows_from_a_field_go_on(flow, optimiser, tmp_path):
     start = generate(TUBES, MASS, GRID, schedule=PLAN).field
 
@@ -162,7 +162,7 @@ def test_another_runs_checkpoint_is_refused(tmp_path):
     ):
         if name == "stepper":
             pytest.importorskip("numba")
-        with pytest.raises(ValueError, match=rf"expected a checkpoint of this run, got one with .*\b{name} .* instead"):
+        with pytest.raises(ValueError, match=rf"\b{name} .* instead"):
             make(checkpoint=path, **changed)
         assert path.read_bytes() == kept
     flipped = bytearray(kept)
@@ -184,7 +184,7 @@ def test_another_runs_checkpoint_is_refused(tmp_path):
 def test_a_checkpoint_is_its_backends(tmp_path):
     """The same flow by other operations ends in other bits."""
     path, start = tmp_path / "run", generate(TUBES, MASS, GRID, schedule=PLAN).field
-    told = {"flow": "mass", "optimiser": "adam", "steps": 40, "checkpoint": path}
+    told = {"optimiser": "adam", "steps": 40, "checkpoint": path}
     descend(start, TUBES, GRID, **told, callbacks=[lambda step, *rest: step == 20], backend="torch")
     with pytest.raises(ValueError, match="backend"):
         descend(start, TUBES, GRID, **told)
@@ -278,4 +278,4 @@ def test_seconds_between_checkpoints(tmp_path):
     assert Checkpoint(tmp_path / "a", 0, {}).is_due()
     assert not Checkpoint(tmp_path / "a", 3600, {}).is_due()
     with pytest.raises(ValueError, match="seconds"):
-        Checkpoint(tmp_path / "a", -1, {})
+        generate(TUBES, MASS, GRID, schedule=PLAN, checkpoint=tmp_path / "a", checkpoint_every=-1)

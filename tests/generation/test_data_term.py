@@ -70,7 +70,7 @@ def test_evidence_of_another_shape_is_refused() -> None:
         descend(torch.zeros(8, 8, 8), WILLMORE, Grid(8), data=Evidence(torch.ones(7, 8, 8)), steps=1)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(("flow", "optimiser"), [("l2", "lbfgs"), ("l2", "adam"), ("mass", "adam"), ("h-1", "adam")])
+@pytest.mark.parametrize(("flow", "optimiser"), [("l2", "lbfgs"), ("l2", "adam"), ("h-1", "adam")])
 def test_every_flow_lowers_energy_and_data_as_plain_torch_does(flow, optimiser) -> None:
     """Adam voxel by voxel. L-BFGS in the energy reached: its line search hangs on the energies' last digits, and
     near the minimum what two searches leave is of second order in what parts them."""
@@ -97,7 +97,7 @@ def test_a_checkpoint_is_its_data_s(tmp_path: Path) -> None:
     options = {"steps": 20, "checkpoint": path, "checkpoint_every": 0.0, "optimiser": "adam"}
     start, stop = 0.5 * drawn(8, 8, 8), [lambda made, total, state: made >= 10]
     descend(start, WILLMORE, Grid(8), data=Evidence(drawn(8, 8, 8)), callbacks=stop, **options)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="this run"):
+    with pytest.raises(ValueError, match="checkpoint"):
         descend(start, WILLMORE, Grid(8), data=Evidence(2 * drawn(8, 8, 8)), **options)
     resumed = descend(start, WILLMORE, Grid(8), data=Evidence(drawn(8, 8, 8)), **options)
     whole = descend(start, WILLMORE, Grid(8), data=Evidence(drawn(8, 8, 8)), **{**options, "checkpoint": None})

