@@ -48,14 +48,14 @@ def main() -> None:
 def shape(name: str, edge: int) -> torch.Tensor:
     flow = generate(preset(name).coefficients, preset(name).mass, Grid((edge, edge, edge)), seed=0)
     print(f"{name}: {flow.status}")
-    return flow.field[None, None]
+    return flow.field
 
 
 def draw(axes: np.ndarray, modality: Modality, field: torch.Tensor, seed: int) -> None:
     """A column: one drawn image of a modality."""
     imaging = modality.draw(seed)
-    seen = image(field, modality.voxel, [imaging], [seed])[0, 0].numpy()
-    truth = regrid(field, modality.voxel, [imaging])[0, 0].numpy()
+    seen = image(field, modality.voxel, imaging, seed).numpy()
+    truth = regrid(field, modality.voxel, imaging).numpy()
     z, y = seen.shape[0] // 2, seen.shape[1] // 2
     project = np.max if imaging.contrast.foreground > imaging.contrast.background else np.min
     slab = seen[z - len(seen) // 8 : z + len(seen) // 8]

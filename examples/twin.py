@@ -42,7 +42,7 @@ def scan(edge: int) -> Field:
     flow = generate(truth.coefficients, truth.mass, Grid((edge, edge, edge)), seed=0)
     kind = modality("micro-ct")
     imaging = kind.base.assign(IMAGING)
-    values = image(flow.field[None, None], kind.voxel, [imaging], [0])[0, 0].numpy()
+    values = image(flow.field, kind.voxel, imaging, 0).numpy()
     return Field(values, imaging.spacing, imaging.unit)
 
 

@@ -134,10 +134,10 @@ def image_and_labels(
     `epsilon` is in the field's voxels, whose edge is `voxel`. A field of whole voxels may hold a few more than an image
     asks for. See `imaging.image` and `Imaging.visible`.
     """
-    u, (z, y, x) = field[None, None], shape
-    grey, sampled = image(u, voxel, [imaging], [seed], epsilon), regrid(u, voxel, [imaging])
-    mask = visible(u, voxel, [imaging], epsilon) if imaging.visible else sampled > 0
-    grey, sampled, mask = (part[0, 0, :z, :y, :x].contiguous() for part in (grey, sampled, mask))
+    z, y, x = shape
+    grey, sampled = image(field, voxel, imaging, seed, epsilon), regrid(field, voxel, imaging)
+    mask = visible(field, voxel, imaging, epsilon) if imaging.visible else sampled > 0
+    grey, sampled, mask = (part[:z, :y, :x].contiguous() for part in (grey, sampled, mask))
     return grey, sampled, mask
 
 

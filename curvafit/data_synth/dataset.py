@@ -183,9 +183,7 @@ class TextureDataset(IterableDataset):
         u = torch.from_numpy(one.values)
         if more:
             length = BLEND_LENGTH * max(voxels)
-            share = torch.sigmoid(BLEND_STEEPNESS * correlated_field(u[None, None], (length,) * 3, [seed], "blend"))[
-                0, 0
-            ]
+            share = torch.sigmoid(BLEND_STEEPNESS * correlated_field(u, (length,) * 3, seed, "blend"))
             u = share * u + (1 - share) * torch.from_numpy(more[0].values)
         return u, one.epsilon, [shape.origin for shape in (one, *more)]
 

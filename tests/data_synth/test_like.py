@@ -60,12 +60,12 @@ CASES = {"photons": PHOTONS, "slices": SLICES, "textured": TEXTURED}
 def shape() -> torch.Tensor:
     points = centres(Grid((N, N, N), (1.0, 1.0, 1.0)))
     distance = torch.stack([tube.distance(points) for tube in TUBES]).amax(0)
-    return optimal_profile(distance, EPSILON).float()[None, None]
+    return optimal_profile(distance, EPSILON).float()
 
 
 def scan_of(shape: torch.Tensor, how: Imaging) -> tuple[Field, np.ndarray]:
-    values = image(shape, 1.0, [how], [3])[0, 0].numpy()
-    return Field(values, how.spacing, "um"), regrid(shape, 1.0, [how])[0, 0].numpy() > 0
+    values = image(shape, 1.0, how, 3).numpy()
+    return Field(values, how.spacing, "um"), regrid(shape, 1.0, how).numpy() > 0
 
 
 @pytest.mark.parametrize("masked", [True, False])
@@ -134,12 +134,12 @@ def test_integers_saturate_where_their_type_ends(shape: torch.Tensor) -> None:
 
 def test_odd_scans(shape: torch.Tensor) -> None:
     """Values below 0, a background of one value or next to no photons, light on dark 0: an estimate, or a sentence."""
-    mask = regrid(shape, 1.0, [Imaging()])[0, 0].numpy() > 0
+    mask = regrid(shape, 1.0, Imaging()).numpy() > 0
     rng = np.random.default_rng(0)
     signed = np.where(mask, 500, -500) + rng.normal(0, 40, mask.shape)
     low = fit_modality(Field(signed.astype(np.int16), (1.0, 1.0, 1.0), "um"), mask)
     assert low.base.detector.ceiling is None
-    assert image(shape, 1.0, [low.base], [0]).amin() < -300
+    assert image(shape, 1.0, low.base, 0).amin() < -300
     for values in (
         np.where(mask, 80.0, 0.0),
         rng.poisson(0.02 + 3.0 * mask),

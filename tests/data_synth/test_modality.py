@@ -18,7 +18,7 @@ from curvafit.priors.profile import optimal_profile
 N = 32
 POINTS = centres(Grid((N, N, N), (1.0, 1.0, 1.0)))
 SHAPES = [Cylinder(5.0, (0.3, 1, 0.2), (16, 16, 16)), Sphere(9.0, (16, 16, 16))]
-FIELDS = torch.stack([optimal_profile(shape.distance(POINTS), effects.EPSILON).float()[None] for shape in SHAPES])
+FIELDS = [optimal_profile(shape.distance(POINTS), effects.EPSILON).float() for shape in SHAPES]
 
 PLAIN = Imaging(contrast=Contrast(background=10, foreground=60))
 
@@ -26,32 +26,30 @@ PLAIN = Imaging(contrast=Contrast(background=10, foreground=60))
 @pytest.mark.parametrize("name", MODALITIES)
 def test_presets_make_images(name: str) -> None:
     kind = MODALITIES[name]
-    drawn = [kind.draw(seed) for seed in (1, 2)]
-    images = image(FIELDS, kind.voxel, drawn, [1, 2])
-    labels = regrid(FIELDS, kind.voxel, drawn) > 0
-    assert images.shape == labels.shape and bool(torch.isfinite(images).all())
-    assert float(images.amin()) >= 0 and float(images.amax()) <= drawn[0]["detector.ceiling"]
-    assert torch.equal(images, images.round())
-    sign = 1 if drawn[0].contrast.foreground > drawn[0].contrast.background else -1
-    for seen, inside in zip(images, labels, strict=True):
+    for seed, field in enumerate(FIELDS):
+        drawn = kind.draw(seed)
+        seen, inside = image(field, kind.voxel, drawn, seed), regrid(field, kind.voxel, drawn) > 0
+        assert seen.shape == inside.shape and bool(torch.isfinite(seen).all())
+        assert float(seen.amin()) >= 0 and float(seen.amax()) <= drawn["detector.ceiling"]
+        assert torch.equal(seen, seen.round())
+        sign = 1 if drawn.contrast.foreground > drawn.contrast.background else -1
         contrast = sign * float(seen[inside].mean() - seen[~inside].mean())
         assert contrast > 0.5 * float(seen[~inside].std())
 
 
 @pytest.mark.parametrize("name", MODALITIES)
 def test_an_image_is_its_own(name: str) -> None:
-    """The same voxels, bit by bit, in any batch."""
+    """The same voxels, bit by bit, from the same seed."""
     kind = MODALITIES[name]
-    first, second = kind.draw(1), kind.draw(2)
-    batch = image(FIELDS, kind.voxel, [first, second], [1, 2])
-    assert torch.equal(batch[1:], image(FIELDS[1:], kind.voxel, [second], [2]))
-    assert torch.equal(batch, image(FIELDS, kind.voxel, [first, second], [1, 2]))
-    assert not torch.equal(batch[1:], image(FIELDS[1:], kind.voxel, [second], [3]))
+    drawn = kind.draw(2)
+    seen = image(FIELDS[1], kind.voxel, drawn, 2)
+    assert torch.equal(seen, image(FIELDS[1], kind.voxel, drawn, 2))
+    assert not torch.equal(seen, image(FIELDS[1], kind.voxel, drawn, 3))
 
 
 def test_without_effects_an_image_is_its_occupancy() -> None:
-    seen = image(FIELDS, 1.0, [PLAIN, PLAIN], [0, 0])
-    torch.testing.assert_close(seen, 10 + 50 * effects.occupancy(FIELDS))
+    for field in FIELDS:
+        torch.testing.assert_close(image(field, 1.0, PLAIN, 0), 10 + 50 * effects.occupancy(field))
 
 
 @pytest.mark.parametrize(
@@ -75,28 +73,30 @@ def test_without_effects_an_image_is_its_occupancy() -> None:
 )
 def test_every_effect_counts_and_leaves_the_others_numbers(effect: dict) -> None:
     noisy = PLAIN.assign({"noise.gaussian": 2.0})
-    with_it = image(FIELDS[:1], 1.0, [PLAIN.assign(effect)], [5])
-    assert not torch.equal(with_it, image(FIELDS[:1], 1.0, [PLAIN], [5]))
+    with_it = image(FIELDS[0], 1.0, PLAIN.assign(effect), 5)
+    assert not torch.equal(with_it, image(FIELDS[0], 1.0, PLAIN, 5))
     if not {"noise.gaussian", "noise.rician", "detector.gain", "detector.ceiling"} & set(effect):
-        noise = image(FIELDS[:1], 1.0, [noisy], [5]) - image(FIELDS[:1], 1.0, [PLAIN], [5])
-        same = image(FIELDS[:1], 1.0, [noisy.assign(effect)], [5]) - with_it
+        noise = image(FIELDS[0], 1.0, noisy, 5) - image(FIELDS[0], 1.0, PLAIN, 5)
+        same = image(FIELDS[0], 1.0, noisy.assign(effect), 5) - with_it
         torch.testing.assert_close(same, noise, rtol=0, atol=1e-4)
 
 
 def test_images_and_labels_share_a_grid() -> None:
     how = replace(PLAIN, spacing=(2.5, 1.0, 1.5), thickness=2.5)
-    seen, labels = image(FIELDS, 1.0, [how, how], [1, 2]), regrid(FIELDS, 1.0, [how, how])
-    assert tuple(seen.shape[2:]) == tuple(labels.shape[2:]) == (12, 32, 21)
     assert field_shape((12, 32, 20), 1.0, how) == (30, 32, 30)
-    agree = (seen > 35) == (labels > 0)
-    assert float(agree.double().mean()) > 0.985
+    for field in FIELDS:
+        seen, labels = image(field, 1.0, how, 1), regrid(field, 1.0, how)
+        assert tuple(seen.shape) == tuple(labels.shape) == (12, 32, 21)
+        agree = (seen > 35) == (labels > 0)
+        assert float(agree.double().mean()) > 0.985
 
 
 def test_masks_of_what_is_seen() -> None:
     """With even stain and no noise, a share of the light is that share of the contrast, but where the image is within
     what float32 rounds off some fifty levels."""
     how = replace(PLAIN, spacing=(2.5, 1.0, 1.0), thickness=2.5, optics=Optics((3.0, 1.0, 1.0), 0.02), visible=0.1)
-    found, clean = visible(FIELDS, 1.0, [how, how]), image(FIELDS, 1.0, [how, how], [1, 2])
+    found = torch.stack([visible(u, 1.0, how) for u in FIELDS])
+    clean = torch.stack([image(u, 1.0, how, 1) for u in FIELDS])
     clear = (clean - (10 + 0.1 * 50)).abs() > 1e-4
     assert found.dtype == torch.bool and torch.equal(found[clear], clean[clear] > 10 + 0.1 * 50)
     assert float(clear.double().mean()) > 0.99
@@ -105,7 +105,7 @@ def test_masks_of_what_is_seen() -> None:
     dark = replace(PLAIN, contrast=Contrast(60, 10))
     assert 60 - visible_share(dark) * 50 == pytest.approx((10 * 60) ** 0.5)
     assert 0 < visible_share(PLAIN.assign({"contrast.background": 0})) < 0.05
-    inside = regrid(FIELDS, 1.0, [how, how]) > 0
+    inside = torch.stack([regrid(u, 1.0, how) for u in FIELDS]) > 0
     assert bool((found | ~inside).all()) and float(found.sum()) > 1.5 * float(inside.sum())
 
 
@@ -148,21 +148,19 @@ def test_bad_parameters_are_named(wrong: dict, word: str) -> None:
 
 
 def test_bad_input_is_told() -> None:
-    finer = replace(PLAIN, spacing=(2.0, 1.0, 1.0))
-    broken = FIELDS.clone()
-    broken[1, 0, 3, 3, 3] = torch.nan
+    field, broken = FIELDS[0], FIELDS[0].clone()
+    broken[3, 3, 3] = torch.nan
     for call, word in (
-        (lambda: image(FIELDS, 1.0, [PLAIN, finer], [1, 2]), "spacing"),
-        (lambda: image(FIELDS, 1.0, [PLAIN], [1, 2]), "imaging"),
-        (lambda: image(FIELDS, 1.0, [PLAIN, PLAIN], [1]), "seeds"),
-        (lambda: image(broken, 1.0, [PLAIN, PLAIN], [1, 2]), "finite"),
-        (lambda: image(FIELDS, 0.0, [PLAIN, PLAIN], [1, 2]), "spacing"),
+        *((lambda seed=seed: image(field, 1.0, PLAIN, seed), "seed") for seed in (-1, 0.5, True)),
+        *((lambda wrong=wrong: image(wrong, 1.0, PLAIN, 1), "finite") for wrong in (broken, field[0], field.long())),
+        (lambda: image(field, 0.0, PLAIN, 1), "spacing"),
+        (lambda: image(field, 1.0, PLAIN, 1, 0.0), "epsilon"),
         (lambda: Imaging.from_dict({"blurr": 1}), "blurr"),
         (lambda: Modality("m", "", 1.0, PLAIN, {"detector.gain": (2.0, 1.0)}), "detector.gain"),
         (lambda: replace(PLAIN, optics=Contrast()), "optics"),
         (lambda: modality("x-ray"), "x-ray"),
         (lambda: Modality("m", "", 0.0, PLAIN), "voxel"),
-        (lambda: Modality("m", "", 1.0, PLAIN).draw(-1), "seeds"),
+        (lambda: Modality("m", "", 1.0, PLAIN).draw(-1), "seed"),
     ):
         with pytest.raises(ValueError, match=word):
             call()

@@ -171,7 +171,7 @@ def _measure_structure(values: np.ndarray, inside: np.ndarray, steps: np.ndarray
     """Return the blur (z, and y = x) with which the mask explains the scan around it best, and the contrast inside."""
     finest = steps.min() / steps
     window = tuple(WINDOW * finest)
-    signal, mask = (torch.from_numpy(volume)[None, None].float() for volume in (values - level, inside))
+    signal, mask = (torch.from_numpy(volume).float() for volume in (values - level, inside))
     near = blur(mask, 1.0, tuple(2 * finest)) > 0.02
 
     def brightness(blurred: torch.Tensor) -> torch.Tensor:
@@ -186,7 +186,7 @@ def _measure_structure(values: np.ndarray, inside: np.ndarray, steps: np.ndarray
     simplex = corner + np.array([[0, 0], [0.5, 0], [0, 0.5]])
     options = {"xatol": 0.02, "fatol": math.inf, "maxfev": 80, "initial_simplex": simplex}
     widths = np.exp(optimize.minimize(misfit, corner, method="Nelder-Mead", options=options).x[[0, 1, 1]])
-    contrast = brightness(blur(mask, 1.0, tuple(widths)))[0, 0].numpy()
+    contrast = brightness(blur(mask, 1.0, tuple(widths))).numpy()
     mean = float(contrast[inside].mean())
     z, y, x = (np.sqrt(np.maximum(widths**2 - 1 / 12, 0)) * steps).tolist()
     return Structure((z, y, x), mean, *_measure_texture(contrast / mean, inside, steps))

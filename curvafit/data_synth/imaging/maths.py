@@ -2,8 +2,8 @@
 
 A map is a small dense matrix: at the sizes of training crops three matrix products take a sixth of the time of three
 passes of a convolution, and the width may change from one voxel to the next. Near the faces of the box a map's weights
-are divided by their sum: what lies beyond counts as what lies within. Random numbers depend on a sample's seed and on
-their purpose alone, whatever batch the sample is in. A volume is `(B, 1, Z, Y, X)`.
+are divided by their sum: what lies beyond counts as what lies within. Random numbers depend on a seed and on their
+purpose alone.
 """
 
 from __future__ import annotations
@@ -19,21 +19,24 @@ from torch import Tensor
 from curvafit.priors.grid import Float
 
 Triple = tuple[float, float, float]
+#: Lengths along (z, y, x), or one for all three.
+Lengths = float | Sequence[float]
+Volume = Float[Tensor, "z y x"]
 
 #: Squared deviations at which a Gaussian ends.
 CUT = 16.0
 
 
 def apply_matrices(
-    volume: Float[Tensor, "b 1 z y x"], z: Tensor | None = None, y: Tensor | None = None, x: Tensor | None = None
-) -> Float[Tensor, "b 1 Z Y X"]:
+    volume: Volume, z: Tensor | None = None, y: Tensor | None = None, x: Tensor | None = None
+) -> Float[Tensor, "Z Y X"]:
     """Apply a matrix (out, in) to each axis, `None` where it stays; that of y or x may be one a slice, (Z, out, in)."""
     if x is not None:
         volume = volume @ x.mT
     if y is not None:
         volume = y @ volume
     if z is not None:
-        volume = (z @ volume.flatten(-2)).unflatten(-1, volume.shape[-2:])
+        volume = torch.tensordot(z, volume, 1)
     return volume
 
 
@@ -81,54 +84,27 @@ def count_samples(count: int, spacing: float, onto: float) -> int:
     return max(1, math.floor(count * spacing / onto + 1e-6))
 
 
-def check_volume(volume: Tensor, name: str = "a volume") -> Tensor:
-    """Return the volume, if it is `(B, 1, Z, Y, X)`, of a floating type and finite."""
-    if volume.ndim != 5 or volume.shape[1] != 1 or not volume.numel():
-        raise ValueError(f"{name} must be of shape (B, 1, Z, Y, X), got {tuple(volume.shape)}")
-    if not volume.dtype.is_floating_point:
-        raise ValueError(f"{name} must be of a floating type, got {volume.dtype}")
-    if not torch.isfinite(volume.sum()) and not torch.isfinite(volume).all():
-        raise ValueError(f"{name} must be finite, got NaN or infinity")
-    return volume
-
-
-def as_triple(value: float | Sequence[float], name: str) -> Triple:
-    """Return three numbers (z, y, x) from 0; one number counts for all."""
-    numbers = (value,) * 3 if isinstance(value, (int, float)) else tuple(value)
-    if len(numbers) != 3 or not all(math.isfinite(h) and h >= 0 for h in numbers):
-        raise ValueError(f"{name} must be 3 numbers (z, y, x) from 0, got {value!r}")
-    return float(numbers[0]), float(numbers[1]), float(numbers[2])
-
-
-def as_spacing(spacing: float | Sequence[float]) -> Triple:
-    """Return a spacing as three lengths (z, y, x) above 0; one number counts for all."""
-    steps = as_triple(spacing, "a spacing")
-    if not all(steps):
-        raise ValueError(f"the spacing must be 3 positive numbers (z, y, x), got {spacing!r}")
-    return steps
+def as_triple(value: Lengths) -> Triple:
+    """Return three numbers (z, y, x); one number counts for all."""
+    z, y, x = (value,) * 3 if isinstance(value, (int, float)) else value
+    return z, y, x
 
 
 # ---- random fields ---------------------------------------------------------------------------------------------------
 
 
 def stream(seed: int, purpose: str, device: torch.device | str = "cpu") -> torch.Generator:
-    """Return the generator of a sample for one purpose; another device draws other numbers."""
+    """Return the random generator of a seed for one purpose; another device draws other numbers."""
     words = np.random.SeedSequence(seed, spawn_key=(zlib.crc32(purpose.encode()),))
     return torch.Generator(device).manual_seed(int(words.generate_state(1)[0]))
 
 
-def white_noise(shape: tuple[int, ...], like: Tensor, seeds: Sequence[int], purpose: str) -> Tensor:
-    """Return independent standard normal numbers (batch, 1, *shape), of the type and on the device of `like`."""
-    drawn = [
-        torch.randn((1, *shape), generator=stream(seed, purpose, like.device), device=like.device, dtype=like.dtype)
-        for seed in seeds_of(seeds, len(like))
-    ]
-    return torch.stack(drawn)
+def white_noise(shape: tuple[int, ...], like: Tensor, seed: int, purpose: str) -> Tensor:
+    """Return independent standard normal numbers of a shape, of the type and on the device of `like`."""
+    return torch.randn(shape, generator=stream(seed, purpose, like.device), device=like.device, dtype=like.dtype)
 
 
-def correlated_field(
-    like: Float[Tensor, "b 1 z y x"], lengths: Sequence[float], seeds: Sequence[int], purpose: str
-) -> Float[Tensor, "b 1 z y x"]:
+def correlated_field(like: Volume, lengths: Sequence[float], seed: int, purpose: str) -> Volume:
     """Return a Gaussian random field of mean 0 and variance 1 whose correlation over a distance d is exp(-½ Σ
     (d/length)²).
 
@@ -140,36 +116,25 @@ def correlated_field(
     lengths
         Along (z, y, x), in voxels. Under half a voxel there is no correlation left; infinity means constant.
     """
-    shape = like.shape[2:]
-    maps = [_interpolate_nodes(n, length, like) for n, length in zip(shape, lengths, strict=True)]
-    nodes = tuple(n if weights is None else weights.shape[-1] for n, weights in zip(shape, maps, strict=True))
-    return apply_matrices(white_noise(nodes, like, seeds, purpose), *maps)
+    maps = [_interpolate_nodes(n, length, like) for n, length in zip(like.shape, lengths, strict=True)]
+    nodes = tuple(n if weights is None else weights.shape[-1] for n, weights in zip(like.shape, maps, strict=True))
+    return apply_matrices(white_noise(nodes, like, seed, purpose), *maps)
 
 
-def grainy_noise(
-    like: Float[Tensor, "b 1 z y x"], widths: Sequence[float], seeds: Sequence[int], purpose: str
-) -> Float[Tensor, "b 1 z y x"]:
+def grainy_noise(like: Volume, widths: Sequence[float], seed: int, purpose: str) -> Volume:
     """Return standard normal noise, smoothed by a Gaussian of deviations `widths` voxels: correlated by √2 widths."""
-    noise = white_noise(tuple(like.shape[2:]), like, seeds, purpose)
-    if not any(widths):
-        return noise
-    maps = [gaussian_matrix(n, width, like) for n, width in zip(like.shape[2:], widths, strict=True)]
-    units = [None if weights is None else weights / weights.square().sum(-1, keepdim=True).sqrt() for weights in maps]
-    return apply_matrices(noise, *units)
+    noise = white_noise(tuple(like.shape), like, seed, purpose)
+    maps = [gaussian_matrix(n, width, like) for n, width in zip(like.shape, widths, strict=True)]
+    return apply_matrices(
+        noise,
+        *(weights if weights is None else weights / weights.square().sum(-1, keepdim=True).sqrt() for weights in maps),
+    )
 
 
 def uniform(count: int, seed: int, purpose: str, like: Tensor) -> Tensor:
-    """Return `count` numbers in [0, 1) of a sample."""
+    """Return `count` random numbers in [0, 1), of the type and on the device of `like`."""
     generator = stream(seed, purpose, like.device)
     return torch.rand(count, generator=generator, device=like.device, dtype=like.dtype)
-
-
-def seeds_of(seeds: Sequence[int], count: int) -> list[int]:
-    """Return the seeds, if there is one a sample and all are whole numbers from 0."""
-    sound = [isinstance(seed, (int, np.integer)) and not isinstance(seed, bool) and seed >= 0 for seed in seeds]
-    if len(sound) != count or not all(sound):
-        raise ValueError(f"seeds must be {count} whole numbers from 0, one a sample, got {list(seeds)!r:.80}")
-    return [int(seed) for seed in seeds]
 
 
 def _interpolate_nodes(count: int, length: float, like: Tensor) -> Tensor | None:

@@ -14,10 +14,10 @@ from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
 import numpy as np
 import yaml
 
-from curvafit.core.checks import LONGEST, SHORTEST, check_float, quoted, simplify_name
+from curvafit.core.checks import LONGEST, SHORTEST, check_float, check_seed, quoted, simplify_name
 from curvafit.core.schema import encode
 from curvafit.core.units import METRES
-from curvafit.data_synth.imaging.maths import Triple, seeds_of
+from curvafit.data_synth.imaging.maths import Triple
 
 
 class Range(NamedTuple):
@@ -296,8 +296,7 @@ class Modality:
 
     def draw(self, seed: int) -> Imaging:
         """Draw one image's parameters; what is drawn for a parameter depends on the seed and its name alone."""
-        (seed,) = seeds_of([seed], 1)
-        drawn = {}
+        seed, drawn = check_seed(seed), {}
         for name, (low, high) in self.ranges.items():
             key = tuple(name.encode())
             share = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key)).random()
