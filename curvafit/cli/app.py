@@ -10,24 +10,10 @@ from typing import Annotated
 
 import typer
 
+from curvafit.cli import demo, generate, infer, measure, nnunet, refine, segment, synth
 from curvafit.cli.atlas import atlas_app
 from curvafit.cli.console import Commands, say
-from curvafit.cli.demo import EXAMPLES as DEMO_EXAMPLES
-from curvafit.cli.demo import demo
-from curvafit.cli.generate import EXAMPLES as GENERATE_EXAMPLES
-from curvafit.cli.generate import generate, presets
-from curvafit.cli.infer import EXAMPLES as INFER_EXAMPLES
-from curvafit.cli.infer import infer
-from curvafit.cli.measure import EXAMPLES as MEASURE_EXAMPLES
-from curvafit.cli.measure import measure
-from curvafit.cli.nnunet import EXAMPLE as NNUNET_EXAMPLE
-from curvafit.cli.nnunet import nnunet
-from curvafit.cli.refine import EXAMPLES as REFINE_EXAMPLES
-from curvafit.cli.refine import refine
 from curvafit.cli.samples import samples_app
-from curvafit.cli.segment import RECONSTRUCT_EXAMPLES, SEGMENT_EXAMPLES, reconstruct, segment
-from curvafit.cli.synth import EXAMPLES as SYNTH_EXAMPLES
-from curvafit.cli.synth import synth
 
 app = typer.Typer(
     help="Shape texture of tubes and membranes in 3D: a scan in, its parameters out; parameters in, shapes out.",
@@ -40,16 +26,16 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
     cls=Commands,
 )
-app.command(epilog=DEMO_EXAMPLES)(demo)
-app.command(epilog=INFER_EXAMPLES)(infer)
-app.command(epilog=MEASURE_EXAMPLES)(measure)
-app.command(epilog=GENERATE_EXAMPLES)(generate)
-app.command()(presets)
-app.command(epilog=NNUNET_EXAMPLE)(nnunet)
-app.command(epilog=SEGMENT_EXAMPLES)(segment)
-app.command(epilog=REFINE_EXAMPLES)(refine)
-app.command(epilog=RECONSTRUCT_EXAMPLES)(reconstruct)
-app.command(epilog=SYNTH_EXAMPLES)(synth)
+app.command(epilog=demo.EXAMPLES)(demo.demo)
+app.command(epilog=infer.EXAMPLES)(infer.infer)
+app.command(epilog=measure.EXAMPLES)(measure.measure)
+app.command(epilog=generate.EXAMPLES)(generate.generate)
+app.command()(generate.presets)
+app.command(epilog=nnunet.EXAMPLES)(nnunet.nnunet)
+app.command(epilog=segment.SEGMENT_EXAMPLES)(segment.segment)
+app.command(epilog=refine.EXAMPLES)(refine.refine)
+app.command(epilog=segment.RECONSTRUCT_EXAMPLES)(segment.reconstruct)
+app.command(epilog=synth.EXAMPLES)(synth.synth)
 app.add_typer(samples_app, name="samples")
 app.add_typer(atlas_app, name="atlas")
 
@@ -68,7 +54,7 @@ def _show_version(version_only: bool) -> None:
 
 
 @app.callback()
-def _options(
+def _take_options(
     version: Annotated[
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and leave.")
     ] = False,

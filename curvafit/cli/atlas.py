@@ -8,14 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from curvafit.cli.console import command_line, error_console, plain_errors, resumable, say, show_stages
-from curvafit.cli.options import (
-    Crew,
-    DashboardOption,
-    OverwriteOption,
-    SchedulerOption,
-    WorkersOption,
-    parse_whole_triple,
-)
+from curvafit.cli.options import Crew, OverwriteOption, examples, parse_whole_triple, takes_groups
 
 if TYPE_CHECKING:
     from curvafit.core.records import Format
@@ -29,11 +22,13 @@ _Store = Annotated[Path, typer.Argument(help="Folder of the Zarr store.")]
 
 @atlas_app.command(
     "build",
-    epilog="[bold]Examples[/bold]\n\n"
-    "curvafit atlas build store.zarr --count 1000 --shape 64\n\n"
-    "curvafit atlas build tubes.zarr --around tubes --spread 0.2 --count 100\n\n"
-    "curvafit atlas build box.zarr --design box.yaml --scheduler tcp://node1:8786",
+    epilog=examples(
+        "curvafit atlas build store.zarr --count 1000 --shape 64",
+        "curvafit atlas build tubes.zarr --around tubes --spread 0.2 --count 100",
+        "curvafit atlas build box.zarr --design box.yaml --scheduler tcp://node1:8786",
+    ),
 )
+@takes_groups
 def build_atlas(
     store: Annotated[Path, typer.Argument(help="Folder of the Zarr store; a store that exists is resumed.")],
     count: Annotated[int, typer.Option(help="Number of viable shapes in the store at the end.")] = 1000,
@@ -48,9 +43,8 @@ def build_atlas(
     spread: Annotated[float | None, typer.Option(help="With --around: share of the random law's intervals.")] = None,
     schedule: Annotated[str, typer.Option(help="Schedule of the flow: fast, paper, deep or cosine.")] = "fast",
     steps: Annotated[int | None, typer.Option(help="Number of steps, instead of the schedule's.")] = None,
-    workers: WorkersOption = None,
-    scheduler: SchedulerOption = None,
-    dashboard: DashboardOption = None,
+    *,
+    crew: Crew,
 ) -> None:
     """Generate shapes into a store until enough are viable. The same command resumes a build that was stopped."""
     with plain_errors():
@@ -62,25 +56,24 @@ def build_atlas(
         from curvafit.generation.schedule import schedule as named
 
         check_count(count, 1)
-        crew = Crew(workers, scheduler, dashboard)
-        crew.check(box)
+        crew.check_memory(box)
         plan = named(schedule, steps)
         settings = settings_of(box, seed, plan, law)
         if store.exists():
             open_store(store, settings)
         check_folder(store.parent)
-        with crew.at_work() as (makers, progress):
-            build(store, count, box, seed, plan, progress, design=law, workers=makers)
+        with crew.start() as (workers, progress):
+            build(store, count, box, seed, plan, progress, design=law, workers=workers)
         say(str(store))
 
 
-@atlas_app.command("extend", epilog="[bold]Example[/bold]\n\ncurvafit atlas extend store.zarr --count 500")
+@atlas_app.command("extend", epilog=examples("curvafit atlas extend store.zarr --count 500"))
+@takes_groups
 def extend_atlas(
     store: _Store,
     count: Annotated[int, typer.Option(help="Number of viable shapes to add; 0 resumes what was stopped.")] = 100,
-    workers: WorkersOption = None,
-    scheduler: SchedulerOption = None,
-    dashboard: DashboardOption = None,
+    *,
+    crew: Crew,
 ) -> None:
     """Add shapes to a store, with the design and the settings of the store."""
     with plain_errors():
@@ -88,19 +81,17 @@ def extend_atlas(
         from curvafit.data_synth.store import open_store
 
         check_count(count, 0)
-        crew = Crew(workers, scheduler, dashboard)
-        crew.check()
         target = open_store(store).wanted + count
 
         def again() -> str:
             return "`--count 0`" if open_store(store).wanted == target else "the same command"
 
-        with crew.at_work(again) as (makers, progress):
-            extend(store, count, progress, workers=makers)
+        with crew.start(again) as (workers, progress):
+            extend(store, count, progress, workers=workers)
         say(str(store))
 
 
-@atlas_app.command("info", epilog="[bold]Example[/bold]\n\ncurvafit atlas info store.zarr")
+@atlas_app.command("info", epilog=examples("curvafit atlas info store.zarr"))
 def atlas_info(store: _Store) -> None:
     """Show the content of a store, and how it was made."""
     with plain_errors():
@@ -111,7 +102,7 @@ def atlas_info(store: _Store) -> None:
             say(f"{name}: {value}")
 
 
-@atlas_app.command("verify", epilog="[bold]Example[/bold]\n\ncurvafit atlas verify store.zarr")
+@atlas_app.command("verify", epilog=examples("curvafit atlas verify store.zarr"))
 def verify_atlas(store: _Store) -> None:
     """Check every draw of a store; exit with code 1 where one is missing, torn or changed."""
     with plain_errors():
@@ -130,8 +121,9 @@ def verify_atlas(store: _Store) -> None:
 
 @atlas_app.command(
     "extract",
-    epilog="[bold]Examples[/bold]\n\ncurvafit atlas extract store.zarr -o atlas.npz\n\n"
-    "curvafit atlas extract box.zarr corner.zarr -o atlas.npz",
+    epilog=examples(
+        "curvafit atlas extract store.zarr -o atlas.npz", "curvafit atlas extract box.zarr corner.zarr -o atlas.npz"
+    ),
 )
 def extract_atlas(
     stores: Annotated[list[Path], typer.Argument(help="Stores made by `curvafit atlas build`, of one grid.")],
@@ -154,16 +146,18 @@ def extract_atlas(
 
 @atlas_app.command(
     "describe",
-    epilog="[bold]Examples[/bold]\n\ncurvafit atlas describe store.zarr -o table.npz\n\n"
-    "curvafit atlas describe box.zarr corner.zarr -o table.npz --views mask,crop",
+    epilog=examples(
+        "curvafit atlas describe store.zarr -o table.npz",
+        "curvafit atlas describe box.zarr corner.zarr -o table.npz --views mask,crop",
+    ),
 )
+@takes_groups
 def describe_atlas(
     stores: Annotated[list[Path], typer.Argument(help="Stores made by `curvafit atlas build`.")],
     out: Annotated[Path, typer.Option("-o", "--output", help="The table (.npz) to write; one that exists goes on.")],
     views: Annotated[str | None, typer.Option(help="Views of each shape, between commas; by default all.")] = None,
-    workers: WorkersOption = None,
-    scheduler: SchedulerOption = None,
-    dashboard: DashboardOption = None,
+    *,
+    crew: Crew,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Measure each shape of stores as field, mask, crop and scan: the table that `atlas train` reads."""
@@ -172,18 +166,16 @@ def describe_atlas(
         from curvafit.inference.table import TABLE_FILE, VIEWS
 
         _check_archive(out, TABLE_FILE, stores, overwrite)
-        crew = Crew(workers, scheduler, dashboard)
-        crew.check()
         names = tuple(VIEWS) if views is None else tuple(views.split(","))
-        with crew.at_work() as (makers, progress):
+        with crew.start() as (workers, progress):
             table = describe(
-                stores, out, names, progress, workers=makers, command=[command_line()], overwrite=overwrite
+                stores, out, names, progress, workers=workers, command=[command_line()], overwrite=overwrite
             )
         say(f"{len(set(table.shapes.tolist()))} shapes, {len(table)} views", to=error_console())
         say(str(out))
 
 
-@atlas_app.command("train", epilog="[bold]Example[/bold]\n\ncurvafit atlas train table.npz -o posterior.npz")
+@atlas_app.command("train", epilog=examples("curvafit atlas train table.npz -o posterior.npz"))
 def train_atlas(
     table: Annotated[Path, typer.Argument(help="A table made by `curvafit atlas describe`.")],
     out: Annotated[Path, typer.Option("-o", "--output", help="The posterior (.npz) to write.")],
@@ -211,9 +203,7 @@ def train_atlas(
 
 
 @atlas_app.command(
-    "map",
-    epilog="[bold]Examples[/bold]\n\ncurvafit atlas map store.zarr -o map\n\n"
-    "curvafit atlas map box.zarr corner.zarr -o map",
+    "map", epilog=examples("curvafit atlas map store.zarr -o map", "curvafit atlas map box.zarr corner.zarr -o map")
 )
 def map_atlas(
     stores: Annotated[list[Path], typer.Argument(help="Stores made by `curvafit atlas build`, of one grid.")],
@@ -223,11 +213,9 @@ def map_atlas(
     """Draw a map of the shapes of stores: a picture, and a page to explore the shapes and to place scans."""
     with plain_errors():
         with resumable(), show_stages() as progress:
-            from curvafit.atlas_map.files import check_map, write_map
+            from curvafit.atlas_map.files import write_map
 
-            check_map(out, stores, overwrite)
-            options = {"command": command_line(), "overwrite": overwrite}
-            files = write_map(stores, out, **options, progress=progress)
+            files = write_map(stores, out, command=command_line(), overwrite=overwrite, progress=progress)
         for path in files:
             say(str(path))
 

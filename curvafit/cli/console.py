@@ -206,28 +206,7 @@ def show_stages() -> Iterator[Callable[[str, float], None]]:
         for line in waiting:
             say(line, to=console)
         return
-    with Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        console=console,
-        transient=True,
-    ) as bar:
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("starting", total=1.0)
         yield lambda text, share: bar.update(task, description=text, completed=share)
-
-
-@contextmanager
-def flow_progress(steps: int) -> Iterator[Callable[..., None]]:
-    """Show a progress bar that is a flow's callback."""
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.completed:.0f} of {task.total:.0f} steps"),
-    )
-    console = error_console()
-    quiet = not console.is_terminal
-    with Progress(*columns, TimeRemainingColumn(), console=console, transient=True, disable=quiet) as bar:
-        task = bar.add_task("starting (a first run compiles the kernels for this processor)", total=steps)
-        yield lambda step, total, state: bar.update(task, completed=step, description="growing")

@@ -14,13 +14,8 @@ EXAMPLES = examples("curvafit demo", "curvafit demo shell -o shell_out")
 
 
 def demo(
-    sample: Annotated[
-        str | None,
-        typer.Argument(help="Name of a sample; by default bone, or else the synthetic scan."),
-    ] = None,
-    out: Annotated[Path, typer.Option("-o", "--output", help="Folder for demo.html and what it rests on.")] = Path(
-        "demo_out"
-    ),
+    sample: Annotated[str | None, typer.Argument(help="A sample; by default bone, or else the synthetic scan.")] = None,
+    out: Annotated[Path, typer.Option("-o", "--output", help="Folder for demo.html and its files.")] = Path("demo_out"),
     seed: Annotated[int, typer.Option(help="Seed of the reading.")] = 0,
     overwrite: OverwriteOption = False,
 ) -> None:

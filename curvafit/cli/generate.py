@@ -9,23 +9,23 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli.console import command_line, error_console, flow_progress, plain_errors, print_table, say
-from curvafit.cli.options import (
-    OverwriteOption,
-    examples,
-    parse_device,
-    parse_numbers,
-    parse_triple,
-    parse_whole_numbers,
-    parse_whole_triple,
+from curvafit.cli.console import (
+    command_line,
+    error_console,
+    plain_errors,
+    print_table,
+    say,
+    say_notes,
+    show_stages,
 )
+from curvafit.cli.options import OverwriteOption, examples, parse_numbers, parse_whole_numbers, parse_whole_triple
 from curvafit.core.runtime import exit_code
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from curvafit.drawing.shapes import Output
-    from curvafit.generation.flow import Flow
+    from curvafit.generation.result import Flow, State
     from curvafit.priors.grid import Grid
     from curvafit.priors.law import Law
 
@@ -49,11 +49,6 @@ _what = partial(typer.Option, rich_help_panel="What to make")
 _how = partial(typer.Option, rich_help_panel="How")
 _out = partial(typer.Option, rich_help_panel="What to write")
 
-Share = Annotated[float | None, _what(help="Share of the volume inside, in (0, 1), instead of a mass.")]
-Epsilon = Annotated[float | None, _what(help="Interface width in working units; 0.02 (two voxels) by default.")]
-Seed = Annotated[int, _what(help="Seed of the noise that the shape grows from.")]
-Steps = Annotated[int | None, _how(help="Number of steps, instead of the schedule's.")]
-
 
 def generate(
     out: Annotated[
@@ -66,7 +61,9 @@ def generate(
     ] = None,
     prior: Annotated[str | None, _what(help="fit.json of `curvafit infer`, or a preset's name.")] = None,
     mass: Annotated[float | None, _what(help="Mean of the field, in (-1, 1).")] = None,
-    volume_fraction: Share = None,
+    volume_fraction: Annotated[
+        float | None, _what(help="Share of the volume inside, in (0, 1), instead of a mass.")
+    ] = None,
     orientation: Annotated[
         str | None, _what(help="θz,θy,θx,μ: tubes and layers lie along θ, more so with a larger μ.")
     ] = None,
@@ -78,65 +75,61 @@ def generate(
     boundary: Annotated[
         str, _what(help="periodic, or replicate (walls that the shape meets at right angles).")
     ] = "periodic",
-    epsilon: Epsilon = None,
-    seed: Seed = 0,
+    epsilon: Annotated[
+        float | None, _what(help="Interface width in working units; 0.02 (two voxels) by default.")
+    ] = None,
+    seed: Annotated[int, _what(help="Seed of the noise that the shape grows from.")] = 0,
     schedule: Annotated[str, _how(help="fast (1500 steps), paper (8000) or cosine (1000).")] = "fast",
-    steps: Steps = None,
+    steps: Annotated[int | None, _how(help="Number of steps, instead of the schedule's.")] = None,
     device: Annotated[str, _how(help="cpu, cuda, cuda:1 …")] = "cpu",
     checkpoint: Annotated[
-        Path | None, _how(help="File to save the run in; the run goes on from it if it exists.")
+        Path | None, _how(help="File to save the run in, and to resume it from if it exists.")
     ] = None,
     checkpoint_every: Annotated[float | None, _how(help="Seconds between two checkpoints; 60 by default.")] = None,
     spacing: Annotated[
-        str | None, _out(help="Edge of a voxel (a cube), in --unit; by default 1, or the prior's.")
+        str | None, _out(help="Edge of a voxel, a cube, in --unit; by default 1, or the prior's.")
     ] = None,
     unit: Annotated[str | None, _out(help="nm, um, mm or m; needs --spacing.")] = None,
     tile: Annotated[str | None, _out(help="Repeat a periodic box N or Z,Y,X times.")] = None,
     cap: Annotated[
-        bool | None,
-        _out("--cap/--no-cap", help="Close a surface on the box's faces (the default), or leave it open there."),
+        bool | None, _out("--cap/--no-cap", help="Close a surface on the box's faces (the default), or leave it open.")
     ] = None,
     picture: Annotated[
-        bool, _out("--picture/--no-picture", help="Draw the shape beside it (.png), once it is written, or do not.")
+        bool, _out("--picture/--no-picture", help="Draw a picture (.png) of the shape, or do not.")
     ] = True,
-    snapshots: Annotated[
-        str | None, _out(help="Also write the field after these numbers of steps: 10,100,1000.")
-    ] = None,
+    snapshots: Annotated[str | None, _out(help="Also write the field after these steps: 10,100,1000.")] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Make a shape from parameters, with a record (.json) and a picture (.png) beside it."""
     with plain_errors():
-        box = None if shape is None else parse_whole_triple(shape, "--shape")
+        from curvafit.drawing.shapes import check_target, shape_record
+        from curvafit.generation.schedule import schedule as named
         from curvafit.priors.grid import Grid
         from curvafit.volumes.parameter_maps import map_shape, read_maps
 
+        box = None if shape is None else parse_whole_triple(shape, "--shape")
         volumes = {} if maps is None else read_maps(maps, box)
         law = _read_law(preset, coefficients, prior, volumes)
         options = _choose_parameters(law, volumes, mass, volume_fraction, epsilon)
-        grid = Grid(box or map_shape(volumes) or EDGE, boundary=boundary)  # type: ignore[arg-type]
-        how = _plan_output(law, grid, spacing, unit, tile, cap)
-        saving = _place_checkpoint(checkpoint, checkpoint_every)
-        options |= {"grid": grid, "seed": seed, **saving}
-        from curvafit.drawing.shapes import check_target
-        from curvafit.generation.schedule import schedule as named
-
+        options["grid"] = grid = Grid(box or map_shape(volumes) or EDGE, boundary=boundary)  # type: ignore[arg-type]
+        options["orientation"] = Q = None if orientation is None else _parse_orientation(orientation)
         options["schedule"] = plan = named(schedule, steps)
         after = () if snapshots is None else parse_whole_numbers(snapshots, "--snapshots")
         options["snapshots"] = tuple(map(plan.check_step, after))
-        options["orientation"] = Q = None if orientation is None else _parse_orientation(orientation)
+        options |= {"seed": seed, "device": device, **_place_checkpoint(checkpoint, checkpoint_every, out)}
+        output = _plan_output(law, grid, spacing, unit, tile, cap)
+        if cap is not None:
+            _check_surface(out)
         law_file = None if not law.fitted else prior or preset
         inputs = [str(path) for path in (law_file, maps) if path is not None]
-        _check_places(out, saving["checkpoint"], cap)
         writing = {"picture": picture, "overwrite": overwrite}
-        check_target(out, how, steps=options["snapshots"], inputs=inputs, **writing)
-        flow = _grow({**options, "device": parse_device(device)})
+        check_target(out, output, steps=options["snapshots"], inputs=inputs, **writing)
+        flow = _grow(options)
         more = {"orientation": Q if Q is None else Q.tolist(), "maps": maps if maps is None else str(maps)}
         more |= {"origin": law.origin, "wanted_volume_fraction": volume_fraction, "command": command_line()}
-        from curvafit.drawing.shapes import shape_record
-
-        record = shape_record(flow, mass=options["mass"], output=how, snapshots=list(flow.snapshots), **more)
-        _write(flow, out, record, output=how, **writing)
-        _remove(saving["checkpoint"])
+        record = shape_record(flow, mass=options["mass"], output=output, snapshots=list(flow.snapshots), **more)
+        _write(flow, out, record, output=output, **writing)
+        _remove(options["checkpoint"])
 
 
 def presets() -> None:
@@ -166,59 +159,60 @@ def _read_law(preset: str | None, six: str | None, prior: str | None, maps: Maps
 
 
 def _choose_parameters(
-    law: Law,
-    maps: Maps3D,
-    mass: float | None,
-    share: float | None,
-    epsilon: float | None,
+    law: Law, maps: Maps3D, mass: float | None, share: float | None, epsilon: float | None
 ) -> dict[str, Any]:
     """Return the law, the mass or the share, and ε as `generate` takes them, with maps in place of numbers."""
     from curvafit.priors.coefficients import NAMES
     from curvafit.priors.grid import WORKING_EPSILON
 
-    for option, value, name in (("--mass", mass, "mass"), ("--epsilon", epsilon, "epsilon")):
+    for name, value in (("mass", mass), ("epsilon", epsilon)):
         if value is not None and name in maps:
-            raise ValueError(f"give either {option} or a map of {name}, got both")
+            raise ValueError(f"give either --{name} or a map of it, got both")
     mean = maps.get("mass", mass)
     if mean is not None and share is not None:
         raise ValueError("give either a mass or --volume-fraction, got both")
-    if mean is None and share is None:
-        mean = law.mass
-    if mean is None and share is None:
-        raise ValueError("coefficients need --mass or --volume-fraction")
     coefficients = replace(law.coefficients, **{name: maps[name] for name in NAMES if name in maps})
     width = maps.get("epsilon", WORKING_EPSILON if epsilon is None else epsilon)
+    mean = law.mass if mean is None and share is None else mean
     return {"law": coefficients, "mass": mean, "volume_fraction": share, "epsilon": width}
 
 
-def _place_checkpoint(file: Path | None, every: float | None) -> dict[str, Any]:
-    """Return the options of the checkpoint as `generate` takes them."""
-    if file is None and every is not None:
-        raise ValueError(f"--checkpoint-every {every:g} needs --checkpoint")
+def _place_checkpoint(file: Path | None, every: float | None, out: Path) -> dict[str, Any]:
+    """Return the options of the checkpoint as `generate` takes them; refuse the place of an output."""
+    from curvafit.core.records import sibling
     from curvafit.generation.checkpoint import resolve_place
 
-    place = None if file is None else resolve_place(file)
-    return {"checkpoint": place} if every is None else {"checkpoint": place, "checkpoint_every": every}
+    if file is None:
+        if every is not None:
+            raise ValueError(f"--checkpoint-every {every:g} needs --checkpoint")
+        return {"checkpoint": None}
+    place = resolve_place(file)
+    if place in [path.resolve() for path in (out, sibling(out, ".json"), sibling(out, ".png"))]:
+        raise ValueError(f"the checkpoint {place} would be written over by an output: choose another name")
+    return {"checkpoint": place} | ({} if every is None else {"checkpoint_every": every})
 
 
 def _plan_output(
     law: Law, grid: Grid, spacing: str | None, unit: str | None, tile: str | None, cap: bool | None
 ) -> Output:
     """Return how to write the shape: voxels as large as the options say, else as the fit's."""
-    if unit is not None and spacing is None:
-        raise ValueError("--unit needs --spacing")
-    edge, fit_unit = law.working_voxel or 1.0, law.length_unit or "voxel"
-    edges = (edge,) * 3 if spacing is None else parse_triple(spacing, "--spacing")
-    if len(set(edges)) > 1:
-        raise ValueError(f"--spacing must be one number, as voxels are cubes, got {spacing!r}")
-    if tile is not None and not grid.periodic:
-        raise ValueError(f"--tile needs a periodic boundary, got {grid.boundary!r}")
     from curvafit.drawing.shapes import Output
 
+    if unit is not None and spacing is None:
+        raise ValueError("--unit needs --spacing")
+    edge = law.working_voxel or 1.0 if spacing is None else parse_numbers(spacing, "--spacing", 1)[0]
     repeats = (1, 1, 1) if tile is None else parse_whole_triple(tile, "--tile")
-    how = Output(edges[0], unit or fit_unit, repeats, cap is not False)
-    how.shape(grid)
-    return how
+    output = Output(edge, unit or law.length_unit or "voxel", repeats, cap is not False)
+    output.shape(grid)
+    return output
+
+
+def _check_surface(out: Path) -> None:
+    """Refuse the options of a surface where a volume is written."""
+    from curvafit.geometry.mesh import SUFFIXES
+
+    if not out.name.lower().endswith(SUFFIXES):
+        raise ValueError(f"--cap and --no-cap are for surfaces ({', '.join(SUFFIXES)}), got {out.name!r}")
 
 
 def _parse_orientation(text: str) -> Tensor:
@@ -229,27 +223,16 @@ def _parse_orientation(text: str) -> Tensor:
     return orientation(direction, strength)
 
 
-def _check_places(out: Path, checkpoint: Path | None, cap: bool | None) -> None:
-    """Refuse a checkpoint at the place of an output, and options of a surface where a volume is written."""
-    from curvafit.core.files import check_folder
-    from curvafit.core.records import sibling
-    from curvafit.geometry.mesh import SUFFIXES
-
-    if cap is not None and not out.name.lower().endswith(SUFFIXES):
-        option = "--cap" if cap else "--no-cap"
-        raise ValueError(f"{option} is for surfaces ({', '.join(SUFFIXES)}), got {out.name!r}")
-    if checkpoint is not None:
-        check_folder(checkpoint.parent)
-        outputs = (out, sibling(out, ".json"), sibling(out, ".png"))
-        if checkpoint in [path.resolve() for path in outputs]:
-            raise ValueError(f"the checkpoint {checkpoint} would be written over by an output: choose another name")
-
-
 def _grow(options: dict[str, Any]) -> Flow:
     """Run the flow with progress; exit with code 1 where it failed or has no surface."""
     from curvafit.generation.flow import generate as make
 
-    with flow_progress(options["schedule"].steps) as watch:
+    with show_stages() as progress:
+        progress("starting (a first run compiles the kernels for this processor)", 0.0)
+
+        def watch(step: int, total: int, state: State) -> None:
+            progress("growing", step / total)
+
         try:
             flow = make(**options, callbacks=[watch], keep_checkpoint=True)
         except KeyboardInterrupt as signal:
@@ -274,11 +257,9 @@ def _write(flow: Flow, out: Path, record: dict[str, Any], **how: Any) -> None:
     """Write the files, and print the flow's status and the paths."""
     from curvafit.drawing.shapes import step_path, write_shape
 
-    notes = [] if flow.viability.viable else [flow.status]
     files = write_shape(flow, out, record=record, **how)
-    notes += [f"no surface after {step} steps" for step in flow.snapshots if step_path(out, step) not in files]
-    for note in notes:
-        say(f"note: {note}", to=error_console())
+    say_notes([] if flow.viability.viable else [flow.status])
+    say_notes(f"no surface after {step} steps" for step in flow.snapshots if step_path(out, step) not in files)
     say(f"{flow.status}; {100 * record['volume_fraction']:.2f} % of the volume")
     for path in files:
         say(str(path))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from curvafit.cli.console import command_line, plain_errors, print_table, say, say_notes, show_stages
-from curvafit.cli.options import OverwriteOption, Reading, Volume, examples, parse_threshold, reads_volume
+from curvafit.cli.options import OverwriteOption, Reading, Volume, examples, parse_threshold, takes_groups
 
 if TYPE_CHECKING:
     from curvafit.inference.infer import Inference
@@ -22,7 +22,7 @@ EXAMPLES = examples(
 )
 
 
-@reads_volume
+@takes_groups
 def infer(
     scan: Volume,
     out: Annotated[Path, typer.Option("-o", "--output", help="Folder for fit.json, report.html, regenerated.nii.gz.")],
@@ -47,25 +47,20 @@ def infer(
     """Infer the parameters of a scanned volume, and write a report."""
     with plain_errors():
         level = parse_threshold(threshold)
-        what = {"kind": kind, "periodic": periodic, "threshold": level, "dark": dark, "roi": roi}
-        how = {"atlas": atlas, "posterior": posterior, "method": method, "fast": fast, "seed": seed}
-        inference, report = _infer_and_write(scan, out, {**what, **how, **reading}, overwrite)
+        files = {"roi": roi, "atlas": atlas, "posterior": posterior}
+        what: dict[str, Any] = {"kind": kind, "periodic": periodic, "threshold": level, "dark": dark, **files}
+        with show_stages() as progress:
+            from curvafit.inference.infer import infer as infer_scan
+            from curvafit.report.page import check_report, with_command, write_inference
+
+            check_report(out, [scan, *(file for file in files.values() if file is not None)], overwrite)
+            how = {"method": method, "fast": fast, "seed": seed, "progress": progress}
+            inference = infer_scan(scan, **what, **how, **reading)
+            progress("drawing the report", 1.0)
+            say_notes(inference.scan.notes)
+            report = write_inference(with_command(inference, command_line()), out, overwrite=overwrite)
         _print_result(inference)
         say(str(report))
-
-
-def _infer_and_write(scan: str, out: Path, options: dict[str, Any], overwrite: bool) -> tuple[Inference, Path]:
-    """Return the inference and the path of its report, and show the progress."""
-    with show_stages() as progress:
-        from curvafit.inference.infer import infer as infer_scan
-        from curvafit.report.page import check_report, with_command, write_inference
-
-        inputs = [each for each in (scan, options["roi"], options["atlas"], options["posterior"]) if each is not None]
-        check_report(out, inputs, overwrite)
-        inference = infer_scan(scan, progress=progress, **options)
-        progress("drawing the report", 1.0)
-        say_notes(inference.scan.notes)
-        return inference, write_inference(with_command(inference, command_line()), out, overwrite=overwrite)
 
 
 def _print_result(inference: Inference) -> None:
@@ -80,10 +75,9 @@ def _print_result(inference: Inference) -> None:
     if rows := parameter_table(inference):
         heads = ("", "working units", "±", "90 % of the posterior", f"with lengths in {fit.length_unit}")
         print_table(heads, rows, right=range(1, 5))
-    for each in fit.weak_directions:
-        say(each)
+    for sentence in fit.weak_directions:
+        say(sentence)
     if inference.twins:
-        apart = ", ".join(
-            f"{TITLES.get(each.name, each.name)} {format_number(each.distance, 2)}" for each in fit.candidates
-        )
-        say(f"Distances in 1/working unit ({format_length(fit.length, fit.length_unit, 3)}): {apart}.")
+        distances = [f"{TITLES.get(each.name, each.name)} {format_number(each.distance, 2)}" for each in fit.candidates]
+        unit = format_length(fit.length, fit.length_unit, 3)
+        say(f"Distances in 1/working unit ({unit}): {', '.join(distances)}.")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from curvafit.cli.console import plain_errors, print_table, say, say_notes, show_stages
-from curvafit.cli.options import OverwriteOption, Reading, examples, parse_threshold, reads_volume
+from curvafit.cli.options import OverwriteOption, Reading, examples, parse_threshold, takes_groups
 
 if TYPE_CHECKING:
     from curvafit.scan.measure import Measures
@@ -20,7 +20,7 @@ EXAMPLES = examples(
 )
 
 
-@reads_volume
+@takes_groups
 def measure(
     scans: Annotated[
         list[str], typer.Argument(help="NIfTI, TIFF (or folder of slices), NPY, NPZ, HDF5 (file.h5::key), RAW, Zarr …")
@@ -44,23 +44,23 @@ def measure(
 
             if out is not None:
                 check_table(out, scans, overwrite)
-            found = []
-            for number, scan in enumerate(scans):
+            found: list[Measures] = []
 
-                def watch(text: str, share: float, number: int = number, scan: str = scan) -> None:
-                    progress(f"{scan}: {text}", (number + share) / len(scans))
+            def watch(text: str, share: float) -> None:
+                progress(f"{scans[len(found)]}: {text}", (len(found) + share) / len(scans))
 
+            for scan in scans:
                 found.append(measure_scan(scan, progress=watch, **options))
-        for each in found:
-            _print_measures(each, len(scans) > 1)
+        for measures in found:
+            if len(scans) > 1:
+                say(measures.source, style="bold")
+            _print_measures(measures)
         if out is not None:
             say(str(write_table(found, out, overwrite=overwrite)))
 
 
-def _print_measures(measures: Measures, several: bool) -> None:
-    """Print the numbers of a scan."""
-    if several:
-        say(measures.source, style="bold")
+def _print_measures(measures: Measures) -> None:
+    """Print the notes and the numbers of a scan."""
     say_notes(measures.notes)
     rows = [(each.name, each.symbol, *each.format(measures.unit)) for each in measures.quantities]
     print_table(("", "", "value", "95 %", "unit"), rows, right=(2, 3))

@@ -10,13 +10,11 @@ from typing import Annotated
 import typer
 
 from curvafit.cli.console import plain_errors, say
+from curvafit.cli.options import examples
 
-EXAMPLE = """[bold]Example[/bold]
-
-eval "$(curvafit nnunet --prior bone/fit.json)"
-
-nnUNetv2_train 4 3d_fullres 0 -tr nnUNetTrainerCurvafit
-"""
+EXAMPLES = examples(
+    'eval "$(curvafit nnunet --prior bone/fit.json)"', "nnUNetv2_train 4 3d_fullres 0 -tr nnUNetTrainerCurvafit"
+)
 
 
 def nnunet(
@@ -48,7 +46,8 @@ def nnunet(
         share = 0.1 if share is None and weight is None else share
         settings = {"SHARE": share, "WEIGHT": weight, "WARMUP": warmup, "EPSILON": epsilon}
         for name, value in settings.items():
-            if value is not None and not (0 <= value < math.inf and (value or name in ("WEIGHT", "WARMUP"))):
+            least = 0 if name in ("WEIGHT", "WARMUP") else math.ulp(0)
+            if value is not None and not least <= value < math.inf:
                 raise ValueError(f"--{name.lower()} must be a positive number, got {value}")
         folder = shlex.quote(str(Path(__file__).resolve().parent.parent / "nnunet"))
         say(f"export nnUNet_extTrainer={folder}${{nnUNet_extTrainer:+:$nnUNet_extTrainer}}")

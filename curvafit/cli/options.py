@@ -7,8 +7,9 @@ import inspect
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -29,14 +30,35 @@ def examples(*lines: str) -> str:
     return "[bold]Examples[/bold]\n\n" + "\n\n".join(lines)
 
 
-# ---- reading a volume ------------------------------------------------------------------------------------------------
+# ---- groups of options -----------------------------------------------------------------------------------------------
+
+
+def takes_groups(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command the options of the groups that its parameters name: `reading` and `crew`, as in `_GROUPS`."""
+    own = inspect.signature(command, eval_str=True).parameters
+    groups = {name: inspect.signature(_GROUPS[name], eval_str=True).parameters for name in own if name in _GROUPS}
+
+    @functools.wraps(command)
+    def run(**arguments: Any) -> None:
+        with plain_errors():
+            for name, options in groups.items():
+                arguments[name] = _GROUPS[name](**{option: arguments.pop(option) for option in options})
+        command(**arguments)
+
+    parameters = [each for name in own for each in groups.get(name, {name: own[name]}).values()]
+    run.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+        [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in parameters]
+    )
+    run.__annotations__ = {each.name: each.annotation for each in parameters}
+    return run
+
 
 _read = partial(typer.Option, rich_help_panel="How to read the file")
 
 Volume = Annotated[
     str, typer.Argument(help="NIfTI, TIFF (or folder of slices), NPY, NPZ, HDF5 (file.h5::key), RAW, Zarr …")
 ]
-#: The options as `curvafit.load` takes them, which `reads_volume` gives to a command.
+#: The options of the group `reading`, as `curvafit.load` takes them.
 Reading = dict[str, Any]
 
 
@@ -75,65 +97,46 @@ def parse_reading(
     }
 
 
-def reads_volume(command: Callable[..., None]) -> Callable[..., None]:
-    """Put the options of reading a volume in the place of a command's parameter `reading`."""
-    options = inspect.signature(parse_reading, eval_str=True).parameters
-    own = inspect.signature(command, eval_str=True).parameters
+@dataclass(frozen=True)
+class Crew:
+    """The workers that the options ask for; ValueError where they contradict each other."""
 
-    @functools.wraps(command)
-    def reader(**arguments: Any) -> None:
-        with plain_errors():
-            reading = parse_reading(**{name: arguments.pop(name) for name in options})
-        command(**arguments, reading=reading)
+    workers: Annotated[
+        int | None,
+        typer.Option(help="Worker processes on this machine; by default one per core, 0 for this process alone."),
+    ] = None
+    scheduler: Annotated[
+        str | None, typer.Option(help="Address of a running dask scheduler, tcp://HOST:PORT, instead of --workers.")
+    ] = None
+    dashboard: Annotated[
+        int | None,
+        typer.Option(help="Port of dask's dashboard on 127.0.0.1, for workers on this machine; by default none."),
+    ] = None
 
-    parameters = [each for name in own for each in (options.values() if name == "reading" else (own[name],))]
-    reader.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-        [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in parameters]
-    )
-    reader.__annotations__ = {each.name: each.annotation for each in parameters}
-    return reader
-
-
-# ---- workers ---------------------------------------------------------------------------------------------------------
-
-WorkersOption = Annotated[
-    int | None,
-    typer.Option(help="Worker processes on this machine; by default one per core, 0 for this process alone."),
-]
-SchedulerOption = Annotated[
-    str | None, typer.Option(help="Address of a running dask scheduler, tcp://HOST:PORT, instead of --workers.")
-]
-DashboardOption = Annotated[
-    int | None,
-    typer.Option(help="Port of dask's dashboard on 127.0.0.1, for workers on this machine; by default none."),
-]
-
-
-class Crew(NamedTuple):
-    """The workers that the options ask for."""
-
-    workers: int | None
-    scheduler: str | None
-    dashboard: int | None
-
-    def check(self, shape: Sequence[int] | None = None) -> None:
-        """Raise ValueError where the options contradict each other, or a shape does not fit into memory."""
-        from curvafit.core.runtime import FLOW, check_memory
+    def __post_init__(self) -> None:
         from curvafit.core.workers import check_workers
 
         check_workers(self.workers, self.scheduler)
-        if shape is not None and self.scheduler is None:
+
+    def check_memory(self, shape: Sequence[int]) -> None:
+        """Raise ValueError where a shape does not fit into this machine's memory, if it is made here."""
+        from curvafit.core.runtime import FLOW, check_memory
+
+        if self.scheduler is None:
             check_memory(shape, FLOW, "a shape")
 
     @contextmanager
-    def at_work(self, again: Callable[[], str] = lambda: "the same command") -> Iterator[tuple[Workers, Progress]]:
+    def start(self, again: Callable[[], str] = lambda: "the same command") -> Iterator[tuple[Workers, Progress]]:
         """Start the workers and their progress bar; `again` returns the command that resumes after an interrupt."""
         from curvafit.core.workers import cluster
 
         with resumable(again), show_stages() as progress:
             progress("starting workers", 0.0)
-            with cluster(*self) as workers:
+            with cluster(self.workers, self.scheduler, self.dashboard) as workers:
                 yield workers, progress
+
+
+_GROUPS: dict[str, Callable[..., Any]] = {"reading": parse_reading, "crew": Crew}
 
 
 # ---- parsing ---------------------------------------------------------------------------------------------------------
@@ -173,21 +176,6 @@ def parse_whole_numbers(text: str, option: str) -> tuple[int, ...]:
     if min(values) < 0 or any(value != int(value) for value in values):
         raise ValueError(f"{option} must be whole numbers from 0, got {text!r}")
     return tuple(int(value) for value in values)
-
-
-def parse_device(text: str) -> str:
-    """Return the name of a device, or raise ValueError where this machine does not have it."""
-    import torch
-
-    try:
-        kind = torch.device(text).type
-    except RuntimeError:
-        kind = ""
-    devices = {"cpu": True, "cuda": torch.cuda.is_available()}
-    if not devices.get(kind):
-        names = ", ".join(name for name, available in devices.items() if available)
-        raise ValueError(f"--device must be one of this machine's ({names}), got {text!r}")
-    return text
 
 
 def parse_threshold(text: str) -> float | str:

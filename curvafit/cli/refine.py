@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from curvafit.cli.console import plain_errors, say_notes
-from curvafit.cli.options import OverwriteOption, Reading, examples, reads_volume
+from curvafit.cli.options import OverwriteOption, Reading, examples, takes_groups
 from curvafit.cli.segment import Epsilon, Job, OwnPrior, Steps, TileOption, Weight, WorkersOption, run_job
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ EXAMPLES = examples(
 _what = partial(typer.Option, rich_help_panel="What to do")
 
 
-@reads_volume
+@takes_groups
 def refine(
     probabilities: Annotated[
         str, typer.Argument(help="Probability of the inside: NIfTI, TIFF, NPY, NPZ, Zarr …; or a folder of NPZ files.")

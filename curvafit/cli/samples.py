@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from curvafit.cli.console import error_console, plain_errors, print_table, say
-from curvafit.cli.options import OverwriteOption
+from curvafit.cli.options import OverwriteOption, examples
 
 #: The sample that needs no network, and its line in the list.
 SYNTHETIC = "synthetic"
@@ -30,13 +30,12 @@ def list_samples(context: typer.Context) -> None:
             print_table(("name", "what", "licence", "source"), [*rows, (SYNTHETIC, *_SYNTHETIC_ABOUT)])
 
 
-@samples_app.command("get", epilog="[bold]Example[/bold]\n\ncurvafit infer $(curvafit samples get bone) -o bone")
+@samples_app.command("get", epilog=examples("curvafit infer $(curvafit samples get bone) -o bone"))
 def get_sample(
     name: Annotated[str, typer.Argument(help="Name of the sample; `curvafit samples` lists the names.")],
     out: Annotated[
-        Path | None,
-        typer.Option("-o", "--output", help="Copy the sample here; by default it stays in the cache."),
-    ] = None,
+        Path | None, typer.Option("-o", "--output", help="Copy it here; by default it stays in the cache.")
+    ] = (None),
     overwrite: OverwriteOption = False,
 ) -> None:
     """Download a sample once, check it, and print its path."""
@@ -54,7 +53,7 @@ def get_sample(
 
 
 def fetch_or_make(name: str) -> Path:
-    """Return the path of a sample: fetched, or, of the synthetic scan, made once."""
+    """Return the path of a sample, which is downloaded, or of the synthetic scan, which is made; both once."""
     from curvafit.data_synth.samples import cache_folder, fetch, synthetic_scan
 
     if name != SYNTHETIC:

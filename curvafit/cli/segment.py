@@ -19,7 +19,7 @@ from curvafit.cli.options import (
     examples,
     parse_threshold,
     parse_whole_numbers,
-    reads_volume,
+    takes_groups,
 )
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ WorkersOption = Annotated[
 Axis = Annotated[str, _what(help="Axis across the slices: z, y or x (first, second, last axis of an array).")]
 
 
-@reads_volume
+@takes_groups
 def segment(
     scan: Volume,
     out: Target,
@@ -89,7 +89,7 @@ def segment(
         run_job(Job(scan, out, prior, reading, record, overwrite, workers), compute)
 
 
-@reads_volume
+@takes_groups
 def reconstruct(
     slices: Volume,
     out: Target,

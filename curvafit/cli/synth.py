@@ -11,16 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from curvafit.cli.console import error_console, plain_errors, say, say_notes
-from curvafit.cli.options import (
-    Crew,
-    DashboardOption,
-    SchedulerOption,
-    WorkersOption,
-    examples,
-    parse_numbers,
-    parse_reading,
-    parse_whole_triple,
-)
+from curvafit.cli.options import Crew, Reading, examples, parse_numbers, parse_whole_triple, takes_groups
 
 if TYPE_CHECKING:
     import numpy as np
@@ -39,107 +30,83 @@ _what = partial(typer.Option, rich_help_panel="Shapes: one of these")
 _image = partial(typer.Option, rich_help_panel="Images")
 _out = partial(typer.Option, rich_help_panel="Output")
 
-Layout = Annotated[str, _out(help="Layout of the files: nnunet (v2, raw), monai (decathlon's list) or zarr.")]
-Seed = Annotated[int, _out(help="Seed of shapes and images; the same seed gives the same voxels.")]
 Laws = Annotated[
     str | None,
     _what(
         "--prior",
         "--preset",
         "--presets",
-        help="Laws of the shapes to generate: presets by name (see `curvafit presets`) or fit.json files of `curvafit "
-        "infer`, several between commas.",
+        help="Laws of shapes to generate: presets or fit.json files of `curvafit infer`, several between commas.",
     ),
 ]
 Kind = Annotated[
     str | None,
     _image("--modality", help="Kind of image: confocal, two-photon, light-sheet, micro-ct, mra, em-membrane."),
 ]
-Voxel = Annotated[
-    float | None,
+Visible = Annotated[
+    str | None,
     _image(
-        help="Edge of a shape's voxel, in --unit, which makes structures thick or thin; by default that of the "
-        "fit.json, or of the modality."
+        help="Masks as annotators draw them: the voxels where this share of the structure's light arrives; "
+        "auto: midway in the logarithm of the levels. By default masks hold the structure itself."
     ),
 ]
-Unit = Annotated[str | None, _image(help="Unit of --spacing and --voxel: nm, um, mm or m.")]
-Channel = Annotated[int | None, _image(help="Channel of --like to read, counted from 0, where the file has several.")]
-Label = Annotated[int | None, _image(help="Label of the structure: the voxels of --like-mask with this value.")]
+Voxel = Annotated[
+    float | None,
+    _image(help="Edge of a shape's voxel, in --unit; by default that of the fit.json, or of the modality."),
+]
+Parts = Annotated[
+    str | None,
+    _out(
+        "--labels",
+        help="Labels besides masks: distance, skeleton, instances, kappa1, kappa2, radius, betti, centreline.",
+    ),
+]
 
 
+@takes_groups
 def synth(
     out: Annotated[Path, _out("-o", "--output", help="Folder of the set; a set that exists is resumed.")],
     count: Annotated[int, _out(help="Number of cases in the set at the end.")] = 200,
     shape: Annotated[str, _out(help="Voxels of an image: N or Z,Y,X.")] = "96",
     laws: Laws = None,
     atlas: Annotated[
-        Path | None,
-        _what(
-            help="Store of `curvafit atlas build`, to crop its shapes; or atlas (.npz), to generate shapes of its laws."
-        ),
+        Path | None, _what(help="Store of `curvafit atlas build`, to crop its shapes; or atlas (.npz), for its laws.")
     ] = None,
     volume_fraction: Annotated[
         float | None,
-        _what(
-            "--volume-fraction",
-            help="Share of the volume that generated shapes fill; by default that of the scan of a fit.json.",
-        ),
+        _what(help="Share of the volume that generated shapes fill; by default that of a fit.json's scan."),
     ] = None,
     modality: Kind = None,
     like: Annotated[
         str | None, _image(help="Scan to take noise, blur, contrast and spacing from, instead of --modality.")
     ] = None,
-    like_mask: Annotated[str | None, _image(help="Mask of the structure in --like, for better estimates.")] = None,
-    visible: Annotated[
-        str | None,
-        _image(
-            help="Masks as annotators draw them: the voxels where this share of the structure's light arrives; "
-            "auto: midway in the logarithm of the levels. By default masks hold the structure itself."
-        ),
+    like_mask: Annotated[
+        str | None, _image(help="Mask of the structure in --like, for better estimates; --label is a value of it.")
     ] = None,
+    visible: Visible = None,
     voxel: Voxel = None,
     calibres: Annotated[
-        str,
-        _image(
-            help="LOW,HIGH: each case draws a factor in between, and its structure is thicker than with --voxel by it."
-        ),
+        str, _image(help="LOW,HIGH: the structure of each case is thicker by a factor drawn in between.")
     ] = "1,1",
-    spacing: Annotated[
-        str | None, _image(help="Voxel edges of --like, Z,Y,X or one number for all; overrides the file.")
-    ] = None,
-    unit: Unit = None,
-    channel: Channel = None,
-    label: Label = None,
-    crop: Annotated[
-        str | None, _image(help="Box of voxels of --like and --like-mask: z0:z1,y0:y1,x0:x1; : is all.")
-    ] = None,
-    strict: Annotated[bool, _image("--strict", help="Refuse a scan with missing chunks or slices for --like.")] = False,
-    layout: Layout = "nnunet",
-    labels: Annotated[
-        str | None,
-        _out(
-            "--labels",
-            help="Labels besides masks: distance, skeleton, instances, kappa1, kappa2, radius, betti, centreline.",
-        ),
-    ] = None,
-    seed: Seed = 0,
-    workers: WorkersOption = None,
-    scheduler: SchedulerOption = None,
-    dashboard: DashboardOption = None,
+    *,
+    reading: Reading,
+    layout: Annotated[str, _out(help="Layout of the files: nnunet (v2, raw), monai (decathlon's list) or zarr.")] = (
+        "nnunet"
+    ),
+    labels: Parts = None,
+    seed: Annotated[int, _out(help="Seed of shapes and images; the same seed gives the same voxels.")] = 0,
+    crew: Crew,
 ) -> None:
     """Make a training set: images of generated shapes with exact labels."""
     with plain_errors():
         box = parse_whole_triple(shape, "--shape")
-        if count < 1:
-            raise ValueError(f"--count must be at least 1, got {count}")
-        crew = Crew(workers, scheduler, dashboard)
-        crew.check()
-        if unit is not None and spacing is None and voxel is None:
-            raise ValueError("--unit needs --spacing or --voxel")
+        unit = reading["unit"]
+        if unit is not None and reading["spacing"] is None:
+            if voxel is None:
+                raise ValueError("--unit needs --spacing or --voxel")
+            reading["unit"] = None  # it is that of --voxel alone, not of --like
         names = [] if laws is None else laws.split(",")
         source = _choose_source(names, atlas, volume_fraction)
-        placed = {"spacing": spacing, "unit": None if spacing is None else unit}  # a unit alone is that of --voxel
-        reading = parse_reading(**placed, crop=crop, channel=channel, label=label, strict=strict)
         kind = _choose_modality(modality, like, like_mask, visible, reading)
         from curvafit.core.units import convert_length
         from curvafit.data_synth.case import Recipe
@@ -152,18 +119,18 @@ def synth(
         _build_and_preview(out, SetSpec(recipe, layout, tuple(labels.split(",")) if labels else ()), count, crew)
 
 
-def _build_and_preview(out: Path, order: SetSpec, count: int, crew: Crew) -> None:
+def _build_and_preview(out: Path, spec: SetSpec, count: int, crew: Crew) -> None:
     from curvafit.core.checks import check_int
     from curvafit.core.files import check_folder
     from curvafit.data_synth.sets import MOST, build_set, cases_of, check_set, write_preview
 
     check_int(count, "a count of at least 1 case", 1, MOST)
     check_folder(out)
-    check_set(out, order)
-    if order.recipe.source.within == math.inf:
-        crew.check(order.recipe.largest)
-    with crew.at_work() as (makers, progress):
-        build_set(out, order, count, progress, workers=makers)
+    check_set(out, spec)
+    if spec.recipe.source.within == math.inf:
+        crew.check_memory(spec.recipe.largest)
+    with crew.start() as (workers, progress):
+        build_set(out, spec, count, progress, workers=workers)
     preview = write_preview(out)
     if (total := len(cases_of(out))) > count:
         say(f"note: {out} holds {total} cases, more than --count {count}: all are listed", to=error_console())
@@ -195,13 +162,14 @@ def _choose_source(laws: list[str], atlas: Path | None, filled: float | None) ->
 def _choose_modality(
     name: str | None, like: str | None, mask: str | None, visible: str | None, reading: dict[str, Any]
 ) -> Modality:
-    """Return the named kind of image, or one like a scan, with the share of light in masks."""
+    """Return the named kind of image, or one like a scan, whose masks hold the visible share of light."""
     if (name is None) == (like is None):
         raise ValueError(f"give either --modality or --like, got {'neither' if name is None else 'both'}")
     if like is None:
-        extras = [key for key, value in reading.items() if value is not None and value is not False]
-        if extras or mask is not None:
-            raise ValueError(f"{f'--{extras[0]}' if extras else '--like-mask'} needs --like")
+        given = {**reading, "like_mask": mask}
+        extras = [name for name, value in given.items() if value is not None and value is not False]
+        if extras:
+            raise ValueError(f"--{extras[0].replace('_', '-')} needs --like")
         from curvafit.data_synth.imaging.modality import modality
 
         return _with_visible(modality(str(name)), visible)
@@ -212,11 +180,13 @@ def _choose_modality(
         raise ValueError("--label needs --like-mask: it is a value of that mask")
     scan = load(like, **{**reading, "label": None})
     say_notes(scan.notes)
-    inside = None if mask is None else _split_mask(load(mask, **{**reading, "channel": None}).values)
+    place = {name: reading[name] for name in ("spacing", "unit", "label", "crop", "strict")}
+    inside = None if mask is None else _split_mask(load(mask, **place).values)
     return _with_visible(fit_modality(scan, inside), visible)
 
 
 def _split_mask(values: np.ndarray) -> np.ndarray:
+    """Return where a volume of two values has the greater one."""
     import numpy as np
 
     kinds = len(np.unique(values))

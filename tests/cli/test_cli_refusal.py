@@ -102,7 +102,7 @@ def test_an_atlas_is_not_begun(
         ("--calibres 1,900 --shape 16", "images"),
         ("--shape 1", "images"),
         ("--shape 1e9", "images"),
-        ("--unit furlong", "--unit"),
+        ("--unit mm", "--unit"),
         ("--unit furlong --voxel 1", "furlong"),
         (f"--count {10**9}", "count"),
         ("--scheduler tcp://x:1", "scheduler"),

@@ -86,7 +86,7 @@ def test_a_set_of_presets_and_of_an_atlas_file(tmp_path):
 def test_bad_input(tmp_path, store):
     out, kind = tmp_path / "set", ["--modality", "confocal"]
     some = ["synth", "-o", out, "--atlas", store]
-    refused(call(*some, *kind, "--count", "0"), "--count")
+    refused(call(*some, *kind, *QUICK, "--count", "0"), "count")
     refused(call(*some, *kind, "--shape", "64"), "24")
     refused(call("synth", "-o", out, "--atlas", tmp_path / "none.zarr", *kind), "none.zarr")
     refused(call("synth", "-o", out, *kind), "--prior")
