@@ -161,34 +161,20 @@ def reconstruct(
 
 @dataclass(frozen=True)
 class Job:
-    """A volume to read and a mask to write of it.
-
-    Attributes
-    ----------
-    prior
-        A preset's name or a file; None where an example says what the law is.
-    reading
-        Options of reading the source.
-    record
-        What the record beside the mask says of the command's options.
-    workers
-        Number of processes that lower tiles at once; this one by default.
-    image
-        The file whose header the mask gets; by default the source.
-    """
+    """A volume to read, with the options of reading, and a mask to write, with a record of the command's options."""
 
     source: str
     out: Path
-    prior: str | None
+    prior: str | None  # a preset's name or a file; None where an example says what the law is
     reading: dict[str, Any]
     record: dict[str, Any]
     overwrite: bool
     workers: int | None = None
-    image: Path | None = None
+    image: Path | None = None  # the file whose header the mask gets; by default the source
 
 
 def run_job(job: Job, compute: Callable[..., Segmentation], read: Callable[..., Field] | None = None) -> None:
-    """Check, read, compute, write and print. Tiles stay beside the output until it is written.
+    """Check, read, compute, write and print. Finished tiles are kept beside the output until it is written.
 
     `read` reads the source; by default its boxes are read where they are asked for.
     """
@@ -198,31 +184,32 @@ def run_job(job: Job, compute: Callable[..., Segmentation], read: Callable[..., 
     from curvafit.segmentation.tiles import Tiling
     from curvafit.volumes.boxes import boxes_of, read_whole
 
-    record, reading, image = job.record, job.reading, job.image
+    record, reading = job.record, job.reading
     law_file = None if preset_name(job.prior) else job.prior
-    shown = (record.get("example"), record.get("example_probabilities"))
-    inputs = [path for path in (job.source, law_file, image, *shown) if path is not None]
-    probability = bool(record.get("runs") or record.get("suggest"))
-    check_mask_target(job.out, inputs=inputs, overwrite=job.overwrite, probability=probability)
+    files = (job.source, law_file, job.image, record.get("example"), record.get("example_probabilities"))
+    options = {"inputs": [file for file in files if file is not None], "overwrite": job.overwrite}
+    options["probability"] = bool(record.get("runs") or record.get("suggest"))
+    check_mask_target(job.out, **options)
     if job.prior is not None:
         Law.of(job.prior)
     with show_stages() as progress:
         progress("reading", 0.0)
         boxes = boxes_of(job.source, **reading) if read is None else boxes_of(read(job.source, **reading))
-        check_mask_target(job.out, boxes.frame.unit, overwrite=job.overwrite, probability=probability)
+        check_mask_target(job.out, boxes.frame.unit, **options)  # again, as a format may not hold the unit
         tiling = Tiling.of(boxes.frame, record["epsilon"], record["tile"], periodic=record.get("periodic", False))
         store = job.out.with_name(f".{job.out.name}.curvafit-tiles")
         with resumable() if tiling.count > 1 else nullcontext():
             result = compute(boxes, progress, tile=record["tile"], store=store, workers=job.workers)
         progress("writing", 1.0)
-        place = ("spacing", "crop") if image else ("spacing", "crop", "channel")
-        like = (image or job.source) if all(reading[name] is None for name in place) else None
+        # The header is kept where it says where the voxels are; one of a file of channels is of all of them.
+        stated = ("spacing", "crop") if job.image else ("spacing", "crop", "channel")
+        like = (job.image or job.source) if all(reading[name] is None for name in stated) else None
         content = {"command": command_line(), "prior": job.prior, **record}
         how = {"like": like, "unit": reading["unit"], "record": content, "overwrite": job.overwrite}
-        files = write_mask(result, read_whole(boxes), job.out, **how)
+        paths = write_mask(result, read_whole(boxes), job.out, **how)
         remove(store)
     for note in result.notes:
         say(note)
     say(f"{result.status[0].upper()}{result.status[1:]}.", style="bold")
-    for path in files:
+    for path in paths:
         say(str(path))
