@@ -10,10 +10,10 @@ from typing import Annotated
 
 import typer
 
-from curvafit.cli import demo, generate, infer, measure, nnunet, refine, segment, synth
+from curvafit.cli import generate, infer, measure, nnunet, refine, samples, segment, synth
 from curvafit.cli.atlas import atlas_app
 from curvafit.cli.console import Commands, say
-from curvafit.cli.samples import samples_app
+from curvafit.cli.options import add_commands
 
 app = typer.Typer(
     help="Shape texture of tubes and membranes in 3D: a scan in, its parameters out; parameters in, shapes out.",
@@ -26,17 +26,9 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
     cls=Commands,
 )
-app.command(epilog=demo.EXAMPLES)(demo.demo)
-app.command(epilog=infer.EXAMPLES)(infer.infer)
-app.command(epilog=measure.EXAMPLES)(measure.measure)
-app.command(epilog=generate.EXAMPLES)(generate.generate)
-app.command()(generate.presets)
-app.command(epilog=nnunet.EXAMPLES)(nnunet.nnunet)
-app.command(epilog=segment.SEGMENT_EXAMPLES)(segment.segment)
-app.command(epilog=refine.EXAMPLES)(refine.refine)
-app.command(epilog=segment.RECONSTRUCT_EXAMPLES)(segment.reconstruct)
-app.command(epilog=synth.EXAMPLES)(synth.synth)
-app.add_typer(samples_app, name="samples")
+add_commands(app, samples.demo, infer.infer, measure.measure, generate.generate, generate.presets, nnunet.nnunet)
+add_commands(app, segment.segment, refine.refine, segment.reconstruct, synth.synth)
+app.add_typer(samples.samples_app, name="samples")
 app.add_typer(atlas_app, name="atlas")
 
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from curvafit.cli.console import command_line, error_console, plain_errors, resumable, say, show_stages
-from curvafit.cli.options import Crew, OverwriteOption, examples, parse_whole_triple, takes_groups
+from curvafit.cli.console import command_line, error_console, resumable, say, show_stages
+from curvafit.cli.options import Crew, OverwriteOption, add_commands, command, parse_whole_triple
 
 if TYPE_CHECKING:
     from curvafit.core.records import Format
@@ -20,26 +20,18 @@ atlas_app = typer.Typer(help="Collections of generated shapes to match scans aga
 _Store = Annotated[Path, typer.Argument(help="Folder of the Zarr store.")]
 
 
-@atlas_app.command(
-    "build",
-    epilog=examples(
-        "curvafit atlas build store.zarr --count 1000 --shape 64",
-        "curvafit atlas build tubes.zarr --around tubes --spread 0.2 --count 100",
-        "curvafit atlas build box.zarr --design box.yaml --scheduler tcp://node1:8786",
-    ),
+@command(
+    "curvafit atlas build store.zarr --count 1000 --shape 64",
+    "curvafit atlas build tubes.zarr --around tubes --spread 0.2 --count 100",
+    "curvafit atlas build box.zarr --design box.yaml --scheduler tcp://node1:8786",
 )
-@takes_groups
 def build_atlas(
     store: Annotated[Path, typer.Argument(help="Folder of the Zarr store; a store that exists is resumed.")],
     count: Annotated[int, typer.Option(help="Number of viable shapes in the store at the end.")] = 1000,
     shape: Annotated[str, typer.Option(help="Voxels of a shape: N or Z,Y,X.")] = "64",
     seed: Annotated[int, typer.Option(help="Seed of the design.")] = 0,
-    design: Annotated[
-        str, typer.Option(help="Design of the parameters: random, sobol, or a YAML file (docs/howto/atlas.md).")
-    ] = "random",
-    around: Annotated[
-        str | None, typer.Option(help="Preset or fit.json to draw parameters around, instead of --design.")
-    ] = None,
+    design: Annotated[str, typer.Option(help="random, sobol, or a YAML file (docs/howto/atlas.md).")] = "random",
+    around: Annotated[str | None, typer.Option(help="Preset or fit.json to draw parameters around.")] = None,
     spread: Annotated[float | None, typer.Option(help="With --around: share of the random law's intervals.")] = None,
     schedule: Annotated[str, typer.Option(help="Schedule of the flow: fast, paper, deep or cosine.")] = "fast",
     steps: Annotated[int | None, typer.Option(help="Number of steps, instead of the schedule's.")] = None,
@@ -47,28 +39,26 @@ def build_atlas(
     crew: Crew,
 ) -> None:
     """Generate shapes into a store until enough are viable. The same command resumes a build that was stopped."""
-    with plain_errors():
-        box = parse_whole_triple(shape, "--shape")
-        law = _choose_design(design, around, spread)
-        from curvafit.core.files import check_folder
-        from curvafit.data_synth.atlas import build, check_count, settings_of
-        from curvafit.data_synth.store import open_store
-        from curvafit.generation.schedule import schedule as named
+    box = parse_whole_triple(shape, "--shape")
+    law = _choose_design(design, around, spread)
+    from curvafit.core.files import check_folder
+    from curvafit.data_synth.atlas import build, check_count, settings_of
+    from curvafit.data_synth.store import open_store
+    from curvafit.generation.schedule import schedule as named
 
-        check_count(count, 1)
-        crew.check_memory(box)
-        plan = named(schedule, steps)
-        settings = settings_of(box, seed, plan, law)
-        if store.exists():
-            open_store(store, settings)
-        check_folder(store.parent)
-        with crew.start() as (workers, progress):
-            build(store, count, box, seed, plan, progress, design=law, workers=workers)
-        say(str(store))
+    check_count(count, 1)
+    crew.check_memory(box)
+    plan = named(schedule, steps)
+    settings = settings_of(box, seed, plan, law)
+    if store.exists():
+        open_store(store, settings)
+    check_folder(store.parent)
+    with crew.start() as (workers, progress):
+        build(store, count, box, seed, plan, progress, design=law, workers=workers)
+    say(str(store))
 
 
-@atlas_app.command("extend", epilog=examples("curvafit atlas extend store.zarr --count 500"))
-@takes_groups
+@command("curvafit atlas extend store.zarr --count 500")
 def extend_atlas(
     store: _Store,
     count: Annotated[int, typer.Option(help="Number of viable shapes to add; 0 resumes what was stopped.")] = 100,
@@ -76,82 +66,68 @@ def extend_atlas(
     crew: Crew,
 ) -> None:
     """Add shapes to a store, with the design and the settings of the store."""
-    with plain_errors():
-        from curvafit.data_synth.atlas import check_count, extend
-        from curvafit.data_synth.store import open_store
+    from curvafit.data_synth.atlas import check_count, extend
+    from curvafit.data_synth.store import open_store
 
-        check_count(count, 0)
-        target = open_store(store).wanted + count
+    check_count(count, 0)
+    target = open_store(store).wanted + count
 
-        def again() -> str:
-            return "`--count 0`" if open_store(store).wanted == target else "the same command"
+    def again() -> str:
+        return "`--count 0`" if open_store(store).wanted == target else "the same command"
 
-        with crew.start(again) as (workers, progress):
-            extend(store, count, progress, workers=workers)
-        say(str(store))
+    with crew.start(again) as (workers, progress):
+        extend(store, count, progress, workers=workers)
+    say(str(store))
 
 
-@atlas_app.command("info", epilog=examples("curvafit atlas info store.zarr"))
-def atlas_info(store: _Store) -> None:
+@command("curvafit atlas info store.zarr")
+def info_atlas(store: _Store) -> None:
     """Show the content of a store, and how it was made."""
-    with plain_errors():
-        from curvafit.data_synth.atlas import summarise
-        from curvafit.data_synth.store import open_store
+    from curvafit.data_synth.atlas import summarise
+    from curvafit.data_synth.store import open_store
 
-        for name, value in summarise(open_store(store)).items():
-            say(f"{name}: {value}")
+    for name, value in summarise(open_store(store)).items():
+        say(f"{name}: {value}")
 
 
-@atlas_app.command("verify", epilog=examples("curvafit atlas verify store.zarr"))
+@command("curvafit atlas verify store.zarr")
 def verify_atlas(store: _Store) -> None:
     """Check every draw of a store; exit with code 1 where one is missing, torn or changed."""
-    with plain_errors():
-        from curvafit.data_synth.atlas import verify
+    from curvafit.data_synth.atlas import verify
 
-        with show_stages() as progress:
-            verdict = verify(store, progress)
-        for note in verdict.notes:
-            say(f"note: {note}")
-        for problem in verdict.problems:
-            say(f"error: {problem}", to=error_console())
-        say(verdict.status)
+    with show_stages() as progress:
+        verdict = verify(store, progress)
+    for note in verdict.notes:
+        say(f"note: {note}")
+    for problem in verdict.problems:
+        say(f"error: {problem}", to=error_console())
+    say(verdict.status)
     if verdict.problems:
         raise typer.Exit(1)
 
 
-@atlas_app.command(
-    "extract",
-    epilog=examples(
-        "curvafit atlas extract store.zarr -o atlas.npz", "curvafit atlas extract box.zarr corner.zarr -o atlas.npz"
-    ),
-)
+@command("curvafit atlas extract store.zarr -o atlas.npz", "curvafit atlas extract box.zarr corner.zarr -o atlas.npz")
 def extract_atlas(
     stores: Annotated[list[Path], typer.Argument(help="Stores made by `curvafit atlas build`, of one grid.")],
     out: Annotated[Path, typer.Option("-o", "--output", help="The atlas (.npz) to write.")],
     overwrite: OverwriteOption = False,
 ) -> None:
     """Measure the shapes of stores, and write the atlas that `infer --atlas` reads."""
-    with plain_errors():
-        from curvafit.atlas_map.extract import extract
-        from curvafit.inference.atlas import ATLAS_FILE, save_atlas
+    from curvafit.atlas_map.extract import extract
+    from curvafit.inference.atlas import ATLAS_FILE, save_atlas
 
-        _check_archive(out, ATLAS_FILE, stores, overwrite)
-        with show_stages() as progress:
-            atlas = extract(stores, [command_line()], progress=progress)
-        out.parent.mkdir(parents=True, exist_ok=True)
-        save_atlas(atlas, out)
-        say(f"{len(atlas.ids)} shapes", to=error_console())
-        say(str(out))
+    _check_archive(out, ATLAS_FILE, stores, overwrite)
+    with show_stages() as progress:
+        atlas = extract(stores, [command_line()], progress=progress)
+    save_atlas(atlas, out)
+    say(f"{len(atlas.ids)} shapes", to=error_console())
+    say(str(out))
 
 
-@atlas_app.command(
-    "describe",
-    epilog=examples(
-        "curvafit atlas describe store.zarr -o table.npz",
-        "curvafit atlas describe box.zarr corner.zarr -o table.npz --views mask,crop",
-    ),
+@command(
+    "curvafit atlas describe store.zarr -o table.npz",
+    "curvafit atlas describe box.zarr corner.zarr -o table.npz --views mask,crop",
 )
-@takes_groups
 def describe_atlas(
     stores: Annotated[list[Path], typer.Argument(help="Stores made by `curvafit atlas build`.")],
     out: Annotated[Path, typer.Option("-o", "--output", help="The table (.npz) to write; one that exists goes on.")],
@@ -161,21 +137,18 @@ def describe_atlas(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Measure each shape of stores as field, mask, crop and scan: the table that `atlas train` reads."""
-    with plain_errors():
-        from curvafit.atlas_map.extract import describe
-        from curvafit.inference.table import TABLE_FILE, VIEWS
+    from curvafit.atlas_map.extract import describe
+    from curvafit.inference.table import TABLE_FILE, VIEWS
 
-        _check_archive(out, TABLE_FILE, stores, overwrite)
-        names = tuple(VIEWS) if views is None else tuple(views.split(","))
-        with crew.start() as (workers, progress):
-            table = describe(
-                stores, out, names, progress, workers=workers, command=[command_line()], overwrite=overwrite
-            )
-        say(f"{len(set(table.shapes.tolist()))} shapes, {len(table)} views", to=error_console())
-        say(str(out))
+    _check_archive(out, TABLE_FILE, stores, overwrite)
+    names = tuple(VIEWS) if views is None else tuple(views.split(","))
+    with crew.start() as (workers, progress):
+        table = describe(stores, out, names, progress, workers=workers, command=[command_line()], overwrite=overwrite)
+    say(f"{len(set(table.shapes.tolist()))} shapes, {len(table)} views", to=error_console())
+    say(str(out))
 
 
-@atlas_app.command("train", epilog=examples("curvafit atlas train table.npz -o posterior.npz"))
+@command("curvafit atlas train table.npz -o posterior.npz")
 def train_atlas(
     table: Annotated[Path, typer.Argument(help="A table made by `curvafit atlas describe`.")],
     out: Annotated[Path, typer.Option("-o", "--output", help="The posterior (.npz) to write.")],
@@ -185,39 +158,38 @@ def train_atlas(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Train the posterior of the parameters, given descriptors, on a table of them."""
-    with plain_errors():
-        from curvafit.inference.posterior import POSTERIOR_FILE, save_posterior
-        from curvafit.inference.table import load_table
-        from curvafit.inference.training import train_posterior
+    from curvafit.inference.posterior import POSTERIOR_FILE, save_posterior
+    from curvafit.inference.table import load_table
+    from curvafit.inference.training import train_posterior
 
-        _check_archive(out, POSTERIOR_FILE, [table], overwrite)
-        content = load_table(table)
-        if views is not None:
-            content = content.select_views(views.split(","))
-        with show_stages() as progress:
-            posterior = train_posterior(content, members=members, seed=seed, progress=progress)
-        out.parent.mkdir(parents=True, exist_ok=True)
-        save_posterior(posterior, out)
-        say(f"{posterior.provenance['shapes']} shapes", to=error_console())
-        say(str(out))
+    _check_archive(out, POSTERIOR_FILE, [table], overwrite)
+    content = load_table(table)
+    if views is not None:
+        content = content.select_views(views.split(","))
+    with show_stages() as progress:
+        posterior = train_posterior(content, members=members, seed=seed, progress=progress)
+    save_posterior(posterior, out)
+    say(f"{posterior.provenance['shapes']} shapes", to=error_console())
+    say(str(out))
 
 
-@atlas_app.command(
-    "map", epilog=examples("curvafit atlas map store.zarr -o map", "curvafit atlas map box.zarr corner.zarr -o map")
-)
+@command("curvafit atlas map store.zarr -o map", "curvafit atlas map box.zarr corner.zarr -o map")
 def map_atlas(
     stores: Annotated[list[Path], typer.Argument(help="Stores made by `curvafit atlas build`, of one grid.")],
     out: Annotated[Path, typer.Option("-o", "--output", help="Folder for atlas.html, atlas.png and a cache.")],
     overwrite: OverwriteOption = False,
 ) -> None:
     """Draw a map of the shapes of stores: a picture, and a page to explore the shapes and to place scans."""
-    with plain_errors():
-        with resumable(), show_stages() as progress:
-            from curvafit.atlas_map.files import write_map
+    with resumable(), show_stages() as progress:
+        from curvafit.atlas_map.files import write_map
 
-            files = write_map(stores, out, command=command_line(), overwrite=overwrite, progress=progress)
-        for path in files:
-            say(str(path))
+        files = write_map(stores, out, command=command_line(), overwrite=overwrite, progress=progress)
+    for path in files:
+        say(str(path))
+
+
+add_commands(atlas_app, build_atlas, extend_atlas, info_atlas, verify_atlas)
+add_commands(atlas_app, extract_atlas, describe_atlas, train_atlas, map_atlas)
 
 
 def _check_archive(out: Path, kind: Format, inputs: list[Path], overwrite: bool) -> None:

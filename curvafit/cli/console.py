@@ -9,7 +9,6 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 from typing import Any, NoReturn
 
 import typer
@@ -37,32 +36,28 @@ _Refusal: type[Exception] = next(kind for kind in typer.BadParameter.__mro__ if 
 class Commands(TyperGroup):
     """A group of commands whose usage errors are one line, as all other errors."""
 
-    def main(self, *args: Any, standalone_mode: bool = True, **more: Any) -> Any:
+    def main(self, *args: Any, **more: Any) -> NoReturn:
         """Run a command and exit, as `click.Group.main` does."""
-        if not standalone_mode:
-            return super().main(*args, standalone_mode=False, **more)
         try:
-            code = super().main(*args, standalone_mode=False, **more)
+            code = super().main(*args, **more | {"standalone_mode": False})
         except _Refusal as error:
             if type(error).__name__ == "NoArgsIsHelpError":
                 error.show()  # type: ignore[attr-defined]
-                sys.exit(2)
-            _leave(error)
+            else:
+                say(_explain_usage(error), to=error_console())
+            sys.exit(2)
         except typer.Abort as error:  # a signal while no command was at work
             signal = error.__cause__
             sys.exit(exit_code(signal) if isinstance(signal, KeyboardInterrupt) else 1)
         sys.exit(code if isinstance(code, int) else 0)
 
 
-def _leave(error: Any) -> NoReturn:
-    """Print the usage error of typer with the command whose help tells more, and exit with code 2."""
+def _explain_usage(error: Any) -> str:
+    """Return the sentence of typer's usage error, with the command whose help tells more."""
     text = error.format_message().rstrip(".")
     context = getattr(error, "ctx", None)
     more = "" if context is None else f" (see {' '.join(['curvafit', *context.command_path.split()[1:], '--help'])})"
-    console = Console(stderr=True, highlight=False)
-    line = writable(sentence(f"{text[:1].lower()}{text[1:]}{more}"), console)
-    console.print(line, markup=False, soft_wrap=True)
-    sys.exit(2)
+    return sentence(f"{text[:1].lower()}{text[1:]}{more}")
 
 
 @contextmanager
@@ -71,14 +66,13 @@ def plain_errors() -> Iterator[None]:
 
     Warnings become notes, printed at the end of a command that succeeds; one that fails prints its error alone.
     """
-    notes: dict[str, None] = {}
+    caught: list[warnings.WarningMessage] = []
     try:
-        with warnings.catch_warnings():
-            warnings.showwarning = partial(_keep_note, notes)
+        with warnings.catch_warnings(record=True) as caught:
             yield
-        _say_notes(notes)
+        _say_warnings(caught)
     except typer.Exit:
-        _say_notes(notes)
+        _say_warnings(caught)
         raise
     except KeyboardInterrupt as signal:
         say(f"{_name_signal(signal)}: nothing is left half-written", to=error_console())
@@ -105,7 +99,7 @@ def _name_signal(signal: KeyboardInterrupt) -> str:
 
 
 def _is_expected(error: Exception) -> bool:
-    """Return whether an exception tells of the input or the machine rather than of a fault of the program."""
+    """Return whether the input or the machine is at fault, rather than the program."""
     if isinstance(error, ImportError):
         return not (error.name or "").startswith("curvafit")
     return not isinstance(error, RuntimeError) or "memory" in str(error).lower()
@@ -119,16 +113,9 @@ def _explain(error: Exception) -> str:
     return sentence(str(error) or type(error).__name__)
 
 
-def _keep_note(
-    notes: dict[str, None], message: Warning | str, category: type[Warning], *_: object, **__: object
-) -> None:
-    if issubclass(category, UserWarning):
-        notes[sentence(str(message), "note")] = None
-
-
-def _say_notes(notes: Iterable[str]) -> None:
-    for note in notes:
-        say(note, to=error_console())
+def _say_warnings(caught: list[warnings.WarningMessage]) -> None:
+    """Print the warnings that are for users, each once."""
+    say_notes(dict.fromkeys(str(each.message) for each in caught if issubclass(each.category, UserWarning)))
 
 
 def command_line() -> str:
@@ -164,17 +151,16 @@ def say(text: str, *, to: Console | None = None, style: str | None = None) -> No
 
 
 def say_notes(notes: Iterable[str]) -> None:
-    """Print sentences on assumptions about a file on the error stream."""
+    """Print notes, such as assumptions about a file, on the error stream."""
     for note in notes:
-        say(f"note: {note}", to=error_console())
+        say(sentence(note, "note"), to=error_console())
 
 
-def print_table(heads: Sequence[str], rows: Iterable[Sequence[str]], right: Iterable[int] = ()) -> None:
+def print_table(heads: Sequence[str], rows: Iterable[Sequence[str]], right: Sequence[int] = ()) -> None:
     """Print a table without a frame; the columns in `right` are aligned to the right."""
     table = Table(box=None, pad_edge=False, header_style="bold")
-    rights = set(right)
     for k, head in enumerate(heads):
-        table.add_column(head, justify="right" if k in rights else "left", no_wrap=k in rights or k == 0)
+        table.add_column(head, justify="right" if k in right else "left", no_wrap=k in right or k == 0)
     for row in rows:
         table.add_row(*(Text(cell.translate(_PLAIN)) for cell in row))
     console = Console(highlight=False)

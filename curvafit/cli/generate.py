@@ -12,13 +12,12 @@ import typer
 from curvafit.cli.console import (
     command_line,
     error_console,
-    plain_errors,
     print_table,
     say,
     say_notes,
     show_stages,
 )
-from curvafit.cli.options import OverwriteOption, examples, parse_numbers, parse_whole_numbers, parse_whole_triple
+from curvafit.cli.options import OverwriteOption, command, parse_numbers, parse_whole_numbers, parse_whole_triple
 from curvafit.core.runtime import exit_code
 
 if TYPE_CHECKING:
@@ -35,7 +34,12 @@ if TYPE_CHECKING:
 #: Number of voxels along an edge by default.
 EDGE = 100
 
-EXAMPLES = examples(
+_what = partial(typer.Option, rich_help_panel="What to make")
+_how = partial(typer.Option, rich_help_panel="How")
+_out = partial(typer.Option, rich_help_panel="What to write")
+
+
+@command(
     "curvafit generate --preset tubes -o tubes.nii.gz",
     "curvafit generate --preset tubes --spacing 0.0195 --unit mm -o tubes.stl",
     "curvafit generate --preset sponge --volume-fraction 0.3 --shape 64,64,128 --tile 1,2,2 -o sponge.zarr",
@@ -44,105 +48,78 @@ EXAMPLES = examples(
     "curvafit generate --preset tubes --maps maps.npz -o graded.nii.gz",
     "curvafit generate --preset tubes --shape 300 --checkpoint run.pt --snapshots 10,100,1000 -o large.nii.gz",
 )
-
-_what = partial(typer.Option, rich_help_panel="What to make")
-_how = partial(typer.Option, rich_help_panel="How")
-_out = partial(typer.Option, rich_help_panel="What to write")
-
-
 def generate(
     out: Annotated[
-        Path,
-        _out("-o", "--output", help="Volume (.nii.gz .nii .tif .npy .mrc .zarr) or surface (.stl .ply .vtp) to write."),
+        Path, _out("-o", "--output", help="Volume (.nii.gz .nii .tif .npy .mrc .zarr) or surface (.stl .ply .vtp).")
     ],
     preset: Annotated[str | None, _what(help="A published shape; see `curvafit presets`.")] = None,
-    coefficients: Annotated[
-        str | None, _what(help="a20,a11,a02,a10,a01,a00 in working units; needs --mass or --volume-fraction.")
-    ] = None,
+    coefficients: Annotated[str | None, _what(help="a20,a11,a02,a10,a01,a00 in working units; needs a mass.")] = None,
     prior: Annotated[str | None, _what(help="fit.json of `curvafit infer`, or a preset's name.")] = None,
     mass: Annotated[float | None, _what(help="Mean of the field, in (-1, 1).")] = None,
-    volume_fraction: Annotated[
-        float | None, _what(help="Share of the volume inside, in (0, 1), instead of a mass.")
-    ] = None,
-    orientation: Annotated[
-        str | None, _what(help="θz,θy,θx,μ: tubes and layers lie along θ, more so with a larger μ.")
-    ] = None,
-    maps: Annotated[
-        Path | None,
-        _what(help="Parameters that vary in space: an .npz of volumes a20 … a00, mass, epsilon, or a folder of them."),
-    ] = None,
+    volume_fraction: Annotated[float | None, _what(help="Share of the volume inside, instead of a mass.")] = None,
+    orientation: Annotated[str | None, _what(help="θz,θy,θx,μ: tubes and layers lie along θ if μ is large.")] = None,
+    maps: Annotated[Path | None, _what(help="Volumes a20 … a00, mass, epsilon that vary: an .npz or a folder.")] = None,
     shape: Annotated[str | None, _what(help=f"Voxels: N or Z,Y,X; {EDGE} or the maps' by default.")] = None,
-    boundary: Annotated[
-        str, _what(help="periodic, or replicate (walls that the shape meets at right angles).")
-    ] = "periodic",
-    epsilon: Annotated[
-        float | None, _what(help="Interface width in working units; 0.02 (two voxels) by default.")
-    ] = None,
+    boundary: Annotated[str, _what(help="periodic, or replicate (walls, met at right angles).")] = "periodic",
+    epsilon: Annotated[float | None, _what(help="Interface width in working units; by default 0.02.")] = None,
     seed: Annotated[int, _what(help="Seed of the noise that the shape grows from.")] = 0,
     schedule: Annotated[str, _how(help="fast (1500 steps), paper (8000) or cosine (1000).")] = "fast",
     steps: Annotated[int | None, _how(help="Number of steps, instead of the schedule's.")] = None,
     device: Annotated[str, _how(help="cpu, cuda, cuda:1 …")] = "cpu",
-    checkpoint: Annotated[
-        Path | None, _how(help="File to save the run in, and to resume it from if it exists.")
-    ] = None,
+    checkpoint: Annotated[Path | None, _how(help="File to save the run in, and to resume it from.")] = None,
     checkpoint_every: Annotated[float | None, _how(help="Seconds between two checkpoints; 60 by default.")] = None,
-    spacing: Annotated[
-        str | None, _out(help="Edge of a voxel, a cube, in --unit; by default 1, or the prior's.")
-    ] = None,
+    spacing: Annotated[str | None, _out(help="Edge of a voxel, in --unit; by default 1, or the prior's.")] = None,
     unit: Annotated[str | None, _out(help="nm, um, mm or m; needs --spacing.")] = None,
     tile: Annotated[str | None, _out(help="Repeat a periodic box N or Z,Y,X times.")] = None,
     cap: Annotated[
         bool | None, _out("--cap/--no-cap", help="Close a surface on the box's faces (the default), or leave it open.")
     ] = None,
-    picture: Annotated[
-        bool, _out("--picture/--no-picture", help="Draw a picture (.png) of the shape, or do not.")
-    ] = True,
+    picture: Annotated[bool, _out("--picture/--no-picture", help="Draw a picture (.png), or do not.")] = True,
     snapshots: Annotated[str | None, _out(help="Also write the field after these steps: 10,100,1000.")] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Make a shape from parameters, with a record (.json) and a picture (.png) beside it."""
-    with plain_errors():
-        from curvafit.drawing.shapes import check_target, shape_record
-        from curvafit.generation.schedule import schedule as named
-        from curvafit.priors.grid import Grid
-        from curvafit.volumes.parameter_maps import map_shape, read_maps
+    from curvafit.drawing.shapes import check_target, shape_record
+    from curvafit.generation.schedule import schedule as named
+    from curvafit.priors.grid import Grid
+    from curvafit.volumes.parameter_maps import map_shape, read_maps
 
-        box = None if shape is None else parse_whole_triple(shape, "--shape")
-        volumes = {} if maps is None else read_maps(maps, box)
-        law = _read_law(preset, coefficients, prior, volumes)
-        options = _choose_parameters(law, volumes, mass, volume_fraction, epsilon)
-        options["grid"] = grid = Grid(box or map_shape(volumes) or EDGE, boundary=boundary)  # type: ignore[arg-type]
-        options["orientation"] = Q = None if orientation is None else _parse_orientation(orientation)
-        options["schedule"] = plan = named(schedule, steps)
-        after = () if snapshots is None else parse_whole_numbers(snapshots, "--snapshots")
-        options["snapshots"] = tuple(map(plan.check_step, after))
-        options |= {"seed": seed, "device": device, **_place_checkpoint(checkpoint, checkpoint_every, out)}
-        output = _plan_output(law, grid, spacing, unit, tile, cap)
-        if cap is not None:
-            _check_surface(out)
-        law_file = None if not law.fitted else prior or preset
-        inputs = [str(path) for path in (law_file, maps) if path is not None]
-        writing = {"picture": picture, "overwrite": overwrite}
-        check_target(out, output, steps=options["snapshots"], inputs=inputs, **writing)
-        flow = _grow(options)
-        more = {"orientation": Q if Q is None else Q.tolist(), "maps": maps if maps is None else str(maps)}
-        more |= {"origin": law.origin, "wanted_volume_fraction": volume_fraction, "command": command_line()}
-        record = shape_record(flow, mass=options["mass"], output=output, snapshots=list(flow.snapshots), **more)
-        _write(flow, out, record, output=output, **writing)
-        _remove(options["checkpoint"])
+    box = None if shape is None else parse_whole_triple(shape, "--shape")
+    volumes = {} if maps is None else read_maps(maps, box)
+    law = _read_law(preset, coefficients, prior, volumes)
+    options = _choose_parameters(law, volumes, mass, volume_fraction, epsilon)
+    options["grid"] = grid = Grid(box or map_shape(volumes) or EDGE, boundary=boundary)  # type: ignore[arg-type]
+    options["orientation"] = Q = None if orientation is None else _parse_orientation(orientation)
+    options["schedule"] = plan = named(schedule, steps)
+    after = () if snapshots is None else parse_whole_numbers(snapshots, "--snapshots")
+    options["snapshots"] = tuple(map(plan.check_step, after))
+    options |= {"seed": seed, "device": device, **_place_checkpoint(checkpoint, checkpoint_every, out)}
+    output = _plan_output(law, grid, spacing, unit, tile, cap)
+    if cap is not None:
+        _check_surface(out)
+    law_file = None if not law.fitted else prior or preset
+    inputs = [str(path) for path in (law_file, maps) if path is not None]
+    writing = {"picture": picture, "overwrite": overwrite}
+    check_target(out, output, steps=options["snapshots"], inputs=inputs, **writing)
+    flow = _grow(options)
+    more = {"orientation": Q if Q is None else Q.tolist(), "maps": maps if maps is None else str(maps)}
+    more |= {"origin": law.origin, "wanted_volume_fraction": volume_fraction, "command": command_line()}
+    record = shape_record(flow, mass=options["mass"], output=output, snapshots=list(flow.snapshots), **more)
+    _write(flow, out, record, output=output, **writing)
+    _remove(options["checkpoint"])
 
 
+@command()
 def presets() -> None:
     """List the published shapes: coefficients in working units, mass, source."""
-    with plain_errors():
-        from curvafit.priors.coefficients import NAMES
-        from curvafit.priors.law import PRESETS
+    from curvafit.priors.coefficients import NAMES
+    from curvafit.priors.law import PRESETS
 
-        rows = [
-            (name, *(f"{value:g}" for value in entry.coefficients.as_dict().values()), f"{entry.mass:g}", entry.source)
-            for name, entry in PRESETS.items()
-        ]
-        print_table(("name", *NAMES, "mass", "source"), rows, right=range(1, 8))
+    rows = [
+        (name, *(f"{value:g}" for value in entry.coefficients.as_dict().values()), f"{entry.mass:g}", entry.source)
+        for name, entry in PRESETS.items()
+    ]
+    print_table(("name", *NAMES, "mass", "source"), rows, right=range(1, 8))
 
 
 def _read_law(preset: str | None, six: str | None, prior: str | None, maps: Maps3D) -> Law:

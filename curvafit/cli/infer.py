@@ -7,22 +7,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli.console import command_line, plain_errors, print_table, say, say_notes, show_stages
-from curvafit.cli.options import OverwriteOption, Reading, Volume, examples, parse_threshold, takes_groups
+from curvafit.cli.console import command_line, print_table, say, say_notes, show_stages
+from curvafit.cli.options import OverwriteOption, Reading, Volume, command, parse_threshold
 
 if TYPE_CHECKING:
     from curvafit.inference.infer import Inference
 
-EXAMPLES = examples(
+
+@command(
     "curvafit infer bone.tif --spacing 0.0195 --unit mm -o bone",
     "curvafit infer vessels.nii.gz --kind mask -o vessels",
     "curvafit infer cells.ome.zarr --channel 1 --crop 0:64,100:300,100:300 --dark --threshold 90 -o cells",
     "curvafit infer vessels.nii.gz --method match -o vessels",
     "curvafit infer fibres.raw --raw-shape 128,128,128 --dtype u1 -o fibres",
 )
-
-
-@takes_groups
 def infer(
     scan: Volume,
     out: Annotated[Path, typer.Option("-o", "--output", help="Folder for fit.json, report.html, regenerated.nii.gz.")],
@@ -32,12 +30,8 @@ def infer(
     threshold: Annotated[str, typer.Option(help="Grey level between the phases, or otsu.")] = "otsu",
     dark: Annotated[bool, typer.Option("--dark", help="The structure is the dark phase.")] = False,
     posterior: Annotated[Path | None, typer.Option(help="Posterior (.npz) instead of the packaged one.")] = None,
-    method: Annotated[
-        str, typer.Option(help="posterior, or match: the atlas's nearest shape, then gradient refinement.")
-    ] = "posterior",
-    fast: Annotated[
-        bool, typer.Option("--fast", help="Seconds instead of minutes: nothing is grown, or checked.")
-    ] = False,
+    method: Annotated[str, typer.Option(help="posterior, or match: the nearest shape, refined.")] = "posterior",
+    fast: Annotated[bool, typer.Option("--fast", help="Seconds, not minutes: nothing is grown or checked.")] = False,
     roi: Annotated[Path | None, typer.Option(help="Mask of the region to measure, of the scan's shape.")] = None,
     *,
     reading: Reading,
@@ -45,22 +39,21 @@ def infer(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Infer the parameters of a scanned volume, and write a report."""
-    with plain_errors():
-        level = parse_threshold(threshold)
-        files = {"roi": roi, "atlas": atlas, "posterior": posterior}
-        what: dict[str, Any] = {"kind": kind, "periodic": periodic, "threshold": level, "dark": dark, **files}
-        with show_stages() as progress:
-            from curvafit.inference.infer import infer as infer_scan
-            from curvafit.report.page import check_report, with_command, write_inference
+    level = parse_threshold(threshold)
+    files = {"roi": roi, "atlas": atlas, "posterior": posterior}
+    what: dict[str, Any] = {"kind": kind, "periodic": periodic, "threshold": level, "dark": dark, **files}
+    with show_stages() as progress:
+        from curvafit.inference.infer import infer as infer_scan
+        from curvafit.report.page import check_report, with_command, write_inference
 
-            check_report(out, [scan, *(file for file in files.values() if file is not None)], overwrite)
-            how = {"method": method, "fast": fast, "seed": seed, "progress": progress}
-            inference = infer_scan(scan, **what, **how, **reading)
-            progress("drawing the report", 1.0)
-            say_notes(inference.scan.notes)
-            report = write_inference(with_command(inference, command_line()), out, overwrite=overwrite)
-        _print_result(inference)
-        say(str(report))
+        check_report(out, [scan, *(file for file in files.values() if file is not None)], overwrite)
+        how = {"method": method, "fast": fast, "seed": seed, "progress": progress}
+        inference = infer_scan(scan, **what, **how, **reading)
+        progress("drawing the report", 1.0)
+        say_notes(inference.scan.notes)
+        report = write_inference(with_command(inference, command_line()), out, overwrite=overwrite)
+    _print_result(inference)
+    say(str(report))
 
 
 def _print_result(inference: Inference) -> None:

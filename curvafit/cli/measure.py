@@ -7,20 +7,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli.console import plain_errors, print_table, say, say_notes, show_stages
-from curvafit.cli.options import OverwriteOption, Reading, examples, parse_threshold, takes_groups
+from curvafit.cli.console import print_table, say, say_notes, show_stages
+from curvafit.cli.options import OverwriteOption, Reading, command, parse_threshold
 
 if TYPE_CHECKING:
     from curvafit.scan.measure import Measures
 
-EXAMPLES = examples(
+
+@command(
     "curvafit measure bone.tif --spacing 0.0195 --unit mm",
     "curvafit measure mouse1.nii.gz mouse2.nii.gz mouse3.nii.gz -o measures.csv",
     "curvafit measure cells.ome.zarr --channel 1 --dark --threshold 90 -o measures.parquet",
 )
-
-
-@takes_groups
 def measure(
     scans: Annotated[
         list[str], typer.Argument(help="NIfTI, TIFF (or folder of slices), NPY, NPZ, HDF5 (file.h5::key), RAW, Zarr …")
@@ -35,28 +33,27 @@ def measure(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Measure scans in seconds: morphometry, fabric and curvature in physical units, with 95 % intervals."""
-    with plain_errors():
-        options: dict[str, Any] = {"kind": kind, "periodic": periodic, "threshold": parse_threshold(threshold)}
-        options |= {"dark": dark, **reading}
-        with show_stages() as progress:
-            from curvafit.scan.measure import measure as measure_scan
-            from curvafit.studies.tables import check_table, write_table
+    options: dict[str, Any] = {"kind": kind, "periodic": periodic, "threshold": parse_threshold(threshold)}
+    options |= {"dark": dark, **reading}
+    with show_stages() as progress:
+        from curvafit.scan.measure import measure as measure_scan
+        from curvafit.studies.tables import check_table, write_table
 
-            if out is not None:
-                check_table(out, scans, overwrite)
-            found: list[Measures] = []
-
-            def watch(text: str, share: float) -> None:
-                progress(f"{scans[len(found)]}: {text}", (len(found) + share) / len(scans))
-
-            for scan in scans:
-                found.append(measure_scan(scan, progress=watch, **options))
-        for measures in found:
-            if len(scans) > 1:
-                say(measures.source, style="bold")
-            _print_measures(measures)
         if out is not None:
-            say(str(write_table(found, out, overwrite=overwrite)))
+            check_table(out, scans, overwrite)
+        found: list[Measures] = []
+
+        def watch(text: str, share: float) -> None:
+            progress(f"{scans[len(found)]}: {text}", (len(found) + share) / len(scans))
+
+        for scan in scans:
+            found.append(measure_scan(scan, progress=watch, **options))
+    for measures in found:
+        if len(scans) > 1:
+            say(measures.source, style="bold")
+        _print_measures(measures)
+    if out is not None:
+        say(str(write_table(found, out, overwrite=overwrite)))
 
 
 def _print_measures(measures: Measures) -> None:

@@ -20,37 +20,44 @@ if TYPE_CHECKING:
     from curvafit.core.workers import Workers
 
 #: Whether files of other programs, or of other commands, may be replaced.
-OverwriteOption = Annotated[
-    bool, typer.Option("--overwrite", help="Replace files or folders of the output's names, whatever wrote them.")
-]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace files that other programs wrote.")]
 
 
-def examples(*lines: str) -> str:
-    """Return the end of a command's help."""
-    return "[bold]Examples[/bold]\n\n" + "\n\n".join(lines)
+# ---- commands --------------------------------------------------------------------------------------------------------
 
 
-# ---- groups of options -----------------------------------------------------------------------------------------------
+def command(*examples: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Return a decorator that makes a function a command, with examples at the end of its help.
+
+    Expected errors leave in one sentence. In place of a parameter `reading` or `crew` the command has the options of
+    that group, as in `_GROUPS`.
+    """
+
+    def decorate(function: Callable[..., None]) -> Callable[..., None]:
+        own = inspect.signature(function, eval_str=True).parameters
+        groups = {name: inspect.signature(_GROUPS[name], eval_str=True).parameters for name in own if name in _GROUPS}
+
+        @functools.wraps(function)
+        def run(**arguments: Any) -> None:
+            with plain_errors():
+                for name, options in groups.items():
+                    arguments[name] = _GROUPS[name](**{option: arguments.pop(option) for option in options})
+                function(**arguments)
+
+        parameters = [each for name in own for each in groups.get(name, {name: own[name]}).values()]
+        keywords = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in parameters]
+        run.__signature__ = inspect.Signature(keywords)  # type: ignore[attr-defined]
+        run.__annotations__ = {each.name: each.annotation for each in parameters}
+        run.examples = "\n\n".join(["[bold]Examples[/bold]", *examples]) if examples else None  # type: ignore[attr-defined]
+        return run
+
+    return decorate
 
 
-def takes_groups(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command the options of the groups that its parameters name: `reading` and `crew`, as in `_GROUPS`."""
-    own = inspect.signature(command, eval_str=True).parameters
-    groups = {name: inspect.signature(_GROUPS[name], eval_str=True).parameters for name in own if name in _GROUPS}
-
-    @functools.wraps(command)
-    def run(**arguments: Any) -> None:
-        with plain_errors():
-            for name, options in groups.items():
-                arguments[name] = _GROUPS[name](**{option: arguments.pop(option) for option in options})
-        command(**arguments)
-
-    parameters = [each for name in own for each in groups.get(name, {name: own[name]}).values()]
-    run.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-        [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in parameters]
-    )
-    run.__annotations__ = {each.name: each.annotation for each in parameters}
-    return run
+def add_commands(app: typer.Typer, *functions: Callable[..., None]) -> None:
+    """Add commands to a group, each under the first word of its function's name."""
+    for function in functions:
+        app.command(function.__name__.partition("_")[0], epilog=getattr(function, "examples", None))(function)
 
 
 _read = partial(typer.Option, rich_help_panel="How to read the file")
@@ -67,9 +74,7 @@ def parse_reading(
     unit: Annotated[str | None, _read(help="Unit of lengths: nm, um, mm or m; overrides the file.")] = None,
     channel: Annotated[int | None, _read(help="Channel to read, counted from 0, of several (colours, times).")] = None,
     label: Annotated[int | None, _read(help="Label of the structure: the voxels with this value.")] = None,
-    crop: Annotated[
-        str | None, _read(help="Box of voxels: z0:z1,y0:y1,x0:x1, counted from 0; : is all of an axis.")
-    ] = None,
+    crop: Annotated[str | None, _read(help="Box of voxels from 0: z0:z1,y0:y1,x0:x1; : is a whole axis.")] = None,
     raw_shape: Annotated[str | None, _read(help="Voxels Z,Y,X of a RAW file.")] = None,
     dtype: Annotated[str | None, _read(help="Type of the numbers in a RAW file: u1, u2, f4 …")] = None,
     key: Annotated[str | None, _read(help="Name of the array in an NPZ, HDF5 or Zarr file.")] = None,
@@ -101,17 +106,9 @@ def parse_reading(
 class Crew:
     """The workers that the options ask for; ValueError where they contradict each other."""
 
-    workers: Annotated[
-        int | None,
-        typer.Option(help="Worker processes on this machine; by default one per core, 0 for this process alone."),
-    ] = None
-    scheduler: Annotated[
-        str | None, typer.Option(help="Address of a running dask scheduler, tcp://HOST:PORT, instead of --workers.")
-    ] = None
-    dashboard: Annotated[
-        int | None,
-        typer.Option(help="Port of dask's dashboard on 127.0.0.1, for workers on this machine; by default none."),
-    ] = None
+    workers: Annotated[int | None, typer.Option(help="Worker processes; by default one per core, 0 for none.")] = None
+    scheduler: Annotated[str | None, typer.Option(help="Address of a dask scheduler, tcp://HOST:PORT.")] = None
+    dashboard: Annotated[int | None, typer.Option(help="Port of dask's dashboard on 127.0.0.1.")] = None
 
     def __post_init__(self) -> None:
         from curvafit.core.workers import check_workers
@@ -164,17 +161,17 @@ def parse_triple(text: str, option: str) -> tuple[float, float, float]:
 
 def parse_whole_triple(text: str, option: str) -> tuple[int, int, int]:
     """Return a text as three positive whole numbers; one counts for all axes."""
-    values = parse_triple(text, option)
-    if any(value != int(value) for value in values):
-        raise ValueError(f"{option} must be whole numbers, got {text!r}")
-    return tuple(int(value) for value in values)  # type: ignore[return-value]
+    return _round(parse_triple(text, option), option)  # type: ignore[return-value]
 
 
 def parse_whole_numbers(text: str, option: str) -> tuple[int, ...]:
     """Return a text as whole numbers from 0."""
-    values = parse_numbers(text, option, text.count(",") + 1)
+    return _round(parse_numbers(text, option, text.count(",") + 1), option)
+
+
+def _round(values: tuple[float, ...], option: str) -> tuple[int, ...]:
     if min(values) < 0 or any(value != int(value) for value in values):
-        raise ValueError(f"{option} must be whole numbers from 0, got {text!r}")
+        raise ValueError(f"{option} must be whole numbers from 0, got {', '.join(f'{value:g}' for value in values)}")
     return tuple(int(value) for value in values)
 
 

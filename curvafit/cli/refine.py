@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli.console import plain_errors, say_notes, show_stages
-from curvafit.cli.options import OverwriteOption, Reading, examples, takes_groups
+from curvafit.cli.console import say_notes, show_stages
+from curvafit.cli.options import OverwriteOption, Reading, command
 from curvafit.cli.segment import Epsilon, Job, OwnPrior, Steps, TileOption, Weight, WorkersOption, run_job
 
 if TYPE_CHECKING:
@@ -17,16 +17,14 @@ if TYPE_CHECKING:
     from curvafit.segmentation.result import Segmentation
     from curvafit.volumes.boxes import Boxes
 
-EXAMPLES = examples(
+_what = partial(typer.Option, rich_help_panel="What to do")
+
+
+@command(
     "curvafit refine p.nii.gz --example mask2.nii.gz --example-probabilities p2.nii.gz -o mask.nii.gz",
     "curvafit refine case.npz --channel 1 --prior vessels/fit.json --weight 10 -o mask.nii.gz",
     "curvafit refine predicted --channel 1 --example mask2.nii.gz --example-probabilities p2.npz -o refined",
 )
-
-_what = partial(typer.Option, rich_help_panel="What to do")
-
-
-@takes_groups
 def refine(
     probabilities: Annotated[
         str, typer.Argument(help="Probability of the inside: NIfTI, TIFF, NPY, NPZ, Zarr …; or a folder of NPZ files.")
@@ -41,9 +39,7 @@ def refine(
     steps: Steps = 400,
     tile: TileOption = None,
     workers: WorkersOption = None,
-    like: Annotated[
-        Path | None, _what(help="Image of the same voxels; by default one beside an NPZ, of its name.")
-    ] = None,
+    like: Annotated[Path | None, _what(help="Image of the same voxels; by default one of the NPZ's name.")] = None,
     reading: Reading,
     overwrite: OverwriteOption = False,
 ) -> None:
@@ -52,59 +48,58 @@ def refine(
     Law and weight are those that do best on an example; where p > 1/2 does best, that is the mask. Of nnU-Net's
     NPZ files --channel takes the class; a folder of them becomes a folder of masks. --label is the example's.
     """
-    with plain_errors():
-        from curvafit.segmentation.evidence import probability_evidence
-        from curvafit.segmentation.refine import calibrate, check_judge, find_image, load_probabilities
-        from curvafit.segmentation.refine import refine as refine_map
-        from curvafit.segmentation.result import check_mask_target
-        from curvafit.segmentation.slices import check_spacing
-        from curvafit.volumes.boxes import read_whole
-        from curvafit.volumes.read import load
+    from curvafit.segmentation.evidence import probability_evidence
+    from curvafit.segmentation.refine import calibrate, check_judge, find_image, load_probabilities
+    from curvafit.segmentation.refine import refine as refine_map
+    from curvafit.segmentation.result import check_mask_target
+    from curvafit.segmentation.slices import check_spacing
+    from curvafit.volumes.boxes import read_whole
+    from curvafit.volumes.read import load
 
-        if (example is None) != (example_probabilities is None):
-            raise ValueError("--example and --example-probabilities go together, got one of them")
-        check_judge(example, weight)
-        if prior is None and example is None:
-            raise ValueError("give --prior or --example: the law, or a mask from which it is inferred")
-        files = _list_files(probabilities, out)
-        if like is not None and len(files) > 1:
-            raise ValueError("--like is for one file; images of a folder lie beside its NPZ files")
-        maps: dict[str, Any] = {name: reading[name] for name in reading if name != "label"} | {"like": like}
-        others = {name: value for name, value in maps.items() if name not in ("crop", "like")}
-        place = {name: reading[name] for name in ("spacing", "unit", "label", "strict")}
-        placed = reading["spacing"] is not None or reading["unit"] is not None
-        images = {source: like or (None if placed else find_image(source)) for source, _ in files}
-        named = {"example": example, "example_probabilities": example_probabilities, "like": like}
-        options = {"epsilon": epsilon, "steps": steps}
-        record: dict[str, Any] = {"job": "refine", "weight": weight, "tile": tile, **options}
-        record |= {name: None if path is None else str(path) for name, path in named.items()}
+    if (example is None) != (example_probabilities is None):
+        raise ValueError("--example and --example-probabilities go together, got one of them")
+    check_judge(example, weight)
+    if prior is None and example is None:
+        raise ValueError("give --prior or --example: the law, or a mask from which it is inferred")
+    files = _list_files(probabilities, out)
+    if like is not None and len(files) > 1:
+        raise ValueError("--like is for one file; images of a folder lie beside its NPZ files")
+    maps: dict[str, Any] = {name: reading[name] for name in reading if name != "label"} | {"like": like}
+    others = {name: value for name, value in maps.items() if name not in ("crop", "like")}
+    place = {name: reading[name] for name in ("spacing", "unit", "label", "strict")}
+    placed = reading["spacing"] is not None or reading["unit"] is not None
+    images = {source: like or (None if placed else find_image(source)) for source, _ in files}
+    named = {"example": example, "example_probabilities": example_probabilities, "like": like}
+    options = {"epsilon": epsilon, "steps": steps}
+    record: dict[str, Any] = {"job": "refine", "weight": weight, "tile": tile, **options}
+    record |= {name: None if path is None else str(path) for name, path in named.items()}
 
-        inputs = [file for file in (*images, *images.values(), *named.values()) if file is not None]
-        for _, target in files:
-            check_mask_target(target, inputs=inputs, overwrite=overwrite)
-        judge: dict[str, Any] = {"weight": weight}
-        chances = None if example is None else load_probabilities(example_probabilities, **others)  # type: ignore[arg-type]
-        for source in images:  # all are read before the first is worked on
-            field = load_probabilities(source, **maps)
-            probability_evidence(field)
-            if chances is not None:
-                check_spacing(chances, field, "the probabilities")
+    inputs = [file for file in (*images, *images.values(), *named.values()) if file is not None]
+    for _, target in files:
+        check_mask_target(target, inputs=inputs, overwrite=overwrite)
+    judge: dict[str, Any] = {"weight": weight}
+    chances = None if example is None else load_probabilities(example_probabilities, **others)  # type: ignore[arg-type]
+    for source in images:  # all are read before the first is worked on
+        field = load_probabilities(source, **maps)
+        probability_evidence(field)
         if chances is not None:
-            mask = load(example, **place)  # type: ignore[arg-type]
-            say_notes((*chances.notes, *mask.notes))
-            with show_stages() as progress:
-                judge = {"example": calibrate(chances, mask, prior, progress=progress, **options)}
-            record["calibration"] = judge["example"].as_dict()
+            check_spacing(chances, field, "the probabilities")
+    if chances is not None:
+        mask = load(example, **place)  # type: ignore[arg-type]
+        say_notes((*chances.notes, *mask.notes))
+        with show_stages() as progress:
+            judge = {"example": calibrate(chances, mask, prior, progress=progress, **options)}
+        record["calibration"] = judge["example"].as_dict()
 
-        def compute(volume: Boxes, progress: Progress, **tools: Any) -> Segmentation:
-            return refine_map(read_whole(volume), prior, progress=progress, **judge, **tools, **options)
+    def compute(volume: Boxes, progress: Progress, **tools: Any) -> Segmentation:
+        return refine_map(read_whole(volume), prior, progress=progress, **judge, **tools, **options)
 
-        for source, target in files:
-            run_job(
-                Job(source, target, prior, maps, record, overwrite, workers, images[source]),
-                compute,
-                load_probabilities,
-            )
+    for source, target in files:
+        run_job(
+            Job(source, target, prior, maps, record, overwrite, workers, images[source]),
+            compute,
+            load_probabilities,
+        )
 
 
 def _list_files(source: str, out: Path) -> list[tuple[str, Path]]:

@@ -1,4 +1,4 @@
-"""The command about sample volumes."""
+"""The commands about sample volumes: samples and demo."""
 
 from __future__ import annotations
 
@@ -9,54 +9,88 @@ from typing import Annotated
 
 import typer
 
-from curvafit.cli.console import error_console, plain_errors, print_table, say
-from curvafit.cli.options import OverwriteOption, examples
+from curvafit.cli.console import error_console, print_table, say, show_stages
+from curvafit.cli.options import OverwriteOption, add_commands, command
 
 #: The sample that needs no network, and its line in the list.
-SYNTHETIC = "synthetic"
-_SYNTHETIC_ABOUT = ("a generated trabecular shape, imaged with blur and noise", "MIT", "made on the spot")
+_SYNTHETIC = "synthetic"
+_ABOUT = ("a generated trabecular shape, imaged with blur and noise", "MIT", "made on the spot")
 
 samples_app = typer.Typer(help="Sample volumes, with their licences.", invoke_without_command=True)
 
 
 @samples_app.callback()
+@command()
 def list_samples(context: typer.Context) -> None:
     """List sample volumes, or fetch one with `get`."""
     if context.invoked_subcommand is None:
-        with plain_errors():
-            from curvafit.data_synth.samples import samples
-
-            rows = [(each.name, each.description, each.licence, each.source) for each in samples()]
-            print_table(("name", "what", "licence", "source"), [*rows, (SYNTHETIC, *_SYNTHETIC_ABOUT)])
+        print_table(("name", "what", "licence", "source"), [(name, *about) for name, about in _list_samples().items()])
 
 
-@samples_app.command("get", epilog=examples("curvafit infer $(curvafit samples get bone) -o bone"))
+@command("curvafit infer $(curvafit samples get bone) -o bone")
 def get_sample(
     name: Annotated[str, typer.Argument(help="Name of the sample; `curvafit samples` lists the names.")],
     out: Annotated[
-        Path | None, typer.Option("-o", "--output", help="Copy it here; by default it stays in the cache.")
-    ] = (None),
+        Path | None, typer.Option("-o", "--output", help="Copy to write; by default it stays cached.")
+    ] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Download a sample once, check it, and print its path."""
-    with plain_errors():
-        from curvafit.data_synth.samples import samples
-
-        about = {each.name: (each.description, each.licence, each.source) for each in samples()}
-        about[SYNTHETIC] = _SYNTHETIC_ABOUT
-        if name not in about:
-            raise ValueError(f"the samples are {', '.join(about)}, got {name!r}")
-        what, licence, source = about[name]
-        say(f"{name}: {what}; licence {licence}; {source}", to=error_console())
-        path = fetch_or_make(name)
-        say(str(path if out is None else _copy_to(path, out, overwrite)))
+    about = _list_samples()
+    if name not in about:
+        raise ValueError(f"the samples are {', '.join(about)}, got {name!r}")
+    what, licence, source = about[name]
+    say(f"{name}: {what}; licence {licence}; {source}", to=error_console())
+    path = _fetch_or_make(name)
+    say(str(path if out is None else _copy_to(path, out, overwrite)))
 
 
-def fetch_or_make(name: str) -> Path:
+add_commands(samples_app, get_sample)
+
+
+@command("curvafit demo", "curvafit demo shell -o shell_out")
+def demo(
+    sample: Annotated[str | None, typer.Argument(help="A sample; by default bone, or else the synthetic scan.")] = None,
+    out: Annotated[Path, typer.Option("-o", "--output", help="Folder for demo.html and its files.")] = Path("demo_out"),
+    seed: Annotated[int, typer.Option(help="Seed of the reading.")] = 0,
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Measure a real scan, fill it from every 8th slice, and read its texture: one page, in minutes."""
+    with show_stages() as progress:
+        from curvafit.data_synth.samples import SampleUnavailable
+        from curvafit.report.demo import write_demo
+        from curvafit.volumes.read import load
+
+        name = sample or "bone"
+        progress(f"fetching {name}", 0.0)
+        try:
+            path = _fetch_or_make(name)
+        except SampleUnavailable as error:
+            if sample is not None:
+                raise
+            say(f"{error}; taking the synthetic scan", to=error_console())
+            name = _SYNTHETIC
+            path = _fetch_or_make(name)
+        title = f"A first look: {name}"
+        found = write_demo(load(path), out, title=title, seed=seed, overwrite=overwrite, progress=progress)
+    dice, every = found.completion.dice, found.completion.every
+    say(f"Filled from every {every}th slice: Dice {dice['curvafit']:.3f} with the slices that were left out.")
+    say(f"Read: {found.fit.status}")
+    say(str(found.page))
+
+
+def _list_samples() -> dict[str, tuple[str, str, str]]:
+    """Return description, licence and source of each sample by name."""
+    from curvafit.data_synth.samples import samples
+
+    return {each.name: (each.description, each.licence, each.source) for each in samples()} | {_SYNTHETIC: _ABOUT}
+
+
+def _fetch_or_make(name: str) -> Path:
     """Return the path of a sample, which is downloaded, or of the synthetic scan, which is made; both once."""
     from curvafit.data_synth.samples import cache_folder, fetch, synthetic_scan
 
-    if name != SYNTHETIC:
+    if name != _SYNTHETIC:
         return fetch(name)
     path = cache_folder() / "synthetic.nii.gz"
     return path if path.is_file() else synthetic_scan(path)

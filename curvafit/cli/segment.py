@@ -16,10 +16,9 @@ from curvafit.cli.options import (
     OverwriteOption,
     Reading,
     Volume,
-    examples,
+    command,
     parse_threshold,
     parse_whole_numbers,
-    takes_groups,
 )
 
 if TYPE_CHECKING:
@@ -28,17 +27,6 @@ if TYPE_CHECKING:
     from curvafit.volumes.boxes import Boxes
     from curvafit.volumes.field import Field
 
-SEGMENT_EXAMPLES = examples(
-    "curvafit segment bone.nii.gz --prior bone/fit.json -o mask.nii.gz",
-    "curvafit segment cells.h5 --key raw --dark --prior sponge --spacing 0.2 --unit um -o mask.tif",
-)
-RECONSTRUCT_EXAMPLES = examples(
-    "curvafit reconstruct labels.nii.gz --every 8 --prior bone/fit.json -o volume.nii.gz",
-    "curvafit reconstruct labels.nii.gz --every 8 --example whole.nii.gz -o volume.nii.gz",
-    "curvafit reconstruct labels.tif --known 0,7,15 --axis x --prior tubes -o volume.tif",
-    "curvafit reconstruct organelles.nii.gz --every 8 --labels all --example whole.nii.gz -o volume.nii.gz",
-    "curvafit reconstruct labels.nii.gz --every 8 --prior bone/fit.json --suggest 3 -o volume.nii.gz",
-)
 
 _what = partial(typer.Option, rich_help_panel="What to do")
 
@@ -49,17 +37,16 @@ Stiffness = Annotated[float | None, _what(help="Stiffness of springs on the know
 Epsilon = Annotated[float | None, _what(help="ε in the scan's unit; by default twice the smallest voxel edge.")]
 Steps = Annotated[int, _what(help="Steps of the flow.", min=1)]
 TileOption = Annotated[
-    int | None,
-    _what("--tile", help="Longest side of a tile, in working voxels; by default one tile up to 256³, else 192.", min=8),
+    int | None, _what("--tile", help="Longest side of a tile, in working voxels; by default 192 beyond 256³.", min=8)
 ]
-WorkersOption = Annotated[
-    int | None,
-    _what("--workers", help="Processes that lower tiles at once; by default this one, a tile at a time.", min=0),
-]
+WorkersOption = Annotated[int | None, _what("--workers", help="Processes that lower tiles; by default one.", min=0)]
 Axis = Annotated[str, _what(help="Axis across the slices: z, y or x (first, second, last axis of an array).")]
 
 
-@takes_groups
+@command(
+    "curvafit segment bone.nii.gz --prior bone/fit.json -o mask.nii.gz",
+    "curvafit segment cells.h5 --key raw --dark --prior sponge --spacing 0.2 --unit um -o mask.tif",
+)
 def segment(
     scan: Volume,
     out: Target,
@@ -76,20 +63,25 @@ def segment(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Find the structure of a noisy scan under a curvature prior; write its mask, a picture and a record."""
-    with plain_errors():
-        options: dict[str, Any] = {"weight": weight, "epsilon": epsilon}
-        options |= {"threshold": parse_threshold(threshold), "dark": dark}
+    options: dict[str, Any] = {"weight": weight, "epsilon": epsilon}
+    options |= {"threshold": parse_threshold(threshold), "dark": dark}
 
-        def compute(volume: Boxes, progress: Progress, **tools: Any) -> Segmentation:
-            from curvafit.segmentation.segment import segment as segment_scan
+    def compute(volume: Boxes, progress: Progress, **tools: Any) -> Segmentation:
+        from curvafit.segmentation.segment import segment as segment_scan
 
-            return segment_scan(volume, prior, steps=steps, progress=progress, **tools, **options)
+        return segment_scan(volume, prior, steps=steps, progress=progress, **tools, **options)
 
-        record = {"job": "segment", "steps": steps, "tile": tile, **options}
-        run_job(Job(scan, out, prior, reading, record, overwrite, workers), compute)
+    record = {"job": "segment", "steps": steps, "tile": tile, **options}
+    run_job(Job(scan, out, prior, reading, record, overwrite, workers), compute)
 
 
-@takes_groups
+@command(
+    "curvafit reconstruct labels.nii.gz --every 8 --prior bone/fit.json -o volume.nii.gz",
+    "curvafit reconstruct labels.nii.gz --every 8 --example whole.nii.gz -o volume.nii.gz",
+    "curvafit reconstruct labels.tif --known 0,7,15 --axis x --prior tubes -o volume.tif",
+    "curvafit reconstruct organelles.nii.gz --every 8 --labels all --example whole.nii.gz -o volume.nii.gz",
+    "curvafit reconstruct labels.nii.gz --every 8 --prior bone/fit.json --suggest 3 -o volume.nii.gz",
+)
 def reconstruct(
     slices: Volume,
     out: Target,

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli.console import error_console, plain_errors, say, say_notes
-from curvafit.cli.options import Crew, Reading, examples, parse_numbers, parse_whole_triple, takes_groups
+from curvafit.cli.console import error_console, say, say_notes
+from curvafit.cli.options import Crew, Reading, command, parse_numbers, parse_whole_triple
 
 if TYPE_CHECKING:
     import numpy as np
@@ -20,103 +20,70 @@ if TYPE_CHECKING:
     from curvafit.data_synth.sets import SetSpec
     from curvafit.data_synth.sources import ShapeSource
 
-EXAMPLES = examples(
-    "curvafit synth -o Dataset101_Tubes --preset tubes,sponge --modality confocal --count 200 --shape 96",
-    "curvafit synth -o Dataset102_Bone --prior bone/fit.json --like bone.nii.gz --count 200 --shape 64",
-    "curvafit synth -o set --atlas store.zarr --modality micro-ct --layout monai --labels distance --shape 48",
-)
-
 _what = partial(typer.Option, rich_help_panel="Shapes: one of these")
 _image = partial(typer.Option, rich_help_panel="Images")
 _out = partial(typer.Option, rich_help_panel="Output")
 
 Laws = Annotated[
-    str | None,
-    _what(
-        "--prior",
-        "--preset",
-        "--presets",
-        help="Laws of shapes to generate: presets or fit.json files of `curvafit infer`, several between commas.",
-    ),
+    str | None, _what("--prior", "--preset", "--presets", help="Presets or fit.json files, several between commas.")
 ]
 Kind = Annotated[
-    str | None,
-    _image("--modality", help="Kind of image: confocal, two-photon, light-sheet, micro-ct, mra, em-membrane."),
-]
-Visible = Annotated[
-    str | None,
-    _image(
-        help="Masks as annotators draw them: the voxels where this share of the structure's light arrives; "
-        "auto: midway in the logarithm of the levels. By default masks hold the structure itself."
-    ),
-]
-Voxel = Annotated[
-    float | None,
-    _image(help="Edge of a shape's voxel, in --unit; by default that of the fit.json, or of the modality."),
+    str | None, _image("--modality", help="confocal, two-photon, light-sheet, micro-ct, mra or em-membrane.")
 ]
 Parts = Annotated[
     str | None,
-    _out(
-        "--labels",
-        help="Labels besides masks: distance, skeleton, instances, kappa1, kappa2, radius, betti, centreline.",
-    ),
+    _out(help="Labels besides masks: distance, skeleton, instances, kappa1, kappa2, radius, betti, centreline."),
 ]
 
 
-@takes_groups
+@command(
+    "curvafit synth -o Dataset101_Tubes --preset tubes,sponge --modality confocal --count 200 --shape 96",
+    "curvafit synth -o Dataset102_Bone --prior bone/fit.json --like bone.nii.gz --count 200 --shape 64",
+    "curvafit synth -o set --atlas store.zarr --modality micro-ct --layout monai --labels distance --shape 48",
+)
 def synth(
     out: Annotated[Path, _out("-o", "--output", help="Folder of the set; a set that exists is resumed.")],
     count: Annotated[int, _out(help="Number of cases in the set at the end.")] = 200,
     shape: Annotated[str, _out(help="Voxels of an image: N or Z,Y,X.")] = "96",
     laws: Laws = None,
-    atlas: Annotated[
-        Path | None, _what(help="Store of `curvafit atlas build`, to crop its shapes; or atlas (.npz), for its laws.")
-    ] = None,
+    atlas: Annotated[Path | None, _what(help="Store of shapes to crop, or atlas (.npz) of laws to grow.")] = None,
     volume_fraction: Annotated[
-        float | None,
-        _what(help="Share of the volume that generated shapes fill; by default that of a fit.json's scan."),
+        float | None, _what(help="Share of the volume inside; by default that of the fit.")
     ] = None,
     modality: Kind = None,
-    like: Annotated[
-        str | None, _image(help="Scan to take noise, blur, contrast and spacing from, instead of --modality.")
+    like: Annotated[str | None, _image(help="Scan to take noise, blur and contrast from.")] = None,
+    like_mask: Annotated[str | None, _image(help="Mask of the structure in --like, for better estimates.")] = None,
+    visible: Annotated[
+        str | None, _image(help="Masks as annotators draw them: where this share of light arrives, or auto.")
     ] = None,
-    like_mask: Annotated[
-        str | None, _image(help="Mask of the structure in --like, for better estimates; --label is a value of it.")
-    ] = None,
-    visible: Visible = None,
-    voxel: Voxel = None,
-    calibres: Annotated[
-        str, _image(help="LOW,HIGH: the structure of each case is thicker by a factor drawn in between.")
-    ] = "1,1",
+    voxel: Annotated[float | None, _image(help="Edge of a shape's voxel, in --unit; by default the law's.")] = None,
+    calibres: Annotated[str, _image(help="LOW,HIGH: a case is thicker by a factor in between.")] = "1,1",
     *,
     reading: Reading,
-    layout: Annotated[str, _out(help="Layout of the files: nnunet (v2, raw), monai (decathlon's list) or zarr.")] = (
-        "nnunet"
-    ),
+    layout: Annotated[str, _out(help="nnunet (v2, raw), monai (decathlon's list) or zarr.")] = "nnunet",
     labels: Parts = None,
     seed: Annotated[int, _out(help="Seed of shapes and images; the same seed gives the same voxels.")] = 0,
     crew: Crew,
 ) -> None:
     """Make a training set: images of generated shapes with exact labels."""
-    with plain_errors():
-        box = parse_whole_triple(shape, "--shape")
-        unit = reading["unit"]
-        if unit is not None and reading["spacing"] is None:
-            if voxel is None:
-                raise ValueError("--unit needs --spacing or --voxel")
-            reading["unit"] = None  # it is that of --voxel alone, not of --like
-        names = [] if laws is None else laws.split(",")
-        source = _choose_source(names, atlas, volume_fraction)
-        kind = _choose_modality(modality, like, like_mask, visible, reading)
-        from curvafit.core.units import convert_length
-        from curvafit.data_synth.case import Recipe
-        from curvafit.data_synth.sets import SetSpec
-        from curvafit.data_synth.sources import choose_voxel
+    box = parse_whole_triple(shape, "--shape")
+    unit = reading["unit"]
+    if unit is not None and reading["spacing"] is None:
+        if voxel is None:
+            raise ValueError("--unit needs --spacing or --voxel")
+        reading["unit"] = None  # it is that of --voxel alone, not of --like
+    names = [] if laws is None else laws.split(",")
+    source = _choose_source(names, atlas, volume_fraction)
+    kind = _choose_modality(modality, like, like_mask, visible, reading)
+    from curvafit.core.units import convert_length
+    from curvafit.data_synth.case import Recipe
+    from curvafit.data_synth.sets import SetSpec
+    from curvafit.data_synth.sources import choose_voxel
 
-        edge = choose_voxel(names, kind) if voxel is None else convert_length(voxel, unit, kind.base.unit)
-        low, high = parse_numbers(calibres, "--calibres", 2)
-        recipe = Recipe(source, kind, box, edge, seed, (low, high))
-        _build_and_preview(out, SetSpec(recipe, layout, tuple(labels.split(",")) if labels else ()), count, crew)
+    edge = choose_voxel(names, kind) if voxel is None else convert_length(voxel, unit, kind.base.unit)
+    low, high = parse_numbers(calibres, "--calibres", 2)
+    recipe = Recipe(source, kind, box, edge, seed, (low, high))
+    _build_and_preview(out, SetSpec(recipe, layout, tuple(labels.split(",")) if labels else ()), count, crew)
 
 
 def _build_and_preview(out: Path, spec: SetSpec, count: int, crew: Crew) -> None:
