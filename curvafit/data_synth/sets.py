@@ -5,8 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,6 +23,7 @@ from curvafit.data_synth.atlas import versions
 from curvafit.data_synth.case import Case, Recipe
 from curvafit.data_synth.centreline import centreline, write_graphml
 from curvafit.data_synth.labels import NAMES, labels_of
+from curvafit.data_synth.store import check_same
 from curvafit.drawing.plot import CONTOUR, write_picture
 from curvafit.priors.grid import Grid
 from curvafit.volumes.field import Field
@@ -31,10 +31,8 @@ from curvafit.volumes.read import read_values
 from curvafit.volumes.write import save
 
 SET = Format("curvafit set", 2, "a set of curvafit", remedy="begin it anew in another folder")
-#: The set's own record, and the folder of the cases'.
-HEADER, RECORDS = "curvafit.json", "cases"
-#: What the layout's readers want.
-LIST = "dataset.json"
+#: The record of the set, the folder of its cases' records, and the list that readers of its layout look for.
+HEADER, RECORDS, LIST = "curvafit.json", "cases", "dataset.json"
 #: Cases that a set may be asked for.
 MOST = 10**7
 #: Labels besides the mask that a set can have.
@@ -46,10 +44,8 @@ SHOWN, ROW = 8, 4
 
 
 class Layout(NamedTuple):
-    """Where a set's files are, with `{case}` for a case's name and `{part}` for a further label's.
-
-    `nnunet` says that the list of cases is nnU-Net's, else it is the decathlon's.
-    """
+    """Paths in a set, with `{case}` for a case's name and `{part}` for a further label's; and whether the list is
+    nnU-Net's or the decathlon's."""
 
     image: str
     label: str
@@ -69,7 +65,7 @@ LAYOUTS: dict[str, Layout] = {
 
 @dataclass(frozen=True)
 class SetSpec:
-    """What a set is to be: its recipe, layout (a name of `LAYOUTS`) and labels besides the mask (names of `PARTS`)."""
+    """The specification of a set: recipe, layout (in `LAYOUTS`) and labels besides the mask (`parts`, in `PARTS`)."""
 
     recipe: Recipe
     layout: str = "nnunet"
@@ -95,28 +91,28 @@ class SetSpec:
 def build_set(
     folder: str | Path, spec: SetSpec, count: int, progress: Progress = silent, *, workers: Workers | None = None
 ) -> Path:
-    """Make cases 0 to `count` - 1 of a set, those that are not there yet, and the list that its readers want.
+    """Make cases 0 to `count` - 1 of a set, without those that are there, and the list that its readers want.
 
-    Case i depends on the specification and i alone, whenever and by however many workers it is made. The folder holds a
-    valid set at any time; a list that a killed run or a full disk left behind lacks cases, and the next run completes
-    it.
-
-    Parameters
-    ----------
-    folder
-        Of the set; a new or an empty one, or a set of the same specification to go on with.
+    The folder is new, empty, or a set of the same specification to go on with. Case i depends on the specification and
+    i alone. The folder holds a valid set at any time; the list may lack cases after a killed run, and the next run
+    completes it.
 
     Raises ValueError where the folder holds something else or a set of another spec; OSError where it can't be written
     or the workers are gone. Finished cases are kept.
     """
     count = check_int(count, "a count of at least 1 case", 1, MOST)
     folder = Path(folder)
-    with _begin(folder, spec):
-        return _fill(folder, spec, count, progress, workers or ThisProcess())
+    check_set(folder, spec)
+    if not (folder / HEADER).exists():
+        first = spec.recipe.case(0)  # where none can be made, nothing is written
+        SET.write(folder / HEADER, {"versions": versions(), "order": spec.as_dict()})
+        check_set(folder, spec)  # another process may have begun it meanwhile
+        _write_case(folder, spec, 0, first)
+    return _fill(folder, spec, count, progress, workers or ThisProcess())
 
 
 def _fill(folder: Path, spec: SetSpec, count: int, progress: Progress, workers: Workers) -> Path:
-    """Make the cases of a set that are not there yet; list them every now and then."""
+    """Make the missing cases of a set; update the list every now and then, and at the end."""
     cases, listed = set(cases_of(folder)), -LISTED_EVERY
     requests = ((make_cases, folder, [index]) for index in range(count) if index not in cases)
     try:
@@ -132,7 +128,7 @@ def _fill(folder: Path, spec: SetSpec, count: int, progress: Progress, workers: 
 
 
 def make_cases(folder: str | Path, indices: Sequence[int]) -> list[int]:
-    """Make some cases of a set that is begun, a worker's part of `build_set`; a case that fails leaves nothing."""
+    """Make some cases of a set, a worker's part of `build_set`; a case that fails leaves no file."""
     folder = Path(folder)
     spec = read_spec(folder)
     try:
@@ -144,7 +140,7 @@ def make_cases(folder: str | Path, indices: Sequence[int]) -> list[int]:
 
 
 def read_spec(folder: str | Path) -> SetSpec:
-    """Return what a set was begun with, or raise ValueError."""
+    """Return the specification that a set was begun with, or raise ValueError."""
 
     def decode(header: dict[str, Any], _: dict[str, np.ndarray]) -> SetSpec:
         content = header["order"]
@@ -175,33 +171,7 @@ def check_set(folder: Path, spec: SetSpec) -> None:
         if folder.is_dir() and any(folder.iterdir()):
             raise ValueError(f"{folder} holds other things than a set: name a new or an empty folder")
         return
-    stored, wanted = read_spec(folder).as_dict(), spec.as_dict()
-    if stored != wanted:
-        name, was, now = _difference(stored, wanted)
-        raise ValueError(f"{folder} was begun with {name} {was} and not {now}: choose another folder, or delete it")
-
-
-@contextmanager
-def _begin(folder: Path, spec: SetSpec) -> Iterator[None]:
-    """Write the header of a new set; remove what was written if its first case can't be made."""
-    new = [place for place in (folder, *folder.absolute().parents) if not place.exists()]
-    check_set(folder, spec)
-    anew = not (folder / HEADER).exists()
-    if anew:
-        SET.write(folder / HEADER, {"versions": versions(), "order": spec.as_dict()})
-        check_set(folder, spec)  # another process may have begun it meanwhile
-    (folder / RECORDS).mkdir(exist_ok=True)
-    try:
-        yield
-    except ValueError:
-        if anew and not cases_of(folder):
-            for place in (folder / HEADER, folder / LIST):
-                place.unlink(missing_ok=True)
-            within = [place for place in folder.rglob("*") if place.is_dir()]
-            for place in [*sorted(within, reverse=True), *new]:
-                with suppress(OSError):  # it holds something else
-                    place.rmdir()
-        raise
+    check_same(read_spec(folder).as_dict(), spec.as_dict(), folder)
 
 
 def _write_list(folder: Path, spec: SetSpec) -> None:
@@ -210,7 +180,7 @@ def _write_list(folder: Path, spec: SetSpec) -> None:
     pairs = [{"image": layout.image.format(case=name), "label": layout.label.format(case=name)} for name in names]
     about = {"name": folder.resolve().name, "description": "synthetic; made by curvafit", "numTraining": len(names)}
     channel = {"0": spec.recipe.modality.name}
-    if layout.nnunet:  # by name: what else lies in the folders, such as a killed run's temporary files, does not count
+    if layout.nnunet:  # cases by name, since the folders may hold a killed run's temporary files too
         listed = {
             "channel_names": channel,
             "labels": {"background": 0, "structure": 1},
@@ -285,24 +255,12 @@ def _write_json(path: Path, content: dict[str, Any]) -> None:
     write_content(path, json.dumps(content, indent=2) + "\n")
 
 
-def _difference(stored: Any, wanted: Any, name: str = "order") -> tuple[str, Any, Any]:
-    """Return the name of the first value that differs, and both."""
-    if isinstance(stored, dict) and isinstance(wanted, dict) and stored.keys() == wanted.keys():
-        for key in stored:
-            if stored[key] != wanted[key]:
-                return _difference(stored[key], wanted[key], key)
-    return name, stored, wanted
-
-
 # ---- picture ---------------------------------------------------------------------------------------------------------
 
 
 def write_preview(folder: str | Path) -> Path:
-    """Write `preview.png` into a set's folder: a slice of each of the first cases, with and without the label's
-    outline.
-
-    The slice is the one with most of the structure.
-    """
+    """Write `preview.png` into a set's folder: of each of the first cases the slice with most of the structure, with
+    and without the label's outline."""
     folder = Path(folder)
     layout = LAYOUTS[read_spec(folder).layout]
     names = [case_name(index) for index in cases_of(folder)[:SHOWN]]

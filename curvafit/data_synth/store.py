@@ -43,19 +43,14 @@ from curvafit.priors.grid import Grid
 
 FORMAT = "curvafit shapes"
 VERSION = 2
-#: What a draw's folder is called, behind a dot, until it is whole.
-PARTIAL = "partial"
-#: A draw's folder is written in less than this; an older one was left by a killed process.
-_STALE_SECONDS = 600.0
+#: Name, behind a dot, of an unfinished draw's folder; one older than so many seconds was left by a killed process.
+PARTIAL, STALE = "partial", 600.0
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What all draws of a store share.
-
-    Sampling (z, y, x), ε and blur in spacing's unit, the design (`Design.as_dict`) and its seed, and the schedule's
-    fields (name, steps, rates).
-    """
+    """What all draws of a store share: sampling (z, y, x), ε and blur in spacing's unit, the design (`Design.as_dict`)
+    and its seed, and the schedule's fields (name, steps, rates)."""
 
     shape: tuple[int, int, int]
     spacing: tuple[float, float, float]
@@ -68,11 +63,8 @@ class Settings:
 
 @dataclass(frozen=True)
 class Record:
-    """One draw, as it is recorded.
-
-    Its index, parameters, noise seed, the steps made (fewer where rejected early), viability figures, final energy F_ε,
-    the flow's status sentence, the software versions and the seconds it took.
-    """
+    """The record of one draw: index, parameters, noise seed, steps made (fewer where rejected early), viability, final
+    F_ε, the flow's status sentence, software versions and the seconds it took."""
 
     index: int
     coefficients: Coefficients
@@ -94,17 +86,16 @@ class Store:
 
     @property
     def name(self) -> str:
-        """Return the store's name in atlases and tables: its folder's, without the suffix."""
+        """Return the name of the store's folder without the suffix, which names the store in atlases and tables."""
         return self.path.resolve().name.removesuffix(".zarr")
 
     @property
     def wanted(self) -> int:
         """Return how many viable shapes the store is to have."""
-        attributes = _read_attributes(self.path)
-        return 0 if attributes is None else int(attributes["wanted"])
+        return int((_read_attributes(self.path) or {"wanted": 0})["wanted"])
 
     def want(self, count: int) -> None:
-        """Set how many viable shapes are wanted, where it is more than before; for one process at a time."""
+        """Raise the number of viable shapes that are wanted to `count`; for one process at a time."""
         if count > self.wanted:
             file = self.path / "zarr.json"
             text = parse_json(file.read_bytes(), "a Zarr group", self.path)
@@ -122,15 +113,15 @@ class Store:
 
     def record(self, index: int) -> Record:
         """Return the record of a draw; KeyError where the draw is missing, ValueError where it is damaged."""
-        attributes = self._complete(index)
+        attributes = self._require(index)
         try:
             return _decode(attributes)
         except (KeyError, TypeError, AttributeError, ValueError) as error:
-            raise self._damage("record", index, error) from error
+            raise self._describe_damage("record", index, error) from error
 
     def viable(self, index: int) -> bool:
         """Return whether a draw is recorded as a shape; KeyError where the draw is missing."""
-        return self._complete(index)["viability"]["viable"]
+        return self._require(index)["viability"]["viable"]
 
     def field(self, index: int) -> np.ndarray:
         """Return the phase field of a viable draw, float32 (Z, Y, X); KeyError and ValueError as for `record`."""
@@ -143,11 +134,11 @@ class Store:
                 raise ValueError(f"{array.dtype} of shape {array.shape}")
             return np.asarray(array[...])
         except Exception as error:  # zarr and its codecs have many ways to say that a field is damaged
-            raise self._damage("field", index, error) from error
+            raise self._describe_damage("field", index, error) from error
 
     def intact(self, index: int) -> bool:
-        """Return whether a draw's record and field have the checksum that was written; KeyError where it is missing."""
-        attributes = self._complete(index)
+        """Return whether a draw's record and field match their checksum; KeyError where the draw is missing."""
+        attributes = self._require(index)
         try:
             field = self.field(index) if attributes["viability"]["viable"] else None
         except ValueError:  # a chunk that is truncated, or whose own checksum is wrong
@@ -157,19 +148,14 @@ class Store:
     def write(self, record: Record, field: np.ndarray | None) -> bool:
         """Add a draw, whole or not at all; return False, and change nothing, where it was there already.
 
-        Parameters
-        ----------
-        field
-            Phase field, float32 of the store's shape; None where the draw is not viable.
+        The phase field is float32 of the store's shape, or None where the draw is not viable.
         """
-        if record.viability.viable != (field is not None):
-            raise ValueError(f"a viable draw has a field and another has none, got viable={record.viability.viable}")
-        if field is not None and (field.dtype != np.float32 or field.shape != self.settings.shape):
-            raise ValueError(f"the field must be float32 {self.settings.shape}, got {field.dtype} {field.shape}")
         place = self._place(record.index)
         if self.has(record.index):
             return False
-        self._clear_stale()
+        for left in (self.path / "draws").glob(f".{PARTIAL}*"):
+            if time.time() - left.stat().st_mtime > STALE:
+                shutil.rmtree(left, ignore_errors=True)
         with temporary_folder(self.path / "draws" / PARTIAL) as partial:
             _write_draw(partial / place.name, record, field)
             if _publish(partial / place.name, place):
@@ -179,13 +165,14 @@ class Store:
             shutil.rmtree(place)  # what is there is torn
             return _publish(partial / place.name, place)
 
-    def _damage(self, part: str, index: int, error: Exception) -> ValueError:
+    def _describe_damage(self, part: str, index: int, error: Exception) -> ValueError:
         return ValueError(
             f"the {part} of draw {index} in {self.path} is damaged ({quoted(str(error))}): "
             "`curvafit atlas verify` lists such draws"
         )
 
-    def _complete(self, index: int) -> dict[str, Any]:
+    def _require(self, index: int) -> dict[str, Any]:
+        """Return a draw's attributes, or raise KeyError."""
         attributes = self._attributes(index)
         if attributes is None:
             raise KeyError(f"{self.path} has no complete draw {index}")
@@ -195,7 +182,7 @@ class Store:
         return self.path / "draws" / f"{index:06d}"
 
     def _attributes(self, index: int) -> dict[str, Any] | None:
-        """Return a draw's attributes, None where anything of it is missing; a field's bytes are checked on reading."""
+        """Return a draw's attributes, None where a part of it is missing; the field is not read."""
         place = self._place(index)
         attributes = _read_attributes(place)
         if attributes is None or attributes.get("index") != index or "sha256" not in attributes:
@@ -204,11 +191,6 @@ class Store:
         if not isinstance(viability, dict) or not isinstance(viability.get("viable"), bool):
             return None
         return attributes if not viability["viable"] or (place / "field/c/0/0/0").is_file() else None
-
-    def _clear_stale(self) -> None:
-        for left in (self.path / "draws").glob(f".{PARTIAL}*"):
-            if time.time() - left.stat().st_mtime > _STALE_SECONDS:
-                shutil.rmtree(left, ignore_errors=True)
 
 
 def open_store(path: str | Path, settings: Settings | None = None) -> Store:
@@ -231,9 +213,20 @@ def open_store(path: str | Path, settings: Settings | None = None) -> Store:
         stored = _decode_settings(attributes)
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise ValueError(f"the header of the store {path} is damaged ({quoted(str(error))})") from error
-    if settings is not None and (difference := _difference(stored, settings)):
-        raise ValueError(f"{path} was made with another {difference}: choose another folder")
+    if settings is not None:
+        # Draws do not depend on the schedule's name.
+        was, now = (dataclasses.asdict(one) | {"schedule": one.schedule | {"name": ""}} for one in (stored, settings))
+        check_same(was, now, path)
     return Store(path, stored)
+
+
+def check_same(stored: Any, wanted: Any, path: Path, name: str = "settings") -> None:
+    """Raise ValueError, with the name of the first nested value that differs, where a folder holds something else."""
+    if isinstance(stored, dict) and isinstance(wanted, dict) and stored.keys() == wanted.keys():
+        for key in stored:
+            check_same(stored[key], wanted[key], path, key)
+    elif stored != wanted:
+        raise ValueError(f"{path} was begun with {name} {stored} and not {wanted}: choose another folder, or delete it")
 
 
 def _decode_settings(attributes: dict[str, Any]) -> Settings:
@@ -247,18 +240,8 @@ def _decode_settings(attributes: dict[str, Any]) -> Settings:
     return settings
 
 
-def _difference(stored: Settings, wanted: Settings) -> str:
-    """Return the first setting that differs, with both values. A schedule's name does not matter: draws ignore it."""
-    for name, value in vars(stored).items():
-        other = getattr(wanted, name)
-        if name == "schedule":
-            value, other = ({**plan, "name": ""} for plan in (value, other))
-        if other != value:
-            return f"{name} ({value} and not {other})"
-    return ""
-
-
 def _create(path: Path, settings: Settings) -> None:
+    """Write an empty store, whole or not at all."""
     there = path.is_dir()  # an empty folder, which may be another disk's
     with temporary_folder(path / "store" if there else path) as partial:
         header = {"format": FORMAT, "version": VERSION, "settings": dataclasses.asdict(settings), "wanted": 0}

@@ -182,11 +182,6 @@ def test_what_is_no_store_is_refused(tmp_path):
         open_store(tmp_path / "none")
     with pytest.raises(ValueError, match="store"):
         open_store(tmp_path)
-    store = open_store(tmp_path / "s.zarr", SETTINGS)
-    for wrong in (None, field(0).astype(np.float64), field(0)[1:]):
-        with pytest.raises(ValueError, match="field"):
-            store.write(record(0), wrong)
-    assert store.indices() == []
 
 
 @pytest.mark.parametrize(

@@ -16,17 +16,17 @@ from curvafit.data_synth.imaging.effects import blur
 from curvafit.data_synth.imaging.modality import Contrast, Detector, Illumination, Imaging, Modality, Noise, Optics
 from curvafit.volumes.field import Field
 
-#: Share of the mean brightness from which on the structure's brightness counts for its texture.
+#: The least brightness, as a share of the mean, that counts for the structure's texture.
 DIMMEST = 0.1
-#: Voxels that are looked at; of a larger scan the middle.
+#: The most voxels that are measured; of a larger scan the middle.
 MOST = 2_000_000
-#: Deviation, in voxels of the finest edge, of the window that the structure's brightness is averaged in.
+#: Deviation, in voxels of the finest edge, of the window in which the structure's brightness is averaged.
 WINDOW = 4.0
-#: Correlation lengths of that brightness, in the same, that are looked at: what a dozen lags can tell apart.
+#: Correlation lengths of that brightness that are tried, in voxels of the finest edge: a dozen lags show no others.
 BRIGHTNESS_LENGTHS = np.geomspace(WINDOW, 6 * WINDOW, 50)
-#: Deviation, in the same, of the smoothing before voxels are told apart.
+#: Deviation, in voxels of the finest edge, of the smoothing before the threshold.
 SMOOTH = 0.8
-#: What a drawn parameter is the estimate's, low and high.
+#: The ends of the range that a parameter is drawn from, as multiples of the estimate.
 SPREAD: dict[str, tuple[float, float]] = {
     "contrast.background": (0.8, 1.25),
     "contrast.foreground": (0.7, 1.4),
@@ -37,24 +37,22 @@ SPREAD: dict[str, tuple[float, float]] = {
     "detector.gain": (0.7, 1.4),
     "noise.gaussian": (0.7, 1.4),
 }
-#: Deviations (voxels) of smoothings that count as the noise's own, and correlation lengths that count as texture.
+#: Deviations (voxels) of the smoothing of noise, and correlation lengths of texture, whose sum is the covariance.
 GRAINS = (0.0, 0.4, 0.5, 0.6, 0.75, 0.9, 1.1)
 TEXTURE_LENGTHS = (3.0, 4.0, 6.0, 8.0, 12.0, 20.0)
-#: Lags, in voxels, that the background's correlation is looked at.
+#: The greatest lag of the background's correlation, in voxels.
 LAGS = 12
-#: Bins of the mean that the variance is looked at in, and voxels that a bin needs.
+#: Bins of the mean in which the variance is measured, and the least voxels of a bin.
 BINS, LEAST = 24, 50
-#: How much larger than the background's the structure's variance is, where noise is said to grow with the signal.
+#: Noise grows with the signal where the structure's variance is so many times the background's.
 GROWS = 1.3
 #: Second differences along both axes of the plane: no plane passes, and nothing else that a blur lets through much.
 RESIDUAL = np.outer((1, -2, 1), (1, -2, 1)).astype(np.float32)[None]
 
 
 class Structure(NamedTuple):
-    """The structure of a scan: its blur in lengths (z, y, x) and its mean contrast.
-
-    `texture` is the contrast's relative deviation, `length` its correlation length in voxels of the finest edge.
-    """
+    """A scan's structure: blur in lengths (z, y, x), mean contrast, the contrast's relative deviation (texture) and
+    its correlation length in voxels of the finest edge."""
 
     blur: tuple[float, float, float]
     contrast: float
@@ -65,17 +63,16 @@ class Structure(NamedTuple):
 def fit_modality(scan: Field, mask: np.ndarray | None = None) -> Modality:
     """Return a modality whose images look like a scan: its spacing, levels, textures, blur, noise and uneven light.
 
-    Assumed: two classes; a Gaussian blur, one width in the plane and one along z; noise whose variance is a line over
-    the mean (`measure_noise`). Not seen: growth with depth, stripes, rings, lost stain and clutter, which stay 0. The
-    blur is the one that makes the mask, times a brightness averaged over some voxels, most like the scan.
+    The scan is taken to have two classes, a Gaussian blur of one width in the plane and one along z, and noise whose
+    variance is a line over the mean (`measure_noise`). Growth with depth, stripes, rings, lost stain and clutter stay
+    0. The blur is the one that makes the mask, times a local brightness, most like the scan.
 
     Parameters
     ----------
     scan
-        Values of any type; counts, whole numbers from 0, are taken to saturate at the highest that their type holds.
+        Values of any type; whole numbers from 0 are taken as counts that saturate at the highest of their type.
     mask
-        The structure's voxels, (Z, Y, X). By default the bright ones: Otsu's, then those above half of the brightness
-        around them.
+        The structure's voxels, (Z, Y, X); by default `find_bright`.
 
     Returns
     -------
@@ -90,24 +87,22 @@ def fit_modality(scan: Field, mask: np.ndarray | None = None) -> Modality:
     ground = measure_background(values, inside, steps)
     structure = _measure_structure(values, inside, steps, ground.level)
     noise = measure_noise(values, inside, ground, steps, ground.level + structure.contrast)
-    base = _to_imaging(scan, structure, noise)
-    ranges = {name: _surround(base[name], *ends) for name, ends in SPREAD.items() if np.any(base[name])}
-    if bias := ranges.get("illumination.bias"):
-        ranges["illumination.bias"] = bias[0], min(bias[1], 1.0)
+    base = _to_imaging(scan, structure, ground, noise)
+    ranges = {name: _surround(base[name], ends) for name, ends in SPREAD.items() if np.any(base[name])}
+    if base.illumination.bias:
+        low, high = ranges["illumination.bias"]
+        ranges["illumination.bias"] = low, min(high, 1.0)
     about = f"estimated from {scan.source or 'a scan'}, {'its mask' if given is not None else 'without a mask'}"
     return Modality("like", about, float(min(scan.spacing)), base, ranges)
 
 
-def _to_imaging(scan: Field, structure: Structure, noise: NoiseEstimate) -> Imaging:
-    """Return the parameters of an image.
-
-    Levels are in photons where the variance grows with the mean; textures are those before the blur.
-    """
+def _to_imaging(scan: Field, structure: Structure, ground: Background, noise: NoiseLine) -> Imaging:
+    """Return the estimates as parameters of an image: levels in photons where there is a gain, textures before blur."""
     unit = noise.gain or 1.0
-    low = max(noise.level - noise.offset, 0.0) / unit
-    high = max(noise.level + structure.contrast - noise.offset, 0.0) / unit
-    shrunk = math.prod(1 + 2 * (σ / noise.length) ** 2 for σ in structure.blur) ** 0.25
-    length = math.sqrt(max(noise.length**2 - 2 * min(structure.blur) ** 2, min(scan.spacing) ** 2))
+    low = max(ground.level - noise.offset, 0.0) / unit
+    high = max(ground.level + structure.contrast - noise.offset, 0.0) / unit
+    shrunk = math.prod(1 + 2 * (σ / ground.length) ** 2 for σ in structure.blur) ** 0.25
+    length = math.sqrt(max(ground.length**2 - 2 * min(structure.blur) ** 2, min(scan.spacing) ** 2))
     counts = scan.values.dtype.kind in "ui" and scan.values.min() >= 0
     return Imaging(
         unit=scan.unit,
@@ -115,17 +110,17 @@ def _to_imaging(scan: Field, structure: Structure, noise: NoiseEstimate) -> Imag
         contrast=Contrast(
             background=low,
             foreground=high,
-            background_texture=min(noise.texture * shrunk / max(low * unit, 1e-9), 2.0),
+            background_texture=min(ground.texture * shrunk / max(low * unit, 1e-9), 2.0),
             background_length=length,
             foreground_texture=min(structure.texture * abs(structure.contrast) / max(high * unit, 1e-9), 2.0),
             foreground_length=structure.length * min(scan.spacing),
         ),
         optics=Optics(structure.blur),
         illumination=Illumination(
-            bias=min(noise.bias * abs(noise.level) / max(low * unit, 1e-9), 0.9),
+            bias=min(ground.bias * abs(ground.level) / max(low * unit, 1e-9), 0.9),
             bias_length=max(n * h for n, h in zip(scan.shape, scan.spacing, strict=True)) / 2,
         ),
-        noise=Noise(gaussian=noise.read_noise, width=noise.width),
+        noise=Noise(gaussian=noise.read_noise, width=ground.width),
         detector=Detector(
             gain=noise.gain,
             offset=noise.offset,
@@ -135,6 +130,7 @@ def _to_imaging(scan: Field, structure: Structure, noise: NoiseEstimate) -> Imag
 
 
 def _crop_middle(scan: Field, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
+    """Check a scan and its mask; return the middle of both, of at most `MOST` voxels."""
     if min(scan.shape) < 8:
         raise ValueError(f"the scan must have at least 8 voxels along each axis, got {scan.shape}")
     if mask is not None and np.shape(mask) != scan.shape:
@@ -152,8 +148,9 @@ def _crop_middle(scan: Field, mask: np.ndarray | None) -> tuple[np.ndarray, np.n
 def find_bright(values: np.ndarray, steps: np.ndarray | Sequence[float]) -> np.ndarray:
     """Guess the structure's voxels in grey values (Z, Y, X) on voxels of edges `steps`.
 
-    They are brighter than half of what Otsu's bright voxels around them are on average, weighted by brightness: so an
-    edge has one place however bright the structure is. Otsu's threshold is that of square roots, for dim structures.
+    A voxel is the structure's where its contrast is above half of the local one: the mean, weighted by brightness, over
+    nearby voxels above Otsu's threshold. So the place of an edge does not depend on the structure's brightness. The
+    threshold is found among square roots, which shows dim structures.
     """
     steps = np.asarray(steps, dtype=float)
     finest = steps.min() / steps
@@ -168,7 +165,7 @@ def find_bright(values: np.ndarray, steps: np.ndarray | Sequence[float]) -> np.n
 
 
 def _measure_structure(values: np.ndarray, inside: np.ndarray, steps: np.ndarray, level: float) -> Structure:
-    """Return the blur (z, and y = x) with which the mask explains the scan around it best, and the contrast inside."""
+    """Return the blur (z, and y = x) by which the mask explains the scan near it best, and the contrast inside."""
     finest = steps.min() / steps
     window = tuple(WINDOW * finest)
     signal, mask = (torch.from_numpy(volume).float() for volume in (values - level, inside))
@@ -195,9 +192,9 @@ def _measure_structure(values: np.ndarray, inside: np.ndarray, steps: np.ndarray
 def _measure_texture(relative: np.ndarray, inside: np.ndarray, steps: np.ndarray) -> tuple[float, float]:
     """Return the deviation and the correlation length, in voxels of the finest edge, of the brightness inside.
 
-    The brightness was averaged over a window of `WINDOW`: that lengthens the correlation, and along a tube it lessens
-    the deviation. Both come from the covariance of its logarithm in the plane. What has lost its light is not looked
-    at: a logarithm would see little else.
+    Both come from the covariance, in the plane, of the brightness's logarithm. The average over `WINDOW` lengthens the
+    correlation, and lessens the deviation along a tube; both are corrected. Voxels darker than `DIMMEST` are left out,
+    since they would decide the logarithm's variance.
     """
     bright_part = inside & (relative > DIMMEST)
     logs = np.log(np.where(bright_part, relative, 1.0))
@@ -213,21 +210,18 @@ def _measure_texture(relative: np.ndarray, inside: np.ndarray, steps: np.ndarray
     return math.sqrt(math.expm1(float(covariances[0]) * max(width / length, 1.0))), length
 
 
-def _surround(value: Any, low: float, high: float) -> tuple[Any, Any]:
-    if isinstance(value, tuple):
-        return tuple(low * part for part in value), tuple(high * part for part in value)
-    return low * value, high * value
+def _surround(value: Any, ends: tuple[float, float]) -> tuple[Any, Any]:
+    """Return a number, or each of several, times both ends."""
+    low, high = (tuple(end * v for v in value) if isinstance(value, tuple) else end * value for end in ends)
+    return low, high
 
 
 # ---- noise and background --------------------------------------------------------------------------------------------
 
 
 class Background(NamedTuple):
-    """Where the background is seen, and how it varies.
-
-    Its level; variance and width (z, y, x), in voxels, of its noise; deviation and length of its texture; range of its
-    uneven light.
-    """
+    """The background's voxels and level; variance and width (z, y, x; voxels) of its noise; deviation and length of its
+    texture; relative range of its uneven light."""
 
     where: np.ndarray
     level: float
@@ -238,24 +232,16 @@ class Background(NamedTuple):
     bias: float
 
 
-class NoiseEstimate(NamedTuple):
-    """Of counts: gain, read noise, offset; the rest as the background has it."""
+class NoiseLine(NamedTuple):
+    """The variance of counts over their mean: gain · (mean - offset) + read_noise²."""
 
     gain: float
     read_noise: float
     offset: float
-    width: tuple[float, float, float]
-    level: float
-    texture: float
-    length: float
-    bias: float
 
 
 def measure_background(values: np.ndarray, inside: np.ndarray, steps: np.ndarray) -> Background:
-    """Return the background's level and correlations, some voxels away from the structure.
-
-    Its covariance over the lag is the sum of a short part, noise smoothed by up to a voxel, and a long one, texture.
-    """
+    """Return the background's level and correlations, measured some voxels away from the structure."""
     finest = steps.min() / steps
     away = ndimage.distance_transform_edt(~inside, sampling=steps) > 4 * steps.min()
     where = away if away.mean() > 0.02 else ~inside
@@ -270,22 +256,20 @@ def measure_background(values: np.ndarray, inside: np.ndarray, steps: np.ndarray
     noise, lateral, texture, length = _split_covariance(plane)
     _, axial, _, _ = _split_covariance(covariances[0])
     bias = _measure_bias(rest, weight, level, values.shape)
-    return Background(
-        where, level, noise, (axial, lateral, lateral), math.sqrt(texture), length * float(steps[2]), bias
-    )
+    width = axial, lateral, lateral
+    return Background(where, level, noise, width, math.sqrt(texture), length * float(steps[2]), bias)
 
 
 def measure_noise(
     values: np.ndarray, inside: np.ndarray, ground: Background, steps: np.ndarray, high: float
-) -> NoiseEstimate:
-    """Return the line of variance over mean through the residuals' bins and the background, if it rises by the
-    structure.
+) -> NoiseLine:
+    """Return the line of variance over mean through the background and the residuals' bins over the structure.
 
-    The line is gain · mean + rest. A negative rest is an offset, -rest / gain, a positive one read noise: of the two
-    that a line cannot tell apart, the smaller. The offset is no brighter than the background's darkest voxels: fine
-    structure that passes for noise makes no steeper line. Where it does not rise, noise is the background's everywhere.
+    A line gain · mean + constant does not tell offset from read noise: a negative constant is taken as an offset, a
+    positive one as read noise. The slope is limited so that the offset is no brighter than the background's darkest
+    voxels, since fine structure may pass for noise. Where the variance hardly rises towards the level `high`, the gain
+    is 0 and the noise is the background's everywhere.
     """
-    rest = ground.level, ground.texture, ground.length, ground.bias
     lines = _measure_bins(values, inside, ground, steps)
     gain = 0.0
     if len(lines) > 2:
@@ -297,16 +281,16 @@ def measure_noise(
     gain = min(gain, ground.noise / max(ground.level - darkest, 1e-12))
     if not gain or gain * abs(high - ground.level) < (GROWS - 1) * ground.noise:
         floor = 0.0 if ground.level > 2 * ground.texture else ground.level - abs(high - ground.level)
-        return NoiseEstimate(0.0, math.sqrt(ground.noise), floor, ground.width, *rest)
+        return NoiseLine(0.0, math.sqrt(ground.noise), floor)
     constant = ground.noise - gain * ground.level
     offset = max(-constant / gain, 0.0)
-    return NoiseEstimate(gain, math.sqrt(max(constant, 0.0)), offset, ground.width, *rest)
+    return NoiseLine(gain, math.sqrt(max(constant, 0.0)), offset)
 
 
 def autocovariance(rest: np.ndarray, weight: np.ndarray, axis: int) -> np.ndarray:
-    """Return the autocovariance along an axis, at lags from 0, of a residual that is 0 off the background.
+    """Return the autocovariance along an axis, at lags from 0, over pairs of voxels whose `weight` is 1.
 
-    `weight` is 1 in the background and 0 elsewhere: pairs count of which both are background.
+    `rest` is the residual times the weight, which is 1 or 0.
     """
     a, w = np.moveaxis(rest, axis, 0), np.moveaxis(weight, axis, 0)
     lags = min(LAGS, len(a) // 3)
@@ -315,9 +299,9 @@ def autocovariance(rest: np.ndarray, weight: np.ndarray, axis: int) -> np.ndarra
 
 
 def _split_covariance(covariances: np.ndarray) -> tuple[float, float, float, float]:
-    """Split a covariance over the lag into noise and texture, by non-negative least squares.
+    """Return variance and width of the noise, and variance and length of the texture, in voxels.
 
-    Returns variance and width of the noise, variance and length of the texture, in voxels.
+    Their covariances over the lag are short and long; non-negative least squares finds the shares of both.
     """
     lag = np.arange(len(covariances))
     short = [np.exp(-((lag / (2 * w)) ** 2)) if w else (lag == 0).astype(float) for w in GRAINS]
@@ -342,7 +326,7 @@ def _measure_bias(rest: np.ndarray, weight: np.ndarray, level: float, shape: tup
 def _measure_bins(
     values: np.ndarray, inside: np.ndarray, ground: Background, steps: np.ndarray
 ) -> list[tuple[float, float, int]]:
-    """Return the mean, the variance of the noise and count, by bins of the mean over the structure."""
+    """Return mean, noise variance and number of voxels, by bins of the smoothed level over the structure."""
     residual = ndimage.convolve(values, RESIDUAL)
     mean = ndimage.gaussian_filter(values, 1.5 * steps.min() / steps)
     top = values.max()
@@ -358,7 +342,7 @@ def _measure_bins(
 
 
 def _robust_square(residual: np.ndarray) -> float:
-    """Return the mean square of a residual without its outliers: beyond four deviations, as the median tells them."""
+    """Return the mean square of a residual without outliers: those beyond four deviations by the median's estimate."""
     square = np.square(residual)
     near = square < 16 * np.median(square) / 0.455
     return float(square[near].mean() if near.any() else square.mean())

@@ -14,7 +14,7 @@ from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
 import numpy as np
 import yaml
 
-from curvafit.core.checks import LONGEST, SHORTEST, check_float, check_seed, quoted, simplify_name
+from curvafit.core.checks import LONGEST, SHORTEST, as_tuple, check_float, check_seed, quoted, simplify_name
 from curvafit.core.schema import encode
 from curvafit.core.units import METRES
 from curvafit.data_synth.imaging.maths import Triple
@@ -54,12 +54,12 @@ def _number(name: str, value: Any, kind: Any, allowed: Range) -> Any:
     """Return the value as a float or a triple of floats; None where the kind allows it."""
     if value is None and NoneType in get_args(kind):
         return None
-    words = f"{name} as 3 numbers (z, y, x), each {allowed.words}" if kind is Triple else f"{name} as {allowed.words}"
-    values = value if kind is Triple else (value,)
-    if not isinstance(values, (tuple, list)) or (kind is Triple and len(values) != 3):
-        values = (None,)  # which no number is
-    numbers = tuple(check_float(number, words, allowed.least, allowed.most, of=value) for number in values)
-    return numbers if kind is Triple else numbers[0]
+    if kind is not Triple:
+        return check_float(value, f"{name} as {allowed.words}", allowed.least, allowed.most)
+    words = f"{name} as 3 numbers (z, y, x), each {allowed.words}"
+    values = as_tuple(value, f"3 numbers for {name}")
+    values = values if len(values) == 3 else (None,)  # which no number is
+    return tuple(check_float(number, words, allowed.least, allowed.most, of=value) for number in values)
 
 
 @dataclass(frozen=True)
