@@ -220,11 +220,11 @@ def open_store(path: str | Path, settings: Settings | None = None) -> Store:
     return Store(path, stored)
 
 
-def check_same(stored: Any, wanted: Any, path: Path, name: str = "settings") -> None:
+def check_same(stored: Any, wanted: Any, path: Path, name: str = "") -> None:
     """Raise ValueError, with the name of the first nested value that differs, where a folder holds something else."""
     if isinstance(stored, dict) and isinstance(wanted, dict) and stored.keys() == wanted.keys():
         for key in stored:
-            check_same(stored[key], wanted[key], path, key)
+            check_same(stored[key], wanted[key], path, f"{name}.{key}" if name else key)
     elif stored != wanted:
         raise ValueError(f"{path} was begun with {name} {stored} and not {wanted}: choose another folder, or delete it")
 
