@@ -17,7 +17,7 @@ from common import CELL, DIAGRAM, KINDS, SURFACE, Shape, draw, grown, parser, wr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from curvafit.data_synth.design import boxed
+from curvafit.data_synth.design import design_box
 from curvafit.drawing.plot import CONTOUR, DIAGONAL, write_picture
 from curvafit.geometry.distances import pairwise
 from curvafit.priors.law import preset
@@ -58,7 +58,7 @@ def random_shapes(options: Namespace) -> tuple[list[Shape], int]:
     found: list[Shape] = []
     index = 0
     while len(found) < options.count:
-        a, mass, seed = boxed().draw(options.seed, index)
+        a, mass, seed = design_box().draw(options.seed, index)
         path = options.output / f"random-{index:04d}.npz"
         shape = grown(path, a, mass, options, keep=False, seed=seed, reject_early=True)
         found += [shape] if shape.facts["viable"] else []

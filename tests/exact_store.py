@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.distance import cdist
 
 import curvafit.atlas_map.files as atlas_files
-from curvafit.data_synth.design import boxed
+from curvafit.data_synth.design import design_box
 from curvafit.data_synth.store import Record, Settings, Store, open_store
 from curvafit.generation.result import Viability
 from curvafit.geometry.distances import sliced_embedding
@@ -19,7 +19,7 @@ SHAPE = 24
 EPSILON = 0.02
 FAMILIES = ("layers", "tubes", "spheres", "sponge")
 SETTINGS = Settings(
-    (SHAPE,) * 3, (0.01,) * 3, EPSILON, 0.02, boxed("random").as_dict(), 3,
+    (SHAPE,) * 3, (0.01,) * 3, EPSILON, 0.02, design_box("random").as_dict(), 3,
     {"name": "fast", "steps": 30, "start": 2e-2, "stop": 1e-4, "shape": "cosine", "momentum": 0.97, "memory": 0.97},
 )  # fmt: skip
 

@@ -18,7 +18,7 @@ import torch
 from curvafit.core.runtime import Progress, silent
 from curvafit.core.workers import ThisProcess, Workers, collect_all
 from curvafit.data_synth.atlas import versions
-from curvafit.data_synth.design import boxed
+from curvafit.data_synth.design import design_box
 from curvafit.data_synth.store import Record, Store, open_store
 from curvafit.generation.result import FORMED, is_well_formed
 from curvafit.generation.schedule import SCHEDULES, present_name
@@ -158,7 +158,7 @@ def _build_command(store: Store, viable: int) -> str:
     """Return the command that makes the same store: building stops at its last viable draw."""
     settings = store.settings
     shape, name = ",".join(map(str, settings.shape)), present_name(settings.schedule)
-    known = {json.dumps(boxed(law).as_dict()): law for law in ("random", "sobol")}
+    known = {json.dumps(design_box(law).as_dict()): law for law in ("random", "sobol")}
     design = known.get(json.dumps(settings.design), f"{store.name}.yaml")
     options = f"--count {viable} --shape {shape} --seed {settings.seed} --design {design} --schedule {name}"
     if name in SCHEDULES and settings.schedule["steps"] != SCHEDULES[name].steps:

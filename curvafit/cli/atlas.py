@@ -209,9 +209,9 @@ def _choose_design(name: str, around: str | None, spread: float | None) -> Desig
         if name not in ("random", "sobol"):
             raise ValueError(f"give either --around or the file of a design, got {around} and {name}")
         share = design.SPREAD if spread is None else spread
-        return design.around(design.point_of(around), share, name)  # type: ignore[arg-type]
+        return design.design_around(design.point_of(around), share, name)  # type: ignore[arg-type]
     if spread is not None:
         raise ValueError("--spread needs --around")
     if name in ("random", "sobol"):
-        return design.boxed(name)  # type: ignore[arg-type]
+        return design.design_box(name)  # type: ignore[arg-type]
     return design.read_design(name)

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from curvafit.data_synth.design import INTERVALS as INTERVALS
     from curvafit.data_synth.design import Design as Design
     from curvafit.data_synth.design import Draw as Draw
-    from curvafit.data_synth.design import around as around
-    from curvafit.data_synth.design import boxed as boxed
+    from curvafit.data_synth.design import design_around as design_around
+    from curvafit.data_synth.design import design_box as design_box
     from curvafit.data_synth.design import read_design as read_design
     from curvafit.data_synth.imaging.modality import MODALITIES as MODALITIES
     from curvafit.data_synth.imaging.modality import Contrast as Contrast

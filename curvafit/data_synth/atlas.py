@@ -20,7 +20,7 @@ from llvmlite import binding
 from curvafit.core.checks import check_int, check_seed, check_type
 from curvafit.core.runtime import FILE, FLOW, Progress, check_memory, silent
 from curvafit.core.workers import ThisProcess, Workers
-from curvafit.data_synth.design import Design, boxed
+from curvafit.data_synth.design import Design, design_box
 from curvafit.data_synth.store import Record, Settings, Store, open_store
 from curvafit.generation.flow import WORKING_BLUR, generate
 from curvafit.generation.schedule import Schedule, present_name
@@ -101,7 +101,7 @@ def settings_of(
     check_memory(grid.shape, FILE, "a shape")
     if design is not None:
         check_type(design, Design, "a Design")
-    plan, design = named_schedule(schedule).as_dict(), design or boxed()
+    plan, design = named_schedule(schedule).as_dict(), design or design_box()
     design.draw(seed, 0)  # refuses a wrong seed, before a store is made
     return Settings(grid.shape, grid.spacing, WORKING_EPSILON, WORKING_BLUR, design.as_dict(), check_seed(seed), plan)
 

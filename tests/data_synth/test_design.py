@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from curvafit.data_synth.design import INTERVALS, PARAMETERS, Design, around, boxed, read_design
+from curvafit.data_synth.design import INTERVALS, PARAMETERS, Design, design_around, design_box, read_design
 from curvafit.priors.law import preset
 
 #: (a20 … a00, m₀, noise seed) of draw 0 of seed 0.
@@ -31,44 +31,44 @@ def test_the_published_intervals_and_the_gauge():
         "a00": (-3000, 3000),
         "mass": (-0.75, -0.15),
     }
-    assert all(boxed().draw(0, index).coefficients.a20 == 1 for index in range(20))
+    assert all(design_box().draw(0, index).coefficients.a20 == 1 for index in range(20))
 
 
 @pytest.mark.parametrize("name", INTERVALS)
 def test_each_parameter_is_uniform_on_its_interval(name):
     low, high = INTERVALS[name]
-    draws = [boxed().draw(5, index) for index in range(1000)]
+    draws = [design_box().draw(5, index) for index in range(1000)]
     values = np.array([mass if name == "mass" else getattr(coefficients, name) for coefficients, mass, _ in draws])
     assert low < values.min() and values.max() < high
     assert kstest(values, "uniform", (low, high - low)).pvalue > 0.01
 
 
 def test_a_parameter_in_log_is_uniform_in_its_logarithm():
-    design = boxed("sobol", ["a02"])
+    design = design_box("sobol", ["a02"])
     values = np.array([design.draw(5, index).coefficients.a02 for index in range(1024)])
     low, high = INTERVALS["a02"]
     assert kstest(np.log(values), "uniform", (np.log(low), np.log(high / low))).pvalue > 0.01
     assert Design.from_dict(design.as_dict()) == design
-    assert "log" not in boxed().as_dict(), "stores made before hold no such key"
+    assert "log" not in design_box().as_dict(), "stores made before hold no such key"
 
 
 def test_parameters_and_noise_seeds_are_uncorrelated():
-    draws = [boxed().draw(1, index) for index in range(2000)]
+    draws = [design_box().draw(1, index) for index in range(2000)]
     table = np.array([[*list(c)[1:], m, s] for c, m, s in draws])
     off_diagonal = np.corrcoef(table.T) - np.eye(7)
     assert np.abs(off_diagonal).max() < 4.5 / np.sqrt(2000)  # 21 pairs of null correlations, sd 1/√n each
 
 
 def test_a_draw_depends_on_its_seed_and_index_alone():
-    alone = boxed().draw(3, 17)
-    in_order = [boxed().draw(3, index) for index in range(20)]
+    alone = design_box().draw(3, 17)
+    in_order = [design_box().draw(3, index) for index in range(20)]
     assert in_order[17] == alone
     assert len({tuple(c) for c, _, _ in in_order}) == len({seed for _, _, seed in in_order}) == 20
-    assert boxed().draw(4, 17) != alone
+    assert design_box().draw(4, 17) != alone
 
 
 def test_the_law_stays_what_stores_and_atlases_were_made_with():
-    coefficients, mass, seed = boxed().draw(0, 0)
+    coefficients, mass, seed = design_box().draw(0, 0)
     values = [*coefficients, mass, seed]
     assert values == pytest.approx(FIRST_DRAW, rel=1e-12)
 
@@ -76,7 +76,7 @@ def test_the_law_stays_what_stores_and_atlases_were_made_with():
 def test_wrong_seeds_are_refused():
     for seed, index in ((-1, 0), (0, -1), (0.5, 0), (0, "1"), (True, 0)):
         with pytest.raises(ValueError, match="seed|index"):
-            boxed().draw(seed, index)
+            design_box().draw(seed, index)
 
 
 def written(tmp_path, text: str):
@@ -90,19 +90,19 @@ def table(design: Design, count: int, seed: int = 0) -> np.ndarray:
 
 
 def test_a_sobol_sequence_fills_the_box_more_evenly_than_chance():
-    values = (table(boxed("sobol"), 256)[:, 1:] - [low for low, _ in INTERVALS.values()]) / [
+    values = (table(design_box("sobol"), 256)[:, 1:] - [low for low, _ in INTERVALS.values()]) / [
         high - low for low, high in INTERVALS.values()
     ]
     for column in values.T:  # one point in every 256th part of every interval: a (0, m, s)-net seen from one side
         assert sorted(np.floor(256 * column).astype(int)) == list(range(256))
-    assert not np.array_equal(table(boxed("sobol"), 4), table(boxed("sobol"), 4, seed=1))
+    assert not np.array_equal(table(design_box("sobol"), 4), table(design_box("sobol"), 4, seed=1))
 
 
 def test_a_draw_of_any_design_depends_on_seed_and_index_alone():
     for design in (
-        boxed(),
-        boxed("sobol"),
-        around(table(boxed(), 1)[0], 0.1),
+        design_box(),
+        design_box("sobol"),
+        design_around(table(design_box(), 1)[0], 0.1),
         Design("list", points=((1.0,) * 6 + (0.0,),)),
     ):
         assert design.draw(3, 17) == design.draw(3, 17)
@@ -120,7 +120,7 @@ def test_a_box_in_yaml_changes_some_intervals_and_fixes_others(tmp_path):
 
 
 def test_a_box_in_yaml_holds_some_parameters_in_logarithms(tmp_path):
-    assert read_design(written(tmp_path, "log: [a02]\nbox: {a11: 2}\n")) == boxed("random", ["a02"], a11=2)
+    assert read_design(written(tmp_path, "log: [a02]\nbox: {a11: 2}\n")) == design_box("random", ["a02"], a11=2)
 
 
 def test_numbers_that_yaml_takes_for_text_are_numbers(tmp_path):
@@ -136,8 +136,8 @@ def test_surroundings_hold_their_point_and_have_the_asked_for_width(tmp_path):
     ):
         assert column.min() < centre < column.max()
         assert np.ptp(column) == pytest.approx(0.2 * (high - low), rel=0.05)
-    scaled = around([2 * value for value in tubes.coefficients] + [tubes.mass], 0.2)
-    np.testing.assert_allclose(table(scaled, 5), table(around([*tubes.coefficients, tubes.mass], 0.2), 5))
+    scaled = design_around([2 * value for value in tubes.coefficients] + [tubes.mass], 0.2)
+    np.testing.assert_allclose(table(scaled, 5), table(design_around([*tubes.coefficients, tubes.mass], 0.2), 5))
 
 
 def test_a_list_comes_in_turn_with_other_noise(tmp_path):
@@ -194,6 +194,6 @@ def test_wrong_yaml_is_one_sentence(tmp_path, text, word):
 
 
 def test_a_byte_order_mark_is_skipped_and_no_file_is_told(tmp_path):
-    assert read_design(written(tmp_path, "\ufeffbox: {a11: 2}")) == boxed(a11=2)
+    assert read_design(written(tmp_path, "\ufeffbox: {a11: 2}")) == design_box(a11=2)
     with pytest.raises(FileNotFoundError, match="none.yaml"):
         read_design(tmp_path / "none.yaml")

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import curvafit.data_synth.samples as module
-from curvafit.data_synth.samples import SampleUnavailable, cache_folder, fetch, samples, synthetic_scan
+from curvafit.data_synth.samples import SAMPLES, SampleUnavailable, cache_folder, fetch, synthetic_scan
 from curvafit.volumes.read import load
 
 CONTENT = b"a volume"
@@ -21,8 +21,8 @@ CONTENT = b"a volume"
 @pytest.fixture(autouse=True)
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("CURVAFIT_CACHE", str(tmp_path / "cache"))
-    bone = dataclasses.replace(module._SAMPLES["bone"], sha256=hashlib.sha256(CONTENT).hexdigest())
-    monkeypatch.setitem(module._SAMPLES, "bone", bone)
+    bone = dataclasses.replace(module.SAMPLES["bone"], sha256=hashlib.sha256(CONTENT).hexdigest())
+    monkeypatch.setitem(module.SAMPLES, "bone", bone)
     return tmp_path / "cache"
 
 
@@ -97,7 +97,7 @@ def test_the_cache_follows_the_environment(monkeypatch: pytest.MonkeyPatch, tmp_
 
 
 def test_every_sample_says_where_it_is_from() -> None:
-    listed = samples()
+    listed = list(SAMPLES.values())
     assert [each.name for each in listed] == ["bone", "shell", "fibers", "fly"]
     for each in listed:
         assert each.licence == "MIT"

@@ -14,7 +14,7 @@ import torch
 
 from curvafit.atlas_map.extract import extract
 from curvafit.data_synth import atlas as building
-from curvafit.data_synth.design import INTERVALS, Design, boxed
+from curvafit.data_synth.design import INTERVALS, Design, design_box
 from curvafit.data_synth.store import open_store
 from curvafit.generation.result import Viability
 from curvafit.generation.schedule import LEARNED, present_name, schedule
@@ -85,7 +85,7 @@ def test_building_draws_in_order_until_enough_are_viable(tmp_path, balls):
     assert store.indices() == list(range(len(records)))
     assert sum(record.viability.viable for record in records) == 5 and records[-1].viability.viable
     assert any(not record.viability.viable for record in records)
-    assert [(r.coefficients, r.mass, r.seed) for r in records] == [boxed().draw(1, i) for i in store.indices()]
+    assert [(r.coefficients, r.mass, r.seed) for r in records] == [design_box().draw(1, i) for i in store.indices()]
     assert balls.seeds == [record.seed for record in records]
     viable = np.cumsum([record.viability.viable for record in records])
     assert said == [(f"{n} viable of {i} draws", n / 5) for i, n in enumerate(viable, 1)]
@@ -288,4 +288,4 @@ def test_the_packaged_atlas_is_of_its_designs_and_small():
 
 def _settings(grid: Grid, plan) -> building.Settings:
     epsilon, blur = building.WORKING_EPSILON, building.WORKING_BLUR
-    return building.Settings(grid.shape, grid.spacing, epsilon, blur, boxed().as_dict(), 0, plan.as_dict())
+    return building.Settings(grid.shape, grid.spacing, epsilon, blur, design_box().as_dict(), 0, plan.as_dict())

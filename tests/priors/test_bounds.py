@@ -13,7 +13,7 @@ from curvafit.core.checks import SHOWN, check_float, check_int, quoted
 from curvafit.core.runtime import check_memory, device_memory
 from curvafit.core.workers import check_workers
 from curvafit.data_synth.case import Recipe
-from curvafit.data_synth.design import Design, around, boxed
+from curvafit.data_synth.design import Design, design_around, design_box
 from curvafit.data_synth.imaging.modality import MODALITIES
 from curvafit.data_synth.sources import Generated
 from curvafit.drawing.shapes import Output
@@ -72,7 +72,9 @@ def test_numpy_numbers_make_the_same_shape() -> None:
     assert flow.grid == Grid((eight, eight, 8), np.float64(0.01)) == Grid(np.array([8, 8, 8]))  # type: ignore[arg-type]
     assert Schedule("x", np.int64(5), np.float32(0.5), 1, "constant").steps == 5
     assert Output(np.float64(2), tile=(np.int64(1), 2, 3)).tile == (1, 2, 3)
-    assert boxed(a11=np.float64(1)) == boxed(a11=1) and boxed().draw(np.int64(1), np.int64(2)) == boxed().draw(1, 2)
+    assert design_box(a11=np.float64(1)) == design_box(a11=1) and design_box().draw(
+        np.int64(1), np.int64(2)
+    ) == design_box().draw(1, 2)
     snapshots = generate(TUBES, MASS, 8, schedule=BRIEF, snapshots=np.array([0, 2])).snapshots
     assert list(snapshots) == [0, 2]
 
@@ -141,9 +143,9 @@ def test_designs_stay_within_what_a_flow_takes() -> None:
     point = (1.0, 2.0, 6.0, -40.0, -40.0, 400.0, -0.6)
     for spread in (1e300, math.nan, -1, "wide"):
         with pytest.raises(ValueError, match="spread"):
-            around(point, spread)  # type: ignore[arg-type]
+            design_around(point, spread)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="a10"):
-        boxed(a10=(0, 1e300))
+        design_box(a10=(0, 1e300))
     with pytest.raises(ValueError, match="a00"):
         Generated(((*point[:5], 1e300, -0.6),), ("far",))
     with pytest.raises(ValueError, match="interval"):
