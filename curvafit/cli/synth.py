@@ -94,7 +94,7 @@ def _build_and_preview(out: Path, spec: SetSpec, count: int, crew: Crew) -> None
     check_int(count, "a count of at least 1 case", 1, MOST)
     check_folder(out)
     check_set(out, spec)
-    if spec.recipe.source.within == math.inf:
+    if spec.recipe.source.edge == math.inf:
         crew.check_memory(spec.recipe.largest)
     with crew.start() as (workers, progress):
         build_set(out, spec, count, progress, workers=workers)

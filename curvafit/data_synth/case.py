@@ -73,7 +73,7 @@ class Recipe:
         object.__setattr__(self, "seed", check_seed(self.seed))
         check_calibres(self.calibres)
         for factor in self.calibres:
-            check_crop(self.source.within, self.shape, self.voxel * factor, self.modality)
+            check_crop(self.source.edge, self.shape, self.voxel * factor, self.modality)
 
     @property
     def largest(self) -> tuple[int, int, int]:
@@ -165,23 +165,23 @@ def check_calibres(calibres: Sequence[float]) -> None:
         raise ValueError(f"expected {words}, got {quoted(pair)}")
 
 
-def check_crop(within: float, shape: Sequence[int], voxel: float, modality: Modality) -> None:
+def check_crop(longest: float, shape: Sequence[int], voxel: float, modality: Modality) -> None:
     """Raise ValueError where a source cannot give the crops that images of `shape` need.
 
-    The crops may be larger than the source's shapes (`within`) or than memory, or too small to be shapes.
+    The crops may be larger than the source's shapes (`longest`) or than memory, or too small to be shapes.
     """
     need = field_shape(shape, voxel, modality.base)
     images, crops = " x ".join(map(str, shape)), " x ".join(map(str, need))
     if not 1 < math.prod(shape) <= MOST:
         raise ValueError(f"images must have 2 to {MOST:.0e} voxels, got {images}")
-    if (min if within == math.inf else max)(need) < FEWEST or math.prod(need) > MOST:
+    if (min if longest == math.inf else max)(need) < FEWEST or math.prod(need) > MOST:
         raise ValueError(
             f"shapes must have from {FEWEST} voxels along an edge to {MOST:.0e} in all, but images of {images} voxels "
             f"need {crops}: is a voxel of {voxel:g} {modality.base.unit} meant?"
         )
-    if max(need) > within:
+    if max(need) > longest:
         raise ValueError(
-            f"the stored shapes have {within} voxels along an edge, but images of {images} voxels of {modality.name} "
+            f"the stored shapes have {longest} voxels along an edge, but images of {images} voxels of {modality.name} "
             f"need {crops}: take smaller images, or build a store with a larger --shape"
         )
 

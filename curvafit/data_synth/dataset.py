@@ -117,7 +117,7 @@ class TextureDataset(IterableDataset):
         else:
             self.source = self._pool(Generated.of(sources, volume_fraction), shapes, rotate)
         for kind, edge in zip(self.modalities, self.voxels, strict=True):
-            check_crop(self.source.within, self.size, edge * calibres[0], kind)
+            check_crop(self.source.edge, self.size, edge * calibres[0], kind)
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
 
     def __repr__(self) -> str:

@@ -30,15 +30,13 @@ from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.priors.kernels.threads import one_thread
 from curvafit.priors.law import Law, LawLike, read_laws
 
-#: Seeds that a shape gets to become well-formed.
-TRIES = 8
-#: Crops that are looked at for one with both structure and background.
-CROPS = 32
+#: Seeds that are tried for a well-formed shape, and crops for one with both structure and background.
+TRIES, CROPS = 8, 32
 #: Rotations and reflections of the cube: orders of the three axes times their directions.
 SYMMETRIES = 48
 _ORDERS = ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0))
 
-_Crop = TypeVar("_Crop", bound=tuple[Any, ...])
+_Origin = TypeVar("_Origin")
 
 
 class PhaseField(NamedTuple):
@@ -56,12 +54,12 @@ class Generated:
     Parameters
     ----------
     names
-        What the points are called, one each.
+        A name for each point.
     schedule
         Of the flow.
     fraction
-        Share of the volume that shapes fill, instead of the points' masses, as near as `generate` gets: a shape's
-        `origin` says where it is missed.
+        Share of the volume that shapes fill, instead of the points' masses; a shape's `origin` says where `generate`
+        misses it.
     """
 
     points: tuple[tuple[float, ...], ...]
@@ -79,12 +77,12 @@ class Generated:
         object.__setattr__(self, "points", Design("list", points=self.points).points)
 
     @property
-    def within(self) -> float:
+    def edge(self) -> float:
         """Return infinity: a shape is grown as large as it is wanted."""
         return math.inf
 
     def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> PhaseField:
-        """Return a well-formed shape, of the first of some seeds that gives one; ValueError where none does."""
+        """Return a well-formed shape, from the first seed that gives one; ValueError where none of some does."""
         turn = index % len(self.points)
         *six, mass = self.points[turn]
         grid, status = Grid(tuple(voxels)), ""  # type: ignore[arg-type]
@@ -114,10 +112,7 @@ class Generated:
     def of(laws: Iterable[LawLike], fraction: float | None = None) -> Generated:
         """Return the source of the shapes of one law or several.
 
-        Parameters
-        ----------
-        fraction
-            As above; by default the volume fraction of the scan, where the laws are fits and agree on it.
+        By default the fraction is that of the scan, where the laws are fits and agree on it.
         """
         stated = tuple(laws)
         known = read_laws(stated)
@@ -149,8 +144,7 @@ class Stored:
     Parameters
     ----------
     draws
-        How many well-formed shapes there are, in all: by default as many as there are now. A store that has grown since
-        is another source.
+        Number of well-formed shapes in all stores, by default the present one. A store that grew is another source.
     rotate
         Whether crops are turned by any rotation, besides the symmetries of the cube.
     """
@@ -161,19 +155,19 @@ class Stored:
 
     def __post_init__(self) -> None:
         if self.draws is None:
-            object.__setattr__(self, "draws", len(_well_formed_draws(self.paths)))
+            object.__setattr__(self, "draws", len(_find_well_formed(self.paths)))
 
     def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> PhaseField:
         """Return a crop of any of the stores' shapes that shows both structure and background."""
-        draws = _well_formed_draws(self.paths)
+        draws = _find_well_formed(self.paths)
         if len(draws) != self.draws:
             raise ValueError(f"the stores had {self.draws} well-formed shapes and grew to {len(draws)}: begin anew")
 
-        def crop() -> tuple[np.ndarray, dict[str, Any], Store, int]:
+        def choose() -> tuple[np.ndarray, tuple[Store, int]]:
             store, draw = draws[int(rng.integers(len(draws)))]
-            return *random_crop(store.field(draw), voxels, rng, self.rotate), store, draw
+            return store.field(draw), (store, draw)
 
-        field, move, store, draw = _retry_crop(crop, voxels)
+        field, move, (store, draw) = _crop_shape(choose, voxels, rng, self.rotate)
         record, settings = store.record(draw), store.settings
         point = dict(zip(PARAMETERS, (*map(float, record.coefficients), record.mass), strict=True))
         origin = {"name": f"{store.path.name} {draw}", "parameters": point, "seed": record.seed, **move}
@@ -181,12 +175,7 @@ class Stored:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the source in JSON's types, for a set's record; `source_of` reads it."""
-        return {
-            "kind": "stored",
-            "paths": [str(path) for path in self.paths],
-            "draws": self.draws,
-            "rotate": self.rotate,
-        }
+        return {"kind": "stored", "paths": list(map(str, self.paths)), "draws": self.draws, "rotate": self.rotate}
 
     @property
     def about(self) -> str:
@@ -194,28 +183,21 @@ class Stored:
         return f"{self.draws} shapes of {', '.join(path.name for path in self.paths)}"
 
     @property
-    def within(self) -> int:
-        """Return the least edge of the stores' shapes, in voxels: what a crop must be within."""
-        return min(min(store.settings.shape) for store, _ in _well_formed_draws(self.paths))
+    def edge(self) -> int:
+        """Return the least edge of the stores' shapes, in voxels; no crop may be longer."""
+        return min(min(store.settings.shape) for store, _ in _find_well_formed(self.paths))
 
 
 @dataclass(frozen=True)
 class Pool:
-    """Random crops, turned at random, of a few shapes that each process generates once, when they are first wanted.
+    """Random crops, turned as of `Stored`, of `count` shapes with `edge` voxels along each axis.
 
-    Parameters
-    ----------
-    count
-        Shapes in the pool.
-    within
-        Voxels along each edge of the shapes.
-    rotate
-        As of `Stored`.
+    Each process generates a shape once, when it is first wanted.
     """
 
     generated: Generated
     count: int
-    within: int
+    edge: int
     rotate: bool = False
 
     @property
@@ -226,15 +208,15 @@ class Pool:
     def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> PhaseField:
         """Return a crop of any of the pool's shapes that shows both structure and background."""
 
-        def crop() -> tuple[np.ndarray, dict[str, Any], PhaseField]:
-            whole = _pool_shape(self.generated, int(rng.integers(self.count)), self.within)
-            return *random_crop(whole.values, voxels, rng, self.rotate), whole
+        def choose() -> tuple[np.ndarray, PhaseField]:
+            whole = _grow_pool_shape(self.generated, int(rng.integers(self.count)), self.edge)
+            return whole.values, whole
 
-        values, move, whole = _retry_crop(crop, voxels)
+        values, move, whole = _crop_shape(choose, voxels, rng, self.rotate)
         return PhaseField(values, whole.epsilon, whole.origin | move)
 
 
-#: Endless shapes for a set: `shape(voxels, index, rng)` depends on its arguments alone; `within` bounds their edges.
+#: Endless shapes for a set: `shape(voxels, index, rng)` depends on its arguments alone; no side is longer than `edge`.
 ShapeSource = Generated | Stored
 
 
@@ -267,23 +249,30 @@ def _point_of(law: Law, fraction: float | None) -> tuple[float, ...]:
     return law.point
 
 
-def _retry_crop(crop: Callable[[], _Crop], voxels: Sequence[int]) -> _Crop:
-    """Return the first crop that shows both structure and background."""
+def _crop_shape(
+    choose: Callable[[], tuple[np.ndarray, _Origin]], voxels: Sequence[int], rng: np.random.Generator, rotate: bool
+) -> tuple[np.ndarray, dict[str, Any], _Origin]:
+    """Return a random crop with both structure and background, its move, and the origin of the shape.
+
+    `choose` draws a shape and its origin.
+    """
     for _ in range(CROPS):
-        parts = crop()
-        if parts[0].min() < 0 < parts[0].max():
-            return parts
+        whole, origin = choose()
+        part, move = random_crop(whole, voxels, rng, rotate)
+        if part.min() < 0 < part.max():
+            return part, move, origin
     edges = " x ".join(map(str, voxels))
     raise ValueError(f"{CROPS} crops of {edges} voxels show no structure, or nothing else: take larger ones")
 
 
 @lru_cache(maxsize=256)
-def _pool_shape(generated: Generated, number: int, edge: int) -> PhaseField:
+def _grow_pool_shape(generated: Generated, number: int, edge: int) -> PhaseField:
+    """Return a shape of a pool by its number."""
     return generated.shape((edge,) * 3, number, np.random.default_rng(number))
 
 
 @lru_cache(maxsize=16)
-def _well_formed_draws(paths: tuple[Path, ...]) -> list[tuple[Store, int]]:
+def _find_well_formed(paths: tuple[Path, ...]) -> list[tuple[Store, int]]:
     """Return the well-formed draws of some stores, each with its store."""
     draws = []
     for store in map(open_store, paths):
@@ -298,9 +287,7 @@ def _well_formed_draws(paths: tuple[Path, ...]) -> list[tuple[Store, int]]:
 
 
 def apply_symmetry(values: np.ndarray, symmetry: int) -> np.ndarray:
-    """Return a volume (…, Z, Y, X) under one of the cube's symmetries, 0 to 47; 0 leaves it as it is. A view."""
-    if not 0 <= symmetry < SYMMETRIES:
-        raise ValueError(f"a symmetry is a number from 0 to {SYMMETRIES - 1}, got {symmetry}")
+    """Return a view of a volume (…, Z, Y, X) under one of the cube's symmetries, 0 to 47; 0 leaves it as it is."""
     order, flips = divmod(symmetry, 8)
     lead = values.ndim - 3
     axes = (*range(lead), *(lead + axis for axis in _ORDERS[order]))
@@ -309,24 +296,18 @@ def apply_symmetry(values: np.ndarray, symmetry: int) -> np.ndarray:
 
 
 def crop_periodic(values: np.ndarray, corner: Sequence[int], shape: Sequence[int]) -> np.ndarray:
-    """Return the part (z, y, x) of a periodic volume (Z, Y, X) that begins at a corner, across its faces if need be.
-
-    A part that is larger than the volume repeats it.
-    """
+    """Return the part of a periodic volume (Z, Y, X) that begins at a corner; it goes on across the faces."""
     for axis, (first, part) in enumerate(zip(corner, shape, strict=True)):
-        values = np.take(values, np.arange(first, first + part) % values.shape[axis], axis)
+        values = np.take(values, np.arange(first, first + part), axis, mode="wrap")
     return values
 
 
 def crop_rotated(
     values: np.ndarray, corner: Sequence[int], shape: Sequence[int], quaternion: Sequence[float]
 ) -> np.ndarray:
-    """Return a part as `crop_periodic` does, turned about its middle by any rotation, interpolated linearly.
+    """Return a part as `crop_periodic` does, turned about its middle and interpolated linearly.
 
-    Parameters
-    ----------
-    quaternion
-        Of the rotation (x, y, z, w): where the volume's axes go, in the order (z, y, x).
+    The quaternion (x, y, z, w) rotates vectors in the order (z, y, x).
     """
     kornia = require("kornia.geometry.transform", "synth", "rotating crops")
     turn = Rotation.from_quat(quaternion).as_matrix()
@@ -344,10 +325,7 @@ def crop_rotated(
 def random_crop(
     values: np.ndarray, shape: Sequence[int], rng: np.random.Generator, rotate: bool = False
 ) -> tuple[np.ndarray, dict[str, Any]]:
-    """Return a random crop of a periodic volume under a random symmetry, and which; with `rotate` under any rotation.
-
-    Such a crop has the texture of the whole.
-    """
+    """Return a random crop of a periodic volume under a random symmetry, with `rotate` under any rotation, and both."""
     symmetry = int(rng.integers(SYMMETRIES))
     moved = apply_symmetry(values, symmetry)
     if any(part > whole for part, whole in zip(shape, moved.shape, strict=True)):

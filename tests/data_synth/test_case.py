@@ -74,7 +74,7 @@ def test_a_shape_that_falls_between_the_slices_is_not_a_case():
     class Sheets:
         """Half sheets beside the only slice, the third one on it, if asked for."""
 
-        within = 11.0
+        edge = 11.0
 
         def __init__(self, third: int) -> None:
             self.asked, self.places = 0, [0, 0, third]

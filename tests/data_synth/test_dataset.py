@@ -175,7 +175,7 @@ def test_shapes_of_laws(tmp_path):
     tubes = preset("tubes")
     for laws in ("tubes", [tubes, "sponge"]):
         dataset = TextureDataset(laws, QUIET, 12, shapes=2, seed=1)
-        assert dataset.source.within == 16
+        assert dataset.source.edge == 16
         made.append([dataset[k] for k in (0, 1)])
     for sample in (sample for samples in made for sample in samples):
         assert 0 < float(sample.label.float().mean()) < 1

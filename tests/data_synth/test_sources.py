@@ -75,5 +75,3 @@ def test_a_rotated_plane_is_the_plane_rotated():
 def test_what_cannot_be():
     with pytest.raises(ValueError, match="crop"):
         random_crop(VALUES, (6, 6, 6), np.random.default_rng(0))
-    with pytest.raises(ValueError, match="symmetry"):
-        apply_symmetry(VALUES, 48)
