@@ -1,11 +1,10 @@
-"""Build an atlas, a store of generated shapes; say what it holds, and whether it is whole."""
+"""Build an atlas, a store of generated shapes; summarise and verify it."""
 
 from __future__ import annotations
 
 import importlib.metadata
 import itertools
 import math
-import os
 import platform
 import time
 from collections import Counter
@@ -28,10 +27,8 @@ from curvafit.generation.schedule import schedule as named_schedule
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.kernels.threads import one_thread
 
-#: A design is given up when none of its first so many draws was viable, or fewer than one in so many.
+#: A build ends with an error where fewer than one draw in so many is viable.
 BARREN = 200
-#: Shapes that a store may be asked for.
-MOST = 10**7
 
 
 # ---- build -----------------------------------------------------------------------------------------------------------
@@ -48,25 +45,21 @@ def build(
     design: Design | None = None,
     workers: Workers | None = None,
 ) -> Store:
-    """Generate draws 0, 1, 2 … of a design until `count` are viable; resumes a store that has some already.
+    """Generate draws 0, 1, 2 … of a design until `count` are viable; a store that has some already is resumed.
 
-    Draw i depends on (design, seed, i) alone, so however often it is stopped and resumed, and by however many workers
-    it is made, the store ends with the same draws: the last of them is the `count`-th viable one.
+    Draw i depends on (design, seed, i) alone: stopped, resumed and with any number of workers, a store ends with the
+    same draws, of which the last is the `count`-th viable one.
 
     Parameters
     ----------
-    store_path
-        Folder of the store, created where missing.
-    count
-        Viable shapes to end with.
     shape
         Voxels (z, y, x), or one number for a cube; the box is periodic, in working units.
     progress
-        Called after every new draw with a sentence and the share of the viable shapes that are there.
+        Called after every new draw with a sentence and the share of the viable shapes that are made.
     design
         Experiment 4's random law by default.
     workers
-        Whoever makes the draws (`cluster`); this process by default.
+        The processes that make the draws (`cluster`); this one by default.
 
     Raises ValueError where the store was made with other settings, a shape does not fit into memory, or hardly any draw
     is viable; OSError where the store can't be written or the workers are gone. Finished draws are kept.
@@ -79,7 +72,7 @@ def build(
 
 
 def extend(store_path: str | Path, count: int, progress: Progress = silent, *, workers: Workers | None = None) -> Store:
-    """Continue a store, by its own settings, until it has `count` more viable shapes than were asked of it so far.
+    """Continue a store, by its own settings, until it has `count` more viable shapes than were wanted so far.
 
     A count of 0 finishes a build that was stopped. Raises FileNotFoundError where there is no store, and as `build`.
     """
@@ -90,24 +83,23 @@ def extend(store_path: str | Path, count: int, progress: Progress = silent, *, w
 
 def check_count(count: int, least: int) -> None:
     """Raise ValueError unless `count` is a whole number from `least` to 10 million."""
-    check_int(count, f"a count of shapes from {least}", least, MOST)
+    check_int(count, f"a count of shapes from {least}", least, 10**7)
 
 
 def settings_of(
     shape: int | Sequence[int], seed: int = 0, schedule: str | Schedule = "fast", design: Design | None = None
 ) -> Settings:
-    """Return the settings of the store that `build` makes of these."""
+    """Return the settings of the store that `build` makes from these arguments, or raise ValueError."""
     grid = Grid(shape)  # type: ignore[arg-type]
     check_memory(grid.shape, FILE, "a shape")
     if design is not None:
         check_type(design, Design, "a Design")
     plan, design = named_schedule(schedule).as_dict(), design or design_box()
-    design.draw(seed, 0)  # refuses a wrong seed, before a store is made
     return Settings(grid.shape, grid.spacing, WORKING_EPSILON, WORKING_BLUR, design.as_dict(), check_seed(seed), plan)
 
 
 def _fill(store: Store, count: int, workers: Workers, progress: Progress) -> Store:
-    """Ask for draws in order, never for more than may still be needed: none is made after the last viable one."""
+    """Request draws in order, and only as many at once as may be needed, so that the last draw is viable."""
     store.want(count)
     viable = {index: store.viable(index) for index in store.indices()}
     pending = 0
@@ -132,10 +124,10 @@ def _fill(store: Store, count: int, workers: Workers, progress: Progress) -> Sto
 
 
 def make_draws(path: str | Path, indices: Sequence[int]) -> list[Record]:
-    """Make the draws of a store that are not there yet, write each as soon as it is done, and return all records.
+    """Make the missing draws among `indices`, a worker's part of `build`, and return the records of all.
 
-    This is a worker's part of `build`. Each draw is made on one thread, so that a field depends on nothing but its
-    store's settings, its index and the kind of processor.
+    Each draw is made on one thread, so that a field depends on nothing but its store's settings, its index and the kind
+    of processor.
     """
     store = open_store(path)
     try:
@@ -148,6 +140,7 @@ def make_draws(path: str | Path, indices: Sequence[int]) -> list[Record]:
 
 
 def _make_draw(store: Store, index: int) -> None:
+    """Generate a draw and write it to the store."""
     settings, began = store.settings, time.perf_counter()
     draw = Design.from_dict(settings.design).draw(settings.seed, index)
     with one_thread():
@@ -179,16 +172,13 @@ def _make_draw(store: Store, index: int) -> None:
 
 def versions() -> dict[str, str]:
     """Return the versions that a generated field's bits depend on: Python, libraries, processor."""
-    names = ("curvafit", "torch", "numpy", "numba")
-    machine = {"python": platform.python_version(), "processor": binding.get_host_cpu_name()}
-    return machine | {name: _version(name) for name in names}
-
-
-def _version(name: str) -> str:
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return "not installed"
+    found = {"python": platform.python_version(), "processor": binding.get_host_cpu_name()}
+    for name in ("curvafit", "torch", "numpy", "numba"):
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return found
 
 
 # ---- look ------------------------------------------------------------------------------------------------------------
@@ -196,7 +186,7 @@ def _version(name: str) -> str:
 
 @dataclass(frozen=True)
 class Verdict:
-    """The problems of a store and notes on it, one sentence each; `status` is the verdict in one sentence."""
+    """The outcome of `verify`: problems and notes, a sentence each, and a `status` in one sentence."""
 
     problems: tuple[str, ...]
     notes: tuple[str, ...]
@@ -204,10 +194,10 @@ class Verdict:
 
 
 def verify(path: str | Path, progress: Progress = silent) -> Verdict:
-    """Check that every draw of a store is there and has the checksum that was written.
+    """Check that every draw of a store is there and matches its checksum.
 
-    Draws that are missing from a store whose build was stopped are a note, from a finished one a problem. Raises
-    FileNotFoundError or ValueError where there is no store of this version.
+    Missing draws are a problem of a finished store, and a note on one whose build was stopped. Raises FileNotFoundError
+    or ValueError where there is no store of this version.
     """
     store = open_store(path)
     indices, problems, notes, viable = store.indices(), [], [], 0
@@ -216,8 +206,7 @@ def verify(path: str | Path, progress: Progress = silent) -> Verdict:
         viable += store.viable(index)
         if not store.intact(index):
             problems.append(
-                f"draw {index} is not what was written: its checksum differs (delete draws/{index:06d}, and a build "
-                "makes it again)"
+                f"draw {index} does not match its checksum: delete draws/{index:06d}, and a build makes it again"
             )
     there = {int(entry.name) for entry in (store.path / "draws").iterdir() if entry.name.isdigit()}
     torn = sorted(index for index in there - set(indices) if not store.has(index))  # a build may add some meanwhile
@@ -253,10 +242,9 @@ def summarise(store: Store) -> dict[str, str]:
 
 
 def _size(folder: Path) -> int:
-    """Return the bytes of a folder's files; those that a build takes away meanwhile do not count."""
+    """Return the bytes of a folder's files; those that a build deletes meanwhile do not count."""
     total = 0
-    for place, _, names in os.walk(folder):
-        for name in names:
-            with suppress(FileNotFoundError):
-                total += os.stat(os.path.join(place, name)).st_size
+    for path in folder.rglob("*"):
+        with suppress(FileNotFoundError):
+            total += path.stat().st_size * path.is_file()
     return total

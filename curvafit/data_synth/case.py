@@ -16,21 +16,18 @@ from curvafit.data_synth.imaging.modality import Imaging, Modality
 from curvafit.data_synth.sources import ShapeSource, source_of
 from curvafit.priors.kernels.threads import one_thread
 
-#: Shapes that a case gets until one is seen on the image's voxels, which may be coarse.
+#: Shapes that are tried for a case until one is seen on the image's voxels, which may be coarse.
 TRIES = 8
-#: Voxels that a shape may have.
-MOST = 10**9
-#: Voxels that a shape has along each edge at least, or a crop of one along its longest.
-FEWEST = 4
+#: The most voxels of a shape; and the least along each edge of a grown one, or along the longest edge of a crop.
+MOST, FEWEST = 10**9, 4
 #: Least and greatest calibre.
 CALIBRES = (1e-3, 1e3)
 
 
 class Case(NamedTuple):
-    """One case: an image, the phase field of what it shows, and its mask.
+    """An image, the phase field of what it shows and its mask, (Z, Y, X) on one grid of `spacing`.
 
-    Arrays are (Z, Y, X) on one grid of `spacing`; ε is in spacing's unit; `record` says how the case came about, in
-    JSON's types.
+    ε is in spacing's unit; `record` says how the case was made, in JSON's types.
     """
 
     image: np.ndarray
@@ -44,16 +41,16 @@ class Case(NamedTuple):
 
 @dataclass(frozen=True)
 class Recipe:
-    """What all cases of a set are made by: case i depends on the recipe and i alone.
+    """The recipe of all cases of a set: case i depends on the recipe and i alone.
 
     Parameters
     ----------
     shape
         Voxels (z, y, x) of the images.
     voxel
-        Edge of a shape's voxels, in the modality's unit: how large the texture is in the images.
+        Edge of a shape's voxels, in the modality's unit: it sets how thick structures are in the images.
     calibres
-        How much thinner and thicker than that it may be: every case draws its own factor in between.
+        Least and greatest factor of `voxel`; every case draws its own in between.
     """
 
     source: ShapeSource
@@ -77,11 +74,11 @@ class Recipe:
 
     @property
     def largest(self) -> tuple[int, int, int]:
-        """Return voxels (z, y, x) of the largest shapes, of the thinnest structures."""
+        """Return the voxels (z, y, x) of the largest shapes, those of the least calibre."""
         return field_shape(self.shape, self.voxel * self.calibres[0], self.modality.base)
 
     def case(self, index: int) -> Case:
-        """Return case number `index`, made on one thread; ValueError where no shape is seen on the image's voxels."""
+        """Make case number `index`, on one thread; ValueError where no shape is seen on the image's voxels."""
         for_shape, for_imaging, for_image = np.random.SeedSequence(self.seed, spawn_key=(index,)).spawn(3)
         imaging = self.modality.draw(_draw_number(for_imaging))
         rng = np.random.default_rng(for_shape)
@@ -102,14 +99,11 @@ class Recipe:
                     f"{TRIES} shapes showed no structure on {edges} voxels, or nothing else: take more voxels"
                 )
         record = {"index": index, "source": phase_field.origin, "imaging": imaging.as_dict(), "image_seed": seed}
-        record |= {
-            "voxel": voxel,
-            "volume_fraction": float((sampled > 0).mean()),
-            "mask_fraction": float(mask.mean()),
-        }
-        return Case(
-            _to_counts(grey, imaging), sampled, mask, imaging.spacing, imaging.unit, phase_field.epsilon * voxel, record
-        )
+        record |= {"voxel": voxel, "volume_fraction": float((sampled > 0).mean()), "mask_fraction": float(mask.mean())}
+        ceiling = imaging.detector.ceiling
+        counts = np.uint16 if ceiling is not None and ceiling <= np.iinfo(np.uint16).max else np.float32
+        epsilon = phase_field.epsilon * voxel
+        return Case(grey.astype(counts), sampled, mask, imaging.spacing, imaging.unit, epsilon, record)
 
     def as_dict(self) -> dict[str, Any]:
         """Return all of the recipe in JSON's types."""
@@ -129,12 +123,11 @@ class Recipe:
 def image_and_labels(
     field: torch.Tensor, epsilon: float, voxel: float, imaging: Imaging, seed: int, shape: Sequence[int]
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return the image of a phase field (Z, Y, X), the field on the image's voxels, and its mask there, all of `shape`.
+    """Return the image of a phase field (Z, Y, X), and the field and its mask on the image's voxels, all of `shape`.
 
-    `epsilon` is in the field's voxels, whose edge is `voxel`. A field of whole voxels may hold a few more than an image
-    asks for. See `imaging.image` and `Imaging.visible`.
+    `epsilon` is in the field's voxels, whose edge is `voxel`. See `imaging.image` and `Imaging.visible`.
     """
-    z, y, x = shape
+    z, y, x = shape  # a field of whole voxels may give a few voxels more
     grey, sampled = image(field, voxel, imaging, seed, epsilon), regrid(field, voxel, imaging)
     mask = visible(field, voxel, imaging, epsilon) if imaging.visible else sampled > 0
     grey, sampled, mask = (part[:z, :y, :x].contiguous() for part in (grey, sampled, mask))
@@ -151,14 +144,14 @@ def check_shape(shape: Sequence[int]) -> tuple[int, int, int]:
 def draw_voxel(voxel: float, calibres: Sequence[float], rng: np.random.Generator) -> float:
     """Draw the edge of a shape's voxel: `voxel` times a factor between the calibres, even in the logarithm.
 
-    Equal calibres take no random number.
+    Equal calibres use no random number.
     """
     low, high = calibres
     return voxel * (low if low == high else math.exp(rng.uniform(math.log(low), math.log(high))))
 
 
 def check_calibres(calibres: Sequence[float]) -> None:
-    """Raise ValueError where these are not two positive factors, the lower first."""
+    """Raise ValueError unless the calibres are two positive factors, the lower first."""
     words, pair = "calibres as two positive factors, the lower first", as_tuple(calibres, "two factors")
     low, high = (check_float(n, words, *CALIBRES, of=pair) for n in (pair if len(pair) == 2 else (None, None)))
     if low > high:
@@ -166,10 +159,7 @@ def check_calibres(calibres: Sequence[float]) -> None:
 
 
 def check_crop(longest: float, shape: Sequence[int], voxel: float, modality: Modality) -> None:
-    """Raise ValueError where a source cannot give the crops that images of `shape` need.
-
-    The crops may be larger than the source's shapes (`longest`) or than memory, or too small to be shapes.
-    """
+    """Raise ValueError where images of `shape` need shapes that are too small, too large, or longer than `longest`."""
     need = field_shape(shape, voxel, modality.base)
     images, crops = " x ".join(map(str, shape)), " x ".join(map(str, need))
     if not 1 < math.prod(shape) <= MOST:
@@ -184,13 +174,6 @@ def check_crop(longest: float, shape: Sequence[int], voxel: float, modality: Mod
             f"the stored shapes have {longest} voxels along an edge, but images of {images} voxels of {modality.name} "
             f"need {crops}: take smaller images, or build a store with a larger --shape"
         )
-
-
-def _to_counts(grey: np.ndarray, imaging: Imaging) -> np.ndarray:
-    """Return counts as uint16 where the detector makes whole ones that fit; else float32."""
-    ceiling = imaging.detector.ceiling
-    whole = ceiling is not None and ceiling <= np.iinfo(np.uint16).max
-    return grey.astype(np.uint16 if whole else np.float32)
 
 
 def _draw_number(words: np.random.SeedSequence) -> int:

@@ -21,23 +21,18 @@ from curvafit.data_synth.imaging.modality import Modality, modality
 from curvafit.data_synth.sources import Generated, Pool, Stored, choose_voxel
 from curvafit.priors.law import LAW_TYPES, LawLike
 
-#: Length over which one texture gives way to another, as a share of the crop's longest edge.
-BLEND_LENGTH = 0.5
-#: How sharply: a standard normal field times this, through the logistic function, is the share of the first texture.
-BLEND_STEEPNESS = 4.0
-#: Percentiles that `percentile` makes 0 and 1, beyond which it cuts.
+#: Two textures are mixed by the logistic function of a normal field, whose correlation length is this share of the
+#: crop's longest edge and whose deviation is the steepness.
+BLEND_LENGTH, BLEND_STEEPNESS = 0.5, 4.0
+#: Percentiles that `percentile` makes 0 and 1.
 PERCENTILES = (0.5, 99.5)
-#: Shapes that a pool may have.
-MOST_POOLED = 4096
-#: Voxels by which a generated shape's edge is rounded up.
-ROUND = 8
+#: The most shapes of a pool, and the number of voxels to a multiple of which their edge is rounded up.
+MOST_POOLED, ROUND = 4096, 8
 
 
 class Sample(NamedTuple):
-    """A training pair, and a record of how it came about, in JSON's types.
-
-    The image is float32 and the label uint8 (0, 1), both (1, Z, Y, X); the spacing is the voxel's edges (z, y, x).
-    """
+    """A training pair: image, float32, and label, uint8 (0, 1), both (1, Z, Y, X); the voxel's edges (z, y, x); and a
+    record of how the pair was made, in JSON's types."""
 
     image: Tensor
     label: Tensor
@@ -48,18 +43,16 @@ class Sample(NamedTuple):
 class TextureDataset(IterableDataset):
     """Images with exact labels, cut from generated shapes and imaged on the fly; an epoch is `length` samples.
 
-    Sample k depends on the arguments and k alone; epoch e is samples e·length, e·length + 1, … Workers of a
-    `DataLoader` and ranks of a `torch.distributed` group share them out: none is seen twice, none has another's random
-    numbers.
+    Sample k depends on the arguments and k alone; epoch e is samples e·length, e·length + 1, … Each sample goes to one
+    worker of a `DataLoader` and one rank of a `torch.distributed` group.
 
     Parameters
     ----------
     source
-        The shapes: folders of one or more stores of `curvafit atlas build`; or one or more laws (coefficients, presets,
-        `fit.json`s, fits), of which each process generates `shapes` shapes, each when it is first wanted.
+        Where shapes come from: folders of one or more stores of `curvafit atlas build`; or one or more laws
+        (coefficients, presets, `fit.json`s, fits), of which each process generates `shapes` shapes when first wanted.
     modalities
-        The kinds of image, as `Modality` or by name; each sample is of one of them at random. All of one spacing where
-        samples go into batches.
+        The kinds of image, as `Modality` or by name, of which each sample draws one. Batches need one spacing.
     size
         Voxels (z, y, x) of an image, or one number for a cube.
     length
@@ -67,20 +60,19 @@ class TextureDataset(IterableDataset):
     blend
         Share of samples in which one texture gives way to another.
     voxel
-        Edge of a shape's voxels in the modalities' unit; by default that of the one `fit.json`, else each modality's
-        own.
+        Edge of a shape's voxels in the modalities' unit; by default the fits', else each modality's own.
     calibres
-        How much thinner and thicker than the voxel makes it a structure may be: every sample draws its own factor.
+        Least and greatest factor of `voxel`; every sample draws its own in between.
     normalise
         `zscore` (mean 0, deviation 1), `percentile` (percentiles 0.5 and 99.5 become 0 and 1, values beyond are cut),
         or your own function of an image (1, Z, Y, X); by default images keep their counts.
     rotate
         Turn shapes by any rotation (interpolated linearly), not by the symmetries of the cube alone.
     shapes, volume_fraction
-        With laws: how many shapes are generated, in turn of each law; and the share of the volume that they fill, by
-        default as the law's mass or scan has it.
+        With laws: the number of shapes, which take turns among the laws; and the share of the volume that they fill,
+        by default that of the law's mass or scan.
     transform
-        What to make of each `Sample`: `as_dict`, `as_monai`, `as_subject`, or your own function.
+        A function of each `Sample`: `as_dict`, `as_monai`, `as_subject`, or your own.
     """
 
     def __init__(
@@ -121,7 +113,6 @@ class TextureDataset(IterableDataset):
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
 
     def __repr__(self) -> str:
-        """Return one line: where the shapes come from, the kinds of image, their size, and the epoch's length."""
         kinds, size = ", ".join(kind.name for kind in self.modalities), " x ".join(map(str, self.size))
         return f"TextureDataset({self.source.about}; {kinds}; {size} voxels; {self.length} samples an epoch)"
 
@@ -130,19 +121,20 @@ class TextureDataset(IterableDataset):
         return self.length // self._rank()[1]
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state with the rank, which a spawned worker, outside the group, cannot ask for."""
+        """Return the state with the rank, since a spawned worker is not in the group."""
         return self.__dict__ | {"_group_rank": self._rank()}
 
     def _rank(self) -> tuple[int, int]:
+        """Return the rank of this process, or of the one that spawned it, and the group's size."""
         live = _rank()
         return self.__dict__.get("_group_rank", live) if live == (0, 1) and get_worker_info() else live
 
     def set_epoch(self, epoch: int) -> None:
-        """Set the epoch that comes next, from 0; workers that stay alive see it too."""
+        """Set the next epoch, from 0, in persistent workers too."""
         self._epoch.fill_(epoch)
 
     def __iter__(self) -> Iterator[Any]:
-        """Yield this worker's part of this rank's part of the epoch."""
+        """Yield the samples of this worker and rank in the epoch."""
         (rank, ranks), worker = self._rank(), get_worker_info()
         first, step = (0, 1) if worker is None else (worker.id, worker.num_workers)
         start = int(self._epoch) * self.length
@@ -195,6 +187,7 @@ class TextureDataset(IterableDataset):
         return Pool(generated, count, ROUND * -(-largest // ROUND), rotate)
 
     def _check(self, sources: list[Any]) -> None:
+        """Raise ValueError where an argument is missing or out of range."""
         if not (sources and self.modalities):
             raise ValueError(f"give a source and a modality, got {len(sources)} and {len(self.modalities)}")
         if self.length < 1 or not 0 <= self.blend <= 1:
