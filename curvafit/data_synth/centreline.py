@@ -1,4 +1,4 @@
-"""Curve skeletons with the mask's own topology; and skeletons of crops as graphs, with radii."""
+"""Curve skeletons that keep a mask's topology, and graphs of the skeletons of crops, with radii."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from curvafit.priors.grid import Grid
 if TYPE_CHECKING:
     import networkx as nx
 
-#: A spur is shorter than so many radii of its other node, and a voxel.
+#: A spur is shorter than a voxel and so many radii of its other node.
 SPUR = 1.0
-#: Weights by which voxels' places are averaged along a line, twice, so that their steps do not count.
+#: Weights of the moving average along a line, applied twice, that removes the steps between voxels.
 SMOOTH = (1 / 9, 2 / 9, 3 / 9, 2 / 9, 1 / 9)
-#: How often lines are moved towards the middle.
+#: Number of moves of the lines towards the middle.
 CENTRING = 2
-#: Of 27 voxels, numbered along x, y, z: the middle; as bits the 6 and the 18 nearest to it, and those that touch each,
-#: the middle aside, by a corner at least, or by a side and among the 18.
+#: Voxels of a 3×3×3 block have numbers along x, y, z, and sets of them are bits: `FACES` and `EIGHTEEN` are the 6 and
+#: the 18 nearest to the middle; `CORNERS[k]` touch voxel k by a corner at least, `SIDES[k]` by a face within the 18.
 MIDDLE = 13
 _PLACES = np.stack(np.unravel_index(np.arange(27), (3, 3, 3)), 1)
 _STEPS, _BITS = np.abs(_PLACES[:, None] - _PLACES), 1 << np.arange(27)
@@ -44,14 +44,14 @@ SIDES = ((_STEPS.sum(2) == 1) @ _BITS) & EIGHTEEN
 
 
 def skeleton_of(distance: np.ndarray, grid: Grid) -> np.ndarray:
-    """Return one-voxel wide curves in the middle of {distance > 0}, bool (Z, Y, X), of the same topology.
+    """Return one-voxel wide curves in the middle of {distance > 0}, bool (Z, Y, X), with the mask's topology.
 
-    The distance (Z, Y, X) is positive inside, as `labels.field_distance` gives it. Pieces, tunnels and cavities are as
-    many as the mask's; a cavity keeps a closed sheet around it. Curves run up to the faces of a crop, and on across
-    those of a periodic box.
+    The distance (Z, Y, X) is positive inside, as `labels.field_distance` gives it. The curves have as many pieces,
+    tunnels and cavities as the mask; a cavity keeps a closed sheet around it. Curves run up to the faces of a crop, and
+    across those of a periodic box.
     """
-    # Lee's thinning says where the curves go, in the box continued beyond its faces. The part of a curve outside the
-    # box may hold pieces together, so the mask is thinned once more, in the box itself, around those curves.
+    # Lee's thinning of the box, continued beyond its faces, finds the curves. They may be connected outside the box
+    # alone, so the mask itself is thinned around those curves, and then once more.
     mask = distance > 0
     width = math.ceil(float(distance.max()) / min(grid.spacing)) + 2
     margin = [(min(n // 2, width),) * 2 for n in mask.shape]
@@ -68,7 +68,7 @@ def skeleton_of(distance: np.ndarray, grid: Grid) -> np.ndarray:
 
 @njit(cache=True)
 def _thin(mask, fixed, order, periodic):  # pragma: no cover
-    """Delete simple voxels from the mask, in the given order, until none is left; curve ends and `fixed` ones stay."""
+    """Delete simple voxels from the mask, in the given order, until none is left; `fixed` voxels and ends stay."""
     nz, ny, nx = mask.shape
     changed = True
     while changed:
@@ -98,18 +98,19 @@ def _thin(mask, fixed, order, periodic):  # pragma: no cover
 
 @njit(cache=True)
 def _is_simple(around):  # pragma: no cover
-    """Return whether deleting the middle of 3×3×3 voxels keeps the topology; `around` has the mask around it as bits.
+    """Return whether deleting the middle of 3×3×3 voxels keeps the topology; `around` are the mask's other voxels.
 
-    It does (a simple point, Bertrand and Malandain 1994) where the mask around is one 26-connected piece, and the
-    outside voxels that touch the middle by a face are in one 6-connected piece of the 18 nearest.
+    This is a simple point (Bertrand and Malandain 1994): the mask around it is one 26-connected piece, and the outside
+    voxels that touch the middle by a face are in one 6-connected piece of the 18 nearest.
     """
     outside = ~around & EIGHTEEN
-    return outside & FACES != 0 and _is_one(around, around, CORNERS) and _is_one(outside, outside & FACES, SIDES)
+    one_outside = outside & FACES != 0 and _is_connected(outside, outside & FACES, SIDES)
+    return one_outside and _is_connected(around, around, CORNERS)
 
 
 @njit(cache=True)
-def _is_one(bits, wanted, touching):  # pragma: no cover
-    """Return whether all of the `wanted` bits are in one piece of `bits`; `touching[k]` are the neighbours of bit k."""
+def _is_connected(bits, wanted, touching):  # pragma: no cover
+    """Return whether all `wanted` bits are in one piece of `bits`, where `touching[k]` are the neighbours of bit k."""
     piece, larger = 0, wanted & -wanted
     while larger != piece:
         piece = larger
@@ -125,11 +126,10 @@ def _is_one(bits, wanted, touching):  # pragma: no cover
 def centreline(skeleton: np.ndarray, distance: np.ndarray, spacing: Sequence[float]) -> nx.MultiGraph:
     """Return the graph of a crop's skeleton of one-voxel wide lines (26 neighbours), with radii.
 
-    Voxels of three or more neighbours are junctions, touching ones a single one at their mean; voxels of one neighbour
-    are ends. Lines are smoothed over some voxels, as steps from voxel to voxel would make tilted ones up to a tenth too
-    long, and moved across themselves to where the distance is greatest. A free line that hardly leaves the ball around
-    its other node (`SPUR`) is left out, shortest first; where two lines remain at a junction they become one. A piece
-    that is so left with nothing is a node without edges. Neither changes the cycles.
+    Voxels with three or more neighbours are junctions, and those that touch are one, at their mean; voxels with one
+    neighbour are ends. Lines are smoothed, since steps between voxels would make tilted ones up to a tenth too long,
+    and moved across themselves to the greatest distance. Spurs, free lines that hardly leave the ball around their
+    other node (`SPUR`), are removed, shortest first, and two lines that remain at a junction become one. Cycles stay.
 
     Parameters
     ----------
@@ -144,10 +144,9 @@ def centreline(skeleton: np.ndarray, distance: np.ndarray, spacing: Sequence[flo
     -------
     networkx.MultiGraph
         Nodes 0, 1, … have `position` (z, y, x), `radius`, `kind` ("end", "junction", "point" without edges, "loop" of a
-        line that closes on itself) and `rings`, tunnels some voxels wide within a junction, of which no edge is made,
-        nearly always 0; edges have `points` (N, 3) from the lesser node to the greater and `radii`
-        (N,), both with the nodes' own, `length` and mean `radius`. All is in spacing's unit, the first voxel's centre
-        at the origin.
+        line that closes on itself) and `rings`, the number of tunnels within a junction, nearly always 0. Edges have
+        `points` (N, 3) from the lesser node to the greater and `radii` (N,), both with the nodes' own, `length` and
+        mean `radius`. Lengths are in spacing's unit; the first voxel's centre is the origin.
     """
     if skeleton.shape != distance.shape:
         raise ValueError(f"skeleton and distance must have one shape, got {skeleton.shape} and {distance.shape}")
@@ -162,10 +161,10 @@ def centreline(skeleton: np.ndarray, distance: np.ndarray, spacing: Sequence[flo
 
 
 def write_graphml(graph: nx.MultiGraph, path: str | Path, unit: str = "voxel") -> Path:
-    """Write a `centreline` as GraphML.
+    """Write a `centreline` as GraphML, with its `unit` of length.
 
-    Nodes have `z`, `y`, `x`, `radius`, `kind` and `rings`; edges `length`, `radius`, and as text `points` ("z y x" and
-    a comma between two, from the lesser node to the greater) and `radii`; the graph has its `unit` of length.
+    Nodes have `z`, `y`, `x`, `radius`, `kind` and `rings`; edges `length`, `radius`, and as texts `points` ("z y x",
+    with commas between points) and `radii`.
     """
     nx = _networkx()
     plain = nx.MultiGraph(unit=unit)
@@ -214,7 +213,7 @@ def _trace(skeleton: np.ndarray, distance: np.ndarray) -> nx.MultiGraph:
 
 
 def _count_rings(cloud: np.ndarray) -> int:
-    """Return the tunnels among the voxels of a junction, places (N, 3)."""
+    """Return the number of tunnels among a junction's voxels, at places (N, 3)."""
     voxels = np.zeros(np.ptp(cloud, axis=0) + 1, dtype=bool)
     voxels[tuple((cloud - cloud.min(0)).T)] = True
     return betti_numbers(voxels)[1] if len(cloud) > 3 else 0
@@ -235,7 +234,7 @@ def _prune(graph: nx.MultiGraph, steps: np.ndarray) -> None:
 
 
 def _find_spurs(graph: nx.MultiGraph, steps: np.ndarray) -> list[tuple[float, int, int]]:
-    """Return length, free node and other node of each spur."""
+    """Return the length, free node and other node of all spurs."""
     spurs = []
     for one, other, line in graph.edges(data="line"):
         for tip, root in ((one, other), (other, one)):
@@ -248,7 +247,7 @@ def _find_spurs(graph: nx.MultiGraph, steps: np.ndarray) -> list[tuple[float, in
 
 
 def _dissolve(graph: nx.MultiGraph, node: int) -> None:
-    """Join the two edges of a node into one; other nodes stay."""
+    """Replace a node with two edges, and no rings, by one edge."""
     edges = list(graph.edges(node, data="line"))
     if graph.degree(node) != 2 or len(edges) != 2 or graph.nodes[node]["rings"]:
         return
@@ -260,16 +259,19 @@ def _dissolve(graph: nx.MultiGraph, node: int) -> None:
 
 
 def _centre(graph: nx.MultiGraph, distance: np.ndarray, steps: np.ndarray) -> None:
-    """Move lines across themselves, towards the greatest distance, and nodes as their lines' ends do on average.
+    """Move lines across themselves towards the greatest distance, and nodes by the mean move of their lines' ends.
 
-    In a tube the distance falls by 1 a voxel off the axis: half the difference between a voxel on one side and one on
-    the other is how far off the axis a point is.
+    The distance falls by 1 per voxel off a tube's axis, so that a point is off by half the difference of the values on
+    both sides.
     """
     moves: dict[int, list[np.ndarray]] = defaultdict(list)
     for one, other, of in graph.edges(data=True):
         line = of["line"] = _smooth(of["line"]).copy()
         along = _tangents(line, steps)
-        push = np.stack([_at(distance, line + e) - _at(distance, line - e) for e in np.eye(3)], axis=1) / 2
+        push = (
+            np.stack([_interpolate(distance, line + e) - _interpolate(distance, line - e) for e in np.eye(3)], axis=1)
+            / 2
+        )
         push -= (push * along).sum(1, keepdims=True) * along
         line += push / steps
         moves[min(one, other)].append(push[0] / steps)
@@ -281,7 +283,7 @@ def _centre(graph: nx.MultiGraph, distance: np.ndarray, steps: np.ndarray) -> No
 
 
 def _tangents(line: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Return unit vectors along a line (N, 3) in voxels, in the spacing's unit."""
+    """Return unit tangents, in physical space, of a line (N, 3) in voxels."""
     along = np.gradient(line, axis=0) * steps
     return along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
 
@@ -289,8 +291,8 @@ def _tangents(line: np.ndarray, steps: np.ndarray) -> np.ndarray:
 def _measure_radii(distance: np.ndarray, line: np.ndarray, steps: np.ndarray) -> np.ndarray:
     """Return radii (N,) at the points of a line (N, 3) in voxels.
 
-    The mean, over the 8 voxels around a point, of their distance and how far they are off the line: what it is on a
-    round tube, whose axis misses the voxels.
+    The axis of a tube misses the voxels, whose distance is then too small by how far they are off the line. A radius is
+    the mean of the sum of both over the 8 voxels around a point.
     """
     low, along, radii = np.floor(line).astype(int), _tangents(line, steps), np.zeros(len(line))
     for corner in product((0, 1), repeat=3):
@@ -302,13 +304,13 @@ def _measure_radii(distance: np.ndarray, line: np.ndarray, steps: np.ndarray) ->
     return np.maximum(radii, 0)
 
 
-def _at(values: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the values at points `(N, 3)` in voxels, interpolated linearly."""
+def _interpolate(values: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return the values at points (N, 3) in voxels, interpolated linearly."""
     return ndimage.map_coordinates(values, points.T, order=1, mode="nearest")
 
 
 def _finish(traced: nx.MultiGraph, distance: np.ndarray, steps: np.ndarray) -> nx.MultiGraph:
-    """Return the graph with its nodes numbered anew, in the spacing's unit."""
+    """Return the graph with nodes 0, 1, … and lengths in spacing's unit."""
     graph = _networkx().MultiGraph()
     number = {node: k for k, node in enumerate(sorted(traced))}
     for node, k in number.items():
@@ -327,7 +329,7 @@ def _finish(traced: nx.MultiGraph, distance: np.ndarray, steps: np.ndarray) -> n
 
 
 def _smooth(line: np.ndarray) -> np.ndarray:
-    """Return the line averaged twice along itself; its ends stay, as it is continued through them."""
+    """Return the line after two moving averages; it is continued as a point reflection, so that its ends stay."""
     for _ in range(2 if len(line) > 2 else 0):
         longer = np.pad(line, ((2, 2), (0, 0)), mode="reflect", reflect_type="odd")
         line = ndimage.convolve1d(longer, SMOOTH, axis=0)[2:-2]

@@ -1,4 +1,4 @@
-"""What is exactly known of a generated shape, as training labels."""
+"""Exact training labels of a generated shape."""
 
 from __future__ import annotations
 
@@ -24,37 +24,34 @@ from curvafit.priors.profile import profile_distance
 
 #: Pieces that touch are two where the neck between them is thinner than this part of the thinner one.
 NECK = 0.5
-#: Slope of the profile's distance (1 for a perfect one) from which that is taken off the surface too. Curvature and
-#: normals ask for less, `LEAST_SLOPE`: they hang on the level set's direction and not on how far away it is.
+#: The least slope of the profile's distance (1 where it is perfect) at which it holds off the surface too. Curvature
+#: and normals need the level set's direction alone, for which `LEAST_SLOPE` is enough.
 STEEP = 0.5
-#: Radius (voxels) with which surfaces are taken to curve away from points far off.
+#: Radius (voxels) of the sphere that stands for the surface as seen from far points.
 BEND = 4.0
 
 
 @dataclass(frozen=True, eq=False)
 class Labels:
-    """Labels of a shape {u > 0}, each `(Z, Y, X)`; None where it was not asked for.
+    """Labels of a shape {u > 0}, arrays `(Z, Y, X)`; None where one was not asked for.
 
     Attributes
     ----------
-    grid
-        Voxels, spacing and what lies beyond the box.
     mask
         bool: u > 0.
     distance
         float32, to the surface, positive inside, in spacing's unit; see `field_distance`.
     skeleton
-        bool: curves with the mask's topology; see `skeleton_of`. `centreline` makes a graph of it.
+        bool: curves with the mask's topology; see `skeleton_of`.
     instances
         int32: 0 outside, 1, 2, … in the pieces; see `instances_of`.
     kappa1, kappa2
         float32: the surface's principal curvatures κ1 ≥ κ2 in 1/spacing's unit, positive where the shape is convex, in
-        the voxels on both sides of the surface (those with one of their six neighbours on the other side); NaN in all
-        others, where the grid does not resolve the curvature, and within `diagram.MARGIN` voxels of the faces of a box
-        that is not periodic.
+        voxels with one of their six neighbours on the other side of the surface. NaN elsewhere, where the grid does not
+        resolve the curvature, and within `diagram.MARGIN` voxels of the faces of a crop.
     radius
-        float32: half the local thickness, the radius of the largest ball inside that covers the voxel, in spacing's
-        unit; 0 outside. Up to half a voxel too little on tubes and balls; see `morphometry.local_thickness`.
+        float32: the radius of the largest ball inside that covers the voxel, in spacing's unit; 0 outside. Up to half a
+        voxel too little on tubes and balls; see `morphometry.local_thickness`.
     betti
         b0 pieces, b1 tunnels, b2 cavities; see `topology.betti_numbers`.
     """
@@ -70,15 +67,15 @@ class Labels:
     betti: tuple[int, int, int] | None = None
 
 
-#: What `labels_of` knows.
+#: Names of all labels.
 NAMES = tuple(field.name for field in fields(Labels) if field.name != "grid")
 
 
 def labels_of(field: Tensor | np.ndarray, grid: Grid, epsilon: float, which: Collection[str] | str = NAMES) -> Labels:
-    """Return the labels of a phase field `(Z, Y, X)`, positive inside; only those in `which` cost time.
+    """Return the labels named in `which` of a phase field `(Z, Y, X)`, positive inside.
 
-    A periodic grid's box repeats: distances, curvatures, radii, pieces and lines go on across its faces, and the Betti
-    numbers are those on the torus. Of a crop (replicate) nothing is known beyond: a tube that is cut ends there.
+    Labels of a periodic grid go on across its faces, and the Betti numbers are those on the torus. A tube that is cut
+    by the face of a crop (replicate) ends there.
 
     Raises ValueError where the field is not a finite volume of the grid's shape that crosses 0, or a name is unknown.
     """
@@ -106,10 +103,9 @@ def labels_of(field: Tensor | np.ndarray, grid: Grid, epsilon: float, which: Col
 def instances_of(distance: np.ndarray, grid: Grid) -> np.ndarray:
     """Return the pieces of {distance > 0}: int32 `(Z, Y, X)`, 0 outside and 1, 2, … in the order of their first voxels.
 
-    Pieces are 26-connected, in a periodic box across its faces too. A piece is divided at necks: the watershed of the
-    distance gives each of its maxima a basin, and basins are one again, widest neck first, unless the neck between them
-    is thinner than `NECK` times the thinner one's greatest radius. So balls that touch or are strung on a thinner tube
-    are several, a tube of even width is one.
+    Pieces are 26-connected, in a periodic box across its faces too, and divided at necks: the distance's watershed has
+    a basin around every maximum, and basins are joined, widest neck first, unless the neck between them is thinner than
+    `NECK` times the thinner one's greatest radius. So beads on a thin tube are several, an even tube is one.
     """
     basins = watershed(-distance, mask=distance > 0, connectivity=3).astype(np.int64)
     tops = np.zeros(basins.max() + 1, dtype=np.float32)
@@ -117,15 +113,15 @@ def instances_of(distance: np.ndarray, grid: Grid) -> np.ndarray:
     tops[0] = 0
     owner = np.arange(len(tops))
     for width, one, other in _find_necks(basins, distance, grid):
-        a, b = _root(owner, one), _root(owner, other)
+        a, b = _find_root(owner, one), _find_root(owner, other)
         if a != b and width >= NECK * min(tops[a], tops[b]):
             owner[b] = a
             tops[a] = max(tops[a], tops[b])
-    return _renumber(np.array([_root(owner, k) for k in range(len(owner))])[basins])
+    return _renumber(np.array([_find_root(owner, k) for k in range(len(owner))])[basins])
 
 
 def _find_necks(basins: np.ndarray, distance: np.ndarray, grid: Grid) -> list[tuple[float, int, int]]:
-    """Return the greatest distance at which two basins touch (by faces), widest first."""
+    """Return necks, widest first: the greatest distance at which two basins touch (by faces), and both basins."""
     pairs, widths = [], []
     for axis in range(3):
         next_basins, next_distance = np.roll(basins, -1, axis), np.roll(distance, -1, axis)
@@ -141,8 +137,8 @@ def _find_necks(basins: np.ndarray, distance: np.ndarray, grid: Grid) -> list[tu
     return [(float(widest[k]), int(found[k, 0]), int(found[k, 1])) for k in order]
 
 
-def _root(owner: np.ndarray, k: int) -> int:
-    """Return the basin that basin k was joined to, by way of others."""
+def _find_root(owner: np.ndarray, k: int) -> int:
+    """Return the basin that k was joined to, directly or by way of others."""
     while owner[k] != k:
         k = owner[k]
     return int(k)
@@ -171,7 +167,7 @@ def _measure_curvatures(u: Tensor, mask: np.ndarray, grid: Grid, epsilon: float)
 
 
 def _find_touching(mask: np.ndarray, grid: Grid) -> np.ndarray:
-    """Return the voxels with one of their six neighbours on the other side, without the margin of a crop."""
+    """Return the voxels with one of six neighbours on the other side of the surface, without the margin of a crop."""
     if grid.periodic:
         return find_boundaries(np.pad(mask, 1, mode="wrap"))[1:-1, 1:-1, 1:-1]
     touching, inner = np.zeros_like(mask), (slice(MARGIN, -MARGIN),) * 3
@@ -180,7 +176,7 @@ def _find_touching(mask: np.ndarray, grid: Grid) -> np.ndarray:
 
 
 def _measure_radius(distance: np.ndarray, grid: Grid) -> np.ndarray:
-    """Return half the local thickness; a periodic box is continued as far as balls that reach into it need."""
+    """Return half the local thickness; a periodic box is continued by the reach of the largest balls."""
     width = 2 * math.ceil(float(distance.max()) / min(grid.spacing)) + 4 if grid.periodic else 0
     margin = [min(n // 2, width) for n in grid.shape]
     padded = np.pad(distance > 0, [(m, m) for m in margin], mode="wrap")
@@ -189,6 +185,7 @@ def _measure_radius(distance: np.ndarray, grid: Grid) -> np.ndarray:
 
 
 def _check_field(field: Tensor | np.ndarray, grid: Grid, epsilon: float) -> Tensor:
+    """Return a field in float32, or raise ValueError."""
     u = torch.as_tensor(field).detach().cpu()
     if tuple(u.shape) != grid.shape:
         raise ValueError(f"the field must have the shape {grid.shape}, got {tuple(u.shape)}")
@@ -207,22 +204,23 @@ def _check_field(field: Tensor | np.ndarray, grid: Grid, epsilon: float) -> Tens
 def field_distance(field: Tensor, grid: Grid, epsilon: float) -> np.ndarray:
     """Return the distance of every voxel's centre to {u = 0}, positive inside, float32 (Z, Y, X) in spacing's unit.
 
-    Within one and a half voxels of the surface it is the profile's √2 ε artanh(u) over its slope, however wide the
-    profile: right to 0.02 voxels at less than a voxel from it where its radius of curvature is 5 voxels, to 0.08 where
-    it is 3. Voxels with a neighbour (of six) on the other side so give a point of the surface and its normal each.
-    A voxel further away takes the nearest such voxel's (Euclidean transform), as if the surface there were a sphere of
-    radius `BEND` voxels: right to 0.04 voxels on average, 0.4 at worst. A box that is not periodic knows no surface
-    beyond its faces. Raises NoSurface, a `ValueError`, where the field is of one phase.
+    Within one and a half voxels of the surface it is √2 ε artanh(u) over the slope of that, for a profile of any width.
+    Less than a voxel from the surface it is right to 0.02 voxels where the radius of curvature is 5 voxels, to 0.08
+    where it is 3. Every voxel with one of six neighbours on the other side gives a point of the surface and its normal.
+    A voxel further away takes the point of the nearest such voxel, as if the surface there were a sphere of radius
+    `BEND`: right to 0.04 voxels on average, 0.4 at worst. A crop has no surface beyond its faces.
+
+    Raises NoSurface, a ValueError, where the field is of one phase.
     """
     inside = field > 0
     if not bool(inside.any()) or bool(inside.all()):
         raise NoSurface("the field is of one phase only, so that it has no surface to be distant from")
     near = profile_distance(field.detach().cpu().float(), epsilon).contiguous().numpy()
     edges = np.array(grid.spacing, dtype=np.float32)
-    touching, feet, distance = _near_surface(near, edges, grid.periodic)
+    touching, feet, distance = _measure_near(near, edges, grid.periodic)
     far = np.isnan(distance)
     seed = _find_nearest(touching, edges, grid.periodic)[far]
-    # The foot of the nearest voxel, as seen from the far one: `along` its normal, and across it.
+    # From the far voxel to the nearest one's point on the surface: the whole offset, and its part along the normal.
     foot = feet[tuple((seed % near.shape).T)]
     offset = (seed - np.argwhere(far)) * edges + foot[:, :3]
     square = np.square(offset).sum(1)
@@ -233,7 +231,7 @@ def field_distance(field: Tensor, grid: Grid, epsilon: float) -> np.ndarray:
 
 
 def _find_nearest(touching: np.ndarray, edges: np.ndarray, periodic: bool) -> np.ndarray:
-    """Return the nearest marked voxel of each voxel, (Z, Y, X, 3); a periodic box's may lie up to half a box beyond."""
+    """Return the indices (Z, Y, X, 3) of the nearest marked voxel of each voxel, beyond a periodic box's faces too."""
     before = np.array(touching.shape) // 2 if periodic else np.zeros(3, dtype=int)
     padded = np.pad(~touching, np.stack([before, before], 1), mode="wrap")
     nearest = ndimage.distance_transform_edt(padded, edges, return_distances=False, return_indices=True)
@@ -242,9 +240,9 @@ def _find_nearest(touching: np.ndarray, edges: np.ndarray, periodic: bool) -> np
 
 
 @njit(cache=True)
-def _near_surface(near, edges, periodic):  # pragma: no cover
-    """Return the voxels that touch the other side; their offsets to the surface and its normals (…, 6); the distance of
-    all voxels within one of it, NaN elsewhere."""
+def _measure_near(near, edges, periodic):  # pragma: no cover
+    """Return a mask of the voxels that touch the other side, their offsets to the surface and its normals (…, 6), and
+    the distance near the surface, NaN elsewhere."""
     shape, widest = near.shape, edges.max()
     touching = np.zeros(shape, dtype=np.bool_)
     feet = np.zeros((*shape, 6), dtype=np.float32)
