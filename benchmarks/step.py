@@ -45,7 +45,7 @@ ALLOCATORS = {
 def fused_flow(size: int) -> FusedFlow:
     """Return the fused flow of the preset tubes on a cube."""
     grid, shape = Grid((size, size, size)), preset("tubes")
-    a, betas = [float(value) for value in shape.coefficients], SCHEDULES["fast"].betas
+    a, betas = [float(value) for value in shape.coefficients], SCHEDULES["fast"].betas_at(0)
     start = white_noise(grid, 0).numpy()
     return FusedFlow(start, shape.mass, a, grid, WORKING_EPSILON, BLUR, betas=betas, adam_eps=ADAM_EPS)
 
@@ -53,7 +53,7 @@ def fused_flow(size: int) -> FusedFlow:
 def plain_stepper(size: int) -> TorchStepper:
     """Return the same flow in plain torch."""
     grid, shape = Grid((size, size, size)), preset("tubes")
-    form, betas = DivergenceForm(grid, BLUR, shape.mass), SCHEDULES["fast"].betas
+    form, betas = DivergenceForm(grid, BLUR, shape.mass), SCHEDULES["fast"].betas_at(0)
     return TorchStepper(white_noise(grid, 0), form, shape.coefficients, WORKING_EPSILON, betas, None, "cpu")
 
 

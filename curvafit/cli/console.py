@@ -86,11 +86,13 @@ def plain_errors() -> Iterator[None]:
 
 @contextmanager
 def resumable(again: Callable[[], str] = lambda: "the same command") -> Iterator[None]:
-    """On a signal, print that nothing is lost and which command resumes the work."""
+    """On a signal, print that finished parts are saved, and the command that resumes the work, if `again` names one."""
     try:
         yield
     except KeyboardInterrupt as signal:
-        say(f"{_name_signal(signal)}: finished parts are saved. Run {again()} to resume", to=error_console())
+        if not (line := again()):
+            raise
+        say(f"{_name_signal(signal)}: finished parts are saved. Run {line} to resume", to=error_console())
         raise typer.Exit(exit_code(signal)) from None
 
 

@@ -9,16 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli.console import (
-    command_line,
-    error_console,
-    print_table,
-    say,
-    say_notes,
-    show_stages,
-)
+from curvafit.cli.console import command_line, error_console, print_table, resumable, say, say_notes, show_stages
 from curvafit.cli.options import OverwriteOption, command, parse_numbers, parse_whole_numbers, parse_whole_triple
-from curvafit.core.runtime import exit_code
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -81,6 +73,8 @@ def generate(
     """Make a shape from parameters, with a record (.json) and a picture (.png) beside it."""
     from curvafit.drawing.shapes import check_target, shape_record
     from curvafit.generation.schedule import schedule as named
+    from curvafit.geometry.mesh import SUFFIXES
+    from curvafit.priors.energy import orientation as orient
     from curvafit.priors.grid import Grid
     from curvafit.volumes.parameter_maps import map_shape, read_maps
 
@@ -89,14 +83,17 @@ def generate(
     law = _read_law(preset, coefficients, prior, volumes)
     options = _choose_parameters(law, volumes, mass, volume_fraction, epsilon)
     options["grid"] = grid = Grid(box or map_shape(volumes) or EDGE, boundary=boundary)  # type: ignore[arg-type]
-    options["orientation"] = Q = None if orientation is None else _parse_orientation(orientation)
+    Q = None
+    if orientation is not None:
+        *direction, strength = parse_numbers(orientation, "--orientation", 4)
+        Q = options["orientation"] = orient(direction, strength)
     options["schedule"] = plan = named(schedule, steps)
     after = () if snapshots is None else parse_whole_numbers(snapshots, "--snapshots")
     options["snapshots"] = tuple(map(plan.check_step, after))
     options |= {"seed": seed, "device": device, **_place_checkpoint(checkpoint, checkpoint_every, out)}
     output = _plan_output(law, grid, spacing, unit, tile, cap)
-    if cap is not None:
-        _check_surface(out)
+    if cap is not None and not out.name.lower().endswith(SUFFIXES):
+        raise ValueError(f"--cap and --no-cap are for surfaces ({', '.join(SUFFIXES)}), got {out.name!r}")
     law_file = None if not law.fitted else prior or preset
     inputs = [str(path) for path in (law_file, maps) if path is not None]
     writing = {"picture": picture, "overwrite": overwrite}
@@ -184,39 +181,22 @@ def _plan_output(
     return output
 
 
-def _check_surface(out: Path) -> None:
-    """Refuse the options of a surface where a volume is written."""
-    from curvafit.geometry.mesh import SUFFIXES
-
-    if not out.name.lower().endswith(SUFFIXES):
-        raise ValueError(f"--cap and --no-cap are for surfaces ({', '.join(SUFFIXES)}), got {out.name!r}")
-
-
-def _parse_orientation(text: str) -> Tensor:
-    """Return the orientation of an option."""
-    from curvafit.priors.energy import orientation
-
-    *direction, strength = parse_numbers(text, "--orientation", 4)
-    return orientation(direction, strength)
-
-
 def _grow(options: dict[str, Any]) -> Flow:
     """Run the flow with progress; exit with code 1 where it failed or has no surface."""
     from curvafit.generation.flow import generate as make
 
-    with show_stages() as progress:
+    saved = options["checkpoint"]
+
+    def again() -> str:
+        return "the same command" if saved is not None and saved.exists() else ""
+
+    with resumable(again), show_stages() as progress:
         progress("starting (a first run compiles the kernels for this processor)", 0.0)
 
         def watch(step: int, total: int, state: State) -> None:
             progress("growing", step / total)
 
-        try:
-            flow = make(**options, callbacks=[watch], keep_checkpoint=True)
-        except KeyboardInterrupt as signal:
-            if options["checkpoint"] is None or not options["checkpoint"].exists():
-                raise
-            say(f"interrupted: run the same command to resume from {options['checkpoint']}", to=error_console())
-            raise typer.Exit(exit_code(signal)) from None
+        flow = make(**options, callbacks=[watch], keep_checkpoint=True)
     if not (flow.finite and flow.viability.lowest < 0 < flow.viability.highest):
         _remove(options["checkpoint"])
         say(f"{flow.status}; nothing was written", to=error_console())

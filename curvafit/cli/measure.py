@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from curvafit.cli.console import print_table, say, say_notes, show_stages
-from curvafit.cli.options import OverwriteOption, Reading, command, parse_threshold
+from curvafit.cli.options import FILES, OverwriteOption, Reading, command, parse_threshold
 
 if TYPE_CHECKING:
     from curvafit.scan.measure import Measures
@@ -20,9 +20,7 @@ if TYPE_CHECKING:
     "curvafit measure cells.ome.zarr --channel 1 --dark --threshold 90 -o measures.parquet",
 )
 def measure(
-    scans: Annotated[
-        list[str], typer.Argument(help="NIfTI, TIFF (or folder of slices), NPY, NPZ, HDF5 (file.h5::key), RAW, Zarr …")
-    ],
+    scans: Annotated[list[str], typer.Argument(help=FILES)],
     out: Annotated[Path | None, typer.Option("-o", "--output", help="Table to write: .csv .json .parquet.")] = None,
     kind: Annotated[str, typer.Option(help="Kind of volume: auto, field, mask or image.")] = "auto",
     periodic: Annotated[bool, typer.Option("--periodic", help="The box repeats (generated fields).")] = False,

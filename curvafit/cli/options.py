@@ -29,8 +29,8 @@ OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace file
 def command(*examples: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Return a decorator that makes a function a command, with examples at the end of its help.
 
-    Expected errors leave in one sentence. In place of a parameter `reading` or `crew` the command has the options of
-    that group, as in `_GROUPS`.
+    The command prints expected errors as one sentence. In place of a parameter named in `_GROUPS` it has the options
+    from which the group's value is made.
     """
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
@@ -46,6 +46,7 @@ def command(*examples: str) -> Callable[[Callable[..., None]], Callable[..., Non
 
         parameters = [each for name in own for each in groups.get(name, {name: own[name]}).values()]
         keywords = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in parameters]
+        # typer reads the options of a command from these two.
         run.__signature__ = inspect.Signature(keywords)  # type: ignore[attr-defined]
         run.__annotations__ = {each.name: each.annotation for each in parameters}
         run.examples = "\n\n".join(["[bold]Examples[/bold]", *examples]) if examples else None  # type: ignore[attr-defined]
@@ -62,9 +63,8 @@ def add_commands(app: typer.Typer, *functions: Callable[..., None]) -> None:
 
 _read = partial(typer.Option, rich_help_panel="How to read the file")
 
-Volume = Annotated[
-    str, typer.Argument(help="NIfTI, TIFF (or folder of slices), NPY, NPZ, HDF5 (file.h5::key), RAW, Zarr …")
-]
+FILES = "NIfTI, TIFF (or folder of slices), NPY, NPZ, HDF5 (file.h5::key), RAW, Zarr …"
+Volume = Annotated[str, typer.Argument(help=FILES)]
 #: The options of the group `reading`, as `curvafit.load` takes them.
 Reading = dict[str, Any]
 
@@ -133,6 +133,7 @@ class Crew:
                 yield workers, progress
 
 
+#: Groups of options by the name of the parameter that takes their value.
 _GROUPS: dict[str, Callable[..., Any]] = {"reading": parse_reading, "crew": Crew}
 
 

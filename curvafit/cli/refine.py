@@ -74,12 +74,13 @@ def refine(
     record: dict[str, Any] = {"job": "refine", "weight": weight, "tile": tile, **options}
     record |= {name: None if path is None else str(path) for name, path in named.items()}
 
+    # Everything is read and checked before the first work, which may take minutes.
     inputs = [file for file in (*images, *images.values(), *named.values()) if file is not None]
     for _, target in files:
         check_mask_target(target, inputs=inputs, overwrite=overwrite)
     judge: dict[str, Any] = {"weight": weight}
     chances = None if example is None else load_probabilities(example_probabilities, **others)  # type: ignore[arg-type]
-    for source in images:  # all are read before the first is worked on
+    for source in images:
         field = load_probabilities(source, **maps)
         probability_evidence(field)
         if chances is not None:
@@ -95,11 +96,8 @@ def refine(
         return refine_map(read_whole(volume), prior, progress=progress, **judge, **tools, **options)
 
     for source, target in files:
-        run_job(
-            Job(source, target, prior, maps, record, overwrite, workers, images[source]),
-            compute,
-            load_probabilities,
-        )
+        job = Job(source, target, prior, maps, record, overwrite, workers, images[source])
+        run_job(job, compute, load_probabilities)
 
 
 def _list_files(source: str, out: Path) -> list[tuple[str, Path]]:

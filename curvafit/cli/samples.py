@@ -30,9 +30,7 @@ def list_samples(context: typer.Context) -> None:
 @command("curvafit infer $(curvafit samples get bone) -o bone")
 def get_sample(
     name: Annotated[str, typer.Argument(help="Name of the sample; `curvafit samples` lists the names.")],
-    out: Annotated[
-        Path | None, typer.Option("-o", "--output", help="Copy to write; by default it stays cached.")
-    ] = None,
+    out: Annotated[Path | None, typer.Option("-o", "--output", help="Copy it here, out of the cache.")] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Download a sample once, check it, and print its path."""

@@ -12,21 +12,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from curvafit.cli.console import command_line, plain_errors, resumable, say, say_notes, show_stages
-from curvafit.cli.options import (
-    OverwriteOption,
-    Reading,
-    Volume,
-    command,
-    parse_threshold,
-    parse_whole_numbers,
-)
+from curvafit.cli.options import OverwriteOption, Reading, Volume, command, parse_threshold, parse_whole_numbers
 
 if TYPE_CHECKING:
     from curvafit.core.runtime import Progress
     from curvafit.segmentation.result import Segmentation
     from curvafit.volumes.boxes import Boxes
     from curvafit.volumes.field import Field
-
 
 _what = partial(typer.Option, rich_help_panel="What to do")
 

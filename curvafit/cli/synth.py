@@ -47,9 +47,7 @@ def synth(
     shape: Annotated[str, _out(help="Voxels of an image: N or Z,Y,X.")] = "96",
     laws: Laws = None,
     atlas: Annotated[Path | None, _what(help="Store of shapes to crop, or atlas (.npz) of laws to grow.")] = None,
-    volume_fraction: Annotated[
-        float | None, _what(help="Share of the volume inside; by default that of the fit.")
-    ] = None,
+    volume_fraction: Annotated[float | None, _what(help="Share of the volume inside; by default the fit's.")] = None,
     modality: Kind = None,
     like: Annotated[str | None, _image(help="Scan to take noise, blur and contrast from.")] = None,
     like_mask: Annotated[str | None, _image(help="Mask of the structure in --like, for better estimates.")] = None,

@@ -110,7 +110,7 @@ def _generate_together(jobs: list[tuple], grid: Grid, options: dict[str, Any]) -
         DivergenceForm(grid, costs[0].blur, _stack(bases)),
         Coefficients(*map(_stack, zip(*laws, strict=True))),
         costs[0].epsilon,
-        plan.betas,
+        plan.betas_at(0),
         None,
         device,
         compiled=options["backend"] == "compiled",

@@ -17,7 +17,7 @@ from curvafit.priors.grid import Grid
 FINEST = 0.1
 #: Bounds of a voxel's edge: float32 holds the squares of second differences, and ξ = 1e-6 (`curvature.XI`) is small
 #: beside the inverse of an edge.
-VOXELS = (1e-8, 1e5)
+VOXEL_EDGES = (1e-8, 1e5)
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,8 @@ class Cost:
     def _check_lengths(self) -> None:
         """Convert ε and the blur to numbers; raise ValueError where they or the voxels' edges are out of range."""
         edges, box = self.grid.spacing, self.grid.longest
-        if not VOXELS[0] <= min(edges) <= max(edges) <= VOXELS[1]:
-            raise ValueError(f"a flow needs voxel edges from {VOXELS[0]:g} to {VOXELS[1]:g}, got {edges}")
+        if not VOXEL_EDGES[0] <= min(edges) <= max(edges) <= VOXEL_EDGES[1]:
+            raise ValueError(f"a flow needs voxel edges from {VOXEL_EDGES[0]:g} to {VOXEL_EDGES[1]:g}, got {edges}")
         expected = "epsilon > 0 and blur >= 0 in the spacing's unit"
         if not isinstance(self.epsilon, Tensor):
             object.__setattr__(self, "epsilon", check_float(self.epsilon, expected, math.ulp(0)))

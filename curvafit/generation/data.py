@@ -25,7 +25,7 @@ class Data(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class _OfVoxels:
+class _VoxelTerm:
     """A data term with one number r for each voxel."""
 
     ratio: Float[Tensor, "z y x"]
@@ -41,7 +41,7 @@ class _OfVoxels:
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence(_OfVoxels):
+class Evidence(_VoxelTerm):
     """D(u) = V Σ r (½ - q(u)), q(u) = (3u - u³) / 4 on [-1, 1] and ±½ beyond.
 
     r is a voxel's evidence for the inside (where positive) or for the outside, and V is the voxel's volume. Where u is
@@ -63,7 +63,7 @@ class Evidence(_OfVoxels):
 
 
 @dataclass(frozen=True, eq=False)
-class Hinge(_OfVoxels):
+class Hinge(_VoxelTerm):
     """D(u) = V Σ |r| (m - sign(r) u)₊² / 4, which holds u at ±m or beyond on the side of r's sign.
 
     The term is for voxels whose side is known: there is no force where u is at least m on that side, and a spring where

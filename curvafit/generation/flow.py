@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -30,8 +30,8 @@ WORKING_BLUR = 0.02
 #: Seconds between two checkpoints by default.
 CHECKPOINT_EVERY = 60.0
 #: The ways to run a flow: see `generate`.
-BACKENDS = ("auto", "torch", "fused", "compiled")
 Backend = Literal["auto", "torch", "fused", "compiled"]
+BACKENDS = get_args(Backend)
 
 
 def generate(
@@ -79,18 +79,14 @@ def generate(
         Seed of the start. The same seed, grid and number of threads make the same field, bit for bit.
     orientation
         Q of a further term ε ∫ ∇uᵀQ∇u, symmetric, axes z, y, x; see `priors.energy.orientation`.
-    snapshots
-        Numbers of steps after which `Flow.snapshots` keeps the field.
-    callbacks
-        See `Callback`.
+    snapshots, callbacks
+        Numbers of steps after which `Flow.snapshots` keeps the field; functions as `Callback` describes them.
     reject_early
         Stop as soon as a viability check fails (see `Schedule.checks`) instead of after the last step.
     checkpoint, checkpoint_every
         A file in which the run is saved at intervals of that many seconds, and from which it resumes where the file
-        exists: the result is the same bit for bit on one machine and number of threads. The file is removed at the end,
-        but stays where a callback stopped the flow.
-    keep_checkpoint
-        Whether the file stays at the end too, for the caller to remove once the result is safe.
+        exists: the result is the same bit for bit on one machine and number of threads. The file is removed at the end
+        unless `keep_checkpoint`, but stays where a callback stopped the flow.
     backend
         `"auto"` takes the fused step on processors and plain torch elsewhere; `"torch"` and `"fused"` take only that
         step. `"compiled"` passes the plain step through `torch.compile`; where that fails, a warning says so and the
@@ -98,11 +94,7 @@ def generate(
     device
         Where torch runs, such as `"cpu"` or `"cuda"`.
 
-    Returns
-    -------
-    Flow
-        Where the field is not a shape, or the energy diverged, `viability.viable` is False and `status` says why.
-
+    Where the field is not a shape, or the energy diverged, `Flow.viability.viable` is False and `Flow.status` says why.
     Raises ValueError if an argument is out of range or does not fit the voxels, a file is not this run's checkpoint, or
     the device has no fused step.
     """
@@ -116,9 +108,8 @@ def generate(
     options.check_memory(device)
     base = choose_base(mass, volume_fraction, grid)
     form = DivergenceForm.of(grid, cost.blur, base, execution.blur)
-    stepper = execution.stepper(white_noise(grid, seed), form, cost, plan, "adam", None)
-    checkpoint_file = execution.checkpoint_file(stepper, cost, options, seed=seed, mass=base)
-    return run(stepper, [options], [seed], checkpoint_file)[0]
+    stepper = execution.stepper(white_noise(grid, seed), form, options)
+    return run(stepper, [options], [seed], execution.checkpoint_file(stepper, options, seed=seed, mass=base))[0]
 
 
 def descend(
@@ -187,8 +178,8 @@ def descend(
     if not bool(torch.isfinite(field).all()):
         raise ValueError("the field must be finite, got NaN or infinity")
     form, start = FORMS[flow].at(field, grid, cost.blur, execution.blur)
-    stepper = execution.stepper(start, form, cost, plan, optimiser, frozen)
-    checkpoint_file = execution.checkpoint_file(stepper, cost, options, flow=flow, field=field, frozen=frozen)
+    stepper = execution.stepper(start, form, options, optimiser, frozen)
+    checkpoint_file = execution.checkpoint_file(stepper, options, flow=flow, field=field, frozen=frozen)
     return run(stepper, [options], [None], checkpoint_file)[0]
 
 
@@ -225,27 +216,29 @@ class _Execution:
         return stencils.gaussian_blur if self.plain else kernels.gaussian_blur
 
     def stepper(
-        self, start: Tensor, form: Form, cost: Cost, plan: Schedule, optimiser: str, frozen: Tensor | None
+        self, start: Tensor, form: Form, options: FlowOptions, optimiser: str = "adam", frozen: Tensor | None = None
     ) -> Stepper:
         """Return the stepper of one shape: fused where there is a kernel, unless the backend is plain torch."""
+        cost, betas = options.cost, options.plan.betas_at(0)
         has_kernel = kernels.has_kernel(self.device)
         if self.backend == "fused" and not has_kernel:
             raise ValueError(f"the device {self.device} has no fused step: take backend='torch', or the device 'cpu'")
-        fusible = isinstance(form, DivergenceForm) and optimiser == "adam" and cost.data is None
-        if fusible and has_kernel and not self.plain:
-            return FusedStepper(start, form, cost, plan.betas, frozen)  # type: ignore[arg-type]
+        fusible = optimiser == "adam" and cost.data is None and not self.plain
+        if fusible and has_kernel and isinstance(form, DivergenceForm):
+            return FusedStepper(start, form, cost, betas, frozen)
         return (LbfgsStepper if optimiser == "lbfgs" else TorchStepper)(
-            start, form, cost.coefficients, cost.epsilon, plan.betas, frozen, self.device,
+            start, form, cost.coefficients, cost.epsilon, betas, frozen, self.device,
             orientation=cost.orientation, fused=not self.plain, compiled=self.backend == "compiled", data=cost.data,
         )  # fmt: skip
 
-    def checkpoint_file(self, stepper: Stepper, cost: Cost, options: FlowOptions, **start: object) -> Checkpoint | None:
+    def checkpoint_file(self, stepper: Stepper, options: FlowOptions, **start: object) -> Checkpoint | None:
         """Return the checkpoint of a run from a start, or None where the run has none."""
         if self.checkpoint is None:
             return None
-        job = {"schedule": options.plan, "volume_fraction": options.volume_fraction, "snapshots": [*options.snapshots]}
+        plan, share, snapshots = options.plan, options.volume_fraction, [*options.snapshots]
+        job = {**vars(options.cost), "schedule": plan, "volume_fraction": share, "snapshots": snapshots, **start}
         place = {"stepper": type(stepper).__name__, "backend": self.backend, "device": self.device}
-        return Checkpoint(self.checkpoint, self.every, identity(**vars(cost), **job, **place, **start), self.keep)
+        return Checkpoint(self.checkpoint, self.every, identity(**job, **place), self.keep)
 
 
 def check_device(device: torch.device | str) -> None:
@@ -255,9 +248,7 @@ def check_device(device: torch.device | str) -> None:
     except (RuntimeError, TypeError, ValueError, AssertionError):
         usable = False
     if not usable:
-        raise ValueError(
-            f"torch cannot compute on the device {quoted(device)}: take 'cpu', or 'cuda' where there is one"
-        )
+        raise ValueError(f"torch cannot compute on the device {quoted(device)}: take 'cpu', or a GPU's name, as 'cuda'")
 
 
 def choose_base(mass: float | Tensor | None, share: float | None, grid: Grid) -> float | Tensor:

@@ -1,11 +1,10 @@
-"""Affine maps from the parameters that a flow moves to fields, each with its adjoint; seeded starts."""
+"""Forms, the affine maps from a flow's parameters to fields, each with its adjoint (`pullback`); seeded starts."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -19,27 +18,6 @@ from curvafit.priors.stencils import divergence, gaussian_blur, gradient
 AMPLITUDE = 0.4
 #: A function of field, grid and standard deviation that returns k ∗ field.
 Blur = Callable[[Tensor, Grid, float], Tensor]
-
-
-class Form(Protocol):
-    """A field as an affine function of parameters."""
-
-    @property
-    def grid(self) -> Grid:
-        """The sampling of the field."""
-        ...
-
-    def field(self, parameters: Tensor, /) -> Tensor:
-        """Return u, `(Z, Y, X)`."""
-        ...
-
-    def pullback(self, slope: Tensor, /) -> Tensor:
-        """Return the gradient with respect to the parameters for a gradient `slope` with respect to u."""
-        ...
-
-    def to(self, device: torch.device | str) -> Form:
-        """Return the same form on a device."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -114,6 +92,7 @@ class DirectForm:
         return self
 
 
+Form = DivergenceForm | DirectForm
 #: The flows by name, as forms that can start at a field.
 FORMS: dict[str, type[DivergenceForm] | type[DirectForm]] = {"h-1": DivergenceForm, "l2": DirectForm}
 

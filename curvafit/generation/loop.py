@@ -89,7 +89,7 @@ def _advance(
 ) -> None:
     """Step until the plan ends or every shape has stopped, and save checkpoints."""
     plan, steps = options[0].plan, _resume(stepper, runs, checkpoint)
-    betas = plan.betas
+    betas = plan.betas_at(0)
     while True:
         if steps < plan.steps and plan.betas_at(steps) != betas:
             betas = plan.betas_at(steps)
@@ -201,7 +201,6 @@ class _ShapeRun:
             stepper.shift(correct_mass(stepper.field(k), share, mass, total), k)
 
     def _viability(self, u: Tensor) -> Viability:
-        """Return the viability of a field."""
         return viability(u, self._options.cost.grid, self._options.cost.epsilon)
 
     def _status(self, end: Viability, history: History) -> str:
@@ -241,9 +240,10 @@ def first_mass(share: float, mass: float | None = None) -> float:
 
 
 def correct_mass(u: Tensor, share: float, mass: float, steps: int) -> float:
-    """Return the number to add to the mass in a flow of `steps` steps; a sharp shape's share grows by half of it."""
+    """Return the number to add to the mass during a flow of `steps` steps, so that the share of volume comes nearer."""
     shortfall = share - float(np.count_nonzero(u.numpy() > 0)) / u.numel()
     gain, sharp = min(FRACTION_GAIN, FRACTION_GAIN * FRACTION_GAIN_STEPS / steps), first_mass(share)
+    # Twice, as the share of a sharp shape of mass m is (1 + m) / 2.
     target = min(max(mass + gain * 2 * shortfall, sharp - FRACTION_REACH), sharp + FRACTION_REACH)
     return min(max(target, -FRACTION_BOUND), FRACTION_BOUND) - mass
 

@@ -26,8 +26,6 @@ PHASE_LIMIT = 0.1
 #: `is_well_formed` also requires that |u| reaches a value in this interval in both phases. The published tests accept
 #: plateaus near 0, whose level set is not an interface, and fragments of a few voxels with |u| up to 7.
 FORMED = (0.5, 2.0)
-#: Number of planes that are processed together.
-PLANES = 16
 
 
 @dataclass(frozen=True)
@@ -43,8 +41,11 @@ class Viability:
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """Figures every `RECORD_EVERY` steps and at the end, in arrays `(N,)`: the number of steps, F_ε, maximum and mean
-    of |∂F_ε/∂A| over free voxels, and the mean of u. (In L² flows the gradient is with respect to v.)"""
+    """Figures every `RECORD_EVERY` steps and at the end, in arrays `(N,)`.
+
+    They are the number of steps, F_ε, maximum and mean of |∂F_ε/∂A| over free voxels (∂F_ε/∂v in L² flows), and the
+    mean of u.
+    """
 
     step: np.ndarray
     energy: np.ndarray
@@ -65,7 +66,7 @@ class State:
 
 
 class Callback(Protocol):
-    """A function that a flow calls every `RECORD_EVERY` steps and at the end."""
+    """A function that a flow calls every `RECORD_EVERY` steps and at the end; it may stop the flow."""
 
     def __call__(self, step: int, total: int, state: State, /) -> bool | None:
         """Receive the number of steps so far, the total and the state; return True to stop the flow."""
@@ -108,10 +109,8 @@ class Flow(Pictured):
 
     def __repr__(self) -> str:
         """Return one line with voxels, energy, viability and status."""
-        size, viable = (
-            format_sampling(self.grid.shape, self.grid.spacing),
-            "viable" if self.viability.viable else "not viable",
-        )
+        size = format_sampling(self.grid.shape, self.grid.spacing)
+        viable = "viable" if self.viability.viable else "not viable"
         return f"Flow({size}, energy {self.history.energy[-1]:.4g}, {viable}: {self.status})"
 
     @property
@@ -136,11 +135,11 @@ def viability(u: Float[Tensor, "z y x"], grid: Grid, epsilon: float | Tensor) ->
 
 
 def _discrepancy(u: Tensor, grid: Grid, epsilon: float | Tensor) -> float:
-    """Return `discrepancy_ratio`, a few planes at a time, which takes little memory, with sums in float64."""
+    """Return `discrepancy_ratio` by sums in float64 over a few planes at a time, which take little memory."""
     Z, Y, X = grid.shape
     widths = epsilon.expand(grid.shape) if isinstance(epsilon, Tensor) else None
     above = below = 0.0
-    for planes in torch.arange(Z).tensor_split(max(1, Z // PLANES)):
+    for planes in torch.arange(Z).tensor_split(max(1, Z // 16)):  # some 16 planes at a time
         reach = torch.arange(int(planes[0]) - 1, int(planes[-1]) + 2)
         reach = reach % Z if grid.periodic else reach.clamp(0, Z - 1)
         slab = Grid((len(reach), Y, X), grid.spacing, grid.boundary)

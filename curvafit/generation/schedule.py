@@ -104,11 +104,6 @@ class Schedule:
         return phase.momentum, phase.memory
 
     @property
-    def betas(self) -> tuple[float, float]:
-        """Adam's decay rates at the first step: momentum and memory."""
-        return self.betas_at(0)
-
-    @property
     def bounds(self) -> tuple[int, ...]:
         """The numbers of steps after which a phase of the opening ends."""
         return tuple(round(self.steps * share) for share in accumulate(phase.share for phase in self.opening))
@@ -145,8 +140,10 @@ def _normalise_steps(phase: Phase | Schedule) -> None:
 
 
 def _make_phased(name: str, longest: float) -> Schedule:
-    """Return 1500 steps: the published ones while the topology forms, then longer ones with more momentum and less
-    memory, which follow the same descent."""
+    """Return 1500 steps: as published while the topology forms, then longer, with more momentum and less memory.
+
+    The longer steps follow the same descent.
+    """
     late = {"shape": "cosine", "momentum": 0.97, "memory": 0.99}
     opening = Phase(0.2, 1e-3, 1e-3, "constant"), Phase(0.2, 1e-3, longest, **late)
     return Schedule(name, 1500, longest, 1e-3, **late, opening=opening)

@@ -142,23 +142,10 @@ def adam(
 class TorchStepper(Stepper):
     """Adam on the parameters of a form, on any device, where its whole state stays.
 
-    Parameters
-    ----------
-    start
-        The parameters of one shape, or of `count` shapes that advance together: then the first axis counts the shapes,
-        and the form's base and the coefficients broadcast with `(count, Z, Y, X)`.
-    form, coefficients, epsilon, orientation, data
-        The functional: u as a function of the parameters, F_ε, and the data term, which takes one shape.
-    betas
-        Adam's decay rates.
-    frozen
-        Voxels `(Z, Y, X)` whose parameters stay.
-    fused
-        Whether the energy's gradient comes from a fused kernel where there is one, else from autograd, the definition.
-    compiled
-        Whether the step runs through `torch.compile`, where that works.
-    count
-        Number of shapes; None where the parameters have no axis for them.
+    With a `count`, `start` holds the parameters of that many shapes along a first axis, and the form's base and the
+    coefficients broadcast with `(count, Z, Y, X)`. `fused` takes the energy's gradient from a fused kernel where there
+    is one, instead of from autograd; `compiled` passes the step through `torch.compile`. `frozen` are the voxels
+    `(Z, Y, X)` whose parameters stay.
     """
 
     def __init__(
@@ -192,8 +179,8 @@ class TorchStepper(Stepper):
         self._statistics: list[Statistics] | None = None
         self._evaluate, self._adam = self._evaluate_plainly, adam
         if compiled:
-            switch = _Compiled()
-            self._evaluate, self._adam = switch(self._evaluate_plainly), switch(adam)
+            compile_ = _Compiler()
+            self._evaluate, self._adam = compile_(self._evaluate_plainly), compile_(adam)
         self._start_optimiser()
 
     def _start_optimiser(self) -> None:
@@ -264,8 +251,8 @@ class TorchStepper(Stepper):
         self._taken = state["taken"]
 
 
-class _Compiled:
-    """A maker of compiled functions. Once compilation fails, one warning says so and all run as they are written."""
+class _Compiler:
+    """Compiles functions at their first call; once that fails, a warning says so and all run as they are written."""
 
     failed: bool = False
 

@@ -37,7 +37,7 @@ def test_an_interrupted_run_goes_on_from_its_checkpoint(tmp_path: Path, monkeypa
     with monkeypatch.context() as patch:
         patch.setattr("curvafit.cli.generate.show_stages", interrupting)
         result = call("generate", *saving, "-o", tmp_path / "out.npy")
-    assert result.exit_code == 130 and str(tmp_path / "run.pt") in result.stderr
+    assert result.exit_code == 130 and "resume" in result.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["run.pt"]
     refused(call("generate", *saving, "--seed", 9, "-o", tmp_path / "out.npy"), "checkpoint")
     made(*saving, "-o", tmp_path / "out.npy")
