@@ -106,7 +106,9 @@ def parse_reading(
 class Crew:
     """The workers that the options ask for; ValueError where they contradict each other."""
 
-    workers: Annotated[int | None, typer.Option(help="Worker processes; by default one per core, 0 for none.")] = None
+    workers: Annotated[int | None, typer.Option(help="Worker processes; by default one per core, 0 is this one.")] = (
+        None
+    )
     scheduler: Annotated[str | None, typer.Option(help="Address of a dask scheduler, tcp://HOST:PORT.")] = None
     dashboard: Annotated[int | None, typer.Option(help="Port of dask's dashboard on 127.0.0.1.")] = None
 

@@ -248,7 +248,9 @@ def check_device(device: torch.device | str) -> None:
     except (RuntimeError, TypeError, ValueError, AssertionError):
         usable = False
     if not usable:
-        raise ValueError(f"torch cannot compute on the device {quoted(device)}: take 'cpu', or a GPU's name, as 'cuda'")
+        raise ValueError(
+            f"torch cannot compute on the device {quoted(device)} here: take 'cpu', or a GPU that is there"
+        )
 
 
 def choose_base(mass: float | Tensor | None, share: float | None, grid: Grid) -> float | Tensor:
