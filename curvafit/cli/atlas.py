@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
 atlas_app = typer.Typer(help="Collections of generated shapes to match scans against.", no_args_is_help=True)
 
-
 _Store = Annotated[Path, typer.Argument(help="Folder of the Zarr store.")]
 
 

@@ -108,6 +108,7 @@ def _is_expected(error: Exception) -> bool:
 
 
 def _explain(error: Exception) -> str:
+    """Return the sentence of an expected exception."""
     if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "memory" in str(error).lower()):
         return "error: the volume does not fit into memory"
     if isinstance(error, OSError) and error.strerror:
@@ -178,16 +179,16 @@ def show_stages() -> Iterator[Callable[[str, float], None]]:
     """
     console = error_console()
     if not console.is_terminal:
-        kind, last = "", 0.0
+        stage, last_share = "", 0.0
         waiting: list[str] = []
 
         def write(text: str, share: float) -> None:
-            nonlocal kind, last
-            now = re.sub(r"\d+", "", text)
-            if now != kind or share >= last + 0.05:
-                kind, last = now, share
+            nonlocal stage, last_share
+            without_numbers = re.sub(r"\d+", "", text)
+            if without_numbers != stage or share >= last_share + 0.05:
+                stage, last_share = without_numbers, share
                 waiting.append(f"[{100 * share:3.0f} %] {text}")
-                while len(waiting) > (share == 0):
+                while len(waiting) > (1 if share == 0 else 0):
                     say(waiting.pop(0), to=console)
 
         yield write

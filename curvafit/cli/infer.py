@@ -39,16 +39,15 @@ def infer(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Infer the parameters of a scanned volume, and write a report."""
-    level = parse_threshold(threshold)
     files = {"roi": roi, "atlas": atlas, "posterior": posterior}
-    what: dict[str, Any] = {"kind": kind, "periodic": periodic, "threshold": level, "dark": dark, **files}
+    what: dict[str, Any] = {"kind": kind, "periodic": periodic, "threshold": parse_threshold(threshold), "dark": dark}
     with show_stages() as progress:
         from curvafit.inference.infer import infer as infer_scan
         from curvafit.report.page import check_report, with_command, write_inference
 
         check_report(out, [scan, *(file for file in files.values() if file is not None)], overwrite)
         how = {"method": method, "fast": fast, "seed": seed, "progress": progress}
-        inference = infer_scan(scan, **what, **how, **reading)
+        inference = infer_scan(scan, **what, **files, **how, **reading)
         progress("drawing the report", 1.0)
         say_notes(inference.scan.notes)
         report = write_inference(with_command(inference, command_line()), out, overwrite=overwrite)

@@ -31,8 +31,7 @@ def measure(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Measure scans in seconds: morphometry, fabric and curvature in physical units, with 95 % intervals."""
-    options: dict[str, Any] = {"kind": kind, "periodic": periodic, "threshold": parse_threshold(threshold)}
-    options |= {"dark": dark, **reading}
+    what: dict[str, Any] = {"kind": kind, "periodic": periodic, "threshold": parse_threshold(threshold), "dark": dark}
     with show_stages() as progress:
         from curvafit.scan.measure import measure as measure_scan
         from curvafit.studies.tables import check_table, write_table
@@ -45,7 +44,7 @@ def measure(
             progress(f"{scans[len(found)]}: {text}", (len(found) + share) / len(scans))
 
         for scan in scans:
-            found.append(measure_scan(scan, progress=watch, **options))
+            found.append(measure_scan(scan, progress=watch, **what, **reading))
     for measures in found:
         if len(scans) > 1:
             say(measures.source, style="bold")

@@ -173,6 +173,7 @@ def parse_whole_numbers(text: str, option: str) -> tuple[int, ...]:
 
 
 def _round(values: tuple[float, ...], option: str) -> tuple[int, ...]:
+    """Return numbers as whole ones, or raise ValueError where they are not whole or negative."""
     if min(values) < 0 or any(value != int(value) for value in values):
         raise ValueError(f"{option} must be whole numbers from 0, got {', '.join(f'{value:g}' for value in values)}")
     return tuple(int(value) for value in values)

@@ -64,11 +64,11 @@ def refine(
     files = _list_files(probabilities, out)
     if like is not None and len(files) > 1:
         raise ValueError("--like is for one file; images of a folder lie beside its NPZ files")
-    maps: dict[str, Any] = {name: reading[name] for name in reading if name != "label"} | {"like": like}
-    others = {name: value for name, value in maps.items() if name not in ("crop", "like")}
-    place = {name: reading[name] for name in ("spacing", "unit", "label", "strict")}
-    placed = reading["spacing"] is not None or reading["unit"] is not None
-    images = {source: like or (None if placed else find_image(source)) for source, _ in files}
+    map_reading: dict[str, Any] = {name: reading[name] for name in reading if name != "label"} | {"like": like}
+    example_reading = {name: value for name, value in map_reading.items() if name not in ("crop", "like")}
+    mask_reading = {name: reading[name] for name in ("spacing", "unit", "label", "strict")}
+    has_place = reading["spacing"] is not None or reading["unit"] is not None
+    images = {source: like or (None if has_place else find_image(source)) for source, _ in files}
     named = {"example": example, "example_probabilities": example_probabilities, "like": like}
     options = {"epsilon": epsilon, "steps": steps}
     record: dict[str, Any] = {"job": "refine", "weight": weight, "tile": tile, **options}
@@ -79,14 +79,14 @@ def refine(
     for _, target in files:
         check_mask_target(target, inputs=inputs, overwrite=overwrite)
     judge: dict[str, Any] = {"weight": weight}
-    chances = None if example is None else load_probabilities(example_probabilities, **others)  # type: ignore[arg-type]
+    chances = None if example is None else load_probabilities(example_probabilities, **example_reading)  # type: ignore[arg-type]
     for source in images:
-        field = load_probabilities(source, **maps)
+        field = load_probabilities(source, **map_reading)
         probability_evidence(field)
         if chances is not None:
             check_spacing(chances, field, "the probabilities")
     if chances is not None:
-        mask = load(example, **place)  # type: ignore[arg-type]
+        mask = load(example, **mask_reading)  # type: ignore[arg-type]
         say_notes((*chances.notes, *mask.notes))
         with show_stages() as progress:
             judge = {"example": calibrate(chances, mask, prior, progress=progress, **options)}
@@ -96,7 +96,7 @@ def refine(
         return refine_map(read_whole(volume), prior, progress=progress, **judge, **tools, **options)
 
     for source, target in files:
-        job = Job(source, target, prior, maps, record, overwrite, workers, images[source])
+        job = Job(source, target, prior, map_reading, record, overwrite, workers, images[source])
         run_job(job, compute, load_probabilities)
 
 

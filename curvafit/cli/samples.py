@@ -81,9 +81,8 @@ def _list_samples() -> dict[str, tuple[str, str, str]]:
     """Return description, licence and source of each sample by name."""
     from curvafit.data_synth.samples import SAMPLES
 
-    return {each.name: (each.description, each.licence, each.source) for each in SAMPLES.values()} | {
-        _SYNTHETIC: _ABOUT
-    }
+    about = {each.name: (each.description, each.licence, each.source) for each in SAMPLES.values()}
+    return about | {_SYNTHETIC: _ABOUT}
 
 
 def _fetch_or_make(name: str) -> Path:

@@ -116,17 +116,17 @@ def resolve_place(path: str | Path) -> Path:
 
 def identity(**parts: object) -> dict[str, str]:
     """Return the texts, by name, that tell runs apart: those of its parts, with digests of tensors, and versions."""
-    texts = {name: _text(value) for name, value in parts.items()}
+    texts = {name: _to_text(value) for name, value in parts.items()}
     return {**texts, "curvafit": version("curvafit"), "torch": version("torch")}
 
 
-def _text(value: object) -> str:
+def _to_text(value: object) -> str:
     """Return a text that identifies a value."""
     if isinstance(value, Coefficients):
-        return f"({', '.join(map(_text, value))})"
+        return f"({', '.join(map(_to_text, value))})"
     if isinstance(value, Tensor):
         values = value.detach().cpu().contiguous().numpy()
         return f"{values.dtype} {values.shape} {hashlib.sha256(values.tobytes()).hexdigest()[:16]}"
     if dataclasses.is_dataclass(value) and any(isinstance(part, Tensor) for part in vars(value).values()):
-        return f"{type(value).__name__}({', '.join(map(_text, vars(value).values()))})"
+        return f"{type(value).__name__}({', '.join(map(_to_text, vars(value).values()))})"
     return str(value)

@@ -177,7 +177,7 @@ def descend(
     field = torch.as_tensor(field).detach().to("cpu", torch.float32).contiguous()
     if not bool(torch.isfinite(field).all()):
         raise ValueError("the field must be finite, got NaN or infinity")
-    form, start = FORMS[flow].at(field, grid, cost.blur, execution.blur)
+    form, start = FORMS[flow].start_at(field, grid, cost.blur, execution.blur)
     stepper = execution.stepper(start, form, options, optimiser, frozen)
     checkpoint_file = execution.checkpoint_file(stepper, options, flow=flow, field=field, frozen=frozen)
     return run(stepper, [options], [None], checkpoint_file)[0]

@@ -49,8 +49,8 @@ class DivergenceForm:
         return cls(grid, width, blur(base, grid, width) if isinstance(base, Tensor) else float(base), blur)
 
     @classmethod
-    def at(cls, field: Tensor, grid: Grid, width: float, blur: Blur) -> tuple[DivergenceForm, Tensor]:
-        """Return the form for which u = k ∗ field at A = 0, and that start."""
+    def start_at(cls, field: Tensor, grid: Grid, width: float, blur: Blur) -> tuple[DivergenceForm, Tensor]:
+        """Return the form for which u = k ∗ field at A = 0, and that A."""
         return cls.of(grid, width, field, blur), field.new_zeros((3, *grid.shape))
 
     def field(self, vector: Float[Tensor, "3 z y x"]) -> Float[Tensor, "z y x"]:
@@ -75,7 +75,7 @@ class DirectForm:
     blur: Blur = gaussian_blur
 
     @classmethod
-    def at(cls, field: Tensor, grid: Grid, width: float, blur: Blur) -> tuple[DirectForm, Tensor]:
+    def start_at(cls, field: Tensor, grid: Grid, width: float, blur: Blur) -> tuple[DirectForm, Tensor]:
         """Return the form and the start v = field."""
         return cls(grid, width, blur), field
 

@@ -176,7 +176,7 @@ class _ShapeRun:
         if self._failure:
             end = dataclasses.replace(end, viable=False, reason=self._failure)
         history = History(*np.array(self.rows, dtype=np.float64).T)
-        status = self._status(end, history)
+        status = self._describe_end(end, history)
         return Flow(
             self._field, history, status, cost.grid, end, options.plan, self._seed, self._mass, self.snapshots,
             cost.coefficients, cost.epsilon,
@@ -203,7 +203,7 @@ class _ShapeRun:
     def _viability(self, u: Tensor) -> Viability:
         return viability(u, self._options.cost.grid, self._options.cost.epsilon)
 
-    def _status(self, end: Viability, history: History) -> str:
+    def _describe_end(self, end: Viability, history: History) -> str:
         """Return the sentence that says how the flow ended."""
         if self.stop:
             return self.stop

@@ -58,9 +58,9 @@ class Schedule:
         Adam's decay rates of the gradient and of the gradient's square. Long momentum smooths long steps; short memory
         forgets the steep noise of the start.
     opening
-        Phases before the steps that the fields above describe, in order; these take the rest of the steps. Adam's bias
-        corrections are those of the rates in force: where memory shortens after fewer than some 300 steps, the next
-        steps are longer than these say.
+        Phases that come first, in order; the fields above describe the remaining steps. Where a phase shortens memory
+        within the first 300 steps or so, the next steps are longer than stated, since Adam corrects its bias by the
+        new rate.
 
     Raises ValueError if a number is out of range, the shape has another name, or the phases' shares leave no rest.
     """
@@ -92,7 +92,7 @@ class Schedule:
 
     def rate(self, step: int) -> float:
         """Return the length of a step, numbered from 0 to steps - 1."""
-        phase, first, count = self._phase(step)
+        phase, first, count = self._find_phase(step)
         if phase.shape == "constant" or count == 1:
             return phase.start
         angle = math.pi * (step - first) / (count - 1)
@@ -100,7 +100,7 @@ class Schedule:
 
     def betas_at(self, step: int) -> tuple[float, float]:
         """Return Adam's decay rates at a step: momentum and memory."""
-        phase, _, _ = self._phase(step)
+        phase, _, _ = self._find_phase(step)
         return phase.momentum, phase.memory
 
     @property
@@ -108,7 +108,7 @@ class Schedule:
         """The numbers of steps after which a phase of the opening ends."""
         return tuple(round(self.steps * share) for share in accumulate(phase.share for phase in self.opening))
 
-    def _phase(self, step: int) -> tuple[Phase | Schedule, int, int]:
+    def _find_phase(self, step: int) -> tuple[Phase | Schedule, int, int]:
         """Return the phase of a step, the first step of that phase, and its number of steps."""
         place = bisect_right(self.bounds, step)
         first, end = (0, *self.bounds)[place], (*self.bounds, self.steps)[place]
@@ -129,13 +129,13 @@ class Schedule:
 
 
 def _normalise_steps(phase: Phase | Schedule) -> None:
-    """Make a phase's lengths of steps and its momenta floats, in place; raise ValueError where one is out of range."""
+    """Convert a phase's step lengths and decay rates to floats, in place; raise ValueError if one is out of range."""
     for name in ("start", "stop"):
         length = check_float(getattr(phase, name), "positive step lengths", 1e-30, LONGEST_STEP)
         object.__setattr__(phase, name, length)
     check_choice(phase.shape, ("constant", "cosine"), "a schedule's shape 'constant' or 'cosine'")
     for name in ("momentum", "memory"):
-        # The interval is open below, so 0 is allowed from the greatest float under it.
+        # The interval is open: with the greatest float below 0 as its end, 0 is in it.
         object.__setattr__(phase, name, check_open_interval(getattr(phase, name), f"{name} in [0, 1)", -math.ulp(0), 1))
 
 

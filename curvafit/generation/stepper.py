@@ -42,11 +42,11 @@ class Stepper(Protocol):
     stalled: bool = False
 
     def step(self, rate: float | None) -> None:
-        """Compute u and the gradient, then step by `rate`; None leaves the parameters, and no rate may follow it."""
+        """Compute u and the gradient, then step by `rate`, or not if it is None, after which no rate may come."""
         ...
 
     def run(self, rates: Sequence[float]) -> int:
-        """Make steps without statistics, and return their number, which is smaller than that of rates after a stall."""
+        """Make a step for each rate, without statistics, until a stall; return the number of steps made."""
         for count, rate in enumerate(rates):
             if self.stalled:
                 return count
@@ -74,7 +74,7 @@ class Stepper(Protocol):
         ...
 
     def state(self) -> dict[str, Any]:
-        """Return tensors and numbers, in lists and dictionaries, that determine all later steps."""
+        """Return the tensors and numbers that determine all later steps, in lists and dictionaries."""
         ...
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -125,7 +125,7 @@ class FusedStepper(Stepper):
         self._flow.restore(state)
 
 
-def adam(
+def step_by_adam(
     parameters: Tensor, slope: Tensor, first: Tensor, second: Tensor, betas: tuple[float, float], lengths: Tensor
 ) -> None:
     """Make one step of Adam in place, the one of `torch.optim.Adam`.
@@ -164,23 +164,23 @@ class TorchStepper(Stepper):
         data: Data | None = None,
         count: int | None = None,
     ) -> None:
-        def on_device(value):
+        def move(value):
             return value.to(device, torch.float32) if isinstance(value, Tensor) and value.dim() > 0 else value
 
         self._form, self._betas, self._count = form.to(device), betas, count
         self._data = None if data is None else data.to(device)
-        self._cost = [*map(on_device, coefficients)], form.grid, on_device(epsilon), on_device(orientation)
-        self._slope_of = energy_gradient if fused else energy_gradient_by_autograd
+        self._cost = [*map(move, coefficients)], form.grid, move(epsilon), move(orientation)
+        self._energy_gradient = energy_gradient if fused else energy_gradient_by_autograd
         self._free = None if frozen is None else ~torch.as_tensor(frozen, dtype=torch.bool, device=device)
         self._parameters = start.to(device).clone()
         self._value: Tensor | float = 0.0
         self._u = self._slope = self._parameters
         self._offset = torch.zeros((count, 1, 1, 1) if count else (), device=device)
         self._statistics: list[Statistics] | None = None
-        self._evaluate, self._adam = self._evaluate_plainly, adam
+        self._evaluate, self._adam = self._evaluate_plainly, step_by_adam
         if compiled:
             compile_ = _Compiler()
-            self._evaluate, self._adam = compile_(self._evaluate_plainly), compile_(adam)
+            self._evaluate, self._adam = compile_(self._evaluate_plainly), compile_(step_by_adam)
         self._start_optimiser()
 
     def _start_optimiser(self) -> None:
@@ -191,7 +191,7 @@ class TorchStepper(Stepper):
     def _evaluate_plainly(self, parameters: Tensor, offset: Tensor) -> tuple[Tensor | float, Tensor, Tensor]:
         """Return the energies, u, and the gradient with respect to the parameters."""
         u = self._form.field(parameters) + offset
-        value, slope = self._slope_of(u, *self._cost)
+        value, slope = self._energy_gradient(u, *self._cost)
         if self._data is not None:
             data_value, data_slope = self._data.slope(u, self._form.grid)
             value, slope = value + data_value, slope + data_slope
@@ -304,7 +304,7 @@ class LbfgsStepper(TorchStepper):
         if rate is None:
             return
         first = not self._optimiser.state
-        self._optimiser.param_groups[0]["lr"] = rate * self._first_length() if first else rate
+        self._optimiser.param_groups[0]["lr"] = rate * self._first_rate() if first else rate
         before = self._parameters.clone()
         self._optimiser.step(self._closure)
         self.stalled = torch.equal(before, self._parameters)
@@ -312,8 +312,8 @@ class LbfgsStepper(TorchStepper):
     def run(self, rates: Sequence[float]) -> int:
         return Stepper.run(self, rates)
 
-    def _first_length(self) -> float:
-        """Return a factor that replaces torch's first length, min(1, 1 / Σ|slope|), lost by float32 on large grids."""
+    def _first_rate(self) -> float:
+        """Return the rate that moves no parameter beyond `FIRST_MOVE`; torch scales it by min(1, 1 / Σ|slope|)."""
         size = self._slope.abs()
         return FIRST_MOVE / max(float(size.max()), 1e-30) * max(1.0, float(size.sum(dtype=torch.float64)))
 

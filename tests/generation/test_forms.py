@@ -41,7 +41,7 @@ def ball(grid: Grid, radius: float, epsilon: float) -> torch.Tensor:
 def test_pullback_is_the_adjoint(boundary, name):
     """⟨u(p) - u(0), g⟩ = ⟨p, pullback(g)⟩."""
     grid = Grid((6, 9, 7), ANISOTROPIC, boundary)
-    form, start = FORMS[name].at(rough(*grid.shape), grid, 0.012, gaussian_blur)
+    form, start = FORMS[name].start_at(rough(*grid.shape), grid, 0.012, gaussian_blur)
     parameters, slope = rough(*start.shape, seed=1), rough(*grid.shape, seed=2)
     moved = form.field(parameters) - form.field(torch.zeros_like(start))
     there, back = float((moved * slope).sum()), float((parameters * form.pullback(slope)).sum())
@@ -54,7 +54,7 @@ def test_pullback_is_the_adjoint(boundary, name):
 def test_a_form_starts_at_the_blurred_field(boundary, name):
     grid = Grid((6, 9, 7), ANISOTROPIC, boundary)
     field = rough(*grid.shape)
-    form, start = FORMS[name].at(field, grid, 0.012, gaussian_blur)
+    form, start = FORMS[name].start_at(field, grid, 0.012, gaussian_blur)
     torch.testing.assert_close(form.field(start), gaussian_blur(field, grid, 0.012), rtol=1e-10, atol=1e-12)
 
 
