@@ -166,8 +166,8 @@ class Match:
 
 def mirror_match(match: Match) -> Match:
     """Return a match's shape with inside and outside exchanged, in the gauge a20 = 1."""
-    six = match.coefficients.mirrored()
-    return replace(match, coefficients=six.scaled(1 / float(six.a20)), mass=-match.mass)
+    six = match.coefficients.mirror()
+    return replace(match, coefficients=six.scale(1 / float(six.a20)), mass=-match.mass)
 
 
 def nearest(

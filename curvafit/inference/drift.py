@@ -69,7 +69,7 @@ class ShortFlow:
 
     def residual(self, law: Coefficients) -> np.ndarray:
         """Return the low-passed displacement in voxels, weighted by interface: its squares sum to the mean square."""
-        scaled = law.scaled(self._budget / self._force(law))
+        scaled = law.scale(self._budget / self._force(law))
         flow = descend(
             self.start,
             scaled,

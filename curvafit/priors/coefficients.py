@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
@@ -16,8 +16,8 @@ from curvafit.core.checks import LONGEST, SHORTEST, check_float, quoted
 NAMES = ("a20", "a11", "a02", "a10", "a01", "a00")
 #: Powers of length in their units.
 POWERS = dict(zip(NAMES, (0, 0, 0, 1, 1, 2), strict=True))
-#: The most that a coefficient may be, lengths in units of ε; published ones stay below 15. Float32 holds the energy and
-#: its gradient of noise.
+#: The greatest coefficient, with lengths in units of ε, at which float32 holds the energy of noise and its gradient;
+#: published ones are below 15.
 STRONGEST = 1e6
 
 
@@ -28,15 +28,8 @@ class Coefficients:
     The values are numbers, or tensors that broadcast with the voxels (coefficients that vary in space or over a batch).
     Lengths are in the unit of the grid's spacing; the published values are in working units (spacing 0.01).
 
-    Warns
-    -----
-    UserWarning
-        If a20 ≤ 0 or a02 ≤ 0, where the quadratic part of F_ε is not bounded below.
-
-    Raises
-    ------
-    ValueError
-        If a coefficient is not finite.
+    Warns where a20 ≤ 0 or a02 ≤ 0, for which F_ε is not bounded below; raises ValueError where a coefficient is not
+    finite.
     """
 
     a20: float | Tensor
@@ -65,7 +58,7 @@ class Coefficients:
         return (getattr(self, name) for name in NAMES)
 
     def tensor(self, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None) -> Tensor:
-        """Return the six values stacked along a first axis, `(6,)` or `(6, *shape)`, with their gradients."""
+        """Return the six values stacked along a first axis, `(6,)` or `(6, *shape)`; differentiable."""
         parts = [torch.as_tensor(value, dtype=dtype, device=device) for value in self]
         return torch.stack(torch.broadcast_tensors(*parts))
 
@@ -74,27 +67,23 @@ class Coefficients:
         quadratic = self.a20 * kappa1**2 + self.a11 * kappa1 * kappa2 + self.a02 * kappa2**2
         return quadratic + self.a10 * kappa1 + self.a01 * kappa2 + self.a00
 
-    def scaled(self, factor: float) -> Coefficients:
-        """Return all six coefficients times a positive factor, which has the same minimisers."""
+    def scale(self, factor: float) -> Coefficients:
+        """Return all six coefficients times a positive factor; the energy keeps its minimisers."""
         return Coefficients(*(factor * value for value in self))
 
     def in_unit(self, unit: float) -> Coefficients:
-        """Return the coefficients of the same energy with lengths measured in multiples of `unit`, a length in the old
-        unit: the linear part is multiplied by `unit`, the constant one by its square.
+        """Return the coefficients of the same energy with lengths in multiples of `unit`, a length in the old unit.
+
+        The linear part is multiplied by `unit`, the constant one by its square.
 
         Working units become physical ones by `in_unit(0.01 / working voxel)`.
-
-        Raises
-        ------
-        ValueError
-            If the unit is not a positive number.
         """
         unit = check_float(unit, "a positive length unit", SHORTEST, LONGEST)
         a20, a11, a02, a10, a01, a00 = self
         return Coefficients(a20, a11, a02, a10 * unit, a01 * unit, a00 * unit**2)
 
-    def mirrored(self) -> Coefficients:
-        """Return a' with F_ε[-u; a] = F_ε[u; a']: inside and outside change places, (κ1, κ2) becomes (-κ2, -κ1)."""
+    def mirror(self) -> Coefficients:
+        """Exchange inside and outside: return a' with F_ε[-u; a] = F_ε[u; a'], where (κ1, κ2) becomes (-κ2, -κ1)."""
         a20, a11, a02, a10, a01, a00 = self
         return Coefficients(a02, a11, a20, -a01, -a10, a00)
 
@@ -120,20 +109,15 @@ class Coefficients:
         """Return Willmore's H² (paper, eq. 5)."""
         return cls(1, 2, 1)
 
-    @classmethod
-    def from_dict(cls, values: Mapping[str, float]) -> Coefficients:
-        """Return the coefficients of a dictionary that `as_dict` made."""
-        return cls(*(float(values[name]) for name in NAMES))
-
     def as_dict(self) -> dict[str, float]:
-        """Return a dictionary from names to numbers, for coefficients that do not vary."""
+        """Return numbers by name, of coefficients that do not vary in space."""
         return {name: float(value) for name, value in dataclasses.asdict(self).items()}
 
 
 def check_strengths(
     coefficients: Iterable[float | Tensor], epsilon: float | Tensor, orientation: Tensor | None = None
 ) -> None:
-    """Raise ValueError where a coefficient, or the orientation, is over `STRONGEST` with lengths in units of ε."""
+    """Raise ValueError where a coefficient, or the orientation, exceeds `STRONGEST` with lengths in units of ε."""
     parts = [(name, value, POWERS[name]) for name, value in zip(NAMES, coefficients, strict=True)]
     if orientation is not None:
         parts.append(("the orientation", orientation, POWERS["a00"]))

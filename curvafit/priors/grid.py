@@ -47,10 +47,7 @@ class Grid:
         `"periodic"`: the box repeats. `"replicate"`: the field continues as a mirror image beyond each face
         (for stencils that reach one voxel this is edge replication, i.e. ∇u·n = 0).
 
-    Raises
-    ------
-    ValueError
-        If the shape or the spacing is not three numbers in range, or the boundary has another name.
+    Raises ValueError where the shape or the spacing is not three numbers in range, or the boundary has another name.
     """
 
     shape: tuple[int, int, int]

@@ -1,4 +1,4 @@
-"""A law of shapes: six coefficients and a mass, their units, what they are meant for, and all the ways to state it."""
+"""A law of shapes, six coefficients and a mass with their units; and all the ways to state one."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from typing import Any, Protocol, runtime_checkable
 
 from torch import Tensor
 
-from curvafit.core.checks import simplify_name
-from curvafit.core.records import parse_json, quoted
+from curvafit.core.checks import check_choice, check_float, check_open_interval, quoted, simplify_name
+from curvafit.core.records import parse_json
 from curvafit.core.units import METRES
 from curvafit.priors.coefficients import NAMES, Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
@@ -24,7 +24,7 @@ FORMAT = "curvafit-fit-2"
 
 @dataclass(frozen=True)
 class Law:
-    """What shapes of one texture are grown by: coefficients and mass, in which units, and for which ε and schedule.
+    """A law that shapes of one texture are grown by: coefficients and mass, their units, and their ε and schedule.
 
     Attributes
     ----------
@@ -39,9 +39,9 @@ class Law:
     epsilon
         The ε that the coefficients are meant for, in their own unit.
     schedule
-        The name, in `generation.SCHEDULES`, of the steps by which shapes of this law were made; None where unknown.
+        The name in `generation.SCHEDULES` by which shapes of this law were made; None where unknown.
     working_voxel, length_unit
-        A fit's edge of a working voxel, and the unit that it is in: they make lengths of the law physical. Else None.
+        Of a fit: the edge of a working voxel and its unit, which make the law's lengths physical. Else None.
     volume_fraction
         Share of a fit's scan inside the structure; None where it is unknown.
     source
@@ -68,10 +68,7 @@ class Law:
         law
             A `Law`, `Coefficients`, the name of a preset, the path of a `fit.json`, or a fit or an inference.
 
-        Raises
-        ------
-        FileNotFoundError, ValueError
-            If there is no preset of that name and no such file, the file holds no law, or the value states none.
+        Raises FileNotFoundError or ValueError where the value, or the file, states no law.
         """
         if isinstance(law, Law):
             return law
@@ -91,10 +88,7 @@ class Law:
     def load(cls, path: str | PathLike[str]) -> Law:
         """Read the law in a `fit.json`, whatever else the file holds.
 
-        Raises
-        ------
-        FileNotFoundError, ValueError
-            If there is no such file, it is no `fit.json` of this format, or it has no law.
+        Raises FileNotFoundError where there is no file; ValueError where it is of another format or has no law.
         """
         if not Path(path).is_file():
             raise FileNotFoundError(f"expected a fit.json, found no file {path}")
@@ -108,7 +102,7 @@ class Law:
         try:
             return _read(content, f"prior {os.fspath(path)}")
         except ValueError as error:
-            raise ValueError(f"expected {expected}, but {error} in {path}") from None
+            raise ValueError(f"{path} is not {expected}: {error}") from None
 
     @property
     def fitted(self) -> bool:
@@ -127,36 +121,21 @@ class Law:
 
     @property
     def point(self) -> tuple[float, ...]:
-        """The six coefficients and the mass, as seven numbers.
-
-        Raises
-        ------
-        ValueError
-            If the law has no mass, or its coefficients vary in space.
-        """
+        """The six coefficients and the mass, as seven numbers; ValueError where they vary in space or lack a mass."""
         if self.mass is None:
             raise ValueError(f"expected a preset or a fit, which have a mass, got {self.origin}")
-        return (*map(float, self._numbers()), float(self.mass))  # type: ignore[arg-type]
+        return (*map(float, self._require_numbers()), float(self.mass))  # type: ignore[arg-type]
 
     def in_unit(self, unit: str | None, edge: float | None = None) -> Coefficients:
         """Return the coefficients with lengths in the unit of a scan or a training patch.
 
-        A fit is converted to `unit`, or stays in its own where `unit` is None. A preset's working voxel is taken to be
-        `edge` long. Coefficients that are not in working units stay as they are.
+        A fit is converted to `unit` (nm, um, mm or m), or stays in its own where `unit` is None. A preset's working
+        voxel gets the length `edge`, the smallest edge of a voxel in `unit`. Coefficients that are not in working units
+        stay as they are.
 
-        Parameters
-        ----------
-        unit
-            nm, um, mm or m.
-        edge
-            The smallest edge of a voxel, in `unit`; needed for presets alone.
-
-        Raises
-        ------
-        ValueError
-            If the coefficients vary in space, or the two units cannot be compared.
+        Raises ValueError where the coefficients vary in space, or the two units cannot be compared.
         """
-        numbers = self._numbers()
+        numbers = self._require_numbers()
         if not self.fitted:
             return numbers.in_unit(WORKING_SPACING / edge) if self.working and edge is not None else numbers
         if unit is None or unit == self.length_unit:
@@ -169,12 +148,12 @@ class Law:
 
     @property
     def _length(self) -> float:
-        """λ: a working length of 1 in `length_unit`; raise ValueError where the law is no fit."""
+        """λ: a working length of 1 in `length_unit`; ValueError where the law is no fit."""
         if self.working_voxel is None:
             raise ValueError(f"expected a fit, whose lengths are physical, got {self.origin}")
         return self.working_voxel / WORKING_SPACING
 
-    def _numbers(self) -> Coefficients:
+    def _require_numbers(self) -> Coefficients:
         """Return the coefficients; raise ValueError where they vary in space."""
         if any(isinstance(value, Tensor) and value.dim() > 0 for value in self.coefficients):
             raise ValueError("expected coefficients that are numbers, got coefficients that vary in space")
@@ -197,13 +176,7 @@ LAW_TYPES = (Law, Coefficients, str, PathLike, HasLaw)
 
 
 def read_laws(laws: LawLike | Iterable[LawLike]) -> tuple[Law, ...]:
-    """Return one law or several, however they are stated.
-
-    Raises
-    ------
-    FileNotFoundError, ValueError
-        As `Law.of` does.
-    """
+    """Return one law or several, each stated as in `Law.of`, as a tuple."""
     single = isinstance(laws, LAW_TYPES) or not isinstance(laws, Iterable)
     return (Law.of(laws),) if single else tuple(map(Law.of, laws))  # type: ignore[arg-type]
 
@@ -216,17 +189,19 @@ def _read(content: Mapping[str, Any], origin: str) -> Law:
         raise ValueError(f"it has no law: {status}")
     six = _six(content, "coefficients")
     _six(content, "coefficients_physical")
-    mass = _number(content, "mass", -1, 1)
-    epsilon, voxel = (_number(content, name, 0) for name in ("epsilon_physical", "working_voxel"))
+    mass = check_open_interval(content.get("mass"), "mass as a number between -1 and 1", -1, 1)
+    epsilon, voxel = (
+        check_open_interval(content.get(name), f"{name} as a number above 0", 0, math.inf)
+        for name in ("epsilon_physical", "working_voxel")
+    )
     unit = content.get("length_unit")
-    if unit not in ("voxel", *METRES):
-        raise ValueError(f"length_unit must be one of voxel, {', '.join(METRES)}, got {quoted(unit)}")
+    check_choice(unit, ("voxel", *METRES), f"length_unit as one of voxel, {', '.join(METRES)}")
     morphometry = content.get("morphometry") or {}
     if not isinstance(morphometry, Mapping):
         raise ValueError(f"morphometry must be an object, got {quoted(morphometry)}")
     share = morphometry.get("volume_fraction")
-    if share is not None and not 0 <= (share := _number(morphometry, "morphometry.volume_fraction")) <= 1:
-        raise ValueError(f"morphometry.volume_fraction must be a number from 0 to 1, got {share:g}")
+    if share is not None:
+        share = check_float(share, "morphometry.volume_fraction as a number from 0 to 1", 0, 1)
     width = epsilon * WORKING_SPACING / voxel
     own = {"working_voxel": voxel, "length_unit": unit, "volume_fraction": share}
     return Law(six, mass, origin, epsilon=width, schedule="deep", **own)
@@ -237,16 +212,7 @@ def _six(content: Mapping[str, Any], name: str) -> Coefficients:
     values = content.get(name)
     if not isinstance(values, Mapping):
         raise ValueError(f"{name} must be an object of six coefficients, got {quoted(values)}")
-    return Coefficients(*(_number(values, f"{name}.{key}") for key in NAMES))
-
-
-def _number(content: Mapping[str, Any], name: str, low: float = -math.inf, high: float = math.inf) -> float:
-    """Return the number of that name, which lies between two bounds."""
-    value = content.get(name.rpartition(".")[2])
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low < value < high:
-        bounds = "" if math.isinf(low) else f" above {low:g}" if math.isinf(high) else f" between {low:g} and {high:g}"
-        raise ValueError(f"{name} must be a number{bounds}, got {quoted(value)}")
-    return float(value)
+    return Coefficients(*(check_float(values.get(key), f"{name}.{key} as a number") for key in NAMES))
 
 
 _GALLERY = "curvatubes results/gallery"
@@ -286,12 +252,8 @@ PRESETS: dict[str, Law] = {
 def preset(name: str) -> Law:
     """Return the law of a published shape.
 
-    Capitals do not matter, and spaces, underscores and hyphens are alike: `Bilinear_Tubes` is `bilinear-tubes`.
-
-    Raises
-    ------
-    ValueError
-        If the name is not one of `PRESETS`.
+    Capitals do not matter, and spaces, underscores and hyphens are alike: `Bilinear_Tubes` is `bilinear-tubes`. Raises
+    ValueError where the name is not in `PRESETS`.
     """
     key = preset_name(name)
     if key is None:
@@ -300,6 +262,6 @@ def preset(name: str) -> Law:
 
 
 def preset_name(name: object) -> str | None:
-    """Return the name in `PRESETS` that a text spells (see `preset`), None where there is no such name."""
+    """Return the name in `PRESETS` that a text means (see `preset`), or None."""
     key = simplify_name(name) if isinstance(name, str) else None
     return key if key in PRESETS else None

@@ -15,7 +15,7 @@ SIGMA = 4 / (3 * math.sqrt(2))
 
 #: Deviation, in voxels, of the Gaussian that smooths a mask's stairs.
 STAIRS = 2.0
-#: Number, strength and width (in voxels) of the corrections of voxels that the smoothing moved across the surface.
+#: Number, strength and width (voxels) of the corrections where the smoothing changed the sign.
 SWEEPS, PULL, PULL_WIDTH = 8, 8.0, 1.5
 
 
@@ -46,18 +46,14 @@ def signed_distance(
     """Return the signed distance of every voxel's centre to the faces of `mask`, positive inside, in spacing's unit.
 
     The distance is exact for the set of voxels (faces, edges and corners) on anisotropic and periodic grids. It is cut
-    at `limit`, with which the cost grows; where `limit` is None the whole box is searched.
-
-    Raises
-    ------
-    ValueError
-        If the mask is empty or full, and so has no surface.
+    at `limit`, with which the cost grows; where `limit` is None the whole box is searched. Raises ValueError where the
+    mask is empty or full.
     """
     inside = mask.bool()
     if not inside.flatten(-3).any(-1).all() or inside.flatten(-3).all(-1).any():
         raise ValueError("expected a mask with voxels inside and outside, got an empty or a full one")
     reach = math.inf if limit is None else float(limit)
-    return _distance_to(~inside, grid, reach) - _distance_to(inside, grid, reach)
+    return _measure_distance(~inside, grid, reach) - _measure_distance(inside, grid, reach)
 
 
 def phase_field(mask: Bool[Tensor, "*batch z y x"], grid: Grid, epsilon: float) -> Float[Tensor, "*batch z y x"]:
@@ -67,28 +63,17 @@ def phase_field(mask: Bool[Tensor, "*batch z y x"], grid: Grid, epsilon: float) 
     second moments of 2G - G∗G vanish, so that planes stay exact and a sphere or cylinder of radius R moves by O(σ⁴/R³),
     not by σ²/R. Smooth corrections then restore voxels whose sign changed, at thin places. Only the zero level is
     accurate: across tilted faces, whose voxels overhang, distances are up to a fifth short, about as much as the
-    profiles of generated shapes are wider than tanh.
-
-    Raises
-    ------
-    ValueError
-        If the mask is empty or full.
+    profiles of generated shapes are wider than tanh. Raises ValueError where the mask is empty or full.
     """
     reach = 6 * epsilon + math.ceil(4 * STAIRS) * max(grid.spacing)
-    distance = _without_stairs(signed_distance(mask, grid, limit=reach), grid)
-    return optimal_profile(_with_signs(distance, mask.bool(), grid), epsilon)
-
-
-def _without_stairs(distance: Tensor, grid: Grid) -> Tensor:
-    """Return the distance blurred by 2G - G∗G."""
     voxels = Grid(grid.shape, (1.0, 1.0, 1.0), grid.boundary)
-    once = gaussian_blur(distance, voxels, STAIRS)
-    return 2 * once - gaussian_blur(once, voxels, STAIRS)
+    once = gaussian_blur(signed_distance(mask, grid, limit=reach), voxels, STAIRS)
+    distance = 2 * once - gaussian_blur(once, voxels, STAIRS)
+    return optimal_profile(_restore_signs(distance, mask.bool(), voxels), epsilon)
 
 
-def _with_signs(distance: Tensor, mask: Tensor, grid: Grid) -> Tensor:
+def _restore_signs(distance: Tensor, mask: Tensor, voxels: Grid) -> Tensor:
     """Add Gaussians where the sign differs from the mask's; a sweep lowers a single voxel's error by a seventh."""
-    voxels = Grid(grid.shape, (1.0, 1.0, 1.0), grid.boundary)
     for _ in range(SWEEPS):
         error = torch.where(mask, distance.clamp_max(0), distance.clamp_min(0))
         if not bool(error.any()):
@@ -97,7 +82,7 @@ def _with_signs(distance: Tensor, mask: Tensor, grid: Grid) -> Tensor:
     return distance
 
 
-def _distance_to(target: Tensor, grid: Grid, reach: float) -> Tensor:
+def _measure_distance(target: Tensor, grid: Grid, reach: float) -> Tensor:
     """Return the distance to the voxels of `target`, by a min-plus transform with (|k| - ½)₊ Δx along each axis."""
     dtype = torch.float64 if torch.get_default_dtype() == torch.float64 else torch.float32
     squared = torch.where(target, 0.0, math.inf).to(dtype)

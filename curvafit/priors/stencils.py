@@ -17,7 +17,7 @@ from torch import Tensor
 
 from curvafit.priors.grid import Float, Grid
 
-#: The most voxels that a blur's standard deviation spans: eighty thousand weights.
+#: The greatest standard deviation of a blur, in voxels: it has eighty thousand weights.
 WIDEST = 10_000
 #: Axis pairs of the six Hessian components, in storage order.
 HESSIAN_AXES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
@@ -78,11 +78,6 @@ def gaussian_blur(u: Float[Tensor, "*batch z y x"], grid: Grid, width: float) ->
     """Return k ∗ u, k a separable Gaussian of standard deviation `width` (in spacing's unit), cut at four deviations.
 
     The continuation beyond the box is a reflection group's, so the blur is its own adjoint under both boundaries.
-
-    Raises
-    ------
-    ValueError
-        If the field's shape is not the grid's, or as `check_blur` does.
     """
     _check_shape(u, grid)
     check_blur(grid, width)
@@ -99,25 +94,13 @@ def gaussian_blur(u: Float[Tensor, "*batch z y x"], grid: Grid, width: float) ->
 
 
 def check_blur(grid: Grid, width: float) -> None:
-    """Refuse a blur that is wider than the box, which would leave only the field's mean.
-
-    Raises
-    ------
-    ValueError
-        If the standard deviation is not from 0 to the box's longest side.
-    """
+    """Raise ValueError where a blur is wider than the box's longest side, and so leaves only the field's mean."""
     if not 0 <= width <= grid.longest:
         raise ValueError(f"expected a blur from 0 to the box's longest side, {grid.longest:g}, got {width:g}")
 
 
 def gaussian_taps(deviation: float) -> tuple[float, ...]:
-    """Return the 2⌈4σ⌉ + 1 weights of the one-dimensional blur, whose sum is one; the deviation σ is in voxels.
-
-    Raises
-    ------
-    ValueError
-        If the deviation is not above 0 or spans more than `WIDEST` voxels.
-    """
+    """Return the 2⌈4σ⌉ + 1 weights of the one-dimensional blur, whose sum is one; the deviation σ is in voxels."""
     if not 0 < deviation <= WIDEST:
         raise ValueError(f"expected a blur width above 0 and of at most {WIDEST} voxels, got {deviation:g}")
     radius = math.ceil(4 * deviation)

@@ -108,7 +108,7 @@ def bending(law: Coefficients) -> float:
 
 def normalise_bending(law: Coefficients) -> Coefficients:
     """Scale a law to a20 + a02 = `BENDING`; raise ScanError as `bending`."""
-    return law.scaled(BENDING / bending(law))
+    return law.scale(BENDING / bending(law))
 
 
 # ---- laws ------------------------------------------------------------------------------------------------------------

@@ -171,9 +171,9 @@ def test_parameters_are_those_of_the_law_in_its_gauge() -> None:
     assert law.a20 != 1
     parameters = parameters_of(law, mass)
     assert len(parameters) == len(PARAMETERS)
-    assert parameters_of(law.scaled(3.0), mass) == pytest.approx(parameters)
+    assert parameters_of(law.scale(3.0), mass) == pytest.approx(parameters)
     back, m = law_of(parameters)
-    assert list(back) == pytest.approx(list(law.scaled(1 / law.a20)))
+    assert list(back) == pytest.approx(list(law.scale(1 / law.a20)))
     assert m == mass
     for a20, a02 in ((0.0, 1.0), (1.0, 0.0), (1.0, -2.0)):
         with pytest.warns(UserWarning, match="keep the energy bounded below"):

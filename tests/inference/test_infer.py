@@ -159,8 +159,8 @@ def test_inside_for_outside_is_the_mirrored_law(tubes: np.ndarray, straight: Fit
         other.draws.parameters, mirror_parameters(straight.draws.parameters), rtol=1e-5, atol=1e-5
     )
     own, law = straight.to_law(), other.to_law()
-    six = own.coefficients.mirrored()
-    assert tuple(law.coefficients) == pytest.approx(tuple(six.scaled(1 / float(six.a20))), rel=1e-6)
+    six = own.coefficients.mirror()
+    assert tuple(law.coefficients) == pytest.approx(tuple(six.scale(1 / float(six.a20))), rel=1e-6)
     assert law.mass == pytest.approx(-own.mass)
     assert any("--dark" in note for note in other.notes) and not any("--dark" in note for note in straight.notes)
     mine, theirs = straight.matches[0], other.matches[0]

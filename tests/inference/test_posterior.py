@@ -228,5 +228,5 @@ def test_mirrored_parameters_are_those_of_the_mirrored_law() -> None:
     assert mirror_parameters(mirror_parameters(rows)) == pytest.approx(rows)
     for row in rows:
         six, mass = law_of(row)
-        other = six.mirrored()
-        assert mirror_parameters(row) == pytest.approx(parameters_of(other.scaled(1 / float(other.a20)), -mass))
+        other = six.mirror()
+        assert mirror_parameters(row) == pytest.approx(parameters_of(other.scale(1 / float(other.a20)), -mass))

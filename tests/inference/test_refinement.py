@@ -51,7 +51,7 @@ def test_the_right_parameters_leave_a_mask_where_it_is(mask_phase: torch.Tensor)
 
 def test_only_the_direction_of_a_counts(mask_phase: torch.Tensor) -> None:
     shape = preset("tubes").coefficients
-    weak, strong = (ShortFlow(mask_phase, GRID, WORKING_EPSILON, shape.scaled(c)) for c in (0.5, 2))
+    weak, strong = (ShortFlow(mask_phase, GRID, WORKING_EPSILON, shape.scale(c)) for c in (0.5, 2))
     np.testing.assert_allclose(weak.residual(shape), strong.residual(shape), atol=1e-6)
 
 

@@ -107,8 +107,8 @@ def test_a_shift_changes_nothing(sponge: torch.Tensor, found) -> None:
 @pytest.mark.slow
 def test_the_mirror_image_has_mirrored_coefficients(sponge: torch.Tensor, found) -> None:
     """F_ε[-u; a] = F_ε[u; a'], so -u gives a', in the gauge a20 = 1."""
-    mirrored = found.coefficients.mirrored()
-    expected = mirrored.scaled(1 / mirrored.a20)
+    mirrored = found.coefficients.mirror()
+    expected = mirrored.scale(1 / mirrored.a20)
     other = stationarity(-sponge, GRID, WORKING_EPSILON)
     assert list(other.coefficients)[1:5] == pytest.approx(list(expected)[1:5], rel=0.02)
 

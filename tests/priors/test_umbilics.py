@@ -17,7 +17,7 @@ from curvafit.priors.profile import optimal_profile
 
 #: Of which a20 ≠ a02 and a10 ≠ a01, so that the root counts by itself and times the trace.
 LAW, EPSILON = Coefficients(1.3, -0.7, 4.0, -60.0, 35.0, 500.0), 0.02
-CONCAVE = LAW.mirrored()
+CONCAVE = LAW.mirror()
 BOUNDARIES = ("periodic", "replicate")
 
 

@@ -191,7 +191,7 @@ def test_a_halo_is_cut_off_again() -> None:
 
 
 def test_a_law_s_scale_does_not_matter_to_the_engine() -> None:
-    one, other = normalise_bending(WILLMORE), normalise_bending(WILLMORE.scaled(7.5))
+    one, other = normalise_bending(WILLMORE), normalise_bending(WILLMORE.scale(7.5))
     assert other.as_dict() == pytest.approx(one.as_dict()) and one.a20 + one.a02 == pytest.approx(2)
 
 

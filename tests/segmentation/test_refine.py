@@ -153,7 +153,7 @@ def test_law_and_weight_together_or_evidence_and_weight_together_change_nothing(
     p = network(tubes(), 0).clip(0.02, 0.98)
     odds = (p / (1 - p)) ** 2
     one = refine(p, WILLMORE, weight=6.0, steps=100)
-    for sure, law, weight in ((p, WILLMORE.scaled(3), 2.0), (odds / (1 + odds), WILLMORE, 12.0)):
+    for sure, law, weight in ((p, WILLMORE.scale(3), 2.0), (odds / (1 + odds), WILLMORE, 12.0)):
         other = refine(sure, law, weight=weight, steps=100)
         assert other.weight == pytest.approx(weight) and (one.mask.values != other.mask.values).mean() < 1e-3
 

@@ -193,7 +193,7 @@ def test_a_prior_without_stiffness_is_refused() -> None:
 def test_a_prior_s_scale_does_not_matter_but_its_weight_does() -> None:
     """But for voxels at the surface: the two flows round otherwise."""
     scan = noisy(tubes(), 60)
-    one, thrice = (segment(scan, WILLMORE.scaled(by), weight=1 / by, steps=100) for by in (1, 3))
+    one, thrice = (segment(scan, WILLMORE.scale(by), weight=1 / by, steps=100) for by in (1, 3))
     assert (one.mask.values != thrice.mask.values).mean() < 1e-3
     weak, strong = (segment(scan, WILLMORE, weight=weight, steps=100).mask.values for weight in (0.01, 30))
     bright = scan.values > 80

@@ -99,7 +99,7 @@ def test_strengths_are_tried_as_long_as_they_are_better() -> None:
         wrong = 1 if setting.law is None else 1 - 0.1 * [*NATS].index(setting.strength)
         return truth & (np.random.default_rng(0).random(truth.shape) > 0.3 * wrong)
 
-    other = WILLMORE.scaled(2)
+    other = WILLMORE.scale(2)
     settings = [Trial(PLAIN, law, FIRST, 1) for law in (WILLMORE, other)]
     best = choose_by_masks(Task(None, truth, range(len(truth))), lambda _: settings, fill, (PLAIN,), NATS)
     assert (best.way, best.law, best.strength) == (PLAIN, WILLMORE, NATS[-1]) and len(tried) == len(set(tried))
