@@ -3,46 +3,36 @@
 if __name__ != "curvafit.priors":
     raise ImportError("import curvafit.priors, not priors: the folder at the project's root is a link into the package")
 
-from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.curvature import diffuse_curvatures, geometric_curvatures, jet
-from curvafit.priors.energy import (
-    cahn_hilliard_area,
-    discrepancy_ratio,
-    energy,
-    energy_gradient,
-    energy_terms,
-    orientation,
-)
-from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
-from curvafit.priors.law import PRESETS, Law, LawLike, preset, read_laws
-from curvafit.priors.loss import CombinedLoss, CurvaturePrior, curvature_prior
-from curvafit.priors.profile import SIGMA, optimal_profile, phase_field, profile_distance, signed_distance
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "PRESETS",
-    "SIGMA",
-    "WORKING_EPSILON",
-    "WORKING_SPACING",
-    "Coefficients",
-    "CombinedLoss",
-    "CurvaturePrior",
-    "Grid",
-    "Law",
-    "LawLike",
-    "cahn_hilliard_area",
-    "curvature_prior",
-    "diffuse_curvatures",
-    "discrepancy_ratio",
-    "energy",
-    "energy_gradient",
-    "energy_terms",
-    "geometric_curvatures",
-    "jet",
-    "optimal_profile",
-    "orientation",
-    "phase_field",
-    "preset",
-    "profile_distance",
-    "read_laws",
-    "signed_distance",
-]
+from curvafit.core.faces import attach_lazy_names
+
+if TYPE_CHECKING:
+    from curvafit.priors.coefficients import Coefficients as Coefficients
+    from curvafit.priors.curvature import diffuse_curvatures as diffuse_curvatures
+    from curvafit.priors.curvature import geometric_curvatures as geometric_curvatures
+    from curvafit.priors.curvature import jet as jet
+    from curvafit.priors.energy import cahn_hilliard_area as cahn_hilliard_area
+    from curvafit.priors.energy import discrepancy_ratio as discrepancy_ratio
+    from curvafit.priors.energy import energy as energy
+    from curvafit.priors.energy import energy_gradient as energy_gradient
+    from curvafit.priors.energy import energy_terms as energy_terms
+    from curvafit.priors.energy import orientation as orientation
+    from curvafit.priors.grid import WORKING_EPSILON as WORKING_EPSILON
+    from curvafit.priors.grid import WORKING_SPACING as WORKING_SPACING
+    from curvafit.priors.grid import Grid as Grid
+    from curvafit.priors.law import PRESETS as PRESETS
+    from curvafit.priors.law import Law as Law
+    from curvafit.priors.law import LawLike as LawLike
+    from curvafit.priors.law import preset as preset
+    from curvafit.priors.law import read_laws as read_laws
+    from curvafit.priors.loss import CombinedLoss as CombinedLoss
+    from curvafit.priors.loss import CurvaturePrior as CurvaturePrior
+    from curvafit.priors.loss import curvature_prior as curvature_prior
+    from curvafit.priors.profile import SIGMA as SIGMA
+    from curvafit.priors.profile import optimal_profile as optimal_profile
+    from curvafit.priors.profile import phase_field as phase_field
+    from curvafit.priors.profile import profile_distance as profile_distance
+    from curvafit.priors.profile import signed_distance as signed_distance
+
+attach_lazy_names(__name__)

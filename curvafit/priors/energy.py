@@ -1,5 +1,5 @@
-"""F_ε, its gradient, and its relatives. `energy` is the definition in plain torch, which the fused kernels are tested
-against; `energy_gradient` takes a kernel where there is one.
+"""F_ε, its gradient, and related energies. `energy` is the definition in plain torch, against which the fused kernels
+are tested; `energy_gradient` takes a kernel where there is one.
 
 Every energy is a sum over voxels times the voxel's volume. Fields are `(..., Z, Y, X)`; results drop the space axes.
 """
@@ -42,7 +42,7 @@ def energy(
     orientation
         Q of a further term ε ∫ ∇uᵀQ∇u, symmetric, axes z, y, x; see `orientation`.
     mask
-        Weights of the energy's density, which broadcast with `u`.
+        Weights of the density, which broadcast with `u`.
     """
     field, ε = jet(u, grid), _match_field(epsilon, u)
     terms = energy_terms(field, ε).unbind(-4)
@@ -65,8 +65,8 @@ def energy_gradient(
 ) -> tuple[Tensor, Tensor]:
     """Return F_ε(u) of a field `(Z, Y, X)` (paper, eq. 20) and its gradient ∂F_ε/∂u, a number for every voxel.
 
-    Float32 on a processor takes the fused kernel, where numba is; all else takes `energy` by autograd. The parameters
-    are those of `energy`; the voxel's volume is a factor of the gradient.
+    Float32 on a processor takes the fused kernel, where numba is installed; all else takes autograd. The parameters are
+    those of `energy`; the voxel's volume is a factor of the gradient.
     """
     if u.dtype != torch.float32 or not kernels.has_kernel(u.device):
         return energy_gradient_by_autograd(u, coefficients, grid, epsilon, orientation, mask)
@@ -88,7 +88,7 @@ def energy_gradient_by_autograd(u: Tensor, *cost: Any) -> tuple[Tensor, Tensor]:
         values = energy(u, *cost)
         return values.sum(), values
 
-    if torch.compiler.is_compiling():  # the one form that compilers read; uncompiled, it would take more memory
+    if torch.compiler.is_compiling():  # compilers read this form alone, which takes more memory uncompiled
         gradients, values = torch.func.grad(total, has_aux=True)(u)
         return values, gradients
     free = u.detach().requires_grad_()
@@ -101,22 +101,13 @@ def energy_gradient_by_autograd(u: Tensor, *cost: Any) -> tuple[Tensor, Tensor]:
 def orientation(direction: Sequence[int | float] | Tensor, strength: int | float) -> Float[Tensor, "3 3"]:
     """Return Q = μ θθᵀ, which turns normals away from θ: tubes run along θ and layers contain it (paper, "Extensions").
 
-    Parameters
-    ----------
-    direction
-        θ along (z, y, x), of any length above 0.
-    strength
-        μ; where it is negative, normals turn towards θ.
-
-    Returns
-    -------
-    Tensor
-        Symmetric `(3, 3)`, float64. A sum of orientations is an orientation too.
+    The direction θ (z, y, x) has any length above 0; where the strength μ is negative, normals turn towards θ. Q is
+    symmetric `(3, 3)`, float64; a sum of orientations is an orientation too.
     """
     expected = "a direction of 3 finite numbers (z, y, x), not all 0"
     parts = [check_float(part, expected, of=direction) for part in as_tuple(direction, "3 numbers")]
     θ = torch.tensor(parts, dtype=torch.float64)
-    if tuple(θ.shape) != (3,) or not bool(torch.isfinite(θ).all()) or not bool(θ.any()):
+    if tuple(θ.shape) != (3,) or not bool(θ.any()):
         raise ValueError(f"expected {expected}, got {quoted(direction)}")
     strength = check_float(strength, "a finite strength")
     θ = θ * 2.0 ** -math.frexp(float(θ.abs().max()))[1]  # exact, and its square is finite
@@ -133,10 +124,10 @@ def orientation_form(slope: Float[Tensor, "*batch 3 z y x"], orientation: Float[
 
 
 def energy_terms(field: Jet, epsilon: float | Tensor) -> Float[Tensor, "*batch 6 z y x"]:
-    """Return the densities of the six terms of F_ε, those that a20, a11, a02, a10, a01 and a00 multiply.
+    """Return the densities that a20, a11, a02, a10, a01 and a00 multiply in F_ε (paper, eq. 20).
 
-    They are eq. 20 of the paper, sorted by coefficient: with R = √(2|M|² - (Tr M)²)⁺, that of κ1² is (|M|² + R Tr M)/2ε
-    and that of κ2² (|M|² - R Tr M)/2ε, since κ1, κ2 = (Tr M ± R)/2ε|∇u| (eqs. 17 and 18).
+    With R = √(2|M|² - (Tr M)²)⁺, the density of κ1² is (|M|² + R Tr M)/2ε and that of κ2² (|M|² - R Tr M)/2ε, since
+    κ1, κ2 = (Tr M ± R)/2ε|∇u| (eqs. 17 and 18).
     """
     ε = epsilon
     trace, norm2, root, slope = second_form(field, ε)

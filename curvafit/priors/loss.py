@@ -18,13 +18,11 @@ from curvafit.priors.kernels.differentiable import energies
 from curvafit.priors.law import Law, LawLike, read_laws
 from curvafit.priors.stencils import refine_axis
 
-#: Voxels that ε spans: an axis with fewer, by more than a tenth, is interpolated.
-RESOLVED = 2
-#: The most that an axis is refined, as a factor.
-MOST = 16
-#: The most voxels of the smallest edge that ε spans: no window has more.
+#: Voxels that ε spans; an axis on which it spans fewer, by more than a tenth, is refined, at most `FINEST`-fold.
+RESOLVED, FINEST = 2, 16
+#: The greatest ε in voxels of the smallest edge; no window is longer.
 COARSEST = 10_000
-#: The most that a weight or a mask's value may be: float32 holds its products.
+#: The greatest weight, or value of a mask, whose products float32 holds.
 HEAVIEST = 1e9
 _Values = TypeVar("_Values", bound=Tensor | None)
 
@@ -45,16 +43,15 @@ class CurvaturePrior(nn.Module):
         `Coefficients` with lengths in spacing's unit; a `Law`, or a preset's name, in working units, where the smallest
         voxel edge is 0.01; the path of a `fit.json`, or a fit. Or a sequence of laws, one for each class.
     sigmoid, softmax
-        Whether the input is logits, to which this function is applied first. Without either the input is
-        probabilities; a warning says where it has other values.
+        Whether the input is logits, to which this function is applied first. Else it is probabilities, and a warning
+        says where it has other values.
     include_background
         Whether channel 0 counts.
     to_onehot_y
         Whether the target is class numbers `(B, 1, D, H, W)`.
     reduction
-        `"mean"` over batch and classes; `"sum"` of the energies F_ε, which are not normalised then, so that windows
-        that overlap by 2·border voxels add up to the interior of the whole (border 2 where an axis is interpolated);
-        `"none"`.
+        `"mean"` over batch and classes; `"none"`; or `"sum"` of the energies F_ε, not normalised, so that windows that
+        overlap by 2·border voxels add up to the interior of the whole (border 2 where an axis is interpolated).
     ignore_index
         Voxels where the target has this value do not count.
     spacing
@@ -74,11 +71,6 @@ class CurvaturePrior(nn.Module):
         Voxels (D, H, W) of a whole patch. An input of another shape is then the same patch on a coarser grid, as in
         deep supervision, with a larger spacing. The loss is zero on a level that has no interior or would need a
         refinement of more than 16-fold.
-
-    Raises
-    ------
-    ValueError
-        If an argument is out of range; in `forward`, if a shape does not match, or ε is longer than the window.
     """
 
     def __init__(
@@ -113,7 +105,7 @@ class CurvaturePrior(nn.Module):
         self._warned: set[str] = set()
         self.weight = _read_weights(weight)
         self.coefficients = tuple(_read_coefficients(known, edge, unit, self.epsilon) for known in read_laws(law))
-        times = upsampling(self.spacing, self.epsilon)
+        times = choose_refinement(self.spacing, self.epsilon)
         if max(times) > 1:
             axes = ", ".join(f"{axis} {n}-fold" for axis, n in zip("zyx", times, strict=True) if n > 1)
             warnings.warn(f"ε = {self.epsilon:g} spans fewer than 2 voxels: interpolating {axes}", stacklevel=2)
@@ -124,7 +116,7 @@ class CurvaturePrior(nn.Module):
 
     def forward(self, input: Tensor, target: Tensor | None = None, mask: Tensor | None = None) -> Tensor:
         """Return the loss of a batch; see the class."""
-        input, target, mask = _plain(input), _plain(target), _plain(mask)
+        input, target, mask = _strip_subclass(input), _strip_subclass(target), _strip_subclass(mask)
         with torch.autocast(input.device.type, enabled=False):
             probability, voxels = self._probability(input), self._voxel_weights(input, target, mask)
             classes, spacing = probability.shape[1], self._spacing_of(input)
@@ -136,16 +128,9 @@ class CurvaturePrior(nn.Module):
                 if weight == 0 or skipped:
                     columns.append(field.sum((-3, -2, -1)) * 0)
                     continue
-                value = curvature_prior(
-                    field,
-                    law,
-                    spacing,
-                    self.epsilon,
-                    mask=None if voxels is None else voxels[:, min(channel, voxels.shape[1] - 1)],
-                    normalize=self.reduction != "sum",
-                    border=self.border,
-                )
-                columns.append(weight * value)
+                seen = None if voxels is None else voxels[:, min(channel, voxels.shape[1] - 1)]
+                options = {"mask": seen, "normalize": self.reduction != "sum", "border": self.border}
+                columns.append(weight * curvature_prior(field, law, spacing, self.epsilon, **options))
             values = torch.stack(columns, 1)
             if self.reduction == "none":
                 return values[..., None, None, None]
@@ -154,7 +139,7 @@ class CurvaturePrior(nn.Module):
     def suggest_weight(
         self, loss_fn: Callable[[Tensor, Tensor], Tensor], batch: tuple[Tensor, Tensor], share: float = 1.0
     ) -> float:
-        """Return the factor that gives this loss `share` times the gradient of another loss, as norms over the input.
+        """Return the factor by which this loss has `share` times the gradient's norm, over the input, of another loss.
 
         Parameters
         ----------
@@ -166,10 +151,7 @@ class CurvaturePrior(nn.Module):
             At the default ε, tubes two voxels thick survive a share of 0.1 with `trabec` and `tubes`, but not with
             `pearls`; a share of 1 removes them.
 
-        Raises
-        ------
-        ValueError
-            If either gradient is zero or not finite, as on a batch whose prediction has no surface.
+        Raises ValueError where either gradient is zero or not finite, as on a prediction without a surface.
         """
         output, target = batch
         leaf = output.detach().float().requires_grad_()
@@ -209,7 +191,7 @@ class CurvaturePrior(nn.Module):
             if not fits or tuple(mask.shape[2:]) != space:
                 expected = f"({batch} or 1, {classes} or 1, {', '.join(map(str, space))})"
                 raise ValueError(f"expected a mask of shape {expected}, got {tuple(mask.shape)}")
-            if _number_of(((mask >= 0) & (mask <= HEAVIEST)).all()) == 0:
+            if _read_number(((mask >= 0) & (mask <= HEAVIEST)).all()) == 0:
                 raise ValueError(f"expected a mask of finite numbers from 0, at most {HEAVIEST:g}, got others")
             if mask.shape[1] > 1 and not self.include_background:
                 mask = mask[:, 1:]
@@ -233,12 +215,12 @@ class CurvaturePrior(nn.Module):
         return tuple(h * whole / n for h, whole, n in pairs)  # type: ignore[return-value]
 
     def _is_skipped(self, input: Tensor) -> bool:
-        """Return whether an input is a level of deep supervision that has no interior or is too coarse for ε."""
+        """Return whether an input is a level of deep supervision without an interior or too coarse for ε; then warn."""
         space = tuple(input.shape[2:])
         if self.shape is None or space == self.shape:
             return False
         times = RESOLVED * max(self._spacing_of(input)) / self.epsilon
-        if times <= MOST + 1e-3 and min(space) >= max(4, 2 * self.border + 1):
+        if times <= FINEST + 1e-3 and min(space) >= max(4, 2 * self.border + 1):
             return False
         self._warn(str(space), f"a level of {space} voxels is too coarse for ε = {self.epsilon:g}, so its loss is 0")
         return True
@@ -247,12 +229,12 @@ class CurvaturePrior(nn.Module):
         """Warn once where probabilities are outside [0, 1]."""
         if torch.compiler.is_compiling() or "range" in self._warned:
             return
-        low, high = (_number_of(value) for value in probability.detach().aminmax())
+        low, high = (_read_number(value) for value in probability.detach().aminmax())
         if low is not None and high is not None and not (low >= -1e-3 and high <= 1 + 1e-3):
             self._warn("range", f"expected probabilities, got {low:g} to {high:g}: is sigmoid or softmax missing?")
 
     def _warn(self, subject: str, message: str) -> None:
-        """Warn once about each subject."""
+        """Warn about a subject, once."""
         if not torch.compiler.is_compiling() and subject not in self._warned:
             self._warned.add(subject)
             warnings.warn(message, stacklevel=3)
@@ -278,11 +260,6 @@ class CombinedLoss(nn.Module):
     parts
         The terms of the last call, to log: `base`, `prior` before weighting, and the prior's `weight`, as tensors
         without a gradient on the device of the loss. Empty before the first call.
-
-    Raises
-    ------
-    ValueError
-        If the weight is not a finite number from 0, or the warm-up is not a whole number from 0.
     """
 
     calls: Tensor
@@ -337,25 +314,22 @@ def curvature_prior(
     border
         Number of voxels at each side of the window whose density does not count.
 
-    Raises
-    ------
-    ValueError
-        If the window is too small for its border or for ε, a coefficient is over `STRONGEST` with lengths in units of
-        ε, or as `upsampling` does.
+    Raises ValueError where the window is too small for its border or ε, a coefficient is too large for float32, or an
+    axis would be refined more than 16-fold.
     """
     shape, least = tuple(probability.shape[1:]), max(4, 2 * border + 1)
     if min(shape) < least:
         raise ValueError(
             f"expected a volume of at least {least} voxels along each axis, got {shape}, which has no interior"
         )
-    times = upsampling(spacing, epsilon)
+    times = choose_refinement(spacing, epsilon)
     longest = max(n * h for n, h in zip(shape, spacing, strict=True))
     if epsilon > longest:
         raise ValueError(f"expected an ε of at most the window's longest side, {longest:g}, got {epsilon:g}")
     coefficients = Law.of(law).in_unit(None, min(spacing))
     check_strengths(coefficients, epsilon)
     unit = epsilon / WORKING_EPSILON
-    u, weights = 2 * probability - 1, _window_mask(probability, mask, border)
+    u, weights = 2 * probability - 1, _make_window_mask(probability, mask, border)
     for axis, n in enumerate(times):
         if n > 1:
             u, weights = refine_axis(u, axis, n), weights.repeat_interleave(n, axis - 3)
@@ -367,13 +341,10 @@ def curvature_prior(
     return total / volume.clamp_min(torch.finfo(volume.dtype).tiny)
 
 
-def upsampling(spacing: Sequence[float], epsilon: float) -> tuple[int, int, int]:
-    """Return how many times finer each axis must be for ε to span two voxels; 1 where ε lacks at most a tenth of that.
+def choose_refinement(spacing: Sequence[float], epsilon: float) -> tuple[int, int, int]:
+    """Return by how many times each axis is to be refined for ε to span two voxels; 1 where it lacks at most a tenth.
 
-    Raises
-    ------
-    ValueError
-        If an axis would be refined more than 16-fold, or ε spans more than `COARSEST` voxels.
+    Raises ValueError where an axis would be refined more than 16-fold, or ε spans more than `COARSEST` voxels.
     """
     if not 0 < epsilon <= COARSEST * min(spacing):
         most = COARSEST * min(spacing)
@@ -382,8 +353,8 @@ def upsampling(spacing: Sequence[float], epsilon: float) -> tuple[int, int, int]
         )
     ratios = [RESOLVED * h / epsilon for h in spacing]
     times = tuple(1 if ratio <= 1.1 else math.ceil(ratio - 1e-3) for ratio in ratios)
-    if max(times) > MOST:
-        least = RESOLVED * max(spacing) / MOST
+    if max(times) > FINEST:
+        least = RESOLVED * max(spacing) / FINEST
         raise ValueError(
             f"expected an ε of at least {least:g} for voxels of {tuple(spacing)}, got {epsilon:g}, for which an axis "
             f"is refined {max(times)}-fold: state ε in spacing's unit, or a larger ε"
@@ -426,7 +397,7 @@ def _repeat_per_class(values: tuple, classes: int, name: str) -> tuple:
     return values * classes if len(values) == 1 else values
 
 
-def _window_mask(probability: Tensor, mask: Tensor | None, border: int) -> Tensor:
+def _make_window_mask(probability: Tensor, mask: Tensor | None, border: int) -> Tensor:
     """Return the mask `(1 or batch, z, y, x)` with zeros at the border."""
     inside = probability.new_zeros(probability.shape[1:])
     z, y, x = (slice(border, n - border) for n in inside.shape)
@@ -434,12 +405,12 @@ def _window_mask(probability: Tensor, mask: Tensor | None, border: int) -> Tenso
     return inside[None] if mask is None else inside * mask.to(inside)
 
 
-def _plain(values: _Values) -> _Values:
+def _strip_subclass(values: _Values) -> _Values:
     """Return a tensor without its subclass (MONAI's `MetaTensor`)."""
     return values if values is None or type(values) is Tensor else values.as_subclass(Tensor)  # type: ignore[return-value]
 
 
-def _number_of(value: Tensor) -> float | None:
+def _read_number(value: Tensor) -> float | None:
     """Return a tensor's single number, or None where it has none yet: in compiled code and under `torch.func.vmap`."""
     if torch.compiler.is_compiling():
         return None

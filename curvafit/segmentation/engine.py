@@ -20,7 +20,7 @@ from curvafit.inference.fit import load_draws_and_candidates
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.law import Law, LawLike
-from curvafit.priors.loss import RESOLVED, upsampling
+from curvafit.priors.loss import RESOLVED, choose_refinement
 from curvafit.priors.profile import phase_field
 from curvafit.priors.stencils import refine_axis
 from curvafit.segmentation.evidence import VoxelEvidence
@@ -211,7 +211,7 @@ class WorkingGrid:
         ε = RESOLVED * min(scan.spacing) if epsilon is None else check_float(epsilon, form, SHORTEST, LONGEST)
         if min(scan.shape) < 4:
             raise ScanError(f"the volume must have at least 4 voxels along each axis, got {scan.shape}")
-        times, unit = upsampling(scan.spacing, ε), ε / WORKING_EPSILON
+        times, unit = choose_refinement(scan.spacing, ε), ε / WORKING_EPSILON
         halo = 0 if periodic else halo
         shape = tuple(n * t + 2 * halo for n, t in zip(scan.shape, times, strict=True))
         spacing = tuple(h / t / unit for h, t in zip(scan.spacing, times, strict=True))

@@ -12,7 +12,7 @@ import torch
 from loss_cases import LAW, fit_file, noise, probabilities, slope_of
 
 from curvafit.priors import Coefficients, CombinedLoss, CurvaturePrior, curvature_prior
-from curvafit.priors.loss import upsampling
+from curvafit.priors.loss import choose_refinement
 
 # ---- what counts ----------------------------------------------------------------------------------------------------
 
@@ -307,13 +307,13 @@ def test_any_weight_beside_another_loss_is_finite_or_refused(option, value) -> N
 
 @pytest.mark.parametrize("spacing", [(1.003, 1, 1.003), (0.8, 0.76, 0.76), (1, 1, 1.1)])
 def test_an_axis_a_little_coarser_is_not_interpolated(spacing):
-    assert upsampling(CurvaturePrior("tubes", spacing=spacing).spacing, 2 * min(spacing)) == (1, 1, 1)
+    assert choose_refinement(CurvaturePrior("tubes", spacing=spacing).spacing, 2 * min(spacing)) == (1, 1, 1)
 
 
 def test_other_axes_have_two_voxels_to_epsilon():
-    assert upsampling((1.11, 1.0, 1.0), 2.0) == (2, 1, 1)
-    assert upsampling((5.0, 0.994, 3.0), 1.988) == (6, 1, 4)
-    assert upsampling((16.0, 2.0, 1.0), 2.0) == (16, 2, 1)
+    assert choose_refinement((1.11, 1.0, 1.0), 2.0) == (2, 1, 1)
+    assert choose_refinement((5.0, 0.994, 3.0), 1.988) == (6, 1, 4)
+    assert choose_refinement((16.0, 2.0, 1.0), 2.0) == (16, 2, 1)
 
 
 @pytest.mark.parametrize(("spacing", "epsilon"), [(1.0, 0.02), ((16.1, 1.0, 1.0), 2.0)])

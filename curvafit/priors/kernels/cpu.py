@@ -1,4 +1,4 @@
-"""The energy and the flow's step, fused for processors (numba, float32): what a caller needs; the loops are apart.
+"""The energy and the flow's step, fused for processors (numba, float32), as callers use them; `loops` has the loops.
 
 A step is four passes, each parallel over z: blur of div A along z; energy and gradient; blur of that along z; along y
 and x, with -∇, Adam, and the next step's blur of div A along y and x.
@@ -16,13 +16,13 @@ from curvafit.priors.curvature import ROOT_FLOOR, ROOT_ROUNDING, XI
 from curvafit.priors.grid import Grid
 from curvafit.priors.kernels import loops
 from curvafit.priors.kernels.loops import ALL, EDGE, ENDS, MOVE, SLACK, TAPS, TOGETHER, WIDE
-from curvafit.priors.kernels.threads import allowed, limited
+from curvafit.priors.kernels.threads import count_threads, limit_threads
 from curvafit.priors.stencils import gaussian_taps
 
-#: Voxels that are worth a thread: below, starting it costs more than it saves.
+#: The least voxels for which another thread saves more than its start costs.
 _WORTH = 32768
-#: Cells of a block of rows whose partial derivatives stay in the first-level cache, and of a tile of a plane of which
-#: three planes of u and three of sums stay in the second-level cache.
+#: Cells of a block of rows whose partial derivatives fit into the first-level cache, and of a tile, of which three
+#: planes of u and three of sums fit into the second-level cache.
 _BLOCK, _TILE = 432, 43_000
 #: Floats of a cache line.
 _LINE = 16
@@ -44,29 +44,20 @@ def fused_energy_gradient(
     orientation
         Q of a further term ε ∫ ∇uᵀQ∇u, symmetric, axes z, y, x, or None.
     mask
-        Weights of the energy's density, `(Z, Y, X)`, or None.
+        Weights of the density, `(Z, Y, X)`, or None.
 
-    Raises
-    ------
-    ValueError
-        If an array's shape is not the grid's, or the orientation is not symmetric.
+    Raises ValueError where an array's shape is not the grid's, or the orientation is not symmetric.
     """
     density = _Density(a, grid, epsilon, _threads(grid), orientation, mask)
     gradient = _volume(grid)
-    value = density(_padded(u, grid), gradient)
+    value = density(_pad_field(u, grid), gradient)
     return value, _inner(gradient, grid).copy()
 
 
 def gaussian_blur(u: np.ndarray, grid: Grid, width: float) -> np.ndarray:
-    """Return k ∗ u in float32, as `stencils.gaussian_blur` does.
-
-    Raises
-    ------
-    ValueError
-        If the field's shape is not the grid's.
-    """
+    """Return k ∗ u in float32, as `stencils.gaussian_blur` does; ValueError where its shape is not the grid's."""
     blur = _Blur(grid, width, _threads(grid))
-    volume, along_z = _padded(u, grid), _volume(grid)
+    volume, along_z = _pad_field(u, grid), _volume(grid)
     blur.along_z(volume, along_z, 0.0, _NO_FIELD)
     blur.in_planes(along_z, volume)
     return _inner(volume, grid).copy()
@@ -108,7 +99,7 @@ class FusedFlow:
             self.vector[...] = start
         self._half = np.array([0.5 / h for h in grid.spacing], np.float32)
         self._blur, self._density = _Blur(grid, width, threads), _Density(a, grid, epsilon, threads, orientation)
-        self._mass, self._base = (base, _NO_FIELD) if np.ndim(base) == 0 else (0.0, _padded(base, grid))
+        self._mass, self._base = (base, _NO_FIELD) if np.ndim(base) == 0 else (0.0, _pad_field(base, grid))
         self._keep, self._free = np.empty(0, np.float32), size
         if frozen is not None:
             self._keep = _flat(size // 3)
@@ -116,7 +107,7 @@ class FusedFlow:
             self._free = 3 * int(np.count_nonzero(self._keep))
         self._between, self._field, self._gradient = _volume(grid), _volume(grid), _volume(grid)
         self._sums, self._highest = np.empty(Z), np.empty(Z, np.int32)
-        self._index_z = _continuation(Z, EDGE, EDGE, grid.periodic)
+        self._index_z = _continue_index(Z, EDGE, EDGE, grid.periodic)
         sizes = 3 * _plane(grid) + 2 * SLACK, loops.ROWS * X + SLACK, Y * X + SLACK
         self._rings, self._slopes, self._fluxes = (_scratch(threads, size) for size in sizes)
 
@@ -191,46 +182,30 @@ class FusedFlow:
 
     def _adam_step(self, phase: int, adam: np.ndarray) -> None:
         """Run the last pass, or a part of it."""
-        with limited(self._threads):
+        with limit_threads(self._threads):
             loops.adam_step(
-                phase,
-                self._between,
-                self._vector,
-                self._first,
-                self._second,
-                self._keep,
-                self._gradient,
-                self._blur.rows,
-                self._rings,
-                self._slopes,
-                self._fluxes,
-                self._sums,
-                self._highest,
-                self._half,
-                adam,
-                self.grid.shape,
-                self.grid.periodic,
-                self._index_z,
-                self._blur.planes,
-            )
+                phase, self._between, self._vector, self._first, self._second, self._keep, self._gradient,
+                self._blur.rows, self._rings, self._slopes, self._fluxes, self._sums, self._highest,
+                self._half, adam, self.grid.shape, self.grid.periodic, self._index_z, self._blur.planes,
+            )  # fmt: skip
 
 
 class _Blur:
     """k on a grid. Per axis: which sample stands at -r, -r + 1, …, and the weights of offsets -r … r (then zeros)."""
 
     def __init__(self, grid: Grid, width: float, threads: int) -> None:
-        (z, rz), (y, ry), (x, rx) = (_padded_taps(width / h) for h in grid.spacing)
+        (z, rz), (y, ry), (x, rx) = (_pad_taps(width / h) for h in grid.spacing)
         Z, Y, X = grid.shape
         periodic = grid.periodic
         self._grid, self._threads = grid, threads
-        self._index, self._taps = _continuation(Z, rz, len(z) + TOGETHER, periodic), z
+        self._index, self._taps = _continue_index(Z, rz, len(z) + TOGETHER, periodic), z
         #: Index and weights along y, along x, which samples continue a row at its ends, and the radius along x.
         self.planes = (
-            _continuation(Y, ry + EDGE, len(y) + EDGE + TOGETHER, periodic),
+            _continue_index(Y, ry + EDGE, len(y) + EDGE + TOGETHER, periodic),
             y,
-            _continuation(X, rx, rx, periodic),
+            _continue_index(X, rx, rx, periodic),
             x,
-            _continuation(X, EDGE, EDGE, periodic)[[0, 1, X + EDGE, X + EDGE + 1]],
+            _continue_index(X, EDGE, EDGE, periodic)[[0, 1, X + EDGE, X + EDGE + 1]],
             rx,
         )
         self.rows = _scratch(threads, 2 * TOGETHER * loops.row_length(X, len(x)) + SLACK)
@@ -238,12 +213,12 @@ class _Blur:
     def along_z(self, source: np.ndarray, out: np.ndarray, shift: float, base: np.ndarray) -> None:
         """Blur along z, and add a number and, where it is not empty, a field."""
         Z, plane = self._grid.shape[0], _plane(self._grid)
-        with limited(self._threads):
+        with limit_threads(self._threads):
             loops.blur_z(source, out, base, self._threads, Z, plane, self._index, self._taps, np.float32(shift))
 
     def in_planes(self, source: np.ndarray, out: np.ndarray) -> None:
         """Blur along y and x."""
-        with limited(self._threads):
+        with limit_threads(self._threads):
             loops.blur_in_planes(source, out, self.rows, self._grid.shape, self.planes)
 
 
@@ -264,8 +239,8 @@ class _Density:
                 weights[1:] = [value * _voxelwise(mask, grid) for value in weights[1:]]
             self._general = (ratios, _orientations(orientation, grid), *_local(weights, self._block, grid))
         elif mask is not None:
-            self._general = (ratios, None, _padded(np.asarray(mask), grid), None)
-        self._index = _continuation(Z, EDGE, EDGE, grid.periodic)
+            self._general = (ratios, None, _pad_field(np.asarray(mask), grid), None)
+        self._index = _continue_index(Z, EDGE, EDGE, grid.periodic)
         row = np.zeros(stride, np.float32)
         row[EDGE:-EDGE] = 1
         nothing = np.zeros(self._block * stride + SLACK, np.float32)
@@ -279,21 +254,11 @@ class _Density:
 
     def __call__(self, u: np.ndarray, gradient: np.ndarray) -> float:
         """Fill the gradient; return the energy."""
-        with limited(self._threads):
+        with limit_threads(self._threads):
             loops.fill_gradient(
-                u,
-                gradient,
-                self._energies,
-                self._rings,
-                self._sums,
-                self._inside,
-                self._constants,
-                *self._general,
-                self._index,
-                self._block,
-                self._tile,
-                *self._grid.shape,
-            )
+                u, gradient, self._energies, self._rings, self._sums, self._inside, self._constants, *self._general,
+                self._index, self._block, self._tile, *self._grid.shape,
+            )  # fmt: skip
         return float(self._energies.sum())
 
 
@@ -301,8 +266,8 @@ _NO_FIELD = np.empty(0, np.float32)
 
 
 def _threads(grid: Grid) -> int:
-    """Return how many threads a grid is worth, of those allowed."""
-    return max(1, min(allowed(), math.prod(grid.shape) // _WORTH, grid.shape[0] // TOGETHER))
+    """Return how many threads a grid is worth, of those that numba may use."""
+    return max(1, min(count_threads(), math.prod(grid.shape) // _WORTH, grid.shape[0] // TOGETHER))
 
 
 def _flat(size: int) -> np.ndarray:
@@ -346,34 +311,29 @@ def _inner(volume: np.ndarray, grid: Grid) -> np.ndarray:
     return _whole(volume, grid)[:, EDGE:-EDGE, EDGE:-EDGE]
 
 
-def _padded(u: np.ndarray, grid: Grid) -> np.ndarray:
+def _pad_field(u: np.ndarray, grid: Grid) -> np.ndarray:
     """Copy a field into planes and continue it."""
     if u.shape != grid.shape:
         raise ValueError(f"expected a field of shape {grid.shape}, got {u.shape}")
     volume = _volume(grid)
     whole = _whole(volume, grid)
-    y, x = (EDGE + _continuation(n, EDGE, EDGE, grid.periodic) for n in grid.shape[1:])
+    y, x = (EDGE + _continue_index(n, EDGE, EDGE, grid.periodic) for n in grid.shape[1:])
     whole[:, EDGE:-EDGE, EDGE:-EDGE] = u
-    for k in (0, 1, -2, -1):
-        whole[:, :, k] = whole[:, :, x[k]]
-    for k in (0, 1, -2, -1):
-        whole[:, k] = whole[:, y[k]]
+    sides = [0, 1, -2, -1]
+    whole[:, :, sides] = whole[:, :, x[sides]]
+    whole[:, sides] = whole[:, y[sides]]
     return volume
 
 
-def _padded_taps(deviation: float) -> tuple[np.ndarray, int]:
+def _pad_taps(deviation: float) -> tuple[np.ndarray, int]:
     """Return the weights with zeros after them, and the radius; a deviation of zero is the identity."""
     taps = gaussian_taps(deviation) if deviation > 0 else (1.0,)
     return np.array(taps + (0.0,) * (-len(taps) % TAPS), np.float32), len(taps) // 2
 
 
-def _continuation(n: int, before: int, after: int, periodic: bool) -> np.ndarray:
-    """Return which of n samples stands at -before, … , n + after - 1."""
-    index = np.arange(-before, n + after)
-    if periodic:
-        return index % n
-    index = index % (2 * n)
-    return np.where(index < n, index, 2 * n - 1 - index)
+def _continue_index(n: int, before: int, after: int, periodic: bool) -> np.ndarray:
+    """Return which of n samples stands at places -before to n + after - 1."""
+    return np.pad(np.arange(n), (before, after), mode="wrap" if periodic else "symmetric")
 
 
 def _voxelwise(value, grid: Grid):
@@ -421,7 +381,7 @@ def _local(weights: list, block: int, grid: Grid) -> tuple[np.ndarray, np.ndarra
     mirrored in a block of rows; return of each its offset too, and whether it is a volume."""
     parts = []
     for value in weights:
-        part = np.full(WIDE, value, np.float32) if np.ndim(value) == 0 else _padded(value, grid)
+        part = np.full(WIDE, value, np.float32) if np.ndim(value) == 0 else _pad_field(value, grid)
         if np.ndim(value):
             part[:SLACK] = part[-SLACK:] = 1
         parts.append(part)

@@ -21,10 +21,10 @@ def energies(
 ) -> Float[Tensor, " batch"]:
     """Return `energy` of every field, with its density multiplied by a mask.
 
-    Float32 computes the gradient together with the value, by the fused kernel where there is one and else by autograd,
-    field by field: two numbers for each voxel wait for a backward pass, where autograd alone stores thirty. It has
-    first derivatives only, and a second one raises a RuntimeError. Float64, a compiler without a kernel, and a call
-    that asks for no gradient take the definition.
+    In float32 the gradient is computed together with the value, field by field, by the fused kernel where there is one
+    and else by autograd: two numbers for each voxel wait for a backward pass, where autograd alone stores thirty. There
+    are first derivatives only, and a second one raises a RuntimeError. Float64, a compiler without a kernel, and a call
+    without a gradient take the definition.
 
     Parameters
     ----------
@@ -33,12 +33,7 @@ def energies(
     grid, epsilon
         A grid with the boundary `"replicate"`; ε in spacing's unit.
     mask
-        Weights, which receive no gradient.
-
-    Raises
-    ------
-    ValueError
-        If the mask requires a gradient.
+        Weights, which get no gradient: one that asks for it is a ValueError.
     """
     if mask.requires_grad:
         raise ValueError("expected a mask that asks for no gradient, got one that does: detach it")
@@ -59,7 +54,8 @@ def _compute(u, mask, a, spacing, epsilon) -> tuple[Tensor, Tensor]:
     return values, slopes
 
 
-def _keep(ctx, inputs, output) -> None:
+def _save(ctx, inputs, output) -> None:
+    """Save the gradient and the fields for a backward pass."""
     ctx.save_for_backward(output[1], inputs[0])
     ctx.mark_non_differentiable(output[1])
 
@@ -79,7 +75,7 @@ class _Energies(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx, inputs, output) -> None:
-        _keep(ctx, inputs, output)
+        _save(ctx, inputs, output)
         ctx.save_for_forward(output[1], inputs[0])
 
     backward = staticmethod(_backward)
@@ -101,7 +97,7 @@ class _Energies(torch.autograd.Function):
 
 
 class _PrecomputedGradient(torch.autograd.Function):
-    """The gradient by u, which says that it depends on u but not how."""
+    """The gradient by u as a function of u without a derivative: a second derivative is an error, not zero."""
 
     generate_vmap_rule = True
 
@@ -121,9 +117,7 @@ class _PrecomputedGradient(torch.autograd.Function):
         raise RuntimeError(_ONLY_FIRST)
 
 
-_ONLY_FIRST = "expected first derivatives of F_ε in float32, got a second one: take float64 for it"
-
-
+_ONLY_FIRST = "float32 has first derivatives of F_ε only: take float64 for second ones"
 _SCHEMA = "(Tensor u, Tensor mask, float[] a, float[] spacing, float epsilon) -> (Tensor, Tensor)"
 _energies = torch.library.custom_op("curvafit::energies", _compute, mutates_args=(), schema=_SCHEMA)
 
@@ -133,4 +127,4 @@ def _(u, mask, a, spacing, epsilon):
     return u.new_empty((u.shape[0],)), torch.empty_like(u, memory_format=torch.contiguous_format)
 
 
-_energies.register_autograd(_backward, setup_context=_keep)
+_energies.register_autograd(_backward, setup_context=_save)

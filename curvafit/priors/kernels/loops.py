@@ -125,8 +125,10 @@ class _Vector(types.Type):
         super().__init__(f"float32x{width}")
 
 
+# numba's decorators have no types that a checker can read.
 _register: Any = register_model(_Vector)
 _infer: Any = infer_global
+_intrinsic: Any = intrinsic
 
 
 @_register
@@ -186,7 +188,8 @@ def _address(context, builder, kind, values, width: int):
     return builder.bitcast(builder.gep(data, [values[1]]), _ir(width).as_pointer())
 
 
-def _type_wide(typingctx, array, index):
+@_intrinsic
+def _wide(typingctx, array, index):
     """Load floats `index` … of a flat float32 array."""
 
     def generate(context, builder, sig, values):
@@ -195,7 +198,8 @@ def _type_wide(typingctx, array, index):
     return _VECTOR(array, types.intp), generate
 
 
-def _type_full(typingctx, number):
+@_intrinsic
+def _full(typingctx, number):
     """Fill a vector with one float."""
 
     def generate(context, builder, sig, values):
@@ -204,7 +208,8 @@ def _type_full(typingctx, number):
     return _VECTOR(types.float32), generate
 
 
-def _type_store(typingctx, array, index, value):
+@_intrinsic
+def _store(typingctx, array, index, value):
     """Store: `array[index …] = value`."""
 
     def generate(context, builder, sig, values):
@@ -214,7 +219,8 @@ def _type_store(typingctx, array, index, value):
     return types.void(array, types.intp, value), generate
 
 
-def _type_store_first(typingctx, array, index, value, count):
+@_intrinsic
+def _store_first(typingctx, array, index, value, count):
     """Store the first `count` floats of a vector."""
 
     def generate(context, builder, sig, values):
@@ -232,7 +238,8 @@ def _type_store_first(typingctx, array, index, value, count):
     return types.void(array, types.intp, value, types.intp), generate
 
 
-def _type_inverse_root(typingctx, value, one):
+@_intrinsic
+def _inverse_root(typingctx, value, one):
     """Compute 1/√value of positive floats. `one` is a vector of ones.
 
     LLVM takes the processor's estimate and a Newton step.
@@ -246,7 +253,8 @@ def _type_inverse_root(typingctx, value, one):
     return value(value, value), generate
 
 
-def _type_where_above(typingctx, value, bound, yes, no):
+@_intrinsic
+def _where_above(typingctx, value, bound, yes, no):
     """Choose `yes` where value > bound, else `no`."""
 
     def generate(context, builder, sig, values):
@@ -256,7 +264,8 @@ def _type_where_above(typingctx, value, bound, yes, no):
     return value(value, value, value, value), generate
 
 
-def _type_sum(typingctx, value):
+@_intrinsic
+def _sum(typingctx, value):
     """Add a vector's floats."""
 
     def generate(context, builder, sig, values):
@@ -267,17 +276,8 @@ def _type_sum(typingctx, value):
     return types.float32(value), generate
 
 
-_wide: Any = intrinsic(_type_wide)
-_full: Any = intrinsic(_type_full)
-_store: Any = intrinsic(_type_store)
-_store_first: Any = intrinsic(_type_store_first)
-_inverse_root: Any = intrinsic(_type_inverse_root)
-_where_above: Any = intrinsic(_type_where_above)
-_sum: Any = intrinsic(_type_sum)
-
-
 @njit(**_SERIAL)
-def _scaled(value, ratios, which):
+def _scale(value, ratios, which):
     """Multiply by one of the spacings' ratios, where they differ."""
     if ratios is None:
         return value
@@ -312,7 +312,7 @@ def _cost(k, local, places, cell):
 
 
 @njit(**_SERIAL)
-def _mirrored(orient, across_z, across_y):
+def _mirror(orient, across_z, across_y):
     """Return Q as it stands in the box's mirror image: what has one axis that is mirrored is negative."""
     if orient is None:
         return None
@@ -349,10 +349,10 @@ def _partials(u, m, c, p, stride, n, ring, size, at, inside, from_, k, ratios, o
         zm, zp = _wide(u, m + i), _wide(u, p + i)
         ym, yp = _wide(u, c + i - stride), _wide(u, c + i + stride)
         xm, xp = _wide(u, c + i - 1), _wide(u, c + i + 1)
-        gz, gy, gx = _scaled(zp - zm, ratios, 0), _scaled(yp - ym, ratios, 1), _scaled(xp - xm, ratios, 2)
+        gz, gy, gx = _scale(zp - zm, ratios, 0), _scale(yp - ym, ratios, 1), _scale(xp - xm, ratios, 2)
         twice = u_ + u_
-        zz, yy = _scaled((zp + zm) - twice, ratios, 3), _scaled((yp + ym) - twice, ratios, 4)
-        xx = _scaled((xp + xm) - twice, ratios, 5)
+        zz, yy = _scale((zp + zm) - twice, ratios, 3), _scale((yp + ym) - twice, ratios, 4)
+        xx = _scale((xp + xm) - twice, ratios, 5)
         zy = (_wide(u, p + i + stride) + _wide(u, m + i - stride)) - (
             _wide(u, p + i - stride) + _wide(u, m + i + stride)
         )
@@ -360,8 +360,8 @@ def _partials(u, m, c, p, stride, n, ring, size, at, inside, from_, k, ratios, o
         yx = (_wide(u, c + i + stride + 1) + _wide(u, c + i - stride - 1)) - (
             _wide(u, c + i + stride - 1) + _wide(u, c + i - stride + 1)
         )
-        zy, zx = _scaled(quarter * zy, ratios, 6), _scaled(quarter * zx, ratios, 7)
-        yx = _scaled(quarter * yx, ratios, 8)
+        zy, zx = _scale(quarter * zy, ratios, 6), _scale(quarter * zx, ratios, 7)
+        yx = _scale(quarter * yx, ratios, 8)
         # The density: each invariant once; what two of them share is computed in the order in which it is needed, for
         # registers are what runs out.
         gzz, gyy, gxx = gz * gz, gy * gy, gx * gx
@@ -410,9 +410,9 @@ def _partials(u, m, c, p, stride, n, ring, size, at, inside, from_, k, ratios, o
         dz, dy, dx = e_s * gz - e_q * hz, e_s * gy - e_q * hy, e_s * gx - e_q * hx
         if orient is not None:
             dz, dy, dx = dz + (tz + tz), dy + (ty + ty), dx + (tx + tx)
-        dz, dy, dx = _scaled(dz, ratios, 0), _scaled(dy, ratios, 1), _scaled(dx, ratios, 2)
-        dzz, dyy = _scaled(P2 * zz - e_T - Q * gzz, ratios, 3), _scaled(P2 * yy - e_T - Q * gyy, ratios, 4)
-        dxx = _scaled(P2 * xx - e_T - Q * gxx, ratios, 5)
+        dz, dy, dx = _scale(dz, ratios, 0), _scale(dy, ratios, 1), _scale(dx, ratios, 2)
+        dzz, dyy = _scale(P2 * zz - e_T - Q * gzz, ratios, 3), _scale(P2 * yy - e_T - Q * gyy, ratios, 4)
+        dxx = _scale(P2 * xx - e_T - Q * gxx, ratios, 5)
         # What each neighbour receives: the stencils' coefficients times the derivatives. Off the diagonal, N and q
         # count a component twice and the stencil divides by four, so a half of ∂e/∂D is left.
         o = at + i
@@ -424,9 +424,9 @@ def _partials(u, m, c, p, stride, n, ring, size, at, inside, from_, k, ratios, o
         _store(ring, o + _XM * size, dxx - dx)
         _store(ring, o + _XP * size, dxx + dx)
         Qz, Qy = half_Q * gz, half_Q * gy
-        _store(ring, o + _ZY * size, _scaled(e_P * zy - Qz * gy, ratios, 6))
-        _store(ring, o + _ZX * size, _scaled(e_P * zx - Qz * gx, ratios, 7))
-        _store(ring, o + _YX * size, _scaled(e_P * yx - Qy * gx, ratios, 8))
+        _store(ring, o + _ZY * size, _scale(e_P * zy - Qz * gy, ratios, 6))
+        _store(ring, o + _ZX * size, _scale(e_P * zx - Qz * gx, ratios, 7))
+        _store(ring, o + _YX * size, _scale(e_P * yx - Qy * gx, ratios, 8))
     return _sum(energy)
 
 
@@ -434,21 +434,11 @@ def _partials(u, m, c, p, stride, n, ring, size, at, inside, from_, k, ratios, o
 def _gather(ring, size, at, stride, n, sums, below, centre, above, out, target):
     """Apply the transposed stencils to n cells from `at` of the ring on: finish the plane below, add to this one,
     begin the one above (`below`, `centre`, `above` are offsets into `sums`)."""
-    c, zm, zp, xm, xp, zx = (
-        at + _C * size,
-        at + _ZM * size,
-        at + _ZP * size,
-        at + _XM * size,
-        at + _XP * size,
-        at + _ZX * size,
-    )
+    c, zm, zp = at + _C * size, at + _ZM * size, at + _ZP * size
+    xm, xp, zx = at + _XM * size, at + _XP * size, at + _ZX * size
     yp, ym = at + _YP * size - stride, at + _YM * size + stride
-    zy_m, zy_p, yx_m, yx_p = (
-        at + _ZY * size - stride,
-        at + _ZY * size + stride,
-        at + _YX * size - stride,
-        at + _YX * size + stride,
-    )
+    zy_m, zy_p = at + _ZY * size - stride, at + _ZY * size + stride
+    yx_m, yx_p = at + _YX * size - stride, at + _YX * size + stride
     for i in range(0, n, WIDE):
         within = _wide(ring, c + i) + _wide(ring, yp + i) + (_wide(ring, ym + i) + _wide(ring, xp + i - 1))
         within = within + _wide(ring, xm + i + 1) + (_wide(ring, yx_p + i + 1) - _wide(ring, yx_p + i - 1))
@@ -497,7 +487,7 @@ def _fill_gradient_chunk(
             place = SLACK + 2 * stride
             energy += _partials(
                 u, m + o, c + o, p + o, stride, count * stride, ring, size, place, inside, from_, k, ratios,
-                _mirrored(orient, z < 0 or z >= Z, y < 0 or y >= Y), local, places,
+                _mirror(orient, z < 0 or z >= Z, y < 0 or y >= Y), local, places,
             )  # fmt: skip
             begin = max(y - 1, y0)
             n = (y + count - 1 - begin) * stride
@@ -677,8 +667,8 @@ def blur_in_planes(source, out, rows, shape, blur):
 
 
 @njit(**_INLINE)
-def _within(i, n, periodic):
-    """Bring back an index, at most one beyond either end: to the other end, or to the nearest."""
+def _wrap_index(i, n, periodic):
+    """Return an index that is at most one beyond either end as one inside: at the other end, or at the nearest."""
     if i < 0:
         return n - 1 if periodic else 0
     if i >= n:
@@ -693,12 +683,12 @@ def _divergence_plane(A, flux, half, z, shape, periodic):
     size, n = Y * X, (X + LANES - 1) & -LANES
     Az, Ay, Ax = SLACK, SLACK + (Z + z) * size, SLACK + (2 * Z + z) * size
     odd = _ONE if periodic else -_ONE
-    zm, zp = Az + _within(z - 1, Z, periodic) * size, Az + _within(z + 1, Z, periodic) * size
+    zm, zp = Az + _wrap_index(z - 1, Z, periodic) * size, Az + _wrap_index(z + 1, Z, periodic) * size
     fz_m, fz_p = half[0] * (odd if z == 0 else _ONE), half[0] * (odd if z == Z - 1 else _ONE)
-    fx, left, right = half[2], _within(-1, X, periodic), _within(X, X, periodic)
+    fx, left, right = half[2], _wrap_index(-1, X, periodic), _wrap_index(X, X, periodic)
     for y in range(Y):
         fy_m, fy_p = half[1] * (odd if y == 0 else _ONE), half[1] * (odd if y == Y - 1 else _ONE)
-        row, ym, yp = y * X, Ay + _within(y - 1, Y, periodic) * X, Ay + _within(y + 1, Y, periodic) * X
+        row, ym, yp = y * X, Ay + _wrap_index(y - 1, Y, periodic) * X, Ay + _wrap_index(y + 1, Y, periodic) * X
         o = Ax + row
         for i in range(n):
             total = A[_at(zp + row + i)] * fz_p - A[_at(zm + row + i)] * fz_m
@@ -789,13 +779,8 @@ def _adam_chunk(
             else:
                 if phase != MOVE or z > last:
                     continue
-                source, origin, size, out, edge = (
-                    g,
-                    SLACK + index_z[_at(z + 2)] * plane + corner,
-                    stride,
-                    rings[chunk],
-                    1,
-                )
+                source, size, out, edge = g, stride, rings[chunk], 1
+                origin = SLACK + index_z[_at(z + 2)] * plane + corner
                 target = SLACK + (z + 3) % 3 * plane + corner
             _blur_plane(source, origin, size, rows[chunk], out, target, edge, Y, X, blur)
             if not of_A and z > first:

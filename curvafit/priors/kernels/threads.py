@@ -16,9 +16,9 @@ from numba import get_num_threads, set_num_threads
 def start() -> None:
     """Start numba's threads, which its first parallel loop would do too, once in a process.
 
-    With OpenMP the start sets the starting thread's number of threads to the number of cores and lets parallel loops
-    nest, and torch's loops follow these settings. A thread that ends at once therefore makes the start. The start also
-    fixes the start method of `multiprocessing`, which a program may choose once and later; it is reset here.
+    With OpenMP the start changes settings of the thread that makes it, which torch's loops follow: the number of
+    threads, and whether parallel loops nest. So a thread that ends at once makes it. The start also fixes the start
+    method of `multiprocessing`, which a program may want to choose later; it is reset here.
     """
     chosen = multiprocessing.get_start_method(allow_none=True)
     with ThreadPoolExecutor(1, "curvafit-start") as elsewhere:
@@ -26,16 +26,16 @@ def start() -> None:
     multiprocessing.set_start_method(chosen, force=True)
 
 
-def allowed() -> int:
-    """Return how many threads numba's loops may take."""
+def count_threads() -> int:
+    """Return how many threads numba's loops may use."""
     start()
     return get_num_threads()
 
 
 @contextmanager
-def limited(threads: int) -> Iterator[None]:
+def limit_threads(threads: int) -> Iterator[None]:
     """Run numba's loops on at most `threads` threads."""
-    before = allowed()
+    before = count_threads()
     set_num_threads(min(threads, before))
     try:
         yield
@@ -49,7 +49,7 @@ def one_thread() -> Iterator[None]:
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        with limited(1):
+        with limit_threads(1):
             yield
     finally:
         torch.set_num_threads(before)
