@@ -152,7 +152,7 @@ class FusedFlow:
         return self.blur_adam(rate)
 
     def blur_divergence(self) -> None:
-        """Compute div A blurred along y and x, before the first step."""
+        """Compute div A blurred along y and x, which a step leaves for the next one."""
         self._adam_step(ALL, np.zeros(6, np.float32))
 
     def blur_along_z(self) -> None:
@@ -191,7 +191,7 @@ class FusedFlow:
 
 
 class _Blur:
-    """k on a grid. Per axis: which sample stands at -r, -r + 1, …, and the weights of offsets -r … r (then zeros)."""
+    """The blur k on a grid: for each axis the index of its continuation, and the weights, with zeros after them."""
 
     def __init__(self, grid: Grid, width: float, threads: int) -> None:
         (z, rz), (y, ry), (x, rx) = (_pad_taps(width / h) for h in grid.spacing)
@@ -199,7 +199,7 @@ class _Blur:
         periodic = grid.periodic
         self._grid, self._threads = grid, threads
         self._index, self._taps = _continue_index(Z, rz, len(z) + TOGETHER, periodic), z
-        #: Index and weights along y, along x, which samples continue a row at its ends, and the radius along x.
+        #: Index and weights along y and along x, the samples that continue a row at its ends, and the radius along x.
         self.planes = (
             _continue_index(Y, ry + EDGE, len(y) + EDGE + TOGETHER, periodic),
             y,
@@ -223,21 +223,21 @@ class _Blur:
 
 
 class _Density:
-    """F_ε's constants and scratch on a grid."""
+    """F_ε on a grid: its constants and scratch arrays."""
 
     def __init__(self, a, grid: Grid, epsilon, threads: int, orientation, mask=None) -> None:
         Z, Y, X = grid.shape
         stride = X + 2 * EDGE
         self._grid, self._threads = grid, threads
         self._block, self._tile = max(1, min(8, _BLOCK // stride)), min(Y, max(8, _TILE // stride))
-        weights, ratios = _weights(a, grid, epsilon), _ratios(grid)
-        self._constants, self._general = _density_constants(weights, grid), (ratios, None, None, None)
+        weights, ratios = _compute_weights(a, grid, epsilon), _compute_ratios(grid)
+        self._constants, self._general = _make_constants(weights, grid), (ratios, None, None, None)
         ratios = _RATIOS if ratios is None else ratios
         if orientation is not None or any(np.ndim(value) > 0 for value in weights):
-            weights.append(_voxelwise(epsilon, grid) * grid.voxel_volume / (2 * grid.spacing[2]) ** 2)
+            weights.append(_check_voxelwise(epsilon, grid) * grid.voxel_volume / (2 * grid.spacing[2]) ** 2)
             if mask is not None:
-                weights[1:] = [value * _voxelwise(mask, grid) for value in weights[1:]]
-            self._general = (ratios, _orientations(orientation, grid), *_local(weights, self._block, grid))
+                weights[1:] = [value * _check_voxelwise(mask, grid) for value in weights[1:]]
+            self._general = (ratios, _mirror_orientation(orientation, grid), *_join_weights(weights, self._block, grid))
         elif mask is not None:
             self._general = (ratios, None, _pad_field(np.asarray(mask), grid), None)
         self._index = _continue_index(Z, EDGE, EDGE, grid.periodic)
@@ -276,7 +276,7 @@ def _flat(size: int) -> np.ndarray:
 
 
 def _scratch(threads: int, size: int) -> np.ndarray:
-    """Make room for each thread, on cache lines of its own."""
+    """Make room of a size for each thread, on cache lines of its own."""
     size = -(-size // _LINE) * _LINE
     return _zeros(threads * size).reshape(threads, size)
 
@@ -336,7 +336,7 @@ def _continue_index(n: int, before: int, after: int, periodic: bool) -> np.ndarr
     return np.pad(np.arange(n), (before, after), mode="wrap" if periodic else "symmetric")
 
 
-def _voxelwise(value, grid: Grid):
+def _check_voxelwise(value, grid: Grid):
     """Return a number in float64, or an array with a value for every voxel."""
     value = np.asarray(value)
     if value.ndim and value.shape != grid.shape:
@@ -344,12 +344,14 @@ def _voxelwise(value, grid: Grid):
     return value if value.ndim else float(value)
 
 
-def _weights(a, grid: Grid, epsilon) -> list:
-    """Return (h/ε)² and the weights of X, T², TS, GT, GS and s in the density (numbers, or arrays where they vary),
-    with differences in units of the spacing h along x: with g = 2h∇u, D = h² Hess u, T = (ε/h²) T', where
-    T' = w (h/ε)² r - tr D, and likewise X and P. The voxel's volume is included."""
-    a20, a11, a02, a10, a01, a00 = (_voxelwise(value, grid) for value in a)
-    ε, h = _voxelwise(epsilon, grid), grid.spacing[2]
+def _compute_weights(a, grid: Grid, epsilon) -> list:
+    """Return (h/ε)² and the weights of X, T², TS, GT, GS and s in the density, numbers or arrays where they vary.
+
+    Differences are in units of the spacing h along x: with g = 2h∇u, D = h² Hess u, T = (ε/h²) T', where
+    T' = w (h/ε)² r - tr D, and likewise X and P. The voxel's volume is included.
+    """
+    a20, a11, a02, a10, a01, a00 = (_check_voxelwise(value, grid) for value in a)
+    ε, h = _check_voxelwise(epsilon, grid), grid.spacing[2]
     second, first, zeroth = (ε * (grid.voxel_volume / (power * h**power)) for power in (4, 3, 2))
     X = (a20 + a02 - a11) * second
     return [
@@ -363,9 +365,9 @@ def _weights(a, grid: Grid, epsilon) -> list:
     ]
 
 
-def _density_constants(weights: list, grid: Grid) -> np.ndarray:
-    """Return ξ² and small numbers, then the weights, where they do not vary, as `loops._cost` takes them, and the
-    share of the squares that rounding leaves undecided."""
+def _make_constants(weights: list, grid: Grid) -> np.ndarray:
+    """Return the constants `k` of `loops._differentiate`: ξ², small numbers, weights that do not vary, and the share
+    of the squares that rounding leaves undecided."""
     h = grid.spacing[2]
     well, *rest = (float(value) if np.ndim(value) == 0 else math.nan for value in weights)
     low = ROOT_FLOOR * h**2
@@ -376,9 +378,9 @@ def _density_constants(weights: list, grid: Grid) -> np.ndarray:
     return np.array(numbers, np.float32)
 
 
-def _local(weights: list, block: int, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """Put the weights one after the other, volumes where they vary and else one vector, then signs that say where x is
-    mirrored in a block of rows; return of each its offset too, and whether it is a volume."""
+def _join_weights(weights: list, block: int, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+    """Return `local` and `places` of `loops._differentiate`: the weights, volumes where they vary and else one vector,
+    and the signs of mirrored x in a block of rows, one after the other; and their offsets and whether they vary."""
     parts = []
     for value in weights:
         part = np.full(WIDE, value, np.float32) if np.ndim(value) == 0 else _pad_field(value, grid)
@@ -393,8 +395,8 @@ def _local(weights: list, block: int, grid: Grid) -> tuple[np.ndarray, np.ndarra
     return np.concatenate(parts), np.array([offsets, [*(np.ndim(value) > 0 for value in weights), True]]).T.copy()
 
 
-def _orientations(orientation, grid: Grid) -> np.ndarray:
-    """Return Q's zz, yy, xx, zy, zx, yx, as it is and in mirrors across y, z and both."""
+def _mirror_orientation(orientation, grid: Grid) -> np.ndarray:
+    """Return Q's zz, yy, xx, zy, zx, yx (4, 6): as it is, and mirrored in y, in z and in both."""
     Q = np.zeros((3, 3)) if orientation is None else np.asarray(orientation, np.float64)
     if Q.shape != (3, 3) or not np.array_equal(Q, Q.T):
         raise ValueError(f"expected a symmetric 3×3 orientation (z, y, x), got {Q.tolist()}")
@@ -403,8 +405,8 @@ def _orientations(orientation, grid: Grid) -> np.ndarray:
     return (signs * Q[(0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)]).astype(np.float32)
 
 
-def _ratios(grid: Grid) -> np.ndarray | None:
-    """Return the spacing along x over that along z, y, x, and products zz, yy, xx, zy, zx, yx; None if all are one."""
+def _compute_ratios(grid: Grid) -> np.ndarray | None:
+    """Return the ratios of the spacing along x to that along z, y, x, and their products; None if all are one."""
     z, y, x = (grid.spacing[2] / h for h in grid.spacing)
     return None if z == y == 1 else np.array([z, y, x, z * z, y * y, x * x, z * y, z * x, y * x], np.float32)
 

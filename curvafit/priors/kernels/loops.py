@@ -19,7 +19,7 @@ Notation follows the plain-torch definition: s = |∇u|², d = s + ξ², G = √
 q = ∇uᵀ Hess u ∇u / d, T = Tr M, P = |M|², X = 2P - T², S = √(X⁺), all in the units of `_density_constants`. The root
 and what is taken as its derivative at umbilics, X = 0, are `curvature.positive_root`.
 
-The density and its adjoint (`_partials`), by hand since autograd would store some thirty fields. Write g = ∇u and
+The density and its adjoint (`_differentiate`), by hand since autograd would store some thirty fields. Write g = ∇u and
 D = Hess u, so that M = w g⊗g/d - D in these units (paper, eq. 7), and
 
     T = w r - tr D,    P = |M|² = N - 2 w q + (w r)²,    X = 2P - T².
@@ -63,10 +63,10 @@ from numba.core.imputils import lower_builtin
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
 from numba.extending import intrinsic, models, register_model
 
-#: Of fast-math not the leave to assume that no value is NaN or infinite: a diverged flow must show.
+#: Fast-math without the assumption that no value is NaN or infinite: a diverged flow must show.
 _FLAGS = {"contract", "arcp", "nsz", "afn"}
 _PLAIN: dict[str, Any] = {"fastmath": _FLAGS, "error_model": "numpy", "nogil": True}
-#: Parts are compiled into their callers; Python calls none of them, so that no wrappers are compiled.
+#: Parts are compiled into their callers and need no wrappers for Python.
 _PART: dict[str, Any] = {**_PLAIN, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 _INLINE: dict[str, Any] = {**_PART, "forceinline": True}
 _SUMS = {"fastmath": _FLAGS | {"reassoc"}}
@@ -77,7 +77,7 @@ _PARALLEL: dict[str, Any] = {**_PLAIN, **_SUMS, "parallel": True, "cache": True}
 
 
 def _features() -> str:
-    """Return the features that numba compiles for: the host's, whatever its name, unless others are given."""
+    """Return the processor's features that numba compiles for: the host's, unless its settings give others."""
     features = getattr(config, "CPU_FEATURES", None)
     return llvm.get_host_cpu_features().flatten() if features is None else features
 
@@ -101,9 +101,9 @@ _STRIP = 2048
 _ZERO, _ONE, _LEAST = (np.float32(value) for value in (0, 1, 1e-37))
 #: Floats that a row is rounded up to.
 LANES = 16
-#: What `adam_step` does.
+#: The phases of `adam_step`.
 MOVE, ENDS, ALL = range(3)
-#: An index that is not negative, so that it needs no look from the end.
+#: An index that is not negative, so that numba need not count from the end.
 _at = np.uint64
 
 
@@ -142,7 +142,7 @@ def _ir(width: int) -> ir.VectorType:
     return ir.VectorType(ir.FloatType(), width)
 
 
-def _lanes(builder, first, second, indices):
+def _shuffle(builder, first, second, indices):
     """Shuffle the elements of two vectors."""
     return builder.shuffle_vector(first, second, ir.Constant(ir.VectorType(ir.IntType(32), len(indices)), indices))
 
@@ -150,10 +150,10 @@ def _lanes(builder, first, second, indices):
 def _splat(builder, number, width: int):
     """Fill a vector with one number."""
     nothing = ir.Constant(_ir(width), ir.Undefined)
-    return _lanes(builder, builder.insert_element(nothing, number, ir.IntType(32)(0)), nothing, [0] * width)
+    return _shuffle(builder, builder.insert_element(nothing, number, ir.IntType(32)(0)), nothing, [0] * width)
 
 
-def _function(builder, name: str, result, arguments):
+def _declare(builder, name: str, result, arguments):
     """Declare an LLVM function once in a module."""
     known = builder.module.globals.get(name)
     return known or ir.Function(builder.module, ir.FunctionType(result, arguments), name)
@@ -189,7 +189,7 @@ def _address(context, builder, kind, values, width: int):
 
 
 @_intrinsic
-def _wide(typingctx, array, index):
+def _load(typingctx, array, index):
     """Load floats `index` … of a flat float32 array."""
 
     def generate(context, builder, sig, values):
@@ -199,7 +199,7 @@ def _wide(typingctx, array, index):
 
 
 @_intrinsic
-def _full(typingctx, number):
+def _fill(typingctx, number):
     """Fill a vector with one float."""
 
     def generate(context, builder, sig, values):
@@ -227,11 +227,11 @@ def _store_first(typingctx, array, index, value, count):
         width = value.width
         numbers = ir.VectorType(ir.IntType(64), width)
         nothing = ir.Constant(numbers, ir.Undefined)
-        limit = _lanes(builder, builder.insert_element(nothing, values[3], ir.IntType(32)(0)), nothing, [0] * width)
+        limit = _shuffle(builder, builder.insert_element(nothing, values[3], ir.IntType(32)(0)), nothing, [0] * width)
         within = builder.icmp_signed("<", ir.Constant(numbers, list(range(width))), limit)
         address = _address(context, builder, sig.args[0], values, width)
         kinds = [_ir(width), address.type, ir.IntType(32), within.type]
-        masked = _function(builder, f"llvm.masked.store.v{width}f32.p0", ir.VoidType(), kinds)
+        masked = _declare(builder, f"llvm.masked.store.v{width}f32.p0", ir.VoidType(), kinds)
         builder.call(masked, [values[2], address, ir.IntType(32)(4), within])
         return context.get_dummy_value()
 
@@ -247,7 +247,7 @@ def _inverse_root(typingctx, value, one):
 
     def generate(context, builder, sig, values):
         x, one = values
-        root = _function(builder, f"llvm.sqrt.v{value.width}f32", _ir(value.width), [_ir(value.width)])
+        root = _declare(builder, f"llvm.sqrt.v{value.width}f32", _ir(value.width), [_ir(value.width)])
         return builder.fdiv(one, builder.call(root, [x], fastmath=tuple(_FLAGS)), flags=tuple(_FLAGS))
 
     return value(value, value), generate
@@ -270,7 +270,7 @@ def _sum(typingctx, value):
 
     def generate(context, builder, sig, values):
         whole = f"llvm.vector.reduce.fadd.v{value.width}f32"
-        function = _function(builder, whole, ir.FloatType(), [ir.FloatType(), _ir(value.width)])
+        function = _declare(builder, whole, ir.FloatType(), [ir.FloatType(), _ir(value.width)])
         return builder.call(function, [ir.FloatType()(0.0), *values], fastmath=("reassoc",))
 
     return types.float32(value), generate
@@ -285,35 +285,41 @@ def _scale(value, ratios, which):
 
 
 @njit(**_SERIAL)
-def _weight(local, places, which, cell):
+def _read(local, places, which, cell):
     """Read one of the density's weights where they vary."""
-    return _wide(local, places[which, 0] + places[which, 1] * cell)
+    return _load(local, places[which, 0] + places[which, 1] * cell)
 
 
 @njit(**_SERIAL)
-def _cost(k, local, places, cell):
-    """Read the density's weights: (h/ε)², the floor of X, then those of X, T², TS, GT, GS and s, and twice those
-    of X, T² and s; where they vary, from `cell` on; where `places` is None, `local` is a mask of them."""
+def _read_cost(k, local, places, cell):
+    """Read (h/ε)², the floor of X, the weights of X, T², TS, GT, GS and s, and twice those of X, T² and s.
+
+    They are numbers where `local` is None, numbers times the mask `local` where `places` is, else arrays.
+    """
     if local is None:
         return (
-            _full(k[7]), _full(k[8]), _full(k[9]), _full(k[10]), _full(k[11]), _full(k[12]), _full(k[13]), _full(k[14]),
-            _full(k[15]), _full(k[16]), _full(k[17]),
+            _fill(k[7]), _fill(k[8]), _fill(k[9]), _fill(k[10]), _fill(k[11]), _fill(k[12]), _fill(k[13]), _fill(k[14]),
+            _fill(k[15]), _fill(k[16]), _fill(k[17]),
         )  # fmt: skip
     if places is None:
-        mask = _wide(local, cell)
+        mask = _load(local, cell)
         return (
-            _full(k[7]), _full(k[8]), mask * k[9], mask * k[10], mask * k[11], mask * k[12], mask * k[13], mask * k[14],
+            _fill(k[7]), _fill(k[8]), mask * k[9], mask * k[10], mask * k[11], mask * k[12], mask * k[13], mask * k[14],
             mask * k[15], mask * k[16], mask * k[17],
         )  # fmt: skip
-    well, X, T2 = _weight(local, places, 0, cell), _weight(local, places, 1, cell), _weight(local, places, 2, cell)
-    TS, GT = _weight(local, places, 3, cell), _weight(local, places, 4, cell)
-    GS, s = _weight(local, places, 5, cell), _weight(local, places, 6, cell)
+    well, X, T2 = (
+        _read(local, places, 0, cell),
+        _read(local, places, 1, cell),
+        _read(local, places, 2, cell),
+    )
+    TS, GT = _read(local, places, 3, cell), _read(local, places, 4, cell)
+    GS, s = _read(local, places, 5, cell), _read(local, places, 6, cell)
     return well, well * k[8], X, T2, TS, GT, GS, s, X + X, T2 + T2, s + s
 
 
 @njit(**_SERIAL)
 def _mirror(orient, across_z, across_y):
-    """Return Q as it stands in the box's mirror image: what has one axis that is mirrored is negative."""
+    """Return Q in the box's mirror image: components with one mirrored axis change sign."""
     if orient is None:
         return None
     return orient[2 * across_z + across_y]
@@ -321,8 +327,8 @@ def _mirror(orient, across_z, across_y):
 
 @njit(**_SERIAL)
 def _tilt(gz, gy, gx, orient, local, places, cell, i):
-    """Compute Q∇u times the weight of ∇uᵀQ∇u; a row of signs says where x is mirrored."""
-    weight, sign = _weight(local, places, 7, cell), _wide(local, places[8, 0] + i)
+    """Compute Q∇u times the weight of ∇uᵀQ∇u; a row of signs in `local` is negative where x is mirrored."""
+    weight, sign = _read(local, places, 7, cell), _load(local, places[8, 0] + i)
     gz, gy, gx = weight * gz, weight * gy, weight * gx
     across = sign * gx
     tz = gz * orient[0] + gy * orient[3] + across * orient[4]
@@ -331,39 +337,40 @@ def _tilt(gz, gy, gx, orient, local, places, cell, i):
 
 
 @njit(**_SERIAL)
-def _partials(u, m, c, p, stride, n, ring, size, at, inside, from_, k, ratios, orient, local, places):
-    """Compute the energy of n cells and their partial derivatives, from `at` on in the ring's ten arrays, `size` apart.
+def _differentiate(u, m, c, p, stride, n, ring, size, at, inside, from_, k, ratios, orient, local, places):
+    """Compute the energy of n cells; store the partial derivatives from `at` on in the ring's ten arrays, `size` apart.
 
     `m`, `c`, `p` are the cells' offsets in the planes z-1, z, z+1 of u; `inside` is one in the box from `from_` on.
-    Differences are in units of the spacing, the constants `k` scaled accordingly. They are read where they are used:
-    kept in registers, they would push the variables out. `local` and `places` are None, or the weights where they vary
-    (from row 0 of `places` on: of each its offset in `local`, and one, or zero for a vector that serves everywhere);
-    then `orient` holds Q's zz, yy, xx, zy, zx, yx. Or `local` alone is a volume that all weights are multiplied by.
+    Differences are in units of the spacing, and the constants `k` are scaled so; these are read where they are used,
+    since in registers they would push the variables out. Where weights vary, `local` holds them one after the other and
+    a row of `places` is a weight's offset in it, with 1, or 0 for one vector that holds everywhere; `orient` then holds
+    Q's zz, yy, xx, zy, zx, yx. `local` without `places` is a mask that multiplies all weights.
     """
-    energy = _full(k[1])
+    energy = _fill(k[1])
     for i in range(0, n, WIDE):
-        ξ2, zero, quarter = _full(k[0]), _full(k[1]), _full(k[3])
-        one, two, three = _full(k[4]), _full(k[5]), _full(k[6])
-        well, low, of_X, of_T2, of_TS, of_GT, of_GS, of_s, twice_X, twice_T2, twice_s = _cost(k, local, places, c + i)
-        u_ = _wide(u, c + i)
-        zm, zp = _wide(u, m + i), _wide(u, p + i)
-        ym, yp = _wide(u, c + i - stride), _wide(u, c + i + stride)
-        xm, xp = _wide(u, c + i - 1), _wide(u, c + i + 1)
+        ξ2, zero, quarter = _fill(k[0]), _fill(k[1]), _fill(k[3])
+        one, two, three = _fill(k[4]), _fill(k[5]), _fill(k[6])
+        well, low, of_X, of_T2, of_TS, of_GT, of_GS, of_s, twice_X, twice_T2, twice_s = _read_cost(
+            k, local, places, c + i
+        )
+        u_ = _load(u, c + i)
+        zm, zp = _load(u, m + i), _load(u, p + i)
+        ym, yp = _load(u, c + i - stride), _load(u, c + i + stride)
+        xm, xp = _load(u, c + i - 1), _load(u, c + i + 1)
         gz, gy, gx = _scale(zp - zm, ratios, 0), _scale(yp - ym, ratios, 1), _scale(xp - xm, ratios, 2)
         twice = u_ + u_
         zz, yy = _scale((zp + zm) - twice, ratios, 3), _scale((yp + ym) - twice, ratios, 4)
         xx = _scale((xp + xm) - twice, ratios, 5)
-        zy = (_wide(u, p + i + stride) + _wide(u, m + i - stride)) - (
-            _wide(u, p + i - stride) + _wide(u, m + i + stride)
+        zy = (_load(u, p + i + stride) + _load(u, m + i - stride)) - (
+            _load(u, p + i - stride) + _load(u, m + i + stride)
         )
-        zx = (_wide(u, p + i + 1) + _wide(u, m + i - 1)) - (_wide(u, p + i - 1) + _wide(u, m + i + 1))
-        yx = (_wide(u, c + i + stride + 1) + _wide(u, c + i - stride - 1)) - (
-            _wide(u, c + i + stride - 1) + _wide(u, c + i - stride + 1)
+        zx = (_load(u, p + i + 1) + _load(u, m + i - 1)) - (_load(u, p + i - 1) + _load(u, m + i + 1))
+        yx = (_load(u, c + i + stride + 1) + _load(u, c + i - stride - 1)) - (
+            _load(u, c + i + stride - 1) + _load(u, c + i - stride + 1)
         )
         zy, zx = _scale(quarter * zy, ratios, 6), _scale(quarter * zx, ratios, 7)
         yx = _scale(quarter * yx, ratios, 8)
-        # The density: each invariant once; what two of them share is computed in the order in which it is needed, for
-        # registers are what runs out.
+        # The density. Shared terms are computed once, as late as possible, since registers run out.
         gzz, gyy, gxx = gz * gz, gy * gy, gx * gx
         s = gzz + gyy + gxx
         d = s + ξ2
@@ -394,7 +401,7 @@ def _partials(u, m, c, p, stride, n, ring, size, at, inside, from_, k, ratios, o
         if orient is not None:
             tz, ty, tx = _tilt(gz, gy, gx, orient, local, places, c + i, i)
             e = e + (gz * tz + gy * ty + gx * tx)
-        energy = energy + e * _wide(inside, from_ + i)
+        energy = energy + e * _load(inside, from_ + i)
         # Its derivatives, from the outside in, as at the file's head. The root's is zero where X is not resolved
         # (`curvature.positive_root`); `e_q` and `e_s` are the factors of D g and g in ∂e/∂g.
         slope = _where_above(X, low, i_S, zero)
@@ -432,38 +439,38 @@ def _partials(u, m, c, p, stride, n, ring, size, at, inside, from_, k, ratios, o
 
 @njit(**_SERIAL)
 def _gather(ring, size, at, stride, n, sums, below, centre, above, out, target):
-    """Apply the transposed stencils to n cells from `at` of the ring on: finish the plane below, add to this one,
-    begin the one above (`below`, `centre`, `above` are offsets into `sums`)."""
+    """Apply the transposed stencils to n cells from `at` of the ring on: finish the plane below, add to this one and
+    begin the one above, whose offsets in `sums` are `below`, `centre` and `above`."""
     c, zm, zp = at + _C * size, at + _ZM * size, at + _ZP * size
     xm, xp, zx = at + _XM * size, at + _XP * size, at + _ZX * size
     yp, ym = at + _YP * size - stride, at + _YM * size + stride
     zy_m, zy_p = at + _ZY * size - stride, at + _ZY * size + stride
     yx_m, yx_p = at + _YX * size - stride, at + _YX * size + stride
     for i in range(0, n, WIDE):
-        within = _wide(ring, c + i) + _wide(ring, yp + i) + (_wide(ring, ym + i) + _wide(ring, xp + i - 1))
-        within = within + _wide(ring, xm + i + 1) + (_wide(ring, yx_p + i + 1) - _wide(ring, yx_p + i - 1))
-        within = within + (_wide(ring, yx_m + i - 1) - _wide(ring, yx_m + i + 1))
-        across = (_wide(ring, zy_p + i) - _wide(ring, zy_m + i)) + (_wide(ring, zx + i + 1) - _wide(ring, zx + i - 1))
-        _store(out, target + i, _wide(sums, below + i) + _wide(ring, zm + i) + across)
-        _store(sums, above + i, _wide(ring, zp + i) - across)
+        within = _load(ring, c + i) + _load(ring, yp + i) + (_load(ring, ym + i) + _load(ring, xp + i - 1))
+        within = within + _load(ring, xm + i + 1) + (_load(ring, yx_p + i + 1) - _load(ring, yx_p + i - 1))
+        within = within + (_load(ring, yx_m + i - 1) - _load(ring, yx_m + i + 1))
+        across = (_load(ring, zy_p + i) - _load(ring, zy_m + i)) + (_load(ring, zx + i + 1) - _load(ring, zx + i - 1))
+        _store(out, target + i, _load(sums, below + i) + _load(ring, zm + i) + across)
+        _store(sums, above + i, _load(ring, zp + i) - across)
         if i + WIDE <= n:
-            _store(sums, centre + i, _wide(sums, centre + i) + within)
+            _store(sums, centre + i, _load(sums, centre + i) + within)
         else:
-            _store_first(sums, centre + i, _wide(sums, centre + i) + within, n - i)
+            _store_first(sums, centre + i, _load(sums, centre + i) + within, n - i)
 
 
 @njit(**_SERIAL)
 def _carry(ring, size, stride, count):
-    """Move what the next block needs of the last two of `count` rows (places 2 … of the ring) to places 0 and 1."""
+    """Move the last two of `count` rows, which start at row 2 of the ring, to rows 0 and 1 for the next block."""
     far = count * stride
     for array in range(_C, _YP):
         first = SLACK + array * size + stride
         for i in range(first, first + stride, WIDE):
-            _store(ring, i, _wide(ring, i + far))
+            _store(ring, i, _load(ring, i + far))
     for array in range(_YP, PARTIALS):
         first = SLACK + array * size
         for i in range(first, first + 2 * stride, WIDE):
-            _store(ring, i, _wide(ring, i + far))
+            _store(ring, i, _load(ring, i + far))
 
 
 @njit(**_SERIAL)
@@ -471,7 +478,7 @@ def _fill_gradient_chunk(
     u, out, energies, ring, sums, inside, k, ratios, orient, local, places, index,
     first, last, y0, y1, block, Z, Y, stride,
 ):  # fmt: skip
-    """Compute planes first … last - 1, rows y0 … y1 - 1 of the gradient, and a halo of one cell on every side."""
+    """Compute the gradient in planes first to last - 1 and rows y0 to y1 - 1, which needs partials one cell around."""
     plane, size = pitch(Y, stride - 2 * EDGE), (ring.size - 2 * SLACK) // PARTIALS
     share = (sums.size - 2 * SLACK) // 4
     for z in range(first - 1, last + 1):
@@ -485,7 +492,7 @@ def _fill_gradient_chunk(
             o = (y + EDGE) * stride
             from_ = (block - count if within else block) * stride
             place = SLACK + 2 * stride
-            energy += _partials(
+            energy += _differentiate(
                 u, m + o, c + o, p + o, stride, count * stride, ring, size, place, inside, from_, k, ratios,
                 _mirror(orient, z < 0 or z >= Z, y < 0 or y >= Y), local, places,
             )  # fmt: skip
@@ -520,11 +527,11 @@ def fill_gradient(u, out, energies, rings, sums, inside, k, ratios, orient, loca
 
 
 def _blur_across(begins: bool):
-    """Make the loop over the first weights of a blur across rows, or over further ones."""
+    """Return the loop over the first `TAPS` weights of a blur across rows, or over the next ones."""
 
     @njit(**_INLINE)
     def blur(source, origin, size, index, first, out, target, apart, n, taps, j0, shift):
-        """Compute four neighbouring sums of weighted rows, `TAPS` weights from j0 on; they begin with a number."""
+        """Add the rows under `TAPS` weights from j0 on to four output rows, which begin as a number."""
         for i in range(n):
             if begins:
                 a = b = c = d = shift
@@ -552,8 +559,10 @@ _begin_across, _add_across = _blur_across(True), _blur_across(False)
 
 @njit(**_INLINE)
 def _blur_rows(source, origin, size, index, first, out, target, apart, n, taps, shift):
-    """Compute four rows of n, `apart` in `out`, of a blur across rows: `index` says which of those that stand `size`
-    apart in the source is where, from the first one's first tap at `first` on."""
+    """Blur across rows: compute four rows of n floats, `apart` in `out`.
+
+    `index[first + t]` is the source row, of those `size` apart, under tap t of the first output row.
+    """
     _begin_across(source, origin, size, index, first, out, target, apart, n, taps, 0, shift)
     for j0 in range(TAPS, taps.size, TAPS):
         _add_across(source, origin, size, index, first, out, target, apart, n, taps, j0, shift)
@@ -577,15 +586,17 @@ def _blur_z(chunk, chunks, source, out, base, Z, plane, index, taps, shift):
 
 @njit(**_PARALLEL)
 def blur_z(source, out, base, chunks, Z, plane, index, taps, shift):
-    """Blur along z, plus a number and, where there is one, a field; strip by strip, four planes at a time. Every chunk
-    has four planes or is the whole volume, which has room for four."""
+    """Blur along z, and add a number and, where it is not empty, a field; four planes of a strip at a time.
+
+    Every chunk has four planes or is the whole volume, which has room for four.
+    """
     for chunk in prange(chunks):
         _blur_z(np.int64(chunk), chunks, source, out, base, Z, plane, index, taps, shift)
 
 
 @njit(**_INLINE)
 def _continue_rows(rows, start, length, X, r, index):
-    """Continue four rows, `length` apart, whose samples stand from start + r on."""
+    """Continue four rows, `length` apart, by r samples on both sides; their samples are from start + r on."""
     for j in range(r):
         left, right = r + index[_at(j)], r + index[_at(r + X + j)]
         for k in range(TOGETHER):
@@ -595,11 +606,11 @@ def _continue_rows(rows, start, length, X, r, index):
 
 
 def _blur_along(begins: bool):
-    """Make the loop over the first weights of a blur along rows, or over further ones."""
+    """Return the loop over the first `TAPS` weights of a blur along rows, or over the next ones."""
 
     @njit(**_INLINE)
     def blur(rows, first, out, target, n, taps, j0):
-        """Compute the sums of a row's weighted samples from `first` on, `TAPS` weights from j0 on."""
+        """Add the samples, from `first` on, under `TAPS` weights from j0 on to the outputs of a row."""
         for i in range(n):
             total = _ZERO if begins else out[_at(target + i)]
             for j in range(TAPS):
@@ -614,8 +625,8 @@ _begin_along, _add_along = _blur_along(True), _blur_along(False)
 
 @njit(**_INLINE)
 def _blur_x(rows, start, length, count, out, target, X, taps, ends):
-    """Blur along `count` rows, `length` apart, from their continuation at `start` on, into rows X + 2·EDGE apart, with
-    two samples of their own continuation at either end."""
+    """Blur along `count` continued rows, `length` apart from `start` on, into rows X + 2·EDGE apart, and continue those
+    by two samples at both ends."""
     n = (X + LANES - 1) & -LANES
     for k in range(count):
         o, first = target + k * (X + 2 * EDGE), start + k * length
@@ -628,10 +639,9 @@ def _blur_x(rows, start, length, count, out, target, X, taps, ends):
 
 @njit(**_INLINE)
 def _blur_plane(source, origin, size, rows, out, target, edge, Y, X, blur):
-    """Blur a plane along y and x: rows `size` apart in the source, to rows -edge … Y + edge - 1 of `out`, whose row 0
-    begins at `target`.
+    """Blur a plane along y and x: from rows `size` apart, to rows -edge … Y + edge - 1 of `out`, row 0 at `target`.
 
-    Four rows are blurred along y before the four before them are along x: by then what was written has arrived.
+    Four rows are blurred along y before the previous four are along x, whose values have arrived in memory by then.
     """
     index_y, taps_y, index_x, taps_x, ends, r = blur
     length = row_length(X, taps_x.size)
@@ -699,8 +709,8 @@ def _divergence_plane(A, flux, half, z, shape, periodic):
 
 
 @njit(**_SUMMING)
-def _sizes(slopes, n):
-    """Sum the moduli of n slopes, and find the greatest by their bits, which are in order and keep a NaN."""
+def _measure_sizes(slopes, n):
+    """Return the sum of the moduli of n slopes, and the bits of the greatest: bits are in order and keep a NaN."""
     bits = slopes.view(np.int32)
     total, most = _ZERO, np.int32(0)
     for i in range(n):
@@ -721,7 +731,7 @@ def _adam_rows(A, m, v, o, keep, free, slopes, n, adam):
         first = m[_at(o + i)]
         first += (slope - first) * adam[0]
         second = v[_at(o + i)] * adam[1] + slope * slope * adam[2]
-        # Below the least number whose root the processor estimates, the root is lost beside eps.
+        # Roots of numbers below the least that the processor estimates are negligible beside eps.
         root = second * (_ONE / math.sqrt(max(second, _LEAST)))
         m[_at(o + i)], v[_at(o + i)] = first, second
         A[_at(o + i)] -= first * adam[3] / (root * adam[4] + adam[5])
@@ -729,8 +739,10 @@ def _adam_rows(A, m, v, o, keep, free, slopes, n, adam):
 
 @njit(**_INLINE)
 def _adam_plane(A, m, v, keep, ring, slopes, below, here, above, half, adam, z, shape):
-    """Make Adam's step along -∇ of a plane, some rows at a time; return sum and maximum of the slopes' moduli. `below`,
-    `here`, `above` are the first samples' offsets in the ring."""
+    """Make Adam's step along -∇ of a plane, some rows at a time; return sum and maximum of the slopes' moduli.
+
+    `below`, `here`, `above` are the first samples' offsets in the ring.
+    """
     Z, Y, X = shape
     stride, whole = X + 2 * EDGE, (X + LANES - 1) & -LANES
     total, most = 0.0, np.int32(0)
@@ -749,7 +761,7 @@ def _adam_plane(A, m, v, keep, ring, slopes, below, here, above, half, adam, z, 
                     difference = ring[_at(before + row + i)] - ring[_at(after + row + i)]
                     slopes[_at(k * X + i)] = difference * half[_at(component)]
             _adam_rows(A, m, v, component * Z * Y * X + free, keep, free, slopes, count * X, adam)
-            part, top = _sizes(slopes, count * X)
+            part, top = _measure_sizes(slopes, count * X)
             total += part
             most = max(most, top)
     return total, most
@@ -768,7 +780,7 @@ def _adam_chunk(
     for z in range(first - 1, last + 2):
         for of_A in (False, True):
             if of_A:
-                # The plane whose neighbours, in this chunk, have moved.
+                # A plane whose neighbours in this chunk have moved.
                 moved = z - 2
                 inner = first < moved < last - 1
                 if not first <= moved < last or (phase != ALL and inner != (phase == MOVE)):
@@ -794,11 +806,14 @@ def _adam_chunk(
 def adam_step(
     phase, g, A, m, v, keep, out, rows, rings, slopes, fluxes, sums, highest, half, adam, shape, periodic, index_z, blur
 ):
-    """Blur along y and x, three planes at a time; -∇, the transpose of div; Adam; and as soon as A's neighbouring
-    planes have moved, div A for the next step, blurred along y and x, while A is in the cache: `MOVE`. Then the planes
-    whose neighbours another thread moved: `ENDS`. Or div A alone, of `ALL` planes."""
+    """Run the last pass of a step, in the phases `MOVE` and `ENDS`, or compute div A alone, of `ALL` planes.
+
+    `MOVE` blurs the gradient along y and x, three planes at a time, applies -∇, the transpose of div, and Adam; as soon
+    as a plane's neighbours have moved, while A is in the cache, it computes the next step's div A, blurred along y and
+    x. `ENDS` does so for the planes whose neighbours another thread moved.
+    """
     for chunk in prange(rows.shape[0]):
-        # numba infers a signed counter and compiles an unsigned one: the part would be compiled for both.
+        # numba infers a signed counter but makes an unsigned one: without int64, both would be compiled.
         _adam_chunk(
             np.int64(chunk), phase, g, A, m, v, keep, out, rows, rings, slopes, fluxes, sums, highest, half, adam,
             shape, periodic, index_z, blur,
