@@ -141,15 +141,9 @@ class CurvaturePrior(nn.Module):
     ) -> float:
         """Return the factor by which this loss has `share` times the gradient's norm, over the input, of another loss.
 
-        Parameters
-        ----------
-        loss_fn
-            The other loss, a function of output and target; its values are summed.
-        batch
-            A network's output and its target, as in training.
-        share
-            At the default ε, tubes two voxels thick survive a share of 0.1 with `trabec` and `tubes`, but not with
-            `pearls`; a share of 1 removes them.
+        The batch is a network's output and its target, as in training, of which `loss_fn` is a function; its values are
+        summed. At the default ε, tubes two voxels thick survive a share of 0.1 with `trabec` and `tubes`, but not with
+        `pearls`; a share of 1 removes them.
 
         Raises ValueError where either gradient is zero or not finite, as on a prediction without a surface.
         """

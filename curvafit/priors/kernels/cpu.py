@@ -31,22 +31,10 @@ _LINE = 16
 def fused_energy_gradient(
     u: np.ndarray, a, grid: Grid, epsilon, orientation=None, mask=None
 ) -> tuple[float, np.ndarray]:
-    """Return F_ε(u) and its gradient with respect to every voxel, in which the voxel's volume is a factor.
+    """Return F_ε(u) and its gradient in float32, as `energy.energy_gradient` does, from arrays `(Z, Y, X)`.
 
-    Parameters
-    ----------
-    u
-        Phase field `(Z, Y, X)`; computed in float32.
-    a
-        The six coefficients (a20, a11, a02, a10, a01, a00), numbers or arrays `(Z, Y, X)`.
-    grid, epsilon
-        The sampling, either boundary, and the interface parameter in spacing's unit, a number or an array `(Z, Y, X)`.
-    orientation
-        Q of a further term ε ∫ ∇uᵀQ∇u, symmetric, axes z, y, x, or None.
-    mask
-        Weights of the density, `(Z, Y, X)`, or None.
-
-    Raises ValueError where an array's shape is not the grid's, or the orientation is not symmetric.
+    The coefficients (a20 first) and ε are numbers, or arrays where they vary. Raises ValueError where an array's shape
+    is not the grid's, or the orientation is not symmetric.
     """
     density = _Density(a, grid, epsilon, _threads(grid), orientation, mask)
     gradient = _volume(grid)
@@ -64,7 +52,7 @@ def gaussian_blur(u: np.ndarray, grid: Grid, width: float) -> np.ndarray:
 
 
 class FusedFlow:
-    """The state of the flow u = k ∗ (div A + base) under Adam on A, stepped in place.
+    """The flow u = k ∗ (div A + base) under Adam on A, stepped in place; its cost is as in `fused_energy_gradient`.
 
     Parameters
     ----------
@@ -72,14 +60,12 @@ class FusedFlow:
         A at the first step, `(3, Z, Y, X)`, components z, y, x; None for zeros, to be filled in place through `vector`.
     base
         k ∗ base: the mass m₀, or a blurred field `(Z, Y, X)`.
-    a, grid, epsilon, orientation
-        The cost, as `energy_gradient` takes it.
     width
         The blur's standard deviation in spacing's unit.
     frozen
         Voxels `(Z, Y, X)` whose A is constant, or None.
     betas, adam_eps
-        Adam's decay rates and the number added to its root (`torch.optim.Adam`'s betas and eps).
+        `torch.optim.Adam`'s betas and eps.
     """
 
     def __init__(
@@ -92,7 +78,7 @@ class FusedFlow:
         self.betas = betas
         self._threads = threads = _threads(grid)
         size = 3 * Z * Y * X
-        self._vector, self._first, self._second = (_flat(size) for _ in range(3))
+        self._vector, self._first, self._second = (_zeros(size + 2 * SLACK) for _ in range(3))
         #: Whether the last step has left the next one's blurred div A in place of its gradient.
         self._ahead = False
         if start is not None:
@@ -102,13 +88,13 @@ class FusedFlow:
         self._mass, self._base = (base, _NO_FIELD) if np.ndim(base) == 0 else (0.0, _pad_field(base, grid))
         self._keep, self._free = np.empty(0, np.float32), size
         if frozen is not None:
-            self._keep = _flat(size // 3)
+            self._keep = _zeros(size // 3 + 2 * SLACK)
             self._keep[SLACK:-SLACK] = 1 - np.asarray(frozen, np.float32).ravel()
             self._free = 3 * int(np.count_nonzero(self._keep))
         self._between, self._field, self._gradient = _volume(grid), _volume(grid), _volume(grid)
         self._sums, self._highest = np.empty(Z), np.empty(Z, np.int32)
         self._index_z = _continue_index(Z, EDGE, EDGE, grid.periodic)
-        sizes = 3 * _plane(grid) + 2 * SLACK, loops.ROWS * X + SLACK, Y * X + SLACK
+        sizes = 3 * loops.pitch(Y, X) + 2 * SLACK, loops.ROWS * X + SLACK, Y * X + SLACK
         self._rings, self._slopes, self._fluxes = (_scratch(threads, size) for size in sizes)
 
     @property
@@ -212,9 +198,11 @@ class _Blur:
 
     def along_z(self, source: np.ndarray, out: np.ndarray, shift: float, base: np.ndarray) -> None:
         """Blur along z, and add a number and, where it is not empty, a field."""
-        Z, plane = self._grid.shape[0], _plane(self._grid)
+        Z, *plane = self._grid.shape
         with limit_threads(self._threads):
-            loops.blur_z(source, out, base, self._threads, Z, plane, self._index, self._taps, np.float32(shift))
+            loops.blur_z(
+                source, out, base, self._threads, Z, loops.pitch(*plane), self._index, self._taps, np.float32(shift)
+            )
 
     def in_planes(self, source: np.ndarray, out: np.ndarray) -> None:
         """Blur along y and x."""
@@ -270,11 +258,6 @@ def _threads(grid: Grid) -> int:
     return max(1, min(count_threads(), math.prod(grid.shape) // _WORTH, grid.shape[0] // TOGETHER))
 
 
-def _flat(size: int) -> np.ndarray:
-    """Make room for a flat array and the slack around it."""
-    return _zeros(size + 2 * SLACK)
-
-
 def _scratch(threads: int, size: int) -> np.ndarray:
     """Make room of a size for each thread, on cache lines of its own."""
     size = -(-size // _LINE) * _LINE
@@ -288,22 +271,16 @@ def _zeros(size: int) -> np.ndarray:
     return room[first : first + size]
 
 
-def _plane(grid: Grid) -> int:
-    """Count the floats from a plane to the next."""
-    _, Y, X = grid.shape
-    return loops.pitch(Y, X)
-
-
 def _volume(grid: Grid) -> np.ndarray:
     """Make room for the grid's planes, or for as many as a blur along z makes at once."""
-    return _flat(max(grid.shape[0], TOGETHER) * _plane(grid))
+    return _zeros(max(grid.shape[0], TOGETHER) * loops.pitch(*grid.shape[1:]) + 2 * SLACK)
 
 
 def _whole(volume: np.ndarray, grid: Grid) -> np.ndarray:
     """View the field and its continuation in planes."""
     Z, Y, X = grid.shape
     rows = (X + 2 * EDGE) * 4
-    return as_strided(volume[SLACK:], (Z, Y + 2 * EDGE, X + 2 * EDGE), (_plane(grid) * 4, rows, 4))
+    return as_strided(volume[SLACK:], (Z, Y + 2 * EDGE, X + 2 * EDGE), (loops.pitch(Y, X) * 4, rows, 4))
 
 
 def _inner(volume: np.ndarray, grid: Grid) -> np.ndarray:

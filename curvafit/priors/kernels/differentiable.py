@@ -24,16 +24,8 @@ def energies(
     In float32 the gradient is computed together with the value, field by field, by the fused kernel where there is one
     and else by autograd: two numbers for each voxel wait for a backward pass, where autograd alone stores thirty. There
     are first derivatives only, and a second one raises a RuntimeError. Float64, a compiler without a kernel, and a call
-    without a gradient take the definition.
-
-    Parameters
-    ----------
-    coefficients
-        Numbers.
-    grid, epsilon
-        A grid with the boundary `"replicate"`; ε in spacing's unit.
-    mask
-        Weights, which get no gradient: one that asks for it is a ValueError.
+    without a gradient take the definition. Coefficients are numbers and the boundary is `"replicate"`; a mask that asks
+    for a gradient is a ValueError.
     """
     if mask.requires_grad:
         raise ValueError("expected a mask that asks for no gradient, got one that does: detach it")

@@ -76,14 +76,11 @@ _COUNTING: dict[str, Any] = {**_PLAIN, "forceinline": True, "cache": True}
 _PARALLEL: dict[str, Any] = {**_PLAIN, **_SUMS, "parallel": True, "cache": True}
 
 
-def _features() -> str:
-    """Return the processor's features that numba compiles for: the host's, unless its settings give others."""
-    features = getattr(config, "CPU_FEATURES", None)
-    return llvm.get_host_cpu_features().flatten() if features is None else features
-
-
+#: The processor's features that numba compiles for: the host's, unless numba's settings give others.
+_GIVEN = getattr(config, "CPU_FEATURES", None)
+_FEATURES = llvm.get_host_cpu_features().flatten() if _GIVEN is None else _GIVEN
 #: Floats of a vector of the density: two of the processor's where it has the registers.
-WIDE = 32 if "+avx512f" in _features().split(",") else 8
+WIDE = 32 if "+avx512f" in _FEATURES.split(",") else 8
 #: Floats before and after a flat volume.
 SLACK = 64
 #: Samples of the continuation on every side of a plane.
