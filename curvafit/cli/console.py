@@ -24,7 +24,7 @@ from curvafit.core.runtime import Terminated, exit_code, one_line
 DEBUG = "CURVAFIT_DEBUG"
 #: Most characters of a sentence; a longer one is cut in its middle.
 LONGEST = 700
-#: Signs that look better on a page than in a terminal, where they are copied and some encodings lack them.
+#: Characters that look better on a page, but are copied from a terminal, and that some encodings lack.
 _PLAIN = str.maketrans({"\u2212": "-", "\u2013": "-", "\u202f": " ", "\u00a0": " "})
 #: The exception of an option that typer cannot parse; its name and module change with typer's versions.
 _Refusal: type[Exception] = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
@@ -62,7 +62,7 @@ def _explain_usage(error: Any) -> str:
 
 @contextmanager
 def plain_errors() -> Iterator[None]:
-    """Turn an expected exception into its sentence and exit code 2, and a signal into the exit code of `exit_code`.
+    """Print an expected exception as one sentence and exit with code 2; after a signal, with the code of `exit_code`.
 
     Warnings become notes, printed at the end of a command that succeeds; one that fails prints its error alone.
     """
@@ -135,7 +135,7 @@ def error_console() -> Console:
 
 
 def sentence(text: str, start: str = "error") -> str:
-    """Return a message on one line of limited length, in signs that show; others are escaped."""
+    """Return a message as one line of limited length, in which characters that do not show are escaped."""
     line = one_line(" ".join(text.split()))
     if len(line) > LONGEST:
         line = f"{line[: LONGEST * 2 // 3]} … {line[-LONGEST // 3 :]}"
@@ -143,7 +143,7 @@ def sentence(text: str, start: str = "error") -> str:
 
 
 def writable(text: str, console: Console) -> str:
-    """Return a text in signs that a stream can encode; others are escaped."""
+    """Return a text in which characters that a console cannot encode are escaped."""
     return text.encode(console.encoding, "backslashreplace").decode(console.encoding)
 
 

@@ -51,9 +51,7 @@ def synth(
     modality: Kind = None,
     like: Annotated[str | None, _image(help="Scan to take noise, blur and contrast from.")] = None,
     like_mask: Annotated[str | None, _image(help="Mask of the structure in --like, for better estimates.")] = None,
-    visible: Annotated[
-        str | None, _image(help="Masks as annotators draw them: where this share of light arrives, or auto.")
-    ] = None,
+    visible: Annotated[str | None, _image(help="Masks as seen: where this share of light arrives, or auto.")] = None,
     voxel: Annotated[float | None, _image(help="Edge of a shape's voxel, in --unit; by default the law's.")] = None,
     calibres: Annotated[str, _image(help="LOW,HIGH: a case is thicker by a factor in between.")] = "1,1",
     *,
@@ -85,6 +83,7 @@ def synth(
 
 
 def _build_and_preview(out: Path, spec: SetSpec, count: int, crew: Crew) -> None:
+    """Make the cases of a set and a picture of some, and print where they are listed and drawn."""
     from curvafit.core.checks import check_int
     from curvafit.core.files import check_folder
     from curvafit.data_synth.sets import MOST, build_set, cases_of, check_set, write_preview
@@ -161,6 +160,7 @@ def _split_mask(values: np.ndarray) -> np.ndarray:
 
 
 def _with_visible(kind: Modality, share_text: str | None) -> Modality:
+    """Return a kind of image whose masks end where a share of the light arrives, if the option is given."""
     if share_text is None:
         return kind
     from curvafit.data_synth.imaging.image import visible_share

@@ -115,7 +115,7 @@ def resolve_place(path: str | Path) -> Path:
 
 
 def identity(**parts: object) -> dict[str, str]:
-    """Return the texts, by name, that tell runs apart: those of its parts, with digests of tensors, and versions."""
+    """Return what must be equal for a run to resume another: its parts as texts, tensors as digests, and versions."""
     texts = {name: _to_text(value) for name, value in parts.items()}
     return {**texts, "curvafit": version("curvafit"), "torch": version("torch")}
 

@@ -231,7 +231,7 @@ def _find_infinite(statistics: Statistics, mass: float) -> str:
 def first_mass(share: float, mass: float | None = None) -> float:
     """Return the first mass of a flow towards a share of volume: that of a sharp shape, with values ±1.
 
-    A given mass replaces it, moved to within `FRACTION_REACH` of it. Raises ValueError if the share is not in (0, 1).
+    A given mass is taken instead, as far as `FRACTION_REACH` from it. Raises ValueError if the share is not in (0, 1).
     """
     share = check_open_interval(share, "a volume fraction in (0, 1)", 0, 1)
     sharp = min(max(2 * share - 1, -FRACTION_BOUND), FRACTION_BOUND)

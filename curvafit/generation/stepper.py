@@ -293,7 +293,7 @@ class LbfgsStepper(TorchStepper):
         )
 
     def _evaluate_once(self) -> tuple[Tensor | float, Tensor, Tensor]:
-        """Return the evaluation at the parameters, which is the cached one where they have not moved."""
+        """Return the evaluation at the parameters, from the cache if they have not moved."""
         if self._cached is None or not torch.equal(self._cached[0], self._parameters):
             self._cached = self._parameters.clone(), self._evaluate(self._parameters, self._offset)
         return self._cached[1]
