@@ -41,14 +41,14 @@ def build_atlas(
     box = parse_whole_triple(shape, "--shape")
     law = _choose_design(design, around, spread)
     from curvafit.core.files import check_folder
-    from curvafit.data_synth.atlas import build, check_count, settings_of
+    from curvafit.data_synth.atlas import build, check_count, make_settings
     from curvafit.data_synth.store import open_store
     from curvafit.generation.schedule import schedule as named
 
     check_count(count, 1)
     crew.check_memory(box)
     plan = named(schedule, steps)
-    settings = settings_of(box, seed, plan, law)
+    settings = make_settings(box, seed, plan, law)
     if store.exists():
         open_store(store, settings)
     check_folder(store.parent)
@@ -208,7 +208,7 @@ def _choose_design(name: str, around: str | None, spread: float | None) -> Desig
         if name not in ("random", "sobol"):
             raise ValueError(f"give either --around or the file of a design, got {around} and {name}")
         share = design.SPREAD if spread is None else spread
-        return design.design_around(design.point_of(around), share, name)  # type: ignore[arg-type]
+        return design.design_around(design.read_point(around), share, name)  # type: ignore[arg-type]
     if spread is not None:
         raise ValueError("--spread needs --around")
     if name in ("random", "sobol"):

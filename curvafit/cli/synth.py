@@ -86,7 +86,7 @@ def _build_and_preview(out: Path, spec: SetSpec, count: int, crew: Crew) -> None
     """Make the cases of a set and a picture of some, and print where they are listed and drawn."""
     from curvafit.core.checks import check_int
     from curvafit.core.files import check_folder
-    from curvafit.data_synth.sets import MOST, build_set, cases_of, check_set, write_preview
+    from curvafit.data_synth.sets import MOST, build_set, check_set, list_cases, write_preview
 
     check_int(count, "a count of at least 1 case", 1, MOST)
     check_folder(out)
@@ -96,7 +96,7 @@ def _build_and_preview(out: Path, spec: SetSpec, count: int, crew: Crew) -> None
     with crew.start() as (workers, progress):
         build_set(out, spec, count, progress, workers=workers)
     preview = write_preview(out)
-    if (total := len(cases_of(out))) > count:
+    if (total := len(list_cases(out))) > count:
         say(f"note: {out} holds {total} cases, more than --count {count}: all are listed", to=error_console())
     say(str(out / "dataset.json"))
     say(str(preview))

@@ -9,7 +9,6 @@ import platform
 import time
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -50,16 +49,9 @@ def build(
     Draw i depends on (design, seed, i) alone: stopped, resumed and with any number of workers, a store ends with the
     same draws, of which the last is the `count`-th viable one.
 
-    Parameters
-    ----------
-    shape
-        Voxels (z, y, x), or one number for a cube; the box is periodic, in working units.
-    progress
-        Called after every new draw with a sentence and the share of the viable shapes that are made.
-    design
-        Experiment 4's random law by default.
-    workers
-        The processes that make the draws (`cluster`); this one by default.
+    The shape is voxels (z, y, x), or one number for a cube; the box is periodic, in working units. `progress` is called
+    after every new draw. By default the design is Experiment 4's random law, and this process makes the draws, else
+    `workers` (see `cluster`).
 
     Raises ValueError where the store was made with other settings, a shape does not fit into memory, or hardly any draw
     is viable; OSError where the store can't be written or the workers are gone. Finished draws are kept.
@@ -67,7 +59,7 @@ def build(
     check_count(count, 1)
     if workers is None:
         check_memory(Grid(shape).shape, FLOW, "a shape")  # type: ignore[arg-type]
-    settings = settings_of(shape, seed, schedule, design)
+    settings = make_settings(shape, seed, schedule, design)
     return _fill(open_store(store_path, settings), count, workers or ThisProcess(), progress)
 
 
@@ -86,7 +78,7 @@ def check_count(count: int, least: int) -> None:
     check_int(count, f"a count of shapes from {least}", least, 10**7)
 
 
-def settings_of(
+def make_settings(
     shape: int | Sequence[int], seed: int = 0, schedule: str | Schedule = "fast", design: Design | None = None
 ) -> Settings:
     """Return the settings of the store that `build` makes from these arguments, or raise ValueError."""
@@ -205,9 +197,8 @@ def verify(path: str | Path, progress: Progress = silent) -> Verdict:
         progress(f"{k} of {len(indices)} draws checked", k / len(indices))
         viable += store.viable(index)
         if not store.intact(index):
-            problems.append(
-                f"draw {index} does not match its checksum: delete draws/{index:06d}, and a build makes it again"
-            )
+            mend = f"delete draws/{index:06d}, and a build makes it again"
+            problems.append(f"draw {index} does not match its checksum: {mend}")
     there = {int(entry.name) for entry in (store.path / "draws").iterdir() if entry.name.isdigit()}
     torn = sorted(index for index in there - set(indices) if not store.has(index))  # a build may add some meanwhile
     problems += [f"draw {index} is torn: a part is missing, or it is another draw" for index in torn]
@@ -237,14 +228,4 @@ def summarise(store: Store) -> dict[str, str]:
         "schedule": f"{present_name(settings.schedule)}, {settings.schedule['steps']} steps",
         "made with": "; ".join(f"{text} ({count})" for text, count in makers.items()),
         "seconds a draw": f"{np.mean([record.seconds for record in records]):.2f}" if records else "none",
-        "size": f"{_size(store.path) / 1e6:.1f} MB",
     }
-
-
-def _size(folder: Path) -> int:
-    """Return the bytes of a folder's files; those that a build deletes meanwhile do not count."""
-    total = 0
-    for path in folder.rglob("*"):
-        with suppress(FileNotFoundError):
-            total += path.stat().st_size * path.is_file()
-    return total

@@ -13,7 +13,7 @@ import torch
 from curvafit.core.checks import LONGEST, SHORTEST, as_tuple, check_float, check_int, check_seed, check_type, quoted
 from curvafit.data_synth.imaging.image import field_shape, image, regrid, visible
 from curvafit.data_synth.imaging.modality import Imaging, Modality
-from curvafit.data_synth.sources import ShapeSource, source_of
+from curvafit.data_synth.sources import ShapeSource, decode_source
 from curvafit.priors.kernels.threads import one_thread
 
 #: Shapes that are tried for a case until one is seen on the image's voxels, which may be coarse.
@@ -114,7 +114,7 @@ class Recipe:
     @staticmethod
     def from_dict(content: Mapping[str, Any]) -> Recipe:
         """Return what `as_dict` wrote."""
-        source, modality = source_of(content["source"]), Modality.from_dict(content["modality"])
+        source, modality = decode_source(content["source"]), Modality.from_dict(content["modality"])
         z, y, x = content["shape"]
         low, high = content["calibres"]
         return Recipe(source, modality, (z, y, x), content["voxel"], content["seed"], (low, high))

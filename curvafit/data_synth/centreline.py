@@ -131,22 +131,13 @@ def centreline(skeleton: np.ndarray, distance: np.ndarray, spacing: Sequence[flo
     and moved across themselves to the greatest distance. Spurs, free lines that hardly leave the ball around their
     other node (`SPUR`), are removed, shortest first, and two lines that remain at a junction become one. Cycles stay.
 
-    Parameters
-    ----------
-    skeleton
-        bool (Z, Y, X), as `skeleton_of` gives it for a grid that is not periodic.
-    distance
-        Signed distance (Z, Y, X), positive inside.
-    spacing
-        Edges of a voxel (z, y, x).
+    The skeleton, bool (Z, Y, X), is that of `skeleton_of` for a crop; the distance (Z, Y, X) is positive inside; the
+    spacing is the edges of a voxel (z, y, x).
 
-    Returns
-    -------
-    networkx.MultiGraph
-        Nodes 0, 1, … have `position` (z, y, x), `radius`, `kind` ("end", "junction", "point" without edges, "loop" of a
-        line that closes on itself) and `rings`, the number of tunnels within a junction, nearly always 0. Edges have
-        `points` (N, 3) from the lesser node to the greater and `radii` (N,), both with the nodes' own, `length` and
-        mean `radius`. Lengths are in spacing's unit; the first voxel's centre is the origin.
+    Nodes 0, 1, … have `position` (z, y, x), `radius`, `kind` ("end", "junction", "point" without edges, "loop" of a
+    line that closes on itself) and `rings`, the number of tunnels within a junction, nearly always 0. Edges have
+    `points` (N, 3) from the lesser node to the greater and `radii` (N,), both with the nodes' own, `length` and mean
+    `radius`. Lengths are in spacing's unit; the first voxel's centre is the origin.
     """
     if skeleton.shape != distance.shape:
         raise ValueError(f"skeleton and distance must have one shape, got {skeleton.shape} and {distance.shape}")
@@ -166,7 +157,7 @@ def write_graphml(graph: nx.MultiGraph, path: str | Path, unit: str = "voxel") -
     Nodes have `z`, `y`, `x`, `radius`, `kind` and `rings`; edges `length`, `radius`, and as texts `points` ("z y x",
     with commas between points) and `radii`.
     """
-    nx = _networkx()
+    nx = require("networkx", "synth", "a centreline")
     plain = nx.MultiGraph(unit=unit)
     for node, of in graph.nodes(data=True):
         z, y, x = map(float, of["position"])
@@ -178,13 +169,9 @@ def write_graphml(graph: nx.MultiGraph, path: str | Path, unit: str = "voxel") -
     return write_atomically(Path(path), lambda temporary: nx.write_graphml(plain, temporary))
 
 
-def _networkx():
-    return require("networkx", "synth", "a centreline")
-
-
 def _trace(skeleton: np.ndarray, distance: np.ndarray) -> nx.MultiGraph:
     """Return nodes with `place` (voxels), `radius` and `rings`, and edges with the `line` (N, 3) of their voxels."""
-    nx = _networkx()
+    nx = require("networkx", "synth", "a centreline")
     places, voxels, graph = np.argwhere(skeleton), nx.Graph(), nx.MultiGraph()
     voxels.add_nodes_from(range(len(places)))
     voxels.add_edges_from(KDTree(places).query_pairs(1.8) if len(places) else ())
@@ -311,7 +298,7 @@ def _interpolate(values: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 def _finish(traced: nx.MultiGraph, distance: np.ndarray, steps: np.ndarray) -> nx.MultiGraph:
     """Return the graph with nodes 0, 1, … and lengths in spacing's unit."""
-    graph = _networkx().MultiGraph()
+    graph = type(traced)()
     number = {node: k for k, node in enumerate(sorted(traced))}
     for node, k in number.items():
         of, degree = traced.nodes[node], traced.degree(node)

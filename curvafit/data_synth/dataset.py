@@ -96,7 +96,7 @@ class TextureDataset(IterableDataset):
         self.modalities = [modality(kind) if isinstance(kind, str) else kind for kind in kinds]
         self.size = check_shape((size,) * 3 if isinstance(size, (int, Real)) else size)
         self.length, self.seed, self.blend = int(length), check_seed(seed), blend
-        self.calibres, self.normalise, self.transform = calibres, _normalisation(normalise), transform
+        self.calibres, self.normalise, self.transform = calibres, _choose_normalisation(normalise), transform
         sources: list[Any] = [source] if isinstance(source, LAW_TYPES) else list(as_tuple(source, "laws or stores"))
         self._check(sources)
         stores = all(map(_is_store, sources))
@@ -107,7 +107,7 @@ class TextureDataset(IterableDataset):
                 raise ValueError("volume_fraction applies to laws only; the source is a store of shapes")
             self.source = Stored(tuple(map(Path, sources)), rotate=rotate)
         else:
-            self.source = self._pool(Generated.of(sources, volume_fraction), shapes, rotate)
+            self.source = self._make_pool(Generated.of(sources, volume_fraction), shapes, rotate)
         for kind, edge in zip(self.modalities, self.voxels, strict=True):
             check_crop(self.source.edge, self.size, edge * calibres[0], kind)
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
@@ -126,7 +126,9 @@ class TextureDataset(IterableDataset):
 
     def _rank(self) -> tuple[int, int]:
         """Return the rank of this process, or of the one that spawned it, and the group's size."""
-        live = _rank()
+        group = torch.distributed
+        grouped = group.is_available() and group.is_initialized()
+        live = (group.get_rank(), group.get_world_size()) if grouped else (0, 1)
         return self.__dict__.get("_group_rank", live) if live == (0, 1) and get_worker_info() else live
 
     def set_epoch(self, epoch: int) -> None:
@@ -154,22 +156,18 @@ class TextureDataset(IterableDataset):
         kind = self.modalities[turn]
         imaging, voxel = kind.draw(for_imaging), draw_voxel(self.voxels[turn], self.calibres, rng)
         voxels = field_shape(self.size, voxel, imaging)
-        u, epsilon, origin = self._shape(voxels, rng, for_blend)
+        u, epsilon, origin = self._draw_shape(voxels, rng, for_blend)
         grey, _, mask = image_and_labels(u, epsilon, voxel, imaging, for_image, self.size)
         record = {"number": number, "source": origin, "modality": kind.name, "imaging": imaging.as_dict()}
         record |= {"image_seed": for_image, "voxel": voxel}
         image = grey[None].float()
-        return Sample(
-            image if self.normalise is None else self.normalise(image),
-            mask[None].to(torch.uint8),
-            imaging.spacing,
-            record,
-        )
+        image = image if self.normalise is None else self.normalise(image)
+        return Sample(image, mask[None].to(torch.uint8), imaging.spacing, record)
 
-    def _shape(
+    def _draw_shape(
         self, voxels: Sequence[int], rng: np.random.Generator, seed: int
     ) -> tuple[Tensor, float, list[dict[str, Any]]]:
-        """Return a phase field (Z, Y, X): a crop of one shape, or of two that share the volume."""
+        """Return a phase field (Z, Y, X), its ε and origins: a crop of one shape, or of two that share the volume."""
         blended = rng.random() < self.blend
         one, *more = (self.source.shape(voxels, 0, rng) for _ in range(1 + blended))
         u = torch.from_numpy(one.values)
@@ -179,8 +177,8 @@ class TextureDataset(IterableDataset):
             u = share * u + (1 - share) * torch.from_numpy(more[0].values)
         return u, one.epsilon, [shape.origin for shape in (one, *more)]
 
-    def _pool(self, generated: Generated, count: int, rotate: bool) -> Pool:
-        """Return a pool of shapes as large as the largest crop."""
+    def _make_pool(self, generated: Generated, count: int, rotate: bool) -> Pool:
+        """Return a pool of shapes that are as large as the largest crop."""
         check_int(count, "a pool of at least 1 shape", 1, MOST_POOLED)
         crops = zip(self.modalities, self.voxels, strict=True)
         largest = max(max(field_shape(self.size, edge * self.calibres[0], kind.base)) for kind, edge in crops)
@@ -215,9 +213,7 @@ def as_subject(sample: Sample) -> Any:
     try:
         import torchio  # pyright: ignore[reportMissingImports]
     except ImportError as error:
-        raise ImportError(
-            "as_subject needs TorchIO, which is not installed: pip install torchio", name="torchio"
-        ) from error
+        raise ImportError("as_subject needs TorchIO: pip install torchio", name="torchio") from error
     affine = np.diag([*sample.spacing[::-1], 1.0])
     image, label = (values.permute(0, 3, 2, 1).contiguous() for values in (sample.image, sample.label))
     return torchio.Subject(
@@ -246,16 +242,8 @@ def _is_store(source: Any) -> bool:
     return isinstance(source, (str, PathLike)) and (Path(source).is_dir() or Path(source).suffix == ".zarr")
 
 
-def _normalisation(normalise: str | Callable[[Tensor], Tensor] | None) -> Callable[[Tensor], Tensor] | None:
+def _choose_normalisation(normalise: str | Callable[[Tensor], Tensor] | None) -> Callable[[Tensor], Tensor] | None:
     if normalise is None or callable(normalise):
         return normalise
     check_choice(normalise, NORMALISATIONS, f"a normalisation among {', '.join(NORMALISATIONS)}, a function or None")
     return NORMALISATIONS[normalise]
-
-
-def _rank() -> tuple[int, int]:
-    """Return this process's rank in `torch.distributed`'s group and the group's size; 0 of 1 without one."""
-    group = torch.distributed
-    if group.is_available() and group.is_initialized():
-        return group.get_rank(), group.get_world_size()
-    return 0, 1

@@ -92,7 +92,7 @@ class Design:
             check_strengths(row[:-1], WORKING_EPSILON)
 
     def draw(self, seed: int, index: int) -> Draw:
-        """Draw parameters number `index` of a seed, both whole numbers from 0."""
+        """Return the parameters of draw `index` of a seed, both whole numbers from 0."""
         start = int(_seed_stream(seed, index, "start").generate_state(1)[0])
         if self.sampling == "list":
             values = self.points[index % len(self.points)]
@@ -201,10 +201,8 @@ def read_design(path: str | PathLike[str]) -> Design:
         raise FileNotFoundError(f"found no file {path}")
     try:
         content = yaml.safe_load(path.read_bytes().decode().removeprefix("\ufeff"))
-    except RecursionError as error:
-        raise ValueError(f"{path} is not a design: it is nested too deeply") from error
-    except (yaml.YAMLError, ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:
-        # values with a wrong YAML tag raise the last five
+    except (yaml.YAMLError, ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        # deep nesting and values with a wrong YAML tag raise the last six
         raise ValueError(f"{path} is not YAML: {' '.join(str(error).split())[:200]}") from error
     try:
         return _decode_design(content, path.parent)
@@ -212,7 +210,7 @@ def read_design(path: str | PathLike[str]) -> Design:
         raise ValueError(f"{path}: {error}") from error
 
 
-def point_of(source: Any, folder: Path = Path()) -> tuple[float, ...]:
+def read_point(source: Any, folder: Path = Path()) -> tuple[float, ...]:
     """Return the seven numbers of a law: a preset's name, a `fit.json`, or the numbers by name.
 
     The path of a `fit.json` is relative to `folder`.
@@ -234,13 +232,13 @@ def _decode_design(content: Any, folder: Path) -> Design:
         raise ValueError(f"a design with the key {kind} has no key {quoted(strange[0])}")
     if kind == "list":
         points = as_tuple(content["list"], "points in list")
-        return Design("list", points=tuple(point_of(point, folder) for point in points))
+        return Design("list", points=tuple(read_point(point, folder) for point in points))
     sampling = content.get("law", "random")
     if sampling not in ("random", "sobol"):
         raise ValueError(f"law must be random or sobol, got {quoted(sampling)}")
     if kind == "around":
         spread = check_float(_parse_number(content.get("spread", SPREAD)), "a spread that is a number")
-        return design_around(point_of(content["around"], folder), spread, sampling)
+        return design_around(read_point(content["around"], folder), spread, sampling)
     if not isinstance(content["box"], Mapping):
         raise ValueError(f"box must hold names and intervals, got {quoted(content['box'])}")
     intervals = {str(name): _parse_number(value) for name, value in content["box"].items()}

@@ -113,7 +113,7 @@ def build_set(
 
 def _fill(folder: Path, spec: SetSpec, count: int, progress: Progress, workers: Workers) -> Path:
     """Make the missing cases of a set; update the list every now and then, and at the end."""
-    cases, listed = set(cases_of(folder)), -LISTED_EVERY
+    cases, listed = set(list_cases(folder)), -LISTED_EVERY
     requests = ((make_cases, folder, [index]) for index in range(count) if index not in cases)
     try:
         for case in collect_all(workers, requests):
@@ -152,7 +152,7 @@ def read_spec(folder: str | Path) -> SetSpec:
         raise ValueError(f"{folder} is not a set of curvafit: it has no {HEADER}") from error
 
 
-def cases_of(folder: Path) -> list[int]:
+def list_cases(folder: Path) -> list[int]:
     """Return the indices of the complete cases: those with a record, which is written last."""
     names = (path.stem.removeprefix("case_") for path in (folder / RECORDS).glob("case_*.json"))
     return sorted(int(name) for name in names if name.isdigit())
@@ -175,32 +175,19 @@ def check_set(folder: Path, spec: SetSpec) -> None:
 
 
 def _write_list(folder: Path, spec: SetSpec) -> None:
-    """Write the list of the complete cases that the layout's readers want."""
-    names, layout = list(map(case_name, cases_of(folder))), LAYOUTS[spec.layout]
+    """Write the list of the complete cases, in the form of the layout."""
+    names, layout = list(map(case_name, list_cases(folder))), LAYOUTS[spec.layout]
     pairs = [{"image": layout.image.format(case=name), "label": layout.label.format(case=name)} for name in names]
     about = {"name": folder.resolve().name, "description": "synthetic; made by curvafit", "numTraining": len(names)}
     channel = {"0": spec.recipe.modality.name}
     if layout.nnunet:  # cases by name, since the folders may hold a killed run's temporary files too
-        listed = {
-            "channel_names": channel,
-            "labels": {"background": 0, "structure": 1},
-            "file_ending": ".nii.gz",
-            **about,
-            "dataset": {
-                name: {"images": [pair["image"]], "label": pair["label"]}
-                for name, pair in zip(names, pairs, strict=True)
-            },
-        }
+        listed = {"channel_names": channel, "labels": {"background": 0, "structure": 1}, "file_ending": ".nii.gz"}
+        files = [{"images": [pair["image"]], "label": pair["label"]} for pair in pairs]
+        listed |= {**about, "dataset": dict(zip(names, files, strict=True))}
     else:
-        listed = {
-            **about,
-            "tensorImageSize": "3D",
-            "modality": channel,
-            "labels": {"0": "background", "1": "structure"},
-            "numTest": 0,
-            "training": pairs,
-            "test": [],
-        }
+        labels = {"0": "background", "1": "structure"}
+        listed = {**about, "tensorImageSize": "3D", "modality": channel, "labels": labels}
+        listed |= {"numTest": 0, "training": pairs, "test": []}
     _write_json(folder / LIST, listed)
 
 
@@ -263,7 +250,7 @@ def write_preview(folder: str | Path) -> Path:
     and without the label's outline."""
     folder = Path(folder)
     layout = LAYOUTS[read_spec(folder).layout]
-    names = [case_name(index) for index in cases_of(folder)[:SHOWN]]
+    names = [case_name(index) for index in list_cases(folder)[:SHOWN]]
     columns, rows = min(ROW, len(names)), -(-len(names) // ROW)
     figure = Figure(figsize=(2.4 * columns, 5.0 * rows + 0.3), facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)

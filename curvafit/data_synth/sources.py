@@ -49,17 +49,10 @@ class PhaseField(NamedTuple):
 
 @dataclass(frozen=True)
 class Generated:
-    """Shapes grown from points of seven numbers (`PARAMETERS`, working units), in turn.
+    """Shapes grown from points of seven numbers (`PARAMETERS`, working units), in turn; each point has a name.
 
-    Parameters
-    ----------
-    names
-        A name for each point.
-    schedule
-        Of the flow.
-    fraction
-        Share of the volume that shapes fill, instead of the points' masses; a shape's `origin` says where `generate`
-        misses it.
+    Shapes fill a `fraction` of the volume instead of having the points' masses, where one is given; a shape's `origin`
+    says where `generate` misses it.
     """
 
     points: tuple[tuple[float, ...], ...]
@@ -119,7 +112,7 @@ class Generated:
         shares = {law.volume_fraction for law in known}
         if fraction is None and len(shares) == 1:
             (fraction,) = shares
-        points = tuple(_point_of(law, fraction) for law in known)
+        points = tuple(_choose_point(law, fraction) for law in known)
         names = (
             Path(source).name if isinstance(source, (str, PathLike)) else law.origin
             for source, law in zip(stated, known, strict=True)
@@ -127,26 +120,18 @@ class Generated:
         return Generated(points, tuple(names), fraction=fraction)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the source in JSON's types, for a set's record; `source_of` reads it."""
-        return {
-            "kind": "generated",
-            "names": list(self.names),
-            "points": [list(point) for point in self.points],
-            "schedule": named_schedule(self.schedule).as_dict(),
-            "fraction": self.fraction,
-        }
+        """Return the source in JSON's types, for a set's record; `decode_source` reads it."""
+        points, plan = list(map(list, self.points)), named_schedule(self.schedule).as_dict()
+        texture = {"names": list(self.names), "points": points}
+        return {"kind": "generated", **texture, "schedule": plan, "fraction": self.fraction}
 
 
 @dataclass(frozen=True)
 class Stored:
-    """Random crops of the well-formed shapes of one or more stores, turned at random.
+    """Random crops of the well-formed shapes of one or more stores, under the symmetries of the cube or any rotation.
 
-    Parameters
-    ----------
-    draws
-        Number of well-formed shapes in all stores, by default the present one. A store that grew is another source.
-    rotate
-        Whether crops are turned by any rotation, besides the symmetries of the cube.
+    `draws` is the number of well-formed shapes in all stores, by default the present one: a store that grew is another
+    source.
     """
 
     paths: tuple[Path, ...]
@@ -174,7 +159,7 @@ class Stored:
         return PhaseField(field, settings.epsilon / settings.spacing[0], origin)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the source in JSON's types, for a set's record; `source_of` reads it."""
+        """Return the source in JSON's types, for a set's record; `decode_source` reads it."""
         return {"kind": "stored", "paths": list(map(str, self.paths)), "draws": self.draws, "rotate": self.rotate}
 
     @property
@@ -220,7 +205,7 @@ class Pool:
 ShapeSource = Generated | Stored
 
 
-def source_of(content: dict[str, Any]) -> ShapeSource:
+def decode_source(content: dict[str, Any]) -> ShapeSource:
     """Return the source that its `as_dict` wrote."""
     if content["kind"] == "stored":
         return Stored(tuple(map(Path, content["paths"])), content["draws"], content["rotate"])
@@ -242,7 +227,7 @@ def choose_voxel(laws: Iterable[LawLike], kind: Modality) -> float:
     return edges.pop() if edges else kind.voxel
 
 
-def _point_of(law: Law, fraction: float | None) -> tuple[float, ...]:
+def _choose_point(law: Law, fraction: float | None) -> tuple[float, ...]:
     """Return the seven numbers of a law; where it states no mass, the one that fits the volume fraction."""
     if law.mass is None and fraction is not None:
         return replace(law, mass=first_mass(fraction)).point

@@ -11,7 +11,7 @@ from flat_recipe import SHAPE, flat_recipe
 
 from curvafit.data_synth.case import Recipe
 from curvafit.data_synth.imaging.modality import Imaging, Modality
-from curvafit.data_synth.sources import Generated, PhaseField, source_of
+from curvafit.data_synth.sources import Generated, PhaseField, decode_source
 from curvafit.generation import loop as steering
 
 
@@ -34,9 +34,9 @@ def test_a_case_is_the_image_of_its_field(recipe):
 
 def test_a_set_does_not_go_on_with_a_store_that_grew(recipe):
     kept = recipe.source.as_dict()
-    assert source_of(kept) == recipe.source and kept["draws"] > 0
+    assert decode_source(kept) == recipe.source and kept["draws"] > 0
     with pytest.raises(ValueError, match="grew"):
-        source_of(kept | {"draws": kept["draws"] + 1}).shape((8, 8, 8), 0, np.random.default_rng(0))
+        decode_source(kept | {"draws": kept["draws"] + 1}).shape((8, 8, 8), 0, np.random.default_rng(0))
 
 
 def test_generated_shapes_take_turns_and_other_seeds():
@@ -56,7 +56,7 @@ def test_shapes_fill_the_share_that_is_asked_for(monkeypatch):
     made = source.shape((20, 20, 20), 0, np.random.default_rng(0))
     assert (made.values > 0).mean() == 0.15 and made.origin["parameters"]["mass"] != -0.5
     assert "after 1500 steps" in made.origin["status"] and "volume fraction" not in made.origin["status"]
-    assert source_of(source.as_dict()) == source
+    assert decode_source(source.as_dict()) == source
     with pytest.raises(ValueError, match="fraction"):
         Generated((point,), ("tubes",), fraction=1.5)
     monkeypatch.setattr(steering, "FRACTION_LAST", -1.0)

@@ -76,10 +76,17 @@ def test_workers_share_an_epoch_and_see_the_next(store, workers):
     assert sorted(numbers(loader)) == list(range(15, 20))
 
 
+def join_group(monkeypatch: pytest.MonkeyPatch, rank: int, size: int) -> None:
+    """Make this process one of a group of `torch.distributed`."""
+    answers = {"is_available": True, "is_initialized": True, "get_rank": rank, "get_world_size": size}
+    for name, value in answers.items():
+        monkeypatch.setattr(torch.distributed, name, lambda value=value: value, raising=False)
+
+
 def test_ranks_share_an_epoch_evenly(store, monkeypatch):
     dataset, seen = TextureDataset(store, QUIET, SHAPE, length=7, transform=told), []
     for rank in range(3):
-        monkeypatch.setattr(training, "_rank", lambda rank=rank: (rank, 3))
+        join_group(monkeypatch, rank, 3)
         found = numbers(dataset)
         assert len(found) == len(dataset) == 2
         seen += found
@@ -89,9 +96,9 @@ def test_ranks_share_an_epoch_evenly(store, monkeypatch):
 def test_spawned_workers_know_their_rank(store, monkeypatch):
     """They are outside the group: the data set brings the rank along; elsewhere the live one counts."""
     dataset = TextureDataset(store, QUIET, SHAPE, length=4, transform=told)
-    monkeypatch.setattr(training, "_rank", lambda: (1, 2))
+    join_group(monkeypatch, 1, 2)
     sent = pickle.loads(pickle.dumps(dataset))
-    monkeypatch.setattr(training, "_rank", lambda: (0, 1))
+    join_group(monkeypatch, 0, 1)
     assert numbers(sent) == [0, 1, 2, 3]
     monkeypatch.setattr(training, "get_worker_info", lambda: SimpleNamespace(id=0, num_workers=1))
     assert numbers(sent) == [1, 3]

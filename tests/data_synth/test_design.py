@@ -176,7 +176,7 @@ BOMB = "a0: &a0 [1]\n" + "".join(f"a{k + 1}: &a{k + 1} [{', '.join([f'*a{k}'] * 
         ("box: !!bool abc", "abc"),
         ("box: !!python/object:os.system {}", "YAML"),
         (f"box: {{a11: 1{'0' * 5000}}}", "digits"),
-        ("[" * 100_000, "nested"),
+        ("[" * 100_000, "recursion"),
         ("box: &a [*a]", "box"),
         (BOMB, "a0"),
         (f"box: {'x' * 100_000}", "x"),

@@ -206,17 +206,11 @@ def _speck_profiles(count: int, step: float, place: Tensor, width: Tensor) -> Te
 def poisson_gaussian(
     photons: Volume, gain: float, read_noise: float, offset: float, seed: int, width: Lengths = 0.0
 ) -> Volume:
-    """Return counts: offset + gain · Poisson(photons) + N(0, read_noise²). Its variance is a line over the mean.
+    """Return counts: offset + gain · Poisson(photons) + N(0, read_noise²), whose variance is a line over the mean.
 
-    Parameters
-    ----------
-    photons
-        Means, from 0.
-    gain
-        Counts a photon; 0 for an instrument whose noise does not depend on the signal: offset + photons + N.
-    width
-        Deviation, in voxels (z, y, x), of the Gaussian that smoothed the noise, as reconstruction and denoising do. Its
-        correlation is that of smoothed noise; every voxel's own law stays as it is.
+    Photons are means, from 0. A gain of 0 is an instrument whose noise does not depend on the signal: offset + photons
+    + N. Noise has the correlation that a Gaussian of deviations `width`, in voxels (z, y, x), leaves, as reconstruction
+    and denoising do; every voxel's own law stays as it is.
     """
     counts = photons if gain == 0 else gain * poisson(photons, seed, width)
     return gaussian_noise(counts + offset, read_noise, seed, width)

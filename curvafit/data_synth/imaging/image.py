@@ -20,14 +20,8 @@ def image(
 ) -> Float[torch.Tensor, "Z Y X"]:
     """Return the image of a phase field, of the field's floating type and the shape that `regrid` gives.
 
-    Classes, blur, sampling, light, noise, in that order.
-
-    Parameters
-    ----------
-    spacing
-        Edge of the field's cubic voxels, in the unit of the imaging.
-    epsilon
-        Of the field's profile, in voxels.
+    The order is classes, blur, sampling, light, noise. `spacing` is the edge of the field's cubic voxels, in the
+    imaging's unit; ε of the field's profile is in voxels.
 
     Raises ValueError where the field is not a finite (Z, Y, X) of a floating type, or a number is out of range.
     """
@@ -36,8 +30,12 @@ def image(
     if not (spacing > 0 and epsilon > 0):
         raise ValueError(f"spacing and epsilon must be positive, got {spacing} and {epsilon}")
     seed = check_seed(seed)
-    light = _emit(effects.occupancy(field, epsilon), spacing, imaging, seed)
-    light = effects.sample(_blur_light(light, spacing, imaging), spacing, imaging.spacing, _window(imaging))
+    light, optics = _emit(effects.occupancy(field, epsilon), spacing, imaging, seed), imaging.optics
+    if optics.growth or optics.attenuation:
+        light = effects.blur_with_depth(light, spacing, optics.blur, optics.growth, optics.attenuation)
+    else:
+        light = effects.blur(light, spacing, optics.blur)
+    light = effects.sample(light, spacing, imaging.spacing, _window(imaging))
     return _detect(_illuminate(light, imaging, seed), imaging, seed)
 
 
@@ -54,27 +52,28 @@ def visible(field: Volume, spacing: float, imaging: Imaging, epsilon: float = EP
 
 
 def visible_share(imaging: Imaging) -> float:
-    """Return the share of the structure's light at which an annotator is taken to see it.
+    """Return the share of the structure's light at which an annotator is taken to see the structure.
 
-    There the level is midway from the background's to the structure's in the logarithm, as contrast is seen: 1/2 at
-    faint contrast, less where it is strong.
+    At this share the level is midway, in the logarithm, from the background's to the structure's: 1/2 at faint
+    contrast, less where it is strong.
     """
     below, above = imaging.contrast.background, imaging.contrast.foreground
     return 1 / (1 + math.sqrt(above / max(below, 1e-3 * above, 1e-12)))
 
 
 def field_shape(shape: Sequence[int], spacing: float, imaging: Imaging) -> tuple[int, int, int]:
-    """Return the least voxels (z, y, x) of edge `spacing` that an image of a shape is made from."""
+    """Return the number of voxels (z, y, x) of edge `spacing` that an image of `shape` is made from."""
     z, y, x = (math.ceil(n * h / spacing - 1e-6) for n, h in zip(shape, imaging.spacing, strict=True))
     return z, y, x
 
 
 def _window(how: Imaging) -> Triple:
+    """Return the box (z, y, x) over which a voxel averages."""
     return how.thickness, *how.spacing[1:]
 
 
 def _emit(occupied: torch.Tensor, spacing: float, how: Imaging, seed: int) -> torch.Tensor:
-    """Return the light that the specimen sends out."""
+    """Return the light that the specimen emits."""
     contrast, specimen = how.contrast, how.specimen
     inside = occupied
     if specimen.dropout:
@@ -93,13 +92,6 @@ def _emit(occupied: torch.Tensor, spacing: float, how: Imaging, seed: int) -> to
         height = specimen.clutter_height * (contrast.foreground - contrast.background)
         light = light + height * effects.clutter(occupied, spacing, specimen.clutter, specimen.clutter_radius, seed)
     return light.clamp_min(0)
-
-
-def _blur_light(light: torch.Tensor, spacing: float, how: Imaging) -> torch.Tensor:
-    optics = how.optics
-    if optics.growth or optics.attenuation:
-        return effects.blur_with_depth(light, spacing, optics.blur, optics.growth, optics.attenuation)
-    return effects.blur(light, spacing, optics.blur)
 
 
 def _illuminate(light: torch.Tensor, how: Imaging, seed: int) -> torch.Tensor:

@@ -65,19 +65,11 @@ def fit_modality(scan: Field, mask: np.ndarray | None = None) -> Modality:
 
     The scan is taken to have two classes, a Gaussian blur of one width in the plane and one along z, and noise whose
     variance is a line over the mean (`measure_noise`). Growth with depth, stripes, rings, lost stain and clutter stay
-    0. The blur is the one that makes the mask, times a local brightness, most like the scan.
+    0. The blur is the one that makes the mask, times a local brightness, most like the scan. Whole numbers from 0 are
+    taken as counts that saturate at the highest of their type.
 
-    Parameters
-    ----------
-    scan
-        Values of any type; whole numbers from 0 are taken as counts that saturate at the highest of their type.
-    mask
-        The structure's voxels, (Z, Y, X); by default `find_bright`.
-
-    Returns
-    -------
-    Modality
-        `base` holds the estimates, `ranges` their surroundings (`SPREAD`); `voxel` is the finest edge of the scan's.
+    The mask is the structure's voxels, (Z, Y, X); by default `find_bright`. The modality's `base` holds the estimates,
+    its `ranges` their surroundings (`SPREAD`), and its `voxel` is the finest edge of the scan's.
     """
     values, given = _crop_middle(scan, mask)
     steps = np.array(scan.spacing)

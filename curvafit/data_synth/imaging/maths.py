@@ -41,10 +41,9 @@ def apply_matrices(
 
 
 def gaussian_matrix(count: int, width: float | Tensor, like: Tensor) -> Tensor | None:
-    """Return the matrix (count, count) of a blur by a Gaussian of deviation `width` voxels, cut at four; `None` for
-    width 0.
+    """Return the matrix (count, count) of a blur by a Gaussian of deviation `width` voxels, cut at four; None for 0.
 
-    A tensor of widths (…, 1, 1) gives a matrix each, one of (count, 1) a width to each row.
+    Widths (…, 1, 1) give a matrix each; widths (count, 1) are those of the rows.
     """
     if not isinstance(width, Tensor) and width == 0:
         return None
@@ -54,10 +53,8 @@ def gaussian_matrix(count: int, width: float | Tensor, like: Tensor) -> Tensor |
 
 
 def bell(far: Tensor) -> Tensor:
-    """Return exp(-½ far²), and 0 where far is over four.
-
-    The square is clipped first: arithmetic with denormal numbers is slow.
-    """
+    """Return exp(-½ far²), and 0 where far is over four."""
+    # The square is clipped first, since arithmetic with denormal numbers is slow.
     square = far.square().clamp_max_(CUT)
     return torch.exp(-0.5 * square).masked_fill_(square == CUT, 0)
 
@@ -105,16 +102,11 @@ def white_noise(shape: tuple[int, ...], like: Tensor, seed: int, purpose: str) -
 
 
 def correlated_field(like: Volume, lengths: Sequence[float], seed: int, purpose: str) -> Volume:
-    """Return a Gaussian random field of mean 0 and variance 1 whose correlation over a distance d is exp(-½ Σ
-    (d/length)²).
+    """Return a Gaussian random field of mean 0, variance 1 and correlation exp(-½ Σ (d/length)²) over a distance d.
 
-    White noise on nodes, interpolated by Gaussians; each row's weights have a sum of squares of one, so that the
-    variance is one everywhere, near the faces too.
-
-    Parameters
-    ----------
-    lengths
-        Along (z, y, x), in voxels. Under half a voxel there is no correlation left; infinity means constant.
+    Lengths are along (z, y, x), in voxels; under half a voxel there is no correlation, and infinity means constant.
+    White noise on nodes is interpolated by Gaussians; each row's weights have a sum of squares of one, so that the
+    variance is one near the faces too.
     """
     maps = [_interpolate_nodes(n, length, like) for n, length in zip(like.shape, lengths, strict=True)]
     nodes = tuple(n if weights is None else weights.shape[-1] for n, weights in zip(like.shape, maps, strict=True))
@@ -138,7 +130,7 @@ def uniform(count: int, seed: int, purpose: str, like: Tensor) -> Tensor:
 
 
 def _interpolate_nodes(count: int, length: float, like: Tensor) -> Tensor | None:
-    """Return the weights (count, nodes) that interpolate random nodes.
+    """Return the weights (count, nodes) that interpolate random nodes, or None where every voxel is a node.
 
     Nodes are a deviation apart, at least a voxel, and go four deviations beyond the box.
     """

@@ -64,14 +64,9 @@ def _number(name: str, value: Any, kind: Any, allowed: Range) -> Any:
 
 @dataclass(frozen=True)
 class Contrast(Checked):
-    """The levels of background and structure, and how uneven each is.
+    """The levels of background and structure, in photons (grey values where the detector's gain is 0).
 
-    Parameters
-    ----------
-    background, foreground
-        Levels of the two classes, in photons (grey values where the detector's gain is 0).
-    background_texture, background_length, foreground_texture, foreground_length
-        Relative deviation of each class, and the length over which the deviation is correlated.
+    A texture is the relative deviation of a level, and its length that of the deviation's correlation.
     """
 
     background: Annotated[float, FROM_ZERO] = 10.0
@@ -84,14 +79,10 @@ class Contrast(Checked):
 
 @dataclass(frozen=True)
 class Specimen(Checked):
-    """The flaws of the specimen: stain that is lost, specks that are not the structure.
+    """The flaws of the specimen: lost stain and specks.
 
-    Parameters
-    ----------
-    dropout, dropout_length, dropout_loss
-        Share of the structure whose stain is lost, the length of the lost stretches, and how much of the stain goes.
-    clutter, clutter_radius, clutter_height
-        Specks per unit of volume, their half-width, and their height as a part of the contrast.
+    A share `dropout` of the structure loses a share `dropout_loss` of its stain, in stretches of `dropout_length`.
+    `clutter` is the number of specks per unit of volume; their height is a share of the contrast.
     """
 
     dropout: Annotated[float, SHARE] = 0.0
@@ -104,16 +95,9 @@ class Specimen(Checked):
 
 @dataclass(frozen=True)
 class Optics(Checked):
-    """The Gaussian point-spread function, and the light lost on the way.
+    """A Gaussian point-spread function of deviations `blur` (z, y, x) at depth 0.
 
-    Parameters
-    ----------
-    blur
-        Deviations of the point-spread function (z, y, x) at depth 0.
-    growth
-        Relative growth of the deviations per unit of depth.
-    attenuation
-        Loss of light per unit of depth.
+    `growth` is the relative growth of the deviations, `attenuation` the loss of light, per unit of depth.
     """
 
     blur: Annotated[Triple, FROM_ZERO] = (0.0, 0.0, 0.0)
@@ -123,14 +107,9 @@ class Optics(Checked):
 
 @dataclass(frozen=True)
 class Illumination(Checked):
-    """The unevenness of the light.
+    """Uneven light: a smooth factor between 1 - bias and 1 + bias, correlated over a length; and stripes along x.
 
-    Parameters
-    ----------
-    bias, bias_length
-        A smooth factor between 1 - bias and 1 + bias, and the length over which it is correlated.
-    stripes, stripe_width
-        Relative deviation of stripes along x, and their width.
+    `stripes` is the relative deviation of the stripes.
     """
 
     bias: Annotated[float, SHARE] = 0.0
@@ -141,16 +120,10 @@ class Illumination(Checked):
 
 @dataclass(frozen=True)
 class Noise(Checked):
-    """The noise besides that of the photons, which the detector's gain brings.
+    """Noise besides that of the photons, which the detector's gain brings; deviations in counts.
 
-    Parameters
-    ----------
-    gaussian
-        Deviation of the noise that does not depend on the signal (read noise), in counts.
-    rician
-        Deviation of the noise of each channel of a magnitude, in counts.
-    width
-        Deviations (z, y, x) of the Gaussian that smooths the noise, in voxels of the image.
+    `gaussian` is read noise, which does not depend on the signal; `rician` that of both channels of a magnitude. All
+    noise is smoothed by a Gaussian of deviations `width` (z, y, x), in voxels of the image.
     """
 
     gaussian: Annotated[float, FROM_ZERO] = 0.0
@@ -160,18 +133,11 @@ class Noise(Checked):
 
 @dataclass(frozen=True)
 class Detector(Checked):
-    """How light becomes counts.
+    """A detector that makes counts of light.
 
-    Parameters
-    ----------
-    gain
-        Counts per photon; 0 means that levels are counts already and no photon is counted.
-    offset
-        Counts in the dark.
-    rings, ring_width
-        Deviation of rings about z, as a part of the contrast, and their width.
-    ceiling
-        Counts are whole numbers and end here; they are real numbers where it is None.
+    `gain` is counts per photon, where 0 means that levels are counts already; `offset` is counts in the dark. `rings`
+    is the deviation of rings about z, as a share of the contrast. Counts are whole numbers up to the `ceiling`, or real
+    numbers where it is None.
     """
 
     gain: Annotated[float, FROM_ZERO] = 0.0
@@ -183,20 +149,18 @@ class Detector(Checked):
 
 @dataclass(frozen=True)
 class Imaging(Checked):
-    """The parameters of one image; an effect whose strength is 0 is left out.
+    """The parameters of one image; an effect of strength 0 is not applied.
 
     Parameters
     ----------
     unit
         Of all lengths: a unit of length, or voxel.
     spacing, thickness
-        Edges of the image's voxels (z, y, x); the thickness over which a slice averages (0: a point on z, as optical
-        sections have).
+        Edges of the image's voxels (z, y, x); and the thickness over which a slice averages, 0 for optical sections.
     contrast, specimen, optics, illumination, noise, detector
         The parts, in the order of the physics.
     visible
-        What masks hold: voxels that this share of a structure's light reaches, as an annotator sees them, or, at 0, the
-        structure itself.
+        Masks hold voxels that this share of a structure's light reaches, as an annotator sees them; at 0 the structure.
 
     Raises ValueError where a number is out of range or the unit is unknown.
     """
@@ -247,7 +211,7 @@ class Imaging(Checked):
 
 
 def _leaves(content: Mapping[str, Any], part: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield names, with their part's before a dot, and values of nested objects."""
+    """Yield the names, such as `optics.blur`, and values in nested objects."""
     for name, value in content.items():
         if isinstance(value, Mapping):
             yield from _leaves(value, f"{part}{name}.")
@@ -261,19 +225,19 @@ NAMES = tuple(name for name, _ in _leaves(asdict(Imaging())))
 
 @dataclass(frozen=True)
 class Modality:
-    """A kind of image: what all have in common, and the intervals that the rest is drawn from.
+    """A kind of image: a typical one, and the ranges from which some parameters are drawn.
 
     Parameters
     ----------
     name, about
-        What it is, and where its numbers come from.
+        Its name, and the source of its numbers.
     voxel
-        Edge of a shape's voxels, in the unit of the imaging: it makes structures as thick as what is imaged so.
+        Edge of a shape's voxels, in the unit of the imaging, which gives structures their usual thickness.
     base
         A typical image.
     ranges
-        By the name of a parameter, as `optics.blur`: low and high, numbers or three of them that move together. Drawn
-        evenly in the logarithm where both ends are above zero, else evenly.
+        Low and high by the name of a parameter, as `optics.blur`; three numbers change together. Draws are even in the
+        logarithm where both ends are above zero, else even.
 
     Raises ValueError where a range has no known name or an end that an `Imaging` refuses.
     """
@@ -295,7 +259,7 @@ class Modality:
         object.__setattr__(self, "ranges", ranges)
 
     def draw(self, seed: int) -> Imaging:
-        """Draw one image's parameters; what is drawn for a parameter depends on the seed and its name alone."""
+        """Draw one image's parameters, each of which depends on the seed and its own name alone."""
         seed, drawn = check_seed(seed), {}
         for name, (low, high) in self.ranges.items():
             key = tuple(name.encode())
