@@ -113,7 +113,7 @@ class Recipe:
 
     @staticmethod
     def from_dict(content: Mapping[str, Any]) -> Recipe:
-        """Return what `as_dict` wrote."""
+        """Return the recipe that `as_dict` wrote."""
         source, modality = decode_source(content["source"]), Modality.from_dict(content["modality"])
         z, y, x = content["shape"]
         low, high = content["calibres"]

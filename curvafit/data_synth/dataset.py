@@ -194,7 +194,7 @@ class TextureDataset(IterableDataset):
 
 
 def as_dict(sample: Sample) -> dict[str, Tensor]:
-    """Return `image` and `label`, what a `DataLoader` batches."""
+    """Return `image` and `label` as a dictionary, of which a `DataLoader` makes batches."""
     return {"image": sample.image, "label": sample.label}
 
 

@@ -47,7 +47,7 @@ class SampleScan:
 
     @property
     def source(self) -> str:
-        """Return the package and the path in it, for people."""
+        """Return the package and the path in it, for messages."""
         return f"{_PACKAGE} ({self.file})"
 
 

@@ -91,7 +91,7 @@ class SetSpec:
 def build_set(
     folder: str | Path, spec: SetSpec, count: int, progress: Progress = silent, *, workers: Workers | None = None
 ) -> Path:
-    """Make cases 0 to `count` - 1 of a set, without those that are there, and the list that its readers want.
+    """Make the missing ones of cases 0 to `count` - 1 of a set, and the list that readers of its layout look for.
 
     The folder is new, empty, or a set of the same specification to go on with. Case i depends on the specification and
     i alone. The folder holds a valid set at any time; the list may lack cases after a killed run, and the next run

@@ -75,7 +75,7 @@ class Generated:
         return math.inf
 
     def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> PhaseField:
-        """Return a well-formed shape, from the first seed that gives one; ValueError where none of some does."""
+        """Return a well-formed shape, from the first of some seeds that gives one; ValueError where none does."""
         turn = index % len(self.points)
         *six, mass = self.points[turn]
         grid, status = Grid(tuple(voxels)), ""  # type: ignore[arg-type]
@@ -206,7 +206,7 @@ ShapeSource = Generated | Stored
 
 
 def decode_source(content: dict[str, Any]) -> ShapeSource:
-    """Return the source that its `as_dict` wrote."""
+    """Return the source that `as_dict` wrote."""
     if content["kind"] == "stored":
         return Stored(tuple(map(Path, content["paths"])), content["draws"], content["rotate"])
     points, plan = tuple(map(tuple, content["points"])), Schedule(**content["schedule"])
@@ -310,7 +310,7 @@ def crop_rotated(
 def random_crop(
     values: np.ndarray, shape: Sequence[int], rng: np.random.Generator, rotate: bool = False
 ) -> tuple[np.ndarray, dict[str, Any]]:
-    """Return a random crop of a periodic volume under a random symmetry, with `rotate` under any rotation, and both."""
+    """Return a crop of a periodic volume under a random symmetry, and any rotation if `rotate`; and how it was made."""
     symmetry = int(rng.integers(SYMMETRIES))
     moved = apply_symmetry(values, symmetry)
     if any(part > whole for part, whole in zip(shape, moved.shape, strict=True)):

@@ -57,9 +57,7 @@ def jet(u: Tensor, grid: Grid) -> Jet:
 def second_form(field: Jet, epsilon: float | Tensor, xi: float = XI) -> SecondForm:
     """Return the invariants of M_ε = -ε Hess u + W'(u)/ε n⊗n (paper, eq. 7), where n⊗n = ∇u⊗∇u / (|∇u|² + ξ²).
 
-    ε is a number or a tensor that broadcasts with the field.
-
-    The root's derivative at umbilics is a choice: see `positive_root`.
+    ε is a number or a tensor that broadcasts with the field. `positive_root` says what the root's derivative is.
     """
     ε = epsilon
     slope2, laplacian, hess2, normal = _invariants(field)
@@ -83,12 +81,7 @@ def positive_root(square: Tensor, squares: Tensor) -> Tensor:
     holds for float64 too, so that both types have one gradient; the root itself is exact there. (The paper's smooth
     positive part, 1e-6 wide, ends about the floor; its slope was that of neither side.)
 
-    Parameters
-    ----------
-    square
-        x = 2|M|² - (Tr M)².
-    squares
-        The sum of the terms of |M|² before any of them cancels.
+    `square` is x = 2|M|² - (Tr M)²; `squares` is the sum of the terms of |M|² before any of them cancels.
     """
     resolved = square > (ROOT_ROUNDING * squares).clamp_min(ROOT_FLOOR)
     return torch.where(resolved, square, square.detach().clamp_min(ROOT_FLOOR)).sqrt()

@@ -100,7 +100,7 @@ class Law:
             got = f"got {quoted(version)} in {path}: run `curvafit infer` again"
             raise ValueError(f"expected a fit.json of format {FORMAT}, {got}")
         try:
-            return _read(content, f"prior {os.fspath(path)}")
+            return _decode(content, f"prior {os.fspath(path)}")
         except ValueError as error:
             raise ValueError(f"{path} is not {expected}: {error}") from None
 
@@ -166,7 +166,6 @@ class HasLaw(Protocol):
 
     def to_law(self) -> Law:
         """Return the law."""
-        ...
 
 
 #: All that states a law: see `Law.of`.
@@ -181,14 +180,14 @@ def read_laws(laws: LawLike | Iterable[LawLike]) -> tuple[Law, ...]:
     return (Law.of(laws),) if single else tuple(map(Law.of, laws))  # type: ignore[arg-type]
 
 
-def _read(content: Mapping[str, Any], origin: str) -> Law:
+def _decode(content: Mapping[str, Any], origin: str) -> Law:
     """Return the law in the content of a `fit.json`."""
     status = content.get("status", "no reason")
     keys = ("coefficients", "mass", "coefficients_physical")
     if any(name in content and content[name] is None for name in keys):
         raise ValueError(f"it has no law: {status}")
-    six = _six(content, "coefficients")
-    _six(content, "coefficients_physical")
+    six = _read_six(content, "coefficients")
+    _read_six(content, "coefficients_physical")
     mass = check_open_interval(content.get("mass"), "mass as a number between -1 and 1", -1, 1)
     epsilon, voxel = (
         check_open_interval(content.get(name), f"{name} as a number above 0", 0, math.inf)
@@ -207,7 +206,7 @@ def _read(content: Mapping[str, Any], origin: str) -> Law:
     return Law(six, mass, origin, epsilon=width, schedule="deep", **own)
 
 
-def _six(content: Mapping[str, Any], name: str) -> Coefficients:
+def _read_six(content: Mapping[str, Any], name: str) -> Coefficients:
     """Return the six coefficients of that name."""
     values = content.get(name)
     if not isinstance(values, Mapping):

@@ -313,9 +313,7 @@ def curvature_prior(
     """
     shape, least = tuple(probability.shape[1:]), max(4, 2 * border + 1)
     if min(shape) < least:
-        raise ValueError(
-            f"expected a volume of at least {least} voxels along each axis, got {shape}, which has no interior"
-        )
+        raise ValueError(f"expected at least {least} voxels along each axis, got {shape}, which has no interior")
     times = choose_refinement(spacing, epsilon)
     longest = max(n * h for n, h in zip(shape, spacing, strict=True))
     if epsilon > longest:
@@ -342,9 +340,7 @@ def choose_refinement(spacing: Sequence[float], epsilon: float) -> tuple[int, in
     """
     if not 0 < epsilon <= COARSEST * min(spacing):
         most = COARSEST * min(spacing)
-        raise ValueError(
-            f"expected an ε above 0 and of at most {most:g} for voxels of {tuple(spacing)}, got {epsilon:g}"
-        )
+        raise ValueError(f"ε must be above 0 and at most {most:g} for voxels of {tuple(spacing)}, got {epsilon:g}")
     ratios = [RESOLVED * h / epsilon for h in spacing]
     times = tuple(1 if ratio <= 1.1 else math.ceil(ratio - 1e-3) for ratio in ratios)
     if max(times) > FINEST:

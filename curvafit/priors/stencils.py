@@ -1,10 +1,9 @@
-"""Finite differences and the Gaussian blur, each linear map beside its exact adjoint.
+"""Finite differences, their exact adjoints, and the Gaussian blur.
 
 Fields are `(..., Z, Y, X)` tensors of any floating type on any device. Vectors add an axis of 3 (z, y, x) before
-the space axes, Hessians an axis of 6 (zz, yy, xx, zy, zx, yx).
-
-Beyond the box a field continues periodically or as its mirror image. The transpose of a difference is then the same
-difference of another continuation: periodic, or mirrored with a sign along the axes that are differenced once.
+the space axes, Hessians an axis of 6 (zz, yy, xx, zy, zx, yx). Beyond the box a field continues periodically or as its
+mirror image. The transpose of a difference is then the same difference of another continuation: periodic, or mirrored
+with a sign along the axes that are differenced once.
 """
 
 from __future__ import annotations
@@ -25,11 +24,8 @@ HESSIAN_AXES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 def pad(u: Float[Tensor, "*batch z y x"], grid: Grid, width: int = 1, odd: tuple[int, ...] = ()) -> Tensor:
     """Continue `u` by `width` voxels on every side: periodic, or mirrored (with a sign along the axes in `odd`)."""
-    for axis in range(3):
+    for axis, n in enumerate(u.shape[-3:]):
         dim = axis - 3
-        n = u.shape[dim]
-        if width > n:
-            raise ValueError(f"expected at least {width} voxels along axis {axis} for this stencil, got {n}")
         head, tail = u.narrow(dim, 0, width), u.narrow(dim, n - width, width)
         if grid.periodic:
             head, tail = tail, head
@@ -124,13 +120,8 @@ def refine_axis(u: Tensor, axis: int, times: int) -> Tensor:
 def _pad_axis(v: Tensor, grid: Grid, axis: int, width: int) -> Tensor:
     """Continue a field by `width` voxels, any number, at both ends of an axis."""
     dim, n = axis - 3, grid.shape[axis]
-    index = torch.arange(-width, n + width, device=v.device)
-    if grid.periodic:
-        index = index % n
-    else:
-        index = index % (2 * n)
-        index = torch.where(index < n, index, 2 * n - 1 - index)
-    return v.index_select(dim, index)
+    index = torch.arange(-width, n + width, device=v.device) % (n if grid.periodic else 2 * n)
+    return v.index_select(dim, torch.where(index < n, index, 2 * n - 1 - index))
 
 
 def _central(v: Tensor, axis: int) -> Tensor:

@@ -217,7 +217,7 @@ def poisson_gaussian(
 
 
 def poisson(photons: Volume, seed: int, width: Lengths = 0.0) -> Volume:
-    """Draw numbers of photons with these means, by quantiles (`poisson_quantile`) of noise of a grain `width`."""
+    """Draw numbers of photons with these means: the `poisson_quantile` of noise that is smoothed by `width` voxels."""
     return poisson_quantile(photons, grainy_noise(photons, as_triple(width), seed, "photons"))
 
 

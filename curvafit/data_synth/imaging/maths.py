@@ -30,7 +30,7 @@ CUT = 16.0
 def apply_matrices(
     volume: Volume, z: Tensor | None = None, y: Tensor | None = None, x: Tensor | None = None
 ) -> Float[Tensor, "Z Y X"]:
-    """Apply a matrix (out, in) to each axis, `None` where it stays; that of y or x may be one a slice, (Z, out, in)."""
+    """Apply a matrix (out, in), or None, along each axis; those of y and x may differ by slice, (Z, out, in)."""
     if x is not None:
         volume = volume @ x.mT
     if y is not None:

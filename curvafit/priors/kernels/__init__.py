@@ -1,7 +1,6 @@
-"""Fused kernels for float32 fields on processors: whether there is one, and what it takes.
+"""Fused kernels for float32 fields on processors: `cpu` is for callers, `loops` has the loops.
 
-`cpu` is what callers use, `loops` are its loops. `energy.energy_gradient`, and `gaussian_blur` here, choose between
-a kernel and plain torch by the field's type and device.
+`energy.energy_gradient`, and `gaussian_blur` here, choose between a kernel and plain torch by type and device.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from curvafit.priors.grid import Grid
 
 
 def has_kernel(device: torch.device | str) -> bool:
-    """Return whether there is a fused kernel for float32 fields on a device: on processors, where numba is."""
+    """Return whether a device has a fused kernel for float32 fields: processors have, where numba is installed."""
     return torch.device(device).type == "cpu" and importlib.util.find_spec("numba") is not None
 
 

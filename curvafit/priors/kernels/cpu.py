@@ -36,19 +36,19 @@ def fused_energy_gradient(
     The coefficients (a20 first) and ε are numbers, or arrays where they vary. Raises ValueError where an array's shape
     is not the grid's, or the orientation is not symmetric.
     """
-    density = _Density(a, grid, epsilon, _threads(grid), orientation, mask)
-    gradient = _volume(grid)
+    density = _Density(a, grid, epsilon, _choose_threads(grid), orientation, mask)
+    gradient = _make_volume(grid)
     value = density(_pad_field(u, grid), gradient)
-    return value, _inner(gradient, grid).copy()
+    return value, _view_field(gradient, grid).copy()
 
 
 def gaussian_blur(u: np.ndarray, grid: Grid, width: float) -> np.ndarray:
     """Return k ∗ u in float32, as `stencils.gaussian_blur` does; ValueError where its shape is not the grid's."""
-    blur = _Blur(grid, width, _threads(grid))
-    volume, along_z = _pad_field(u, grid), _volume(grid)
+    blur = _Blur(grid, width, _choose_threads(grid))
+    volume, along_z = _pad_field(u, grid), _make_volume(grid)
     blur.along_z(volume, along_z, 0.0, _NO_FIELD)
     blur.in_planes(along_z, volume)
-    return _inner(volume, grid).copy()
+    return _view_field(volume, grid).copy()
 
 
 class FusedFlow:
@@ -76,9 +76,9 @@ class FusedFlow:
         self._adam_eps = adam_eps
         #: Adam's decay rates, which may change between steps.
         self.betas = betas
-        self._threads = threads = _threads(grid)
+        self._threads = threads = _choose_threads(grid)
         size = 3 * Z * Y * X
-        self._vector, self._first, self._second = (_zeros(size + 2 * SLACK) for _ in range(3))
+        self._vector, self._first, self._second = (_make_zeros(size + 2 * SLACK) for _ in range(3))
         #: Whether the last step has left the next one's blurred div A in place of its gradient.
         self._ahead = False
         if start is not None:
@@ -88,19 +88,19 @@ class FusedFlow:
         self._mass, self._base = (base, _NO_FIELD) if np.ndim(base) == 0 else (0.0, _pad_field(base, grid))
         self._keep, self._free = np.empty(0, np.float32), size
         if frozen is not None:
-            self._keep = _zeros(size // 3 + 2 * SLACK)
+            self._keep = _make_zeros(size // 3 + 2 * SLACK)
             self._keep[SLACK:-SLACK] = 1 - np.asarray(frozen, np.float32).ravel()
             self._free = 3 * int(np.count_nonzero(self._keep))
-        self._between, self._field, self._gradient = _volume(grid), _volume(grid), _volume(grid)
+        self._between, self._field, self._gradient = _make_volume(grid), _make_volume(grid), _make_volume(grid)
         self._sums, self._highest = np.empty(Z), np.empty(Z, np.int32)
         self._index_z = _continue_index(Z, EDGE, EDGE, grid.periodic)
         sizes = 3 * loops.pitch(Y, X) + 2 * SLACK, loops.ROWS * X + SLACK, Y * X + SLACK
-        self._rings, self._slopes, self._fluxes = (_scratch(threads, size) for size in sizes)
+        self._rings, self._slopes, self._fluxes = (_make_scratch(threads, size) for size in sizes)
 
     @property
     def field(self) -> np.ndarray:
         """The last phase field, `(Z, Y, X)`: a view that the next step overwrites."""
-        return _inner(self._field, self.grid)
+        return _view_field(self._field, self.grid)
 
     @property
     def vector(self) -> np.ndarray:
@@ -126,8 +126,8 @@ class FusedFlow:
 
     def evaluate(self) -> float:
         """Compute u and the gradient of F_ε with respect to u; return F_ε."""
-        if not self._ahead:
-            self.blur_divergence()
+        if not self._ahead:  # a step leaves div A blurred along y and x for the next one
+            self._adam_step(ALL, np.zeros(6, np.float32))
         self._ahead = False
         self.blur_along_z()
         return self.fill_gradient()
@@ -136,10 +136,6 @@ class FusedFlow:
         """Make an Adam step of length `rate` along the last gradient; return maximum and mean of |∂F_ε/∂A|."""
         self.blur_gradient_along_z()
         return self.blur_adam(rate)
-
-    def blur_divergence(self) -> None:
-        """Compute div A blurred along y and x, which a step leaves for the next one."""
-        self._adam_step(ALL, np.zeros(6, np.float32))
 
     def blur_along_z(self) -> None:
         """Blur along z and add the base, the first part of a step."""
@@ -194,7 +190,7 @@ class _Blur:
             _continue_index(X, EDGE, EDGE, periodic)[[0, 1, X + EDGE, X + EDGE + 1]],
             rx,
         )
-        self.rows = _scratch(threads, 2 * TOGETHER * loops.row_length(X, len(x)) + SLACK)
+        self.rows = _make_scratch(threads, 2 * TOGETHER * loops.row_length(X, len(x)) + SLACK)
 
     def along_z(self, source: np.ndarray, out: np.ndarray, shift: float, base: np.ndarray) -> None:
         """Blur along z, and add a number and, where it is not empty, a field."""
@@ -235,10 +231,10 @@ class _Density:
         self._inside = np.concatenate([np.tile(row, self._block), nothing])
         self._energies = np.empty((-(-Y // self._tile), Z))
         part = -(-(self._block + 2) * stride // _LINE) * _LINE + SLACK
-        self._rings = _scratch(threads, loops.PARTIALS * part + 2 * SLACK)
+        self._rings = _make_scratch(threads, loops.PARTIALS * part + 2 * SLACK)
         # Three planes of sums, and a block to discard into.
         part = -(-max(self._tile, self._block + 1) * stride // _LINE) * _LINE + SLACK
-        self._sums = _scratch(threads, 4 * part + 2 * SLACK)
+        self._sums = _make_scratch(threads, 4 * part + 2 * SLACK)
 
     def __call__(self, u: np.ndarray, gradient: np.ndarray) -> float:
         """Fill the gradient; return the energy."""
@@ -253,47 +249,47 @@ class _Density:
 _NO_FIELD = np.empty(0, np.float32)
 
 
-def _threads(grid: Grid) -> int:
+def _choose_threads(grid: Grid) -> int:
     """Return how many threads a grid is worth, of those that numba may use."""
     return max(1, min(count_threads(), math.prod(grid.shape) // _WORTH, grid.shape[0] // TOGETHER))
 
 
-def _scratch(threads: int, size: int) -> np.ndarray:
+def _make_scratch(threads: int, size: int) -> np.ndarray:
     """Make room of a size for each thread, on cache lines of its own."""
     size = -(-size // _LINE) * _LINE
-    return _zeros(threads * size).reshape(threads, size)
+    return _make_zeros(threads * size).reshape(threads, size)
 
 
-def _zeros(size: int) -> np.ndarray:
+def _make_zeros(size: int) -> np.ndarray:
     """Make zeros that begin at a cache line."""
     room = np.zeros(size + _LINE, np.float32)
     first = -room.ctypes.data // 4 % _LINE
     return room[first : first + size]
 
 
-def _volume(grid: Grid) -> np.ndarray:
+def _make_volume(grid: Grid) -> np.ndarray:
     """Make room for the grid's planes, or for as many as a blur along z makes at once."""
-    return _zeros(max(grid.shape[0], TOGETHER) * loops.pitch(*grid.shape[1:]) + 2 * SLACK)
+    return _make_zeros(max(grid.shape[0], TOGETHER) * loops.pitch(*grid.shape[1:]) + 2 * SLACK)
 
 
-def _whole(volume: np.ndarray, grid: Grid) -> np.ndarray:
+def _view_whole(volume: np.ndarray, grid: Grid) -> np.ndarray:
     """View the field and its continuation in planes."""
     Z, Y, X = grid.shape
     rows = (X + 2 * EDGE) * 4
     return as_strided(volume[SLACK:], (Z, Y + 2 * EDGE, X + 2 * EDGE), (loops.pitch(Y, X) * 4, rows, 4))
 
 
-def _inner(volume: np.ndarray, grid: Grid) -> np.ndarray:
+def _view_field(volume: np.ndarray, grid: Grid) -> np.ndarray:
     """View the field without its continuation."""
-    return _whole(volume, grid)[:, EDGE:-EDGE, EDGE:-EDGE]
+    return _view_whole(volume, grid)[:, EDGE:-EDGE, EDGE:-EDGE]
 
 
 def _pad_field(u: np.ndarray, grid: Grid) -> np.ndarray:
     """Copy a field into planes and continue it."""
     if u.shape != grid.shape:
         raise ValueError(f"expected a field of shape {grid.shape}, got {u.shape}")
-    volume = _volume(grid)
-    whole = _whole(volume, grid)
+    volume = _make_volume(grid)
+    whole = _view_whole(volume, grid)
     y, x = (EDGE + _continue_index(n, EDGE, EDGE, grid.periodic) for n in grid.shape[1:])
     whole[:, EDGE:-EDGE, EDGE:-EDGE] = u
     sides = [0, 1, -2, -1]
