@@ -166,6 +166,7 @@ class HasLaw(Protocol):
 
     def to_law(self) -> Law:
         """Return the law."""
+        ...
 
 
 #: All that states a law: see `Law.of`.
