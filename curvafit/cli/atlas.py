@@ -172,6 +172,39 @@ def train_atlas(
     say(str(out))
 
 
+@command(
+    "curvafit atlas teach store.zarr -o filler.npz",
+    "curvafit atlas teach presets.zarr box.zarr corner.zarr -o filler.npz",
+)
+def teach_filler(
+    stores: Annotated[list[Path], typer.Argument(help="Stores made by `curvafit atlas build`, or masks.")],
+    out: Annotated[Path, typer.Option("-o", "--output", help="The weights (.npz) to write.")],
+    steps: Annotated[int, typer.Option(help="Steps of teaching, some .4 s each on two cores.", min=1)] = 4500,
+    seed: Annotated[int, typer.Option(help="Seed of the teaching.")] = 0,
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Teach the network that `reconstruct` fills volumes with. The same command resumes one that was stopped."""
+    from curvafit.core.files import remove
+    from curvafit.segmentation.filler import FILLER_FILE
+    from curvafit.segmentation.teach import FEW, load_textures, teach
+
+    _check_archive(out, FILLER_FILE, stores, overwrite)
+    checkpoint = out.with_name(f".{out.name}.curvafit-steps")
+    with resumable(), show_stages() as progress:
+        sources, card = load_textures(stores, progress)
+        if (count := sum(map(len, sources))) < FEW:
+            say(f"note: {count} shapes teach little: {FEW} or more are better", to=error_console())
+        card["command"] = command_line()
+        taught = teach(sources, card, steps=steps, seed=seed, checkpoint=checkpoint, progress=progress)
+    taught.save(out)
+    remove(checkpoint)
+    losses = (taught.card[f"held_out_{name}"] for name in ("loss", "cubic"))
+    say(
+        "cross entropy of shapes held out {:.4f}, of the cubic interpolation {:.4f}".format(*losses), to=error_console()
+    )
+    say(str(out))
+
+
 @command("curvafit atlas map store.zarr -o map", "curvafit atlas map box.zarr corner.zarr -o map")
 def map_atlas(
     stores: Annotated[list[Path], typer.Argument(help="Stores made by `curvafit atlas build`, of one grid.")],
@@ -188,7 +221,7 @@ def map_atlas(
 
 
 add_commands(atlas_app, build_atlas, extend_atlas, info_atlas, verify_atlas)
-add_commands(atlas_app, extract_atlas, describe_atlas, train_atlas, map_atlas)
+add_commands(atlas_app, extract_atlas, describe_atlas, train_atlas, teach_filler, map_atlas)
 
 
 def _check_archive(out: Path, kind: Format, inputs: list[Path], overwrite: bool) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli.console import command_line, plain_errors, resumable, say, say_notes, show_stages
+from curvafit.cli.console import command_line, resumable, say, say_notes, show_stages
 from curvafit.cli.options import OverwriteOption, Reading, Volume, command, parse_threshold, parse_whole_numbers
 
 if TYPE_CHECKING:
@@ -24,7 +24,9 @@ _what = partial(typer.Option, rich_help_panel="What to do")
 
 Target = Annotated[Path, typer.Option("-o", "--output", help="Mask to write: .nii.gz .nii .tif .npy .mrc .zarr.")]
 Weight = Annotated[float | None, _what(help="Cost of a unit of the energy, in nats; by default chosen, with the law.")]
-OwnPrior = Annotated[str | None, _what("--prior", help="As in segment; by default inferred from the example.")]
+OwnPrior = Annotated[
+    str | None, _what("--prior", help="A law as in segment, which is tried from the network's volume; by default none.")
+]
 Stiffness = Annotated[float | None, _what(help="Stiffness of springs on the known slices: try nothing out.")]
 Epsilon = Annotated[float | None, _what(help="ε in the scan's unit; by default twice the smallest voxel edge.")]
 Steps = Annotated[int, _what(help="Steps of the flow.", min=1)]
@@ -68,11 +70,12 @@ def segment(
 
 
 @command(
-    "curvafit reconstruct labels.nii.gz --every 8 --prior bone/fit.json -o volume.nii.gz",
+    "curvafit reconstruct labels.nii.gz --every 8 -o volume.nii.gz",
     "curvafit reconstruct labels.nii.gz --every 8 --example whole.nii.gz -o volume.nii.gz",
-    "curvafit reconstruct labels.tif --known 0,7,15 --axis x --prior tubes -o volume.tif",
-    "curvafit reconstruct organelles.nii.gz --every 8 --labels all --example whole.nii.gz -o volume.nii.gz",
-    "curvafit reconstruct labels.nii.gz --every 8 --prior bone/fit.json --suggest 3 -o volume.nii.gz",
+    "curvafit reconstruct labels.tif --known 0,7,15 --axis x --suggest 3 -o volume.tif",
+    "curvafit reconstruct labels.nii.gz --ignore 255 -o volume.nii.gz",
+    "curvafit reconstruct organelles.nii.gz --every 8 --labels all -o volume.nii.gz",
+    "curvafit reconstruct labels.nii.gz --every 8 --prior bone/fit.json -o volume.nii.gz",
 )
 def reconstruct(
     slices: Volume,
@@ -81,6 +84,9 @@ def reconstruct(
     every: Annotated[int | None, _what(help="Distance of known slices: with 8, every eighth slice is known.")] = None,
     first: Annotated[int | None, _what(help="Number of the first known slice, with --every; by default 0.")] = None,
     known: Annotated[str | None, _what("--known", "--slices", help="Or: numbers of the known slices, 0,7,15.")] = None,
+    ignore: Annotated[
+        int | None, _what(help="Or: the label of voxels that nobody annotated; all others are known.")
+    ] = None,
     axis: Axis = "z",
     *,
     labels: Annotated[
@@ -88,16 +94,15 @@ def reconstruct(
         _what(help="Several structures that exclude each other: all, or their labels, 1,2,5; writes labels."),
     ] = None,
     example: Annotated[
-        Path | None, _what(help="Mask of another such volume, known whole: the prior is tried out on it.")
+        Path | None, _what(help="Mask of another such volume, known whole: it tunes the network for a minute.")
+    ] = None,
+    careful: Annotated[bool, _what("--careful", help="Average eight mirror images: eight times as long.")] = False,
+    filler: Annotated[
+        Path | None, _what(help="Weights of `curvafit atlas teach`; by default the packaged ones.")
     ] = None,
     stiffness: Stiffness = None,
     periodic: Annotated[bool, _what("--periodic", help="The volume repeats, as generated ones do.")] = False,
-    runs: Annotated[
-        int, _what(help="Further runs that tell the probability of the inside; 8 are a good number.", min=0)
-    ] = 0,
-    suggest: Annotated[
-        int, _what(help="Number of slices to suggest for annotation; needs --runs, by default 8.", min=0)
-    ] = 0,
+    suggest: Annotated[int, _what(help="Number of slices to suggest for annotation next.", min=0)] = 0,
     epsilon: Epsilon = None,
     steps: Steps = 400,
     tile: TileOption = None,
@@ -105,42 +110,39 @@ def reconstruct(
     reading: Reading,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Fill a mask between known slices, with a curvature prior where it helps; write mask, picture and record."""
-    with plain_errors():
-        if axis.lower() not in ("z", "y", "x"):
-            raise ValueError(f"--axis must be z, y or x, got {axis!r}")
-        if (every is None) == (known is None):
-            raise ValueError(f"give either --every or --known, got {'neither' if every is None else 'both'}")
-        if prior is None and example is None:
-            raise ValueError("give --prior or --example: the law, or a mask from which it is inferred")
-        if labels is not None and (reading["label"] is not None or runs or suggest):
-            raise ValueError("--labels is for several structures; --label, --runs and --suggest are for one")
-        several = None if labels in (None, "all") else list(parse_whole_numbers(labels, "--labels"))
-        numbers = None if known is None else list(parse_whole_numbers(known, "--known"))
-        if known is not None and first is not None:
-            raise ValueError(f"--first {first} goes with --every, not with --known")
-        place = {"every": every, "first": first or 0, "known": numbers, "axis": "zyx".index(axis.lower())}
-        how: dict[str, Any] = {"stiffness": stiffness, "periodic": periodic, "epsilon": epsilon}
+    """Fill a mask between known slices; write it, the probability of each voxel, a picture and a record."""
+    if axis.lower() not in ("z", "y", "x"):
+        raise ValueError(f"--axis must be z, y or x, got {axis!r}")
+    if (every, known, ignore).count(None) != 2:
+        raise ValueError("give either --every, --known or --ignore: which slices are known, or what is not")
+    if labels is not None and (reading["label"] is not None or suggest):
+        raise ValueError("--labels is for several structures; --label and --suggest are for one")
+    several = None if labels in (None, "all") else list(parse_whole_numbers(labels, "--labels"))
+    numbers = None if known is None else list(parse_whole_numbers(known, "--known"))
+    if every is None and first is not None:
+        raise ValueError(f"--first {first} goes with --every")
+    place = {"every": every, "first": first or 0, "known": numbers, "ignore": ignore, "axis": "zyx".index(axis.lower())}
+    how: dict[str, Any] = {"stiffness": stiffness, "periodic": periodic, "epsilon": epsilon, "careful": careful}
 
-        def compute(volume: Boxes, progress: Progress, **tools: Any) -> Segmentation:
-            from curvafit.segmentation.reconstruct import reconstruct as fill
-            from curvafit.segmentation.reconstruct import reconstruct_labels
-            from curvafit.volumes.boxes import read_whole
-            from curvafit.volumes.read import load
+    def compute(volume: Boxes, progress: Progress, **tools: Any) -> Segmentation:
+        from curvafit.segmentation.reconstruct import reconstruct as fill
+        from curvafit.segmentation.reconstruct import reconstruct_labels
+        from curvafit.volumes.boxes import read_whole
+        from curvafit.volumes.read import load
 
-            alike = {name: reading[name] for name in ("spacing", "unit", "label", "strict")}
-            whole = None if example is None else load(example, **alike)
-            say_notes(() if whole is None else whole.notes)
-            common = {"example": whole, "steps": steps, "progress": progress, **tools, **place, **how}
-            if labels is None:
-                return fill(read_whole(volume), prior, runs=runs, suggest=suggest, **common)
-            return reconstruct_labels(read_whole(volume), prior, chosen=several, **common)
+        alike = {name: reading[name] for name in ("spacing", "unit", "label", "strict")}
+        whole = None if example is None else load(example, **alike)
+        say_notes(() if whole is None else whole.notes)
+        common = {"example": whole, "filler": filler, "steps": steps, "progress": progress, **tools, **place, **how}
+        if labels is None:
+            return fill(read_whole(volume), prior, suggest=suggest, **common)
+        return reconstruct_labels(read_whole(volume), prior, chosen=several, **common)
 
-        record: dict[str, Any] = {"job": "reconstruct", "steps": steps, "tile": tile}
-        record |= {"labels": labels} if labels else {}
-        record |= {"example": None if example is None else str(example), **place, **how}
-        record |= {"runs": runs, "suggest": suggest}
-        run_job(Job(slices, out, prior, reading, record, overwrite, workers), compute)
+    record: dict[str, Any] = {"job": "reconstruct", "steps": steps, "tile": tile}
+    record |= {"labels": labels} if labels else {}
+    record |= {"example": None if example is None else str(example), **place, **how, "suggest": suggest}
+    record["filler"] = None if filler is None else str(filler)
+    run_job(Job(slices, out, prior, reading, record, overwrite, workers), compute)
 
 
 @dataclass(frozen=True)
@@ -170,9 +172,9 @@ def run_job(job: Job, compute: Callable[..., Segmentation], read: Callable[..., 
 
     record, reading = job.record, job.reading
     law_file = None if preset_name(job.prior) else job.prior
-    files = (job.source, law_file, job.image, record.get("example"), record.get("example_probabilities"))
-    options = {"inputs": [file for file in files if file is not None], "overwrite": job.overwrite}
-    options["probability"] = bool(record.get("runs") or record.get("suggest"))
+    shown = (job.image, *(record.get(name) for name in ("example", "example_probabilities", "filler")))
+    options = {"inputs": [file for file in (job.source, law_file, *shown) if file], "overwrite": job.overwrite}
+    options["probability"] = record["job"] == "reconstruct"
     check_mask_target(job.out, **options)
     if job.prior is not None:
         Law.of(job.prior)

@@ -160,16 +160,6 @@ def infer_law(example: Field | None, progress: Progress = silent) -> Inference:
     return infer(example, kind="mask", fast=True, progress=progress)
 
 
-def draw_laws(prior: LawLike, scan: Field, count: int) -> tuple[Coefficients, ...]:
-    """Return `count` laws from a fit's posterior draws, lengths in the scan's unit; none of a prior without draws."""
-    law = Law.of(prior)
-    draws, _ = load_draws_and_candidates(prior) if law.fitted else (None, ())
-    if draws is None or not len(draws.values):
-        return ()
-    rows = draws.values[np.linspace(0, len(draws.values) - 1, count).astype(int), :5]
-    return _convert_laws([Coefficients(1.0, *map(float, row)) for row in rows], law, scan)
-
-
 def _convert_laws(laws: Sequence[Coefficients], fit: Law, scan: Field) -> tuple[Coefficients, ...]:
     """Convert laws from a fit's working units to the scan's unit."""
     return tuple(law_of(replace(fit, coefficients=each), scan)[0] for each in laws)

@@ -1,11 +1,11 @@
-"""A volume between known slices: plain interpolation, or F_ε lowered from there with the slices held; one structure or
-several that exclude each other."""
+"""A volume between known slices: filled by a network, and by F_ε where a law is better; one structure or several."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import product
 from os import PathLike
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.special import expit, logit
 
 from curvafit.core.checks import SEEDS, check_float, check_int
 from curvafit.core.runtime import Progress, silent, sub_progress
@@ -21,14 +22,24 @@ from curvafit.generation import data
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
 from curvafit.priors.law import LawLike
 from curvafit.priors.loss import RESOLVED
-from curvafit.priors.profile import optimal_profile
-from curvafit.segmentation.engine import STEPS, WILLMORE, WorkingGrid, draw_laws, infer_law, laws_of
-from curvafit.segmentation.examples import Example, crop_to_surface, grow_task
+from curvafit.priors.profile import profile_distance
+from curvafit.segmentation.engine import STEPS, WorkingGrid, laws_of
+from curvafit.segmentation.examples import Example, crop_to_surface
+from curvafit.segmentation.filler import Taught, fill
 from curvafit.segmentation.result import Segmentation, Uncertainty, flow_summary
-from curvafit.segmentation.slices import WAYS, Slices, check_spacing, known_places, require_labels
+from curvafit.segmentation.slices import Slices, annotated_slices, check_spacing, known_places, require_labels
+from curvafit.segmentation.teach import tune
 from curvafit.segmentation.tiles import LoweredVolume, Problem, Tiling, lower_volume
-from curvafit.segmentation.trials import ODDS, Trial, best_plain_way, choose_by_masks, leave_out_slices
-from curvafit.segmentation.uncertainty import RUNS, ProbabilityMap, entropy, estimate_probability, suggest_slices
+from curvafit.segmentation.trials import Task, Trial, choose_by_masks, leave_out_slices
+from curvafit.segmentation.uncertainty import (
+    best_threshold,
+    calibration_error,
+    entropy,
+    fit_weights,
+    near_surface,
+    probability,
+    suggest_slices,
+)
 from curvafit.volumes.boxes import digest_of
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.part import Box
@@ -40,10 +51,12 @@ STIFFNESS = 1e7
 MARGIN = math.tanh(WORKING_SPACING / 2 / (math.sqrt(2) * WORKING_EPSILON))
 #: Least and greatest stiffness.
 STIFFEST = (1e-9, 1e12)
-#: Most runs.
-MOST = 1000
-#: Stiffness of the springs on unknown voxels, in working units, for each nat of an example's odds: both are tried.
-PULLS = (1e4, 3e4)
+#: Stiffness of the springs on unknown voxels, in working units, for each nat of their log-odds: all are tried.
+PULLS = (0.0, 1e4, 3e4)
+#: Label of unknown voxels in the mask of one structure.
+UNKNOWN = 255
+#: Probabilities of labels are at least this.
+SURE = 1e-6
 
 
 def reconstruct(
@@ -53,12 +66,14 @@ def reconstruct(
     every: int | None = None,
     first: int = 0,
     known: Sequence[int] | None = None,
+    ignore: int | None = None,
     axis: int = 0,
     example: Source | None = None,
-    stiffness: float | None = None,
-    periodic: bool = False,
-    runs: int = 0,
+    careful: bool = False,
     suggest: int = 0,
+    periodic: bool = False,
+    filler: str | Path | None = None,
+    stiffness: float | None = None,
     epsilon: float | None = None,
     steps: int = STEPS,
     tile: int | None = None,
@@ -67,12 +82,11 @@ def reconstruct(
     progress: Progress = silent,
     **reading: Any,
 ) -> Segmentation:
-    """Fill a volume between known slices: lower F_ε from an interpolation if that is better than the interpolation.
+    """Fill a volume between known slices, and say how sure each voxel is.
 
-    Which is better is tried out on an example with as few slices given, or else on every second known slice, which the
-    others predict. From an example the odds are learned that a voxel between two slices is inside, by its distances
-    from both outlines: where they are the best interpolation, springs of these odds hold the surface while F_ε is
-    lowered. Known slices stay as they are. Where the volume ends, the surface goes on freely.
+    A network fills it that generated shapes have taught (`filler.Filler`). An example tunes the network, where that
+    makes it better by more than the noise. With a law, F_ε is lowered from there if this is better: it is tried out on
+    the part of the example that did not tune, or else on every second known slice. Known slices stay as they are.
 
     Parameters
     ----------
@@ -80,158 +94,216 @@ def reconstruct(
         A mask, or labels, of the whole volume's shape, positive inside, as a path, a `Field`, an array or a tensor;
         only the known slices count.
     prior
-        As in `segment`, by default the law that `infer` finds of the example. Each law that a fit trusts is tried.
+        A law as in `segment`, to be tried; by default none. Each law that a fit trusts is tried.
     every, first
-        Slices `first`, `first + every`, … along `axis` are known. The volume is extrapolated before the first known
-        slice and beyond the last.
+        Slices `first`, `first + every`, … along `axis` are known. Before the first known slice and beyond the last, the
+        volume goes on as that slice is.
     known
         The numbers of the known slices, two or more, in place of `every` and `first`.
+    ignore
+        The label of voxels that nobody annotated, in place of `every` and `known`: slices without it are known, two or
+        more, and so is each other voxel, in slices along any axis or in parts of slices.
     axis
         The axis of the array across the slices, 0, 1 or 2, that is z, y or x.
     example
         A mask of another volume of the same kind, known whole. A file or an array has the slices' `spacing` and `unit`.
-    stiffness
-        Stiffness of the springs on known voxels, in working units: nothing is tried out, and the first law is lowered
-        from the spline.
+    careful
+        Whether the network fills the volume in all eight mirror images, which takes eight times as long.
+    suggest
+        Number of slices to suggest for annotation next.
     periodic
         Whether the volume repeats, as generated ones do.
-    runs
-        Number of further runs, from other starts and under laws drawn from a fit's posterior. How probable the inside
-        is where they agree is learned from the example, or else from a shape grown from the law: two flows a run.
-    suggest
-        Number of slices to suggest for annotation next; needs `runs`, by default 8.
+    filler
+        Weights of `curvafit atlas teach`; by default the packaged ones.
+    stiffness
+        Stiffness of the springs on known voxels, in working units: the first law is lowered without being tried out.
     epsilon, steps, tile, store, workers, progress, reading
         As in `segment`.
 
     Raises
     ------
     ValueError, FileNotFoundError
-        As `segment`; or if fewer than two slices are known, or too few to try the prior out on and there is neither an
+        As `segment`; or if fewer than two slices are known, or too few to try a law out on and there is neither an
         example nor a stiffness; or if known slices are all empty, all full or grey levels, the example's spacing is
-        another one, more slices are to be suggested than are unknown, or there is neither a prior nor an example.
+        another one, or more slices are to be suggested than are unknown.
     """
     volume = field_of(slices, **reading)
     axis = check_int(axis, "an axis 0, 1 or 2 (z, y, x)", 0, 2)
-    places = known_places(volume.shape[axis], every, first, known)
-    target = Slices.of(volume, places, axis, periodic)
-    tiling = Tiling.of(target.frame, epsilon, tile, periodic=periodic)
+    places, marks = _find_known(volume, axis, every, first, known, ignore)
+    target = Slices.of(volume, places, axis, periodic, marks)
+    suggest = check_int(suggest, "a number of slices from 0", 0, volume.shape[axis] - len(places))
     if stiffness is not None:
         stiffness = check_float(stiffness, "a positive stiffness", *STIFFEST)
-    suggest = check_int(suggest, "a number of slices from 0", 0, volume.shape[axis] - len(places))
-    runs = check_int(runs, "a number of runs from 0", 0, MOST)
-    shown = None if example is None else _load_example(example, volume, reading)
-    other = None if shown is None else Example.of(shown, places, axis)
-    prior = infer_law(shown, progress) if prior is None else prior
-    laws, notes = laws_of(prior, volume)
-    if suggest and not runs:
-        runs, notes = RUNS, (*notes, f"Suggestions need runs: {RUNS} are made.")
-    firm = STIFFNESS if stiffness is None else stiffness
-    level = Slices.level if other is None else other.level
-
-    def candidates(way: str) -> list[Trial]:
-        pulls = PULLS if way == ODDS else (0.0,)
-        return [Trial(way, law, firm, steps, pull) for law, pull in product(laws, pulls)]
-
-    def pose(slices: Slices, trial: Trial) -> SlicesProblem:
-        return SlicesProblem(trial, slices, level(slices, ODDS) if trial.way == ODDS else None)
-
-    def fill(slices: Slices, trial: Trial) -> np.ndarray:
-        if trial.law is None:
-            return level(slices, trial.way) > 0
-        step: Progress = lambda _, share: progress("trying the prior out", share)  # noqa: E731
-        return _lower(pose(slices, trial), epsilon, None, step).mask
-
-    def run(slices: Slices, trial: Trial, moved: np.ndarray, step: Progress) -> tuple[np.ndarray, float]:
-        again: Progress = lambda _, share: step("running again", share)  # noqa: E731
-        return _lower(SlicesProblem(trial, slices, moved), epsilon, tile, again).phase, tiling.place.epsilon
-
-    chosen, gain, uncertain = candidates("spline")[0], "", None
-    fair = (grow_task(target, laws[0], epsilon, progress) if other is None else other.part) if runs else None
-    if stiffness is None:
-        chosen = _choose(target if tiling.count == 1 else crop_to_surface(target)[0], other, candidates, fill)
-        gain = _describe_gain(chosen, "left out" if other is None else "of the example")
-    found = lower_volume(pose(target, chosen), tiling, store=store, workers=workers, progress=progress)
-    end = flow_summary(found)
-    if fair is not None:
-        drawn = () if chosen.law is None else draw_laws(prior, volume, runs)
-        likely = estimate_probability(
-            fair, target, chosen, drawn or (chosen.law,), runs, level=level, flow=run, progress=progress
-        )
-        uncertain = _uncertainty(likely, target, volume, axis, runs, suggest)
-        end = f"{end}; {_describe_errors(uncertain, 'a shape of the law' if other is None else 'the example')}"
-    notes = (*notes, *(() if other is None else other.notes), *_known_notes(places, volume.shape[axis]))
+    laws, notes = ((), ()) if prior is None else laws_of(prior, volume)
+    tiling = Tiling.of(target.frame, epsilon, tile, periodic=periodic)
+    taught, other = Taught.load(filler), None
+    if example is not None:
+        other = Example.of(_load_example(example, volume, reading), places, axis)
+        taught = tune(taught, other, sub_progress(progress, 0.0, 0.5))
+        notes = (*notes, *other.notes)
+    engine = _Engine(taught, careful, epsilon, progress)
+    chosen, said, task = Trial(), taught.status, None if other is None else other.task
+    if laws and stiffness is None:
+        task = _pose_task(target if tiling.count == 1 else crop_to_surface(target)[0], other)
+        trials = [Trial(law, STIFFNESS, steps, pull) for law, pull in product(laws, PULLS)]
+        chosen = choose_by_masks(task, trials, lambda given, trial: engine.run(given, trial) > 0)
+        said = _describe_gain(chosen, "left out" if other is None else "of the example")
+    elif laws:
+        chosen, said = Trial(laws[0], stiffness or STIFFNESS, steps), "the law is lowered from the network's volume"
+    if chosen.law is None:
+        phase = engine.run(target, chosen)
+        found = LoweredVolume(target.keep_known(phase > 0), phase, (), 0)
+        likely = expit(engine.logits(target)), taught.error
+    else:
+        problem = SlicesProblem(chosen, target, engine.level(target))
+        found = lower_volume(problem, tiling, store=store, workers=workers, progress=progress)
+        likely = _weigh_evidence(engine, chosen, task, target, found.phase)
+        notes = (*notes, *tiling.place.notes)
+    uncertain = _uncertainty(*likely, target, volume, axis, suggest)
+    end = _describe_errors(uncertain)
     whole = replace(found, mask=_turn_back(axis, found.mask), phase=_turn_back(axis, found.phase))
     return Segmentation.of(
-        volume, whole, chosen.law, tiling.place.epsilon, (*notes, *tiling.place.notes),
-        weight=None, status=f"{gain}{end}", uncertainty=uncertain,
+        volume, whole, chosen.law, tiling.place.epsilon, (*notes, *_known_notes(places, volume.shape[axis])),
+        weight=None, status=f"{said}: {flow_summary(found)}; {end}", uncertainty=uncertain,
     )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Engine:
+    """What fills any slices: the network, and laws that start from its volume."""
+
+    taught: Taught
+    careful: bool
+    epsilon: float | None
+    progress: Progress
+    filled: dict[Slices, np.ndarray] = field(default_factory=dict)
+
+    def logits(self, slices: Slices) -> np.ndarray:
+        """Return the network's log-odds of the inside (Z, Y, X), computed once."""
+        if slices not in self.filled:
+            step = sub_progress(self.progress, 0.5, 1.0)
+            self.filled[slices] = fill(slices, self.taught, careful=self.careful, progress=step)
+        return self.filled[slices]
+
+    def level(self, slices: Slices) -> np.ndarray:
+        """Return log-odds over those of the best threshold (Z, Y, X), times the edge of a voxel."""
+        logits = self.logits(slices)
+        least = logit(best_threshold(expit(logits[slices.between])))
+        return np.float32(min(slices.spacing[1:])) * (logits - np.float32(least))
+
+    def run(self, slices: Slices, trial: Trial) -> np.ndarray:
+        """Return the phase field (Z, Y, X) of a trial."""
+        tiling = Tiling.of(slices.frame, self.epsilon, periodic=slices.periodic)
+        if trial.law is None:
+            return _profile(self.level(slices), tiling.place.epsilon)
+        step: Progress = lambda _, share: self.progress("trying the law out", share)  # noqa: E731
+        return lower_volume(SlicesProblem(trial, slices, self.level(slices)), tiling, progress=step).phase
 
 
 @dataclass(frozen=True, eq=False)
 class SlicesProblem(Problem):
     """The volume between slices, and a trial whose strength is the stiffness of springs on the known voxels.
 
-    The start is `level` (length, Y, X), by default the trial's own interpolation.
+    `level` (length, Y, X), positive inside, is the start: log-odds over a threshold's, times the edge of a voxel.
     """
 
     slices: Slices
-    level: np.ndarray | None = None
+    level: np.ndarray
 
     @property
     def parts(self) -> dict[str, object]:
         slices, trial = self.slices, self.trial
         numbers = {"places": slices.places, "spacing": slices.spacing, "periodic": slices.periodic}
-        start = trial.way if self.level is None else digest_of(self.level)
         springs = {"strength": trial.strength, "pull": trial.pull}
-        return {"slices": digest_of(slices.inside), **numbers, "start": start, **springs}
+        return {"slices": digest_of(slices.inside), **numbers, "start": digest_of(self.level), **springs}
 
     def terms(self, box: Box, place: WorkingGrid) -> tuple[np.ndarray, data.Data]:
-        """Return the interpolation on a box, positive inside, and the hinge term that holds voxels there.
+        """Return the level on a box, and the hinge term that holds voxels there.
 
-        Known voxels are held with the trial's strength. Where the start is an example's odds, voxels between known
-        slices are held too: by the trial's pull for each pixel of the level, which is then the log-odds of the inside.
+        Known voxels are held with the trial's strength, those between known slices by its pull for each nat.
         """
         slices, trial, (rows, inside) = self.slices, self.trial, self.slices.known(box)
         numbers = slices.numbers(box)
-        level = slices.level(trial.way, box) if self.level is None else self.level[np.ix_(*numbers)]
+        level = self.level[np.ix_(*numbers)]
         held = slices.between[numbers[0], None, None]
         pull = np.where(held, trial.pull / min(slices.spacing[1:]) * level, 0).astype(np.float32)
         pull[rows] = np.where(inside, trial.strength, -trial.strength)
+        if slices.marks is not None:
+            marks = slices.marks[np.ix_(*numbers)]
+            pull = np.where(marks == 0, pull, trial.strength * marks).astype(np.float32)
         return level, data.Hinge(place.spread(pull, centre=0), MARGIN)
 
     def plain(self, level: np.ndarray, place: WorkingGrid) -> np.ndarray:
-        """Return the optimal profile tanh(d / √2 ε) of the interpolation."""
-        return np.tanh(level / (math.sqrt(2) * place.epsilon))
+        """Return the optimal profile tanh(d / √2 ε) of the level."""
+        return _profile(level, place.epsilon)
 
     def mask(self, phase: np.ndarray, box: Box) -> np.ndarray:
         """Return the voxels where the phase field is positive, and the known ones as they are."""
-        mask, (rows, inside) = phase > 0, self.slices.known(box)
-        mask[rows] = inside
-        return mask
+        return self.slices.keep_known(phase > 0, box)
 
 
-def _lower(problem: SlicesProblem, epsilon: float | None, tile: int | None, progress: Progress) -> LoweredVolume:
-    """Lower a problem on a tiling of its own slices."""
-    tiling = Tiling.of(problem.slices.frame, epsilon, tile, periodic=problem.slices.periodic)
-    return lower_volume(problem, tiling, progress=progress)
+def _profile(level: np.ndarray, epsilon: float) -> np.ndarray:
+    return np.tanh(level / (math.sqrt(2) * epsilon))
 
 
-def _choose(
-    slices: Slices,
-    example: Example | None,
-    candidates: Callable[[str], list[Trial]],
-    fill: Callable[[Slices, Trial], np.ndarray],
-) -> Trial:
-    """Return the trial that is best on the example, or else on every second known slice."""
-    if example is not None:
-        return choose_by_masks(example.part, candidates, fill, (best_plain_way(example.whole, fill, (*WAYS, ODDS)),))
-    task = leave_out_slices(slices)
+def _find_known(
+    volume: Field, axis: int, every: int | None, first: int, known: Sequence[int] | None, ignore: int | None
+) -> tuple[list[int], np.ndarray | None]:
+    """Return the numbers of the known slices, and the marks in others."""
+    if ignore is None:
+        return known_places(volume.shape[axis], every, first, known), None
+    if every is not None or known is not None:
+        raise ScanError("give either every, known or ignore")
+    return annotated_slices(np.moveaxis(volume.values, axis, 0), check_int(ignore, "a label to ignore", -SEEDS, SEEDS))
+
+
+def _pose_task(slices: Slices, example: Example | None) -> Task[Slices]:
+    """Return what a law is tried out on: a part of the example, or else every second known slice."""
+    task = leave_out_slices(slices) if example is None else example.part
     if task is None:
         raise ScanError(
             "to try the prior out, give three or more known slices with voxels inside and outside, an example or a "
             f"stiffness, got {len(slices.places)} slices"
         )
-    return choose_by_masks(task, candidates, fill, ("spline",))
+    return task
+
+
+def _weigh_evidence(
+    engine: _Engine, trial: Trial, task: Task[Slices] | None, target: Slices, phase: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Return the probability of the inside (Z, Y, X) where a law was lowered, and its calibration error on the task.
+
+    The evidence is the network's log-odds and the depth below the law's surface, with weights fitted to the task; where
+    there is none, all the weight is the network's.
+    """
+
+    def evidence(slices: Slices, phase: np.ndarray, rows: list[int]) -> np.ndarray:
+        depth = profile_distance(torch.from_numpy(phase[rows]), RESOLVED).numpy()
+        return np.stack([engine.logits(slices)[rows].ravel(), depth.ravel()], axis=-1)
+
+    if task is None:
+        return expit(engine.logits(target)), engine.taught.error
+    rows, tried = list(task.places), engine.run(task.given, trial)
+    known = evidence(task.given, tried, rows)
+    weights = fit_weights(known, task.truth.ravel())
+    told, near = probability(known, weights).reshape(task.truth.shape), near_surface(tried > 0)[rows]
+    values = probability(evidence(target, phase, list(range(target.length))), weights).reshape(target.shape)
+    return values, calibration_error(told[near], task.truth[near])
+
+
+def _uncertainty(likely: np.ndarray, error: float, slices: Slices, volume: Field, axis: int, count: int) -> Uncertainty:
+    """Return probabilities (Z, Y, X) as a volume, 0 or 1 where it is known, and `count` slices to annotate next."""
+    none, every = (slices.keep_known(np.full(slices.shape, value)) for value in (False, True))
+    values = np.where(none == every, none, likely).astype(np.float32)
+    suggestions = suggest_slices(entropy(values).sum((1, 2)), slices.places, count, slices.periodic)
+    return Uncertainty(replace(volume, values=_turn_back(axis, values), notes=()), error, suggestions)
+
+
+def _describe_errors(uncertain: Uncertainty) -> str:
+    """Say how good probabilities are, and what to annotate next, as the end of a sentence."""
+    text = f"probabilities err by {uncertain.calibration_error:.3f} near the surface"
+    following = ", ".join(map(str, uncertain.suggestions))
+    return f"{text}; annotate next: {following}" if following else text
 
 
 def _turn_back(axis: int, values: np.ndarray) -> np.ndarray:
@@ -239,28 +311,12 @@ def _turn_back(axis: int, values: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(np.moveaxis(values, 0, axis))
 
 
-def _uncertainty(
-    likely: ProbabilityMap, slices: Slices, volume: Field, axis: int, runs: int, count: int
-) -> Uncertainty:
-    """Return the probability map of a volume from its runs, and the `count` slices most worth annotating next."""
-    suggestions = suggest_slices(entropy(likely.values).sum((1, 2)), slices.places, count, slices.periodic)
-    probability = replace(volume, values=_turn_back(axis, likely.values), notes=())
-    return Uncertainty(probability, seeds=tuple(range(runs)), calibration_error=likely.error, suggestions=suggestions)
-
-
-def _describe_errors(uncertain: Uncertainty, where: str) -> str:
-    """Say how good probabilities are, and what to annotate next, as the end of a sentence."""
-    following = ", ".join(map(str, uncertain.suggestions))
-    text = f"probabilities of {len(uncertain.seeds)} runs err by {uncertain.calibration_error:.3f} on {where}"
-    return f"{text}; annotate next: {following}" if following else text
-
-
 def _describe_gain(best: Trial, where: str) -> str:
     """Say what was chosen and what it gains, as the beginning of a sentence."""
     score, plain = f"Dice {best.score:.3f}", f"{best.plain:.3f}"
     if best.law is None:
-        return f"no prior helps here: Dice {plain} on slices {where} by {best.way}, {best.score:.3f} with a prior; "
-    return f"a prior helps, from {best.way}: {score} on slices {where}, {plain} without; "
+        return f"no law helps here: Dice {plain} on slices {where} by the network alone, {best.score:.3f} with a law"
+    return f"a law helps: {score} on slices {where}, {plain} by the network alone"
 
 
 def _load_example(example: Source, volume: Field, reading: dict[str, Any]) -> Field:
@@ -289,6 +345,7 @@ def reconstruct_labels(
     every: int | None = None,
     first: int = 0,
     known: Sequence[int] | None = None,
+    ignore: int | None = None,
     axis: int = 0,
     example: Source | None = None,
     store: str | PathLike[str] | None = None,
@@ -301,28 +358,28 @@ def reconstruct_labels(
     one with the greater phase field there.
 
     Where every voxel of the known slices is labelled, so is every voxel of the volume: an unclaimed voxel goes to the
-    label with the largest phase value. A label for which slices or example are too few is interpolated by the spline,
-    and a note says why.
+    label with the largest phase value. A label for which slices or example are too few for what is asked is filled by
+    the network alone, and a note says why.
 
     Parameters
     ----------
     slices
         Labels of the whole volume's shape, whole numbers, 0 where there is nothing; only the known slices count.
     prior
-        A law for all labels, or one for each; by default the law that `infer` finds of each label of the example, or
-        the Willmore energy for a label without one.
+        A law for all labels, or one for each, to be tried; by default none.
     chosen
         The labels that are structures, by default all but 0; the others count as nothing.
     example
         Labels of another volume of the same kind, known whole, with the same values for the same structures.
-    every, first, known, axis, store, progress, spacing, unit, options
-        As in `reconstruct`, without `runs` and `suggest`.
+    every, first, known, ignore, axis, store, progress, spacing, unit, options
+        As in `reconstruct`, without `suggest`.
 
     Returns
     -------
     Segmentation
         `labels` has the label of the structure at each voxel, `mask` whether there is one, `phase` the greatest phase
-        field; there are no coefficients. Its `status` is that of `reconstruct` for each label.
+        field, `probability` that of the voxel's label; there are no coefficients. Its `status` is that of `reconstruct`
+        for each label.
 
     Raises
     ------
@@ -331,43 +388,40 @@ def reconstruct_labels(
     """
     volume = field_of(slices, spacing=spacing, unit=unit)
     axis = check_int(axis, "an axis 0, 1 or 2 (z, y, x)", 0, 2)
-    places = known_places(volume.shape[axis], every, first, known)
+    places, _ = _find_known(volume, axis, every, first, known, ignore)
     planes = np.moveaxis(volume.values, axis, 0)[places]
     numbers = find_labels(planes, chosen)
     other = None if example is None else _load_example(example, volume, {"spacing": spacing, "unit": unit})
     notes = list(volume.notes)
     laws = prior if isinstance(prior, Mapping) else dict.fromkeys(numbers, prior)
-    if missing := [number for number in numbers if number not in laws]:
-        raise ScanError(f"each label needs a law, but there is none for {', '.join(map(str, missing))}")
-    if prior is None:
-        laws = {number: _infer_label(other, number, notes, progress) for number in numbers}
     deepest, owner = np.full(volume.shape, -np.inf, dtype=np.float32), np.zeros(volume.shape, dtype=np.int64)
+    largest, odds = np.zeros(volume.shape, dtype=np.float32), np.zeros(volume.shape, dtype=np.float32)
     parts: list[Segmentation] = []
-    refusals: list[ScanError] = []
     for count, number in enumerate(numbers):
-        mask, shown = _select_label(volume, number), _select_label(other, number)
-        if shown is not None and not shown.values.any():
-            shown = None
-            notes.append(f"The example has no label {number}: it is tried out on slices left out.")
+        mask, shown = _select_label(volume, number, ignore), _select_label(other, number)
         folder = None if store is None else Path(store) / str(number)
         step = sub_progress(progress, count / len(numbers), (count + 1) / len(numbers))
+        which = {"known": places} if ignore is None else {"ignore": UNKNOWN}
+        same = partial(reconstruct, mask, axis=axis, progress=step, **which, **options)
         try:
-            part = reconstruct(
-                mask, laws[number], known=places, axis=axis, example=shown, store=folder, progress=step, **options
-            )
+            part = same(laws.get(number), example=shown, store=folder)
         except ScanError as reason:
-            refusals.append(reason)
-            part = _interpolate(mask, places, axis, f"Of label {number}: {reason}.")
+            part = same()
+            notes.append(f"Label {number} is filled by the network alone: {reason}.")
         owner = np.where(part.phase.values > deepest, number, owner)
         deepest = np.maximum(deepest, part.phase.values)
+        own = _odds(part)
+        largest, odds = np.maximum(largest, own), odds + own
         notes += part.notes
         parts.append(part)
-    if len(refusals) == len(numbers):
-        raise refusals[0]
-    inside = np.isin(planes, numbers)
-    values = owner if inside.all() else np.where(deepest > 0, owner, 0)
-    np.moveaxis(values, axis, 0)[places] = np.where(inside, planes, 0)
+    full = bool(np.isin(planes, numbers).all())
+    values = owner if full else np.where(deepest > 0, owner, 0)
+    likely = np.where(values, largest, 1.0) / (odds + (not full))
+    known_voxels = _mark_known(volume, axis, places, ignore)
+    values = np.where(known_voxels, np.where(np.isin(volume.values, numbers), volume.values, 0), values)
+    likely = np.where(known_voxels, 1.0, likely)
     values = values.astype(np.int32 if min(numbers) < 0 else np.min_scalar_type(max(numbers)))
+    error = max(part.uncertainty.calibration_error for part in parts if part.uncertainty is not None)
     return Segmentation(
         mask=replace(volume, values=values != 0, notes=()),
         phase=replace(volume, values=deepest, notes=()),
@@ -377,7 +431,23 @@ def reconstruct_labels(
         status="; ".join(f"label {number}: {part.status}" for number, part in zip(numbers, parts, strict=True)),
         notes=tuple(dict.fromkeys(notes)),
         labels=replace(volume, values=values, notes=()),
+        uncertainty=Uncertainty(replace(volume, values=likely.astype(np.float32), notes=()), error, ()),
     )
+
+
+def _mark_known(volume: Field, axis: int, places: list[int], ignore: int | None) -> np.ndarray:
+    """Return which voxels are known."""
+    if ignore is not None:
+        return volume.values != ignore
+    mask = np.zeros(volume.shape, dtype=bool)
+    np.moveaxis(mask, axis, 0)[places] = True
+    return mask
+
+
+def _odds(part: Segmentation) -> np.ndarray:
+    """Return the odds of the inside, finite."""
+    likely = np.clip(part.mask.values if part.probability is None else part.probability.values, SURE, 1 - SURE)
+    return likely / (1 - likely)
 
 
 def find_labels(values: np.ndarray, chosen: Sequence[int] | None) -> list[int]:
@@ -398,25 +468,11 @@ def find_labels(values: np.ndarray, chosen: Sequence[int] | None) -> list[int]:
     return numbers
 
 
-def _select_label(volume: Any, number: int) -> Any:
-    """Return the mask of a label, of a volume if there is one."""
-    return None if volume is None else replace(volume, values=volume.values == number, notes=())
-
-
-def _infer_label(example: Field | None, number: int, notes: list[str], progress: Progress) -> LawLike:
-    """Infer the law of a label of the example; without one, note why, and return the Willmore energy."""
-    try:
-        return infer_law(None if example is None else replace(example, values=example.values == number), progress)
-    except ScanError as reason:
-        if example is None:
-            raise
-        notes.append(f"Label {number} of the example has no law ({reason}): the Willmore energy is tried.")
-        return WILLMORE
-
-
-def _interpolate(mask: Field, places: list[int], axis: int, note: str) -> Segmentation:
-    """Return a label's interpolation by the spline, as a segmentation without an ε."""
-    level = _turn_back(axis, Slices.of(mask, places, axis).level("spline"))
-    phase = optimal_profile(torch.from_numpy(level), RESOLVED * min(mask.spacing)).numpy()
-    lowered = LoweredVolume(phase > 0, phase, (), 0)
-    return Segmentation.of(mask, lowered, None, 0.0, (note,), weight=None, status="interpolated by a spline")
+def _select_label(volume: Any, number: int, ignore: int | None = None) -> Any:
+    """Return the mask of a label, of a volume if there is one; voxels of the label to ignore are `UNKNOWN`."""
+    if volume is None:
+        return None
+    mask = (volume.values == number).astype(np.uint8)
+    if ignore is not None:
+        mask[volume.values == ignore] = UNKNOWN
+    return replace(volume, values=mask, notes=())

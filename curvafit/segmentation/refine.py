@@ -39,8 +39,6 @@ from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.part import Box, Crop
 from curvafit.volumes.read import Source, field_of, place_of
 
-#: The plain way from probabilities to a mask.
-PLAIN = "p > 1/2"
 #: Weights that are tried, in nats of a unit of the Willmore energy, and the first of them.
 NATS, FIRST = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0), 10.0
 #: Longest edge in voxels of the part of an example on which laws and weights are tried.
@@ -145,7 +143,7 @@ def refine(
     if example is None:
         laws, notes = laws_of(infer_law(None) if prior is None else prior, field)
         strength = check_float(weight, "a positive weight", *WEIGHTS) * bending(laws[0]) / BENDING
-        trial = Trial(PLAIN, laws[0], strength, steps)
+        trial = Trial(laws[0], strength, steps)
     else:
         if not isinstance(example, Calibration):
             alike = {name: value for name, value in reading.items() if name not in ("like", "crop")}
@@ -205,7 +203,7 @@ def calibrate(
             return np.zeros(part.shape, dtype=bool)
 
     task = Task(probability_evidence(part), inside[where], range(part.shape[0]))
-    best = choose_by_masks(task, lambda way: [Trial(way, law, FIRST, steps) for law in tried], fill, (PLAIN,), NATS)
+    best = choose_by_masks(task, [Trial(law, FIRST, steps) for law in tried], fill, NATS)
     return Calibration(best, best.law in laws, field, notes)
 
 

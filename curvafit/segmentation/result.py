@@ -35,23 +35,21 @@ _NIFTI = (".nii", ".nii.gz")
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """How sure a volume between known slices is, by several runs.
+    """How sure a volume between known slices is.
 
     Attributes
     ----------
     probability
-        The probability of the inside, float32, with the scan's grid, spacing, unit and affine; 0 or 1 on known slices.
-    seeds
-        The seed of each run.
+        The probability of the inside, or of several structures that of the voxel's label, float32, with the scan's
+        grid, spacing, unit and affine; 0 or 1 on known slices.
     calibration_error
-        How far shares inside differ from probabilities, on average, within 3 voxels of the surface, on the slices that
-        the probabilities were calibrated on.
+        How far shares inside differ from probabilities near the surface, on average: on the example, or else on
+        generated shapes that did not teach.
     suggestions
         Numbers of the slices to annotate next, the most informative first.
     """
 
     probability: Field
-    seeds: tuple[int, ...]
     calibration_error: float
     suggestions: tuple[int, ...]
 
@@ -73,7 +71,7 @@ class Segmentation(Pictured):
     notes
         Sentences on the evidence and on assumptions.
     uncertainty
-        Of a reconstruction with several runs: the probability of the inside, and what to annotate next.
+        Of a volume between known slices: how sure it is, and what to annotate next.
     labels
         Of several structures: the label at each voxel, a whole number, 0 where there is none.
     """
@@ -104,7 +102,7 @@ class Segmentation(Pictured):
 
     @property
     def probability(self) -> Field | None:
-        """The probability of the inside, of a reconstruction with several runs."""
+        """The probability of the inside, of a volume between known slices."""
         return None if self.uncertainty is None else self.uncertainty.probability
 
     def __repr__(self) -> str:
@@ -234,8 +232,7 @@ def _map_path(target: Path) -> Path:
 def _record(segmentation: Segmentation, scan: Field, more: dict[str, Any]) -> dict[str, Any]:
     uncertain, doubts = segmentation.uncertainty, {}
     if uncertain is not None:
-        doubts = {name: getattr(uncertain, name) for name in ("seeds", "calibration_error", "suggestions")}
-        doubts["runs"] = len(uncertain.seeds)
+        doubts = {name: getattr(uncertain, name) for name in ("calibration_error", "suggestions")}
     return {
         "status": segmentation.status,
         **more,

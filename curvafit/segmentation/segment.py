@@ -122,7 +122,7 @@ def segment(
     _check_phases(_GreyEvidence(boxes, bounds, classes), tiling)
     gain, stiffness = "", bending(laws[0])
     if weight is not None:
-        trial = Trial("start", laws[0], stiffness / BENDING * weight, steps)
+        trial = Trial(laws[0], stiffness / BENDING * weight, steps)
     else:
         inside = grey_evidence(levels, sample, classes).level > 0
         block = max(blocks, key=lambda block: int(count_faces(inside[block]).sum()))

@@ -23,6 +23,8 @@ WAYS = ("spline", "linear", "nearest")
 LABELS = 256
 #: Share by which the voxel sizes of two files may differ, and voxels by which their places may.
 SAME, ASTRAY = 1e-3, 0.1
+#: The box that is all of a volume.
+WHOLE: Box = (slice(0, None), slice(0, None), slice(0, None))
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +43,8 @@ class Slices:
         Voxel edges (z, y, x), and their unit.
     periodic
         Whether the last slice of the volume is followed by the first.
+    marks
+        What is known in the other slices, int8 (length, Y, X): 1 inside, -1 outside, 0 unknown. None if nothing is.
     """
 
     inside: np.ndarray
@@ -49,10 +53,18 @@ class Slices:
     spacing: tuple[float, float, float]
     unit: str = "voxel"
     periodic: bool = False
+    marks: np.ndarray | None = None
 
     @classmethod
-    def of(cls, volume: Field, places: Sequence[int], axis: int, periodic: bool = False) -> Slices:
-        """Take the known slices of a volume across an axis, which becomes the first.
+    def of(
+        cls,
+        volume: Field,
+        places: Sequence[int],
+        axis: int,
+        periodic: bool = False,
+        marks: np.ndarray | None = None,
+    ) -> Slices:
+        """Take the known slices of a volume across an axis, which becomes the first; `marks` have it first already.
 
         Raises `ScanError` if they hold grey levels, or are all empty or all full.
         """
@@ -61,11 +73,32 @@ class Slices:
             state = "full" if inside.all() else "empty"
             raise ScanError(f"the known slices must have voxels inside and outside, but all are {state}")
         edges = [volume.spacing[k] for k in (axis, *(k for k in range(3) if k != axis))]
-        return cls(inside, tuple(places), volume.shape[axis], (edges[0], edges[1], edges[2]), volume.unit, periodic)
+        return cls(
+            inside, tuple(places), volume.shape[axis], (edges[0], edges[1], edges[2]), volume.unit, periodic, marks
+        )
 
     def select(self, rows: Sequence[int]) -> Slices:
         """Keep some of the known slices, by their rows in `inside`."""
         return replace(self, inside=self.inside[list(rows)], places=tuple(self.places[k] for k in rows))
+
+    def crop(self, box: Box) -> Slices:
+        """Return what is known in a box, whose first edge begins and ends with known slices."""
+        (start, stop), (_, ys, xs) = (box[0].start, box[0].stop), box
+        rows = [k for k, place in enumerate(self.places) if start <= place < stop]
+        places = tuple(self.places[k] - start for k in rows)
+        marks = None if self.marks is None else self.marks[box]
+        inside = self.inside[rows][:, ys, xs]
+        return replace(self, inside=inside, places=places, length=stop - start, periodic=False, marks=marks)
+
+    def keep_known(self, mask: np.ndarray, box: Box = WHOLE) -> np.ndarray:
+        """Return a mask (Z, Y, X) of a box, with the known voxels as they are."""
+        rows, inside = self.known(box)
+        kept = mask.copy()
+        kept[rows] = inside
+        if self.marks is not None:
+            marks = self.marks[np.ix_(*self.numbers(box))]
+            kept = np.where(marks == 0, kept, marks > 0)
+        return kept
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -89,14 +122,14 @@ class Slices:
         positions = [k for k, place in enumerate(numbers) if place in index_of_place]
         return positions, self.inside[[index_of_place[int(numbers[k])] for k in positions]][:, ys][:, :, xs]
 
-    def level(self, way: str, box: Box | None = None) -> np.ndarray:
+    def level(self, way: str, box: Box = WHOLE) -> np.ndarray:
         """Return an interpolation by one of `WAYS`, float32 (length, Y, X), positive inside, or a box of it.
 
         At a known slice it is the signed distance within the plane. Before the first slice and beyond the last it has
         the value of the nearest; in a periodic volume it goes around. An empty mask has minus the largest gap between
         slices, a full one plus this gap.
         """
-        numbers, ys, xs = self.numbers((slice(0, self.length), slice(0, None), slice(0, None)) if box is None else box)
+        numbers, ys, xs = self.numbers(box)
         places, distances = np.array(self.places), self.distances(self.gap * self.spacing[0])[:, ys][:, :, xs]
         where = numbers.clip(places[0], places[-1])
         if self.periodic:
@@ -167,6 +200,20 @@ def known_places(length: int, every: int | None, first: int, known: Sequence[int
 def _to_int(number: Any) -> Any:
     """Return a float that is a whole number as an int."""
     return int(number) if isinstance(number, float) and number.is_integer() else number
+
+
+def annotated_slices(values: np.ndarray, ignore: int) -> tuple[list[int], np.ndarray | None]:
+    """Return the numbers of the slices (Z, Y, X) that are annotated whole, and marks of the others.
+
+    `ignore` is the label of voxels that nobody annotated; 0 is known to be empty. Marks are those of `Slices`.
+    """
+    seen = values != ignore
+    whole = seen.all((1, 2))
+    places = np.flatnonzero(whole).tolist()
+    if len(places) < 2:
+        raise ScanError(f"two or more slices must have no voxel of the label {ignore}, got {places}")
+    seen[whole] = False
+    return places, np.where(seen, np.where(values > 0, 1, -1), 0).astype(np.int8) if seen.any() else None
 
 
 def harmonic_distance(places: Sequence[int], length: int, periodic: bool = False) -> np.ndarray:

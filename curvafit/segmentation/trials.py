@@ -19,13 +19,11 @@ from curvafit.priors.coefficients import Coefficients
 from curvafit.scan.grids import box_with_most_surface
 from curvafit.segmentation.engine import HALO, WorkingGrid, likelihood, lower_energy
 from curvafit.segmentation.evidence import LEAST_NOISE, Classes, VoxelEvidence, grey_evidence
-from curvafit.segmentation.slices import WAYS, Slices
+from curvafit.segmentation.slices import Slices
 from curvafit.volumes.field import Field, ScanError
 
 #: The known part of a volume.
 Given = TypeVar("Given")
-#: The way of `examples.Odds`, beside those of `slices.WAYS`.
-ODDS = "odds"
 #: Standard errors by which a trial must be better than a simpler one.
 BEYOND = 1.0
 #: Edges in voxels of cubes whose errors are taken to be independent: for the Dice of masks, and for grey levels.
@@ -45,24 +43,21 @@ FEWEST = 100
 
 @dataclass(frozen=True)
 class Trial:
-    """A way to find or fill a structure: a plain one, or a law lowered from there; and its score, once it is chosen.
+    """A way to find or fill a structure: the start as it is, or a law lowered from there; and its score, once chosen.
 
     Attributes
     ----------
-    way
-        One of `slices.WAYS`, `ODDS` or another plain way.
     law
-        Coefficients with lengths in the scan's unit; None where the plain way stays as it is.
+        Coefficients with lengths in the scan's unit; None where the start stays as it is.
     strength, steps
         Stiffness of the springs on known voxels, or nats of a unit of the Willmore energy; and steps of the flow.
     pull
-        Stiffness of the springs on the other voxels for each nat of an example's odds.
+        Stiffness of the springs on the other voxels for each nat of their log-odds.
     score, plain, noise
-        Of the chosen trial: the score of the best law, that of the plain way, and the standard error of the difference.
+        Of the chosen trial: the score of the best law, that of the start, and the standard error of the difference.
         Scores are Dice on known masks, or the share of voxels left out that the law brings to their side (plain: 0).
     """
 
-    way: str
     law: Coefficients | None = None
     strength: float = 0.0
     steps: int = 0
@@ -122,57 +117,37 @@ def leave_out_slices(slices: Slices) -> Task[Slices] | None:
 
 def choose_by_masks(
     task: Task[Given],
-    candidates: Callable[[str], Sequence[Trial]],
+    trials: Sequence[Trial],
     fill: Callable[[Given, Trial], np.ndarray],
-    ways: Sequence[str] = WAYS,
     strengths: Sequence[float] = (),
 ) -> Trial:
-    """Return the trial with the best Dice on a task: a law where it beats the best plain way by more than the noise.
+    """Return the trial with the best Dice on a task: a law where it beats the start by more than the noise.
 
     Parameters
     ----------
-    candidates
-        Returns the trials of laws that start from a plain way. The best of them is tried at other strengths, and then
-        the others at the best strength.
+    trials
+        Trials of laws. The best of them is tried at other strengths, and then the others at the best strength.
     fill
         Fills the task's volume by a trial: a mask (Z, Y, X).
-    ways
-        Plain ways to compare with. With slices left out give one alone: at their double gap the nearest slice may win
-        by much and yet lose at the true gap.
     strengths
-        Strengths to try, ascending, the candidates' own among them; by default only their own.
+        Strengths to try, ascending, the trials' own among them; by default only their own.
     """
 
     @cache
     def counts(trial: Trial) -> np.ndarray:
-        return _tallies(fill(task.given, trial)[list(task.places)], task.truth, task.places)
+        return tally(fill(task.given, trial)[list(task.places)], task.truth, task.places)
 
     def worth(trial: Trial) -> float:
-        return float(_dice(counts(trial).sum(0)))
+        return float(dice_of(counts(trial).sum(0)))
 
-    start = Trial(best_plain_way(task, fill, ways))
-    trials = candidates(start.way)
-    best = search(trials, strengths, worth)
+    start, best = Trial(), search(trials, strengths, worth)
     best = max((best, *(replace(trial, strength=best.strength) for trial in trials)), key=worth)
-    gain, noise = _gain(counts(best), counts(start))
+    gain, noise = gain_of(counts(best), counts(start))
     chosen = best if gain > BEYOND * noise else start
     return replace(chosen, score=worth(best), plain=worth(start), noise=noise)
 
 
-def best_plain_way(task: Task[Given], fill: Callable[[Given, Trial], np.ndarray], ways: Sequence[str] = WAYS) -> str:
-    """Return the plain way with the best Dice on a task; a later one must win by more than the noise."""
-    if len(ways) == 1:
-        return ways[0]
-    places = list(task.places)
-    counts = {way: _tallies(fill(task.given, Trial(way))[places], task.truth, places) for way in ways}
-    best = ways[0]
-    for way in ways[1:]:
-        gain, noise = _gain(counts[way], counts[best])
-        best = way if gain > BEYOND * noise else best
-    return best
-
-
-def _tallies(masks: np.ndarray, truth: np.ndarray, places: Sequence[int]) -> np.ndarray:
+def tally(masks: np.ndarray, truth: np.ndarray, places: Sequence[int]) -> np.ndarray:
     """Count, in each of T cubes, the voxels inside both stacks of slices, and those inside either added up: (T, 2)."""
     pair = np.stack([masks & truth, masks.astype(np.uint8) + truth.astype(np.uint8)], axis=-1).astype(np.int64)
     for axis, where in enumerate((places, *map(range, truth.shape[1:]))):
@@ -181,19 +156,19 @@ def _tallies(masks: np.ndarray, truth: np.ndarray, places: Sequence[int]) -> np.
     return pair.reshape(-1, 2)
 
 
-def _dice(counts: np.ndarray) -> np.ndarray:
+def dice_of(counts: np.ndarray) -> np.ndarray:
     """Return the Dice coefficients of counts (..., 2), 1 where nothing is inside."""
     both, sizes = np.moveaxis(counts, -1, 0)
     return np.where(sizes == 0, 1.0, 2 * both / np.maximum(sizes, 1))
 
 
-def _gain(after: np.ndarray, before: np.ndarray) -> tuple[float, float]:
+def gain_of(after: np.ndarray, before: np.ndarray) -> tuple[float, float]:
     """Return the difference of the Dice coefficients of two counts (T, 2), and its error by a jackknife over the cubes.
 
     The errors of neighbouring voxels are correlated, those of cubes hardly.
     """
-    whole = _dice(after.sum(0)) - _dice(before.sum(0))
-    without = _dice(after.sum(0) - after) - _dice(before.sum(0) - before)
+    whole = dice_of(after.sum(0)) - dice_of(before.sum(0))
+    without = dice_of(after.sum(0) - after) - dice_of(before.sum(0) - before)
     return float(whole), float(np.sqrt((len(without) - 1) * without.var()))
 
 
@@ -257,7 +232,7 @@ def choose_by_voxels(
         return -np.inf if phases is None else judge.worth(phases)
 
     def best(laws: Sequence[Coefficients | None], strength: float, classes: Classes) -> Trial:
-        trials = [Trial("start", law, strength, steps) for law in laws]
+        trials = [Trial(law, strength, steps) for law in laws]
         return search(trials, WEIGHTS, lambda trial: worth(trial, classes))
 
     # Measuring the classes anew moves the surface, and the surface moves the classes: a few rounds settle both.

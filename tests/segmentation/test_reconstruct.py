@@ -1,4 +1,4 @@
-"""A volume between known slices: interpolations, an example's odds, the choice of a prior by the data, labels."""
+"""A volume between known slices: interpolations, the network, an example, the choice of a law by the data, labels."""
 
 from __future__ import annotations
 
@@ -18,11 +18,10 @@ from curvafit.inference.candidates import Candidate
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.law import preset
 from curvafit.segmentation.engine import TRUSTED, WorkingGrid, law_of, laws_of, normalise_bending
-from curvafit.segmentation.examples import Example, Odds
-from curvafit.segmentation.reconstruct import MARGIN, STIFFNESS, SlicesProblem, reconstruct, reconstruct_labels
+from curvafit.segmentation.examples import Example
+from curvafit.segmentation.reconstruct import MARGIN, STIFFNESS, reconstruct, reconstruct_labels
 from curvafit.segmentation.slices import WAYS, Slices
-from curvafit.segmentation.tiles import Tiling, lower_volume
-from curvafit.segmentation.trials import ODDS, Trial, leave_out_slices
+from curvafit.segmentation.trials import leave_out_slices
 from curvafit.volumes.field import Field, ScanError
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
@@ -105,7 +104,7 @@ def test_the_known_slices_around_a_slice() -> None:
     assert around.neighbours[2][[0, 6, 7]].tolist() == [1, 0, 0] and (~around.between).sum() == 2
 
 
-# ---- an example's odds -----------------------------------------------------------------------------------------------
+# ---- an example ------------------------------------------------------------------------------------------------------
 
 
 def pancakes(thin: int, seed: int = 0, width: int = 32) -> np.ndarray:
@@ -117,59 +116,32 @@ def pancakes(thin: int, seed: int = 0, width: int = 32) -> np.ndarray:
     return mask
 
 
-def odds_of(mask: np.ndarray) -> Odds:
-    between = [n for n in range(len(mask)) if n % 8]
-    return Odds.of(known(mask, 8), mask[between], between)
-
-
-@pytest.mark.parametrize("thin", [1, 2, 3])
-def test_odds_are_learnt_from_an_example(thin: int) -> None:
-    truth = pancakes(thin, seed=1)
-    level = odds_of(pancakes(thin)).level(known(truth, 8))
-    assert np.array_equal(level > 0, truth)
-    assert not any(np.array_equal(known(truth, 8).level(way) > 0, truth) for way in WAYS)
-    coarse = replace(known(truth, 8), spacing=(2.0, 2.0, 2.0), unit="um")
-    np.testing.assert_allclose(odds_of(pancakes(thin)).level(coarse), 2 * level, rtol=1e-5)
-
-
-def test_each_half_of_an_example_is_judged_by_the_other() -> None:
-    halves = np.concatenate([pancakes(1, seed=2), pancakes(3, seed=3)], axis=2)
-    level = odds_of(halves).level(known(halves, 8), crossed=True)
-    assert np.array_equal(level > 0, np.concatenate([pancakes(3, seed=2), pancakes(1, seed=3)], axis=2))
-
-
-def test_laws_are_lowered_on_a_box_of_an_example(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Odds are counted on all of it, and a box of it is judged by the half that it does not lie in."""
-    monkeypatch.setattr("curvafit.segmentation.examples.PART", 20)
+def test_an_example_is_cut_in_two() -> None:
     mask = np.concatenate([pancakes(1, seed=2), pancakes(3, seed=3)], axis=2)
     example = Example.of(Field(mask.astype(np.uint8)), range(0, 33, 8), axis=0)
-    given, box = example.part.given, example.box
-    assert given.shape == (33, 20, 20) and example.whole.given.shape == mask.shape and not example.notes
+    assert np.array_equal(example.lesson.inside, mask[:, :, :42]) and example.lesson.places == tuple(range(41))
+    given = example.task.given
+    assert np.array_equal(given.inside, mask[::8, :, 42:]) and given.places == (0, 8, 16, 24, 32, 40)
+    assert np.array_equal(example.task.truth, mask[[n for n in range(41) if n % 8], :, 42:]) and not example.notes
+
+
+def test_laws_are_tried_on_a_box_of_an_example(monkeypatch: pytest.MonkeyPatch) -> None:
+    mask = np.concatenate([pancakes(1, seed=2), pancakes(3, seed=3)], axis=2)
+    monkeypatch.setattr("curvafit.segmentation.examples.PART", 16)
+    part = Example.of(Field(mask.astype(np.uint8)), range(0, 33, 8), axis=0).part
+    assert part.given.shape[1:] == (16, 16) and part.truth.shape == (len(part.places), 16, 16)
     monkeypatch.setattr("curvafit.segmentation.examples.LARGEST", 32)
     smaller = Example.of(Field(mask.astype(np.uint8)), range(0, 33, 8), axis=0)
-    assert smaller.notes == ("Of the example 33 x 32 x 32 voxels are read, where most of its surface is.",)
-    assert np.array_equal(given.inside, mask[box][::8])
-    assert np.array_equal(example.part.truth, mask[box][[n for n in range(32) if n % 8]])
-    np.testing.assert_array_equal(example.level(given, ODDS), example.level(example.whole.given, ODDS)[box])
+    assert smaller.notes == ("Of the example 32 x 32 x 32 voxels are read, where most of its surface is.",)
 
 
-def test_odds_replace_an_interpolation_where_they_are_better() -> None:
-    truth, other = pancakes(2, seed=1), np.concatenate([pancakes(2, seed=2), pancakes(2, seed=3)], axis=2)
-    found = reconstruct(truth, WILLMORE, every=8, example=other, steps=1)
-    assert f"no prior helps here: Dice 1.000 on slices of the example by {ODDS}" in found.status
-    assert np.array_equal(found.mask.values, truth)
-
-
-def test_odds_hold_the_surface_while_the_energy_is_lowered() -> None:
-    """With springs on every voxel the odds last longer than without: thin discs cost much."""
-    truth = pancakes(2, seed=1)
-    slices = known(truth, 8)
-    level, tiling = odds_of(pancakes(2)).level(slices), Tiling.of(slices.frame, None)
-    held, free = (
-        lower_volume(SlicesProblem(Trial(ODDS, WILLMORE, 1e7, 60, pull), slices, level), tiling).mask
-        for pull in (1e7, 0.0)
-    )
-    assert (held != truth).sum() < (free != truth).sum()
+@pytest.mark.slow
+def test_an_example_tunes_the_network_where_that_is_better() -> None:
+    """Discs that end between slices: the network cannot know where, and learns it from others."""
+    truth, other = pancakes(1, seed=1), np.concatenate([pancakes(1, seed=k) for k in (2, 3, 4)], axis=2)
+    alone, tuned = reconstruct(truth, every=8), reconstruct(truth, every=8, example=other)
+    assert "tuned on the example" in tuned.status
+    assert dice(tuned.mask.values, truth) > dice(alone.mask.values, truth) + 0.1
 
 
 # ---- grids -----------------------------------------------------------------------------------------------------------
@@ -218,12 +190,32 @@ def test_there_may_be_too_few_slices_to_leave_any_out() -> None:
     assert leave_out_slices(Slices(middle, (0, 4, 8), 9, EDGES)) is None
 
 
-def test_no_prior_helps_where_the_interpolation_is_exact() -> None:
+def test_a_straight_tube_is_filled_exactly_and_no_law_helps() -> None:
     truth = straight()
     found = reconstruct(truth, WILLMORE, every=6, steps=3)
     assert np.array_equal(found.mask.values, truth)
-    assert found.status.startswith("no prior helps here: Dice 1.000 on slices left out by spline")
+    assert found.status.startswith("no law helps here: Dice 1.000 on slices left out by the network")
     assert found.coefficients is None and np.array_equal(found.phase.values > 0, truth)
+
+
+def test_two_slices_are_enough_without_a_law() -> None:
+    found = reconstruct(straight(), known=[0, 23])
+    assert np.array_equal(found.mask.values, straight()) and found.status.startswith("filled by the network")
+
+
+def test_what_is_annotated_along_another_axis_is_kept_and_helps() -> None:
+    """Every eighth slice of a leaning tube and a ball, and one plane across them."""
+    truth = leaning(33)
+    labels = np.full(truth.shape, 7, dtype=np.uint8)
+    labels[::8] = truth[::8]
+    sparse = reconstruct(labels, ignore=7)
+    labels[:, 16] = truth[:, 16]
+    found = reconstruct(labels, ignore=7)
+    assert np.array_equal(sparse.mask.values, reconstruct(truth, every=8).mask.values)
+    assert np.array_equal(found.mask.values[:, 16], truth[:, 16])
+    assert set(np.unique(found.probability.values[:, 16])) == {0, 1}  # type: ignore[union-attr]
+    rest = [n for n in range(33) if n != 16]
+    assert dice(found.mask.values[:, rest], truth[:, rest]) > dice(sparse.mask.values[:, rest], truth[:, rest]) - 0.005
 
 
 def test_the_same_slices_make_the_same_choice() -> None:
@@ -253,14 +245,6 @@ def test_an_axis_and_numbers_of_slices() -> None:
     assert np.array_equal(turned.mask.values[..., known], truth.transpose(1, 2, 0)[..., known])
 
 
-def test_an_example_is_degraded_as_the_volume_is() -> None:
-    """Every sixth slice of a ball is known, and so of the example, a straight tube, where there is nothing to gain."""
-    found = reconstruct(ball(), WILLMORE, every=6, example=straight(), steps=3)
-    assert "no prior helps here: Dice 1.000 on slices of the example by spline" in found.status
-    turned = reconstruct(ball(), WILLMORE, every=6, axis=2, example=straight().transpose(1, 2, 0), steps=3)
-    assert np.array_equal(turned.mask.values.transpose(2, 0, 1), found.mask.values)
-
-
 @pytest.mark.parametrize(
     ("options", "word"),
     [
@@ -281,10 +265,13 @@ def test_an_example_is_degraded_as_the_volume_is() -> None:
         ({"every": 8, "epsilon": -1.0}, "epsilon"),
         ({"known": [8, 24]}, "three or more"),
         ({"every": 8, "stiffness": 0.0}, "stiffness"),
+        ({"every": 8, "ignore": 1}, "ignore"),
+        ({"ignore": 1}, "two or more"),
+        ({"every": 8, "filler": "no.npz"}, "no.npz"),
     ],
 )
 def test_bad_slices_and_examples_are_refused(options: dict, word: str) -> None:
-    with pytest.raises(ValueError, match=word):
+    with pytest.raises((ValueError, FileNotFoundError), match=word):
         reconstruct(ball(), **{"prior": WILLMORE, **options})
 
 
@@ -396,14 +383,14 @@ def test_where_all_is_labelled_no_voxel_is_left_out() -> None:
     assert dice(found.labels.values == 300, truth == 300) > 0.95
 
 
-def test_a_label_that_is_refused_is_interpolated_and_said() -> None:
+def test_a_label_that_is_refused_is_filled_by_the_network_and_said() -> None:
     truth = organelles()
     truth[0, :4, :4] = 9  # in the first slice alone: no slice can be left out that shows it
     found = reconstruct_labels(truth, WILLMORE, known=[0, 12, 24], chosen=[2, 9], steps=30)
     assert found.labels is not None
     assert np.array_equal(found.labels.values[0] == 9, truth[0] == 9)
     assert not (found.labels.values == 7).any()
-    assert "label 9: interpolated by a spline" in found.status or "label 9: no prior" in found.status
+    assert any(note.startswith("Label 9 is filled by the network alone") for note in found.notes)
 
 
 @pytest.mark.parametrize(
@@ -413,8 +400,6 @@ def test_a_label_that_is_refused_is_interpolated_and_said() -> None:
         (organelles(), {"chosen": [0, 2]}, "other than 0"),
         (organelles(), {"chosen": [2, 5]}, "5"),
         (organelles() + 0.5, {}, "whole numbers"),
-        (organelles(), {"prior": {2: WILLMORE}}, "law"),
-        (organelles(), {"every": 24, "stiffness": None}, "three or more"),
     ],
 )
 def test_bad_labels_are_refused(values: np.ndarray, options: dict, word: str) -> None:

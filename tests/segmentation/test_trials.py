@@ -12,7 +12,7 @@ import curvafit.segmentation.trials as room
 from curvafit.priors.coefficients import Coefficients
 from curvafit.scan.grids import box_with_most_surface
 from curvafit.segmentation.evidence import Classes, estimate_classes, grey_levels
-from curvafit.segmentation.refine import FIRST, NATS, PLAIN
+from curvafit.segmentation.refine import FIRST, NATS
 from curvafit.segmentation.segment import segment
 from curvafit.segmentation.slices import Slices
 from curvafit.segmentation.trials import (
@@ -52,14 +52,14 @@ def every_twelfth(mask: np.ndarray) -> Slices:
 
 
 def decided(better: np.ndarray) -> Trial:
-    """The choice between interpolations of a ball and a prior that fills with `better`."""
+    """The choice between an interpolation of a ball and a prior that fills with `better`."""
     mask, slices = ball(), every_twelfth(ball())
     between = [n for n in range(36) if n % 12]
 
     def filled(given: Slices, setting: Trial) -> np.ndarray:
-        return given.level(setting.way) > 0 if setting.law is None else better
+        return given.level("spline") > 0 if setting.law is None else better
 
-    return choose_by_masks(Task(slices, mask[between], between), lambda way: [Trial(way, WILLMORE, 1.0, 1)], filled)
+    return choose_by_masks(Task(slices, mask[between], between), [Trial(WILLMORE, 1.0, 1)], filled)
 
 
 def test_a_prior_is_taken_where_it_is_better_only() -> None:
@@ -67,14 +67,13 @@ def test_a_prior_is_taken_where_it_is_better_only() -> None:
     assert best.law is WILLMORE and best.score == 1 > best.plain
     plain = decided(np.zeros((48, 48, 48), dtype=bool))
     assert plain.law is None and plain.score == 0 and plain.plain == best.plain
-    same = decided(every_twelfth(ball()).level(plain.way) > 0)
-    assert same.law is None and same.way == plain.way and same.noise == 0
+    same = decided(every_twelfth(ball()).level("spline") > 0)
+    assert same.law is None and same.noise == 0
 
 
 def test_a_gain_within_the_noise_is_none() -> None:
     """A single voxel is one tile's gain: as large as its standard error, (T - 1) / T of it being the jackknife's."""
-    way = decided(ball()).way
-    start = every_twelfth(ball()).level(way) > 0
+    start = every_twelfth(ball()).level("spline") > 0
     wrong = np.argwhere(start != ball())
     wrong = wrong[(wrong[:, 0] < 36) & (wrong[:, 0] % 12 > 0)]
     better = start.copy()
@@ -85,9 +84,7 @@ def test_a_gain_within_the_noise_is_none() -> None:
 
 def test_a_climb_ends_at_the_best_on_either_side() -> None:
     for heights, first, best in (([5, 1, 2, 3, 4], 2, 4), ([5, 4, 3, 1, 9], 2, 0), ([1, 2, 1], 1, 1), ([7], 0, 0)):
-        found = search(
-            [Trial(PLAIN, None, first)], range(len(heights)), lambda trial, h=heights: h[int(trial.strength)]
-        )
+        found = search([Trial(None, first)], range(len(heights)), lambda trial, h=heights: h[int(trial.strength)])
         assert found.strength == best
 
 
@@ -100,9 +97,9 @@ def test_strengths_are_tried_as_long_as_they_are_better() -> None:
         return truth & (np.random.default_rng(0).random(truth.shape) > 0.3 * wrong)
 
     other = WILLMORE.scale(2)
-    settings = [Trial(PLAIN, law, FIRST, 1) for law in (WILLMORE, other)]
-    best = choose_by_masks(Task(None, truth, range(len(truth))), lambda _: settings, fill, (PLAIN,), NATS)
-    assert (best.way, best.law, best.strength) == (PLAIN, WILLMORE, NATS[-1]) and len(tried) == len(set(tried))
+    settings = [Trial(law, FIRST, 1) for law in (WILLMORE, other)]
+    best = choose_by_masks(Task(None, truth, range(len(truth))), settings, fill, NATS)
+    assert (best.law, best.strength) == (WILLMORE, NATS[-1]) and len(tried) == len(set(tried))
     assert {setting.strength for setting in tried if setting.law is WILLMORE} == {3.0, *NATS[NATS.index(FIRST) :]}
     assert [setting.strength for setting in tried if setting.law is other] == [FIRST, NATS[-1]]
 
@@ -115,7 +112,7 @@ def test_errors_side_by_side_are_one() -> None:
     def fill(given: None, setting: Trial) -> np.ndarray:
         return truth if setting.law is None else truth & half
 
-    best = choose_by_masks(Task(None, truth, range(16)), lambda way: [Trial(way, WILLMORE, 1.0, 1)], fill, (PLAIN,))
+    best = choose_by_masks(Task(None, truth, range(16)), [Trial(WILLMORE, 1.0, 1)], fill)
     assert best.noise == pytest.approx(math.sqrt(1 / 4))  # without the one cube 0, without the other -1
 
 

@@ -1,0 +1,400 @@
+"""A small network that fills the gap between two known slices, taught by the generator's shapes.
+
+For each gap it reads the signed distances of the four nearest known slices, in square pixels, and for each height in
+the gap it returns the log-odds of the inside. Convolutions see `REACH` pixels at most and nothing is normalised over a
+slice, so that the background around a structure, or a cut into tiles, changes nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import resources
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy import ndimage
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from curvafit.core.checks import check_float, check_int
+from curvafit.core.records import Format
+from curvafit.core.runtime import Progress, silent
+from curvafit.scan.grids import centre_distance
+from curvafit.segmentation.slices import Slices
+
+FILLER_FILE = Format("curvafit filler", 1, "weights of a filler", "teach them again with `curvafit atlas teach`")
+#: Signed distances are cut here, in pixels: what is further away does not matter for a gap of 24 pixels at most.
+FAR = 16.0
+#: Pixels beyond which nothing is seen: that of the convolutions, of the distances, and a multiple of 4.
+REACH = 40
+#: Pixels beyond the border that the last convolutions at half and at full size need.
+RIM = 8
+#: Pixels by which numbers are scaled: distances, and gaps.
+_DISTANCE, _GAP = 8.0, 16.0
+#: Log-odds of the inside for a pixel of the cubic interpolation, before anything is learnt.
+SLOPE = 0.6
+#: Numbers that tell a height: place in the gap, distance to the nearer end, the gap and a step from slice to slice.
+CONDITIONS = 4
+
+
+class Block(nn.Module):
+    """Two convolutions with a shortcut; features are normalised over channels, pixel by pixel.
+
+    Parameters
+    ----------
+    conditions
+        Length of a condition that scales and shifts each channel.
+    skips
+        Channels of features that are the same for all slices of a gap: they are convolved once, and added.
+    """
+
+    def __init__(self, inputs: int, outputs: int, conditions: int = 0, skips: int = 0) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(inputs, outputs, 3, padding=1)
+        self.second = nn.Conv2d(outputs, outputs, 3, padding=1)
+        self.shortcut = nn.Conv2d(inputs, outputs, 1)
+        self.condition = nn.Linear(conditions, 2 * outputs) if conditions else None
+        self.skip = nn.Conv2d(skips, outputs, 3, padding=1) if skips else None
+
+    def forward(self, x: Tensor, condition: Tensor | None = None, skip: Tensor | None = None) -> Tensor:
+        """Return features (N, outputs, Y, X) of x (N, inputs, Y, X), a condition (N, c) and a skip (B, s, Y, X)."""
+        y = self.first(x)
+        if self.skip is not None and skip is not None:
+            y = (y.unflatten(0, (len(skip), -1)) + self.skip(skip)[:, None]).flatten(0, 1)
+        y = _normalise(y)
+        if self.condition is not None and condition is not None:
+            scale, shift = self.condition(condition)[..., None, None].chunk(2, dim=1)
+            y = torch.addcmul(shift, y, 1 + scale)
+        return self.shortcut(x) + self.second(F.silu(y))
+
+
+def _normalise(x: Tensor) -> Tensor:
+    """Divide features by their root mean square over channels."""
+    return x * torch.rsqrt(x.square().mean(1, keepdim=True) + 1e-3)
+
+
+@dataclass(frozen=True)
+class Gaps:
+    """Gaps between known slices, B at a time, all with n slices to fill.
+
+    Attributes
+    ----------
+    distances
+        Signed distances in the four nearest known slices (B, 4, Y, X), in pixels, positive inside, cut at `FAR`; the
+        gap is between the second and the third. Y and X are multiples of 4.
+    step
+        Distance from slice to slice (B,), in pixels.
+    marks
+        What is known in the slices to fill (B, n, Y, X): 1 inside, -1 outside, 0 not known.
+    """
+
+    distances: Tensor
+    step: Tensor
+    marks: Tensor
+
+    @property
+    def heights(self) -> Tensor:
+        """The heights of the slices to fill, (n,), from 0 to 1 without the ends."""
+        count = self.marks.shape[1]
+        return torch.arange(1, count + 1, device=self.marks.device) / (count + 1)
+
+    @property
+    def conditions(self) -> Tensor:
+        """What tells a height, (B * n, CONDITIONS)."""
+        t, (count, n) = self.heights, self.marks.shape[:2]
+        gap = self.step * (n + 1) / _GAP
+        place = torch.stack([t, torch.minimum(t, 1 - t)], dim=1).repeat(count, 1)
+        size = torch.stack([gap, self.step / 4], dim=1).repeat_interleave(n, 0)
+        return torch.cat([place, size], dim=1)
+
+
+def interpolate(distances: Tensor, heights: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the linear and the cubic (Catmull-Rom) interpolation (B, n, Y, X) of distances (B, 4, Y, X) at heights."""
+    t = heights
+    zero = torch.zeros_like(t)
+    linear = torch.stack([zero, 1 - t, t, zero], dim=1)
+    cubic = torch.stack(
+        [
+            -0.5 * t**3 + t**2 - 0.5 * t,
+            1.5 * t**3 - 2.5 * t**2 + 1,
+            -1.5 * t**3 + 2 * t**2 + 0.5 * t,
+            0.5 * t**3 - 0.5 * t**2,
+        ],
+        dim=1,
+    )
+    return torch.einsum("nk,bkyx->bnyx", linear, distances), torch.einsum("nk,bkyx->bnyx", cubic, distances)
+
+
+class Filler(nn.Module):
+    """The network: an encoder of the four slices, once a gap; a decoder, once a height; and a pass through the gap.
+
+    The cubic interpolation, times `SLOPE`, is added at the end: what is learnt is how log-odds differ from it.
+    """
+
+    def __init__(self, width: int = 16) -> None:
+        super().__init__()
+        c = check_int(width, "a width of the filler", 1, 256)
+        self.width, hidden = c, 32
+        self.fine, self.middle, self.coarse = Block(4, c), Block(c, 2 * c), Block(2 * c, 4 * c)
+        self.condition = nn.Sequential(nn.Linear(CONDITIONS, hidden), nn.SiLU(), nn.Linear(hidden, hidden), nn.SiLU())
+        self.deep = Block(4 * c, 4 * c, hidden)
+        self.to_middle, self.up_middle = nn.Conv2d(4 * c, 2 * c, 1), Block(2 * c, 2 * c, hidden, skips=2 * c)
+        self.to_fine, self.up_fine = nn.Conv2d(2 * c, c, 1), Block(c + 4, c, hidden, skips=c)
+        self.out = nn.Conv2d(c, 1, 1)
+        self.slope = nn.Parameter(torch.tensor(SLOPE))
+        self.through = nn.Sequential(
+            nn.Conv3d(2, 8, 3, padding=1), nn.SiLU(), nn.Conv3d(8, 8, 3, padding=1), nn.SiLU(), nn.Conv3d(8, 1, 1)
+        )
+        for last in (self.out, self.through[-1]):
+            nn.init.zeros_(last.weight)  # type: ignore[arg-type]
+            nn.init.zeros_(last.bias)  # type: ignore[arg-type]
+        for part in self.modules():
+            if isinstance(part, nn.Conv2d):
+                part.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+    def forward(self, gaps: Gaps, drop: int = 0) -> Tensor:
+        """Return the log-odds of the inside (B, n, Y - 2 drop, X - 2 drop) in the slices to fill.
+
+        `drop` pixels at each border, a multiple of 4, are only seen: 0, or 16 and more.
+        """
+        n, rim = gaps.marks.shape[1], min(drop, RIM)
+        fine = self.fine(gaps.distances / _DISTANCE)
+        middle = self.middle(F.avg_pool2d(fine, 2))
+        coarse = self.coarse(F.avg_pool2d(middle, 2))
+        condition = self.condition(gaps.conditions)
+        x = _trim(self.deep(coarse.repeat_interleave(n, 0), condition), (drop - 2 * rim) // 4)
+        x = self.up_middle(_double(self.to_middle(x)), condition, _trim(middle, (drop - 2 * rim) // 2))
+        x = _trim(x, rim // 2)
+        distances, marks = _trim(gaps.distances, drop - rim), _trim(gaps.marks, drop - rim)
+        linear, cubic = interpolate(distances, gaps.heights)
+        hints = torch.stack([linear / _DISTANCE, cubic / _DISTANCE, marks, marks.abs()], dim=2).flatten(0, 1)
+        x = torch.cat([_double(self.to_fine(x)), hints], dim=1)
+        x = self.up_fine(x, condition, _trim(fine, drop - rim))
+        logits = self.out(x).unflatten(0, (-1, n))[:, :, 0] + self.slope * cubic
+        ends = self.slope * distances[:, 1:3]
+        stack = torch.cat([ends[:, :1], logits, ends[:, 1:]], dim=1) / _DISTANCE
+        known = torch.ones_like(stack)
+        known[:, 1:-1] = marks.abs()
+        return _trim(logits + self.through(torch.stack([stack, known], dim=1))[:, 0, 1:-1], rim)
+
+
+def _trim(x: Tensor, pixels: int) -> Tensor:
+    """Drop pixels at the borders of the last two axes."""
+    return x[..., pixels : x.shape[-2] - pixels, pixels : x.shape[-1] - pixels]
+
+
+def _double(x: Tensor) -> Tensor:
+    return F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
+
+
+# ---- volumes ---------------------------------------------------------------------------------------------------------
+
+#: Thickness of structures, in pixels, that needs no other pixels: slices are resampled to the nearer end.
+THICKNESS = (3.0, 16.0)
+#: Longest edge of a tile of slices that is filled at once, in pixels.
+TILE = 256
+
+
+def fill(slices: Slices, taught: Taught, *, careful: bool = False, progress: Progress = silent) -> np.ndarray:
+    """Return calibrated log-odds of the inside of a volume between known slices, float32 (length, Y, X).
+
+    In known slices, and in those before the first and beyond the last, they are `SLOPE` times the signed distance in
+    pixels from the outline in the nearest known slice.
+
+    Parameters
+    ----------
+    careful
+        Whether the results of all eight mirror images are averaged: eight times as long.
+    progress
+        Called with a sentence, and the share of the gaps that are filled.
+    """
+    raster = Raster.of(slices)
+    known = [raster.distances(mask) for mask in slices.inside]
+    logits = (SLOPE / raster.pixel) * slices.level("nearest")
+    places, count = list(slices.places), len(slices.places)
+    gaps = [(k, (places[(k + 1) % count] - places[k]) % slices.length) for k in range(count - (not slices.periodic))]
+    for number, (k, gap) in enumerate(gaps):
+        progress("filling the gaps", number / len(gaps))
+        if gap < 2:
+            continue
+        rows = [k - 1, k, k + 1, k + 2]
+        rows = [row % count for row in rows] if slices.periodic else [min(max(row, 0), count - 1) for row in rows]
+        stack = np.stack([known[row] for row in rows])
+        step = slices.spacing[0] / raster.pixel
+        numbers = np.arange(places[k] + 1, places[k] + gap) % slices.length
+        marks = None if slices.marks is None else raster.marks(slices.marks[numbers])
+        inside = _fill_gap(taught.filler, stack, marks, gap - 1, step, careful) / taught.temperature(gap * step)
+        logits[numbers] = raster.to_slices(inside)
+    progress("filling the gaps", 1.0)
+    return logits
+
+
+@dataclass(frozen=True)
+class Raster:
+    """Square pixels for slices, `pixel` wide in the unit of their spacing, so that structures are some pixels thick."""
+
+    shape: tuple[int, int]
+    edges: tuple[float, float]
+    pixel: float
+
+    @classmethod
+    def of(cls, slices: Slices) -> Raster:
+        edges, finest = slices.spacing[1:], min(slices.spacing[1:])
+        thickness = plane_thickness(slices.inside, edges) / finest
+        pixel = finest * thickness / float(np.clip(thickness, *THICKNESS)) if math.isfinite(thickness) else finest
+        return cls(slices.inside.shape[1:], edges, pixel)  # type: ignore[arg-type]
+
+    @property
+    def scale(self) -> tuple[float, float]:
+        """Pixels for each voxel along both axes."""
+        return (self.edges[0] / self.pixel, self.edges[1] / self.pixel)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Pixels of a slice, a multiple of 4 that covers it."""
+        return tuple(4 * math.ceil(n * h / 4) for n, h in zip(self.shape, self.scale, strict=True))  # type: ignore[return-value]
+
+    def distances(self, mask: np.ndarray) -> np.ndarray:
+        """Return the signed distances of a slice (Y, X) in pixels, cut at `FAR`, float32.
+
+        The outlines are continued by `REACH` pixels on each side: the shape is `size` + 2 `REACH`.
+        """
+        before = [math.ceil(REACH / h) for h in self.scale]
+        beyond = [math.ceil((m + REACH) / h) - n for n, m, h in zip(self.shape, self.size, self.scale, strict=True)]
+        padded = np.pad(mask, list(zip(before, beyond, strict=True)), mode="edge")
+        signed = centre_distance(padded, self.edges, FAR * self.pixel) / self.pixel
+        if self.scale == (1.0, 1.0):
+            return signed
+        start = [n - REACH / h for n, h in zip(before, self.scale, strict=True)]
+        shape = [m + 2 * REACH for m in self.size]
+        return _sample(signed, shape, [1 / h for h in self.scale], start)
+
+    def marks(self, marks: np.ndarray) -> np.ndarray:
+        """Return marks (n, Y, X) in pixels, float32, 0 in the margin."""
+        kept = np.zeros((len(marks), *(m + 2 * REACH for m in self.size)), dtype=np.float32)
+        centres = [((np.arange(m) + 0.5) / h).astype(int) for m, h in zip(self.size, self.scale, strict=True)]
+        ys, xs = (each[each < n] for each, n in zip(centres, self.shape, strict=True))
+        kept[:, REACH : REACH + len(ys), REACH : REACH + len(xs)] = marks[:, ys][:, :, xs]
+        return kept
+
+    def to_slices(self, values: np.ndarray) -> np.ndarray:
+        """Return values (n, *size) on the voxels of the slices, (n, Y, X)."""
+        if self.scale == (1.0, 1.0):
+            return values[:, : self.shape[0], : self.shape[1]]
+        return np.stack([_sample(plane, self.shape, self.scale, (0.0, 0.0)) for plane in values])
+
+
+def _sample(plane: np.ndarray, shape: Sequence[int], step: Sequence[float], start: Sequence[float]) -> np.ndarray:
+    """Interpolate a plane linearly, from a corner on, at the centres of pixels `step` wide."""
+    offset = [a + 0.5 * h - 0.5 for a, h in zip(start, step, strict=True)]
+    matrix = np.diag(step)
+    return ndimage.affine_transform(plane, matrix, offset, shape, np.float32, order=1, mode="nearest")  # type: ignore[arg-type]
+
+
+def plane_thickness(masks: np.ndarray, edges: Sequence[float]) -> float:
+    """Return the mean thickness of a structure in planes (N, Y, X) with voxel edges (y, x), in their unit.
+
+    Four times the mean distance to the outline inside, which is the width of a strip.
+    """
+    means = [centre_distance(mask, edges)[mask] for mask in masks if mask.any() and not mask.all()]
+    return 4 * float(np.concatenate(means).mean()) if means else math.inf
+
+
+@torch.inference_mode()
+def _fill_gap(
+    filler: Filler, known: np.ndarray, marks: np.ndarray | None, count: int, step: float, careful: bool
+) -> np.ndarray:
+    """Return the log-odds (count, Y, X) in the slices of a gap whose four known slices have distances (4, Y', X').
+
+    Those are longer by `REACH` on all sides. Where all four are far inside or far outside, nothing is computed; the
+    rest is filled tile by tile.
+    """
+    distances = torch.from_numpy(np.ascontiguousarray(known))
+    near = _trim(~((distances == FAR).all(0) | (distances == -FAR).all(0)), REACH)
+    told = torch.zeros(1, count, *known.shape[1:])
+    if marks is not None:
+        told, near = torch.from_numpy(marks)[None], torch.ones_like(near)
+    heights = Gaps(distances, torch.ones(1), told).heights
+    logits = SLOPE * interpolate(_trim(distances, REACH)[None], heights)[0][0]
+    for y, x in product(*(range(0, n, TILE) for n in near.shape)):
+        core = (slice(y, y + TILE), slice(x, x + TILE))
+        if near[core].any():
+            seen = (..., slice(y, y + TILE + 2 * REACH), slice(x, x + TILE + 2 * REACH))
+            gaps = Gaps(distances[seen][None], torch.tensor([step]), told[seen])
+            mirrors = product((False, True), repeat=3) if careful else [(False, False, False)]
+            found = torch.stack([_fill_mirrored(filler, gaps, *axes) for axes in mirrors]).mean(0)[0]
+            logits[:, *core] = torch.where(near[core], found, logits[:, *core])
+    return logits.numpy()
+
+
+def _fill_mirrored(filler: Filler, gaps: Gaps, z: bool, y: bool, x: bool) -> Tensor:
+    """Return the log-odds of gaps that are mirrored along some axes, filled and mirrored back."""
+    axes = [axis for axis, flip in ((1, z), (2, y), (3, x)) if flip]
+    mirrored = Gaps(gaps.distances.flip(axes), gaps.step, gaps.marks.flip(axes))
+    return filler(mirrored, REACH).flip(axes)
+
+
+# ---- files -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Taught:
+    """A filler with its card: what taught it, how well it does on shapes held out, and its temperatures.
+
+    Attributes
+    ----------
+    temperatures
+        Gaps in pixels, ascending, and by what log-odds are divided there to be true probabilities: (2, k).
+    card
+        Stores, seeds, steps, versions and held-out figures, of JSON's types.
+    error
+        The calibration error near surfaces, on shapes held out or on an example.
+    status
+        What fills, as the beginning of a sentence.
+    """
+
+    filler: Filler
+    temperatures: np.ndarray
+    card: dict[str, Any]
+    error: float
+    status: str = "filled by the network"
+
+    def temperature(self, gap: float) -> float:
+        """Return by what log-odds are divided in a gap of so many pixels."""
+        return float(np.interp(gap, *self.temperatures))
+
+    def save(self, path: str | Path) -> None:
+        """Write weights and card as one `.npz`; nothing in it runs when it is read."""
+        arrays = {name: value.numpy() for name, value in self.filler.state_dict().items()}
+        header = {"width": self.filler.width, "card": self.card, "error": self.error}
+        FILLER_FILE.write(path, header, {"temperatures": self.temperatures, **arrays})
+
+    @classmethod
+    def load(cls, path: str | Path | None = None) -> Taught:
+        """Read a filler, by default the packaged one.
+
+        Raises FileNotFoundError if there is no such file, and ValueError if it is something else, is damaged or of
+        another version.
+        """
+        if path is None:
+            packaged = resources.files("curvafit.segmentation") / "data" / "filler.npz"
+            with packaged.open("rb") as file:
+                return FILLER_FILE.read(file, cls._of, place="the packaged filler")
+        return FILLER_FILE.read(path, cls._of)
+
+    @classmethod
+    def _of(cls, header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Taught:
+        temperatures = arrays.pop("temperatures")
+        if not all(np.isfinite(each).all() for each in (temperatures, *arrays.values())):
+            raise ValueError("numbers that are not finite")
+        if temperatures.ndim != 2 or len(temperatures) != 2 or not (temperatures > 0).all():
+            raise ValueError("temperatures that are not positive")
+        with torch.random.fork_rng():  # first weights are drawn, and then replaced
+            filler = Filler(header["width"]).eval()
+        filler.load_state_dict({name: torch.from_numpy(value) for name, value in arrays.items()})
+        return cls(filler, temperatures, dict(header["card"]), check_float(header["error"], "an error", 0.0, 1.0))

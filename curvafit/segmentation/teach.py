@@ -1,0 +1,471 @@
+"""Teach a filler from generated shapes: cut slices of them, and let the network fill the gaps.
+
+Windows of a shape are read at any rotation, scale and stretch: a shape that repeats has no border. What a person's
+slices have and a shape has not is added: outlines that tremble, slices that are shifted, specks, structures of two
+calibres, slices that are known in part. The losses are cross entropies, so that the log-odds are those of the inside.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy import ndimage, special
+from scipy.optimize import minimize_scalar
+from torch import Tensor
+from torch.nn import functional as F
+from torch.utils.data import DataLoader, Dataset, Subset
+
+from curvafit.core.checks import check_int, check_seed
+from curvafit.core.files import write_atomically
+from curvafit.core.runtime import Progress, silent, sub_progress
+from curvafit.data_synth.store import open_store
+from curvafit.generation.result import is_well_formed
+from curvafit.scan.grids import centre_distance
+from curvafit.segmentation.examples import Example
+from curvafit.segmentation.filler import FAR, SLOPE, Filler, Gaps, Raster, Taught, fill, interpolate, plane_thickness
+from curvafit.segmentation.trials import BEYOND, dice_of, gain_of, tally
+from curvafit.segmentation.uncertainty import best_threshold, calibration_error
+from curvafit.volumes.read import load
+
+#: Steps of teaching and of tuning, and the greatest rates of both.
+STEPS, TUNING = 4500, 150
+RATE, TUNING_RATE = 2e-3, 5e-4
+#: Largest norm of a step's gradient.
+STEEPEST = 1.0
+#: Steps between two checkpoints.
+SAVED = 100
+#: Shares of a volume between which a shape teaches, and the number of shapes below which they teach little.
+FILLED, FEW = (0.02, 0.75), 200
+#: The largest gap, in thicknesses of a structure, that can be learnt.
+SLIMMEST = 4.0
+#: One of so many shapes is held out.
+HELD_OUT = 10
+#: Batches of shapes held out, and temperatures that are fitted to them.
+JUDGED, TEMPERATURES = 80, 5
+#: Log-odds within which a voxel counts for a temperature.
+UNSURE = 4.0
+
+#: Distances (B, 4, Y, X), steps (B,), marks (B, n, Y, X) and the truth (B, n, Y, X), as in `filler.Gaps`.
+Lesson = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+# ---- lessons ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Texture:
+    """A shape that teaches: a field (Z, Y, X), positive inside, that repeats or ends; and its thickness in voxels."""
+
+    values: np.ndarray
+    periodic: bool = True
+    thickness: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        planes = [np.moveaxis(self.values, axis, 0)[::4] > 0 for axis in range(3)]
+        found = [plane_thickness(masks, (1.0, 1.0)) for masks in planes]
+        object.__setattr__(self, "thickness", float(np.mean(found)))
+
+    def read(self, points: np.ndarray) -> np.ndarray:
+        """Return the field at points (3, ...), in voxels."""
+        mode = "grid-wrap" if self.periodic else "mirror"
+        return ndimage.map_coordinates(self.values, points, np.float32, order=1, mode=mode, prefilter=False)
+
+
+@dataclass(frozen=True)
+class Mix:
+    """How windows are drawn; lengths in pixels, shares from 0 to 1.
+
+    Attributes
+    ----------
+    thickness, gap, most
+        Intervals of the structures' thickness (uniform in the logarithm) and of the gap, and the most slices to fill.
+    upright
+        Share of windows along the axes of the shape; the others have any rotation.
+    stretch
+        Deviation of the logarithm by which each axis is stretched.
+    coarse
+        Share of windows whose slices are not one pixel apart.
+    ends, pairs, holes, trembling, partial
+        Shares of windows that end at a known slice, have structures of two shapes, are turned inside out, have slices
+        as a person draws them, and have slices to fill that are known in part.
+    """
+
+    thickness: tuple[float, float] = (3.0, 14.0)
+    gap: tuple[float, float] = (2.0, 20.0)
+    most: int = 15
+    upright: float = 0.6
+    stretch: float = 0.2
+    coarse: float = 0.3
+    ends: float = 0.2
+    pairs: float = 0.1
+    holes: float = 0.05
+    trembling: float = 0.15
+    partial: float = 0.15
+
+
+@dataclass(frozen=True, eq=False)
+class Lessons(Dataset):
+    """Batches of gaps to fill, the same for ever for a seed: batch k depends on (seed, k) alone.
+
+    Attributes
+    ----------
+    sources
+        Shapes by where they come from: each source teaches as often as the others.
+    edge, halo
+        Pixels of a window's side that count, and around it that are only seen.
+    size
+        Windows of a batch.
+    """
+
+    sources: Sequence[Sequence[Texture]]
+    mix: Mix
+    seed: int
+    length: int
+    size: int = 3
+    edge: int = 80
+    halo: int = 8
+
+    def __len__(self) -> int:
+        return self.length
+
+    def __getitem__(self, number: int) -> Lesson:
+        rng = np.random.default_rng([self.seed, number])
+        count = int(rng.integers(1, self.mix.most + 1))
+        inner = (slice(None), *(slice(self.halo, -self.halo),) * 2)
+        found: list[tuple[np.ndarray, float, np.ndarray, np.ndarray]] = []
+        while len(found) < self.size:
+            step = 1.0
+            if rng.random() < self.mix.coarse:
+                step = float(np.exp(rng.uniform(math.log(0.5), math.log(6))))
+            low, high = self.mix.gap
+            if not low <= step * (count + 1) <= high:
+                step = float(rng.uniform(low, high)) / (count + 1)
+            window = self._draw(rng, count, step)
+            if window[2:-2][inner].any() and not window[2:-2][inner].all():
+                found.append(self._pose(rng, window, step))
+        distances, steps, marks, truth = zip(*found, strict=True)
+        return np.stack(distances), np.array(steps, np.float32), np.stack(marks), np.stack(truth)
+
+    def _draw(self, rng: np.random.Generator, count: int, step: float) -> np.ndarray:
+        """Return slices of a structure, bool (count + 4, Y, X): two known, those to fill, two known."""
+        inside = self._cut(rng, count, step)
+        if rng.random() < self.mix.pairs:
+            inside |= self._cut(rng, count, step)
+        return ~inside if rng.random() < self.mix.holes else inside
+
+    def _cut(self, rng: np.random.Generator, count: int, step: float) -> np.ndarray:
+        """Return the slices of a window of one shape."""
+        textures = self.sources[int(rng.integers(len(self.sources)))]
+        texture = textures[int(rng.integers(len(textures)))]
+        low, high = self.mix.thickness
+        low = min(max(low, step * (count + 1) / SLIMMEST), high)
+        voxels = texture.thickness / np.exp(rng.uniform(math.log(low), math.log(high)))
+        if rng.random() < self.mix.upright or not texture.periodic:
+            turn = np.eye(3)[rng.permutation(3)] * rng.choice([-1.0, 1.0], 3)[:, None]
+        else:
+            turn, _ = np.linalg.qr(rng.standard_normal((3, 3)))
+        matrix = turn * (voxels * np.exp(self.mix.stretch * rng.standard_normal(3)))
+        plane = np.arange(self.edge + 2 * self.halo, dtype=np.float64)
+        heights = step * np.array([-count - 1, *range(count + 2), 2 * count + 2], dtype=np.float64)
+        grid = np.stack(np.meshgrid(heights, plane, plane, indexing="ij")).reshape(3, -1)
+        corner = rng.uniform(0, texture.values.shape)[:, None]
+        return texture.read(matrix @ grid + corner).reshape(len(heights), len(plane), len(plane)) > 0
+
+    def _pose(
+        self, rng: np.random.Generator, window: np.ndarray, step: float
+    ) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
+        """Return what of a window is shown, and what is to be found."""
+        known, truth = window[[0, 1, -2, -1]], window[2:-2]
+        if rng.random() < self.mix.trembling:
+            known = np.stack([_tremble(mask, rng) for mask in known])
+        distances = np.stack([centre_distance(mask, (1.0, 1.0), FAR) for mask in known])
+        if rng.random() < self.mix.ends:
+            distances[0] = distances[1]
+        if rng.random() < self.mix.ends:
+            distances[3] = distances[2]
+        marks = np.zeros(truth.shape, np.float32)
+        if rng.random() < self.mix.partial:
+            marks = np.where(_mark(truth.shape, rng), 2 * truth.astype(np.float32) - 1, 0).astype(np.float32)
+        return distances, step, marks, truth.astype(np.float32)
+
+
+def _tremble(mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return a mask as a person draws it: shifted by a pixel or so, its outline moved to and fro, with a few specks."""
+    wave = ndimage.gaussian_filter(rng.standard_normal(mask.shape, dtype=np.float32), 2.0)
+    level = centre_distance(mask, (1.0, 1.0), FAR) + rng.uniform(0, 1.0) * wave / wave.std()
+    level = ndimage.shift(level, rng.normal(0, 0.7, 2), order=1, mode="nearest")
+    specks = ndimage.gaussian_filter((rng.random(mask.shape) < 5e-4).astype(np.float32), 1.0) > 0.06
+    return (level > 0) ^ specks
+
+
+def _mark(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
+    """Return the voxels, bool (n, Y, X), of slices to fill that are known: a slice across, or a rectangle of one."""
+    marked = np.zeros(shape, bool)
+    count, ys, xs = shape
+    kind = rng.random()
+    if kind < 0.35:
+        marked[:, int(rng.integers(ys)) :: max(ys // 2, 8)] = True
+    elif kind < 0.7:
+        marked[:, :, int(rng.integers(xs)) :: max(xs // 2, 8)] = True
+    else:
+        y, x = int(rng.integers(ys // 2)), int(rng.integers(xs // 2))
+        marked[int(rng.integers(count)), y : y + ys // 2, x : x + xs // 2] = True
+    return marked
+
+
+def load_textures(
+    sources: Sequence[str | Path], progress: Progress = silent
+) -> tuple[list[list[Texture]], dict[str, Any]]:
+    """Return the shapes of stores and of mask files that can teach, by source, and a card that says what they are.
+
+    Of a store all well-formed shapes between `FILLED` of the volume are taken: they repeat. A mask ends at its borders.
+    Raises ValueError and FileNotFoundError as `open_store` and `load`.
+    """
+    textures, names = [], []
+    for number, source in enumerate(map(Path, sources)):
+        found = []
+        if (source / "draws").is_dir():
+            store = open_store(source)
+            for index in store.indices():
+                if is_well_formed(store.record(index).viability):
+                    found.append(Texture(store.field(index)))
+            settings = dataclasses.asdict(store.settings)
+            kept = {"design": settings["design"], "seed": settings["seed"], "shape": settings["shape"]}
+        else:
+            mask = load(source)
+            found.append(Texture(2 * (mask.values > 0).astype(np.float32) - 1, periodic=False))
+            kept = {"shape": list(mask.shape)}
+        found = [each for each in found if FILLED[0] < (each.values > 0).mean() < FILLED[1]]
+        if not found:
+            raise ValueError(f"{source} has no shape that can teach")
+        textures.append(found)
+        names.append({"source": source.name, "shapes": len(found), **kept})
+        progress(f"reading {source.name}", (number + 1) / len(sources))
+    return textures, {"sources": names, "curvafit": version("curvafit"), "torch": version("torch")}
+
+
+# ---- learning --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class ExampleLessons(Dataset):
+    """Batches of gaps in a mask that is known whole, across its slices; batch k depends on (seed, k) alone.
+
+    Attributes
+    ----------
+    distances
+        Signed distances in each slice (Z, Y, X), in pixels.
+    gap, step
+        Slices from a known one to the next, and pixels from slice to slice.
+    """
+
+    distances: np.ndarray
+    gap: int
+    step: float
+    length: int
+    seed: int = 0
+    size: int = 3
+    edge: int = 64
+    halo: int = 8
+
+    def __len__(self) -> int:
+        return self.length
+
+    def __getitem__(self, number: int) -> Lesson:
+        rng = np.random.default_rng([self.seed, number])
+        depth, most = len(self.distances), self.edge + 2 * self.halo
+        gap = min(self.gap + int(rng.integers(-1, 2)), depth - 1)
+        gap = max(gap, 2)
+        found: list[tuple[np.ndarray, np.ndarray]] = []
+        while len(found) < self.size:
+            start = int(rng.integers(depth - gap))
+            corner = [int(rng.integers(max(n - most, 0) + 1)) for n in self.distances.shape[1:]]
+            part = self.distances[:, *(slice(a, a + most) for a in corner)]
+            rows = [start - gap, start, start + gap, start + 2 * gap]
+            rows[0] = start if rows[0] < 0 or rng.random() < 0.1 else rows[0]
+            rows[3] = start + gap if rows[3] >= depth or rng.random() < 0.1 else rows[3]
+            known, truth = part[rows], part[start + 1 : start + gap] > 0
+            for axis in range(3):
+                if rng.random() < 0.5:
+                    known, truth = np.flip(known, axis), np.flip(truth, axis)
+            found.append((known, truth))
+        distances, truths = (np.ascontiguousarray(np.stack(each)) for each in zip(*found, strict=True))
+        steps = np.full(self.size, self.step, np.float32)
+        return distances, steps, np.zeros(truths.shape, np.float32), truths.astype(np.float32)
+
+
+def learn(
+    filler: Filler,
+    lessons: Lessons | ExampleLessons,
+    rate: float,
+    *,
+    checkpoint: Path | None = None,
+    workers: int = 1,
+    progress: Progress = silent,
+) -> list[float]:
+    """Lower the cross entropy of lessons by AdamW in one cycle of rates; return the mean loss of each hundred steps.
+
+    The filler learns in place. With a checkpoint, the state is written there every `SAVED` steps, and learning goes on
+    from it.
+    """
+    total, inner = len(lessons), (..., slice(lessons.halo, -lessons.halo), slice(lessons.halo, -lessons.halo))
+    optimiser = torch.optim.AdamW(filler.parameters(), rate, weight_decay=1e-4)
+    cycle = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=total, pct_start=0.1)
+    parts = {"filler": filler, "optimiser": optimiser, "cycle": cycle}
+    begun, losses = 0, []
+    if checkpoint is not None and checkpoint.exists():
+        state = torch.load(checkpoint, weights_only=True)
+        for name, part in parts.items():
+            part.load_state_dict(state[name])
+        begun, losses = state["step"], state["losses"]
+    rest = Subset(lessons, range(begun, total))
+    filler.train()
+    for step, (distances, steps, marks, truth) in enumerate(
+        DataLoader(rest, batch_size=None, num_workers=workers), begun + 1
+    ):
+        loss = F.binary_cross_entropy_with_logits(filler(Gaps(distances, steps, marks))[inner], truth[inner])
+        optimiser.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(filler.parameters(), STEEPEST)
+        optimiser.step()
+        cycle.step()
+        losses.append(float(loss.detach()))
+        progress(f"step {step} of {total}, loss {np.mean(losses[-100:]):.4f}", step / total)
+        if checkpoint is not None and (step % SAVED == 0 or step == total):
+            state = {name: part.state_dict() for name, part in parts.items()} | {"step": step, "losses": losses}
+            write_atomically(checkpoint, partial(torch.save, state))
+    filler.eval()
+    return [float(np.mean(losses[k : k + 100])) for k in range(0, total, 100)]
+
+
+def teach(
+    sources: Sequence[Sequence[Texture]],
+    card: dict[str, Any],
+    *,
+    steps: int = STEPS,
+    seed: int = 0,
+    mix: Mix | None = None,
+    checkpoint: Path | None = None,
+    workers: int = 1,
+    progress: Progress = silent,
+) -> Taught:
+    """Teach a filler by shapes, every tenth of which is held out to judge it.
+
+    Parameters
+    ----------
+    sources
+        Shapes by where they come from, each source at least one; with fewer than 200 in all the filler knows little.
+    card
+        Where they come from, kept beside the weights.
+    checkpoint
+        A file by which a run that was stopped goes on; the caller deletes it.
+    workers
+        Processes that cut windows: 1, or 0 for this one.
+
+    Raises ValueError if a source is empty, or an argument is out of range.
+    """
+    steps, seed = check_int(steps, "a number of steps from 1", 1, 10**7), check_seed(seed)
+    if not sources or not all(sources):
+        raise ValueError("expected sources with one shape or more to teach with")
+    held = [texture for source in sources for texture in source[HELD_OUT - 1 :: HELD_OUT]] or [sources[-1][-1]]
+    taught = [[texture for texture in source if texture not in held] or list(source) for source in sources]
+    mix = mix or Mix()
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        filler = Filler()
+    lessons = Lessons(taught, mix, seed, steps)
+    losses = learn(
+        filler, lessons, RATE, checkpoint=checkpoint, workers=workers, progress=sub_progress(progress, 0, 0.97)
+    )
+    temperatures, figures, error = _judge(filler, Lessons([held], replace(mix, partial=0.0), seed + 1, JUDGED))
+    progress("judging on shapes held out", 1.0)
+    told = {"shapes": sum(map(len, taught)), "held_out": len(held), "steps": steps, "seed": seed, "mix": asdict(mix)}
+    return Taught(filler, temperatures, {**card, **told, "losses": losses, **figures}, error)
+
+
+@torch.inference_mode()
+def _judge(filler: Filler, lessons: Lessons) -> tuple[np.ndarray, dict[str, float], float]:
+    """Return temperatures (2, k) by gap; the cross entropy of held-out lessons and that of the cubic alone; and the
+    calibration error near surfaces, where a temperature is of another half of the lessons.
+    """
+    inner = (slice(lessons.halo, -lessons.halo),) * 2
+    gaps, logits, plain, truths = [], [], [], []
+    for distances, steps, marks, truth in DataLoader(lessons, batch_size=None):
+        batch = Gaps(distances, steps, marks)
+        found, cubic = filler(batch), SLOPE * interpolate(distances, batch.heights)[1]
+        gaps += (steps * (marks.shape[1] + 1)).tolist()
+        for each, values in ((logits, found), (plain, cubic), (truths, truth)):
+            each += [values[k, :, *inner].flatten() for k in range(len(values))]
+    table, errors = [], []
+    for rows in np.array_split(np.argsort(gaps), TEMPERATURES):
+        halves = [rows[::2], rows[1::2]]
+        parts = [(torch.cat([logits[k] for k in half]), torch.cat([truths[k] for k in half])) for half in halves]
+        cooled = [fit_temperature(*part) for part in parts]
+        errors += [_near_error(z / t, y) for (z, y), t in zip(parts, cooled[::-1], strict=True)]
+        table.append((float(np.mean([gaps[k] for k in rows])), float(np.sqrt(np.prod(cooled)))))
+    cross_entropy = F.binary_cross_entropy_with_logits
+    whole = {
+        name: float(cross_entropy(torch.cat(each), torch.cat(truths)))
+        for name, each in (("loss", logits), ("cubic", plain))
+    }
+    return np.array(table).T, {f"held_out_{name}": value for name, value in whole.items()}, float(np.mean(errors))
+
+
+def fit_temperature(logits: Tensor, truth: Tensor) -> float:
+    """Return by what log-odds (N,) are to be divided for the least cross entropy near surfaces."""
+    near = logits.abs() < UNSURE
+    if not near.any():
+        return 1.0
+    z, y = logits[near], truth[near]
+    found = minimize_scalar(lambda t: float(F.binary_cross_entropy_with_logits(z / math.exp(t), y)), bounds=(-1, 2))
+    return math.exp(found.x)
+
+
+def _near_error(logits: Tensor, truth: Tensor) -> float:
+    """Return the calibration error of log-odds (N,) near surfaces."""
+    near = logits.abs() < UNSURE
+    return calibration_error(torch.sigmoid(logits[near]).numpy(), truth[near].numpy())
+
+
+# ---- an example ------------------------------------------------------------------------------------------------------
+
+
+def tune(taught: Taught, example: Example, progress: Progress = silent) -> Taught:
+    """Teach a filler the texture of an example for a minute, and keep what it learnt if it is better than the noise.
+
+    It learns from the example's lesson; on the task it is judged, and its probabilities are calibrated.
+    """
+    given, truth, places = example.task.given, example.task.truth, list(example.task.places)
+    raster = Raster.of(given)
+    distances = np.stack([raster.distances(mask) for mask in example.lesson.inside])
+    filler = copy.deepcopy(taught.filler)
+    lessons = ExampleLessons(distances, given.gap, given.spacing[0] / raster.pixel, TUNING)
+    learn(filler, lessons, TUNING_RATE, workers=0, progress=lambda _, share: progress("tuning on the example", share))
+    tuned = replace(taught, filler=filler)
+    volumes = [fill(given, each)[places] for each in (taught, tuned)]
+    masks = (special.expit(volume) > best_threshold(special.expit(volume)) for volume in volumes)
+    before, after = (tally(mask, truth, places) for mask in masks)
+    gain, noise = gain_of(after, before)
+    better = gain > BEYOND * noise
+    logits = torch.from_numpy(volumes[better]).flatten()
+    answer = torch.from_numpy(truth).float().flatten()
+    temperature = fit_temperature(logits, answer)
+    scores = (
+        f"Dice {dice_of(before.sum(0)):.3f} on a part of the example, {dice_of(after.sum(0)):.3f} tuned on the rest"
+    )
+    return replace(
+        tuned if better else taught,
+        temperatures=taught.temperatures * [[1.0], [temperature]],
+        error=_near_error(logits / temperature, answer),
+        status=f"filled by the network{', tuned on the example' if better else ''} ({scores})",
+    )

@@ -1,0 +1,245 @@
+"""The network that fills gaps: what it must not depend on, what it keeps, and its file."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import curvafit.segmentation.filler as room
+from curvafit.segmentation.filler import (
+    FAR,
+    REACH,
+    Filler,
+    Gaps,
+    Raster,
+    Taught,
+    fill,
+    interpolate,
+    plane_thickness,
+)
+from curvafit.segmentation.slices import Slices, annotated_slices
+from curvafit.volumes.field import ScanError
+
+EDGES = (1.0, 1.0, 1.0)
+
+
+def stirred(seed: int = 0) -> Taught:
+    """A filler whose weights are all random, also the last ones."""
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        filler = Filler(8).eval()
+        for weight in filler.parameters():
+            torch.nn.init.normal_(weight, std=0.1)
+    return Taught(filler, np.array([[4.0, 16.0], [1.0, 1.5]]), {}, 0.0)
+
+
+def known(mask: np.ndarray, every: int = 6, spacing=EDGES, *, periodic: bool = False) -> Slices:
+    places = tuple(range(0, len(mask), every))
+    return Slices(mask[list(places)], places, len(mask), spacing, periodic=periodic)
+
+
+def leaning(n: int = 37) -> np.ndarray:
+    """A leaning tube and a ball, clear of the border."""
+    z, y, x = np.mgrid[:n, :n, :n] - n / 2 + 0.5
+    return (np.hypot(y - 0.3 * z, x - 4) < 4) | (z**2 + (y + 7) ** 2 + (x + 7) ** 2 < 25)
+
+
+# ---- what it must not depend on --------------------------------------------------------------------------------------
+
+
+def test_background_around_a_structure_changes_nothing() -> None:
+    mask, taught = leaning(), stirred()
+    wide = np.pad(mask, ((0, 0), (200, 200), (200, 200)))
+    found = fill(known(wide), taught)[:, 200:-200, 200:-200]
+    assert np.abs(found - fill(known(mask), taught)).max() < 1e-5
+
+
+def test_tiles_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    mask, taught = leaning(), stirred()
+    whole = fill(known(mask), taught)
+    monkeypatch.setattr(room, "TILE", 12)
+    assert np.abs(fill(known(mask), taught) - whole).max() < 1e-5
+
+
+def test_no_pixel_sees_further_than_the_reach() -> None:
+    filler, distances = stirred().filler, torch.randn(1, 4, 120, 120, generator=torch.Generator().manual_seed(0))
+    gaps = Gaps(distances, torch.ones(1), torch.zeros(1, 3, 120, 120))
+    moved = distances.clone()
+    moved[..., 60, 60] += 3
+    with torch.no_grad():
+        change = (filler(replace(gaps, distances=moved)) - filler(gaps)).abs().amax((0, 1))
+    rows, columns = torch.nonzero(change, as_tuple=True)
+    assert max(int((each - 60).abs().max()) for each in (rows, columns)) <= REACH
+
+
+def test_a_border_that_is_only_seen_changes_nothing() -> None:
+    generator = torch.Generator().manual_seed(0)
+    gaps = Gaps(torch.randn(2, 4, 96, 104, generator=generator), torch.ones(2), torch.zeros(2, 3, 96, 104))
+    filler = stirred().filler
+    with torch.no_grad():
+        torch.testing.assert_close(filler(gaps, 16), filler(gaps)[..., 16:-16, 16:-16], atol=1e-5, rtol=1e-5)
+
+
+def test_a_volume_that_repeats_may_begin_anywhere() -> None:
+    mask, taught = leaning(36), stirred()
+    found = fill(known(mask, periodic=True), taught)
+    turned = fill(known(np.roll(mask, 12, 0), periodic=True), taught)
+    np.testing.assert_allclose(np.roll(turned, -12, 0), found, atol=1e-5)
+
+
+def test_mirror_images_are_filled_alike_where_all_are_averaged() -> None:
+    """Slices are a multiple of four pixels wide, so that the coarser pixels lie alike."""
+    mask, taught = leaning()[:, :36, 1:], stirred()
+    found = fill(known(mask), taught, careful=True)
+    for axis in range(3):
+        mirrored = fill(known(np.flip(mask, axis).copy()), taught, careful=True)
+        np.testing.assert_allclose(np.flip(mirrored, axis), found, atol=2e-4)
+
+
+def test_a_unit_of_length_changes_nothing() -> None:
+    mask, taught = leaning(), stirred()
+    np.testing.assert_allclose(fill(known(mask, spacing=(0.3,) * 3), taught), fill(known(mask), taught), atol=1e-4)
+
+
+# ---- what is known ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("spacing", [EDGES, (4.0, 1.0, 1.0), (1.0, 2.0, 1.0)])
+def test_known_slices_are_kept(spacing: tuple[float, float, float]) -> None:
+    mask = leaning()
+    found = fill(known(mask, spacing=spacing), stirred())
+    assert found.dtype == np.float32 and found.shape == mask.shape
+    assert np.array_equal(found[::6] > 0, mask[::6])
+
+
+def test_an_untaught_filler_is_the_cubic_interpolation() -> None:
+    """Its last layers are zero: log-odds are the slope times distances in pixels, in pixels of any size."""
+    mask = leaning()
+    taught = Taught(Filler().eval(), np.array([[4.0, 16.0], [1.0, 1.0]]), {}, 0.0)
+    slices = known(mask)
+    distances = torch.from_numpy(np.stack([slices.distances(FAR)[k].clip(-FAR, FAR) for k in (1, 2, 3, 4)])).float()
+    _, cubic = interpolate(distances[None], torch.arange(1, 6) / 6)
+    np.testing.assert_allclose(fill(slices, taught)[13:18], room.SLOPE * cubic[0].numpy(), atol=1e-4)
+
+
+def test_marks_are_those_of_the_voxels_that_somebody_annotated() -> None:
+    labels = np.full((5, 4, 4), 9)
+    labels[[0, 4]] = 0
+    labels[0, 1, 1], labels[2, :, 2], labels[2, 1, 2] = 3, 0, 3
+    places, marks = annotated_slices(labels, 9)
+    assert places == [0, 4] and marks is not None
+    assert marks[2, :, 2].tolist() == [-1, 1, -1, -1] and np.count_nonzero(marks) == 4
+    assert annotated_slices(np.where(labels == 9, 0, labels), 9)[1] is None
+    with pytest.raises(ScanError, match="two"):
+        annotated_slices(labels[:3], 9)
+
+
+def test_what_is_known_in_a_slice_to_fill_reaches_the_network_and_stays() -> None:
+    mask = leaning()
+    marks = np.zeros(mask.shape, np.int8)
+    marks[:, 18] = np.where(mask[:, 18], 1, -1)
+    slices = replace(known(mask), marks=marks)
+    kept = slices.keep_known(np.zeros(mask.shape, bool))
+    assert np.array_equal(kept[:, 18], mask[:, 18]) and np.array_equal(kept[::6], mask[::6]) and not kept[3, :18].any()
+    taught = stirred()
+    assert not np.array_equal(fill(slices, taught)[1:6], fill(known(mask), taught)[1:6])
+    coarse = replace(slices, spacing=(1.0, 2.0, 1.0))
+    raster = Raster.of(coarse)
+    assert raster.scale == (2.0, 1.0)
+    assert np.array_equal(raster.marks(marks[:1])[0, REACH + 36 : REACH + 38, REACH : REACH + 37], marks[0, [18, 18]])
+
+
+# ---- pixels ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_cubic_goes_through_parabolas() -> None:
+    t = torch.arange(1, 8) / 8
+    nodes = torch.tensor([-1.0, 0.0, 1.0, 2.0])
+    linear, cubic = interpolate((3 * nodes**2 - nodes + 2)[None, :, None, None], t)
+    torch.testing.assert_close(cubic[0, :, 0, 0], 3 * t**2 - t + 2)
+    torch.testing.assert_close(linear[0, :, 0, 0], 2 + 2 * t)
+
+
+def test_the_thickness_of_strips_is_their_width() -> None:
+    plane = ((np.arange(60) + 14) % 20 < 8)[:, None] & np.ones((60, 40), bool)
+    assert plane_thickness(plane[None], (1.0, 1.0)) == pytest.approx(8, rel=0.1)
+    assert plane_thickness(plane[None], (0.5, 0.5)) == pytest.approx(4, rel=0.1)
+    assert np.isinf(plane_thickness(np.zeros((1, 4, 4), bool), (1.0, 1.0)))
+
+
+@pytest.mark.parametrize("factor", [1, 3, 8])
+def test_slices_come_back_from_any_pixels(factor: int) -> None:
+    """Distances of a disc, in pixels some voxels wide, are those of the disc."""
+    n = 32 * factor
+    disc = np.hypot(*(np.mgrid[:n, :n] - n / 2 + 0.5)) < n / 4
+    slices = Slices(np.stack([disc, disc]), (0, 4), 5, (1.0, 1.0, 1.0))
+    raster = Raster.of(slices)
+    inner = raster.distances(disc)[REACH:-REACH, REACH:-REACH]
+    assert inner.shape == raster.size and raster.pixel >= 1
+    back = raster.to_slices(inner[None])[0] * raster.pixel
+    exact = n / 4 - np.hypot(*(np.mgrid[:n, :n] - n / 2 + 0.5))
+    near = np.abs(exact) < 4
+    assert np.abs(back - exact)[near].max() < 1.2 * raster.pixel
+
+
+# ---- files -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_filler_comes_back_from_its_file(tmp_path: Path) -> None:
+    taught = replace(stirred(), card={"seed": 3}, error=0.02)
+    taught.save(tmp_path / "filler.npz")
+    other = Taught.load(tmp_path / "filler.npz")
+    assert other.card == {"seed": 3} and other.error == 0.02 and other.temperature(10.0) == taught.temperature(10.0)
+    assert np.array_equal(fill(known(leaning()), other), fill(known(leaning()), taught))
+
+
+def test_files_that_are_no_filler_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "filler.npz"
+    with pytest.raises(FileNotFoundError, match="missing"):
+        Taught.load(path)
+    path.write_bytes(b"PK nothing")
+    with pytest.raises(ValueError, match="damaged"):
+        Taught.load(path)
+    broken = stirred()
+    with torch.no_grad():
+        broken.filler.slope.fill_(float("nan"))
+    broken.save(path)
+    with pytest.raises(ValueError, match="finite"):
+        Taught.load(path)
+    room.FILLER_FILE.write(path, {"width": 9, "card": {}, "error": 0.0}, {"temperatures": np.ones((2, 2))})
+    with pytest.raises(ValueError, match="read"):
+        Taught.load(path)
+
+
+def test_the_packaged_filler_is_small_and_says_what_taught_it() -> None:
+    taught = Taught.load()
+    assert sum(weight.numel() for weight in taught.filler.parameters()) < 300_000
+    assert {"sources", "seed", "steps", "held_out_loss", "held_out_cubic"} <= taught.card.keys()
+    assert taught.card["held_out_loss"] < 0.9 * taught.card["held_out_cubic"] and taught.error < 0.03
+
+
+@pytest.mark.parametrize(
+    "shape",
+    ["leaning", "branch", "end"],
+)
+def test_the_packaged_filler_knows_tubes(shape: str) -> None:
+    """A leaning tube, one that forks and one that ends are filled at least as well as by the best interpolation."""
+    z, y, x = np.mgrid[:33, :64, :64].astype(float)
+    away = {
+        "leaning": np.hypot(y - 32, x - 16 - 1.0 * z),
+        "branch": np.minimum(np.hypot(y - 32, x - 32 - 0.7 * z), np.hypot(y - 32, x - 32 + 0.7 * z)),
+        "end": np.sqrt((y - 32) ** 2 + (x - 32) ** 2 + np.maximum(z - 12, 0) ** 2),
+    }[shape]
+    mask = away < 5
+    slices = known(mask, 8)
+    between = [n for n in range(33) if n % 8]
+    gain = {way: dice(slices.level(way)[between] > 0, mask[between]) for way in ("spline", "linear", "nearest")}
+    assert dice(fill(slices, Taught.load())[between] > 0, mask[between]) > max(gain.values()) - 0.005
+
+
+def dice(one: np.ndarray, other: np.ndarray) -> float:
+    return 2 * float((one & other).sum()) / float(one.sum() + other.sum())
