@@ -68,13 +68,13 @@ class Example:
     @property
     def part(self) -> Task[Slices]:
         """A box of the task, on which laws are lowered."""
-        given, box = crop_to_surface(self.task.given)
+        given, box = crop_to_surface(self.task.given, PART)
         kept = [k for k, place in enumerate(self.task.places) if box[0].start < place < box[0].stop]
         places = [self.task.places[k] - box[0].start for k in kept]
         return Task(given, self.task.truth[kept][:, box[1], box[2]], places)
 
 
-def crop_to_surface(slices: Slices, edge: int = PART) -> tuple[Slices, Box]:
+def crop_to_surface(slices: Slices, edge: int) -> tuple[Slices, Box]:
     """Return the known slices in a box that holds most of their surface, at most so many voxels a side but for
     `FEWEST` slices, and its place in the volume."""
     count = max(FEWEST, edge // slices.gap + 1)

@@ -24,7 +24,7 @@ from curvafit.priors.law import LawLike
 from curvafit.priors.loss import RESOLVED
 from curvafit.priors.profile import profile_distance
 from curvafit.segmentation.engine import STEPS, WorkingGrid, laws_of
-from curvafit.segmentation.examples import Example, crop_to_surface
+from curvafit.segmentation.examples import PART, Example, crop_to_surface
 from curvafit.segmentation.filler import Taught, fill
 from curvafit.segmentation.result import Segmentation, Uncertainty, flow_summary
 from curvafit.segmentation.slices import Slices, annotated_slices, check_spacing, known_places, require_labels
@@ -144,7 +144,7 @@ def reconstruct(
     engine = _Engine(taught, careful, epsilon, progress)
     chosen, said, task = Trial(), taught.status, None if other is None else other.task
     if laws and stiffness is None:
-        task = _pose_task(target if tiling.count == 1 else crop_to_surface(target)[0], other)
+        task = _pose_task(target if tiling.count == 1 else crop_to_surface(target, PART)[0], other)
         trials = [Trial(law, STIFFNESS, steps, pull) for law, pull in product(laws, PULLS)]
         chosen = choose_by_masks(task, trials, lambda given, trial: engine.run(given, trial) > 0)
         said = _describe_gain(chosen, "left out" if other is None else "of the example")

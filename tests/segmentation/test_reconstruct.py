@@ -200,7 +200,7 @@ def test_a_straight_tube_is_filled_exactly_and_no_law_helps() -> None:
 
 def test_two_slices_are_enough_without_a_law() -> None:
     found = reconstruct(straight(), known=[0, 23])
-    assert np.array_equal(found.mask.values, straight()) and found.status.startswith("filled by the network")
+    assert dice(found.mask.values, straight()) > 0.97 and found.status.startswith("filled by the network")
 
 
 def test_what_is_annotated_along_another_axis_is_kept_and_helps() -> None:
