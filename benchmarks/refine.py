@@ -1,13 +1,9 @@
-"""Masks from probabilities, and probabilities of completed volumes, on generated shapes.
+"""Masks from probabilities, on generated shapes.
 
-`--what probabilities`: a shape of 64³ is blurred, under Gaussian noise; the network is a random forest on Gaussian
+A shape of 64³ is blurred, under Gaussian noise; the network is a random forest on Gaussian
 features that learns from three slices of another seed's scan, made as sure as networks are. `p > 1/2` is its own mask;
 `smoothing` and `TV` of p, and the `walker` on p, take the best setting *in hindsight*; `refine` and `Willmore` choose
 their weight on an example (another seed), blind.
-
-`--what calibration`: crops, every 8th slice known, 8 runs of `reconstruct`; the probabilities are fitted on a shape
-grown from the inferred law (`grown`) or on another seed's mask (`example`). Expected calibration error within 3 voxels
-of the surface of probability 1/2 (`error`) and of the true one (`true`), what `reconstruct` states, and Dice.
 
 Chosen on target 2, reported on target 4.
 """
@@ -24,16 +20,11 @@ from skimage.restoration import denoise_tv_chambolle
 from skimage.segmentation import random_walker
 
 from benchmarks.completion import EDGE, fitted, shape
-from benchmarks.harness import Cases, Figure, Values, best, dice, scores, show
+from benchmarks.harness import Cases, Figure, Values, best, scores, show
 from curvafit.priors.coefficients import Coefficients
-from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.refine import refine
-from curvafit.segmentation.uncertainty import calibration_error, near_surface
 
-LAWS = {
-    "probabilities": ("tubes", "trabec", "sponge", "metatubes"),
-    "calibration": ("tubes", "sponge", "trabec", "pearls"),
-}
+LAWS = ("tubes", "trabec", "sponge", "metatubes")
 WAYS = ("p > 1/2", "smoothing", "TV", "walker", "Willmore", "refine")
 #: Deviation of the scan's noise in contrasts, and of its blur in voxels.
 NOISE, BLUR = 2.5, 0.7
@@ -42,7 +33,6 @@ FEATURES, LEARNT = (0.7, 1.0, 1.6, 2.5, 4.0), (16, 32, 48)
 WIDTHS, WEIGHTS, BETAS = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8), (0.1, 0.2, 0.4, 0.8, 1.6, 3.2), (1, 10, 130, 1000)
 #: Distance of a probability from 0 and 1 that makes a seed of the random walker.
 SURE = 0.1
-EVERY, RUNS = 8, 8
 
 
 def features(law: str, seed: int, cases: Cases) -> np.ndarray:
@@ -97,51 +87,24 @@ def way_case(way: str, law: str, seed: int, cases: Cases) -> Values:
     return {**scores(mask, truth), "status": status}
 
 
-def calibration_case(way: str, law: str, seed: int, cases: Cases) -> Values:
-    truth = shape(law, seed, cases)
-    other = {"example": shape(law, seed + 1, cases).astype(np.uint8)} if way == "example" else {}
-    found = reconstruct(truth.astype(np.uint8), fitted(law, seed + 1, cases), every=EVERY, runs=RUNS, **other)
-    p, between = found.probability.values, [n for n in range((EDGE - 1) // EVERY * EVERY) if n % EVERY]
-    bands = {"error": near_surface(p > 0.5), "true": near_surface(truth)}
-    errors = {name: float(calibration_error(p[between][band[between]], truth[between][band[between]]))
-              for name, band in bands.items()}  # fmt: skip
-    masks = {"mask": found.mask.values > 0, "half": p > 0.5}
-    more = {name: dice(mask[between], truth[between]) for name, mask in masks.items()}
-    return {**errors, **more, "stated": float(found.uncertainty.calibration_error), "status": found.status}
-
-
 def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--what", choices=tuple(LAWS), default="probabilities")
-    parser.add_argument("--laws")
+    parser.add_argument("--laws", default=",".join(LAWS))
     parser.add_argument("--target", type=int, default=4, help="seed; the law's and example's, the network's are next")
 
 
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
-    what, seed = options.what, options.target
-    laws = options.laws.split(",") if options.laws else LAWS[what]
-    if options.quick:
-        laws = laws[:1]
-    if what == "probabilities":
-        ways = WAYS[:2] if options.quick else WAYS
-        jobs = {f"{way.replace('/', '')}-{law}-{seed}": lambda w=way, a=law: way_case(w, a, seed, cases)
-                for law, way in product(laws, ways)}  # fmt: skip
-        keys = ("dice", "betti")
-    else:
-        ways = ("grown", "example")
-        jobs = {f"{way}-{law}-{seed}": lambda w=way, a=law: calibration_case(w, a, seed, cases)
-                for law, way in product(laws, ways)}  # fmt: skip
-        keys = ("error", "true", "stated", "mask", "half")
+    laws, seed = options.laws.split(","), options.target
+    laws, ways = (laws[:1], WAYS[:2]) if options.quick else (laws, WAYS)
+    jobs = {f"{way.replace('/', '')}-{law}-{seed}": lambda w=way, a=law: way_case(w, a, seed, cases)
+            for law, way in product(laws, ways)}  # fmt: skip
     found = cases.all(jobs, seed)
-    show(["case", *keys], [[name, *(row[key] for key in keys)] for name, row in found.items()])
+    show(["case", "dice", "betti"], [[name, row["dice"], row["betti"]] for name, row in found.items()])
     if seed != 4:
         return {}
     figures = {}
     for name, row in found.items():
         way, law = name.split("-")[:2]
-        if what == "probabilities":
-            slug = "half" if way.startswith("p >") else way.lower()
-            figures[f"probabilities.{slug}.{law}"] = Figure(row["dice"])
-            figures[f"probability_betti.{slug}.{law}"] = Figure(row["betti"])
-        else:
-            figures |= {f"calibration.{law}_{way}.{key}": Figure(row[key]) for key in keys}
+        slug = "half" if way.startswith("p >") else way.lower()
+        figures[f"probabilities.{slug}.{law}"] = Figure(row["dice"])
+        figures[f"probability_betti.{slug}.{law}"] = Figure(row["betti"])
     return figures

@@ -127,11 +127,11 @@ def picture(lines: Counter[str], arrows: Counter[tuple[str, str]], floors: dict[
 
 def print_types() -> None:
     """Print the types that a scan is on its way through `infer`, and slices through `reconstruct`."""
-    from curvafit import Coefficients, generate, infer, reconstruct
+    from curvafit import generate, infer, reconstruct
 
     mask = (generate("tubes", grid=40).field.numpy() > 0).astype("uint8")
     scan = types_handed_on(lambda: infer(mask, kind="mask", periodic=True, fast=True))
-    slices = types_handed_on(lambda: reconstruct(mask, Coefficients.willmore(), every=8))
+    slices = types_handed_on(lambda: reconstruct(mask, every=8))
     print(f"{len(scan)} of a scan: {', '.join(scan)}\n{len(slices)} of slices: {', '.join(slices)}")
 
 

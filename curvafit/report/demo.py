@@ -22,7 +22,6 @@ from curvafit.geometry.distances import sliced_embedding
 from curvafit.inference.atlas import load_atlas
 from curvafit.inference.infer import infer
 from curvafit.inference.posterior import load_posterior
-from curvafit.priors.coefficients import Coefficients
 from curvafit.report.page import (
     MARK,
     SYMBOLS,
@@ -114,8 +113,7 @@ def write_demo(
     inference = infer(scan, fast=True, seed=seed, atlas=atlas, posterior=posterior, progress=reading)
     mask = find_level(scan).mask
     volume = Field(mask.view(np.uint8), scan.spacing, scan.unit)
-    law = inference.fit if inference.fit.best is not None else Coefficients.willmore()
-    filled = reconstruct(volume, law, every=EVERY, progress=sub_progress(progress, 0.3, 0.95))
+    filled = reconstruct(volume, every=EVERY, progress=sub_progress(progress, 0.3, 0.95))
     completion = score_completion(mask, filled.mask.values, EVERY, filled.status)
     progress("drawing the page", 0.95)
     text = demo_page(inference, measures, completion, atlas, posterior.box, title)

@@ -101,8 +101,8 @@ COMMANDS: dict[str, Command] = {
     ),
     "reconstruct": Command(
         ("reconstruct", "mask.nii.gz", "--every", "4", *_PRIOR),
-        "every first slices axis example stiffness periodic runs suggest epsilon steps spacing unit channel label crop",
-        "steps runs",
+        "every first slices axis example stiffness periodic suggest epsilon steps spacing unit channel label crop",
+        "steps",
         taking("mask.nii.gz"),
         each=5,
     ),
