@@ -278,7 +278,7 @@ def _weigh_evidence(
     """
 
     def evidence(slices: Slices, phase: np.ndarray, rows: list[int]) -> np.ndarray:
-        depth = profile_distance(torch.from_numpy(phase[rows]), RESOLVED).numpy()
+        depth = profile_distance(torch.from_numpy(phase[rows]), float(RESOLVED)).numpy()
         return np.stack([engine.logits(slices)[rows].ravel(), depth.ravel()], axis=-1)
 
     if task is None:

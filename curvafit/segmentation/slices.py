@@ -208,6 +208,8 @@ def annotated_slices(values: np.ndarray, ignore: int) -> tuple[list[int], np.nda
     `ignore` is the label of voxels that nobody annotated; 0 is known to be empty. Marks are those of `Slices`.
     """
     seen = values != ignore
+    if seen.all():
+        raise ScanError(f"no voxel has the label {ignore}, which tells what nobody annotated")
     whole = seen.all((1, 2))
     places = np.flatnonzero(whole).tolist()
     if len(places) < 2:

@@ -133,7 +133,10 @@ def test_marks_are_those_of_the_voxels_that_somebody_annotated() -> None:
     places, marks = annotated_slices(labels, 9)
     assert places == [0, 4] and marks is not None
     assert marks[2, :, 2].tolist() == [-1, 1, -1, -1] and np.count_nonzero(marks) == 4
-    assert annotated_slices(np.where(labels == 9, 0, labels), 9)[1] is None
+    labels[2] = 9
+    assert annotated_slices(labels, 9)[1] is None
+    with pytest.raises(ScanError, match="no voxel"):
+        annotated_slices(labels, 5)
     with pytest.raises(ScanError, match="two"):
         annotated_slices(labels[:3], 9)
 

@@ -142,7 +142,7 @@ def test_a_reconstruction_says_how_sure_it_is() -> None:
 def test_a_law_s_surface_counts_as_evidence() -> None:
     """Weights are fitted to slices left out; without any to leave out they are the network's."""
     mask = ball(32, 12.0)
-    tried = reconstruct(mask, WILLMORE, every=5, steps=30, example=np.pad(ball(32, 10.0), ((0, 0), (0, 0), (0, 24))))
+    tried = reconstruct(mask, WILLMORE, every=5, steps=30, example=np.concatenate([ball(32, 11.0)] * 3, axis=2))
     assert tried.probability is not None and tried.probability.values.max() <= 1
 
 
