@@ -188,7 +188,8 @@ def can_write(
     def replaceable(there: Path) -> bool:
         if not isinstance(ours, Format):
             return ours(there)
-        return (there.is_file() and there.name in listed) or (there == target and ours.owns(there))
+        listed_too = there.name in listed and (there.is_file() or is_own_zarr(there, ours.name))
+        return listed_too or (there == target and ours.owns(there))
 
     sources = [source for name in inputs if (source := Path(str(name).partition("::")[0])).exists()]
     for place in (target, *more):

