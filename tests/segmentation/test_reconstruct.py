@@ -209,12 +209,13 @@ def test_what_is_annotated_along_another_axis_is_kept_and_helps() -> None:
     labels = np.full(truth.shape, 7, dtype=np.uint8)
     labels[::8] = truth[::8]
     sparse = reconstruct(labels, ignore=7)
-    labels[:, 16] = truth[:, 16]
+    labels[..., 8] = truth[..., 8]
     found = reconstruct(labels, ignore=7)
     assert np.array_equal(sparse.mask.values, reconstruct(truth, every=8).mask.values)
-    assert np.array_equal(found.mask.values[:, 16], truth[:, 16])
-    assert set(np.unique(found.probability.values[:, 16])) == {0, 1}  # type: ignore[union-attr]
-    assert dice(found.mask.values, truth) > dice(sparse.mask.values, truth) - 0.01
+    assert np.array_equal(found.mask.values[..., 8], truth[..., 8])
+    assert set(np.unique(found.probability.values[..., 8])) == {0, 1}  # type: ignore[union-attr]
+    beside = np.s_[..., [6, 7, 9, 10]]
+    assert dice(found.mask.values[beside], truth[beside]) > dice(sparse.mask.values[beside], truth[beside])
 
 
 def test_the_same_slices_make_the_same_choice() -> None:
