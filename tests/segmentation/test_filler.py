@@ -230,7 +230,7 @@ def test_the_packaged_filler_is_small_and_says_what_taught_it() -> None:
     ["leaning", "branch", "end"],
 )
 def test_the_packaged_filler_knows_tubes(shape: str) -> None:
-    """A leaning tube, one that forks and one that ends: of straight tubes a spline knows all, the network nearly all."""
+    """A tube that leans, forks or ends: of straight ones a spline knows all, and the network nearly all."""
     z, y, x = np.mgrid[:33, :64, :64].astype(float)
     away = {
         "leaning": np.hypot(y - 32, x - 16 - 1.0 * z),
