@@ -281,9 +281,13 @@ def on_scans(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
         names = {(each, way): f"{name}-{each}-{every}-{way}" for each, way in product(parts, ways)}
         jobs = {case: partial(scan_case, name, *map(int, each.split("-")), every, way, cases)
                 for (each, way), case in names.items()}  # fmt: skip
-        key = f"slices.{options.set}.{name}.{every}.{{way}}_{{key}}"
-        figures |= gains(f"{name}, every {every}", names, cases.all(jobs), ways, key)
-    return figures
+        group = "filled" if options.set == "report" else options.set
+        figures |= gains(f"{name}, every {every}", names, cases.all(jobs), ways, f"{group}.{name}.{{way}}_{{key}}")
+    medians = [figures[f"filled.{name}.filler_gain"].value for name in STRUCTURES if f"filled.{name}.filler_gain" in figures]
+    if len(medians) > 1:
+        figures["filled.all"] = bootstrap(medians)
+        figures["filled.least"] = Figure(min(figure.value for key, figure in figures.items() if key.endswith("filler_least")))
+    return figures if every == 8 else {}
 
 
 # ---- runs ------------------------------------------------------------------------------------------------------------
