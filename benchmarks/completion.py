@@ -283,10 +283,14 @@ def on_scans(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
                 for (each, way), case in names.items()}  # fmt: skip
         group = "filled" if options.set == "report" else options.set
         figures |= gains(f"{name}, every {every}", names, cases.all(jobs), ways, f"{group}.{name}.{{way}}_{{key}}")
-    medians = [figures[f"filled.{name}.filler_gain"].value for name in STRUCTURES if f"filled.{name}.filler_gain" in figures]
+    medians = [
+        figures[f"filled.{name}.filler_gain"].value for name in STRUCTURES if f"filled.{name}.filler_gain" in figures
+    ]
     if len(medians) > 1:
         figures["filled.all"] = bootstrap(medians)
-        figures["filled.least"] = Figure(min(figure.value for key, figure in figures.items() if key.endswith("filler_least")))
+        figures["filled.least"] = Figure(
+            min(figure.value for key, figure in figures.items() if key.endswith("filler_least"))
+        )
     return figures if every == 8 else {}
 
 
