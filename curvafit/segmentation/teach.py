@@ -331,7 +331,8 @@ def learn(
     rest = Subset(lessons, range(begun, total))
     filler.train()
     for step, (distances, steps, marks, truth) in enumerate(
-        DataLoader(rest, batch_size=None, num_workers=workers), begun + 1
+        DataLoader(rest, batch_size=None, num_workers=workers, multiprocessing_context="spawn" if workers else None),
+        begun + 1,
     ):
         loss = F.binary_cross_entropy_with_logits(filler(Gaps(distances, steps, marks))[inner], truth[inner])
         optimiser.zero_grad()
