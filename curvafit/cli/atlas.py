@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from curvafit.cli.console import command_line, error_console, resumable, say, show_stages
+from curvafit.cli.console import command_line, error_console, resumable, say, say_notes, show_stages
 from curvafit.cli.options import Crew, OverwriteOption, add_commands, command, parse_whole_triple
 
 if TYPE_CHECKING:
@@ -193,7 +193,7 @@ def teach_filler(
     with resumable(), show_stages() as progress:
         sources, card = load_textures(stores, progress)
         if (count := sum(map(len, sources))) < FEW:
-            say(f"note: {count} shapes teach little: {FEW} or more are better", to=error_console())
+            say_notes([f"{count} shapes teach little: {FEW} or more are better"])
         card["command"] = command_line()
         taught = teach(sources, card, steps=steps, seed=seed, checkpoint=checkpoint, progress=progress)
     taught.save(out)

@@ -1,7 +1,9 @@
-"""Writing of files and folders that are whole or absent."""
+"""Writing of files and folders that are whole or absent, and reading of the package's own."""
 
 from __future__ import annotations
 
+import importlib.resources
+import io
 import os
 import re
 import shutil
@@ -88,6 +90,11 @@ def remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
+
+
+def open_packaged(room: str, name: str) -> io.BytesIO:
+    """Return a file of this package, in the `data` of a room such as `inference`, as an open file."""
+    return io.BytesIO((importlib.resources.files(f"curvafit.{room}") / "data" / name).read_bytes())
 
 
 # ---- folders ---------------------------------------------------------------------------------------------------------

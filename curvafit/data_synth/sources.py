@@ -19,7 +19,7 @@ from curvafit.core.extras import require
 from curvafit.core.units import METRES, convert_length
 from curvafit.data_synth.design import PARAMETERS, Design
 from curvafit.data_synth.imaging.modality import Modality
-from curvafit.data_synth.store import Store, open_store
+from curvafit.data_synth.store import Store, find_well_formed
 from curvafit.generation.flow import generate
 from curvafit.generation.loop import first_mass
 from curvafit.generation.result import is_well_formed
@@ -140,11 +140,11 @@ class Stored:
 
     def __post_init__(self) -> None:
         if self.draws is None:
-            object.__setattr__(self, "draws", len(_find_well_formed(self.paths)))
+            object.__setattr__(self, "draws", len(find_well_formed(self.paths)))
 
     def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> PhaseField:
         """Return a crop of any of the stores' shapes that shows both structure and background."""
-        draws = _find_well_formed(self.paths)
+        draws = find_well_formed(self.paths)
         if len(draws) != self.draws:
             raise ValueError(f"the stores had {self.draws} well-formed shapes and grew to {len(draws)}: begin anew")
 
@@ -170,7 +170,7 @@ class Stored:
     @property
     def edge(self) -> int:
         """Return the least edge of the stores' shapes, in voxels; no crop may be longer."""
-        return min(min(store.settings.shape) for store, _ in _find_well_formed(self.paths))
+        return min(min(store.settings.shape) for store, _ in find_well_formed(self.paths))
 
 
 @dataclass(frozen=True)
@@ -254,18 +254,6 @@ def _crop_shape(
 def _grow_pool_shape(generated: Generated, number: int, edge: int) -> PhaseField:
     """Return a shape of a pool by its number."""
     return generated.shape((edge,) * 3, number, np.random.default_rng(number))
-
-
-@lru_cache(maxsize=16)
-def _find_well_formed(paths: tuple[Path, ...]) -> list[tuple[Store, int]]:
-    """Return the well-formed draws of some stores, each with its store."""
-    draws = []
-    for store in map(open_store, paths):
-        formed = [(store, index) for index in store.indices() if is_well_formed(store.record(index).viability)]
-        if not formed:
-            raise ValueError(f"the store {store.path} has no well-formed shapes")
-        draws += formed
-    return draws
 
 
 # ---- crops -----------------------------------------------------------------------------------------------------------

@@ -25,6 +25,7 @@ import os
 import shutil
 import time
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,7 @@ from curvafit.core.checks import SEEDS, check_float, check_int, quoted
 from curvafit.core.files import temporary_folder, write_content
 from curvafit.core.records import parse_json
 from curvafit.core.runtime import hold_signals
-from curvafit.generation.result import Viability
+from curvafit.generation.result import Viability, is_well_formed
 from curvafit.generation.schedule import Schedule
 from curvafit.priors.coefficients import NAMES, Coefficients
 from curvafit.priors.grid import Grid
@@ -218,6 +219,18 @@ def open_store(path: str | Path, settings: Settings | None = None) -> Store:
         was, now = (dataclasses.asdict(one) | {"schedule": one.schedule | {"name": ""}} for one in (stored, settings))
         check_same(was, now, path)
     return Store(path, stored)
+
+
+@lru_cache(maxsize=16)
+def find_well_formed(paths: tuple[Path, ...]) -> list[tuple[Store, int]]:
+    """Return the well-formed draws of some stores, each with its store; found once in a process."""
+    draws = []
+    for store in map(open_store, paths):
+        formed = [(store, index) for index in store.indices() if is_well_formed(store.record(index).viability)]
+        if not formed:
+            raise ValueError(f"the store {store.path} has no well-formed shapes")
+        draws += formed
+    return draws
 
 
 def check_same(stored: Any, wanted: Any, path: Path, name: str = "") -> None:

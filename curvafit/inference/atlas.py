@@ -9,11 +9,11 @@ from typing import Annotated, Any
 
 import numpy as np
 
+from curvafit.core.files import open_packaged
 from curvafit.core.records import Format
 from curvafit.core.schema import Rule
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.distances import one_to_many, sliced_embedding, wasserstein
-from curvafit.inference.table import open_packaged
 from curvafit.priors.coefficients import Coefficients
 
 VERSION = 1
@@ -100,7 +100,7 @@ def load_atlas(path: str | Path | None = None) -> Atlas:
     another format version.
     """
     if path is None:
-        return ATLAS_FILE.read(open_packaged("atlas.npz"), _from_arrays, place="the packaged atlas")
+        return ATLAS_FILE.read(open_packaged("inference", "atlas.npz"), _from_arrays, place="the packaged atlas")
     if Path(path).is_dir():
         raise FileNotFoundError(
             f"expected an atlas file, got the folder {path}: `curvafit atlas extract` makes one of it"

@@ -12,10 +12,11 @@ from torch import Tensor, nn
 
 from curvafit.core.checks import check_float, check_int, quoted
 from curvafit.core.extras import require
+from curvafit.core.files import open_packaged
 from curvafit.core.records import Format
 from curvafit.geometry.descriptors import BLOCKS, Descriptors
 from curvafit.inference.emulator import Emulator, Layer
-from curvafit.inference.table import PARAMETERS, Compression, column_names, open_packaged
+from curvafit.inference.table import PARAMETERS, Compression, column_names
 
 POSTERIOR_FILE = Format("curvafit posterior", 3, "a posterior", "train it again", {"blocks": BLOCKS})
 #: Largest size of a flow, and most flows of an ensemble.
@@ -191,7 +192,9 @@ def load_posterior(path: str | Path | None = None) -> Posterior:
     another format version or other blocks.
     """
     if path is None:
-        return POSTERIOR_FILE.read(open_packaged("posterior.npz"), _from_arrays, place="the packaged posterior")
+        return POSTERIOR_FILE.read(
+            open_packaged("inference", "posterior.npz"), _from_arrays, place="the packaged posterior"
+        )
     return POSTERIOR_FILE.read(path, _from_arrays)
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.resources
-import io
 import json
 import math
 from collections.abc import Callable, Sequence
@@ -142,11 +140,6 @@ def load_table(path: str | Path) -> Table:
     format version or other blocks.
     """
     return TABLE_FILE.read(path, _from_arrays)
-
-
-def open_packaged(name: str) -> io.BytesIO:
-    """Return a file of this package, in `inference/data`, as an open file."""
-    return io.BytesIO((importlib.resources.files("curvafit.inference") / "data" / name).read_bytes())
 
 
 def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Table:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from curvafit.scan.grids import box_with_most_surface
-from curvafit.segmentation.slices import Slices, require_labels
+from curvafit.segmentation.slices import Slices
 from curvafit.segmentation.trials import Task
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.part import Box
@@ -50,9 +50,7 @@ class Example:
                 f"{gap} apart and an example of {length}"
             )
         whole = Slices.of(volume, range(length), axis)
-        require_labels(whole.inside, "an example")
-        rows, ys, xs = box_with_most_surface(whole.inside, (LARGEST,) * 3)
-        inside = whole.inside[rows, ys, xs]
+        inside = whole.inside[box_with_most_surface(whole.inside, LARGEST)]
         notes = (f"Of the example {' x '.join(map(str, inside.shape))} voxels are read, where most of its surface is.",)
         cut = inside.size < whole.inside.size
         side = 1 + int(np.argmax(inside.shape[1:]))

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import resources
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from curvafit.core.checks import check_float, check_int
+from curvafit.core.files import open_packaged
 from curvafit.core.records import Format
 from curvafit.core.runtime import Progress, silent
 from curvafit.scan.grids import centre_distance
@@ -100,8 +100,7 @@ class Gaps:
     @property
     def heights(self) -> Tensor:
         """The heights of the slices to fill, (n,), from 0 to 1 without the ends."""
-        count = self.marks.shape[1]
-        return torch.arange(1, count + 1, device=self.marks.device) / (count + 1)
+        return heights_between(self.marks.shape[1]).to(self.marks.device)
 
     @property
     def conditions(self) -> Tensor:
@@ -111,6 +110,11 @@ class Gaps:
         place = torch.stack([t, torch.minimum(t, 1 - t)], dim=1).repeat(count, 1)
         size = torch.stack([gap, self.step / 4], dim=1).repeat_interleave(n, 0)
         return torch.cat([place, size], dim=1)
+
+
+def heights_between(count: int) -> Tensor:
+    """Return the heights of `count` slices in a gap, from 0 to 1 without the ends."""
+    return torch.arange(1, count + 1) / (count + 1)
 
 
 def interpolate(distances: Tensor, heights: Tensor) -> tuple[Tensor, Tensor]:
@@ -319,8 +323,7 @@ def _fill_gap(
     told = torch.zeros(1, count, *known.shape[1:])
     if marks is not None:
         told, near = torch.from_numpy(marks)[None], torch.ones_like(near)
-    heights = Gaps(distances, torch.ones(1), told).heights
-    logits = SLOPE * interpolate(_trim(distances, REACH)[None], heights)[0][0]
+    logits = SLOPE * interpolate(_trim(distances, REACH)[None], heights_between(count))[0][0]
     for y, x in product(*(range(0, n, TILE) for n in near.shape)):
         core = (slice(y, y + TILE), slice(x, x + TILE))
         if near[core].any():
@@ -382,9 +385,8 @@ class Taught:
         another version.
         """
         if path is None:
-            packaged = resources.files("curvafit.segmentation") / "data" / "filler.npz"
-            with packaged.open("rb") as file:
-                return FILLER_FILE.read(file, cls._of, place="the packaged filler")
+            packaged = open_packaged("segmentation", "filler.npz")
+            return FILLER_FILE.read(packaged, cls._of, place="the packaged filler")
         return FILLER_FILE.read(path, cls._of)
 
     @classmethod

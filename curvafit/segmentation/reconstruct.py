@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.special import expit, logit
+from scipy.special import expit
 
 from curvafit.core.checks import SEEDS, check_float, check_int
 from curvafit.core.runtime import Progress, silent, sub_progress
@@ -27,12 +27,19 @@ from curvafit.segmentation.engine import STEPS, WorkingGrid, laws_of
 from curvafit.segmentation.examples import PART, Example, crop_to_surface
 from curvafit.segmentation.filler import Taught, fill
 from curvafit.segmentation.result import Segmentation, Uncertainty, flow_summary
-from curvafit.segmentation.slices import Slices, annotated_slices, check_spacing, known_places, require_labels
+from curvafit.segmentation.slices import (
+    Slices,
+    annotated_slices,
+    check_spacing,
+    known_places,
+    mark_known,
+    require_labels,
+)
 from curvafit.segmentation.teach import tune
 from curvafit.segmentation.tiles import LoweredVolume, Problem, Tiling, lower_volume
 from curvafit.segmentation.trials import Task, Trial, choose_by_masks, leave_out_slices
 from curvafit.segmentation.uncertainty import (
-    best_threshold,
+    best_log_odds,
     calibration_error,
     entropy,
     fit_weights,
@@ -143,13 +150,13 @@ def reconstruct(
         notes = (*notes, *other.notes)
     engine = _Engine(taught, careful, epsilon, progress)
     chosen, said, task = Trial(), taught.status, None if other is None else other.task
-    if laws and stiffness is None:
+    if stiffness is not None and laws:
+        chosen, said = Trial(laws[0], stiffness, steps), "the law is lowered from the network's volume"
+    elif laws:
         task = _pose_task(target if tiling.count == 1 else crop_to_surface(target, PART)[0], other)
         trials = [Trial(law, STIFFNESS, steps, pull) for law, pull in product(laws, PULLS)]
         chosen = choose_by_masks(task, trials, lambda given, trial: engine.run(given, trial) > 0)
         said = _describe_gain(chosen, "left out" if other is None else "of the example")
-    elif laws:
-        chosen, said = Trial(laws[0], stiffness or STIFFNESS, steps), "the law is lowered from the network's volume"
     if chosen.law is None:
         phase = engine.run(target, chosen)
         found = LoweredVolume(target.keep_known(phase > 0), phase, (), 0)
@@ -177,6 +184,7 @@ class _Engine:
     epsilon: float | None
     progress: Progress
     filled: dict[Slices, np.ndarray] = field(default_factory=dict)
+    lowered: dict[tuple[Any, ...], np.ndarray] = field(default_factory=dict)
 
     def logits(self, slices: Slices) -> np.ndarray:
         """Return the network's log-odds of the inside (Z, Y, X), computed once."""
@@ -188,16 +196,20 @@ class _Engine:
     def level(self, slices: Slices) -> np.ndarray:
         """Return log-odds over those of the best threshold (Z, Y, X), times the edge of a voxel."""
         logits = self.logits(slices)
-        least = logit(best_threshold(expit(logits[slices.between])))
-        return np.float32(min(slices.spacing[1:])) * (logits - np.float32(least))
+        least = np.float32(best_log_odds(logits[slices.between]))
+        return np.float32(min(slices.spacing[1:])) * (logits - least)
 
     def run(self, slices: Slices, trial: Trial) -> np.ndarray:
-        """Return the phase field (Z, Y, X) of a trial."""
+        """Return the phase field (Z, Y, X) of a trial; a law is lowered once, whatever the trial's scores."""
         tiling = Tiling.of(slices.frame, self.epsilon, periodic=slices.periodic)
         if trial.law is None:
             return _profile(self.level(slices), tiling.place.epsilon)
-        step: Progress = lambda _, share: self.progress("trying the law out", share)  # noqa: E731
-        return lower_volume(SlicesProblem(trial, slices, self.level(slices)), tiling, progress=step).phase
+        key = (slices, trial.law, trial.strength, trial.steps, trial.pull)
+        if key not in self.lowered:
+            step: Progress = lambda _, share: self.progress("trying the law out", share)  # noqa: E731
+            problem = SlicesProblem(trial, slices, self.level(slices))
+            self.lowered[key] = lower_volume(problem, tiling, progress=step).phase
+        return self.lowered[key]
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,8 +305,8 @@ def _weigh_evidence(
 
 def _uncertainty(likely: np.ndarray, error: float, slices: Slices, volume: Field, axis: int, count: int) -> Uncertainty:
     """Return probabilities (Z, Y, X) as a volume, 0 or 1 where it is known, and `count` slices to annotate next."""
-    none, every = (slices.keep_known(np.full(slices.shape, value)) for value in (False, True))
-    values = np.where(none == every, none, likely).astype(np.float32)
+    inside = slices.keep_known(np.zeros(slices.shape, dtype=bool))
+    values = np.where(slices.known_voxels, inside, likely).astype(np.float32)
     suggestions = suggest_slices(entropy(values).sum((1, 2)), slices.places, count, slices.periodic)
     return Uncertainty(replace(volume, values=_turn_back(axis, values), notes=()), error, suggestions)
 
@@ -388,7 +400,7 @@ def reconstruct_labels(
     """
     volume = field_of(slices, spacing=spacing, unit=unit)
     axis = check_int(axis, "an axis 0, 1 or 2 (z, y, x)", 0, 2)
-    places, _ = _find_known(volume, axis, every, first, known, ignore)
+    places, marks = _find_known(volume, axis, every, first, known, ignore)
     planes = np.moveaxis(volume.values, axis, 0)[places]
     numbers = find_labels(planes, chosen)
     other = None if example is None else _load_example(example, volume, {"spacing": spacing, "unit": unit})
@@ -417,7 +429,7 @@ def reconstruct_labels(
     full = bool(np.isin(planes, numbers).all())
     values = owner if full else np.where(deepest > 0, owner, 0)
     likely = np.where(values, largest, 1.0) / (odds + (not full))
-    known_voxels = _mark_known(volume, axis, places, ignore)
+    known_voxels = _turn_back(axis, mark_known(np.moveaxis(volume.values, axis, 0).shape, places, marks))
     values = np.where(known_voxels, np.where(np.isin(volume.values, numbers), volume.values, 0), values)
     likely = np.where(known_voxels, 1.0, likely)
     values = values.astype(np.int32 if min(numbers) < 0 else np.min_scalar_type(max(numbers)))
@@ -433,15 +445,6 @@ def reconstruct_labels(
         labels=replace(volume, values=values, notes=()),
         uncertainty=Uncertainty(replace(volume, values=likely.astype(np.float32), notes=()), error, ()),
     )
-
-
-def _mark_known(volume: Field, axis: int, places: list[int], ignore: int | None) -> np.ndarray:
-    """Return which voxels are known."""
-    if ignore is not None:
-        return volume.values != ignore
-    mask = np.zeros(volume.shape, dtype=bool)
-    np.moveaxis(mask, axis, 0)[places] = True
-    return mask
 
 
 def _odds(part: Segmentation) -> np.ndarray:

@@ -101,6 +101,11 @@ class Slices:
         return kept
 
     @property
+    def known_voxels(self) -> np.ndarray:
+        """Which voxels of the volume are known, bool (length, Y, X)."""
+        return mark_known(self.shape, self.places, self.marks)
+
+    @property
     def shape(self) -> tuple[int, int, int]:
         """The shape of the volume."""
         return (self.length, *self.inside.shape[1:])  # type: ignore[return-value]
@@ -153,11 +158,6 @@ class Slices:
         """The largest distance, in slices, between a known slice and the next."""
         steps = np.diff(self.places)
         return int(max(*steps, self.places[0] + self.length - self.places[-1]) if self.periodic else steps.max())
-
-    @property
-    def harmonic_distance(self) -> np.ndarray:
-        """`harmonic_distance` of each slice, (length,), in the unit of the spacing."""
-        return self.spacing[0] * harmonic_distance(self.places, self.length, self.periodic)
 
     @property
     def neighbours(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -216,6 +216,13 @@ def annotated_slices(values: np.ndarray, ignore: int) -> tuple[list[int], np.nda
         raise ScanError(f"two or more slices must have no voxel of the label {ignore}, got {places}")
     seen[whole] = False
     return places, np.where(seen, np.where(values > 0, 1, -1), 0).astype(np.int8) if seen.any() else None
+
+
+def mark_known(shape: Sequence[int], places: Sequence[int], marks: np.ndarray | None) -> np.ndarray:
+    """Return which voxels are known of a volume (Z, Y, X): those of the slices at `places`, and those with a mark."""
+    known = np.zeros(shape, dtype=bool) if marks is None else marks != 0
+    known[list(places)] = True
+    return known
 
 
 def harmonic_distance(places: Sequence[int], length: int, periodic: bool = False) -> np.ndarray:

@@ -8,7 +8,6 @@ calibres, slices that are known in part. The losses are cross entropies, so that
 from __future__ import annotations
 
 import copy
-import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -19,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy import ndimage, special
+from scipy import ndimage
 from scipy.optimize import minimize_scalar
 from torch import Tensor
 from torch.nn import functional as F
@@ -28,13 +27,12 @@ from torch.utils.data import DataLoader, Dataset, Subset
 from curvafit.core.checks import check_int, check_seed
 from curvafit.core.files import write_atomically
 from curvafit.core.runtime import Progress, silent, sub_progress
-from curvafit.data_synth.store import open_store
-from curvafit.generation.result import is_well_formed
+from curvafit.data_synth.store import find_well_formed
 from curvafit.scan.grids import centre_distance
 from curvafit.segmentation.examples import Example
 from curvafit.segmentation.filler import FAR, SLOPE, Filler, Gaps, Raster, Taught, fill, interpolate, plane_thickness
 from curvafit.segmentation.trials import BEYOND, dice_of, gain_of, tally
-from curvafit.segmentation.uncertainty import best_threshold, calibration_error
+from curvafit.segmentation.uncertainty import best_log_odds, calibration_error
 from curvafit.volumes.read import load
 
 #: Steps of teaching and of tuning, and the greatest rates of both.
@@ -113,8 +111,23 @@ class Mix:
     partial: float = 0.15
 
 
+class Batches(Dataset):
+    """Batches of gaps to fill: `length` of them; of a window only what is `halo` pixels from its border counts."""
+
+    length: int
+    halo: int
+
+    def __len__(self) -> int:
+        return self.length
+
+    @property
+    def inner(self) -> tuple[Any, ...]:
+        """The part of a window, on its last two axes, that counts."""
+        return (..., slice(self.halo, -self.halo), slice(self.halo, -self.halo))
+
+
 @dataclass(frozen=True, eq=False)
-class Lessons(Dataset):
+class Lessons(Batches):
     """Batches of gaps to fill, the same for ever for a seed: batch k depends on (seed, k) alone.
 
     Attributes
@@ -135,13 +148,9 @@ class Lessons(Dataset):
     edge: int = 80
     halo: int = 8
 
-    def __len__(self) -> int:
-        return self.length
-
     def __getitem__(self, number: int) -> Lesson:
         rng = np.random.default_rng([self.seed, number])
         count = int(rng.integers(1, self.mix.most + 1))
-        inner = (slice(None), *(slice(self.halo, -self.halo),) * 2)
         found: list[tuple[np.ndarray, float, np.ndarray, np.ndarray]] = []
         while len(found) < self.size:
             step = 1.0
@@ -151,7 +160,7 @@ class Lessons(Dataset):
             if not low <= step * (count + 1) <= high:
                 step = float(rng.uniform(low, high)) / (count + 1)
             window = self._draw(rng, count, step)
-            if window[2:-2][inner].any() and not window[2:-2][inner].all():
+            if window[2:-2][self.inner].any() and not window[2:-2][self.inner].all():
                 found.append(self._pose(rng, window, step))
         distances, steps, marks, truth = zip(*found, strict=True)
         return np.stack(distances), np.array(steps, np.float32), np.stack(marks), np.stack(truth)
@@ -233,17 +242,14 @@ def load_textures(
     """
     textures, names = [], []
     for number, source in enumerate(map(Path, sources)):
-        found = []
         if (source / "draws").is_dir():
-            store = open_store(source)
-            for index in store.indices():
-                if is_well_formed(store.record(index).viability):
-                    found.append(Texture(store.field(index)))
-            settings = dataclasses.asdict(store.settings)
-            kept = {"design": settings["design"], "seed": settings["seed"], "shape": settings["shape"]}
+            draws = find_well_formed((source,))
+            found = [Texture(store.field(index)) for store, index in draws]
+            settings = draws[0][0].settings
+            kept = {"design": settings.design, "seed": settings.seed, "shape": list(settings.shape)}
         else:
             mask = load(source)
-            found.append(Texture(2 * (mask.values > 0).astype(np.float32) - 1, periodic=False))
+            found = [Texture(2 * (mask.values > 0).astype(np.float32) - 1, periodic=False)]
             kept = {"shape": list(mask.shape)}
         found = [each for each in found if FILLED[0] < (each.values > 0).mean() < FILLED[1]]
         if not found:
@@ -258,7 +264,7 @@ def load_textures(
 
 
 @dataclass(frozen=True, eq=False)
-class ExampleLessons(Dataset):
+class ExampleLessons(Batches):
     """Batches of gaps in a mask that is known whole, across its slices; batch k depends on (seed, k) alone.
 
     Attributes
@@ -277,9 +283,6 @@ class ExampleLessons(Dataset):
     size: int = 3
     edge: int = 64
     halo: int = 8
-
-    def __len__(self) -> int:
-        return self.length
 
     def __getitem__(self, number: int) -> Lesson:
         rng = np.random.default_rng([self.seed, number])
@@ -306,7 +309,7 @@ class ExampleLessons(Dataset):
 
 def learn(
     filler: Filler,
-    lessons: Lessons | ExampleLessons,
+    lessons: Batches,
     rate: float,
     *,
     checkpoint: Path | None = None,
@@ -318,7 +321,7 @@ def learn(
     The filler learns in place. With a checkpoint, the state is written there every `SAVED` steps, and learning goes on
     from it.
     """
-    total, inner = len(lessons), (..., slice(lessons.halo, -lessons.halo), slice(lessons.halo, -lessons.halo))
+    total, inner = len(lessons), lessons.inner
     optimiser = torch.optim.AdamW(filler.parameters(), rate, weight_decay=1e-4)
     cycle = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=total, pct_start=0.1)
     parts = {"filler": filler, "optimiser": optimiser, "cycle": cycle}
@@ -399,14 +402,13 @@ def _judge(filler: Filler, lessons: Lessons) -> tuple[np.ndarray, dict[str, floa
     """Return temperatures (2, k) by gap; the cross entropy of held-out lessons and that of the cubic alone; and the
     calibration error near surfaces, where a temperature is of another half of the lessons.
     """
-    inner = (slice(lessons.halo, -lessons.halo),) * 2
     gaps, logits, plain, truths = [], [], [], []
     for distances, steps, marks, truth in DataLoader(lessons, batch_size=None):
         batch = Gaps(distances, steps, marks)
         found, cubic = filler(batch), SLOPE * interpolate(distances, batch.heights)[1]
         gaps += (steps * (marks.shape[1] + 1)).tolist()
         for each, values in ((logits, found), (plain, cubic), (truths, truth)):
-            each += [values[k, :, *inner].flatten() for k in range(len(values))]
+            each += [window[lessons.inner].flatten() for window in values]
     table, errors = [], []
     for rows in np.array_split(np.argsort(gaps), TEMPERATURES):
         halves = [rows[::2], rows[1::2]]
@@ -454,8 +456,7 @@ def tune(taught: Taught, example: Example, progress: Progress = silent) -> Taugh
     learn(filler, lessons, TUNING_RATE, workers=0, progress=lambda _, share: progress("tuning on the example", share))
     tuned = replace(taught, filler=filler)
     volumes = [fill(given, each)[places] for each in (taught, tuned)]
-    masks = (special.expit(volume) > best_threshold(special.expit(volume)) for volume in volumes)
-    before, after = (tally(mask, truth, places) for mask in masks)
+    before, after = (tally(volume > best_log_odds(volume), truth, places) for volume in volumes)
     gain, noise = gain_of(after, before)
     better = gain > BEYOND * noise
     logits = torch.from_numpy(volumes[better]).flatten()

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from scipy.optimize import minimize
-from scipy.special import entr, expit
+from scipy.special import entr, expit, logit
 
 from curvafit.scan.grids import centre_distance
 from curvafit.segmentation.slices import harmonic_distance
@@ -59,6 +59,11 @@ def best_threshold(probability: np.ndarray) -> float:
     sizes, sums = (np.cumsum(each[::-1]) for each in (counts, counts * (edges[1:] + edges[:-1]) / 2))
     best = int(np.argmax(sums / np.maximum(sizes + sums[-1], 1e-9)))
     return min(0.5, float(edges[::-1][best + 1]))
+
+
+def best_log_odds(logits: np.ndarray) -> float:
+    """Return the log-odds of the `best_threshold` of voxels with these log-odds."""
+    return float(logit(best_threshold(expit(logits))))
 
 
 def calibration_error(probability: np.ndarray, inside: np.ndarray, bins: int = BINS) -> float:
