@@ -198,8 +198,8 @@ def _double(x: Tensor) -> Tensor:
 
 # ---- volumes ---------------------------------------------------------------------------------------------------------
 
-#: Thickness of structures, in pixels, that needs no other pixels: slices are resampled to the nearer end.
-THICKNESS = (3.0, 16.0)
+#: Thinner structures get smaller pixels; thicker ones get larger pixels where gaps are longer than `LONG` pixels.
+THICKNESS, LONG = (3.0, 16.0), 12.0
 #: Longest edge of a tile of slices that is filled at once, in pixels.
 TILE = 256
 
@@ -250,7 +250,9 @@ class Raster:
     def of(cls, slices: Slices) -> Raster:
         edges, finest = slices.spacing[1:], min(slices.spacing[1:])
         thickness = plane_thickness(slices.inside, edges) / finest
-        pixel = finest * thickness / float(np.clip(thickness, *THICKNESS)) if math.isfinite(thickness) else finest
+        gap = slices.gap * slices.spacing[0] / finest
+        coarser = float(np.clip(gap / LONG, 1.0, max(thickness / THICKNESS[1], 1.0)))
+        pixel = finest * min(thickness / THICKNESS[0], coarser)
         return cls(slices.inside.shape[1:], edges, pixel)  # type: ignore[arg-type]
 
     @property
