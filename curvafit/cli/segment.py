@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -103,6 +103,10 @@ def reconstruct(
     stiffness: Stiffness = None,
     periodic: Annotated[bool, _what("--periodic", help="The volume repeats, as generated ones do.")] = False,
     suggest: Annotated[int, _what(help="Number of slices to suggest for annotation next.", min=0)] = 0,
+    sure: Annotated[
+        float | None,
+        _what(help="Also write labels for nnU-Net, to be ignored where less probable than, say, 0.9.", min=0.5, max=1),
+    ] = None,
     epsilon: Epsilon = None,
     steps: Steps = 400,
     tile: TileOption = None,
@@ -140,7 +144,7 @@ def reconstruct(
 
     record: dict[str, Any] = {"job": "reconstruct", "steps": steps, "tile": tile}
     record |= {"labels": labels} if labels else {}
-    record |= {"example": None if example is None else str(example), **place, **how, "suggest": suggest}
+    record |= {"example": None if example is None else str(example), **place, **how, "suggest": suggest, "sure": sure}
     record["filler"] = None if filler is None else str(filler)
     run_job(Job(slices, out, prior, reading, record, overwrite, workers), compute)
 
@@ -174,7 +178,8 @@ def run_job(job: Job, compute: Callable[..., Segmentation], read: Callable[..., 
     law_file = None if preset_name(job.prior) else job.prior
     shown = (job.image, *(record.get(name) for name in ("example", "example_probabilities", "filler")))
     options = {"inputs": [file for file in (job.source, law_file, *shown) if file], "overwrite": job.overwrite}
-    options["probability"] = record["job"] == "reconstruct"
+    least = record.get("sure")
+    options["maps"] = (["probability"] if record["job"] == "reconstruct" else []) + (["sure"] if least else [])
     check_mask_target(job.out, **options)
     if job.prior is not None:
         Law.of(job.prior)
@@ -187,11 +192,13 @@ def run_job(job: Job, compute: Callable[..., Segmentation], read: Callable[..., 
         with resumable() if tiling.count > 1 else nullcontext():
             result = compute(boxes, progress, tile=record["tile"], store=store, workers=job.workers)
         progress("writing", 1.0)
+        sure = result.keep_sure(least) if least else None
+        result = result if sure is None else replace(result, notes=(*result.notes, *sure.notes))
         # The header is kept where it says where the voxels are; one of a file of channels is of all of them.
         stated = ("spacing", "crop") if job.image else ("spacing", "crop", "channel")
         like = (job.image or job.source) if all(reading[name] is None for name in stated) else None
         content = {"command": command_line(), "prior": job.prior, **record}
-        how = {"like": like, "unit": reading["unit"], "record": content, "overwrite": job.overwrite}
+        how = {"sure": sure, "like": like, "unit": reading["unit"], "record": content, "overwrite": job.overwrite}
         paths = write_mask(result, read_whole(boxes), job.out, **how)
         remove(store)
     for note in result.notes:

@@ -15,5 +15,6 @@ if TYPE_CHECKING:
     from curvafit.segmentation.refine import refine as refine
     from curvafit.segmentation.result import Segmentation as Segmentation
     from curvafit.segmentation.segment import segment as segment
+    from curvafit.segmentation.transforms import FillSlicesd as FillSlicesd
 
 attach_lazy_names(__name__)

@@ -1,9 +1,9 @@
-"""The result of a segmentation, and its files: mask, picture, record, probability."""
+"""The result of a segmentation, and its files: mask, picture, record, probability, labels to train with."""
 
 from __future__ import annotations
 
 import datetime
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from curvafit.core.checks import SEEDS, check_float, check_int
 from curvafit.core.files import move_together, remove, temporary_folder
 from curvafit.core.pictures import Pictured
 from curvafit.core.records import Format, can_write, sibling
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 SETTLED = 0.001
 #: `format` of the record beside a mask.
 FORMAT = Format("curvafit-mask-1", title="the record of a mask")
+#: Volumes that may lie beside a mask, by the ending of their names.
+MAPS = ("probability", "sure")
 _NIFTI = (".nii", ".nii.gz")
 
 
@@ -105,6 +108,25 @@ class Segmentation(Pictured):
         """The probability of the inside, of a volume between known slices."""
         return None if self.uncertainty is None else self.uncertainty.probability
 
+    def keep_sure(self, least: float = 0.9, ignored: int | None = None) -> Field:
+        """Return labels to train a network with: where one is less probable than `least`, it is replaced by `ignored`.
+
+        `ignored` is by default the highest label + 1, as nnU-Net demands. Known voxels keep their labels, of which one
+        structure has 0 and 1. Raises ValueError if there is no probability, or a label is as high as `ignored`.
+        """
+        if self.probability is None:
+            raise ValueError("labels can be kept where they are sure only in a volume with probabilities")
+        least = check_float(least, "a probability from 0.5 to 1", 0.5, 1.0)
+        labels, likely = self.mask.values if self.labels is None else self.labels.values, self.probability.values
+        likely = np.where(labels, likely, 1 - likely) if self.labels is None else likely
+        lowest = max(int(labels.max()), 0) + 1
+        number = lowest if ignored is None else check_int(ignored, f"a label to ignore from {lowest}", lowest, SEEDS)
+        values = labels.astype(np.promote_types(labels.dtype, np.min_scalar_type(number)))
+        values[likely < least] = number
+        share = 100 * float((likely < least).mean())
+        note = f"{share:.3g} % of the voxels are less sure than {least:g} and have the label to ignore, {number}."
+        return replace(self.mask, values=values, notes=(note,))
+
     def __repr__(self) -> str:
         mask = self.mask.values
         count = f"{np.count_nonzero(mask)} inside ({100 * mask.mean():.3g} %)"
@@ -134,16 +156,16 @@ def check_mask_target(
     inputs: Iterable[str | Path] = (),
     overwrite: bool = False,
     *,
-    probability: bool = False,
+    maps: Sequence[str] = (),
 ) -> Path:
     """Return the path, or raise ValueError where a mask in `unit` cannot be written there; called before the work.
 
     None of the `inputs`, files or folders, may be overwritten. `overwrite` says whether files of other origin may be
-    replaced, `probability` whether a probability map goes beside the mask.
+    replaced, `maps` which of `MAPS` go beside the mask.
     """
     target = Path(path)
     pick_writer(target, unit or "mm")
-    more = [sibling(target, ".json"), sibling(target, ".png"), *([_map_path(target)] if probability else [])]
+    more = [sibling(target, ".json"), sibling(target, ".png"), *(_map_path(target, name) for name in maps)]
     return can_write(target, FORMAT, more=more, inputs=inputs, overwrite=overwrite)
 
 
@@ -152,6 +174,7 @@ def write_mask(
     scan: Field,
     path: str | Path,
     *,
+    sure: Field | None = None,
     like: str | Path | None = None,
     unit: str | None = None,
     record: dict[str, Any] | None = None,
@@ -160,12 +183,14 @@ def write_mask(
     """Write the mask (0 and 1, uint8) or labels, a picture, a record, and the probability where there is one.
 
     The files `mask.nii.gz`, `mask.png`, `mask.json` and `mask_probability.nii.gz` appear together once all are whole;
-    their paths are returned. A former probability is removed.
+    their paths are returned. Former ones of `MAPS` are removed.
 
     Parameters
     ----------
     scan
         The scan, for the picture's grey levels.
+    sure
+        Labels of `Segmentation.keep_sure`, for `mask_sure.nii.gz`.
     like, unit
         The scan's file, and the unit of its lengths, by default its header's. If this file and the target are NIfTI,
         the mask gets the same header but for type and range.
@@ -176,10 +201,13 @@ def write_mask(
     """
     from curvafit.drawing.plot import DPI
 
-    probability = segmentation.probability
+    maps = {
+        name: each.values for name, each in zip(MAPS, (segmentation.probability, sure), strict=True) if each is not None
+    }
     inputs = () if like is None else (like,)
-    target = check_mask_target(path, scan.unit, inputs, overwrite, probability=probability is not None)
-    former = _map_path(target).name in FORMAT.companions(target)
+    target = check_mask_target(path, scan.unit, inputs, overwrite, maps=list(maps))
+    listed = FORMAT.companions(target)
+    former = [place for name in MAPS if name not in maps and (place := _map_path(target, name)).name in listed]
 
     def write(values: np.ndarray, place: Path) -> Path:
         if like is not None and all(str(each).lower().endswith(_NIFTI) for each in (like, target)):
@@ -196,14 +224,13 @@ def write_mask(
         rows = [(scan.values, None), (scan.values, mask) if labels is None else (labels.values, None)]
         _figure(rows, segmentation).savefig(picture, dpi=DPI)
         parts = [temporary, picture, note]
-        if probability is not None:
-            parts.append(write(probability.values, _map_path(temporary)))
+        parts += [write(values, _map_path(temporary, name)) for name, values in maps.items()]
         content = {**_record(segmentation, scan, record or {}), "files": [part.name for part in parts]}
         FORMAT.write(note, content)
         with hold_signals():
             files = move_together(parts, target.parent)
-            if former and probability is None:
-                remove(_map_path(target))
+            for place in former:
+                remove(place)
         return files
 
 
@@ -224,9 +251,9 @@ def _figure(rows: list[tuple[np.ndarray, np.ndarray | None]], segmentation: Segm
     return section_figure([*rows, (unsure, mask.values)], mask.spacing, places)
 
 
-def _map_path(target: Path) -> Path:
-    """Return `mask_probability.nii.gz` for `mask.nii.gz`."""
-    return sibling(target, f"_probability{target.name.removeprefix(sibling(target, '').name)}")
+def _map_path(target: Path, name: str) -> Path:
+    """Return `mask_probability.nii.gz` for `mask.nii.gz` and `probability`."""
+    return sibling(target, f"_{name}{target.name.removeprefix(sibling(target, '').name)}")
 
 
 def _record(segmentation: Segmentation, scan: Field, more: dict[str, Any]) -> dict[str, Any]:

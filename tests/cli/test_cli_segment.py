@@ -175,6 +175,33 @@ def test_reconstruct_writes_what_is_uncertain(tmp_path: Path) -> None:
     refused(call(*told[:-1], tmp_path / "other.npy", "--suggest", 16), "slices")
 
 
+def test_reconstruct_writes_labels_to_train_with(oblique: Path, tmp_path: Path) -> None:
+    """Beside the mask, with its header to the bit, until it is filled again without them."""
+    labels, target = tmp_path / "labels.nii.gz", tmp_path / "out" / "volume.nii.gz"
+    header = nibabel.load(oblique).header.copy()
+    header.set_slope_inter(1, 0)  # type: ignore[attr-defined]
+    nibabel.save(nibabel.Nifti1Image(ball().astype(np.uint8).T, None, header), labels)
+    told = ("reconstruct", labels, "--every", 4, "-o", target)
+    result = call(*told, "--sure", 0.9)
+    assert result.exit_code == 0, (result.output, result.exception)
+    place = target.with_name("volume_sure.nii.gz")
+    sure, mask, chances = (np.asanyarray(nibabel.load(each).dataobj).T for each in  # type: ignore[attr-defined]
+                           (place, target, target.with_name("volume_probability.nii.gz")))  # fmt: skip
+    assert sure.dtype == np.uint8 and np.array_equal(sure[::4], ball()[::4])
+    assert np.array_equal(sure == 2, (chances < 0.9) & (chances > 1 - np.float32(0.9)))
+    assert np.array_equal(sure[sure < 2], mask[sure < 2]) and (sure == 2).any()
+    one, other = (nibabel.load(each).header for each in (labels, place))
+    assert all(one[name].tobytes() == other[name].tobytes() for name in KEPT)  # type: ignore[index]
+    record = json.loads((target.parent / "volume.json").read_text())
+    assert record["sure"] == 0.9 and place.name in record["files"]
+    assert "label to ignore, 2" in " ".join(result.stdout.split()) and str(place) in result.stdout
+    assert call(*told).exit_code == 0 and not place.exists()
+    (tmp_path / "other_sure.npy").write_text("mine")
+    refused(call(*told[:-1], tmp_path / "other.npy", "--sure", 0.9), "free")
+    refused(call(*told[:-1], tmp_path / "new.npy", "--sure", 0.4), "sure")
+    assert not list(tmp_path.glob("new*"))
+
+
 def test_a_picture_shows_the_slices(oblique: Path, tmp_path: Path) -> None:
     from matplotlib.image import imread
 

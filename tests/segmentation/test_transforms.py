@@ -1,0 +1,138 @@
+"""MONAI's transform that fills a label, in MONAI's own chains and caches."""
+
+from __future__ import annotations
+
+import sys
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import nibabel
+import numpy as np
+import pytest
+import torch
+
+from curvafit.segmentation.reconstruct import reconstruct, reconstruct_labels
+from curvafit.volumes.field import Field
+
+pytest.importorskip("monai", reason="needs monai, of the extra [dev]")
+
+from monai.data import CacheDataset, DataLoader, MetaTensor
+from monai.transforms import Compose, EnsureChannelFirstd, LoadImaged, RandSpatialCropd
+
+from curvafit.segmentation import FillSlicesd
+
+pytestmark = pytest.mark.filterwarnings("ignore:NvImgCodecPydicomReader")  # MONAI misses a reader of DICOM
+
+SPACING = (0.5, 0.25, 0.25)
+
+
+def organelles(length: int = 13) -> np.ndarray:
+    """Two tubes along z that lean towards each other, labels 2 and 7; slices other than every sixth are empty."""
+    z, y, x = np.indices((length, 24, 32))
+    one, other = (np.hypot(y - 12, x - at) < 5 for at in (7 + z / 8, 25 - z / 8))
+    labels = np.where(one, 2, np.where(other, 7, 0)).astype(np.uint8)
+    labels[z % 6 != 0] = 0
+    return labels
+
+
+@cache
+def filled(roll: int = 0) -> Any:
+    """The organelles, moved by some slices, as `reconstruct_labels` fills them."""
+    return reconstruct_labels(Field(np.roll(organelles(), roll, axis=0), SPACING), every=6, first=roll)
+
+
+def tensor(labels: np.ndarray) -> MetaTensor:
+    affine = torch.diag(torch.tensor([*SPACING, 1.0], dtype=torch.float64))
+    affine[:3, 3] = torch.tensor([3.0, -2.0, 7.0])
+    return MetaTensor(torch.from_numpy(labels)[None].float(), affine=affine)
+
+
+def test_a_nifti_file_is_filled_in_monai_s_chain_and_stays_where_it_is(tmp_path: Path) -> None:
+    labels = organelles()
+    affine = np.array([[0, -0.25, 0, 5], [0.25, 0, 0, -3], [0, 0, 0.5, 2], [0, 0, 0, 1]])
+    nibabel.save(nibabel.Nifti1Image(labels.T, affine), tmp_path / "labels.nii.gz")
+    read = [LoadImaged("label", reader="NibabelReader"), EnsureChannelFirstd("label")]
+    chain = Compose([*read, FillSlicesd("label", every=6, axis=2)])
+    given, found = (
+        Compose(steps)({"label": tmp_path / "labels.nii.gz"})["label"] for steps in (read, chain.transforms)
+    )
+    assert isinstance(found, MetaTensor) and found.dtype == given.dtype == torch.float32
+    assert torch.equal(found.affine, given.affine) and np.allclose(found.affine, affine)
+    assert found.meta["filename_or_obj"] == given.meta["filename_or_obj"]
+    wanted = reconstruct_labels(Field(labels.T, SPACING[::-1]), every=6, axis=2).labels
+    assert wanted is not None and (wanted.values[..., 3] > 0).any() and not labels[3].any()
+    assert np.array_equal(found[0].numpy(), wanted.values)
+    assert np.array_equal(given[0].numpy().T, labels)  # what was given is not changed
+
+
+def test_slices_may_be_named_or_annotated_in_part() -> None:
+    labels = organelles()
+    named = FillSlicesd("label", known=[0, 6, 12])({"label": tensor(labels)})["label"]
+    labels[np.arange(13) % 6 != 0] = 9
+    ignoring = FillSlicesd("label", ignore=9)({"label": tensor(labels)})["label"]
+    moved = np.roll(organelles(), 2, axis=0)
+    later = FillSlicesd("label", every=6, first=2)({"label": tensor(moved)})["label"]
+    wanted = filled().labels.values
+    assert all(np.array_equal(found[0].numpy(), wanted) for found in (named, ignoring))
+    assert np.array_equal(later[0].numpy(), filled(2).labels.values)
+
+
+def test_targets_are_soft_or_sure() -> None:
+    labels = organelles()
+    soft = FillSlicesd("label", every=6, soft=True)({"label": tensor(labels)})["label"]
+    assert isinstance(soft, MetaTensor) and soft.dtype == torch.float32
+    wanted = reconstruct(Field(labels, SPACING), every=6).probability
+    assert wanted is not None and np.array_equal(soft[0].numpy(), wanted.values)
+    sure = FillSlicesd("label", every=6, sure=0.8, ignored=11)({"label": tensor(labels)})["label"]
+    assert isinstance(sure, MetaTensor) and set(np.unique(sure)) == {0, 2, 7, 11}
+    assert np.array_equal(sure[0].numpy(), filled().keep_sure(0.8, 11).values)
+
+
+def test_arrays_and_tensors_stay_what_they_are() -> None:
+    mask = (organelles() == 2)[None]
+    one = FillSlicesd("label", every=6)({"label": mask, "image": 1})
+    other = FillSlicesd("label", every=6)({"label": torch.from_numpy(mask)})["label"]
+    assert isinstance(one["label"], np.ndarray) and one["image"] == 1 and type(other) is torch.Tensor
+    assert one["label"].dtype == np.uint8 and np.array_equal(one["label"], other) and one["label"][0, 3].any()
+    assert FillSlicesd(["label", "none"], every=6, allow_missing_keys=True)({"label": mask}).keys() == {"label"}
+
+
+def test_a_cache_fills_once_and_a_loader_makes_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+    step = FillSlicesd("label", every=6)
+    monkeypatch.setattr(FillSlicesd, "_fill", lambda self, label, spacing: calls.append(1) or label[0])
+    chain = Compose([step, RandSpatialCropd("label", 8, random_size=False)])
+    data = CacheDataset([{"label": tensor(organelles())}], chain, num_workers=0, progress=False)
+    for _ in range(3):
+        (batch,) = DataLoader(data)
+    assert calls == [1] and batch["label"].shape == (1, 1, 8, 8, 8)
+
+
+@pytest.mark.parametrize(
+    ("label", "word"),
+    [
+        (np.zeros((24, 24, 24)), "channel"),
+        (np.zeros((2, 24, 24, 24)), "channel"),
+        (np.zeros((1, 24, 24, 24)), "other than 0"),
+        (np.random.default_rng(0).random((1, 24, 24, 24)), "whole numbers"),
+    ],
+)
+def test_what_is_no_label_is_refused(label: np.ndarray, word: str) -> None:
+    with pytest.raises(ValueError, match=word):
+        FillSlicesd("label", every=6)({"label": label})
+
+
+def test_soft_and_sure_exclude_each_other() -> None:
+    with pytest.raises(ValueError, match="soft"):
+        FillSlicesd("label", every=6, soft=True, sure=0.9)
+
+
+def test_without_monai_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    import curvafit.segmentation
+
+    monkeypatch.delitem(sys.modules, "curvafit.segmentation.transforms")
+    monkeypatch.delitem(curvafit.segmentation.__dict__, "FillSlicesd")
+    monkeypatch.setitem(sys.modules, "monai.transforms.transform", None)  # type: ignore[arg-type]
+    with pytest.raises(ImportError, match="pip install monai"):
+        _ = curvafit.segmentation.FillSlicesd
