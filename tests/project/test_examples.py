@@ -179,3 +179,13 @@ def test_willmore(script, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> No
     assert [numbers(row.split(")")[1])[1] for row in rows] == pytest.approx([16 * np.pi] * 3, rel=0.09)
     assert numbers(area)[0] == pytest.approx(4 * np.pi * 0.66**2, rel=0.1)
     assert (tmp_path / "sphere.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_pictures_of_filling(script, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    helps = script("helps")
+    truth, mask = np.array([[True, True, False, False]]), np.array([[True, False, True, False]])
+    assert helps.colours(mask, truth).tolist() == [[[*helps.SHARED], [*helps.MISSING], [*helps.EXCESS], [1, 1, 1]]]
+    monkeypatch.setattr(sys, "argv", ["helps", "--small", "-o", str(tmp_path)])
+    helps.main()
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"helps_better.png", "helps_equal.png", "helps_not.png", "filled.png"}
