@@ -44,13 +44,17 @@ def split(values: np.ndarray) -> np.ndarray:
     return values > threshold_otsu(values)
 
 
-def walked(values: np.ndarray, beta: float) -> np.ndarray:
-    """Return skimage's random walker's mask, from seeds where smoothed levels are within a quarter of the means."""
+def level_seeds(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return where smoothed levels are within a quarter of the bright mean, and of the dark one."""
     smooth = ndimage.gaussian_filter(values, 1.0)
     bright = split(smooth)
     low, high = float(smooth[~bright].mean()), float(smooth[bright].mean())
-    edge = (high - low) / 4
-    seeds = np.where(smooth > high - edge, 1, np.where(smooth < low + edge, 2, 0))
+    return smooth > high - (high - low) / 4, smooth < low + (high - low) / 4
+
+
+def walked(values: np.ndarray, inside: np.ndarray, outside: np.ndarray, beta: float) -> np.ndarray:
+    """Return skimage's random walker's mask, from seeds inside and outside."""
+    seeds = np.where(inside, 1, np.where(outside, 2, 0))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of probabilities a little beyond [0, 1]
         return random_walker(values, seeds, beta=beta, mode="cg_j", tol=1e-3) == 1
@@ -69,7 +73,7 @@ def case(way: str, law: str, seed: int, noise: float, cases: Cases) -> Values:
     elif way == "TV":
         mask = best((split(denoise_tv_chambolle(values, weight=weight)) for weight in WEIGHTS), truth)
     elif way == "walker":
-        mask = best((walked(values, beta) for beta in BETAS), truth)
+        mask = best((walked(values, *level_seeds(values), beta) for beta in BETAS), truth)
     else:
         prior = Coefficients.willmore() if way == "Willmore" else fitted(law, seed + 1, cases)
         found = segment(Field(values, (1.0, 1.0, 1.0)), prior)

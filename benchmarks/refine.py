@@ -11,16 +11,15 @@ Chosen on target 2, reported on target 4.
 from __future__ import annotations
 
 import argparse
-import warnings
 from itertools import product
 
 import numpy as np
 from scipy import ndimage
 from skimage.restoration import denoise_tv_chambolle
-from skimage.segmentation import random_walker
 
 from benchmarks.completion import EDGE, fitted, shape
 from benchmarks.harness import Cases, Figure, Values, best, scores, show
+from benchmarks.noise import walked
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.refine import refine
 
@@ -60,14 +59,6 @@ def probabilities(law: str, seed: int, trained: int, cases: Cases) -> np.ndarray
     return cases.array(f"p-{law}-{seed}-{trained}", make).astype(np.float32)
 
 
-def walked(p: np.ndarray, beta: float) -> np.ndarray:
-    """Return skimage's random walker's mask, from seeds where p is sure."""
-    seeds = np.where(p > 1 - SURE, 1, np.where(p < SURE, 2, 0))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # of probabilities a little beyond [0, 1]
-        return random_walker(p, seeds, beta=beta, mode="cg_j", tol=1e-3) == 1
-
-
 def way_case(way: str, law: str, seed: int, cases: Cases) -> Values:
     """Return the scores of a way; the example has the next seed, and the network learns from the one after."""
     p, truth, status = probabilities(law, seed, seed + 2, cases), shape(law, seed, cases), ""
@@ -78,7 +69,7 @@ def way_case(way: str, law: str, seed: int, cases: Cases) -> Values:
     elif way == "TV":
         mask = best((denoise_tv_chambolle(p, weight) > 0.5 for weight in WEIGHTS), truth)
     elif way == "walker":
-        mask = best((walked(p, beta) for beta in BETAS), truth)
+        mask = best((walked(p, p > 1 - SURE, p < SURE, beta) for beta in BETAS), truth)
     else:
         prior = Coefficients.willmore() if way == "Willmore" else fitted(law, seed + 1, cases)
         other = shape(law, seed + 1, cases).astype(np.uint8)
