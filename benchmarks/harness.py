@@ -13,8 +13,10 @@ from __future__ import annotations
 import ast
 import hashlib
 import json
+import os
 import re
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
@@ -148,6 +150,15 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     temporary = path.with_name(f".partial-{path.name}")
     write(temporary)
     temporary.replace(path)
+
+
+def run_python(*words: object, **environment: str) -> str:
+    """Return what Python prints in a process of its own; if it fails, end with its errors."""
+    command, more = [sys.executable, *map(str, words)], os.environ | environment
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=more)
+    if done.returncode:
+        raise SystemExit(done.stderr)
+    return done.stdout
 
 
 def _short(value: Any) -> str:

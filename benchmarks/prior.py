@@ -7,15 +7,13 @@ target, in float32 fields of their size, in a process of its own. Needs monai.
 from __future__ import annotations
 
 import argparse
-import subprocess
-import sys
 from collections.abc import Callable
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.harness import Cases, Figure, Values, bootstrap, in_turns, show
+from benchmarks.harness import Cases, Figure, Values, bootstrap, in_turns, run_python, show
 from curvafit.priors import CombinedLoss, CurvaturePrior, Grid
 from curvafit.priors.stencils import gaussian_blur
 
@@ -92,8 +90,7 @@ print((most() - now) / (4 * logits.numel()))
 
 
 def memory(edge: int) -> Values:
-    done = subprocess.run([sys.executable, "-c", MEMORY, str(edge)], capture_output=True, text=True, check=True)
-    return {"fields": float(done.stdout)}
+    return {"fields": float(run_python("-c", MEMORY, edge))}
 
 
 def options(parser: argparse.ArgumentParser) -> None:

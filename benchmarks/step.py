@@ -10,15 +10,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import subprocess
-import sys
 import tracemalloc
 
 import numpy as np
 import torch
 
-from benchmarks.harness import Cases, Figure, in_turns, show
+from benchmarks.harness import Cases, Figure, in_turns, run_python, show
 from curvafit.generation.forms import DivergenceForm, white_noise
 from curvafit.generation.schedule import SCHEDULES
 from curvafit.generation.stepper import ADAM_EPS, TorchStepper
@@ -88,12 +85,7 @@ def measure(size: int, rounds: int) -> dict[str, float]:
 def apart(size: int, rounds: int, allocator: str) -> dict[str, float]:
     """Measure in a process of its own, under an allocator."""
     script = f"import json; from benchmarks.step import measure; print(json.dumps(measure({size}, {rounds})))"
-    done = subprocess.run(
-        [sys.executable, "-c", script], env=os.environ | ALLOCATORS[allocator], capture_output=True, text=True
-    )
-    if done.returncode:
-        raise SystemExit(done.stderr)
-    return json.loads(done.stdout.splitlines()[-1])
+    return json.loads(run_python("-c", script, **ALLOCATORS[allocator]).splitlines()[-1])
 
 
 def options(parser: argparse.ArgumentParser) -> None:

@@ -8,16 +8,13 @@ by the command line with 1 worker, then extended by 2, each in a process of its 
 from __future__ import annotations
 
 import argparse
-import os
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import torch
 from torch.utils.data import DataLoader
 
-from benchmarks.harness import Cases, Figure, Values, show
+from benchmarks.harness import Cases, Figure, Values, run_python, show
 from curvafit.data_synth import TextureDataset, as_dict, modality
 
 MODALITIES = ("micro-ct", "em-membrane", "confocal", "light-sheet", "mra", "two-photon")
@@ -25,12 +22,8 @@ MODALITIES = ("micro-ct", "em-membrane", "confocal", "light-sheet", "mra", "two-
 
 def building(store: Path, edge: int, count: int, workers: int) -> Values:
     """Build a store, and return shapes an hour."""
-    options = ["--count", str(count), "--shape", str(edge), "--workers", str(workers)]
-    command = [sys.executable, "-m", "curvafit", "atlas", "build", str(store), *options]
-    begun = time.perf_counter()
-    done = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
-    if done.returncode:
-        raise SystemExit(done.stderr)
+    options, begun = ["--count", count, "--shape", edge, "--workers", workers], time.perf_counter()
+    run_python("-m", "curvafit", "atlas", "build", store, *options, OMP_NUM_THREADS="1")
     return {"shapes an hour": 3600 * count / (time.perf_counter() - begun)}
 
 

@@ -12,15 +12,12 @@ slice known, the law the true one, not tried out.
 from __future__ import annotations
 
 import argparse
-import subprocess
-import sys
 import time
-from pathlib import Path
 
 import numpy as np
 
 from benchmarks.completion import EDGE, shape
-from benchmarks.harness import Cases, Figure, Values, dice, show
+from benchmarks.harness import Cases, Figure, Values, dice, run_python, show
 from curvafit.segmentation.reconstruct import STIFFNESS, reconstruct
 
 EVERY, WHOLE, CORE = 8, 88, 32
@@ -61,12 +58,9 @@ def timed(law: str, edge: int, workers: int, cases: Cases) -> Values:
     source = cases.folder / f"volume-{law}-{edge}.npy"
     np.save(source, volume(law, edge, cases))
     options = f"--every {EVERY} --prior {law} --workers {workers} --overwrite --stiffness {STIFFNESS}".split()
-    command = [sys.executable, "-c", PROGRAM, "reconstruct", str(source), *options, "-o", str(Path(f"{source}.zarr"))]
     begun = time.monotonic()
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise SystemExit(done.stderr)
-    own, worker = (int(n) * 1024 / 1e9 for n in done.stdout.strip().splitlines()[-1].split())
+    said = run_python("-c", PROGRAM, "reconstruct", source, *options, "-o", f"{source}.zarr")
+    own, worker = (int(n) * 1024 / 1e9 for n in said.strip().splitlines()[-1].split())
     return {"seconds": time.monotonic() - begun, "GB": own, "worker's GB": worker}
 
 
