@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import nibabel
@@ -12,6 +13,8 @@ import pytest
 from calling import call, refused
 from found import made_fit
 
+import curvafit.segmentation
+from curvafit.segmentation.filler import FILLER_FILE
 from curvafit.volumes.field import Field
 from curvafit.volumes.read import load
 from curvafit.volumes.write import save
@@ -244,6 +247,63 @@ def test_wrong_input_is_a_sentence(arguments, word, oblique, tmp_path, monkeypat
     last = result.stderr.strip().splitlines()[-1]
     assert last.startswith("error: ") and word in last
     assert not (tmp_path / "m.nii.gz").exists() and not list(tmp_path.glob(".m*"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        ("ball.nii --example coarse.nii", "spacing"),
+        ("ball.nii --example other.nii", "spacing"),
+        ("ball.nii --labels all --example coarse.nii", "spacing"),
+        ("ball.nii --filler version.npz", "version 2"),
+        ("ball.nii --labels all --filler version.npz", "version 2"),
+        ("ball.nii --filler cut.npz", "truncated"),
+        ("ball.nii --filler arrays.npz", "filler"),
+        ("ball.nii --filler lacks.npz", "slope"),
+        ("ball.nii --filler ball.nii", "something else"),
+        ("many.nii", "256"),
+        ("many.nii --labels all", "256"),
+        ("levels.nii", "whole numbers"),
+        ("empty.nii", "empty"),
+        ("empty.nii --labels all", "other than 0"),
+        ("empty.nii --labels 1", "but not 1"),
+        ("ball.nii -o taken.nii", "free"),
+        ("ball.nii -o noted.nii", "free"),
+        ("ball.nii -o mapped.nii", "free"),
+        ("ball.nii -o ball.nii", "input"),
+    ],
+)
+def test_bad_slices_examples_and_fillers_are_a_sentence(arguments, word, bad_files, monkeypatch) -> None:
+    monkeypatch.chdir(bad_files)
+    before = {path: path.read_bytes() for path in bad_files.iterdir()}
+    words = [*arguments.split(), "--every", 4]
+    refused(call("reconstruct", *(words if "-o" in words else [*words, "-o", "m.nii"])), word, progress=True)
+    assert before == {path: path.read_bytes() for path in bad_files.iterdir()}
+
+
+@pytest.fixture(scope="module")
+def bad_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A mask, and what is not to be had in place of a mask, an example, weights or an output."""
+    folder, mask, draw = tmp_path_factory.mktemp("bad"), ball(), np.random.default_rng(0)
+    emptied = mask.copy()
+    emptied[::4] = False
+    volumes = {
+        "ball": mask, "coarse": mask, "other": mask, "empty": emptied, "grey": grey(),
+        "levels": grey() / np.float32(3), "many": draw.integers(0, 512, mask.shape, dtype=np.int16),
+    }  # fmt: skip
+    for name, values in volumes.items():
+        edge, unit = 0.04 if name == "coarse" else 0.02, "um" if name == "other" else "mm"
+        save(Field(values, (edge,) * 3, unit), folder / f"{name}.nii")
+    packaged = Path(curvafit.segmentation.__file__).parent / "data" / "filler.npz"
+    (folder / "cut.npz").write_bytes(packaged.read_bytes()[:9999])
+    header, arrays = FILLER_FILE.read(packaged)
+    header = {name: header[name] for name in ("width", "card", "error")}
+    replace(FILLER_FILE, version=2).write(folder / "version.npz", header, arrays)
+    FILLER_FILE.write(folder / "lacks.npz", header, {name: arrays[name] for name in arrays if name != "slope"})
+    np.savez(folder / "arrays.npz", slope=np.ones(3))
+    for name in ("taken.nii", "noted.json", "mapped_probability.nii"):
+        (folder / name).write_text("mine")
+    return folder
 
 
 def test_a_part_of_a_file_is_segmented_where_it_was(oblique: Path, tmp_path: Path) -> None:

@@ -101,7 +101,7 @@ COMMANDS: dict[str, Command] = {
     ),
     "reconstruct": Command(
         ("reconstruct", "mask.nii.gz", "--every", "4", *_PRIOR),
-        "every first slices axis example stiffness periodic suggest epsilon steps spacing unit channel label crop",
+        "every first slices axis example stiffness periodic suggest sure epsilon steps spacing unit channel label crop",
         "steps",
         taking("mask.nii.gz"),
         each=5,
