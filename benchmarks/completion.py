@@ -218,7 +218,7 @@ def sides(name: str) -> tuple[Field, Field]:
     """Return the masks of a structure's two sides."""
     structure = STRUCTURES[name]
     folder = Path(os.environ["CURVAFIT_DATA"]) / "scans"
-    volumes = [_mask(load(folder / file, **structure.reading), structure) for file in structure.files]
+    volumes = [mask_of(load(folder / file, **structure.reading), structure) for file in structure.files]
     if len(volumes) == 1:
         (whole,) = volumes
         middle, margin = whole.shape[2] // 2, structure.gap // 2
@@ -227,7 +227,7 @@ def sides(name: str) -> tuple[Field, Field]:
     return volumes[0], volumes[1]
 
 
-def _mask(volume: Field, structure: Structure) -> Field:
+def mask_of(volume: Field, structure: Structure) -> Field:
     """Return the mask of a file; coarser voxels are inside where half of them is."""
     from skimage.filters import threshold_otsu
     from skimage.segmentation import find_boundaries

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -175,27 +175,45 @@ def train_atlas(
 @command(
     "curvafit atlas teach store.zarr -o filler.npz",
     "curvafit atlas teach presets.zarr box.zarr corner.zarr -o filler.npz",
+    "curvafit atlas teach presets.zarr box.zarr corner.zarr --images 160 -o image.npz",
 )
 def teach_filler(
     stores: Annotated[list[Path], typer.Argument(help="Stores made by `curvafit atlas build`, or masks.")],
     out: Annotated[Path, typer.Option("-o", "--output", help="The weights (.npz) to write.")],
-    steps: Annotated[int, typer.Option(help="Steps of teaching, some .4 s each on two cores.", min=1)] = 4500,
+    images: Annotated[
+        int, typer.Option(help="Teach from images of so many shapes, for `reconstruct --image`.", min=0)
+    ] = 0,
+    filler: Annotated[
+        Path | None, typer.Option(help="With --images: the filler to begin with; by default the packaged one.")
+    ] = None,
+    steps: Annotated[
+        int | None, typer.Option(help="Steps of teaching, by default 4500; 1500 with --images.", min=1)
+    ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the teaching.")] = 0,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Teach the network that `reconstruct` fills volumes with. The same command resumes one that was stopped."""
     from curvafit.core.files import remove
-    from curvafit.segmentation.filler import FILLER_FILE
-    from curvafit.segmentation.teach import FEW, load_textures, teach
+    from curvafit.segmentation import teach_image
+    from curvafit.segmentation.filler import FILLER_FILE, Taught
+    from curvafit.segmentation.teach import FEW, STEPS, load_textures, teach
 
-    _check_archive(out, FILLER_FILE, stores, overwrite)
+    if filler is not None and not images:
+        raise ValueError("--filler goes with --images")
+    _check_archive(out, FILLER_FILE, [*stores, *([filler] if filler else [])], overwrite)
     checkpoint = out.with_name(f".{out.name}.curvafit-steps")
     with resumable(), show_stages() as progress:
+        plain = Taught.load(filler) if images else None
         sources, card = load_textures(stores, progress)
         if (count := sum(map(len, sources))) < FEW:
             say_notes([f"{count} shapes teach little: {FEW} or more are better"])
         card["command"] = command_line()
-        taught = teach(sources, card, steps=steps, seed=seed, checkpoint=checkpoint, progress=progress)
+        how: dict[str, Any] = {"seed": seed, "checkpoint": checkpoint, "progress": progress}
+        if plain is None:
+            taught = teach(sources, card, steps=steps or STEPS, **how)
+        else:
+            how |= {"steps": steps or teach_image.STEPS, "volumes": images}
+            taught = teach_image.teach_image(sources, plain, card, **how)
     taught.save(out)
     remove(checkpoint)
     losses = (taught.card[f"held_out_{name}"] for name in ("loss", "cubic"))

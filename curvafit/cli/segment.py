@@ -71,6 +71,7 @@ def segment(
 
 @command(
     "curvafit reconstruct labels.nii.gz --every 8 -o volume.nii.gz",
+    "curvafit reconstruct labels.nii.gz --every 8 --image scan.nii.gz -o volume.nii.gz",
     "curvafit reconstruct labels.nii.gz --every 8 --example whole.nii.gz -o volume.nii.gz",
     "curvafit reconstruct labels.tif --known 0,7,15 --axis x --suggest 3 -o volume.tif",
     "curvafit reconstruct labels.nii.gz --ignore 255 -o volume.nii.gz",
@@ -93,6 +94,7 @@ def reconstruct(
         str | None,
         _what(help="Several structures that exclude each other: all, or their labels, 1,2,5; writes labels."),
     ] = None,
+    image: Annotated[str | None, _what(help="The grey levels of the volume, on the same voxels.")] = None,
     example: Annotated[
         Path | None, _what(help="Mask of another such volume, known whole: it tunes the network for a minute.")
     ] = None,
@@ -137,14 +139,32 @@ def reconstruct(
         alike = {name: reading[name] for name in ("spacing", "unit", "label", "strict")}
         whole = None if example is None else load(example, **alike)
         say_notes(() if whole is None else whole.notes)
-        common = {"example": whole, "filler": filler, "steps": steps, "progress": progress, **tools, **place, **how}
+        seen = None if image is None else load(image, **{name: reading[name] for name in ("spacing", "unit", "crop")})
+        say_notes(() if seen is None else seen.notes)
+        common = {
+            "image": seen,
+            "example": whole,
+            "filler": filler,
+            "steps": steps,
+            "progress": progress,
+            **tools,
+            **place,
+            **how,
+        }
         if labels is None:
             return fill(read_whole(volume), prior, suggest=suggest, **common)
         return reconstruct_labels(read_whole(volume), prior, chosen=several, **common)
 
     record: dict[str, Any] = {"job": "reconstruct", "steps": steps, "tile": tile}
     record |= {"labels": labels} if labels else {}
-    record |= {"example": None if example is None else str(example), **place, **how, "suggest": suggest, "sure": sure}
+    record |= {
+        "image": image,
+        "example": None if example is None else str(example),
+        **place,
+        **how,
+        "suggest": suggest,
+        "sure": sure,
+    }
     record["filler"] = None if filler is None else str(filler)
     run_job(Job(slices, out, prior, reading, record, overwrite, workers), compute)
 
@@ -176,7 +196,7 @@ def run_job(job: Job, compute: Callable[..., Segmentation], read: Callable[..., 
 
     record, reading = job.record, job.reading
     law_file = None if preset_name(job.prior) else job.prior
-    shown = (job.image, *(record.get(name) for name in ("example", "example_probabilities", "filler")))
+    shown = (job.image, *(record.get(name) for name in ("image", "example", "example_probabilities", "filler")))
     options = {"inputs": [file for file in (job.source, law_file, *shown) if file], "overwrite": job.overwrite}
     least = record.get("sure")
     options["maps"] = (["probability"] if record["job"] == "reconstruct" else []) + (["sure"] if least else [])

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,8 @@ RIM = 8
 _DISTANCE, _GAP = 8.0, 16.0
 #: Log-odds of the inside for a pixel of the cubic interpolation, before anything is learnt.
 SLOPE = 0.6
+#: The weight of an image's log-odds before anything is learnt, and where they are cut.
+TRUST, SUREST = 0.7, 8.0
 #: Numbers that tell a height: place in the gap, distance to the nearer end, the gap and a step from slice to slice.
 CONDITIONS = 4
 
@@ -91,11 +93,14 @@ class Gaps:
         Distance from slice to slice (B,), in pixels.
     marks
         What is known in the slices to fill (B, n, Y, X): 1 inside, -1 outside, 0 not known.
+    evidence
+        What an image says of the slices to fill, as log-odds (B, n, Y, X); None without an image.
     """
 
     distances: Tensor
     step: Tensor
     marks: Tensor
+    evidence: Tensor | None = None
 
     @property
     def heights(self) -> Tensor:
@@ -137,22 +142,28 @@ def interpolate(distances: Tensor, heights: Tensor) -> tuple[Tensor, Tensor]:
 class Filler(nn.Module):
     """The network: an encoder of the four slices, once a gap; a decoder, once a height; and a pass through the gap.
 
-    The cubic interpolation, times `SLOPE`, is added at the end: what is learnt is how log-odds differ from it.
+    The cubic interpolation, times `SLOPE`, is added at the end, and the evidence of an image, times `TRUST`: what is
+    learnt is how log-odds differ from that.
     """
 
-    def __init__(self, width: int = 16) -> None:
+    def __init__(self, width: int = 16, *, image: bool = False) -> None:
         super().__init__()
         c = check_int(width, "a width of the filler", 1, 256)
-        self.width, hidden = c, 32
+        self.width, self.image, hidden = c, image, 32
         self.fine, self.middle, self.coarse = Block(4, c), Block(c, 2 * c), Block(2 * c, 4 * c)
         self.condition = nn.Sequential(nn.Linear(CONDITIONS, hidden), nn.SiLU(), nn.Linear(hidden, hidden), nn.SiLU())
         self.deep = Block(4 * c, 4 * c, hidden)
         self.to_middle, self.up_middle = nn.Conv2d(4 * c, 2 * c, 1), Block(2 * c, 2 * c, hidden, skips=2 * c)
-        self.to_fine, self.up_fine = nn.Conv2d(2 * c, c, 1), Block(c + 4, c, hidden, skips=c)
+        self.to_fine, self.up_fine = nn.Conv2d(2 * c, c, 1), Block(c + 4 + image, c, hidden, skips=c)
         self.out = nn.Conv2d(c, 1, 1)
         self.slope = nn.Parameter(torch.tensor(SLOPE))
+        self.trust = nn.Parameter(torch.tensor(TRUST)) if image else None
         self.through = nn.Sequential(
-            nn.Conv3d(2, 8, 3, padding=1), nn.SiLU(), nn.Conv3d(8, 8, 3, padding=1), nn.SiLU(), nn.Conv3d(8, 1, 1)
+            nn.Conv3d(2 + image, 8, 3, padding=1),
+            nn.SiLU(),
+            nn.Conv3d(8, 8, 3, padding=1),
+            nn.SiLU(),
+            nn.Conv3d(8, 1, 1),
         )
         for last in (self.out, self.through[-1]):
             nn.init.zeros_(last.weight)  # type: ignore[arg-type]
@@ -160,6 +171,18 @@ class Filler(nn.Module):
         for part in self.modules():
             if isinstance(part, nn.Conv2d):
                 part.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+    @classmethod
+    def with_image(cls, plain: Filler) -> Filler:
+        """Return a filler that takes the evidence of an image, and without it knows what a plain one knows."""
+        filler, known = cls(plain.width, image=True), plain.state_dict()
+        state = filler.state_dict()
+        for name, values in state.items():
+            if name in known:
+                wider = [(0, n - m) for n, m in zip(values.shape, known[name].shape, strict=True)]
+                state[name] = F.pad(known[name], [n for pair in reversed(wider) for n in pair])
+        filler.load_state_dict(state)
+        return filler
 
     def forward(self, gaps: Gaps, drop: int = 0) -> Tensor:
         """Return the log-odds of the inside (B, n, Y - 2 drop, X - 2 drop) in the slices to fill.
@@ -172,19 +195,27 @@ class Filler(nn.Module):
         coarse = self.coarse(F.avg_pool2d(middle, 2))
         condition = self.condition(gaps.conditions)
         x = _trim(self.deep(coarse.repeat_interleave(n, 0), condition), (drop - 2 * rim) // 4)
-        x = self.up_middle(_double(self.to_middle(x)), condition, _trim(middle, (drop - 2 * rim) // 2))
+        x = self.up_middle(double(self.to_middle(x)), condition, _trim(middle, (drop - 2 * rim) // 2))
         x = _trim(x, rim // 2)
         distances, marks = _trim(gaps.distances, drop - rim), _trim(gaps.marks, drop - rim)
         linear, cubic = interpolate(distances, gaps.heights)
-        hints = torch.stack([linear / _DISTANCE, cubic / _DISTANCE, marks, marks.abs()], dim=2).flatten(0, 1)
-        x = torch.cat([_double(self.to_fine(x)), hints], dim=1)
+        hints = [linear / _DISTANCE, cubic / _DISTANCE, marks, marks.abs()]
+        seen = None if gaps.evidence is None else _trim(gaps.evidence, drop - rim).clamp(-SUREST, SUREST)
+        if seen is not None:
+            hints.append(seen / _DISTANCE)
+        x = torch.cat([double(self.to_fine(x)), torch.stack(hints, dim=2).flatten(0, 1)], dim=1)
         x = self.up_fine(x, condition, _trim(fine, drop - rim))
         logits = self.out(x).unflatten(0, (-1, n))[:, :, 0] + self.slope * cubic
+        if seen is not None and self.trust is not None:
+            logits = logits + self.trust * seen
         ends = self.slope * distances[:, 1:3]
         stack = torch.cat([ends[:, :1], logits, ends[:, 1:]], dim=1) / _DISTANCE
         known = torch.ones_like(stack)
         known[:, 1:-1] = marks.abs()
-        return _trim(logits + self.through(torch.stack([stack, known], dim=1))[:, 0, 1:-1], rim)
+        volumes = [stack, known]
+        if seen is not None:
+            volumes.append(F.pad(seen / _DISTANCE, (0, 0, 0, 0, 1, 1)))
+        return _trim(logits + self.through(torch.stack(volumes, dim=1))[:, 0, 1:-1], rim)
 
 
 def _trim(x: Tensor, pixels: int) -> Tensor:
@@ -192,7 +223,8 @@ def _trim(x: Tensor, pixels: int) -> Tensor:
     return x[..., pixels : x.shape[-2] - pixels, pixels : x.shape[-1] - pixels]
 
 
-def _double(x: Tensor) -> Tensor:
+def double(x: Tensor) -> Tensor:
+    """Return features (N, C, Y, X) at twice the pixels."""
     return F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
 
 
@@ -204,14 +236,24 @@ THICKNESS, LONG = (3.0, 16.0), 12.0
 TILE = 256
 
 
-def fill(slices: Slices, taught: Taught, *, careful: bool = False, progress: Progress = silent) -> np.ndarray:
+def fill(
+    slices: Slices,
+    taught: Taught,
+    *,
+    evidence: np.ndarray | None = None,
+    careful: bool = False,
+    progress: Progress = silent,
+) -> np.ndarray:
     """Return calibrated log-odds of the inside of a volume between known slices, float32 (length, Y, X).
 
     In known slices, and in those before the first and beyond the last, they are `SLOPE` times the signed distance in
-    pixels from the outline in the nearest known slice.
+    pixels from the outline in the nearest known slice; with an image, slices before the first and beyond the last have
+    its evidence.
 
     Parameters
     ----------
+    evidence
+        What an image says, as log-odds (length, Y, X), if the filler was taught with images.
     careful
         Whether the results of all eight mirror images are averaged: eight times as long.
     progress
@@ -221,6 +263,9 @@ def fill(slices: Slices, taught: Taught, *, careful: bool = False, progress: Pro
     known = [raster.distances(mask) for mask in slices.inside]
     logits = (SLOPE / raster.pixel) * slices.level("nearest")
     places, count = list(slices.places), len(slices.places)
+    if evidence is not None and not slices.periodic:
+        for outer in (slice(0, places[0]), slice(places[-1] + 1, None)):
+            logits[outer] = evidence[outer]
     gaps = [(k, (places[(k + 1) % count] - places[k]) % slices.length) for k in range(count - (not slices.periodic))]
     for number, (k, gap) in enumerate(gaps):
         progress("filling the gaps", number / len(gaps))
@@ -232,7 +277,8 @@ def fill(slices: Slices, taught: Taught, *, careful: bool = False, progress: Pro
         step = slices.spacing[0] / raster.pixel
         numbers = np.arange(places[k] + 1, places[k] + gap) % slices.length
         marks = None if slices.marks is None else raster.marks(slices.marks[numbers])
-        inside = _fill_gap(taught.filler, stack, marks, gap - 1, step, careful) / taught.temperature(gap * step)
+        read = None if evidence is None else np.stack([raster.spread(plane) for plane in evidence[numbers]])
+        inside = _fill_gap(taught.filler, stack, marks, read, gap - 1, step, careful) / taught.temperature(gap * step)
         logits[numbers] = raster.to_slices(inside)
     progress("filling the gaps", 1.0)
     return logits
@@ -270,15 +316,28 @@ class Raster:
 
         The outlines are continued by `REACH` pixels on each side: the shape is `size` + 2 `REACH`.
         """
+        margins = self._margins
+        signed = centre_distance(np.pad(mask, margins, mode="edge"), self.edges, FAR * self.pixel) / self.pixel
+        return self._resample(signed, margins)
+
+    def spread(self, plane: np.ndarray) -> np.ndarray:
+        """Return a plane (Y, X) in pixels, float32; its border is continued as that of `distances`."""
+        margins = self._margins
+        return self._resample(np.pad(plane, margins, mode="edge"), margins)
+
+    @property
+    def _margins(self) -> list[tuple[int, int]]:
+        """Voxels before and beyond a slice, along both axes, that cover the margin."""
         before = [math.ceil(REACH / h) for h in self.scale]
         beyond = [math.ceil((m + REACH) / h) - n for n, m, h in zip(self.shape, self.size, self.scale, strict=True)]
-        padded = np.pad(mask, list(zip(before, beyond, strict=True)), mode="edge")
-        signed = centre_distance(padded, self.edges, FAR * self.pixel) / self.pixel
+        return list(zip(before, beyond, strict=True))
+
+    def _resample(self, plane: np.ndarray, margins: list[tuple[int, int]]) -> np.ndarray:
+        """Return a plane with margins in pixels, `size` + 2 `REACH`."""
         if self.scale == (1.0, 1.0):
-            return signed
-        start = [n - REACH / h for n, h in zip(before, self.scale, strict=True)]
-        shape = [m + 2 * REACH for m in self.size]
-        return _sample(signed, shape, [1 / h for h in self.scale], start)
+            return plane
+        start = [before - REACH / h for (before, _), h in zip(margins, self.scale, strict=True)]
+        return _sample(plane, [m + 2 * REACH for m in self.size], [1 / h for h in self.scale], start)
 
     def marks(self, marks: np.ndarray) -> np.ndarray:
         """Return marks (n, Y, X) in pixels, float32, 0 in the margin."""
@@ -313,7 +372,13 @@ def plane_thickness(masks: np.ndarray, edges: Sequence[float]) -> float:
 
 @torch.inference_mode()
 def _fill_gap(
-    filler: Filler, known: np.ndarray, marks: np.ndarray | None, count: int, step: float, careful: bool
+    filler: Filler,
+    known: np.ndarray,
+    marks: np.ndarray | None,
+    evidence: np.ndarray | None,
+    count: int,
+    step: float,
+    careful: bool,
 ) -> np.ndarray:
     """Return the log-odds (count, Y, X) in the slices of a gap whose four known slices have distances (4, Y', X').
 
@@ -325,12 +390,15 @@ def _fill_gap(
     told = torch.zeros(1, count, *known.shape[1:])
     if marks is not None:
         told, near = torch.from_numpy(marks)[None], torch.ones_like(near)
+    read = None
+    if evidence is not None:
+        read, near = torch.from_numpy(np.ascontiguousarray(evidence))[None], torch.ones_like(near)
     logits = SLOPE * interpolate(_trim(distances, REACH)[None], heights_between(count))[0][0]
     for y, x in product(*(range(0, n, TILE) for n in near.shape)):
         core = (slice(y, y + TILE), slice(x, x + TILE))
         if near[core].any():
             seen = (..., slice(y, y + TILE + 2 * REACH), slice(x, x + TILE + 2 * REACH))
-            gaps = Gaps(distances[seen][None], torch.tensor([step]), told[seen])
+            gaps = Gaps(distances[seen][None], torch.tensor([step]), told[seen], None if read is None else read[seen])
             mirrors = product((False, True), repeat=3) if careful else [(False, False, False)]
             found = torch.stack([_fill_mirrored(filler, gaps, *axes) for axes in mirrors]).mean(0)[0]
             logits[:, *core] = torch.where(near[core], found, logits[:, *core])
@@ -340,7 +408,8 @@ def _fill_gap(
 def _fill_mirrored(filler: Filler, gaps: Gaps, z: bool, y: bool, x: bool) -> Tensor:
     """Return the log-odds of gaps that are mirrored along some axes, filled and mirrored back."""
     axes = [axis for axis, flip in ((1, z), (2, y), (3, x)) if flip]
-    mirrored = Gaps(gaps.distances.flip(axes), gaps.step, gaps.marks.flip(axes))
+    evidence = None if gaps.evidence is None else gaps.evidence.flip(axes)
+    mirrored = Gaps(gaps.distances.flip(axes), gaps.step, gaps.marks.flip(axes), evidence)
     return filler(mirrored, REACH).flip(axes)
 
 
@@ -376,20 +445,24 @@ class Taught:
     def save(self, path: str | Path) -> None:
         """Write weights and card as one `.npz`; nothing in it runs when it is read."""
         arrays = {name: value.numpy() for name, value in self.filler.state_dict().items()}
-        header = {"width": self.filler.width, "card": self.card, "error": self.error}
+        header = {"width": self.filler.width, "image": self.filler.image, "card": self.card, "error": self.error}
         FILLER_FILE.write(path, header, {"temperatures": self.temperatures, **arrays})
 
     @classmethod
-    def load(cls, path: str | Path | None = None) -> Taught:
-        """Read a filler, by default the packaged one.
+    def load(cls, path: str | Path | None = None, *, image: bool = False) -> Taught:
+        """Read a filler, by default a packaged one: without images, or for the evidence of an image.
 
-        Raises FileNotFoundError if there is no such file, and ValueError if it is something else, is damaged or of
-        another version.
+        Raises FileNotFoundError if there is no such file, and ValueError if it is something else, is damaged, of
+        another version or not for what is asked.
         """
         if path is None:
-            packaged = open_packaged("segmentation", "filler.npz")
+            packaged = open_packaged("segmentation", "image.npz" if image else "filler.npz")
             return FILLER_FILE.read(packaged, cls._of, place="the packaged filler")
-        return FILLER_FILE.read(path, cls._of)
+        taught = FILLER_FILE.read(path, cls._of)
+        if taught.filler.image != image:
+            ways = ("with", "without") if image else ("without", "with")
+            raise ValueError(f"{path} must be a filler taught {ways[0]} images, but was taught {ways[1]} them")
+        return taught
 
     @classmethod
     def _of(cls, header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Taught:
@@ -399,6 +472,8 @@ class Taught:
         if temperatures.ndim != 2 or len(temperatures) != 2 or not (temperatures > 0).all():
             raise ValueError("temperatures that are not positive")
         with torch.random.fork_rng():  # first weights are drawn, and then replaced
-            filler = Filler(header["width"]).eval()
+            filler = Filler(header["width"], image=header.get("image", False)).eval()
         filler.load_state_dict({name: torch.from_numpy(value) for name, value in arrays.items()})
-        return cls(filler, temperatures, dict(header["card"]), check_float(header["error"], "an error", 0.0, 1.0))
+        error = check_float(header["error"], "an error", 0.0, 1.0)
+        taught = cls(filler, temperatures, dict(header["card"]), error)
+        return replace(taught, status=f"{cls.status}, which also read the image") if filler.image else taught

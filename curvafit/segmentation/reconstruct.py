@@ -26,10 +26,12 @@ from curvafit.priors.profile import profile_distance
 from curvafit.segmentation.engine import STEPS, WorkingGrid, laws_of
 from curvafit.segmentation.examples import PART, Example, crop_to_surface
 from curvafit.segmentation.filler import Taught, fill
+from curvafit.segmentation.image import read_image
 from curvafit.segmentation.result import Segmentation, Uncertainty, flow_summary
 from curvafit.segmentation.slices import (
     Slices,
     annotated_slices,
+    check_place,
     check_spacing,
     known_places,
     mark_known,
@@ -62,6 +64,8 @@ STIFFEST = (1e-9, 1e12)
 PULLS = (0.0, 1e4, 3e4)
 #: Label of unknown voxels in the mask of one structure.
 UNKNOWN = 255
+#: Fewest grey levels of an image, and most voxels in which they are counted.
+GREY, SAMPLED = 8, 1_000_000
 #: Probabilities of labels are at least this.
 SURE = 1e-6
 
@@ -75,6 +79,7 @@ def reconstruct(
     known: Sequence[int] | None = None,
     ignore: int | None = None,
     axis: int = 0,
+    image: Source | None = None,
     example: Source | None = None,
     careful: bool = False,
     suggest: int = 0,
@@ -92,8 +97,10 @@ def reconstruct(
     """Fill a volume between known slices, and say how sure each voxel is.
 
     A network fills it that generated shapes have taught (`filler.Filler`). An example tunes the network, where that
-    makes it better by more than the noise. With a law, F_ε is lowered from there if this is better: it is tried out on
-    the part of the example that did not tune, or else on every second known slice. Known slices stay as they are.
+    makes it better by more than the noise. With an image, trees learn from the known slices which grey levels are
+    inside, and the network weighs what they say of the others. With a law, F_ε is lowered from there if this is better:
+    it is tried out on the part of the example that did not tune, or else on every second known slice. Known slices stay
+    as they are.
 
     Parameters
     ----------
@@ -112,6 +119,8 @@ def reconstruct(
         more, and so is each other voxel, in slices along any axis or in parts of slices.
     axis
         The axis of the array across the slices, 0, 1 or 2, that is z, y or x.
+    image
+        Grey levels of the volume, on the same voxels; needs `curvafit[image]`. It goes with neither example nor law.
     example
         A mask of another volume of the same kind, known whole. A file or an array has the slices' `spacing` and `unit`.
     careful
@@ -121,7 +130,7 @@ def reconstruct(
     periodic
         Whether the volume repeats, as generated ones do.
     filler
-        Weights of `curvafit atlas teach`; by default the packaged ones.
+        Weights of `curvafit atlas teach`, for an image those of `--images`; by default the packaged ones.
     stiffness
         Stiffness of the springs on known voxels, in working units: the first law is lowered without being tried out.
     epsilon, steps, tile, store, workers, progress, reading
@@ -131,8 +140,10 @@ def reconstruct(
     ------
     ValueError, FileNotFoundError
         As `segment`; or if fewer than two slices are known, or too few to try a law out on and there is neither an
-        example nor a stiffness; or if known slices are all empty, all full or grey levels, the example's spacing is
-        another one, or more slices are to be suggested than are unknown.
+        example nor a stiffness; or if known slices are all empty, all full or grey levels, the example's spacing or the
+        image's voxels are other ones, or more slices are to be suggested than are unknown.
+    ImportError
+        If an image is given, and scikit-learn is not installed.
     """
     volume = field_of(slices, **reading)
     axis = check_int(axis, "an axis 0, 1 or 2 (z, y, x)", 0, 2)
@@ -143,12 +154,19 @@ def reconstruct(
         stiffness = check_float(stiffness, "a positive stiffness", *STIFFEST)
     laws, notes = ((), ()) if prior is None else laws_of(prior, volume)
     tiling = Tiling.of(target.frame, epsilon, tile, periodic=periodic)
-    taught, other = Taught.load(filler), None
+    taught, other = Taught.load(filler, image=image is not None), None
+    evidence = None
+    if image is not None:
+        if example is not None or laws:
+            raise ScanError("give an image, or an example or a law, but not both: nothing joins them yet")
+        seen = _load_image(image, volume, reading)
+        step = sub_progress(progress, 0.0, 0.5)
+        evidence = read_image(np.moveaxis(seen.values, axis, 0), target, progress=step)
     if example is not None:
         other = Example.of(_load_example(example, volume, reading), places, axis)
         taught = tune(taught, other, sub_progress(progress, 0.0, 0.5))
         notes = (*notes, *other.notes)
-    engine = _Engine(taught, careful, epsilon, progress)
+    engine = _Engine(taught, evidence, careful, epsilon, progress)
     chosen, said, task = Trial(), taught.status, None if other is None else other.task
     if stiffness is not None and laws:
         chosen, said = Trial(laws[0], stiffness, steps), "the law is lowered from the network's volume"
@@ -180,6 +198,7 @@ class _Engine:
     """What fills any slices: the network, and laws that start from its volume."""
 
     taught: Taught
+    evidence: np.ndarray | None
     careful: bool
     epsilon: float | None
     progress: Progress
@@ -190,7 +209,8 @@ class _Engine:
         """Return the network's log-odds of the inside (Z, Y, X), computed once."""
         if slices not in self.filled:
             step = sub_progress(self.progress, 0.5, 1.0)
-            self.filled[slices] = fill(slices, self.taught, careful=self.careful, progress=step)
+            how: dict[str, Any] = {"evidence": self.evidence, "careful": self.careful, "progress": step}
+            self.filled[slices] = fill(slices, self.taught, **how)
         return self.filled[slices]
 
     def level(self, slices: Slices) -> np.ndarray:
@@ -329,6 +349,16 @@ def _describe_gain(best: Trial, where: str) -> str:
     if best.law is None:
         return f"no law helps here: Dice {plain} on slices {where} by the network alone, {best.score:.3f} with a law"
     return f"a law helps: {score} on slices {where}, {plain} by the network alone"
+
+
+def _load_image(image: Source, volume: Field, reading: dict[str, Any]) -> Field:
+    """Load the grey levels of the volume that the slices are of."""
+    placed = {} if isinstance(image, Field) else {name: reading.get(name) for name in ("spacing", "unit", "crop")}
+    field = field_of(image, **placed)
+    check_place(field, volume, "the image", "the slices")
+    if (count := len(np.unique(field.values.ravel()[:: -(-field.values.size // SAMPLED)]))) < GREY:
+        raise ScanError(f"the image must have grey levels, but has {count} values: is it a mask?")
+    return field
 
 
 def _load_example(example: Source, volume: Field, reading: dict[str, Any]) -> Field:

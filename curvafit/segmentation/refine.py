@@ -178,7 +178,7 @@ def calibrate(
     A part of 96³ voxels that holds most of the surface is judged by Dice. See `refine` for the parameters and errors.
     """
     field, truth = load_probabilities(probabilities, **reading), _load_truth(mask, label, reading)
-    check_place(truth, field)
+    check_place(truth, field, "the mask", "the probabilities")
     inside = require_labels(truth.values, "the example") > 0
     if inside.all() or not inside.any():
         state = "full" if inside.all() else "empty"

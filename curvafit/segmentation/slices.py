@@ -269,15 +269,16 @@ def check_spacing(example: Field, volume: Field, name: str) -> None:
         raise ScanError(f"the example must have the spacing of {name} ({expected}), got {given}")
 
 
-def check_place(mask: Field, probability: Field) -> None:
-    """Raise ScanError where a mask has other voxels than a probability map, by shape and, where both exist, affine."""
-    if mask.shape != probability.shape:
-        raise ScanError(f"the mask must have the probabilities' shape {probability.shape}, got {mask.shape}")
-    if mask.affine is None or probability.affine is None:
+def check_place(field: Field, other: Field, name: str, kind: str) -> None:
+    """Raise ScanError where a field has other voxels than another, by shape and, where both exist, affine; the message
+    calls the first `name`, and the voxels those of the `kind`."""
+    if field.shape != other.shape:
+        raise ScanError(f"{name} must have the shape of {kind} {other.shape}, got {field.shape}")
+    if field.affine is None or other.affine is None:
         return
-    factor = METRES[mask.unit] / METRES[probability.unit] if {mask.unit, probability.unit} <= METRES.keys() else 1.0
-    corners = np.array(list(product(*((0, n - 1) for n in mask.shape[::-1]))))
-    one, two = (corners @ affine[:3, :3].T + affine[:3, 3] for affine in (probability.affine, mask.affine))
-    far = float(np.linalg.norm(factor * two - one, axis=1).max()) / min(probability.spacing)
+    factor = METRES[field.unit] / METRES[other.unit] if {field.unit, other.unit} <= METRES.keys() else 1.0
+    corners = np.array(list(product(*((0, n - 1) for n in field.shape[::-1]))))
+    one, two = (corners @ affine[:3, :3].T + affine[:3, 3] for affine in (other.affine, field.affine))
+    far = float(np.linalg.norm(factor * two - one, axis=1).max()) / min(other.spacing)
     if not far < ASTRAY:
-        raise ScanError(f"the mask must have the probabilities' affine, but lies {far:.3g} voxels away")
+        raise ScanError(f"{name} must have the affine of {kind}, but lies {far:.3g} voxels away")

@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 import torch
 from scipy import ndimage
-from scipy.optimize import minimize_scalar
 from torch import Tensor
 from torch.nn import functional as F
 from torch.utils.data import DataLoader, Dataset, Subset
@@ -32,7 +31,7 @@ from curvafit.scan.grids import centre_distance
 from curvafit.segmentation.examples import Example
 from curvafit.segmentation.filler import FAR, SLOPE, Filler, Gaps, Raster, Taught, fill, interpolate, plane_thickness
 from curvafit.segmentation.trials import BEYOND, dice_of, gain_of, tally
-from curvafit.segmentation.uncertainty import best_log_odds, calibration_error
+from curvafit.segmentation.uncertainty import UNSURE, best_log_odds, calibration_error, fit_temperature
 from curvafit.volumes.read import load
 
 #: Steps of teaching and of tuning, and the greatest rates of both.
@@ -46,15 +45,15 @@ SAVED = 100
 FILLED, FEW = (0.02, 0.75), 200
 #: The largest gap, in thicknesses of a structure, that can be learnt.
 SLIMMEST = 4.0
+#: Pixels around a window that are only seen.
+HALO = 8
 #: One of so many shapes is held out.
 HELD_OUT = 10
 #: Batches of shapes held out, and temperatures that are fitted to them.
 JUDGED, TEMPERATURES = 80, 5
-#: Log-odds within which a voxel counts for a temperature.
-UNSURE = 4.0
 
-#: Distances (B, 4, Y, X), steps (B,), marks (B, n, Y, X) and the truth (B, n, Y, X), as in `filler.Gaps`.
-Lesson = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+#: Distances (B, 4, Y, X), steps (B,), marks and evidence (B, n, Y, X), as in `filler.Gaps`; and the truth (B, n, Y, X).
+Lesson = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None, np.ndarray]
 
 
 # ---- lessons ---------------------------------------------------------------------------------------------------------
@@ -146,7 +145,7 @@ class Lessons(Batches):
     length: int
     size: int = 3
     edge: int = 80
-    halo: int = 8
+    halo: int = HALO
 
     def __getitem__(self, number: int) -> Lesson:
         rng = np.random.default_rng([self.seed, number])
@@ -163,7 +162,7 @@ class Lessons(Batches):
             if window[2:-2][self.inner].any() and not window[2:-2][self.inner].all():
                 found.append(self._pose(rng, window, step))
         distances, steps, marks, truth = zip(*found, strict=True)
-        return np.stack(distances), np.array(steps, np.float32), np.stack(marks), np.stack(truth)
+        return np.stack(distances), np.array(steps, np.float32), np.stack(marks), None, np.stack(truth)
 
     def _draw(self, rng: np.random.Generator, count: int, step: float) -> np.ndarray:
         """Return slices of a structure, bool (count + 4, Y, X): two known, those to fill, two known."""
@@ -264,8 +263,8 @@ def load_textures(
 
 
 @dataclass(frozen=True, eq=False)
-class ExampleLessons(Batches):
-    """Batches of gaps in a mask that is known whole, across its slices; batch k depends on (seed, k) alone.
+class Whole:
+    """A volume that is known whole.
 
     Attributes
     ----------
@@ -273,38 +272,58 @@ class ExampleLessons(Batches):
         Signed distances in each slice (Z, Y, X), in pixels.
     gap, step
         Slices from a known one to the next, and pixels from slice to slice.
+    evidence
+        What an image of it says where slices 0, `gap`, 2 `gap`, … are known: log-odds (Z, Y, X).
     """
 
     distances: np.ndarray
     gap: int
     step: float
+    evidence: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class WholeLessons(Batches):
+    """Batches of gaps in volumes that are known whole, a batch of one volume; batch k depends on (seed, k) alone.
+
+    Without evidence gaps are shorter or longer by one slice, and begin anywhere.
+    """
+
+    volumes: Sequence[Whole]
     length: int
     seed: int = 0
     size: int = 3
     edge: int = 64
-    halo: int = 8
+    halo: int = HALO
 
     def __getitem__(self, number: int) -> Lesson:
         rng = np.random.default_rng([self.seed, number])
-        depth, most = len(self.distances), self.edge + 2 * self.halo
-        gap = min(self.gap + int(rng.integers(-1, 2)), depth - 1)
-        gap = max(gap, 2)
-        found: list[tuple[np.ndarray, np.ndarray]] = []
+        whole = self.volumes[int(rng.integers(len(self.volumes)))]
+        depth, most = len(whole.distances), self.edge + 2 * self.halo
+        gap, starts = whole.gap, np.arange(0, depth - whole.gap, whole.gap)
+        if whole.evidence is None:
+            gap = max(min(whole.gap + int(rng.integers(-1, 2)), depth - 1), 2)
+            starts = np.arange(depth - gap)
+        found: list[list[np.ndarray]] = []
         while len(found) < self.size:
-            start = int(rng.integers(depth - gap))
-            corner = [int(rng.integers(max(n - most, 0) + 1)) for n in self.distances.shape[1:]]
-            part = self.distances[:, *(slice(a, a + most) for a in corner)]
+            start = int(rng.choice(starts))
+            corner = [int(rng.integers(max(n - most, 0) + 1)) for n in whole.distances.shape[1:]]
+            window = tuple(slice(a, a + most) for a in corner)
+            part = whole.distances[:, *window]
             rows = [start - gap, start, start + gap, start + 2 * gap]
             rows[0] = start if rows[0] < 0 or rng.random() < 0.1 else rows[0]
             rows[3] = start + gap if rows[3] >= depth or rng.random() < 0.1 else rows[3]
-            known, truth = part[rows], part[start + 1 : start + gap] > 0
+            between = slice(start + 1, start + gap)
+            parts = [part[rows], part[between] > 0]
+            if whole.evidence is not None:
+                parts.append(whole.evidence[between][:, *window])
             for axis in range(3):
                 if rng.random() < 0.5:
-                    known, truth = np.flip(known, axis), np.flip(truth, axis)
-            found.append((known, truth))
-        distances, truths = (np.ascontiguousarray(np.stack(each)) for each in zip(*found, strict=True))
-        steps = np.full(self.size, self.step, np.float32)
-        return distances, steps, np.zeros(truths.shape, np.float32), truths.astype(np.float32)
+                    parts = [np.flip(each, axis) for each in parts]
+            found.append(parts)
+        distances, truths, *evidence = (np.ascontiguousarray(np.stack(each)) for each in zip(*found, strict=True))
+        steps, truths = np.full(self.size, whole.step, np.float32), truths.astype(np.float32)
+        return distances, steps, np.zeros_like(truths), evidence[0] if evidence else None, truths
 
 
 def learn(
@@ -333,11 +352,11 @@ def learn(
         begun, losses = state["step"], state["losses"]
     rest = Subset(lessons, range(begun, total))
     filler.train()
-    for step, (distances, steps, marks, truth) in enumerate(
+    for step, (*given, truth) in enumerate(
         DataLoader(rest, batch_size=None, num_workers=workers, multiprocessing_context="spawn" if workers else None),
         begun + 1,
     ):
-        loss = F.binary_cross_entropy_with_logits(filler(Gaps(distances, steps, marks))[inner], truth[inner])
+        loss = F.binary_cross_entropy_with_logits(filler(Gaps(*given))[inner], truth[inner])
         optimiser.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(filler.parameters(), STEEPEST)
@@ -391,29 +410,29 @@ def teach(
     losses = learn(
         filler, lessons, RATE, checkpoint=checkpoint, workers=workers, progress=sub_progress(progress, 0, 0.97)
     )
-    temperatures, figures, error = _judge(filler, Lessons([held], replace(mix, partial=0.0), seed + 1, JUDGED))
+    temperatures, figures, error = judge(filler, Lessons([held], replace(mix, partial=0.0), seed + 1, JUDGED))
     progress("judging on shapes held out", 1.0)
     told = {"shapes": sum(map(len, taught)), "held_out": len(held), "steps": steps, "seed": seed, "mix": asdict(mix)}
     return Taught(filler, temperatures, {**card, **told, "losses": losses, **figures}, error)
 
 
 @torch.inference_mode()
-def _judge(filler: Filler, lessons: Lessons) -> tuple[np.ndarray, dict[str, float], float]:
+def judge(filler: Filler, lessons: Batches) -> tuple[np.ndarray, dict[str, float], float]:
     """Return temperatures (2, k) by gap; the cross entropy of held-out lessons and that of the cubic alone; and the
     calibration error near surfaces, where a temperature is of another half of the lessons.
     """
     gaps, logits, plain, truths = [], [], [], []
-    for distances, steps, marks, truth in DataLoader(lessons, batch_size=None):
-        batch = Gaps(distances, steps, marks)
-        found, cubic = filler(batch), SLOPE * interpolate(distances, batch.heights)[1]
-        gaps += (steps * (marks.shape[1] + 1)).tolist()
+    for *given, truth in DataLoader(lessons, batch_size=None):
+        batch = Gaps(*given)
+        found, cubic = filler(batch), SLOPE * interpolate(batch.distances, batch.heights)[1]
+        gaps += (batch.step * (truth.shape[1] + 1)).tolist()
         for each, values in ((logits, found), (plain, cubic), (truths, truth)):
             each += [window[lessons.inner].flatten() for window in values]
     table, errors = [], []
     for rows in np.array_split(np.argsort(gaps), TEMPERATURES):
         halves = [rows[::2], rows[1::2]]
         parts = [(torch.cat([logits[k] for k in half]), torch.cat([truths[k] for k in half])) for half in halves]
-        cooled = [fit_temperature(*part) for part in parts]
+        cooled = [fit_temperature(z.numpy(), y.numpy()) for z, y in parts]
         errors += [_near_error(z / t, y) for (z, y), t in zip(parts, cooled[::-1], strict=True)]
         table.append((float(np.mean([gaps[k] for k in rows])), float(np.sqrt(np.prod(cooled)))))
     cross_entropy = F.binary_cross_entropy_with_logits
@@ -422,16 +441,6 @@ def _judge(filler: Filler, lessons: Lessons) -> tuple[np.ndarray, dict[str, floa
         for name, each in (("loss", logits), ("cubic", plain))
     }
     return np.array(table).T, {f"held_out_{name}": value for name, value in whole.items()}, float(np.mean(errors))
-
-
-def fit_temperature(logits: Tensor, truth: Tensor) -> float:
-    """Return by what log-odds (N,) are to be divided for the least cross entropy near surfaces."""
-    near = logits.abs() < UNSURE
-    if not near.any():
-        return 1.0
-    z, y = logits[near], truth[near]
-    found = minimize_scalar(lambda t: float(F.binary_cross_entropy_with_logits(z / math.exp(t), y)), bounds=(-1, 2))
-    return math.exp(found.x)
 
 
 def _near_error(logits: Tensor, truth: Tensor) -> float:
@@ -452,7 +461,7 @@ def tune(taught: Taught, example: Example, progress: Progress = silent) -> Taugh
     raster = Raster.of(given)
     distances = np.stack([raster.distances(mask) for mask in example.lesson.inside])
     filler = copy.deepcopy(taught.filler)
-    lessons = ExampleLessons(distances, given.gap, given.spacing[0] / raster.pixel, TUNING)
+    lessons = WholeLessons([Whole(distances, given.gap, given.spacing[0] / raster.pixel)], TUNING)
     learn(filler, lessons, TUNING_RATE, workers=0, progress=lambda _, share: progress("tuning on the example", share))
     tuned = replace(taught, filler=filler)
     volumes = [fill(given, each)[places] for each in (taught, tuned)]
@@ -461,7 +470,7 @@ def tune(taught: Taught, example: Example, progress: Progress = silent) -> Taugh
     better = gain > BEYOND * noise
     logits = torch.from_numpy(volumes[better]).flatten()
     answer = torch.from_numpy(truth).float().flatten()
-    temperature = fit_temperature(logits, answer)
+    temperature = fit_temperature(logits.numpy(), answer.numpy())
     scores = (
         f"Dice {dice_of(before.sum(0)):.3f} on a part of the example, {dice_of(after.sum(0)):.3f} tuned on the rest"
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import minimize, minimize_scalar
 from scipy.special import entr, expit, logit
 
 from curvafit.scan.grids import centre_distance
@@ -19,6 +19,8 @@ STRONGEST = 20.0
 MOST = 1_000_000
 #: Thresholds that are tried.
 THRESHOLDS = 1000
+#: Log-odds within which a voxel counts for a temperature.
+UNSURE = 4.0
 #: Bins of the calibration error.
 BINS = 15
 
@@ -29,7 +31,7 @@ def near_surface(mask: np.ndarray) -> np.ndarray:
 
 
 def fit_weights(evidence: np.ndarray, inside: np.ndarray) -> np.ndarray:
-    """Return the weights under which evidence (N, 2) makes what is inside (N,) most likely: one for each kind, from 0,
+    """Return the weights under which evidence (N, K) makes what is inside (N,) most likely: one for each kind, from 0,
     and a constant.
     """
     stride = -(-len(inside) // MOST)
@@ -39,8 +41,9 @@ def fit_weights(evidence: np.ndarray, inside: np.ndarray) -> np.ndarray:
         margin = signed @ weights
         return float(np.logaddexp(0, -margin).mean()), -(expit(-margin) @ signed) / len(signed)
 
-    bounds = [(0, STRONGEST), (0, STRONGEST), (-STRONGEST, STRONGEST)]
-    return minimize(cost, np.array([1.0, 1.0, 0.0]), jac=True, method="L-BFGS-B", bounds=bounds).x
+    kinds = evidence.shape[1]
+    bounds = [*[(0, STRONGEST)] * kinds, (-STRONGEST, STRONGEST)]
+    return minimize(cost, np.append(np.ones(kinds), 0.0), jac=True, method="L-BFGS-B", bounds=bounds).x
 
 
 def probability(evidence: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -64,6 +67,16 @@ def best_threshold(probability: np.ndarray) -> float:
 def best_log_odds(logits: np.ndarray) -> float:
     """Return the log-odds of the `best_threshold` of voxels with these log-odds."""
     return float(logit(best_threshold(expit(logits))))
+
+
+def fit_temperature(logits: np.ndarray, inside: np.ndarray) -> float:
+    """Return by what log-odds (N,) are to be divided for the least cross entropy where they are unsure."""
+    near = np.abs(logits) < UNSURE
+    if not near.any():
+        return 1.0
+    signed = np.where(inside[near] > 0, -1.0, 1.0) * logits[near]
+    found = minimize_scalar(lambda t: float(np.logaddexp(0, signed / np.exp(t)).mean()), bounds=(-1, 2))
+    return float(np.exp(found.x))
 
 
 def calibration_error(probability: np.ndarray, inside: np.ndarray, bins: int = BINS) -> float:

@@ -17,11 +17,11 @@ from curvafit.generation.schedule import schedule
 from curvafit.segmentation.examples import Example
 from curvafit.segmentation.filler import FAR, Filler, Taught
 from curvafit.segmentation.teach import (
-    ExampleLessons,
     Lessons,
     Mix,
     Texture,
-    fit_temperature,
+    Whole,
+    WholeLessons,
     learn,
     load_textures,
     teach,
@@ -60,7 +60,8 @@ def test_a_lesson_depends_on_its_number_alone() -> None:
 
 def test_lessons_have_what_the_network_reads() -> None:
     for number in range(6):
-        distances, steps, marks, truth = lessons(Mix())[number]
+        distances, steps, marks, evidence, truth = lessons(Mix())[number]
+        assert evidence is None
         count = truth.shape[1]
         assert distances.shape == (2, 4, 24, 24) and steps.shape == (2,) and marks.shape == truth.shape
         assert np.abs(distances).max() <= FAR and set(np.unique(truth)) <= {0, 1}
@@ -75,7 +76,7 @@ def test_a_shape_that_goes_on_unchanged_is_shown_unchanged() -> None:
     straight = Lessons([[prism]], replace(EXACT, thickness=(7.0, 7.0)), 0, 40, 1, 16, 4)
     found = 0
     for number in range(40):
-        distances, _, _, truth = straight[number]
+        distances, _, _, _, truth = straight[number]
         if all(np.array_equal(distances[0, 0], each) for each in distances[0]):
             found += 1
             assert all(np.array_equal(each, distances[0, 0] > 0) for each in truth[0])
@@ -93,9 +94,19 @@ def test_lessons_of_an_example_are_its_own_slices() -> None:
     z, y, x = np.mgrid[:30, :20, :20]
     distances = (4 - np.hypot(y - 10, x - 5 - z / 4)).astype(np.float32)
     for number in range(5):
-        known, steps, marks, truth = ExampleLessons(distances, 6, 1.5, 5, size=2)[number]
+        known, steps, marks, evidence, truth = WholeLessons([Whole(distances, 6, 1.5)], 5, size=2)[number]
+        assert evidence is None
         assert known.shape[:2] == (2, 4) and 4 <= truth.shape[1] <= 6 and (steps == 1.5).all() and not marks.any()
         assert np.isin(known, distances).all()
+
+
+def test_lessons_of_an_imaged_volume_have_the_evidence_of_their_slices() -> None:
+    z, y, x = np.mgrid[:25, :20, :20]
+    distances = (4 - np.hypot(y - 10, x - 5 - z / 4)).astype(np.float32)
+    for number in range(5):
+        known, _, _, evidence, truth = WholeLessons([Whole(distances, 6, 1.5, distances)], 5)[number]
+        assert evidence is not None
+        assert truth.shape[1] == 5 and ((evidence > 0) == truth).all() and np.isin(known, distances[::6]).all()
 
 
 # ---- learning --------------------------------------------------------------------------------------------------------
@@ -120,14 +131,6 @@ def test_a_run_that_was_stopped_ends_as_one_that_was_not(tmp_path: Path, monkeyp
         learn(small(), lessons(), 1e-3, checkpoint=checkpoint, workers=0, progress=stop)
     assert learn(parts, lessons(), 1e-3, checkpoint=checkpoint, workers=0) == losses
     assert all(torch.equal(a, b) for a, b in zip(whole.parameters(), parts.parameters(), strict=True))
-
-
-def test_the_temperature_is_that_by_which_labels_were_drawn() -> None:
-    generator = torch.Generator().manual_seed(0)
-    logits = 3 * torch.randn(60_000, generator=generator)
-    labels = torch.bernoulli(torch.sigmoid(logits / 1.7), generator=generator)
-    assert fit_temperature(logits, labels) == pytest.approx(1.7, rel=0.05)
-    assert fit_temperature(torch.tensor([50.0]), torch.tensor([1.0])) == 1
 
 
 @pytest.mark.slow
@@ -177,3 +180,6 @@ def test_the_command_teaches_and_refuses(tmp_path: Path, monkeypatch: pytest.Mon
     assert not list(tmp_path.glob(".*"))
     refused(call("atlas", "teach", tmp_path / "mask.npy", "-o", tmp_path / "filler.txt"), "npz")
     refused(call("atlas", "teach", tmp_path / "none.zarr", "-o", tmp_path / "new.npz"), "none")
+    new = ("atlas", "teach", tmp_path / "mask.npy", "-o", tmp_path / "new.npz", "--filler", target)
+    refused(call(*new), "--images")
+    assert not (tmp_path / "new.npz").exists()

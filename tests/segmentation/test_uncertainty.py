@@ -13,6 +13,7 @@ from curvafit.segmentation.uncertainty import (
     best_threshold,
     calibration_error,
     entropy,
+    fit_temperature,
     fit_weights,
     near_surface,
     probability,
@@ -142,7 +143,7 @@ def test_a_reconstruction_says_how_sure_it_is() -> None:
 def test_a_law_s_surface_counts_as_evidence() -> None:
     """Weights are fitted to slices left out; without any to leave out they are the network's."""
     mask = ball(32, 12.0)
-    tried = reconstruct(mask, WILLMORE, every=5, steps=30, example=np.concatenate([ball(32, 11.0)] * 3, axis=2))
+    tried = reconstruct(mask, WILLMORE, every=5, steps=30)
     assert tried.probability is not None and tried.probability.values.max() <= 1
 
 
@@ -199,3 +200,11 @@ def test_an_even_gap_is_halved_and_the_most_uncertain_comes_first() -> None:
 def test_where_nothing_is_open_nothing_is_suggested() -> None:
     assert suggest_slices(np.zeros(10), [0, 9], 3) == ()
     assert suggest_slices(np.ones(4), [0, 1, 2], 3) == (3,)
+
+
+def test_the_temperature_is_that_by_which_labels_were_drawn() -> None:
+    random = np.random.default_rng(0)
+    logits = 3 * random.standard_normal(60_000)
+    labels = random.random(60_000) < 1 / (1 + np.exp(-logits / 1.7))
+    assert fit_temperature(logits, labels) == pytest.approx(1.7, rel=0.05)
+    assert fit_temperature(np.array([50.0]), np.array([1.0])) == 1

@@ -1,0 +1,201 @@
+"""The volume between annotated slices of a real image, every eighth known: the filler with the image, and its rivals.
+
+Needs $CURVAFIT_DATA, scikit-learn and monai. All ways know the same slices, and the image of the whole volume.
+
+- `ours`: `reconstruct(image=…)`; `alone`: without the image; `trees`: its reading of the image, at log-odds of 0.
+- `forest`: a random forest of 60 trees on smoothed levels, gradients, Laplacians and Hessian eigenvalues, as ilastik
+  has them; `refined`: `refine` on its map, Willmore, at the best of `WEIGHTS` *in hindsight*.
+- `U-Net`: a small 3D one by Dice and cross-entropy of the known slices, the rest ignored.
+
+Dice counts unknown slices alone. Intervals: a jackknife over slabs between slices times 32² pixels. VesselExpress and
+shapes chose features and mix; the others are run once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from collections.abc import Mapping
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from benchmarks.completion import STRUCTURES, mask_of
+from benchmarks.harness import Cases, Figure, Values, show
+from benchmarks.networks import UNKNOWN, dice_ce
+from curvafit.priors.coefficients import Coefficients
+from curvafit.segmentation.image import read_image
+from curvafit.segmentation.reconstruct import reconstruct
+from curvafit.segmentation.refine import refine
+from curvafit.segmentation.slices import Slices
+from curvafit.segmentation.trials import dice_of, gain_of, tally
+from curvafit.segmentation.uncertainty import calibration_error, near_surface
+from curvafit.volumes.field import Field
+from curvafit.volumes.read import load
+
+WAYS = ("ours", "alone", "trees", "forest", "refined", "U-Net")
+EVERY, WEIGHTS = 8, (1.0, 5.0)
+STEPS, BATCH, PATCH, RATE = 300, 2, (24, 64, 64), 5e-3
+
+
+class Scan(NamedTuple):
+    """An image, the structure of `completion` that is its mask, a box of both, the axis across slices, and the noise
+    that is added, in contrasts."""
+
+    image: str
+    mask: str
+    box: tuple[slice, slice, slice]
+    axis: int = 0
+    noise: float = 0.0
+    reading: Mapping[str, Any] = {}
+
+
+_ALL = (slice(None),) * 3
+_BONE = ("lhdl_trabecular_200.tif", "bone", (slice(0, 97), slice(44, 156), slice(44, 156)))
+_POON = "vesselNN/poon2015_BBB_noLeakage_img.tif"
+SCANS = {
+    "vesselexpress": Scan("vesselexpress_000.tif", "vesselexpress", _ALL),
+    "poon-0": Scan(_POON, "poon", (slice(None), slice(0, 249), slice(0, 240)), 1),
+    "poon-1": Scan(_POON, "poon", (slice(None), slice(256, 505), slice(272, 512)), 1),
+    "bone": Scan(*_BONE),
+    "bone-noise-1": Scan(*_BONE, noise=1.0),
+    "bone-noise-2": Scan(*_BONE, noise=2.0),
+    "membranes": Scan("plantseg_sample_ovule.h5", "membranes", _ALL, 1, reading={"key": "raw"}),
+}
+
+
+def read(name: str) -> tuple[Field, Field]:
+    """Return the image and the mask of a scan."""
+    scan, folder = SCANS[name], Path(os.environ["CURVAFIT_DATA"]) / "scans"
+    structure = STRUCTURES[scan.mask]
+    mask = mask_of(load(folder / structure.files[0], **structure.reading), structure).crop(scan.box)
+    grey = load(folder / scan.image, **scan.reading).crop(scan.box).values.astype(np.float32)
+    inside = mask.values > 0
+    contrast = abs(float(grey[inside].mean()) - float(grey[~inside].mean()))
+    grey = grey + scan.noise * contrast * np.random.default_rng(0).standard_normal(grey.shape, dtype=np.float32)
+    return Field(grey, mask.spacing, mask.unit), mask
+
+
+def forest(grey: np.ndarray, truth: np.ndarray, places: list[int]) -> np.ndarray:
+    """Return the probabilities of a random forest that learns from the known slices."""
+    from skimage.feature import multiscale_basic_features
+    from sklearn.ensemble import RandomForestClassifier
+
+    features = multiscale_basic_features(grey, sigma_min=0.7, sigma_max=6.0, workers=1)
+    random = np.random.default_rng(0)
+    table, inside = features[places].reshape(-1, features.shape[-1]), truth[places].ravel()
+    rows = random.permutation(len(table))[:200_000]
+    trees = RandomForestClassifier(60, min_samples_leaf=3, n_jobs=-1, random_state=0).fit(table[rows], inside[rows])
+    return np.stack([trees.predict_proba(each.reshape(-1, each.shape[-1]))[:, 1] for each in features]).reshape(
+        grey.shape
+    )
+
+
+def u_net(grey: np.ndarray, truth: np.ndarray, places: list[int]) -> np.ndarray:
+    """Return the probabilities of a 3D network that learns from the known slices."""
+    from monai.inferers.utils import sliding_window_inference
+    from monai.networks.nets.unet import UNet
+
+    torch.manual_seed(0)
+    values = torch.from_numpy((grey - grey.mean()) / grey.std())
+    target = torch.full(grey.shape, UNKNOWN, dtype=torch.uint8)
+    target[places] = torch.from_numpy(truth[places]).to(torch.uint8)
+    size = [min(n // 4 * 4, edge) for n, edge in zip(grey.shape, PATCH, strict=True)]
+    net = UNet(3, 1, 1, (12, 24, 48), (2, 2), num_res_units=1, norm="batch")
+    adam = torch.optim.AdamW(net.parameters(), RATE)
+    cycle = torch.optim.lr_scheduler.OneCycleLR(adam, RATE, total_steps=STEPS)
+    random = np.random.default_rng(0)
+    for _ in range(STEPS):
+        pairs = []
+        for _ in range(BATCH):
+            starts = [int(random.integers(n - edge + 1)) for n, edge in zip(grey.shape, size, strict=True)]
+            window = tuple(slice(a, a + edge) for a, edge in zip(starts, size, strict=True))
+            flips = [axis for axis in range(3) if random.random() < 0.5]
+            pairs.append([each[window].flip(flips)[None] for each in (values, target)])
+        x, y = (torch.stack(each) for each in zip(*pairs, strict=True))
+        adam.zero_grad()
+        dice_ce(net(x), y.float()).backward()
+        adam.step()
+        cycle.step()
+    net.eval()
+    with torch.inference_mode():
+        found = sliding_window_inference(values[None, None], size, 2, net, overlap=0.5, mode="gaussian")
+    return torch.sigmoid(found)[0, 0].numpy()  # type: ignore[index]
+
+
+def case(name: str, way: str, cases: Cases) -> Values:
+    """Return the scores of a way, and its counts in cells."""
+    image, mask = read(name)
+    axis, begun = SCANS[name].axis, time.perf_counter()
+    places = list(range(0, mask.shape[axis], EVERY))
+    grey, truth = (np.moveaxis(each.values, axis, 0) for each in (image, mask))
+    truth, status, likely = truth > 0, "", None
+    edges = (mask.spacing[axis], *(h for k, h in enumerate(mask.spacing) if k != axis))
+    if way in ("ours", "alone"):
+        found = reconstruct(mask, known=places, axis=axis, image=image if way == "ours" else None)
+        inside, likely = (np.moveaxis(each.values, axis, 0) for each in (found.mask, found.probability))
+        inside, status = inside > 0, found.status
+    elif way == "refined":
+        likely = cases.array(f"forest-{name}", lambda: forest(grey, truth, places))
+        volume = Field(likely.astype(np.float32), edges, mask.unit)
+        inside = max(
+            (refine(volume, Coefficients.willmore(), weight=weight).mask.values > 0 for weight in WEIGHTS),
+            key=lambda each: int((each == truth).sum()),
+        )
+        likely = None
+    else:
+        if way == "forest":
+            likely = cases.array(f"forest-{name}", lambda: forest(grey, truth, places))
+        elif way == "trees":
+            slices = Slices(truth[places], tuple(places), len(truth), edges, mask.unit)
+            likely = 1 / (1 + np.exp(-read_image(grey, slices)))
+        else:
+            likely = u_net(grey, truth, places)
+        inside = likely > 0.5
+    seconds = time.perf_counter() - begun
+    unknown = [n for n in range(places[-1]) if n not in places]
+    counts = tally(inside[unknown], truth[unknown], [n // EVERY * 32 for n in unknown])
+    values: Values = {"dice": float(dice_of(counts.sum(0))), "seconds": seconds, "status": status}
+    if likely is not None:
+        near = near_surface(inside)[unknown]
+        values["calibration"] = calibration_error(likely[unknown][near], truth[unknown][near])
+    return {**values, "counts": counts.tolist()}
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--only", default=",".join(SCANS))
+    parser.add_argument("--ways", default=",".join(WAYS))
+
+
+def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
+    if "CURVAFIT_DATA" not in os.environ:
+        raise SystemExit("set CURVAFIT_DATA to the folder that holds scans/")
+    names, ways = options.only.split(","), options.ways.split(",")
+    if options.quick:
+        names, ways = names[:1], ["ours", "trees"]
+    jobs = {f"{name}-{way}": partial(case, name, way, cases) for name, way in product(names, ways)}
+    found = cases.all(jobs)
+    groups = {"poon": [name for name in names if name.startswith("poon")]} | {n: [n] for n in names if n[:4] != "poon"}
+    figures, table = {}, []
+    for group, members in groups.items():
+        if not members or any(f"{name}-{way}" not in found for name, way in product(members, ways)):
+            continue
+        counts = {way: np.concatenate([found[f"{name}-{way}"]["counts"] for name in members]) for way in ways}
+        for way in ways:
+            figures[f"image.{group}.{way.lower()}"] = Figure(float(dice_of(counts[way].sum(0))))
+        row = [group, *(figures[f"image.{group}.{way.lower()}"].value for way in ways)]
+        if "ours" in ways:
+            rival = max((way for way in ways if way not in ("ours", "trees")), key=lambda way: row[1 + ways.index(way)])
+            gain, noise = (100 * each for each in gain_of(counts["ours"], counts[rival]))
+            figures[f"image.{group}.gain"] = Figure(gain, gain - 1.96 * noise, gain + 1.96 * noise)
+            errors = [found[f"{name}-ours"]["calibration"] for name in members]
+            figures[f"image.{group}.calibration"] = Figure(float(np.mean(errors)))
+            row += [f"{rival}", figures[f"image.{group}.gain"], np.mean(errors)]
+        table.append(row)
+    show(["scan", *ways, "best rival", "gain on it, points", "calibration"], table, f"every {EVERY}")
+    return figures

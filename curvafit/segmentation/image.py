@@ -1,0 +1,88 @@
+"""What an image says of a volume: boosted trees on its grey levels, learnt from the volume's own known slices."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import combinations_with_replacement
+from typing import Any
+
+import numpy as np
+from scipy import ndimage
+from skimage.feature import hessian_matrix_eigvals
+
+from curvafit.core.extras import require
+from curvafit.core.runtime import Progress, silent
+from curvafit.segmentation.slices import Slices
+from curvafit.segmentation.uncertainty import fit_weights
+
+#: Widths of the Gaussians, in voxels of the shortest edge, and the least one along an axis, in its own voxels.
+WIDTHS, LEAST = (0.7, 1.2, 2.0, 3.4, 5.6), 0.5
+#: Width of a second Gaussian before derivatives are taken.
+SMOOTH = 0.7
+#: Most voxels that trees learn from, trees, their rate and leaves.
+LEARNT, TREES, RATE, LEAVES = 200_000, 80, 0.1, 31
+#: Voxels whose features are held at once.
+HELD = 4_000_000
+#: Known slices of which every second one first judges; with fewer the log-odds are taken as they are.
+FEWEST = 4
+
+
+def read_image(values: np.ndarray, slices: Slices, seed: int = 0, progress: Progress = silent) -> np.ndarray:
+    """Return what an image (Z, Y, X) says of a volume of which some slices are known: log-odds, float32 (Z, Y, X).
+
+    Trees learn, from the known slices, which levels are inside, by the slopes and Hessians about them at several
+    widths. First they learn from every second slice; the others say how sure they may be.
+
+    Raises ImportError where scikit-learn is not installed.
+    """
+    known, slope, shift = slices.inside, 1.0, 0.0
+    parts = _features(values, slices.spacing)
+    if values.size <= HELD:
+        parts = list(parts)
+    features = np.concatenate([part[np.isin(rows, slices.places)] for rows, part in parts])
+    if len(known) >= FEWEST:
+        trees = _learn(features[::2], known[::2], seed)
+        logits = trees.decision_function(features[1::2].reshape(-1, features.shape[-1]))
+        slope, shift = fit_weights(logits[:, None], known[1::2].ravel())
+    trees = _learn(features, known, seed)
+    evidence = np.empty(values.shape, dtype=np.float32)
+    for rows, part in parts if isinstance(parts, list) else _features(values, slices.spacing):
+        progress("reading the image", rows[0] / len(values))
+        logits = trees.decision_function(part.reshape(-1, part.shape[-1]))
+        evidence[rows] = (slope * logits + shift).reshape(part.shape[:3])
+    progress("reading the image", 1.0)
+    return evidence
+
+
+def _learn(features: np.ndarray, inside: np.ndarray, seed: int) -> Any:
+    """Return trees that tell the inside by features (N, Y, X, F)."""
+    ensemble = require("sklearn.ensemble", "image", "reading an image")
+    table, truth = features.reshape(-1, features.shape[-1]), inside.ravel()
+    rows = np.random.default_rng(seed).permutation(len(table))[:LEARNT]
+    options = {"max_iter": TREES, "learning_rate": RATE, "max_leaf_nodes": LEAVES, "l2_regularization": 1.0}
+    return ensemble.HistGradientBoostingClassifier(**options, early_stopping=False, random_state=seed).fit(
+        table[rows], truth[rows]
+    )
+
+
+def _features(values: np.ndarray, spacing: Sequence[float]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield numbers of slices and their features (n, Y, X, F): smoothed levels, their slopes, and the eigenvalues of
+    their Hessians, as many slices at once as may be held."""
+    edges = [edge / min(spacing) for edge in spacing]
+    halo, depth = int(4 * (max(WIDTHS) + SMOOTH) / edges[0]) + 3, len(values)
+    most = max(1, HELD // values[0].size)
+    pairs = list(combinations_with_replacement(range(3), 2))
+
+    def blur(levels: np.ndarray, width: float) -> np.ndarray:
+        deviations = [max(width / edge, LEAST) for edge in edges]
+        return ndimage.gaussian_filter(levels, deviations, mode="nearest")
+
+    for start in range(0, depth, most):
+        rows, low = np.arange(start, min(start + most, depth)), max(start - halo, 0)
+        slab, found = values[low : rows[-1] + halo + 1].astype(np.float32), []
+        for width in WIDTHS:
+            smooth = blur(slab, width)
+            slopes = np.gradient(blur(smooth, SMOOTH), *edges)
+            curved = [np.gradient(slopes[i], edges[j], axis=j) for i, j in pairs]
+            found += [smooth, np.sqrt(sum(slope**2 for slope in slopes)), *hessian_matrix_eigvals(curved)]
+        yield rows, np.stack([each[rows - low] for each in found], axis=-1).astype(np.float32)
