@@ -366,6 +366,7 @@ def _load_example(example: Source, volume: Field, reading: dict[str, Any]) -> Fi
     placed = {} if isinstance(example, Field) else {name: reading.get(name) for name in ("spacing", "unit")}
     field = field_of(example, **placed)
     check_spacing(field, volume, "the slices")
+    require_labels(field.values, "the example")
     return field
 
 
@@ -488,7 +489,7 @@ def find_labels(values: np.ndarray, chosen: Sequence[int] | None) -> list[int]:
 
     Raises `ScanError` if the values are grey levels, a chosen label is missing, or there is none but 0.
     """
-    found = [int(value) for value in np.unique(require_labels(values, "the volume of known slices"))]
+    found = [int(value) for value in np.unique(require_labels(values, "the known slices"))]
     if chosen is None:
         numbers = [number for number in found if number]
     else:

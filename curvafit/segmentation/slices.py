@@ -19,8 +19,9 @@ from curvafit.volumes.formats.part import Box
 
 #: Plain interpolations, the usual one first: signed distances on a cubic spline and on lines; the nearest slice.
 WAYS = ("spline", "linear", "nearest")
-#: Most values of a mask; more are grey levels.
-LABELS = 256
+#: Most values of a mask; more are grey levels. So are more than `FEW` where most neighbours differ: of labels that are
+#: cut from shapes a few in a hundred do, of images of eight bits three in four.
+LABELS, FEW = 256, 16
 #: Share by which the voxel sizes of two files may differ, and voxels by which their places may.
 SAME, ASTRAY = 1e-3, 0.1
 #: The box that is all of a volume.
@@ -63,15 +64,16 @@ class Slices:
         axis: int,
         periodic: bool = False,
         marks: np.ndarray | None = None,
+        name: str = "the known slices",
     ) -> Slices:
         """Take the known slices of a volume across an axis, which becomes the first; `marks` have it first already.
 
-        Raises `ScanError` if they hold grey levels, or are all empty or all full.
+        Raises `ScanError` if they hold grey levels, or are all empty or all full; the message calls them `name`.
         """
-        inside = require_labels(np.moveaxis(volume.values, axis, 0)[list(places)], "known slices") > 0
+        inside = require_labels(np.moveaxis(volume.values, axis, 0)[list(places)], name) > 0
         if inside.all() or not inside.any():
             state = "full" if inside.all() else "empty"
-            raise ScanError(f"the known slices must have voxels inside and outside, but all are {state}")
+            raise ScanError(f"{name} must have voxels inside and outside, but all are {state}")
         edges = [volume.spacing[k] for k in (axis, *(k for k in range(3) if k != axis))]
         return cls(
             inside, tuple(places), volume.shape[axis], (edges[0], edges[1], edges[2]), volume.unit, periodic, marks
@@ -256,9 +258,14 @@ def plane_distances(masks: np.ndarray, spacing: Sequence[float], gap: float) -> 
 def require_labels(values: np.ndarray, name: str) -> np.ndarray:
     """Return the values, or raise ScanError where they are grey levels; the message calls them `name`."""
     if values.dtype.kind == "f" and not np.array_equal(values, np.round(values)):
-        raise ScanError(f"{name} must be a mask or labels, but has values that are not whole numbers")
+        raise ScanError(f"{name} must be a mask or labels, got values that are not whole numbers")
     if values.dtype.itemsize > 1 and (count := len(np.unique(values))) > LABELS:
         raise ScanError(f"{name} must be a mask or have at most {LABELS} labels, got {count} values")
+    differ = np.count_nonzero(values[..., 1:] != values[..., :-1])
+    if 2 * differ > values.size and (count := len(np.unique(values))) > FEW:
+        raise ScanError(
+            f"{name} must be a mask or labels, got a grey image: {count} values, and most neighbours differ"
+        )
     return values
 
 

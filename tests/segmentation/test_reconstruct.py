@@ -283,6 +283,7 @@ def test_bad_slices_and_examples_are_refused(options: dict, word: str) -> None:
         (ball() * np.float32(0.5), "whole numbers"),
         (np.random.default_rng(0).integers(0, 999, (32, 32, 32)).astype(np.int16), "256"),
         (np.where(ball(), np.nan, 0), "whole numbers"),
+        (np.random.default_rng(0).integers(0, 99, (32, 32, 32)).astype(np.uint8), "grey image"),
         (np.zeros((32, 32, 32)), "empty"),
     ],
 )
