@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from itertools import combinations_with_replacement
 from typing import Any
 
 import numpy as np
+import torch
 from scipy import ndimage
 from skimage.feature import hessian_matrix_eigvals
 
@@ -21,8 +23,8 @@ WIDTHS, LEAST = (0.7, 1.2, 2.0, 3.4, 5.6), 0.5
 SMOOTH = 0.7
 #: Most voxels that trees learn from, trees, their rate and leaves.
 LEARNT, TREES, RATE, LEAVES = 200_000, 80, 0.1, 31
-#: Voxels whose features are held at once.
-HELD = 4_000_000
+#: Voxels whose features are computed at once, and most of which they are kept for the second reading.
+HELD, KEPT = 4_000_000, 20_000_000
 #: Known slices of which every second one first judges; with fewer the log-odds are taken as they are.
 FEWEST = 4
 
@@ -36,8 +38,9 @@ def read_image(values: np.ndarray, slices: Slices, seed: int = 0, progress: Prog
     Raises ImportError where scikit-learn is not installed.
     """
     known, slope, shift = slices.inside, 1.0, 0.0
-    parts = _features(values, slices.spacing)
-    if values.size <= HELD:
+    levels = ((values - values.mean()) / max(float(values.std()), 1e-12)).astype(np.float32)
+    parts: Iterable[tuple[np.ndarray, np.ndarray]] = _features(levels, slices.spacing)
+    if values.size <= KEPT:
         parts = list(parts)
     features = np.concatenate([part[np.isin(rows, slices.places)] for rows, part in parts])
     if len(known) >= FEWEST:
@@ -46,7 +49,7 @@ def read_image(values: np.ndarray, slices: Slices, seed: int = 0, progress: Prog
         slope, shift = fit_weights(logits[:, None], known[1::2].ravel())
     trees = _learn(features, known, seed)
     evidence = np.empty(values.shape, dtype=np.float32)
-    for rows, part in parts if isinstance(parts, list) else _features(values, slices.spacing):
+    for rows, part in parts if isinstance(parts, list) else _features(levels, slices.spacing):
         progress("reading the image", rows[0] / len(values))
         logits = trees.decision_function(part.reshape(-1, part.shape[-1]))
         evidence[rows] = (slope * logits + shift).reshape(part.shape[:3])
@@ -65,24 +68,30 @@ def _learn(features: np.ndarray, inside: np.ndarray, seed: int) -> Any:
     )
 
 
-def _features(values: np.ndarray, spacing: Sequence[float]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield numbers of slices and their features (n, Y, X, F): smoothed levels, their slopes, and the eigenvalues of
-    their Hessians, as many slices at once as may be held."""
+def _features(levels: np.ndarray, spacing: Sequence[float]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield numbers of slices and their features (n, Y, X, F), float16: smoothed levels, their slopes, and the
+    eigenvalues of their Hessians; as many slices at once as may be held, by as many threads as torch has."""
     edges = [edge / min(spacing) for edge in spacing]
-    halo, depth = int(4 * (max(WIDTHS) + SMOOTH) / edges[0]) + 3, len(values)
-    most = max(1, HELD // values[0].size)
+    halo, depth = int(4 * (max(WIDTHS) + SMOOTH) / edges[0]) + 3, len(levels)
+    most = max(1, HELD // levels[0].size)
     pairs = list(combinations_with_replacement(range(3), 2))
 
-    def blur(levels: np.ndarray, width: float) -> np.ndarray:
+    def blur(values: np.ndarray, width: float) -> np.ndarray:
         deviations = [max(width / edge, LEAST) for edge in edges]
-        return ndimage.gaussian_filter(levels, deviations, mode="nearest")
+        return ndimage.gaussian_filter(values, deviations, mode="nearest")
 
-    for start in range(0, depth, most):
+    def describe(start: int) -> tuple[np.ndarray, np.ndarray]:
         rows, low = np.arange(start, min(start + most, depth)), max(start - halo, 0)
-        slab, found = values[low : rows[-1] + halo + 1].astype(np.float32), []
+        slab, found = levels[low : rows[-1] + halo + 1], []
         for width in WIDTHS:
             smooth = blur(slab, width)
             slopes = np.gradient(blur(smooth, SMOOTH), *edges)
             curved = [np.gradient(slopes[i], edges[j], axis=j) for i, j in pairs]
-            found += [smooth, np.sqrt(sum(slope**2 for slope in slopes)), *hessian_matrix_eigvals(curved)]
-        yield rows, np.stack([each[rows - low] for each in found], axis=-1).astype(np.float32)
+            each = [smooth, np.sqrt(sum(slope**2 for slope in slopes)), *hessian_matrix_eigvals(curved)]
+            found += [values[rows - low].astype(np.float16) for values in each]
+        return rows, np.stack(found, axis=-1)
+
+    starts, crew = range(0, depth, most), torch.get_num_threads()
+    with ThreadPoolExecutor(crew) as threads:
+        for k in range(0, len(starts), crew):
+            yield from threads.map(describe, starts[k : k + crew])
