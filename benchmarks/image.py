@@ -196,6 +196,6 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
             errors = [found[f"{name}-ours"]["calibration"] for name in members]
             figures[f"image.{group}.calibration"] = Figure(float(np.mean(errors)))
             row += [f"{rival}", figures[f"image.{group}.gain"], np.mean(errors)]
-        table.append(row)
+        table.append([*row, *[""] * (len(ways) + 4 - len(row))])
     show(["scan", *ways, "best rival", "gain on it, points", "calibration"], table, f"every {EVERY}")
     return figures

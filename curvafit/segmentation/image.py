@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import combinations_with_replacement
@@ -17,12 +18,13 @@ from curvafit.core.runtime import Progress, silent
 from curvafit.segmentation.slices import Slices
 from curvafit.segmentation.uncertainty import fit_weights
 
-#: Widths of the Gaussians, in voxels of the shortest edge, and the least one along an axis, in its own voxels.
+#: Widths of the Gaussians in voxels of the shortest edge, and the least one along an axis in its own voxels. Along a
+#: longer edge they shrink by its root: optics ask for its ratio, and outlines that are drawn voxel by voxel for none.
 WIDTHS, LEAST = (0.7, 1.2, 2.0, 3.4, 5.6), 0.5
 #: Width of a second Gaussian before derivatives are taken.
 SMOOTH = 0.7
 #: Most voxels that trees learn from, trees, their rate and leaves.
-LEARNT, TREES, RATE, LEAVES = 200_000, 80, 0.1, 31
+LEARNT, TREES, RATE, LEAVES = 200_000, 120, 0.1, 31
 #: Voxels whose features are computed at once, and most of which they are kept for the second reading.
 HELD, KEPT = 4_000_000, 20_000_000
 #: Known slices of which every second one first judges; with fewer the log-odds are taken as they are.
@@ -71,7 +73,7 @@ def _learn(features: np.ndarray, inside: np.ndarray, seed: int) -> Any:
 def _features(levels: np.ndarray, spacing: Sequence[float]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield numbers of slices and their features (n, Y, X, F), float16: smoothed levels, their slopes, and the
     eigenvalues of their Hessians; as many slices at once as may be held, by as many threads as torch has."""
-    edges = [edge / min(spacing) for edge in spacing]
+    edges = [math.sqrt(edge / min(spacing)) for edge in spacing]
     halo, depth = int(4 * (max(WIDTHS) + SMOOTH) / edges[0]) + 3, len(levels)
     most = max(1, HELD // levels[0].size)
     pairs = list(combinations_with_replacement(range(3), 2))
