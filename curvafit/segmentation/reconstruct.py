@@ -44,6 +44,7 @@ from curvafit.segmentation.uncertainty import (
     best_log_odds,
     calibration_error,
     entropy,
+    expected_dice,
     fit_weights,
     near_surface,
     probability,
@@ -64,6 +65,8 @@ STIFFEST = (1e-9, 1e12)
 PULLS = (0.0, 1e4, 3e4)
 #: Label of unknown voxels in the mask of one structure.
 UNKNOWN = 255
+#: Least expected Dice of a volume that slices tell.
+HALF = 0.5
 #: Fewest grey levels of an image, and most voxels in which they are counted.
 GREY, SAMPLED = 8, 1_000_000
 #: Probabilities of labels are at least this.
@@ -184,7 +187,9 @@ def reconstruct(
         found = lower_volume(problem, tiling, store=store, workers=workers, progress=progress)
         likely = _weigh_evidence(engine, chosen, task, target, found.phase)
         notes = (*notes, *tiling.place.notes)
-    uncertain = _uncertainty(*likely, target, volume, axis, suggest)
+    uncertain = _uncertainty(*likely, found.mask, target, volume, axis, suggest)
+    if uncertain.expected_dice < HALF:
+        notes = (*notes, "Known slices lie too far apart: what lies between them is more unknown than known.")
     end = _describe_errors(uncertain)
     whole = replace(found, mask=_turn_back(axis, found.mask), phase=_turn_back(axis, found.phase))
     return Segmentation.of(
@@ -323,17 +328,22 @@ def _weigh_evidence(
     return values, calibration_error(told[near], task.truth[near])
 
 
-def _uncertainty(likely: np.ndarray, error: float, slices: Slices, volume: Field, axis: int, count: int) -> Uncertainty:
-    """Return probabilities (Z, Y, X) as a volume, 0 or 1 where it is known, and `count` slices to annotate next."""
+def _uncertainty(
+    likely: np.ndarray, error: float, mask: np.ndarray, slices: Slices, volume: Field, axis: int, count: int
+) -> Uncertainty:
+    """Return probabilities (Z, Y, X) as a volume, 0 or 1 where it is known, what they say of the mask, and `count`
+    slices to annotate next."""
     inside = slices.keep_known(np.zeros(slices.shape, dtype=bool))
     values = np.where(slices.known_voxels, inside, likely).astype(np.float32)
     suggestions = suggest_slices(entropy(values).sum((1, 2)), slices.places, count, slices.periodic)
-    return Uncertainty(replace(volume, values=_turn_back(axis, values), notes=()), error, suggestions)
+    dice = expected_dice(likely[slices.between], mask[slices.between])
+    return Uncertainty(replace(volume, values=_turn_back(axis, values), notes=()), error, suggestions, dice)
 
 
 def _describe_errors(uncertain: Uncertainty) -> str:
     """Say how good probabilities are, and what to annotate next, as the end of a sentence."""
-    text = f"probabilities err by {uncertain.calibration_error:.3f} near the surface"
+    text = f"expect a Dice of {uncertain.expected_dice:.2f} between known slices"
+    text = f"{text}; probabilities err by {uncertain.calibration_error:.3f} near the surface"
     following = ", ".join(map(str, uncertain.suggestions))
     return f"{text}; annotate next: {following}" if following else text
 
@@ -464,7 +474,8 @@ def reconstruct_labels(
     values = np.where(known_voxels, np.where(np.isin(volume.values, numbers), volume.values, 0), values)
     likely = np.where(known_voxels, 1.0, likely)
     values = values.astype(np.int32 if min(numbers) < 0 else np.min_scalar_type(max(numbers)))
-    error = max(part.uncertainty.calibration_error for part in parts if part.uncertainty is not None)
+    doubts = [part.uncertainty for part in parts if part.uncertainty is not None]
+    error, dice = max(doubt.calibration_error for doubt in doubts), min(doubt.expected_dice for doubt in doubts)
     return Segmentation(
         mask=replace(volume, values=values != 0, notes=()),
         phase=replace(volume, values=deepest, notes=()),
@@ -474,7 +485,7 @@ def reconstruct_labels(
         status="; ".join(f"label {number}: {part.status}" for number, part in zip(numbers, parts, strict=True)),
         notes=tuple(dict.fromkeys(notes)),
         labels=replace(volume, values=values, notes=()),
-        uncertainty=Uncertainty(replace(volume, values=likely.astype(np.float32), notes=()), error, ()),
+        uncertainty=Uncertainty(replace(volume, values=likely.astype(np.float32), notes=()), error, (), dice),
     )
 
 

@@ -50,11 +50,14 @@ class Uncertainty:
         generated shapes that did not teach.
     suggestions
         Numbers of the slices to annotate next, the most informative first.
+    expected_dice
+        The Dice of the mask between known slices that the probabilities let expect; of several structures the least.
     """
 
     probability: Field
     calibration_error: float
     suggestions: tuple[int, ...]
+    expected_dice: float
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -259,7 +262,7 @@ def _map_path(target: Path, name: str) -> Path:
 def _record(segmentation: Segmentation, scan: Field, more: dict[str, Any]) -> dict[str, Any]:
     uncertain, doubts = segmentation.uncertainty, {}
     if uncertain is not None:
-        doubts = {name: getattr(uncertain, name) for name in ("calibration_error", "suggestions")}
+        doubts = {name: getattr(uncertain, name) for name in ("calibration_error", "suggestions", "expected_dice")}
     return {
         "status": segmentation.status,
         **more,

@@ -64,6 +64,11 @@ def best_threshold(probability: np.ndarray) -> float:
     return min(0.5, float(edges[::-1][best + 1]))
 
 
+def expected_dice(probability: np.ndarray, mask: np.ndarray) -> float:
+    """Return the Dice that a mask has, to first order on average, if voxels are inside with these probabilities."""
+    return 2 * float(probability[mask].sum()) / max(float(mask.sum() + probability.sum()), 1e-9)
+
+
 def best_log_odds(logits: np.ndarray) -> float:
     """Return the log-odds of the `best_threshold` of voxels with these log-odds."""
     return float(logit(best_threshold(expit(logits))))

@@ -455,7 +455,7 @@ def segmentation(mask: list[bool], likely: list[float], labels: list[int] | None
     """One row of voxels with these probabilities, of the inside or of their labels."""
     inside, chances = (Field(np.array(each)[None, None]) for each in (mask, np.float32(likely)))
     several = None if labels is None else Field(np.array(labels, dtype=np.uint8)[None, None])
-    uncertain = Uncertainty(chances, 0.0, ())
+    uncertain = Uncertainty(chances, 0.0, (), 1.0)
     return Segmentation(inside, chances, None, None, 1.0, "", (), uncertain, several)
 
 

@@ -13,6 +13,7 @@ from curvafit.segmentation.uncertainty import (
     best_threshold,
     calibration_error,
     entropy,
+    expected_dice,
     fit_temperature,
     fit_weights,
     near_surface,
@@ -208,3 +209,20 @@ def test_the_temperature_is_that_by_which_labels_were_drawn() -> None:
     labels = random.random(60_000) < 1 / (1 + np.exp(-logits / 1.7))
     assert fit_temperature(logits, labels) == pytest.approx(1.7, rel=0.05)
     assert fit_temperature(np.array([50.0]), np.array([1.0])) == 1
+
+
+def test_the_expected_dice_is_that_of_truths_that_are_drawn() -> None:
+    random = np.random.default_rng(0)
+    likely = random.beta(0.5, 1.5, 40_000)
+    mask = likely > best_threshold(likely)
+    drawn = [random.random(likely.shape) < likely for _ in range(20)]
+    found = [2 * (truth & mask).sum() / (truth.sum() + mask.sum()) for truth in drawn]
+    assert expected_dice(likely, mask) == pytest.approx(np.mean(found), abs=2e-3)
+
+
+def test_slices_too_far_apart_are_said_to_be() -> None:
+    z, y, x = np.mgrid[:33, :40, :40]
+    specks = (np.sin(1.1 * z) * np.sin(1.3 * y + z) * np.sin(1.2 * x - 2 * z)) > 0.6
+    far = reconstruct(specks.astype(np.uint8), every=16)
+    assert far.uncertainty is not None and far.uncertainty.expected_dice < 0.5
+    assert any("too far apart" in note for note in far.notes)
