@@ -27,15 +27,13 @@ SMOOTH = 0.7
 LEARNT, TREES, RATE, LEAVES = 200_000, 120, 0.1, 31
 #: Voxels whose features are computed at once, and most of which they are kept for the second reading.
 HELD, KEPT = 4_000_000, 20_000_000
-#: Known slices of which every second one first judges; with fewer the log-odds are taken as they are.
-FEWEST = 4
 
 
 def read_image(values: np.ndarray, slices: Slices, seed: int = 0, progress: Progress = silent) -> np.ndarray:
     """Return what an image (Z, Y, X) says of a volume of which some slices are known: log-odds, float32 (Z, Y, X).
 
     Trees learn, from the known slices, which levels are inside, by the slopes and Hessians about them at several
-    widths. First they learn from every second slice; the others say how sure they may be.
+    widths. First they learn from every second slice, and the others say how sure they may be, if both have an inside.
 
     Raises ImportError where scikit-learn is not installed.
     """
@@ -45,7 +43,7 @@ def read_image(values: np.ndarray, slices: Slices, seed: int = 0, progress: Prog
     if values.size <= KEPT:
         parts = list(parts)
     features = np.concatenate([part[np.isin(rows, slices.places)] for rows, part in parts])
-    if len(known) >= FEWEST:
+    if all(half.any() and not half.all() for half in (known[::2], known[1::2])):
         trees = _learn(features[::2], known[::2], seed)
         logits = trees.decision_function(features[1::2].reshape(-1, features.shape[-1]))
         slope, shift = fit_weights(logits[:, None], known[1::2].ravel())
@@ -64,6 +62,8 @@ def _learn(features: np.ndarray, inside: np.ndarray, seed: int) -> Any:
     ensemble = require("sklearn.ensemble", "image", "reading an image")
     table, truth = features.reshape(-1, features.shape[-1]), inside.ravel()
     rows = np.random.default_rng(seed).permutation(len(table))[:LEARNT]
+    if len(np.unique(truth[rows])) == 1:
+        rows = np.append(rows, np.flatnonzero(truth != truth[rows[0]]))
     options = {"max_iter": TREES, "learning_rate": RATE, "max_leaf_nodes": LEAVES, "l2_regularization": 1.0}
     return ensemble.HistGradientBoostingClassifier(**options, early_stopping=False, random_state=seed).fit(
         table[rows], truth[rows]

@@ -72,6 +72,14 @@ def test_slices_that_are_read_in_parts_are_read_alike(monkeypatch: pytest.Monkey
     assert np.median(np.abs(parts - whole)) < 1e-6 and ((parts > 0) == (whole > 0)).mean() > 0.995
 
 
+def test_a_structure_in_one_slice_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(room, "LEARNT", 50)
+    mask = np.zeros((25, 30, 30), bool)
+    mask[10:15, 12:16, 12:16] = True
+    said = read_image(photograph(mask, 0.1), known(mask))
+    assert np.isfinite(said).all() and said[mask].mean() > said[~mask].mean() + 1
+
+
 # ---- filling ---------------------------------------------------------------------------------------------------------
 
 
