@@ -269,6 +269,7 @@ def on_scans(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
         raise SystemExit("set CURVAFIT_DATA to the folder that holds scans/")
     ways, every = [*plain_ways(), *(way for way in options.ways.split(",") if way in OURS)], options.every
     figures: dict[str, Figure] = {}
+    group = "filled" if options.set == "report" else options.set
     for name in options.only.split(","):
         shown = [
             side
@@ -281,16 +282,13 @@ def on_scans(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
         names = {(each, way): f"{name}-{each}-{every}-{way}" for each, way in product(parts, ways)}
         jobs = {case: partial(scan_case, name, *map(int, each.split("-")), every, way, cases)
                 for (each, way), case in names.items()}  # fmt: skip
-        group = "filled" if options.set == "report" else options.set
         figures |= gains(f"{name}, every {every}", names, cases.all(jobs), ways, f"{group}.{name}.{{way}}_{{key}}")
-    medians = [
-        figures[f"filled.{name}.filler_gain"].value for name in STRUCTURES if f"filled.{name}.filler_gain" in figures
-    ]
-    if len(medians) > 1:
-        figures["filled.all"] = bootstrap(medians)
-        figures["filled.least"] = Figure(
-            min(figure.value for key, figure in figures.items() if key.endswith("filler_least"))
-        )
+    for way, key in (("filler", "filled.{}"), ("tuned", "filled.tuned_{}")):
+        gains_of = [each.value for name, each in figures.items() if name.endswith(f"{way}_gain")]
+        if group == "filled" and len(gains_of) > 1:
+            figures[key.format("all")] = bootstrap(gains_of)
+            leasts = [each.value for name, each in figures.items() if name.endswith(f"{way}_least")]
+            figures[key.format("least")] = Figure(min(leasts))
     return figures if every == 8 else {}
 
 

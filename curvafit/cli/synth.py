@@ -126,7 +126,10 @@ def _choose_source(laws: list[str], atlas: Path | None, filled: float | None) ->
 def _choose_modality(
     name: str | None, like: str | None, mask: str | None, visible: str | None, reading: dict[str, Any]
 ) -> Modality:
-    """Return the named kind of image, or one like a scan, whose masks hold the visible share of light."""
+    """Return the modality of a name, or one fitted to the scan `like`.
+
+    If `visible` is given, masks end where less than this share of the structure's light arrives.
+    """
     if (name is None) == (like is None):
         raise ValueError(f"give either --modality or --like, got {'neither' if name is None else 'both'}")
     if like is None:

@@ -74,7 +74,10 @@ class Recipe:
 
     @property
     def largest(self) -> tuple[int, int, int]:
-        """Return the voxels (z, y, x) of the largest shapes, those of the least calibre."""
+        """Return the most voxels (z, y, x) that a shape can have.
+
+        A shape's voxel is smallest at the least calibre, so that the box of an image needs most of them there.
+        """
         return field_shape(self.shape, self.voxel * self.calibres[0], self.modality.base)
 
     def case(self, index: int) -> Case:

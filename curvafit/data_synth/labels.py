@@ -241,8 +241,11 @@ def _find_nearest(touching: np.ndarray, edges: np.ndarray, periodic: bool) -> np
 
 @njit(cache=True)
 def _measure_near(near, edges, periodic):  # pragma: no cover
-    """Return a mask of the voxels that touch the other side, their offsets to the surface and its normals (…, 6), and
-    the distance near the surface, NaN elsewhere."""
+    """Measure the surface near its voxels, from the distance that the profile states, positive inside (`near`).
+
+    Returns the voxels that have a neighbour of the other sign; for each of them its offset to the surface, and then the
+    normal there (…, 6); and the distance of all voxels near the surface, NaN elsewhere.
+    """
     shape, widest = near.shape, edges.max()
     touching = np.zeros(shape, dtype=np.bool_)
     feet = np.zeros((*shape, 6), dtype=np.float32)

@@ -124,10 +124,10 @@ def write_shape(
     picture: bool = True,
     overwrite: bool = False,
 ) -> tuple[Path, ...]:
-    """Write a flow's field as a volume or a surface, by suffix, with a record and a picture of one box.
+    """Write a flow's field as a volume or a surface, by suffix, with a record and a picture of one period.
 
-    All files are made in a temporary folder, then moved together. If the picture cannot be drawn, a warning says so,
-    and an earlier one is deleted.
+    All files are made in a temporary folder, then moved together. If the picture cannot be drawn, a warning says so.
+    The picture of a shape that is replaced is deleted, also where none is drawn now.
 
     Parameters
     ----------

@@ -58,7 +58,8 @@ class ShortFlow:
         if halo:
             self.frozen = torch.ones(self.grid.shape, dtype=torch.bool)
             self.frozen[inside] = False
-        # The displacement is weighed by the interface near a voxel: |∇u|, low-passed.
+        # The displacement is the low-passed change of u over `share`, the low-passed |∇u|; its squares are weighted by
+        # share / Σ share. So the mean square is Σ (change / norm)², with norm = √(share Σ share).
         slope = gradient(self._before.double(), self.grid).square().sum(-4).sqrt()
         self._read = tuple(slice(s.start, s.stop, STRIDE) for s in inside)
         share = gaussian_blur(slope, self.grid, LOW_PASS * self._voxel)[self._read]
@@ -68,7 +69,10 @@ class ShortFlow:
         self._budget = self._force(fix_gauge(np.array([float(value) for value in reference]))[0])
 
     def residual(self, law: Coefficients) -> np.ndarray:
-        """Return the low-passed displacement in voxels, weighted by interface: its squares sum to the mean square."""
+        """Return, for each voxel that is read, its low-passed displacement in voxels times the root of its weight.
+
+        The sum of the squares is the weighted mean square of the displacement.
+        """
         scaled = law.scale(self._budget / self._force(law))
         flow = descend(
             self.start,

@@ -152,9 +152,9 @@ def train_emulator(
 ) -> tuple[Emulator, dict[str, np.ndarray]]:
     """Fit networks to the compressed descriptors of a table's rows, given their parameters.
 
-    Other networks are fitted to the deviations of what the first miss of shapes that they did not learn from. Returned
-    as well, by view: what the emulator leaves unexplained of such shapes, sums of squares as of `emulator.misfits`, of
-    `REFERENCE` rows at most.
+    One ensemble of networks learns the mean. A second one learns the deviations of the first one's errors on shapes
+    held out. Returned beside the emulator, by view: the misfits (`emulator.misfits`) of shapes held out, of
+    `REFERENCE` rows at most, to which the misfit of a scan is compared.
     """
     views = tuple(sorted(set(table.views.tolist())))
     target = compression(table.descriptors)

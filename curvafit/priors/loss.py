@@ -297,10 +297,10 @@ def curvature_prior(
     probability
         Values in [0, 1]; float32, or float64, which takes the definition in plain torch.
     law
-        Coefficients in spacing's unit, or another law, as in `CurvaturePrior`.
+        `Coefficients` in spacing's unit, a preset's name, or a fit or its path, as in `CurvaturePrior`.
     spacing, epsilon
-        Voxel edges (z, y, x), and ε in their unit. An axis on which ε spans fewer than two voxels, by more than a
-        tenth, is refined by cubic interpolation until it spans two.
+        Voxel edges (z, y, x), and ε in their unit. An axis whose voxels are longer than .55 ε is refined by cubic
+        interpolation until they are ε / 2 or shorter.
     mask
         Weights of the energy's density.
     normalize

@@ -514,7 +514,7 @@ def find_labels(values: np.ndarray, chosen: Sequence[int] | None) -> list[int]:
 
 
 def _select_label(volume: Any, number: int, ignore: int | None = None) -> Any:
-    """Return the mask of a label, of a volume if there is one; voxels of the label to ignore are `UNKNOWN`."""
+    """Return the mask of the label `number` as a volume, `UNKNOWN` where the label is `ignore`; None of no volume."""
     if volume is None:
         return None
     mask = (volume.values == number).astype(np.uint8)

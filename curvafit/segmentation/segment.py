@@ -67,9 +67,9 @@ def segment(
 ) -> Segmentation:
     """Find the structure of a scan: lower -log p(scan | mask) + λ F_ε from a smoothed, thresholded start.
 
-    Grey levels left out decide on the law and its weight: the laws that a fit trusts and the Willmore energy are tried,
-    and where none predicts these levels better than the start does, the start is the result. A network's probabilities
-    are for `refine`: neighbouring ones are correlated, so that none can be left out.
+    Held-out voxels decide on the law and its weight: the laws that a fit trusts and the Willmore energy are tried, and
+    where none predicts the grey levels of these voxels better than the start does, the start is the result. A network's
+    probabilities are for `refine`: neighbouring ones are correlated, so that none can be held out.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def segment(
         `Coefficients` with lengths in the scan's unit; or a preset's name, in working units of which the smallest voxel
         edge is 0.01; or the path of a `fit.json`, whose unit is converted.
     weight
-        λ, in nats per unit of F_ε, for the first law; by default it is chosen, with the law, by voxels left out. Small
+        λ, in nats per unit of F_ε, of the prior's own law, of a fit its best one; then nothing is tried out. Small
         bumps on a plane cost (a20 + a02) / 2 times their Willmore energy (linear terms aside, since ∫κ1κ2 = 0).
     threshold, dark
         The grey level between the phases, or `"otsu"`; whether the structure is the dark one.

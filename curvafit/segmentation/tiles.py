@@ -232,7 +232,7 @@ class Problem(ABC):
 
     @abstractmethod
     def plain(self, level: np.ndarray, place: WorkingGrid) -> np.ndarray:
-        """Return the phase field of a start, on the scan's voxels."""
+        """Return the phase field on the scan's voxels where no law is lowered: that of the start's level."""
 
     def mask(self, phase: np.ndarray, box: Box) -> np.ndarray:
         """Return the mask, bool (Z, Y, X), of a phase field on a box."""

@@ -140,7 +140,10 @@ class InFile:
 
     @property
     def digest(self) -> str:
-        """The file's name, size and time of change; of a folder, the sum and the latest of its files'."""
+        """A text that changes with the content, without reading it: path, options, size and time of change.
+
+        Of a folder these are the total size, and the latest time.
+        """
         files = [path for path in self.path.rglob("*") if path.is_file()] if self.path.is_dir() else [self.path]
         states = [path.stat() for path in files]
         size, time = sum(state.st_size for state in states), max(state.st_mtime_ns for state in states)

@@ -114,7 +114,9 @@ def correlated_field(like: Volume, lengths: Sequence[float], seed: int, purpose:
 
 
 def grainy_noise(like: Volume, widths: Sequence[float], seed: int, purpose: str) -> Volume:
-    """Return standard normal noise, smoothed by a Gaussian of deviations `widths` voxels: correlated by √2 widths."""
+    """Return Gaussian noise of mean 0 and variance 1, smoothed by a Gaussian of deviations `widths` (z, y, x), in
+    voxels. Its correlation is a Gaussian of deviations √2 `widths`.
+    """
     noise = white_noise(tuple(like.shape), like, seed, purpose)
     maps = [gaussian_matrix(n, width, like) for n, width in zip(like.shape, widths, strict=True)]
     return apply_matrices(

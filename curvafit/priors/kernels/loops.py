@@ -458,7 +458,10 @@ def _gather(ring, size, at, stride, n, sums, below, centre, above, out, target):
 
 @njit(**_SERIAL)
 def _carry(ring, size, stride, count):
-    """Move the last two of `count` rows, which start at row 2 of the ring, to rows 0 and 1 for the next block."""
+    """Move the rows that the next block still reads from the end of the ring to its beginning.
+
+    Of `count` new rows, which start at row 2, these are the last one of each array, or the last two of the partials.
+    """
     far = count * stride
     for array in range(_C, _YP):
         first = SLACK + array * size + stride
