@@ -133,7 +133,7 @@ class Cases:
         values = make()
         record = {"topic": self.topic, "name": name, "values": values, "seed": seed}
         record |= provenance(self.topic) | {"seconds": round(time.perf_counter() - begun, 2)}
-        text = json.dumps(record, indent=1, ensure_ascii=False) + "\n"
+        text = json.dumps(record, ensure_ascii=False) + "\n"
         write_whole(self._cached(name), lambda temporary: temporary.write_text(text, encoding="utf-8"))
         return record
 

@@ -3,7 +3,7 @@
 Needs $CURVAFIT_DATA, scikit-learn and monai. All ways know the same slices, and the image of the whole volume.
 
 - `ours`: `reconstruct(image=…)`; `alone`: without the image; `trees`: its reading of the image, at log-odds of 0.
-- `forest`: a random forest of 60 trees on smoothed levels, gradients, Laplacians and Hessian eigenvalues, as ilastik
+- `forest`: a random forest of 60 trees on smoothed levels, edges and Hessian eigenvalues, as ilastik
   has them; `refined`: `refine` on its map, Willmore, at the best of `WEIGHTS` *in hindsight*.
 - `U-Net`: a small 3D one by Dice and cross-entropy of the known slices, the rest ignored.
 
@@ -140,16 +140,8 @@ def case(name: str, way: str, cases: Cases) -> Values:
         found = reconstruct(mask, known=places, axis=axis, image=image if way == "ours" else None)
         inside, likely = (np.moveaxis(each.values, axis, 0) for each in (found.mask, found.probability))
         inside, status = inside > 0, found.status
-    elif way == "refined":
-        likely = cases.array(f"forest-{name}", lambda: forest(grey, truth, places))
-        volume = Field(likely.astype(np.float32), edges, mask.unit)
-        inside = max(
-            (refine(volume, Coefficients.willmore(), weight=weight).mask.values > 0 for weight in WEIGHTS),
-            key=lambda each: int((each == truth).sum()),
-        )
-        likely = None
     else:
-        if way == "forest":
+        if way in ("forest", "refined"):
             likely = cases.array(f"forest-{name}", lambda: forest(grey, truth, places))
         elif way == "trees":
             slices = Slices(truth[places], tuple(places), len(truth), edges, mask.unit)
@@ -157,6 +149,12 @@ def case(name: str, way: str, cases: Cases) -> Values:
         else:
             likely = u_net(grey, truth, places)
         inside = likely > 0.5
+    if way == "refined":
+        volume, likely = Field(likely.astype(np.float32), edges, mask.unit), None
+        inside = max(
+            (refine(volume, Coefficients.willmore(), weight=weight).mask.values > 0 for weight in WEIGHTS),
+            key=lambda each: int((each == truth).sum()),
+        )
     seconds = time.perf_counter() - begun
     unknown = [n for n in range(places[-1]) if n not in places]
     counts = tally(inside[unknown], truth[unknown], [n // EVERY * 32 for n in unknown])

@@ -195,7 +195,7 @@ class Filler(nn.Module):
         coarse = self.coarse(F.avg_pool2d(middle, 2))
         condition = self.condition(gaps.conditions)
         x = _trim(self.deep(coarse.repeat_interleave(n, 0), condition), (drop - 2 * rim) // 4)
-        x = self.up_middle(double(self.to_middle(x)), condition, _trim(middle, (drop - 2 * rim) // 2))
+        x = self.up_middle(_double(self.to_middle(x)), condition, _trim(middle, (drop - 2 * rim) // 2))
         x = _trim(x, rim // 2)
         distances, marks = _trim(gaps.distances, drop - rim), _trim(gaps.marks, drop - rim)
         linear, cubic = interpolate(distances, gaps.heights)
@@ -203,7 +203,7 @@ class Filler(nn.Module):
         seen = None if gaps.evidence is None else _trim(gaps.evidence, drop - rim).clamp(-SUREST, SUREST)
         if seen is not None:
             hints.append(seen / _DISTANCE)
-        x = torch.cat([double(self.to_fine(x)), torch.stack(hints, dim=2).flatten(0, 1)], dim=1)
+        x = torch.cat([_double(self.to_fine(x)), torch.stack(hints, dim=2).flatten(0, 1)], dim=1)
         x = self.up_fine(x, condition, _trim(fine, drop - rim))
         logits = self.out(x).unflatten(0, (-1, n))[:, :, 0] + self.slope * cubic
         if seen is not None and self.trust is not None:
@@ -223,8 +223,7 @@ def _trim(x: Tensor, pixels: int) -> Tensor:
     return x[..., pixels : x.shape[-2] - pixels, pixels : x.shape[-1] - pixels]
 
 
-def double(x: Tensor) -> Tensor:
-    """Return features (N, C, Y, X) at twice the pixels."""
+def _double(x: Tensor) -> Tensor:
     return F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
 
 

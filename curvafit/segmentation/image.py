@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from itertools import combinations_with_replacement
 from typing import Any
 
@@ -39,17 +40,16 @@ def read_image(values: np.ndarray, slices: Slices, seed: int = 0, progress: Prog
     """
     known, slope, shift = slices.inside, 1.0, 0.0
     levels = ((values - values.mean()) / max(float(values.std()), 1e-12)).astype(np.float32)
-    parts: Iterable[tuple[np.ndarray, np.ndarray]] = _features(levels, slices.spacing)
-    if values.size <= KEPT:
-        parts = list(parts)
-    features = np.concatenate([part[np.isin(rows, slices.places)] for rows, part in parts])
+    describe = partial(_features, levels, slices.spacing)
+    kept = list(describe()) if values.size <= KEPT else None
+    features = np.concatenate([part[np.isin(rows, slices.places)] for rows, part in kept or describe()])
     if all(half.any() and not half.all() for half in (known[::2], known[1::2])):
         trees = _learn(features[::2], known[::2], seed)
         logits = trees.decision_function(features[1::2].reshape(-1, features.shape[-1]))
         slope, shift = fit_weights(logits[:, None], known[1::2].ravel())
     trees = _learn(features, known, seed)
     evidence = np.empty(values.shape, dtype=np.float32)
-    for rows, part in parts if isinstance(parts, list) else _features(levels, slices.spacing):
+    for rows, part in kept or describe():
         progress("reading the image", rows[0] / len(values))
         logits = trees.decision_function(part.reshape(-1, part.shape[-1]))
         evidence[rows] = (slope * logits + shift).reshape(part.shape[:3])
