@@ -145,7 +145,7 @@ def case(name: str, way: str, cases: Cases) -> Values:
             likely = cases.array(f"forest-{name}", lambda: forest(grey, truth, places))
         elif way == "trees":
             slices = Slices(truth[places], tuple(places), len(truth), edges, mask.unit)
-            likely = 1 / (1 + np.exp(-read_image(grey, slices)))
+            likely = 1 / (1 + np.exp(-read_image(grey, slices)[0]))
         else:
             likely = u_net(grey, truth, places)
         inside = likely > 0.5

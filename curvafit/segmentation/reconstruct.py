@@ -29,6 +29,7 @@ from curvafit.segmentation.filler import Taught, fill
 from curvafit.segmentation.image import read_image
 from curvafit.segmentation.result import Segmentation, Uncertainty, flow_summary
 from curvafit.segmentation.slices import (
+    WHOLE,
     Slices,
     annotated_slices,
     check_place,
@@ -69,6 +70,10 @@ UNKNOWN = 255
 HALF = 0.5
 #: Fewest grey levels of an image, and most voxels in which they are counted.
 GREY, SAMPLED = 8, 1_000_000
+#: Least share of the entropy of slices held out that an image takes away: that of the structure takes half or more.
+TOLD = 0.1
+#: Labels whose status is told one by one; voxels around a label's box.
+FEW, ROOM = 4, 16
 #: Probabilities of labels are at least this.
 SURE = 1e-6
 
@@ -164,7 +169,10 @@ def reconstruct(
             raise ScanError("give an image, or an example or a law, but not both: nothing joins them yet")
         seen = _load_image(image, volume, reading)
         step = sub_progress(progress, 0.0, 0.5)
-        evidence = read_image(np.moveaxis(seen.values, axis, 0), target, progress=step)
+        evidence, told = read_image(np.moveaxis(seen.values, axis, 0), target, progress=step)
+        if told < TOLD:
+            taught, evidence = Taught.load(), None
+            notes = (*notes, "The image does not tell the structure in annotated slices held out: it is left out.")
     if example is not None:
         other = Example.of(_load_example(example, volume, reading), places, axis)
         taught = tune(taught, other, sub_progress(progress, 0.0, 0.5))
@@ -190,11 +198,11 @@ def reconstruct(
     uncertain = _uncertainty(*likely, found.mask, target, volume, axis, suggest)
     if uncertain.expected_dice < HALF:
         notes = (*notes, "Known slices lie too far apart: what lies between them is more unknown than known.")
-    end = _describe_errors(uncertain)
+    end, known_slices = _describe_errors(uncertain), f"{len(places)} of {volume.shape[axis]} slices known"
     whole = replace(found, mask=_turn_back(axis, found.mask), phase=_turn_back(axis, found.phase))
     return Segmentation.of(
-        volume, whole, chosen.law, tiling.place.epsilon, (*notes, *_known_notes(places, volume.shape[axis])),
-        weight=None, status=f"{said}: {flow_summary(found)}; {end}", uncertainty=uncertain,
+        volume, whole, chosen.law, tiling.place.epsilon, (*notes, *_extrapolated(places, volume.shape[axis])),
+        weight=None, status=f"{said}: {known_slices}, {flow_summary(found)}; {end}", uncertainty=uncertain,
     )  # fmt: skip
 
 
@@ -380,11 +388,12 @@ def _load_example(example: Source, volume: Field, reading: dict[str, Any]) -> Fi
     return field
 
 
-def _known_notes(places: list[int], length: int) -> tuple[str, ...]:
-    """Return sentences on the number of known slices, and of extrapolated ones."""
+def _extrapolated(places: list[int], length: int) -> tuple[str, ...]:
+    """Return sentences on the slices before the first known one and beyond the last."""
     before, beyond = places[0], length - 1 - places[-1]
-    outer = f"The {before} before the first and the {beyond} beyond the last are extrapolated."
-    return f"{len(places)} of {length} slices are known.", *((outer,) if before or beyond else ())
+    first = f"Slices before the first known one ({before}) are as that one is."
+    last = f"Slices beyond the last known one ({beyond}) are as that one is."
+    return *((first,) if before else ()), *((last,) if beyond else ())
 
 
 # ---- several structures ----------------------------------------------------------------------------------------------
@@ -400,6 +409,7 @@ def reconstruct_labels(
     known: Sequence[int] | None = None,
     ignore: int | None = None,
     axis: int = 0,
+    image: Source | None = None,
     example: Source | None = None,
     store: str | PathLike[str] | None = None,
     progress: Progress = silent,
@@ -411,8 +421,8 @@ def reconstruct_labels(
     one with the greater phase field there.
 
     Where every voxel of the known slices is labelled, so is every voxel of the volume: an unclaimed voxel goes to the
-    label with the largest phase value. A label for which slices or example are too few for what is asked is filled by
-    the network alone, and a note says why.
+    label with the largest phase value; else each label is filled in the box where it may be. A label for which slices
+    or example are too few for what is asked is filled by the network alone, and a note says why.
 
     Parameters
     ----------
@@ -424,7 +434,7 @@ def reconstruct_labels(
         The labels that are structures, by default all but 0; the others count as nothing.
     example
         Labels of another volume of the same kind, known whole, with the same values for the same structures.
-    every, first, known, ignore, axis, store, progress, spacing, unit, options
+    every, first, known, ignore, axis, image, store, progress, spacing, unit, options
         As in `reconstruct`, without `suggest`.
 
     Returns
@@ -432,7 +442,7 @@ def reconstruct_labels(
     Segmentation
         `labels` has the label of the structure at each voxel, `mask` whether there is one, `phase` the greatest phase
         field, `probability` that of the voxel's label; there are no coefficients. Its `status` is that of `reconstruct`
-        for each label.
+        for each label, or of many a summary.
 
     Raises
     ------
@@ -442,50 +452,97 @@ def reconstruct_labels(
     volume = field_of(slices, spacing=spacing, unit=unit)
     axis = check_int(axis, "an axis 0, 1 or 2 (z, y, x)", 0, 2)
     places, marks = _find_known(volume, axis, every, first, known, ignore)
-    planes = np.moveaxis(volume.values, axis, 0)[places]
-    numbers = find_labels(planes, chosen)
+    moved = np.moveaxis(volume.values, axis, 0)
+    known_voxels = _turn_back(axis, mark_known(moved.shape, places, marks))
+    numbers = find_labels(moved[places], chosen)
+    full = bool(np.isin(moved[places], numbers).all())
     other = None if example is None else _load_example(example, volume, {"spacing": spacing, "unit": unit})
-    notes = list(volume.notes)
+    seen = None if image is None else _load_image(image, volume, {"spacing": spacing, "unit": unit})
     laws = prior if isinstance(prior, Mapping) else dict.fromkeys(numbers, prior)
     deepest, owner = np.full(volume.shape, -np.inf, dtype=np.float32), np.zeros(volume.shape, dtype=np.int64)
     largest, odds = np.zeros(volume.shape, dtype=np.float32), np.zeros(volume.shape, dtype=np.float32)
-    parts: list[Segmentation] = []
+    parts: dict[int, Segmentation] = {}
+    notes: dict[str, list[int]] = {}
     for count, number in enumerate(numbers):
-        mask, shown = _select_label(volume, number, ignore), _select_label(other, number)
+        inside = (volume.values == number) & known_voxels
+        box = WHOLE if full or options.get("periodic") else _box_of_label(inside, places, axis, volume.spacing)
+        mask, shown = _select_label(_cut(volume, box), number, ignore), _select_label(other, number)
+        start, stop, _ = box[axis].indices(volume.shape[axis])
+        which = {"known": [k - start for k in places if start <= k < stop]} if ignore is None else {"ignore": UNKNOWN}
         folder = None if store is None else Path(store) / str(number)
         step = sub_progress(progress, count / len(numbers), (count + 1) / len(numbers))
-        which = {"known": places} if ignore is None else {"ignore": UNKNOWN}
         same = partial(reconstruct, mask, axis=axis, progress=step, **which, **options)
         try:
-            part = same(laws.get(number), example=shown, store=folder)
+            part = same(laws.get(number), image=None if seen is None else _cut(seen, box), example=shown, store=folder)
         except ScanError as reason:
             part = same()
-            notes.append(f"Label {number} is filled by the network alone: {reason}.")
-        owner = np.where(part.phase.values > deepest, number, owner)
-        deepest = np.maximum(deepest, part.phase.values)
+            notes[f"Filled by the network alone: {reason}."] = [number]
+        owner[box] = np.where(part.phase.values > deepest[box], number, owner[box])
+        deepest[box] = np.maximum(deepest[box], part.phase.values)
         own = _odds(part)
-        largest, odds = np.maximum(largest, own), odds + own
-        notes += part.notes
-        parts.append(part)
-    full = bool(np.isin(planes, numbers).all())
+        largest[box], odds[box] = np.maximum(largest[box], own), odds[box] + own
+        for note in part.notes:
+            notes.setdefault(note, []).append(number)
+        parts[number] = part
     values = owner if full else np.where(deepest > 0, owner, 0)
     likely = np.where(values, largest, 1.0) / (odds + (not full))
-    known_voxels = _turn_back(axis, mark_known(np.moveaxis(volume.values, axis, 0).shape, places, marks))
     values = np.where(known_voxels, np.where(np.isin(volume.values, numbers), volume.values, 0), values)
     likely = np.where(known_voxels, 1.0, likely)
     values = values.astype(np.int32 if min(numbers) < 0 else np.min_scalar_type(max(numbers)))
-    doubts = [part.uncertainty for part in parts if part.uncertainty is not None]
-    error, dice = max(doubt.calibration_error for doubt in doubts), min(doubt.expected_dice for doubt in doubts)
+    doubts = {number: part.uncertainty for number, part in parts.items() if part.uncertainty is not None}
+    error = max(doubt.calibration_error for doubt in doubts.values())
+    dice = {number: doubt.expected_dice for number, doubt in doubts.items()}
+    likely = replace(volume, values=likely.astype(np.float32), notes=())
     return Segmentation(
         mask=replace(volume, values=values != 0, notes=()),
-        phase=replace(volume, values=deepest, notes=()),
+        phase=replace(volume, values=np.maximum(deepest, -1), notes=()),
         weight=None,
         coefficients=None,
-        epsilon=max(part.epsilon for part in parts),
-        status="; ".join(f"label {number}: {part.status}" for number, part in zip(numbers, parts, strict=True)),
-        notes=tuple(dict.fromkeys(notes)),
+        epsilon=max(part.epsilon for part in parts.values()),
+        status=_describe_labels(parts, dice),
+        notes=(
+            *volume.notes,
+            *(text if len(of) == len(numbers) else f"{_name_labels(of)}: {text}" for text, of in notes.items()),
+        ),
         labels=replace(volume, values=values, notes=()),
-        uncertainty=Uncertainty(replace(volume, values=likely.astype(np.float32), notes=()), error, (), dice),
+        uncertainty=Uncertainty(likely, error, (), min(dice.values()), dice),
+    )
+
+
+def _cut(volume: Field, box: Box) -> Field:
+    """Return the voxels of a box, wherever they lie."""
+    return replace(volume, values=volume.values[box], affine=None, notes=())
+
+
+def _box_of_label(inside: np.ndarray, places: list[int], axis: int, spacing: Sequence[float]) -> Box:
+    """Return the box in which a label may be, given where it is known to be (Z, Y, X): along the axis up to the known
+    slices without it, and across it `ROOM` voxels and two gaps beyond."""
+    step = 2 * max(np.diff(places)) * spacing[axis]
+    box: list[slice] = []
+    for k in range(3):
+        found = np.flatnonzero(inside.any(tuple({0, 1, 2} - {k})))
+        low, high = int(found[0]), int(found[-1])
+        if k == axis:
+            before, beyond = [p for p in places if p < low], [p for p in places if p > high]
+            box.append(slice(before[-1] if before else 0, beyond[0] + 1 if beyond else inside.shape[k]))
+        else:
+            margin = ROOM + math.ceil(step / spacing[k])
+            box.append(slice(max(low - margin, 0), min(high + 1 + margin, inside.shape[k])))
+    return box[0], box[1], box[2]
+
+
+def _name_labels(numbers: Sequence[int]) -> str:
+    return f"Label{'s' if len(numbers) > 1 else ''} {', '.join(map(str, numbers))}"
+
+
+def _describe_labels(parts: Mapping[int, Segmentation], dice: Mapping[int, float]) -> str:
+    """Say how some labels were filled, and of many how well in the median and in the worst case."""
+    if len(parts) <= FEW:
+        return "; ".join(f"label {number}: {part.status}" for number, part in parts.items())
+    worst = ", ".join(f"label {number} {dice[number]:.2f}" for number in sorted(dice, key=lambda n: dice[n])[:FEW])
+    median = float(np.median(list(dice.values())))
+    return (
+        f"{len(parts)} labels filled: expect a Dice of {median:.2f} between known slices in the median; least: {worst}"
     )
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import datetime
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -52,12 +52,15 @@ class Uncertainty:
         Numbers of the slices to annotate next, the most informative first.
     expected_dice
         The Dice of the mask between known slices that the probabilities let expect; of several structures the least.
+    dice_of_labels
+        Of several structures: that of each label.
     """
 
     probability: Field
     calibration_error: float
     suggestions: tuple[int, ...]
     expected_dice: float
+    dice_of_labels: Mapping[int, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -263,6 +266,8 @@ def _record(segmentation: Segmentation, scan: Field, more: dict[str, Any]) -> di
     uncertain, doubts = segmentation.uncertainty, {}
     if uncertain is not None:
         doubts = {name: getattr(uncertain, name) for name in ("calibration_error", "suggestions", "expected_dice")}
+        if uncertain.dice_of_labels:
+            doubts["dice_of_labels"] = {str(number): dice for number, dice in uncertain.dice_of_labels.items()}
     return {
         "status": segmentation.status,
         **more,

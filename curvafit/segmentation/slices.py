@@ -73,7 +73,10 @@ class Slices:
         inside = require_labels(np.moveaxis(volume.values, axis, 0)[list(places)], name) > 0
         if inside.all() or not inside.any():
             state = "full" if inside.all() else "empty"
-            raise ScanError(f"{name} must have voxels inside and outside, but all are {state}")
+            raise ScanError(
+                f"{name} must have voxels inside and outside, but all are {state}; is another "
+                "slice the first, is there a label that nobody annotated, or are there several labels?"
+            )
         edges = [volume.spacing[k] for k in (axis, *(k for k in range(3) if k != axis))]
         return cls(
             inside, tuple(places), volume.shape[axis], (edges[0], edges[1], edges[2]), volume.unit, periodic, marks

@@ -89,7 +89,7 @@ def image_shape(textures: Sequence[Sequence[Texture]], mix: ImageMix, seed: Sequ
     slices = Slices(known, tuple(range(0, len(inside), gap)), len(inside), tuple(edges.tolist()))
     raster, margin = Raster.of(slices), slice(REACH - HALO, HALO - REACH)
     distances = np.stack([raster.distances(mask)[margin, margin] for mask in inside])
-    evidence = np.stack([raster.spread(plane)[margin, margin] for plane in read_image(seen, slices)])
+    evidence = np.stack([raster.spread(plane)[margin, margin] for plane in read_image(seen, slices)[0]])
     return Whole(distances, gap, slices.spacing[0] / raster.pixel, evidence)
 
 

@@ -48,27 +48,27 @@ def dice(mask: np.ndarray, truth: np.ndarray) -> float:
 
 def test_the_inside_is_found_whether_bright_or_dark() -> None:
     mask = rods()
-    bright, dark = (read_image(values, known(mask)) > 0 for values in (photograph(mask), -photograph(mask)))
+    bright, dark = (read_image(values, known(mask))[0] > 0 for values in (photograph(mask), -photograph(mask)))
     assert dice(bright, mask) > 0.85 and dice(dark, mask) > 0.85
 
 
 def test_the_unit_of_grey_levels_changes_nothing() -> None:
     mask = rods()
-    once, other = (read_image(values, known(mask)) for values in (photograph(mask), 64 * photograph(mask)))
+    once, other = (read_image(values, known(mask))[0] for values in (photograph(mask), 64 * photograph(mask)))
     assert np.array_equal(once, other)
 
 
 def test_noise_alone_says_little() -> None:
     mask = rods()
-    said = read_image(photograph(np.zeros_like(mask), 1.0), known(mask))
+    said = read_image(photograph(np.zeros_like(mask), 1.0), known(mask))[0]
     assert (np.abs(said - np.log(mask.mean() / (1 - mask.mean()))) < 2.5).mean() > 0.9
 
 
 def test_slices_that_are_read_in_parts_are_read_alike(monkeypatch: pytest.MonkeyPatch) -> None:
     mask = rods()
-    whole = read_image(photograph(mask), known(mask))
+    whole = read_image(photograph(mask), known(mask))[0]
     monkeypatch.setattr(room, "HELD", 5 * 37 * 37)
-    parts = read_image(photograph(mask), known(mask))
+    parts = read_image(photograph(mask), known(mask))[0]
     assert np.median(np.abs(parts - whole)) < 1e-6 and ((parts > 0) == (whole > 0)).mean() > 0.995
 
 
@@ -76,7 +76,7 @@ def test_a_structure_in_one_slice_is_read(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(room, "LEARNT", 50)
     mask = np.zeros((25, 30, 30), bool)
     mask[10:15, 12:16, 12:16] = True
-    said = read_image(photograph(mask, 0.1), known(mask))
+    said = read_image(photograph(mask, 0.1), known(mask))[0]
     assert np.isfinite(said).all() and said[mask].mean() > said[~mask].mean() + 1
 
 
@@ -122,6 +122,14 @@ def test_the_packaged_filler_finds_what_only_the_image_shows() -> None:
     assert dice(found, mask) > dice(alone, mask) + 0.02
     assert not alone[ball].any() and dice(found[ball], mask[ball]) > 0.8
     assert np.array_equal(found[::EVERY], mask[::EVERY])
+
+
+def test_an_image_of_something_else_is_left_out() -> None:
+    mask = rods()
+    shown = Field(mask.astype(np.uint8))
+    found = reconstruct(shown, every=EVERY, image=photograph(np.zeros_like(mask)))
+    assert np.array_equal(found.mask.values, reconstruct(shown, every=EVERY).mask.values)
+    assert any("image" in note for note in found.notes) and "image" not in found.status
 
 
 def test_any_axis_may_lie_across_the_slices() -> None:

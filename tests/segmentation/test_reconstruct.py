@@ -323,10 +323,11 @@ def test_labels_count_as_inside_and_what_is_extrapolated_is_said() -> None:
     found = reconstruct(Field(labels), WILLMORE, every=8.0, first=2, steps=1, stiffness=1e7)  # type: ignore[arg-type]
     plain = reconstruct(Field(truth), WILLMORE, known=[2, 10, 18, 26], steps=1, stiffness=1e7)
     assert np.array_equal(found.mask.values, plain.mask.values) and found.notes == plain.notes
-    assert "The 2 before the first and the 5 beyond the last are extrapolated." in found.notes
+    assert any("before" in note and "(2)" in note for note in found.notes)
+    assert any("beyond" in note and "(5)" in note for note in found.notes)
     assert "after 1 step:" in found.status
     whole = reconstruct(Field(truth), WILLMORE, known=[0, 15, 31], steps=1, stiffness=1e7)
-    assert not any("extrapolated" in note for note in whole.notes)
+    assert not any("beyond" in note for note in whole.notes)
 
 
 # ---- several structures ----------------------------------------------------------------------------------------------
@@ -393,7 +394,21 @@ def test_a_label_that_is_refused_is_filled_by_the_network_and_said() -> None:
     assert found.labels is not None
     assert np.array_equal(found.labels.values[0] == 9, truth[0] == 9)
     assert not (found.labels.values == 7).any()
-    assert any(note.startswith("Label 9 is filled by the network alone") for note in found.notes)
+    assert any(note.startswith("Label 9: Filled by the network alone") for note in found.notes)
+
+
+def test_a_label_is_filled_in_its_own_box_as_in_the_whole_volume() -> None:
+    z, y, x = np.indices((49, 120, 120))
+    labels = np.zeros(z.shape, np.uint8)
+    for number, (a, b) in enumerate(((20, 20), (20, 90), (90, 25), (95, 95), (60, 60)), 1):
+        labels[(np.hypot(y - a - 0.2 * (z - 24), x - b) < 6) & (abs(z - 24) < 18)] = number
+    found = reconstruct_labels(labels, every=8)
+    for number in range(1, 6):
+        alone = reconstruct((labels == number).astype(np.uint8), every=8).mask.values
+        assert dice(found.labels.values == number, alone) > 0.995  # type: ignore[union-attr]
+    assert set(found.uncertainty.dice_of_labels) == set(range(1, 6))  # type: ignore[union-attr]
+    assert found.status.startswith("5 labels") and len(found.status) < 250
+    assert found.phase.values.min() >= -1 and not found.labels.values[:, :8, 100:].any()  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize(
