@@ -23,7 +23,7 @@ from matplotlib.ticker import MaxNLocator
 from scipy.ndimage import gaussian_filter
 
 from curvafit.core.files import write_content
-from curvafit.core.units import unit_name
+from curvafit.core.units import format_length, unit_name
 from curvafit.drawing.render import DPI, QUIET, render_in_box
 from curvafit.generation.result import Flow
 from curvafit.geometry.diagram import Diagram
@@ -41,6 +41,8 @@ BINS, DECADES = 72, 3.0
 _DRAWN, _SQUARE = "#2B6FA8", 1.25
 #: Percent of the voxels that are drawn black, white; most voxels along an axis of which these are taken.
 TAILS, THIN = (0.5, 99.5), 256
+#: Most values of masks and labels, which are drawn from the least to the greatest.
+FEW = 3
 
 Spacing = tuple[float, float, float]
 Limits = tuple[float, float]
@@ -247,44 +249,56 @@ def _name_families(axes: Axes, limits: Limits) -> None:
 
 def field_figure(field: Field) -> Figure:
     """Return a figure of a field's middle slices."""
-    return section_figure([(field.values, None)], field.spacing)
+    return section_figure({"": (field.values, None)}, field.spacing, field.unit)
 
 
 def section_figure(
-    rows: Sequence[tuple[np.ndarray, np.ndarray | None]],
+    rows: Mapping[str, tuple[np.ndarray, np.ndarray | None]],
     spacing: Sequence[float],
+    unit: str,
     places: Sequence[int] | None = None,
 ) -> Figure:
-    """Return a figure of slices across z, y and x.
+    """Return a figure of slices across z, y and x, with the scale.
 
     Parameters
     ----------
     rows
-        Values (Z, Y, X) for each row of pictures, and the mask that is outlined over them, or None.
-    spacing
-        Voxel edges (z, y, x).
+        For each row of pictures, by its title: values (Z, Y, X), and the mask that is outlined over them, or None.
+    spacing, unit
+        Voxel edges (z, y, x), and their unit.
     places
         Number of the slice across each axis; by default the middle one.
     """
     figure = _figure(7.2, 2.5 * len(rows), layout="constrained")
     axes = figure.subplots(len(rows), 3, squeeze=False)
-    places = [n // 2 for n in rows[0][0].shape] if places is None else places
-    for row, (values, mask) in zip(axes, rows, strict=True):
+    places = [n // 2 for n in next(iter(rows.values()))[0].shape] if places is None else places
+    for row, (title, (values, mask)) in zip(axes, rows.items(), strict=True):
         if not values.size or (values.dtype.kind == "f" and not np.isfinite(values).all()):
             raise ValueError("a volume to draw needs voxels, all of finite values")
-        thinned = values[tuple(slice(None, None, -(-n // THIN)) for n in values.shape)]
-        low, high = np.percentile(thinned.astype(np.float32), TAILS)
+        thinned = values[tuple(slice(None, None, -(-n // THIN)) for n in values.shape)].astype(np.float32)
+        levels = np.unique(thinned)
+        low, high = levels[[0, -1]] if len(levels) <= FEW else np.percentile(thinned, TAILS)
         for axis in range(3):
             plane = np.take(values, places[axis], axis)
             outline = None if mask is None else np.take(mask, places[axis], axis)
             edges = [spacing[other] for other in range(3) if other != axis]
             section_on(row[axis], plane, outline, (low, high), edges[0] / edges[1])
+        row[0].set_ylabel(title)
     for axis, name in enumerate("zyx"):
         rows_name, columns_name = (other for other in "zyx" if other != name)
-        axes[0, axis].set_title(f"{name} = {places[axis]}", fontsize=9)
-        axes[-1, axis].set_xlabel(columns_name)
-        axes[-1, axis].set_ylabel(rows_name, rotation=0, labelpad=6)
+        axes[0, axis].set_title(f"{name} = {places[axis]}  ({rows_name} down, {columns_name} across)", fontsize=8)
+    _scale_on(axes[-1, 0], spacing[2], unit)
     return figure
+
+
+def _scale_on(axes: Axes, edge: float, unit: str) -> None:
+    """Draw a bar of a round length below a slice whose voxels are `edge` wide."""
+    width = abs(np.diff(axes.get_xlim()).item())
+    power = 10.0 ** math.floor(math.log10(width * edge / 3))
+    length = max(step * power for step in (1, 2, 5) if step * power <= width * edge / 3)
+    bar = axes.get_xaxis_transform()
+    axes.plot([0, length / edge], [-0.05, -0.05], color=INK, linewidth=2.5, transform=bar, clip_on=False)
+    axes.text(length / edge + 0.02 * width, -0.05, format_length(length, unit, 1), transform=bar, va="center", fontsize=8)
 
 
 def section_on(axes: Axes, plane: np.ndarray, outline: np.ndarray | None, limits: Limits, aspect: float) -> None:

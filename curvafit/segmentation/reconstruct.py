@@ -163,7 +163,7 @@ def reconstruct(
     laws, notes = ((), ()) if prior is None else laws_of(prior, volume)
     tiling = Tiling.of(target.frame, epsilon, tile, periodic=periodic)
     taught, other = Taught.load(filler, image=image is not None), None
-    evidence = None
+    evidence = seen = None
     if image is not None:
         if example is not None or laws:
             raise ScanError("give an image, or an example or a law, but not both: nothing joins them yet")
@@ -202,7 +202,7 @@ def reconstruct(
     whole = replace(found, mask=_turn_back(axis, found.mask), phase=_turn_back(axis, found.phase))
     return Segmentation.of(
         volume, whole, chosen.law, tiling.place.epsilon, (*notes, *_extrapolated(places, volume.shape[axis])),
-        weight=None, status=f"{said}: {known_slices}, {flow_summary(found)}; {end}", uncertainty=uncertain,
+        weight=None, status=f"{said}: {known_slices}, {flow_summary(found)}; {end}", uncertainty=uncertain, image=seen,
     )  # fmt: skip
 
 
@@ -505,6 +505,7 @@ def reconstruct_labels(
             *(text if len(of) == len(numbers) else f"{_name_labels(of)}: {text}" for text, of in notes.items()),
         ),
         labels=replace(volume, values=values, notes=()),
+        image=seen,
         uncertainty=Uncertainty(likely, error, (), min(dice.values()), dice),
     )
 

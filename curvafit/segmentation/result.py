@@ -83,6 +83,8 @@ class Segmentation(Pictured):
         Of a volume between known slices: how sure it is, and what to annotate next.
     labels
         Of several structures: the label at each voxel, a whole number, 0 where there is none.
+    image
+        Of a volume filled with its image: that image.
     """
 
     mask: Field
@@ -94,6 +96,7 @@ class Segmentation(Pictured):
     notes: tuple[str, ...]
     uncertainty: Uncertainty | None = None
     labels: Field | None = None
+    image: Field | None = None
 
     @classmethod
     def of(
@@ -227,8 +230,8 @@ def write_mask(
         mask, labels = segmentation.mask.values, segmentation.labels
         write(mask.view(np.uint8) if labels is None else labels.values, temporary)
         picture, note = sibling(temporary, ".png"), sibling(temporary, ".json")
-        rows = [(scan.values, None), (scan.values, mask) if labels is None else (labels.values, None)]
-        _figure(rows, segmentation).savefig(picture, dpi=DPI)
+        rows = {"scan": (scan.values, None), "mask": (scan.values, mask)}
+        _figure(segmentation, rows).savefig(picture, dpi=DPI)
         parts = [temporary, picture, note]
         parts += [write(values, _map_path(temporary, name)) for name, values in maps.items()]
         content = {**_record(segmentation, scan, record or {}), "files": [part.name for part in parts]}
@@ -242,19 +245,29 @@ def write_mask(
 
 def segmentation_figure(segmentation: Segmentation) -> Figure:
     """Draw the mask's outline on the phase field, in the middle slices or the most uncertain ones."""
-    return _figure([(segmentation.phase.values, segmentation.mask.values)], segmentation)
+    return _figure(segmentation, {"mask": (segmentation.phase.values, segmentation.mask.values)})
 
 
-def _figure(rows: list[tuple[np.ndarray, np.ndarray | None]], segmentation: Segmentation) -> Figure:
-    """Draw rows of middle slices; where there is a probability, of the most uncertain slices, with its entropy."""
+def _figure(segmentation: Segmentation, rows: Mapping[str, tuple[np.ndarray, np.ndarray | None]]) -> Figure:
+    """Draw rows of middle slices; or of a volume between known slices the most uncertain ones.
+
+    There the outline is drawn over the image, if there is one, or else over what is known; below is how unsure it is.
+    """
     from curvafit.drawing.plot import section_figure
 
-    probability, mask = segmentation.probability, segmentation.mask
+    mask, labels, probability = segmentation.mask, segmentation.labels, segmentation.probability
     if probability is None:
-        return section_figure(rows, mask.spacing)
+        return section_figure(rows, mask.spacing, mask.unit)
     unsure = entropy(probability.values)
     places = [int(unsure.sum(tuple({0, 1, 2} - {axis})).argmax()) for axis in range(3)]
-    return section_figure([*rows, (unsure, mask.values)], mask.spacing, places)
+    shown = {"filled": (labels.values, None)} if labels is not None else {}
+    if segmentation.image is not None:
+        shown = {"image, filled": (segmentation.image.values, mask.values), **shown}
+    elif labels is None:
+        known = np.where(unsure == 0, 2 * mask.values.astype(np.int8) - 1, 0)
+        shown = {"known, filled": (known, mask.values)}
+    shown["how unsure"] = (unsure, mask.values)
+    return section_figure(shown, mask.spacing, mask.unit, places)
 
 
 def _map_path(target: Path, name: str) -> Path:

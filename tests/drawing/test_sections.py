@@ -25,7 +25,7 @@ def test_the_three_middle_slices_are_drawn_in_proportion() -> None:
     for shown, plane in zip(images(figure), (VALUES[2], VALUES[:, 3], VALUES[:, :, 3]), strict=True):
         assert np.array_equal(shown, plane)
     assert [axes.get_aspect() for axes in figure.axes] == [2.0, 3.0, 1.5]
-    assert [axes.get_title() for axes in figure.axes] == ["z = 2", "y = 3", "x = 3"]
+    assert [axes.get_title()[:5] for axes in figure.axes] == ["z = 2", "y = 3", "x = 3"]
 
 
 def test_a_notebook_shows_a_line_and_a_small_picture() -> None:
@@ -48,7 +48,9 @@ def test_a_segmentation_shows_its_outline() -> None:
 
 
 def test_each_row_has_its_values_and_its_outline() -> None:
-    figure = section_figure([(VALUES, None), (VALUES, VALUES > 100)], (1, 1, 1))
+    figure = section_figure({"one": (VALUES, None), "two": (VALUES, VALUES > 100)}, (1, 1, 1), "um")
+    assert [figure.axes[k].get_ylabel() for k in (0, 3)] == ["one", "two"]
+    assert [text.get_text() for text in figure.axes[3].texts] == ["2\xa0µm"]
     assert [len(axes.collections) for axes in figure.axes[:3]] == [0, 0, 0]
     assert sum(len(axes.collections) for axes in figure.axes[3:]) >= 1
 
