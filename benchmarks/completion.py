@@ -6,7 +6,9 @@ repeats; the law is inferred by `infer --fast` from the mask of another seed, th
 
 - `spline`, `linear`, `nearest`, `ITK` (its morphological contour interpolation, where its package is installed): plain
   interpolations. Gains are held to the best of them *in hindsight*, case by case.
-- `filler`: `reconstruct` without an example; `tuned`: with one; `law`: with one, and its law tried.
+- `offset`: the spline with the threshold that is best on the example; `scratch`: the network that it alone taught.
+- `filler`: `reconstruct` without an example; `tuned`: with one; `law`, `willmore`, `area`: with one, and its law, the
+  Willmore energy or the area tried.
 
 Dice and the calibration error within 3 voxels of the surface count the unknown slices between the first and the last
 known one; the sum of the Betti numbers' errors and the error of the mean thickness, in voxels, count all between them.
@@ -27,6 +29,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from scipy import ndimage
 
 from benchmarks.harness import Cases, Figure, Values, bootstrap, dice, scores, show
@@ -34,17 +37,25 @@ from curvafit.generation.flow import generate
 from curvafit.geometry.morphometry import local_thickness
 from curvafit.inference.fit import Fit
 from curvafit.inference.infer import infer
+from curvafit.priors.coefficients import Coefficients
+from curvafit.segmentation.examples import Example
+from curvafit.segmentation.filler import Filler, Raster, Taught, fill
 from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.slices import WAYS, Slices
-from curvafit.segmentation.uncertainty import calibration_error, near_surface
+from curvafit.segmentation.teach import RATE, Whole, WholeLessons, learn
+from curvafit.segmentation.uncertainty import best_log_odds, calibration_error, near_surface
 from curvafit.volumes.field import Field
 from curvafit.volumes.read import load
 
 LAWS = ("tubes", "trabec", "sponge", "metatubes", "pearls", "sieve", "flow", "bilayers")
 EDGE = 64
 ITK = "ITK"
-#: What is not a plain interpolation.
-OURS = ("filler", "tuned", "law")
+#: Laws that are tried where not the example's own; the area costs as much as Willmore's energy of tubes 8 voxels thick.
+LAWS_TRIED = {"willmore": Coefficients.willmore(), "area": Coefficients(0, 0, 0, 0, 0, 1 / 16)}
+#: Ways of `reconstruct`, and others that need an example: neither is a plain interpolation.
+OURS, TAUGHT = ("filler", "tuned", "law", *LAWS_TRIED), ("offset", "scratch")
+#: Steps of the network that an example alone teaches.
+SCRATCH = 600
 #: What is kept of each case.
 FIGURES = ("dice", "betti", "thickness", "calibration", "seconds")
 #: Sides of structures on which the network's mix and the threshold were chosen.
@@ -80,6 +91,25 @@ def interpolated(slices: Slices, way: str) -> np.ndarray:
     return mask
 
 
+def by_example(slices: Slices, way: str, example: Field, axis: int) -> np.ndarray:
+    """Return the mask of a way that an example alone tells: the spline's best threshold, or a network from nothing."""
+    other = Example.of(example, slices.places, axis)
+    given, truth, places = other.task.given, other.task.truth, list(other.task.places)
+    if way == "offset":
+        level = given.level("spline")[places]
+        least = max(np.quantile(level, np.linspace(0.3, 0.999, 200)), key=lambda least: dice(level > least, truth))
+        return slices.keep_known(slices.level("spline") > least)
+    raster = Raster.of(given)
+    whole = Whole(np.stack([raster.distances(mask) for mask in other.lesson.inside]), given.gap,
+                  given.spacing[0] / raster.pixel)  # fmt: skip
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        filler = Filler()
+    learn(filler, WholeLessons([whole], SCRATCH), RATE, workers=0)
+    logits = fill(slices, Taught(filler, np.array([[2.0, 20.0], [1.0, 1.0]]), {}, 0.0))
+    return slices.keep_known(logits > best_log_odds(logits[slices.between]))
+
+
 # ---- generated shapes ------------------------------------------------------------------------------------------------
 
 
@@ -109,7 +139,7 @@ def filled(
     begun, first = time.perf_counter(), np.moveaxis(truth.values > 0, axis, 0)
     likely = None
     if way in OURS:
-        with_law = prior() if way == "law" else None
+        with_law = prior() if way == "law" else LAWS_TRIED.get(way)
         shown, begun = None if way == "filler" else example(), time.perf_counter()
         found = reconstruct(truth, with_law, known=places, axis=axis, example=shown, **told)
         mask, likely = (np.moveaxis(each.values, axis, 0) for each in (found.mask, found.probability))
@@ -117,7 +147,8 @@ def filled(
     else:
         edges = (truth.spacing[axis], *(h for k, h in enumerate(truth.spacing) if k != axis))
         slices = Slices(first[places], tuple(places), len(first), edges, truth.unit, told.get("periodic", False))
-        mask, status = interpolated(slices, way), ""
+        mask = by_example(slices, way, example(), axis) if way in TAUGHT else interpolated(slices, way)
+        status = ""
     seconds, last = time.perf_counter() - begun, places[-1] + 1
     unknown = [k for k in range(last) if k not in places]
     edges = tuple(h / min(truth.spacing) for h in np.roll(truth.spacing, -axis))
@@ -136,12 +167,12 @@ def shape_case(way: str, law: str, seed: int, every: int, periodic: bool, cases:
 
 
 def on_shapes(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
-    ways = [*plain_ways(), *(way for way in options.ways.split(",") if way in OURS)]
+    ways = [*plain_ways(), *(way for way in options.ways.split(",") if way in OURS + TAUGHT)]
     laws, every, seed = options.laws.split(","), options.every, options.target
     if options.quick:
         laws, ways = laws[:1], ["spline", "filler"]
     figures: dict[str, Figure] = {}
-    for kind in ("crop", "box")[: 1 if options.quick else 2]:
+    for kind in options.kinds.split(",")[: 1 if options.quick else None]:
         names = {(law, way): f"{kind}-{way}-{law}-{seed}-{every}" for law, way in product(laws, ways)}
         jobs = {
             name: partial(shape_case, way, law, seed, every, kind == "box", cases) for (law, way), name in names.items()
@@ -163,7 +194,7 @@ def gains(
     rows = {t: {w: cases[names[t, w]] for w in ways} for t in things if all(names[t, w] in cases for w in ways)}
     if not rows:
         return {}
-    best = np.array([max(row[way]["dice"] for way in ways if way not in OURS) for row in rows.values()])
+    best = np.array([max(row[way]["dice"] for way in ways if way not in OURS + TAUGHT) for row in rows.values()])
     table, figures = [], {key.format(way="best", key="plain"): bootstrap(best)}
     for way in ways:
         mine = {figure: np.array([row[way].get(figure, np.nan) for row in rows.values()]) for figure in FIGURES}
@@ -267,7 +298,7 @@ def scan_case(name: str, side: int, block: int, every: int, way: str, cases: Cas
 def on_scans(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     if "CURVAFIT_DATA" not in os.environ:
         raise SystemExit("set CURVAFIT_DATA to the folder that holds scans/")
-    ways, every = [*plain_ways(), *(way for way in options.ways.split(",") if way in OURS)], options.every
+    ways, every = [*plain_ways(), *(way for way in options.ways.split(",") if way in OURS + TAUGHT)], options.every
     figures: dict[str, Figure] = {}
     group = "filled" if options.set == "report" else options.set
     for name in options.only.split(","):
@@ -283,13 +314,17 @@ def on_scans(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
         jobs = {case: partial(scan_case, name, *map(int, each.split("-")), every, way, cases)
                 for (each, way), case in names.items()}  # fmt: skip
         figures |= gains(f"{name}, every {every}", names, cases.all(jobs), ways, f"{group}.{name}.{{way}}_{{key}}")
-    for way, key in (("filler", "filled.{}"), ("tuned", "filled.tuned_{}")):
-        gains_of = [each.value for name, each in figures.items() if name.endswith(f"{way}_gain")]
-        if group == "filled" and len(gains_of) > 1:
-            figures[key.format("all")] = bootstrap(gains_of)
-            leasts = [each.value for name, each in figures.items() if name.endswith(f"{way}_least")]
-            figures[key.format("least")] = Figure(min(leasts))
-    return figures if every == 8 else {}
+    if group != "filled" or "," not in options.only:
+        return figures if every == 8 else {}
+    whole: dict[str, Figure] = {}
+    for way in ways:
+        each = {key: [figure.value for name, figure in figures.items() if name.endswith(f".{way.lower()}_{key}")]
+                for key in ("gain", "least", "calibration", "betti", "thickness")}  # fmt: skip
+        whole |= {f"gaps.{every}.{way.lower()}_{key}": bootstrap(values) for key, values in each.items()}
+        whole[f"gaps.{every}.{way.lower()}_least"] = Figure(min(each["least"]))
+    names = {"filler_gain": "all", "filler_least": "least", "tuned_gain": "tuned_all", "tuned_least": "tuned_least"}
+    whole |= {f"filled.{name}": whole[f"gaps.8.{key}"] for key, name in names.items() if f"gaps.8.{key}" in whole}
+    return whole | (figures if every == 8 else {})
 
 
 # ---- runs ------------------------------------------------------------------------------------------------------------
@@ -298,6 +333,7 @@ def on_scans(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--on", choices=("shapes", "scans"), default="shapes")
     parser.add_argument("--laws", default=",".join(LAWS), help="of shapes")
+    parser.add_argument("--kinds", default="crop,box", help="of shapes")
     parser.add_argument("--only", default=",".join(STRUCTURES), help="structures of scans")
     parser.add_argument("--every", type=int, default=8)
     parser.add_argument("--target", type=int, default=2, help="seed of the shapes; their laws are of the next")
