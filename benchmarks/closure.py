@@ -30,7 +30,7 @@ from scipy import stats
 
 from benchmarks.harness import Cases, Figure, Values, show
 from curvafit.geometry.descriptors import descriptors
-from curvafit.inference.emulator import optimum
+from curvafit.inference.emulator import best_parameters
 from curvafit.inference.posterior import Architecture, Posterior, load_posterior
 from curvafit.inference.table import PARAMETERS, Table, column_names, compression_of, load_table, parameters_of
 from curvafit.inference.training import train_posterior
@@ -111,9 +111,8 @@ def best_fits(trained: Posterior, queries: Table) -> Answers:
     random, shape = np.random.default_rng(0), (len(queries), DRAWS, len(PARAMETERS))
     mean, draws = np.empty(shape[::2]), np.empty(shape)
     for k, (row, view) in enumerate(zip(queries.descriptors, queries.views.tolist(), strict=True)):
-        found = optimum(trained.emulator, row, view, trained.sample(row, view, STARTS))
-        mean[k] = found.parameters
-        draws[k] = np.clip(random.multivariate_normal(found.parameters, found.covariance, DRAWS), *trained.box.T)
+        mean[k], covariance = best_parameters(trained.emulator, row, view, trained.sample(row, view, STARTS))
+        draws[k] = np.clip(random.multivariate_normal(mean[k], covariance, DRAWS), *trained.box.T)
     return Answers(mean, draws)
 
 

@@ -81,7 +81,7 @@ def halves(name: str) -> Values:
         box = tuple(part if axis == n else slice(None) for n in range(3))
         fit = infer(field.crop(box), kind=SCANS[name].kind, fast=True).fit  # type: ignore[arg-type]
         if fit.draws is not None:
-            found[str(k)] = (fit.draws.parameters / scale).mean(0).tolist()
+            found[str(k)] = (fit.draws / scale).mean(0).tolist()
     return found
 
 

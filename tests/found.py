@@ -13,7 +13,7 @@ from curvafit.geometry.diagram import Diagram, diagram
 from curvafit.geometry.morphometry import Morphometry
 from curvafit.inference.atlas import Match
 from curvafit.inference.candidates import Candidate, Misfit, Twin
-from curvafit.inference.fit import Draws, Fit
+from curvafit.inference.fit import Fit
 from curvafit.inference.infer import Inference
 from curvafit.priors import Coefficients, Grid, preset
 from curvafit.scan.prepare import Prepared
@@ -73,7 +73,6 @@ def made_fit(chosen: str | None = "posterior", lost: bool = False) -> Fit:
     other = Coefficients(1, 1.8, 5.2, -38.5, -41, 433)
     rng = np.random.default_rng(1)
     rows = np.array([1.8, np.log(5.2), -38.5, -41, 433, -0.58]) + rng.normal(size=(60, 6)) * [0.4, 0.2, 6, 9, 51, 0.02]
-    draws = Draws.from_parameters(rows, "scan", "corrected by 12 simulations")
     matches = tuple(Match(f"0-{k:05d}", 2.1 + 0.4 * k, near.coefficients, -0.6 + 0.02 * k, 40 + k) for k in range(5))
     own = {"a20": 0.0, "a11": 0.4, "a02": 0.9, "a10": 6.0, "a01": 9.0, "a00": 51.0, "mass": 0.02}
     grown = (None, None, ()) if lost else (1.6, 1.1, (NUMBERS, NUMBERS))
@@ -86,7 +85,8 @@ def made_fit(chosen: str | None = "posterior", lost: bool = False) -> Fit:
         family="tubes",
         candidates=candidates if chosen else (),
         chosen=chosen,
-        draws=draws if chosen else None,
+        draws=rows if chosen else None,
+        view="scan" if chosen else "",
         weak_directions=("a11 and a00 together: anything from 1 to 2 grows this texture.",),
         misfit=Misfit(0.4, {"curvature": 0.3, "fabric": 0.004}, "12 simulations"),
         drift=0.25,

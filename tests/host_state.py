@@ -240,10 +240,8 @@ class Calls:
             curvafit.save(curvafit.Field(self.ball.astype(np.uint8), (2.0, 1.0, 1.0), "um"), self.folder / name)
 
     def _infer(self) -> None:
-        from curvafit.inference.simulate import Effort
-
-        few = Effort(simulations=4, rounds=1, twins=2, regrown=2)
-        found = curvafit.infer(curvafit.Field(self.flow.field.numpy()), kind="field", periodic=True, effort=few)
+        few = {"simulations": 4, "rounds": 1, "twins": 2}
+        found = curvafit.infer(curvafit.Field(self.flow.field.numpy()), kind="field", periodic=True, **few)
         (self.folder / "fit.json").write_text(found.fit.to_json())
 
 

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from curvafit.inference.atlas import save_atlas as save_atlas
     from curvafit.inference.candidates import Candidate as Candidate
     from curvafit.inference.candidates import Misfit as Misfit
-    from curvafit.inference.fit import Draws as Draws
     from curvafit.inference.fit import Fit as Fit
     from curvafit.inference.infer import Inference as Inference
     from curvafit.inference.infer import infer as infer

@@ -109,29 +109,13 @@ class Emulator:
         return (self.basis @ slopes) / self(parameters, view).deviation[..., None]
 
 
-class Optimum(NamedTuple):
-    """The parameters whose emulated descriptors fit best, in a box that is the prior.
+def best_parameters(
+    emulator: Emulator, descriptors: np.ndarray, view: str, starts: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the parameters `(6,)` of greatest posterior density given a row of descriptors, and their covariance.
 
-    Attributes
-    ----------
-    parameters, covariance
-        `(6,)` and `(6, 6)`: in working units (`PARAMETERS`); the covariance is that of the quadratic form at the best.
-    weak
-        Sentences on the directions that are known up to more than `WEAK` of the prior's deviation, weakest first.
-    misfit
-        Sum of the squares of the whitened descriptors that are not explained, over the emulator's inflation.
-    """
-
-    parameters: np.ndarray
-    covariance: np.ndarray
-    weak: tuple[str, ...]
-    misfit: float
-
-
-def optimum(emulator: Emulator, descriptors: np.ndarray, view: str, starts: np.ndarray) -> Optimum:
-    """Find the parameters of greatest posterior density given a row of descriptors.
-
-    Levenberg and Marquardt's method from many starts, with exact derivatives in float64, by optimistix.
+    Levenberg and Marquardt's method from many starts, with exact derivatives in float64, by optimistix. The covariance
+    `(6, 6)` is Laplace's approximation. Both are in working units (`PARAMETERS`); the box is the prior.
 
     Parameters
     ----------
@@ -142,10 +126,27 @@ def optimum(emulator: Emulator, descriptors: np.ndarray, view: str, starts: np.n
         theirs.
     """
     row = np.atleast_2d(descriptors)
-    parameters, jacobians, left, values = _minimise(emulator, row, view, np.asarray(starts, dtype=np.float64)[None])
+    parameters, slopes, _, values = _minimise(emulator, row, view, np.asarray(starts, dtype=np.float64)[None])
     best = int(values[0].argmin())
-    covariance, weak = _expand(emulator, parameters[0, best], jacobians[0, best])
-    return Optimum(parameters[0, best], covariance, weak, float(left[0, best]))
+    slope, deviation = slopes[0, best], emulator.deviation
+    # In deviations of the prior, whose own precision is 1.
+    covariance = np.linalg.inv(slope.T @ slope + np.eye(len(PARAMETERS)))
+    return parameters[0, best], np.outer(deviation, deviation) * covariance
+
+
+def describe_weak_directions(emulator: Emulator, parameters: np.ndarray, covariance: np.ndarray) -> tuple[str, ...]:
+    """Return sentences on the directions known up to more than `WEAK` of the prior's deviation, the weakest first."""
+    # In direction v of singular value s the posterior's deviation is 1 / √(1 + s²) of the prior's, so a direction that
+    # the descriptors do not see keeps the prior's.
+    variances, directions = np.linalg.eigh(covariance / np.outer(emulator.deviation, emulator.deviation))
+    weak = []
+    for spread, direction in zip(np.sqrt(variances[::-1]), directions.T[::-1], strict=True):
+        if spread > WEAK:
+            direction = direction * np.sign(direction[np.abs(direction).argmax()])
+            step = NINETY * spread * direction * emulator.deviation
+            ends = [np.clip(parameters + sign * step, *emulator.box.T) for sign in (-1, 1)]
+            weak.append(_describe_direction(direction, ends))
+    return tuple(weak)
 
 
 def misfits(emulator: Emulator, descriptors: np.ndarray, view: str, starts: np.ndarray) -> np.ndarray:
@@ -257,24 +258,6 @@ def _minimiser() -> Callable[..., Any]:
 
     starts = jax.vmap(minimise, (None, None, None, None, None, 0))
     return jax.jit(jax.vmap(starts, (None, None, 0, 0, None, 0)))
-
-
-def _expand(emulator: Emulator, parameters: np.ndarray, jacobian: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return the covariance at the best parameters, by Laplace's approximation, and sentences on weak directions."""
-    # In deviations of the prior, whose own precision is 1: in direction v of singular value s the posterior's deviation
-    # is 1 / √(1 + s²), so a direction that the descriptors do not see keeps the prior's.
-    firmness = jacobian.T @ jacobian
-    covariance = np.linalg.inv(firmness + np.eye(len(PARAMETERS)))
-    squares, directions = np.linalg.eigh(firmness)
-    weak = []
-    for square, direction in zip(squares, directions.T, strict=True):
-        spread = 1 / np.sqrt(1 + max(square, 0))
-        if spread > WEAK:
-            direction = direction * np.sign(direction[np.abs(direction).argmax()])
-            step = NINETY * spread * direction * emulator.deviation
-            ends = [np.clip(parameters + sign * step, *emulator.box.T) for sign in (-1, 1)]
-            weak.append(_describe_direction(direction, ends))
-    return np.outer(emulator.deviation, emulator.deviation) * covariance, tuple(weak)
 
 
 def _describe_direction(direction: np.ndarray, ends: list[np.ndarray]) -> str:

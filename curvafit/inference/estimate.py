@@ -15,10 +15,10 @@ from curvafit.geometry.descriptors import BLOCKS, Descriptors, descriptors
 from curvafit.geometry.mesh import NoSurface
 from curvafit.inference.atlas import Match
 from curvafit.inference.candidates import Candidate, Misfit
-from curvafit.inference.emulator import Optimum, misfits, optimum
-from curvafit.inference.fit import Draws, Fit
+from curvafit.inference.emulator import best_parameters, describe_weak_directions, misfits
+from curvafit.inference.fit import COLUMNS, Fit, to_columns
 from curvafit.inference.posterior import Posterior
-from curvafit.inference.simulate import Effort, Search, Simulate, simulate_draws
+from curvafit.inference.simulate import Search, Simulate, simulate_draws
 from curvafit.inference.table import (
     PARAMETERS,
     VIEWS,
@@ -37,8 +37,6 @@ from curvafit.volumes.field import ScanError
 DRAWS, POOL = 400, 2000
 #: Edges, in working voxels, of the boxes in which draws are grown.
 EDGES = (32, 64)
-#: How draws come about, in words.
-METHOD = "amortised: conditional flows given the descriptors"
 #: Draws by which a row is summarised in `check`, and those of them from which the best parameters are looked for.
 SUMMARY_DRAWS, STARTS = 64, 8
 #: Least simulations to compare with.
@@ -51,14 +49,22 @@ FLOOR = 0.1
 
 
 def estimate(
-    fit: Fit, prepared: Prepared, posterior: Posterior, *, seed: int, fast: bool, effort: Effort, progress: Progress
+    fit: Fit,
+    prepared: Prepared,
+    posterior: Posterior,
+    *,
+    seed: int,
+    simulations: int,
+    rounds: int,
+    schedule: Schedule | str,
+    progress: Progress,
 ) -> tuple[Fit, dict[str, tuple[np.ndarray, np.ndarray]] | None]:
     """Read the law of a scan from its descriptors: draw from the posterior, grow some draws, and compare.
 
     Parameters
     ----------
-    fast
-        Grow nothing: the scan is compared with what training left unexplained.
+    simulations, rounds, schedule
+        As in `infer`. Without simulations the scan is compared with what training left unexplained.
 
     Returns
     -------
@@ -73,24 +79,24 @@ def estimate(
     seen, row, view, turn = found
     progress("reading the posterior", 0.1)
     parameters = posterior.sample(row, view, DRAWS, seed)
-    best = optimum(posterior.emulator, row, view, parameters[:STARTS])
-    draws = Draws.from_parameters(turn(parameters), view, METHOD)
+    best = best_parameters(posterior.emulator, row, view, parameters[:STARTS])
     other = "Of the other phase: " if turn is mirror_parameters else ""
-    fit = replace(fit, draws=draws, weak_directions=tuple(other + each for each in best.weak))
-    middle = Draws.from_parameters(parameters, view, "").middle(np.ptp(parameters, axis=0))
-    likely = Candidate("posterior", *law_of(turn(middle)), draws.deviations)
+    weak = tuple(other + each for each in describe_weak_directions(posterior.emulator, *best))
+    fit = replace(fit, draws=turn(parameters), view=view, weak_directions=weak)
+    likely = Candidate("posterior", *law_of(turn(middle_of(parameters))), _deviations(turn(parameters)))
+    simulate = _simulator(seen, view, schedule)
     grown = None
-    if not fast:
-        simulate = _simulator(seen, view, effort.schedule)
+    if simulations:
         part = sub_progress(progress, 0.15, 0.45)
-        grown = simulate_draws(parameters, simulate, effort.simulations, seed=seed, progress=part)
+        grown = simulate_draws(parameters, simulate, simulations, seed=seed, progress=part)
     if grown is None or len(grown.parameters) < FEWEST:
-        misfit = Misfit(tail_probability(posterior, view, best.misfit), {}, "by the best fit, nothing grown")
-        return replace(fit, misfit=misfit, candidates=(likely, _best_fit(posterior, best, view, turn))), None
+        left = misfits(posterior.emulator, row[None], view, parameters[None, :STARTS])[0]
+        misfit = Misfit(tail_probability(posterior, view, left), {}, "by the best fit, nothing grown")
+        return replace(fit, misfit=misfit, candidates=(likely, _best_fit(posterior, *best, turn))), None
     pool = posterior.sample(row, view, POOL, seed)
     search = Search(posterior.emulator, view, row)
     part = sub_progress(progress, 0.45, 1.0)
-    likeliest, every = search.run(pool, grown, simulate, rounds=effort.rounds, seed=seed, progress=part)
+    likeliest, every = search.run(pool, grown, simulate, rounds=rounds, seed=seed, progress=part)
     near = every.parameters[search.nearest(every)[0]]
     refined, simulation = (
         Candidate(name, *law_of(turn(each)), {}) for name, each in (("refined", likeliest), ("simulation", near))
@@ -111,7 +117,13 @@ def refine_matches(prepared: Prepared, posterior: Posterior, matches: Sequence[M
         return ()
     _, row, view, turn = found
     starts = turn(np.stack([parameters_of(each.coefficients, each.mass) for each in matches]))
-    return (_best_fit(posterior, optimum(posterior.emulator, row, view, starts), view, turn),)
+    return (_best_fit(posterior, *best_parameters(posterior.emulator, row, view, starts), turn),)
+
+
+def middle_of(parameters: np.ndarray) -> np.ndarray:
+    """Return the row of parameters `(n, 6)` nearest to the medians, in units of each column's range."""
+    away = (parameters - np.median(parameters, 0)) / np.ptp(parameters, axis=0)
+    return parameters[np.square(away).sum(1).argmin()]
 
 
 #: From parameters of the phase that is described to those of the structure.
@@ -131,12 +143,15 @@ def _describe(prepared: Prepared) -> tuple[Prepared, np.ndarray, str, Turn] | No
     return seen, measured[0].vector(), measured[1], mirror_parameters if turned else np.asarray
 
 
-def _best_fit(posterior: Posterior, best: Optimum, view: str, turn: Turn) -> Candidate:
+def _best_fit(posterior: Posterior, best: np.ndarray, covariance: np.ndarray, turn: Turn) -> Candidate:
     """Return the best fit of the descriptors, with deviations by draws from the normal distribution around it."""
-    rng = np.random.default_rng(0)
-    near = rng.multivariate_normal(best.parameters, best.covariance, DRAWS, check_valid="ignore")
-    deviations = Draws.from_parameters(turn(np.clip(near, *posterior.box.T)), view, "").deviations
-    return Candidate("optimum", *law_of(turn(best.parameters)), deviations)
+    near = np.random.default_rng(0).multivariate_normal(best, covariance, DRAWS, check_valid="ignore")
+    return Candidate("optimum", *law_of(turn(best)), _deviations(turn(np.clip(near, *posterior.box.T))))
+
+
+def _deviations(parameters: np.ndarray) -> dict[str, float]:
+    """Return the standard deviations by name, 0 for a20, of parameters `(n, 6)`."""
+    return {"a20": 0.0} | dict(zip(COLUMNS, to_columns(parameters).std(1).tolist(), strict=True))
 
 
 def _simulator(prepared: Prepared, view: str, schedule: Schedule | str) -> Simulate:

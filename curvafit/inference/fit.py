@@ -31,65 +31,8 @@ KINDS = {"field": "a phase field", "mask": "a mask", "image": "an image"}
 COLUMNS = ("a11", "a02", "a10", "a01", "a00", "mass")
 #: Levels of the intervals, in percent.
 LEVELS = (50, 90)
-#: Significant digits of a draw in a file.
-_DIGITS = 6
-
-
-@dataclass(frozen=True, eq=False)
-class Draws:
-    """Draws `(n, 6)` of (a11, a02, a10, a01, a00, m₀) in working units, with a20 = 1.
-
-    Attributes
-    ----------
-    view
-        What the scan was taken for: a kind of view that the posterior was trained on.
-    method
-        How they were drawn, in words.
-    """
-
-    values: np.ndarray
-    view: str
-    method: str
-
-    def __post_init__(self) -> None:
-        if self.values.ndim != 2 or self.values.shape[1] != len(COLUMNS) or not np.isfinite(self.values).all():
-            raise ValueError(f"expected finite draws (n, {len(COLUMNS)}), got shape {self.values.shape}")
-
-    @staticmethod
-    def from_parameters(parameters: np.ndarray, view: str, method: str) -> Draws:
-        """Return draws from parameters `(n, 6)`, which have log a02 for a02 (`table.PARAMETERS`)."""
-        values = np.array(parameters, dtype=np.float64)
-        values[:, 1] = np.exp(values[:, 1])
-        return Draws(values, view, method)
-
-    @property
-    def parameters(self) -> np.ndarray:
-        """Return the draws as `table.PARAMETERS`, with log a02 for a02."""
-        values = self.values.copy()
-        values[:, 1] = np.log(values[:, 1])
-        return values
-
-    @property
-    def deviations(self) -> dict[str, float]:
-        """Return the standard deviations by name, 0 for a20."""
-        return {"a20": 0.0} | {name: float(x) for name, x in zip(COLUMNS, self.values.std(0), strict=True)}
-
-    def middle(self, scale: np.ndarray) -> np.ndarray:
-        """Return the row of `parameters` nearest to the medians, in units of `scale` `(6,)`."""
-        rows = self.parameters
-        return rows[np.square((rows - np.median(rows, 0)) / scale).sum(1).argmin()]
-
-    def intervals(self, length: float = 1.0) -> dict[str, dict[str, Any]]:
-        """Return each parameter's median and central intervals; a working length of 1 is `length` in their unit."""
-        parts = {}
-        powers = (*(POWERS[name] for name in NAMES[1:]), 0)
-        for name, power, column in zip(COLUMNS, powers, self.values.T, strict=True):
-            values = column * length**-power
-            parts[name] = {"median": float(np.median(values))} | {
-                str(level): [float(x) for x in np.percentile(values, (50 - level / 2, 50 + level / 2))]
-                for level in LEVELS
-            }
-        return parts
+#: How draws come about, in words, and the significant digits of a draw, as a file has them.
+_METHOD, _DIGITS = "amortised: conditional flows given the descriptors", 6
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -103,7 +46,10 @@ class Fit(Pictured):
     chosen
         Name of the candidate that is best supported; None where none is a law of the scan: `status` says why.
     draws
-        Draws from the posterior; None where the scan's descriptors could not be measured.
+        Draws from the posterior `(n, 6)`, in the order of `table.PARAMETERS`; None where the scan's descriptors could
+        not be measured.
+    view
+        What the scan was taken for: a kind of view that the posterior was trained on.
     weak_directions
         Sentences, one for each direction in which the scan leaves the parameters open.
     misfit
@@ -135,7 +81,8 @@ class Fit(Pictured):
     diagram: Diagram | None = None
     candidates: tuple[Candidate, ...] = ()
     chosen: str | None = None
-    draws: Draws | None = None
+    draws: np.ndarray | None = None
+    view: str = ""
     weak_directions: tuple[str, ...] = ()
     misfit: Misfit | None = None
     drift: float | None = None
@@ -182,6 +129,23 @@ class Fit(Pictured):
         """Return the interface width ε in `length_unit`."""
         return WORKING_EPSILON * self.length
 
+    def intervals(self, length: float = 1.0) -> dict[str, dict[str, Any]] | None:
+        """Return the median and the central intervals of each parameter's draws; None without draws.
+
+        A working length of 1 is `length` in their unit.
+        """
+        if self.draws is None:
+            return None
+        parts = {}
+        powers = (*(POWERS[name] for name in NAMES[1:]), 0)
+        for name, power, column in zip(COLUMNS, powers, to_columns(self.draws), strict=True):
+            values = column * length**-power
+            parts[name] = {"median": float(np.median(values))} | {
+                str(level): [float(x) for x in np.percentile(values, (50 - level / 2, 50 + level / 2))]
+                for level in LEVELS
+            }
+        return parts
+
     def to_law(self) -> Law:
         """Return the chosen law; raise ValueError if the fit has none."""
         six, mass = self.coefficients, self.mass
@@ -217,6 +181,13 @@ class Fit(Pictured):
     def load(cls, path: str | PathLike[str]) -> Fit:
         """Read a `fit.json`; raise FileNotFoundError if there is none, ValueError as `from_json`."""
         return _fit_of(_parse(_content(path), path, FIT_SCHEMA))
+
+
+def to_columns(draws: np.ndarray) -> np.ndarray:
+    """Return draws of `table.PARAMETERS` `(n, 6)` as `COLUMNS` `(6, n)`: a02 in place of its logarithm."""
+    columns = draws.T.copy()
+    columns[1] = np.exp(columns[1])
+    return columns
 
 
 # ---- the file --------------------------------------------------------------------------------------------------------
@@ -296,19 +267,16 @@ FIT_SCHEMA: dict[str, Any] = schema_of(_File)
 _SAME = tuple({field.name for field in fields(Fit)} & {field.name for field in fields(_File)} - {"diagram"})
 
 
-def load_draws_and_candidates(law: LawLike) -> tuple[Draws | None, tuple[Candidate, ...]]:
-    """Return the draws and the candidates of a fit, an inference or a `fit.json`; None and () of any other law.
+def load_candidates(law: LawLike) -> tuple[Candidate, ...]:
+    """Return the candidates of a fit, an inference or a `fit.json`; none of any other law.
 
     Of a file no other entries are read: it may lack them. Raises FileNotFoundError or ValueError as `Fit.load`.
     """
     if not isinstance(law, (str, PathLike)):
-        fit = getattr(law, "fit", law)
-        return getattr(fit, "draws", None), getattr(fit, "candidates", ())
-    parts = {name: FIT_SCHEMA["properties"][name] for name in ("posterior", "candidates", "format")}
+        return getattr(getattr(law, "fit", law), "candidates", ())
+    parts = {name: FIT_SCHEMA["properties"][name] for name in ("candidates", "format")}
     content = _parse(_content(law), law, {**FIT_SCHEMA, "required": ["format"], "properties": parts})
-    hints = get_type_hints(_File, include_extras=True)
-    candidates = decode(hints["candidates"], content.get("candidates", []))
-    return _draws_of(decode(hints["posterior"], content.get("posterior"))), candidates
+    return decode(get_type_hints(_File, include_extras=True)["candidates"], content.get("candidates", []))
 
 
 def _content(path: str | PathLike[str]) -> bytes:
@@ -333,7 +301,6 @@ def _parse(text: str | bytes, place: object, schema: dict[str, Any]) -> dict[str
 
 def _file_of(fit: Fit) -> _File:
     """Return the content of a fit's file."""
-    draws = fit.draws
     return _File(
         **{name: getattr(fit, name) for name in _SAME},
         format=FORMAT,
@@ -342,9 +309,9 @@ def _file_of(fit: Fit) -> _File:
         uncertainty=fit.uncertainty,
         coefficients_physical=fit.coefficients_physical,
         epsilon_physical=fit.epsilon_physical,
-        intervals=None if draws is None else draws.intervals(),
-        intervals_physical=None if draws is None else draws.intervals(fit.length),
-        posterior=None if draws is None else _posterior_of(draws),
+        intervals=fit.intervals(),
+        intervals_physical=fit.intervals(fit.length),
+        posterior=None if fit.draws is None else _posterior_of(fit.draws, fit.view),
         diagram=None if fit.diagram is None else _columns_of(fit.diagram, fit.kind),
     )  # type: ignore[arg-type]
 
@@ -353,25 +320,26 @@ def _fit_of(content: dict[str, Any]) -> Fit:
     """Return the fit of a checked content."""
     file: _File = decode(_File, content)
     same = {name: getattr(file, name) for name in _SAME}
-    fit = Fit(**same, draws=_draws_of(file.posterior), diagram=_diagram_of(file.diagram))
+    draws, view = (None, "") if file.posterior is None else (_draws_of(file.posterior), file.posterior.view)
+    fit = Fit(**same, draws=draws, view=view, diagram=_diagram_of(file.diagram))
     if (fit.chosen is None) != (fit.best is None):
         raise ValueError(f"expected a chosen law among the fit's candidates, got {fit.chosen!r}")
     return fit
 
 
-def _posterior_of(draws: Draws) -> _Posterior:
+def _posterior_of(draws: np.ndarray, view: str) -> _Posterior:
     """Return draws as columns of `_DIGITS` digits."""
-    columns = [tuple(float(f"{x:.{_DIGITS}g}") for x in column) for column in draws.values.T]
-    return _Posterior(draws.view, draws.method, _DrawColumns(*columns))
+    columns = [tuple(float(f"{x:.{_DIGITS}g}") for x in column) for column in to_columns(draws)]
+    return _Posterior(view, _METHOD, _DrawColumns(*columns))
 
 
-def _draws_of(posterior: _Posterior | None) -> Draws | None:
+def _draws_of(posterior: _Posterior) -> np.ndarray:
     """Return the draws of a file's columns."""
-    if posterior is None:
-        return None
     columns = [getattr(posterior.draws, name) for name in COLUMNS]
     _check_lengths(columns, "draws", "posterior")
-    return Draws(np.array(columns, dtype=np.float64).T, posterior.view, posterior.method)
+    draws = np.array(columns, dtype=np.float64).T
+    draws[:, 1] = np.log(draws[:, 1])
+    return draws
 
 
 def _columns_of(diagram: Diagram, kind: str) -> _Columns:

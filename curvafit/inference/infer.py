@@ -16,17 +16,18 @@ from curvafit.core.checks import SEEDS, check_choice, check_int, check_type
 from curvafit.core.pictures import Pictured
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.core.units import format_number
-from curvafit.generation.schedule import LEARNED, SCHEDULES
+from curvafit.generation.schedule import LEARNED, SCHEDULES, Schedule
 from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram, family_of
 from curvafit.geometry.morphometry import morphometry
 from curvafit.inference.atlas import Atlas, Match, load_atlas, mirror_match, nearest
-from curvafit.inference.candidates import TITLES, Candidate, Twin, best_candidate, twin, verdict
+from curvafit.inference.candidates import TITLES, Candidate, Twin, best_candidate, twin
 from curvafit.inference.drift import drift
 from curvafit.inference.estimate import estimate, refine_matches
 from curvafit.inference.fit import KINDS, Fit
 from curvafit.inference.posterior import Posterior, load_posterior
-from curvafit.inference.simulate import Effort
+from curvafit.inference.simulate import ROUNDS
 from curvafit.inference.stationarity import stationarity
+from curvafit.inference.verdict import verdict
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.law import Law
 from curvafit.scan.measure import scan_diagram
@@ -101,7 +102,10 @@ def infer(
     label: int | None = None,
     crop: Crop | None = None,
     seed: int = 0,
-    effort: Effort = Effort(),  # noqa: B008
+    simulations: int = 16,
+    rounds: int = ROUNDS,
+    twins: int = 3,
+    schedule: Schedule | str = LEARNED,
     progress: Progress = silent,
     **reading: Any,
 ) -> Inference:
@@ -136,8 +140,13 @@ def infer(
         How structure and background are split: see `curvafit.scan.prepare.prepare`.
     label, crop
         The voxels of one value as a mask; a box of voxels, of the scan and of `roi`: see `curvafit.load`.
-    effort
-        How many shapes are grown, of how many steps.
+    simulations, rounds
+        How many draws of the posterior are grown, and then rounds of three shapes whose parameters the shapes before
+        them suggest.
+    twins
+        How many shapes of the best law are grown.
+    schedule
+        Steps of each shape.
     progress
         Called with a sentence and the share done.
     reading
@@ -166,19 +175,22 @@ def infer(
     simulated = None
     if method == "posterior":
         part = sub_progress(progress, 0.1, 0.5)
-        fit, simulated = estimate(fit, prepared, posterior, seed=seed, fast=fast, effort=effort, progress=part)
+        options = {"simulations": 0 if fast else simulations, "rounds": rounds, "schedule": schedule}
+        fit, simulated = estimate(fit, prepared, posterior, seed=seed, progress=part, **options)
     progress("searching the atlas", 0.5)
     matches = _match(prepared, measured, atlas, exact=method == "match")
     read = fit.candidates if method == "posterior" else refine_matches(prepared, posterior, matches)
-    laws, twins = _list_laws(prepared, read, matches, seed, sub_progress(progress, 0.5, 0.6)), {}
+    laws, grown = _list_laws(prepared, read, matches, seed, sub_progress(progress, 0.5, 0.6)), {}
     if not fast:
-        laws, twins = _grow(laws, measured, prepared, seed, effort, sub_progress(progress, 0.6, 1.0))
-    chosen, status = verdict(laws, fit.misfit, fit.morphometry, fast=fast)
-    law = next((each.coefficients for each in laws if each.name == chosen), None)
-    moved = None if law is None else drift(*_main_window(prepared), WORKING_EPSILON, law)
-    fit = replace(fit, candidates=laws, chosen=chosen, matches=matches, drift=moved, status=status)
+        part = sub_progress(progress, 0.6, 1.0)
+        laws, grown = _grow(laws, measured, prepared, count=twins, schedule=schedule, seed=seed, progress=part)
+    fit = replace(fit, candidates=laws, matches=matches)
+    chosen, status = verdict(fit, fast=fast)
+    fit = replace(fit, chosen=chosen, status=status)
+    if fit.coefficients is not None:
+        fit = replace(fit, drift=drift(*_main_window(prepared), WORKING_EPSILON, fit.coefficients))
     progress("done", 1.0)
-    return Inference(volume, prepared, measured, twins, fit, simulated)
+    return Inference(volume, prepared, measured, grown, fit, simulated)
 
 
 def _match(prepared: Prepared, measured: Diagram, atlas: Atlas, exact: bool) -> tuple[Match, ...]:
@@ -214,23 +226,31 @@ def _main_window(prepared: Prepared) -> tuple[torch.Tensor, Grid]:
 
 
 def _grow(
-    laws: tuple[Candidate, ...], measured: Diagram, prepared: Prepared, seed: int, effort: Effort, progress: Progress
+    laws: tuple[Candidate, ...],
+    measured: Diagram,
+    prepared: Prepared,
+    *,
+    count: int,
+    schedule: Schedule | str,
+    seed: int,
+    progress: Progress,
 ) -> tuple[tuple[Candidate, ...], dict[str, tuple[Twin, ...]]]:
-    """Grow a twin of each law, and `effort.twins` of the best: of the nearest, and of the first that is as near."""
+    """Grow a twin of each law, and `count` of the best: of the nearest, and of the first that is as near."""
     twins: dict[str, tuple[Twin, ...]] = {}
 
     def grow(law: Candidate, share: float) -> Candidate:
         """Grow another twin of a law."""
         start = seed + len(twins.get(law.name, ()))
         progress(f"growing: {TITLES[law.name]}, seed {start}", share)
-        twins[law.name] = (*twins.get(law.name, ()), twin(law.coefficients, law.mass, prepared, start, effort.schedule))
+        twins[law.name] = (*twins.get(law.name, ()), twin(law.coefficients, law.mass, prepared, start, schedule))
         return law.compare(measured, twins[law.name])
 
     laws = tuple(grow(law, 0.7 * k / len(laws)) for k, law in enumerate(laws))
-    for k in range(effort.regrown):
+    most = 2 * count  # another twin may make another law the best
+    for k in range(most):
         best = best_candidate(laws)
-        if best is not None and len(twins[best.name]) < effort.twins:
-            laws = tuple(grow(law, 0.7 + 0.3 * k / effort.regrown) if law is best else law for law in laws)
+        if best is not None and len(twins[best.name]) < count:
+            laws = tuple(grow(law, 0.7 + 0.3 * k / most) if law is best else law for law in laws)
     return laws, twins
 
 

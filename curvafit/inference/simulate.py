@@ -16,13 +16,12 @@ from scipy import linalg
 
 from curvafit.core.checks import check_int
 from curvafit.core.runtime import Progress, silent
-from curvafit.generation.schedule import LEARNED, Schedule
 from curvafit.geometry.descriptors import Descriptors
 from curvafit.inference.emulator import Emulator
 from curvafit.inference.table import to_row
 
-#: Simulations in a round, and most rounds at the end that simulate the likeliest parameters alone.
-BATCH, LAST = 3, 4
+#: Rounds, simulations in a round, and most rounds at the end that simulate the likeliest parameters alone.
+ROUNDS, BATCH, LAST = 7, 3, 4
 #: New parameters are tried around the `NEAREST` simulations: `AROUND` at each width, in deviations of the prior.
 NEAREST, AROUND, WIDTHS = 4, 300, (0.15, 0.4)
 #: Tried for the Gaussian process: lengths in deviations of the prior; variances of the process and of its noise, in
@@ -30,28 +29,6 @@ NEAREST, AROUND, WIDTHS = 4, 300, (0.15, 0.4)
 LENGTHS, VARIANCES, NOISES = (0.5, 1.0, 2.0, 4.0), (0.1, 0.3, 1.0, 3.0), (0.05, 0.1, 0.2, 0.4, 0.8)
 #: Added to the deviance at parameters that grew nothing, and how far around, in deviations of the prior.
 BARREN, REACH = 50.0, 0.3
-
-
-class Effort(NamedTuple):
-    """How many shapes an inference grows, and by which steps.
-
-    Attributes
-    ----------
-    simulations
-        Draws of the posterior.
-    rounds
-        Rounds of three shapes whose parameters the shapes before them suggest.
-    twins, regrown
-        Shapes of the best law, and the most shapes that may be grown to find which law that is.
-    schedule
-        Steps of each shape.
-    """
-
-    simulations: int = 16
-    rounds: int = 7
-    twins: int = 3
-    regrown: int = 6
-    schedule: Schedule | str = LEARNED
 
 
 class Simulations(NamedTuple):
@@ -137,7 +114,7 @@ class Search:
         simulated: Simulations,
         simulate: Simulate,
         *,
-        rounds: int = Effort().rounds,
+        rounds: int = ROUNDS,
         seed: int = 0,
         progress: Progress = silent,
     ) -> tuple[np.ndarray, Simulations]:

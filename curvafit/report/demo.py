@@ -39,7 +39,7 @@ from curvafit.volumes.field import Field
 
 if TYPE_CHECKING:
     from curvafit.inference.atlas import Atlas
-    from curvafit.inference.fit import Draws, Fit
+    from curvafit.inference.fit import Fit
     from curvafit.inference.infer import Inference
     from curvafit.scan.measure import Measures
 
@@ -262,12 +262,12 @@ def _say_intervals(measures: Measures) -> str:
     return f"No intervals: they need eight blocks of one thickness and one spacing each, and the scan holds {count}."
 
 
-def _parameter_rows(draws: Draws | None, box: np.ndarray) -> list[tuple[str, str, str, str]]:
+def _parameter_rows(draws: np.ndarray | None, box: np.ndarray) -> list[tuple[str, str, str, str]]:
     """Return each parameter's name, 90 % interval, the interval's share of the prior's, and whether it is read."""
     if draws is None:
         return []
     rows = []
-    low, high = np.percentile(draws.parameters, (5, 95), axis=0)
+    low, high = np.percentile(draws, (5, 95), axis=0)
     shares = (high - low) / (0.9 * (box[:, 1] - box[:, 0]))
     for name, a, b, share in zip(SYMBOLS, low, high, shares, strict=True):
         word = "read" if share <= _READ else "partly read" if share <= _PARTLY else "not read"

@@ -38,8 +38,9 @@ from curvafit.drawing.plot import (
     slice_figure,
     surface_figure,
 )
-from curvafit.inference.candidates import TITLES, UNBELIEVED, UNDECIDED, Candidate, seed_noise_of
+from curvafit.inference.candidates import TITLES, Candidate, seed_noise_of
 from curvafit.inference.table import parameters_of
+from curvafit.inference.verdict import UNBELIEVED, UNDECIDED
 from curvafit.priors.law import FORMAT
 from curvafit.volumes.field import Field
 from curvafit.volumes.write import save
@@ -283,7 +284,7 @@ def _parameters(inference: Inference) -> list[tuple[str, tuple[str, ...], str]]:
     fit, best, physical = inference.fit, inference.fit.best, inference.fit.coefficients_physical
     if best is None or physical is None:
         return []
-    intervals = {} if fit.draws is None else fit.draws.intervals()
+    intervals = fit.intervals() or {}
     rows = []
     for name, value in {**best.coefficients.as_dict(), "mass": best.mass}.items():
         known, power = intervals.get(name), _TERMS[name][2]
@@ -467,11 +468,11 @@ def _corner(inference: Inference) -> Picture | None:
         return None
     shown = [each for each in inference.fit.candidates if each.name in (inference.fit.chosen, "match")]
     marks = {_title(each): parameters_of(each.coefficients, each.mass) for each in shown}
-    rows = [np.percentile(draws.parameters, (0.5, 99.5), axis=0), *(mark[None] for mark in marks.values())]
+    rows = [np.percentile(draws, (0.5, 99.5), axis=0), *(mark[None] for mark in marks.values())]
     low, high = np.concatenate(rows).min(0), np.concatenate(rows).max(0)
     rim = 0.06 * np.maximum(high - low, 1e-6)
     limits = list(zip((low - rim).tolist(), (high + rim).tolist(), strict=True))
-    return picture_of(corner_figure(draws.parameters, SYMBOLS, limits, marks), "Draws of the parameters, two by two")
+    return picture_of(corner_figure(draws, SYMBOLS, limits, marks), "Draws of the parameters, two by two")
 
 
 def bands(inference: Inference) -> Picture | None:

@@ -16,7 +16,7 @@ from curvafit.core.runtime import Progress, silent
 from curvafit.core.units import METRES
 from curvafit.generation.data import Data, Evidence
 from curvafit.generation.flow import WORKING_BLUR, Flow, descend
-from curvafit.inference.fit import load_draws_and_candidates
+from curvafit.inference.fit import load_candidates
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.law import Law, LawLike
@@ -141,8 +141,7 @@ def laws_of(prior: LawLike, scan: Field) -> tuple[tuple[Coefficients, ...], tupl
     law = Law.of(prior)
     if not law.fitted:
         return (first,), notes
-    _, candidates = load_draws_and_candidates(prior)
-    others = [each.coefficients for each in candidates if each.name in TRUSTED]
+    others = [each.coefficients for each in load_candidates(prior) if each.name in TRUSTED]
     return (first, *_convert_laws([other for other in others if other != law.coefficients], law, scan)), notes
 
 

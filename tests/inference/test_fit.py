@@ -12,7 +12,8 @@ import pytest
 from found import lattice, made_fit, measured
 
 from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE
-from curvafit.inference.fit import COLUMNS, Draws, Fit
+from curvafit.inference.estimate import middle_of
+from curvafit.inference.fit import COLUMNS, Fit, to_columns
 from curvafit.priors import Law
 
 
@@ -24,8 +25,9 @@ def fit() -> Fit:
 
 def fields(fit: Fit) -> dict:
     """All but the diagram; the draws as a file has them."""
-    draws = None if fit.draws is None else (fit.draws.view, fit.draws.method, fit.as_dict()["posterior"])
-    return {name: value for name, value in vars(fit).items() if name != "diagram"} | {"draws": draws}
+    return {name: value for name, value in vars(fit).items() if name != "diagram"} | {
+        "draws": fit.as_dict()["posterior"]
+    }
 
 
 def test_every_field_comes_back(fit: Fit) -> None:
@@ -90,29 +92,30 @@ def test_intervals_in_the_scan_s_unit_are_the_draws_in_that_unit(fit: Fit) -> No
     content = json.loads(fit.to_json())
     for name, power in (("a11", 0), ("a02", 0), ("a10", 1), ("a01", 1), ("a00", 2), ("mass", 0)):
         working, physical = content["intervals"][name], content["intervals_physical"][name]
-        column = fit.draws.values[:, ("a11", "a02", "a10", "a01", "a00", "mass").index(name)]
+        column = to_columns(fit.draws)[COLUMNS.index(name)]
         assert working["median"] == pytest.approx(np.median(column))
         assert working["90"] == pytest.approx(np.percentile(column, (5, 95)).tolist())
         assert physical["90"] == pytest.approx([x / fit.length**power for x in working["90"]])
 
 
-def test_intervals_are_central_and_in_powers_of_a_length() -> None:
-    draws = Draws(np.outer(np.arange(101.0), np.ones(6)), "mask", "")
-    working, other = draws.intervals(), draws.intervals(2.0)
-    assert list(working) == list(COLUMNS)
+def test_intervals_are_central_and_in_powers_of_a_length(fit: Fit) -> None:
+    draws = np.outer(np.arange(1.0, 102.0), np.ones(6))
+    draws[:, 1] = np.log(draws[:, 1])
+    even = dataclasses.replace(fit, draws=draws)
+    working, other = even.intervals(), even.intervals(2.0)
+    assert working is not None and other is not None and list(working) == list(COLUMNS)
     for name, scale in zip(COLUMNS, (1, 1, 2, 2, 4, 1), strict=True):
-        assert working[name]["median"] == 50
-        assert (working[name]["50"], working[name]["90"]) == (pytest.approx([25, 75]), pytest.approx([5, 95]))
-        assert other[name]["90"] == pytest.approx([5 / scale, 95 / scale])
+        assert working[name]["median"] == pytest.approx(51)
+        assert (working[name]["50"], working[name]["90"]) == (pytest.approx([26, 76]), pytest.approx([6, 96]))
+        assert other[name]["90"] == pytest.approx([6 / scale, 96 / scale])
 
 
 def test_the_middle_is_the_draw_nearest_to_the_medians() -> None:
-    rows = np.zeros((5, 6))
-    rows[:, 0] = (-3, -1, 0.5, 1, 9)  # median .5
+    rows = np.repeat(np.array([-3, -1, 0.5, 1, 9])[:, None], 6, 1)  # median .5
     rows[:, 2] = (0, 0, 40, 3, 0)  # median 0
-    draws = Draws.from_parameters(rows, "mask", "")
-    assert draws.middle(np.ones(6)) == pytest.approx(rows[1])
-    assert draws.middle(np.array([1, 1, 100, 1, 1, 1.0])) == pytest.approx(rows[2])
+    assert middle_of(rows) == pytest.approx(rows[3])
+    rows[0, 2] = -4000  # of this range 40 is little
+    assert middle_of(rows) == pytest.approx(rows[2])
 
 
 def test_draws_of_several_lengths_are_refused(fit: Fit) -> None:

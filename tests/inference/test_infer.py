@@ -19,11 +19,10 @@ from curvafit.geometry.distances import wasserstein
 from curvafit.inference.atlas import load_atlas
 from curvafit.inference.candidates import TITLES
 from curvafit.inference.estimate import DRAWS
-from curvafit.inference.fit import COLUMNS, Fit
+from curvafit.inference.fit import Fit
 from curvafit.inference.infer import Inference, infer
 from curvafit.inference.posterior import load_posterior
-from curvafit.inference.simulate import Effort
-from curvafit.inference.table import law_of, mirror_parameters, parameters_of
+from curvafit.inference.table import PARAMETERS, mirror_parameters, parameters_of
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.law import FORMAT, Law, preset
 from curvafit.report.page import write_inference
@@ -44,8 +43,8 @@ def tubes() -> np.ndarray:
 def inference(tubes: np.ndarray) -> Inference:
     """With fewer shapes, of fewer steps, than a user's: every stage is passed, none polished."""
     scan = Field((tubes > 0).astype(np.uint8), (2.0, 2.0, 2.0), "um", source="tubes")
-    effort = Effort(simulations=8, rounds=1, twins=2, regrown=2, schedule=schedule(LEARNED, steps=400))
-    return infer(scan, kind="mask", periodic=True, seed=3, effort=effort)
+    few = {"simulations": 8, "rounds": 1, "twins": 2, "schedule": schedule(LEARNED, steps=400)}
+    return infer(scan, kind="mask", periodic=True, seed=3, **few)
 
 
 @pytest.mark.slow
@@ -72,13 +71,10 @@ def test_a_mask_is_taken_to_parameters_and_back(inference: Inference) -> None:
 def test_the_truth_lies_among_the_draws(inference: Inference) -> None:
     """Each parameter within the draws' extremes: what a 90 % interval misses one time in ten."""
     shape, draws = preset("tubes"), inference.fit.draws
-    assert draws is not None and draws.view == "mask" and len(draws.values) == DRAWS
-    truth = law_of(parameters_of(shape.coefficients, shape.mass))
-    low, high = draws.values.min(0), draws.values.max(0)
-    for name, value in (*truth[0].as_dict().items(), ("mass", truth[1])):
-        if name != "a20":
-            k = COLUMNS.index(name)
-            assert low[k] < value < high[k], name
+    assert draws is not None and inference.fit.view == "mask" and len(draws) == DRAWS
+    truth = parameters_of(shape.coefficients, shape.mass)
+    for name, value, column in zip(PARAMETERS, truth, draws.T, strict=True):
+        assert column.min() < value < column.max(), name
 
 
 @pytest.mark.slow
@@ -124,7 +120,7 @@ def places(fit: Fit) -> np.ndarray:
     """The medians and quartiles of the draws in deviations of the prior's box, `(18,)`."""
     assert fit.draws is not None
     box = load_posterior().box
-    rows = (fit.draws.parameters - box[:, 0]) / (box[:, 1] - box[:, 0]) * np.sqrt(12)
+    rows = (fit.draws - box[:, 0]) / (box[:, 1] - box[:, 0]) * np.sqrt(12)
     return np.percentile(rows, (25, 50, 75), axis=0).ravel()
 
 
@@ -155,9 +151,7 @@ def test_inside_for_outside_is_the_mirrored_law(tubes: np.ndarray, straight: Fit
     """And the note says how to turn it round."""
     other = quick(tubes <= 0)
     assert straight.draws is not None and other.draws is not None
-    np.testing.assert_allclose(
-        other.draws.parameters, mirror_parameters(straight.draws.parameters), rtol=1e-5, atol=1e-5
-    )
+    np.testing.assert_allclose(other.draws, mirror_parameters(straight.draws), rtol=1e-5, atol=1e-5)
     own, law = straight.to_law(), other.to_law()
     six = own.coefficients.mirror()
     assert tuple(law.coefficients) == pytest.approx(tuple(six.scale(1 / float(six.a20))), rel=1e-6)

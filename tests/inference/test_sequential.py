@@ -7,7 +7,7 @@ import pytest
 from emulated import BOX, HIGH, LOW, NOISE, linear, row, told
 
 from curvafit.geometry.descriptors import BLOCKS, Descriptors
-from curvafit.inference.simulate import BATCH, LAST, Effort, Process, Search, Simulate, Simulations, simulate_draws
+from curvafit.inference.simulate import BATCH, LAST, ROUNDS, Process, Search, Simulate, Simulations, simulate_draws
 
 #: What the emulator misses of each of the five sums, in deviations of the prior.
 MISSED = np.array([0.4, -0.3, 0.3, 0.2, -0.4])
@@ -48,7 +48,7 @@ def test_what_the_emulator_misses_is_learnt() -> None:
     assert apart(parameters) < 0.5 * apart(draws.mean(0))
     assert apart(parameters) < 1.5
     assert (parameters >= LOW).all() and (parameters <= HIGH).all()
-    assert every.count == len(every.parameters) == 12 + Effort().rounds * BATCH + 1
+    assert every.count == len(every.parameters) == 12 + ROUNDS * BATCH + 1
     assert len(set(every.seeds.tolist())) == every.count
     nearest = every.parameters[Search(linear(), "mask", QUERY).nearest(every)[0]]
     assert apart(nearest) <= min(map(apart, every.parameters)) + 1.0  # noise is .3
@@ -70,7 +70,7 @@ def test_the_answer_grows_or_is_the_nearest_that_did() -> None:
     first = simulate_draws(np.random.default_rng(0).uniform(LOW, HIGH, (400, 6)), simulator(), 12)
     search = Search(linear(), "mask", QUERY)
     parameters, every = search.run(first.parameters, first, lambda *_: None)
-    assert every.count == 12 + Effort().rounds * BATCH + LAST and len(every.parameters) == 12
+    assert every.count == 12 + ROUNDS * BATCH + LAST and len(every.parameters) == 12
     assert np.array_equal(parameters, first.parameters[search.nearest(first)[0]])
 
 

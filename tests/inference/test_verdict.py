@@ -8,23 +8,12 @@ import math
 
 import numpy as np
 import pytest
-from found import NUMBERS
+from found import NUMBERS, made_fit
 
 from curvafit.core.schema import decode, encode
 from curvafit.geometry.diagram import Diagram
-from curvafit.inference.candidates import (
-    CLOSE,
-    FURTHEST,
-    TELLING,
-    UNBELIEVABLE,
-    Candidate,
-    Misfit,
-    Twin,
-    best_candidate,
-    find_differences,
-    seed_noise_of,
-    verdict,
-)
+from curvafit.inference.candidates import CLOSE, Candidate, Misfit, Twin, best_candidate, seed_noise_of
+from curvafit.inference.verdict import FURTHEST, TELLING, UNBELIEVABLE, find_differences, verdict
 from curvafit.priors.coefficients import Coefficients
 
 LAW = Coefficients(1, 2, 6, -40, -40, 400)
@@ -34,6 +23,11 @@ ODD = Misfit(0.001, {"gaps": 0.004, "chords": 0.3, "depths": 0.0005}, "12 simula
 
 def law(name: str, distance: float | None = None, noise: float | None = None, status: str = "") -> Candidate:
     return Candidate(name, LAW, -0.6, {"a11": 0.4}, distance, noise, status=status)
+
+
+def judge(candidates: tuple[Candidate, ...], misfit: Misfit | None, fast: bool = False) -> tuple[str | None, str]:
+    """The verdict on a scan of the familiar `NUMBERS`."""
+    return verdict(dataclasses.replace(made_fit(), candidates=candidates, misfit=misfit), fast=fast)
 
 
 def twin(diagram: Diagram | None, mass: float) -> Twin:
@@ -100,41 +94,41 @@ def test_a_candidate_comes_back_from_its_json() -> None:
 
 def test_without_growing_the_first_is_named_and_not_checked() -> None:
     said = "Nothing was grown to check the law (--fast)."
-    assert verdict((law("optimum"), law("match")), None, NUMBERS, fast=True) == ("optimum", said)
+    assert judge((law("optimum"), law("match")), None, fast=True) == ("optimum", said)
     unusual = "The model does not make such descriptors (p = 0.0010); the strangest: depths, gaps."
-    assert verdict((law("optimum"),), ODD, NUMBERS, fast=True) == ("optimum", f"{unusual} {said}")
+    assert judge((law("optimum"),), ODD, fast=True) == ("optimum", f"{unusual} {said}")
 
 
 def test_where_nothing_grew_there_is_no_law() -> None:
     why = "No shape grew: the field is of one phase."
-    name, status = verdict((law("posterior", status=why), law("match")), USUAL, NUMBERS)
+    name, status = judge((law("posterior", status=why), law("match")), USUAL)
     assert name is None and status == f"No law: nothing grew from any candidate. {why}"
 
 
 def test_the_nearest_is_supported_where_its_twins_are_near() -> None:
     usual = "The scan's descriptors are of a kind that the model makes (p = 0.40)."
     near = "Supported (nearest match): its twins lie 0.9 from the scan's curvature diagram"
-    assert verdict((law("match", 0.9, 0.5),), USUAL, NUMBERS) == ("match", f"{near}, 0.5 from each other. {usual}")
+    assert judge((law("match", 0.9, 0.5),), USUAL) == ("match", f"{near}, 0.5 from each other. {usual}")
     once = (
         near.replace("Supported", "Undecided")
         + ". No law grew twice, so it is not known how far apart two seeds lie. Hm."
     )
-    assert verdict((law("match", 0.9, status="Hm."),), None, NUMBERS) == ("match", once)
+    assert judge((law("match", 0.9, status="Hm."),), None) == ("match", once)
     limit = law("match", CLOSE * 0.5, 0.5)
-    assert verdict((limit,), None, NUMBERS)[1].startswith("Supported")
-    assert verdict((limit,), dataclasses.replace(USUAL, probability=UNBELIEVABLE), NUMBERS)[1].startswith("Supported")
+    assert judge((limit,), None)[1].startswith("Supported")
+    assert judge((limit,), dataclasses.replace(USUAL, probability=UNBELIEVABLE))[1].startswith("Supported")
 
 
 def test_twins_with_the_scans_familiar_numbers_are_near() -> None:
     near = dataclasses.replace(law("match", 1.1, 0.5), twins=(NUMBERS, NUMBERS))
-    name, status = verdict((near,), USUAL, NUMBERS)
+    name, status = judge((near,), USUAL)
     assert name == "match"
     assert status.startswith("Near (nearest match): its twins lie 1.1 from the scan's curvature diagram, 0.5 from each")
     thick = dataclasses.replace(NUMBERS, thickness_mean=1.5 * NUMBERS.thickness_mean)
-    _, status = verdict((dataclasses.replace(near, twins=(thick,)),), USUAL, NUMBERS)
+    _, status = judge((dataclasses.replace(near, twins=(thick,)),), USUAL)
     assert status.startswith("No believable twin: ") and status.endswith("Twins over scan: thickness 1.5.")
     close = dataclasses.replace(near, distance=0.9, twins=(thick,))
-    _, status = verdict((close,), USUAL, NUMBERS)
+    _, status = judge((close,), USUAL)
     assert (
         status.startswith("Near (nearest match): its twins lie 0.9 from")
         and "near enough. Twins over scan: thickness 1.5." in status
@@ -144,29 +138,27 @@ def test_twins_with_the_scans_familiar_numbers_are_near() -> None:
 def test_a_far_or_strange_one_is_named_but_not_believed() -> None:
     far = "No believable twin: of the nearest law (nearest of the simulations), its twins lie 2.6 from the scan's"
     said = f"{far} curvature diagram, 0.5 from each other. Twins should lie some 0.5 from it."
-    assert verdict((law("simulation", 1.04 * FURTHEST * 0.5, 0.5), law("match", 9.0)), USUAL, NUMBERS) == (
+    assert judge((law("simulation", 1.04 * FURTHEST * 0.5, 0.5), law("match", 9.0)), USUAL) == (
         "simulation",
         said,
     )
-    name, status = verdict((law("simulation", 0.1, 0.5),), ODD, NUMBERS)
+    name, status = judge((law("simulation", 0.1, 0.5),), ODD)
     assert name == "simulation" and status.startswith("No believable twin: ")
     assert status.endswith(
         "0.5 from each other. The model does not make such descriptors (p = 0.0010); the strangest: depths, gaps."
     )
     single = dataclasses.replace(ODD, blocks={"gaps": 0.3})
-    assert verdict((law("simulation", 0.1),), single, NUMBERS)[1].endswith(
-        "(p = 0.0010); the strangest: none by itself."
-    )
+    assert judge((law("simulation", 0.1),), single)[1].endswith("(p = 0.0010); the strangest: none by itself.")
     aligned = dataclasses.replace(ODD, blocks={"fabric": 0.001})
     direction = "The scan has a direction (fabric), and the model has none."
-    assert verdict((law("simulation", 0.1),), aligned, NUMBERS)[1].endswith(direction)
+    assert judge((law("simulation", 0.1),), aligned)[1].endswith(direction)
 
 
 def test_seeds_far_apart_support_nothing() -> None:
     near = law("match", 1.5 * TELLING, 1.01 * TELLING)
-    assert "or the volume holds too little" in verdict((near,), USUAL, NUMBERS)[1]
-    assert verdict((near,), USUAL, NUMBERS)[1].startswith("Undecided (nearest match): ")
-    assert verdict((law("match", TELLING, TELLING),), USUAL, NUMBERS)[1].startswith("Supported")
+    assert "or the volume holds too little" in judge((near,), USUAL)[1]
+    assert judge((near,), USUAL)[1].startswith("Undecided (nearest match): ")
+    assert judge((law("match", TELLING, TELLING),), USUAL)[1].startswith("Supported")
 
 
 def test_few_tunnels_may_differ_by_the_root_of_their_count() -> None:
