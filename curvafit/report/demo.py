@@ -32,7 +32,7 @@ from curvafit.report.page import (
     write_inference,
 )
 from curvafit.scan.measure import measure
-from curvafit.scan.structure import find_level
+from curvafit.scan.structure import find_structure
 from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.slices import WAYS, Slices
 from curvafit.volumes.field import Field
@@ -111,7 +111,8 @@ def write_demo(
     atlas, posterior = load_atlas(), load_posterior()
     reading = sub_progress(progress, 0.1, 0.3)
     inference = infer(scan, fast=True, seed=seed, atlas=atlas, posterior=posterior, progress=reading)
-    mask = find_level(scan).mask
+    _, signed = find_structure(scan)
+    mask = signed.values > 0
     volume = Field(mask.view(np.uint8), scan.spacing, scan.unit)
     filled = reconstruct(volume, every=EVERY, progress=sub_progress(progress, 0.3, 0.95))
     completion = score_completion(mask, filled.mask.values, EVERY, filled.status)

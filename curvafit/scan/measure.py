@@ -22,7 +22,7 @@ from curvafit.geometry.topology import euler_shares
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.scan.grids import median_thickness, remove_specks
 from curvafit.scan.prepare import LARGEST_WINDOW, Prepared, prepare, smallest_piece
-from curvafit.scan.structure import check_options, find_level, is_rounded
+from curvafit.scan.structure import check_options, find_structure, is_rounded
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.read import Source, field_of
 
@@ -199,20 +199,18 @@ def measure(
 
 def _find_structure(field: Field, kind: str, options: dict[str, Any]) -> tuple[np.ndarray, str, tuple[str, ...]]:
     """Return the structure on the scan's voxels, its kind, and notes; specks of an image are dropped."""
-    level = find_level(field, kind=kind, **options)  # type: ignore[arg-type]
-    mask, notes = level.mask, (*field.notes, level.note)
-    if level.kind == "image":
+    seen, signed = find_structure(field, kind=kind, **options)  # type: ignore[arg-type]
+    mask, notes = signed.values > 0, signed.notes
+    if seen == "image":
         thickness, _ = median_thickness(mask, field.spacing, options["periodic"])
         smallest = smallest_piece(thickness) / math.prod(field.spacing)
         mask, specks, holes = remove_specks(mask, smallest, options["periodic"])
         if specks or holes:
-            notes = (
-                *notes,
-                f"Dropped what is smaller than a ball of half the median thickness: {specks} specks, {holes} pinholes.",
-            )
+            counts = f"{specks} specks, {holes} pinholes"
+            notes = (*notes, f"Dropped what is smaller than a ball of half the median thickness: {counts}.")
     if mask.all() or not mask.any():
         raise ScanError("expected a structure and background in the scan, got one of them only")
-    return mask, level.kind, notes
+    return mask, seen, notes
 
 
 def _sum_voxels(

@@ -27,9 +27,8 @@ from curvafit.scan.grids import (
 )
 from curvafit.scan.structure import (
     Kind,
-    Level,
     Quality,
-    find_level,
+    find_structure,
     is_noise,
     measure_quality,
     region_of_interest,
@@ -74,8 +73,6 @@ class Prepared:
         Working voxel in scan voxels (z, y, x).
     working_voxel
         Edge of a working voxel in `unit`.
-    threshold
-        Grey level that separates the phases, None for fields and masks.
     thickness
         Median thickness beneath the surface, in working voxels, of the phase that fills less of the volume.
     windows
@@ -99,7 +96,6 @@ class Prepared:
     scale: tuple[float, float, float]
     working_voxel: float
     unit: str
-    threshold: float | None
     thickness: float
     windows: tuple[Window, ...]
     notes: tuple[str, ...]
@@ -194,37 +190,37 @@ def prepare(
     region = region_of_interest(roi, field)
     where, notes = bounding_box(field.shape, region, LARGEST_SCAN)
     region = None if region is None else region[where]
-    part = replace(field, values=field.values[where], affine=None)
+    part = replace(field, values=field.values[where], affine=None, notes=field.notes + notes)
     periodic = periodic and part.shape == field.shape
     options = {"kind": kind, "threshold": threshold, "dark": dark}
     extremes = (field.values.min(), field.values.max())
-    level = find_level(part, region=region, periodic=periodic, extremes=extremes, **options)  # type: ignore[arg-type]
-    noise = level.kind != "field" and is_noise(level.mask)
-    scan = _Scan(level, part.shape, part.spacing, periodic, region, noise, field.notes + notes + (level.note,))
-    prepared = _put_on_grid(scan)
-    if level.kind == "image":
-        grey = -part.values if dark else part.values
-        prepared = replace(prepared, quality=measure_quality(grey, level.mask, part.spacing))
+    seen, signed = find_structure(part, region=region, periodic=periodic, extremes=extremes, **options)  # type: ignore[arg-type]
+    mask, quality = signed.values > 0, None
+    prepared = _put_on_grid(_Scan(seen, signed, periodic, region, noise=seen != "field" and is_noise(mask)))
+    if seen == "image":
+        quality = measure_quality(-part.values if dark else part.values, mask, part.spacing)
     corner = tuple(s.start + o for s, o in zip(where, prepared.origin, strict=True))
-    return replace(prepared, unit=field.unit, origin=corner)  # type: ignore[arg-type]
+    return replace(prepared, quality=quality, origin=corner)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
 class _Scan:
-    """What is left of a scan once its structure is known."""
+    """A scan once its structure, where the field is above 0, is known."""
 
-    level: Level
-    shape: tuple[int, int, int]
-    spacing: tuple[float, float, float]
+    kind: Kind
+    field: Field
     periodic: bool
     region: np.ndarray | None
     noise: bool
-    notes: tuple[str, ...]
+
+    @property
+    def mask(self) -> np.ndarray:
+        return self.field.values > 0
 
     @property
     def keeps_grid(self) -> bool:
         """Return whether the grid is kept whatever the thickness: a phase field has its ε, and noise no thickness."""
-        return self.level.kind == "field" or self.noise
+        return self.kind == "field" or self.noise
 
     @property
     def thinner(self) -> tuple[np.ndarray, str]:
@@ -238,7 +234,7 @@ class _Scan:
     @property
     def counted(self) -> np.ndarray:
         """Return the structure within the region of interest."""
-        return self.level.mask if self.region is None else self.level.mask & self.region
+        return self.mask if self.region is None else self.mask & self.region
 
 
 def _put_on_grid(scan: _Scan) -> Prepared:
@@ -246,7 +242,7 @@ def _put_on_grid(scan: _Scan) -> Prepared:
     thickness, notes = _measure_thickness(scan)
     scale, why = _choose_scale(scan, thickness)
     start, shape, cut = _choose_box(scan, scale)
-    edges = [s * h for s, h in zip(scale, scan.spacing, strict=True)]
+    edges = [s * h for s, h in zip(scale, scan.field.spacing, strict=True)]
     edge = edges[0] if max(edges) <= (1 + 1e-9) * min(edges) else math.prod(edges) ** (1 / 3)
     values, region = _move(scan, scale, start, shape)
     grid = Grid(
@@ -254,28 +250,27 @@ def _put_on_grid(scan: _Scan) -> Prepared:
         (WORKING_SPACING, WORKING_SPACING, WORKING_SPACING),
         "periodic" if scan.periodic and not cut else "replicate",
     )
-    mask, dropped = _clean_mask(scan.level.kind, values, region, thickness / edge, grid.periodic)
+    mask, dropped = _clean_mask(scan.kind, values, region, thickness / edge, grid.periodic)
     windows = boxes_by_surface(surface_voxels(mask), LARGEST_WINDOW)
     filled = float((mask if region is None else mask[region]).mean())
     inverted = (MOSTLY.format(filled),) if filled > HALF else ()
     if not windows:
         raise ScanError("expected a surface between structure and background, got none on the working grid")
-    if scan.level.kind != "field":
+    if scan.kind != "field":
         phase = _profile(mask, grid)
     else:
         phase = values if region is None or region.all() else np.minimum(values, _profile(region, grid))
     return Prepared(
-        kind=scan.level.kind,
+        kind=scan.kind,
         phase=np.ascontiguousarray(phase, dtype=np.float32),
         mask=mask,
         grid=grid,
         scale=scale,
         working_voxel=edge,
-        unit="voxel",
-        threshold=scan.level.threshold,
+        unit=scan.field.unit,
         thickness=thickness / edge,
         windows=tuple(windows),
-        notes=scan.notes + notes + why + cut + dropped + inverted,
+        notes=scan.field.notes + notes + why + cut + dropped + inverted,
         origin=tuple(a * s for a, s in zip(start, scale, strict=True)),  # type: ignore[arg-type]
         roi=region,
         noise=scan.noise,
@@ -285,8 +280,8 @@ def _put_on_grid(scan: _Scan) -> Prepared:
 def _measure_thickness(scan: _Scan) -> tuple[float, tuple[str, ...]]:
     """Return the median thickness in the scan's unit, and a note; refuse what is too thin to have a shape."""
     phase, name = scan.thinner
-    median, thick = median_thickness(phase, scan.spacing, scan.periodic)
-    voxel = math.prod(scan.spacing) ** (1 / 3)
+    median, thick = median_thickness(phase, scan.field.spacing, scan.periodic)
+    voxel = math.prod(scan.field.spacing) ** (1 / 3)
     thin = thick < (THINNEST - 0.5) * voxel  # balls on the grid understate thin tubes
     if thin and not scan.keeps_grid:
         raise ScanError(
@@ -300,19 +295,19 @@ def _measure_thickness(scan: _Scan) -> tuple[float, tuple[str, ...]]:
 
 def _choose_scale(scan: _Scan, thickness: float) -> tuple[tuple[float, float, float], tuple[str, ...]]:
     """Return the working voxel in scan voxels, per axis; all ones where the scan's grid is kept."""
-    spacing, finest = scan.spacing, min(scan.spacing)
+    spacing, finest = scan.field.spacing, min(scan.field.spacing)
     isotropic = max(spacing) <= 1.01 * finest
     if isotropic and (scan.keeps_grid or KEPT_THICKNESS[0] <= thickness / finest <= KEPT_THICKNESS[1]):
         return (1.0, 1.0, 1.0), ("The scan's grid is kept.",)
     edge = finest if scan.keeps_grid else thickness / WORKING_THICKNESS
-    extent = min(n * h for n, h in zip(scan.shape, spacing, strict=True))
+    extent = min(n * h for n, h in zip(scan.field.shape, spacing, strict=True))
     note = f"Resampled to {thickness / edge:.3g} voxels a thickness"
     if extent < FEWEST * edge and edge > finest:
         edge = max(extent / FEWEST, finest)
         note = f"Resampled as far as leaves {FEWEST} voxels a side"
     scale = [edge / h for h in spacing]
     if scan.periodic:
-        scale = [n / max(4, round(n / s)) for n, s in zip(scan.shape, scale, strict=True)]
+        scale = [n / max(4, round(n / s)) for n, s in zip(scan.field.shape, scale, strict=True)]
     edges = " x ".join(f"{s:.3g}" for s in scale)
     return (scale[0], scale[1], scale[2]), (f"{note}: a working voxel is {edges} scan voxels (z, y, x).",)
 
@@ -321,7 +316,7 @@ def _choose_box(
     scan: _Scan, scale: tuple[float, float, float]
 ) -> tuple[tuple[int, int, int], tuple[int, int, int], tuple[str, ...]]:
     """Return the first working voxel, number of voxels, and a note where that is not all of the scan."""
-    full = [math.floor(n / s + 1e-6) for n, s in zip(scan.shape, scale, strict=True)]
+    full = [math.floor(n / s + 1e-6) for n, s in zip(scan.field.shape, scale, strict=True)]
     if min(full) < 4:
         raise ScanError(f"expected at least 4 working voxels along each axis, got {_join_sides(full)}")
     if max(full) <= LARGEST_BOX:
@@ -339,13 +334,13 @@ def _move(
     scan: _Scan, scale: tuple[float, float, float], start: tuple[int, int, int], shape: tuple[int, int, int]
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Return the level values and region of interest on the working grid."""
-    values, region = scan.level.values, scan.region
+    values, region = scan.field.values, scan.region
     if scale == (1.0, 1.0, 1.0):
         box = tuple(slice(a, a + n) for a, n in zip(start, shape, strict=True))
         return values[box], None if region is None else region[box]
-    if scan.level.kind == "mask":
-        reach = 4 * max(max(s * h, h) for s, h in zip(scale, scan.spacing, strict=True))
-        values = centre_distance(scan.level.mask, scan.spacing, reach, scan.periodic)
+    if scan.kind == "mask":
+        reach = 4 * max(max(s * h, h) for s, h in zip(scale, scan.field.spacing, strict=True))
+        values = centre_distance(scan.mask, scan.field.spacing, reach, scan.periodic)
     moved = resample(values, scale, start, shape, periodic=scan.periodic)
     if region is None:
         return moved, None

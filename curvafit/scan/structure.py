@@ -1,7 +1,7 @@
 """What in a scan is structure, how blurred it is and how noisy.
 
-`find_level` decides the kind of a scan and splits structure from background. `Quality` is how the scan blurs and how
-noisy it is, measured from its grey levels (`measure_quality`), and scans a grown shape alike (`Quality.rescan`).
+`find_structure` decides the kind of a scan and splits structure from background. `Quality` is how the scan blurs and
+how noisy it is, measured from its grey levels (`measure_quality`), and scans a grown shape alike (`Quality.rescan`).
 
 Two rooms split grey levels otherwise, on purpose. `segmentation.evidence` needs the noise of each voxel: it smooths as
 far as the noise asks, and splits half way between the means of the raw levels. `data_synth.imaging` follows brightness
@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -51,21 +51,7 @@ NOISY, SLICED = 0.02, 1.5
 _ROUNDED_VALUES = 4096
 
 
-@dataclass(frozen=True, eq=False)
-class Level:
-    """A scan whose structure is where `values` (float32) > 0, and the grey level that was subtracted."""
-
-    kind: Kind
-    values: np.ndarray
-    threshold: float | None
-    note: str
-
-    @property
-    def mask(self) -> np.ndarray:
-        return self.values > 0
-
-
-def find_level(
+def find_structure(
     field: Field,
     *,
     kind: Literal["auto", "field", "mask", "image"] = "auto",
@@ -74,34 +60,35 @@ def find_level(
     region: np.ndarray | None = None,
     periodic: bool = False,
     extremes: tuple[float, float] | None = None,
-) -> Level:
-    """Find the structure of a scan; the parameters are as in `prepare.prepare`.
+) -> tuple[Kind, Field]:
+    """Return the kind of a scan, and the scan as float32 values that are above 0 in its structure, with a note on how.
 
-    `extremes` are the lowest and highest value of the whole that `field` is a part of: they tell a mask's two values.
-    Raises ScanError if the kind or threshold fits nothing in the scan, or a phase is empty.
+    The parameters are as in `prepare.prepare`; `extremes` are the lowest and highest value of the whole that `field` is
+    a part of: they tell a mask's two values. Raises ScanError if the kind or threshold fits nothing in the scan, or a
+    phase is empty.
     """
     if kind not in ("auto", "field", "mask", "image"):
         raise ScanError(f"expected kind auto, field, mask or image, got {kind!r}")
     values = field.values
     lowest, highest = (values.min(), values.max()) if extremes is None else extremes
     two = bool(np.all((values == lowest) | (values == highest)))
-    kind = _guess_kind(values, threshold, two) if kind == "auto" else kind
-    if kind == "field":
+    seen = _guess_kind(values, threshold, two) if kind == "auto" else kind
+    if seen == "field":
         note = f"Taken for a phase field: values {values.min():.3g} to {values.max():.3g}."
-        level = Level("field", (-values if dark else values).astype(np.float32), None, note)
-    elif kind == "mask":
+        values = (-values if dark else values).astype(np.float32)
+    elif seen == "mask":
         positive = "Taken for a mask: the structure is where it is positive."
         note = f"Taken for a mask of the values {float(lowest):g} and {float(highest):g}." if two else positive
         mask = values == highest if two else values > 0
-        level = Level("mask", np.where(mask != dark, np.float32(1), np.float32(-1)), None, note)
+        values = np.where(mask != dark, np.float32(1), np.float32(-1))
     else:
-        level = _split_image(field, threshold, dark, region, periodic)
-    counted = level.mask if region is None else level.mask[region]
+        values, note = _split_image(field, threshold, dark, region, periodic)
+    counted = values > 0 if region is None else values[region] > 0
     if not counted.any():
         raise ScanError("expected a structure in the scan, got none: every voxel is background")
     if counted.all():
         raise ScanError("expected background in the scan, got none: every voxel is structure")
-    return level
+    return seen, replace(field, values=values, notes=(*field.notes, note))
 
 
 def check_options(kind: str, threshold: float | str, label: int | None) -> None:
@@ -178,8 +165,8 @@ def _find_threshold(values: np.ndarray) -> float:
 
 def _split_image(
     field: Field, threshold: Literal["otsu"] | float, dark: bool, region: np.ndarray | None, periodic: bool
-) -> Level:
-    """Return grey levels smoothed by one voxel of the finest axis, less the threshold, which is that of the raw levels.
+) -> tuple[np.ndarray, str]:
+    """Return grey levels smoothed by one voxel of the finest axis, less the raw levels' threshold, and a note.
 
     Smoothing lowers thin structures' grey: a threshold of the smoothed levels would sink and make them fat.
     """
@@ -199,7 +186,7 @@ def _split_image(
     how = "Otsu's" if threshold == "otsu" else "the given"
     side = "dark" if dark else "bright"
     note = f"Smoothed by one voxel, split at {how} threshold of {level:.4g}: the {side} phase is the structure."
-    return Level("image", (level - smooth) if dark else (smooth - level), level, note)
+    return (level - smooth if dark else smooth - level), note
 
 
 @dataclass(frozen=True)
@@ -257,8 +244,8 @@ class Quality:
 
 def split(scan: Field, shape: Sequence[int], *, periodic: bool = False) -> np.ndarray:
     """Return the structure of grey levels, split as an image is, on cubic voxels of edge 1 `(Z, Y, X)`."""
-    values = find_level(scan, kind="image", periodic=periodic).values
-    return resample(values, [1 / h for h in scan.spacing], (0, 0, 0), shape, periodic=periodic) > 0
+    _, signed = find_structure(scan, kind="image", periodic=periodic)
+    return resample(signed.values, [1 / h for h in scan.spacing], (0, 0, 0), shape, periodic=periodic) > 0
 
 
 def voxelise(mask: np.ndarray, scale: Sequence[float], smallest: float) -> np.ndarray:

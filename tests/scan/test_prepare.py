@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,7 +13,7 @@ from scipy import ndimage
 from curvafit.priors import Grid, phase_field
 from curvafit.scan.grids import boxes_by_surface, median_thickness, remove_specks, resample
 from curvafit.scan.prepare import LARGEST_WINDOW, WORKING_THICKNESS, Prepared, is_ball, prepare
-from curvafit.scan.structure import find_level, is_noise
+from curvafit.scan.structure import find_structure, is_noise
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.read import load
 from curvafit.volumes.write import save
@@ -26,6 +28,13 @@ def tube_mask(shape: tuple[int, int, int], spacing: tuple[float, float, float], 
 def image_of(mask: np.ndarray, noise: float = 8.0, seed: int = 0) -> np.ndarray:
     grey = 50 + 100 * ndimage.gaussian_filter(mask.astype(np.float32), 0.7)
     return np.clip(grey + np.random.default_rng(seed).normal(0, noise, mask.shape), 0, 255).astype(np.uint8)
+
+
+def threshold_of(scan: Prepared | Field) -> float:
+    """The grey level that separates the phases, as a note says."""
+    match = re.search(r"threshold of ([\d.]+):", " ".join(scan.notes))
+    assert match is not None
+    return float(match[1])
 
 
 # ---- kinds -----------------------------------------------------------------------------------------------------------
@@ -52,7 +61,6 @@ def test_a_phase_field_stays_as_it_is() -> None:
     assert np.array_equal(prepared.phase, field)
     assert prepared.grid == Grid(mask.shape, boundary="periodic")
     assert (prepared.scale, prepared.working_voxel, prepared.unit) == ((1, 1, 1), 0.5, "um")
-    assert prepared.threshold is None
     assert np.array_equal(prepare(Field(field), dark=True).mask, ~(field >= 0))
 
 
@@ -71,10 +79,8 @@ def test_the_image_of_a_mask_gives_the_mask_back() -> None:
     for prepared in (bright, dark):
         overlap = (prepared.mask & mask).sum() / (prepared.mask | mask).sum()
         assert overlap > 0.9
-        assert prepared.threshold is not None and 0 < prepared.threshold < 255
-    assert bright.threshold == pytest.approx(100, abs=12)
+    assert threshold_of(bright) == pytest.approx(100, abs=12)
     given = prepare(Field(image_of(mask)), threshold=100.0)
-    assert given.threshold == 100
     assert "the given threshold of 100" in " ".join(given.notes)
 
 
@@ -309,7 +315,7 @@ def test_a_field_without_surface_is_refused() -> None:
     values = np.full((16, 16, 16), -0.9, np.float32)
     values[3, 3, 3] = -0.8
     with pytest.raises(ScanError, match="background"):
-        find_level(Field(values), kind="field")
+        find_structure(Field(values), kind="field")
 
 
 # ---- real scans ------------------------------------------------------------------------------------------------------
@@ -329,7 +335,9 @@ def test_bone_is_kept_on_its_grid(data) -> None:
     scan = load(data / "scans" / "lhdl_trabecular_200.tif")
     truth = load(data / "scans" / "lhdl_trabecular_200_otsu_mask.tif").values > 0
     inner = (slice(60, 140),) * 3
-    assert find_level(scan).threshold == pytest.approx(84, abs=0.5)  # as the mask's README states, between whole levels
+    assert threshold_of(find_structure(scan)[1]) == pytest.approx(
+        84, abs=0.5
+    )  # as the mask's README states, between whole levels
     prepared = prepare(Field(scan.values[inner], scan.spacing, scan.unit), threshold=84)
     check(prepared)
     assert (prepared.kind, prepared.scale, prepared.working_voxel, prepared.unit) == ("image", (1, 1, 1), 19.5, "um")
@@ -356,7 +364,7 @@ def test_thin_fibres_are_magnified(data) -> None:
 @pytest.mark.parametrize("name", ["sponge", "trabec", "weird", "pearls"])
 def test_gallery_fields_are_known_as_such(data, name: str) -> None:
     field = load(next((data / "gallery").glob(f"{name} *")))
-    assert find_level(field).kind == "field"
+    assert find_structure(field)[0] == "field"
     if name == "weird":
         prepared = prepare(field, periodic=True)
         check(prepared)
