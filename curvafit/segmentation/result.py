@@ -260,7 +260,9 @@ def _figure(segmentation: Segmentation, rows: Mapping[str, tuple[np.ndarray, np.
         return section_figure(rows, mask.spacing, mask.unit)
     unsure = entropy(probability.values)
     places = [int(unsure.sum(tuple({0, 1, 2} - {axis})).argmax()) for axis in range(3)]
-    shown = {"filled": (labels.values, None)} if labels is not None else {}
+    shown: dict[str, tuple[np.ndarray, np.ndarray | None]] = {}
+    if labels is not None:
+        shown = {"filled": (labels.values, None)}
     if segmentation.image is not None:
         shown = {"image, filled": (segmentation.image.values, mask.values), **shown}
     elif labels is None:
