@@ -320,7 +320,7 @@ def on_scans(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     whole: dict[str, Figure] = {}
     for way in ways:
         each = {key: [figure.value for name, figure in figures.items() if name.endswith(f".{way.lower()}_{key}")]
-                for key in ("gain", "least", "calibration", "betti", "thickness")}  # fmt: skip
+                for key in ("gain", "least", *FIGURES)}  # fmt: skip
         whole |= {f"gaps.{every}.{way.lower()}_{key}": bootstrap(values) for key, values in each.items()}
         whole[f"gaps.{every}.{way.lower()}_least"] = Figure(min(each["least"]))
     names = {"filler_gain": "all", "filler_least": "least", "tuned_gain": "tuned_all", "tuned_least": "tuned_least"}
