@@ -298,7 +298,9 @@ def _scale_on(axes: Axes, edge: float, unit: str) -> None:
     length = max(step * power for step in (1, 2, 5) if step * power <= width * edge / 3)
     bar = axes.get_xaxis_transform()
     axes.plot([0, length / edge], [-0.05, -0.05], color=INK, linewidth=2.5, transform=bar, clip_on=False)
-    axes.text(length / edge + 0.02 * width, -0.05, format_length(length, unit, 1), transform=bar, va="center", fontsize=8)
+    axes.text(
+        length / edge + 0.02 * width, -0.05, format_length(length, unit, 1), transform=bar, va="center", fontsize=8
+    )
 
 
 def section_on(axes: Axes, plane: np.ndarray, outline: np.ndarray | None, limits: Limits, aspect: float) -> None:

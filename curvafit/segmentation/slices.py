@@ -132,15 +132,15 @@ class Slices:
         positions = [k for k, place in enumerate(numbers) if place in index_of_place]
         return positions, self.inside[[index_of_place[int(numbers[k])] for k in positions]][:, ys][:, :, xs]
 
-    def level(self, way: str, box: Box = WHOLE) -> np.ndarray:
-        """Return an interpolation by one of `WAYS`, float32 (length, Y, X), positive inside, or a box of it.
+    def level(self, way: str) -> np.ndarray:
+        """Return an interpolation by one of `WAYS`, float32 (length, Y, X), positive inside.
 
         At a known slice it is the signed distance within the plane. Before the first slice and beyond the last it has
         the value of the nearest; in a periodic volume it goes around. An empty mask has minus the largest gap between
         slices, a full one plus this gap.
         """
-        numbers, ys, xs = self.numbers(box)
-        places, distances = np.array(self.places), self.distances(self.gap * self.spacing[0])[:, ys][:, :, xs]
+        numbers, places = np.arange(self.length), np.array(self.places)
+        distances = plane_distances(self.inside, self.spacing[1:], self.gap * self.spacing[0])
         where = numbers.clip(places[0], places[-1])
         if self.periodic:
             places, distances = np.append(places, places[0] + self.length), np.concatenate([distances, distances[:1]])
@@ -154,10 +154,6 @@ class Slices:
             return distances[nearest].astype(np.float32)
         return curve(where).astype(np.float32)
 
-    def distances(self, gap: float) -> np.ndarray:
-        """Return `plane_distances` of the known slices."""
-        return plane_distances(self.inside, self.spacing[1:], gap)
-
     @property
     def gap(self) -> int:
         """The largest distance, in slices, between a known slice and the next."""
@@ -165,24 +161,13 @@ class Slices:
         return int(max(*steps, self.places[0] + self.length - self.places[-1]) if self.periodic else steps.max())
 
     @property
-    def neighbours(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """For each slice of the volume: the distance, in slices, to the nearer of the two known slices around it, the
-        row of that one in `inside`, and the row of the other; the rows are equal outside the known slices."""
-        places, where, count = np.array(self.places), np.arange(self.length), len(self.places)
-        before, after = np.searchsorted(places, where, "right") - 1, np.searchsorted(places, where, "left")
-        if not self.periodic:
-            before, after = before.clip(0), after.clip(max=count - 1)
-        down, up = where - places[before % count], places[after % count] - where
-        if self.periodic:
-            down, up = down % self.length, up % self.length
-        before, after, down, up = before % count, after % count, np.abs(down), np.abs(up)
-        return np.minimum(down, up), np.where(down <= up, before, after), np.where(down <= up, after, before)
-
-    @property
     def between(self) -> np.ndarray:
         """Whether each slice of the volume lies between two known ones, bool (length,)."""
-        away, near, far = self.neighbours
-        return (away > 0) & (near != far)
+        unknown = np.ones(self.length, dtype=bool)
+        unknown[list(self.places)] = False
+        if not self.periodic:
+            unknown[: self.places[0]] = unknown[self.places[-1] :] = False
+        return unknown
 
 
 def known_places(length: int, every: int | None, first: int, known: Sequence[int] | None) -> list[int]:
