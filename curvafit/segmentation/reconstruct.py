@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy import ndimage
 from scipy.special import expit
 
 from curvafit.core.checks import SEEDS, check_float, check_int
@@ -420,9 +421,9 @@ def reconstruct_labels(
     """Fill several structures between known slices, each by `reconstruct`; a voxel that two of them claim goes to the
     one with the greater phase field there.
 
-    Where every voxel of the known slices is labelled, so is every voxel of the volume: an unclaimed voxel goes to the
-    label with the largest phase value; else each label is filled in the box where it may be. A label for which slices
-    or example are too few for what is asked is filled by the network alone, and a note says why.
+    Each label is filled in the box where it may be. Where every voxel of the known slices is labelled, so is every
+    voxel of the volume: an unclaimed voxel goes to the label with the largest phase value, or to the nearest. A label
+    for which slices or example are too few for what is asked is filled by the network alone, and a note says why.
 
     Parameters
     ----------
@@ -465,7 +466,7 @@ def reconstruct_labels(
     notes: dict[str, list[int]] = {}
     for count, number in enumerate(numbers):
         inside = (volume.values == number) & known_voxels
-        box = WHOLE if full or options.get("periodic") else _box_of_label(inside, places, axis, volume.spacing)
+        box = WHOLE if options.get("periodic") else _box_of_label(inside, places, axis, volume.spacing)
         mask, shown = _select_label(_cut(volume, box), number, ignore), _select_label(other, number)
         start, stop, _ = box[axis].indices(volume.shape[axis])
         which = {"known": [k - start for k in places if start <= k < stop]} if ignore is None else {"ignore": UNKNOWN}
@@ -484,8 +485,11 @@ def reconstruct_labels(
         for note in part.notes:
             notes.setdefault(note, []).append(number)
         parts[number] = part
+    if full and (unseen := np.isneginf(deepest)).any():  # in no label's box
+        near = ndimage.distance_transform_edt(unseen, volume.spacing, return_distances=False, return_indices=True)
+        owner = owner[tuple(near)]  # type: ignore[arg-type]
     values = owner if full else np.where(deepest > 0, owner, 0)
-    likely = np.where(values, largest, 1.0) / (odds + (not full))
+    likely = np.where(values, largest, 1.0) / np.maximum(odds + (not full), SURE)
     values = np.where(known_voxels, np.where(np.isin(volume.values, numbers), volume.values, 0), values)
     likely = np.where(known_voxels, 1.0, likely)
     values = values.astype(np.int32 if min(numbers) < 0 else np.min_scalar_type(max(numbers)))

@@ -406,6 +406,16 @@ def test_a_label_is_filled_in_its_own_box_as_in_the_whole_volume() -> None:
     assert found.phase.values.min() >= -1 and not found.labels.values[:, :8, 100:].any()  # type: ignore[union-attr]
 
 
+def test_a_volume_that_is_labelled_everywhere_stays_so_where_no_label_s_box_is() -> None:
+    labels = np.ones((17, 90, 90), np.uint8)
+    labels[:, 45:] = 2
+    labels[8:, :, 40:] = 3
+    labels[8:, :10, :10] = 3
+    sparse = np.where(np.isin(np.indices(labels.shape)[0], (0, 16)), labels, 0)
+    found = reconstruct_labels(sparse, known=[0, 16]).labels
+    assert found is not None and set(np.unique(found.values)) == {1, 2, 3}
+
+
 @pytest.mark.parametrize(
     ("values", "options", "word"),
     [
