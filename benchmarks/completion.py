@@ -7,7 +7,7 @@ repeats; the law is inferred by `infer --fast` from the mask of another seed, th
 - `spline`, `linear`, `nearest`, `ITK` (its morphological contour interpolation, where its package is installed): plain
   interpolations. Gains are held to the best of them *in hindsight*, case by case.
 - `offset`: the spline with the threshold that is best on the example; `scratch`: the network that it alone taught.
-- `filler`: `reconstruct` without an example; `tuned`: with one; `law`, `willmore`, `area`: with one, and its law, the
+- `filler`: `reconstruct` without an example, `careful` with all mirror images; `tuned`: with an example; `law`, `willmore`, `area`: with one, and its law, the
   Willmore energy or the area tried.
 
 Dice and the calibration error within 3 voxels of the surface count the unknown slices between the first and the last
@@ -54,7 +54,7 @@ ITK = "ITK"
 #: Willmore's energy, and costs twenty times as much as that of tubes 8 voxels thick.
 LAWS_TRIED = {"willmore": Coefficients.willmore(), "area": Coefficients(0.05, 0.1, 0.05, 0, 0, 1 / 16)}
 #: Ways of `reconstruct`, and others that need an example: neither is a plain interpolation.
-OURS, TAUGHT = ("filler", "tuned", "law", *LAWS_TRIED), ("offset", "scratch")
+OURS, TAUGHT = ("filler", "careful", "tuned", "law", *LAWS_TRIED), ("offset", "scratch")
 #: Steps of the network that an example alone teaches.
 SCRATCH = 600
 #: What is kept of each case.
@@ -141,8 +141,8 @@ def filled(
     likely = None
     if way in OURS:
         with_law = prior() if way == "law" else LAWS_TRIED.get(way)
-        shown, begun = None if way == "filler" else example(), time.perf_counter()
-        found = reconstruct(truth, with_law, known=places, axis=axis, example=shown, **told)
+        shown, begun = None if way in ("filler", "careful") else example(), time.perf_counter()
+        found = reconstruct(truth, with_law, known=places, axis=axis, example=shown, careful=way == "careful", **told)
         mask, likely = (np.moveaxis(each.values, axis, 0) for each in (found.mask, found.probability))
         status = found.status
     else:
