@@ -7,8 +7,8 @@ repeats; the law is inferred by `infer --fast` from the mask of another seed, th
 - `spline`, `linear`, `nearest`, `ITK` (its morphological contour interpolation, where its package is installed): plain
   interpolations. Gains are held to the best of them *in hindsight*, case by case.
 - `offset`: the spline with the threshold that is best on the example; `scratch`: the network that it alone taught.
-- `filler`: `reconstruct` without an example, `careful` with all mirror images; `tuned`: with an example; `law`, `willmore`, `area`: with one, and its law, the
-  Willmore energy or the area tried.
+- `filler`: `reconstruct` without an example; `careful`: with all mirror images. `tuned`: with an example; `law`,
+  `willmore`, `area`: with one, and its law, the Willmore energy or the area tried.
 
 Dice and the calibration error within 3 voxels of the surface count the unknown slices between the first and the last
 known one; the sum of the Betti numbers' errors and the error of the mean thickness, in voxels, count all between them.
