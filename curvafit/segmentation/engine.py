@@ -167,6 +167,13 @@ def _convert_laws(laws: Sequence[Coefficients], fit: Law, scan: Field) -> tuple[
 # ---- grids -----------------------------------------------------------------------------------------------------------
 
 
+def choose_epsilon(scan: Field, epsilon: float | None) -> float:
+    """Return ε, by default twice the smallest voxel edge; raise ValueError where it is not positive."""
+    if epsilon is None:
+        return RESOLVED * min(scan.spacing)
+    return check_float(epsilon, f"a positive epsilon in {scan.unit}", SHORTEST, LONGEST)
+
+
 @dataclass(frozen=True)
 class WorkingGrid:
     """The grid of a flow: working units, axes refined until ε spans two voxels, and a halo without data.
@@ -192,12 +199,11 @@ class WorkingGrid:
 
     @classmethod
     def of(cls, scan: Field, epsilon: float | None, *, halo: int = 0, periodic: bool = False) -> WorkingGrid:
-        """Return the working grid of a scan; ε is twice the smallest voxel edge by default.
+        """Return the working grid of a scan, for the ε of `choose_epsilon`.
 
         A periodic scan has no halo. Raises `ValueError` if ε is not positive or the scan is too small.
         """
-        form = f"a positive epsilon in {scan.unit}"
-        ε = RESOLVED * min(scan.spacing) if epsilon is None else check_float(epsilon, form, SHORTEST, LONGEST)
+        ε = choose_epsilon(scan, epsilon)
         if min(scan.shape) < 4:
             raise ScanError(f"the volume must have at least 4 voxels along each axis, got {scan.shape}")
         times, unit = choose_refinement(scan.spacing, ε), ε / WORKING_EPSILON

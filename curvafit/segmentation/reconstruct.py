@@ -24,11 +24,11 @@ from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
 from curvafit.priors.law import LawLike
 from curvafit.priors.loss import RESOLVED
 from curvafit.priors.profile import profile_distance
-from curvafit.segmentation.engine import STEPS, WorkingGrid, laws_of
+from curvafit.segmentation.engine import STEPS, WorkingGrid, choose_epsilon, laws_of
 from curvafit.segmentation.examples import PART, Example, crop_to_surface
 from curvafit.segmentation.filler import Taught, fill
 from curvafit.segmentation.image import read_image
-from curvafit.segmentation.result import Segmentation, Uncertainty, flow_summary
+from curvafit.segmentation.result import Segmentation, Uncertainty, flow_summary, volume_summary
 from curvafit.segmentation.slices import (
     WHOLE,
     Slices,
@@ -40,7 +40,7 @@ from curvafit.segmentation.slices import (
     require_labels,
 )
 from curvafit.segmentation.teach import tune
-from curvafit.segmentation.tiles import LoweredVolume, Problem, Tiling, lower_volume
+from curvafit.segmentation.tiles import Problem, Tiling, lower_volume
 from curvafit.segmentation.trials import Task, Trial, choose_by_masks, leave_out_slices
 from curvafit.segmentation.uncertainty import (
     best_log_odds,
@@ -162,7 +162,7 @@ def reconstruct(
     if stiffness is not None:
         stiffness = check_float(stiffness, "a positive stiffness", *STIFFEST)
     laws, notes = ((), ()) if prior is None else laws_of(prior, volume)
-    tiling = Tiling.of(target.frame, epsilon, tile, periodic=periodic)
+    width = choose_epsilon(volume, epsilon)
     taught, other = Taught.load(filler, image=image is not None), None
     evidence = seen = None
     if image is not None:
@@ -183,27 +183,30 @@ def reconstruct(
     if stiffness is not None and laws:
         chosen, said = Trial(laws[0], stiffness, steps), "the law is lowered from the network's volume"
     elif laws:
+        tiling = Tiling.of(target.frame, epsilon, tile, periodic=periodic)
         task = _pose_task(target if tiling.count == 1 else crop_to_surface(target, PART)[0], other)
         trials = [Trial(law, STIFFNESS, steps, pull) for law, pull in product(laws, PULLS)]
         chosen = choose_by_masks(task, trials, lambda given, trial: engine.run(given, trial) > 0)
         said = _describe_gain(chosen, "left out" if other is None else "of the example")
     if chosen.law is None:
         phase = engine.run(target, chosen)
-        found = LoweredVolume(target.keep_known(phase > 0), phase, (), 0)
-        likely = expit(engine.logits(target)), taught.error
+        mask, likely = target.keep_known(phase > 0), (expit(engine.logits(target)), taught.error)
+        summary = volume_summary(mask)
     else:
+        tiling = Tiling.of(target.frame, epsilon, tile, periodic=periodic)
         problem = SlicesProblem(chosen, target, engine.level(target))
         found = lower_volume(problem, tiling, store=store, workers=workers, progress=progress)
-        likely = _weigh_evidence(engine, chosen, task, target, found.phase)
+        mask, phase, summary = found.mask, found.phase, flow_summary(found)
+        likely = _weigh_evidence(engine, chosen, task, target, phase)
         notes = (*notes, *tiling.place.notes)
-    uncertain = _uncertainty(*likely, found.mask, target, volume, axis, suggest)
+    uncertain = _uncertainty(*likely, mask, target, volume, axis, suggest)
     if uncertain.expected_dice < HALF:
         notes = (*notes, "Known slices lie too far apart: what lies between them is more unknown than known.")
     end, known_slices = _describe_errors(uncertain), f"{len(places)} of {volume.shape[axis]} slices known"
-    whole = replace(found, mask=_turn_back(axis, found.mask), phase=_turn_back(axis, found.phase))
     return Segmentation.of(
-        volume, whole, chosen.law, tiling.place.epsilon, (*notes, *_extrapolated(places, volume.shape[axis])),
-        weight=None, status=f"{said}: {known_slices}, {flow_summary(found)}; {end}", uncertainty=uncertain, image=seen,
+        volume, _turn_back(axis, mask), _turn_back(axis, phase), chosen.law, width,
+        (*notes, *_extrapolated(places, volume.shape[axis])),
+        weight=None, status=f"{said}: {known_slices}, {summary}; {end}", uncertainty=uncertain, image=seen,
     )  # fmt: skip
 
 
@@ -235,9 +238,9 @@ class _Engine:
 
     def run(self, slices: Slices, trial: Trial) -> np.ndarray:
         """Return the phase field (Z, Y, X) of a trial; a law is lowered once, whatever the trial's scores."""
-        tiling = Tiling.of(slices.frame, self.epsilon, periodic=slices.periodic)
         if trial.law is None:
-            return _profile(self.level(slices), tiling.place.epsilon)
+            return _profile(self.level(slices), choose_epsilon(slices.frame, self.epsilon))
+        tiling = Tiling.of(slices.frame, self.epsilon, periodic=slices.periodic)
         key = (slices, trial.law, trial.strength, trial.steps, trial.pull)
         if key not in self.lowered:
             step: Progress = lambda _, share: self.progress("trying the law out", share)  # noqa: E731

@@ -156,7 +156,7 @@ def refine(
     found = lower_volume(_pose(evidence, trial), tiling, store=store, workers=workers, progress=progress)
     spread = f"Probabilities from {field.values.min():.3g} to {field.values.max():.3g}."
     return Segmentation.of(
-        field, found, trial.law, tiling.place.epsilon, (*notes, spread, *tiling.place.notes),
+        field, found.mask, found.phase, trial.law, tiling.place.epsilon, (*notes, spread, *tiling.place.notes),
         weight=None if trial.law is None else trial.strength * BENDING / bending(trial.law),
         status=f"{gain}{flow_summary(found)}",
     )  # fmt: skip

@@ -102,15 +102,16 @@ class Segmentation(Pictured):
     def of(
         cls,
         scan: Field,
-        lowered: LoweredVolume,
+        mask: np.ndarray,
+        phase: np.ndarray,
         law: Coefficients | None,
         epsilon: float,
         notes: tuple[str, ...],
         **more: Any,
     ) -> Segmentation:
-        """Return the segmentation of a scan whose energy was lowered; `more` are attributes by name."""
-        mask, phase = (replace(scan, values=values, notes=()) for values in (lowered.mask, lowered.phase))
-        return cls(mask, phase, coefficients=law, epsilon=epsilon, notes=(*scan.notes, *notes), **more)
+        """Return a segmentation whose mask and phase field (Z, Y, X) lie as the scan does; `more` are attributes."""
+        inside, field = (replace(scan, values=values, notes=()) for values in (mask, phase))
+        return cls(inside, field, coefficients=law, epsilon=epsilon, notes=(*scan.notes, *notes), **more)
 
     @property
     def probability(self) -> Field | None:
@@ -143,10 +144,15 @@ class Segmentation(Pictured):
         return f"Segmentation({size}, {count}: {self.status})"
 
 
+def volume_summary(mask: np.ndarray) -> str:
+    """Say which share of the volume is inside."""
+    return f"{100 * mask.mean():.2f} % of the volume is inside"
+
+
 def flow_summary(lowered: LoweredVolume) -> str:
     """Say whether a flow settled, if there was one, and which share of the volume is inside."""
     share, energy, steps = float(lowered.mask.mean()), lowered.energies, lowered.steps
-    inside = f"{100 * share:.2f} % of the volume is inside"
+    inside = volume_summary(lowered.mask)
     if not steps:
         return inside
     fall = (energy[0] - energy[-1]) / max(abs(energy[-1]), 1e-30) if len(energy) > 1 else 1.0

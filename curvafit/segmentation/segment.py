@@ -140,8 +140,9 @@ def segment(
         weight = trial.strength * BENDING / bending(trial.law)
     notes = (*notes, f"{str(classes).capitalize()}.", *tiling.place.notes)
     return Segmentation.of(
-        frame, found, trial.law, tiling.place.epsilon, notes, weight=weight, status=f"{gain}{flow_summary(found)}"
-    )
+        frame, found.mask, found.phase, trial.law, tiling.place.epsilon, notes,
+        weight=weight, status=f"{gain}{flow_summary(found)}",
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

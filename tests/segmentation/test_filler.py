@@ -21,7 +21,7 @@ from curvafit.segmentation.filler import (
     interpolate,
     plane_thickness,
 )
-from curvafit.segmentation.slices import Slices, annotated_slices
+from curvafit.segmentation.slices import Slices, annotated_slices, plane_distances
 from curvafit.volumes.field import ScanError
 
 EDGES = (1.0, 1.0, 1.0)
@@ -121,7 +121,7 @@ def test_an_untaught_filler_is_the_cubic_interpolation() -> None:
     mask = leaning()
     taught = Taught(Filler().eval(), np.array([[4.0, 16.0], [1.0, 1.0]]), {}, 0.0)
     slices = known(mask)
-    distances = torch.from_numpy(np.stack([slices.distances(FAR)[k].clip(-FAR, FAR) for k in (1, 2, 3, 4)])).float()
+    distances = torch.from_numpy(plane_distances(slices.inside, EDGES[1:], FAR)[1:5].clip(-FAR, FAR)).float()
     _, cubic = interpolate(distances[None], torch.arange(1, 6) / 6)
     np.testing.assert_allclose(fill(slices, taught)[13:18], room.SLOPE * cubic[0].numpy(), atol=1e-4)
 
