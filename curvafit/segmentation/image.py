@@ -57,8 +57,9 @@ def read_image(
     evidence = np.empty(values.shape, dtype=np.float32)
     for rows, part in kept or describe():
         progress("reading the image", rows[0] / len(values))
-        logits = trees.decision_function(part.reshape(-1, part.shape[-1]))
-        evidence[rows] = (slope * logits + shift).reshape(part.shape[:3])
+        for row, plane in zip(rows, part, strict=True):
+            logits = trees.decision_function(plane.reshape(-1, plane.shape[-1]))
+            evidence[row] = (slope * logits + shift).reshape(plane.shape[:2])
     progress("reading the image", 1.0)
     return evidence, told
 
