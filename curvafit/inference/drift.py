@@ -12,7 +12,7 @@ from torch import Tensor
 
 from curvafit.generation.flow import WORKING_BLUR, descend
 from curvafit.generation.schedule import Schedule
-from curvafit.inference.stationarity import energy_gradients, fix_gauge
+from curvafit.inference.stationarity import fix_gauge
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Float, Grid
 from curvafit.priors.stencils import gaussian_blur, gradient
@@ -33,73 +33,36 @@ _LOST = 10.0
 def drift(phase: Float[Tensor, "z y x"], grid: Grid, epsilon: float, coefficients: Coefficients) -> float | None:
     """Return how far, in voxels, a short flow of a law moves the surface of `phase`: root mean square, low-passed.
 
-    None where the box is too small to have an inside apart from its borders.
+    Only the direction of the coefficients counts: the flow takes them in their gauge. None where the box is too small
+    to have an inside apart from its borders.
     """
     if not grid.periodic and min(grid.shape) <= 2 * HALO + STRIDE:
         return None
-    return float(np.linalg.norm(ShortFlow(phase, grid, epsilon, coefficients).residual(coefficients)))
+    values, grid = _cut_box(phase.detach().to("cpu", torch.float32), grid)
+    start, voxel = deblur(values, grid, epsilon), grid.spacing[0]
+    law, _ = fix_gauge(np.array([float(value) for value in coefficients]))
+    options = {"steps": SHORT_FLOW.steps, "schedule": SHORT_FLOW, "epsilon": epsilon, "blur": WORKING_BLUR}
+    flow = descend(start, law, grid, flow="h-1", optimiser="adam", frozen=halo_of(grid), **options)
+    before = gaussian_blur(start, grid, epsilon)
+    moved = (flow.field - before).double()
+    if not bool(torch.isfinite(moved).all()):
+        return _LOST
+    margin = 0 if grid.periodic else HALO
+    read = tuple(slice(margin, n - margin, STRIDE) for n in grid.shape)
+    # The displacement is the low-passed change of u over `share`, the low-passed |∇u|, and weighs by `share`.
+    slope = gradient(before.double(), grid).square().sum(-4).sqrt()
+    share, change = (gaussian_blur(each, grid, LOW_PASS * voxel)[read] for each in (slope, moved))
+    kept = share > _FAINT * share.max()
+    return float((change[kept].square() / share[kept]).sum() / share[kept].sum()) ** 0.5 / voxel
 
 
-class ShortFlow:
-    """Short flows of several laws from one phase field, with the displacement of the interface that each leaves.
-
-    A weak energy moves nothing. So that laws compare, every flow gets the same budget of force, that of the law
-    `reference`: the norm of (a_α × the force of term α alone) at the start. Only the direction of a counts.
-    """
-
-    def __init__(self, phase: Tensor, grid: Grid, epsilon: float, reference: Coefficients) -> None:
-        values, self.grid = _cut_box(phase.detach().to("cpu", torch.float32), grid)
-        self.epsilon, self._voxel = epsilon, grid.spacing[0]
-        self.start = deblur(values, self.grid, epsilon)
-        self._before = gaussian_blur(self.start, self.grid, epsilon)
-        halo = 0 if self.grid.periodic else HALO
-        inside = tuple(slice(halo, n - halo) for n in self.grid.shape)
-        self.frozen = None
-        if halo:
-            self.frozen = torch.ones(self.grid.shape, dtype=torch.bool)
-            self.frozen[inside] = False
-        # The displacement is the low-passed change of u over `share`, the low-passed |∇u|; its squares are weighted by
-        # share / Σ share. So the mean square is Σ (change / norm)², with norm = √(share Σ share).
-        slope = gradient(self._before.double(), self.grid).square().sum(-4).sqrt()
-        self._read = tuple(slice(s.start, s.stop, STRIDE) for s in inside)
-        share = gaussian_blur(slope, self.grid, LOW_PASS * self._voxel)[self._read]
-        self._kept = share > _FAINT * share.max()
-        self._norm = (share * share[self._kept].sum()).sqrt()[self._kept]
-        self._forces = self._measure_forces()
-        self._budget = self._force(fix_gauge(np.array([float(value) for value in reference]))[0])
-
-    def residual(self, law: Coefficients) -> np.ndarray:
-        """Return, for each voxel that is read, its low-passed displacement in voxels times the root of its weight.
-
-        The sum of the squares is the weighted mean square of the displacement.
-        """
-        scaled = law.scale(self._budget / self._force(law))
-        flow = descend(
-            self.start,
-            scaled,
-            self.grid,
-            flow="h-1",
-            optimiser="adam",
-            steps=SHORT_FLOW.steps,
-            schedule=SHORT_FLOW,
-            epsilon=self.epsilon,
-            blur=WORKING_BLUR,
-            frozen=self.frozen,
-        )
-        moved = (flow.field - self._before).double()
-        if not bool(torch.isfinite(moved).all()):
-            return np.full(len(self._norm), _LOST / np.sqrt(len(self._norm)))
-        low = gaussian_blur(moved, self.grid, LOW_PASS * self._voxel)[self._read][self._kept]
-        return (low / self._norm / self._voxel).numpy()
-
-    def _measure_forces(self) -> np.ndarray:
-        """Return the root mean square of each of the six low-passed ∂F_α/∂u where the residual is read."""
-        terms = energy_gradients(self._before.double(), self.grid, self.epsilon)
-        low = gaussian_blur(terms, self.grid, LOW_PASS * self._voxel)[(slice(None), *self._read)][:, self._kept]
-        return low.square().mean(1).sqrt().numpy()
-
-    def _force(self, law: Coefficients) -> float:
-        return float(np.linalg.norm(self._forces * law.tensor().numpy()))
+def halo_of(grid: Grid) -> Tensor | None:
+    """Return the voxels at the sides of a crop that a flow holds; None where the box repeats."""
+    if grid.periodic:
+        return None
+    halo = torch.ones(grid.shape, dtype=torch.bool)
+    halo[HALO:-HALO, HALO:-HALO, HALO:-HALO] = False
+    return halo
 
 
 def deblur(phase: Tensor, grid: Grid, width: float) -> Tensor:
