@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -40,6 +39,7 @@ class Atlas:
     mask_diagrams: tuple[Diagram, ...]
     provenance: dict[str, Any]
     format_version: int = VERSION
+    _embedded: dict[str, np.ndarray] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         n = len(self.ids)
@@ -69,16 +69,9 @@ class Atlas:
 
     def embeddings(self, seen_as: str) -> np.ndarray:
         """Return the sliced-quantile embeddings (N, 288) of those diagrams; computed once."""
-        self.diagrams(seen_as)
-        return self._field_embeddings if seen_as == "field" else self._mask_embeddings
-
-    @cached_property
-    def _field_embeddings(self) -> np.ndarray:
-        return np.stack([np.asarray(sliced_embedding(d)) for d in self.field_diagrams])
-
-    @cached_property
-    def _mask_embeddings(self) -> np.ndarray:
-        return np.stack([np.asarray(sliced_embedding(d)) for d in self.mask_diagrams])
+        if seen_as not in self._embedded:
+            self._embedded[seen_as] = np.stack([np.asarray(sliced_embedding(each)) for each in self.diagrams(seen_as)])
+        return self._embedded[seen_as]
 
 
 def save_atlas(atlas: Atlas, path: str | Path) -> None:

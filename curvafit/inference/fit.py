@@ -11,10 +11,8 @@ from typing import Annotated, Any, Literal, get_type_hints
 
 import numpy as np
 
-from curvafit.core.checks import quoted
 from curvafit.core.files import write_content
 from curvafit.core.pictures import Pictured
-from curvafit.core.records import parse_json
 from curvafit.core.schema import Rule, decode, encode, schema_of, violation
 from curvafit.core.units import METRES
 from curvafit.geometry.diagram import Diagram
@@ -23,7 +21,7 @@ from curvafit.inference.atlas import Match
 from curvafit.inference.candidates import Candidate, Deviations, Misfit, NotNegative
 from curvafit.priors.coefficients import NAMES, POWERS, Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
-from curvafit.priors.law import FORMAT, Law, LawLike
+from curvafit.priors.law import FORMAT, Law, LawLike, Mass, Positive, parse_fit, read_fit
 
 #: What a scan was taken for, in words.
 KINDS = {"field": "a phase field", "mask": "a mask", "image": "an image"}
@@ -171,7 +169,7 @@ class Fit(Pictured):
     @classmethod
     def from_json(cls, text: str | bytes) -> Fit:
         """Return the fit that a `fit.json`'s text states; raise ValueError if it is not whole (`FIT_SCHEMA`)."""
-        return _fit_of(_parse(text, "the text", FIT_SCHEMA))
+        return _fit_of(parse_fit(text, "the text", FIT_SCHEMA))
 
     def save(self, path: str | PathLike[str]) -> Path:
         """Write a `fit.json`, whole or not at all, and return its path."""
@@ -180,7 +178,7 @@ class Fit(Pictured):
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Fit:
         """Read a `fit.json`; raise FileNotFoundError if there is none, ValueError as `from_json`."""
-        return _fit_of(_parse(_content(path), path, FIT_SCHEMA))
+        return _fit_of(read_fit(path, FIT_SCHEMA))
 
 
 def to_columns(draws: np.ndarray) -> np.ndarray:
@@ -192,7 +190,6 @@ def to_columns(draws: np.ndarray) -> np.ndarray:
 
 # ---- the file --------------------------------------------------------------------------------------------------------
 
-Positive = Annotated[float, Rule(above=0)]
 Column = Annotated[tuple[float, ...], Rule(filled=True)]
 
 
@@ -239,7 +236,7 @@ class _File:
     kind: Literal["field", "mask", "image"]
     family: str
     coefficients: Coefficients | None
-    mass: Annotated[float | None, Rule(above=-1, below=1)]
+    mass: Mass
     uncertainty: Deviations
     chosen: str | None
     scale: tuple[Positive, Positive, Positive]
@@ -275,28 +272,8 @@ def load_candidates(law: LawLike) -> tuple[Candidate, ...]:
     if not isinstance(law, (str, PathLike)):
         return getattr(getattr(law, "fit", law), "candidates", ())
     parts = {name: FIT_SCHEMA["properties"][name] for name in ("candidates", "format")}
-    content = _parse(_content(law), law, {**FIT_SCHEMA, "required": ["format"], "properties": parts})
+    content = read_fit(law, {**FIT_SCHEMA, "required": ["format"], "properties": parts})
     return decode(get_type_hints(_File, include_extras=True)["candidates"], content.get("candidates", []))
-
-
-def _content(path: str | PathLike[str]) -> bytes:
-    """Return the bytes of a `fit.json`."""
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"expected a fit.json, found no file {path}")
-    return Path(path).read_bytes()
-
-
-def _parse(text: str | bytes, place: object, schema: dict[str, Any]) -> dict[str, Any]:
-    """Return the content of a `fit.json`, checked; messages call the file `place`."""
-    expected = "a fit.json written by `curvafit infer`"
-    content = parse_json(text, expected, place)
-    version = content.get("format", FORMAT) if isinstance(content, dict) else FORMAT
-    if version != FORMAT:
-        got = f"got {quoted(version)} in {place}: run `curvafit infer` again"
-        raise ValueError(f"expected a fit.json of format {FORMAT}, {got}")
-    if fault := violation(content, schema):
-        raise ValueError(f"expected {expected} with {fault} in {place}")
-    return content
 
 
 def _file_of(fit: Fit) -> _File:

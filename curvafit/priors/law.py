@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Annotated, Any, Literal, Protocol, runtime_checkable
 
 from torch import Tensor
 
-from curvafit.core.checks import check_choice, check_float, check_open_interval, quoted, simplify_name
+from curvafit.core.checks import quoted, simplify_name
 from curvafit.core.records import parse_json
+from curvafit.core.schema import Rule, decode, schema_of, violation
 from curvafit.core.units import METRES
-from curvafit.priors.coefficients import NAMES, Coefficients
+from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
 
 #: The format of a `fit.json`.
@@ -90,19 +90,14 @@ class Law:
 
         Raises FileNotFoundError where there is no file; ValueError where it is of another format or has no law.
         """
-        if not Path(path).is_file():
-            raise FileNotFoundError(f"expected a fit.json, found no file {path}")
-        expected = "a fit.json written by `curvafit infer`"
-        content = parse_json(Path(path).read_bytes(), expected, path)
-        if not isinstance(content, Mapping):
-            raise ValueError(f"expected {expected}, got {quoted(content)} in {path}")
-        if (version := content.get("format", FORMAT)) != FORMAT:
-            got = f"got {quoted(version)} in {path}: run `curvafit infer` again"
-            raise ValueError(f"expected a fit.json of format {FORMAT}, {got}")
-        try:
-            return _decode(content, f"prior {os.fspath(path)}")
-        except ValueError as error:
-            raise ValueError(f"{path} is not {expected}: {error}") from None
+        content = read_fit(path, _SCHEMA)
+        file: _LawFile = decode(_LawFile, content)
+        if file.coefficients is None or file.mass is None or file.coefficients_physical is None:
+            raise ValueError(f"expected a fit with a law, got one without in {path}: {content.get('status', '')}")
+        share = (file.morphometry or {}).get("volume_fraction")
+        width = file.epsilon_physical * WORKING_SPACING / file.working_voxel
+        own = {"working_voxel": file.working_voxel, "length_unit": file.length_unit, "volume_fraction": share}
+        return cls(file.coefficients, file.mass, f"prior {os.fspath(path)}", epsilon=width, schedule="deep", **own)
 
     @property
     def fitted(self) -> bool:
@@ -181,39 +176,54 @@ def read_laws(laws: LawLike | Iterable[LawLike]) -> tuple[Law, ...]:
     return (Law.of(laws),) if single else tuple(map(Law.of, laws))  # type: ignore[arg-type]
 
 
-def _decode(content: Mapping[str, Any], origin: str) -> Law:
-    """Return the law in the content of a `fit.json`."""
-    status = content.get("status", "no reason")
-    keys = ("coefficients", "mass", "coefficients_physical")
-    if any(name in content and content[name] is None for name in keys):
-        raise ValueError(f"it has no law: {status}")
-    six = _read_six(content, "coefficients")
-    _read_six(content, "coefficients_physical")
-    mass = check_open_interval(content.get("mass"), "mass as a number between -1 and 1", -1, 1)
-    epsilon, voxel = (
-        check_open_interval(content.get(name), f"{name} as a number above 0", 0, math.inf)
-        for name in ("epsilon_physical", "working_voxel")
-    )
-    unit = content.get("length_unit")
-    check_choice(unit, ("voxel", *METRES), f"length_unit as one of voxel, {', '.join(METRES)}")
-    morphometry = content.get("morphometry") or {}
-    if not isinstance(morphometry, Mapping):
-        raise ValueError(f"morphometry must be an object, got {quoted(morphometry)}")
-    share = morphometry.get("volume_fraction")
-    if share is not None:
-        share = check_float(share, "morphometry.volume_fraction as a number from 0 to 1", 0, 1)
-    width = epsilon * WORKING_SPACING / voxel
-    own = {"working_voxel": voxel, "length_unit": unit, "volume_fraction": share}
-    return Law(six, mass, origin, epsilon=width, schedule="deep", **own)
+# ---- fit.json --------------------------------------------------------------------------------------------------------
+
+Positive = Annotated[float, Rule(above=0)]
+Mass = Annotated[float | None, Rule(above=-1, below=1)]
 
 
-def _read_six(content: Mapping[str, Any], name: str) -> Coefficients:
-    """Return the six coefficients of that name."""
-    values = content.get(name)
-    if not isinstance(values, Mapping):
-        raise ValueError(f"{name} must be an object of six coefficients, got {quoted(values)}")
-    return Coefficients(*(check_float(values.get(key), f"{name}.{key} as a number") for key in NAMES))
+@dataclass(frozen=True)
+class _LawFile:
+    """What a law needs of a `fit.json`; `inference.fit` knows the rest."""
 
+    coefficients: Coefficients | None
+    mass: Mass
+    coefficients_physical: Coefficients | None
+    epsilon_physical: Positive
+    working_voxel: Positive
+    length_unit: Literal["voxel", *METRES]  # type: ignore[valid-type]
+    morphometry: Annotated[
+        dict[str, Any] | None, Rule(keys=(("volume_fraction", Annotated[float, Rule(least=0, most=1, unknown=True)]),))
+    ] = None
+
+
+_SCHEMA = schema_of(_LawFile)
+
+
+def read_fit(path: str | PathLike[str], schema: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content of the file of a fit; raise FileNotFoundError if there is none, ValueError as `parse_fit`."""
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"expected a fit.json, found no file {path}")
+    return parse_fit(Path(path).read_bytes(), path, schema)
+
+
+def parse_fit(text: str | bytes, place: object, schema: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content of a `fit.json`'s text; raise ValueError if it is of another format or breaks a schema.
+
+    Messages call the file `place`.
+    """
+    expected = "a fit.json written by `curvafit infer`"
+    content = parse_json(text, expected, place)
+    version = content.get("format", FORMAT) if isinstance(content, dict) else FORMAT
+    if version != FORMAT:
+        got = f"got {quoted(version)} in {place}: run `curvafit infer` again"
+        raise ValueError(f"expected a fit.json of format {FORMAT}, {got}")
+    if fault := violation(content, schema):
+        raise ValueError(f"expected {expected} with {fault} in {place}")
+    return content
+
+
+# ---- presets ---------------------------------------------------------------------------------------------------------
 
 _GALLERY = "curvatubes results/gallery"
 _TABLE_3, _TABLE_4 = "paper, Table 'four shapes'", "paper, Table 'spatialized'"
