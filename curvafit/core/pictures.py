@@ -26,10 +26,7 @@ class Pictured:
     def plot(self, **options: Any) -> Figure:
         """Return a matplotlib `Figure`; the options are those of the function that draws this type.
 
-        Raises
-        ------
-        ValueError
-            If there is nothing to draw: no surface, or a field that is not finite.
+        Raises ValueError if there is nothing to draw: no surface, or a field that is not finite.
         """
         figures = sys.modules[__name__.partition(".")[0]]._FIGURES
         place = next(figures[each.__name__] for each in type(self).__mro__ if each.__name__ in figures)

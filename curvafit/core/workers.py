@@ -111,6 +111,9 @@ def check_workers(count: int | None, scheduler: str | None) -> None:
 def cluster(count: int | None = None, scheduler: str | None = None, dashboard: int | None = None) -> Iterator[Workers]:
     """Start `count` workers on this machine, or take those of a dask scheduler; end them with the block.
 
+    Raises ImportError if dask.distributed is not installed and more than this process is wanted, and OSError if there
+    is no scheduler at the address, it has no workers, or it goes.
+
     Parameters
     ----------
     count
@@ -120,13 +123,6 @@ def cluster(count: int | None = None, scheduler: str | None = None, dashboard: i
         Address of a scheduler, whose workers are used.
     dashboard
         Port of dask's own page on the loopback; by default there is none.
-
-    Raises
-    ------
-    ImportError
-        If dask.distributed is not installed and more than this process is wanted.
-    OSError
-        If there is no scheduler at the address, it has no workers, or it goes.
     """
     check_workers(count, scheduler)
     if count == 0 and scheduler is None:

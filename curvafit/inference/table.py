@@ -16,9 +16,9 @@ from curvafit.core.records import Format, encode_json
 from curvafit.geometry.descriptors import BLOCKS, Descriptors
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
-from curvafit.scan.grids import centre_distance, median_thickness, remove_specks, resample
+from curvafit.scan.grids import median_thickness, remove_specks
 from curvafit.scan.prepare import KEPT_THICKNESS, THINNEST, smallest_piece
-from curvafit.scan.structure import split
+from curvafit.scan.structure import split, voxelise
 from curvafit.volumes.field import Field, ScanError
 
 TABLE_FILE = Format(
@@ -186,13 +186,8 @@ def see_resampled(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
     """
     part, window = see_crop(u, grid, rng)
     thickness = _measure_thickness(part)
-    scale = float(np.clip(thickness / math.exp(rng.uniform(*np.log(KEPT_THICKNESS))), *SCALES))
-    coarse = [round(n / scale) for n in part.shape]
-    zoom = [n / m for n, m in zip(part.shape, coarse, strict=True)]
-    other = resample(centre_distance(part, (1.0,) * 3, 8.0), zoom, (0, 0, 0), coarse) > 0
-    distance = centre_distance(other, zoom, 8.0)
-    back = resample(distance, [1 / z for z in zoom], (0, 0, 0), part.shape) > 0
-    return View(remove_specks(back, smallest_piece(thickness), False)[0], window)
+    voxel = float(np.clip(thickness / math.exp(rng.uniform(*np.log(KEPT_THICKNESS))), *SCALES))
+    return View(voxelise(part, (1 / voxel,) * 3, smallest_piece(thickness), periodic=False), window)
 
 
 def see_scan(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:

@@ -21,8 +21,6 @@ else:
 
         Bool = Float
 
-__all__ = ["WORKING_EPSILON", "WORKING_SPACING", "Bool", "Boundary", "Float", "Grid"]
-
 Boundary = Literal["periodic", "replicate"]
 
 #: Length of a voxel's edge in working units; the published parameters are all stated at this sampling.

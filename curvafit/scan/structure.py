@@ -248,18 +248,18 @@ def split(scan: Field, shape: Sequence[int], *, periodic: bool = False) -> np.nd
     return resample(signed.values, [1 / h for h in scan.spacing], (0, 0, 0), shape, periodic=periodic) > 0
 
 
-def voxelise(mask: np.ndarray, scale: Sequence[float], smallest: float) -> np.ndarray:
-    """Return a periodic mask `(Z, Y, X)` as it comes back from a mask on the voxels of a scan.
+def voxelise(mask: np.ndarray, scale: Sequence[float], smallest: float, periodic: bool = True) -> np.ndarray:
+    """Return a mask `(Z, Y, X)` as it comes back from a mask on the voxels of a scan.
 
     It is resampled there and back by signed distances, and pieces of under `smallest` working voxels are dropped.
     `scale` is a working voxel in scan voxels (z, y, x).
     """
     shape, voxel = _sample_grid(mask.shape, scale)
-    distance = centre_distance(mask, (1.0, 1.0, 1.0), 4 * max(voxel), periodic=True)
-    coarse = resample(distance, voxel, (0, 0, 0), shape, periodic=True) > 0
-    distance = centre_distance(coarse, voxel, 4 * max(1.0, *voxel), periodic=True)
-    inside = resample(distance, [1 / h for h in voxel], (0, 0, 0), mask.shape, periodic=True) > 0
-    return remove_specks(inside, smallest, True)[0]
+    distance = centre_distance(mask, (1.0, 1.0, 1.0), 4 * max(voxel), periodic)
+    coarse = resample(distance, voxel, (0, 0, 0), shape, periodic=periodic) > 0
+    distance = centre_distance(coarse, voxel, 4 * max(1.0, *voxel), periodic)
+    inside = resample(distance, [1 / h for h in voxel], (0, 0, 0), mask.shape, periodic=periodic) > 0
+    return remove_specks(inside, smallest, periodic)[0]
 
 
 def _sample_grid(shape: Sequence[int], scale: Sequence[float]) -> tuple[list[int], list[float]]:

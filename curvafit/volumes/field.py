@@ -15,12 +15,12 @@ from curvafit.core.units import format_sampling, parse_unit
 from curvafit.volumes.formats.base import ScanError
 from curvafit.volumes.formats.part import Crop, parse_box, resolve_box
 
-__all__ = ["Field", "ScanError", "positive_triple"]
-
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Field(Pictured):
     """A volume and its place in the world: values with spacing, unit and affine.
+
+    Raises ScanError where values are not a 3D array of real numbers or the spacing is not 3 positive numbers.
 
     Parameters
     ----------
@@ -37,11 +37,6 @@ class Field(Pictured):
         Where the volume came from: the path of its file.
     notes
         Sentences on what was assumed while reading.
-
-    Raises
-    ------
-    ValueError
-        If values are not a 3D array of real numbers, spacing is not 3 positive numbers or the unit has no known name.
     """
 
     values: np.ndarray

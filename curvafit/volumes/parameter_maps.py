@@ -21,6 +21,9 @@ PARAMETERS = (*NAMES, "mass", "epsilon")
 def read_maps(path: str | Path, shape: tuple[int, int, int] | None = None) -> dict[str, float | Tensor]:
     """Return the map `(Z, Y, X)`, float32, or the number of each parameter.
 
+    Raises FileNotFoundError if there is no such file or folder, and ValueError if it is empty or holds another name, or
+    a map has another shape or values that are not finite.
+
     Parameters
     ----------
     path
@@ -28,14 +31,6 @@ def read_maps(path: str | Path, shape: tuple[int, int, int] | None = None) -> di
         `mass.tif` …). An array of one number holds everywhere.
     shape
         Voxels of every map (z, y, x); by default the shape of the first map.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file or folder.
-    ValueError
-        If a name is not in `PARAMETERS`, the file or folder is empty, or a map has another shape or values that are
-        not finite.
     """
     place = Path(path)
     if not place.exists():

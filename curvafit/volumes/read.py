@@ -27,8 +27,6 @@ from curvafit.volumes.formats.part import Crop, Part, parse_box, take_part
 from curvafit.volumes.formats.tiff import SLICES, read_slices, read_tiff
 from curvafit.volumes.formats.zarr import read_zarr
 
-__all__ = ["READABLE", "Source", "field_of", "load", "place_of", "read_file", "read_values", "split_key", "to_field"]
-
 #: A volume as a caller gives it.
 Source = str | os.PathLike[str] | Field | np.ndarray | torch.Tensor
 
@@ -51,9 +49,6 @@ READERS: dict[str, Callable[..., Raw]] = {
 #: Readers of formats that can hold several arrays, by key.
 KEYED = (read_npz, read_hdf5, read_zarr, read_dicom)
 
-#: Suffixes that `load` knows.
-READABLE = tuple(READERS)
-
 
 def load(
     path: str | os.PathLike[str],
@@ -69,6 +64,10 @@ def load(
     strict: bool = False,
 ) -> Field:
     """Read a volume from a file, or from a folder of slices.
+
+    Raises FileNotFoundError if there is no such file, and ScanError, which is a ValueError, if the suffix is unknown,
+    the file is damaged or truncated, the key is missing, the volume is not 3D, not finite, constant or larger than
+    memory, the spacing is not positive, or the file has no such channel, label or crop.
 
     Parameters
     ----------
@@ -91,15 +90,6 @@ def load(
     strict
         Refuse a volume with parts that are not stored: chunks of Zarr or HDF5, which otherwise get the fill value, or
         slices that a folder's numbers skip. Without `strict` a note tells of such parts.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ScanError
-        A `ValueError`: if the suffix is unknown, the file is damaged or truncated, the key is missing, the volume is
-        not 3D, not finite, constant or larger than memory, the spacing is not positive, or the file has no such
-        channel, label or crop.
     """
     location, key = split_key(path, key)
     part = Part(channel, parse_box(crop))
@@ -128,6 +118,8 @@ def field_of(
 ) -> Field:
     """Return the `Field` of any source of a volume.
 
+    Raises ScanError if the source is none of these or an option does not apply to it, and what `load` raises.
+
     Parameters
     ----------
     source
@@ -139,13 +131,6 @@ def field_of(
         The voxels of one value, as a mask; a box of voxels: see `Field.label` and `Field.crop`.
     reading
         Options of reading a file: see `load`.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ScanError
-        A `ValueError`: if the source is none of these, an option does not apply to it, or `load` refuses the file.
     """
     if isinstance(source, str | os.PathLike):
         return load(source, spacing=spacing, unit=unit, label=label, crop=crop, **reading)

@@ -17,8 +17,6 @@ from curvafit.volumes.formats.tiff import write_ome_tiff, write_tiff
 from curvafit.volumes.formats.zarr import mark, write_zarr
 from curvafit.volumes.read import Source, field_of
 
-__all__ = ["WRITABLE", "pick_writer", "save"]
-
 #: Suffix -> writer(field, path).
 WRITERS: dict[str, Callable[[Any, Path], None]] = {
     ".nii": write_nifti,
@@ -52,6 +50,9 @@ def save(
     NIfTI keeps the affine (qform and sform) and the unit. TIFF (ImageJ's or OME's metadata), MRC (in Å) and Zarr
     (OME-NGFF 0.5, with halved copies of a large volume) keep spacing and unit. NPY keeps the values only.
 
+    Raises ValueError if the suffix is unknown, the format cannot hold the values' type or needs a unit and the volume
+    has none, the source is not a volume, or another folder has that name.
+
     Parameters
     ----------
     source
@@ -62,14 +63,6 @@ def save(
         The mark of a Zarr store: what the store is for.
     overwrite
         Whether any other folder of that name may be replaced.
-
-    Raises
-    ------
-    ScanError
-        If the suffix is unknown, the format cannot hold the values' type, the format needs a unit and the volume has
-        none, or the source is not a volume.
-    ValueError
-        If another folder has that name.
     """
     field = field_of(source, spacing=spacing, unit=unit)
     target = Path(path)

@@ -24,7 +24,7 @@ from curvafit import infer, refine, segment
 from curvafit.core.units import parse_unit
 from curvafit.volumes import Field, ScanError, field_of, load, save
 from curvafit.volumes.formats.tiff import natural_key
-from curvafit.volumes.read import READABLE
+from curvafit.volumes.read import READERS
 
 UNITS = ("voxel", "nm", "um", "mm", "m")
 VALUES = (np.random.default_rng(0).random((9, 10, 11)) * 200 + 1).astype(np.uint16)
@@ -527,7 +527,7 @@ def test_bad_names_are_refused(tmp_path: Path) -> None:
     for kind in (str, complex, object):
         with pytest.raises(ValueError, match="real numbers"):
             Field(ramp().astype(kind))
-    for suffix in READABLE:
+    for suffix in READERS:
         path = tmp_path / f"scan{suffix}"
         path.write_bytes(b"not a volume at all")
         refused(path, "", raw_shape=(4, 5, 6))

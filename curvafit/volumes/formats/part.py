@@ -13,8 +13,6 @@ import numpy as np
 from curvafit.core.checks import SEEDS, check_int, quoted
 from curvafit.volumes.formats.base import Raw, ScanError, check_array
 
-__all__ = ["Box", "Crop", "Part", "index_of", "parse_box", "read_part", "resolve_box", "take_part"]
-
 #: A box of voxels along (z, y, x).
 Box = tuple[slice, slice, slice]
 #: A box as a caller gives it: `"z0:z1,y0:y1,x0:x1"`, or three slices.
