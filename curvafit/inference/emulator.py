@@ -81,10 +81,10 @@ class Emulator:
     def inputs(self, parameters: np.ndarray, view: str) -> np.ndarray:
         """Return what the networks read: the parameters in deviations of the prior, and the kind of view."""
         scaled = (np.atleast_2d(parameters) - self.centre) / self.deviation
-        return np.concatenate([scaled, np.repeat(self.kind(view)[None], len(scaled), 0)], 1)
+        return np.concatenate([scaled, np.repeat(self.encode_view(view)[None], len(scaled), 0)], 1)
 
-    def kind(self, view: str) -> np.ndarray:
-        """Return 1 in the place of a kind of view, else 0."""
+    def encode_view(self, view: str) -> np.ndarray:
+        """Return a number for each kind of view: 1 for this one, 0 for the others."""
         if view not in self.views:
             raise ValueError(f"expected views among {', '.join(self.views)}, got {view}")
         return (np.array(self.views) == view).astype(float)
@@ -193,7 +193,7 @@ def _minimise(
         import jax.numpy as jnp
 
         deviation *= np.sqrt(emulator.inflation)
-        rest = (emulator.basis, target, deviation, emulator.kind(view), np.log(share / (1 - share)))
+        rest = (emulator.basis, target, deviation, emulator.encode_view(view), np.log(share / (1 - share)))
         ends = _minimiser()(_as_jax(emulator.mean), *(jnp.asarray(part, float) for part in rest))
         free, jacobian, misfit, value = (np.asarray(part) for part in ends)
     return low + (high - low) / (1 + np.exp(-free)), jacobian, misfit, value

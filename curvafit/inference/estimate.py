@@ -11,7 +11,7 @@ from scipy import stats
 from curvafit.core.runtime import Progress, sub_progress
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import Schedule
-from curvafit.geometry.descriptors import BLOCKS, Descriptors, descriptors
+from curvafit.geometry.descriptors import BLOCKS, descriptors
 from curvafit.geometry.mesh import NoSurface
 from curvafit.inference.atlas import Match
 from curvafit.inference.candidates import Candidate, Misfit
@@ -27,6 +27,7 @@ from curvafit.inference.table import (
     law_of,
     mirror_parameters,
     parameters_of,
+    to_row,
 )
 from curvafit.priors.grid import Grid
 from curvafit.scan.measure import scan_descriptors
@@ -74,7 +75,7 @@ def estimate(
         simulations `(n, k)`; None without simulations.
     """
     progress("measuring descriptors", 0.0)
-    if (found := _describe(prepared)) is None:
+    if (found := _measure_descriptors(prepared)) is None:
         return fit, None
     seen, row, view, turn = found
     progress("reading the posterior", 0.1)
@@ -113,7 +114,7 @@ def refine_matches(prepared: Prepared, posterior: Posterior, matches: Sequence[M
     Levenberg and Marquardt's method, by optimistix, starts from each match, with the exact derivatives of the emulator.
     Returns one law; none where the descriptors of the scan cannot be measured.
     """
-    if (found := _describe(prepared)) is None:
+    if (found := _measure_descriptors(prepared)) is None:
         return ()
     _, row, view, turn = found
     starts = turn(np.stack([parameters_of(each.coefficients, each.mass) for each in matches]))
@@ -130,7 +131,7 @@ def middle_of(parameters: np.ndarray) -> np.ndarray:
 Turn = Callable[[np.ndarray], np.ndarray]
 
 
-def _describe(prepared: Prepared) -> tuple[Prepared, np.ndarray, str, Turn] | None:
+def _measure_descriptors(prepared: Prepared) -> tuple[Prepared, np.ndarray, str, Turn] | None:
     """Return the phase that is described, its row of descriptors and kind of view, and the way to the structure's law.
 
     Of a structure that fills most of the volume the background is described, as the shapes of the training were thin.
@@ -140,7 +141,7 @@ def _describe(prepared: Prepared) -> tuple[Prepared, np.ndarray, str, Turn] | No
     measured = scan_descriptors(seen)
     if measured is None:
         return None
-    return seen, measured[0].vector(), measured[1], mirror_parameters if turned else np.asarray
+    return seen, *measured, mirror_parameters if turned else np.asarray
 
 
 def _best_fit(posterior: Posterior, best: np.ndarray, covariance: np.ndarray, turn: Turn) -> Candidate:
@@ -164,17 +165,18 @@ def _simulator(prepared: Prepared, view: str, schedule: Schedule | str) -> Simul
     # A window of something larger loses what its faces cut; a box that repeats loses nothing.
     apply_view = VIEWS["mask" if prepared.part(prepared.windows[0]).periodic else "crop"]
 
-    def simulate(parameters: np.ndarray, seed: int) -> Descriptors | None:
+    def simulate(parameters: np.ndarray, seed: int) -> np.ndarray:
         flow = generate(*law_of(parameters), grid, schedule=schedule, seed=seed, reject_early=True)
         if not flow.viability.viable:
-            return None
+            return to_row(None)
         field = flow.field.numpy()
         try:
             if view == "field":
-                return descriptors(field, grid)
-            return descriptors(*apply_view(prepared.rescan(field > 0, seed), grid, np.random.default_rng(seed)))
+                return descriptors(field, grid).vector()
+            seen = apply_view(prepared.rescan(field > 0, seed), grid, np.random.default_rng(seed))
+            return descriptors(*seen).vector()
         except (ScanError, NoSurface):
-            return None
+            return to_row(None)
 
     return simulate
 

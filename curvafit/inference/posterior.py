@@ -14,7 +14,7 @@ from curvafit.core.checks import check_float, check_int, quoted
 from curvafit.core.extras import require
 from curvafit.core.files import open_packaged
 from curvafit.core.records import Format
-from curvafit.geometry.descriptors import BLOCKS, Descriptors
+from curvafit.geometry.descriptors import BLOCKS
 from curvafit.inference.emulator import Emulator, Layer
 from curvafit.inference.table import PARAMETERS, Compression, column_names
 
@@ -113,13 +113,12 @@ class Posterior:
     misfits: dict[str, np.ndarray]
     provenance: dict[str, Any]
 
-    def sample(self, descriptors: Descriptors | np.ndarray, view: str, count: int = 1000, seed: int = 0) -> np.ndarray:
+    def sample(self, descriptors: np.ndarray, view: str, count: int = 1000, seed: int = 0) -> np.ndarray:
         """Draw parameters `(N, count, 6)` given descriptors `(N, 351)`; `(count, 6)` given one.
 
         Raises ValueError if it was not trained on the view, or descriptors are not finite.
         """
-        row = descriptors.vector() if isinstance(descriptors, Descriptors) else np.asarray(descriptors)
-        rows, single = np.atleast_2d(row), row.ndim == 1
+        rows = np.atleast_2d(descriptors)
         context = self.context(rows, np.full(len(rows), view))
         parts = [len(part) for part in np.array_split(np.arange(count), len(self.members))]
         with torch.random.fork_rng(), torch.no_grad():
@@ -127,7 +126,7 @@ class Posterior:
             draws = [member(context).sample(torch.Size((n,))) for member, n in zip(self.members, parts, strict=True)]
         standard = torch.cat(draws).movedim(0, 1).double().numpy()
         parameters = self.from_logits(standard * self.spread + self.centre)
-        return parameters[0] if single else parameters
+        return parameters[0] if descriptors.ndim == 1 else parameters
 
     def context(self, descriptors: np.ndarray, views: np.ndarray) -> Tensor:
         """Return what the flows see: components of the descriptors and the kind of each view.

@@ -16,9 +16,7 @@ from scipy import linalg
 
 from curvafit.core.checks import check_int
 from curvafit.core.runtime import Progress, silent
-from curvafit.geometry.descriptors import Descriptors
 from curvafit.inference.emulator import Emulator
-from curvafit.inference.table import to_row
 
 #: Rounds, simulations in a round, and most rounds at the end that simulate the likeliest parameters alone.
 ROUNDS, BATCH, LAST = 7, 3, 4
@@ -40,8 +38,9 @@ class Simulations(NamedTuple):
     count: int
 
 
-#: Grows a shape from parameters `(6,)` and a seed, and measures it as the query was; None where nothing grows.
-Simulate = Callable[[np.ndarray, int], Descriptors | None]
+#: Grows a shape from parameters `(6,)` and a seed, and returns its descriptors `(351,)`, measured as the query's were;
+#: NaN where nothing grows.
+Simulate = Callable[[np.ndarray, int], np.ndarray]
 
 
 def simulate_draws(
@@ -52,7 +51,7 @@ def simulate_draws(
     chosen = draws[np.random.default_rng(seed).choice(len(draws), count, replace=False)]
     rows = []
     for k, parameters in enumerate(chosen):
-        rows.append(to_row(simulate(parameters, seed + k)))
+        rows.append(simulate(parameters, seed + k))
         progress(f"simulated {k + 1} of {count}", (k + 1) / count)
     descriptors = np.array(rows)
     grown = np.isfinite(descriptors).all(1)
@@ -136,7 +135,7 @@ class Search:
             others = rng.choice(len(candidates), BATCH - 1 if k < rounds else 0, p=likelihood / likelihood.sum())
             chosen = candidates[[int(deviance.argmin()), *others]]
             seeds = seed + simulated.count + np.arange(len(chosen))
-            rows = np.array([to_row(simulate(each, int(start))) for each, start in zip(chosen, seeds, strict=True)])
+            rows = np.array([simulate(each, int(start)) for each, start in zip(chosen, seeds, strict=True)])
             grown = np.isfinite(rows).all(1)
             barren = np.concatenate([barren, chosen[~grown]])
             new = (chosen[grown], seeds[grown], rows[grown])

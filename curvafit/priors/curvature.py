@@ -54,7 +54,7 @@ def jet(u: Tensor, grid: Grid) -> Jet:
     return Jet(u, gradient(u, grid), hessian(u, grid))
 
 
-def second_form(field: Jet, epsilon: float | Tensor, xi: float = XI) -> SecondForm:
+def second_form(field: Jet, epsilon: float | Tensor) -> SecondForm:
     """Return the invariants of M_ε = -ε Hess u + W'(u)/ε n⊗n (paper, eq. 7), where n⊗n = ∇u⊗∇u / (|∇u|² + ξ²).
 
     ε is a number or a tensor that broadcasts with the field. `positive_root` says what the root's derivative is.
@@ -62,7 +62,7 @@ def second_form(field: Jet, epsilon: float | Tensor, xi: float = XI) -> SecondFo
     ε = epsilon
     slope2, laplacian, hess2, normal = _invariants(field)
     W_ = double_well_derivative(field.value)
-    length2 = slope2 + xi**2
+    length2 = slope2 + XI**2
     unit = slope2 / length2
     trace = -ε * laplacian + W_ / ε * unit
     bend2, well2 = ε**2 * hess2, (W_ / ε * unit) ** 2
@@ -95,13 +95,13 @@ def diffuse_curvatures(field: Jet, epsilon: float | Tensor) -> Curvatures:
     return Curvatures((trace + root) / width, (trace - root) / width, 2 * trace / width, gauss)
 
 
-def geometric_curvatures(field: Jet, xi: float = XI) -> Curvatures:
+def geometric_curvatures(field: Jet) -> Curvatures:
     """Return the eigenvalues of the level sets' shape operator -P (Hess u) P / |∇u|, P = I - n⊗n, for any profile.
 
     H = -(Δu - nᵀHess u n) / |∇u| and K = ∇uᵀ adj(Hess u) ∇u / |∇u|⁴ (Goldman 2005).
     """
     slope2, laplacian, _, normal = _invariants(field)
-    length2 = slope2 + xi**2
+    length2 = slope2 + XI**2
     mean = -(laplacian - normal / length2) / length2.sqrt()
     gauss = _adjugate_form(field) / length2**2
     root = (mean**2 - 4 * gauss).clamp_min(0).sqrt()

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from curvafit.core.checks import check_choice, check_float, check_int, quoted
-from curvafit.core.units import METRES
+from curvafit.core.units import METRES, convert_length
 from curvafit.priors.coefficients import Coefficients, check_strengths
 from curvafit.priors.grid import WORKING_EPSILON, Float, Grid
 from curvafit.priors.kernels.differentiable import energies
@@ -371,9 +371,8 @@ def _read_coefficients(law: Law, edge: float, unit: str | None, epsilon: float) 
         if unit is not None and unit not in METRES:
             raise ValueError(f"expected a unit among {', '.join(METRES)}, got {quoted(unit)}")
         return numbers
-    width, fit_unit = law.epsilon_physical, law.length_unit
-    unit = unit or fit_unit
-    width *= 1 if unit == fit_unit else METRES[fit_unit] / METRES[unit]
+    unit = unit or law.length_unit
+    width = convert_length(law.epsilon_physical, law.length_unit, unit)
     if not 1 / 4 <= epsilon / width <= 4:
         widths = f"ε is {epsilon:g} {unit} here and was {width:g} {unit} in the fit"
         warnings.warn(f"{widths}: state spacing and its unit if the two should be alike", stacklevel=4)

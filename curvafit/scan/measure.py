@@ -14,7 +14,7 @@ from scipy import ndimage, stats
 
 from curvafit.core.runtime import Progress, silent
 from curvafit.core.units import format_number, per_unit, unit_name
-from curvafit.geometry.descriptors import Descriptors, descriptors
+from curvafit.geometry.descriptors import descriptors
 from curvafit.geometry.diagram import FAMILIES, MARGIN, Diagram, diagram, families
 from curvafit.geometry.mesh import NoSurface, area_vectors
 from curvafit.geometry.morphometry import local_thickness, measure_connectivity, smooth_surface
@@ -324,8 +324,8 @@ def _measure_tile(prepared: Prepared, tile: tuple[slice, ...]) -> Diagram:
     return replace(part, places=part.places + corner)
 
 
-def scan_descriptors(prepared: Prepared) -> tuple[Descriptors, str] | None:
-    """Measure a scan's descriptors, and name the kind of view that it is (`curvafit.inference.table`).
+def scan_descriptors(prepared: Prepared) -> tuple[np.ndarray, str] | None:
+    """Measure a scan's descriptors `(351,)`, and name the kind of view that it is (`curvafit.inference.table`).
 
     They are those of the main window, or of the largest cube within the region of interest. None where that cube is
     smaller than `SMALLEST_CUBE` voxels, or shows no surface.
@@ -336,7 +336,7 @@ def scan_descriptors(prepared: Prepared) -> tuple[Descriptors, str] | None:
     mask, grid = np.ascontiguousarray(prepared.mask[where]), prepared.part(where)
     view = _kind_of_view(prepared, grid)
     try:
-        return descriptors(prepared.phase if view == "field" else mask, grid), view
+        return descriptors(prepared.phase if view == "field" else mask, grid).vector(), view
     except NoSurface:
         return None
 

@@ -93,7 +93,7 @@ def load(
     """
     location, key = split_key(path, key)
     part = Part(channel, parse_box(crop))
-    read = read_file(location, key, raw_shape, dtype, None if part.whole else part)
+    read = read_file(location, key, raw_shape, dtype, None if part == Part() else part)
     raw, start = take_part(read, part, location)
     if strict and raw.gaps:
         raise ScanError(f"{location} is not whole: {raw.gaps[0]}")

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from emulated import BOX, HIGH, LOW, NOISE, linear, row, told
 
-from curvafit.geometry.descriptors import BLOCKS, Descriptors
+from curvafit.geometry.descriptors import BLOCKS
 from curvafit.inference.emulator import misfits
 from curvafit.inference.estimate import STARTS, check, tail_probability
 from curvafit.inference.posterior import Posterior
 from curvafit.inference.simulate import simulate_draws
-from curvafit.inference.table import PARAMETERS, column_names
+from curvafit.inference.table import PARAMETERS, column_names, to_row
 
 NAMES = np.array(column_names())
 
@@ -84,11 +84,11 @@ def test_few_simulations_are_refused() -> None:
         check(POSTERIOR, rows[0], "mask", rows[1:])
 
 
-def described(parameters: np.ndarray, seed: int) -> Descriptors | None:
+def described(parameters: np.ndarray, seed: int) -> np.ndarray:
     """Descriptors that hold the parameters and the seed; none of every third seed."""
-    blocks = {name: np.zeros(length) for name, length in BLOCKS.items()}
-    blocks["curvature"][:7] = *parameters, seed
-    return None if seed % 3 == 0 else Descriptors(**blocks)
+    values = np.zeros(sum(BLOCKS.values()))
+    values[:7] = *parameters, seed
+    return to_row(None) if seed % 3 == 0 else values
 
 
 def test_simulations_are_of_draws_each_with_its_seed() -> None:
@@ -110,7 +110,7 @@ def test_a_number_of_simulations_has_bounds(count: int) -> None:
 
 
 def test_nothing_grown_is_no_row() -> None:
-    grown = simulate_draws(np.zeros((40, 6)), lambda parameters, seed: None, 3)
+    grown = simulate_draws(np.zeros((40, 6)), lambda parameters, seed: to_row(None), 3)
     assert grown.descriptors.shape == (0, sum(BLOCKS.values()))
     assert len(grown.parameters) == len(grown.seeds) == 0
 

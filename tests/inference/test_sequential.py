@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from emulated import BOX, HIGH, LOW, NOISE, linear, row, told
 
-from curvafit.geometry.descriptors import BLOCKS, Descriptors
 from curvafit.inference.simulate import BATCH, LAST, ROUNDS, Process, Search, Simulate, Simulations, simulate_draws
+from curvafit.inference.table import to_row
 
 #: What the emulator misses of each of the five sums, in deviations of the prior.
 MISSED = np.array([0.4, -0.3, 0.3, 0.2, -0.4])
@@ -19,13 +19,12 @@ QUERY[:5] += MISSED
 def simulator(barren: float = -np.inf) -> Simulate:
     """Shapes whose sums are off by `MISSED`, in noise; none grows where a11 is below a bound."""
 
-    def simulate(parameters: np.ndarray, seed: int) -> Descriptors | None:
+    def simulate(parameters: np.ndarray, seed: int) -> np.ndarray:
         if parameters[0] < barren:
-            return None
+            return to_row(None)
         values = row(parameters[None])[0]
         values[:5] += MISSED + 0.3 * NOISE * np.random.default_rng(seed).standard_normal(5)
-        parts = np.split(values, np.cumsum(list(BLOCKS.values()))[:-1])
-        return Descriptors(**dict(zip(BLOCKS, parts, strict=True)))
+        return values
 
     return simulate
 
@@ -69,7 +68,7 @@ def test_the_answer_grows_or_is_the_nearest_that_did() -> None:
     """Nothing grows after the first simulations: the nearest of those is the answer."""
     first = simulate_draws(np.random.default_rng(0).uniform(LOW, HIGH, (400, 6)), simulator(), 12)
     search = Search(linear(), "mask", QUERY)
-    parameters, every = search.run(first.parameters, first, lambda *_: None)
+    parameters, every = search.run(first.parameters, first, lambda *_: to_row(None))
     assert every.count == 12 + ROUNDS * BATCH + LAST and len(every.parameters) == 12
     assert np.array_equal(parameters, first.parameters[search.nearest(first)[0]])
 

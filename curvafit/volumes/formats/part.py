@@ -26,11 +26,6 @@ class Part:
     channel: int | None = None
     crop: Box | None = None
 
-    @property
-    def whole(self) -> bool:
-        """Return whether the part is the whole array."""
-        return self.channel is None and self.crop is None
-
     def index(
         self, shape: Sequence[int], channels: int | None, place: object
     ) -> tuple[tuple[slice, ...], tuple[int, ...]]:
