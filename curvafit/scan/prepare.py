@@ -28,6 +28,7 @@ from curvafit.scan.grids import (
 from curvafit.scan.structure import (
     Kind,
     Quality,
+    check_options,
     find_structure,
     is_noise,
     measure_quality,
@@ -169,8 +170,8 @@ def prepare(
     isotropic with a median thickness of 5 to 16 voxels; else it is resampled to a thickness of 8: images as smoothed
     grey levels, masks as signed distances. Thickness is the local thickness (`morphometry.local_thickness`), its median
     over the structure's surface. Specks and pinholes smaller than a ball of half that diameter are dropped. Raises
-    ScanError if there is no structure, nothing else, no surface, or nothing at least 3 voxels thick; or if `roi` or
-    `threshold` do not fit the scan.
+    ValueError if a kind or threshold is none, and ScanError if there is no structure, nothing else, no surface, or
+    nothing at least 3 voxels thick; or if `roi` or `threshold` do not fit the scan.
 
     Parameters
     ----------
@@ -187,6 +188,7 @@ def prepare(
     roi
         Nonzero where the scan counts (array, field or file of the scan's shape).
     """
+    check_options(kind, threshold)
     region = region_of_interest(roi, field)
     where, notes = bounding_box(field.shape, region, LARGEST_SCAN)
     region = None if region is None else region[where]

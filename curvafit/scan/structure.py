@@ -64,11 +64,8 @@ def find_structure(
     """Return the kind of a scan, and the scan as float32 values that are above 0 in its structure, with a note on how.
 
     The parameters are as in `prepare.prepare`; `extremes` are the lowest and highest value of the whole that `field` is
-    a part of: they tell a mask's two values. Raises ScanError if the kind or threshold fits nothing in the scan, or a
-    phase is empty.
+    a part of: they tell a mask's two values. Raises ScanError if the threshold splits nothing or a phase is empty.
     """
-    if kind not in ("auto", "field", "mask", "image"):
-        raise ScanError(f"expected kind auto, field, mask or image, got {kind!r}")
     values = field.values
     lowest, highest = (values.min(), values.max()) if extremes is None else extremes
     two = bool(np.all((values == lowest) | (values == highest)))
@@ -91,7 +88,7 @@ def find_structure(
     return seen, replace(field, values=values, notes=(*field.notes, note))
 
 
-def check_options(kind: str, threshold: float | str, label: int | None) -> None:
+def check_options(kind: str, threshold: float | str, label: int | None = None) -> None:
     """Raise ValueError where a kind, threshold or label is none, or contradicts another."""
     check_choice(kind, ("auto", "field", "mask", "image"), "kind auto, field, mask or image")
     otsu = isinstance(threshold, str) and threshold == "otsu"
@@ -175,10 +172,7 @@ def _split_image(
     mode = "wrap" if periodic else "nearest"
     smooth = ndimage.gaussian_filter(field.values.astype(np.float32), width, mode=mode, truncate=3.0)
     counted, raw = (smooth, field.values) if region is None else (smooth[region], field.values[region])
-    try:
-        level = _find_threshold(raw) if threshold == "otsu" else float(threshold)
-    except ValueError:
-        raise ScanError(f"expected a threshold that is a number or 'otsu', got {threshold!r}") from None
+    level = _find_threshold(raw) if threshold == "otsu" else float(threshold)
     lowest, highest = float(counted.min()), float(counted.max())
     if not lowest < level < highest:
         levels = f"{lowest:.4g} to {highest:.4g}"

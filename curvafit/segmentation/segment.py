@@ -114,7 +114,7 @@ def segment(
     tiling = Tiling.of(frame, epsilon, tile)
     if weight is not None:
         weight = check_float(weight, "a positive weight", *WEIGHTS)
-    check_options("image", threshold, None)
+    check_options("image", threshold)
     check_finite(boxes)
     sample, blocks = subsample(boxes)
     levels, bounds = grey_levels(sample, threshold), grey_bounds(sample.values.astype(np.float32), threshold)

@@ -303,9 +303,9 @@ def test_what_has_no_shape_is_refused() -> None:
         prepare(Field(full), kind="mask")
     with pytest.raises(ScanError, match="400"):
         prepare(Field(image), threshold=400.0)
-    with pytest.raises(ScanError, match="otsu"):
+    with pytest.raises(ValueError, match="otsu"):
         prepare(Field(image), threshold="li")  # type: ignore[arg-type]
-    with pytest.raises(ScanError, match="kind"):
+    with pytest.raises(ValueError, match="kind"):
         prepare(Field(image), kind="tube")  # type: ignore[arg-type]
     with pytest.raises(ScanError, match="at least 4"):
         prepare(Field(image[15:18]))
