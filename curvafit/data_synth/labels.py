@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numba import njit
 from scipy import ndimage
+from scipy.cluster.hierarchy import DisjointSet
 from skimage.segmentation import find_boundaries, watershed
 from torch import Tensor
 
@@ -17,7 +18,7 @@ from curvafit.data_synth.centreline import skeleton_of
 from curvafit.geometry.diagram import LEAST_SLOPE, MARGIN, find_resolved
 from curvafit.geometry.mesh import NoSurface
 from curvafit.geometry.morphometry import local_thickness
-from curvafit.geometry.topology import betti_numbers
+from curvafit.geometry.topology import betti_numbers, number_pieces
 from curvafit.priors.curvature import geometric_curvatures, jet
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import profile_distance
@@ -111,13 +112,13 @@ def instances_of(distance: np.ndarray, grid: Grid) -> np.ndarray:
     tops = np.zeros(basins.max() + 1, dtype=np.float32)
     np.maximum.at(tops, basins.ravel(), distance.ravel())
     tops[0] = 0
-    owner = np.arange(len(tops))
+    pieces = DisjointSet(range(len(tops)))
     for width, one, other in _find_necks(basins, distance, grid):
-        a, b = _find_root(owner, one), _find_root(owner, other)
+        a, b = pieces[one], pieces[other]
         if a != b and width >= NECK * min(tops[a], tops[b]):
-            owner[b] = a
-            tops[a] = max(tops[a], tops[b])
-    return _renumber(np.array([_find_root(owner, k) for k in range(len(owner))])[basins])
+            pieces.merge(a, b)
+            tops[pieces[a]] = max(tops[a], tops[b])
+    return number_pieces(np.array([pieces[k] for k in pieces])[basins])
 
 
 def _find_necks(basins: np.ndarray, distance: np.ndarray, grid: Grid) -> list[tuple[float, int, int]]:
@@ -135,22 +136,6 @@ def _find_necks(basins: np.ndarray, distance: np.ndarray, grid: Grid) -> list[tu
     np.maximum.at(widest, index.reshape(-1), np.concatenate(widths))
     order = np.argsort(-widest, kind="stable")
     return [(float(widest[k]), int(found[k, 0]), int(found[k, 1])) for k in order]
-
-
-def _find_root(owner: np.ndarray, k: int) -> int:
-    """Return the basin that k was joined to, directly or by way of others."""
-    while owner[k] != k:
-        k = owner[k]
-    return int(k)
-
-
-def _renumber(labels: np.ndarray) -> np.ndarray:
-    """Return the labels numbered 1, 2, … in the order of their first voxels; 0 stays."""
-    values, first, index = np.unique(labels, return_index=True, return_inverse=True)
-    order = np.argsort(np.where(values > 0, first, -1))  # 0 comes first, if it is there
-    rank = np.empty(len(values), dtype=np.int32)
-    rank[order] = np.arange(len(values)) + int(values[0] > 0)
-    return rank[index].reshape(labels.shape)
 
 
 def _measure_curvatures(u: Tensor, mask: np.ndarray, grid: Grid, epsilon: float) -> tuple[np.ndarray, np.ndarray]:

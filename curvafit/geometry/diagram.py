@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 import torch
 from scipy.integrate import cumulative_trapezoid
+from scipy.ndimage import map_coordinates
 from torch import Tensor
 
 from curvafit.core.checks import LONGEST, SHORTEST, check_choice, check_float, check_type
@@ -253,31 +254,15 @@ def _voxel_curvatures(values: Tensor, grid: Grid, epsilon: float, curvature: str
 def _interpolate(
     fields: tuple[np.ndarray, ...], resolved: np.ndarray, centres: np.ndarray, periodic: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return values `(N, 2)` at `centres` `(N, 3)` (in voxels) from the resolved voxels around, and where any are."""
-    corners, weights = _corners(resolved.shape, centres, periodic)
-    weights = weights * resolved.reshape(-1)[corners]
-    total = weights.sum(0)
-    known = total > 0
-    safe = np.where(known, total, 1)
-    points = np.stack([(weights * field.reshape(-1)[corners]).sum(0) / safe for field in fields], axis=1)
-    return points.astype(np.float64), known
+    """Return values `(N, 2)` at `centres` `(N, 3)` (in voxels) from the resolved voxels around, and where any are.
 
-
-def _corners(shape: tuple[int, ...], centres: np.ndarray, periodic: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Return the flat indices and weights `(8, N)` of linear interpolation."""
-    size = np.array(shape)
-    low = np.floor(centres).astype(np.int64)
-    low = low if periodic else np.clip(low, 0, size - 2)
-    part = centres - low
-    index = np.zeros((8, len(centres)), dtype=np.int64)
-    weight = np.ones((8, len(centres)))
-    for corner in range(8):
-        for axis in range(3):
-            step = corner >> axis & 1
-            at = low[:, axis] + step
-            index[corner] = index[corner] * size[axis] + (at % size[axis] if periodic else at)
-            weight[corner] *= part[:, axis] if step else 1 - part[:, axis]
-    return index, weight
+    Fields are 0 where they are not resolved.
+    """
+    *sums, total = (
+        map_coordinates(values, centres.T, np.float64, order=1, mode="grid-wrap" if periodic else "nearest")
+        for values in (*fields, resolved)
+    )
+    return np.stack(sums, axis=1) / np.where(total > 0, total, 1)[:, None], total > 0
 
 
 def family_shares(diagram: Diagram, radius: float) -> dict[str, float]:

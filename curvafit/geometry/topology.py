@@ -20,11 +20,17 @@ def components(mask: np.ndarray, *, periodic: bool = False, connectivity: int = 
     if periodic and count:
         pairs = _find_seams(labels, connectivity == 26)[:, :2] - 1
         merged = connected_components(_graph(pairs, count), directed=False)[1]
-        _, first = np.unique(merged, return_index=True)  # numbered in the order of their first voxels
-        rank = np.empty(len(first), dtype=np.int32)
-        rank[np.argsort(first)] = np.arange(1, len(first) + 1)
-        labels, count = np.concatenate([[0], rank[merged]])[labels], len(first)
-    return labels.astype(np.int32), int(count)
+        labels = number_pieces(np.concatenate([[0], merged + 1])[labels])
+        count = int(labels.max())
+    return labels, count
+
+
+def number_pieces(labels: np.ndarray) -> np.ndarray:
+    """Return pieces numbered 1, 2, … in the order of their first voxels, int32; 0 stays."""
+    first = np.full(labels.max() + 1, labels.size)
+    np.minimum.at(first, labels.ravel(), np.arange(labels.size))
+    first[0] = -1
+    return np.argsort(np.argsort(first)).astype(np.int32)[labels]
 
 
 def euler_number(mask: np.ndarray, *, periodic: bool = False) -> int:
