@@ -47,20 +47,8 @@ Measured = tuple[float, Diagram, Diagram]
 def extract(stores: Sequence[str | Path | Store], command: Sequence[str] = (), progress: Progress = silent) -> Atlas:
     """Measure every well-formed shape of stores (`generation.result.is_well_formed`), as field and as mask.
 
-    Parameters
-    ----------
-    stores
-        Open stores, or their folders.
-    command
-        Command lines for the provenance, after those that make the stores.
-    progress
-        Called before each shape with a sentence and the share of the shapes that are measured.
-
-    Raises
-    ------
-    FileNotFoundError, ValueError
-        If there is no such store, one is of another version or grid, two have one name, or none holds a well-formed
-        shape.
+    `command` is command lines for the provenance, after those that make the stores. Raises FileNotFoundError or
+    ValueError where a store is missing or of another version or grid, two have one name, or none holds such a shape.
     """
     draws, shapes = read_draws(stores)
     measures = []
@@ -72,8 +60,7 @@ def extract(stores: Sequence[str | Path | Store], command: Sequence[str] = (), p
 
 def read_draws(stores: Sequence[str | Path | Store]) -> tuple[list[Drawn], list[Drawn]]:
     """Return the draws of stores of one grid and ε, and those of the draws that are well-formed shapes."""
-    sources = [store if isinstance(store, Store) else open_store(store) for store in stores]
-    _check_names(sources)
+    sources = _open_all(stores)
     grids = {(store.settings.shape, store.settings.spacing, store.settings.epsilon) for store in sources}
     if len(grids) > 1:
         sizes = ", ".join(" x ".join(map(str, shape)) for shape, _, _ in sorted(grids))
@@ -86,11 +73,13 @@ def read_draws(stores: Sequence[str | Path | Store]) -> tuple[list[Drawn], list[
     return draws, shapes
 
 
-def _check_names(stores: Sequence[Store]) -> None:
-    """Raise ValueError where two stores have one name."""
-    names = [store.name for store in stores]
+def _open_all(stores: Sequence[str | Path | Store]) -> list[Store]:
+    """Open stores; raise ValueError where two have one name."""
+    sources = [store if isinstance(store, Store) else open_store(store) for store in stores]
+    names = [store.name for store in sources]
     if len(set(names)) < len(names):
         raise ValueError(f"stores must have different names, got {', '.join(names)}")
+    return sources
 
 
 def shape_id(store: Store, record: Record) -> str:
@@ -133,12 +122,7 @@ def _provenance(draws: Sequence[Drawn], command: Sequence[str]) -> dict[str, Any
         "selection": {"extent_of_both_phases": FORMED},
         "settings": {name: getattr(stores[0].settings, name) for name in ("shape", "spacing", "epsilon")},
         "stores": accounts,
-        "diagrams": {
-            "curvature": "geometric",
-            "bin_width": BIN_WIDTH,
-            "tail_share": TAIL_SHARE,
-            "unit": "1/working unit",
-        },
+        "diagrams": {"curvature": "geometric", "bin_width": BIN_WIDTH, "tail_share": TAIL_SHARE, "unit": Diagram.unit},
         "measured_with": versions(),
     }
 
@@ -179,39 +163,20 @@ def describe(
     command: Sequence[str] = (),
     overwrite: bool = False,
 ) -> Table:
-    """Measure the well-formed shapes of stores in each view, and add them to a table, whose own rows stay.
+    """Measure the well-formed shapes of stores in each view (`VIEWS`), and add them to a table, whose own rows stay.
 
-    A view depends only on the shape, its seed and the view's name: a resumed table has the same rows, possibly in
-    another order. Shapes that a build adds or removes meanwhile are left out.
+    The table `out` (.npz) is written every minute; with `overwrite` it is begun anew. A view depends only on the shape,
+    its seed and the view's name: a resumed table has the same rows, possibly in another order. Shapes that a build adds
+    or removes meanwhile are left out. `workers` measure (`core.workers.cluster`), else this process; `command` is for
+    the provenance.
 
-    Parameters
-    ----------
-    stores
-        Folders of stores.
-    out
-        The table (.npz), written every minute.
-    views
-        Names in `VIEWS`.
-    progress
-        Called after each shape with a sentence and the share of the shapes that are measured.
-    workers
-        Who measures (`core.workers.cluster`); by default this process.
-    command
-        Command line for the provenance.
-    overwrite
-        Whether to begin anew where `out` exists.
-
-    Raises
-    ------
-    FileNotFoundError, ValueError
-        If there is no such store, two have one name, `out` is no table, a view is unknown, or no shape is well-formed.
+    Raises FileNotFoundError or ValueError where a store is missing, two have one name, `out` is no table, a view is
+    unknown, or no shape is well-formed.
     """
     unknown = [name for name in views if name not in VIEWS]
     if unknown or not views:
         raise ValueError(f"views must be some of {', '.join(VIEWS)}, got {', '.join(unknown) or 'none'}")
-    sources = [open_store(path) for path in stores]
-    _check_names(sources)
-    path = Path(out)
+    sources, path = _open_all(stores), Path(out)
     begun = load_table(path) if path.exists() and not overwrite else None
     provenance, rows = _table_provenance(begun, sources, command), []
     if begun is not None:

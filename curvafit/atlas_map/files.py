@@ -59,18 +59,13 @@ def write_map(
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> tuple[Path, Path]:
-    """Write `atlas.png` and `atlas.html` of the stores' well-formed shapes into a folder; returns their paths.
+    """Write `atlas.png` and `atlas.html` of the stores' well-formed shapes into a folder; return their paths.
 
     Measures and distances are kept in the folder's `cache`: a run that was stopped goes on where it was, and one on
     larger stores measures only the new shapes. The cache may be deleted at any time.
 
-    Raises
-    ------
-    ImportError
-        If the extra `[atlas]` is not installed.
-    FileNotFoundError, ValueError
-        If there are too few well-formed shapes, or as `extract` does; or if a file of another origin would be replaced
-        without `overwrite`.
+    Raises ImportError without the extra `[atlas]`; FileNotFoundError or ValueError as `extract` does, for too few
+    shapes, and where a file of another origin would be replaced without `overwrite`.
     """
     check_extra()
     sources = [store if isinstance(store, Store) else open_store(store) for store in stores]

@@ -14,15 +14,7 @@ import numpy as np
 
 from curvafit.core.records import Format
 from curvafit.core.runtime import Progress, silent
-from curvafit.geometry.diagram import (
-    BIN_WIDTH,
-    FAMILIES,
-    Diagram,
-    family_of,
-    family_shares,
-    half_thickness,
-    leading_family,
-)
+from curvafit.geometry.diagram import BIN_WIDTH, FAMILIES, Diagram, family_shares, half_thickness, leading_family
 from curvafit.geometry.distances import digests, pairwise
 from curvafit.inference.atlas import Atlas
 
@@ -76,19 +68,9 @@ class AtlasMap:
 
 
 def map_atlas(atlas: Atlas, distances: np.ndarray) -> AtlasMap:
-    """Lay an atlas out by its distances, find clusters, and name them (paper, Experiment 4 and Figure 10).
+    """Lay an atlas out by its `diagram_distances` `(N, N)`, find and name clusters (paper, Experiment 4, Figure 10).
 
-    Parameters
-    ----------
-    distances
-        `(N, N)`, symmetric: see `diagram_distances`.
-
-    Raises
-    ------
-    ImportError
-        If umap-learn or scikit-learn is not installed.
-    ValueError
-        If there are fewer than `LEAST_SHAPES` shapes, or the distances are not finite, symmetric and of that size.
+    Raises ImportError without the extra `[atlas]`, and ValueError for fewer than `LEAST_SHAPES` shapes.
     """
     check_extra()
     check_size(n := len(atlas))
@@ -107,13 +89,10 @@ def diagram_distances(
 ) -> np.ndarray:
     """Return the Wasserstein distances of all pairs `(N, N)`, with the paper's settings.
 
-    Parameters
-    ----------
-    saved
-        File (`.npz`) that is replaced every half minute and at the end. Distances between these diagrams that it holds
-        are taken from it: a run that was stopped goes on, and a longer list costs only its new rows. Diagrams are
-        recognised by their content, in any order. A file of another kind or of other settings is a ValueError, one
-        that cannot be written an OSError before anything is computed.
+    The file `saved` (`.npz`) is replaced every half minute and at the end. Distances between these diagrams that it
+    holds are taken from it: a run that was stopped goes on, and a longer list costs only its new rows. Diagrams are
+    recognised by their content, in any order. A file of another kind or of other settings is a ValueError, one that
+    cannot be written an OSError before anything is computed.
     """
     if saved is None:
         return pairwise(diagrams, **DISTANCE, progress=progress)
@@ -142,16 +121,19 @@ def _read_distances(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> tu
 
 
 def embed(distances: np.ndarray) -> np.ndarray:
-    """Return UMAP's places `(N, 2)` of shapes with distances `(N, N)`; with fewer than 26 shapes, all are
-    neighbours."""
-    options = UMAP | {"n_neighbors": min(UMAP["n_neighbors"], len(distances) - 1)}
+    """Return UMAP's places `(N, 2)` of shapes with distances `(N, N)`."""
     with warnings.catch_warnings():
         # That its neural variant is not installed, that given distances cannot be inverted, that families lie apart.
         warnings.simplefilter("ignore")
         from umap import UMAP as Umap
 
-        places = Umap(metric="precomputed", n_jobs=1, **options).fit_transform(distances.astype(np.float32))
-    return np.asarray(places, dtype=np.float64)
+        options = _umap_options(len(distances))
+        return Umap(n_jobs=1, **options).fit_transform(distances.astype(np.float32)).astype(np.float64)
+
+
+def _umap_options(count: int) -> dict[str, Any]:
+    """Return UMAP's options for so many shapes: of fewer than 26, all are neighbours."""
+    return UMAP | {"n_neighbors": min(UMAP["n_neighbors"], count - 1), "metric": "precomputed"}
 
 
 def find_clusters(positions: np.ndarray) -> np.ndarray:
@@ -160,8 +142,7 @@ def find_clusters(positions: np.ndarray) -> np.ndarray:
         return np.full(len(positions), NOISE)
     from sklearn.cluster import HDBSCAN as Hdbscan
 
-    options: dict[str, Any] = HDBSCAN | {"copy": True}
-    labels = Hdbscan(**options).fit_predict(positions)
+    labels = Hdbscan(**HDBSCAN, copy=True).fit_predict(positions)
     sizes = np.bincount(labels[labels >= 0], minlength=1)
     rank = np.argsort(np.argsort(-sizes, kind="stable"))
     return np.where(labels >= 0, rank[labels], NOISE)
@@ -186,9 +167,8 @@ def families_of(atlas: Atlas) -> tuple[tuple[str, ...], np.ndarray]:
     box = float(np.prod(sampling["shape"]) * np.prod(sampling["spacing"]))
     names, shares = [], []
     for diagram, fraction in zip(atlas.field_diagrams, atlas.volume_fractions, strict=True):
-        radius = half_thickness(diagram, float(fraction) * box)
-        names.append(family_of(diagram, radius))
-        parts = family_shares(diagram, radius)
+        parts = family_shares(diagram, half_thickness(diagram, float(fraction) * box))
+        names.append(leading_family(parts))
         shares.append([parts[name] for name in FAMILIES])
     return tuple(names), np.array(shares)
 
@@ -197,7 +177,7 @@ def _settings(count: int) -> dict[str, Any]:
     """Return the parameters and versions that a map of so many shapes is made with."""
     return {
         "distances": {"of": "fields", **DISTANCE},
-        "umap": UMAP | {"n_neighbors": min(UMAP["n_neighbors"], count - 1), "metric": "precomputed"},
+        "umap": _umap_options(count),
         "hdbscan": HDBSCAN,
         "versions": {name: version(name) for name in ("curvafit", "umap-learn", "scikit-learn", "numpy", "torch")},
     }

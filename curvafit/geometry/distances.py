@@ -28,6 +28,8 @@ from curvafit.priors.kernels import threads
 BLOCK = 8192
 #: Seconds between two saves.
 EVERY = 30.0
+#: Lines on which a sliced embedding projects a diagram, and quantiles of each.
+DIRECTIONS, QUANTILES = 12, 24
 #: All of fast-math but the leave to assume that no value is NaN or infinite.
 _SERIAL = {
     "cache": True,
@@ -58,22 +60,15 @@ def pairwise(
     """Return `wasserstein` of every pair of N diagrams: `(N, N)` float64, symmetric, with a zero diagonal.
 
     `wasserstein` is met to 1e-4 of itself, or 1e-5 where that is less than 0.1: the steps are the same, in float32. A
-    pair takes half a millisecond, on numba's threads. Raises ValueError if a diagram is empty, the units differ, or a
-    parameter is out of range.
+    pair takes half a millisecond, on numba's threads. Options and errors are those of `wasserstein`.
 
     Parameters
     ----------
-    diagrams
-        In one unit.
-    blur, reach, bin_width
-        As `wasserstein` takes them.
     known
         Distances of before, NaN where there is none: only these are computed.
     save
         Called with the distances so far, NaN where there is none yet: first, about every `EVERY` seconds, and at the
         end, even after an exception.
-    progress
-        Called after every block of pairs with a sentence and the share done.
     """
     clouds = _pack_diagrams(diagrams, blur, reach, bin_width)
     distances = np.full((len(diagrams),) * 2, np.nan) if known is None else known.copy()
@@ -161,8 +156,6 @@ def wasserstein(
 
     Parameters
     ----------
-    a, b
-        Diagrams in the same unit.
     reach
         How far area is moved before it is cheaper to destroy it; None moves all.
     bin_width
@@ -188,14 +181,9 @@ def sinkhorn_divergence(
     before it held, which would be exact at convergence (unbalanced: to blur² / 2 reach² of it). The steps stop short of
     that, so that the gradient leads down but its length may differ from the value's own slope by a third.
 
-    Parameters
-    ----------
-    points_a, points_b
-        `(N, 2)` and `(M, 2)`, of one floating-point type. Differences of near clouds want float64.
-    weights_a, weights_b
-        `(N,)` and `(M,)`, of at least 0, each with a total of 1.
-    blur, reach
-        As `wasserstein` takes them, in the points' unit.
+    Points are `(N, 2)` and `(M, 2)`, of one floating-point type; differences of near clouds want float64. Weights are
+    `(N,)` and `(M,)`, of at least 0, each with a total of 1. Blur and reach are as in `wasserstein`, in the points'
+    unit.
     """
     boxes = [points[weights > 0].detach().float().double().cpu().numpy() for points, weights in
              ((points_a, weights_a), (points_b, weights_b))]  # fmt: skip
@@ -221,22 +209,22 @@ def _normalise(diagrams: Sequence[Diagram], blur: float, reach: float | None, bi
     return [each.thin(bin_width, TAIL_SHARE) if bin_width else each for each in whole]
 
 
-def sliced_embedding(diagram: Diagram, directions: int = 12, quantiles: int = 24) -> np.ndarray:
-    """Return quantiles of a diagram's projections on lines through the origin, `(directions · quantiles,)`.
+def sliced_embedding(diagram: Diagram) -> np.ndarray:
+    """Return 24 quantiles of a diagram's projections on each of 12 lines through the origin, `(288,)`.
 
-    Scaled so that the Euclidean distance of two embeddings is their sliced W₂, the mean over directions of the squared
-    one-dimensional distances: |s| / √2 for a shift by s, as in `wasserstein`.
+    They are scaled so that the Euclidean distance of two embeddings is their sliced W₂, the mean over directions of the
+    squared one-dimensional distances: |s| / √2 for a shift by s, as in `wasserstein`.
     """
     whole = diagram.normalised
-    angles = np.pi * np.arange(directions) / directions
-    levels = (np.arange(quantiles) + 0.5) / quantiles
+    angles = np.pi * np.arange(DIRECTIONS) / DIRECTIONS
+    levels = (np.arange(QUANTILES) + 0.5) / QUANTILES
     lines = whole.points @ np.stack([np.cos(angles), np.sin(angles)])
     rows = []
     for values in lines.T:
         order = np.argsort(values, kind="stable")
         reached = np.cumsum(whole.weights[order]) - whole.weights[order] / 2
         rows.append(np.interp(levels, reached, values[order]))
-    return np.concatenate(rows) / math.sqrt(directions * quantiles)
+    return np.concatenate(rows) / math.sqrt(DIRECTIONS * QUANTILES)
 
 
 class Clouds(NamedTuple):

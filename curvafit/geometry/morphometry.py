@@ -15,13 +15,12 @@ from typing import Annotated
 import numpy as np
 from numba import njit
 from scipy import ndimage
-from skimage import measure
+from skimage.measure import block_reduce
 
 from curvafit.core.schema import Rule
-from curvafit.geometry.mesh import Surface, areas
+from curvafit.geometry.mesh import Surface, areas, surface
 from curvafit.geometry.topology import euler_number, euler_of_window
-
-__all__ = ["Morphometry", "local_thickness", "measure_connectivity", "morphometry", "smooth_surface"]
+from curvafit.priors.grid import Grid
 
 #: How far a periodic box is continued before distances are taken, in voxels.
 _WRAPPED = 32
@@ -52,24 +51,13 @@ def morphometry(
 ) -> Morphometry:
     """Measure volume fraction (BV/TV), thickness (Tb.Th), spacing (Tb.Sp), Euler number, connectivity density, BS/BV.
 
-    Raises ValueError if the mask is not 3D, or empty or full.
+    The mask is bool (Z, Y, X), neither empty nor full (else ValueError); the spacing is voxel edges (z, y, x) in
+    `unit`, or one for all. A box that is not periodic is a window: balls may reach out of it, its faces are no surface,
+    and its Euler number is its share of the whole's (`topology.euler_of_window`).
 
-    Parameters
-    ----------
-    mask
-        Bool array (Z, Y, X), True in the structure.
-    spacing
-        Voxel edges (z, y, x) in `unit`, or one for all.
-    periodic
-        The box repeats. Else it is a window: balls may reach out of it, its faces are no surface, and its Euler number
-        is its share of the whole's (`topology.euler_of_window`).
-
-    Returns
-    -------
-    Morphometry
-        `euler` is 26-connected, and a window's share rounded; `surface_to_volume` is the area by marching cubes over
-        the structure's volume, in 1/unit; `connectivity_density` is (1 - χ) over the box's volume, or over that between
-        the centres of a window's outer voxels, in 1/unit³.
+    Of the result, `euler` is 26-connected, and a window's share rounded; `surface_to_volume` is the area by marching
+    cubes over the structure's volume, in 1/unit; `connectivity_density` is (1 - χ) over the box's volume, or over that
+    between the centres of a window's outer voxels, in 1/unit³.
     """
     mask = np.asarray(mask, dtype=bool)
     edges = (spacing, spacing, spacing) if isinstance(spacing, (int, float)) else spacing
@@ -112,24 +100,12 @@ def local_thickness(
 ) -> np.ndarray:
     """Return the diameter of the largest ball inside `mask` that covers each voxel: 0 outside, infinite in a full mask.
 
-    Diameters are 2·EDT, EDT being the distance to the nearest outer voxel's centre: half a voxel too much on plates
-    (on average over their positions), up to a voxel too little on tubes and balls, whose axes miss the grid; for the
-    same reason a ball covers voxels up to half a voxel beyond its rim. Where balls are wider than `largest` voxels in
-    radius they are painted on a grid coarser by a whole factor, at a cost of under 1/`largest` of their size.
-
-    Parameters
-    ----------
-    mask
-        Bool array (Z, Y, X).
-    spacing
-        Voxel edges (z, y, x).
-    periodic
-        The box repeats (seen to a depth of `_WRAPPED` voxels); else balls may reach out of it.
-
-    Returns
-    -------
-    np.ndarray
-        float32 (Z, Y, X), in spacing's unit.
+    The result is float32 (Z, Y, X), in spacing's unit. Diameters are 2·EDT, EDT being the distance to the nearest outer
+    voxel's centre: half a voxel too much on plates (on average over their positions), up to a voxel too little on tubes
+    and balls, whose axes miss the grid; for the same reason a ball covers voxels up to half a voxel beyond its rim.
+    Where balls are wider than `largest` voxels in radius they are painted on a grid coarser by a whole factor, at a
+    cost of under 1/`largest` of their size. A periodic box is continued by `_WRAPPED` voxels; of another, balls may
+    reach out.
     """
     mask = np.asarray(mask, dtype=bool)
     if not mask.any() or mask.all():
@@ -144,16 +120,10 @@ def local_thickness(
     factor = math.ceil(float(radius.max()) / edge / largest)
     if factor == 1:
         return 2 * _largest_balls(radius, np.asarray(spacing, dtype=np.float32), edge)
-    painted = _largest_balls(_coarsen(radius, factor), np.asarray(spacing, dtype=np.float32) * factor, edge)
+    coarse = block_reduce(radius, factor, np.max)
+    painted = _largest_balls(coarse, np.asarray(spacing, dtype=np.float32) * factor, edge)
     fine = painted.repeat(factor, 0).repeat(factor, 1).repeat(factor, 2)[tuple(slice(n) for n in mask.shape)]
     return np.where(mask, 2 * np.maximum(fine, radius), np.float32(0))
-
-
-def _coarsen(radius: np.ndarray, factor: int) -> np.ndarray:
-    """Return the largest radius of each block of factor³ voxels."""
-    padded = np.pad(radius, [(0, -n % factor) for n in radius.shape])
-    z, y, x = (n // factor for n in padded.shape)
-    return padded.reshape(z, factor, y, factor, x, factor).max(axis=(1, 3, 5))
 
 
 def _largest_balls(radius: np.ndarray, spacing: np.ndarray, edge: float) -> np.ndarray:
@@ -203,7 +173,4 @@ def smooth_surface(mask: np.ndarray, spacing: tuple[float, float, float], *, per
     soft = ndimage.gaussian_filter(mask.astype(np.float32), 0.7, mode="wrap" if periodic else "nearest")
     if not soft.min() < 0.5 < soft.max():
         soft = mask.astype(np.float32)
-    if periodic:
-        soft = np.pad(soft, [(0, 1)] * 3, mode="wrap")
-    vertices, faces, _, _ = measure.marching_cubes(soft, 0.5, spacing=spacing)
-    return Surface(vertices.astype(np.float64), faces.astype(np.int64))
+    return surface(soft, Grid(mask.shape, spacing, "periodic" if periodic else "replicate"), 0.5)  # type: ignore[arg-type]
