@@ -127,8 +127,8 @@ def embed(distances: np.ndarray) -> np.ndarray:
         warnings.simplefilter("ignore")
         from umap import UMAP as Umap
 
-        options = _umap_options(len(distances))
-        return Umap(n_jobs=1, **options).fit_transform(distances.astype(np.float32)).astype(np.float64)
+        places = Umap(n_jobs=1, **_umap_options(len(distances))).fit_transform(distances.astype(np.float32))
+    return np.asarray(places, dtype=np.float64)
 
 
 def _umap_options(count: int) -> dict[str, Any]:
@@ -142,7 +142,8 @@ def find_clusters(positions: np.ndarray) -> np.ndarray:
         return np.full(len(positions), NOISE)
     from sklearn.cluster import HDBSCAN as Hdbscan
 
-    labels = Hdbscan(**HDBSCAN, copy=True).fit_predict(positions)
+    options: dict[str, Any] = HDBSCAN | {"copy": True}
+    labels = Hdbscan(**options).fit_predict(positions)
     sizes = np.bincount(labels[labels >= 0], minlength=1)
     rank = np.argsort(np.argsort(-sizes, kind="stable"))
     return np.where(labels >= 0, rank[labels], NOISE)
