@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from curvafit.core.checks import LONGEST, SHORTEST, as_tuple, check_float, check_int, check_seed, check_type, quoted
+from curvafit.core.schema import encode
 from curvafit.data_synth.imaging.image import field_shape, image, regrid, visible
 from curvafit.data_synth.imaging.modality import Imaging, Modality
 from curvafit.data_synth.sources import ShapeSource, decode_source
@@ -43,14 +44,9 @@ class Case(NamedTuple):
 class Recipe:
     """The recipe of all cases of a set: case i depends on the recipe and i alone.
 
-    Parameters
-    ----------
-    shape
-        Voxels (z, y, x) of the images.
-    voxel
-        Edge of a shape's voxels, in the modality's unit: it sets how thick structures are in the images.
-    calibres
-        Least and greatest factor of `voxel`; every case draws its own in between.
+    `shape` is the voxels (z, y, x) of the images; `voxel` is the edge of a shape's voxels in the modality's unit, which
+    sets how thick structures are in the images; `calibres` are the least and the greatest factor of it, between which
+    every case draws its own.
     """
 
     source: ShapeSource
@@ -68,16 +64,13 @@ class Recipe:
         voxel = check_float(self.voxel, "a shape's voxel of positive length", SHORTEST, LONGEST)
         object.__setattr__(self, "voxel", voxel)
         object.__setattr__(self, "seed", check_seed(self.seed))
-        check_calibres(self.calibres)
+        object.__setattr__(self, "calibres", check_calibres(self.calibres))
         for factor in self.calibres:
             check_crop(self.source.edge, self.shape, self.voxel * factor, self.modality)
 
     @property
     def largest(self) -> tuple[int, int, int]:
-        """Return the most voxels (z, y, x) that a shape can have.
-
-        A shape's voxel is smallest at the least calibre, so that the box of an image needs most of them there.
-        """
+        """Return the most voxels (z, y, x) that a shape can have: those at the least calibre."""
         return field_shape(self.shape, self.voxel * self.calibres[0], self.modality.base)
 
     def case(self, index: int) -> Case:
@@ -110,17 +103,14 @@ class Recipe:
 
     def as_dict(self) -> dict[str, Any]:
         """Return all of the recipe in JSON's types."""
-        parts = {"source": self.source.as_dict(), "modality": self.modality.as_dict()}
-        numbers = {"shape": list(self.shape), "voxel": self.voxel, "seed": self.seed, "calibres": list(self.calibres)}
-        return parts | numbers
+        return encode(vars(self) | {"source": self.source.as_dict()})
 
     @staticmethod
     def from_dict(content: Mapping[str, Any]) -> Recipe:
         """Return the recipe that `as_dict` wrote."""
         source, modality = decode_source(content["source"]), Modality.from_dict(content["modality"])
-        z, y, x = content["shape"]
-        low, high = content["calibres"]
-        return Recipe(source, modality, (z, y, x), content["voxel"], content["seed"], (low, high))
+        numbers = (content[name] for name in ("shape", "voxel", "seed", "calibres"))
+        return Recipe(source, modality, *numbers)
 
 
 def image_and_labels(
@@ -153,12 +143,13 @@ def draw_voxel(voxel: float, calibres: Sequence[float], rng: np.random.Generator
     return voxel * (low if low == high else math.exp(rng.uniform(math.log(low), math.log(high))))
 
 
-def check_calibres(calibres: Sequence[float]) -> None:
-    """Raise ValueError unless the calibres are two positive factors, the lower first."""
+def check_calibres(calibres: Sequence[float]) -> tuple[float, float]:
+    """Return calibres as two positive factors, the lower first, or raise ValueError."""
     words, pair = "calibres as two positive factors, the lower first", as_tuple(calibres, "two factors")
     low, high = (check_float(n, words, *CALIBRES, of=pair) for n in (pair if len(pair) == 2 else (None, None)))
     if low > high:
         raise ValueError(f"expected {words}, got {quoted(pair)}")
+    return low, high
 
 
 def check_crop(longest: float, shape: Sequence[int], voxel: float, modality: Modality) -> None:

@@ -50,19 +50,10 @@ class Draw(NamedTuple):
 class Design:
     """A sequence of parameters, the same for ever for a seed: draw i depends on (seed, i) alone.
 
-    Parameters
-    ----------
-    sampling
-        `"random"`: uniform and independent in a box. `"sobol"`: the same box, filled evenly by a scrambled Sobol
-        sequence. `"list"`: the points in turn, again and again with other noise.
-    box
-        Intervals of (a20, a11, a02, a10, a01, a00, m₀) in working units; both ends are alike where one is fixed.
-    points
-        Points of seven numbers, for `"list"`.
-    log
-        Names of the parameters that are uniform in the logarithm; their intervals are above 0.
-
-    Raises ValueError where a parameter is out of range, such as m₀ outside (-1, 1).
+    Sampling is `"random"`, uniform and independent in a box; `"sobol"`, the same box, filled evenly by a scrambled
+    Sobol sequence; or `"list"`, the points of seven numbers in turn, again and again with other noise. The box holds
+    intervals of (a20, a11, a02, a10, a01, a00, m₀) in working units; both ends are alike where one is fixed. Parameters
+    named in `log` are uniform in the logarithm; their intervals are above 0. A parameter out of range is a ValueError.
     """
 
     sampling: Sampling
@@ -102,9 +93,8 @@ class Design:
 
     def __str__(self) -> str:
         """Return the sampling with the number of points, or with the box."""
-        return f"{self.sampling} " + (
-            f"of {len(self.points)} points" if self.points else f"in {list(map(list, self.box))}"
-        )
+        where = f"of {len(self.points)} points" if self.points else f"in {list(map(list, self.box))}"
+        return f"{self.sampling} {where}"
 
     def as_dict(self) -> dict[str, Any]:
         """Return the design in JSON's types, for a store's record."""

@@ -76,9 +76,7 @@ def labels_of(field: Tensor | np.ndarray, grid: Grid, epsilon: float, which: Col
     """Return the labels named in `which` of a phase field `(Z, Y, X)`, positive inside.
 
     Labels of a periodic grid go on across its faces, and the Betti numbers are those on the torus. A tube that is cut
-    by the face of a crop (replicate) ends there.
-
-    Raises ValueError where the field is not a finite volume of the grid's shape that crosses 0, or a name is unknown.
+    by the face of a crop (replicate) ends there. A field that does not cross 0 is a NoSurface, a ValueError.
     """
     wanted = {which} if isinstance(which, str) else set(which)
     if unknown := sorted(wanted - set(NAMES)):
@@ -194,12 +192,7 @@ def field_distance(field: Tensor, grid: Grid, epsilon: float) -> np.ndarray:
     where it is 3. Every voxel with one of six neighbours on the other side gives a point of the surface and its normal.
     A voxel further away takes the point of the nearest such voxel, as if the surface there were a sphere of radius
     `BEND`: right to 0.04 voxels on average, 0.4 at worst. A crop has no surface beyond its faces.
-
-    Raises NoSurface, a ValueError, where the field is of one phase.
     """
-    inside = field > 0
-    if not bool(inside.any()) or bool(inside.all()):
-        raise NoSurface("the field is of one phase only, so that it has no surface to be distant from")
     near = profile_distance(field.detach().cpu().float(), epsilon).contiguous().numpy()
     edges = np.array(grid.spacing, dtype=np.float32)
     touching, feet, distance = _measure_near(near, edges, grid.periodic)

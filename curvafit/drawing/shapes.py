@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.ndimage import map_coordinates
 from torch import Tensor
 
 from curvafit.core.checks import LONGEST, SHORTEST, as_tuple, check_float, check_int, check_type
@@ -38,21 +39,10 @@ MOST = 10**6
 
 @dataclasses.dataclass(frozen=True)
 class Output:
-    """How a field becomes a file.
+    """How a field becomes a file: the edge of a voxel and its unit, for spacing or vertices; ValueError for others.
 
-    Parameters
-    ----------
-    voxel, unit
-        Edge of a voxel, for spacing or vertices.
-    tile
-        How often the box is repeated along z, y, x; for periodic boxes.
-    cap
-        Whether a surface is closed on the box's faces (then watertight, around the volume of {u > 0}) or open there.
-
-    Raises
-    ------
-    ValueError
-        If the unit is unknown, the voxel is not from 1e-12 to 1e12, or a repeat is under 1.
+    A periodic box is repeated `tile` times along z, y, x. With `cap`, a surface is closed on the box's faces,
+    watertight around the volume of {u > 0}.
     """
 
     voxel: float = 1.0
@@ -126,25 +116,10 @@ def write_shape(
 ) -> tuple[Path, ...]:
     """Write a flow's field as a volume or a surface, by suffix, with a record and a picture of one period.
 
-    All files are made in a temporary folder, then moved together. If the picture cannot be drawn, a warning says so.
-    The picture of a shape that is replaced is deleted, also where none is drawn now.
-
-    Parameters
-    ----------
-    record
-        Content of the record: see `shape_record`.
-    overwrite
-        Whether files of another origin may be replaced.
-
-    Returns
-    -------
-    The paths of the shape, the record (`.json`), the flow's snapshots (not those without a surface, if surfaces are
-    written), and the picture (`.png`).
-
-    Raises
-    ------
-    ValueError
-        As `check_target` does, or if the field has no surface.
+    Return the paths of the shape, the record (`.json`, see `shape_record`), the flow's snapshots (not those without a
+    surface, if surfaces are written), and the picture (`.png`). All files are made in a temporary folder, then moved
+    together. If the picture cannot be drawn, a warning says so. The picture of a shape that is replaced is deleted,
+    also where none is drawn now. Raises ValueError as `check_target` does, or if the field has no surface.
     """
     target = check_target(path, output, steps=flow.snapshots, picture=picture, overwrite=overwrite)
     image = sibling(target, ".png")
@@ -192,11 +167,7 @@ def write_field(field: Tensor, grid: Grid, path: str | Path, output: Output | No
 
 
 def shape_record(
-    flow: Flow,
-    *,
-    mass: float | Tensor | None = None,
-    output: Output | None = None,
-    **more: Any,
+    flow: Flow, *, mass: float | Tensor | None = None, output: Output | None = None, **more: Any
 ) -> dict[str, Any]:
     """Return what is needed to make a shape again (parameters, sampling, seed, schedule, versions), and its status.
 
@@ -233,8 +204,6 @@ def _number_or_range(value: float | Tensor) -> float | dict[str, float]:
 
 def _vertex_curvatures(mesh: Surface, field: Tensor, grid: Grid) -> dict[str, np.ndarray]:
     """Return κ1, κ2 `(V,)` of a field's level sets at a mesh's vertices, interpolated linearly."""
-    from scipy.ndimage import map_coordinates
-
     ε = WORKING_EPSILON / WORKING_SPACING * grid.spacing[0]
     κ1, κ2, _, _ = geometric_curvatures(jet(profile_distance(field, ε), grid))
     places = (mesh.vertices / np.array(grid.spacing)).T

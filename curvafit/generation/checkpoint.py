@@ -27,16 +27,9 @@ _HEAD = b"curvafit checkpoint 2 "
 class Checkpoint:
     """The file of one run, which is written under another name and then renamed.
 
-    Parameters
-    ----------
-    path
-        Path of the file; a link is followed and stays. The folder is created.
-    every
-        The least number of seconds between two saves; 0 saves after every step.
-    run
-        The run's parameters by name; see `identity`.
-    keep
-        Whether the file stays at the end of the run.
+    A link is followed and stays; the folder is created. `every` is the least number of seconds between two saves (0
+    saves after every step), `run` the run's parameters by name (see `identity`). With `keep`, the file stays at the
+    end of the run.
     """
 
     def __init__(self, path: str | Path, every: float, run: dict[str, str], keep: bool = False) -> None:

@@ -46,12 +46,8 @@ class Evidence(_VoxelTerm):
 
     r is a voxel's evidence for the inside (where positive) or for the outside, and V is the voxel's volume. Where u is
     ±1, D is the cost of the mask u > 0, up to a constant. D is C¹ and acts on the interface alone: q'(±1) = 0, so that
-    noise, whose sign changes from voxel to voxel, does not pull the phases to values between ±1.
-
-    Parameters
-    ----------
-    ratio
-        r, `(Z, Y, X)`, finite (or ValueError is raised); 0 where nothing is known.
+    noise, whose sign changes from voxel to voxel, does not pull the phases to values between ±1. The `ratio` r,
+    `(Z, Y, X)`, is finite (else ValueError), and 0 where nothing is known.
     """
 
     def slope(self, u: Float[Tensor, "z y x"], grid: Grid, /) -> tuple[float, Float[Tensor, "z y x"]]:
@@ -68,14 +64,8 @@ class Hinge(_VoxelTerm):
 
     The term is for voxels whose side is known: there is no force where u is at least m on that side, and a spring where
     it is not. At m = 1 the wrong phase, off by 2, costs |r| V, but a profile that crosses known voxels is squeezed; it
-    is free where m is the profile's value in a voxel next to the surface (`priors.profile.optimal_profile`).
-
-    Parameters
-    ----------
-    ratio
-        r, `(Z, Y, X)`, finite (or ValueError is raised); 0 where nothing is known.
-    margin
-        m, from 0 to 1.
+    is free where m is the profile's value in a voxel next to the surface (`priors.profile.optimal_profile`). The ratio
+    r is as in `Evidence`; the margin m is from 0 to 1.
     """
 
     margin: float = 1.0

@@ -25,15 +25,7 @@ class DivergenceForm:
     """u = k ∗ (div A + base), whose mass is the base's for every A (paper, eq. 24 and Algorithm 1).
 
     The descent of A is the H⁻¹ flow ∂u/∂t = Δ ∂F_ε/∂u (eq. 2): ∂F_ε/∂A = -∇ ∂F_ε/∂u moves u by the divergence of that.
-
-    Parameters
-    ----------
-    grid, width
-        The sampling, and the standard deviation of k in spacing's unit.
-    base
-        k ∗ base: the mass m₀, or a blurred field `(Z, Y, X)`.
-    blur
-        The function that blurs, plain torch by default.
+    `width` is the standard deviation of k in spacing's unit; `base` is k ∗ base: the mass m₀, or a blurred field.
     """
 
     grid: Grid

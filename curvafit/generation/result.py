@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -65,34 +64,18 @@ class State:
     mass: float
 
 
-class Callback(Protocol):
-    """A function that a flow calls every `RECORD_EVERY` steps and at the end; it may stop the flow."""
-
-    def __call__(self, step: int, total: int, state: State, /) -> bool | None:
-        """Receive the number of steps so far, the total and the state; return True to stop the flow."""
-        ...
+#: A function that a flow calls every `RECORD_EVERY` steps and at the end, with the number of steps so far, the total
+#: and the state; True stops the flow.
+Callback = Callable[[int, int, State], bool | None]
 
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Flow(Pictured):
-    """The result of a flow: the field, the history, and whether the field is a shape.
+    """The result of a flow: the field u, float32 `(Z, Y, X)`, its mean (`mass`), and whether the field is a shape.
 
-    Attributes
-    ----------
-    field
-        u, float32 `(Z, Y, X)`.
-    history
-        Figures at regular steps.
-    status
-        A sentence that says how the flow ended.
-    coefficients, epsilon
-        Parameters of the energy: numbers, or tensors that vary in space, in the unit of the grid's spacing.
-    seed
-        Seed of the start; None where the flow started from a field.
-    mass
-        The mean of the field.
-    snapshots
-        Fields by the number of steps after which they were taken.
+    The `status` is a sentence that says how the flow ended. Coefficients and ε are numbers, or tensors that vary in
+    space, in the unit of the grid's spacing. The seed is None where the flow started from a field. Snapshots are fields
+    by the number of steps after which they were taken.
     """
 
     field: Tensor

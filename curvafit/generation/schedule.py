@@ -17,15 +17,7 @@ MOST_STEPS, LONGEST_STEP = 10**7, 1e6
 
 @dataclass(frozen=True)
 class Phase:
-    """Lengths and decay rates of the steps at a schedule's beginning.
-
-    Parameters
-    ----------
-    share
-        Share of the schedule's steps, in (0, 1).
-    start, stop, shape, momentum, memory
-        As in `Schedule`.
-    """
+    """Lengths and decay rates, as in `Schedule`, of a share in (0, 1) of the steps at a schedule's beginning."""
 
     share: float
     start: float

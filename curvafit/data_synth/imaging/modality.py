@@ -149,20 +149,11 @@ class Detector(Checked):
 
 @dataclass(frozen=True)
 class Imaging(Checked):
-    """The parameters of one image; an effect of strength 0 is not applied.
+    """The parameters of one image, its parts in the order of the physics; an effect of strength 0 is not applied.
 
-    Parameters
-    ----------
-    unit
-        Of all lengths: a unit of length, or voxel.
-    spacing, thickness
-        Edges of the image's voxels (z, y, x); and the thickness over which a slice averages, 0 for optical sections.
-    contrast, specimen, optics, illumination, noise, detector
-        The parts, in the order of the physics.
-    visible
-        Masks hold voxels that this share of a structure's light reaches, as an annotator sees them; at 0 the structure.
-
-    Raises ValueError where a number is out of range or the unit is unknown.
+    `unit` is that of all lengths: a unit of length, or voxel. `spacing` is the edges of the image's voxels (z, y, x);
+    `thickness` is what a slice averages over, 0 for optical sections. Masks hold the voxels that the share `visible` of
+    a structure's light reaches, as an annotator sees them; at 0 the structure. A number out of range is a ValueError.
     """
 
     unit: str = "um"
@@ -225,21 +216,12 @@ NAMES = tuple(name for name, _ in _leaves(asdict(Imaging())))
 
 @dataclass(frozen=True)
 class Modality:
-    """A kind of image: a typical one, and the ranges from which some parameters are drawn.
+    """A kind of image: a typical one (`base`), and the ranges from which some parameters are drawn.
 
-    Parameters
-    ----------
-    name, about
-        Its name, and the source of its numbers.
-    voxel
-        Edge of a shape's voxels, in the unit of the imaging, which gives structures their usual thickness.
-    base
-        A typical image.
-    ranges
-        Low and high by the name of a parameter, as `optics.blur`; three numbers change together. Draws are even in the
-        logarithm where both ends are above zero, else even.
-
-    Raises ValueError where a range has no known name or an end that an `Imaging` refuses.
+    `about` is the source of its numbers. `voxel` is the edge of a shape's voxels, in the unit of the imaging, which
+    gives structures their usual thickness. `ranges` holds low and high by the name of a parameter, as `optics.blur`;
+    three numbers change together. Draws are even in the logarithm where both ends are above zero, else even. A range
+    with an unknown name or an end that an `Imaging` refuses is a ValueError.
     """
 
     name: str
