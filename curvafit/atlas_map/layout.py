@@ -32,22 +32,11 @@ NOISE = -1
 
 @dataclass(frozen=True, eq=False)
 class AtlasMap:
-    """The map of an atlas of N shapes.
+    """The map of an atlas of N shapes, with the parameters and versions that it was made with (`settings`).
 
-    Attributes
-    ----------
-    distances
-        Between the diagrams of the fields, `(N, N)`, in 1 / working unit.
-    positions
-        Places on the map, `(N, 2)`; only nearness has a meaning, not direction.
-    clusters
-        Cluster of each shape `(N,)`, from 0, or `NOISE`.
-    cluster_families
-        What each cluster is called: where the normalised diagrams of its shapes, taken together, have their mass.
-    families
-        What each shape is called: where its own diagram has its mass.
-    settings
-        How the map was made: parameters of every step, versions.
+    `distances` `(N, N)` are between the diagrams of the fields, in 1 / working unit; of the `positions` `(N, 2)` only
+    nearness has a meaning, not direction; `clusters` `(N,)` are from 0, or `NOISE`. A shape's family is where its
+    diagram has its mass, and a cluster's where the normalised diagrams of its shapes, taken together, have theirs.
     """
 
     atlas: Atlas

@@ -60,14 +60,10 @@ CUT, LEVELS = 0.5, 31
 def page_html(
     mapped: AtlasMap, shapes: Sequence[Miniature], commands: Sequence[str], account: Sequence[tuple[str, str]]
 ) -> str:
-    """Return the text of the page.
+    """Return the text of the page, from each shape's miniature and the command that grows it again, in the atlas's
+    order.
 
-    Parameters
-    ----------
-    shapes, commands
-        The miniature of each shape, and the command that grows it again, in the atlas's order.
-    account
-        Rows, name and text, on how the map was made.
+    `account` is rows, name and text, on how the map was made.
     """
     blobs = {
         "thumbnails": _join_base64(one.thumbnail for one in shapes),

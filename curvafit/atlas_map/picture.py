@@ -43,10 +43,7 @@ _NAMED = 0.05
 def map_picture(mapped: AtlasMap, field: Callable[[int], np.ndarray], path: str | Path) -> Path:
     """Write the map as a PNG, its settings among the PNG's texts.
 
-    Parameters
-    ----------
-    field
-        Function of an index in the atlas that returns the shape's phase field `(Z, Y, X)`; called for those shown.
+    `field` returns the phase field `(Z, Y, X)` of a shape by its index in the atlas; it is called for those shown.
     """
     figure = map_figure(mapped, field)
     settings = json.dumps({"map": mapped.settings, "atlas": mapped.atlas.provenance})

@@ -74,29 +74,17 @@ class Descriptors:
         return np.concatenate([getattr(self, name) for name in BLOCKS])
 
 
+_NAMES = [field.name for field in fields(Descriptors)]
 #: Lengths of the blocks, in their order.
-BLOCKS: dict[str, int] = dict(
-    zip(
-        (field.name for field in fields(Descriptors)),
-        (288, 1, 3, *[len(LEVELS)] * 4, len(RADII), 3),
-        strict=True,
-    )
-)
+BLOCKS = dict(zip(_NAMES, (288, 1, 3, *[len(LEVELS)] * 4, len(RADII), 3), strict=True))
 
 
 def descriptors(shape: np.ndarray | Tensor, grid: Grid, epsilon: float = WORKING_EPSILON) -> Descriptors:
-    """Measure a phase field or a mask.
+    """Measure a phase field `(Z, Y, X)`, positive inside, or a bool mask, which is re-profiled as `infer` does.
 
-    Raises ValueError if voxels are not cubic, or there is no surface (`NoSurface`) whose curvature the grid resolves.
-
-    Parameters
-    ----------
-    shape
-        `(Z, Y, X)`: bool, a mask, which is re-profiled as `infer` does; else a phase field, positive inside.
-    grid
-        Cubic voxels. Where it is not periodic, the shape is a window of something larger.
-    epsilon
-        Interface parameter, in the grid's unit.
+    Voxels are cubic, and ε is in the grid's unit. Where the grid is not periodic, the shape is a window of something
+    larger. Raises ValueError if voxels are not cubic, and `NoSurface`, one too, if there is no surface whose curvature
+    the grid resolves.
     """
     check_type(grid, Grid, "a Grid")
     check_type(shape, (np.ndarray, Tensor), f"a field or a mask of shape {grid.shape}")
@@ -113,37 +101,24 @@ def descriptors(shape: np.ndarray | Tensor, grid: Grid, epsilon: float = WORKING
     mesh = surface(phase, grid)
     normals = area_vectors(mesh)
     area = np.linalg.norm(normals, axis=1)
-    density = area.sum() / _cell_volume(grid)
+    counted = area > 0
+    tensor = (normals[counted] / area[counted, None]).T @ normals[counted] / area.sum()
+    # Of marching cubes; those of a window lie between its outermost voxels' centres.
+    cells = grid.volume if grid.periodic else grid.voxel_volume * float(np.prod([n - 1 for n in grid.shape]))
+    density, euler = area.sum() / cells, int(euler_shares(mask, periodic=grid.periodic).sum(dtype=np.int64))
     chords, gaps = (voxel * _chord_quantiles(phase, grid.periodic) for phase in (mask, ~mask))
     depths, clearances = (voxel * each for each in _depth_quantiles(inside, grid))
     return Descriptors(
         curvature=sliced_embedding(measured.bin(_CURVATURE_BIN / (100 * voxel))),
         fraction=np.array([mask.mean()]),
-        densities=np.array([density, density * measured.mean().mean(), _euler_density(mask, grid)]),
+        densities=np.array([density, density * measured.mean().mean(), euler / cells]),
         chords=chords,
         gaps=gaps,
         depths=depths,
         clearances=clearances,
         correlation=_correlation(mask, grid.periodic),
-        fabric=_fabric(normals, area),
+        fabric=np.linalg.eigvalsh(tensor)[::-1],
     )
-
-
-def _cell_volume(grid: Grid) -> float:
-    """Return the volume of the cells of marching cubes: of a window, those between its outermost voxels' centres."""
-    return grid.volume if grid.periodic else grid.voxel_volume * float(np.prod([n - 1 for n in grid.shape]))
-
-
-def _fabric(normals: np.ndarray, area: np.ndarray) -> np.ndarray:
-    """Return the eigenvalues of the mean n⊗n over a surface, of its triangles' normals times their area."""
-    counted = area > 0
-    tensor = (normals[counted] / area[counted, None]).T @ normals[counted] / area.sum()
-    return np.linalg.eigvalsh(tensor)[::-1]
-
-
-def _euler_density(mask: np.ndarray, grid: Grid) -> float:
-    """Return χ per volume of the union of the closed voxels; in a window, of the voxels whose neighbours are seen."""
-    return int(euler_shares(mask, periodic=grid.periodic).sum(dtype=np.int64)) / _cell_volume(grid)
 
 
 def _chord_quantiles(phase: np.ndarray, periodic: bool) -> np.ndarray:
@@ -220,16 +195,12 @@ def _correlation(mask: np.ndarray, periodic: bool) -> np.ndarray:
     size: tuple[int, ...] = mask.shape
     if not periodic:
         size = tuple(next_fast_len(n + int(RADII[-1]) + 2, True) or n for n in mask.shape)
-    products = _autocorrelation(mask - part, size)
+    spectrum = np.fft.rfftn(mask - part, size, (0, 1, 2))
+    products = np.fft.irfftn(np.abs(spectrum) ** 2, size, (0, 1, 2))
     pairs = mask.size if periodic else _window_pairs(mask.shape, size)
     shells, counts, radii = _shells(size)
     means = np.bincount(shells, (products / pairs).ravel())[: len(radii)] / counts
     return np.interp(RADII, radii, means / (part * (1 - part)))
-
-
-def _autocorrelation(values: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
-    """Return the sums of products of values and the same values at each offset, in a periodic box of some size."""
-    return np.fft.irfftn(np.abs(np.fft.rfftn(values, size, (0, 1, 2))) ** 2, size, (0, 1, 2))
 
 
 @lru_cache(maxsize=4)

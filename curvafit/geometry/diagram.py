@@ -49,22 +49,13 @@ _DEEPEST = 6.0
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Diagram(Pictured):
-    """A measure on the (κ1, κ2) plane.
+    """A measure on the (κ1, κ2) plane: areas (`weights`, `(N,)`) in the grid's unit squared, at points `(N, 2)` in
+    `unit`.
 
-    Attributes
-    ----------
-    points
-        (κ1, κ2) with κ1 ≥ κ2, `(N, 2)` float64, in `unit`.
-    weights
-        Areas `(N,)` float64, in the grid's unit squared.
-    spread
-        Root mean square distance of the measured points to the ones that stand for them: 0 unless binned. The
-        transport distance (cost ½|x - y|²) between a diagram and its binned self is at most √½ · spread.
-    excluded
-        Part of the surface's area, in [0, 1], left out because curvature is not resolved there.
-    places
-        (z, y, x) on the surface of each point, `(N, 3)`, in the grid's unit from the first voxel's centre; None once
-        points were merged or read from a file.
+    `spread` is the root mean square distance of the measured points to the ones that stand for them, 0 unless binned:
+    the transport distance (cost ½|x - y|²) between a diagram and its binned self is at most √½ · spread. `excluded` is
+    the part of the surface's area left out because curvature is not resolved there. `places` `(N, 3)` are (z, y, x) on
+    the surface of each point, in the grid's unit from the first voxel's centre; None once points were merged or read.
     """
 
     points: np.ndarray
@@ -167,15 +158,11 @@ def diagram(
 
     Curvatures of the voxels around a triangle are interpolated linearly at its barycentre. The geometric ones are those
     of the level sets of √2 ε artanh(u), which are u's own: differences of that near-distance err far less than
-    differences of tanh. The diffuse ones are the paper's, of u itself. Raises ValueError if there is no surface in the
-    box or in `where`, the field is not finite, or `curvature` has another name.
+    differences of tanh. The diffuse ones, to reproduce the paper, are of u itself. The field `(Z, Y, X)` is finite and
+    positive inside. Where there is no surface, in the box or in `where`, NoSurface is raised, a ValueError.
 
     Parameters
     ----------
-    u
-        Phase field `(Z, Y, X)`, positive inside.
-    curvature
-        `"geometric"`, or `"diffuse"` to reproduce the paper.
     margin
         Voxels left out along every side of a box that is not periodic; `MARGIN` by default. 0 measures up to the
         outermost centres, right where the mirror image beyond them is real.

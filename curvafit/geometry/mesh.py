@@ -156,14 +156,8 @@ def _weld(mesh: Surface) -> Surface:
 def write_surface(mesh: Surface, path: str | Path, *, unit: str = "voxel", data: Data | None = None) -> Path:
     """Write a binary STL, PLY or VTP file by suffix; whole or not at all.
 
-    Raises ValueError if the suffix is another, or there is not one number a vertex.
-
-    Parameters
-    ----------
-    unit
-        Unit of the lengths, written as a remark: none of the formats has a field for it.
-    data
-        Numbers `(V,)` at the vertices by name, for PLY and VTP; STL cannot hold them.
+    The unit of the lengths is written as a remark: none of the formats has a field for it. `data` is numbers `(V,)` at
+    the vertices by name, for PLY and VTP; STL cannot hold them. Another suffix or shape is a ValueError.
     """
     path = Path(path)
     suffix = path.suffix.lower()

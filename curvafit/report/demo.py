@@ -96,12 +96,8 @@ def write_demo(
 
     The structure is measured (`measure`). The volume is filled from the kept slices (`reconstruct`) and compared with
     those left out. The law is inferred (`infer(fast=True)`), and the curvature diagram placed among the atlas's.
-    `fit.json` and `report.html` are written beside the page. `title` is the page's heading, plain text.
-
-    Raises
-    ------
-    ValueError
-        If the scan has no structure, or as `report.page.check_report`.
+    `fit.json` and `report.html` are written beside the page. `title` is the page's heading, plain text. Raises
+    ValueError if the scan has no structure, or as `report.page.check_report`.
     """
     folder = check_report(directory, [scan.source] if scan.source else (), overwrite)
     page = folder / PAGE
@@ -150,12 +146,19 @@ def demo_page(
     a01, a00, m₀); `title` is the heading, plain text.
     """
     fit = inference.fit
+    shapes = {
+        f"every {completion.every}th slice": completion.known,
+        "filled between them": completion.filled,
+        "the scan, which was left out": completion.truth,
+    }
     return render_template(
         "demo.html",
         version=version("curvafit"),
         title=title,
         scan=describe_scan(inference),
-        shapes=picture_of(_completion_figure(completion), "Known slices, the filled volume, and the scan"),
+        shapes=picture_of(
+            gallery_figure(shapes, columns=3, width=1500, azimuth=122), "Known slices, the filled volume, and the scan"
+        ),
         slices=picture_of(_slice_figure(inference.scan, completion), "A left-out slice, as it is and as filled"),
         every=completion.every,
         score=f"{completion.dice['curvafit']:.3f}",
@@ -169,16 +172,6 @@ def demo_page(
         weak=fit.weak_directions,
         notes=dict.fromkeys((*inference.scan.notes, *fit.notes)),
     )
-
-
-def _completion_figure(completion: Completion) -> Figure:
-    """Return surfaces of the known slices, of the filled volume and of the truth, side by side."""
-    shapes = {
-        f"every {completion.every}th slice": completion.known,
-        "filled between them": completion.filled,
-        "the scan, which was left out": completion.truth,
-    }
-    return gallery_figure(shapes, columns=3, width=1500, azimuth=122)
 
 
 def _slice_figure(scan: Field, completion: Completion) -> Figure:

@@ -181,7 +181,6 @@ def report_html(inference: Inference) -> str:
         corner=_corner(inference),
         bands=bands(inference),
         symbols=[symbol for symbol, _, _ in _TERMS.values()],
-        matches=[(each.id, _match_cells(each)) for each in fit.matches],
         provenance=[(str(name).replace("_", " "), _to_words(value)) for name, value in fit.provenance.items()],
     )
 
@@ -322,12 +321,6 @@ def _deviation(candidate: Candidate, name: str) -> str:
 def _interval(known: Mapping[str, Any] | None, level: str) -> str:
     """Return a posterior's interval of one level as text, empty without a posterior."""
     return "" if known is None else " to ".join(format_number(end) for end in known[level])
-
-
-def _match_cells(match: Any) -> list[str]:
-    """Return a match's distance, parameters and seed as text."""
-    values = (*match.coefficients.as_dict().values(), match.mass)
-    return [format_number(match.distance, 2), *map(format_number, values), str(match.seed)]
 
 
 def _to_words(value: object) -> str:

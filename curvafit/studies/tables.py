@@ -6,6 +6,7 @@ import csv
 import io
 import math
 from collections.abc import Sequence
+from importlib.metadata import version
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,6 @@ from curvafit.core.extras import require
 from curvafit.core.files import write_atomically, write_content
 from curvafit.core.records import Format, can_write, has_mark
 from curvafit.scan.measure import Measures
-
-__all__ = ["SUFFIXES", "check_table", "rows_of", "write_table"]
 
 #: Suffixes of the files that are written.
 SUFFIXES = (".csv", ".json", ".parquet")
@@ -27,8 +26,6 @@ FORMAT = Format("curvafit measures 1", title="a table of measures")
 
 def rows_of(measures: Measures) -> list[dict[str, Any]]:
     """Return a row for each quantity of a scan, as values by column; None where a number is not known."""
-    from importlib.metadata import version
-
     release, z, y, x = version("curvafit"), *measures.direction
     rows = []
     for each in measures.quantities:

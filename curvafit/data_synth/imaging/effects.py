@@ -172,10 +172,11 @@ def clutter(occupied: Volume, spacing: Lengths, density: float, radius: float, s
     place = tried[torch.arange(count, device=tried.device), free.long().argmax(1)] * sides
     height = (0.5 + 0.5 * drawn[:, 0]) * free.any(1)
     width = radius * (0.5 + drawn[:, 1:4])
-    z, y, x = (
-        _speck_profiles(n, h, place[:, k], width[:, k])
-        for k, (n, h) in enumerate(zip(occupied.shape, steps, strict=True))
+    centres = (
+        (torch.arange(n, device=place.device, dtype=place.dtype) + 0.5) * h
+        for n, h in zip(occupied.shape, steps, strict=True)
     )
+    z, y, x = (bell((at - place[:, k, None]) / width[:, k, None]) for k, at in enumerate(centres))
     planes = (height[:, None, None] * z[:, :, None] * y[:, None, :]).flatten(1)
     return (planes.mT @ x).reshape(occupied.shape).clamp_max_(1) * (1 - occupied)
 
@@ -192,12 +193,6 @@ def _find_level(values: Tensor, share: float) -> Tensor:
     if passed == 0 or passed == count:
         return values.new_tensor(math.inf if passed == 0 else -math.inf)
     return values.kthvalue(count - passed).values
-
-
-def _speck_profiles(count: int, step: float, place: Tensor, width: Tensor) -> Tensor:
-    """Return the profile of each speck along an axis, (specks, voxels)."""
-    at = (torch.arange(count, device=place.device, dtype=place.dtype) + 0.5) * step
-    return bell((at - place[:, None]) / width[:, None])
 
 
 # ---- noise -----------------------------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -80,7 +80,8 @@ def fit_modality(scan: Field, mask: np.ndarray | None = None) -> Modality:
     structure = _measure_structure(values, inside, steps, ground.level)
     noise = measure_noise(values, inside, ground, steps, ground.level + structure.contrast)
     base = _to_imaging(scan, structure, ground, noise)
-    ranges = {name: _surround(base[name], ends) for name, ends in SPREAD.items() if np.any(base[name])}
+    known = {name: np.asarray(base[name]) for name in SPREAD if np.any(base[name])}
+    ranges = {name: tuple((end * value).tolist() for end in SPREAD[name]) for name, value in known.items()}
     if base.illumination.bias:
         low, high = ranges["illumination.bias"]
         ranges["illumination.bias"] = low, min(high, 1.0)
@@ -200,12 +201,6 @@ def _measure_texture(relative: np.ndarray, inside: np.ndarray, steps: np.ndarray
     width = float(BRIGHTNESS_LENGTHS[int(np.argmin(misfit))])
     length = math.sqrt(max(width**2 - 2 * WINDOW**2, WINDOW**2))
     return math.sqrt(math.expm1(float(covariances[0]) * max(width / length, 1.0))), length
-
-
-def _surround(value: Any, ends: tuple[float, float]) -> tuple[Any, Any]:
-    """Return a number, or each of several, times both ends."""
-    low, high = (tuple(end * v for v in value) if isinstance(value, tuple) else end * value for end in ends)
-    return low, high
 
 
 # ---- noise and background --------------------------------------------------------------------------------------------

@@ -65,8 +65,7 @@ def sampling_matrix(count: int, spacing: float, onto: float, window: float, like
     The corners of both grids' first voxels coincide. A window narrower than a voxel is as wide as one: the means are
     then linear interpolations. `None` where nothing changes.
     """
-    window = max(window, spacing)
-    fits = count_samples(count, spacing, onto)
+    window, fits = max(window, spacing), max(1, math.floor(count * spacing / onto + 1e-6))
     if fits == count and math.isclose(spacing, onto) and math.isclose(window, spacing):
         return None
     centre = (torch.arange(fits, dtype=torch.float64)[:, None] + 0.5) * onto
@@ -74,11 +73,6 @@ def sampling_matrix(count: int, spacing: float, onto: float, window: float, like
     upper, lower = (centre + window / 2).minimum(edge + spacing), (centre - window / 2).maximum(edge)
     weight = (upper - lower).clamp_min(0)
     return (weight / weight.sum(-1, keepdim=True)).to(like)
-
-
-def count_samples(count: int, spacing: float, onto: float) -> int:
-    """Return how many voxels of edge `onto` fit into `count` of edge `spacing`; at least one."""
-    return max(1, math.floor(count * spacing / onto + 1e-6))
 
 
 def as_triple(value: Lengths) -> Triple:
@@ -119,10 +113,7 @@ def grainy_noise(like: Volume, widths: Sequence[float], seed: int, purpose: str)
     """
     noise = white_noise(tuple(like.shape), like, seed, purpose)
     maps = [gaussian_matrix(n, width, like) for n, width in zip(like.shape, widths, strict=True)]
-    return apply_matrices(
-        noise,
-        *(weights if weights is None else weights / weights.square().sum(-1, keepdim=True).sqrt() for weights in maps),
-    )
+    return apply_matrices(noise, *(None if weights is None else _normalise_rows(weights) for weights in maps))
 
 
 def uniform(count: int, seed: int, purpose: str, like: Tensor) -> Tensor:
@@ -144,5 +135,9 @@ def _interpolate_nodes(count: int, length: float, like: Tensor) -> Tensor | None
     step, beyond = max(width, 1.0), math.ceil(4 * width)
     nodes = torch.arange(0, count + 2 * beyond, step, device=like.device, dtype=like.dtype) - beyond
     place = torch.arange(count, device=like.device, dtype=like.dtype)
-    weight = bell((place[:, None] - nodes) / width)
-    return weight / weight.square().sum(-1, keepdim=True).sqrt()
+    return _normalise_rows(bell((place[:, None] - nodes) / width))
+
+
+def _normalise_rows(weights: Tensor) -> Tensor:
+    """Return weights whose rows have a sum of squares of one, which keeps the variance of white noise."""
+    return weights / weights.square().sum(-1, keepdim=True).sqrt()

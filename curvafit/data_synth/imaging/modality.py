@@ -268,13 +268,9 @@ def _interpolate(low: Any, high: Any, share: float) -> Any:
     return tuple(value.tolist()) if value.ndim else float(value)
 
 
-def _load_modalities() -> dict[str, Modality]:
-    content = yaml.safe_load(files("curvafit.data_synth.imaging").joinpath("modalities.yaml").read_text("utf-8"))
-    return {name: Modality.from_dict({"name": name, **part}) for name, part in content.items()}
-
-
+_PRESETS = yaml.safe_load(files("curvafit.data_synth.imaging").joinpath("modalities.yaml").read_text("utf-8"))
 #: The presets of `modalities.yaml` by name, as at the command line.
-MODALITIES = _load_modalities()
+MODALITIES = {name: Modality.from_dict({"name": name, **part}) for name, part in _PRESETS.items()}
 
 
 def modality(name: str) -> Modality:
