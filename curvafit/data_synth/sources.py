@@ -217,8 +217,8 @@ def decode_source(content: dict[str, Any]) -> ShapeSource:
 def choose_voxel(laws: Iterable[LawLike], kind: Modality) -> float:
     """Return the voxel edge, in the modality's unit, that the fitted laws agree on, or else the modality's default.
 
-    A fit whose lengths are in voxels has no edge in a unit of length and is passed over. Raises ValueError where fits
-    differ.
+    A fit whose lengths are in voxels has no edge in a unit of length and is passed over. Fits that differ are a
+    ValueError.
     """
     unit = kind.base.unit
     fits = [(law.working_voxel, law.length_unit) for law in read_laws(laws) if law.working_voxel and law.length_unit]

@@ -50,8 +50,7 @@ PARTIAL, STALE = "partial", 600.0
 
 @dataclass(frozen=True)
 class Settings:
-    """What all draws of a store share: sampling (z, y, x), ε and blur in spacing's unit, the design (`Design.as_dict`)
-    and its seed, and the schedule's fields (name, steps, rates)."""
+    """What all draws of a store share; ε and blur are in spacing's unit, design and schedule as their `as_dict`."""
 
     shape: tuple[int, int, int]
     spacing: tuple[float, float, float]

@@ -59,17 +59,14 @@ def generate_batch(
     """
     jobs, plan = _list_jobs(laws, masses, seeds), named_schedule(schedule)
     grid = grid if isinstance(grid, Grid) else Grid(grid)  # type: ignore[arg-type]
-    options = {
-        "schedule": plan, "epsilon": epsilon, "blur": blur, "reject_early": reject_early, "backend": backend,
-        "device": device,
-    }  # fmt: skip
+    options = {"schedule": plan, "epsilon": epsilon, "blur": blur, "reject_early": reject_early}
+    options |= {"backend": backend, "device": device}
     check_choice(backend, BACKENDS, f"a backend among {', '.join(BACKENDS)}")
     check_device(device)
     size = 1
     if backend in ("torch", "compiled") or not kernels.has_kernel(device):
         size = _count_fitting(grid, device) if together is None else together
-    size = check_int(size, "at least one shape at a time", 1, 10**6)
-    if size == 1:
+    if check_int(size, "at least one shape at a time", 1, 10**6) == 1:
         return (generate(law, mass, grid, seed=seed, **options) for law, mass, seed in jobs)
     groups = [jobs[first : first + size] for first in range(0, len(jobs), size)]
     return (flow for group in groups for flow in _generate_together(group, grid, options))

@@ -53,8 +53,6 @@ class Schedule:
         Phases that come first, in order; the fields above describe the remaining steps. Where a phase shortens memory
         within the first 300 steps or so, the next steps are longer than stated, since Adam corrects its bias by the
         new rate.
-
-    Raises ValueError if a number is out of range, the shape has another name, or the phases' shares leave no rest.
     """
 
     name: str

@@ -39,11 +39,7 @@ def rows_of(measures: Measures) -> list[dict[str, Any]]:
 
 
 def check_table(path: str | PathLike[str], inputs: Sequence[str | Path] = (), overwrite: bool = False) -> Path:
-    """Return the path of a table that may be written.
-
-    Raises ValueError if the suffix is another, or the file is an input or of another origin, without `overwrite`, and
-    ImportError if a Parquet table is to be written without pandas and pyarrow.
-    """
+    """Return the path of a table that may be written, else raise ValueError; ImportError for Parquet without pandas."""
     target = Path(path)
     if target.suffix.lower() not in SUFFIXES:
         raise ValueError(f"the name of a table must end in {', '.join(SUFFIXES)}, got {target}")
@@ -53,10 +49,7 @@ def check_table(path: str | PathLike[str], inputs: Sequence[str | Path] = (), ov
 
 
 def write_table(measures: Sequence[Measures], path: str | PathLike[str], *, overwrite: bool = False) -> Path:
-    """Write a table of scans as `.csv`, `.json` or `.parquet`, and return its path.
-
-    Raises ValueError or ImportError as `check_table`.
-    """
+    """Write a table of scans as `.csv`, `.json` or `.parquet`, and return its path; errors are `check_table`'s."""
     target = check_table(path, overwrite=overwrite)
     rows = [row for each in measures for row in rows_of(each)]
     if target.suffix.lower() == ".parquet":

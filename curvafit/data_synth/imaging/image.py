@@ -22,8 +22,6 @@ def image(
 
     The order is classes, blur, sampling, light, noise. `spacing` is the edge of the field's cubic voxels, in the
     imaging's unit; ε of the field's profile is in voxels.
-
-    Raises ValueError where the field is not a finite (Z, Y, X) of a floating type, or a number is out of range.
     """
     if field.ndim != 3 or not field.is_floating_point() or not torch.isfinite(field).all():
         raise ValueError(f"a field must be finite floats (Z, Y, X), got {field.dtype} {tuple(field.shape)}")

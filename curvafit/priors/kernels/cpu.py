@@ -33,8 +33,7 @@ def fused_energy_gradient(
 ) -> tuple[float, np.ndarray]:
     """Return F_ε(u) and its gradient in float32, as `energy.energy_gradient` does, from arrays `(Z, Y, X)`.
 
-    The coefficients (a20 first) and ε are numbers, or arrays where they vary. Raises ValueError where an array's shape
-    is not the grid's, or the orientation is not symmetric.
+    The coefficients (a20 first) and ε are numbers, or arrays where they vary.
     """
     density = _Density(a, grid, epsilon, _choose_threads(grid), orientation, mask)
     gradient = _make_volume(grid)
@@ -54,18 +53,9 @@ def gaussian_blur(u: np.ndarray, grid: Grid, width: float) -> np.ndarray:
 class FusedFlow:
     """The flow u = k ∗ (div A + base) under Adam on A, stepped in place; its cost is as in `fused_energy_gradient`.
 
-    Parameters
-    ----------
-    start
-        A at the first step, `(3, Z, Y, X)`, components z, y, x; None for zeros, to be filled in place through `vector`.
-    base
-        k ∗ base: the mass m₀, or a blurred field `(Z, Y, X)`.
-    width
-        The blur's standard deviation in spacing's unit.
-    frozen
-        Voxels `(Z, Y, X)` whose A is constant, or None.
-    betas, adam_eps
-        `torch.optim.Adam`'s betas and eps.
+    `start` is A at the first step, `(3, Z, Y, X)`, components z, y, x; None for zeros, to be filled in place through
+    `vector`. `base` is k ∗ base: the mass m₀, or a blurred field. `width` is the blur's standard deviation in spacing's
+    unit; A is constant in `frozen` voxels; `betas` and `adam_eps` are `torch.optim.Adam`'s.
     """
 
     def __init__(
