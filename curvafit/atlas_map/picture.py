@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import ConnectionPatch
@@ -19,7 +18,7 @@ from scipy.spatial.distance import cdist
 
 from curvafit.atlas_map.layout import AtlasMap
 from curvafit.core.files import write_atomically
-from curvafit.drawing.plot import DPI, INK, QUIET
+from curvafit.drawing.plot import DPI, INK, QUIET, make_figure
 from curvafit.drawing.render import render
 
 #: Colours that stay apart for the colour-blind: of families (Okabe & Ito 2008), and of clusters (Tol's muted ones).
@@ -53,8 +52,7 @@ def map_picture(mapped: AtlasMap, field: Callable[[int], np.ndarray], path: str 
 
 def map_figure(mapped: AtlasMap, field: Callable[[int], np.ndarray]) -> Figure:
     """Return a figure of the map, with thumbnails of some shapes around it; `field` as in `map_picture`."""
-    figure = Figure(figsize=(_WIDTH, _HEIGHT), facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = make_figure(_WIDTH, _HEIGHT)
     margin = _CELL + 0.28
     axes = figure.add_axes(
         (margin / _WIDTH, (margin + 0.62) / _HEIGHT, 1 - 2 * margin / _WIDTH, 1 - (2 * margin + 0.62) / _HEIGHT)

@@ -11,8 +11,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from curvafit.core.checks import as_tuple, check_choice, check_int, check_type
 from curvafit.core.files import remove, write_content
@@ -24,7 +22,7 @@ from curvafit.data_synth.case import Case, Recipe
 from curvafit.data_synth.centreline import centreline, write_graphml
 from curvafit.data_synth.labels import NAMES, labels_of
 from curvafit.data_synth.store import check_same
-from curvafit.drawing.plot import CONTOUR, write_picture
+from curvafit.drawing.plot import CONTOUR, make_figure, write_picture
 from curvafit.priors.grid import Grid
 from curvafit.volumes.field import Field
 from curvafit.volumes.read import read_values
@@ -252,8 +250,7 @@ def write_preview(folder: str | Path) -> Path:
     layout = LAYOUTS[read_spec(folder).layout]
     names = [case_name(index) for index in list_cases(folder)[:SHOWN]]
     columns, rows = min(ROW, len(names)), -(-len(names) // ROW)
-    figure = Figure(figsize=(2.4 * columns, 5.0 * rows + 0.3), facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = make_figure(2.4 * columns, 5.0 * rows + 0.3, layout="constrained")
     axes = np.atleast_2d(figure.subplots(2 * rows, columns, squeeze=False))
     for axis in axes.flat:
         axis.set_axis_off()

@@ -44,7 +44,6 @@ TAILS, THIN = (0.5, 99.5), 256
 #: Most values of masks and labels, which are drawn from the least to the greatest.
 FEW = 3
 
-Spacing = tuple[float, float, float]
 Limits = tuple[float, float]
 
 
@@ -53,23 +52,13 @@ Limits = tuple[float, float]
 
 def surface_figure(u: np.ndarray, *, width: int = 720, **options) -> Figure:
     """Return a figure `width` pixels wide of one surface; `options` are those of `surface_on`."""
-    figure = _figure(width / DPI, width / DPI)
+    figure = make_figure(width / DPI, width / DPI)
     surface_on(figure.add_axes((0, 0, 1, 1)), u, width=width, **options)
     return figure
 
 
-def surface_on(
-    axes: Axes,
-    u: np.ndarray,
-    *,
-    spacing: Spacing = (1.0, 1.0, 1.0),
-    level: float = 0.0,
-    width: int = 720,
-    azimuth: float = 32.0,
-    elevation: float = 24.0,
-) -> None:
-    """Draw the level set of a field (or the outline of a bool mask) in its box, cut faces capped."""
-    options = {"spacing": spacing, "level": level, "azimuth": azimuth, "elevation": elevation}
+def surface_on(axes: Axes, u: np.ndarray, *, width: int = 720, **options) -> None:
+    """Draw the level set of a field (or the outline of a bool mask) in its box; `options` are those of `render`."""
     axes.set_axis_off()
     axes.imshow(render_in_box(u, width=width, **options), interpolation="antialiased")
 
@@ -84,7 +73,7 @@ def gallery_figure(fields: Mapping[str, np.ndarray], *, columns: int = 4, width:
     columns = min(columns, len(fields))
     rows = math.ceil(len(fields) / columns)
     cell = width / columns / DPI
-    figure = _figure(cell * columns, 1.13 * cell * rows)
+    figure = make_figure(cell * columns, 1.13 * cell * rows)
     for k, (name, u) in enumerate(fields.items()):
         row, column = divmod(k, columns)
         bottom = 1 - (row + 1) / rows
@@ -108,24 +97,15 @@ def slice_figure(
     axes_names: tuple[str, str],
     window: tuple[float, float, float, float] | None = None,
 ) -> Figure:
-    """Return a figure of a grey slice with the zero contour of `structure` over it.
+    """Return a figure of a grey slice with the zero contour of `structure` over it, and a frame around a `window`.
 
-    Parameters
-    ----------
-    image, structure
-        Two-dimensional, rows first, over the rectangles `image_extent` and `extent` (left, right, bottom, top) in
-        `unit`.
-    limits
-        Grey values shown as black and white.
-    axes_names
-        Names of the vertical and the horizontal axis.
-    window
-        A rectangle to frame, in the order of `extent`.
+    Image and structure are two-dimensional, rows first, over rectangles (left, right, bottom, top) in `unit`. `limits`
+    are the grey values shown as black and white, `axes_names` those of the vertical and the horizontal axis.
     """
     left, right, bottom, top = extent
     ratio = min(max(abs(top - bottom) / abs(right - left), 0.25), 2.0)
     inner, strip = 3.9, 0.36
-    figure = _figure(4.2, inner * ratio + strip + 0.04)
+    figure = make_figure(4.2, inner * ratio + strip + 0.04)
     height = figure.get_figheight()
     axes = figure.add_axes((1 - (inner + 0.02) / 4.2, 0.03 / height, inner / 4.2, inner * ratio / height))
     axes.spines[:].set_color(QUIET)
@@ -175,7 +155,7 @@ def diagram_figure(
     if not diagram.area > 0:
         raise ValueError("the diagram is empty: it has no area to draw")
     unit = diagram.unit.removeprefix("1/") if unit is None else unit
-    figure = _figure(4.2, 4.2)
+    figure = make_figure(4.2, 4.2)
     axes = figure.add_axes((0.16, 0.13, 0.82, 0.85))
     diagram_on(axes, diagram, limits=limits or shared_limits([diagram], length=length), unit=unit, length=length)
     return figure
@@ -260,16 +240,11 @@ def section_figure(
 ) -> Figure:
     """Return a figure of slices across z, y and x, with the scale.
 
-    Parameters
-    ----------
-    rows
-        For each row of pictures, by its title: values (Z, Y, X), and the mask that is outlined over them, or None.
-    spacing, unit
-        Voxel edges (z, y, x), and their unit.
-    places
-        Number of the slice across each axis; by default the middle one.
+    `rows` holds for each row of pictures, by its title, values (Z, Y, X) and the mask that is outlined over them, or
+    None. The spacing is voxel edges (z, y, x) in `unit`; `places` are the numbers of the slices, by default the middle
+    ones.
     """
-    figure = _figure(7.2, 2.5 * len(rows), layout="constrained")
+    figure = make_figure(7.2, 2.5 * len(rows), layout="constrained")
     axes = figure.subplots(len(rows), 3, squeeze=False)
     places = [n // 2 for n in next(iter(rows.values()))[0].shape] if places is None else places
     for row, (title, (values, mask)) in zip(axes, rows.items(), strict=True):
@@ -324,7 +299,7 @@ def corner_figure(
     `limits` are the ends of each parameter's axis; `marks` are at most three points `(d,)` to mark, by name.
     """
     d = draws.shape[1]
-    figure = _figure(_SQUARE * d + 0.7, _SQUARE * d + 0.6)
+    figure = make_figure(_SQUARE * d + 0.7, _SQUARE * d + 0.6)
     grid = figure.add_gridspec(d, d, left=0.09, right=0.985, bottom=0.085, top=0.985, wspace=0.09, hspace=0.09)
     for row in range(d):
         for column in range(row + 1):
@@ -375,7 +350,7 @@ def bands_figure(blocks: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
     """
     columns = 3
     rows = -(-len(blocks) // columns)
-    figure = _figure(10.0, 1.95 * rows, layout="constrained")
+    figure = make_figure(10.0, 1.95 * rows, layout="constrained")
     for place, (name, (own, others)) in enumerate(blocks.items(), 1):
         axes = figure.add_subplot(rows, columns, place)
         at = np.arange(len(own))
@@ -424,7 +399,8 @@ def write_picture(figure: Figure, path: str | Path) -> Path:
     return write_content(Path(path), png(figure))
 
 
-def _figure(width: float, height: float, **options: Any) -> Figure:
+def make_figure(width: float, height: float, **options: Any) -> Figure:
+    """Return an empty white figure, in inches, that is none of pyplot's."""
     figure = Figure(figsize=(width, height), facecolor="white", **options)
     FigureCanvasAgg(figure)
     return figure

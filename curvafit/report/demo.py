@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
@@ -17,7 +16,7 @@ from curvafit.atlas_map.picture import FAMILY_COLOURS
 from curvafit.core.files import write_content
 from curvafit.core.records import can_write, has_mark
 from curvafit.core.runtime import Progress, silent, sub_progress
-from curvafit.drawing.plot import INK, diagram_on, gallery_figure, section_on, shared_limits
+from curvafit.drawing.plot import INK, diagram_on, gallery_figure, make_figure, section_on, shared_limits
 from curvafit.geometry.distances import sliced_embedding
 from curvafit.inference.atlas import load_atlas
 from curvafit.inference.infer import infer
@@ -179,8 +178,7 @@ def _slice_figure(scan: Field, completion: Completion) -> Figure:
     every, n = completion.every, len(completion.truth)
     place = (n // 2 // every) * every + every // 2
     truth, filled = completion.truth[place], completion.filled[place]
-    figure = Figure(figsize=(10.2, 3.9), facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = make_figure(10.2, 3.9, layout="constrained")
     axes = figure.subplots(1, 3)
     plane = np.asarray(scan.values[place], dtype=np.float32)
     low, high = np.percentile(plane, (0.5, 99.5))
@@ -211,8 +209,7 @@ def _map_figure(inference: Inference, atlas: Atlas) -> Figure:
     own = (np.asarray(sliced_embedding(inference.diagram)) - mean) @ axes_of[:2].T
     share = float((spread[:2] ** 2).sum() / (spread**2).sum())
     names, _ = families_of(atlas)
-    figure = Figure(figsize=(10.2, 4.6), facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = make_figure(10.2, 4.6)
     λ, unit = inference.fit.length, inference.fit.length_unit
     left = figure.add_axes((0.07, 0.13, 0.36, 0.78))
     diagram_on(left, inference.diagram, limits=shared_limits([inference.diagram], length=λ), unit=unit, length=λ)

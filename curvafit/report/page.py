@@ -8,7 +8,7 @@ from __future__ import annotations
 import base64
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -289,7 +289,7 @@ def _parameters(inference: Inference) -> list[tuple[str, tuple[str, ...], str]]:
         known, power = intervals.get(name), _TERMS[name][2]
         median = format_number(known["median"]) if known else ""
         scaled = "" if name == "mass" else format_number(physical.as_dict()[name])
-        ranges = _interval(known, "50"), _interval(known, "90")
+        ranges = ("" if known is None else " to ".join(map(format_number, known[level])) for level in ("50", "90"))
         cells = (format_number(value), _deviation(best, name), median, *ranges, scaled)
         rows.append((name, cells, per_unit(fit.length_unit, power) if power else ""))
     return rows
@@ -316,11 +316,6 @@ def _deviation(candidate: Candidate, name: str) -> str:
     """Return a candidate's deviation of a parameter as text, empty where it has none."""
     value = candidate.uncertainty.get(name)
     return "" if value is None else "fixed" if value == 0 else format_number(value, 2)
-
-
-def _interval(known: Mapping[str, Any] | None, level: str) -> str:
-    """Return a posterior's interval of one level as text, empty without a posterior."""
-    return "" if known is None else " to ".join(format_number(end) for end in known[level])
 
 
 def _to_words(value: object) -> str:
