@@ -11,10 +11,11 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-from scipy import ndimage
+import torch
 from scipy.spatial.transform import Rotation
 
 from curvafit.core.checks import as_tuple
+from curvafit.core.extras import require
 from curvafit.core.units import METRES, convert_length
 from curvafit.data_synth.design import PARAMETERS, Design
 from curvafit.data_synth.imaging.modality import Modality
@@ -27,7 +28,7 @@ from curvafit.generation.schedule import schedule as named_schedule
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.priors.kernels.threads import one_thread
-from curvafit.priors.law import LawLike, read_laws
+from curvafit.priors.law import Law, LawLike, read_laws
 
 #: Seeds that are tried for a well-formed shape, and crops for one with both structure and background.
 TRIES, CROPS = 8, 32
@@ -111,9 +112,7 @@ class Generated:
         shares = {law.volume_fraction for law in known}
         if fraction is None and len(shares) == 1:
             (fraction,) = shares
-        # Where a law states no mass, the one that fits the volume fraction.
-        massless = None if fraction is None else first_mass(fraction)
-        points = tuple((law if law.mass is not None else replace(law, mass=massless)).point for law in known)
+        points = tuple(_choose_point(law, fraction) for law in known)
         names = (
             Path(source).name if isinstance(source, (str, PathLike)) else law.origin
             for source, law in zip(stated, known, strict=True)
@@ -228,6 +227,13 @@ def choose_voxel(laws: Iterable[LawLike], kind: Modality) -> float:
     return edges.pop() if edges else kind.voxel
 
 
+def _choose_point(law: Law, fraction: float | None) -> tuple[float, ...]:
+    """Return the seven numbers of a law; where it states no mass, the one that fits the volume fraction."""
+    if law.mass is None and fraction is not None:
+        return replace(law, mass=first_mass(fraction)).point
+    return law.point
+
+
 def _crop_shape(
     choose: Callable[[], tuple[np.ndarray, _Origin]], voxels: Sequence[int], rng: np.random.Generator, rotate: bool
 ) -> tuple[np.ndarray, dict[str, Any], _Origin]:
@@ -276,11 +282,17 @@ def crop_rotated(
 
     The quaternion (x, y, z, w) rotates vectors in the order (z, y, x).
     """
+    kornia = require("kornia.geometry.transform", "synth", "rotating crops")
     turn = Rotation.from_quat(quaternion).as_matrix()
     half = (np.array(shape) - 1) / 2
     margin = np.ceil(np.abs(turn.T) @ half - half).astype(int) + 1
     around = crop_periodic(values, np.array(corner) - margin, np.array(shape) + 2 * margin)
-    return ndimage.affine_transform(around, turn.T, half + margin - turn.T @ half, tuple(shape), order=1)
+    move = np.column_stack([turn, half - turn @ (half + margin)])
+    matrix = torch.from_numpy(np.concatenate([move[::-1, 2::-1], move[::-1, 3:]], axis=1)[None]).float()
+    volume = torch.from_numpy(around)[None, None].float()
+    depth, height, width = (max(int(n), 2) for n in shape)  # grids of one voxel are not defined there
+    part = kornia.warp_affine3d(volume, matrix, (depth, height, width), align_corners=True)[0, 0].numpy()
+    return part[tuple(slice(n) for n in shape)]
 
 
 def random_crop(
