@@ -70,7 +70,7 @@ def page_html(
         "volumes": _join_base64(one.volume for one in shapes),
     }
     data = _page_data(mapped, commands)
-    scale, pieces = _diagrams(mapped.atlas.field_diagrams)
+    scale, pieces = _encode_diagrams(mapped.atlas.field_diagrams)
     data["diagram"]["scale"], blobs["diagrams"] = scale, _join_base64(pieces)
     scale, pieces = _embeddings(mapped)
     data["embedding"]["scale"], blobs["embeddings"] = scale, _join_base64(pieces)
@@ -152,7 +152,7 @@ def _nearest_quantiles(embeddings: np.ndarray) -> list[float]:
     return np.quantile(apart.min(1), [0.5, 0.95]).round(4).tolist()
 
 
-def _diagrams(diagrams: Sequence[Diagram]) -> tuple[float, list[bytes]]:
+def _encode_diagrams(diagrams: Sequence[Diagram]) -> tuple[float, list[bytes]]:
     """Return the step of κ, and each diagram's κ1, κ2 (int16, in steps) and shares of area (uint16, of 65535)."""
     step = max(float(np.abs(diagram.points).max()) for diagram in diagrams) / 32767
     return step, [

@@ -166,7 +166,7 @@ def _with_visible(kind: Modality, share_text: str | None) -> Modality:
     """Return a kind of image whose masks end where a share of the light arrives, if the option is given."""
     if share_text is None:
         return kind
-    from curvafit.data_synth.imaging.image import visible_share
+    from curvafit.data_synth.imaging.image import annotator_threshold
 
-    share = visible_share(kind.base) if share_text == "auto" else parse_numbers(share_text, "--visible", 1)[0]
+    share = annotator_threshold(kind.base) if share_text == "auto" else parse_numbers(share_text, "--visible", 1)[0]
     return replace(kind, base=replace(kind.base, visible=share))

@@ -147,7 +147,7 @@ def centreline(skeleton: np.ndarray, distance: np.ndarray, spacing: Sequence[flo
         _dissolve(graph, node)
     _prune(graph, steps)
     for _ in range(CENTRING):
-        _centre(graph, distance, steps)
+        _move_to_axis(graph, distance, steps)
     return _finish(graph, distance, steps)
 
 
@@ -245,11 +245,11 @@ def _dissolve(graph: nx.MultiGraph, node: int) -> None:
     _add_edge(graph, one, other, np.concatenate([first[:-1], second]))
 
 
-def _centre(graph: nx.MultiGraph, distance: np.ndarray, steps: np.ndarray) -> None:
-    """Move lines across themselves towards the greatest distance, and nodes by the mean move of their lines' ends.
+def _move_to_axis(graph: nx.MultiGraph, distance: np.ndarray, steps: np.ndarray) -> None:
+    """Move each line sideways to the middle of its tube, and each node by the mean move of its lines' ends.
 
-    The distance falls by 1 per voxel off a tube's axis, so that a point is off by half the difference of the values on
-    both sides.
+    Half the difference of the distances one voxel to either side is how far a point is off the axis. A line starts at
+    its node with the lower number.
     """
     moves: dict[int, list[np.ndarray]] = defaultdict(list)
     for one, other, of in graph.edges(data=True):

@@ -49,7 +49,7 @@ RIDGE, FAINTEST = 3.0, 0.05
 FLOOR = 0.1
 
 
-def estimate(
+def estimate_law(
     fit: Fit,
     prepared: Prepared,
     posterior: Posterior,
@@ -70,13 +70,14 @@ def estimate(
     Returns
     -------
     tuple
-        The fit with draws, weak directions, misfit and candidates, the most trusted first; as it is where the
+        The fit with draws, weak directions, misfit and candidates, the most trusted first; the same fit where the
         descriptors cannot be measured. And by block of descriptors the scan's numbers `(k,)` and those of the
         simulations `(n, k)`; None without simulations.
     """
     progress("measuring descriptors", 0.0)
     if (found := _measure_descriptors(prepared)) is None:
         return fit, None
+    # Of a structure that fills over half, the background is described: `turn` gives the law of the structure.
     seen, row, view, turn = found
     progress("reading the posterior", 0.1)
     parameters = posterior.sample(row, view, DRAWS, seed)

@@ -22,7 +22,7 @@ from curvafit.geometry.morphometry import morphometry
 from curvafit.inference.atlas import Atlas, Match, load_atlas, mirror_match, nearest
 from curvafit.inference.candidates import TITLES, Candidate, Twin, best_candidate, twin
 from curvafit.inference.drift import drift
-from curvafit.inference.estimate import estimate, refine_matches
+from curvafit.inference.estimate import estimate_law, refine_matches
 from curvafit.inference.fit import KINDS, Fit
 from curvafit.inference.posterior import Posterior, load_posterior
 from curvafit.inference.simulate import ROUNDS
@@ -176,7 +176,7 @@ def infer(
     if method == "posterior":
         part = sub_progress(progress, 0.1, 0.5)
         options = {"simulations": 0 if fast else simulations, "rounds": rounds, "schedule": schedule}
-        fit, simulated = estimate(fit, prepared, posterior, seed=seed, progress=part, **options)
+        fit, simulated = estimate_law(fit, prepared, posterior, seed=seed, progress=part, **options)
     progress("searching the atlas", 0.5)
     matches = _match(prepared, measured, atlas, exact=method == "match")
     read = fit.candidates if method == "posterior" else refine_matches(prepared, posterior, matches)

@@ -82,7 +82,8 @@ class Process(NamedTuple):
         return min(tried, key=lambda process: process.deviance(values))
 
     def deviance(self, values: np.ndarray) -> float:
-        """Return twice the negative log likelihood of the values, for each column, up to a constant."""
+        """Return twice the negative log likelihood, the mean over columns, of the values it was fitted to, up to a
+        constant."""
         fit = float((values * self.coefficients).sum()) / values.shape[1]
         return fit + 2 * float(np.log(np.diag(self.factor)).sum())
 

@@ -45,7 +45,7 @@ _EDGE = 0.01
 
 
 class Problem(NamedTuple):
-    """Triangles `(6, 6)`, multiplier eliminated: of the equations, and of what the field's error adds to them."""
+    """Upper triangles `(6, 6)`: of the weak equations without the multiplier, and of what the field's error adds."""
 
     columns: np.ndarray
     error: np.ndarray
@@ -203,7 +203,10 @@ def _propagate_error(
 
 
 def total_least_squares(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least singular vector (a20 + a02 > 0) and the singular values of the columns whitened by the error."""
+    """Return the coefficients a `(6,)` with the least |R a| / |N a|, and the singular values of R N⁻¹.
+
+    R are the problem's columns, N its error; the sign is chosen so that a20 + a02 > 0.
+    """
     whitened = np.linalg.solve(problem.error.T, problem.columns.T).T
     _, singular, rows = np.linalg.svd(whitened)
     a = np.linalg.solve(problem.error, rows[-1])

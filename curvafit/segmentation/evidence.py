@@ -89,9 +89,10 @@ def estimate_classes(values: np.ndarray, scan: Field, threshold: float | str = "
 
 
 def grey_evidence(values: np.ndarray, scan: Field, classes: Classes, known: np.ndarray | None = None) -> VoxelEvidence:
-    """Return the evidence of grey levels (Z, Y, X) with known classes: r = (g - t) (c₁ - c₀) / σ².
+    """Return the log-likelihood ratio, inside to outside, of grey levels (Z, Y, X), and smoothed levels to start from.
 
-    Only the voxels in `known`, bool (Z, Y, X), have evidence; by default all.
+    r = (g - t) (c₁ - c₀) / σ² with grey level g, middle t, means c₁ inside and c₀ outside, and noise σ. Voxels outside
+    `known`, bool (Z, Y, X), have the ratio 0, and a level smoothed in from their neighbours.
     """
     steep, sign = np.float32(classes.contrast / classes.noise**2), -1 if classes.contrast < 0 else 1
     ratio, width = (

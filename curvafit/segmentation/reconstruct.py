@@ -260,7 +260,7 @@ class SlicesProblem(Problem):
     level: np.ndarray
 
     @property
-    def parts(self) -> dict[str, object]:
+    def inputs(self) -> dict[str, object]:
         slices, trial = self.slices, self.trial
         numbers = {"places": slices.places, "spacing": slices.spacing, "periodic": slices.periodic}
         springs = {"strength": trial.strength, "pull": trial.pull}
@@ -518,7 +518,7 @@ def reconstruct_labels(
 
 
 def _cut(volume: Field, box: Box) -> Field:
-    """Return the voxels of a box, wherever they lie."""
+    """Crop a volume to a box, without its affine and notes."""
     return replace(volume, values=volume.values[box], affine=None, notes=())
 
 

@@ -266,7 +266,7 @@ class RefineProblem(Problem):
     evidence: VoxelEvidence
 
     @property
-    def parts(self) -> dict[str, object]:
+    def inputs(self) -> dict[str, object]:
         return {"probabilities": digest_of(self.evidence.ratio), "nats": self.trial.strength}
 
     def terms(self, box: Box, place: WorkingGrid) -> tuple[np.ndarray, Evidence]:

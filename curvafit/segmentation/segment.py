@@ -165,7 +165,7 @@ class ScanProblem(Problem):
     evidence: _GreyEvidence
 
     @property
-    def parts(self) -> dict[str, object]:
+    def inputs(self) -> dict[str, object]:
         evidence = self.evidence
         return {"scan": evidence.boxes.digest, "evidence": str(evidence.classes), "nats": self.trial.strength}
 

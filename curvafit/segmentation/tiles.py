@@ -223,8 +223,8 @@ class Problem(ABC):
 
     @property
     @abstractmethod
-    def parts(self) -> dict[str, object]:
-        """What tells the problem from others with the same law and steps, by name."""
+    def inputs(self) -> dict[str, object]:
+        """The inputs besides law and steps, by name: tiles of other inputs are another run's."""
 
     @abstractmethod
     def terms(self, box: Box, place: WorkingGrid) -> tuple[np.ndarray, Data]:
@@ -264,7 +264,7 @@ def lower_volume(
     too, and workers, or a number of processes; by default this process lowers the tiles, one after another.
     """
     trial = problem.trial
-    run = {**problem.parts, "law": trial.law, "steps": trial.steps, "tiles": tiling.counts, "place": tiling.place}
+    run = {**problem.inputs, "law": trial.law, "steps": trial.steps, "tiles": tiling.counts, "place": tiling.place}
     folder = store if tiling.count > 1 else None
     opened = nullcontext(TileStore(tiling.shape)) if folder is None else open_store(folder, tiling.shape, run)
     with _start(workers if tiling.count > 1 else None) as crew, opened as finished:

@@ -10,7 +10,7 @@ import torch
 from exact import Cylinder, Sphere, centres
 
 from curvafit.data_synth.imaging import effects
-from curvafit.data_synth.imaging.image import field_shape, image, regrid, visible, visible_share
+from curvafit.data_synth.imaging.image import annotator_threshold, field_shape, image, regrid, visible
 from curvafit.data_synth.imaging.modality import MODALITIES, Contrast, Imaging, Modality, Optics, modality
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
@@ -100,11 +100,11 @@ def test_masks_of_what_is_seen() -> None:
     clear = (clean - (10 + 0.1 * 50)).abs() > 1e-4
     assert found.dtype == torch.bool and torch.equal(found[clear], clean[clear] > 10 + 0.1 * 50)
     assert float(clear.double().mean()) > 0.99
-    level = 10 + visible_share(how) * 50
+    level = 10 + annotator_threshold(how) * 50
     assert level == pytest.approx((10 * 60) ** 0.5)
     dark = replace(PLAIN, contrast=Contrast(60, 10))
-    assert 60 - visible_share(dark) * 50 == pytest.approx((10 * 60) ** 0.5)
-    assert 0 < visible_share(PLAIN.assign({"contrast.background": 0})) < 0.05
+    assert 60 - annotator_threshold(dark) * 50 == pytest.approx((10 * 60) ** 0.5)
+    assert 0 < annotator_threshold(PLAIN.assign({"contrast.background": 0})) < 0.05
     inside = torch.stack([regrid(u, 1.0, how) for u in FIELDS]) > 0
     assert bool((found | ~inside).all()) and float(found.sum()) > 1.5 * float(inside.sum())
 

@@ -49,11 +49,11 @@ def visible(field: Volume, spacing: float, imaging: Imaging, epsilon: float = EP
     return effects.sample(light, spacing, imaging.spacing, _window(imaging)) > imaging.visible
 
 
-def visible_share(imaging: Imaging) -> float:
-    """Return the share of the structure's light at which an annotator is taken to see the structure.
+def annotator_threshold(imaging: Imaging) -> float:
+    """Return the share of the structure's light in a voxel from which an annotator marks it, for `Imaging.visible`.
 
-    At this share the level is midway, in the logarithm, from the background's to the structure's: 1/2 at faint
-    contrast, less where it is strong.
+    There the grey level is the geometric mean of background and structure: share 1/2 at faint contrast, less where it
+    is strong.
     """
     below, above = imaging.contrast.background, imaging.contrast.foreground
     return 1 / (1 + math.sqrt(above / max(below, 1e-3 * above, 1e-12)))

@@ -313,11 +313,13 @@ def _measure_bias(rest: np.ndarray, weight: np.ndarray, level: float, shape: tup
 def _measure_bins(
     values: np.ndarray, inside: np.ndarray, ground: Background, steps: np.ndarray
 ) -> list[tuple[float, float, int]]:
-    """Return mean, noise variance and number of voxels, by bins of the smoothed level over the structure."""
+    """Return mean level, noise variance and number of voxels of the structure, in bins of its smoothed level."""
     residual = ndimage.convolve(values, RESIDUAL)
     mean = ndimage.gaussian_filter(values, 1.5 * steps.min() / steps)
     top = values.max()
+    # Saturated voxels and their neighbours have no noise to measure.
     used = inside & (ndimage.maximum_filter(values, 3) < top) if (values == top).mean() > 1e-5 else inside
+    # The share of the noise's variance that the filter lets through.
     passed = max(_robust_square(residual[ground.where]), 1e-12) / max(ground.noise, 1e-12)
     found = []
     edges = np.quantile(mean[used], np.linspace(0, 1, BINS + 1)) if used.any() else np.zeros(1)
