@@ -84,7 +84,7 @@ def reconstruct(
     prior: OwnPrior = None,
     every: Annotated[int | None, _what(help="Distance of known slices: with 8, every eighth slice is known.")] = None,
     first: Annotated[int | None, _what(help="Number of the first known slice, with --every; by default 0.")] = None,
-    known: Annotated[str | None, _what("--known", "--slices", help="Or: numbers of the known slices, 0,7,15.")] = None,
+    known: Annotated[str | None, _what("--known", "--slices", help="Or also: numbers of known slices, 0,7,15.")] = None,
     ignore: Annotated[
         int | None, _what(help="Or: the label of voxels that nobody annotated; all others are known.")
     ] = None,
@@ -119,8 +119,8 @@ def reconstruct(
     """Fill a mask between known slices; write it, the probability of each voxel, a picture and a record."""
     if axis.lower() not in ("z", "y", "x"):
         raise ValueError(f"--axis must be z, y or x, got {axis!r}")
-    if (every, known, ignore).count(None) != 2:
-        raise ValueError("give either --every, --known or --ignore: which slices are known, or what is not")
+    if (every is None and known is None) == (ignore is None):
+        raise ValueError("give either --every and --known, which slices are known, or --ignore, what is not")
     if labels is not None and (reading["label"] is not None or suggest):
         raise ValueError("--labels is for several structures; --label and --suggest are for one")
     several = None if labels in (None, "all") else list(parse_whole_numbers(labels, "--labels"))
@@ -209,7 +209,8 @@ def run_job(job: Job, compute: Callable[..., Segmentation], read: Callable[..., 
         check_mask_target(job.out, boxes.frame.unit, **options)  # again, as a format may not hold the unit
         tiling = Tiling.of(boxes.frame, record["epsilon"], record["tile"], periodic=record.get("periodic", False))
         store = job.out.with_name(f".{job.out.name}.curvafit-tiles")
-        with resumable() if tiling.count > 1 else nullcontext():
+        tiles = tiling.count > 1 and (record["job"] != "reconstruct" or job.prior is not None)
+        with resumable() if tiles else nullcontext():
             result = compute(boxes, progress, tile=record["tile"], store=store, workers=job.workers)
         progress("writing", 1.0)
         sure = result.keep_sure(least) if least else None

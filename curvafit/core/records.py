@@ -33,6 +33,8 @@ MARK = "curvafit"
 _HEAD = 4096
 #: Suffixes of two parts; any other suffix is what follows the last dot.
 _DOUBLE = (".nii.gz", ".ome.tif", ".ome.tiff", ".ome.zarr")
+#: Seconds after its record within which a file is the one that was written with it.
+LATER = 10.0
 #: Files of a Zarr group of images that `curvafit.volumes` wrote.
 _WRITTEN = re.compile(r"(\d+/)?zarr\.json|\d+/c(/\d+)*")
 #: What the making of a result from a damaged file may raise.
@@ -148,11 +150,17 @@ class Format:
     def companions(self, target: Path) -> list[str]:
         """Return the names of the files written together with `target`, by its record `sibling(target, ".json")`.
 
-        There are none if the record is not there, is of another format, or does not list `target`.
+        There are none if the record is not there, is of another format, or does not list `target`. A file that somebody
+        changed since is left out.
         """
-        header = _read_header(sibling(target, ".json"))
+        record = sibling(target, ".json")
+        header = _read_header(record)
         names = header.get("files") if header.get("format") == self.name else None
-        return names if isinstance(names, list) and target.name in names else []
+        if not isinstance(names, list) or target.name not in names:
+            return []
+        latest = record.stat().st_mtime + LATER
+        files = {name: target.with_name(str(name)) for name in names}
+        return [name for name, file in files.items() if not file.is_file() or file.stat().st_mtime < latest]
 
 
 def can_write(

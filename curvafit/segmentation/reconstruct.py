@@ -120,9 +120,9 @@ def reconstruct(
         A law as in `segment`, to be tried; by default none. Each law that a fit trusts is tried.
     every, first
         Slices `first`, `first + every`, … along `axis` are known. Before the first known slice and beyond the last, the
-        volume goes on as that slice is.
+        volume goes on as that slice is, or as an image tells.
     known
-        The numbers of the known slices, two or more, in place of `every` and `first`.
+        The numbers of known slices, in place of `every` or besides.
     ignore
         The label of voxels that nobody annotated, in place of `every` and `known`: slices without it are known, two or
         more, and so is each other voxel, in slices along any axis or in parts of slices.
@@ -205,7 +205,7 @@ def reconstruct(
     end, known_slices = _describe_errors(uncertain), f"{len(places)} of {volume.shape[axis]} slices known"
     return Segmentation.of(
         volume, _turn_back(axis, mask), _turn_back(axis, phase), chosen.law, width,
-        (*notes, *_extrapolated(places, volume.shape[axis])),
+        (*notes, *_extrapolated(places, volume.shape[axis], evidence is not None)),
         weight=None, status=f"{said}: {known_slices}, {summary}; {end}", uncertainty=uncertain, image=seen,
     )  # fmt: skip
 
@@ -231,10 +231,13 @@ class _Engine:
         return self.filled[slices]
 
     def level(self, slices: Slices) -> np.ndarray:
-        """Return log-odds over those of the best threshold (Z, Y, X), times the edge of a voxel."""
-        logits = self.logits(slices)
-        least = np.float32(best_log_odds(logits[slices.between]))
-        return np.float32(min(slices.spacing[1:])) * (logits - least)
+        """Return log-odds over those of the best threshold (Z, Y, X), times the edge of a voxel.
+
+        Slices before the first known one and beyond the last have no threshold, unless an image tells them.
+        """
+        logits, told = self.logits(slices), slices.between | (self.evidence is not None)
+        least = best_log_odds(logits[slices.between]) if slices.between.any() else 0.0
+        return (min(slices.spacing[1:]) * (logits - np.where(told, least, 0)[:, None, None])).astype(np.float32)
 
     def run(self, slices: Slices, trial: Trial) -> np.ndarray:
         """Return the phase field (Z, Y, X) of a trial; a law is lowered once, whatever the trial's scores."""
@@ -348,7 +351,7 @@ def _uncertainty(
     inside = slices.keep_known(np.zeros(slices.shape, dtype=bool))
     values = np.where(slices.known_voxels, inside, likely).astype(np.float32)
     suggestions = suggest_slices(entropy(values).sum((1, 2)), slices.places, count, slices.periodic)
-    dice = expected_dice(likely[slices.between], mask[slices.between])
+    dice = expected_dice(likely[slices.between], mask[slices.between]) if slices.between.any() else 1.0
     return Uncertainty(replace(volume, values=_turn_back(axis, values), notes=()), error, suggestions, dice)
 
 
@@ -392,11 +395,12 @@ def _load_example(example: Source, volume: Field, reading: dict[str, Any]) -> Fi
     return field
 
 
-def _extrapolated(places: list[int], length: int) -> tuple[str, ...]:
+def _extrapolated(places: list[int], length: int, image: bool) -> tuple[str, ...]:
     """Return sentences on the slices before the first known one and beyond the last."""
     before, beyond = places[0], length - 1 - places[-1]
-    first = f"Slices before the first known one ({before}) are as that one is."
-    last = f"Slices beyond the last known one ({beyond}) are as that one is."
+    how = "told by the image alone" if image else "as that one is"
+    first = f"Before the first known slice: {before} of the volume, {how}."
+    last = f"Beyond the last known slice: {beyond} of the volume, {how}."
     return *((first,) if before else ()), *((last,) if beyond else ())
 
 

@@ -171,15 +171,16 @@ class Slices:
 
 
 def known_places(length: int, every: int | None, first: int, known: Sequence[int] | None) -> list[int]:
-    """Return the numbers of the known slices, ascending: every `every`-th from `first` on, or those listed in `known`.
+    """Return the numbers of the known slices, ascending: every `every`-th from `first` on, and those listed in `known`.
 
-    Raises `ValueError` if both or neither are given, or they are not two or more slices of the volume.
+    Raises `ValueError` if neither is given, or they are not two or more slices of the volume.
     """
-    if (every is None) == (known is None):
-        raise ScanError(f"give either every or known, the known slices, got {'neither' if every is None else 'both'}")
-    if known is None:
+    if every is None and known is None:
+        raise ScanError("give every or known: which slices are known")
+    known = [*(known or ())]
+    if every is not None:
         every = check_int(_to_int(every), "every, a whole number from 1", 1, MOST)
-        known = range(check_int(_to_int(first), "first, a whole number from 0", 0, MOST), length, every)
+        known += range(check_int(_to_int(first), "first, a whole number from 0", 0, MOST), length, every)
     form = f"known slices that are whole numbers from 0 to {length - 1}"
     places = sorted({check_int(_to_int(number), form, 0, length - 1) for number in known})
     if len(places) < 2:

@@ -17,6 +17,8 @@ NEAR = 3
 STRONGEST = 20.0
 #: Most voxels that the weights are fitted to.
 MOST = 1_000_000
+#: Least threshold, by the Dice of real structures at gaps of 8 to 16 slices.
+LEAST = 0.35
 #: Thresholds that are tried.
 THRESHOLDS = 1000
 #: Log-odds within which a voxel counts for a temperature.
@@ -70,8 +72,11 @@ def expected_dice(probability: np.ndarray, mask: np.ndarray) -> float:
 
 
 def best_log_odds(logits: np.ndarray) -> float:
-    """Return the log-odds of the `best_threshold` of voxels with these log-odds."""
-    return float(logit(best_threshold(expit(logits))))
+    """Return the log-odds of the `best_threshold` of voxels with these log-odds, but not below that of `LEAST`.
+
+    Where structures are thinner than those that taught, probabilities are too small, and so would the threshold be.
+    """
+    return float(logit(max(best_threshold(expit(logits)), LEAST)))
 
 
 def fit_temperature(logits: np.ndarray, inside: np.ndarray) -> float:

@@ -109,6 +109,18 @@ def test_a_program_replaces_only_what_it_wrote(tmp_path: Path) -> None:
         can_write(tmp_path, NOTE, overwrite=True)
 
 
+def test_a_file_that_somebody_changed_is_not_replaced(tmp_path: Path) -> None:
+    form, target = Format("mask-test", title="a record"), tmp_path / "mask.npy"
+    target.write_bytes(b"ours")
+    form.write(tmp_path / "mask.json", {"files": ["mask.npy", "mask.json"]})
+    assert can_write(target, form) == target
+    later = (tmp_path / "mask.json").stat().st_mtime + 60
+    os.utime(target, (later, later))
+    with pytest.raises(ValueError, match="free"):
+        can_write(target, form)
+    assert can_write(target, form, overwrite=True) == target
+
+
 def test_names_beside_a_file() -> None:
     cases = {"a/b.c.nii.gz": "a/b.c.json", "b.STL": "b.json", "b.OME.zarr": "b.json", "b": "b.json", ".b": ".b.json"}
     assert {name: str(sibling(name, ".json")) for name in cases} == cases

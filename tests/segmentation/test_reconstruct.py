@@ -250,7 +250,7 @@ def test_an_axis_and_numbers_of_slices() -> None:
         ({"example": np.zeros((32, 32, 32), dtype=np.uint8), "every": 8}, "empty"),
         ({"example": ball() * np.float32(0.5), "every": 8}, "whole numbers"),
         ({}, "every"),
-        ({"every": 8, "known": [1, 2]}, "every"),
+        ({"known": [3], "ignore": 1}, "ignore"),
         ({"every": 0}, "every"),
         ({"known": [3]}, "two or more"),
         ({"known": [3, 99]}, "31"),
@@ -311,6 +311,20 @@ def test_known_voxels_leave_the_profile_free() -> None:
     assert pytest.approx(np.tanh(0.5 / (2 * np.sqrt(2)))) == MARGIN
 
 
+def test_slices_beyond_the_known_ones_are_as_those_are() -> None:
+    truth = leaning()
+    found = reconstruct(truth.astype(np.uint8), every=8, first=3).mask.values
+    assert np.array_equal(found[:3], np.stack([truth[3]] * 3)) and np.array_equal(found[-4:], np.stack([truth[27]] * 4))
+
+
+def test_more_slices_are_known_besides_every_so_many() -> None:
+    truth = leaning().astype(np.uint8)
+    both = reconstruct(truth, every=8, known=[5, 17]).mask.values
+    assert np.array_equal(both, reconstruct(truth, known=[0, 5, 8, 16, 17, 24]).mask.values)
+    whole = reconstruct(truth, every=1)
+    assert np.array_equal(whole.mask.values, truth > 0) and whole.uncertainty.expected_dice == 1  # type: ignore[union-attr]
+
+
 def test_labels_count_as_inside_and_what_is_extrapolated_is_said() -> None:
     truth = leaning()
     labels = np.where(truth, np.random.default_rng(0).integers(1, 200, truth.shape), 0).astype(np.float32)
@@ -318,11 +332,11 @@ def test_labels_count_as_inside_and_what_is_extrapolated_is_said() -> None:
     found = reconstruct(Field(labels), WILLMORE, every=8.0, first=2, steps=1, stiffness=1e7)  # type: ignore[arg-type]
     plain = reconstruct(Field(truth), WILLMORE, known=[2, 10, 18, 26], steps=1, stiffness=1e7)
     assert np.array_equal(found.mask.values, plain.mask.values) and found.notes == plain.notes
-    assert any("before" in note and "(2)" in note for note in found.notes)
-    assert any("beyond" in note and "(5)" in note for note in found.notes)
+    assert any("Before" in note and "2" in note for note in found.notes)
+    assert any("Beyond" in note and "5" in note for note in found.notes)
     assert "after 1 step:" in found.status
     whole = reconstruct(Field(truth), WILLMORE, known=[0, 15, 31], steps=1, stiffness=1e7)
-    assert not any("beyond" in note for note in whole.notes)
+    assert not any("Beyond" in note for note in whole.notes)
 
 
 # ---- several structures ----------------------------------------------------------------------------------------------
