@@ -141,22 +141,27 @@ def _mesh(field: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.clip(vertices - 1.0, 0, np.array(field.shape) - 1), faces
 
 
-@njit(cache=True)
-def _draw(points, faces, shape):  # pragma: no cover
+def _draw(points: np.ndarray, faces: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Return the number of the nearest face at each pixel, -1 for none, and the weights of that face's corners.
 
     Points `(V, 3)` are row, column and nearness.
     """
-    front, depth = np.full(shape, -1), np.full(shape, -np.inf)
-    weights = np.zeros((*shape, 3), np.float32)
+    front, weights = np.full(shape, -1), np.zeros((*shape, 3), np.float32)
+    _fill_depth(points, faces, front, np.full(shape, -np.inf), weights)
+    return front, weights
+
+
+@njit(cache=True)
+def _fill_depth(points, faces, front, depth, weights):  # pragma: no cover
+    """Draw faces into buffers. It makes no array: Ctrl-C while compiled code returns one ends the process."""
     for face in range(len(faces)):
         a, b, c = points[faces[face, 0]], points[faces[face, 1]], points[faces[face, 2]]
         area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
         if area == 0:
             continue
         low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
-        for i in range(max(0, math.ceil(low[0])), min(shape[0] - 1, math.floor(high[0])) + 1):
-            for j in range(max(0, math.ceil(low[1])), min(shape[1] - 1, math.floor(high[1])) + 1):
+        for i in range(max(0, math.ceil(low[0])), min(len(depth) - 1, math.floor(high[0])) + 1):
+            for j in range(max(0, math.ceil(low[1])), min(depth.shape[1] - 1, math.floor(high[1])) + 1):
                 of_b = ((i - a[0]) * (c[1] - a[1]) - (j - a[1]) * (c[0] - a[0])) / area
                 of_c = ((b[0] - a[0]) * (j - a[1]) - (b[1] - a[1]) * (i - a[0])) / area
                 of_a = 1 - of_b - of_c
@@ -164,7 +169,6 @@ def _draw(points, faces, shape):  # pragma: no cover
                 if min(of_a, of_b, of_c) > -1e-6 and near > depth[i, j]:
                     front[i, j], depth[i, j] = face, near
                     weights[i, j, 0], weights[i, j, 1], weights[i, j, 2] = of_a, of_b, of_c
-    return front, weights
 
 
 # ---- light -----------------------------------------------------------------------------------------------------------
