@@ -39,7 +39,7 @@ from curvafit.inference.fit import Fit
 from curvafit.inference.infer import infer
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.examples import Example
-from curvafit.segmentation.filler import Filler, Raster, Taught, fill
+from curvafit.segmentation.filler import Filler, Taught, fill
 from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.slices import WAYS, Slices
 from curvafit.segmentation.teach import RATE, Whole, WholeLessons, learn
@@ -100,13 +100,10 @@ def by_example(slices: Slices, way: str, example: Field, axis: int) -> np.ndarra
         level = given.level("spline")[places]
         least = max(np.quantile(level, np.linspace(0.3, 0.999, 200)), key=lambda least: dice(level > least, truth))
         return slices.keep_known(slices.level("spline") > least)
-    raster = Raster.of(given)
-    whole = Whole(np.stack([raster.distances(mask) for mask in other.lesson.inside]), given.gap,
-                  given.spacing[0] / raster.pixel)  # fmt: skip
     with torch.random.fork_rng():
         torch.manual_seed(0)
         filler = Filler()
-    learn(filler, WholeLessons([whole], SCRATCH), RATE, workers=0)
+    learn(filler, WholeLessons([Whole.of(other)], SCRATCH), RATE, workers=0)
     logits = fill(slices, Taught(filler, np.array([[2.0, 20.0], [1.0, 1.0]]), {}, 0.0))
     return slices.keep_known(logits > best_log_odds(logits[slices.between]))
 
@@ -146,8 +143,7 @@ def filled(
         mask, likely = (np.moveaxis(each.values, axis, 0) for each in (found.mask, found.probability))
         status = found.status
     else:
-        edges = (truth.spacing[axis], *(h for k, h in enumerate(truth.spacing) if k != axis))
-        slices = Slices(first[places], tuple(places), len(first), edges, truth.unit, told.get("periodic", False))
+        slices = Slices.of(truth, places, axis, told.get("periodic", False))
         mask = by_example(slices, way, example(), axis) if way in TAUGHT else interpolated(slices, way)
         status = ""
     seconds, last = time.perf_counter() - begun, places[-1] + 1

@@ -10,6 +10,7 @@ them. What the real other half teaches is `completion --ways scratch`. $CURVAFIT
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from functools import partial
 from itertools import product
 
@@ -25,7 +26,7 @@ from curvafit.data_synth.store import find_well_formed
 from curvafit.priors.grid import Grid
 from curvafit.segmentation.filler import Taught, fill
 from curvafit.segmentation.slices import WAYS, Slices
-from curvafit.segmentation.teach import Texture, _tremble, teach
+from curvafit.segmentation.teach import Texture, teach, tremble
 from curvafit.segmentation.uncertainty import best_log_odds
 
 TEACHERS = ("laws", "presets", "cuts", "capsules", "all")
@@ -71,10 +72,9 @@ def gains(taught: Taught, hand: bool) -> list[float]:
             for number, block in enumerate(blocks(name, side)[: STRUCTURES[name].targets]):
                 axis = int(block.shape[0] < FEW)
                 truth, places = np.moveaxis(block.values > 0, axis, 0), range(0, block.shape[axis], EVERY)
-                edges = (block.spacing[axis], *(h for k, h in enumerate(block.spacing) if k != axis))
-                random = np.random.default_rng(number)
-                known = np.stack([_tremble(mask, random) if hand else mask for mask in truth[places]])
-                slices = Slices(known, tuple(places), len(truth), edges, block.unit)
+                slices, random = Slices.of(block, places, axis), np.random.default_rng(number)
+                if hand:
+                    slices = replace(slices, inside=np.stack([tremble(mask, random) for mask in slices.inside]))
                 rows = [k for k in range(places[-1]) if k % EVERY]
                 plain = max(dice(slices.level(way)[rows] > 0, truth[rows]) for way in WAYS)
                 logits = fill(slices, taught)[rows]

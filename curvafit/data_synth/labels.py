@@ -195,7 +195,9 @@ def field_distance(field: Tensor, grid: Grid, epsilon: float) -> np.ndarray:
     """
     near = profile_distance(field.detach().cpu().float(), epsilon).contiguous().numpy()
     edges = np.array(grid.spacing, dtype=np.float32)
-    touching, feet, distance = _measure_near(near, edges, grid.periodic)
+    touching, feet = np.zeros(near.shape, dtype=bool), np.zeros((*near.shape, 6), dtype=np.float32)
+    distance = np.full(near.shape, np.nan, dtype=np.float32)
+    _measure_near(near, edges, grid.periodic, touching, feet, distance)
     far = np.isnan(distance)
     seed = _find_nearest(touching, edges, grid.periodic)[far]
     # From the far voxel to the nearest one's point on the surface: the whole offset, and its part along the normal.
@@ -218,16 +220,14 @@ def _find_nearest(touching: np.ndarray, edges: np.ndarray, periodic: bool) -> np
 
 
 @njit(cache=True)
-def _measure_near(near, edges, periodic):  # pragma: no cover
+def _measure_near(near, edges, periodic, touching, feet, distance):  # pragma: no cover
     """Measure the surface near its voxels, from the distance that the profile states, positive inside (`near`).
 
-    Returns the voxels that have a neighbour of the other sign; for each of them its offset to the surface, and then the
-    normal there (…, 6); and the distance of all voxels near the surface, NaN elsewhere.
+    Fills what the caller made: the voxels that have a neighbour of the other sign; for each of them its offset to the
+    surface, and then the normal there (…, 6); and the distance of all voxels near the surface. It returns no array:
+    Ctrl-C while compiled code returns one ends the process.
     """
     shape, widest = near.shape, edges.max()
-    touching = np.zeros(shape, dtype=np.bool_)
-    feet = np.zeros((*shape, 6), dtype=np.float32)
-    distance = np.full(shape, np.nan, dtype=np.float32)
     slope, at = np.zeros(3, dtype=np.float32), np.zeros(3, dtype=np.int64)
     for z, y, x in np.ndindex(shape):
         here = near[z, y, x]
@@ -262,4 +262,3 @@ def _measure_near(near, edges, periodic):  # pragma: no cover
             feet[z, y, x, 3:] = slope / steep
         feet[z, y, x, :3] = -sign * length * feet[z, y, x, 3:]
         distance[z, y, x] = sign * length
-    return touching, feet, distance

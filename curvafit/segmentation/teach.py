@@ -195,7 +195,7 @@ class Lessons(Batches):
         """Return what of a window is shown, and what is to be found."""
         known, truth = window[[0, 1, -2, -1]], window[2:-2]
         if rng.random() < self.mix.trembling:
-            known = np.stack([_tremble(mask, rng) for mask in known])
+            known = np.stack([tremble(mask, rng) for mask in known])
         distances = np.stack([centre_distance(mask, (1.0, 1.0), FAR) for mask in known])
         if rng.random() < self.mix.ends:
             distances[0] = distances[1]
@@ -207,7 +207,7 @@ class Lessons(Batches):
         return distances, step, marks, truth.astype(np.float32)
 
 
-def _tremble(mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def tremble(mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return a mask as a person draws it: shifted by a pixel or so, its outline moved to and fro, with a few specks."""
     wave = ndimage.gaussian_filter(rng.standard_normal(mask.shape, dtype=np.float32), 2.0)
     level = centre_distance(mask, (1.0, 1.0), FAR) + rng.uniform(0, 1.0) * wave / wave.std()
@@ -280,6 +280,13 @@ class Whole:
     gap: int
     step: float
     evidence: np.ndarray | None = None
+
+    @classmethod
+    def of(cls, example: Example) -> Whole:
+        """Return the part of an example that teaches, in the pixels and with the gap of its task."""
+        given, raster = example.task.given, Raster.of(example.task.given)
+        distances = np.stack([raster.distances(mask) for mask in example.lesson.inside])
+        return cls(distances, given.gap, given.spacing[0] / raster.pixel)
 
 
 @dataclass(frozen=True, eq=False)
@@ -458,10 +465,8 @@ def tune(taught: Taught, example: Example, progress: Progress = silent) -> Taugh
     It learns from the example's lesson; on the task it is judged, and its probabilities are calibrated.
     """
     given, truth, places = example.task.given, example.task.truth, list(example.task.places)
-    raster = Raster.of(given)
-    distances = np.stack([raster.distances(mask) for mask in example.lesson.inside])
     filler = copy.deepcopy(taught.filler)
-    lessons = WholeLessons([Whole(distances, given.gap, given.spacing[0] / raster.pixel)], TUNING)
+    lessons = WholeLessons([Whole.of(example)], TUNING)
     learn(filler, lessons, TUNING_RATE, workers=0, progress=lambda _, share: progress("tuning on the example", share))
     tuned = replace(taught, filler=filler)
     volumes = [fill(given, each)[places] for each in (taught, tuned)]
