@@ -40,7 +40,7 @@ from curvafit.segmentation.slices import (
     require_labels,
 )
 from curvafit.segmentation.teach import tune
-from curvafit.segmentation.tiles import Problem, Tiling, lower_volume
+from curvafit.segmentation.tiles import Problem, Tiling, check_edge, lower_volume
 from curvafit.segmentation.trials import Task, Trial, choose_by_masks, leave_out_slices
 from curvafit.segmentation.uncertainty import (
     best_log_odds,
@@ -162,7 +162,7 @@ def reconstruct(
     if stiffness is not None:
         stiffness = check_float(stiffness, "a positive stiffness", *STIFFEST)
     laws, notes = ((), ()) if prior is None else laws_of(prior, volume)
-    width = choose_epsilon(volume, epsilon)
+    width, tile = choose_epsilon(volume, epsilon), check_edge(tile)
     taught, other = Taught.load(filler, image=image is not None), None
     evidence = seen = None
     if image is not None:

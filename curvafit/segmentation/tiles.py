@@ -77,6 +77,12 @@ class Tile:
         return tuple(slice(c.start - b.start, c.stop - b.start) for c, b in pairs)  # type: ignore[return-value]
 
 
+def check_edge(edge: int | None) -> int | None:
+    """Return the edge of a tile in working voxels, if one is given; raise ValueError unless it is from `SHORTEST`."""
+    form = f"a tile of {SHORTEST} or more working voxels a side"
+    return None if edge is None else check_int(edge, form, SHORTEST, MOST)
+
+
 @dataclass(frozen=True)
 class Tiling:
     """A volume of `shape` voxels in tiles: `counts` along each axis, whose sizes differ by a voxel at most.
@@ -96,9 +102,8 @@ class Tiling:
         `WorkingGrid.of`, or if the edge is not a whole number from `SHORTEST`.
         """
         place = WorkingGrid.of(frame, epsilon, halo=HALO, periodic=periodic)
-        if edge is None:
-            edge = max(place.grid.shape) if math.prod(place.grid.shape) <= WHOLE else EDGE
-        edge = check_int(edge, f"a tile of {SHORTEST} or more working voxels a side", SHORTEST, MOST)
+        whole = max(place.grid.shape) if math.prod(place.grid.shape) <= WHOLE else EDGE
+        edge = check_edge(whole if edge is None else edge) or whole
         pairs = zip(frame.shape, place.times, strict=True)
         return cls(frame.shape, place, tuple(-(-n // max(1, edge // times)) for n, times in pairs))  # type: ignore[arg-type]
 

@@ -88,6 +88,8 @@ def test_large_volumes_have_tiles() -> None:
 def test_a_tile_s_edge_is_checked() -> None:
     with pytest.raises(ValueError, match="tile"):
         reconstruct(beads(), WILLMORE, every=8, stiffness=1e7, tile=7)
+    with pytest.raises(ValueError, match="tile"):
+        reconstruct(beads(), every=8, tile=7)
 
 
 # ---- starts ----------------------------------------------------------------------------------------------------------
