@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap, LogNorm
@@ -35,6 +36,8 @@ CONTOUR, DIAGONAL, INK = "#E69F00", "#C8372D", "#22262B"
 DENSITY = LinearSegmentedColormap.from_list(
     "density", ["#E3ECF5", "#A9CBE3", "#5AA2CB", "#2B6FA8", "#1B3F7A", "#16193F"]
 )
+#: Colours of labels from 0 on, which begin again after the last.
+LABELS = np.vstack([(0, 0, 0, 1), colormaps["tab20"](np.arange(20))])
 #: Bins along each axis of a drawn diagram, and decades that its colours span.
 BINS, DECADES = 72, 3.0
 #: The colour of draws, and the width in inches of one square of a corner plot.
@@ -237,12 +240,13 @@ def section_figure(
     spacing: Sequence[float],
     unit: str,
     places: Sequence[int] | None = None,
+    labelled: Sequence[str] = (),
 ) -> Figure:
     """Return a figure of slices across z, y and x, with the scale.
 
     `rows` holds for each row of pictures, by its title, values (Z, Y, X) and the mask that is outlined over them, or
     None. The spacing is voxel edges (z, y, x) in `unit`; `places` are the numbers of the slices, by default the middle
-    ones.
+    ones. Rows of the titles in `labelled` hold labels, each drawn in a colour of its own.
     """
     figure = make_figure(7.2, 2.5 * len(rows), layout="constrained")
     axes = figure.subplots(len(rows), 3, squeeze=False)
@@ -255,6 +259,7 @@ def section_figure(
         low, high = levels[[0, -1]] if len(levels) <= FEW else np.percentile(thinned, TAILS)
         for axis in range(3):
             plane = np.take(values, places[axis], axis)
+            plane = LABELS[np.where(plane, (plane - 1) % (len(LABELS) - 1) + 1, 0)] if title in labelled else plane
             outline = None if mask is None else np.take(mask, places[axis], axis)
             edges = [spacing[other] for other in range(3) if other != axis]
             section_on(row[axis], plane, outline, (low, high), edges[0] / edges[1])
@@ -279,7 +284,7 @@ def _scale_on(axes: Axes, edge: float, unit: str) -> None:
 
 
 def section_on(axes: Axes, plane: np.ndarray, outline: np.ndarray | None, limits: Limits, aspect: float) -> None:
-    """Draw a slice, with the outline of a mask; `limits` are the values that are black and white."""
+    """Draw a slice, grey or (Y, X, RGBA), with the outline of a mask; `limits` are the levels of black and white."""
     low, high = limits
     plane, high = plane.astype(np.float32), max(high, low + 1e-6)
     axes.imshow(plane, cmap="gray", vmin=low, vmax=high, aspect=aspect, interpolation="nearest")

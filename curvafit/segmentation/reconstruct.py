@@ -202,11 +202,14 @@ def reconstruct(
     uncertain = _uncertainty(*likely, mask, target, volume, axis, suggest)
     if uncertain.expected_dice < HALF:
         notes = (*notes, "Known slices lie too far apart: what lies between them is more unknown than known.")
-    end, known_slices = _describe_errors(uncertain), f"{len(places)} of {volume.shape[axis]} slices known"
+    said = f"{said}: {len(places)} of {volume.shape[axis]} slices known, {summary}; {_describe_errors(uncertain)}"
     return Segmentation.of(
         volume, _turn_back(axis, mask), _turn_back(axis, phase), chosen.law, width,
-        (*notes, *_extrapolated(places, volume.shape[axis], evidence is not None)),
-        weight=None, status=f"{said}: {known_slices}, {summary}; {end}", uncertainty=uncertain, image=seen,
+        (
+            *_doubt_places(volume, axis, places, every), *_doubt_labels(volume, axis, places, ignore), *notes,
+            *_extrapolated(places, volume.shape[axis], evidence is not None),
+        ),
+        weight=None, status=said, uncertainty=uncertain, image=seen,
     )  # fmt: skip
 
 
@@ -307,6 +310,25 @@ def _find_known(
     if every is not None or known is not None:
         raise ScanError("give either every, known or ignore")
     return annotated_slices(np.moveaxis(volume.values, axis, 0), check_int(ignore, "a label to ignore", -SEEDS, SEEDS))
+
+
+def _doubt_places(volume: Field, axis: int, places: list[int], every: int | None) -> tuple[str, ...]:
+    """Return a sentence where few slices have labels, and some of them are not every `every`-th."""
+    labelled = np.flatnonzero((np.moveaxis(volume.values, axis, 0) > 0).any((1, 2)))
+    strange = sorted(set(labelled.tolist()) - set(places))
+    if every is None or not strange or 2 * len(labelled) > np.ptp(labelled) + 1:
+        return ()
+    numbers = ", ".join(map(str, strange[:FEW])) + (", …" if len(strange) > FEW else "")
+    few = f"Only {len(labelled)} of {volume.shape[axis]} slices have labels, but {numbers} are not among the known ones"
+    return (f"{few}: if those are what you annotated, another every or first is meant, or known.",)
+
+
+def _doubt_labels(volume: Field, axis: int, places: list[int], ignore: int | None) -> tuple[str, ...]:
+    """Return a sentence where known slices have several labels, which are filled as one structure."""
+    values = np.unique(np.moveaxis(volume.values, axis, 0)[places])
+    count = np.count_nonzero((values > 0) & (values != ignore))
+    how = "reconstruct_labels, or --labels all, fills each by itself"
+    return (f"The known slices have {count} labels, which are filled as one structure: {how}.",) if count > 1 else ()
 
 
 def _pose_task(slices: Slices, example: Example | None) -> Task[Slices]:
@@ -464,6 +486,7 @@ def reconstruct_labels(
     known_voxels = _turn_back(axis, mark_known(moved.shape, places, marks))
     numbers = find_labels(moved[places], chosen)
     full = bool(np.isin(moved[places], numbers).all())
+    misplaced = _doubt_places(volume, axis, places, every)
     other = None if example is None else _load_example(example, volume, {"spacing": spacing, "unit": unit})
     seen = None if image is None else _load_image(image, volume, {"spacing": spacing, "unit": unit})
     laws = prior if isinstance(prior, Mapping) else dict.fromkeys(numbers, prior)
@@ -513,6 +536,7 @@ def reconstruct_labels(
         status=_describe_labels(parts, dice),
         notes=(
             *volume.notes,
+            *misplaced,
             *(text if len(of) == len(numbers) else f"{_name_labels(of)}: {text}" for text, of in notes.items()),
         ),
         labels=replace(volume, values=values, notes=()),
@@ -569,11 +593,11 @@ def find_labels(values: np.ndarray, chosen: Sequence[int] | None) -> list[int]:
 
     Raises `ScanError` if the values are grey levels, a chosen label is missing, or there is none but 0.
     """
+    if chosen is not None:
+        chosen = sorted({check_int(n, "labels that are whole numbers", -SEEDS, SEEDS) for n in chosen})
+        values = np.where(np.isin(values, chosen), values, 0)  # of the others there may be any number
     found = [int(value) for value in np.unique(require_labels(values, "the known slices"))]
-    if chosen is None:
-        numbers = [number for number in found if number]
-    else:
-        numbers = sorted({check_int(n, "labels that are whole numbers", -SEEDS, SEEDS) for n in chosen})
+    numbers = [number for number in found if number] if chosen is None else chosen
     listed = ", ".join(map(str, found[:12])) + (", …" if len(found) > 12 else "")
     if not numbers or 0 in numbers:
         raise ScanError(f"labels must be other than 0, got {'0' if numbers else f'{listed} in the known slices'}")

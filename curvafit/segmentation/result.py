@@ -275,7 +275,7 @@ def _figure(segmentation: Segmentation, rows: Mapping[str, tuple[np.ndarray, np.
         known = np.where(unsure == 0, 2 * mask.values.astype(np.int8) - 1, 0)
         shown = {"known, filled": (known, mask.values)}
     shown["how unsure"] = (unsure, mask.values)
-    return section_figure(shown, mask.spacing, mask.unit, places)
+    return section_figure(shown, mask.spacing, mask.unit, places, ["filled"])
 
 
 def _map_path(target: Path, name: str) -> Path:
