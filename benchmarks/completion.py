@@ -56,7 +56,7 @@ LAWS_TRIED = {"willmore": Coefficients.willmore(), "area": Coefficients(0.05, 0.
 #: Ways of `reconstruct`, and others that need an example: neither is a plain interpolation.
 OURS, TAUGHT = ("filler", "careful", "tuned", "law", *LAWS_TRIED), ("offset", "scratch")
 #: Steps of the network that an example alone teaches.
-SCRATCH = 600
+SCRATCH = 300
 #: What is kept of each case.
 FIGURES = ("dice", "betti", "thickness", "calibration", "seconds")
 #: Sides of structures on which the network's mix and the threshold were chosen.
