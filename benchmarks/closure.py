@@ -12,6 +12,10 @@ folds alone, all its views being in one fold. Methods: `match`, the nearest trai
 
 `--gallery` ($CURVAFIT_DATA) asks the packaged posterior, and its emulator's best fit, for the author's
 volumes as masks; the deviations are those of its box.
+
+`--unseen STORE…` asks the packaged posterior for laws that no choice has seen: shapes of 64³ as masks, crops and scans
+(or `--views`), and of larger stores as windows. Intervals are of the bootstrap over laws. Combinations of parameters
+are the directions of least error against the prior's variance, found on every second law and tested on the others.
 """
 
 from __future__ import annotations
@@ -22,20 +26,35 @@ import re
 import warnings
 import zlib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy import stats
+import torch
+from scipy import linalg, stats
 
 from benchmarks.harness import Cases, Figure, Values, show
-from curvafit.geometry.descriptors import descriptors
+from curvafit.data_synth.store import Store, find_well_formed
+from curvafit.geometry.descriptors import BLOCKS, descriptors
+from curvafit.geometry.diagram import FAMILIES, diagram, family_shares, half_thickness, leading_family
+from curvafit.geometry.mesh import NoSurface
 from curvafit.inference.emulator import best_parameters
 from curvafit.inference.posterior import Architecture, Posterior, load_posterior
-from curvafit.inference.table import PARAMETERS, Table, column_names, compression_of, load_table, parameters_of
+from curvafit.inference.table import (
+    PARAMETERS,
+    VIEWS,
+    Table,
+    View,
+    column_names,
+    compression_of,
+    load_table,
+    parameters_of,
+)
 from curvafit.inference.training import train_posterior
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
+from curvafit.volumes.field import ScanError
 
 DRAWS, STARTS, MEMBERS, FOLDS = 400, 16, 4, 5
 
@@ -222,6 +241,105 @@ def on_gallery(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
             for parameter, value in zip(SLUGS, row["error"], strict=True)}  # fmt: skip
 
 
+# ---- laws that no choice has seen ------------------------------------------------------------------------------------
+
+#: Intervals of the corner of the box in which the presets lie.
+CORNER = {"log a02": (np.log(0.25), np.log(15)), "a10": (-80, 80), "a01": (-80, 80), "a00": (-500, 1000)}
+
+
+def see_window(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
+    """Return {u > 0}, not told that it repeats: `infer` sees a larger scan so."""
+    return View(u > 0, Grid(grid.shape, grid.spacing, "replicate"))
+
+
+def unseen_table(paths: list[Path], view: str, cases: Cases) -> tuple[Table, np.ndarray]:
+    """Return the descriptors of the well-formed shapes of stores in a view, and the families of the shapes."""
+    see, rows, laws, names = {**VIEWS, "window": see_window}[view], [], [], []
+
+    def measured(store: Store, index: int) -> np.ndarray:
+        field, grid = store.field(index), Grid(store.settings.shape)
+        own = diagram(torch.from_numpy(field), grid, store.settings.epsilon)
+        shares = family_shares(own, half_thickness(own, float((field > 0).mean()) * grid.volume))
+        try:
+            seen = see(field, grid, np.random.default_rng([zlib.crc32(view.encode()), index]))
+            return np.append(descriptors(*seen).vector(), FAMILIES.index(leading_family(shares)))
+        except (ScanError, NoSurface):
+            return np.full(sum(BLOCKS.values()) + 1, np.nan)
+
+    for store, index in find_well_formed(tuple(paths)):
+        names.append(f"{store.name}-{index}")
+        rows.append(cases.array(f"unseen-{names[-1]}-{view}", partial(measured, store, index)))
+        laws.append(parameters_of(store.record(index).coefficients, store.record(index).mass))
+    found, shown = np.array(rows), np.isfinite(rows).all(1)
+    table = Table(np.array(names), np.array([view] * len(rows)), np.array(laws), found[:, :-1], {})
+    return table.rows(shown), np.array(FAMILIES)[found[shown, -1].astype(int)]
+
+
+def unseen_answers(paths: list[Path], view: str, cases: Cases) -> Values:
+    """Return laws, families, errors, truths and widths, in deviations of the prior, and whether intervals hold."""
+    (table, families), trained = unseen_table(paths, view, cases), load_posterior()
+    prior, truth = trained.emulator.deviation, table.parameters
+    draws = trained.sample(table.descriptors, "crop" if view == "window" else view, DRAWS)
+    least, most = np.quantile(draws, (0.05, 0.95), axis=1)
+    laws = [f"{zlib.crc32(np.round(row, 6).tobytes()):08x}" for row in truth]
+    columns = ((truth[:, PARAMETERS.index(name)], interval) for name, interval in CORNER.items())
+    inside = [(low <= column) & (column <= high) for column, (low, high) in columns]
+    one = np.unique(laws, return_index=True)[1]  # queries of one law are not independent
+    return {
+        "law": laws,
+        "family": families.tolist(),
+        "corner": np.logical_and.reduce(inside).tolist(),
+        "error": np.round((np.median(draws, axis=1) - truth) / prior, 3).tolist(),
+        "truth": np.round((truth - trained.emulator.centre) / prior, 3).tolist(),
+        "width": np.round((most - least) / prior, 3).tolist(),
+        "in 90": ((least <= truth) & (truth <= most)).tolist(),
+        "TARP": list(tarp(truth[one], draws[one])),
+    }
+
+
+def over_laws(values: np.ndarray, laws: np.ndarray, statistic: Callable[..., np.ndarray]) -> list[Figure]:
+    """Return a statistic of queries' values (N, k), by column, with the intervals of the bootstrap over laws."""
+    rows, random = [values[laws == law] for law in np.unique(laws)], np.random.default_rng(0)
+    drawn = [statistic(np.concatenate([rows[k] for k in random.integers(len(rows), size=len(rows))]), axis=0)
+             for _ in range(1000)]  # fmt: skip
+    return list(map(Figure, statistic(values, axis=0), *np.quantile(drawn, (0.025, 0.975), axis=0)))
+
+
+def combinations_known(error: np.ndarray, truth: np.ndarray, laws: np.ndarray) -> np.ndarray:
+    """Return the R² of the six combinations that are known best, found on every second law and tested on the others."""
+    half, found = np.isin(laws, np.unique(laws)[::2]), []
+    for learnt, tested in ((half, ~half), (~half, half)):
+        directions = linalg.eigh(np.cov(error[learnt].T), np.cov(truth[learnt].T))[1]
+        left, whole = error[tested] @ directions, truth[tested] @ directions
+        found.append(1 - np.square(left).mean(0) / whole.var(0))
+    return np.mean(found, axis=0)
+
+
+def on_unseen(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
+    views, figures = options.views.split(","), {}
+    found = cases.all({f"unseen-{view}": partial(unseen_answers, options.unseen, view, cases) for view in views})
+    for view, row in ((name.removeprefix("unseen-"), row) for name, row in found.items()):
+        laws, families, corner = (np.array(row[key]) for key in ("law", "family", "corner"))
+        error, truth, inside = (np.array(row[key], dtype=float) for key in ("error", "truth", "in 90"))
+        table, off = [], np.abs(error)
+        parts = {"all": laws != "", "corner": corner, **{name: families == name for name in np.unique(families)}}
+        for name, part in parts.items():
+            if len(np.unique(laws[part])) < 2:
+                continue
+            median, held = over_laws(off[part], laws[part], np.median), over_laws(inside[part], laws[part], np.mean)
+            table += [[f"{name}: error", *median], ["in 90", *held]]
+            if name == "all":
+                key = f"unseen.{view}"
+                figures |= {f"{key}.error.{slug}": each for slug, each in zip(SLUGS, median, strict=True)}
+                figures |= {f"{key}.in90.{slug}": each for slug, each in zip(SLUGS, held, strict=True)}
+        known = combinations_known(error, truth, laws)
+        figures |= {f"unseen.{view}.combination.{k + 1}": Figure(value) for k, value in enumerate(known)}
+        figures |= {f"unseen.{view}.tarp": Figure(row["TARP"][0]), f"unseen.{view}.tarp_p": Figure(row["TARP"][1])}
+        table += [["width", *np.mean(row["width"], axis=0)], ["R² of combinations", *known]]
+        show([view, *PARAMETERS], table, f"{len(laws)} queries of {len(np.unique(laws))} laws; TARP {row['TARP']}")
+    return figures
+
+
 # ---- runs ------------------------------------------------------------------------------------------------------------
 
 #: Names of the parameters in the ledger.
@@ -233,12 +351,15 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--views", default="mask,crop,scan")
     parser.add_argument("--methods", default=",".join(METHODS))
     parser.add_argument("--gallery", action="store_true")
+    parser.add_argument("--unseen", type=Path, nargs="+", help="stores of laws that no choice has seen")
 
 
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     warnings.filterwarnings("ignore", module="sklearn")
     if options.gallery:
         return on_gallery(options, cases)
+    if options.unseen:
+        return on_unseen(options, cases)
     if options.table is None:
         raise SystemExit("name a table with --table (curvafit atlas describe makes one), or --gallery")
     views, folds = options.views.split(","), 2 if options.quick else FOLDS
