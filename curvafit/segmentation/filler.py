@@ -215,12 +215,29 @@ class Filler(nn.Module):
         volumes = [stack, known]
         if seen is not None:
             volumes.append(F.pad(seen / _DISTANCE, (0, 0, 0, 0, 1, 1)))
-        return _trim(logits + self.through(torch.stack(volumes, dim=1))[:, 0, 1:-1], rim)
+        x = torch.stack(volumes, dim=1)
+        for part in self.through:
+            x = _convolve(part, x) if isinstance(part, nn.Conv3d) else part(x)
+        return _trim(logits + x[:, 0, 1:-1], rim)
 
 
 def _trim(x: Tensor, pixels: int) -> Tensor:
     """Drop pixels at the borders of the last two axes."""
     return x[..., pixels : x.shape[-2] - pixels, pixels : x.shape[-1] - pixels]
+
+
+def _convolve(part: nn.Conv3d, x: Tensor) -> Tensor:
+    """Return a convolution in 3D, (B, c, Z, Y, X), as one in 2D of slices with their neighbours as channels.
+
+    With few channels and slices that is five times as fast on a processor.
+    """
+    size, count = part.kernel_size[0], x.shape[2]
+    margin = size // 2
+    padded = F.pad(x, (0, 0, 0, 0, margin, margin))
+    near = torch.cat([padded[:, :, k : k + count] for k in range(size)], dim=1)
+    planes = near.transpose(1, 2).flatten(0, 1).contiguous(memory_format=torch.channels_last)
+    weight = part.weight.transpose(1, 2).flatten(1, 2).contiguous(memory_format=torch.channels_last)
+    return F.conv2d(planes, weight, part.bias, padding=margin).unflatten(0, (-1, count)).transpose(1, 2)
 
 
 def _double(x: Tensor) -> Tensor:
