@@ -33,6 +33,7 @@ import torch
 from scipy import ndimage
 
 from benchmarks.harness import Cases, Figure, Values, bootstrap, dice, scores, show
+from curvafit.data_synth.design import design_box
 from curvafit.generation.flow import generate
 from curvafit.geometry.morphometry import local_thickness
 from curvafit.inference.fit import Fit
@@ -48,6 +49,10 @@ from curvafit.volumes.field import Field
 from curvafit.volumes.read import load
 
 LAWS = ("tubes", "trabec", "sponge", "metatubes", "pearls", "sieve", "flow", "bilayers")
+#: Draws of the paper's box, with log a02, that no network and no choice has seen: the seed of Sobol's sequence, and the
+#: first twenty that grow shapes.
+SOBOL = 4100
+DRAWN = tuple(f"draw-{k}" for k in (0, 1, 2, 5, 6, 9, 11, 12, 13, 20, 21, 22, 24, 26, 29, 34, 37, 38, 44, 45))
 EDGE = 64
 ITK = "ITK"
 #: Laws that are tried where not the example's own. The area alone would let surfaces crumple: it has a twentieth of
@@ -56,7 +61,7 @@ LAWS_TRIED = {"willmore": Coefficients.willmore(), "area": Coefficients(0.05, 0.
 #: Ways of `reconstruct`, and others that need an example: neither is a plain interpolation.
 OURS, TAUGHT = ("filler", "careful", "tuned", "law", *LAWS_TRIED), ("offset", "scratch")
 #: Steps of the network that an example alone teaches.
-SCRATCH = 300
+SCRATCH = 600
 #: What is kept of each case.
 FIGURES = ("dice", "betti", "thickness", "calibration", "seconds")
 #: Sides of structures on which the network's mix and the threshold were chosen.
@@ -100,12 +105,18 @@ def by_example(slices: Slices, way: str, example: Field, axis: int) -> np.ndarra
         level = given.level("spline")[places]
         least = max(np.quantile(level, np.linspace(0.3, 0.999, 200)), key=lambda least: dice(level > least, truth))
         return slices.keep_known(slices.level("spline") > least)
+    logits = fill(slices, Taught(scratch(example, slices.places, axis), np.array([[2.0, 20.0], [1.0, 1.0]]), {}, 0.0))
+    return slices.keep_known(logits > best_log_odds(logits[slices.between]))
+
+
+@cache
+def scratch(example: Field, places: tuple[int, ...], axis: int) -> Filler:
+    """Return the network that an example alone taught; blocks of one side have one."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
         filler = Filler()
-    learn(filler, WholeLessons([Whole.of(other)], SCRATCH), RATE, workers=0)
-    logits = fill(slices, Taught(filler, np.array([[2.0, 20.0], [1.0, 1.0]]), {}, 0.0))
-    return slices.keep_known(logits > best_log_odds(logits[slices.between]))
+    learn(filler, WholeLessons([Whole.of(Example.of(example, places, axis))], SCRATCH), RATE, workers=0)
+    return filler
 
 
 # ---- generated shapes ------------------------------------------------------------------------------------------------
@@ -115,7 +126,11 @@ def shape(law: str, seed: int, cases: Cases) -> np.ndarray:
     """Return a mask of a law, grown once for all topics."""
 
     def grow() -> np.ndarray:
-        return np.packbits(generate(law, grid=EDGE, schedule="deep", seed=seed).field.numpy() > 0)
+        known: tuple[Any, ...] = (law,)
+        if law.startswith("draw-"):
+            draw = design_box("sobol", ["a02"]).draw(SOBOL, int(law.removeprefix("draw-")))
+            known = (draw.coefficients, draw.mass)
+        return np.packbits(generate(*known, grid=EDGE, schedule="deep", seed=seed).field.numpy() > 0)
 
     packed = cases.of("completion").array(f"shape-{law}-{seed}", grow)
     return np.unpackbits(packed).reshape(EDGE, EDGE, EDGE) > 0
@@ -166,6 +181,7 @@ def shape_case(way: str, law: str, seed: int, every: int, periodic: bool, cases:
 def on_shapes(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     ways = [*plain_ways(), *(way for way in options.ways.split(",") if way in OURS + TAUGHT)]
     laws, every, seed = options.laws.split(","), options.every, options.target
+    group, laws = ("drawn", DRAWN) if laws == ["drawn"] else ("shapes", laws)
     if options.quick:
         laws, ways = laws[:1], ["spline", "filler"]
     figures: dict[str, Figure] = {}
@@ -175,7 +191,7 @@ def on_shapes(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
             name: partial(shape_case, way, law, seed, every, kind == "box", cases) for (law, way), name in names.items()
         }
         figures |= gains(
-            f"{kind}s, every {every}", names, cases.all(jobs, seed), ways, f"shapes.{{way}}.{kind}_{{key}}"
+            f"{kind}s, every {every}", names, cases.all(jobs, seed), ways, f"{group}.{{way}}.{kind}_{{key}}"
         )
     return figures if (every, seed) == (8, 2) else {}
 
@@ -329,7 +345,7 @@ def on_scans(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
 
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--on", choices=("shapes", "scans"), default="shapes")
-    parser.add_argument("--laws", default=",".join(LAWS), help="of shapes")
+    parser.add_argument("--laws", default=",".join(LAWS), help="of shapes, or drawn: twenty random ones")
     parser.add_argument("--kinds", default="crop,box", help="of shapes")
     parser.add_argument("--only", default=",".join(STRUCTURES), help="structures of scans")
     parser.add_argument("--every", type=int, default=8)

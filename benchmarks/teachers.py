@@ -90,7 +90,7 @@ def case(teacher: str, seed: int, steps: int, cases: Cases) -> Values:
 
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--teachers", default=",".join(TEACHERS))
-    parser.add_argument("--steps", type=int, default=300)
+    parser.add_argument("--steps", type=int, default=600)
 
 
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
