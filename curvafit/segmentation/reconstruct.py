@@ -73,6 +73,7 @@ HALF = 0.5
 GREY, SAMPLED = 8, 1_000_000
 #: Least share of the entropy of slices held out that an image takes away: that of the structure takes half or more.
 TOLD = 0.1
+UNTOLD = "The image does not tell the structure in annotated slices held out: it is left out."
 #: Labels whose status is told one by one; voxels around a label's box.
 FEW, ROOM = 4, 16
 #: Probabilities of labels are at least this.
@@ -169,11 +170,9 @@ def reconstruct(
         if example is not None or laws:
             raise ScanError("give an image, or an example or a law, but not both: nothing joins them yet")
         seen = _load_image(image, volume, reading)
-        step = sub_progress(progress, 0.0, 0.5)
-        evidence, told = read_image(np.moveaxis(seen.values, axis, 0), target, progress=step)
-        if told < TOLD:
-            taught, evidence = Taught.load(), None
-            notes = (*notes, "The image does not tell the structure in annotated slices held out: it is left out.")
+        evidence = _read_evidence(np.moveaxis(seen.values, axis, 0), target, sub_progress(progress, 0.0, 0.5))
+        if evidence is None:
+            taught, notes = Taught.load(), (*notes, UNTOLD)
     if example is not None:
         other = Example.of(_load_example(example, volume, reading), places, axis)
         taught = tune(taught, other, sub_progress(progress, 0.0, 0.5))
@@ -202,7 +201,9 @@ def reconstruct(
     uncertain = _uncertainty(*likely, mask, target, volume, axis, suggest)
     if uncertain.expected_dice < HALF:
         notes = (*notes, "Known slices lie too far apart: what lies between them is more unknown than known.")
-    said = f"{said}: {len(places)} of {volume.shape[axis]} slices known, {summary}; {_describe_errors(uncertain)}"
+    tested = "the example" if other else "slices left out" if chosen.law else "generated shapes"
+    end = _describe_errors(uncertain, tested)
+    said = f"{said}: {len(places)} of {volume.shape[axis]} slices known, {summary}; {end}"
     return Segmentation.of(
         volume, _turn_back(axis, mask), _turn_back(axis, phase), chosen.law, width,
         (
@@ -377,10 +378,10 @@ def _uncertainty(
     return Uncertainty(replace(volume, values=_turn_back(axis, values), notes=()), error, suggestions, dice)
 
 
-def _describe_errors(uncertain: Uncertainty) -> str:
-    """Say how good probabilities are, and what to annotate next, as the end of a sentence."""
+def _describe_errors(uncertain: Uncertainty, tested: str) -> str:
+    """Say how good probabilities are, and on what, and what to annotate next, as the end of a sentence."""
     text = f"expect a Dice of {uncertain.expected_dice:.2f} between known slices"
-    text = f"{text}; probabilities err by {uncertain.calibration_error:.3f} near the surface"
+    text = f"{text}; probabilities err by {uncertain.calibration_error:.3f} near the surface of {tested}"
     following = ", ".join(map(str, uncertain.suggestions))
     return f"{text}; annotate next: {following}" if following else text
 
@@ -406,6 +407,12 @@ def _load_image(image: Source, volume: Field, reading: dict[str, Any]) -> Field:
     if (count := len(np.unique(field.values.ravel()[:: -(-field.values.size // SAMPLED)]))) < GREY:
         raise ScanError(f"the image must have grey levels, but has {count} values: is it a mask?")
     return field
+
+
+def _read_evidence(values: np.ndarray, slices: Slices, progress: Progress) -> np.ndarray | None:
+    """Return the log-odds of an image (Z, Y, X); None where it does not tell known slices that are held out."""
+    evidence, told = read_image(values, slices, progress=progress)
+    return None if told < TOLD else evidence
 
 
 def _load_example(example: Source, volume: Field, reading: dict[str, Any]) -> Field:
