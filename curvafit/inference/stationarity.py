@@ -30,6 +30,8 @@ from curvafit.scan.structure import is_rounded
 
 #: Standard deviation of the test functions, in voxels; in a crop less, for what their support takes from each side.
 TEST_WIDTH, CROP_WIDTH = 4.0, 3.0
+#: Least edge of a crop: in a smaller one test functions would be narrower than the blur, and no blurred ones.
+SMALLEST_CROP = 28
 #: Reach in voxels of a density's gradient: one of the stencil, one of its adjoint.
 _REACH = 2
 #: Planes treated at once, which bounds the memory.
@@ -84,7 +86,7 @@ def stationarity(
     vector. Levenberg and Marquardt's method, by optimistix, in float64. m₀ is the field's mean.
 
     The deviations are a jackknife over octants: they hold what varies over the box, not a bias common to all of it.
-    Raises ValueError if the field is not finite, has another shape than the grid, or is a crop under 24 voxels along an
+    Raises ValueError if the field is not finite, has another shape than the grid, or is a crop under 28 voxels along an
     axis.
 
     Parameters
@@ -139,8 +141,8 @@ def _test_width(grid: Grid) -> float:
     """Return the width of the test functions; in a small crop the one that leaves a core of eight voxels."""
     if grid.periodic:
         return TEST_WIDTH
-    if min(grid.shape) < 24:
-        raise ValueError(f"expected a crop of at least 24 voxels along each axis, got {grid.shape}")
+    if min(grid.shape) < SMALLEST_CROP:
+        raise ValueError(f"expected a crop of at least {SMALLEST_CROP} voxels along each axis, got {grid.shape}")
     return min(CROP_WIDTH, (min(grid.shape) - 8 - 2 * _REACH) // 2 / 4)
 
 

@@ -80,7 +80,7 @@ def lower_energy(
 
 
 def likelihood(evidence: VoxelEvidence, nats: float, place: WorkingGrid) -> Evidence:
-    """Return -log p(scan | mask) in units of F_ε, where a unit of the Willmore energy costs `nats`."""
+    """Return -log p(scan | mask) in units of F_ε, where a unit of F_ε costs `nats`."""
     return Evidence(place.spread(evidence.ratio) / (nats * place.grid.voxel_volume))
 
 

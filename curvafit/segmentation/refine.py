@@ -39,7 +39,7 @@ from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.part import Box, Crop
 from curvafit.volumes.read import Source, field_of, place_of
 
-#: Weights that are tried, in nats of a unit of the Willmore energy, and the first of them.
+#: Weights that are tried, in nats of a unit of F_ε, and the first of them.
 NATS, FIRST = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0), 10.0
 #: Longest edge in voxels of the part of an example on which laws and weights are tried.
 EDGE = 96
@@ -54,7 +54,7 @@ class Calibration:
     Attributes
     ----------
     trial
-        The law and its strength in nats of a unit of the Willmore energy, or p > 1/2; and the Dice of both.
+        The law and its strength in nats of a unit of F_ε, or p > 1/2; and the Dice of both.
     fitted
         Whether the law is one of the prior's, rather than the Willmore energy.
     example
@@ -261,7 +261,7 @@ class Refine:
 
 @dataclass(frozen=True, eq=False)
 class RefineProblem(Problem):
-    """The evidence of probabilities, and a law whose strength is in nats of a unit of the Willmore energy."""
+    """The evidence of probabilities, and a law whose strength is in nats of a unit of F_ε."""
 
     evidence: VoxelEvidence
 

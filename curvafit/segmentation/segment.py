@@ -160,7 +160,7 @@ class _GreyEvidence:
 
 @dataclass(frozen=True, eq=False)
 class ScanProblem(Problem):
-    """A scan's evidence, and a law whose strength is in nats of a unit of the Willmore energy."""
+    """A scan's evidence, and a law whose strength is in nats of a unit of F_ε."""
 
     evidence: _GreyEvidence
 

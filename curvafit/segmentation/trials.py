@@ -33,7 +33,7 @@ EDGE = 64
 #: Share of its voxels that is left out at a time, in blocks, and how many times; longest edge of a block, in voxels,
 #: and the correlation of the noise below which voxels count as independent.
 LEFT_OUT, TIMES, LONGEST_BLOCK, CORRELATED = 0.25, 2, 6, 0.15
-#: Weights that are tried, in nats of a unit of the Willmore energy, and the first of them.
+#: Weights that are tried, in nats of a unit of F_ε, and the first of them.
 WEIGHTS, FIRST = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0), 1.0
 #: Most times that the classes are measured again, and the gain in nats below which that ends.
 ROUNDS, ENOUGH = 4, 3.0
@@ -50,7 +50,7 @@ class Trial:
     law
         Coefficients with lengths in the scan's unit; None where the start stays as it is.
     strength, steps
-        Stiffness of the springs on known voxels, or nats of a unit of the Willmore energy; and steps of the flow.
+        Stiffness of the springs on known voxels, or nats of a unit of F_ε; and steps of the flow.
     pull
         Stiffness of the springs on the other voxels for each nat of their log-odds.
     score, plain, noise

@@ -128,7 +128,7 @@ def test_a_crop_says_what_its_inside_says(sponge: torch.Tensor) -> None:
 
 
 def test_refusals(sponge: torch.Tensor) -> None:
-    with pytest.raises(ValueError, match="expected a crop of at least 24 voxels"):
+    with pytest.raises(ValueError, match="expected a crop of at least 28 voxels"):
         stationarity(sponge[:20, :20, :20], Grid((20, 20, 20), 0.01, "replicate"), WORKING_EPSILON)
     with pytest.raises(ValueError, match="expected a finite field"):
         stationarity(sponge.clone().fill_(math.nan), GRID, WORKING_EPSILON)
