@@ -35,6 +35,7 @@ import torch
 from scipy import linalg, stats
 
 from benchmarks.harness import Cases, Figure, Values, show
+from curvafit.data_synth.design import INTERVALS
 from curvafit.data_synth.store import Store, find_well_formed
 from curvafit.geometry.descriptors import BLOCKS, descriptors
 from curvafit.geometry.diagram import FAMILIES, diagram, family_shares, half_thickness, leading_family
@@ -276,21 +277,22 @@ def unseen_table(paths: list[Path], view: str, cases: Cases) -> tuple[Table, np.
 
 
 def unseen_answers(paths: list[Path], view: str, cases: Cases) -> Values:
-    """Return laws, families, errors, truths and widths, in deviations of the prior, and whether intervals hold."""
+    """Return laws, families, errors, truths and widths in deviations of the paper's box, and whether intervals hold."""
     (table, families), trained = unseen_table(paths, view, cases), load_posterior()
-    prior, truth = trained.emulator.deviation, table.parameters
+    truth, (low, high) = table.parameters, np.array([np.log(i) if n == "a02" else i for n, i in INTERVALS.items()]).T
+    middle, prior = (low + high) / 2, (high - low) / np.sqrt(12)
     draws = trained.sample(table.descriptors, "crop" if view == "window" else view, DRAWS)
     least, most = np.quantile(draws, (0.05, 0.95), axis=1)
     laws = [f"{zlib.crc32(np.round(row, 6).tobytes()):08x}" for row in truth]
     columns = ((truth[:, PARAMETERS.index(name)], interval) for name, interval in CORNER.items())
-    inside = [(low <= column) & (column <= high) for column, (low, high) in columns]
+    inside = [(a <= column) & (column <= b) for column, (a, b) in columns]
     one = np.unique(laws, return_index=True)[1]  # queries of one law are not independent
     return {
         "law": laws,
         "family": families.tolist(),
         "corner": np.logical_and.reduce(inside).tolist(),
         "error": np.round((np.median(draws, axis=1) - truth) / prior, 3).tolist(),
-        "truth": np.round((truth - trained.emulator.centre) / prior, 3).tolist(),
+        "truth": np.round((truth - middle) / prior, 3).tolist(),
         "width": np.round((most - least) / prior, 3).tolist(),
         "in 90": ((least <= truth) & (truth <= most)).tolist(),
         "TARP": list(tarp(truth[one], draws[one])),
