@@ -95,6 +95,11 @@ def per_unit(unit: str, power: int) -> str:
     return f"1/{unit_name(unit)}{ {1: '', 2: '²', 3: '³'}[power] }"
 
 
+def power_name(unit: str, power: int) -> str:
+    """Return a unit to a power as written in text: µm, 1/µm³, or nothing for a plain number."""
+    return "" if power == 0 else unit_name(unit) if power > 0 else per_unit(unit, -power)
+
+
 def unit_name(unit: str, count: float = 1) -> str:
     """Return a unit as written in text: µm for `um`, voxels for several."""
     if unit == "um":

@@ -13,7 +13,7 @@ import numpy as np
 from scipy import ndimage, stats
 
 from curvafit.core.runtime import Progress, silent
-from curvafit.core.units import format_number, per_unit, unit_name
+from curvafit.core.units import convert_length, format_number, power_name
 from curvafit.geometry.descriptors import descriptors
 from curvafit.geometry.diagram import FAMILIES, MARGIN, Diagram, diagram, families
 from curvafit.geometry.mesh import NoSurface, area_vectors
@@ -62,8 +62,7 @@ class Quantity:
 
     def format(self, unit: str) -> tuple[str, str, str]:
         """Return the number, its interval and its unit as text, of a scan in `unit`."""
-        name = "" if self.power == 0 else unit_name(unit) if self.power > 0 else per_unit(unit, -self.power)
-        return format_number(self.value, 4), f"± {format_number(self.half, 2)}", name
+        return format_number(self.value, 4), f"± {format_number(self.half, 2)}", power_name(unit, self.power)
 
 
 #: Name, symbol and power of each quantity, and how it comes from sums.
@@ -129,6 +128,28 @@ class Measures:
             if name in (each.name, each.symbol):
                 return each
         raise KeyError(f"expected one of {', '.join(each.name for each in self.quantities)}, got {name!r}")
+
+    def convert(self, unit: str) -> Measures:
+        """Return the same measures in another unit of length; ValueError if one of the two is the voxel."""
+        if unit == self.unit:
+            return self
+        if "voxel" in (unit, self.unit):
+            raise ValueError(f"expected lengths in a unit that converts to {unit}, got {self.unit}")
+        factor = convert_length(1.0, self.unit, unit)
+        quantities = (
+            replace(each, value=each.value * factor**each.power, half=each.half * factor**each.power)
+            for each in self.quantities
+        )
+        old = self.diagram
+        diagram = replace(
+            old,
+            points=old.points / factor,
+            weights=old.weights * factor**2,
+            unit=f"1/{unit}",
+            spread=old.spread / factor,
+            places=None if old.places is None else old.places * factor,
+        )
+        return replace(self, unit=unit, quantities=tuple(quantities), diagram=diagram)
 
 
 def measure(
@@ -412,14 +433,23 @@ def errors(sums: np.ndarray, blocks: Blocks, figures: Callable[[np.ndarray], np.
     would be σ² tr(P W P) / n², P taking the mean off: that sets its scale, and with tr² / tr(·²) the degrees of freedom
     of Student's t. A bootstrap over single blocks would take neighbours for independent.
     """
-    count = len(sums)
-    kernel = np.ones((1, 1))
-    for n in blocks.counts:
-        kernel = np.kron(kernel, np.eye(n) + (np.eye(n, k=1) + np.eye(n, k=-1)) / 2)
-    centred = np.eye(count) - 1 / count
-    form = centred @ kernel @ centred
-    freedom = np.trace(form) ** 2 / (form**2).sum()
-    total = sums.sum(0)
+    form, kernel = _neighbour_forms(blocks.counts)
+    count, total = len(sums), sums.sum(0)
     change = (figures(total) - figures(total - sums)) * (count - 1) / count
     variance = (change * (kernel @ change)).sum(0) * count / np.trace(form)
-    return float(stats.t.ppf((1 + SURE) / 2, freedom)) * np.sqrt(np.maximum(variance, 0))
+    return interval_reach(blocks.counts) * np.sqrt(np.maximum(variance, 0))
+
+
+def interval_reach(counts: Sequence[int]) -> float:
+    """Return how many standard errors an interval of `errors` reaches to either side, from the blocks along axes."""
+    form, _ = _neighbour_forms(counts)
+    return float(stats.t.ppf((1 + SURE) / 2, np.trace(form) ** 2 / (form**2).sum()))
+
+
+def _neighbour_forms(counts: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return P W P and W of `errors`, each (N, N)."""
+    kernel = np.ones((1, 1))
+    for n in counts:
+        kernel = np.kron(kernel, np.eye(n) + (np.eye(n, k=1) + np.eye(n, k=-1)) / 2)
+    centred = np.eye(len(kernel)) - 1 / len(kernel)
+    return centred @ kernel @ centred, kernel
