@@ -8,6 +8,7 @@ curvatures at constant volume.
 - Prior: `segment(scan, law)`, `refine(probabilities, law)` and `reconstruct(labels, law)` give a mask;
   `curvafit.priors` has the loss for networks.
 - Files: `load(path)` and `save(volume, path)` read and write volumes with their spacing and unit.
+- Compare: `compare(group_a, group_b)` tells whether two groups of scans differ, and in what.
 - Measure: `measure(scan)`, `diagram(u, grid, epsilon)` and `wasserstein(a, b)`; more in `curvafit.geometry`.
 
 A law is `Coefficients`, the name of a preset (`preset`), or the path of a `fit.json`. The public names are loaded when
@@ -40,6 +41,8 @@ if TYPE_CHECKING:
     from curvafit.segmentation.refine import refine as refine
     from curvafit.segmentation.result import Segmentation as Segmentation
     from curvafit.segmentation.segment import segment as segment
+    from curvafit.studies.compare import Comparison as Comparison
+    from curvafit.studies.compare import compare as compare
     from curvafit.volumes.field import Field as Field
     from curvafit.volumes.read import load as load
     from curvafit.volumes.write import save as save
@@ -48,6 +51,7 @@ __version__ = "0.1.0"
 
 #: The function that draws each type with a picture, as `module:function`; see `curvafit.core.pictures`.
 _FIGURES = {
+    "Comparison": "curvafit.drawing.groups:comparison_figure",
     "Diagram": "curvafit.drawing.plot:diagram_figure",
     "Field": "curvafit.drawing.plot:field_figure",
     "Fit": "curvafit.drawing.plot:fit_figure",

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import colormaps
+from matplotlib import colormaps, rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap, LogNorm
@@ -180,11 +180,17 @@ def diagram_on(
     shares = gaussian_filter(shares, 0.8).T
     highest = max(float(shares.max()), 1e-9)
     shown = np.ma.masked_less(shares, highest * 10**-DECADES)
+    norm = LogNorm(highest * 10**-DECADES, highest)
+    axes.pcolormesh(edges, edges, shown, cmap=DENSITY, norm=norm, rasterized=True, zorder=2)
+    frame_diagram(axes, limits, unit)
+
+
+def frame_diagram(axes: Axes, limits: Limits, unit: str) -> None:
+    """Draw what is around the areas of a diagram: axes, the line κ1 = κ2, names of families."""
+    low, high = limits
     axes.add_patch(Polygon([(low, low), (low, high), (high, high)], color="#F3F4F6", zorder=0))
     axes.axhline(0, color=QUIET, linewidth=0.7, zorder=1)
     axes.axvline(0, color=QUIET, linewidth=0.7, zorder=1)
-    norm = LogNorm(highest * 10**-DECADES, highest)
-    axes.pcolormesh(edges, edges, shown, cmap=DENSITY, norm=norm, rasterized=True, zorder=2)
     axes.plot([low, high], [low, high], color=DIAGONAL, linewidth=1.4, zorder=3)
     axes.set(xlim=limits, ylim=limits, aspect="equal")
     axes.spines[:].set_color(QUIET)
@@ -396,6 +402,14 @@ def png(figure: Figure) -> bytes:
     """Return the figure as a PNG."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=DPI)
+    return buffer.getvalue()
+
+
+def svg(figure: Figure) -> bytes:
+    """Return the figure as an SVG, the same for the same figure."""
+    buffer = io.BytesIO()
+    with rc_context({"svg.hashsalt": "curvafit"}):
+        figure.savefig(buffer, format="svg", dpi=DPI, metadata={"Date": None})
     return buffer.getvalue()
 
 

@@ -10,6 +10,9 @@ if TYPE_CHECKING:
     from curvafit.scan.measure import Measures as Measures
     from curvafit.scan.measure import Quantity as Quantity
     from curvafit.scan.measure import measure as measure
+    from curvafit.studies.compare import Comparison as Comparison
+    from curvafit.studies.compare import Number as Number
+    from curvafit.studies.compare import compare as compare
     from curvafit.studies.tables import write_table as write_table
 
 attach_lazy_names(__name__)

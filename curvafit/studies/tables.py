@@ -24,17 +24,20 @@ COLUMNS = ("scan", "quantity", "symbol", "value", "low", "high", "unit", "direct
 FORMAT = Format("curvafit measures 1", title="a table of measures")
 
 
-def rows_of(measures: Measures) -> list[dict[str, Any]]:
-    """Return a row for each quantity of a scan, as values by column; None where a number is not known."""
+def rows_of(measures: Measures, **more: str) -> list[dict[str, Any]]:
+    """Return a row for each quantity of a scan, as values by column; None where a number is not known.
+
+    `more` are further columns with the same value in each row.
+    """
     release, z, y, x = version("curvafit"), *measures.direction
     rows = []
     for each in measures.quantities:
         ends = (each.value, each.value - each.half, each.value + each.half)
         value, low, high = (end if math.isfinite(end) else None for end in ends)
         axis = f"{z:.4f} {y:.4f} {x:.4f}" if each.symbol == "DA" else ""
-        unit = _unit(measures.unit, each.power)
+        unit = plain_unit(measures.unit, each.power)
         cells = (measures.source, each.name, each.symbol, value, low, high, unit, axis, release)
-        rows.append(dict(zip(COLUMNS, cells, strict=True)))
+        rows.append(dict(zip(COLUMNS, cells, strict=True)) | more)
     return rows
 
 
@@ -60,11 +63,16 @@ def write_table(measures: Sequence[Measures], path: str | PathLike[str], *, over
             {"scan": each.source, "kind": each.kind, "blocks": each.blocks, "notes": each.notes} for each in measures
         ]
         return FORMAT.write(target, {"scans": scans, "rows": rows})
+    return write_content(target, format_csv(rows))
+
+
+def format_csv(rows: Sequence[dict[str, Any]]) -> str:
+    """Return rows of the same columns as CSV; None is an empty cell."""
     text = io.StringIO(newline="")
     writer = csv.writer(text)
-    writer.writerow(COLUMNS)
+    writer.writerow(rows[0])
     writer.writerows(row.values() for row in rows)
-    return write_content(target, text.getvalue())
+    return text.getvalue()
 
 
 def _ours(target: Path) -> bool:
@@ -74,7 +82,7 @@ def _ours(target: Path) -> bool:
     return target.suffix.lower() == ".json" and FORMAT.owns(target)
 
 
-def _unit(unit: str, power: int) -> str:
+def plain_unit(unit: str, power: int) -> str:
     """Return a unit to a power in plain signs: mm, 1/mm, 1/mm^3."""
     if power == 0:
         return ""
