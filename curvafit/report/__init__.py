@@ -1,4 +1,4 @@
-"""The page that shows an inference."""
+"""The pages that show an inference, and two groups of scans."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from curvafit.core.faces import attach_lazy_names
 
 if TYPE_CHECKING:
+    from curvafit.report.comparison import write_comparison as write_comparison
     from curvafit.report.page import describe as describe
     from curvafit.report.page import report_html as report_html
     from curvafit.report.page import write_inference as write_inference

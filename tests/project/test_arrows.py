@@ -20,7 +20,8 @@ FLOORS = (
     ("data_synth",),
     ("segmentation",),
     ("atlas_map",),
-    ("studies", "report"),
+    ("studies",),
+    ("report",),
     ("cli", "nnunet"),
     ("__main__",),
 )

@@ -1,0 +1,57 @@
+"""The command that compares two groups of scans."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from curvafit.cli.console import command_line, print_table, say, say_notes, show_stages
+from curvafit.cli.options import OverwriteOption, Reading, command, parse_threshold
+
+
+@command(
+    "curvafit compare control/ treated/ --spacing 0.0195 --unit mm -o compared",
+    "curvafit compare control/ treated/ --subjects mice.csv -o compared",
+    "curvafit compare --subjects study.csv -o compared",
+)
+def compare(
+    out: Annotated[Path, typer.Option("-o", "--output", help="Folder for compare.html, figures and tables.")],
+    group_a: Annotated[Path | None, typer.Argument(help="Folder of scans.")] = None,
+    group_b: Annotated[Path | None, typer.Argument(help="Folder of the other scans.")] = None,
+    subjects: Annotated[Path | None, typer.Option(help="CSV: scan, subject; without folders scan, group.")] = None,
+    kind: Annotated[str, typer.Option(help="Kind of volume: auto, field, mask or image.")] = "auto",
+    periodic: Annotated[bool, typer.Option("--periodic", help="The box repeats (generated fields).")] = False,
+    threshold: Annotated[str, typer.Option(help="Grey level between the phases, or otsu.")] = "otsu",
+    dark: Annotated[bool, typer.Option("--dark", help="The structure is the dark phase.")] = False,
+    *,
+    reading: Reading,
+    permutations: Annotated[int, typer.Option(help="Permutations of subjects; all where there are fewer.")] = 9999,
+    seed: Annotated[int, typer.Option(help="Seed of the permutations, where not all are tried.")] = 0,
+    workers: Annotated[int, typer.Option(help="Processes that measure; 0 is this one.")] = 0,
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Tell whether two groups of scans differ, in which direction of curvature, and by how much."""
+    what: dict[str, Any] = {"kind": kind, "periodic": periodic, "threshold": parse_threshold(threshold), "dark": dark}
+    with show_stages() as progress:
+        from curvafit.report.comparison import check_comparison, write_comparison
+        from curvafit.studies.compare import compare as compare_groups
+
+        inputs = [place for place in (group_a, group_b, subjects) if place is not None]
+        check_comparison(out, inputs, overwrite)
+        how = {"permutations": permutations, "seed": seed, "workers": workers, "progress": progress}
+        comparison = compare_groups(group_a, group_b, subjects=subjects, **what, **how, **reading)
+        progress("drawing the page", 1.0)
+        check_comparison(out, [str(each.source) for each in comparison.cases], overwrite)
+        page = write_comparison(comparison, out, command=command_line(), overwrite=overwrite)
+    say_notes(comparison.notes)
+    say(comparison.status, style="bold")
+    from curvafit.core.units import format_number
+
+    rows = [
+        (each.name, each.symbol, *(format_number(value) for value in (*each.means, each.effect, each.p, each.most)))
+        for each in comparison.numbers
+    ]
+    print_table(("", "", *comparison.groups, "Hedges' g", "p", "family-wise p"), rows, right=range(2, 7))
+    say(str(page))

@@ -1,0 +1,218 @@
+"""The page of two groups that are compared, its figures and tables, and a paragraph on the methods."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from curvafit.core.files import move_together, temporary_folder
+from curvafit.core.records import Format, can_write, has_mark
+from curvafit.core.runtime import hold_signals
+from curvafit.core.units import format_number, format_percent, per_unit, power_name
+from curvafit.drawing.groups import comparison_figure, numbers_figure
+from curvafit.drawing.plot import png, svg
+from curvafit.geometry.distances import DIRECTIONS, QUANTILES
+from curvafit.report.page import MARK, picture_of, render_template
+from curvafit.studies.compare import BINS, LEVEL, SMOOTH, Comparison, Number
+from curvafit.studies.tables import format_csv, plain_unit, rows_of
+
+#: `format` of a comparison's record.
+FORMAT = Format("curvafit comparison", 1, title="the record of a comparison")
+#: What a comparison writes into its folder.
+FILES = ("compare.json", "compare.html", "measures.csv", "numbers.csv")
+FILES += ("difference.svg", "difference.png", "numbers.svg", "numbers.png")
+
+
+def check_comparison(directory: str | Path, inputs: Iterable[str | Path] = (), overwrite: bool = False) -> Path:
+    """Return the folder if `write_comparison` can write there, else raise ValueError; call it before the work."""
+    folder = Path(directory)
+    ours = FORMAT.owns(folder / FILES[0]) and has_mark(folder / FILES[1], MARK)
+    first, *more = (folder / name for name in FILES)
+    can_write(first, lambda _: ours, more=more, inputs=inputs, overwrite=overwrite)
+    return folder
+
+
+def write_comparison(
+    comparison: Comparison, directory: str | Path, *, command: str = "", overwrite: bool = False
+) -> Path:
+    """Write the page, figures, tables and record of a comparison into a folder, and return the page's path.
+
+    The files (`FILES`) are moved into the folder once all are whole. Those of an earlier comparison are replaced;
+    others are a ValueError without `overwrite`. `command` is what the record calls the command line.
+    """
+    target = check_comparison(directory, overwrite=overwrite)
+    with temporary_folder(target / FILES[0] if target.is_dir() else target) as work:
+        texts = {
+            "measures.csv": format_csv(list(_measure_rows(comparison))),
+            "numbers.csv": format_csv(list(_test_rows(comparison))),
+            "compare.html": comparison_html(comparison, command),
+        }
+        for name, text in texts.items():
+            (work / name).write_text(text, encoding="utf-8", newline="")
+        for name, figure in (("difference", comparison_figure(comparison)), ("numbers", numbers_figure(comparison))):
+            (work / f"{name}.png").write_bytes(png(figure))
+            (work / f"{name}.svg").write_bytes(svg(figure))
+        FORMAT.write(work / FILES[0], _record(comparison, command))
+        with hold_signals():
+            target.mkdir(exist_ok=True)
+            move_together(sorted(work.iterdir()), target)
+    return target / "compare.html"
+
+
+def comparison_html(comparison: Comparison, command: str = "") -> str:
+    """Return the page of a comparison as text."""
+    a, b = comparison.groups
+    bins = int(comparison.significant.sum())
+    title = f"{a} and {b} {'differ' if comparison.p <= LEVEL else 'are not told apart'}"
+    region = f"The outline holds the bins that differ at a family-wise level of {LEVEL:.2g}."
+    record = _record(comparison, command)
+    return render_template(
+        "compare.html",
+        version=version("curvafit"),
+        title=title[0].upper() + title[1:],
+        a=a,
+        b=b,
+        scans="; ".join(_count_scans(comparison)) + ".",
+        status=comparison.status,
+        difference=picture_of(comparison_figure(comparison), "Mean curvature diagrams and their difference"),
+        region=region if bins else f"No bin differs at a family-wise level of {LEVEL:.2g}.",
+        rows=[_format_row(number, comparison.unit) for number in comparison.numbers],
+        level=f"{LEVEL:.2g}",
+        numbers=picture_of(numbers_figure(comparison), "Each number by group"),
+        methods=describe_methods(comparison),
+        notes=[*comparison.notes, *_gather_notes(comparison)],
+        provenance=[(name, record[name]) for name in ("command", "date", "seed", "permutations") if record[name] != ""],
+    )
+
+
+def describe_methods(comparison: Comparison) -> str:
+    """Return a paragraph, for a paper, on what was done and what came of it."""
+    c, unit = comparison, per_unit(comparison.unit, 1)
+    tried = f"{c.permutations} permutations"
+    tried = f"all {tried}" if c.exact else f"{tried} (random, seed {c.options['seed']})"
+    differ = [each for each in c.numbers if each.most <= LEVEL]
+    found = ", ".join(f"{each.symbol} (g = {format_number(each.effect, 2)})" for each in differ)
+    found = f"{len(differ)} of them differ{f': {found}' if differ else ''}."
+    tested = int(np.isfinite(c.bins_p).sum())
+    kinds = " and ".join(f"{n} were taken for {kind}s" for kind, n in Counter(each.kind for each in c.measures).items())
+    grey = f" (threshold {c.options['threshold']})" if "image" in kinds and "threshold" in c.options else ""
+    return " ".join(
+        [
+            f"Scans of two groups, {' and '.join(_count_scans(c))}, were measured with curvafit {version('curvafit')}; "
+            f"{kinds}{grey}.",
+            "Thickness and spacing are mean diameters of the largest balls that fit (Hildebrand & Rüegsegger 1997); "
+            "connectivity is that of the Euler number.",
+            "The curvature diagram of a scan is the share of its surface's area over the principal curvatures κ₁ ≥ κ₂.",
+            "Scans of a subject were averaged; subjects are what all tests count.",
+            "Diagrams were compared by the energy distance (Székely & Rizzo 2004) of the groups, over the sliced "
+            f"Wasserstein distance of subjects' diagrams ({DIRECTIONS} directions, {QUANTILES} quantiles): "
+            f"E = {format_number(c.energy, 3)} {unit}, p = {format_number(c.p, 2)}, the share of {tried} of subjects "
+            "with at least that distance.",
+            f"Each of {len(c.numbers)} numbers was tested by the difference of means over the same permutations, and "
+            "corrected for all of them by the greatest correlation with the group in each permutation (Westfall & "
+            "Young 1993), besides the corrections of Holm and of Benjamini and Hochberg.",
+            f"At a family-wise level of {LEVEL:.2g}, {found}",
+            "Effect sizes are Hedges' g, with 95 % intervals of the noncentral t distribution (normal subjects).",
+            f"The difference of the mean diagrams, over {BINS} × {BINS} bins and smoothed by a Gaussian of {SMOOTH:g} "
+            f"bins, was tested in the {tested} with area, corrected likewise; {int(c.significant.sum())} differ.",
+        ]
+    )
+
+
+def _gather_notes(comparison: Comparison) -> Iterator[str]:
+    """Yield the scans' notes; of those that differ in numbers only, the first."""
+    alike: dict[str, list[str]] = {}
+    for measures, case in zip(comparison.measures, comparison.cases, strict=True):
+        for note in measures.notes:
+            alike.setdefault(re.sub(r"[\d.e-]+", "", note), []).append(f"{case.name}: {note}")
+    for first, *more in alike.values():
+        yield first + (f" And so, but for numbers, of {len(more)} more." if more else "")
+
+
+def _count_scans(comparison: Comparison) -> list[str]:
+    """Return each group's name with the numbers of its scans and subjects."""
+    groups = Counter(case.group for case in comparison.cases)
+    return [
+        f"{name} ({groups[name]} scans of {count} subjects)"
+        for name, count in zip(comparison.groups, comparison.counts, strict=True)
+    ]
+
+
+def _format_row(number: Number, unit: str) -> dict[str, Any]:
+    """Return a row of the page's table."""
+    name = power_name(unit, number.power)
+    means = (
+        f"{format_number(mean)} ± {format_number(sd, 2)}"
+        for mean, sd in zip(number.means, number.deviations, strict=True)
+    )
+    ps = (format_number(each, 2) for each in (number.p, number.most, number.holm, number.discovery))
+    interval = f"{format_number(number.low, 2)} to {format_number(number.high, 2)}"
+    known = "–" if math.isnan(number.known) else "all" if number.known >= 1 else format_percent(number.known)
+    cells = (*means, format_number(number.difference), format_number(number.effect, 2), interval, *ps, known)
+    title = number.name[0].upper() + number.name[1:]
+    symbol = ", ".join(part for part in ("" if number.symbol in number.name else number.symbol, name) if part)
+    return {"name": title, "symbol": symbol, "cells": cells, "chosen": number.most <= LEVEL}
+
+
+# ---- tables and record -----------------------------------------------------------------------------------------------
+
+
+def _measure_rows(comparison: Comparison) -> Iterator[dict[str, Any]]:
+    """Yield the rows of `curvafit measure`'s table, with subject and group."""
+    for measures, case in zip(comparison.measures, comparison.cases, strict=True):
+        yield from rows_of(measures, subject=case.subject, group=case.group)
+
+
+def _test_rows(comparison: Comparison) -> Iterator[dict[str, Any]]:
+    """Yield a row for each test: the diagrams', then each number's; None where there is no value."""
+    columns = ("quantity", "symbol", "unit", "mean_a", "mean_b", "sd_a", "sd_b", "difference", "g", "g_low", "g_high")
+    columns += ("p", "p_family", "p_holm", "p_bh", "known_error")
+    empty = dict.fromkeys(columns)
+    whole = {"quantity": "curvature diagram", "symbol": "E", "unit": plain_unit(comparison.unit, -1)}
+    yield empty | whole | {"difference": comparison.energy, "p": comparison.p}
+    for each in comparison.numbers:
+        cells = (each.name, each.symbol, plain_unit(comparison.unit, each.power), *each.means, *each.deviations)
+        cells += (each.difference, each.effect, each.low, each.high)
+        cells += (each.p, each.most, each.holm, each.discovery, each.known)
+        yield {name: _known(cell) for name, cell in zip(columns, cells, strict=True)}
+
+
+def _record(comparison: Comparison, command: str) -> dict[str, Any]:
+    """Return the content of `compare.json`."""
+    return {
+        "curvafit": version("curvafit"),
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "command": command,
+        "groups": list(comparison.groups),
+        "unit": comparison.unit,
+        "scans": [
+            {"scan": each.source, "subject": case.subject, "group": case.group, "kind": each.kind}
+            for each, case in zip(comparison.measures, comparison.cases, strict=True)
+        ],
+        "options": {name: value for name, value in comparison.options.items() if value is not None},
+        "seed": comparison.options["seed"],
+        "permutations": comparison.permutations,
+        "exact": comparison.exact,
+        "status": comparison.status,
+        "energy": comparison.energy,
+        "p": comparison.p,
+        "apart": comparison.apart,
+        "within": comparison.within,
+        "tests": list(_test_rows(comparison)),
+        "methods": describe_methods(comparison),
+        "notes": list(comparison.notes),
+        "files": list(FILES),
+    }
+
+
+def _known(cell: Any) -> Any:
+    """Return a cell, None where it is a number that is not finite."""
+    return None if isinstance(cell, float) and not math.isfinite(cell) else cell
