@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from curvafit.core.files import move_together, temporary_folder
 from curvafit.core.records import Format, can_write, has_mark
@@ -50,30 +51,31 @@ def write_comparison(
     """
     target = check_comparison(directory, overwrite=overwrite)
     with temporary_folder(target / FILES[0] if target.is_dir() else target) as work:
+        figures = {"difference": comparison_figure(comparison), "numbers": numbers_figure(comparison)}
+        record = _record(comparison, command)
         texts = {
             "measures.csv": format_csv(list(_measure_rows(comparison))),
             "numbers.csv": format_csv(list(_test_rows(comparison))),
-            "compare.html": comparison_html(comparison, command),
+            "compare.html": _page(comparison, record, figures),
         }
         for name, text in texts.items():
             (work / name).write_text(text, encoding="utf-8", newline="")
-        for name, figure in (("difference", comparison_figure(comparison)), ("numbers", numbers_figure(comparison))):
+        for name, figure in figures.items():
             (work / f"{name}.png").write_bytes(png(figure))
             (work / f"{name}.svg").write_bytes(svg(figure))
-        FORMAT.write(work / FILES[0], _record(comparison, command))
+        FORMAT.write(work / FILES[0], record)
         with hold_signals():
             target.mkdir(exist_ok=True)
             move_together(sorted(work.iterdir()), target)
     return target / "compare.html"
 
 
-def comparison_html(comparison: Comparison, command: str = "") -> str:
-    """Return the page of a comparison as text."""
+def _page(comparison: Comparison, record: dict[str, Any], figures: dict[str, Figure]) -> str:
+    """Return the page of a comparison, with its record and its figures, as text."""
     a, b = comparison.groups
     bins = int(comparison.significant.sum())
     title = f"{a} and {b} {'differ' if comparison.p <= LEVEL else 'are not told apart'}"
     region = f"The outline holds the bins that differ at a family-wise level of {LEVEL:.2g}."
-    record = _record(comparison, command)
     return render_template(
         "compare.html",
         version=version("curvafit"),
@@ -82,12 +84,12 @@ def comparison_html(comparison: Comparison, command: str = "") -> str:
         b=b,
         scans="; ".join(_count_scans(comparison)) + ".",
         status=comparison.status,
-        difference=picture_of(comparison_figure(comparison), "Mean curvature diagrams and their difference"),
+        difference=picture_of(figures["difference"], "Mean curvature diagrams and their difference"),
         region=region if bins else f"No bin differs at a family-wise level of {LEVEL:.2g}.",
         rows=[_format_row(number, comparison.unit) for number in comparison.numbers],
         level=f"{LEVEL:.2g}",
-        numbers=picture_of(numbers_figure(comparison), "Each number by group"),
-        methods=describe_methods(comparison),
+        numbers=picture_of(figures["numbers"], "Each number by group"),
+        methods=record["methods"],
         notes=[*comparison.notes, *_gather_notes(comparison)],
         provenance=[(name, record[name]) for name in ("command", "date", "seed", "permutations") if record[name] != ""],
     )

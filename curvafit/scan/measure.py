@@ -441,7 +441,12 @@ def errors(sums: np.ndarray, blocks: Blocks, figures: Callable[[np.ndarray], np.
 
 
 def interval_reach(counts: Sequence[int]) -> float:
-    """Return how many standard errors an interval of `errors` reaches to either side, from the blocks along axes."""
+    """Return how many standard errors an interval of `errors` reaches to either side, from the blocks along axes.
+
+    NaN of a single block, which has no error.
+    """
+    if math.prod(counts) == 1:
+        return math.nan
     form, _ = _neighbour_forms(counts)
     return float(stats.t.ppf((1 + SURE) / 2, np.trace(form) ** 2 / (form**2).sum()))
 

@@ -61,17 +61,18 @@ def list_cases(
 
 def _check(cases: Sequence[Case]) -> None:
     """Raise ValueError if a group has too few subjects, or both have one subject or one scan."""
+    places = Counter(Path(str(case.source)).resolve() for case in cases if isinstance(case.source, str | PathLike))
+    if places and (most := places.most_common(1)[0])[1] > 1:
+        raise ValueError(f"expected each scan once, got {most[0]} {most[1]} times")
     subjects = {
-        name: {case.subject for case in cases if case.group == name} for name in dict.fromkeys(c[3] for c in cases)
+        name: {case.subject for case in cases if case.group == name}
+        for name in dict.fromkeys(case.group for case in cases)
     }
     for name, there in subjects.items():
         if len(there) < FEWEST:
             raise ValueError(f"expected at least {FEWEST} subjects in each group, got {len(there)} in {name}")
     if both := set.intersection(*subjects.values()):
         raise ValueError(f"expected groups of different subjects, got {quoted(min(both))} in both")
-    places = Counter(Path(str(case.source)).resolve() for case in cases if isinstance(case.source, str | PathLike))
-    if places and (most := places.most_common(1)[0])[1] > 1:
-        raise ValueError(f"expected each scan once, got {most[0]} {most[1]} times")
 
 
 # ---- folders and sequences -------------------------------------------------------------------------------------------
