@@ -43,14 +43,13 @@ def compare(
         how = {"permutations": permutations, "seed": seed, "workers": workers, "progress": progress}
         comparison = compare_groups(group_a, group_b, subjects=subjects, **what, **how, **reading)
         progress("drawing the page", 1.0)
-        check_comparison(out, [str(each.source) for each in comparison.cases], overwrite)
         page = write_comparison(comparison, out, command=command_line(), overwrite=overwrite)
     say_notes(comparison.notes)
     say(comparison.status, style="bold")
     from curvafit.core.units import format_number
 
     rows = [
-        (each.name, each.symbol, *(format_number(value) for value in (*each.means, each.effect, each.p, each.most)))
+        (each.name, each.symbol, *(format_number(value) for value in (*each.means, each.effect, each.p, each.family)))
         for each in comparison.numbers
     ]
     print_table(("", "", *comparison.groups, "Hedges' g", "p", "family-wise p"), rows, right=range(2, 7))

@@ -20,6 +20,8 @@ FIRST, SECOND = "#0072B2", "#D55E00"
 MORE = LinearSegmentedColormap.from_list("more", [FIRST, "#8CC0E0", "#FFFFFF", "#F0B48A", SECOND])
 #: Panels of numbers in a row.
 COLUMNS = 7
+#: Letters of a group's name that a panel has room for.
+WORD = 14
 
 
 def comparison_figure(comparison: Any) -> Figure:
@@ -27,7 +29,7 @@ def comparison_figure(comparison: Any) -> Figure:
 
     The outline holds the bins that differ significantly among all.
     """
-    edges, (a, b) = comparison.edges, comparison.groups
+    edges, (a, b) = comparison.edges, map(_plain, comparison.groups)
     limits, unit = (edges[0], edges[-1]), comparison.unit
     figure = make_figure(13.2, 4.5)
     for k, (name, diagram) in enumerate(zip((a, b), comparison.diagrams, strict=True)):
@@ -83,12 +85,17 @@ def numbers_figure(comparison: Any) -> Figure:
         axes.set_title(
             number.symbol + (f" ({unit})" if unit else ""),
             fontsize=9.5,
-            fontweight="bold" if number.most <= comparison.level else "normal",
+            fontweight="bold" if number.family <= comparison.level else "normal",
         )
         axes.set_xlabel(f"g = {format_number(number.effect, 2)}, p = {format_number(number.p, 2)}", fontsize=8)
-        axes.set_xticks([0, 1], comparison.groups, fontsize=8)
+        axes.set_xticks([0, 1], [_plain(name)[:WORD] for name in comparison.groups], fontsize=8)
         axes.set_xlim(-0.6, 1.6)
         axes.yaxis.set_major_locator(MaxNLocator(4))
         axes.tick_params(length=2, labelsize=8)
         axes.spines[:].set_color(QUIET)
     return figure
+
+
+def _plain(name: str) -> str:
+    """Return a name that matplotlib does not take for a formula."""
+    return name.replace("$", "\\$")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections import Counter
@@ -100,7 +101,7 @@ def describe_methods(comparison: Comparison) -> str:
     c, unit = comparison, per_unit(comparison.unit, 1)
     tried = f"{c.permutations} permutations"
     tried = f"all {tried}" if c.exact else f"{tried} (random, seed {c.options['seed']})"
-    differ = [each for each in c.numbers if each.most <= LEVEL]
+    differ = [each for each in c.numbers if each.family <= LEVEL]
     found = ", ".join(f"{each.symbol} (g = {format_number(each.effect, 2)})" for each in differ)
     found = f"{len(differ)} of them differ{f': {found}' if differ else ''}."
     tested = int(np.isfinite(c.bins_p).sum())
@@ -155,13 +156,13 @@ def _format_row(number: Number, unit: str) -> dict[str, Any]:
         f"{format_number(mean)} ± {format_number(sd, 2)}"
         for mean, sd in zip(number.means, number.deviations, strict=True)
     )
-    ps = (format_number(each, 2) for each in (number.p, number.most, number.holm, number.discovery))
+    ps = (format_number(each, 2) for each in (number.p, number.family, number.holm, number.discovery))
     interval = f"{format_number(number.low, 2)} to {format_number(number.high, 2)}"
     known = "–" if math.isnan(number.known) else "all" if number.known >= 1 else format_percent(number.known)
     cells = (*means, format_number(number.difference), format_number(number.effect, 2), interval, *ps, known)
     title = number.name[0].upper() + number.name[1:]
     symbol = ", ".join(part for part in ("" if number.symbol in number.name else number.symbol, name) if part)
-    return {"name": title, "symbol": symbol, "cells": cells, "chosen": number.most <= LEVEL}
+    return {"name": title, "symbol": symbol, "cells": cells, "chosen": number.family <= LEVEL}
 
 
 # ---- tables and record -----------------------------------------------------------------------------------------------
@@ -183,7 +184,7 @@ def _test_rows(comparison: Comparison) -> Iterator[dict[str, Any]]:
     for each in comparison.numbers:
         cells = (each.name, each.symbol, plain_unit(comparison.unit, each.power), *each.means, *each.deviations)
         cells += (each.difference, each.effect, each.low, each.high)
-        cells += (each.p, each.most, each.holm, each.discovery, each.known)
+        cells += (each.p, each.family, each.holm, each.discovery, each.known)
         yield {name: _known(cell) for name, cell in zip(columns, cells, strict=True)}
 
 
@@ -199,7 +200,7 @@ def _record(comparison: Comparison, command: str) -> dict[str, Any]:
             {"scan": each.source, "subject": case.subject, "group": case.group, "kind": each.kind}
             for each, case in zip(comparison.measures, comparison.cases, strict=True)
         ],
-        "options": {name: value for name, value in comparison.options.items() if value is not None},
+        "options": json.loads(json.dumps(comparison.options, default=str)),
         "seed": comparison.options["seed"],
         "permutations": comparison.permutations,
         "exact": comparison.exact,

@@ -67,9 +67,10 @@ class Number:
         Hedges' g of that difference, and its 95 % interval.
     p
         Share of permutations that differ at least as much.
-    holm, discovery, most
-        p corrected for all quantities: by Holm, by Benjamini and Hochberg, and by the most of |r| over all quantities
-        in each permutation. The last is the strongest, and the only one that few subjects can pass.
+    family, holm, discovery
+        p corrected for all quantities. The first two hold the chance of any false finding: by the most of |r| over all
+        quantities in each permutation, and by Holm, whose p cannot be small with few subjects. The third, by Benjamini
+        and Hochberg, holds the share of false findings.
     known
         The part of the variance within groups that the scans' own intervals explain.
     """
@@ -84,9 +85,9 @@ class Number:
     low: float
     high: float
     p: float
+    family: float
     holm: float
     discovery: float
-    most: float
     known: float
 
 
@@ -390,10 +391,10 @@ def _compare_numbers(
 ) -> tuple[Number, ...]:
     """Test each quantity of subjects' values (S, K); `scan` has the quantities' names."""
     told = np.asarray(np.isfinite(values).all(0))
-    p, holm, discovery, most = np.full((4, len(told)), np.nan)
+    p, family, holm, discovery = np.full((4, len(told)), np.nan)
     p[told] = share_beyond(correlate(values[:, told], choices))
     holm[told], discovery[told] = correct_holm(p[told]), false_discovery_control(p[told])
-    most[told] = correct_by_most(values[:, told], choices)
+    family[told] = correct_by_most(values[:, told], choices)
     rows = []
     for k, quantity in enumerate(scan.quantities):
         parts = values[~second, k], values[second, k]
@@ -410,9 +411,9 @@ def _compare_numbers(
                 b - a,
                 *effect,
                 p=float(p[k]),
+                family=float(family[k]),
                 holm=float(holm[k]),
                 discovery=float(discovery[k]),
-                most=float(most[k]),
                 known=float((errors[:, k] ** 2).mean() / spread) if math.isfinite(effect[0]) else math.nan,
             )
         )

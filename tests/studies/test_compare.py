@@ -7,6 +7,7 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from calling import call, refused
 from scipy import ndimage, stats
 
 import curvafit
+from curvafit.drawing.groups import numbers_figure
 from curvafit.geometry.diagram import Diagram
 from curvafit.report.comparison import FILES, check_comparison, describe_methods, write_comparison
 from curvafit.scan.measure import QUANTITIES, Measures, Quantity, interval_reach
@@ -70,7 +72,7 @@ def test_p_is_uniform_under_the_null(null: Sequence[Comparison]) -> None:
 def test_corrections_hold_the_chance_of_any_false_finding(null: Sequence[Comparison]) -> None:
     """At most .05 of null studies find any; 200 tell that to ±.0154, and 3 of these are allowed."""
     for any_found in (
-        [min(number.most for number in each.numbers) <= each.level for each in null],
+        [min(number.family for number in each.numbers) <= each.level for each in null],
         [min(number.holm for number in each.numbers) <= each.level for each in null],
         [bool(each.significant.any()) for each in null],
     ):
@@ -169,6 +171,19 @@ def test_known_error_is_the_scans_own_share_of_the_variance() -> None:
         assert number.known == pytest.approx(error / np.mean(np.square(number.deviations)))
 
 
+def test_a_number_that_a_subject_lacks_is_not_tested() -> None:
+    random = np.random.default_rng(9)
+    scans = [drawn(random) for _ in range(6)]
+    first, *others = scans[0].quantities
+    scans[0] = replace(scans[0], quantities=(replace(first, value=math.nan), *others))
+    found = compare(scans[:3], scans[3:])
+    number, *tested = found.numbers
+    assert all(map(math.isnan, (number.p, number.holm, number.effect, number.known)))
+    own = np.array([each.p for each in tested])
+    assert [each.holm for each in tested] == pytest.approx(correct_holm(own))
+    assert len(numbers_figure(found).axes) == len(QUANTITIES)
+
+
 # ---- subjects --------------------------------------------------------------------------------------------------------
 
 
@@ -228,7 +243,7 @@ def test_tubes_and_balls_differ_in_the_direction_that_they_do(shapes: Comparison
     assert shapes.p == pytest.approx(2 / 70)
     assert "differ" in shapes.status and re.search("of tubes falls .* of spheres rises", shapes.status)
     assert shapes["share of spheres"].difference > 0.9 and shapes["share of tubes"].difference < -0.9
-    assert shapes["κ2"].low > 0 and shapes["share of spheres"].most == pytest.approx(2 / 70)
+    assert shapes["κ2"].low > 0 and shapes["share of spheres"].family == pytest.approx(2 / 70)
     κ2, κ1 = np.meshgrid(*[(shapes.edges[1:] + shapes.edges[:-1]) / 2] * 2, indexing="ij")
     more, less = shapes.significant & (shapes.difference > 0), shapes.significant & (shapes.difference < 0)
     assert more.any() and less.any()
@@ -305,6 +320,18 @@ def test_a_table_names_groups_and_subjects(folders: tuple[Path, Path], tmp_path:
     assert again.subjects == found.subjects and again.p == found.p
 
 
+@pytest.mark.slow
+def test_workers_measure_the_same(folders: tuple[Path, Path]) -> None:
+    pytest.importorskip("distributed", reason="the extra 'synth' is not installed")
+    alone, crew = (compare(*folders, periodic=True, workers=workers) for workers in (0, 2))
+    assert crew.p == alone.p and [each.source for each in crew.measures] == [each.source for each in alone.measures]
+    assert crew.values == pytest.approx(alone.values)
+    tiny(*folders)
+    with pytest.raises(ValueError, match="t0.npy"):
+        compare(*folders, periodic=True, workers=2)
+
+
+@pytest.mark.slow
 def test_a_comparison_draws_and_writes_itself(shapes: Comparison, tmp_path: Path) -> None:
     assert len(shapes.plot().axes) >= 3
     page = write_comparison(shapes, tmp_path / "out")
