@@ -363,7 +363,7 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     if options.unseen:
         return on_unseen(options, cases)
     if options.table is None:
-        raise SystemExit("name a table with --table (curvafit atlas describe makes one), or --gallery")
+        raise SystemExit("name a table with --table (curvafit atlas describe makes one), --gallery or --unseen")
     views, folds = options.views.split(","), 2 if options.quick else FOLDS
     table = load_table(options.table).visible.select_views(views)
     figures: dict[str, Figure] = {}

@@ -152,9 +152,9 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     temporary.replace(path)
 
 
-def run_python(*words: object, **environment: str) -> str:
-    """Return what Python prints in a process of its own; if it fails, end with its errors."""
-    command, more = [sys.executable, *map(str, words)], os.environ | environment
+def run_python(*words: object, python: str | Path = sys.executable, **environment: str) -> str:
+    """Return what Python, or another one, prints in a process of its own; if it fails, end with its errors."""
+    command, more = [str(python), *map(str, words)], os.environ | environment
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=more)
     if done.returncode:
         raise SystemExit(done.stderr)

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import subprocess
 import time
 from functools import partial
 from pathlib import Path
@@ -22,7 +21,7 @@ import numpy as np
 
 from benchmarks import image
 from benchmarks.completion import CHOSEN_ON, FEW, STRUCTURES, blocks, dice, interpolated, plain_ways
-from benchmarks.harness import Cases, Figure, Values, bootstrap, show
+from benchmarks.harness import Cases, Figure, Values, bootstrap, run_python, show
 from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.slices import Slices
 
@@ -59,11 +58,7 @@ def run_elsewhere(python: Path, program: str, folder: Path, **arrays: np.ndarray
     """Return what a program makes of arrays in another interpreter, and its seconds."""
     given, found, begun = folder / "given.npz", folder / "found.npy", time.perf_counter()
     np.savez(given, allow_pickle=False, **arrays)
-    done = subprocess.run(
-        [str(python), "-c", program, str(given), str(found)], capture_output=True, text=True, check=False
-    )
-    if done.returncode:
-        raise SystemExit(done.stderr[-2000:])
+    run_python("-c", program, given, found, python=python)
     return np.load(found), time.perf_counter() - begun
 
 

@@ -315,9 +315,11 @@ def _find_known(
 
 def _doubt_places(volume: Field, axis: int, places: list[int], every: int | None) -> tuple[str, ...]:
     """Return a sentence where few slices have labels, and some of them are not every `every`-th."""
+    if every is None:
+        return ()
     labelled = np.flatnonzero((np.moveaxis(volume.values, axis, 0) > 0).any((1, 2)))
     strange = sorted(set(labelled.tolist()) - set(places))
-    if every is None or not strange or 2 * len(labelled) > np.ptp(labelled) + 1:
+    if not strange or 2 * len(labelled) > np.ptp(labelled) + 1:
         return ()
     numbers = ", ".join(map(str, strange[:FEW])) + (", …" if len(strange) > FEW else "")
     few = f"Only {len(labelled)} of {volume.shape[axis]} slices have labels, but {numbers} are not among the known ones"
@@ -602,7 +604,8 @@ def find_labels(values: np.ndarray, chosen: Sequence[int] | None) -> list[int]:
     """
     if chosen is not None:
         chosen = sorted({check_int(n, "labels that are whole numbers", -SEEDS, SEEDS) for n in chosen})
-        values = np.where(np.isin(values, chosen), values, 0)  # of the others there may be any number
+        others = require_labels(values, "the known slices", math.inf)  # of those that are not chosen any number
+        values = np.where(np.isin(others, chosen), others, 0)
     found = [int(value) for value in np.unique(require_labels(values, "the known slices"))]
     numbers = [number for number in found if number] if chosen is None else chosen
     listed = ", ".join(map(str, found[:12])) + (", …" if len(found) > 12 else "")

@@ -244,12 +244,13 @@ def plane_distances(masks: np.ndarray, spacing: Sequence[float], gap: float) -> 
 # ---- checks ----------------------------------------------------------------------------------------------------------
 
 
-def require_labels(values: np.ndarray, name: str) -> np.ndarray:
-    """Return the values, or raise ScanError where they are grey levels; the message calls them `name`."""
+def require_labels(values: np.ndarray, name: str, most: float = LABELS) -> np.ndarray:
+    """Return the values, or raise ScanError where they are grey levels, or more than `most`; the message calls them
+    `name`."""
     if values.dtype.kind == "f" and not np.array_equal(values, np.round(values)):
         raise ScanError(f"{name} must be a mask or labels, got values that are not whole numbers")
-    if values.dtype.itemsize > 1 and (count := len(np.unique(values))) > LABELS:
-        raise ScanError(f"{name} must be a mask or have at most {LABELS} labels, got {count} values")
+    if values.dtype.itemsize > 1 and (count := len(np.unique(values))) > most:
+        raise ScanError(f"{name} must be a mask or have at most {most} labels, got {count} values")
     differ = np.count_nonzero(values[..., 1:] != values[..., :-1])
     if 2 * differ > values.size and (count := len(np.unique(values))) > FEW:
         raise ScanError(

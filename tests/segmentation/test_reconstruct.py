@@ -448,6 +448,8 @@ def test_a_volume_that_is_labelled_everywhere_stays_so_where_no_label_s_box_is()
         (organelles(), {"chosen": [0, 2]}, "other than 0"),
         (organelles(), {"chosen": [2, 5]}, "5"),
         (organelles() + 0.5, {}, "whole numbers"),
+        (organelles() + 0.5, {"chosen": [2]}, "whole numbers"),
+        (np.random.default_rng(0).integers(0, 99, (25, 24, 32), np.uint8), {"chosen": [2]}, "grey image"),
     ],
 )
 def test_bad_labels_are_refused(values: np.ndarray, options: dict, word: str) -> None:
