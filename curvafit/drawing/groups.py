@@ -19,7 +19,7 @@ from curvafit.drawing.render import QUIET
 FIRST, SECOND = "#0072B2", "#D55E00"
 MORE = LinearSegmentedColormap.from_list("more", [FIRST, "#8CC0E0", "#FFFFFF", "#F0B48A", SECOND])
 #: Panels of numbers in a row.
-COLUMNS = 7
+COLUMNS = 6
 #: Letters of a group's name that a panel has room for.
 WORD = 14
 

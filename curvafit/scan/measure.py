@@ -76,6 +76,7 @@ QUANTITIES: tuple[tuple[str, str, int, Callable[[Sums], np.ndarray]], ...] = (
         lambda s: _deviation(s["thickness"] / s["inside"], s["thickness²"] / s["inside"]),
     ),
     ("spacing", "Tb.Sp", 1, lambda s: s["gap"] / (s["volume"] - s["inside"])),
+    ("number per length", "Tb.N", -1, lambda s: s["inside"] ** 2 / s["volume"] / s["thickness"]),  # (BV/TV) / Tb.Th
     ("connectivity density", "Conn.D", -3, lambda s: -s["χ"] / s["volume"]),
     ("Euler number", "χ", 0, lambda s: s["χ"]),
     ("surface to volume", "BS/BV", -1, lambda s: s["area"] / s["inside"]),

@@ -181,7 +181,7 @@ def test_a_number_that_a_subject_lacks_is_not_tested() -> None:
     assert all(map(math.isnan, (number.p, number.holm, number.effect, number.known)))
     own = np.array([each.p for each in tested])
     assert [each.holm for each in tested] == pytest.approx(correct_holm(own))
-    assert len(numbers_figure(found).axes) == len(QUANTITIES)
+    assert sum(axes.axison for axes in numbers_figure(found).axes) == len(QUANTITIES)
 
 
 # ---- subjects --------------------------------------------------------------------------------------------------------

@@ -58,6 +58,7 @@ def test_parallel_tubes() -> None:
     found = measure(tubes(), periodic=True)
     assert found["volume fraction"].value == pytest.approx(tubes().mean(), abs=1e-12)
     assert found["Tb.Th"].value == pytest.approx(12, abs=1e-6)
+    assert found["Tb.N"].value == pytest.approx(math.pi / 4 * 12 / 24**2, rel=0.04)  # a disk of 113 has 109 voxels
     assert found["share of tubes"].value > 0.95
     assert found["κ1"].value == pytest.approx(1 / 6, rel=0.05)
     assert abs(found["κ2"].value) < 0.01
@@ -123,6 +124,12 @@ def test_layers_say_that_the_direction_is_within_them() -> None:
     assert found["share of layers"].value > 0.95
     assert abs(found.direction[0]) < 1e-6
     assert found["Tb.Th"].value == pytest.approx(7, abs=1)
+
+
+def test_layers_of_even_thickness_have_their_number_per_length() -> None:
+    layers = np.broadcast_to((np.indices((N,))[0] % 16 < 6)[:, None, None], (N, N, N)).astype(np.uint8)
+    found = measure(Field(layers, 0.5, "mm"), kind="mask", periodic=True)["Tb.N"]
+    assert (found.value, found.power) == (pytest.approx(1 / (16 * 0.5), rel=1e-6), -1)
 
 
 # ---- blocks ----------------------------------------------------------------------------------------------------------
@@ -192,7 +199,7 @@ def test_tables_are_tidy(measures: Measures, tmp_path: Path) -> None:
     assert len(rows) == 2 * len(QUANTITIES)
     assert float(rows[1]["value"]) == measures["Tb.Th"].value
     assert float(rows[1]["high"]) - float(rows[1]["low"]) == pytest.approx(2 * measures["Tb.Th"].half)
-    assert [rows[k]["unit"] for k in (0, 1, 4, 6)] == ["", "um", "1/um^3", "1/um"]
+    assert [rows[k]["unit"] for k in (0, 1, 4, 5, 7)] == ["", "um", "1/um", "1/um^3", "1/um"]
     content = json.loads(write_table([measures], tmp_path / "table.json").read_text(encoding="utf-8"))
     assert content["rows"] == rows_of(measures)
     assert write_table([measures], path) == path  # its own file
