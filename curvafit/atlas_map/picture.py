@@ -16,10 +16,11 @@ from matplotlib.patheffects import withStroke
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
-from curvafit.atlas_map.layout import AtlasMap
+from curvafit.atlas_map.layout import AtlasMap, families_of
 from curvafit.core.files import write_atomically
 from curvafit.drawing.plot import DPI, INK, QUIET, make_figure
 from curvafit.drawing.render import render
+from curvafit.inference.atlas import Atlas
 
 #: Colours that stay apart for the colour-blind: of families (Okabe & Ito 2008), and of clusters (Tol's muted ones).
 FAMILY_COLOURS = {
@@ -73,6 +74,32 @@ def map_figure(mapped: AtlasMap, field: Callable[[int], np.ndarray]) -> Figure:
         _thumbnail(figure, axes, field(k), slot, mapped.positions[k], colours[k])
     _legend(figure, mapped)
     return figure
+
+
+def map_on(axes: Axes, atlas: Atlas, seen_as: str, embeddings: np.ndarray) -> np.ndarray:
+    """Draw an atlas's shapes on the two directions in which their diagrams differ most.
+
+    Return the places (n, 2) there of diagrams whose sliced `embeddings` (n, 288) are in working units.
+    """
+    of_atlas = atlas.embeddings(seen_as)
+    mean = of_atlas.mean(0)
+    # The main axes of the sliced quantiles, in which Euclidean distance is the sliced Wasserstein distance.
+    _, spread, main = np.linalg.svd(of_atlas - mean, full_matrices=False)
+    places, own = ((rows - mean) @ main[:2].T for rows in (of_atlas, embeddings))
+    names = np.array(families_of(atlas)[0])
+    for name, colour in FAMILY_COLOURS.items():
+        if (names == name).any():
+            axes.scatter(*places[names == name].T, s=9, c=colour, linewidths=0, alpha=0.75, label=name)
+    ends = np.concatenate([np.percentile(places, (0.3, 99.7), axis=0), own])
+    (left, bottom), (right, top) = low, high = ends.min(0), ends.max(0)
+    x, y = 0.06 * (high - low)
+    axes.set(xlim=(left - x, right + x), ylim=(bottom - y, top + y), xticks=[], yticks=[])
+    legend = {"fontsize": 8, "frameon": False, "handletextpad": 0, "columnspacing": 0.9}
+    axes.legend(loc="lower center", ncols=6, bbox_to_anchor=(0.5, -0.15), **legend)
+    share = float((spread[:2] ** 2).sum() / (spread**2).sum())
+    axes.set_title(f"its place among {len(atlas)} grown textures ({share:.0%} of their spread)", fontsize=11)
+    axes.spines[:].set_color("#dfe2e6")
+    return own
 
 
 def farthest_points(positions: np.ndarray, count: int) -> np.ndarray:

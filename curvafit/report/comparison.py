@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
@@ -91,7 +90,7 @@ def _page(comparison: Comparison, record: dict[str, Any], figures: dict[str, Fig
         level=f"{LEVEL:.2g}",
         numbers=picture_of(figures["numbers"], "Each number by group"),
         methods=record["methods"],
-        notes=[*comparison.notes, *_gather_notes(comparison)],
+        notes=comparison.notes,
         provenance=[(name, record[name]) for name in ("command", "date", "seed", "permutations") if record[name] != ""],
     )
 
@@ -128,16 +127,6 @@ def describe_methods(comparison: Comparison) -> str:
             f"bins, was tested in the {tested} with area, corrected likewise; {int(c.significant.sum())} differ.",
         ]
     )
-
-
-def _gather_notes(comparison: Comparison) -> Iterator[str]:
-    """Yield the scans' notes; of those that differ in numbers only, the first."""
-    alike: dict[str, list[str]] = {}
-    for measures, case in zip(comparison.measures, comparison.cases, strict=True):
-        for note in measures.notes:
-            alike.setdefault(re.sub(r"[\d.e-]+", "", note), []).append(f"{case.name}: {note}")
-    for first, *more in alike.values():
-        yield first + (f" And so, but for numbers, of {len(more)} more." if more else "")
 
 
 def _count_scans(comparison: Comparison) -> list[str]:

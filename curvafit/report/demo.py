@@ -11,8 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
-from curvafit.atlas_map.layout import families_of
-from curvafit.atlas_map.picture import FAMILY_COLOURS
+from curvafit.atlas_map.picture import map_on
 from curvafit.core.files import write_content
 from curvafit.core.records import can_write, has_mark
 from curvafit.core.runtime import Progress, silent, sub_progress
@@ -201,37 +200,19 @@ def _slice_figure(scan: Field, completion: Completion) -> Figure:
 def _map_figure(inference: Inference, atlas: Atlas) -> Figure:
     """Return a figure of the scan's diagram and its place among the atlas's, on the main axes of sliced quantiles."""
     assert inference.diagram is not None
-    embeddings = atlas.embeddings("field" if inference.fit.kind == "field" else "mask")
-    mean = embeddings.mean(0)
-    # The main axes of the sliced quantiles, in which Euclidean distance is the sliced Wasserstein distance.
-    _, spread, axes_of = np.linalg.svd(embeddings - mean, full_matrices=False)
-    places = (embeddings - mean) @ axes_of[:2].T
-    own = (np.asarray(sliced_embedding(inference.diagram)) - mean) @ axes_of[:2].T
-    share = float((spread[:2] ** 2).sum() / (spread**2).sum())
-    names, _ = families_of(atlas)
     figure = make_figure(10.2, 4.6)
     λ, unit = inference.fit.length, inference.fit.length_unit
     left = figure.add_axes((0.07, 0.13, 0.36, 0.78))
     diagram_on(left, inference.diagram, limits=shared_limits([inference.diagram], length=λ), unit=unit, length=λ)
     left.set_title("how much surface has which curvatures", fontsize=11)
     right = figure.add_axes((0.5, 0.13, 0.48, 0.78))
-    for name, colour in FAMILY_COLOURS.items():
-        of = [k for k, each in enumerate(names) if each == name]
-        if of:
-            right.scatter(*places[of].T, s=9, c=colour, linewidths=0, alpha=0.75, label=name)
+    seen_as = "field" if inference.fit.kind == "field" else "mask"
+    own = map_on(right, atlas, seen_as, sliced_embedding(inference.diagram)[None])[0]
     right.scatter(*own, s=150, marker="*", c=INK, edgecolors="white", linewidths=1.2, zorder=5)
     right.annotate(
         "this scan", own, (7, 7), textcoords="offset points", fontsize=11, fontweight="bold", color=INK, zorder=6,
         path_effects=[withStroke(linewidth=3, foreground="white")],
     )  # fmt: skip
-    low, high = np.percentile(places, (0.3, 99.7), axis=0)
-    low, high = np.minimum(low, own), np.maximum(high, own)
-    rim = 0.06 * (high - low)
-    right.set(xlim=(low[0] - rim[0], high[0] + rim[0]), ylim=(low[1] - rim[1], high[1] + rim[1]), xticks=[], yticks=[])
-    legend = {"fontsize": 8, "frameon": False, "handletextpad": 0, "columnspacing": 0.9}
-    right.legend(loc="lower center", ncols=6, bbox_to_anchor=(0.5, -0.15), **legend)
-    right.set_title(f"its place among {len(atlas)} grown textures ({share:.0%} of their spread)", fontsize=11)
-    right.spines[:].set_color("#dfe2e6")
     return figure
 
 

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Sequence
+from dataclasses import dataclass
 from os import PathLike
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -20,11 +17,10 @@ from curvafit.core.checks import check_int, check_seed
 from curvafit.core.pictures import Pictured
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.core.units import format_number, format_percent, per_unit
-from curvafit.core.workers import cluster, collect_all
 from curvafit.drawing.plot import shared_limits
 from curvafit.geometry.diagram import FAMILIES, Diagram
 from curvafit.geometry.distances import sliced_embedding
-from curvafit.scan.measure import SURE, Measures, interval_reach, measure
+from curvafit.scan.measure import SURE, Measures, interval_reach
 from curvafit.scan.structure import check_options
 from curvafit.studies.groups import Case, Group, list_cases
 from curvafit.studies.permutation import (
@@ -36,21 +32,16 @@ from curvafit.studies.permutation import (
     relabel,
     share_beyond,
 )
-from curvafit.volumes.field import ScanError
-from curvafit.volumes.read import field_of
+from curvafit.studies.scans import gather_notes, measure_scans
 
 #: Permutations of subjects that are tried: all where there are no more.
 PERMUTATIONS = 9999
 #: What p must not exceed for a difference that is shown.
 LEVEL = 1 - SURE
-#: Edge of the bins of a scan's diagram as it is kept, over the inverse of the structure's thickness.
-FINE = 0.1
 #: Bins along each axis of the difference of diagrams, and the width in bins of the Gaussian that smooths it.
 BINS, SMOOTH = 48, 2.0
 #: Bins with less than this part of the fullest one's area are not tested.
 LEAST_SHARE = 0.02
-#: Voxel edges of the groups that differ by more than this part deserve a note.
-ALIKE_EDGES = 0.1
 
 
 @dataclass(frozen=True)
@@ -237,14 +228,11 @@ def compare(
     check_int(permutations, "a number of permutations from 99", 99, 10**6)
     check_seed(seed)
     cases, notes = list_cases(group_a, group_b, subjects)
-    unit, more = _check_scans(cases, reading, sub_progress(progress, 0.0, 0.05))
     options = {"kind": kind, "periodic": periodic, "threshold": threshold, "dark": dark}
-    measures = _measure_all(cases, options | reading, workers, sub_progress(progress, 0.05, 0.97))
+    measures, more = measure_scans(cases, options, reading, workers, sub_progress(progress, 0.0, 0.97))
     progress("comparing", 0.97)
-    units = {each.unit for each in measures}
-    notes += more if len(units) == 1 else [*more, f"Lengths in {', '.join(sorted(units))} were converted to {unit}."]
     parameters = {**options, **reading, "permutations": permutations, "seed": seed}
-    return compare_measures([each.convert(unit) for each in measures], cases, parameters, notes)
+    return compare_measures(measures, cases, parameters, [*notes, *more])
 
 
 def compare_measures(
@@ -287,68 +275,8 @@ def compare_measures(
         permutations=len(relabelled),
         exact=exact,
         options=options,
-        notes=tuple(notes),
+        notes=(*notes, *gather_notes(measures, cases)),
     )
-
-
-def _check_scans(cases: Sequence[Case], reading: dict[str, Any], progress: Progress) -> tuple[str, list[str]]:
-    """Read all scans once, so that what is wrong is said before long work; return their unit, and notes."""
-    units: dict[str, str] = {}
-    edges: dict[str, list[float]] = {}
-    for k, case in enumerate(cases):
-        progress(f"{case.name}: reading", k / len(cases))
-        if isinstance(case.source, Measures):
-            units.setdefault(case.source.unit, case.name)
-            continue
-        with _named(case):
-            field = field_of(case.source, **reading)
-        units.setdefault(field.unit, case.name)
-        edges.setdefault(case.group, []).append(float(np.prod(field.spacing) ** (1 / 3)))
-    if len(units) > 1 and "voxel" in units:
-        other = next(name for name in units if name != "voxel")
-        raise ValueError(
-            f"expected a physical spacing in all scans or in none, got none in {units['voxel']} and {other} in "
-            f"{units[other]}: say it with --spacing and --unit"
-        )
-    notes = ["Lengths are counted in voxels: compare only scans of one voxel size."] if "voxel" in units else []
-    if len(edges) == 2 and len(units) == 1:
-        one, other = (float(np.median(each)) for each in edges.values())
-        if not 1 - ALIKE_EDGES < one / other < 1 + ALIKE_EDGES:
-            sizes = f"{format_number(one)} and {format_number(other)} {next(iter(units))}"
-            notes.append(f"Voxels differ between the groups, {sizes}: so does what they resolve.")
-    return next(iter(units)), notes
-
-
-def _measure_all(cases: Sequence[Case], options: dict[str, Any], workers: int, progress: Progress) -> list[Measures]:
-    """Measure the scans, in this process or by several, and return their measures in order."""
-    found = {k: case.source for k, case in enumerate(cases) if isinstance(case.source, Measures)}
-    left = [k for k in range(len(cases)) if k not in found]
-    with cluster(workers) as crew:
-        watches = {k: sub_progress(progress, k / len(cases), (k + 1) / len(cases)) for k in left}
-        make = {k: partial(_measure_case, cases[k], options, silent if workers else watches[k]) for k in left}
-        for k, measures in collect_all(crew, ((make[k], Path(), [k]) for k in left)):
-            found[k] = measures
-            progress(f"{len(found)} of {len(cases)} scans measured", len(found) / len(cases))
-    return [found[k] for k in range(len(cases))]
-
-
-def _measure_case(
-    case: Case, options: dict[str, Any], progress: Progress, folder: Path, indices: Sequence[int]
-) -> list[tuple[int, Measures]]:
-    """Measure one scan; its diagram is binned finely, so that many scans take little memory."""
-    with _named(case):
-        measures = measure(case.source, progress=lambda text, share: progress(f"{case.name}: {text}", share), **options)  # type: ignore[arg-type]
-    diagram = measures.diagram.bin(FINE / measures["thickness"].value)
-    return [(k, replace(measures, diagram=diagram, source=measures.source or case.name)) for k in indices]
-
-
-@contextmanager
-def _named(case: Case) -> Iterator[None]:
-    """Add a scan's name to what is wrong with it."""
-    try:
-        yield
-    except ValueError as error:
-        raise error if case.name in str(error) else ScanError(f"{case.name}: {error}") from None
 
 
 def _pool(diagrams: Sequence[Diagram]) -> Diagram:

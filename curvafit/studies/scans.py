@@ -1,0 +1,110 @@
+"""Many scans: read once before long work, measured in this process or by several, in one unit."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from curvafit.core.runtime import Progress, silent, sub_progress
+from curvafit.core.units import format_number
+from curvafit.core.workers import cluster, collect_all
+from curvafit.scan.measure import Measures, measure
+from curvafit.studies.groups import Case
+from curvafit.volumes.field import ScanError
+from curvafit.volumes.read import field_of
+
+#: Edge of the bins of a scan's diagram as it is kept, over the inverse of the structure's thickness.
+FINE = 0.1
+#: Voxel edges of groups that differ by more than this part deserve a note.
+ALIKE_EDGES = 0.1
+
+
+def measure_scans(
+    cases: Sequence[Case], options: dict[str, Any], reading: dict[str, Any], workers: int, progress: Progress
+) -> tuple[list[Measures], list[str]]:
+    """Measure scans with `options` of `measure`; return their measures, in the first scan's unit, and notes.
+
+    All are read before the first is measured. Raises ValueError, with the scan's name, as `measure`; and where only
+    some scans have a physical unit.
+    """
+    unit, notes = _check_scans(cases, reading, sub_progress(progress, 0.0, 0.05))
+    measures = _measure_all(cases, options | reading, workers, sub_progress(progress, 0.05, 1.0))
+    units = {each.unit for each in measures}
+    notes += [] if len(units) == 1 else [f"Lengths in {', '.join(sorted(units))} were converted to {unit}."]
+    return [each.convert(unit) for each in measures], notes
+
+
+def gather_notes(measures: Sequence[Measures], cases: Sequence[Case]) -> Iterator[str]:
+    """Yield the scans' notes; of those that differ in numbers only, the first."""
+    alike: dict[str, list[str]] = {}
+    for scan, case in zip(measures, cases, strict=True):
+        for note in scan.notes:
+            alike.setdefault(re.sub(r"[\d.e-]+", "", note), []).append(f"{case.name}: {note}")
+    for first, *more in alike.values():
+        yield first + (f" And so, but for numbers, of {len(more)} more." if more else "")
+
+
+def _check_scans(cases: Sequence[Case], reading: dict[str, Any], progress: Progress) -> tuple[str, list[str]]:
+    """Read all scans once, so that what is wrong is said before long work; return their unit, and notes."""
+    units: dict[str, str] = {}
+    edges: dict[str, list[float]] = {}
+    for k, case in enumerate(cases):
+        progress(f"{case.name}: reading", k / len(cases))
+        if isinstance(case.source, Measures):
+            units.setdefault(case.source.unit, case.name)
+            continue
+        with _named(case):
+            field = field_of(case.source, **reading)
+        units.setdefault(field.unit, case.name)
+        edges.setdefault(case.group, []).append(float(np.prod(field.spacing) ** (1 / 3)))
+    if len(units) > 1 and "voxel" in units:
+        other = next(name for name in units if name != "voxel")
+        raise ValueError(
+            f"expected a physical spacing in all scans or in none, got none in {units['voxel']} and {other} in "
+            f"{units[other]}: say it with --spacing and --unit"
+        )
+    notes = ["Lengths are counted in voxels: compare only scans of one voxel size."] if "voxel" in units else []
+    medians = [float(np.median(each)) for each in edges.values()]
+    if medians and len(units) == 1 and min(medians) < (1 - ALIKE_EDGES) * max(medians):
+        ends = " and ".join(format_number(end) for end in (min(medians), max(medians)))
+        notes.append(f"Voxels differ, {ends} {next(iter(units))}: so does what they resolve.")
+    return next(iter(units)), notes
+
+
+def _measure_all(cases: Sequence[Case], options: dict[str, Any], workers: int, progress: Progress) -> list[Measures]:
+    """Measure the scans, in this process or by several, and return their measures in order."""
+    found = {k: case.source for k, case in enumerate(cases) if isinstance(case.source, Measures)}
+    left = [k for k in range(len(cases)) if k not in found]
+    with cluster(workers) as crew:
+        watches = {k: sub_progress(progress, k / len(cases), (k + 1) / len(cases)) for k in left}
+        make = {k: partial(_measure_case, cases[k], options, silent if workers else watches[k]) for k in left}
+        for k, measures in collect_all(crew, ((make[k], Path(), [k]) for k in left)):
+            found[k] = measures
+            progress(f"{len(found)} of {len(cases)} scans measured", len(found) / len(cases))
+    return [found[k] for k in range(len(cases))]
+
+
+def _measure_case(
+    case: Case, options: dict[str, Any], progress: Progress, folder: Path, indices: Sequence[int]
+) -> list[tuple[int, Measures]]:
+    """Measure one scan; its diagram is binned finely, so that many scans take little memory."""
+    with _named(case):
+        measures = measure(case.source, progress=lambda text, share: progress(f"{case.name}: {text}", share), **options)  # type: ignore[arg-type]
+    diagram = measures.diagram.bin(FINE / measures["thickness"].value)
+    return [(k, replace(measures, diagram=diagram, source=measures.source or case.name)) for k in indices]
+
+
+@contextmanager
+def _named(case: Case) -> Iterator[None]:
+    """Add a scan's name to what is wrong with it."""
+    try:
+        yield
+    except ValueError as error:
+        raise error if case.name in str(error) else ScanError(f"{case.name}: {error}") from None
