@@ -68,6 +68,14 @@ def _commands(seed: int) -> Iterator[Case]:
 
             command = ("segment", source, "--prior", "tubes", "--steps", "1", "-o", out)
             yield Case(f"damage-command/{name}/{k}", setup, command)
+    for name in STORES:
+
+        def groups(place: Place, name: str = name) -> None:
+            for part in ("first/a", "first/b", "second/c", "second/d"):
+                store = place.take(name, f"{part}.zarr")
+            _in_chunk(lambda path, rng: path.unlink())(store, place.rng)
+
+        yield Case(f"damage-command/{name}/0", groups, ("compare", "first", "second", "--strict", "-o", "out"))
 
 
 def _load(case: Case, place: Place) -> list[Fault]:

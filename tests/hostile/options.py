@@ -53,6 +53,12 @@ class Command(NamedTuple):
     each: int = 5
 
 
+def _take_groups(place: Place) -> None:
+    """Two folders of two masks each."""
+    for name in ("first/a", "first/b", "second/c", "second/d"):
+        place.take("mask.nii.gz", f"{name}.nii.gz")
+
+
 _SMALL = ("--shape", "10", "--steps", "4")
 #: Nothing is grown, as in `case.INFER`.
 _INFER = ("--fast", "--atlas", "{larder}/atlas.npz")
@@ -136,6 +142,13 @@ COMMANDS: dict[str, Command] = {
         setup=taking("labels.npy"),
         each=2,
     ),
+    "compare": Command(
+        ("compare", "first", "second", "-o", "out"),
+        "kind threshold spacing subjects permutations seed workers",
+        "permutations workers",
+        _take_groups,
+        each=2,
+    ),
     "build": Command(
         ("atlas", "build", "out.zarr", "--count", "1", "--shape", "16", "--around", "tubes", "--workers", "0"),
         "count shape seed design around spread schedule steps workers scheduler",
@@ -207,7 +220,9 @@ def _without(arguments: tuple[str, ...], option: str) -> tuple[str, ...]:
 
 
 def _short(name: str) -> bool:
-    return name not in ("build", "synth-grown") and not name.startswith(("infer", "synth-like", "synth-channels"))
+    return name not in ("build", "synth-grown") and not name.startswith(
+        ("compare", "infer", "synth-like", "synth-channels")
+    )
 
 
 _SENSELESS: dict[str, tuple[str, ...]] = {

@@ -259,6 +259,7 @@ def test_windows_of_one_texture_are_not_told_apart() -> None:
     found = compare(windows[::2], windows[1::2])
     assert found.p > 0.1 and "not told apart" in found.status  # .9 here, which other processors move little
     assert any("counted in voxels" in note for note in found.notes)
+    assert any("No intervals" in note for note in found.notes)
 
 
 def test_units_are_converted(shapes: Comparison) -> None:
@@ -370,6 +371,11 @@ def mixed(first: Path, second: Path) -> None:
     curvafit.save(Field(balls(5.0), (0.01,) * 3, "mm"), second / "t9.nii.gz")
 
 
+def hole(first: Path, second: Path) -> None:
+    curvafit.save(Field(balls(5.0)), second / "t9.zarr")
+    next(path for path in (second / "t9.zarr").rglob("c/*/*/*") if path.is_file()).unlink()
+
+
 def inside(first: Path, second: Path) -> None:
     second.rename(first / "treated")
 
@@ -388,6 +394,7 @@ def inside(first: Path, second: Path) -> None:
         (empty, "control treated", "vary"),
         (tiny, "control treated", "t0.npy"),
         (mixed, "control treated", "spacing"),
+        (hole, "control treated --strict", "t9.zarr"),
         (None, "control treated --permutations 5", "permutations"),
         (None, "control treated --output control", "write over"),
     ],
