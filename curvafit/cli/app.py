@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from curvafit.cli import compare, generate, infer, measure, nnunet, refine, samples, segment, synth
+from curvafit.cli import compare, generate, infer, measure, nnunet, refine, samples, segment, synth, windows
 from curvafit.cli.atlas import atlas_app
 from curvafit.cli.console import Commands, say
 from curvafit.cli.options import add_commands
@@ -26,7 +26,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
     cls=Commands,
 )
-add_commands(app, samples.demo, infer.infer, measure.measure, compare.compare)
+add_commands(app, samples.demo, infer.infer, measure.measure, windows.windows, compare.compare)
 add_commands(app, generate.generate, generate.presets, nnunet.nnunet)
 add_commands(app, segment.segment, refine.refine, segment.reconstruct, synth.synth)
 app.add_typer(samples.samples_app, name="samples")

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from curvafit.cli.console import command_line, print_table, say, say_notes, show_stages
-from curvafit.cli.options import OverwriteOption, Reading, command, parse_threshold
+from curvafit.cli.options import OverwriteOption, Reading, Structure, command
 
 
 @command(
@@ -21,11 +21,8 @@ def compare(
     group_a: Annotated[Path | None, typer.Argument(help="Folder of scans.")] = None,
     group_b: Annotated[Path | None, typer.Argument(help="Folder of the other scans.")] = None,
     subjects: Annotated[Path | None, typer.Option(help="CSV: scan, subject; without folders scan, group.")] = None,
-    kind: Annotated[str, typer.Option(help="Kind of volume: auto, field, mask or image.")] = "auto",
-    periodic: Annotated[bool, typer.Option("--periodic", help="The box repeats (generated fields).")] = False,
-    threshold: Annotated[str, typer.Option(help="Grey level between the phases, or otsu.")] = "otsu",
-    dark: Annotated[bool, typer.Option("--dark", help="The structure is the dark phase.")] = False,
     *,
+    structure: Structure,
     reading: Reading,
     permutations: Annotated[int, typer.Option(help="Permutations of subjects; all where there are fewer.")] = 9999,
     seed: Annotated[int, typer.Option(help="Seed of the permutations, where not all are tried.")] = 0,
@@ -33,7 +30,6 @@ def compare(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Tell whether two groups of scans differ, in which direction of curvature, and by how much."""
-    what: dict[str, Any] = {"kind": kind, "periodic": periodic, "threshold": parse_threshold(threshold), "dark": dark}
     with show_stages() as progress:
         from curvafit.report.comparison import check_comparison, write_comparison
         from curvafit.studies.compare import compare as compare_groups
@@ -41,7 +37,7 @@ def compare(
         inputs = [place for place in (group_a, group_b, subjects) if place is not None]
         check_comparison(out, inputs, overwrite)
         how = {"permutations": permutations, "seed": seed, "workers": workers, "progress": progress}
-        comparison = compare_groups(group_a, group_b, subjects=subjects, **what, **how, **reading)
+        comparison = compare_groups(group_a, group_b, subjects=subjects, **structure, **how, **reading)
         progress("drawing the page", 1.0)
         page = write_comparison(comparison, out, command=command_line(), overwrite=overwrite)
     say_notes(comparison.notes)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from curvafit.cli.console import command_line, print_table, say, say_notes, show_stages
-from curvafit.cli.options import OverwriteOption, Reading, Volume, command, parse_threshold
+from curvafit.cli.options import OverwriteOption, Reading, Structure, Volume, command
 
 if TYPE_CHECKING:
     from curvafit.inference.infer import Inference
@@ -24,30 +24,26 @@ if TYPE_CHECKING:
 def infer(
     scan: Volume,
     out: Annotated[Path, typer.Option("-o", "--output", help="Folder for fit.json, report.html, regenerated.nii.gz.")],
-    kind: Annotated[str, typer.Option(help="Kind of volume: auto, field, mask or image.")] = "auto",
-    periodic: Annotated[bool, typer.Option("--periodic", help="The box repeats (generated fields).")] = False,
     atlas: Annotated[Path | None, typer.Option(help="Atlas (.npz) instead of the packaged one.")] = None,
-    threshold: Annotated[str, typer.Option(help="Grey level between the phases, or otsu.")] = "otsu",
-    dark: Annotated[bool, typer.Option("--dark", help="The structure is the dark phase.")] = False,
     posterior: Annotated[Path | None, typer.Option(help="Posterior (.npz) instead of the packaged one.")] = None,
     method: Annotated[str, typer.Option(help="posterior, or match: the nearest shape, refined.")] = "posterior",
     fast: Annotated[bool, typer.Option("--fast", help="Seconds, not minutes: nothing is grown or checked.")] = False,
     roi: Annotated[Path | None, typer.Option(help="Mask of the region to measure, of the scan's shape.")] = None,
     *,
+    structure: Structure,
     reading: Reading,
     seed: Annotated[int, typer.Option(help="Seed of the shapes that are generated for comparison.")] = 0,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Infer the parameters of a scanned volume, and write a report."""
     files = {"roi": roi, "atlas": atlas, "posterior": posterior}
-    what: dict[str, Any] = {"kind": kind, "periodic": periodic, "threshold": parse_threshold(threshold), "dark": dark}
     with show_stages() as progress:
         from curvafit.inference.infer import infer as infer_scan
         from curvafit.report.page import check_report, with_command, write_inference
 
         check_report(out, [scan, *(file for file in files.values() if file is not None)], overwrite)
         how = {"method": method, "fast": fast, "seed": seed, "progress": progress}
-        inference = infer_scan(scan, **what, **files, **how, **reading)
+        inference = infer_scan(scan, **structure, **files, **how, **reading)
         progress("drawing the report", 1.0)
         say_notes(inference.scan.notes)
         report = write_inference(with_command(inference, command_line()), out, overwrite=overwrite)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from curvafit.cli.console import print_table, say, say_notes, show_stages
-from curvafit.cli.options import FILES, OverwriteOption, Reading, command, parse_threshold
+from curvafit.cli.options import FILES, OverwriteOption, Reading, Structure, command
 
 if TYPE_CHECKING:
     from curvafit.scan.measure import Measures
@@ -22,16 +22,12 @@ if TYPE_CHECKING:
 def measure(
     scans: Annotated[list[str], typer.Argument(help=FILES)],
     out: Annotated[Path | None, typer.Option("-o", "--output", help="Table to write: .csv .json .parquet.")] = None,
-    kind: Annotated[str, typer.Option(help="Kind of volume: auto, field, mask or image.")] = "auto",
-    periodic: Annotated[bool, typer.Option("--periodic", help="The box repeats (generated fields).")] = False,
-    threshold: Annotated[str, typer.Option(help="Grey level between the phases, or otsu.")] = "otsu",
-    dark: Annotated[bool, typer.Option("--dark", help="The structure is the dark phase.")] = False,
     *,
+    structure: Structure,
     reading: Reading,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Measure scans in seconds: morphometry, fabric and curvature in physical units, with 95 % intervals."""
-    what: dict[str, Any] = {"kind": kind, "periodic": periodic, "threshold": parse_threshold(threshold), "dark": dark}
     with show_stages() as progress:
         from curvafit.scan.measure import measure as measure_scan
         from curvafit.studies.tables import check_table, write_table
@@ -44,7 +40,7 @@ def measure(
             progress(f"{scans[len(found)]}: {text}", (len(found) + share) / len(scans))
 
         for scan in scans:
-            found.append(measure_scan(scan, progress=watch, **what, **reading))
+            found.append(measure_scan(scan, progress=watch, **structure, **reading))
     for measures in found:
         if len(scans) > 1:
             say(measures.source, style="bold")

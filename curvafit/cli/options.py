@@ -102,6 +102,20 @@ def parse_reading(
     }
 
 
+#: The options of the group `structure`, as `curvafit.measure` and `infer` take them.
+Structure = dict[str, Any]
+
+
+def parse_structure(
+    kind: Annotated[str, typer.Option(help="Kind of volume: auto, field, mask or image.")] = "auto",
+    periodic: Annotated[bool, typer.Option("--periodic", help="The box repeats (generated fields).")] = False,
+    threshold: Annotated[str, typer.Option(help="Grey level between the phases, or otsu.")] = "otsu",
+    dark: Annotated[bool, typer.Option("--dark", help="The structure is the dark phase.")] = False,
+) -> Structure:
+    """Return the options on what is structure in a scan; raise ValueError where one is malformed."""
+    return {"kind": kind, "periodic": periodic, "threshold": parse_threshold(threshold), "dark": dark}
+
+
 @dataclass(frozen=True)
 class Crew:
     """The workers that the options ask for; ValueError where they contradict each other."""
@@ -136,7 +150,7 @@ class Crew:
 
 
 #: Groups of options by the name of the parameter that takes their value.
-_GROUPS: dict[str, Callable[..., Any]] = {"reading": parse_reading, "crew": Crew}
+_GROUPS: dict[str, Callable[..., Any]] = {"reading": parse_reading, "structure": parse_structure, "crew": Crew}
 
 
 # ---- parsing ---------------------------------------------------------------------------------------------------------

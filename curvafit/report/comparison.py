@@ -14,14 +14,12 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from curvafit.core.files import move_together, temporary_folder
-from curvafit.core.records import Format, can_write, has_mark
-from curvafit.core.runtime import hold_signals
+from curvafit.core.records import Format
 from curvafit.core.units import format_number, format_percent, per_unit, power_name
 from curvafit.drawing.groups import comparison_figure, numbers_figure
 from curvafit.drawing.plot import png, svg
 from curvafit.geometry.distances import DIRECTIONS, QUANTILES
-from curvafit.report.page import MARK, picture_of, render_template
+from curvafit.report.page import check_result_folder, fill_folder, picture_of, render_template
 from curvafit.studies.compare import BINS, LEVEL, SMOOTH, Comparison, Number
 from curvafit.studies.tables import format_csv, plain_unit, rows_of
 
@@ -34,11 +32,7 @@ FILES += ("difference.svg", "difference.png", "numbers.svg", "numbers.png")
 
 def check_comparison(directory: str | Path, inputs: Iterable[str | Path] = (), overwrite: bool = False) -> Path:
     """Return the folder if `write_comparison` can write there, else raise ValueError; call it before the work."""
-    folder = Path(directory)
-    ours = FORMAT.owns(folder / FILES[0]) and has_mark(folder / FILES[1], MARK)
-    first, *more = (folder / name for name in FILES)
-    can_write(first, lambda _: ours, more=more, inputs=inputs, overwrite=overwrite)
-    return folder
+    return check_result_folder(FORMAT, FILES, directory, inputs, overwrite)
 
 
 def write_comparison(
@@ -50,7 +44,7 @@ def write_comparison(
     others are a ValueError without `overwrite`. `command` is what the record calls the command line.
     """
     target = check_comparison(directory, overwrite=overwrite)
-    with temporary_folder(target / FILES[0] if target.is_dir() else target) as work:
+    with fill_folder(target, FILES) as work:
         figures = {"difference": comparison_figure(comparison), "numbers": numbers_figure(comparison)}
         record = _record(comparison, command)
         texts = {
@@ -64,9 +58,6 @@ def write_comparison(
             (work / f"{name}.png").write_bytes(png(figure))
             (work / f"{name}.svg").write_bytes(svg(figure))
         FORMAT.write(work / FILES[0], record)
-        with hold_signals():
-            target.mkdir(exist_ok=True)
-            move_together(sorted(work.iterdir()), target)
     return target / "compare.html"
 
 

@@ -8,7 +8,8 @@ from __future__ import annotations
 import base64
 import dataclasses
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,7 +17,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
-from curvafit.core.files import move_together, temporary_folder, write_content
+from curvafit.core.files import move_together, remove, temporary_folder, write_content
 from curvafit.core.records import Format, can_write, has_mark
 from curvafit.core.runtime import hold_signals
 from curvafit.core.units import (
@@ -100,17 +101,40 @@ class Picture(NamedTuple):
 # ---- files -----------------------------------------------------------------------------------------------------------
 
 
-def check_report(directory: str | Path, inputs: Iterable[str | Path] = (), overwrite: bool = False) -> Path:
-    """Return the folder if `write_inference` can write there, else raise ValueError; call it before the work.
+def check_result_folder(
+    kind: Format, files: Sequence[str], directory: str | Path, inputs: Iterable[str | Path], overwrite: bool
+) -> Path:
+    """Return the folder if a result's files, the record and the page first, can be written there; else ValueError.
 
     `inputs` are files or folders that are read, and so never written over; `overwrite` allows to replace files that no
-    inference wrote.
+    such result wrote.
     """
     folder = Path(directory)
-    ours = Format(FORMAT).owns(folder / "fit.json") and has_mark(folder / "report.html", MARK)
-    first, *more = (folder / name for name in FILES)
-    can_write(first, lambda _: ours, more=more, inputs=inputs, overwrite=overwrite)
+    first, page, *more = (folder / name for name in files)
+    ours = kind.owns(first) and has_mark(page, MARK)
+    can_write(first, lambda _: ours, more=(page, *more), inputs=inputs, overwrite=overwrite)
     return folder
+
+
+@contextmanager
+def fill_folder(target: Path, files: Sequence[str]) -> Iterator[Path]:
+    """Give a temporary folder, and move its files into `target` together once all are whole.
+
+    Those of `files` that an earlier result had and this one lacks are deleted.
+    """
+    with temporary_folder(target / files[0] if target.is_dir() else target) as work:
+        yield work
+        with hold_signals():
+            target.mkdir(exist_ok=True)
+            for name in files:
+                if not (work / name).exists():
+                    remove(target / name)
+            move_together(sorted(work.iterdir()), target)
+
+
+def check_report(directory: str | Path, inputs: Iterable[str | Path] = (), overwrite: bool = False) -> Path:
+    """Return the folder if `write_inference` can write there, else raise ValueError; call it before the work."""
+    return check_result_folder(Format(FORMAT), FILES, directory, inputs, overwrite)
 
 
 def write_inference(inference: Inference, directory: str | Path, *, overwrite: bool = False) -> Path:
@@ -120,16 +144,12 @@ def write_inference(inference: Inference, directory: str | Path, *, overwrite: b
     replaced; others are a ValueError without `overwrite`.
     """
     target = check_report(directory, overwrite=overwrite)
-    with temporary_folder(target / FILES[0] if target.is_dir() else target) as work:
+    with fill_folder(target, FILES) as work:
         (work / "fit.json").write_text(inference.fit.to_json(), encoding="utf-8")
         write_report(inference, work / "report.html")
         if inference.best is not None:
             edge = inference.fit.working_voxel
             save(Field(inference.best, (edge, edge, edge), inference.fit.length_unit), work / "regenerated.nii.gz")
-        with hold_signals():
-            target.mkdir(exist_ok=True)
-            (target / "regenerated.nii.gz").unlink(missing_ok=True)
-            move_together(sorted(work.iterdir()), target)
     return target / "report.html"
 
 

@@ -7,7 +7,7 @@ import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from scipy import ndimage, stats
@@ -183,26 +183,12 @@ def measure(
     check_options(kind, threshold, reading.get("label"))
     field = field_of(scan, **reading)
     options = {"threshold": threshold, "dark": dark, "periodic": periodic}
-    progress("finding the structure", 0.0)
-    mask, seen, notes = _find_structure(field, kind, options)
-    progress("measuring thickness", 0.1)
-    maps = [local_thickness(each, field.spacing, periodic=periodic) for each in (mask, ~mask)]
-    blocks = Blocks.divide(
-        field.shape, field.spacing, sum(float(each[each > 0].mean(dtype=np.float64)) for each in maps)
-    )
-    progress("measuring curvature", 0.6)
-    prepared = prepare(field, kind=seen, **options)  # type: ignore[arg-type]
-    curved, diagram = _sum_curvatures(blocks, prepared)
-    sums = {
-        **_sum_voxels(blocks, mask, maps, field.spacing),
-        **_sum_surface(blocks, mask, field.spacing, periodic),
-        **curved,
-    }
-    table = np.stack([sums[name] for name in SUMS], axis=1)
-    values, names = _combine(table.sum(0)), [name for name, *_ in QUANTITIES]
+    totals = sum_over_blocks(field, kind, options, progress=progress)
+    blocks, table, notes = totals.blocks, totals.table, totals.notes
+    values, names = combine(table.sum(0)), [name for name, *_ in QUANTITIES]
     whole = [names.index("Euler number"), names.index("connectivity density")]
-    values[whole] = measure_connectivity(mask, field.spacing, periodic=periodic)
-    halves = errors(table, blocks, _combine) if blocks.count >= LEAST else np.full(len(values), np.nan)
+    values[whole] = measure_connectivity(totals.mask, field.spacing, periodic=periodic)
+    halves = errors(table, blocks, combine) if blocks.count >= LEAST else np.full(len(values), np.nan)
     if blocks.count < LEAST:
         notes = (*notes, f"No intervals: they need {LEAST} blocks of a period, and the scan has {blocks.count}.")
     rows = zip(QUANTITIES, values, halves, strict=True)
@@ -210,13 +196,53 @@ def measure(
     return Measures(
         source=field.source,
         unit=field.unit,
-        kind=prepared.kind,
+        kind=totals.kind,
         quantities=tuple(Quantity(name, symbol, float(v), float(h), power) for (name, symbol, power, _), v, h in rows),
         direction=tuple(map(float, axes[:, 0] * np.sign(axes[np.abs(axes[:, 0]).argmax(), 0]))),  # type: ignore[arg-type]
-        diagram=diagram,
+        diagram=totals.diagram,
         blocks=blocks.counts,
-        notes=(*notes, *(f"Of curvature: {note}" for note in prepared.notes if note not in notes)),
+        notes=notes,
     )
+
+
+class Totals(NamedTuple):
+    """What a scan sums up to over `blocks`: `table` (N, C) has a row for each block, a column for each of `SUMS`.
+
+    `mask` is the structure on the scan's voxels, and `diagram` has the whole scan's areas in its unit.
+    """
+
+    blocks: Blocks
+    table: np.ndarray
+    mask: np.ndarray
+    diagram: Diagram
+    kind: str
+    notes: tuple[str, ...]
+
+
+def sum_over_blocks(
+    field: Field, kind: str, options: dict[str, Any], blocks: Blocks | None = None, progress: Progress = silent
+) -> Totals:
+    """Return the sums from which `combine` makes a scan's numbers, over blocks, by default of a period.
+
+    `options` are the threshold, dark and periodic of `measure`, whose errors are these too.
+    """
+    progress("finding the structure", 0.0)
+    mask, seen, notes = _find_structure(field, kind, options)
+    progress("measuring thickness", 0.1)
+    maps = [local_thickness(each, field.spacing, periodic=options["periodic"]) for each in (mask, ~mask)]
+    if blocks is None:
+        period = sum(float(each[each > 0].mean(dtype=np.float64)) for each in maps)
+        blocks = Blocks.divide(field.shape, field.spacing, period)
+    progress("measuring curvature", 0.6)
+    prepared = prepare(field, kind=seen, **options)  # type: ignore[arg-type]
+    curved, diagram = _sum_curvatures(blocks, prepared)
+    sums = {
+        **_sum_voxels(blocks, mask, maps, field.spacing),
+        **_sum_surface(blocks, mask, field.spacing, options["periodic"]),
+        **curved,
+    }
+    notes = (*notes, *(f"Of curvature: {note}" for note in prepared.notes if note not in notes))
+    return Totals(blocks, np.stack([sums[name] for name in SUMS], axis=1), mask, diagram, prepared.kind, notes)
 
 
 def _find_structure(field: Field, kind: str, options: dict[str, Any]) -> tuple[np.ndarray, str, tuple[str, ...]]:
@@ -282,7 +308,7 @@ def _sum_curvatures(blocks: Blocks, prepared: Prepared) -> tuple[dict[str, np.nd
     return dict(zip(("curved", "H", "H²", "K", "κ1", "κ2", "C", *FAMILIES), sums.T, strict=True)), physical
 
 
-def _combine(sums: np.ndarray) -> np.ndarray:
+def combine(sums: np.ndarray) -> np.ndarray:
     """Return the quantities (…, K) that follow from sums (…, C)."""
     named = dict(zip(SUMS, np.moveaxis(sums, -1, 0), strict=True))
     with np.errstate(divide="ignore", invalid="ignore"):  # draws of blocks without surface

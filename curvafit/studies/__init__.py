@@ -14,5 +14,7 @@ if TYPE_CHECKING:
     from curvafit.studies.compare import Number as Number
     from curvafit.studies.compare import compare as compare
     from curvafit.studies.tables import write_table as write_table
+    from curvafit.studies.windows import Windows as Windows
+    from curvafit.studies.windows import windows as windows
 
 attach_lazy_names(__name__)

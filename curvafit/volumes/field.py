@@ -93,7 +93,7 @@ class Field(Pictured):
             raise ScanError(f"label {label} {fault} of the scan, which has {listed}")
         return replace(self, values=mask, notes=(*self.notes, f"The structure is label {label}."))
 
-    def move_origin(self, start: Sequence[int]) -> Field:
+    def move_origin(self, start: Sequence[float]) -> Field:
         """Return the field with its first voxel placed where its voxel `start` (z, y, x) is."""
         affine = np.diag([*self.spacing[::-1], 1.0]) if self.affine is None else self.affine.copy()
         affine[:3, 3] += affine[:3, :3] @ np.array(start[::-1], dtype=np.float64)
