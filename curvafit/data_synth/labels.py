@@ -159,12 +159,8 @@ def _find_touching(mask: np.ndarray, grid: Grid) -> np.ndarray:
 
 
 def _measure_radius(distance: np.ndarray, grid: Grid) -> np.ndarray:
-    """Return half the local thickness; a periodic box is continued by the reach of the largest balls."""
-    width = 2 * math.ceil(float(distance.max()) / min(grid.spacing)) + 4 if grid.periodic else 0
-    margin = [min(n // 2, width) for n in grid.shape]
-    padded = np.pad(distance > 0, [(m, m) for m in margin], mode="wrap")
-    inner = tuple(slice(m, m + n) for m, n in zip(margin, grid.shape, strict=True))
-    return local_thickness(padded, grid.spacing)[inner] / 2
+    """Return half the local thickness."""
+    return local_thickness(distance > 0, grid.spacing, periodic=grid.periodic) / 2
 
 
 def _check_field(field: Tensor | np.ndarray, grid: Grid, epsilon: float) -> Tensor:

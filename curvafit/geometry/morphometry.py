@@ -22,8 +22,8 @@ from curvafit.geometry.mesh import Surface, areas, surface
 from curvafit.geometry.topology import euler_number, euler_of_window
 from curvafit.priors.grid import Grid
 
-#: How far a periodic box is continued before distances are taken, in voxels.
-_WRAPPED = 32
+#: How far a periodic box is continued before distances are taken, in voxels: at first, and where balls are wider.
+_WRAPPED = (16, 32)
 
 Length = Annotated[float, Rule(least=0, unknown=True)]
 
@@ -104,64 +104,75 @@ def local_thickness(
     voxel's centre: half a voxel too much on plates (on average over their positions), up to a voxel too little on tubes
     and balls, whose axes miss the grid; for the same reason a ball covers voxels up to half a voxel beyond its rim.
     Where balls are wider than `largest` voxels in radius they are painted on a grid coarser by a whole factor, at a
-    cost of under 1/`largest` of their size. A periodic box is continued by `_WRAPPED` voxels; of another, balls may
-    reach out.
+    cost of under 1/`largest` of their size. Balls of a periodic box go round it, up to 32 voxels in radius; of
+    another they may reach out.
     """
     mask = np.asarray(mask, dtype=bool)
     if not mask.any() or mask.all():
         return np.where(mask, np.float32(np.inf), np.float32(0))
-    if periodic:
-        margin = [min(n // 2, _WRAPPED) for n in mask.shape]
-        padded = np.pad(mask, [(m, m) for m in margin], mode="wrap")
-        inner = tuple(slice(m, m + n) for m, n in zip(margin, mask.shape, strict=True))
-        return local_thickness(padded, spacing, largest=largest)[inner]
     edge = float(min(spacing))
-    radius = ndimage.distance_transform_edt(mask, sampling=spacing).astype(np.float32)  # type: ignore[union-attr]
-    factor = math.ceil(float(radius.max()) / edge / largest)
+    for width in _WRAPPED if periodic else (0,):
+        margin = [min(n // 2, width) for n in mask.shape]
+        inner = tuple(slice(m, m + n) for m, n in zip(margin, mask.shape, strict=True))
+        padded = np.pad(mask, [(m, m) for m in margin], mode="wrap")
+        radius = ndimage.distance_transform_edt(padded, sampling=spacing).astype(np.float32)  # type: ignore[union-attr]
+        if radius[inner].max() < width * edge:
+            break
+    factor = math.ceil(float(radius[inner].max()) / edge / largest)
     if factor == 1:
-        return 2 * _largest_balls(radius, np.asarray(spacing, dtype=np.float32), edge)
+        return 2 * _largest_balls(radius[inner], np.asarray(spacing, dtype=np.float32), edge, periodic)
     coarse = block_reduce(radius, factor, np.max)
     painted = _largest_balls(coarse, np.asarray(spacing, dtype=np.float32) * factor, edge)
-    fine = painted.repeat(factor, 0).repeat(factor, 1).repeat(factor, 2)[tuple(slice(n) for n in mask.shape)]
-    return np.where(mask, 2 * np.maximum(fine, radius), np.float32(0))
+    fine = painted.repeat(factor, 0).repeat(factor, 1).repeat(factor, 2)[tuple(slice(n) for n in padded.shape)]
+    return np.where(padded, 2 * np.maximum(fine, radius), np.float32(0))[inner]
 
 
-def _largest_balls(radius: np.ndarray, spacing: np.ndarray, edge: float) -> np.ndarray:
+def _largest_balls(radius: np.ndarray, spacing: np.ndarray, edge: float, periodic: bool = False) -> np.ndarray:
     centres = np.flatnonzero(radius > 0)
     order = centres[np.argsort(-radius.ravel()[centres], kind="stable")]
     painted = np.zeros(radius.size, dtype=np.float32)
     owner = np.full(radius.size, -1, dtype=np.int64)
-    _paint(order, radius.ravel(), painted, owner, np.array(radius.shape), spacing, np.float32(edge))
+    _paint(order, radius.ravel(), painted, owner, np.array(radius.shape), spacing, np.float32(edge), periodic)
     return np.where(radius > 0, painted.reshape(radius.shape), np.float32(0))
 
 
 @njit(cache=True)
-def _paint(order, radius, painted, owner, shape, spacing, edge):  # pragma: no cover
+def _paint(order, radius, painted, owner, shape, spacing, edge, periodic):  # pragma: no cover
     """Paint balls in descending size; each voxel keeps the first, hence largest, that covers it (and which it was)."""
-    ny, nx = shape[1], shape[2]
+    nz, ny, nx = shape
     hz, hy, hx = spacing
     for centre in order:
         r = radius[centre]
         z, y, x = centre // (ny * nx), centre // nx % ny, centre % nx
         if owner[centre] >= 0:
             o = owner[centre]
-            dz, dy, dx = (z - o // (ny * nx)) * hz, (y - o // nx % ny) * hy, (x - o % nx) * hx
-            out = np.sqrt(dz * dz + dy * dy + dx * dx) + r - radius[o]
+            dz, dy, dx = abs(z - o // (ny * nx)), abs(y - o // nx % ny), abs(x - o % nx)
+            if periodic:
+                dz, dy, dx = min(dz, nz - dz), min(dy, ny - dy), min(dx, nx - dx)
+            out = np.sqrt((dz * hz) ** 2 + (dy * hy) ** 2 + (dx * hx) ** 2) + r - radius[o]
             if out <= max(0.5 * edge, 0.05 * radius[o]):
                 continue
         reach = r + 0.5 * edge
         kz, ky = int(reach / hz), int(reach / hy)
-        for k in range(max(0, z - kz), min(shape[0], z + kz + 1)):
-            for j in range(max(0, y - ky), min(ny, y + ky + 1)):
+        lowest, highest = (z - kz, z + kz + 1) if periodic else (max(0, z - kz), min(nz, z + kz + 1))
+        front, back = (y - ky, y + ky + 1) if periodic else (max(0, y - ky), min(ny, y + ky + 1))
+        for k in range(lowest, highest):
+            plane = (k + nz if k < 0 else k - nz if k >= nz else k) * ny
+            for j in range(front, back):
                 rest = reach * reach - ((k - z) * hz) ** 2 - ((j - y) * hy) ** 2
                 if rest < 0:
                     continue
                 kx = int(np.sqrt(rest) / hx)
-                row = (k * ny + j) * nx
+                row = (plane + (j + ny if j < 0 else j - ny if j >= ny else j)) * nx
                 for i in range(max(0, x - kx), min(nx, x + kx + 1)):
                     if painted[row + i] < r:
                         painted[row + i] = r
                         owner[row + i] = centre
+                if periodic:
+                    for i in range(x - kx, x + kx + 1):
+                        if not 0 <= i < nx and painted[row + i % nx] < r:
+                            painted[row + i % nx] = r
+                            owner[row + i % nx] = centre
 
 
 def smooth_surface(mask: np.ndarray, spacing: tuple[float, float, float], *, periodic: bool = False) -> Surface:
