@@ -27,6 +27,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import product
+from typing import Any
 
 import numpy as np
 from scipy import ndimage, stats
@@ -134,8 +135,8 @@ def studies(pools: Sequence[Sequence[Measures]], count: int, times: int) -> Valu
             scans = [subjects[k] for k in chosen]
             whole = compare(scans[:count], scans[count:], permutations=PERMUTATIONS, seed=seed)
             assert np.allclose(p, (whole.p, min(each.family for each in whole.numbers)))
-        t = stats.ttest_ind(numbers[:count, FAMILIAR], numbers[count:, FAMILIAR]).pvalue
-        found.append([*map(float, p), float(correct_holm(t).min())])
+        t: Any = stats.ttest_ind(numbers[:count, FAMILIAR], numbers[count:, FAMILIAR])
+        found.append([*map(float, p), float(correct_holm(t.pvalue).min())])
     return {test: np.round(p, 4).tolist() for test, p in zip(TESTS, np.transpose(found), strict=True)}
 
 
