@@ -47,7 +47,7 @@ from curvafit.studies.scans import FINE
 from curvafit.volumes.field import Field, ScanError
 
 WINDOW, EDGE, SUBJECTS = 50, 64, 20
-BASE, SHIFTED, SHIFTS = "tubes", ("a10", "a01"), (0.25, 0.5, 1.0)
+BASE, SHIFTED, SHIFTS = "tubes", ("a10", "a01"), (0.25, 0.5, 0.1)
 LAWS = (BASE, *(f"{name}-{shift:g}" for name, shift in product(SHIFTED, SHIFTS)))
 COUNTS, STUDIES, NULLS, PERMUTATIONS = (4, 6, 10), 200, 1000, 499
 OTHERS = ("mitochondria-32", "felt", "vesselexpress")
