@@ -132,47 +132,59 @@ def _largest_balls(radius: np.ndarray, spacing: np.ndarray, edge: float, periodi
     order = centres[np.argsort(-radius.ravel()[centres], kind="stable")]
     painted = np.zeros(radius.size, dtype=np.float32)
     owner = np.full(radius.size, -1, dtype=np.int64)
-    _paint(order, radius.ravel(), painted, owner, np.array(radius.shape), spacing, np.float32(edge), periodic)
+    _paint(order, (radius.ravel(), painted, owner), np.array(radius.shape), spacing, np.float32(edge), periodic)
     return np.where(radius > 0, painted.reshape(radius.shape), np.float32(0))
 
 
 @njit(cache=True)
-def _paint(order, radius, painted, owner, shape, spacing, edge, periodic):  # pragma: no cover
+def _paint(order, balls, shape, spacing, edge, periodic):  # pragma: no cover
     """Paint balls in descending size; each voxel keeps the first, hence largest, that covers it (and which it was)."""
+    radius, _, owner = balls
     nz, ny, nx = shape
     hz, hy, hx = spacing
     for centre in order:
         r = radius[centre]
-        z, y, x = centre // (ny * nx), centre // nx % ny, centre % nx
         if owner[centre] >= 0:
             o = owner[centre]
-            dz, dy, dx = abs(z - o // (ny * nx)), abs(y - o // nx % ny), abs(x - o % nx)
+            dz, dy, dx = (
+                abs(centre // (ny * nx) - o // (ny * nx)),
+                abs(centre // nx % ny - o // nx % ny),
+                abs(centre % nx - o % nx),
+            )
             if periodic:
                 dz, dy, dx = min(dz, nz - dz), min(dy, ny - dy), min(dx, nx - dx)
             out = np.sqrt((dz * hz) ** 2 + (dy * hy) ** 2 + (dx * hx) ** 2) + r - radius[o]
             if out <= max(0.5 * edge, 0.05 * radius[o]):
                 continue
-        reach = r + 0.5 * edge
-        kz, ky = int(reach / hz), int(reach / hy)
-        lowest, highest = (z - kz, z + kz + 1) if periodic else (max(0, z - kz), min(nz, z + kz + 1))
-        front, back = (y - ky, y + ky + 1) if periodic else (max(0, y - ky), min(ny, y + ky + 1))
-        for k in range(lowest, highest):
-            plane = (k + nz if k < 0 else k - nz if k >= nz else k) * ny
-            for j in range(front, back):
-                rest = reach * reach - ((k - z) * hz) ** 2 - ((j - y) * hy) ** 2
-                if rest < 0:
-                    continue
-                kx = int(np.sqrt(rest) / hx)
-                row = (plane + (j + ny if j < 0 else j - ny if j >= ny else j)) * nx
-                for i in range(max(0, x - kx), min(nx, x + kx + 1)):
-                    if painted[row + i] < r:
-                        painted[row + i] = r
-                        owner[row + i] = centre
-                if periodic:
-                    for i in range(x - kx, x + kx + 1):
-                        if not 0 <= i < nx and painted[row + i % nx] < r:
-                            painted[row + i % nx] = r
-                            owner[row + i % nx] = centre
+        _paint_ball(centre, balls, shape, spacing, r + 0.5 * edge, periodic)
+
+
+@njit(cache=True)
+def _paint_ball(centre, balls, shape, spacing, reach, periodic):  # pragma: no cover
+    """Paint one ball where no larger one is."""
+    radius, painted, owner = balls
+    nz, ny, nx = shape
+    hz, hy, hx = spacing
+    r, z, y, x = radius[centre], centre // (ny * nx), centre // nx % ny, centre % nx
+    kz, ky = int(reach / hz), int(reach / hy)
+    lowest, highest = (z - kz, z + kz + 1) if periodic else (max(0, z - kz), min(nz, z + kz + 1))
+    front, back = (y - ky, y + ky + 1) if periodic else (max(0, y - ky), min(ny, y + ky + 1))
+    for k in range(lowest, highest):
+        plane = (k + nz if k < 0 else k - nz if k >= nz else k) * ny
+        for j in range(front, back):
+            rest = reach * reach - ((k - z) * hz) ** 2 - ((j - y) * hy) ** 2
+            if rest < 0:
+                continue
+            kx = int(np.sqrt(rest) / hx)
+            row = (plane + (j + ny if j < 0 else j - ny if j >= ny else j)) * nx
+            for i in range(row + max(0, x - kx), row + min(nx, x + kx + 1)):
+                if painted[i] < r:
+                    painted[i] = r
+                    owner[i] = centre
+            for i in range(x - kx, x + kx + 1 if periodic else x - kx):
+                if not 0 <= i < nx and painted[row + i % nx] < r:
+                    painted[row + i % nx] = r
+                    owner[row + i % nx] = centre
 
 
 def smooth_surface(mask: np.ndarray, spacing: tuple[float, float, float], *, periodic: bool = False) -> Surface:
