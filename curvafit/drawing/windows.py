@@ -14,7 +14,7 @@ from curvafit.drawing.plot import LABELS, TAILS, THIN, make_figure
 from curvafit.drawing.render import QUIET
 
 #: Panels in a row; grey of structure whose windows are not known.
-COLUMNS, UNKNOWN = 6, 0.88
+COLUMNS, UNKNOWN = 5, 0.88
 #: Colours of clusters from 0 on: the strong ones of labels first.
 COLOURS = np.vstack([LABELS[:1], LABELS[1::2], LABELS[2::2]])
 
@@ -26,7 +26,7 @@ def windows_figure(windows: Any) -> Figure:
     """
     quantities = windows.quantities
     rows = -(-(3 + len(quantities)) // COLUMNS)
-    figure = make_figure(13.2, 2.65 * rows, layout="constrained")
+    figure = make_figure(13.2, 3.1 * rows, layout="constrained")
     panels = figure.subplots(rows, COLUMNS, squeeze=False).ravel()
     for axes in panels[3 + len(quantities) :]:
         axes.set_axis_off()

@@ -1,0 +1,66 @@
+"""What maps of windows say of volumes whose local size is known.
+
+White noise, blurred by a Gaussian whose width is another in each slice, is cut at its 70 % quantile: the width is the
+only length there is, so that thickness goes with it, and surface per volume and curvedness with its inverse. In `graded`
+volumes the width goes from 2.5 to 4.5 voxels along z; in `halves` it is one or the other, and the clusters of windows
+that do not straddle are held against it.
+"""
+
+from __future__ import annotations
+
+import argparse
+from functools import partial
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from benchmarks.harness import Cases, Figure, Values, bootstrap, show
+from curvafit.studies.windows import windows
+
+#: Voxels along z, y, x; the widths at both ends; windows; and seeds.
+SHAPE, ENDS, SIZE, STRIDE, SEEDS = (128, 80, 80), (2.5, 4.5), 32, 16, 4
+POWERS = {"thickness": 1, "spacing": 1, "surface density": -1, "curvedness": -1}
+
+
+def textured(widths: np.ndarray, seed: int) -> np.ndarray:
+    """Return a level set, uint8, whose Gaussian field has a width of its own in each slice."""
+    noise, field = np.random.default_rng(seed).standard_normal(SHAPE), np.empty(SHAPE)
+    for width in np.unique(widths):
+        blurred = gaussian_filter(noise, width, mode="wrap")
+        field[widths == width] = (blurred / blurred.std())[widths == width]
+    return (field > np.quantile(field, 0.7)).astype(np.uint8)
+
+
+def case(kind: str, seed: int) -> Values:
+    steps = np.linspace(*ENDS, 17 if kind == "graded" else 2)
+    widths = steps[np.arange(SHAPE[0]) * len(steps) // SHAPE[0]]
+    maps = windows(textured(widths, seed), SIZE, STRIDE, kind="mask")
+    known = maps.known
+    local = np.lib.stride_tricks.sliding_window_view(widths, SIZE)[::STRIDE]
+    truth = np.broadcast_to(local.mean(1)[:, None, None], known.shape)
+    if kind == "halves":
+        whole = known & (np.ptp(local, axis=1) == 0)[:, None, None]
+        right = (maps.clusters.values == 2) == (truth > np.mean(ENDS))
+        return {"clusters": float(right[whole].mean()), "windows": int(whole.sum())}
+    return {
+        name: float(np.corrcoef(truth[known] ** power, maps[name].values[known])[0, 1] ** 2)
+        for name, power in POWERS.items()
+    }
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    pass
+
+
+def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
+    seeds = range(1 if options.quick else SEEDS)
+    jobs = {f"{kind}-{seed}": partial(case, kind, seed) for kind in ("graded", "halves") for seed in seeds}
+    found = cases.all(jobs)
+    figures = {
+        f"windows.{name.replace(' ', '_')}": bootstrap(
+            [values[name] for values in found.values() if name in values], np.mean
+        )
+        for name in (*POWERS, "clusters")
+    }
+    show(["R² of the map with the truth; share of windows in their half's cluster", "mean"], list(figures.items()))
+    return figures
