@@ -1,9 +1,9 @@
 """What maps of windows say of volumes whose local size is known.
 
-White noise, blurred by a Gaussian whose width is another in each slice, is cut at its 70 % quantile: the width is the
-only length there is, so that thickness goes with it, and surface per volume and curvedness with its inverse. In `graded`
-volumes the width goes from 2.5 to 4.5 voxels along z; in `halves` it is one or the other, and the clusters of windows
-that do not straddle are held against it.
+White noise, blurred by a Gaussian whose width is another in each slice, is cut at its 70 % quantile. The width is
+the only length there: thickness goes with it, surface per volume and curvedness with its inverse. In `graded` volumes
+the width goes from 2.5 to 4.5 voxels along z; in `halves` it is one or the other, and the clusters of windows that do
+not straddle are held against it. A window holds few periods: what R² lacks is mostly chance.
 """
 
 from __future__ import annotations
