@@ -10,6 +10,7 @@ curvatures at constant volume.
 - Files: `load(path)` and `save(volume, path)` read and write volumes with their spacing and unit.
 - Compare: `compare(group_a, group_b)` tells whether two groups of scans differ, and in what.
 - Map: `windows(scan)` measures a scan in windows: where its texture differs, in maps and clusters.
+- Follow: `trajectory(scans, times)` tells what a series of scans of one thing does over time.
 - Measure: `measure(scan)`, `diagram(u, grid, epsilon)` and `wasserstein(a, b)`; more in `curvafit.geometry`.
 
 A law is `Coefficients`, the name of a preset (`preset`), or the path of a `fit.json`. The public names are loaded when
@@ -44,6 +45,8 @@ if TYPE_CHECKING:
     from curvafit.segmentation.segment import segment as segment
     from curvafit.studies.compare import Comparison as Comparison
     from curvafit.studies.compare import compare as compare
+    from curvafit.studies.trajectory import Trajectory as Trajectory
+    from curvafit.studies.trajectory import trajectory as trajectory
     from curvafit.studies.windows import Windows as Windows
     from curvafit.studies.windows import windows as windows
     from curvafit.volumes.field import Field as Field
@@ -61,6 +64,7 @@ _FIGURES = {
     "Flow": "curvafit.drawing.plot:flow_figure",
     "Inference": "curvafit.report.page:inference_figure",
     "Segmentation": "curvafit.segmentation.result:segmentation_figure",
+    "Trajectory": "curvafit.report.trajectory:trajectory_figure",
     "Windows": "curvafit.drawing.windows:windows_figure",
 }
 

@@ -10,7 +10,19 @@ from typing import Annotated
 
 import typer
 
-from curvafit.cli import compare, generate, infer, measure, nnunet, refine, samples, segment, synth, windows
+from curvafit.cli import (
+    compare,
+    generate,
+    infer,
+    measure,
+    nnunet,
+    refine,
+    samples,
+    segment,
+    synth,
+    trajectory,
+    windows,
+)
 from curvafit.cli.atlas import atlas_app
 from curvafit.cli.console import Commands, say
 from curvafit.cli.options import add_commands
@@ -26,7 +38,8 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
     cls=Commands,
 )
-add_commands(app, samples.demo, infer.infer, measure.measure, windows.windows, compare.compare)
+add_commands(app, samples.demo, infer.infer, measure.measure, windows.windows)
+add_commands(app, compare.compare, trajectory.trajectory)
 add_commands(app, generate.generate, generate.presets, nnunet.nnunet)
 add_commands(app, segment.segment, refine.refine, segment.reconstruct, synth.synth)
 app.add_typer(samples.samples_app, name="samples")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,7 @@ def comparison_figure(comparison: Any) -> Figure:
 
     The outline holds the bins that differ significantly among all.
     """
-    edges, (a, b) = comparison.edges, map(_plain, comparison.groups)
+    edges, (a, b) = comparison.edges, map(plain, comparison.groups)
     limits, unit = (edges[0], edges[-1]), comparison.unit
     figure = make_figure(13.2, 4.5)
     for k, (name, diagram) in enumerate(zip((a, b), comparison.diagrams, strict=True)):
@@ -68,34 +69,51 @@ def numbers_figure(comparison: Any) -> Figure:
 
     A long line is a group's mean. The names of quantities that differ significantly among all are bold.
     """
-    rows = -(-len(comparison.numbers) // COLUMNS)
-    figure = make_figure(13.2, 2.5 * rows, layout="constrained")
-    panels = figure.subplots(rows, COLUMNS, squeeze=False).ravel()
-    for axes in panels[len(comparison.numbers) :]:
-        axes.set_axis_off()
+    figure, panels = number_panels(
+        comparison.numbers,
+        comparison.unit,
+        comparison.level,
+        lambda number: f"g = {format_number(number.effect, 2)}, p = {format_number(number.p, 2)}",
+    )
     second = np.array([group == comparison.groups[1] for group, _ in comparison.subjects])
-    for k, (axes, number) in enumerate(zip(panels, comparison.numbers, strict=False)):
+    for k, (axes, number) in enumerate(zip(panels, comparison.numbers, strict=True)):
         for side, colour in ((0, FIRST), (1, SECOND)):
             values, errors = (table[second == bool(side), k] for table in (comparison.values, comparison.errors))
             places = side + np.linspace(-0.18, 0.18, len(values))
             axes.vlines(places, values - 1.96 * errors, values + 1.96 * errors, color=colour, alpha=0.35, linewidth=1.4)
             axes.plot(places, values, "o", color=colour, markersize=4, markeredgewidth=0)
             axes.hlines(number.means[side], side - 0.32, side + 0.32, color=INK, linewidth=1.4)
-        unit = power_name(comparison.unit, number.power)
-        axes.set_title(
-            number.symbol + (f" ({unit})" if unit else ""),
-            fontsize=9.5,
-            fontweight="bold" if number.family <= comparison.level else "normal",
-        )
-        axes.set_xlabel(f"g = {format_number(number.effect, 2)}, p = {format_number(number.p, 2)}", fontsize=8)
-        axes.set_xticks([0, 1], [_plain(name)[:WORD] for name in comparison.groups], fontsize=8)
+        axes.set_xticks([0, 1], [plain(name)[:WORD] for name in comparison.groups], fontsize=8)
         axes.set_xlim(-0.6, 1.6)
-        axes.yaxis.set_major_locator(MaxNLocator(4))
-        axes.tick_params(length=2, labelsize=8)
-        axes.spines[:].set_color(QUIET)
     return figure
 
 
-def _plain(name: str) -> str:
+def number_panels(
+    numbers: Sequence[Any], unit: str, level: float, label: Callable[[Any], str]
+) -> tuple[Figure, list[Axes]]:
+    """Return a figure with a panel for each quantity, its symbol above and its label below.
+
+    The symbol is bold where the quantity's family-wise p is at most `level`.
+    """
+    rows = -(-len(numbers) // COLUMNS)
+    figure = make_figure(13.2, 2.5 * rows, layout="constrained")
+    panels = list(figure.subplots(rows, COLUMNS, squeeze=False).ravel())
+    for axes in panels[len(numbers) :]:
+        axes.set_axis_off()
+    for axes, number in zip(panels, numbers, strict=False):
+        name = power_name(unit, number.power)
+        axes.set_title(
+            number.symbol + (f" ({name})" if name else ""),
+            fontsize=9.5,
+            fontweight="bold" if number.family <= level else "normal",
+        )
+        axes.set_xlabel(label(number), fontsize=8)
+        axes.yaxis.set_major_locator(MaxNLocator(4))
+        axes.tick_params(length=2, labelsize=8)
+        axes.spines[:].set_color(QUIET)
+    return figure, panels[: len(numbers)]
+
+
+def plain(name: str) -> str:
     """Return a name that matplotlib does not take for a formula."""
     return name.replace("$", "\\$")

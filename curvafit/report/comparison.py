@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -17,11 +17,12 @@ from matplotlib.figure import Figure
 from curvafit.core.records import Format
 from curvafit.core.units import format_number, format_percent, per_unit, power_name
 from curvafit.drawing.groups import comparison_figure, numbers_figure
-from curvafit.drawing.plot import png, svg
 from curvafit.geometry.distances import DIRECTIONS, QUANTILES
-from curvafit.report.page import check_result_folder, fill_folder, picture_of, render_template
+from curvafit.report.page import check_result_folder, picture_of, render_template, write_study
+from curvafit.scan.measure import Measures
 from curvafit.studies.compare import BINS, LEVEL, SMOOTH, Comparison, Number
 from curvafit.studies.tables import format_csv, plain_unit, rows_of
+from curvafit.studies.trajectory import Change, Trajectory
 
 #: `format` of a comparison's record.
 FORMAT = Format("curvafit comparison", 1, title="the record of a comparison")
@@ -44,21 +45,14 @@ def write_comparison(
     others are a ValueError without `overwrite`. `command` is what the record calls the command line.
     """
     target = check_comparison(directory, overwrite=overwrite)
-    with fill_folder(target, FILES) as work:
-        figures = {"difference": comparison_figure(comparison), "numbers": numbers_figure(comparison)}
-        record = _record(comparison, command)
-        texts = {
-            "measures.csv": format_csv(list(_measure_rows(comparison))),
-            "numbers.csv": format_csv(list(_test_rows(comparison))),
-            "compare.html": _page(comparison, record, figures),
-        }
-        for name, text in texts.items():
-            (work / name).write_text(text, encoding="utf-8", newline="")
-        for name, figure in figures.items():
-            (work / f"{name}.png").write_bytes(png(figure))
-            (work / f"{name}.svg").write_bytes(svg(figure))
-        FORMAT.write(work / FILES[0], record)
-    return target / "compare.html"
+    figures = {"difference": comparison_figure(comparison), "numbers": numbers_figure(comparison)}
+    record = _record(comparison, command)
+    texts = {
+        "measures.csv": format_csv(list(_measure_rows(comparison))),
+        "numbers.csv": format_csv(list(_test_rows(comparison))),
+        "compare.html": _page(comparison, record, figures),
+    }
+    return write_study(target, FORMAT, FILES, record, texts, **figures)
 
 
 def _page(comparison: Comparison, record: dict[str, Any], figures: dict[str, Figure]) -> str:
@@ -95,12 +89,10 @@ def describe_methods(comparison: Comparison) -> str:
     found = ", ".join(f"{each.symbol} (g = {format_number(each.effect, 2)})" for each in differ)
     found = f"{len(differ)} of them differ{f': {found}' if differ else ''}."
     tested = int(np.isfinite(c.bins_p).sum())
-    kinds = " and ".join(f"{n} were taken for {kind}s" for kind, n in Counter(each.kind for each in c.measures).items())
-    grey = f" (threshold {c.options['threshold']})" if "image" in kinds and "threshold" in c.options else ""
     return " ".join(
         [
             f"Scans of two groups, {' and '.join(_count_scans(c))}, were measured with curvafit {version('curvafit')}; "
-            f"{kinds}{grey}.",
+            f"{say_kinds(c.measures, c.options)}.",
             "Thickness and spacing are mean diameters of the largest balls that fit (Hildebrand & Rüegsegger 1997); "
             "connectivity is that of the Euler number.",
             "The curvature diagram of a scan is the share of its surface's area over the principal curvatures κ₁ ≥ κ₂.",
@@ -120,6 +112,12 @@ def describe_methods(comparison: Comparison) -> str:
     )
 
 
+def say_kinds(measures: Sequence[Measures], options: dict[str, Any]) -> str:
+    """Return what scans were taken for, and the threshold of images."""
+    kinds = " and ".join(f"{n} were taken for {kind}s" for kind, n in Counter(each.kind for each in measures).items())
+    return kinds + (f" (threshold {options['threshold']})" if "image" in kinds and "threshold" in options else "")
+
+
 def _count_scans(comparison: Comparison) -> list[str]:
     """Return each group's name with the numbers of its scans and subjects."""
     groups = Counter(case.group for case in comparison.cases)
@@ -131,7 +129,6 @@ def _count_scans(comparison: Comparison) -> list[str]:
 
 def _format_row(number: Number, unit: str) -> dict[str, Any]:
     """Return a row of the page's table."""
-    name = power_name(unit, number.power)
     means = (
         f"{format_number(mean)} ± {format_number(sd, 2)}"
         for mean, sd in zip(number.means, number.deviations, strict=True)
@@ -140,9 +137,13 @@ def _format_row(number: Number, unit: str) -> dict[str, Any]:
     interval = f"{format_number(number.low, 2)} to {format_number(number.high, 2)}"
     known = "–" if math.isnan(number.known) else "all" if number.known >= 1 else format_percent(number.known)
     cells = (*means, format_number(number.difference), format_number(number.effect, 2), interval, *ps, known)
-    title = number.name[0].upper() + number.name[1:]
-    symbol = ", ".join(part for part in ("" if number.symbol in number.name else number.symbol, name) if part)
-    return {"name": title, "symbol": symbol, "cells": cells, "chosen": number.family <= LEVEL}
+    return {**name_quantity(number, unit), "cells": cells, "chosen": number.family <= LEVEL}
+
+
+def name_quantity(number: Number | Change, unit: str) -> dict[str, str]:
+    """Return the name of a quantity, and its symbol and unit, as a table has them."""
+    parts = ("" if number.symbol in number.name else number.symbol, power_name(unit, number.power))
+    return {"name": number.name[0].upper() + number.name[1:], "symbol": ", ".join(part for part in parts if part)}
 
 
 # ---- tables and record -----------------------------------------------------------------------------------------------
@@ -165,37 +166,44 @@ def _test_rows(comparison: Comparison) -> Iterator[dict[str, Any]]:
         cells = (each.name, each.symbol, plain_unit(comparison.unit, each.power), *each.means, *each.deviations)
         cells += (each.difference, each.effect, each.low, each.high)
         cells += (each.p, each.family, each.holm, each.discovery, each.known)
-        yield {name: _known(cell) for name, cell in zip(columns, cells, strict=True)}
+        yield {name: known(cell) for name, cell in zip(columns, cells, strict=True)}
 
 
 def _record(comparison: Comparison, command: str) -> dict[str, Any]:
     """Return the content of `compare.json`."""
     return {
-        "curvafit": version("curvafit"),
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "command": command,
+        **record_study(comparison, command, FILES),
         "groups": list(comparison.groups),
-        "unit": comparison.unit,
         "scans": [
             {"scan": each.source, "subject": case.subject, "group": case.group, "kind": each.kind}
             for each, case in zip(comparison.measures, comparison.cases, strict=True)
         ],
-        "options": json.loads(json.dumps(comparison.options, default=str)),
-        "seed": comparison.options["seed"],
-        "permutations": comparison.permutations,
-        "exact": comparison.exact,
-        "status": comparison.status,
         "energy": comparison.energy,
-        "p": comparison.p,
         "apart": comparison.apart,
         "within": comparison.within,
         "tests": list(_test_rows(comparison)),
         "methods": describe_methods(comparison),
-        "notes": list(comparison.notes),
-        "files": list(FILES),
     }
 
 
-def _known(cell: Any) -> Any:
+def record_study(study: Comparison | Trajectory, command: str, files: Sequence[str]) -> dict[str, Any]:
+    """Return what the records of all studies hold."""
+    return {
+        "curvafit": version("curvafit"),
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "command": command,
+        "unit": study.unit,
+        "options": json.loads(json.dumps(study.options, default=str)),
+        "seed": study.options["seed"],
+        "permutations": study.permutations,
+        "exact": study.exact,
+        "status": study.status,
+        "p": known(study.p),
+        "notes": list(study.notes),
+        "files": list(files),
+    }
+
+
+def known(cell: Any) -> Any:
     """Return a cell, None where it is a number that is not finite."""
     return None if isinstance(cell, float) and not math.isfinite(cell) else cell

@@ -38,6 +38,7 @@ from curvafit.drawing.plot import (
     shared_limits,
     slice_figure,
     surface_figure,
+    svg,
 )
 from curvafit.inference.candidates import TITLES, Candidate, seed_noise_of
 from curvafit.inference.table import parameters_of
@@ -130,6 +131,20 @@ def fill_folder(target: Path, files: Sequence[str]) -> Iterator[Path]:
                 if not (work / name).exists():
                     remove(target / name)
             move_together(sorted(work.iterdir()), target)
+
+
+def write_study(
+    target: Path, form: Format, files: Sequence[str], record: dict[str, Any], texts: dict[str, str], **figures: Figure
+) -> Path:
+    """Write a study's record, texts, and figures as PNG and SVG, into a folder together; return the page's path."""
+    with fill_folder(target, files) as work:
+        for name, text in texts.items():
+            (work / name).write_text(text, encoding="utf-8", newline="")
+        for name, figure in figures.items():
+            (work / f"{name}.png").write_bytes(png(figure))
+            (work / f"{name}.svg").write_bytes(svg(figure))
+        form.write(work / files[0], record)
+    return target / files[1]
 
 
 def check_report(directory: str | Path, inputs: Iterable[str | Path] = (), overwrite: bool = False) -> Path:

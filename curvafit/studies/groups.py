@@ -9,7 +9,7 @@ from os import PathLike, fspath
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from curvafit.core.checks import quoted
+from curvafit.core.checks import as_tuple, quoted
 from curvafit.scan.measure import Measures
 from curvafit.volumes.field import ScanError
 from curvafit.volumes.read import Source, pick_reader
@@ -57,6 +57,11 @@ def list_cases(
             cases = [case._replace(subject=f"{case.group}/{case.subject}") for case in cases] if both else cases
     _check(cases)
     return cases, notes
+
+
+def list_series(scans: Sequence[Source | Measures]) -> list[Case]:
+    """Return the scans of a series, each a group of its own."""
+    return [case._replace(group=case.subject) for case in _gather(as_tuple(scans, "scans"), "scan ", [])]
 
 
 def _check(cases: Sequence[Case]) -> None:

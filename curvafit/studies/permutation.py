@@ -1,8 +1,8 @@
-"""Do two groups differ? Tests by relabelling of subjects, corrections for many numbers, and an effect size.
+"""Do two groups differ, does a series move? Tests by relabelling, corrections for many numbers, and an effect size.
 
 If both groups are of one law, each choice of subjects for the second was as likely as the one that was made: a p-value
 is the share of choices that differ at least as much, and p ≤ α comes up with probability α at most, however few the
-subjects are.
+subjects are. So it is with the orders of a series, if each was as likely.
 """
 
 from __future__ import annotations
@@ -37,6 +37,17 @@ def relabel(second: np.ndarray, most: int, seed: int = 0) -> tuple[np.ndarray, b
     return choices[np.argsort((choices != second).any(1), kind="stable")], exact
 
 
+def reorder(count: int, most: int, seed: int = 0) -> tuple[np.ndarray, bool]:
+    """Return orders of 0 to `count` - 1, int (m, count), the natural one first, and whether they are all there are.
+
+    All are returned where there are no more than `most`; else `most` random ones after the first, from `seed`.
+    """
+    if math.factorial(count) <= most:
+        return np.array(list(itertools.permutations(range(count)))), True
+    random = np.random.default_rng(seed)
+    return np.stack([np.arange(count), *(random.permutation(count) for _ in range(most))]), False
+
+
 def share_beyond(statistics: np.ndarray) -> np.ndarray:
     """Return the share (…) of choices whose statistic (m, …) is at least that of the first: the p-value."""
     return (statistics >= statistics[0] * (1 - TIE)).mean(0)
@@ -60,6 +71,8 @@ def measure_energy(away: np.ndarray, choices: np.ndarray) -> np.ndarray:
 
 def correlate(values: np.ndarray, choices: np.ndarray) -> np.ndarray:
     """Return |r| (m, d), the correlation of each number (n, d) with being in the second group, by choice (m, n).
+
+    Choices may be numbers too, such as times in other orders.
 
     For one number it orders choices as the difference of means and Student's t do; over many it is free of their
     scales. It is 0 where a number is the same for all, and NaN where one is not known.

@@ -24,7 +24,7 @@ COLUMNS = ("scan", "quantity", "symbol", "value", "low", "high", "unit", "direct
 FORMAT = Format("curvafit measures 1", title="a table of measures")
 
 
-def rows_of(measures: Measures, **more: str) -> list[dict[str, Any]]:
+def rows_of(measures: Measures, **more: str | float) -> list[dict[str, Any]]:
     """Return a row for each quantity of a scan, as values by column; None where a number is not known.
 
     `more` are further columns with the same value in each row.

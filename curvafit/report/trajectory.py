@@ -1,0 +1,224 @@
+"""The page of a series of scans, its figures and its table, and a paragraph on the methods."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+
+from curvafit.atlas_map.picture import FAMILY_COLOURS, map_on
+from curvafit.core.records import Format
+from curvafit.core.units import format_number, per_unit
+from curvafit.drawing.groups import FIRST, number_panels, plain
+from curvafit.drawing.plot import INK, QUIET, make_figure
+from curvafit.geometry.diagram import FAMILIES
+from curvafit.geometry.distances import DIRECTIONS, QUANTILES
+from curvafit.inference.atlas import load_atlas
+from curvafit.priors.grid import WORKING_SPACING
+from curvafit.report.comparison import known, name_quantity, record_study, say_kinds
+from curvafit.report.page import check_result_folder, picture_of, render_template, write_study
+from curvafit.scan.prepare import WORKING_THICKNESS
+from curvafit.studies.compare import LEVEL
+from curvafit.studies.tables import format_csv, plain_unit, rows_of
+from curvafit.studies.trajectory import Change, Trajectory, say_change
+
+#: `format` of a series' record.
+FORMAT = Format("curvafit trajectory", 1, title="the record of a series of scans")
+#: What a series writes into its folder.
+FILES = ("trajectory.json", "trajectory.html", "trajectory.csv", "path.svg", "path.png", "numbers.svg", "numbers.png")
+#: Colours of scans from the first to the last.
+LATER = LinearSegmentedColormap.from_list("later", ["#C4C9D1", INK])
+#: Least share of the surface of a family that is named in its area.
+NAMED = 0.1
+
+
+def check_trajectory(directory: str | Path, inputs: Iterable[str | Path] = (), overwrite: bool = False) -> Path:
+    """Return the folder if `write_trajectory` can write there, else raise ValueError; call it before the work."""
+    return check_result_folder(FORMAT, FILES, directory, inputs, overwrite)
+
+
+def write_trajectory(
+    trajectory: Trajectory, directory: str | Path, *, command: str = "", overwrite: bool = False
+) -> Path:
+    """Write the page, figures, table and record of a series into a folder, and return the page's path.
+
+    The files (`FILES`) are moved into the folder once all are whole. Those of an earlier series are replaced; others
+    are a ValueError without `overwrite`. `command` is what the record calls the command line.
+    """
+    target = check_trajectory(directory, overwrite=overwrite)
+    path, numbers = trajectory_figure(trajectory), numbers_figure(trajectory)
+    record = _record(trajectory, command)
+    page = render_template(
+        "trajectory.html",
+        version=version("curvafit"),
+        title=f"{len(trajectory.times)} scans, {' to '.join(trajectory.ends)}",
+        status=trajectory.status,
+        path=picture_of(path, "The curvature diagram over time"),
+        numbers=picture_of(numbers, "Each number over time"),
+        ends=trajectory.ends,
+        rows=[_format_row(trajectory, change) for change in trajectory.changes],
+        level=f"{LEVEL:.2g}",
+        methods=record["methods"],
+        notes=trajectory.notes,
+        provenance=[(name, record[name]) for name in ("command", "date", "seed", "permutations") if record[name] != ""],
+    )
+    rows = [
+        row
+        for measures, time in zip(trajectory.measures, trajectory.times, strict=True)
+        for row in rows_of(measures, time=time, unit_of_time=trajectory.unit_of_time)
+    ]
+    texts = {"trajectory.html": page, "trajectory.csv": format_csv(rows)}
+    return write_study(target, FORMAT, FILES, record, texts, path=path, numbers=numbers)
+
+
+# ---- figures ---------------------------------------------------------------------------------------------------------
+
+
+def trajectory_figure(trajectory: Trajectory) -> Figure:
+    """Return a figure of the diagram's distance from the first, the families' shares, and the path on the atlas's map.
+
+    The map's unit is that in which the first scan's structure is as thick as scans are resampled to.
+    """
+    figure = make_figure(13.2, 4.4)
+    away, shares, place = (
+        figure.add_axes((left, 0.13, width, 0.78)) for left, width in ((0.05, 0.23), (0.33, 0.23), (0.6, 0.39))
+    )
+    away.plot(trajectory.times, trajectory.distances, "o-", color=FIRST, markersize=5, clip_on=False)
+    away.set(ylim=(0, None), title=f"distance from the first ({per_unit(trajectory.unit, 1)})")
+    _shares_on(shares, trajectory)
+    for axes in (away, shares):
+        axes.set_xlabel(plain(f"time ({trajectory.unit_of_time})" if trajectory.unit_of_time else "time"))
+        axes.set_xlim(trajectory.times[0], trajectory.times[-1])
+        axes.title.set_fontsize(11)
+        axes.tick_params(length=3, labelsize=9)
+        axes.spines[:].set_color(QUIET)
+    length = trajectory.measures[0]["thickness"].value / (WORKING_THICKNESS * WORKING_SPACING)
+    seen_as = "field" if all(each.kind == "field" for each in trajectory.measures) else "mask"
+    own = map_on(place, load_atlas(), seen_as, trajectory.embeddings * length)
+    for k, shade in enumerate(LATER(np.linspace(0, 1, len(own)))):
+        place.plot(
+            *own[max(k - 1, 0) : k + 1].T,
+            color=shade,
+            linewidth=2.2,
+            zorder=5,
+            path_effects=[withStroke(linewidth=4, foreground="white")],
+        )
+        place.scatter(*own[k], s=60, color=shade, edgecolors="white", linewidths=1.0, zorder=6)
+    for point, name in zip(own[[0, -1]], trajectory.ends, strict=True):
+        place.annotate(
+            plain(name), point, (7, 7), textcoords="offset points", fontsize=10, fontweight="bold", color=INK, zorder=7,
+            path_effects=[withStroke(linewidth=3, foreground="white")],
+        )  # fmt: skip
+    return figure
+
+
+def _shares_on(axes: Axes, trajectory: Trajectory) -> None:
+    """Draw the share of each family over time, one above the other, each with its name where it is thickest."""
+    shares = np.stack([trajectory.table(f"share of {name}")[0] for name in FAMILIES])
+    axes.stackplot(trajectory.times, shares, colors=[FAMILY_COLOURS[name] for name in FAMILIES], alpha=0.8, linewidth=0)
+    middles = shares.cumsum(0) - shares / 2
+    sides = {0: "left", len(trajectory.times) - 1: "right"}
+    for name, share, middle in zip(FAMILIES, shares, middles, strict=True):
+        k = int(share.argmax())
+        if share[k] >= NAMED:
+            axes.text(trajectory.times[k], middle[k], f" {name} ", ha=sides.get(k, "center"), va="center", fontsize=9)
+    axes.set(ylim=(0, 1), title="shares of the surface")
+
+
+def numbers_figure(trajectory: Trajectory) -> Figure:
+    """Return a figure of each quantity over time, with the band of its 95 % intervals.
+
+    The names of quantities that move with time, among all, are bold.
+    """
+    figure, panels = number_panels(
+        trajectory.changes,
+        trajectory.unit,
+        LEVEL,
+        lambda change: (
+            say_change(change, "")
+            if math.isnan(change.p)
+            else f"ρ = {format_number(change.correlation, 2)}, p = {format_number(change.p, 2)}"
+        ),
+    )
+    for axes, change in zip(panels, trajectory.changes, strict=True):
+        values, halves = trajectory.table(change.name)
+        axes.fill_between(trajectory.times, values - halves, values + halves, color=FIRST, alpha=0.2, linewidth=0)
+        axes.plot(trajectory.times, values, "o-", color=FIRST, markersize=4, markeredgewidth=0, linewidth=1.2)
+    return figure
+
+
+# ---- words, table and record -----------------------------------------------------------------------------------------
+
+
+def describe_series(trajectory: Trajectory) -> str:
+    """Return a paragraph, for a paper, on what was done and what came of it."""
+    t, unit = trajectory, per_unit(trajectory.unit, 1)
+    changed = ", ".join(f"{each.symbol} ({say_change(each, t.unit)})" for each in t.changes if each.significant)
+    lines = [
+        f"{len(t.times)} scans of one object, from {' to '.join(t.ends)}, were measured with curvafit "
+        f"{version('curvafit')}; {say_kinds(t.measures, t.options)}.",
+        "Intervals of each scan's numbers are 95 %, by a jackknife over blocks; that of the change from the first scan "
+        "to the last is the root of the sum of the squares of both.",
+        f"Of {len(t.changes)} numbers, these intervals are without 0 of {changed or 'none'}.",
+        "The curvature diagram of a scan is the share of its surface's area over the principal curvatures κ₁ ≥ κ₂; the "
+        f"sliced Wasserstein distance ({DIRECTIONS} directions, {QUANTILES} quantiles) of the last from the first is "
+        f"{format_number(t.distances[-1], 3)} {unit}.",
+    ]
+    if not math.isnan(t.p):
+        tried = (
+            f"all {t.permutations} orders" if t.exact else f"{t.permutations} orders (random, seed {t.options['seed']})"
+        )
+        moving = ", ".join(
+            f"{each.symbol} (ρ = {format_number(each.correlation, 2)})" for each in t.changes if each.moves
+        )
+        lines += [
+            f"Each number's Spearman correlation with time was tested over {tried} of the scans, and corrected for all "
+            "numbers by the greatest correlation in each order (Westfall & Young 1993).",
+            f"At a family-wise level of {LEVEL:.2g} move {moving or 'none'}.",
+            "Whether the distance of two diagrams goes with the time between them was tested over the same orders "
+            f"(Mantel 1967): p = {format_number(t.p, 2)}.",
+        ]
+    return " ".join(lines)
+
+
+def _format_row(trajectory: Trajectory, change: Change) -> dict[str, Any]:
+    """Return a row of the page's table."""
+    values, halves = trajectory.table(change.name)
+    texts = [f"{format_number(values[k])} ± {format_number(halves[k], 2)}" for k in (0, -1)]
+    tests = (format_number(each, 2) for each in (change.correlation, change.p, change.family))
+    return {
+        **name_quantity(change, trajectory.unit),
+        "cells": (*texts, say_change(change, ""), *tests),
+        "chosen": (2,) * change.significant + (5,) * change.moves,
+    }
+
+
+def _record(trajectory: Trajectory, command: str) -> dict[str, Any]:
+    """Return the content of `trajectory.json`."""
+    changes = [
+        {
+            "quantity": each.name,
+            "symbol": each.symbol,
+            "unit": plain_unit(trajectory.unit, each.power),
+            **{name: known(getattr(each, name)) for name in ("difference", "half", "correlation", "p", "family")},
+        }
+        for each in trajectory.changes
+    ]
+    return {
+        **record_study(trajectory, command, FILES),
+        "unit_of_time": trajectory.unit_of_time,
+        "scans": [
+            {"scan": each.source, "time": time, "kind": each.kind, "distance": float(distance)}
+            for each, time, distance in zip(trajectory.measures, trajectory.times, trajectory.distances, strict=True)
+        ],
+        "changes": changes,
+        "methods": describe_series(trajectory),
+    }
