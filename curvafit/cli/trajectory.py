@@ -55,5 +55,5 @@ def trajectory(
         )
         for each in found.changes
     ]
-    print_table(("", "", "change", "ρ with time", "p", "family-wise p"), rows, right=range(2, 6))
+    print_table(("", "", "change", "r with time", "p", "family-wise p"), rows, right=range(2, 6))
     say(str(page))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -112,11 +113,10 @@ def trajectory_figure(trajectory: Trajectory) -> Figure:
             path_effects=[withStroke(linewidth=4, foreground="white")],
         )
         place.scatter(*own[k], s=60, color=shade, edgecolors="white", linewidths=1.0, zorder=6)
-    for point, name in zip(own[[0, -1]], trajectory.ends, strict=True):
-        place.annotate(
-            plain(name), point, (7, 7), textcoords="offset points", fontsize=10, fontweight="bold", color=INK, zorder=7,
-            path_effects=[withStroke(linewidth=3, foreground="white")],
-        )  # fmt: skip
+    words = {"textcoords": "offset points", "fontsize": 10, "fontweight": "bold", "zorder": 7}
+    words["path_effects"] = [withStroke(linewidth=3, foreground="white")]
+    place.annotate(plain(trajectory.ends[0]), own[0], (-8, -8), ha="right", va="top", **words)
+    place.annotate(plain(trajectory.ends[1]), own[-1], (8, 8), **words)
     return figure
 
 
@@ -145,7 +145,7 @@ def numbers_figure(trajectory: Trajectory) -> Figure:
         lambda change: (
             say_change(change, "")
             if math.isnan(change.p)
-            else f"ρ = {format_number(change.correlation, 2)}, p = {format_number(change.p, 2)}"
+            else f"r = {format_number(change.correlation, 2)}, p = {format_number(change.p, 2)}"
         ),
     )
     for axes, change in zip(panels, trajectory.changes, strict=True):
@@ -177,13 +177,13 @@ def describe_series(trajectory: Trajectory) -> str:
             f"all {t.permutations} orders" if t.exact else f"{t.permutations} orders (random, seed {t.options['seed']})"
         )
         moving = ", ".join(
-            f"{each.symbol} (ρ = {format_number(each.correlation, 2)})" for each in t.changes if each.moves
+            f"{each.symbol} (r = {format_number(each.correlation, 2)})" for each in t.changes if each.moves
         )
         lines += [
-            f"Each number's Spearman correlation with time was tested over {tried} of the scans, and corrected for all "
-            "numbers by the greatest correlation in each order (Westfall & Young 1993).",
+            f"Each number's correlation with the scan's place in the series was tested over {tried} of the scans, and "
+            "corrected for all numbers by the greatest correlation in each order (Westfall & Young 1993).",
             f"At a family-wise level of {LEVEL:.2g} move {moving or 'none'}.",
-            "Whether the distance of two diagrams goes with the time between them was tested over the same orders "
+            "Whether the distance of two diagrams goes with theirs in the series was tested over the same orders "
             f"(Mantel 1967): p = {format_number(t.p, 2)}.",
         ]
     return " ".join(lines)
@@ -204,12 +204,7 @@ def _format_row(trajectory: Trajectory, change: Change) -> dict[str, Any]:
 def _record(trajectory: Trajectory, command: str) -> dict[str, Any]:
     """Return the content of `trajectory.json`."""
     changes = [
-        {
-            "quantity": each.name,
-            "symbol": each.symbol,
-            "unit": plain_unit(trajectory.unit, each.power),
-            **{name: known(getattr(each, name)) for name in ("difference", "half", "correlation", "p", "family")},
-        }
+        {name: known(value) for name, value in asdict(each).items()} | {"unit": plain_unit(trajectory.unit, each.power)}
         for each in trajectory.changes
     ]
     return {

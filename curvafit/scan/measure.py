@@ -7,7 +7,7 @@ import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from scipy import ndimage, stats
@@ -31,6 +31,7 @@ SUMS = ("volume", "inside", "thickness", "thickness²", "gap", "χ", "area", *(f
 SUMS += ("curved", "H", "H²", "K", "κ1", "κ2", "C", *FAMILIES)
 _UPPER = np.triu_indices(3)
 Sums = Mapping[str, np.ndarray]
+Row = TypeVar("Row", bound=Any)
 #: Least edge, in working voxels, of a cube whose descriptors are measured.
 SMALLEST_CUBE = 24
 #: The fewest blocks, and the most along an axis; the length of a block in periods of the structure.
@@ -125,10 +126,7 @@ class Measures:
 
     def __getitem__(self, name: str) -> Quantity:
         """Return the quantity of a name or a symbol; raise KeyError where there is none."""
-        for each in self.quantities:
-            if name in (each.name, each.symbol):
-                return each
-        raise KeyError(f"expected one of {', '.join(each.name for each in self.quantities)}, got {name!r}")
+        return find_quantity(self.quantities, name)
 
     def convert(self, unit: str) -> Measures:
         """Return the same measures in another unit of length; ValueError if one of the two is the voxel."""
@@ -151,6 +149,14 @@ class Measures:
             places=None if old.places is None else old.places * factor,
         )
         return replace(self, unit=unit, quantities=tuple(quantities), diagram=diagram)
+
+
+def find_quantity(rows: Sequence[Row], name: str) -> Row:
+    """Return the row of a quantity by its name or symbol; raise KeyError where there is none."""
+    for each in rows:
+        if name in (each.name, each.symbol):
+            return each
+    raise KeyError(f"expected one of {', '.join(each.name for each in rows)}, got {name!r}")
 
 
 def measure(

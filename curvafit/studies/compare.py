@@ -20,7 +20,7 @@ from curvafit.core.units import format_number, format_percent, per_unit
 from curvafit.drawing.plot import shared_limits
 from curvafit.geometry.diagram import FAMILIES, Diagram
 from curvafit.geometry.distances import sliced_embedding
-from curvafit.scan.measure import SURE, Measures, interval_reach
+from curvafit.scan.measure import SURE, Measures, find_quantity, interval_reach
 from curvafit.scan.structure import check_options
 from curvafit.studies.groups import Case, Group, list_cases
 from curvafit.studies.permutation import (
@@ -139,10 +139,7 @@ class Comparison(Pictured):
 
     def __getitem__(self, name: str) -> Number:
         """Return the test of a quantity by its name or symbol; raise KeyError where there is none."""
-        for each in self.numbers:
-            if name in (each.name, each.symbol):
-                return each
-        raise KeyError(f"expected one of {', '.join(each.name for each in self.numbers)}, got {name!r}")
+        return find_quantity(self.numbers, name)
 
     @property
     def counts(self) -> tuple[int, int]:

@@ -9,18 +9,17 @@ from typing import Any, Literal
 
 import numpy as np
 from scipy.spatial.distance import cdist
-from scipy.stats import rankdata
 
 from curvafit.core.checks import as_tuple, check_float, check_int, check_seed, check_type, quoted
 from curvafit.core.pictures import Pictured
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.core.units import format_number, per_unit, power_name
 from curvafit.geometry.distances import sliced_embedding
-from curvafit.scan.measure import Measures
+from curvafit.scan.measure import Measures, find_quantity
 from curvafit.scan.structure import check_options
 from curvafit.studies.compare import LEVEL, PERMUTATIONS
 from curvafit.studies.groups import list_series
-from curvafit.studies.permutation import TIE, correct_by_most, correlate, reorder, share_beyond
+from curvafit.studies.permutation import correct_by_most, correlate, reorder, share_beyond
 from curvafit.studies.scans import gather_notes, measure_scans
 from curvafit.volumes.read import Source
 
@@ -40,7 +39,7 @@ class Change:
         The last scan's number less the first's, and half the width of its 95 % interval: the root of the summed squares
         of the two scans' own.
     correlation
-        Spearman's, with time; NaN, as p is, of fewer than four scans.
+        With the scan's place in the series; NaN, as p is, of fewer than four scans.
     p, family
         Share of the scans' orders with at least that correlation or its negative; and the same corrected for all
         quantities, by the most of |correlation| over them in each order.
@@ -82,8 +81,8 @@ class Trajectory(Pictured):
         The diagrams' sliced quantiles (N, 288), in 1 / `unit`, and their sliced Wasserstein distances (N,) from the
         first.
     p
-        Share of orders in which the distance of two diagrams goes with the time between them at least as much (Mantel
-        1967); NaN of fewer than four scans.
+        Share of orders in which the distance of two diagrams goes at least as much with how far apart they are in the
+        series (Mantel 1967); NaN of fewer than four scans.
     permutations, exact
         How many orders of the scans were tried, and whether they are all.
     """
@@ -106,10 +105,7 @@ class Trajectory(Pictured):
 
     def __getitem__(self, name: str) -> Change:
         """Return the change of a quantity by its name or symbol; raise KeyError where there is none."""
-        for each in self.changes:
-            if name in (each.name, each.symbol):
-                return each
-        raise KeyError(f"expected one of {', '.join(each.name for each in self.changes)}, got {name!r}")
+        return find_quantity(self.changes, name)
 
     @property
     def ends(self) -> tuple[str, str]:
@@ -139,8 +135,9 @@ class Trajectory(Pictured):
         ]
         if math.isnan(self.p):
             return " ".join([*lines, f"Whether anything moves with time needs {FEWEST} scans."])
-        moving = [each.symbol for each in self.changes if each.moves]
-        lines.append(f"With time move {', '.join(moving)}." if moving else "No number moves with time.")
+        word = "moves" if self.p <= LEVEL else "is not seen to move"
+        moving = ", ".join(each.symbol for each in self.changes if each.moves) or "none"
+        lines.append(f"It {word} with time (p = {format_number(self.p, 2)}); numbers that do: {moving}.")
         if (least := 2 / self.permutations) > LEVEL:
             lines.append(f"So few scans cannot give a p below {format_number(least, 2)}.")
         return " ".join(lines)
@@ -172,7 +169,7 @@ def trajectory(
 ) -> Trajectory:
     """Follow one thing through scans at several times: each number of `measure` with its interval, and the diagram.
 
-    Of four scans or more, each number's Spearman correlation with time is tested over orders of the scans. Raises
+    Of four scans or more, each number's correlation with the scan's place is tested over orders of the scans. Raises
     ValueError where there are fewer than two scans, times do not increase, or only some scans have a physical unit; and
     as `measure`, with the scan's name.
 
@@ -212,7 +209,7 @@ def trajectory(
         changes=_follow_numbers(measures, orders),
         embeddings=embeddings,
         distances=away[0],
-        p=_test_distances(away, np.array(moments)[orders]),
+        p=_test_distances(away, orders),
         permutations=len(orders),
         exact=exact,
         options={**options, **reading, "permutations": permutations, "seed": seed},
@@ -234,12 +231,12 @@ def check_times(times: Sequence[float] | None, count: int) -> tuple[float, ...]:
     return moments
 
 
-def _test_distances(away: np.ndarray, times: np.ndarray) -> float:
-    """Return the p of distances (N, N) that go with the time between scans, over times in other orders (m, N)."""
+def _test_distances(away: np.ndarray, orders: np.ndarray) -> float:
+    """Return the p of distances (N, N) that go with those in the series, over orders (m, N)."""
     if len(away) < FEWEST:
         return math.nan
     i, j = np.triu_indices(len(away), 1)
-    return float(share_beyond(correlate(away[i, j][:, None], np.abs(times[:, i] - times[:, j])))[0])
+    return float(share_beyond(correlate(away[i, j][:, None], np.abs(orders[:, i] - orders[:, j])))[0])
 
 
 def _follow_numbers(measures: Sequence[Measures], orders: np.ndarray) -> tuple[Change, ...]:
@@ -250,12 +247,9 @@ def _follow_numbers(measures: Sequence[Measures], orders: np.ndarray) -> tuple[C
     correlation, p, family = np.full((3, values.shape[1]), np.nan)
     if len(measures) >= FEWEST:
         told = np.isfinite(values).all(0)
-        # Values that are equal but for sums taken in another order have equal ranks.
-        steps = TIE * np.maximum(np.abs(values[:, told]).max(0), np.finfo(float).tiny)
-        ranks = rankdata(np.rint(values[:, told] / steps), axis=0)
-        every = correlate(ranks, orders)
-        p[told], family[told] = share_beyond(every), correct_by_most(ranks, orders)
-        correlation[told] = every[0] * np.sign((orders[0] - orders[0].mean()) @ ranks)
+        every = correlate(values[:, told], orders)
+        p[told], family[told] = share_beyond(every), correct_by_most(values[:, told], orders)
+        correlation[told] = every[0] * np.sign((orders[0] - orders[0].mean()) @ values[:, told])
     differences, reach = values[-1] - values[0], np.hypot(halves[0], halves[-1])
     columns = np.stack([differences, reach, correlation, p, family], axis=1).tolist()
     return tuple(
