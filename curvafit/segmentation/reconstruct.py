@@ -27,7 +27,7 @@ from curvafit.priors.profile import profile_distance
 from curvafit.segmentation.engine import STEPS, WorkingGrid, choose_epsilon, laws_of
 from curvafit.segmentation.examples import PART, Example, crop_to_surface
 from curvafit.segmentation.filler import Taught, fill
-from curvafit.segmentation.image import read_image
+from curvafit.segmentation.image import find_shift, read_image
 from curvafit.segmentation.result import Segmentation, Uncertainty, flow_summary, volume_summary
 from curvafit.segmentation.slices import (
     WHOLE,
@@ -73,6 +73,7 @@ HALF = 0.5
 GREY, SAMPLED = 8, 1_000_000
 #: Least share of the entropy of slices held out that an image takes away: that of the structure takes half or more.
 TOLD = 0.1
+SHIFTED = "The image seems to lie off the annotated slices by {where}: it fits them better when it is moved back."
 UNTOLD = "The image does not tell the structure in annotated slices held out: it is left out."
 #: Labels whose status is told one by one; voxels around a label's box.
 FEW, ROOM = 4, 16
@@ -170,9 +171,8 @@ def reconstruct(
         if example is not None or laws:
             raise ScanError("give an image, or an example or a law, but not both: nothing joins them yet")
         seen = _load_image(image, volume, reading)
-        evidence = _read_evidence(np.moveaxis(seen.values, axis, 0), target, sub_progress(progress, 0.0, 0.5))
-        if evidence is None:
-            taught, notes = Taught.load(), (*notes, UNTOLD)
+        evidence, doubts = _read_evidence(seen, target, axis, sub_progress(progress, 0.0, 0.5))
+        taught, notes = taught if evidence is not None else Taught.load(), (*notes, *doubts)
     if example is not None:
         other = Example.of(_load_example(example, volume, reading), places, axis)
         taught = tune(taught, other, sub_progress(progress, 0.0, 0.5))
@@ -411,10 +411,19 @@ def _load_image(image: Source, volume: Field, reading: dict[str, Any]) -> Field:
     return field
 
 
-def _read_evidence(values: np.ndarray, slices: Slices, progress: Progress) -> np.ndarray | None:
-    """Return the log-odds of an image (Z, Y, X); None where it does not tell known slices that are held out."""
-    evidence, told = read_image(values, slices, progress=progress)
-    return None if told < TOLD else evidence
+def _read_evidence(
+    image: Field, slices: Slices, axis: int, progress: Progress
+) -> tuple[np.ndarray | None, tuple[str, ...]]:
+    """Return the log-odds of an image of slices across an axis, which becomes the first; None where it does not tell
+    known slices that are held out. And sentences on what is doubtful."""
+    levels, names = np.moveaxis(image.values, axis, 0), "zyx".replace("zyx"[axis], "")
+    shift = find_shift(levels, slices)
+    where = " and ".join(
+        f"{voxels:+d} voxels along {name}" for voxels, name in zip(shift, names, strict=True) if voxels
+    )
+    doubts = (SHIFTED.format(where=where),) if where else ()
+    evidence, told = read_image(levels, slices, progress=progress)
+    return (None, (*doubts, UNTOLD)) if told < TOLD else (evidence, doubts)
 
 
 def _load_example(example: Source, volume: Field, reading: dict[str, Any]) -> Field:

@@ -12,7 +12,7 @@ from calling import call
 
 import curvafit.segmentation.image as room
 from curvafit.segmentation.filler import Filler, Gaps, Taught, fill
-from curvafit.segmentation.image import read_image
+from curvafit.segmentation.image import find_shift, read_image
 from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.slices import Slices
 from curvafit.segmentation.teach import Texture
@@ -62,6 +62,16 @@ def test_noise_alone_says_little() -> None:
     mask = rods()
     said = read_image(photograph(np.zeros_like(mask), 1.0), known(mask))[0]
     assert (np.abs(said - np.log(mask.mean() / (1 - mask.mean()))) < 2.5).mean() > 0.9
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_an_image_that_lies_off_the_slices_is_told(sign: int) -> None:
+    mask = rods()
+    image, slices = sign * photograph(mask, 1.0), known(mask)
+    assert find_shift(image, slices) == (0, 0)
+    assert find_shift(np.roll(image, (4, -3), (1, 2)), slices) == (4, -3)
+    for seed in range(5):
+        assert find_shift(photograph(np.zeros_like(mask), seed=seed), slices) == (0, 0)
 
 
 def test_slices_that_are_read_in_parts_are_read_alike(monkeypatch: pytest.MonkeyPatch) -> None:
