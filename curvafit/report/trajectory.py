@@ -143,7 +143,7 @@ def numbers_figure(trajectory: Trajectory) -> Figure:
         trajectory.unit,
         LEVEL,
         lambda change: (
-            say_change(change, "")
+            say_change(change)
             if math.isnan(change.p)
             else f"r = {format_number(change.correlation, 2)}, p = {format_number(change.p, 2)}"
         ),
@@ -196,7 +196,7 @@ def _format_row(trajectory: Trajectory, change: Change) -> dict[str, Any]:
     tests = (format_number(each, 2) for each in (change.correlation, change.p, change.family))
     return {
         **name_quantity(change, trajectory.unit),
-        "cells": (*texts, say_change(change, ""), *tests),
+        "cells": (*texts, say_change(change), *tests),
         "chosen": (2,) * change.significant + (5,) * change.moves,
     }
 

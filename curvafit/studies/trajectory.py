@@ -143,13 +143,11 @@ class Trajectory(Pictured):
         return " ".join(lines)
 
 
-def say_change(change: Change, unit: str) -> str:
-    """Return a change with its interval and its unit as text."""
+def say_change(change: Change, unit: str = "") -> str:
+    """Return a change with its interval as text, and with its unit where the scans' is given."""
+    name = power_name(unit, change.power) if unit else ""
     sign = "+" if change.difference > 0 else ""
-    text = (
-        f"{sign}{format_number(change.difference)} ± {format_number(change.half, 2)} {power_name(unit, change.power)}"
-    )
-    return text.rstrip()
+    return f"{sign}{format_number(change.difference)} ± {format_number(change.half, 2)} {name}".rstrip()
 
 
 def trajectory(

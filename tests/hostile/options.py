@@ -149,6 +149,13 @@ COMMANDS: dict[str, Command] = {
         _take_groups,
         each=2,
     ),
+    "trajectory": Command(
+        ("trajectory", "first/a.nii.gz", "first/b.nii.gz", "-o", "out"),
+        "times unit-of-time threshold permutations seed",
+        "permutations",
+        _take_groups,
+        each=2,
+    ),
     "build": Command(
         ("atlas", "build", "out.zarr", "--count", "1", "--shape", "16", "--around", "tubes", "--workers", "0"),
         "count shape seed design around spread schedule steps workers scheduler",
@@ -221,7 +228,7 @@ def _without(arguments: tuple[str, ...], option: str) -> tuple[str, ...]:
 
 def _short(name: str) -> bool:
     return name not in ("build", "synth-grown") and not name.startswith(
-        ("compare", "infer", "synth-like", "synth-channels")
+        ("compare", "infer", "synth-like", "synth-channels", "trajectory")
     )
 
 
