@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -24,6 +25,7 @@ from curvafit.volumes.formats.base import Damaged, Raw, ScanError, check_regular
 from curvafit.volumes.formats.medical import is_dicom, read_dicom, read_metaimage, read_mrc, read_nrrd
 from curvafit.volumes.formats.nifti import read_nifti
 from curvafit.volumes.formats.part import Crop, Part, parse_box, take_part
+from curvafit.volumes.formats.scanco import read_aim, read_isq
 from curvafit.volumes.formats.tiff import SLICES, read_slices, read_tiff
 from curvafit.volumes.formats.zarr import read_zarr
 
@@ -44,6 +46,8 @@ READERS: dict[str, Callable[..., Raw]] = {
     ".mha": read_metaimage,
     ".mhd": read_metaimage,
     **dict.fromkeys((".mrc", ".map", ".rec"), read_mrc),
+    ".isq": read_isq,
+    ".aim": read_aim,
 }
 
 #: Readers of formats that can hold several arrays, by key.
@@ -72,8 +76,8 @@ def load(
     Parameters
     ----------
     path
-        NIfTI, TIFF, NPY, NPZ, HDF5, RAW, Zarr; with `curvafit[io]` also NRRD, MHA/MHD, MRC and DICOM folders.
-        `file.h5::key` names an array within a file; `key` does the same.
+        NIfTI, TIFF, NPY, NPZ, HDF5, RAW, Zarr, Scanco's ISQ and AIM; with `curvafit[io]` also NRRD, MHA/MHD, MRC and
+        DICOM folders. `file.h5::key` names an array within a file; `key` does the same.
     spacing, unit
         Voxel edges (z, y, x), or one for all, and nm, um, mm or m, in place of what the file says. A `unit` alone
         renames the file's numbers; it does not convert them.
@@ -84,7 +88,7 @@ def load(
         The voxels that have this value, as a mask.
     crop
         A box of voxels, `"z0:z1,y0:y1,x0:x1"` or three slices; the affine says where the box lies. From Zarr, HDF5,
-        NPY, RAW and uncompressed NIfTI only the box is read.
+        NPY, RAW, ISQ, AIM and uncompressed NIfTI only the box is read.
     raw_shape, dtype
         Voxels (z, y, x) and numpy type of a RAW file, which does not state them.
     strict
@@ -202,8 +206,9 @@ def pick_reader(path: Path, shape_given: bool = False) -> Callable[..., Raw]:
     """Return the reader of a file by its suffix, or of a folder by its content."""
     if path.is_dir():
         return _pick_folder(path)
+    name = re.sub(r";\d+$", "", path.name.lower())  # VMS numbers the versions of a file: SCAN.AIM;1
     for suffix in sorted(READERS, key=len, reverse=True):
-        if path.name.lower().endswith(suffix):
+        if name.endswith(suffix):
             return READERS[suffix]
     if shape_given:
         return read_raw

@@ -121,12 +121,12 @@ def read_numbers(stream: Any, shape: Sequence[int], dtype: np.dtype, place: obje
     return values.reshape(shape)
 
 
-def map_numbers(path: Path, start: int, shape: Sequence[int], dtype: np.dtype) -> np.ndarray:
-    """Map the array, last axis fastest, that fills a file from the byte `start` to the end."""
+def map_numbers(path: Path, start: int, shape: Sequence[int], dtype: np.dtype, tail: bool = False) -> np.ndarray:
+    """Map the array, last axis fastest, that fills a file from the byte `start` to the end, or to a `tail`."""
     nbytes, size = math.prod(shape) * dtype.itemsize, path.stat().st_size - start
-    if nbytes != size:
+    if nbytes > size or (nbytes < size and not tail):
         raise Damaged(f"{nbytes} bytes of values by its header, {size} in the file")
-    return np.memmap(path, dtype, "r", start, tuple(shape)) if size else np.empty(tuple(shape), dtype)
+    return np.memmap(path, dtype, "r", start, tuple(shape)) if nbytes else np.empty(tuple(shape), dtype)
 
 
 def check_array(shape: Sequence[int], dtype: np.dtype, place: object) -> None:
